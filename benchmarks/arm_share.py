@@ -18,7 +18,7 @@ from typing import Any
 import msgpack
 from mcap.reader import make_reader
 
-from applications.pick_place.contact_check import Recheck, Recording
+from applications.pick_place.contact_check import ContactCheck, Recording
 from common.application import find_application
 from common.config import load_cell
 from common.transport.codec import decode
@@ -69,7 +69,7 @@ def checked(recording: Path) -> str:
             key = channel.topic.partition("/")[2]
             if key in topics:
                 fold.on(key, decode(topics[key].message, message.data), 0.0, 0)
-    recheck = Recheck(cell, STEP)
+    recheck = ContactCheck(cell, STEP)
     contacts = recheck.contacts(heard)
     return "; ".join([f"{len(contacts)} contacts in {recheck.checked:,} positions", *map(str, contacts)])
 

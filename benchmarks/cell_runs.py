@@ -17,7 +17,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from applications.pick_place.contact_check import Contact, Recheck, Recording
+from applications.pick_place.contact_check import Contact, ContactCheck, Recording
 from common.application import find_application
 from common.config import load_cell
 from common.transport.bus import Bus
@@ -84,7 +84,7 @@ async def run_once(label: str, balls: int, speed: float, options: list[str], fol
             stop.set()
             recorded = await recording
         summary = cell.summary
-    recheck = Recheck(load_cell(CELL))
+    recheck = ContactCheck(load_cell(CELL))
     contacts = await asyncio.to_thread(recheck.contacts, recorded)
     steps = [max(abs(a - b) for a, b in zip(p.position[:7], q.position[:7], strict=True))
              for p, q in zip(recorded.joints, recorded.joints[1:], strict=False)]

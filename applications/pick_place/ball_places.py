@@ -38,7 +38,7 @@ def shows_table(around: Surroundings, camera: Pinhole, pixels: Array) -> npt.NDA
 
 
 @dataclass(frozen=True)
-class Resting:
+class BallGeometry:
     """Known size of the balls and the heights at which their centres can be, in world [m]."""
 
     radius: float
@@ -46,7 +46,7 @@ class Resting:
     container: Container
 
     @classmethod
-    def of(cls, surroundings: Surroundings) -> Resting:
+    def of(cls, surroundings: Surroundings) -> BallGeometry:
         """What the surroundings say."""
         return cls(surroundings.ball_radius, surroundings.table_height, surroundings.container)
 
@@ -121,13 +121,14 @@ MOST_HIDDEN = 0.02  # part of the table within reach that may be hidden while it
 STEP = 0.02  # [m] between the places that stand for the table
 
 
-class Region:
+class VisibleTable:
     """Places (n, 3) [m] in world at which a ball may lie within reach, and which of them a camera can see at all."""
 
     def __init__(self, around: Surroundings, bounds: WorkspaceBounds) -> None:
         """Spread places over the tables, within the bounds and clear of the containers."""
         self.radius = around.ball_radius
-        self._resting = [Resting(around.ball_radius, around.table_height, box) for box in around.containers.values()]
+        self._resting = [BallGeometry(around.ball_radius, around.table_height, box)
+                         for box in around.containers.values()]
         plane = around.table_height + around.ball_radius
         found = [
             (x, y, plane)
@@ -175,8 +176,8 @@ class Region:
         return float(np.mean(~shown[all_of_it])) if all_of_it.any() else 0.0
 
 
-def looking_poses(
-    robot: RobotModel, cameras: Sequence[Pinhole], region: Region, most: float, carries: float
+def find_viewing_poses(
+    robot: RobotModel, cameras: Sequence[Pinhole], region: VisibleTable, most: float, carries: float
 ) -> list[list[float]]:
     """Joint positions [rad] from which cameras see the table past the robot: home turned about the first joint.
 
@@ -204,7 +205,7 @@ def _steps(middle: float, half: float) -> list[float]:
 MOST = 4  # poses that are tried one after the other
 
 
-class Looking:
+class ViewingPoses:
     """Joint positions [rad] from which the cameras see past the arm, the nearest to home first."""
 
     def __init__(self, config: Config) -> None:
@@ -233,7 +234,7 @@ class Looking:
             return [list(p.look_from)]
         if self._poses is None:
             cameras = [Pinhole.from_config(camera) for camera in p.world.cameras.values() if not camera.mount]
-            region = Region(p.world, WorkspaceBounds())
+            region = VisibleTable(p.world, WorkspaceBounds())
             radius = p.world.ball_radius
-            self._poses = looking_poses(RobotModel.load(p.robot), cameras, region, MOST_HIDDEN, radius)[:MOST]
+            self._poses = find_viewing_poses(RobotModel.load(p.robot), cameras, region, MOST_HIDDEN, radius)[:MOST]
         return self._poses

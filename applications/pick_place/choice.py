@@ -21,7 +21,7 @@ from common.scene.slots import column_at, low_columns
 from common.scene.workspace import yaw_candidates
 from common.tasks.engine import appeared
 from common.tasks.stages import Cycle, Place, View, place_of
-from common.tasks.watchdogs import Patience
+from common.tasks.watchdogs import DwellTimer
 
 Spot = tuple[float, float]  # (x, y) [m]
 Spots = list[Spot]
@@ -85,14 +85,14 @@ class Pick(Cycle):
         self.subject = self.target.id
 
 
-class LetGo(BaseModel):
+class ReleasePositions(BaseModel):
     """Where the last was let go above each column of the container: its centre [m] once it lies, world."""
 
     places: list[tuple[FiniteFloat, FiniteFloat, FiniteFloat]] = []
 
 
 @dataclass
-class GivenUp:
+class AbandonedTarget:
     """An object that is left alone until something changes on the table where `spots` are.
 
     One to which there was no way is tried once more, from another posture of the arm: then it is `open` meanwhile.
@@ -163,11 +163,11 @@ class Choice:
         """
         self.p, self.container, self.radius, self._counted = config, container, radius, counted
         self._misses: list[tuple[Place, int]] = []
-        self._given_up: list[GivenUp] = []
+        self._given_up: list[AbandonedTarget] = []
         self._judged_by: dict[str, Any] = {}  # values of the parameters
-        self._empty = Patience()
+        self._empty = DwellTimer()
         self._expected = (0, 0.0)  # balls that will be in the container soon, and until when that is only expected
-        self.let_go = LetGo()
+        self.let_go = ReleasePositions()
 
     def next(self, view: PickPlaceView, origin: Sequence[float], under_way: Sequence[Pick]) -> Pick | None:
         """The nearest ball to `origin` (x, y) that can be taken, with its yaws; None when there is none now."""
@@ -205,7 +205,7 @@ class Choice:
     def held(self, name: str, view: PickPlaceView) -> Pick:
         """What is left of a pick whose object is in the hand: a restart or a failure has left nothing else of it."""
         pick = Pick(target=Target(name, view.tool), over=self._over(view.tool, view, []))
-        pick.begun = True
+        pick.started = True
         return pick
 
     def _over(self, place: Place, view: PickPlaceView, under_way: Sequence[Pick]) -> Spot:
@@ -227,8 +227,8 @@ class Choice:
         """
         seen = [place_of(thing.pose) for thing in view.objects("contained")]
         empty = not seen and 0 < view.scene_stamp >= self._expected[1] and not _hidden(view)
-        if self._empty.lasts(empty, view.scene_stamp) >= EMPTY_FOR and empty and self.let_go.places:
-            self.let_go = LetGo()
+        if self._empty.elapsed(empty, view.scene_stamp) >= EMPTY_FOR and empty and self.let_go.places:
+            self.let_go = ReleasePositions()
         return [*seen, *self.let_go.places]
 
     def _top(self, over: Spot, lie: Sequence[Place]) -> float:
@@ -243,7 +243,7 @@ class Choice:
             g.retry, g.open = False, True
         return bool(again)
 
-    def _given_up_at(self, place: Place) -> GivenUp | None:
+    def _given_up_at(self, place: Place) -> AbandonedTarget | None:
         return next((g for g in self._given_up if same_place(g.target.position, place, self.radius)), None)
 
     def _is_open(self, ball: Target, view: PickPlaceView, under_way: Sequence[Pick]) -> bool:
@@ -266,7 +266,7 @@ class Choice:
         """A ball was let go above the container, where it will be seen when it has come to rest."""
         over = column_at(self.container, view.tool[:2])  # where there was no way to above another, anywhere
         place = (*over, self._top(over, self._lie(view)))
-        self.let_go = LetGo(places=[*(other for other in self.let_go.places if other[:2] != over), place])
+        self.let_go = ReleasePositions(places=[*(other for other in self.let_go.places if other[:2] != over), place])
         self._expected = self._contained(view) + 1, view.now + SETTLING
         self._forget(pick.target)
 
@@ -286,7 +286,7 @@ class Choice:
         """Leave a ball alone until something changes on the table, or until it is opened for a retry."""
         if (left := self._given_up_at(target.position)) is not None:
             self._given_up.remove(left)
-        self._given_up.append(GivenUp(target, reason, view.spots(None, self.radius), retry))
+        self._given_up.append(AbandonedTarget(target, reason, view.spots(None, self.radius), retry))
 
     def rejections(self) -> list[m.Rejection]:
         """What is given up now, and why."""

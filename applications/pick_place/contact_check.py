@@ -32,7 +32,7 @@ ABOUT = 0.16  # [m] from where the fingers move: within it they may touch that b
 
 
 @dataclass
-class Recording:
+class RecordedMotion:
     """What a cell said about arm, hand and truth, in the order in which it came; what comes again counts once."""
 
     joints: list[JointState] = field(default_factory=list)
@@ -73,7 +73,7 @@ class _Window:
     last: int
 
 
-class Recheck:
+class ContactCheck:
     """Checks recordings of one cell."""
 
     def __init__(self, cell: Cell, step: float = STEP) -> None:
@@ -86,7 +86,7 @@ class Recheck:
         self.gripper, self.gripper_links = cell.robot.gripper, cell.robot.gripper.links
         self.checked = 0  # positions so far
 
-    def contacts(self, recording: Recording) -> list[Contact]:
+    def contacts(self, recording: RecordedMotion) -> list[Contact]:
         """Every pair that touched on the way, once for each time that it did.
 
         The ball in the hand moves with it and counts as part of the arm; it may touch what it touches when it is taken
@@ -125,7 +125,7 @@ class Recheck:
             while at < len(fine) and world.collides(fine[at]):
                 at += 1
 
-    def _spans(self, recording: Recording, stamps: NDArray[np.int64]) -> Iterator[tuple[PoseArray, int, int]]:
+    def _spans(self, recording: RecordedMotion, stamps: NDArray[np.int64]) -> Iterator[tuple[PoseArray, int, int]]:
         """Truths between which only the hand and falling balls move, with the first and last sample of each."""
         kept: list[PoseArray] = []
         for balls in recording.balls:
@@ -138,7 +138,7 @@ class Recheck:
                 yield balls, first, last
 
     def _windows(
-        self, recording: Recording, stamps: NDArray[np.int64], places: Array
+        self, recording: RecordedMotion, stamps: NDArray[np.int64], places: Array
     ) -> Iterator[_Window]:
         """The balls that the fingers closed on or let go, while the hand was about them."""
         truth = iter(recording.balls)

@@ -29,7 +29,7 @@ LEAST = 0.15  # part of a whole ball's points that must be seen
 GATES = (0.012, 0.009, 0.006, 0.005, 0.004, 0.004, 0.004)  # [m] in each step of Gauss-Newton
 
 
-def find_in_depth(mask: Mask, depth: Depth, camera: Pinhole, radius: float) -> Array:
+def find_balls_in_depth(mask: Mask, depth: Depth, camera: Pinhole, radius: float) -> Array:
     """Centres (n, 3) [m] in world of balls in a picture.
 
     Args:

@@ -11,7 +11,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from applications.pick_place.ball_places import Resting
+from applications.pick_place.ball_places import BallGeometry
 from applications.pick_place.topics import DETECTED_OBJECTS
 from common import topics
 from common.config import Parameters, RobotConfig, Surroundings
@@ -38,7 +38,7 @@ class ViewsParameters(Parameters):
 
 
 @dataclass(frozen=True)
-class Seen:
+class CameraDetections:
     """A frame of detections and the camera that took the picture.
 
     A camera on the robot looks `at_times`, from home: its frame is what is known until it looks again. What cannot be
@@ -51,7 +51,7 @@ class Seen:
     hidden: Occlusion | None = None
 
 
-class Views:
+class DetectionViews:
     """Readers for each view: what was detected, and the camera. A view called left has its keys under `left/`."""
 
     def __init__(
@@ -81,10 +81,10 @@ class Views:
         self._views = list(names)
         self._names, self._home = robot.joints, HomeWatch(robot.named_poses["home"])
         self._only_at_home = only_at_home
-        self._newest: list[Seen | None] = [None for _ in keys]
+        self._newest: list[CameraDetections | None] = [None for _ in keys]
         self._left_out = SkippedFrames(log, "a frame of detections")
 
-    async def watch(self, look: Callable[[int, Seen], Awaitable[None]]) -> None:
+    async def watch(self, look: Callable[[int, CameraDetections], Awaitable[None]]) -> None:
         """Have every frame looked at as it comes, one after the other, with the number of its view; never returns."""
         turn = asyncio.Lock()
 
@@ -102,7 +102,8 @@ class Views:
                     continue
                 hidden = self._hidden(number, frame, camera) if not moves else None
                 clear = _clear_of(frame, hidden, self._radius)
-                seen = self._newest[number] = Seen(self._without_cut_off(number, clear), camera, moves, hidden)
+                seen = CameraDetections(self._without_cut_off(number, clear), camera, moves, hidden)
+                self._newest[number] = seen
                 async with turn:
                     await look(number, seen)
 
@@ -113,7 +114,7 @@ class Views:
             for number in range(len(self._frames)):
                 group.create_task(follow(number))
 
-    def newest(self) -> list[Seen]:
+    def newest(self) -> list[CameraDetections]:
         """The newest frame of each view that tells of now; that of a camera on the robot does until it looks again."""
         found = [seen for seen in self._newest if seen is not None]
         latest = max((seen.frame.header.stamp for seen in found), default=0)
@@ -182,7 +183,7 @@ Place = tuple[float, float, float]
 HIDDEN = "hidden"  # label of a target that was seen before something hid it
 
 
-class Remembered:
+class OccludedTargets:
     """Keeps targets while their places are hidden: what nobody sees is not gone."""
 
     def __init__(self, same_place: float = 0.03) -> None:
@@ -217,7 +218,7 @@ ODD_FOR = 0.5  # [s] for which a detector finds something odd at a place before 
 
 
 @dataclass
-class Verdict:
+class ValidationResult:
     """What became of the detections of one frame; places are (x, y, z) [m] in world.
 
     Attributes:
@@ -248,13 +249,13 @@ class Verdict:
 
 
 @dataclass
-class _Told:
+class _Reported:
     place: Place
     seen: int  # stamp of the newest frame that shows something there [ns]
 
 
 @dataclass
-class _Suspect(_Told):
+class _Suspect(_Reported):
     since: int  # [ns]
 
 
@@ -272,47 +273,47 @@ class Validation:
             forget_after: a place that was empty for so long is told again [s, cell time]; may be changed.
             same_place: detections within this are at the same place [m]; less than balls are apart.
         """
-        self._resting = Resting.of(around)
+        self._resting = BallGeometry.of(around)
         self._reach = reach
         self.forget_after = forget_after
         self._same_place = same_place
-        self._told: list[_Told] = []
-        self._odd: list[_Suspect] = []
+        self._reported: list[_Reported] = []
+        self._outliers: list[_Suspect] = []
 
-    def judge_all(self, views: Sequence[tuple[MarkerArray, Pinhole]]) -> Verdict:
+    def validate_views(self, views: Sequence[tuple[MarkerArray, Pinhole]]) -> ValidationResult:
         """What becomes of what several views show, of which each place counts once."""
-        joined = Verdict()
+        joined = ValidationResult()
         for frame, camera in views:
-            verdict = self.judge(frame, camera)
+            result = self.validate(frame, camera)
             known = list(joined.targets)
-            joined.targets += [p for p in verdict.targets if all(math.dist(p, q) >= self._same_place for q in known)]
-            joined.rejections += verdict.rejections
-            joined.inside += verdict.inside
-            joined.unknown += verdict.unknown
+            joined.targets += [p for p in result.targets if all(math.dist(p, q) >= self._same_place for q in known)]
+            joined.rejections += result.rejections
+            joined.inside += result.inside
+            joined.unknown += result.unknown
             others = [place for place, _ in joined.refused]
-            joined.refused += [(p, why) for p, why in verdict.refused
+            joined.refused += [(p, why) for p, why in result.refused
                                if all(math.dist(p, q) >= self._same_place for q in others)]
-            joined.remarks += verdict.remarks
+            joined.remarks += result.remarks
         return joined
 
-    def judge(self, frame: MarkerArray, camera: Pinhole) -> Verdict:
+    def validate(self, frame: MarkerArray, camera: Pinhole) -> ValidationResult:
         """What becomes of the detections of a frame. The same frame may be judged again when more is known."""
-        verdict = Verdict(remarks=[frame.remark] if frame.remark else [])
+        result = ValidationResult(remarks=[frame.remark] if frame.remark else [])
         stamp = frame.header.stamp
-        self._told = [told for told in self._told if stamp - told.seen <= self.forget_after * 1e9]
+        self._reported = [told for told in self._reported if stamp - told.seen <= self.forget_after * 1e9]
         for marker in frame.markers:
             place, reason = self._reason(marker, camera)
             if reason is None:
-                verdict.unknown.append(place)
+                result.unknown.append(place)
             elif reason == INSIDE_CONTAINER:
-                verdict.inside += 1
+                result.inside += 1
             elif reason:
-                verdict.refused.append((place, reason))
+                result.refused.append((place, reason))
                 if not marker.text or self._stays(place, stamp):  # what falls looks odd for a moment
-                    self._tell(verdict, place, reason, stamp)
+                    self._tell(result, place, reason, stamp)
             else:
-                verdict.targets.append(place)
-        return verdict
+                result.targets.append(place)
+        return result
 
     def unknown(self, frame: MarkerArray, camera: Pinhole) -> list[Place]:
         """Places in a frame that need inverse kinematics before they can be judged."""
@@ -331,18 +332,18 @@ class Validation:
 
     def _stays(self, place: Place, stamp: int) -> bool:
         """Whether something odd has been there for a while."""
-        self._odd = [one for one in self._odd if stamp - one.seen <= ODD_FOR * 1e9]
-        for one in self._odd:
+        self._outliers = [one for one in self._outliers if stamp - one.seen <= ODD_FOR * 1e9]
+        for one in self._outliers:
             if math.dist(one.place, place) < self._same_place:
                 one.seen = max(one.seen, stamp)
                 return stamp - one.since >= ODD_FOR * 1e9
-        self._odd.append(_Suspect(place, stamp, stamp))
+        self._outliers.append(_Suspect(place, stamp, stamp))
         return False
 
-    def _tell(self, verdict: Verdict, place: Place, reason: str, stamp: int) -> None:
-        for told in self._told:
+    def _tell(self, result: ValidationResult, place: Place, reason: str, stamp: int) -> None:
+        for told in self._reported:
             if math.dist(told.place, place) < self._same_place:
                 told.seen, told.place = max(told.seen, stamp), place
                 return
-        self._told.append(_Told(place, stamp))
-        verdict.rejections.append(Rejection(position=Vector3(x=place[0], y=place[1], z=place[2]), reason=reason))
+        self._reported.append(_Reported(place, stamp))
+        result.rejections.append(Rejection(position=Vector3(x=place[0], y=place[1], z=place[2]), reason=reason))

@@ -11,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field, model_validator
 
-from applications.pick_place.ball_places import Resting, is_table, shows_table
-from applications.pick_place.depth_spheres import find_in_depth
+from applications.pick_place.ball_places import BallGeometry, is_table, shows_table
+from applications.pick_place.depth_spheres import find_balls_in_depth
 from applications.pick_place.outliers import (
     BELOW,
     BLURRED,
@@ -25,7 +25,7 @@ from applications.pick_place.outliers import (
     MOST_UNLIKE,
     NOT_ROUND,
     THIN,
-    Odd,
+    Outlier,
     covered,
     oval,
     sized,
@@ -37,12 +37,12 @@ from applications.pick_place.segmentation import (
     Mask,
     Masks,
     Outline,
+    OutlineKey,
     RedMasks,
-    Traced,
     all_of,
+    blob_centers,
     find_blobs,
-    long_ones,
-    middles,
+    long_components,
     small_blobs,
 )
 from applications.pick_place.sphere_fit import Fit, fit_each, fit_spheres, separate
@@ -66,7 +66,7 @@ _LEAST_TABLE = 0.1  # part of a picture that shows the table, at least, for it t
 Hue = Annotated[int, Field(ge=0, le=180)]
 Byte = Annotated[int, Field(ge=0, le=255)]
 Hsv = tuple[Hue, Byte, Byte]
-_Key = tuple[Traced, tuple[float, float], float]  # of a blob: its outline, its centre [px], the offset expected [m]
+_Key = tuple[OutlineKey, tuple[float, float], float]  # of a blob: its outline, its centre [px], the offset expected [m]
 
 
 class DetectorOptions(Parameters):
@@ -142,14 +142,14 @@ class Detector:
             options: colour windows and sizes; they may change between pictures.
         """
         self.options = options or DetectorOptions()
-        self.resting = Resting.of(surroundings)
+        self.resting = BallGeometry.of(surroundings)
         self._around = surroundings
         self._table: tuple[Pinhole, BoolMask | None] | None = None  # where the last camera shows it
         self._masks = Masks()
-        self._outlines: dict[Traced, Outline] = {}  # of the last picture: what is there again is not worked out again
+        self._outlines: dict[OutlineKey, Outline] = {}  # of the last image, reused while a blob stays the same
         self._fits: dict[_Key, list[_Round]] = {}
         self.blind = ""  # why the last picture tells nothing
-        self.odd: list[Odd] = []  # what is red in the last picture and no ball on the table
+        self.outliers: list[Outlier] = []  # what is red in the last picture and no ball on the table
         self.too_small = 0  # blobs in the last picture that were not looked at, but for those in the container
         self.too_large = 0  # round blobs in it that look larger than a stack, but for those in the container
         self._last: tuple[Mask, Pinhole, DetectorOptions, list[Detection]] | None = None
@@ -183,7 +183,7 @@ class Detector:
     def detect_in_depth(self, picture: Picture, depth: Depth, camera: Pinhole) -> list[Detection]:
         """The same by a picture with depth (height, width) [m]: balls are where they are, on the table or on others."""
         fine, closed, narrow = self.masks(picture, camera)
-        centers = find_in_depth(fine, depth, camera, self.resting.radius)
+        centers = find_balls_in_depth(fine, depth, camera, self.resting.radius)
         found = []
         if len(centers):
             pixels, outlines = camera.project(centers), silhouettes(camera, centers, self.resting.radius, 32)
@@ -192,9 +192,9 @@ class Detector:
             for center, pixel, outline, whole in zip(centers.tolist(), pixels.tolist(), outlines, inside, strict=True):
                 place, seen = (center[0], center[1], center[2]), (pixel[0], pixel[1])
                 found.append(Detection(place, seen, area, not whole, outline))
-        self.odd = self._on_table(camera, [
-            self._odd(np.array(middle), camera, NOT_ROUND)
-            for middle, contour in middles(closed, self.options.min_contour_area_px)
+        self.outliers = self._on_table(camera, [
+            self._outlier(np.array(middle), camera, NOT_ROUND)
+            for middle, contour in blob_centers(closed, self.options.min_contour_area_px)
             if not any(cv2.pointPolygonTest(contour, one.pixel, False) >= 0 for one in found)
         ] + self._thin(narrow, camera))
         self.blind, self.too_small, self._last = "" if found else blank_image_reason(picture), 0, None
@@ -215,7 +215,7 @@ class Detector:
         pixel_size = abs(float(camera.position[2]) - self.resting.plane) / camera.fx
         offset = self.options.outline_offset_px * pixel_size
         seen: list[_Seen] = []
-        self.odd, self.too_large = self._thin(narrow, camera), 0
+        self.outliers, self.too_large = self._thin(narrow, camera), 0
         alone, crowded, offsets = self._alone(blobs, camera, offset, pixel_size)
         seen += alone
         spread = 1.0 * pixel_size
@@ -227,18 +227,18 @@ class Detector:
             if len(centers):
                 fit = fit_spheres(blob.outline, centers, self.resting.radius, offset=offset, offset_std=spread)
                 if not self._is_explained(blob, fit.owner, camera):
-                    self.odd += [self._odd(camera.project(center + camera.position), camera, NOT_ROUND)
+                    self.outliers += [self._outlier(camera.project(center + camera.position), camera, NOT_ROUND)
                                  for center in fit.centers]
                     continue
                 reasons = self._higher(blob, fit, camera, fine, offset if offsets else None, pixel_size)
                 if reasons:
-                    self.odd += [self._odd(camera.project(center + camera.position), camera, reason)
+                    self.outliers += [self._outlier(camera.project(center + camera.position), camera, reason)
                                  for center, reason in zip(fit.centers, reasons, strict=True)]
                     continue
                 seen += [_Seen(center, blob.area / len(centers), blob.border) for center in fit.centers]
             elif not len(blob.border):
-                self.odd.append(self._odd(blob.centroid, camera, NOT_ROUND))
-        self.odd = self._on_table(camera, self.odd)
+                self.outliers.append(self._outlier(blob.centroid, camera, NOT_ROUND))
+        self.outliers = self._on_table(camera, self.outliers)
         return sorted(self._detections(seen, camera), key=lambda d: (d.pixel[1], d.pixel[0]))
 
     def _pixel_size(self, camera: Pinhole, pixel: Array) -> float:
@@ -300,9 +300,9 @@ class Detector:
                 self.too_large += not self.resting.shows_container(camera, blob.centroid)
                 continue
             if abs(best.offset - offset) > self.options.max_offset_px * pixel_size:
-                self.odd.append(self._odd(blob.centroid, camera, sized(best.offset, offset)))
+                self.outliers.append(self._outlier(blob.centroid, camera, sized(best.offset, offset)))
             elif best.oval > MOST_OVAL * there and not self.resting.shows_container(camera, blob.centroid):
-                self.odd.append(self._odd(blob.centroid, camera, FLAT))
+                self.outliers.append(self._outlier(blob.centroid, camera, FLAT))
             else:
                 alone.append(_Seen(best.center, blob.area, blob.border))
                 offsets.append(best.offset / there)
@@ -311,7 +311,7 @@ class Detector:
         for k in np.flatnonzero(unlike(np.array(offsets), MOST_UNLIKE))[::-1].tolist():
             pixel = camera.project(alone[k].center + camera.position)
             if not self.resting.shows_container(camera, pixel):
-                self.odd.append(self._odd(pixel, camera, sized(offsets[k] * sizes[k], usual * sizes[k])))
+                self.outliers.append(self._outlier(pixel, camera, sized(offsets[k] * sizes[k], usual * sizes[k])))
                 del alone[k], offsets[k]
         return alone, crowded, offsets
 
@@ -378,19 +378,19 @@ class Detector:
         least = 0.5 * _WARMEST * min(1.0, blue_of_ball / max(green_of_ball, _LEAST_GREEN))
         return least if _TURNS_RED[0] <= green / max(red, 1e-3) <= _TURNS_RED[1] and blue <= least * green else None
 
-    def _thin(self, narrow: Mask, camera: Pinhole) -> list[Odd]:
+    def _thin(self, narrow: Mask, camera: Pinhole) -> list[Outlier]:
         """What is long and thin."""
         least = LONG * 2 * self.resting.radius
-        return [self._odd(np.array(pixel), camera, THIN)
-                for pixel in long_ones(narrow, camera, self.resting.table_height, least)]
+        return [self._outlier(np.array(pixel), camera, THIN)
+                for pixel in long_components(narrow, camera, self.resting.table_height, least)]
 
-    def _on_table(self, camera: Pinhole, odd: list[Odd]) -> list[Odd]:
+    def _on_table(self, camera: Pinhole, outliers: list[Outlier]) -> list[Outlier]:
         """Those that are not in the container, nor above the horizon, where no ray meets the table."""
-        return [one for one in odd
+        return [one for one in outliers
                 if np.isfinite(one.position).all() and not self.resting.shows_container(camera, one.pixel)]
 
-    def _odd(self, pixel: Array, camera: Pinhole, reason: str) -> Odd:
-        return Odd.at(camera, pixel, self.resting.plane, reason)
+    def _outlier(self, pixel: Array, camera: Pinhole, reason: str) -> Outlier:
+        return Outlier.at(camera, pixel, self.resting.plane, reason)
 
     def _detections(self, seen: list[_Seen], camera: Pinhole) -> list[Detection]:
         if not seen:
@@ -420,9 +420,9 @@ class Detector:
         return bool((distance < self.resting.radius).any())
 
 
-def rehearse(surroundings: Surroundings, options: DetectorOptions) -> None:
+def warm_up(surroundings: Surroundings, options: DetectorOptions) -> None:
     """Look at a made-up picture: what is set up when it is first used does not hold up the first real one."""
-    radius, plane = surroundings.ball_radius, Resting.of(surroundings).plane
+    radius, plane = surroundings.ball_radius, BallGeometry.of(surroundings).plane
     camera = Pinhole.from_config(CameraConfig(position=(0, 0, plane + 25 * radius), rpy=(np.pi, 0, 0)))
     picture = np.full((camera.height, camera.width, 3), 128, np.uint8)
     detector = Detector(surroundings, options)

@@ -18,7 +18,7 @@ ANY_YAW = 3.1  # [rad] a tolerance of so much leaves the hand any yaw
 
 
 @dataclass(frozen=True)
-class Rows:
+class MotionSequences:
     """Builds rows of stages; knows heights and tolerances, nothing of what happens."""
 
     p: Config
@@ -36,15 +36,15 @@ class Rows:
                 (yaw, 0.0)))
         above = self._region((x, y, low + self.p.grasp.approach_clearance), yaw)
         approach: list[Stage] = [
-            Move("pre-grasp", "GRASPING", cycle, whole=True, fresh=True, goal=above),
-            Move("descend", "GRASPING", cycle, goal=grasp, straight=True, fresh=not self.p.world.on_hand),
+            Move("pre-grasp", "GRASPING", cycle, needs_full_plan=True, needs_fresh_image=True, goal=above),
+            Move("descend", "GRASPING", cycle, goal=grasp, straight=True, needs_fresh_image=not self.p.world.on_hand),
         ]
         lifted = self._region((x, y, low + self.p.grasp.lift_height), yaw)
         carry: list[Stage] = [Move("lift", "GRASPING", cycle, goal=lifted, carries=True), self._across(cycle, yaw)]
         if self.p.joined:
             across = self._across(cycle, yaw)
             across.goal = _through(lifted, across.goal, self.p.grasp.lift_height / 2)
-            across.otherwise, carry = carry, [across]
+            across.fallback, carry = carry, [across]
         # A cup touches what it takes; what was not found once is looked for at each yaw by itself.
         if self.p.joined and self.gripper.cup is None and (cycle.target.size is not None or not cycle.apart):
             grasps = self._grasps(cycle, (x, y, low))
@@ -54,7 +54,8 @@ class Rows:
                     "pose": each.pose.model_copy(update={"position": above.pose.position}),
                     "position_tolerance": above.position_tolerance}) for each in _each(grasps)])
             goal = _through(over, grasps, self.p.grasp.approach_clearance / 2)
-            approach = [Move("pre-grasp", "GRASPING", cycle, whole=True, fresh=True, goal=goal, otherwise=approach)]
+            approach = [Move("pre-grasp", "GRASPING", cycle, needs_full_plan=True, needs_fresh_image=True, goal=goal,
+                             fallback=approach)]
         cycle.apart = True
         return [*approach, self._close(cycle, yaw), *carry, self._release(cycle)]
 
@@ -101,7 +102,7 @@ class Rows:
                 for at, middle in zip(cycle.over, (box.x, box.y), strict=True))
         goal = self._above((x, y), yaw, wide / 2)
         goal.position_tolerance.z = wide
-        return Move("across", "PLACING", cycle, goal=goal, carries=True, otherwise=[anywhere])
+        return Move("across", "PLACING", cycle, goal=goal, carries=True, fallback=[anywhere])
 
     def _above(self, at: tuple[float, float], yaw: float, side: float) -> m.PoseGoal:
         above = self._region((*at, self.p.grasp.drop_z), yaw, side)

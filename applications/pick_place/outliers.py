@@ -39,7 +39,7 @@ FEWEST = 3  # balls by which it is told how large they look
 
 
 @dataclass(frozen=True)
-class Odd:
+class Outlier:
     """What is red and no ball on the table: about where (3,) [m] in world, at which pixel, and why."""
 
     position: tuple[float, float, float]
@@ -47,7 +47,7 @@ class Odd:
     reason: str
 
     @classmethod
-    def at(cls, camera: Pinhole, pixel: Array, plane: float, reason: str) -> Odd:
+    def at(cls, camera: Pinhole, pixel: Array, plane: float, reason: str) -> Outlier:
         """What is seen at a pixel, as if it lay at the height of balls on the table."""
         x, y = camera.on_plane(pixel, plane).tolist()
         return cls((x, y, plane), (float(pixel[0]), float(pixel[1])), reason)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from applications.pick_place.ball_places import Resting
+from applications.pick_place.ball_places import BallGeometry
 from common import messages as m
 from common.config import GripperConfig, Parameters, Surroundings, Tunable
 from common.messages import Color, Marker, Quaternion
@@ -217,7 +217,7 @@ class PerceivedScene:
         self.around, self.gripper, self.tcp_link = around, gripper, tcp_link
         self.p, self._tracks = parameters, Tracks(parameters)
         self._fixed = fixed_objects(around)
-        self._resting = [replace(Resting.of(around), container=box) for box in around.containers.values()]
+        self._resting = [replace(BallGeometry.of(around), container=box) for box in around.containers.values()]
         self._with_slots = next((box.container for box in self._resting), None)
         self._slots = slot_positions(around.container, around.ball_radius, around.table_height).reshape(-1, 3)
         self._in_slots = [

@@ -17,7 +17,7 @@ Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.uint8]
 Contour = npt.NDArray[np.int32]
 Part = tuple[Contour, bool]  # a contour, and whether it is that of a hole
-Traced = tuple[tuple[bytes, bool], ...]  # the parts of an outline
+OutlineKey = tuple[tuple[bytes, bool], ...]  # the parts of an outline
 
 _REACH = 3  # contour points to either side from which the direction of the outline is taken
 MOST_NARROW = 0.05  # part of a picture that may be narrow for what is long in it to be told
@@ -69,11 +69,11 @@ class Blob:
     centroid: Array
     outline: Outline
     border: Array
-    traced: Traced = ()
+    traced: OutlineKey = ()
 
 
 def find_blobs(
-    closed: Mask, fine: Mask, camera: Pinhole, min_area: float, known: Mapping[Traced, Outline] | None = None
+    closed: Mask, fine: Mask, camera: Pinhole, min_area: float, known: Mapping[OutlineKey, Outline] | None = None
 ) -> list[Blob]:
     """Blobs of the closed mask of at least `min_area` [px^2], outlined by the finer mask from before closing.
 
@@ -122,7 +122,7 @@ def small_blobs(closed: Mask, min_area: float) -> list[tuple[float, float]]:
     return [(float(u), float(v)) for u, v in small]
 
 
-def middles(closed: Mask, min_area: float) -> list[tuple[tuple[float, float], Contour]]:
+def blob_centers(closed: Mask, min_area: float) -> list[tuple[tuple[float, float], Contour]]:
     """Blobs of at least `min_area` [px^2] in the closed mask: the middle (u, v) [px] and the outer edge of each."""
     outer, _ = cv2.findContours(closed, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     found = []
@@ -133,7 +133,7 @@ def middles(closed: Mask, min_area: float) -> list[tuple[tuple[float, float], Co
     return found
 
 
-def long_ones(narrow: Mask, camera: Pinhole, plane: float, least: float) -> list[tuple[float, float]]:
+def long_components(narrow: Mask, camera: Pinhole, plane: float, least: float) -> list[tuple[float, float]]:
     """Where a mask of narrow things has one that is long: a pixel (u, v) on it, in the middle of its outline [px].
 
     Args:

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from applications.pick_place.ball_places import Resting
+from applications.pick_place.ball_places import BallGeometry
 from applications.pick_place.segmentation import Mask, Outline
 from common.perception.pinhole import Pinhole
 from common.perception.sphere import ray_distances, silhouettes
@@ -199,7 +199,7 @@ class _Candidate:
     whole: float  # points that its whole outline has
 
 
-def separate(outline: Outline, mask: Mask, camera: Pinhole, resting: Resting, offset: float) -> Array:
+def separate(outline: Outline, mask: Mask, camera: Pinhole, resting: BallGeometry, offset: float) -> Array:
     """First guesses of the balls in a blob: (k, 3) centres relative to the optical centre [m].
 
     Args:
@@ -233,7 +233,7 @@ def separate(outline: Outline, mask: Mask, camera: Pinhole, resting: Resting, of
     return kept
 
 
-def _votes(outline: Outline, camera: Pinhole, resting: Resting, offset: float) -> Array:
+def _votes(outline: Outline, camera: Pinhole, resting: BallGeometry, offset: float) -> Array:
     """(n, 2) where each point puts the centre, on the plane of the balls on the table [m], world."""
     drop = resting.plane - camera.position[2]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -248,7 +248,7 @@ def _votes(outline: Outline, camera: Pinhole, resting: Resting, offset: float) -
     return kept
 
 
-def _peaks(votes: Array, camera: Pinhole, resting: Resting) -> Array:
+def _peaks(votes: Array, camera: Pinhole, resting: BallGeometry) -> Array:
     """(m, 2) places at which many votes meet, the most voted for first [m], world."""
     if not len(votes):
         return np.empty((0, 2))
@@ -274,7 +274,7 @@ def _whole_outline(camera: Pinhole, radius: float, distance: float) -> float:
 
 
 def _refined(
-    places: Array, outline: Outline, camera: Pinhole, resting: Resting, offset: float
+    places: Array, outline: Outline, camera: Pinhole, resting: BallGeometry, offset: float
 ) -> list[_Candidate]:
     """Candidates near places (k, 2), each at the height that fits best; places that few points support give none."""
     radius = resting.radius + offset

@@ -9,16 +9,16 @@ import math
 
 from pydantic import BaseModel
 
-from applications.pick_place.ball_places import Looking
-from applications.pick_place.choice import Choice, LetGo, Pick, PickPlaceView, Spot, Spots, same_place
+from applications.pick_place.ball_places import ViewingPoses
+from applications.pick_place.choice import Choice, Pick, PickPlaceView, ReleasePositions, Spot, Spots, same_place
 from applications.pick_place.grasping import Config
-from applications.pick_place.motion_sequences import Rows
+from applications.pick_place.motion_sequences import MotionSequences
 from applications.pick_place.topics import PickPlaceStatus
 from common import messages as m
 from common.scene.home import is_home
 from common.tasks.engine import Task
-from common.tasks.stages import MISSES, Cycle, Grip, Look, Move, Stage
-from common.tasks.watchdogs import Patience
+from common.tasks.stages import MISSES, AwaitImage, Cycle, Grip, Move, Stage
+from common.tasks.watchdogs import DwellTimer
 
 GONE = "the ball is no longer where it was seen"
 MOST = 400  # characters of a message
@@ -37,12 +37,13 @@ class PickPlace(Task[PickPlaceView]):
         """Start from nothing known: see `Task`."""
         super().__init__(config, status, prefix, speed)
         self._around = config.world
-        self._rows = Rows(config, self.gripper)
+        self._sequences = MotionSequences(config, self.gripper)
         self._choice = Choice(config, config.world.container, config.world.ball_radius, lambda: self.status.done)
-        self._contained, self._released = Patience(), False
-        self._looking, self._hidden = Looking(config), Patience()
-        self._carried, self._due = False, 0  # how many there were as one fell out of the hand, until all are seen again
-        self._still, self._places = Patience(), list[Spot]()  # where everything is seen to lie since then
+        self._contained, self._released = DwellTimer(), False
+        self._viewing, self._hidden = ViewingPoses(config), DwellTimer()
+        self._carried = False
+        self._expected = 0  # objects there were when one fell out of the gripper, until all are seen again
+        self._still, self._places = DwellTimer(), list[Spot]()  # where everything is seen to lie since then
 
     # --- what to do next -------------------------------------------------------------------------------------
 
@@ -53,18 +54,18 @@ class PickPlace(Task[PickPlaceView]):
             self._let_go(view)
         elif view.holding:
             if view.attached:  # else the planning scene has not caught up yet
-                self.row += self._rows.place_held(self._choice.held(view.attached, view), view.tool)
+                self.queue += self._sequences.place_held(self._choice.held(view.attached, view), view.tool)
         elif self._looks_elsewhere(view):
-            self.row += [self.home(view), Look()]
+            self.queue += [self.home(view), AwaitImage()]
         elif not self._queue_next(view):
             self._wait_for_the_end(view)
 
     def decide_ahead(self, running: Stage, view: PickPlaceView) -> None:
         """While one ball is carried across, the way to the next is planned, or to where a camera on the hand looks."""
-        waiting = any(stage.cycle is not None and not stage.cycle.begun for stage in self.row)
+        waiting = any(stage.cycle is not None and not stage.cycle.started for stage in self.queue)
         if running.name == "across" and self._around.on_hand:
-            if not any(isinstance(stage, Look) for stage in self.row):
-                self.row += [self.home(view.let_go()), Look()]
+            if not any(isinstance(stage, AwaitImage) for stage in self.queue):
+                self.queue += [self.home(view.let_go()), AwaitImage()]
         elif running.name == "across" and not waiting:
             self._queue_next(view)
 
@@ -76,23 +77,23 @@ class PickPlace(Task[PickPlaceView]):
     def _queue_next(self, view: PickPlaceView) -> bool:
         """Append the stages for the nearest ball that can be taken; whether there is one."""
         assert view.gripper is not None
-        if min(view.stamps) <= self.look_after or self.unseen(view):
+        if min(view.stamps) <= self.images_after or self.unseen(view):
             return False
         if self.running is None and not (view.seen and view.seen.unseen):
-            self._looking.found()
+            self._viewing.found()
         running = _pick_of(self.running.stage) if self.running else None
         box = self._around.container
         cycle = self._choice.next(view, (box.x, box.y) if running else view.tool, [running] if running else [])
         if cycle is None and not running and self._choice.once_more():
             # Whether the last way down can be followed depends on how the arm arrived above it.
-            self.row.append(Move("home", "HOMING", Cycle(), goal=m.JointGoal(named="home")))
+            self.queue.append(Move("home", "HOMING", Cycle(), goal=m.JointGoal(named="home")))
             return True
         if cycle is None:
             return False
         if not running and view.gripper.width < self.gripper.max_width - 0.002:
-            self.row.append(self._rows.open())
-        self.row += self._rows.pick_and_place(cycle)
-        self.patience.reset()
+            self.queue.append(self._sequences.open())
+        self.queue += self._sequences.pick_and_place(cycle)
+        self.wait_timer.reset()
         self.status.message = self.status.overlooked = ""
         return True
 
@@ -103,14 +104,14 @@ class PickPlace(Task[PickPlaceView]):
         left = max(len(view.balls()), len(view.targets))  # one of the two may have just begun to look
         done = False
         if unseen := self.unseen(view):
-            self.patience.reset()
+            self.wait_timer.reset()
             self.status.message = unseen
         else:
             # Time of pictures, not of the clock: that nobody looks any more is no sign of an empty table.
-            seen = max(self.look_after, min(view.stamps))
-            done = self.patience.lasts(bool(left), seen) >= (self.p.grace if left else self.p.empty)
+            seen = max(self.images_after, min(view.stamps))
+            done = self.wait_timer.elapsed(bool(left), seen) >= (self.p.grace if left else self.p.empty)
             done = done and self._counted(view) <= self.status.done  # else it is about to be counted
-            missing = self._due - self.status.done - left
+            missing = self._expected - self.status.done - left
             remarks = [view.seen.remark if view.seen else "",
                        f"{missing} that was seen before something fell out of the hand was not seen again"
                        if missing > 0 else ""]
@@ -130,17 +131,17 @@ class PickPlace(Task[PickPlaceView]):
         if super().unseen(view):
             return False
         if not why:
-            self._looking.found()
+            self._viewing.found()
             self._hidden.reset()
             return False
-        self.patience.reset()
+        self.wait_timer.reset()
         self.status.state, self.status.stage, self.status.subject = "IDLE", "", ""
         self.status.message = why if view.blind else f"{why}: it is not known to be empty"
-        waited = self._hidden.lasts(bool(view.blind), view.now)
-        looked = not view.blind and waited >= STANDING and min(view.stamps) > self.look_after
-        if looked and (pose := self._looking.next()):
+        waited = self._hidden.elapsed(bool(view.blind), view.now)
+        looked = not view.blind and waited >= STANDING and min(view.stamps) > self.images_after
+        if looked and (pose := self._viewing.next()):
             self._hidden.reset()
-            self.row += [Move("look", "HOMING", goal=m.JointGoal(positions=pose)), Look()]
+            self.queue += [Move("look", "HOMING", goal=m.JointGoal(positions=pose)), AwaitImage()]
         elif waited >= self.p.look_timeout:
             self.end("ERROR", f"{why}, for {waited:.0f} s: what lies there is not known")
         return True
@@ -157,21 +158,21 @@ class PickPlace(Task[PickPlaceView]):
         # tell of it only later, when it was started again as well. A ball that is let go counts when it is: until then
         # it may hang over others, and a picture of it shows one more.
         contained = self._counted(view)
-        stages = {status.stage, *(stage.name for stage in self.under_way)}
-        releases = "release" in stages or self.waits_for_the_arm == "release"
+        stages = {status.stage, *(stage.name for stage in self.active_stages)}
+        releases = "release" in stages or self.deferred_grip == "release"
         if self._carried and not view.holding and not releases:
-            self._due, self._places = max(self._due, status.total), []
+            self._expected, self._places = max(self._expected, status.total), []
         self._carried = view.holding and not releases
         if releases:
             self._contained.reset()
-        elif self._contained.lasts(contained, view.scene_stamp) >= min(CONTAINED_FOR, self.p.empty):
+        elif self._contained.elapsed(contained, view.scene_stamp) >= min(CONTAINED_FOR, self.p.empty):
             status.done = max(status.done, contained)
-        looked = not self._around.on_hand or min(view.stamps) > self.look_after
+        looked = not self._around.on_hand or min(view.stamps) > self.images_after
         if looked and not view.holding and not stages & {"close", "lift", "across", "release"}:
             found = status.done + len(view.targets)
-            if found >= self._due and self._lie_still(view):
-                self._due = 0
-            status.total = max(found, self._due)
+            if found >= self._expected and self._lie_still(view):
+                self._expected = 0
+            status.total = max(found, self._expected)
 
     def _lie_still(self, view: PickPlaceView) -> bool:
         """Whether everything on the table is seen where it was some time ago."""
@@ -179,7 +180,7 @@ class PickPlace(Task[PickPlaceView]):
         if any(all(math.dist(spot, before) > self.p.moved for before in self._places) for spot in spots):
             self._places = spots
             self._still.reset()
-        return self._still.lasts(True, min(view.stamps)) >= AT_REST
+        return self._still.elapsed(True, min(view.stamps)) >= AT_REST
 
     def _counted(self, view: PickPlaceView) -> int:
         """How many lie in the container. Once this task put some there itself, no more than are seen.
@@ -193,24 +194,24 @@ class PickPlace(Task[PickPlaceView]):
     def _waits(self, view: PickPlaceView) -> bool:
         """Whether nothing is under way, and nobody keeps the task from deciding what comes next."""
         assert view.motion is not None
-        idle = self.running is None and not self.row and view.motion.state != "active"
+        idle = self.running is None and not self.queue and view.motion.state != "active"
         kept = self.status.paused or view.motion.held or view.motion.fault or view.motion.stopped
         return idle and self.status.started and not kept
 
-    def began_anew(self) -> None:
+    def on_restart(self) -> None:
         """What was in the way of looking before may be gone."""
-        self._looking.found()
+        self._viewing.found()
         self._hidden.reset()
-        self._due = 0
+        self._expected = 0
 
     @property
-    def memory(self) -> LetGo:
+    def memory(self) -> ReleasePositions:
         """Where balls were let go: what leans on others in the container may look as if it lay on its floor."""
         return self._choice.let_go
 
     def remember(self, memory: BaseModel) -> None:
         """Go on from there."""
-        assert isinstance(memory, LetGo)
+        assert isinstance(memory, ReleasePositions)
         self._choice.let_go = memory
 
     def succeeded(self, stage: Stage, view: PickPlaceView) -> None:
@@ -220,7 +221,7 @@ class PickPlace(Task[PickPlaceView]):
             self.status.done += 1
             self._released = True
             if self._around.on_hand:
-                self.look_after = view.now
+                self.images_after = view.now
             self._choice.released(pick, view)
 
     def missed(self, stage: Grip, view: PickPlaceView) -> None:
@@ -235,11 +236,11 @@ class PickPlace(Task[PickPlaceView]):
 
     def _let_go(self, view: PickPlaceView) -> None:
         self.clear()
-        self.row += [self._rows.open(), *self.back_off(view.let_go())]
-        if view.seen is not None and view.seen.unseen and (pose := self._looking.best()):
+        self.queue += [self._sequences.open(), *self.back_off(view.let_go())]
+        if view.seen is not None and view.seen.unseen and (pose := self._viewing.best()):
             # The hand hides what it did not take, which may lie elsewhere now.
-            self.row += [Move("look", "HOMING", goal=m.JointGoal(positions=pose)), Look()]
-        self.look_after = view.now
+            self.queue += [Move("look", "HOMING", goal=m.JointGoal(positions=pose)), AwaitImage()]
+        self.images_after = view.now
 
     def plan_failed(self, move: Move, response: m.PlanResponse, view: PickPlaceView) -> None:
         """Try the next yaw for a ball that was not begun with, or leave it alone."""
@@ -247,25 +248,25 @@ class PickPlace(Task[PickPlaceView]):
         if pick is None and move.cycle is not None:  # on the way home for another try, which begins here then
             self.clear()
             return
-        if pick is None or pick.begun or self.stands_against(move, response):
+        if pick is None or pick.started or self.starts_in_contact(move, response):
             super().plan_failed(move, response, view)
             return
         pick.first_error = pick.first_error or response.message
-        for stage in [stage for stage in self.row if stage.cycle is pick]:
-            self.row.remove(stage)
+        for stage in [stage for stage in self.queue if stage.cycle is pick]:
+            self.queue.remove(stage)
         if pick.yaws:
-            self.row += self._rows.pick_and_place(pick)
+            self.queue += self._sequences.pick_and_place(pick)
         else:
             self._choice.give_up(pick.target, pick.first_error, view, retry=not pick.again)
 
     # --- what its motions need -------------------------------------------------------------------------------
 
-    def may_begin(self, stage: Stage, view: PickPlaceView) -> bool:
+    def may_start(self, stage: Stage, view: PickPlaceView) -> bool:
         """A hand goes only to where a ball still is."""
-        if not super().may_begin(stage, view):
+        if not super().may_start(stage, view):
             return False
         pick = _pick_of(stage)
-        if not (isinstance(stage, Move) and stage.fresh) or pick is None:
+        if not (isinstance(stage, Move) and stage.needs_fresh_image) or pick is None:
             return True
         if self._is_there(pick, view):
             return True
@@ -276,7 +277,9 @@ class PickPlace(Task[PickPlaceView]):
     def outdated(self, stage: Stage, view: PickPlaceView) -> str:
         """On the way to a ball and down to it in one motion it is looked at as long as the hand is above."""
         pick = _pick_of(stage)
-        if pick is None or not (isinstance(stage, Move) and stage.fresh and isinstance(stage.goal, m.SequenceGoal)):
+        if pick is None or not (isinstance(stage, Move) and stage.needs_fresh_image):
+            return ""
+        if not isinstance(stage.goal, m.SequenceGoal):
             return ""
         if self._around.on_hand:  # what it was shown from home is what is known
             return ""
@@ -297,7 +300,7 @@ class PickPlace(Task[PickPlaceView]):
             move.touches = [(link, target) for link in self.gripper.links]
         if move.carries:
             move.attach = target
-            move.attach_pose = self._rows.attach_pose(pick) if pick and not in_hand else None
+            move.attach_pose = self._sequences.attach_pose(pick) if pick and not in_hand else None
         request = super().request(move, start, view)
         if pick is not None and pick.again:  # other samples of the goal than those from which there was no way on
             request.seed = self.p.run.seed + 1
@@ -309,7 +312,7 @@ class PickPlace(Task[PickPlaceView]):
         Ids are looked up by place, because the scene manager may have been restarted since the object was chosen.
         """
         pick = _pick_of(move)
-        if view.holding and view.attached and (pick is None or pick.begun):
+        if view.holding and view.attached and (pick is None or pick.started):
             return view.attached, True
         if pick is None:
             return "", False
@@ -325,14 +328,14 @@ class PickPlace(Task[PickPlaceView]):
 
     def back_off(self, view: PickPlaceView, contact: tuple[str, str] | None = None) -> list[Stage]:
         """Up from where the hand is: the camera sees enough from there."""
-        return [self._rows.retreat(view, contact), Look()]
+        return [self._sequences.retreat(view, contact), AwaitImage()]
 
     def time_limit(self, stage: Stage) -> float:
         """A stage that takes longer is stopped [s]."""
         return self.p.goal_timeout
 
     @property
-    def most_failures(self) -> int:
+    def failure_limit(self) -> int:
         """So many in a row, and it gives up."""
         return self.p.max_failures
 

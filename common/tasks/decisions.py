@@ -14,8 +14,8 @@ from pydantic import BaseModel, Field
 from common import messages as m
 from common.config import GripperConfig, Parameters, RobotConfig, Run, Tunable
 from common.errors import ConfigError
-from common.tasks.stages import Command, Execution, Grip, Look, Move, Stage, View
-from common.tasks.watchdogs import FrameAge, Patience
+from common.tasks.stages import AwaitImage, Command, Execution, Grip, Move, Stage, View
+from common.tasks.watchdogs import DwellTimer, ImageAge
 
 V = TypeVar("V", bound=View)
 
@@ -47,7 +47,7 @@ class TaskConfig(Parameters):
     )
 
 
-class Deciding(Generic[V]):
+class TaskDecisions(Generic[V]):
     """What a task says, what it decides, and what helps it to: `decide` is its own, all else has a default."""
 
     p: TaskConfig
@@ -78,17 +78,17 @@ class Deciding(Generic[V]):
         """
         self.p, self.status, self.prefix, self.speed = config, status, prefix, speed
         self.status.started = config.run.autostart
-        self.row: deque[Stage] = deque()
+        self.queue: deque[Stage] = deque()
         self.running: Execution | None = None
         self._opening: Execution | None = None  # what was let go is free of the fingers, which open on
         self._shut = False  # fingers that closed about nothing ahead of the arm have to be opened before what is next
         self._early: Execution | None = None  # of the fingers, which wait for the motion that runs to be nearly over
         self._held_up = False  # the arm was as fingers closed early: the next ones close once it stands
-        self.patience = Patience()
-        self.look_after = 0.0  # only a picture that is later decides [s]
-        self._frames = FrameAge(speed)
+        self.wait_timer = DwellTimer()
+        self.images_after = 0.0  # only a picture that is later decides [s]
+        self._frames = ImageAge(speed)
         self._planning: tuple[Move, str] | None = None
-        self._in_the_way = Patience()
+        self._in_the_way = DwellTimer()
         self._stopping = False
         self._found = False  # whether the robot was looked at, or a person has said what to do
         self._began: float | None = None
@@ -108,9 +108,9 @@ class Deciding(Generic[V]):
     def note(self, view: V) -> None:
         """With each step: bring the counters of the status up to date."""
 
-    def may_begin(self, stage: Stage, view: V) -> bool:
+    def may_start(self, stage: Stage, view: V) -> bool:
         """Whether a stage that is planned may begin now; if not, it waits, or `clear` has thrown the row away."""
-        if not isinstance(stage, Move) or not stage.fresh:
+        if not isinstance(stage, Move) or not stage.needs_fresh_image:
             return True
         waits = f"{stage.name} waits"
         if unseen := self.unseen(view):
@@ -135,7 +135,7 @@ class Deciding(Generic[V]):
         self.status.retries += 1
         self.fail(f"{stage.name}: {stage.problem}", view, go_home=False)
         if self.status.state != "ERROR":
-            self.row += [Grip("open", stage.state, width=self.gripper.max_width), *self.back_off(view.let_go())]
+            self.queue += [Grip("open", stage.state, width=self.gripper.max_width), *self.back_off(view.let_go())]
 
     def forgotten(self, stage: Stage, view: V) -> None:
         """A controller that was started again knows nothing of a stage that it had begun."""
@@ -151,10 +151,10 @@ class Deciding(Generic[V]):
 
     def plan_failed(self, move: Move, response: m.PlanResponse, view: V) -> None:
         """There is no way: free the arm from what it stands against, or go home and decide anew."""
-        if self.stands_against(move, response):
+        if self.starts_in_contact(move, response):
             self.fail(response.message, view, go_home=False)
             if self.status.state != "ERROR":
-                self.row += self.back_off(view, response.colliding)
+                self.queue += self.back_off(view, response.colliding)
         else:
             # What runs is sound; what was to follow is decided anew when it has ended.
             self.fail(response.message, view, go_home=self.running is None and move.name != "home")
@@ -163,19 +163,19 @@ class Deciding(Generic[V]):
         """Count a failure, throw the row away and, where it helps, go home to look again."""
         go_home = go_home and self._early is None  # what the fingers began ends first
         self.clear()
-        self.look_after = view.now
+        self.images_after = view.now
         self.status.message = message
         self.status.failures += 1
         self._failures_in_a_row += 1
-        if self._failures_in_a_row >= self.most_failures:
+        if self._failures_in_a_row >= self.failure_limit:
             self.status.state = "ERROR"
             self.status.message = f"{message}; that makes {self._failures_in_a_row} failures in a row"
         elif go_home:
-            self.row += [self.home(view), Look()]
+            self.queue += [self.home(view), AwaitImage()]
         if self._failures_in_a_row > 1:  # what is known may be older than the world: let it come
             self._again_at = view.now + min(PAUSE * 2 ** (self._failures_in_a_row - 2), LONGEST_PAUSE)
 
-    def began_anew(self) -> None:
+    def on_restart(self) -> None:
         """A person has started it once more after its end."""
 
     @property
@@ -193,7 +193,7 @@ class Deciding(Generic[V]):
 
     def back_off(self, view: V, contact: tuple[str, str] | None = None) -> list[Stage]:
         """Away from where the hand is, whatever it touches there, to where everything is seen."""
-        return [self.retreat(view, contact), self.home(view), Look()]
+        return [self.retreat(view, contact), self.home(view), AwaitImage()]
 
     def retreat(self, view: V, contact: tuple[str, str] | None = None, height: float = RETREAT) -> Move:
         """Straight up from where the tool is, whatever the hand touches there now."""
@@ -212,7 +212,7 @@ class Deciding(Generic[V]):
     def request(self, move: Move, start: list[float], view: V) -> m.PlanRequest:
         """What is asked of the planner for a motion; an empty `start` is where the robot is."""
         return m.PlanRequest(
-            id=self.mint(), stage=move.name, start=start, goal=move.goal, straight=move.straight,
+            id=self.new_id(), stage=move.name, start=start, goal=move.goal, straight=move.straight,
             allowed_collisions=move.touches, attach=move.attach or view.attached if move.carries else "",
             attach_pose=move.attach_pose, release=not move.carries, planning_time=self.p.planning_time,
         )
@@ -222,7 +222,7 @@ class Deciding(Generic[V]):
         return OVERTIME + (stage.seconds if isinstance(stage, Move) else 0.0)
 
     @property
-    def most_failures(self) -> int:
+    def failure_limit(self) -> int:
         """So many in a row, and it gives up."""
         return MOST_FAILURES
 
@@ -234,12 +234,12 @@ class Deciding(Generic[V]):
     # --- what helps to decide --------------------------------------------------------------------------------
 
     @property
-    def under_way(self) -> list[Stage]:
+    def active_stages(self) -> list[Stage]:
         """What arm and fingers do: of fingers that begin before the arm stands the status tells once it does."""
-        return [one.stage for one in (self.running, self._early) if one is not None and one.begun]
+        return [one.stage for one in (self.running, self._early) if one is not None and one.started]
 
     @property
-    def waits_for_the_arm(self) -> str:
+    def deferred_grip(self) -> str:
         """Name of the stage of fingers that were asked to begin before the arm stands; they may have, untold."""
         return self._early.stage.name if self._early is not None else ""
 
@@ -258,13 +258,13 @@ class Deciding(Generic[V]):
         """Why the newest picture cannot be decided by; empty when it can."""
         return self._frames.problem(view.now, view.stamps, self.p.frame_timeout, self.p.clock_tolerance)
 
-    def sees(self, view: V) -> bool:
+    def has_fresh_image(self, view: V) -> bool:
         """Whether there is a picture to decide by, which is later than what was done since; else the status says so."""
         if unseen := self.unseen(view):
             self.status.message = unseen
-        return not unseen and min(view.stamps) > self.look_after
+        return not unseen and min(view.stamps) > self.images_after
 
-    def stands_against(self, move: Move, response: m.PlanResponse) -> bool:
+    def starts_in_contact(self, move: Move, response: m.PlanResponse) -> bool:
         """Whether a plan failed because the arm touches something where it stands, from which a retreat may free it."""
         collides = response.error == "start_in_collision" and response.colliding is not None
         return collides and self.running is None and move.name != "retreat"
@@ -276,20 +276,20 @@ class Deciding(Generic[V]):
 
     def clear(self) -> None:
         """Throw the row away; what runs goes on."""
-        self.row.clear()
+        self.queue.clear()
         self._planning = None
 
     def stop(self, view: V, reason: str, by: Literal["operator", "requester"] = "requester") -> list[Command]:
         """Throw the row away and bring the arm to rest; fingers finish what they began."""
         self.clear()
-        self.look_after = view.now
+        self.images_after = view.now
         if self.running is None or not self.running.moves_arm:
             return []
         running, self.running, self._stopping = self.running, None, True
         self.status.moving_seconds += running.moving
         return [m.StopRequest(id=running.command.id, reason=reason, by=by)]
 
-    def mint(self) -> str:
+    def new_id(self) -> str:
         """An id that nobody else has."""
         self._minted += 1
         return f"{self.prefix}-{self._minted}"

@@ -15,8 +15,8 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 from common import messages as m
-from common.tasks.decisions import Deciding, V
-from common.tasks.stages import MISSES, Command, Execution, Grip, Look, Move, Report, Stage
+from common.tasks.decisions import TaskDecisions, V
+from common.tasks.stages import MISSES, AwaitImage, Command, Execution, Grip, Move, Report, Stage
 
 # Refusals that have nothing to do with the motion.
 ANEW = ("busy", "stale_request", "clock_ahead", "stopped", "not_owner")
@@ -32,11 +32,11 @@ OPENED_BY = 0.5  # of a motion that began while the fingers opened: then they ha
 MOST_FIGURES = 200  # plans that a status tells of: a cell may run for days
 
 
-class Task(Deciding[V]):
+class Task(TaskDecisions[V]):
     """State machine of a task. Override `decide`, and of the rest what is different in yours.
 
     What it may use: `row`, to which `decide` appends stages; `running`, what is under way; `status`; `patience`, for
-    what it waits for; and all of `Deciding`.
+    what it waits for; and all of `TaskDecisions`.
     """
 
     # --- what a person says ----------------------------------------------------------------------------------
@@ -44,7 +44,7 @@ class Task(Deciding[V]):
     def command(self, command: str, view: V) -> list[Command]:
         """Start, pause, resume or stop: a pause holds the arm on its path, from which it goes on; a stop ends that."""
         status = self.status
-        self.patience.reset()
+        self.wait_timer.reset()
         self._found = True
         if command == "pause":
             status.paused = True
@@ -56,7 +56,7 @@ class Task(Deciding[V]):
                 status.state, status.message = "IDLE", ""
                 self._began, self._failures_in_a_row = None, 0
                 self._again_at = -math.inf
-                self.began_anew()
+                self.on_restart()
             return [m.HoldRequest(hold=False, reason=reason, stops=command == "start")]
         status.paused = status.started = False
         return self.stop(view, reason, "operator") or [m.StopRequest(reason=reason)]
@@ -73,11 +73,11 @@ class Task(Deciding[V]):
         self.planned(move, response)
         if response.ok and response.trajectory is not None and response.trajectory.points:
             move.trajectory, move.plan, move.scene_stamp = response.trajectory, response.id, response.scene_stamp
-        elif move.otherwise and move in self.row and not response.error.startswith("start_"):
-            at = self.row.index(move)
-            self.row.remove(move)
-            for stage in reversed(move.otherwise):
-                self.row.insert(at, stage)
+        elif move.fallback and move in self.queue and not response.error.startswith("start_"):
+            at = self.queue.index(move)
+            self.queue.remove(move)
+            for stage in reversed(move.fallback):
+                self.queue.insert(at, stage)
         else:
             self.plan_failed(move, response, view)
 
@@ -101,7 +101,7 @@ class Task(Deciding[V]):
             assert isinstance(stage, Grip)
             self._early, stage.early = None, False
             if self.running is not None:
-                self.row.appendleft(stage)
+                self.queue.appendleft(stage)
             return
         self.running = None
         # What somebody else asked for, or that it came too late, is no failure: it is decided anew.
@@ -133,7 +133,7 @@ class Task(Deciding[V]):
         if self._began is None and status.started:
             self._began = view.now
         if self._early is not None and view.gripper.id == self._early.command.id:
-            self._early.begun = self._early.begun or view.gripper.state != "cancelled"
+            self._early.started = self._early.started or view.gripper.state != "cancelled"
         commands = self._watch(view)
         self._stopping = self._stopping and view.motion.state == "active"
         if view.motion.fault and not commands and self.running is None:
@@ -144,15 +144,15 @@ class Task(Deciding[V]):
         if waits or view.motion.stopped or commands or self._stopping or view.now < self._again_at:
             self._count(view)
             return commands
-        while self.running is None and self.row and isinstance(self.row[0], Look):
-            self.row.popleft()
-            self.look_after = view.now
+        while self.running is None and self.queue and isinstance(self.queue[0], AwaitImage):
+            self.queue.popleft()
+            self.images_after = view.now
         if self.running is not None:
             self.decide_ahead(self.running.stage, view)
-        elif not (self.row or self._early or view.motion.state == "active" or view.gripper.moving):
+        elif not (self.queue or self._early or view.motion.state == "active" or view.gripper.moving):
             shut, self._shut = self._shut, False  # not before what a task before this one began has ended
             if shut and not view.holding:
-                self.row.append(Grip("open", status.state, width=self.gripper.max_width))
+                self.queue.append(Grip("open", status.state, width=self.gripper.max_width))
             else:
                 self.decide(view)
         if status.state not in ("DONE", "ERROR"):
@@ -197,7 +197,7 @@ class Task(Deciding[V]):
             if self._early is not None and isinstance(self._early.stage, Grip):  # where it is let go nobody knows
                 self._early = replace(self._early, stage=replace(self._early.stage, holds=None))
             self.forgotten(stage, view)
-        elif running.moves_arm and stage.carries and not view.holding and not (self._early and self._early.begun):
+        elif running.moves_arm and stage.carries and not view.holding and not (self._early and self._early.started):
             stop = self.stop(view, "what it held fell")
             slipped = f": {view.gripper.message}" if view.gripper.outcome == "slipping" else ""
             self.fail(f"what the hand held fell during {stage.name}{slipped}", view, go_home=False)
@@ -231,7 +231,7 @@ class Task(Deciding[V]):
         outcome = early.outcome(view.motion, view.gripper)
         if outcome == "running" and early.spent <= self.time_limit(early.stage):
             return
-        self._early, self.look_after = None, view.now
+        self._early, self.images_after = None, view.now
         stage, reported = early.stage, early.report(view.motion, view.gripper)
         if outcome != "ended" or not isinstance(stage, Grip):
             return
@@ -276,11 +276,11 @@ class Task(Deciding[V]):
         if not held or not ours or view.trouble or view.motion.paused or self.status.paused:
             self._in_the_way.reset()
             return ""
-        return held[0] if self._in_the_way.lasts("in the way", view.now) >= self.p.obstacle_patience else ""
+        return held[0] if self._in_the_way.elapsed("in the way", view.now) >= self.p.obstacle_patience else ""
 
     def _decide_anew(self, message: str, view: V) -> None:
         self.clear()
-        self.look_after = view.now
+        self.images_after = view.now
         self.status.message = message
 
     def _ended(self, stage: Stage, reported: Report, view: V) -> None:
@@ -312,7 +312,7 @@ class Task(Deciding[V]):
             if self._early is not None and view.motion is not None and view.gripper is not None:
                 self.running, self._early = self._early, None
                 self.running.wait_no_more(view.motion, view.gripper)
-                self.running.begun = True
+                self.running.started = True
                 self._tell_stage(self.running.stage)
 
     # --- planning and doing ----------------------------------------------------------------------------------
@@ -327,7 +327,7 @@ class Task(Deciding[V]):
         for grip in (running, self._early.stage if self._early else None):
             if width is not None and isinstance(grip, Grip):
                 width = grip.width_after(width)
-        for move in self.row:
+        for move in self.queue:
             if width is not None and isinstance(move, Grip):
                 width = move.width_after(width)
             if not isinstance(move, Move):
@@ -346,18 +346,18 @@ class Task(Deciding[V]):
         """Begin the next stage when the one before it has ended and its motion is planned and still right."""
         if self.running is not None:
             yield from self._begin_early(self.running, view)
-        if self.running is not None or self._early is not None or not self.row:
+        if self.running is not None or self._early is not None or not self.queue:
             return
-        stage = self.row[0]
+        stage = self.queue[0]
         if stage.carries and not view.holding:
             self.fail(f"what the hand held fell before {stage.name}", view, go_home=False)
             return
-        if (isinstance(stage, Move) and not self._is_planned(stage)) or not self.may_begin(stage, view):
+        if (isinstance(stage, Move) and not self._is_planned(stage)) or not self.may_start(stage, view):
             return
         if isinstance(stage, Move) and (
             appeared(self.obstacles(stage, view), stage.planned_around, self.moved) or self._fingers_differ(stage, view)
         ):
-            for later in self.row:
+            for later in self.queue:
                 if isinstance(later, Move):
                     later.trajectory = None
             self._planning = None
@@ -367,7 +367,7 @@ class Task(Deciding[V]):
 
     def _begin_early(self, running: Execution, view: V) -> Iterator[Command]:
         """Have the fingers begin before the arm stands: until then they touch nothing, or let nothing go."""
-        stage, arm = (self.row[0] if self.row else None), running.stage
+        stage, arm = (self.queue[0] if self.queue else None), running.stage
         if not (isinstance(stage, Grip) and stage.early and isinstance(arm, Move)) or self._opening or self._early:
             return
         if stage.holds and self._held_up:
@@ -377,10 +377,10 @@ class Task(Deciding[V]):
         if motion.id != running.command.id or motion.state != "active":
             return
         left = (1.0 - motion.progress) * arm.seconds
-        if left <= AHEAD * motion.speed_scaling and stage.carries == view.holding and self.may_begin(stage, view):
-            self.row.popleft()
+        if left <= AHEAD * motion.speed_scaling and stage.carries == view.holding and self.may_start(stage, view):
+            self.queue.popleft()
             self._early = self._execution(stage, view)
-            self._early.begun = False
+            self._early.started = False
             command = self._early.command
             assert isinstance(command, m.GripperCommand)
             command.after = running.command.id
@@ -409,7 +409,7 @@ class Task(Deciding[V]):
         return width > planned + FINGERS_OFF or (width < planned - FINGERS_OFF and not move.carries)
 
     def _begin(self, stage: Stage, view: V) -> Command:
-        self.row.popleft()
+        self.queue.popleft()
         self.running = self._execution(stage, view)
         self._tell_stage(stage)
         return self.running.command
@@ -423,14 +423,14 @@ class Task(Deciding[V]):
         if isinstance(stage, Move):
             assert stage.trajectory is not None
             command = m.ExecuteRequest(
-                id=self.mint(), trajectory=stage.trajectory, plan=stage.plan, scene_stamp=stage.scene_stamp)
+                id=self.new_id(), trajectory=stage.trajectory, plan=stage.plan, scene_stamp=stage.scene_stamp)
         else:
             assert isinstance(stage, Grip)
-            command = m.GripperCommand(id=self.mint(), width=stage.width, effort=stage.effort, mass=stage.mass)
+            command = m.GripperCommand(id=self.new_id(), width=stage.width, effort=stage.effort, mass=stage.mass)
             if stage.expected_width is not None:
                 command.expected_width, command.width_tolerance = stage.expected_width, stage.width_tolerance
         if stage.cycle is not None:
-            stage.cycle.begun = True
+            stage.cycle.started = True
         begun = Execution(stage, command, view.now)
         assert view.motion is not None and view.gripper is not None
         if isinstance(stage, Grip):
@@ -440,8 +440,10 @@ class Task(Deciding[V]):
         return begun
 
     def _is_planned(self, move: Move) -> bool:
-        whole = [s for s in self.row if isinstance(s, Move) and s.cycle is move.cycle] if move.whole else [move]
-        return all(stage.trajectory is not None for stage in whole)
+        needed = [move]
+        if move.needs_full_plan:
+            needed = [stage for stage in self.queue if isinstance(stage, Move) and stage.cycle is move.cycle]
+        return all(stage.trajectory is not None for stage in needed)
 
 
 def appeared(now: list[tuple[float, float]], before: list[tuple[float, float]], moved: float) -> bool:

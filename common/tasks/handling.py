@@ -22,7 +22,7 @@ from common.robot.transforms import invert, matrix_to_pose, matrix_to_rpy, pose_
 from common.scene.home import AT_HOME
 from common.tasks.decisions import TaskConfig
 from common.tasks.engine import Task
-from common.tasks.stages import MISSES, Cycle, Grip, Look, Move, Place, Stage, View, place_of
+from common.tasks.stages import MISSES, AwaitImage, Cycle, Grip, Move, Place, Stage, View, place_of
 
 Array = npt.NDArray[np.float64]
 
@@ -84,24 +84,24 @@ class Handling(Task[View]):
             x, y, _ = place_of(thing.pose)
             self.end("ERROR", f"{thing.kind or thing.id} at ({x:.3f}, {y:.3f}): {self._problem}")
             return
-        self.patience.reset()
-        self.row += self._take(thing, view)
+        self.wait_timer.reset()
+        self.queue += self._take(thing, view)
 
     def finish(self, view: View, **figures: float) -> None:
         """It is done, if it looks so for a while; with the task's own figures."""
-        if self.patience.lasts("done", view.scene_stamp) >= self.p.settle:
+        if self.wait_timer.elapsed("done", view.scene_stamp) >= self.p.settle:
             self.status.figures.update(figures)
             self.end("DONE")
 
     def lack(self, what: str, view: View) -> None:
         """Something is missing: wait for it a while, then give up."""
         self.status.message = what
-        if self.patience.lasts(what, view.scene_stamp) >= self.p.give_up:
+        if self.wait_timer.elapsed(what, view.scene_stamp) >= self.p.give_up:
             self.end("ERROR", what)
 
     def shown(self, view: View) -> bool:
         """Whether the scene shows all that was done so far: else it is too early to count."""
-        return self.running is None and not view.holding and view.scene_stamp > self.look_after
+        return self.running is None and not view.holding and view.scene_stamp > self.images_after
 
     def container_of(self, thing: m.CollisionObject) -> str:
         """The id of the container over or in which a thing is; empty when it is none's."""
@@ -137,16 +137,16 @@ class Handling(Task[View]):
         if self.status.state == "DONE":  # whatever is put there now: nobody has asked for more
             return
         if view.holding and view.gripper.outcome in MISSES:  # it is not what was to be taken
-            self.row += [self._open(None), *self.back_off(view.let_go())]
+            self.queue += [self._open(None), *self.back_off(view.let_go())]
         elif view.holding and not view.scene.header.stamp:  # what stands around is seen from home only
-            self.row += [self.home(view), Look()] if away else []
+            self.queue += [self.home(view), AwaitImage()] if away else []
         elif view.holding:
             if view.scene.attached:  # else the planning scene has not caught up yet
                 held = view.scene.attached[0].object
-                self.row += self._put(held, held.pose, Cycle(held.id), view)
+                self.queue += self._put(held, held.pose, Cycle(held.id), view)
         elif away:
-            self.row += self.back_off(view)
-        elif self.sees(view):
+            self.queue += self.back_off(view)
+        elif self.has_fresh_image(view):
             self.status.state, self.status.stage, self.status.subject, self.status.message = "IDLE", "", "", ""
             self.choose(view)
 
@@ -171,7 +171,7 @@ class Handling(Task[View]):
         self._tries[cycle.subject] += 1
         self._problem = problem
 
-    def began_anew(self) -> None:
+    def on_restart(self) -> None:
         """What did not work before may do so now."""
         self._tries.clear()
 
@@ -187,7 +187,7 @@ class Handling(Task[View]):
         above = _raised(T_world_tcp, self.p.grasp.approach_clearance)
         return [
             self._open(cycle),
-            Move("pre-grasp", "GRASPING", cycle, goal=_at(above), whole=True, fresh=True),
+            Move("pre-grasp", "GRASPING", cycle, goal=_at(above), needs_full_plan=True, needs_fresh_image=True),
             Move("descend", "GRASPING", cycle, goal=_at(T_world_tcp), straight=True, touches=self._fingers_on(thing)),
             Grip("close", "GRASPING", cycle, width=0.0, holds=True, effort=thing.grip_effort, mass=thing.mass,
                  expected_width=width, width_tolerance=self.p.width_tolerance),
@@ -213,7 +213,7 @@ class Handling(Task[View]):
             Grip("release", "PLACING", cycle, width=self.gripper.max_width, carries=True, holds=False),
             Move("up", "HOMING", cycle, goal=_at(above), straight=True, touches=self._fingers_on(thing)),
             Move("home", "HOMING", cycle, goal=m.JointGoal(named="home")),
-            Look(),
+            AwaitImage(),
         ]
 
     def _under(self, thing: m.CollisionObject, goal: m.Pose, view: View) -> list[m.CollisionObject]:

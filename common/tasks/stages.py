@@ -24,7 +24,7 @@ class Cycle:
     """What some stages of a row are for: one object, for example. An application adds what it has to remember."""
 
     subject: str = ""  # what the status calls it
-    begun: bool = False
+    started: bool = False
 
 
 @dataclass(eq=False)
@@ -49,9 +49,9 @@ class Move(Stage):
     touches: list[tuple[str, str]] = field(default_factory=list, kw_only=True)  # pairs that may touch in it
     attach: str = field(default="", kw_only=True)  # id of what it carries; empty: of what is in the hand
     attach_pose: m.Pose | None = field(default=None, kw_only=True)  # in the tool's frame, when not held yet
-    fresh: bool = field(default=False, kw_only=True)  # begins only while pictures come
-    whole: bool = field(default=False, kw_only=True)  # begins only once all of its cycle is planned
-    otherwise: list[Stage] = field(default_factory=list, kw_only=True)
+    needs_fresh_image: bool = field(default=False, kw_only=True)  # begins only while pictures come
+    needs_full_plan: bool = field(default=False, kw_only=True)  # begins only once all of its cycle is planned
+    fallback: list[Stage] = field(default_factory=list, kw_only=True)
     trajectory: m.JointTrajectory | None = field(default=None, init=False)
     planned_around: list[tuple[float, float]] = field(default_factory=list, init=False)  # (x, y) [m]
     planned_width: float | None = field(default=None, init=False)  # between the fingers on the way [m]
@@ -92,7 +92,7 @@ class Grip(Stage):
 
 
 @dataclass(eq=False)
-class Look(Stage):
+class AwaitImage(Stage):
     """What was seen up to here decides nothing any more: what follows is decided by a later picture."""
 
     name: str = "look"
@@ -113,7 +113,7 @@ class Execution:
     moving: float = 0.0  # in motion so far
     spent: float = 0.0  # as if the motion were at full speed: what time-outs go by
     accepted: int | None = None  # stamp of the answer that accepted it; an older report knows nothing of it
-    begun: bool = True  # else it waits for the arm
+    started: bool = True  # else it waits for the arm
     held: float | None = None  # between the fingers as it began, where they held something [m]
     over: Report | None = None  # the answer, when it told of the end already: it was asked for more than once
 
@@ -145,7 +145,7 @@ class Execution:
         """
         if self.accepted is not None and gripper.id in (self.before, self.command.id):  # nobody else told them anything
             self.accepted = max(self.accepted, motion.header.stamp - 1)
-        self.begun = self.begun or (gripper.id == self.command.id and gripper.state != "cancelled")
+        self.started = self.started or (gripper.id == self.command.id and gripper.state != "cancelled")
 
     def outcome(self, motion: m.MotionStatus, gripper: m.GripperState) -> Literal["running", "ended", "forgotten"]:
         """What the controllers say of it; forgotten once they accepted it and tell of another goal."""
@@ -171,7 +171,7 @@ def _is_near(thing: m.CollisionObject) -> bool:
     return max(*map(abs, place_of(thing.pose)), *thing.dimensions) <= FARTHEST
 
 
-def without_far(scene: m.PlanningScene) -> m.PlanningScene:
+def within_range(scene: m.PlanningScene) -> m.PlanningScene:
     """The scene without what is so far away, or so large, that no message has room for a motion there."""
     objects = [thing for thing in scene.objects if _is_near(thing)]
     attached = [thing for thing in scene.attached if _is_near(thing.object)]
@@ -198,7 +198,7 @@ class View:
     def __post_init__(self) -> None:
         """Leave out what no motion is for."""
         if self.scene is not None:
-            self.scene = without_far(self.scene)
+            self.scene = within_range(self.scene)
 
     @property
     def missing(self) -> list[str]:

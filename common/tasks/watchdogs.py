@@ -80,7 +80,7 @@ class LivenessWatchdog:
         return f"no joint states for {1e3 * self._timeout():.0f} ms" if awake - self._heard > patience else ""
 
 
-class FrameAge:
+class ImageAge:
     """Judges pictures by when they were taken. Tolerances are wall time [s], stamps cell time [s]."""
 
     def __init__(self, speed: float) -> None:
@@ -108,14 +108,14 @@ class FrameAge:
         return "" if now - min(stamps) < frame_timeout * self._speed else "no fresh picture"
 
 
-class Patience:
+class DwellTimer:
     """For how long the same reason to wait has lasted."""
 
     def __init__(self) -> None:
         """Begin without a reason."""
         self._since: tuple[object, float] | None = None
 
-    def lasts(self, reason: object, now: float) -> float:
+    def elapsed(self, reason: object, now: float) -> float:
         """How long ago that reason was given for the first time, with no other since [s]."""
         if self._since is None or self._since[0] != reason:
             self._since = reason, now

@@ -23,7 +23,7 @@ from applications.outlining.topics import (
     OutlineSelect,
     OutlineSelection,
 )
-from applications.outlining.visits import ask_person, store
+from applications.outlining.visits import ask_operator, store
 from common import messages as m
 from common import topics
 from common.errors import NoResponder, RequestLost
@@ -98,7 +98,7 @@ async def test_the_person_looks_at_the_picture_whose_contours_are_asked_for(
 
     detector.serve(OUTLINE_SELECT, select)
     await detector.ready()
-    asked = asyncio.create_task(ask_person(bus, tmp_path))
+    asked = asyncio.create_task(ask_operator(bus, tmp_path))
     await soon()
     for stamp, pixels in ((1, None), (2, RIGHT), (3, WRONG)):
         seen.put(contours(stamp, pixels) if pixels else Contours(header=header(stamp), width=16, height=12))
@@ -137,7 +137,7 @@ async def test_choice_whose_answer_was_lost_is_made_again_and_one_that_nobody_an
             raise NoResponder(OUTLINE_SELECT.key)
 
     monkeypatch.setattr(bus, "client", lambda _topic: Losing())
-    asked = asyncio.create_task(ask_person(bus, tmp_path))
+    asked = asyncio.create_task(ask_operator(bus, tmp_path))
     await soon()
     seen.put(contours(1, RIGHT))
     drawn.put(array_to_image(np.zeros((12, 16, 3), np.uint8), "bgr8", header(1)))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from applications.pick_place.contact_check import Recheck, Recording
+from applications.pick_place.contact_check import ContactCheck, Recording
 from common.application import find_application
 from common.config import load_cell
 from common.messages import GripperState, Header, JointState, Pose, PoseArray, Vector3
@@ -23,8 +23,8 @@ SECOND = 1_000_000_000
 
 
 @cache
-def recheck() -> Recheck:
-    return Recheck(CELL)
+def recheck() -> ContactCheck:
+    return ContactCheck(CELL)
 
 
 def at(x: float, y: float, z: float) -> Array:
