@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from applications.pick_place.ball_places import MOST_HIDDEN, Region, find_viewing_poses
+from applications.pick_place.ball_places import MOST_HIDDEN, VisibleTable, find_viewing_poses
 from applications.pick_place.detections import HIDDEN, OccludedTargets
 from applications.pick_place.perceived_scene import PerceivedScene, SceneParameters, Sighting, Tracks
 from common import messages as m
@@ -72,7 +72,7 @@ def test_what_lies_in_the_container_is_kept_while_the_hand_hides_it() -> None:
 
 
 def test_arm_is_turned_out_of_the_way_as_little_as_need_be() -> None:
-    robot, region = RobotModel.load(CELL.robot), Region(AROUND, WorkspaceBounds())
+    robot, region = RobotModel.load(CELL.robot), VisibleTable(AROUND, WorkspaceBounds())
     silhouettes = RobotSilhouettes(robot, 0.03)
     within = region.within(CAMERA, silhouettes, robot)
 

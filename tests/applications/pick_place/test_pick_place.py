@@ -190,7 +190,7 @@ def test_grasp_asks_for_what_was_seen_as_hard_as_the_scene_says() -> None:
 
 def test_grasp_of_what_is_not_as_wide_as_it_was_seen_is_let_go_and_retried() -> None:
     cell = CellDouble([(0.40, -0.30)])
-    cell.odd = 2
+    cell.outliers = 2
     cell.until("open")
     assert cell.task.status.message == "the fingers closed on a brick at (0.400, -0.300)"
     cell.until("DONE")
@@ -202,7 +202,7 @@ def test_grasp_of_what_is_not_as_wide_as_it_was_seen_is_let_go_and_retried() -> 
 
 def test_what_is_never_as_wide_as_it_was_seen_is_given_up() -> None:
     cell = CellDouble([(0.40, -0.30)], max_retries=2)
-    cell.odd = 1000
+    cell.outliers = 1000
     cell.until("DONE")
     assert (cell.contained, cell.task.status.retries) == (0, 3)
     assert cell.task.status.skipped[0].reason == "the fingers closed on a brick 3 times"
@@ -210,7 +210,7 @@ def test_what_is_never_as_wide_as_it_was_seen_is_given_up() -> None:
 
 def test_what_was_not_to_be_taken_is_let_go_by_a_task_that_finds_it_in_the_hand() -> None:
     cell = CellDouble([(0.40, -0.30)])
-    cell.odd = 1
+    cell.outliers = 1
     cell.until("open")
     cell.tell("stop")
     for _ in range(10):

@@ -54,20 +54,20 @@ def look(*things: WorldObject, others: bool = True) -> Detector:
 @pytest.mark.parametrize("others", [True, False])
 @pytest.mark.parametrize("side", [0.045, 0.05, 0.06])
 def test_cube_is_told_by_its_outline(place: tuple[float, float], side: float, others: bool) -> None:
-    odd = look(red("box", (*place, side / 2), (side, side, side)), others=others).odd
+    odd = look(red("box", (*place, side / 2), (side, side, side)), others=others).outliers
     assert {one.reason for one in odd} == {NOT_ROUND} and math.dist(odd[0].position[:2], place) < 0.03
 
 
 @pytest.mark.parametrize("place", [(0.30, 0.455), (0.44, 0.455), (0.74, -0.08), (0.06, -0.12)])
 def test_cube_that_the_border_cuts_is_told_by_what_shows_of_its_outline(place: tuple[float, float]) -> None:
-    odd = look(red("box", (*place, 0.035), (0.07, 0.07, 0.07))).odd
+    odd = look(red("box", (*place, 0.035), (0.07, 0.07, 0.07))).outliers
     assert {one.reason for one in odd} == {NOT_ROUND}
     assert min(math.dist(one.position[:2], place) for one in odd) < 0.06
 
 
 @pytest.mark.parametrize("place", PLACES)
 def test_cable_is_told_by_its_outline(place: tuple[float, float]) -> None:
-    odd = look(red("cylinder", (*place, 0.01), (0.02, 0.02, 0.2), roll=math.pi / 2)).odd
+    odd = look(red("cylinder", (*place, 0.01), (0.02, 0.02, 0.2), roll=math.pi / 2)).outliers
     assert {one.reason for one in odd} == {NOT_ROUND}
 
 
@@ -99,12 +99,12 @@ def test_picture_full_of_red_specks_shows_no_cable() -> None:
 @pytest.mark.parametrize("place", [(0.60, -0.30), (0.20, -0.35), (0.62, -0.25)])
 def test_disc_away_from_the_axis_is_told_by_its_shape(place: tuple[float, float]) -> None:
     for diameter in (0.06, 0.0624):  # the second one is as large in the picture as a ball
-        odd = look(red("cylinder", (*place, 0.0005), (diameter, diameter, 0.001)), others=False).odd
+        odd = look(red("cylinder", (*place, 0.0005), (diameter, diameter, 0.001)), others=False).outliers
         assert [one.reason for one in odd] == [FLAT]
 
 
 def test_disc_below_the_camera_is_told_by_its_size_beside_balls() -> None:
-    odd = look(red("cylinder", (0.40, 0.0, 0.0005), (0.06, 0.06, 0.001))).odd
+    odd = look(red("cylinder", (0.40, 0.0, 0.0005), (0.06, 0.06, 0.001))).outliers
     assert len(odd) == 1 and "smaller than a ball on the table" in odd[0].reason
 
 
@@ -112,7 +112,7 @@ def test_disc_below_the_camera_is_told_by_its_size_beside_balls() -> None:
 @pytest.mark.parametrize("others", [True, False])
 @pytest.mark.parametrize("height", [0.079, 0.09])
 def test_ball_on_top_of_something_looks_too_large(place: tuple[float, float], height: float, others: bool) -> None:
-    odd = look(ball(*place, height), others=others).odd
+    odd = look(ball(*place, height), others=others).outliers
     assert len(odd) == 1 and "larger than a ball on the table: it lies higher" in odd[0].reason
 
 
