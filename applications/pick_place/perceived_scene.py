@@ -238,8 +238,8 @@ class PerceivedScene:
         """Process the detections of one frame of one view.
 
         Frames taken before the last gripper change still show the held object on the table and are skipped. Detections
-        at the held object are ignored. Objects of a view that looks `at_times` stay known until it looks again; objects in
-        the `hidden` part of an image until a view shows their positions.
+        at the held object are ignored. Objects of a view that looks `at_times` stay known until it looks again; objects
+        in the `hidden` part of an image until a view shows their positions.
         """
         stamp = detections.header.stamp
         if stamp <= self._changed_hands_at:

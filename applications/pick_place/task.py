@@ -155,8 +155,8 @@ class PickPlace(Task[PickPlaceView]):
             self._hidden.reset()
         status.skipped = self._choice.rejections()
         # Objects in the container were placed before a restart of the task, or by another program; a restarted scene
-        # manager may report them later. A released ball counts at its release: before, it may hang above others, and an image
-        # shows one more.
+        # manager may report them later. A released ball counts at its release: before, it may hang above others, and an
+        # image shows one more.
         contained = self._counted(view)
         stages = {status.stage, *(stage.name for stage in self.active_stages)}
         releases = "release" in stages or self.deferred_grip == "release"
