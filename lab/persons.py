@@ -15,7 +15,7 @@ from common import topics
 from common.client.operator_motion import MotionFailed, OperatorMotion
 from common.control.jogging import DEADMAN, STANDS
 from common.errors import RequestFailed
-from common.process.persist import persist
+from common.process.timing import call_until_answered
 from common.topics import Request, Topic
 from common.transport.reader import Reader
 from lab.faults import Fault
@@ -240,4 +240,4 @@ def _started(task: m.TaskStatus | None, motion: m.MotionStatus | None) -> bool:
 
 async def _insist(bus: VirtualBus, request: Request[Any, Any], message: m.Message) -> None:
     """Ask until there is an answer, whatever it is."""
-    await persist(bus.client(request), message, PERSON_TIMEOUT, lambda error: None, lambda problem: None)
+    await call_until_answered(bus.client(request), message, PERSON_TIMEOUT, lambda error: None, lambda problem: None)

@@ -8,8 +8,8 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from common import topics
+from common.client.rates import Rates
 from common.sources import monotonic
-from common.supervision.rates import Rates
 from recording.report.fold import Fold
 
 if TYPE_CHECKING:

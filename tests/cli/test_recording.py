@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from common.client.keyboard import names_of
+from recording.keyboard import names_of
 from recording.reading import Recording
 from recording.sink import Figures
 from recording.summary import summarise

@@ -7,9 +7,8 @@ import threading
 import pytest
 from rich.console import Console
 
-from cli.operation.live import MOST_LINES, LiveScreen, render
-from cli.operation.screen import Content
-from cli.operation.screens import JsonScreen, PlainScreen, ScreenHandler, open_screen
+from cli.session.live_table import MOST_LINES, LiveScreen, render
+from cli.session.screens import Content, JsonScreen, PlainScreen, ScreenHandler, open_screen
 from common.messages import ServiceStatus
 
 CONTENT = Content(

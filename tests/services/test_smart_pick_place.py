@@ -117,7 +117,7 @@ async def test_what_a_task_knows_of_what_it_let_go_outlives_it(damaged, monkeypa
     kept.write_text(damaged)
     async with running_service(LocalNetwork(), run, CONFIG, name="smart_pick_place"):
         assert tasks[2].memory == LetGo()
-    assert f"what was done before is not known: {kept} cannot be read: it is damaged" in caplog.text
+    assert f"the memory of the task is lost: {kept} cannot be read: it is damaged" in caplog.text
 
 
 async def test_memory_that_a_task_begins_with_stays_where_none_was_kept_and_is_written_as_soon_as_it_can_be(

@@ -13,7 +13,7 @@ from collections.abc import Mapping
 
 from common.config import Cell
 from common.errors import ZencellError
-from common.supervision.launch import python_module
+from common.supervision.launch import module_command
 from tools.check.finding import Finding
 
 NICE = 10  # the cell goes first
@@ -34,7 +34,7 @@ async def doubts_beside(cell: Cell, environ: Mapping[str, str]) -> list[Finding]
         NotLooked: it failed; what it said of that is on stderr.
     """
     process = await asyncio.create_subprocess_exec(
-        *python_module(__name__), stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE, env=environ,
+        *module_command(__name__), stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE, env=environ,
         start_new_session=True,  # Ctrl-C is for us
     )
     try:

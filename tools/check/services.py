@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from common.config import Cell
 from common.errors import ConfigError, ZencellError
-from common.supervision.wired import Unwired, wired
+from common.supervision.wiring import WiringFailed, wire_service
 from tools.check.cell import quick, thorough
 from tools.check.finding import Finding, error, refusal
 from tools.check.wiring import Keys, check_wiring
@@ -31,10 +31,10 @@ def wiring(cell: Cell) -> Iterator[Finding]:
                     f"name one of {', '.join(cell.services)}")
     for entry in cell.services.values():
         try:
-            each = wired(cell, entry)
+            each = wire_service(cell, entry)
         except ConfigError as told:
             yield refusal(told)
-        except Unwired as told:
+        except WiringFailed as told:
             yield error(str(told), "correct the service, or its parameters", refused=True)
         except ZencellError as told:
             yield error(f"services.{entry.name}: {told}", "correct it", refused=True)

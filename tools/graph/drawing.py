@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from common.supervision.wired import Wired
+    from common.supervision.wiring import ServiceWiring
 
 OUTSIDE = "zencell, you"  # who sends the requests that no service of the cell sends
 SUPERVISOR = "supervisor"
@@ -20,7 +20,7 @@ class Graph:
     """A cell as services with the keys between them. `alive` is None while the cell is not up."""
 
     cell: str
-    services: list[Wired]  # in start order
+    services: list[ServiceWiring]  # in start order
     kinds: dict[str, str]  # by key: stream, event, state, request; in the order of their writers or callers
     alive: frozenset[str] | None = None
     outside: list[str] = field(default_factory=list)  # requests that no service of the cell sends
@@ -30,8 +30,8 @@ class Graph:
         return self.alive is None or service in self.alive
 
 
-def graph_of(cell: str, services: list[Wired], alive: frozenset[str] | None = None) -> Graph:
-    """The graph of a cell's wired services.
+def graph_of(cell: str, services: list[ServiceWiring], alive: frozenset[str] | None = None) -> Graph:
+    """The graph of a cell's wire_service services.
 
     Args:
         cell: its name.
@@ -39,12 +39,12 @@ def graph_of(cell: str, services: list[Wired], alive: frozenset[str] | None = No
         alive: the services that are ready, when the cell is up.
     """
     from common.application import find_topic
-    from common.supervision.wired import Wired
+    from common.supervision.wiring import ServiceWiring
     from common.topics import SUPERVISOR_STATUS
 
     services = [replace(each, calls=[key for key in each.calls if not key.startswith(PARAMETERS)]) for each in services]
     if any(SUPERVISOR_STATUS.key in each.reads for each in services):
-        services.append(Wired(SUPERVISOR, "", writes=[SUPERVISOR_STATUS.key]))
+        services.append(ServiceWiring(SUPERVISOR, "", writes=[SUPERVISOR_STATUS.key]))
     called = {key for service in services for key in service.calls}
     outside = [key for service in services for key in service.serves if key not in called]
     keys = [key for service in services for key in (*service.writes, *service.calls)] + outside

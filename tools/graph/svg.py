@@ -95,8 +95,8 @@ def _right_side(graph: Graph, rows: list[Row], bottom: float) -> tuple[list[Box]
 
 def _ending_at(graph: Graph, service: str, rows: list[Row]) -> list[Row]:
     """The rows from which a line goes to a service, from top to bottom."""
-    wired = next(each for each in graph.services if each.name == service)
-    return [row for row in rows if row.key in wired.reads or row.key in wired.serves]
+    wire_service = next(each for each in graph.services if each.name == service)
+    return [row for row in rows if row.key in wire_service.reads or row.key in wire_service.serves]
 
 
 def _lines(graph: Graph, rows: list[Row], readers: list[Box], colours: dict[str, str]) -> list[str]:

@@ -50,7 +50,7 @@ async def test_added_solid_stands_beside_what_is_perceived_and_is_there_again_af
             assert [thing.id for thing in (await scenes.next()).objects] == ["ball", "added/pole"]
             assert (await edits.call(SceneEdit(op="remove", id="pole"), 5.0)).ids == []
             assert [thing.id for thing in (await scenes.next()).objects] == ["ball"]
-    assert "added by persons before: added/pole" in caplog.text
+    assert "solids from an earlier session: added/pole" in caplog.text
 
 
 async def test_solid_that_cannot_be_kept_is_not_added(monkeypatch: pytest.MonkeyPatch) -> None:

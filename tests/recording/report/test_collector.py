@@ -6,6 +6,7 @@ from applications.pick_place.messages import PickPlaceStatus
 from applications.pick_place.topics import PICK_PLACE_STATUS, REJECTED_TARGETS, SCENE_BALLS, VALIDATED_TARGETS
 from common import topics
 from common.application import Application
+from common.client.rates import MOST_SERVICES, Rates
 from common.clock import Clock
 from common.messages import (
     Header,
@@ -17,7 +18,6 @@ from common.messages import (
     ServiceCounters,
     Vector3,
 )
-from common.supervision.rates import MOST_SERVICES, Rates
 from common.transport.local import LocalNetwork
 from recording.report.collector import Collector
 from recording.report.fold import Fold
