@@ -1,4 +1,4 @@
-"""Writing never waits, and what was lost is told."""
+"""The dropping writer never blocks, and reports how many lines it dropped."""
 
 import fcntl
 import io
@@ -31,7 +31,7 @@ def read_until(read, last):
     return text.decode()
 
 
-def test_lines_come_in_order_and_all_of_them_when_somebody_reads(pipe):
+def test_all_lines_are_written_in_order_while_they_are_read(pipe):
     read, stream = pipe
     writer = DroppingWriter(stream)
     for number in range(1000):
@@ -40,7 +40,7 @@ def test_lines_come_in_order_and_all_of_them_when_somebody_reads(pipe):
     writer.flush(WAIT)
 
 
-def test_nobody_waits_when_nobody_reads_and_what_was_lost_is_told_when_somebody_does(pipe):
+def test_stalled_reader_blocks_no_writer_and_gets_the_number_of_dropped_lines_later(pipe):
     read, stream = pipe
     writer = DroppingWriter(stream, most=10_000)
     began = time.process_time()
@@ -48,15 +48,15 @@ def test_nobody_waits_when_nobody_reads_and_what_was_lost_is_told_when_somebody_
         writer.put(f"{number:04d} {'x' * 95}\n")
     assert time.process_time() - began < 2.0
     writer.flush(0.05)  # gives up
-    lines = read_until(read, b"were lost: nobody read them\n").splitlines()
-    kept = [line for line in lines if line.endswith("x")]
-    assert [int(line[:4]) for line in kept] == list(range(len(kept))), "what was first stays, in order"
-    assert int(lines[-1].split()[0]) == 5000 - len(kept) > 0
+    lines = read_until(read, b"were dropped: the reader was too slow\n").splitlines()
+    written = [line for line in lines if line.endswith("x")]
+    assert [int(line[:4]) for line in written] == list(range(len(written))), "the first lines stay, in order"
+    assert int(lines[-1].split()[0]) == 5000 - len(written) > 0
     writer.put("after\n")
     assert read_until(read, b"after\n") == "after\n"
 
 
-def test_pipe_that_is_dead_is_written_to_no_more():
+def test_writer_ends_when_the_reader_has_closed_the_pipe():
     read, write = os.pipe()
     os.close(read)
     with os.fdopen(write, "w") as stream:
@@ -69,14 +69,14 @@ def test_pipe_that_is_dead_is_written_to_no_more():
         assert not writer._thread.is_alive()
 
 
-def test_text_in_memory_has_its_lines_at_once():
+def test_stream_without_a_file_descriptor_is_written_directly():
     text = io.StringIO()
     DroppingWriter(text).put("now\n")
     assert text.getvalue() == "now\n"
 
 
 @pytest.mark.parametrize("as_json", [False, True])
-def test_log_of_a_process_does_not_wait_and_tells_what_was_lost_in_its_own_format(pipe, monkeypatch, as_json):
+def test_log_of_a_process_reports_dropped_lines_in_its_own_format(pipe, monkeypatch, as_json):
     read, stream = pipe
     monkeypatch.setattr("sys.stderr", stream)
     root = logging.getLogger()
@@ -87,9 +87,9 @@ def test_log_of_a_process_does_not_wait_and_tells_what_was_lost_in_its_own_forma
             root.info("x" * 100)
         for handler in root.handlers:
             handler.flush()
-        text = read_until(read, b"nobody read them")
+        text = read_until(read, b"too slow")
     finally:
         root.handlers[:] = before
         root.setLevel(level)
     last = text.splitlines()[-1]
-    assert last.startswith('{"time"' if as_json else "WARNING camera: ") and "lines were lost: nobody read them" in last
+    assert last.startswith('{"time"' if as_json else "WARNING camera: ") and "lines were dropped: the reader was too slow" in last

@@ -1,4 +1,4 @@
-"""The judgement with a clock of the test's own; that a stuck process really ends, with processes."""
+"""A stuck event loop ends its process: the timer on a clock of the test, the end with real processes."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ PATIENCE = 20.0
 CELL = str(Path(__file__).with_name("toy_cell.yaml"))
 
 
-def test_a_loop_that_turns_is_never_stuck() -> None:
-    turning = StallTimer()
+def test_timer_loop_is_never_stuck() -> None:
+    timer = StallTimer()
     for k in range(100):
-        assert turning.still_for(k * PERIOD) <= PERIOD
-        turning.turned()
+        assert timer.still_for(k * PERIOD) <= PERIOD
+        timer.turned()
 
 
-def test_time_without_a_turn_adds_up_and_a_turn_ends_it() -> None:
-    turning = StallTimer()
-    assert [turning.still_for(k * PERIOD) for k in range(9)][-1] == 8 * PERIOD
-    turning.turned()
-    assert turning.still_for(9 * PERIOD) == 0.0
+def test_stall_lasts_until_the_next_turn() -> None:
+    timer = StallTimer()
+    assert [timer.still_for(k * PERIOD) for k in range(9)][-1] == 8 * PERIOD
+    timer.turned()
+    assert timer.still_for(9 * PERIOD) == 0.0
 
 
-def test_a_process_that_was_suspended_as_a_whole_is_not_stuck() -> None:
-    turning = StallTimer()
-    turning.still_for(0.0)
-    assert turning.still_for(3600.0) <= 2 * PERIOD
+def test_suspended_process_is_not_stuck() -> None:
+    timer = StallTimer()
+    timer.still_for(0.0)
+    assert timer.still_for(3600.0) <= 2 * PERIOD
 
 
 @pytest.fixture
@@ -46,7 +46,7 @@ async def toy(processes, domain: int):
     return start
 
 
-async def test_a_stuck_service_ends_itself_and_says_where_it_hangs(toy, processes, until) -> None:
+async def test_stuck_service_exits_and_logs_where_it_is_stuck(toy, processes, until) -> None:
     process = toy("stuck")
     await until(lambda: process.poll() is not None)
     assert process.poll() == STUCK_EXIT
@@ -57,7 +57,7 @@ async def test_a_stuck_service_ends_itself_and_says_where_it_hangs(toy, processe
 
 
 @pytest.mark.slow
-async def test_what_blocks_a_thread_beside_the_loop_does_no_harm(toy, processes) -> None:
+async def test_blocked_thread_next_to_the_loop_does_not_count(toy, processes) -> None:
     process = toy("native")
     await processes.said(process, "woke up")
     assert process.poll() is None
