@@ -212,18 +212,18 @@ class Console(Desk):
         return await client.call(message, timeout)
 
     @property
-    def heard(self) -> int | None:
+    def acknowledged(self) -> int | None:
         """`since` of the newest stop or hold that the page knows of; None where nobody tells of them."""
         motion = self.latest(topics.MOTION_STATUS)
         return max(motion.newest, self._newest) if motion else None
 
-    async def command(self, command: str, override: bool = False, heard: int | None = None) -> None:
+    async def command(self, command: str, override: bool = False, acknowledged: int | None = None) -> None:
         """Tell the task to start, pause, resume or stop; to start or resume although another person holds the arm.
 
         Nothing is let go of that is newer than what was `heard` of as this was decided; left out: that is now.
         """
-        heard = self.heard if heard is None else heard
-        said = {"command": command, "by": self.doors.person, "override": override, "heard": heard}
+        acknowledged = self.acknowledged if acknowledged is None else acknowledged
+        said = {"command": command, "by": self.doors.person, "override": override, "acknowledged": acknowledged}
         await self.ask(topics.TASK_COMMAND, TaskCommand.model_validate(said))
 
     async def stop(self) -> str:
@@ -251,9 +251,9 @@ class Console(Desk):
         """Have the motion of the robot for who asks now until it is given back, or give it back."""
         return await self.ask(topics.MOTION_OWN, OwnRequest(act=act, owner=self.doors.person, over=over), _SOON)
 
-    def jog(self, heard: int, **velocities: Any) -> None:
+    def jog(self, acknowledged: int, **velocities: Any) -> None:
         """Move with velocities for the next 0.1 s, as a `JogCommand` has them; without any come to rest."""
-        fields = {"header": self._bus.header(), "owner": self.doors.person, "heard": heard, **velocities}
+        fields = {"header": self._bus.header(), "owner": self.doors.person, "acknowledged": acknowledged, **velocities}
         self._jog.put(JogCommand.model_validate(fields))
 
     def header(self) -> Header:

@@ -58,9 +58,9 @@ class HandPanel:
 
     def _moving(self, name: str, width: Callable[[], float]) -> Callable[[], Any]:
         async def move() -> None:
-            heard = (await self._free()).newest
+            acknowledged = (await self._free()).newest
             asked = check(GripperCommand, {
-                "header": self._console.header(), "heard": heard,
+                "header": self._console.header(), "acknowledged": acknowledged,
                 "id": f"page-{new_id()}", "owner": self._console.doors.person,
                 "width": width() * 1e-3, "effort": self._force}, "gripper")
             self._console.tell(f"Fingers: {name} …", "busy")

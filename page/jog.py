@@ -13,9 +13,9 @@ from typing import Any, Protocol
 import viser
 
 from common.client.arm import NO_WAY
-from common.client.operator_motion import OURSELVES, SOMEBODY
+from common.client.operator_motion import OURSELVES
 from common.control.jogging import PAUSE
-from common.messages import MotionOwner, MotionStatus
+from common.messages import UNKNOWN_OPERATOR, MotionOwner, MotionStatus
 from common.sources import monotonic
 from page.console import Desk
 from page.doors import Doors
@@ -39,7 +39,7 @@ class Jogs(Protocol):
 
     doors: Doors  # know who that person is
 
-    def jog(self, heard: int, **velocities: Any) -> None:
+    def jog(self, acknowledged: int, **velocities: Any) -> None:
         """Move so for a moment; without any come to rest."""
 
 
@@ -79,14 +79,14 @@ class Jogger(Holder):
         newest = motion.newest if motion is not None else 0
         why = self._kept() or self._inhibited(motion)
         if not (why or begins) and motion is not None and newest > self._heard:
-            why = f"it is {motion.inhibits[-1].told}"
+            why = f"it is {motion.interlocks[-1].description}"
         jogged = owner is not None and owner.jogging and owner.owner == self._jogs.doors.person
         self._taken = jogged or (self._taken and not begins)
         if owner is not None and not (why or begins or jogged) and now - self._began > UNANSWERED:
             if self._taken and owner.kind == "none" and not owner.jogging:
                 why = "nothing was heard of the button for a moment (a slow link, or a busy machine): press it again"
             else:
-                why = f"{NO_WAY}; the motion is {owner.told}"
+                why = f"{NO_WAY}; the motion is {owner.description}"
         if begins:
             self._press, self._began = (who, press), now
             if newest != self._heard:  # the executor wants a pause after a stop: else this press would never count
@@ -102,9 +102,9 @@ class Jogger(Holder):
 
     def _inhibited(self, motion: MotionStatus | None) -> str:
         """Who else stopped the arm, in words."""
-        ours = (self._jogs.doors.person, SOMEBODY, *OURSELVES)
-        inhibits = motion.inhibits if motion is not None else []
-        return "; ".join(f"it is {one.told}" for one in inhibits if one.by not in ours)
+        ours = (self._jogs.doors.person, UNKNOWN_OPERATOR, *OURSELVES)
+        interlocks = motion.interlocks if motion is not None else []
+        return "; ".join(f"it is {one.description}" for one in interlocks if one.by not in ours)
 
     def release(self, who: object) -> None:
         """Have the arm come to rest, if that page moved it."""

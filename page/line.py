@@ -130,7 +130,7 @@ class Line:
         """Why who looks may not move the arm, whatever the arm does."""
         doors = self._desk.doors
         if owner is not None and owner.asked and owner.kind != "task" and owner.owner != doors.person:
-            return f"the motion is {owner.told}: Take it over, or wait until it is given back"
+            return f"the motion is {owner.description}: Take it over, or wait until it is given back"
         return doors.objection(VISITOR.get(), "operate")
 
     def _heard(self, connection: ServerConnection, data: str | bytes, delays: Delays) -> bool:
@@ -148,7 +148,7 @@ class Line:
         desk, doors = self._desk, self._desk.doors
         unknown = doors.guarded and not doors.is_in(VISITOR.get())  # which page it is: only STOP is for all
         if said.do == "page":
-            visitor = doors.page_of(said.what)
+            visitor = doors.build_report(said.what)
             if visitor is not None:
                 VISITOR.set(visitor)
             return visitor is not None

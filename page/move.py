@@ -46,7 +46,9 @@ class Motions(Protocol):
     async def plan(self, goal: PoseGoal | JointGoal, *, planner: str = "") -> PlanResponse:
         """A plan to a goal; nothing moves."""
 
-    async def move(self, goal: PoseGoal | JointGoal, *, planner: str = "", heard: int | None = None) -> MotionStatus:
+    async def move(
+        self, goal: PoseGoal | JointGoal, *, planner: str = "", acknowledged: int | None = None
+    ) -> MotionStatus:
         """The end of a motion to a goal; what was said later than `heard` keeps the arm."""
 
     async def follow(self, trajectory: JointTrajectory, *, plan: PlanResponse | None = None) -> MotionStatus:
@@ -311,20 +313,20 @@ class MovePanel:
         self._tell("There", "good")
 
     async def _move(
-        self, goal: PoseGoal | JointGoal, planner: str, there: str, heard: int | None = None
+        self, goal: PoseGoal | JointGoal, planner: str, there: str, acknowledged: int | None = None
     ) -> None:
         self._forget()
-        await self._motions.move(goal, planner=planner, heard=heard)
+        await self._motions.move(goal, planner=planner, acknowledged=acknowledged)
         self._tell(there, "good")
 
     async def _through(self, names: list[str]) -> None:
         goals = [JointGoal(positions=self._taught.positions(name)) for name in names]
 
         async def go() -> None:
-            heard = (await self._motions.require_free()).newest  # a STOP between two poses ends all of it
+            acknowledged = (await self._motions.require_free()).newest  # a STOP between two poses ends all of it
             for name, goal in zip(names, goals, strict=True):
                 self._tell(f"Going to {name} …", "busy")
-                await self._move(goal, self._asked, f"At {name}", heard)
+                await self._move(goal, self._asked, f"At {name}", acknowledged)
                 await asyncio.sleep(0)
 
         await self._do(go(), "Going through the poses …")

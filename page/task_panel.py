@@ -92,12 +92,12 @@ class TaskPanel:
             lines.append(f"<div>{span(task.message, 'bad' if task.state == 'ERROR' else 'dim')}</div>")
         lines.append(f"<div>{span('Arm:', 'dim')} {text(words.motion(motion))} · {text(gripper)}</div>")
         if owner is not None:
-            lines.append(f"<div>{span('The motion is', 'dim')} {text(owner.told)}</div>")
+            lines.append(f"<div>{span('The motion is', 'dim')} {text(owner.description)}</div>")
         if self._console.doors.guarded:
             lines.append(f"<div>{span('Operates:', 'dim')} {text(self._console.doors.operator or 'nobody')}</div>")
-        for one in motion.inhibits if motion is not None else ():
-            if task is None or one.told not in task.message:
-                lines.append(f"<div>{span(one.told, 'dim')}</div>")
+        for one in motion.interlocks if motion is not None else ():
+            if task is None or one.description not in task.message:
+                lines.append(f"<div>{span(one.description, 'dim')}</div>")
         if task is not None:
             lines.append(fields(self._words.counters(task, rejected)))
         state = task.state if task else ""
@@ -164,7 +164,7 @@ class TaskPanel:
     def _others(self) -> object:
         """The newest that others said of the arm, and whose it is: who presses twice overrides what they were told."""
         owner = self._console.latest(topics.MOTION_OWNER)
-        return self._console.heard, owner.owner if owner is not None else ""
+        return self._console.acknowledged, owner.owner if owner is not None else ""
 
     async def _own(self, act: Literal["take", "give"]) -> None:
         asked = act, self._others
@@ -178,7 +178,7 @@ class TaskPanel:
             self.tell(f"{problem(error)}: press Take again for that")
         else:
             kept = act == "give" and now.owner not in ("", self._console.doors.person)
-            self.tell(f"Nothing to give back: the motion is {now.told}" if kept else f"The motion is {now.told}",
+            self.tell(f"{'Nothing to give back: the' if kept else 'The'} motion is {now.description}",
                       "bad" if kept else "good")
 
     async def _command(self, chosen: str) -> None:

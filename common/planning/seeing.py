@@ -13,8 +13,8 @@ from pydantic import Field, model_validator
 from common.config import Section
 from common.errors import Refused, ZencellError
 from common.messages import CameraInfo, Image, JointState, PlanningScene, PointCloud2, TFMessage
+from common.perception.camera_input import FrameError
 from common.perception.depth import Depth, check_depth, depth_of
-from common.perception.intake import Unusable
 from common.perception.pinhole import CameraError, Pinhole
 from common.planning.obstacles import BadShape
 from common.planning.points import KnownShapes, PointObstacle, View, depth_points, unseen
@@ -165,7 +165,7 @@ class Seeing:
                 camera.fx / step, camera.fy / step, camera.cx / step, camera.cy / step, camera.width, camera.height, T
             )
             return View(f"points of {name}", depth_points(depth[::step, ::step], coarse), q, width), (depth, camera)
-        except (Unusable, CameraError) as error:
+        except (FrameError, CameraError) as error:
             raise Refused("bad_points", f"{name}: {error}") from None
         except ZencellError as error:
             if isinstance(error, Refused):
@@ -215,7 +215,7 @@ def frame_pose(frame: str, poses: TFMessage | None, robot: RobotModel, q: Array)
     """(4, 4) pose in the world of a frame that hangs, over others, on the world or on a link of the robot at q.
 
     Raises:
-        Unusable: it does.
+        FrameError: it does.
     """
     known = {t.child_frame_id: t for t in (poses.transforms if poses is not None else [])}
     links = set(robot.link_names)
@@ -229,7 +229,7 @@ def frame_pose(frame: str, poses: TFMessage | None, robot: RobotModel, q: Array)
             break
         T = pose_to_matrix(known[at].transform) @ T
         at = known[at].header.frame_id
-    raise Unusable("unknown_frame", f"tf_static does not say where frame {frame!r} is; it has: "
+    raise FrameError("unknown_frame", f"tf_static does not say where frame {frame!r} is; it has: "
                                     f"{', '.join(known) or 'none'}")
 
 
@@ -237,18 +237,18 @@ def cloud_points(cloud: PointCloud2) -> Array:
     """(N, 3) points [m] of a cloud in its frame, without those that are no number.
 
     Raises:
-        Unusable: it has no x, y and z, or its bytes do not add up.
+        FrameError: it has no x, y and z, or its bytes do not add up.
     """
     missing = [name for name in ("x", "y", "z") if name not in cloud.fields]
     if missing:
-        raise Unusable("fields", f"the cloud has no {missing[0]}; its fields are {', '.join(cloud.fields) or 'none'}")
+        raise FrameError("fields", f"the cloud has no {missing[0]}; its fields are {', '.join(cloud.fields) or 'none'}")
     at = [cloud.fields.index(name) for name in ("x", "y", "z")]
     row = cloud.width * cloud.point_step
     if cloud.point_step % 4 or 4 * (max(at) + 1) > cloud.point_step or cloud.row_step < row:
-        raise Unusable("step", f"point_step {cloud.point_step} and row_step {cloud.row_step} do not fit "
+        raise FrameError("step", f"point_step {cloud.point_step} and row_step {cloud.row_step} do not fit "
                                f"{len(cloud.fields)} fields of {cloud.width} points")
     if len(cloud.data) < cloud.row_step * (cloud.height - 1) + row:
-        raise Unusable("truncated", f"{len(cloud.data)} bytes are too few for {cloud.width}x{cloud.height} points")
+        raise FrameError("truncated", f"{len(cloud.data)} bytes are too few for {cloud.width}x{cloud.height} points")
     data = np.frombuffer(cloud.data, np.uint8)
     rows = np.lib.stride_tricks.as_strided(data, (cloud.height, row), (cloud.row_step, 1), writeable=False)
     values = np.ascontiguousarray(rows).view("<f4").reshape(-1, cloud.point_step // 4)[:, at]

@@ -19,7 +19,6 @@ PLAN_OVERTIME = 5.0  # [s] wall: that a plan may take beyond its planning time
 REFUSAL_DELAY = 0.1  # [s] wall: after the second refused motion in a row; doubles with each further one
 LONGEST_REFUSAL_DELAY = 2.0  # [s] wall
 RELEASE = "release"  # kind of a command that ends an operator's hold
-PERSON = "person"  # an operator without a name
 BY_THEMSELVES = ("watchdog", "controller", "scene_monitor")  # owners of holds that they release themselves
 
 # Unanswered stops and holds of an operator, each with its interlock's kind and owner.
@@ -79,7 +78,7 @@ class TaskRequests(Generic[V]):
             command.header = self._bus.header()  # time of the decision, also when it is sent again
         pending = {sending: owner for sending, owner in self._pending.items() if not sending.done()}
         self._sending = {kind: sending for kind, sending in self._sending.items() if not sending.done()}
-        releases = isinstance(command, m.HoldRequest) and command.by == "person" and not command.hold
+        releases = isinstance(command, m.HoldRequest) and command.by == "operator" and not command.hold
         for kind in _voided(command):
             void = self._sending.pop(kind, None)
             if void is not None:
@@ -87,9 +86,9 @@ class TaskRequests(Generic[V]):
         sending = self._sending[_kind(command)] = group.create_task(
             self._send_after(command, pending if releases else {}, self._newest_seen() if releases else None))
         sending.add_done_callback(lambda _: self._finish(command))
-        if not releases and isinstance(command, m.HoldRequest | m.StopRequest) and command.by == "person":
+        if not releases and isinstance(command, m.HoldRequest | m.StopRequest) and command.by == "operator":
             interlock = "stopped" if isinstance(command, m.StopRequest) else "held"
-            self._pending = {**pending, sending: (interlock, command.owner or PERSON)}
+            self._pending = {**pending, sending: (interlock, command.owner or m.UNKNOWN_OPERATOR)}
 
     async def carried_out(self, commands: list[Command]) -> bool:
         """Return whether the commands were answered in time; does not wait while no executor is available."""
@@ -116,9 +115,9 @@ class TaskRequests(Generic[V]):
         seen = wall_ns() if seen is None else seen  # executor unknown: interlocks set from now on stay
         if before:  # a release must not overtake what it releases
             await asyncio.wait(before)
-        if isinstance(command, m.HoldRequest) and command.by == "person" and not command.hold:
-            command.heard = _release_until(seen, before) if command.heard is None else min(
-                command.heard, max(seen, self._newest_seen() or 0))
+        if isinstance(command, m.HoldRequest) and command.by == "operator" and not command.hold:
+            command.acknowledged = _release_until(seen, before) if command.acknowledged is None else min(
+                command.acknowledged, max(seen, self._newest_seen() or 0))
         return await self._send(command)
 
     def _finish(self, command: Command) -> None:
@@ -176,8 +175,8 @@ def _kind(command: Command) -> str:
     """Return the kind of a command, of which only the newest counts; holds are told apart by their owner."""
     if not isinstance(command, m.HoldRequest):
         return f"{type(command).__name__} "
-    if command.by == "person":
-        return f"{type(command).__name__} person {command.owner}" if command.hold else RELEASE
+    if command.by == "operator":
+        return f"{type(command).__name__} operator {command.owner}" if command.hold else RELEASE
     return f"{type(command).__name__} {command.by}"
 
 
@@ -187,11 +186,11 @@ def _release_until(seen: int, before: Pending) -> int:
     An interlock that another operator set in between stays, and so do all later ones.
     """
     answers = [sending.result() for sending in before if not sending.cancelled() and sending.exception() is None]
-    inhibits = {one.since: one for answer in answers if answer is not None for one in answer.inhibits
+    interlocks = {one.since: one for answer in answers if answer is not None for one in answer.interlocks
                 if one.kind == "stopped" or one.by not in BY_THEMSELVES}
-    for since in sorted(inhibits):
+    for since in sorted(interlocks):
         if since > seen:
-            if (inhibits[since].kind, inhibits[since].by) not in before.values():
+            if (interlocks[since].kind, interlocks[since].by) not in before.values():
                 break
             seen = since
     return seen
@@ -203,7 +202,7 @@ def _voided(command: Command) -> tuple[str, ...]:
     A stop voids the motion before it, an operator's stop also a release; a hold voids the same owner's earlier one.
     """
     if isinstance(command, m.StopRequest):
-        return f"{m.ExecuteRequest.__name__} ", *((RELEASE,) if command.by == "person" else ())
+        return f"{m.ExecuteRequest.__name__} ", *((RELEASE,) if command.by == "operator" else ())
     if not isinstance(command, m.HoldRequest):
         return ()
-    return _kind(command), *((RELEASE,) if command.by == "person" else ())
+    return _kind(command), *((RELEASE,) if command.by == "operator" else ())

@@ -11,11 +11,11 @@ from common import messages as m
 from common import topics
 from common.errors import Refused, RequestFailed
 from common.kept_file import KeptFile, Unreadable, standing_folder
-from common.process.task_requests import BY_THEMSELVES, GOAL_TIMEOUT, PERSON, AnswerHandler, TaskRequests
+from common.process.task_requests import BY_THEMSELVES, GOAL_TIMEOUT, AnswerHandler, TaskRequests
 from common.robot.model import RobotModel
 from common.robot.transforms import matrix_to_pose
 from common.sources import monotonic, new_id
-from common.tasks.deciding import TaskConfig
+from common.tasks.decisions import TaskConfig
 from common.tasks.engine import Task
 from common.tasks.stages import Command, View, without_far
 from common.tasks.watchdogs import LOOK_PERIOD, LivenessWatchdog
@@ -29,7 +29,7 @@ WAITS = "the arm waits: "
 ENDED = ("DONE", "ERROR")
 NOT_ANSWERED = "trajectory_executor has not answered yet: until it does, this is lost when the task ends"
 OWN_PERIOD = 0.2  # [s] wall between two requests for motion authority, in which the new owner is received
-UNNAMED = ("", PERSON, *BY_THEMSELVES)  # owners whose holds any operator may release
+UNNAMED = ("", m.UNKNOWN_OPERATOR, *BY_THEMSELVES)  # owners whose holds any operator may release
 SAVE_RETRY = 2.0  # [s] wall after the memory could not be written
 
 C = TypeVar("C", bound=TaskConfig)
@@ -182,11 +182,11 @@ class TaskRunner(Generic[V]):
         _require_allowed(command, view.motion if view else None, self._owner.latest)
         requests = self._task.command(command.command, view)
         for request in requests:
-            if isinstance(request, m.HoldRequest | m.StopRequest) and request.by == "person":
+            if isinstance(request, m.HoldRequest | m.StopRequest) and request.by == "operator":
                 request.owner = command.by
             if isinstance(request, m.HoldRequest):
                 request.override = command.override and not request.hold
-                request.heard = command.heard
+                request.acknowledged = command.acknowledged
         self._commanded += requests
         self._woken.set()
         now, answered = self._task.status, await self._requests.carried_out(requests)
@@ -231,14 +231,15 @@ def _require_allowed(command: m.TaskCommand, motion: m.MotionStatus | None, owne
         raise Refused("stopped", f"the robot is {motion.stopped}: start the task to continue")
     if command.override or command.command not in ("start", "resume"):
         return
-    if owner is not None and owner.asked and owner.kind != "task" and owner.owner not in (PERSON, command.by):
-        raise Refused("not_owner", f"the motion is {owner.told}: only they can hand it over, unless you override that")
+    unnamed = m.UNKNOWN_OPERATOR
+    if owner is not None and owner.asked and owner.kind != "task" and owner.owner not in (unnamed, command.by):
+        raise Refused("not_owner", f"the motion is {owner.description}: only the owner gives it back; else override")
     if motion is None:
         return
-    others = [inhibit.told for inhibit in motion.inhibits
-              if inhibit.kind == "held" and inhibit.by not in (*UNNAMED, command.by)]
+    others = [interlock.description for interlock in motion.interlocks
+              if interlock.kind == "held" and interlock.by not in (*UNNAMED, command.by)]
     if others:
-        raise Refused("held", f"the robot is {'; '.join(others)}: only they can release it, unless you override that")
+        raise Refused("held", f"the robot is {'; '.join(others)}: only they can release it, unless you override")
 
 
 class TaskMemory:

@@ -458,7 +458,7 @@ def test_any_key_is_called_and_listened_to() -> None:
             break
         answer = await cell.call("motion/hold", hold=True, owner="program")
         again = await cell.call(topics.MOTION_HOLD, HoldRequest(hold=True, owner="program"))
-        assert answer.held and again.held and [each.by for each in again.inhibits] == ["program"]
+        assert answer.held and again.held and [each.by for each in again.interlocks] == ["program"]
         await cell.arm.release()
         for asked, error, words in (
             (cell.call("motion/hodl"), UnknownName, "motion/hold"),

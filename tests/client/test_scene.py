@@ -15,7 +15,7 @@ from common.errors import ConfigError, RemoteError
 from common.transport.bus import Bus
 from tests.client.test_cell import Over
 from tests.harness import until
-from tests.simulated.test_inhibits import again
+from tests.simulated.test_interlocks import again
 from tests.simulated.visited import SimulatedCell
 
 pytestmark = pytest.mark.timeout(600)  # some seconds of work, on a machine that may be busy

@@ -35,7 +35,7 @@ from common.messages import (
     Vector3,
     WorldObjects,
 )
-from common.perception.intake import Unusable
+from common.perception.camera_input import FrameError
 from common.planning.collision import CollisionWorld, interpolate
 from common.planning.ik import solve_ik
 from common.planning.seeing import JointHistory, PointsOptions, cloud_points, frame_pose
@@ -230,10 +230,10 @@ def test_camera_on_the_robot_is_where_its_link_was() -> None:
     poses = TFMessage(transforms=[stamped("mount", "lens", on_tool, 0), stamped(link, "mount", on_tool, 0)])
     expected = ROBOT.link_poses(START)[link] @ on_tool @ on_tool
     np.testing.assert_allclose(frame_pose("lens", poses, ROBOT, START), expected, atol=1e-12)
-    with pytest.raises(Unusable, match="'nowhere' is; it has: lens, mount"):
+    with pytest.raises(FrameError, match="'nowhere' is; it has: lens, mount"):
         frame_pose("nowhere", poses, ROBOT, START)
     around = TFMessage(transforms=[stamped("a", "b", on_tool, 0), stamped("b", "a", on_tool, 0)])
-    with pytest.raises(Unusable, match="'a' is"):
+    with pytest.raises(FrameError, match="'a' is"):
         frame_pose("a", around, ROBOT, START)
 
 
@@ -255,10 +255,10 @@ def test_clouds_are_read_by_their_fields() -> None:
     cloud = PointCloud2(
         header=Header(), height=2, width=2, fields=["y", "x"], point_step=8, row_step=20, data=rows.tobytes()
     )
-    with pytest.raises(Unusable, match="the cloud has no z; its fields are y, x"):
+    with pytest.raises(FrameError, match="the cloud has no z; its fields are y, x"):
         cloud_points(cloud)
     flat = cloud.model_copy(update={"fields": ["z", "x"]})
-    with pytest.raises(Unusable, match="no y"):
+    with pytest.raises(FrameError, match="no y"):
         cloud_points(flat)
     three = values.repeat(2, axis=2)[..., :3].copy()  # x, x, y
     three = np.ascontiguousarray(three)
@@ -266,7 +266,7 @@ def test_clouds_are_read_by_their_fields() -> None:
         header=Header(), height=2, width=2, fields=["z", "x", "y"], point_step=12, row_step=24, data=three.tobytes()
     )
     np.testing.assert_allclose(cloud_points(whole), [[1, 2, 1], [3, 4, 3], [5, 6, 5]])
-    with pytest.raises(Unusable, match="too few for 2x2"):
+    with pytest.raises(FrameError, match="too few for 2x2"):
         cloud_points(whole.model_copy(update={"data": b"0" * 47}))
-    with pytest.raises(Unusable, match="do not fit"):
+    with pytest.raises(FrameError, match="do not fit"):
         cloud_points(whole.model_copy(update={"row_step": 20}))

@@ -18,7 +18,7 @@ from common.planning.obstacles import ObstacleCache
 from common.planning.robot_geometry import RobotGeometry
 from common.robot.model import RobotModel
 from common.scene.fixtures import container_panels, fixture_objects
-from tools.check.finding import Finding, error, warning
+from tools.check import Finding, error, warning
 
 Array = NDArray[np.float64]
 

@@ -92,4 +92,5 @@ def test_log_of_a_process_reports_dropped_lines_in_its_own_format(pipe, monkeypa
         root.handlers[:] = before
         root.setLevel(level)
     last = text.splitlines()[-1]
-    assert last.startswith('{"time"' if as_json else "WARNING camera: ") and "lines were dropped: the reader was too slow" in last
+    assert last.startswith('{"time"' if as_json else "WARNING camera: ")
+    assert "lines were dropped: the reader was too slow" in last
