@@ -18,7 +18,7 @@ from common.config.basics import Rgb
 from common.errors import ConfigError
 from common.hardware.loading import is_simulated
 from common.perception.pinhole import Pinhole
-from common.planning.free_axes import chooses, solve_down
+from common.planning.ik import controls_full_pose, solve_tool_down_ik
 from common.planning.robot_geometry import RobotGeometry
 from common.robot.model import RobotModel
 from common.robot.transforms import tool_down
@@ -132,9 +132,9 @@ def reach(cell: Cell, arm: Arm) -> Iterator[Finding]:
     gripper = cell.robot.gripper
     width = gripper.max_width if gripper is not None and gripper.joints else None
     tilt = cell.grasp.tilt(arm.robot.dof)
-    turned = f"with any of {bounds.yaw_count} hand orientations" if chooses(arm.robot) else "at any yaw"
+    turned = f"with any of {bounds.yaw_count} hand orientations" if controls_full_pose(arm.robot) else "at any yaw"
     turns = [yaw + (math.pi / 2 if gripper is not None and gripper.closing_axis == "x" else 0.0)
-             for yaw in (yaw_candidates(bounds.yaw_count) if chooses(arm.robot) else [0.0])]
+             for yaw in (yaw_candidates(bounds.yaw_count) if controls_full_pose(arm.robot) else [0.0])]
     things = []
     if is_simulated(cell.robot):
         layout(cell.world, cell.run.seed,
@@ -148,7 +148,7 @@ def reach(cell: Cell, arm: Arm) -> Iterator[Finding]:
         low = cell.grasp.height(z)
         poses = [tool_down(x, y, low, turn) for turn in turns]
         if reason := cache.reason((x, y, z)):
-            told = reason.startswith(("too ", "singular")) or not chooses(arm.robot)
+            told = reason.startswith(("too ", "singular")) or not controls_full_pose(arm.robot)
             why = "" if told else arm.why_not(poses, width, tilt)
             yield error(f"{what}, {reason}{f' ({why})' if why else ''}", "move it, or robot.base_position")
         elif why := arm.why_not(poses, width, tilt):
@@ -246,8 +246,8 @@ def _is_free(robot: RobotModel, geometry: RobotGeometry, place: tuple[float, flo
     """Whether the arm is clear of itself as it takes something there, with one turn of the hand, coming from home."""
     x, y, z = place
     at, home, tilt = (x, y, grasp.height(z)), robot.named("home"), grasp.tilt(robot.dof)
-    found = (solve_down(robot, at, yaw, home, tilt=tilt, iterations=20)
-             for yaw in (yaw_candidates(WorkspaceBounds().yaw_count) if chooses(robot) else (0.0,)))
+    found = (solve_tool_down_ik(robot, at, yaw, home, tilt=tilt, iterations=20)
+             for yaw in (yaw_candidates(WorkspaceBounds().yaw_count) if controls_full_pose(robot) else (0.0,)))
     return any(q is not None and not hits(robot, geometry, q) for q in found)
 
 
@@ -278,8 +278,8 @@ def _box(robot: RobotModel, reached: list[Place], grasp: Grasp) -> tuple[Place, 
 
 def _released(robot: RobotModel, place: Place, grasp: Grasp) -> bool:
     """Whether the tool comes above the box, coming from home."""
-    at, tilt = (*place, grasp.drop_z), grasp.tilt(robot.dof) if chooses(robot) else RELEASED
-    return solve_down(robot, at, 0.0, robot.named("home"), tilt=tilt, restarts=20, iterations=40) is not None
+    at, tilt = (*place, grasp.drop_z), grasp.tilt(robot.dof) if controls_full_pose(robot) else RELEASED
+    return solve_tool_down_ik(robot, at, 0.0, robot.named("home"), tilt=tilt, restarts=20, iterations=40) is not None
 
 
 CHECKS = Checks(quick=quick, reach=reach)

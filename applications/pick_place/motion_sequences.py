@@ -9,7 +9,7 @@ from applications.pick_place.choice import Pick, PickPlaceView
 from applications.pick_place.grasping import RELEASED, Config
 from common import messages as m
 from common.config import GripperConfig
-from common.planning.free_axes import ALL
+from common.planning.ik import FULL_POSE_DOF
 from common.robot.transforms import matrix_to_pose, rpy_to_matrix, tool_down, transform
 from common.tasks.stages import Grip, Move, Place, Stage
 
@@ -74,7 +74,7 @@ class Rows:
     @property
     def _takes_any(self) -> bool:
         """Whether the arm cannot choose how the tool is turned, so that any yaw must do that leaves the hand clear."""
-        return len(self.p.robot.joints) < ALL
+        return len(self.p.robot.joints) < FULL_POSE_DOF
 
     def _close(self, cycle: Pick, yaw: float) -> Grip:
         cup = self.gripper.cup is not None

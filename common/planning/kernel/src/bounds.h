@@ -11,7 +11,7 @@
 #define MOST_PROJECTIONS 30 /* steps */
 #define LONGEST_PROJECTION 0.5 /* [rad], [m] in one joint and step */
 
-/* Shares of the slack that states may use, and what is proved between them: as PLANNED in constraints.py. */
+/* Shares of the slack that states may use, and what is proved between them: as PLANNING_SHARES in constraints.py. */
 #define KEPT_STATE 0.25
 #define KEPT_LINE 0.5
 

@@ -1,4 +1,4 @@
-"""Obstacles as they are seen: points of cameras, without the robot and known objects, as spheres for the planner."""
+"""Obstacles seen by cameras: points without the robot and known objects, as spheres for the planner."""
 
 from __future__ import annotations
 
@@ -21,26 +21,26 @@ from common.robot.transforms import pose_to_matrix
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-_FARTHEST = 1e4  # [m] beyond which a point is taken for none
+_FARTHEST = 1e4  # [m] farther points are ignored
 _CELLS = 1 << 20  # of the grid on each side of the origin
 
 
 @dataclass(frozen=True, eq=False)
 class PointObstacle:
-    """Spheres (N, 4), middle and radius [m] in the world, about all that one camera saw; `name` is told in errors."""
+    """Spheres (N, 4), centre and radius [m], world, about all that one camera saw; `name` appears in errors."""
 
     name: str
     spheres: Array
 
 
 @dataclass(frozen=True, eq=False)
-class View:
-    """What one camera saw at one moment.
+class CameraView:
+    """What one camera saw at one time.
 
     Attributes:
-        name: of the obstacle that comes of it.
-        points: (N, 3) [m] in the world; what is no number is no point.
-        q: (dof,) [rad] where the robot was; width: between its fingers [m], None as the robot file holds them.
+        name: of the resulting obstacle.
+        points: (N, 3) [m], world; rows that are not finite are ignored.
+        q: (dof,) [rad] where the robot was; width: of its gripper [m], None: as in the robot file.
     """
 
     name: str
@@ -49,54 +49,54 @@ class View:
     width: float | None = None
 
 
-def thinned(points: Array, side: float, skip: Mask | None = None) -> Array:
-    """Spheres (M, 4), middle and radius [m]: one for each cube of a grid in which there are any of points (N, 3).
+def downsampled(points: Array, side: float, skip: Mask | None = None) -> Array:
+    """Return spheres (M, 4), centre and radius [m]: one for each cube of a grid that contains any of points (N, 3).
 
-    A sphere is about the mean of its points and holds all of them, so nothing that was seen is lost. It is no smaller
-    than half a side, because a point stands for a piece of a surface.
+    A sphere is centred at the mean of its points and contains all of them, so no point is lost. Its radius is at least
+    half a side, because a point stands for a piece of a surface.
 
     Args:
         side: of the cubes [m].
-        skip: (N,) points that are left out.
+        skip: (N,) points to leave out.
     """
-    given = np.ascontiguousarray(points, dtype=float)
-    if given.ndim != 2 or given.shape[1] != 3 or not side > 0:
-        raise ValueError(f"points have shape {given.shape}, cubes a side of {side} m")
+    array = np.ascontiguousarray(points, dtype=float)
+    if array.ndim != 2 or array.shape[1] != 3 or not side > 0:
+        raise ValueError(f"points have shape {array.shape}, cubes a side of {side} m")
     found = library()
     if found is None:
-        return _thinned(given, side, skip)
+        return _downsampled_by_numpy(array, side, skip)
     without = None if skip is None else np.ascontiguousarray(skip, dtype=np.uint8)
-    out = np.empty((len(given), 4))
+    out = np.empty((len(array), 4))
     count = found.zk_thin(
-        len(given), address(given), None if without is None else address(without), side, address(out)
+        len(array), address(array), None if without is None else address(without), side, address(out)
     )
     if count < 0:
         raise MemoryError
     return out[:count].copy()
 
 
-def _thinned(points: Array, side: float, skip: Mask | None) -> Array:
-    kept = (np.abs(points) < _FARTHEST).all(axis=1)
+def _downsampled_by_numpy(points: Array, side: float, skip: Mask | None) -> Array:
+    used = (np.abs(points) < _FARTHEST).all(axis=1)
     if skip is not None:
-        kept &= ~skip
-    points = points[kept]
+        used &= ~skip
+    points = points[used]
     cells = np.clip(np.floor(points / side), -_CELLS, _CELLS - 1).astype(np.int64) + _CELLS
     keys = (cells[:, 0] << 42) | (cells[:, 1] << 21) | cells[:, 2]
     _, owner, members = np.unique(keys, return_inverse=True, return_counts=True)
     sums = np.stack([np.bincount(owner, points[:, k], len(members)) for k in range(3)], axis=1)
-    middles = sums / members[:, None]
+    centres = sums / members[:, None]
     radii = np.full(len(members), 0.5 * side)
-    np.maximum.at(radii, owner, np.linalg.norm(points - middles[owner], axis=1) * (1 + 1e-12) + 1e-12)
-    return np.column_stack([middles, radii])
+    np.maximum.at(radii, owner, np.linalg.norm(points - centres[owner], axis=1) * (1 + 1e-12) + 1e-12)
+    return np.column_stack([centres, radii])
 
 
 def depth_points(depth: Depth, camera: Pinhole) -> Array:
-    """(N, 3) points [m] in the world of all pixels of a depth picture (height, width) that measured any depth."""
+    """Return (N, 3) points [m], world, of all pixels of a depth image (height, width) with a depth."""
     valid = is_valid(depth)
     height, width = depth.shape
     far = depth.astype(float)
     seen = np.empty((3, int(np.count_nonzero(valid))))
-    with np.errstate(invalid="ignore"):  # of what measured nothing
+    with np.errstate(invalid="ignore"):  # of pixels without a depth
         seen[0] = (far * ((np.arange(width) - camera.cx) / camera.fx))[valid]
         seen[1] = (far * ((np.arange(height) - camera.cy) / camera.fy)[:, None])[valid]
     seen[2] = far[valid]
@@ -104,20 +104,20 @@ def depth_points(depth: Depth, camera: Pinhole) -> Array:
     return np.ascontiguousarray((T[:3, :3] @ seen + T[:3, 3:]).T)
 
 
-def unseen(pictures: Sequence[tuple[Depth, Pinhole]], low: Array, high: Array, side: float) -> Array:
-    """Spheres (N, 4), middle and radius [m], about the cubes of a box in the world that no camera saw through.
+def occluded_spheres(images: Sequence[tuple[Depth, Pinhole]], low: Array, high: Array, side: float) -> Array:
+    """Return spheres (N, 4), centre and radius [m], about the cubes of a box in the world that no camera saw through.
 
-    A camera sees through a cube whose middle is nearer than what it measured there. What is behind that, where it
-    measured nothing and out of its picture is not known to be free.
+    A camera sees through a cube whose centre is nearer than the depth measured there. Cubes behind that depth, at
+    pixels without a depth and outside the image are not known to be free.
 
     Args:
-        pictures: depth (height, width) [m] and the camera that took it, of one or several.
+        images: depth (height, width) [m] and the camera that took it, of one or several.
         low, high: (3,) corners of the box; side: of its cubes [m].
     """
     counts = np.maximum(np.ceil((np.asarray(high) - np.asarray(low)) / side - 1e-9), 1).astype(int)
     axes = [float(low[k]) + side * (np.arange(counts[k]) + 0.5) for k in range(3)]
     middles = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    for depth, camera in pictures:
+    for depth, camera in images:
         T = camera.T_world_optical
         x, y, z = ((middles - T[:3, 3]) @ T[:3, :3]).T
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -125,27 +125,27 @@ def unseen(pictures: Sequence[tuple[Depth, Pinhole]], low: Array, high: Array, s
             inside = (z > 0) & (u >= 0) & (u < depth.shape[1]) & (v >= 0) & (v < depth.shape[0])
             there = np.flatnonzero(inside)
             through = depth[v[there].astype(int), u[there].astype(int)] > z[there]  # NaN is not
-        keep = np.ones(len(middles), dtype=bool)
-        keep[there[through]] = False
-        middles = middles[keep]
+        occluded = np.ones(len(middles), dtype=bool)
+        occluded[there[through]] = False
+        middles = middles[occluded]
     return np.column_stack([middles, np.full(len(middles), 0.5 * math.sqrt(3) * side)])
 
 
-class KnownShapes:
-    """Tells which points belong to the robot or to objects of the planning scene. Not for several threads at once."""
+class KnownShapeFilter:
+    """Finds the points that belong to the robot or to objects of the planning scene. Not thread-safe."""
 
     def __init__(self, robot: RobotGeometry) -> None:
-        self._cache = ObstacleCache(robot)  # apart from the planner's, whose banks belong to its worlds
+        self._cache = ObstacleCache(robot)  # separate from the planner's, whose banks belong to its worlds
 
     def mask(
         self, scene: PlanningScene, q: Array, points: Array, *, margin: float, object_margin: float,
         width: float | None = None,
     ) -> Mask:
-        """(N,) which of points (N, 3), world, are within a margin [m] of the robot at q, or of what it holds or avoids.
+        """Return (N,) which of points (N, 3), world, are within a margin [m] of the robot at q or of a known object.
 
         Args:
-            scene: objects where they are, and what is attached; both by `object_margin`.
-            q: (dof,) [rad]; margin: of the robot's own links; width: between its fingers [m].
+            scene: objects and attached objects, with `object_margin`.
+            q: (dof,) [rad]; margin: of the robot's own links; width: of its gripper [m].
         """
         bank = self._bank(scene)
         bank.open_fingers(width)
@@ -165,17 +165,18 @@ class KnownShapes:
         return bank
 
     def obstacle(
-        self, view: View, scene: PlanningScene, *, side: float = 0.01, margin: float = 0.03, object_margin: float = 0.02
+        self, view: CameraView, scene: PlanningScene, *, side: float = 0.01, margin: float = 0.03,
+        object_margin: float = 0.02,
     ) -> PointObstacle:
-        """The obstacle that a view shows: its points without those that are known, thinned to cubes of a side [m]."""
+        """Return the obstacle of a view: its points without known ones, downsampled to cubes of a side [m]."""
         known = self.mask(scene, view.q, view.points, margin=margin, object_margin=object_margin, width=view.width)
-        return PointObstacle(view.name, thinned(view.points, side, known))
+        return PointObstacle(view.name, downsampled(view.points, side, known))
 
     def unknown(
         self, name: str, spheres: Array, scene: PlanningScene, q: Array, *, margin: float, object_margin: float,
         width: float | None = None,
     ) -> PointObstacle:
-        """The obstacle of space that was not seen: spheres (N, 4) without those that reach into what is known."""
+        """Return the obstacle of occluded space: spheres (N, 4) without those that reach into known objects."""
         reach = float(spheres[:, 3].max(initial=0.0))
         known = self.mask(
             scene, q, spheres[:, :3], margin=margin + reach, object_margin=object_margin + reach, width=width)

@@ -7,10 +7,9 @@ import pytest
 
 from common.config import load_cell
 from common.messages import ArcGoal, GoalSet, JointGoal, PlanRequest, PoseGoal, SequenceGoal, SequenceItem, Vector3
-from common.planning.goal_sampling import missed_by, sample_pose
+from common.planning.goal_sampling import distance_outside, nearest_pose_in, sample_pose
 from common.planning.pipeline import PlanningPipeline
 from common.planning.problem import Cancel, Region
-from common.planning.resolving import nearest_in
 from common.planning.validation import fine_samples
 from common.robot.transforms import matrix_to_pose, tool_down
 from tests.common.planning.planner_checks import assert_sound, wall, with_planner
@@ -58,7 +57,7 @@ def test_region_on_the_way_is_passed_within_the_radius_without_a_stop():
     timed = assert_sound(PIPELINE, through(VIA, GRASP), TABLE, response)
     assert np.abs(timed.velocities[1:-1]).max(axis=1).min() > 1e-3
     assert passes_by(timed, VIA) < RADIUS
-    assert missed_by(region(GRASP), ROBOT.fk(last(response))) < 2e-4
+    assert distance_outside(region(GRASP), ROBOT.fk(last(response))) < 2e-4
     path, _ = fine_samples(timed, 0.003)
     tool = np.array([ROBOT.fk(q)[:3, 3] for q in path])
     low = tool[tool[:, 2] < BALL[2] + 0.04]
@@ -147,6 +146,6 @@ def test_nearest_pose_of_a_region_lies_in_it_and_those_inside_stay(seed):
     wide = Region(T, np.array([0.3, 0.3, 0.3]), 3.0, math.pi)
     for _ in range(50):
         pose = sample_pose(wide, rng)
-        assert missed_by(small, nearest_in(small, pose)) < 1e-6
+        assert distance_outside(small, nearest_pose_in(small, pose)) < 1e-6
         inside = sample_pose(small, rng)
-        np.testing.assert_allclose(nearest_in(small, inside), inside, atol=1e-6)
+        np.testing.assert_allclose(nearest_pose_in(small, inside), inside, atol=1e-6)

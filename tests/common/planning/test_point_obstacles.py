@@ -11,13 +11,19 @@ import pytest
 
 from common.messages import AttachedObject, JointGoal, PlanRequest
 from common.perception.pinhole import Pinhole
-from common.planning import obstacles, points
 from common.planning.collision import CollisionWorld, interpolate
 from common.planning.kernel import library
 from common.planning.kernel.oracle import DEPTH, DISTANCE, Oracle
-from common.planning.kernel.world import KernelWorld, NoKernel
+from common.planning.kernel.world import KernelWorld
 from common.planning.pipeline import PlanningPipeline
-from common.planning.points import KnownShapes, PointObstacle, View, depth_points, thinned, unseen
+from common.planning.point_obstacles import (
+    CameraView,
+    KnownShapeFilter,
+    PointObstacle,
+    depth_points,
+    downsampled,
+    occluded_spheres,
+)
 from common.planning.robot_geometry import RobotGeometry
 from common.robot.transforms import transform
 from tests.common.planning.planning_scenes import CELL, GEOMETRY, HOME, ROBOT, SPREAD, ball, cache, held_scene, scene
@@ -26,29 +32,13 @@ from tests.common.planning.ur5_scene import ROBOT as UR5
 needs_kernel = pytest.mark.skipif(library.library() is None, reason="the planning kernel is not built here")
 
 
-@pytest.fixture(params=["kernel", "coal"])
-def either(request, monkeypatch):
-    """Both ways to the same answers; the cache is without a kernel where that is asked."""
-    if request.param == "kernel":
-        if library.library() is None:
-            pytest.skip("the planning kernel is not built here")
-        return request.param
-
-    def none(*_args):
-        raise NoKernel("none for this test")
-
-    monkeypatch.setattr(points, "library", lambda: None)
-    monkeypatch.setattr(obstacles, "KernelWorld", none)
-    return request.param
-
-
 @pytest.mark.parametrize("side", [0.005, 0.01, 0.1])
-def test_every_point_is_in_a_sphere(either, side):
+def test_every_point_is_in_a_sphere(backend, side):
     rng = np.random.default_rng(int(side * 1000))
     seen = np.concatenate([rng.normal(size=(500, 3)) * 0.05, rng.uniform(-1, 1, (500, 3)), np.full((3, 3), 0.3)])
     seen[::100] = np.nan
     skip = rng.uniform(size=len(seen)) < 0.1
-    spheres = thinned(seen, side, skip)
+    spheres = downsampled(seen, side, skip)
     left = seen[~skip & np.isfinite(seen).all(axis=1)]
     away = np.linalg.norm(left[:, None] - spheres[None, :, :3], axis=2) - spheres[None, :, 3]
     assert (away.min(axis=1) <= 0).all()
@@ -57,11 +47,11 @@ def test_every_point_is_in_a_sphere(either, side):
 
 
 @needs_kernel
-def test_spheres_are_the_same_without_the_kernel(monkeypatch):
+def test_spheres_are_the_same_without_the_kernel():
     seen = np.random.default_rng(1).uniform(-0.3, 0.3, (3000, 3))
-    one = thinned(seen, 0.02)
-    monkeypatch.setattr(points, "library", lambda: None)
-    other = thinned(seen, 0.02)
+    one = downsampled(seen, 0.02)
+    with library.without_kernel():
+        other = downsampled(seen, 0.02)
     assert len(one) == len(other)
     np.testing.assert_allclose(one[np.lexsort(one.T)], other[np.lexsort(other.T)], atol=1e-9)
 
@@ -86,7 +76,7 @@ def worlds(model, hulls: pin.GeometryModel, spheres: np.ndarray, held: bool) -> 
             single.addCollisionPair(pin.CollisionPair(i, one))
     kernel = KernelWorld(model, seen, points=[index])
     kernel.set_points(index, spheres)
-    kernel.placed()
+    kernel.refresh()
     return kernel, Oracle(model, single), links
 
 
@@ -152,7 +142,7 @@ def test_a_sphere_in_the_way_is_found_however_small():
     assert not kernel.edge_free(np.array([-0.5]), np.array([0.5]))
     assert kernel.edge_free(np.array([-0.5]), np.array([0.12198]))
     kernel.set_points(1, np.zeros((0, 4)))
-    kernel.placed()
+    kernel.refresh()
     assert kernel.edge_free(np.array([-0.5]), np.array([0.5]))
 
 
@@ -162,8 +152,8 @@ def post() -> np.ndarray:
     return np.concatenate([np.stack([np.full(y.size, x), y.ravel(), z.ravel()], axis=1) for x in (0.38, 0.43)])
 
 
-def test_world_keeps_padding_from_points_and_names_them(either):
-    spheres = thinned(post(), 0.02)
+def test_world_keeps_padding_from_points_and_names_them(backend):
+    spheres = downsampled(post(), 0.02)
     tip = ROBOT.fk(HOME)[:3, 3]
     near = PointObstacle("points of camera", np.array([[*tip, 0.015]]) - (0, 0, 0.02, 0))
     world = CollisionWorld(ROBOT, scene(), start=HOME, cache=cache(), points=[near])
@@ -185,7 +175,7 @@ def test_world_keeps_padding_from_points_and_names_them(either):
     assert CollisionWorld(ROBOT, scene(), start=elsewhere, padding=0.05, cache=shared, points=[near]).collides(HOME)
 
 
-def test_what_is_held_keeps_padding_from_points_but_where_it_starts(either):
+def test_what_is_held_keeps_padding_from_points_but_where_it_starts(backend):
     base, tip = held_scene(scene(SPREAD[:2]), "ball_0"), ROBOT.fk(HOME)[:3, 3]
     middle = np.array([[*tip, 0.01]]) - (0, 0, 0.055, 0)  # 15 mm below a ball of 30 mm
     near, deep = (PointObstacle("points of camera", middle - (0, 0, down, 0)) for down in (0.0, -0.02))
@@ -198,7 +188,7 @@ def test_what_is_held_keeps_padding_from_points_but_where_it_starts(either):
     assert world(HOME, deep).colliding_pair(HOME) == ("ball_0", "points of camera")
 
 
-def test_robot_and_known_objects_are_taken_out(either):
+def test_robot_and_known_objects_are_taken_out(backend):
     rng = np.random.default_rng(2)
     base = scene(SPREAD[:2])
     held = ball(9, 0, 0, 0, role="attached")
@@ -210,11 +200,11 @@ def test_robot_and_known_objects_are_taken_out(either):
     off_ball = np.array([*SPREAD[0], 0.03]) + 0.055 * _directions(rng, 50)
     off_ball = off_ball[off_ball[:, 2] > 0.03]
     free = rng.uniform((0.3, 0.4, 0.3), (0.5, 0.6, 0.5), (50, 3))
-    known = KnownShapes(GEOMETRY)
+    known = KnownShapeFilter(GEOMETRY)
     every = np.concatenate([on_robot, on_ball, off_ball, free])
     mask = known.mask(base, q, every, margin=0.03, object_margin=0.02)
     assert mask[:100].all() and not mask[100:].any()
-    obstacle = known.obstacle(View("camera", every, q), base, side=0.01)
+    obstacle = known.obstacle(CameraView("camera", every, q), base, side=0.01)
     assert np.linalg.norm(obstacle.spheres[:, :3] - tip, axis=1).min() > 0.03
 
 
@@ -224,14 +214,14 @@ def _directions(rng, count):
 
 
 @needs_kernel
-def test_near_is_coals_distance(monkeypatch):
+def test_near_is_coals_distance():
     rng = np.random.default_rng(3)
     q = HOME + 0.2
     seen = ROBOT.fk(q)[:3, 3] + rng.normal(size=(300, 3)) * 0.15
     given = {"margin": 0.02, "object_margin": 0.01}
-    fast = KnownShapes(GEOMETRY).mask(scene(SPREAD), q, seen, **given)
-    monkeypatch.setattr(obstacles.ObstacleBank, "kernel", lambda _bank: None)
-    slow = KnownShapes(GEOMETRY).mask(scene(SPREAD), q, seen, **given)
+    fast = KnownShapeFilter(GEOMETRY).mask(scene(SPREAD), q, seen, **given)
+    with library.without_kernel():
+        slow = KnownShapeFilter(GEOMETRY).mask(scene(SPREAD), q, seen, **given)
     assert fast.any() and not fast.all()
     assert (fast == slow).all()
 
@@ -250,7 +240,7 @@ def test_what_no_camera_saw_through_is_occupied():
     depth[30:51, 40:61] = 0.5  # a block, 0.5 m below the camera
     depth[60:, :] = np.nan
     low, high = np.array([0.0, -0.4, 0.0]), np.array([0.8, 0.4, 0.8])
-    spheres = unseen([(depth, CAMERA)], low, high, 0.05)
+    spheres = occluded_spheres([(depth, CAMERA)], low, high, 0.05)
     middles = spheres[:, :3]
 
     def occupied(x, y, z):
@@ -262,9 +252,9 @@ def test_what_no_camera_saw_through_is_occupied():
     assert occupied(0.02, 0.38, 0.75)  # out of the picture
     aside = transform(np.array([[0, 0, 1.0], [1, 0, 0], [0, 1, 0]]), (-0.6, 0, 0.2))
     other = Pinhole(100.0, 100.0, 50.0, 40.0, 101, 81, aside)
-    both = unseen([(depth, CAMERA), (np.full((81, 101), 2.0, np.float32), other)], low, high, 0.05)
+    both = occluded_spheres([(depth, CAMERA), (np.full((81, 101), 2.0, np.float32), other)], low, high, 0.05)
     assert len(both) < len(spheres)  # each takes away what it sees through
-    known = KnownShapes(GEOMETRY).unknown("unknown", spheres, scene(), HOME, margin=0.03, object_margin=0.02)
+    known = KnownShapeFilter(GEOMETRY).unknown("unknown", spheres, scene(), HOME, margin=0.03, object_margin=0.02)
     assert 0 < len(known.spheres) < len(spheres)
     assert not CollisionWorld(ROBOT, scene(), start=HOME, padding=0.02, cache=cache(), points=[known]).collides(HOME)
 
@@ -275,10 +265,10 @@ def _across(number: int = 1) -> PlanRequest:
     return PlanRequest(id=str(number), start=start.tolist(), goal=JointGoal(positions=end.tolist()))
 
 
-def test_pipeline_plans_round_points(either):
+def test_pipeline_plans_round_points(backend):
     pipeline = PlanningPipeline(ROBOT, CELL.motion, CELL.pipeline)
     request = _across()
-    seen = PointObstacle("points of camera", thinned(post(), 0.02))
+    seen = PointObstacle("points of camera", downsampled(post(), 0.02))
     truth = CollisionWorld(ROBOT, scene(box=False), start=request.start, cache=cache(), points=[seen])
     blind = pipeline.plan(request, scene(box=False))
     assert blind.ok and truth.first_collision(_positions(blind)) is not None
@@ -298,10 +288,10 @@ def _positions(response) -> np.ndarray:
 def test_obstacle_is_set_up_in_the_time_of_a_frame():
     rng = np.random.default_rng(4)
     seen = rng.uniform((0.2, -0.8, 0), (1.2, 0.8, 0.02), (100_000, 3))
-    known, shared = KnownShapes(GEOMETRY), cache()
+    known, shared = KnownShapeFilter(GEOMETRY), cache()
 
     def set_up():
-        obstacle = known.obstacle(View("camera", seen, HOME), scene(SPREAD))
+        obstacle = known.obstacle(CameraView("camera", seen, HOME), scene(SPREAD))
         return CollisionWorld(ROBOT, scene(SPREAD), start=HOME, cache=shared, points=[obstacle])
 
     set_up()

@@ -1,4 +1,4 @@
-"""Checks of a request before any planner sees it: each failure is named once, here."""
+"""Checks of a plan request before any planner sees it."""
 
 from __future__ import annotations
 
@@ -24,21 +24,20 @@ from common.messages import (
 )
 from common.planning.collision import CollisionWorld, Pair, interpolate
 from common.planning.constraints import ToolConstraints
-from common.planning.problem import Arc, Goal, GoalChoice, GoalSequence, Part, Region, ToolPath
+from common.planning.problem import Arc, Goal, GoalChoice, GoalSequence, Region, SequenceItem, ToolPath
 from common.robot.model import RobotModel
 from common.robot.transforms import invert, pose_to_matrix
 
 Array = NDArray[np.float64]
 
-
-_MEASURED = 1e-4  # [rad] a measured state may stand this far beyond its limit
-_INWARDS = 2e-3  # [rad] steps in which the way back to a limit is checked
-_FAR = 2.0  # times the reach; of what is nearer the planners tell how far they come
-_AT_FIRST = (0.002, 0.02)  # [m], [rad] a path begins this close to where the robot is
+_MEASURED = 1e-4  # [rad] a measured state may be this far outside its limit
+_INWARDS = 2e-3  # [rad] steps in which the path back to a limit is checked
+_FAR = 2.0  # times the reach; for nearer goals the planners report how far they get
+_AT_FIRST = (0.002, 0.02)  # [m], [rad] a path starts this close to where the robot is
 
 
 class BadRequest(ZencellError):
-    """A request that no planner could serve: code for programs, message for people, the pair where two things touch."""
+    """A request that no planner could serve: code for programs, message for people, the colliding pair if any."""
 
     def __init__(self, code: str, message: str, colliding: Pair | None = None) -> None:
         super().__init__(message)
@@ -50,21 +49,21 @@ class BadRequest(ZencellError):
 class CheckedRequest:
     """Start (dof,) [rad] and goal, such as joint positions or a region, of a request whose numbers fit the robot.
 
-    `beyond` is where the robot stands, (dof,) [rad], when that is beyond a limit and `start` is within.
+    `outside_start` (dof,) [rad] is where the robot is, if that is outside a limit and `start` is within.
     """
 
     start: Array
     goal: Goal
-    beyond: Array | None = None
+    outside_start: Array | None = None
 
 
 def check_request(
     robot: RobotModel, request: PlanRequest, scene: PlanningScene, current: Array | None, tolerance: float = _MEASURED
 ) -> CheckedRequest:
-    """Start and goal of a request; the start may be beyond a limit by the tolerance [rad].
+    """Return start and goal of a request; the start may be outside a limit by the tolerance [rad].
 
     Raises:
-        BadRequest: start or goal do not fit the robot, names that are not known, a scene in another frame.
+        BadRequest: start or goal do not fit the robot, unknown names, a scene in another frame.
     """
     frame = scene.header.frame_id
     if frame not in robot.world_frames:
@@ -78,23 +77,21 @@ def check_request(
     if request.start:
         start = _positions(robot, request.start, "start", "bad_start")
     elif current is None:
-        raise BadRequest("no_state", "no start is given and the robot's joint states are not known yet")
+        raise BadRequest("no_state", "the request has no start and no joint state was received yet")
     else:
         start = _positions(robot, list(current), "current state", "bad_start")
-    stands, start = start, _within_limits(robot, start, "start", "start_out_of_limits", max(tolerance, _MEASURED))
-    beyond = stands if np.abs(stands - start).max() > _MEASURED else None
-    return CheckedRequest(start, _goal(robot, request.goal, start), beyond)
+    actual, start = start, _within_limits(robot, start, "start", "start_out_of_limits", max(tolerance, _MEASURED))
+    outside_start = actual if np.abs(actual - start).max() > _MEASURED else None
+    return CheckedRequest(start, _goal(robot, request.goal, start), outside_start)
 
 
 def _goal(robot: RobotModel, goal: AnyGoal, start: Array) -> Goal:
     if isinstance(goal, PathGoal):
         return _tool_path(robot, start, goal)
     if isinstance(goal, SequenceGoal):
-        parts = [Part(_item_goal(robot, item.goal), item.straight, item.blend_radius) for item in goal.items]
-        return GoalSequence(tuple(parts))
-    if isinstance(goal, GoalSet):
-        return GoalChoice(tuple(_goals_of(robot, goal)))
-    return _single_goal(robot, goal)
+        items = [SequenceItem(_item_goal(robot, item.goal), item.straight, item.blend_radius) for item in goal.items]
+        return GoalSequence(tuple(items))
+    return _item_goal(robot, goal)
 
 
 def _item_goal(robot: RobotModel, goal: JointGoal | PoseGoal | ArcGoal | GoalSet) -> Array | Region | Arc | GoalChoice:
@@ -115,7 +112,7 @@ def _single_goal(robot: RobotModel, goal: JointGoal | PoseGoal | ArcGoal) -> Arr
     if isinstance(goal, ArcGoal):
         _require_near(robot, goal.pose, "goal")
         if goal.via is not None:
-            _require_near(robot, Pose(position=goal.via), "point on the way")
+            _require_near(robot, Pose(position=goal.via), "via point")
         via, center = (None if p is None else np.array([p.x, p.y, p.z]) for p in (goal.via, goal.center))
         return Arc(pose_to_matrix(goal.pose), via, center)
     return _region(robot, goal)
@@ -131,7 +128,7 @@ def _region(robot: RobotModel, goal: PoseGoal) -> Region:
 
 
 def check_constraints(robot: RobotModel, request: PlanRequest, checked: CheckedRequest) -> ToolConstraints | None:
-    """The constraints of a request whose start keeps to them, and its goal as far as it is known.
+    """Return the constraints of a request; its start satisfies them, and its goal as far as it is known.
 
     Raises:
         BadRequest: start_violates_constraint, goal_violates_constraint, with the value and the limit.
@@ -139,15 +136,15 @@ def check_constraints(robot: RobotModel, request: PlanRequest, checked: CheckedR
     if request.constraints is None:
         return None
     constraints = ToolConstraints(robot, request.constraints, checked.start)
-    for what, code, T, turn, way in _known_poses(robot, checked):
-        if wrong := constraints.wrong_with(T, turn, way):
-            raise BadRequest(f"{code}_violates_constraint", f"{what}: {wrong}")
+    for what, code, T, turn, travel in _known_poses(robot, checked):
+        if violation := constraints.pose_violation(T, turn, travel):
+            raise BadRequest(f"{code}_violates_constraint", f"{what}: {violation}")
     return constraints
 
 
 def _known_poses(robot: RobotModel, checked: CheckedRequest) -> Iterator[tuple[str, str, Array, float, float]]:
-    """Name, whether start or goal, pose (4, 4), and by how much turn [rad] and way [m] it may be missed."""
-    for q in (checked.start, checked.beyond):
+    """Yield name, whether start or goal, pose (4, 4), and the tolerance as turn [rad] and travel [m]."""
+    for q in (checked.start, checked.outside_start):
         if q is not None:
             yield "start", "start", robot.fk(q), 0.0, 0.0
     goal = checked.goal
@@ -155,7 +152,7 @@ def _known_poses(robot: RobotModel, checked: CheckedRequest) -> Iterator[tuple[s
     if isinstance(goal, ToolPath):
         goals = [(f"point {number} of {len(goal.poses)}", T) for number, T in enumerate(goal.poses, 1)]
     elif isinstance(goal, GoalSequence):
-        goals = [(f"item {number} of {len(goal.parts)}", part.goal) for number, part in enumerate(goal.parts, 1)]
+        goals = [(f"item {number} of {len(goal.items)}", item.goal) for number, item in enumerate(goal.items, 1)]
     for what, each in goals:
         if isinstance(each, Region):
             yield what, "goal", each.T_world_tcp, each.tilt + each.yaw, float(np.linalg.norm(each.half_sides))
@@ -166,14 +163,14 @@ def _known_poses(robot: RobotModel, checked: CheckedRequest) -> Iterator[tuple[s
 
 
 def check_collisions(world: CollisionWorld, checked: CheckedRequest) -> None:
-    """Nothing, when start and joint goal are free.
+    """Return if start and joint goal are free.
 
     Raises:
         BadRequest: start_in_collision or goal_in_collision with the pair.
     """
     ends = [("start", checked.start)]
-    if checked.beyond is not None:
-        ends += [("start", q) for q in interpolate([checked.beyond, checked.start], _INWARDS)]
+    if checked.outside_start is not None:
+        ends += [("start", q) for q in interpolate([checked.outside_start, checked.start], _INWARDS)]
     if isinstance(checked.goal, np.ndarray):
         ends.append(("goal", checked.goal))
     for what, q in ends:
@@ -196,7 +193,7 @@ def _joint_goal(robot: RobotModel, goal: JointGoal) -> Array:
 
 
 def _require_near(robot: RobotModel, pose: Pose, what: str) -> None:
-    """Return when a pose is not so far off that looking for a way there is absurd.
+    """Return if a pose is near enough that a search for a path to it makes sense.
 
     Raises:
         BadRequest: out_of_reach.
@@ -230,7 +227,7 @@ def _positions(robot: RobotModel, values: list[float], what: str, code: str) -> 
 
 
 def _within_limits(robot: RobotModel, q: Array, what: str, code: str, tolerance: float = _MEASURED) -> Array:
-    """q, clipped to limits that it may miss by the tolerance [rad]."""
+    """Return q clipped to limits that it may exceed by the tolerance [rad]."""
     excess = np.maximum(robot.lower - q, q - robot.upper)
     joint = int(np.argmax(excess))
     if excess[joint] > tolerance:

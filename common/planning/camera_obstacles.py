@@ -1,4 +1,4 @@
-"""From the newest messages of cameras to obstacles: which camera, where it was, where the robot was, and how old."""
+"""From the newest messages of cameras to obstacles: camera poses, robot positions and age limits."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from common.messages import CameraInfo, Image, JointState, PlanningScene, PointC
 from common.perception.camera_input import FrameError
 from common.perception.depth import Depth, check_depth, depth_of
 from common.perception.pinhole import CameraError, Pinhole
-from common.planning.obstacles import BadShape
-from common.planning.points import KnownShapes, PointObstacle, View, depth_points, unseen
+from common.planning.obstacles import InvalidShape
+from common.planning.point_obstacles import CameraView, KnownShapeFilter, PointObstacle, depth_points, occluded_spheres
 from common.planning.robot_geometry import RobotGeometry
 from common.robot.finger_joints import measured_width
 from common.robot.model import RobotModel
@@ -27,12 +27,12 @@ Array = npt.NDArray[np.float64]
 Corner = tuple[float, float, float]
 
 _WORLD = "world"
-_KEPT = 1000  # joint states, of which there are 100 each second
-_BETWEEN = 0.1  # [s] by which joint states that say where the robot was may lie before or after a picture
+_HISTORY = 1000  # joint states, at 100 Hz
+_MAX_GAP = 0.1  # [s] between an image and the joint states before and after it
 
 
 class Camera(Section):
-    """Whose points count: of a topic of point clouds, or of one of depth pictures with that of its intrinsics."""
+    """A camera: the key of its point clouds, or of its depth images and their intrinsics."""
 
     points: str = Field("", description="key of a PointCloud2, such as depth_camera/points")
     depth: str = Field("", description="key of a depth Image, such as depth_camera/depth/image_raw")
@@ -40,13 +40,13 @@ class Camera(Section):
 
     @property
     def key(self) -> str:
-        """The topic that says what was seen."""
+        """Key of the point clouds or depth images."""
         return self.points or self.depth
 
     @model_validator(mode="after")
     def _has_one_kind(self) -> Camera:
         if bool(self.points) == bool(self.depth) or bool(self.depth) != bool(self.info):
-            raise ValueError("a camera has either points, or depth and info")
+            raise ValueError("a camera needs either points, or depth and info")
         return self
 
 
@@ -59,20 +59,20 @@ class Box(Section):
     @model_validator(mode="after")
     def _has_volume(self) -> Box:
         if not all(low < high for low, high in zip(self.low, self.high, strict=True)):
-            raise ValueError(f"low {self.low} has to be less than high {self.high} in x, y and z")
+            raise ValueError(f"low {self.low} must be less than high {self.high} in x, y and z")
         return self
 
 
 class PointsOptions(Section):
-    """What cameras see and the planning scene does not have, as obstacles."""
+    """Obstacles that cameras see and the planning scene does not have."""
 
     cameras: list[Camera] = Field(min_length=1, max_length=16)
     voxel: float = Field(0.01, gt=0, le=0.2, description="side of the cubes whose points become one sphere [m]")
-    stride: int = Field(1, ge=1, le=32, description="of a depth picture every n-th row and column")
-    margin: float = Field(0.03, ge=0, le=0.3, description="from the robot within which points are its own [m]")
-    object_margin: float = Field(0.02, ge=0, le=0.3, description="the same from objects of the planning scene [m]")
-    max_age: float = Field(2.0, gt=0, le=3600, description="of what a camera saw last, in cell time [s]")
-    unknown: Literal["free", "occupied"] = Field("free", description="space in the box that no depth picture shows")
+    stride: int = Field(1, ge=1, le=32, description="use every n-th row and column of a depth image")
+    margin: float = Field(0.03, ge=0, le=0.3, description="points this close to the robot belong to it [m]")
+    object_margin: float = Field(0.02, ge=0, le=0.3, description="the same for objects of the planning scene [m]")
+    max_age: float = Field(2.0, gt=0, le=3600, description="largest age of a camera's newest image, cell time [s]")
+    unknown: Literal["free", "occupied"] = Field("free", description="space in the box that no depth image shows")
     box: Box | None = Field(None, description="in which unknown space is occupied")
     unknown_voxel: float = Field(0.03, gt=0, le=0.5, description="side of its cubes [m]")
 
@@ -85,86 +85,89 @@ class PointsOptions(Section):
             if np.prod(np.ceil(sides)) > 1e6:
                 raise ValueError(f"the box has more than a million cubes of {self.unknown_voxel:g} m")
             if any(camera.points for camera in self.cameras):
-                raise ValueError("unknown: occupied needs depth and info of every camera: clouds do not tell it")
+                raise ValueError("unknown: occupied needs depth and info of every camera; clouds show no free space")
         return self
 
 
 @dataclass(frozen=True)
-class Seen:
+class CameraMessages:
     """The newest messages of one camera."""
 
     camera: Camera
-    picture: Image | PointCloud2 | None
+    image: Image | PointCloud2 | None
     info: CameraInfo | None = None
 
 
-class Seeing:
-    """Makes obstacles of what cameras saw. Not for several threads at once."""
+class CameraObstacles:
+    """Turns camera messages into obstacles. Not thread-safe."""
 
     def __init__(self, robot: RobotModel, geometry: RobotGeometry, options: PointsOptions) -> None:
         self._robot = robot
-        self._known = KnownShapes(geometry)
+        self._known = KnownShapeFilter(geometry)
         self._options = options
 
     def obstacles(
-        self, seen: list[Seen], poses: TFMessage | None, joints: JointHistory, scene: PlanningScene, now_ns: int
+        self, seen: list[CameraMessages], poses: TFMessage | None, joints: JointHistory, scene: PlanningScene,
+        now_ns: int,
     ) -> list[PointObstacle]:
-        """An obstacle for each camera, and one for space that is unknown.
+        """Return an obstacle for each camera, and one for unknown space.
 
         Args:
             seen: newest messages of every camera.
             poses: of the cameras' frames, in the world or in a link of the robot.
-            joints: where the robot was; scene: what is known; now_ns: cell time.
+            joints: where the robot was; scene: known objects; now_ns: cell time.
 
         Raises:
-            Refused: one line that names the camera and what is missing, too old or wrong.
+            Refused: one line that names the camera and what is missing, too old or invalid.
         """
-        options, found, pictures = self._options, [], []
-        latest = max((one.picture.header.stamp for one in seen if one.picture is not None), default=0)
+        options, found, images = self._options, [], []
+        latest = max((one.image.header.stamp for one in seen if one.image is not None), default=0)
         try:
             for one in seen:
-                view, picture = self._view(one, poses, joints, now_ns)
-                if picture is not None:
-                    pictures.append(picture)
+                view, image = self._view(one, poses, joints, now_ns)
+                if image is not None:
+                    images.append(image)
                 margins = {"margin": options.margin, "object_margin": options.object_margin}
                 found.append(self._known.obstacle(view, scene, side=options.voxel, **margins))
             if options.box is not None:
                 q = self._q(joints, latest, "unknown space")
-                spheres = unseen(pictures, np.array(options.box.low), np.array(options.box.high), options.unknown_voxel)
+                low, high = np.array(options.box.low), np.array(options.box.high)
+                spheres = occluded_spheres(images, low, high, options.unknown_voxel)
                 width = joints.width(latest)
                 found.append(self._known.unknown("unknown space", spheres, scene, q, width=width, **margins))
-        except BadShape as error:
+        except InvalidShape as error:
             raise Refused("bad_scene", str(error)) from None
         return found
 
     def _view(
-        self, seen: Seen, poses: TFMessage | None, joints: JointHistory, now_ns: int
-    ) -> tuple[View, tuple[Depth, Pinhole] | None]:
-        """What one camera saw, in the world; its depth picture where that is what it sends."""
-        name, picture = seen.camera.key, seen.picture
-        if picture is None:
-            raise Refused("no_points", f"{name}: nothing came yet, so what stands there is not known")
-        age = (now_ns - picture.header.stamp) / 1e9
+        self, seen: CameraMessages, poses: TFMessage | None, joints: JointHistory, now_ns: int
+    ) -> tuple[CameraView, tuple[Depth, Pinhole] | None]:
+        """Return what one camera saw, in the world, and its depth image if it sends depth."""
+        name, image = seen.camera.key, seen.image
+        if image is None:
+            raise Refused("no_points", f"{name}: no image received yet, so obstacles there are unknown")
+        age = (now_ns - image.header.stamp) / 1e9
         if age > self._options.max_age:
-            raise Refused("old_points", f"{name}: the newest is {age:.2f} s old; points.max_age is "
-                                        f"{self._options.max_age:g} s")
-        q, width = self._q(joints, picture.header.stamp, name), joints.width(picture.header.stamp)
+            raise Refused("old_points", f"{name}: the newest image is {age:.2f} s old; the limit points.max_age "
+                                        f"is {self._options.max_age:g} s")
+        q, width = self._q(joints, image.header.stamp, name), joints.width(image.header.stamp)
         try:
-            T = frame_pose(picture.header.frame_id, poses, self._robot, q)
-            if isinstance(picture, PointCloud2):
-                points = cloud_points(picture)
-                return View(f"points of {name}", points @ T[:3, :3].T + T[:3, 3], q, width), None
+            T = frame_pose(image.header.frame_id, poses, self._robot, q)
+            if isinstance(image, PointCloud2):
+                points = cloud_points(image)
+                return CameraView(f"points of {name}", points @ T[:3, :3].T + T[:3, 3], q, width), None
             if seen.info is None:
-                raise Refused("no_points", f"{seen.camera.info}: nothing came yet, so {name} cannot be measured")
+                raise Refused("no_points", f"{seen.camera.info}: no message received yet, so {name} cannot be used")
             camera = Pinhole.from_info(seen.info, T)
-            depth = depth_of(picture)
-            if (depth > 0).any():  # a picture without any depth shows no points, and nothing that is free
+            depth = depth_of(image)
+            if (depth > 0).any():  # an image without any depth shows no points and no free space
                 check_depth(depth, camera.width, camera.height)
             step = self._options.stride
             coarse = Pinhole(
                 camera.fx / step, camera.fy / step, camera.cx / step, camera.cy / step, camera.width, camera.height, T
             )
-            return View(f"points of {name}", depth_points(depth[::step, ::step], coarse), q, width), (depth, camera)
+            points = depth_points(depth[::step, ::step], coarse)
+            return CameraView(f"points of {name}", points, q, width), (depth, camera)
         except (FrameError, CameraError) as error:
             raise Refused("bad_points", f"{name}: {error}") from None
         except ZencellError as error:
@@ -175,26 +178,26 @@ class Seeing:
     def _q(self, joints: JointHistory, stamp: int, name: str) -> Array:
         q = joints.at(stamp)
         if q is None:
-            raise Refused("no_state", f"{name}: where the robot was when this was seen is not known")
+            raise Refused("no_state", f"{name}: no joint state at the time of this image")
         return q
 
 
 class JointHistory:
-    """Where the robot was in the last seconds."""
+    """Joint positions and gripper width of the last seconds."""
 
     def __init__(self, robot: RobotModel) -> None:
         self._robot = robot
-        self._states: deque[tuple[int, Array, float | None]] = deque(maxlen=_KEPT)
+        self._states: deque[tuple[int, Array, float | None]] = deque(maxlen=_HISTORY)
 
-    def note(self, state: JointState) -> None:
-        """Take over joint states; those without all joints, or older than the newest, are left out."""
+    def add(self, state: JointState) -> None:
+        """Add a joint state, unless it lacks joints or is older than the newest."""
         q = self._robot.order(state.name, state.position)
         if q is not None and (not self._states or state.header.stamp > self._states[-1][0]):
             width = measured_width(self._robot.config.gripper, state.name, state.position)
             self._states.append((state.header.stamp, q, width))
 
     def at(self, stamp: int) -> Array | None:
-        """(dof,) [rad] at a time [ns], between the states before and after it; None when too far from any."""
+        """Return (dof,) [rad] at a time [ns], interpolated between joint states; None if too far from any."""
         near = self._about(stamp)
         if len(near) < 2:
             return near[0][1] if near else None
@@ -202,20 +205,20 @@ class JointHistory:
         return np.asarray(q0 + (stamp - t0) / (t1 - t0) * (q1 - q0))
 
     def width(self, stamp: int) -> float | None:
-        """Between the fingers at a time [ns], the wider of the states before and after it [m]; None when not known."""
+        """Return the gripper width [m] at a time [ns], the wider of the states before and after; None if unknown."""
         return max((width for _, _, width in self._about(stamp) if width is not None), default=None)
 
     def _about(self, stamp: int) -> list[tuple[int, Array, float | None]]:
         states = list(self._states)
         after = next((i for i, (at, _, _) in enumerate(states) if at >= stamp), len(states))
-        return [state for state in states[max(after - 1, 0) : after + 1] if abs(state[0] - stamp) <= _BETWEEN * 1e9]
+        return [state for state in states[max(after - 1, 0) : after + 1] if abs(state[0] - stamp) <= _MAX_GAP * 1e9]
 
 
 def frame_pose(frame: str, poses: TFMessage | None, robot: RobotModel, q: Array) -> Array:
-    """(4, 4) pose in the world of a frame that hangs, over others, on the world or on a link of the robot at q.
+    """Return the (4, 4) world pose of a frame whose chain of parents ends at world or at a link of the robot at q.
 
     Raises:
-        FrameError: it does.
+        FrameError: its chain of parents does not.
     """
     known = {t.child_frame_id: t for t in (poses.transforms if poses is not None else [])}
     links = set(robot.link_names)
@@ -229,15 +232,15 @@ def frame_pose(frame: str, poses: TFMessage | None, robot: RobotModel, q: Array)
             break
         T = pose_to_matrix(known[at].transform) @ T
         at = known[at].header.frame_id
-    raise FrameError("unknown_frame", f"tf_static does not say where frame {frame!r} is; it has: "
+    raise FrameError("unknown_frame", f"tf_static has no pose of frame {frame!r}; its frames: "
                                     f"{', '.join(known) or 'none'}")
 
 
 def cloud_points(cloud: PointCloud2) -> Array:
-    """(N, 3) points [m] of a cloud in its frame, without those that are no number.
+    """Return (N, 3) finite points [m] of a cloud in its frame.
 
     Raises:
-        FrameError: it has no x, y and z, or its bytes do not add up.
+        FrameError: it lacks x, y or z, or its size does not match its layout.
     """
     missing = [name for name in ("x", "y", "z") if name not in cloud.fields]
     if missing:

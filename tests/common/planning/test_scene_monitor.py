@@ -23,7 +23,7 @@ from common.messages import (
     Vector3,
 )
 from common.planning.pipeline import PlanningPipeline
-from common.planning.watching import MOVED, NotWatched, SceneMonitor
+from common.planning.scene_monitor import MOVED, NotMonitored, SceneMonitor
 from common.robot.model import RobotModel
 from common.robot.transforms import matrix_to_pose, tool_down
 
@@ -65,25 +65,25 @@ def begin(monitor, pipeline, on: PlanningScene, start=HOME, **fields: object) ->
     request = PlanRequest(id="p", **{"goal": JointGoal(positions=THERE.tolist()), **fields})
     response = pipeline.plan(request, on, start)
     assert response.ok and response.scene_stamp == 7, response.message
-    monitor.note(request, on, response.trajectory)
+    monitor.add_plan(request, on, response.trajectory)
     monitor.follow("g", "p")
     return response.trajectory
 
 
 def test_what_comes_in_the_way_is_said_with_the_link_and_no_more_once_it_is_gone(monitor, pipeline):
     begin(monitor, pipeline, scene())
-    assert monitor.in_the_way(scene(), 0.0) == ""
-    told = monitor.in_the_way(scene(thing("mug", ROBOT.fk(HALF)[:3, 3])), 0.1)
-    assert told.startswith("mug is in the way of panda_")
-    assert monitor.in_the_way(scene(), 0.1) == ""
+    assert monitor.find_obstruction(scene(), 0.0) == ""
+    told = monitor.find_obstruction(scene(thing("mug", ROBOT.fk(HALF)[:3, 3])), 0.1)
+    assert told.startswith("mug obstructs panda_")
+    assert monitor.find_obstruction(scene(), 0.1) == ""
 
 
 def test_what_comes_behind_the_arm_is_in_nobodys_way(monitor, pipeline):
     begin(monitor, pipeline, scene())
     mug = scene(thing("mug", ROBOT.fk(HALF)[:3, 3]))
-    assert monitor.in_the_way(mug, 0.2)
+    assert monitor.find_obstruction(mug, 0.2)
     monitor.follow("g", "p")
-    assert monitor.in_the_way(mug, 0.9) == ""
+    assert monitor.find_obstruction(mug, 0.9) == ""
 
 
 def test_what_stands_between_two_states_is_found(monitor, pipeline):
@@ -94,7 +94,7 @@ def test_what_stands_between_two_states_is_found(monitor, pipeline):
         monitor.follow("g", "p")
         q = HOME + share * (THERE - HOME)
         wire = thing("wire", ROBOT.fk(q)[:3, 3], "cylinder", (0.002, 0.3), "fixture")
-        assert monitor.in_the_way(scene(wire), 0.0).startswith("wire is in the way of panda_"), share
+        assert monitor.find_obstruction(scene(wire), 0.0).startswith("wire obstructs panda_"), share
 
 
 def test_what_was_planned_around_may_be_seen_a_little_elsewhere_under_any_name(monitor, pipeline):
@@ -105,15 +105,15 @@ def test_what_was_planned_around_may_be_seen_a_little_elsewhere_under_any_name(m
         near[2] -= 0.001
     begin(monitor, pipeline, scene(thing("ball_1", near)), planner="joint_move")
     shaken = up(near, 0.9 * MOVED)
-    assert monitor.in_the_way(scene(thing("ball_9", shaken)), 0.0) == ""
-    assert monitor.in_the_way(scene(thing("ball_9", up(near, 3 * MOVED))), 0.0)
+    assert monitor.find_obstruction(scene(thing("ball_9", shaken)), 0.0) == ""
+    assert monitor.find_obstruction(scene(thing("ball_9", up(near, 3 * MOVED))), 0.0)
 
 
 def test_what_grows_or_turns_into_the_way_is_news(monitor, pipeline):
     below = ROBOT.fk(HALF)[:3, 3] - (0.0, 0.0, 0.12)
     begin(monitor, pipeline, scene(thing("box", below, "box", (0.02, 0.02, 0.02))))
-    assert monitor.in_the_way(scene(thing("box", below, "box", (0.02, 0.02, 0.02), turn=1.0)), 0.0) == ""
-    assert monitor.in_the_way(scene(thing("box", below, "box", (0.02, 0.02, 0.3))), 0.0)
+    assert monitor.find_obstruction(scene(thing("box", below, "box", (0.02, 0.02, 0.02), turn=1.0)), 0.0) == ""
+    assert monitor.find_obstruction(scene(thing("box", below, "box", (0.02, 0.02, 0.3))), 0.0)
 
 
 def test_contact_that_the_motion_may_have_does_not_stop_it(monitor, pipeline):
@@ -124,9 +124,9 @@ def test_contact_that_the_motion_may_have_does_not_stop_it(monitor, pipeline):
     ball = scene(thing("ball_1", (0.5, 0.1, 0.03)))
     begin(monitor, pipeline, ball, np.array(above), goal=PoseGoal(pose=grasp), straight=True, release=True,
           allowed_collisions=[(link, "ball_1") for link in FINGERS])
-    assert monitor.in_the_way(scene(thing("ball_1", (0.512, 0.105, 0.03))), 0.3) == "", "it is what is grasped"
+    assert monitor.find_obstruction(scene(thing("ball_1", (0.512, 0.105, 0.03))), 0.3) == "", "it is what is grasped"
     other = scene(thing("ball_1", (0.5, 0.1, 0.03)), thing("ball_2", (0.5, 0.15, 0.03)))
-    assert monitor.in_the_way(other, 0.3).startswith("ball_2 is in the way of")
+    assert monitor.find_obstruction(other, 0.3).startswith("ball_2 obstructs")
 
 
 def test_what_is_carried_is_part_of_the_arm_before_and_after_the_scene_knows_of_it(monitor, pipeline):
@@ -136,9 +136,9 @@ def test_what_is_carried_is_part_of_the_arm_before_and_after_the_scene_knows_of_
     held = AttachedObject(link=CELL.robot.tcp_link, object=thing("ball_1", (0.002, 0, 0), role="attached"))
     carried = scene(attached=[held], allowed_collisions=[(link, "ball_1") for link in FINGERS])
     for seen in (lies, scene(thing("ball_1", at + np.array([0.01, 0, 0]))), scene(), carried):
-        assert monitor.in_the_way(seen, 0.05) == ""
+        assert monitor.find_obstruction(seen, 0.05) == ""
     rod = thing("rod", ROBOT.fk(HALF)[:3, 3] - (0, 0, 0.028), "cylinder", (0.001, 0.001), "fixture")
-    assert "ball_1" in monitor.in_the_way(scene(rod, attached=[held]), 0.05)
+    assert "ball_1" in monitor.find_obstruction(scene(rod, attached=[held]), 0.05)
 
 
 def test_motion_that_was_planned_elsewhere_keeps_off_the_whole_scene_but_for_what_it_grasps(monitor, pipeline):
@@ -150,17 +150,17 @@ def test_motion_that_was_planned_elsewhere_keeps_off_the_whole_scene_but_for_wha
     place = ROBOT.fk(HALF)[:3, 3] + np.array([0, 0, 0.01])
     for each in (trajectory, turned):
         other.follow("g", "unknown", each)
-        assert other.in_the_way(scene(), 0.0) == ""
-        assert other.in_the_way(scene(thing("ball", place, dimensions=(0.004,))), 0.0) == ""
+        assert other.find_obstruction(scene(), 0.0) == ""
+        assert other.find_obstruction(scene(thing("ball", place, dimensions=(0.004,))), 0.0) == ""
         post = thing("post", place, "box", (0.01, 0.01, 0.01), "fixture")
-        assert other.in_the_way(scene(post), 0.0).startswith("post is in the way of")
-    with pytest.raises(NotWatched, match="goal 'h' has other joints"):
+        assert other.find_obstruction(scene(post), 0.0).startswith("post obstructs")
+    with pytest.raises(NotMonitored, match="goal 'h' moves other joints"):
         other.follow("h", "", trajectory.model_copy(update={"joint_names": list("abcdefg")}))
-    assert other.in_the_way(scene(post), 0.0) == "", "and it does not judge by the one before"
+    assert other.find_obstruction(scene(post), 0.0) == "", "and it does not judge by the one before"
 
 
 def test_trajectory_without_points_is_not_watched(monitor):
-    with pytest.raises(NotWatched, match="goal 'g' has no points"):
+    with pytest.raises(NotMonitored, match="goal 'g' has no points"):
         monitor.follow("g", "", JointTrajectory(joint_names=ROBOT.joint_names, points=[]))
 
 
@@ -172,30 +172,31 @@ def test_trajectory_that_takes_too_many_states_to_look_at_is_not_watched(monitor
               JointTrajectoryPoint(time_from_start=seconds, positions=[far] * ROBOT.dof, velocities=fast,
                                    accelerations=none)]
     monitor.follow("g", "", JointTrajectory(joint_names=ROBOT.joint_names, points=points))
-    with pytest.raises(NotWatched, match="more than 25000 states"):
-        monitor.in_the_way(scene(thing("ball", (0.5, 0.0, 0.5))), 0.0)
+    with pytest.raises(NotMonitored, match="more than 25000 states"):
+        monitor.find_obstruction(scene(thing("ball", (0.5, 0.0, 0.5))), 0.0)
 
 
 def test_scene_with_the_same_in_it_is_judged_once(monitor, pipeline):
     begin(monitor, pipeline, scene())
     mug = scene(thing("mug", ROBOT.fk(HALF)[:3, 3]))
-    told = monitor.in_the_way(mug, 0.0)
+    told = monitor.find_obstruction(mug, 0.0)
     with patch.object(monitor, "_hit", side_effect=AssertionError):
-        assert monitor.in_the_way(mug.model_copy(update={"header": Header(stamp=9, frame_id="world")}), 0.1) == told
+        again = mug.model_copy(update={"header": Header(stamp=9, frame_id="world")})
+        assert monitor.find_obstruction(again, 0.1) == told
 
 
 def test_what_was_in_the_way_has_to_leave_it_clearly(monitor, pipeline):
     begin(monitor, pipeline, scene())
     place = ROBOT.fk(HALF)[:3, 3]
     away = next(d for d in np.arange(0.0, 0.2, 0.001) if _free(monitor, up(place, -d)))
-    assert monitor.in_the_way(scene(thing("mug", place)), 0.0)
-    assert monitor.in_the_way(scene(thing("mug", up(place, -away))), 0.0), "a hair's breadth is not enough"
-    assert monitor.in_the_way(scene(thing("mug", up(place, -away - 0.007))), 0.0) == ""
+    assert monitor.find_obstruction(scene(thing("mug", place)), 0.0)
+    assert monitor.find_obstruction(scene(thing("mug", up(place, -away))), 0.0), "a hair's breadth is not enough"
+    assert monitor.find_obstruction(scene(thing("mug", up(place, -away - 0.007))), 0.0) == ""
 
 
 def _free(monitor: SceneMonitor, place) -> bool:
     monitor.follow("g", "p")
-    return monitor.in_the_way(scene(thing("mug", place)), 0.0) == ""
+    return monitor.find_obstruction(scene(thing("mug", place)), 0.0) == ""
 
 
 def test_only_what_was_in_the_way_has_to_leave_it_clearly(monitor, pipeline):
@@ -204,6 +205,6 @@ def test_only_what_was_in_the_way_has_to_leave_it_clearly(monitor, pipeline):
     away = next(d for d in np.arange(0.0, 0.2, 0.001) if _free(monitor, up(place, -d)))
     close_by = thing("bowl", up(place, -away))  # never in the way, and no farther than that
     monitor.follow("g", "p")
-    assert monitor.in_the_way(scene(close_by), 0.0) == ""
-    assert monitor.in_the_way(scene(close_by, thing("mug", place)), 0.0).startswith("mug ")
-    assert monitor.in_the_way(scene(close_by), 0.0) == ""
+    assert monitor.find_obstruction(scene(close_by), 0.0) == ""
+    assert monitor.find_obstruction(scene(close_by, thing("mug", place)), 0.0).startswith("mug ")
+    assert monitor.find_obstruction(scene(close_by), 0.0) == ""
