@@ -276,7 +276,7 @@ def test_circles_are_seen() -> None:
 @pytest.mark.parametrize("does", [
     "import services.camera_simulator, common.sim.kinematic",
     "import common.supervision.supervisor, recording.report.aggregator, cli.session.session as o\n"
-    "o.Operation('panda', connect='tcp/127.0.0.1:9')",
+    "o.CellSession('panda', connect='tcp/127.0.0.1:9')",
 ], ids=["camera", "supervisor"])
 def test_process_that_plans_nothing_loads_no_planner(does: str) -> None:
     told = f"{does}\nimport sys\nprint(*{{'pinocchio', 'coal', 'ompl', 'viser'}} & set(sys.modules))"

@@ -4,25 +4,35 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from dataclasses import dataclass
 from itertools import groupby
+from typing import TYPE_CHECKING
 
-from rich.console import Console, Group
-from rich.live import Live
-from rich.table import Table
-from rich.text import Text
-
-from cli.session.screens import Content
+from common.messages import ServiceStatus
 from common.process.dropping_writer import lost_lines_text
 from common.terminal import STATE_STYLES, printable
 
-REFRESHES = 4  # [1/s]
-MOST_LINES = 200  # between two of them: a line takes 0.1 ms to draw, and the cell's signals and news wait meanwhile
+if TYPE_CHECKING:
+    from rich.console import Console, Group
+    from rich.text import Text
+
+REFRESH_RATE = 4  # [Hz]
+MOST_LINES = 200  # per refresh: a line takes 0.1 ms to draw, which delays the cell's signals and messages
+
+
+@dataclass(frozen=True)
+class Content:
+    """The content of the table."""
+
+    services: list[ServiceStatus]
+    rates: dict[str, tuple[str, float]]  # by service: the topic that it writes most often, and its rate [Hz]
+    progress: str  # of the task
 
 
 class LiveScreen:
     """A table of the processes that stays below the lines that they write.
 
-    A thread draws, all lines since the last time at once: the table is drawn anew below each piece of text.
+    A thread draws all lines since its last refresh at once, because the table is drawn again below each piece of text.
     """
 
     def __init__(
@@ -32,11 +42,13 @@ class LiveScreen:
 
         Args:
             console: of the terminal.
-            content: asked for what to show a few times a second; called on another thread.
-            drain: returns soon, when all was written if somebody reads.
+            content: returns what to show; called on another thread, `REFRESH_RATE` times a second.
+            drain: returns when all is written, or soon if the terminal does not accept it.
         """
+        from rich.live import Live
+
         self._drain = drain
-        self._waiting: list[tuple[Text, bool]] = []  # and whether it may be wider than the terminal
+        self._waiting: list[tuple[Text, bool]] = []  # each with whether it may be wider than the terminal
         self._lost = 0
         self._lock = threading.Lock()
         self._live = Live(
@@ -45,11 +57,13 @@ class LiveScreen:
         )
         self._live.start(refresh=True)
         self._ends = threading.Event()
-        self._drawing = threading.Thread(target=self._draw_on, name="table", daemon=True)
+        self._drawing = threading.Thread(target=self._draw_until_closed, name="table", daemon=True)
         self._drawing.start()
 
     def line(self, service: str, text: str) -> None:
-        """Have one line shown soon that a process wrote, above the table; of too many at once the last are lost."""
+        """Show a line of a process above the table; the last of too many lines at once are dropped."""
+        from rich.text import Text
+
         named = printable(text if f" {service}: " in text[:80] else f"{service}: {text}")
         with self._lock:
             if len(self._waiting) < MOST_LINES:
@@ -58,32 +72,35 @@ class LiveScreen:
                 self._lost += 1
 
     def note(self, text: str) -> None:
-        """Have a line shown soon for the person in front of it, above the table."""
+        """Show a line for the user above the table."""
+        from rich.text import Text
+
         with self._lock:
             self._waiting.append((Text(printable(text, keep="\n")), True))
 
     def progress(self, text: str) -> None:
-        """The table shows it anyway."""
+        """Do nothing: the table shows the progress of the task."""
 
     def close(self) -> None:
-        """Leave the last table standing and give the terminal back."""
+        """Leave the last table on the terminal and give the terminal back."""
         self._ends.set()
         self._drawing.join()
         self._draw()
         self._live.stop()
         self._drain()
 
-    def _draw_on(self) -> None:
-        while not self._ends.wait(1 / REFRESHES):
+    def _draw_until_closed(self) -> None:
+        while not self._ends.wait(1 / REFRESH_RATE):
             self._draw()
 
     def _draw(self) -> None:
+        from rich.text import Text
+
         with self._lock:
             waiting, self._waiting = self._waiting, []
             lost, self._lost = self._lost, 0
         if lost:
-            told = lost_lines_text(lost, "there were too many to show")
-            waiting.append((Text(told, style="yellow"), False))
+            waiting.append((Text(lost_lines_text(lost, "too many at once"), style="yellow"), False))
         for wide, some in groupby(waiting, key=lambda each: each[1]):
             self._live.console.print(Text("\n").join(text for text, _ in some), soft_wrap=wide)
         self._live.refresh()
@@ -96,7 +113,11 @@ def _style_of(line: str) -> str:
 
 
 def render(content: Content) -> Group:
-    """The table, and the task's line under it."""
+    """Return the table with the progress of the task below it."""
+    from rich.console import Group
+    from rich.table import Table
+    from rich.text import Text
+
     table = Table(box=None, pad_edge=False, header_style="dim")
     for title in ("service", "state", "pid", "restarts", "writes", "Hz"):
         table.add_column(title, justify="right" if title in ("pid", "restarts", "Hz") else "left", no_wrap=True)

@@ -1,4 +1,4 @@
-"""What a person sees while a cell is up: lines on stderr, as text or JSON, or a live table on a terminal."""
+"""Output of a running cell: lines of text or JSON on stderr, or a live table on a terminal."""
 
 from __future__ import annotations
 
@@ -9,60 +9,50 @@ import os
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Protocol, TextIO, cast
 
-from common.messages import ServiceStatus
+from cli.session.live_table import Content, LiveScreen
 from common.process.dropping_writer import DroppingWriter, lost_lines_text
 from common.terminal import printable
 
 
-@dataclass(frozen=True)
-class Content:
-    """What the live table shows."""
-
-    services: list[ServiceStatus]
-    rates: dict[str, tuple[str, float]]  # by service: the topic that it writes most often, and how often [Hz]
-    progress: str  # of the task
-
-
 class Screen(Protocol):
-    """Where lines and the state of the cell are shown."""
+    """Shows log lines and the state of the cell."""
 
     def line(self, service: str, text: str) -> None:
-        """Show one line that a process wrote."""
+        """Show a line that a process wrote."""
 
     def note(self, text: str) -> None:
-        """Show a line of the supervisor's own for the person in front of it."""
+        """Show a line for the user."""
 
     def progress(self, text: str) -> None:
-        """Show how far the task is."""
+        """Show the progress of the task."""
 
     def close(self) -> None:
-        """Leave the terminal as it was."""
+        """Restore the terminal."""
 
 
 class PlainScreen:
-    """Lines on stderr, each with the name of who wrote it; no control characters. Notes go to stdout."""
+    """Lines on stderr, each with the name of its process, without control characters; notes on stdout."""
 
     def __init__(self) -> None:
-        """Write to stderr and stdout of now."""
+        """Write to the current stderr and stdout."""
         self._lines, self._notes = DroppingWriter(sys.stderr), DroppingWriter(sys.stdout)
 
     def line(self, service: str, text: str) -> None:
-        """Show one line that a process wrote."""
+        """Show a line that a process wrote."""
         self._lines.put(printable(text if f" {service}: " in text[:80] else f"{service}: {text}") + "\n")
 
     def note(self, text: str) -> None:
-        """Show a line for the person in front of it."""
+        """Show a line for the user."""
         self._notes.put(printable(text, keep="\n") + "\n")
 
     def progress(self, text: str) -> None:
-        """Show how far the task is."""
+        """Show the progress of the task."""
         self.line("task", text)
 
     def close(self) -> None:
-        """Write what still waits, if somebody reads."""
+        """Write the queued lines, unless the reader is stalled."""
         self._lines.flush()
         self._notes.flush()
 
@@ -71,12 +61,12 @@ class JsonScreen:
     """One JSON object a line on stderr: time, service, level, message."""
 
     def __init__(self) -> None:
-        """Write to stderr of now."""
+        """Write to the current stderr."""
         self._lines = DroppingWriter(
             sys.stderr, lambda lines: _object("supervisor", "warning", lost_lines_text(lines)).rstrip("\n"))
 
     def line(self, service: str, text: str) -> None:
-        """Pass on what is such an object already, wrap what is not."""
+        """Pass on a line that is such an object already, and wrap any other."""
         if text.startswith("{"):
             try:
                 value = json.loads(text)
@@ -88,37 +78,35 @@ class JsonScreen:
         self._lines.put(_object(service, "info", text))
 
     def note(self, text: str) -> None:
-        """Show a line for the person in front of it."""
+        """Show a line for the user."""
         self._lines.put(_object("supervisor", "info", text))
 
     def progress(self, text: str) -> None:
-        """Show how far the task is."""
+        """Show the progress of the task."""
         self._lines.put(_object("task", "info", text))
 
     def close(self) -> None:
-        """Write what still waits, if somebody reads."""
+        """Write the queued lines, unless the reader is stalled."""
         self._lines.flush()
 
 
 def open_screen(content: Callable[[], Content], *, log_json: bool, plain: bool = False) -> Screen:
-    """The screen that suits where stderr goes; `plain` keeps the terminal free for a question."""
+    """Return the screen that suits stderr; `plain` leaves the terminal free for a question."""
     if log_json:
         return JsonScreen()
     if not plain and sys.stderr.isatty() and os.environ.get("TERM", "dumb") != "dumb":
         from rich.console import Console
 
-        from cli.session.live_table import LiveScreen
-
-        terminal = _Terminal(sys.stderr)
+        terminal = _NonBlockingTerminal(sys.stderr)
         return LiveScreen(Console(file=cast(TextIO, terminal)), content, terminal.drain)
     return PlainScreen()
 
 
 class ScreenHandler(logging.Handler):
-    """Shows the supervisor's own log among the lines of its processes."""
+    """Shows the supervisor's log lines on a screen, among those of its processes."""
 
     def __init__(self, screen: Screen, *, log_json: bool) -> None:
-        """Show on a screen, as JSON objects if asked to."""
+        """Show lines on a screen, as text or JSON objects."""
         super().__init__(logging.INFO)
         self._screen = screen
         self._json = log_json
@@ -137,12 +125,12 @@ class ScreenHandler(logging.Handler):
 
 
 def _object(service: str, level: str, message: str) -> str:
-    said = {"time": round(time.time(), 6), "service": service, "level": level, "message": message}
-    return json.dumps(said) + "\n"
+    line = {"time": round(time.time(), 6), "service": service, "level": level, "message": message}
+    return json.dumps(line) + "\n"
 
 
-class _Terminal(io.TextIOBase):
-    """A terminal that nobody waits for who writes to it."""
+class _NonBlockingTerminal(io.TextIOBase):
+    """A terminal whose `write` never blocks."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream, self._out = stream, DroppingWriter(stream)
@@ -152,10 +140,10 @@ class _Terminal(io.TextIOBase):
         return len(text)
 
     def flush(self) -> None:
-        """Nothing: it is written soon."""
+        """Do nothing: a thread writes the queue."""
 
     def drain(self) -> None:
-        """Write what still waits, if somebody reads."""
+        """Write the queue, unless the terminal is stalled."""
         self._out.flush()
 
     def isatty(self) -> bool:

@@ -287,7 +287,7 @@ class CellSession:
         root.setLevel(logging.INFO)
 
     def _content(self) -> Content:
-        from cli.session.screens import Content
+        from cli.session.live_table import Content
 
         assert self._supervisor is not None
         statuses = self._supervisor.statuses
