@@ -19,7 +19,8 @@ from common.supervision.multi_host import HostOptions
 from common.terminal import printable
 
 if TYPE_CHECKING:
-    from cli.session.screens import Content, Screen
+    from cli.session.live_table import Content
+    from cli.session.screens import Screen
     from common.config import Cell
     from common.messages import Interlock
     from common.supervision.supervisor import Supervisor

@@ -35,7 +35,7 @@ def test_many_lines_on_a_terminal_are_drawn_together_and_those_that_are_too_many
         screen.line("chatty", f"line {number}")
     screen.close()
     shown = [int(number) for number in re.findall(r"chatty: line (\d+)", text.getvalue())]
-    lost = sum(int(number) for number in re.findall(r"(\d+) lines were lost: there were too many", text.getvalue()))
+    lost = sum(int(number) for number in re.findall(r"(\d+) lines were dropped: too many", text.getvalue()))
     assert shown == sorted(shown) and shown[:MOST_LINES - 1] == list(range(MOST_LINES - 1))
     assert len(shown) + lost == 2000
     assert text.getvalue().count(CONTENT.progress) < 200, "the table is not drawn for each line"
