@@ -7,7 +7,6 @@ from collections.abc import AsyncIterator
 from typing import Any, cast
 
 import pytest
-from common.time_source import wall_ns
 
 from applications.pick_place.topics import PICK_PLACE_STATUS, PickPlaceStatus
 from common import messages as m
@@ -16,6 +15,7 @@ from common.client.arm import Arm
 from common.client.operator_motion import MotionFailed, OperatorMotion
 from common.client.subscriptions import Subscriptions
 from common.errors import ConfigError
+from common.sources import wall_ns
 from common.transport.local import LocalNetwork
 
 HOME = m.JointGoal(named="home")

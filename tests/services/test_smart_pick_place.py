@@ -14,7 +14,7 @@ from common import topics
 from common.clock import Clock
 from common.config import load_cell, service_config
 from common.kept_file import STANDING_VARIABLE
-from common.process import task_memory
+from common.process import task_runner
 from common.process.in_process import running_service
 from common.process.task_runner import run_task
 from common.transport.bus import Bus
@@ -126,7 +126,7 @@ async def test_memory_that_a_task_begins_with_stays_where_none_was_kept_and_is_w
     in_the_way = tmp_path / "standing"
     in_the_way.write_text("no folder")
     monkeypatch.setenv(STANDING_VARIABLE, str(in_the_way / "cell"))
-    monkeypatch.setattr(task_memory, "SAVE_AGAIN", 0.01)
+    monkeypatch.setattr(task_runner, "SAVE_RETRY", 0.01)
     begun, later = LetGo(places=[(0.5, 0.2, 0.095)]), LetGo(places=[(0.5, 0.3, 0.035)])
     tasks: list[PickPlace] = []
 

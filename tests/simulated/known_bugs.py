@@ -8,8 +8,6 @@ import contextlib
 import sys
 from unittest.mock import patch
 
-from common.time_source import host_ns, wall_ns
-
 from applications.pick_place.perceived_scene import PerceivedScene
 from common import topics
 from common.config import load_cell
@@ -19,6 +17,7 @@ from common.control.interlocks import Record
 from common.control.limiter import Limiter
 from common.control.ownership import Ownership
 from common.control.record_file import RecordFile
+from common.sources import host_ns, wall_ns
 from common.transport import requests
 from common.transport.reader import Newness
 from lab import processes

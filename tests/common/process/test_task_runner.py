@@ -8,8 +8,6 @@ from contextlib import asynccontextmanager
 from itertools import pairwise
 from typing import Any
 
-from common.time_source import wall_ns
-
 from applications.pick_place.topics import PICK_PLACE_STATUS, PickPlaceStatus
 from common import messages as m
 from common import topics
@@ -17,6 +15,7 @@ from common.clock import Clock
 from common.errors import Refused
 from common.process.in_process import running_service
 from common.process.task_runner import TaskRunner
+from common.sources import wall_ns
 from common.tasks.stages import Command, View
 from common.tasks.watchdogs import LivenessWatchdog
 from common.transport.bus import Bus
