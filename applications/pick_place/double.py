@@ -1,4 +1,4 @@
-"""A double of perception, for simulations: says what lies on the table and in the container, and needs no picture."""
+"""Replacement of the perception in simulations: reports the objects on the table and in containers, without images."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ WORLD = "world"
 
 
 class Config(SceneParameters):
-    """How often is looked."""
+    """How often the scene is published."""
 
     robot: RobotConfig
     world: Surroundings
@@ -28,13 +28,13 @@ class Config(SceneParameters):
 
 
 def marker(index: int, thing: WorldObject) -> Marker:
-    """An object as a detector that sees everything would tell of it."""
+    """Return an object as the marker of a perfect detector."""
     return Marker(ns="ball", id=index, type="sphere", pose=Pose(position=thing.pose.position), scale=thing.size,
                   color=thing.color)
 
 
 async def run(bus: Bus, config: Config) -> None:
-    """Keep the planning scene as `scene_manager` does, and offer all that lies on the table to the task."""
+    """Publish the planning scene as `scene_manager` does, and everything on the table as targets."""
     truth, joints = bus.reader(topics.SCENE_OBJECTS), bus.reader(topics.JOINT_STATES)
     gripper = bus.reader(topics.GRIPPER_STATE)
     validated, out = bus.writer(VALIDATED_TARGETS), SceneWriter(bus)

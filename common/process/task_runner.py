@@ -17,7 +17,7 @@ from common.robot.transforms import matrix_to_pose
 from common.sources import monotonic, new_id
 from common.tasks.decisions import TaskConfig
 from common.tasks.engine import Task
-from common.tasks.stages import Command, View, without_far
+from common.tasks.stages import Command, View, within_range
 from common.tasks.watchdogs import LOOK_PERIOD, LivenessWatchdog
 from common.topics import Topic
 from common.transport.bus import Bus
@@ -67,7 +67,7 @@ async def run_task(
         known.now = bus.clock.now()
         if scene.latest is not None and scene.latest is not perceived:
             perceived = scene.latest
-            known.scene = without_far(perceived)
+            known.scene = within_range(perceived)
         known.motion = motion.latest
         known.gripper = gripper.latest if config.robot.gripper is not None else m.GripperState()
         for name, reader in own.items():

@@ -9,8 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from applications.outlining import stage_files
-from applications.outlining import visits as asking
+from applications.outlining import stage_files, visits
 from applications.outlining.topics import (
     CONTOUR_IMAGE,
     CONTOUR_PATH,
@@ -23,7 +22,7 @@ from applications.outlining.topics import (
     OutlineSelect,
     OutlineSelection,
 )
-from applications.outlining.visits import ask_person, store
+from applications.outlining.visits import ask_operator, store_stages
 from common import messages as m
 from common import topics
 from common.errors import NoResponder, RequestLost
@@ -59,7 +58,7 @@ async def test_stages_are_those_of_the_picture_of_the_path(tmp_path: Path, path_
     picture, depth = bus.writer(topics.DEPTH_CAMERA_IMAGE), bus.writer(topics.DEPTH_CAMERA_DEPTH)
     seen, found, paths = bus.writer(CONTOURS), bus.writer(CONTOUR_POINTS), bus.writer(CONTOUR_PATH)
 
-    storing = asyncio.create_task(store(bus, tmp_path, None))
+    storing = asyncio.create_task(store_stages(bus, tmp_path, None))
     await soon()
     for stamp in (1, 2):
         depth.put(array_to_image(np.full((12, 16), 0.5, np.float32), "32FC1", header(stamp)))
@@ -89,7 +88,7 @@ async def test_the_person_looks_at_the_picture_whose_contours_are_asked_for(
     bus, detector = network.bus(), network.bus(service="contour_detector")
     seen, drawn = detector.writer(CONTOURS), detector.writer(CONTOUR_IMAGE)
     answers: asyncio.Queue[str] = asyncio.Queue()
-    monkeypatch.setattr(asking, "_line", answers.get)
+    monkeypatch.setattr(visits, "_line", answers.get)
     chosen: list[OutlineSelect] = []
 
     async def select(wanted: OutlineSelect) -> OutlineSelection:
@@ -98,7 +97,7 @@ async def test_the_person_looks_at_the_picture_whose_contours_are_asked_for(
 
     detector.serve(OUTLINE_SELECT, select)
     await detector.ready()
-    asked = asyncio.create_task(ask_person(bus, tmp_path))
+    asked = asyncio.create_task(ask_operator(bus, tmp_path))
     await soon()
     for stamp, pixels in ((1, None), (2, RIGHT), (3, WRONG)):
         seen.put(contours(stamp, pixels) if pixels else Contours(header=header(stamp), width=16, height=12))
@@ -122,14 +121,14 @@ async def test_choice_whose_answer_was_lost_is_made_again_and_one_that_nobody_an
     bus, detector = network.bus(), network.bus(service="contour_detector")
     seen, drawn = detector.writer(CONTOURS), detector.writer(CONTOUR_IMAGE)
     answers: asyncio.Queue[str] = asyncio.Queue()
-    monkeypatch.setattr(asking, "_line", answers.get)
+    monkeypatch.setattr(visits, "_line", answers.get)
     choices = 0
 
     class Losing:
         async def call(self, _wanted: OutlineSelect) -> OutlineSelection:
             nonlocal choices
             choices += 1
-            if choices <= asking.TRIES + 1:
+            if choices <= visits.TRIES + 1:
                 raise RequestLost(OUTLINE_SELECT.key)
             return OutlineSelection(index=0, label="Object_0")
 
@@ -137,7 +136,7 @@ async def test_choice_whose_answer_was_lost_is_made_again_and_one_that_nobody_an
             raise NoResponder(OUTLINE_SELECT.key)
 
     monkeypatch.setattr(bus, "client", lambda _topic: Losing())
-    asked = asyncio.create_task(ask_person(bus, tmp_path))
+    asked = asyncio.create_task(ask_operator(bus, tmp_path))
     await soon()
     seen.put(contours(1, RIGHT))
     drawn.put(array_to_image(np.zeros((12, 16, 3), np.uint8), "bgr8", header(1)))
@@ -145,7 +144,7 @@ async def test_choice_whose_answer_was_lost_is_made_again_and_one_that_nobody_an
     answers.put_nowait("0")
     async with asyncio.timeout(5):
         await asked
-    assert choices == asking.TRIES + 2
+    assert choices == visits.TRIES + 2
     said = capsys.readouterr().out
     assert said.count("outline which one?") == 2 and said.count("may have been carried out") == 1
     assert said.endswith("Object_0 is chosen\n")

@@ -54,20 +54,20 @@ def look(*things: WorldObject, others: bool = True) -> Detector:
 @pytest.mark.parametrize("others", [True, False])
 @pytest.mark.parametrize("side", [0.045, 0.05, 0.06])
 def test_cube_is_told_by_its_outline(place: tuple[float, float], side: float, others: bool) -> None:
-    odd = look(red("box", (*place, side / 2), (side, side, side)), others=others).odd
+    odd = look(red("box", (*place, side / 2), (side, side, side)), others=others).outliers
     assert {one.reason for one in odd} == {NOT_ROUND} and math.dist(odd[0].position[:2], place) < 0.03
 
 
 @pytest.mark.parametrize("place", [(0.30, 0.455), (0.44, 0.455), (0.74, -0.08), (0.06, -0.12)])
 def test_cube_that_the_border_cuts_is_told_by_what_shows_of_its_outline(place: tuple[float, float]) -> None:
-    odd = look(red("box", (*place, 0.035), (0.07, 0.07, 0.07))).odd
+    odd = look(red("box", (*place, 0.035), (0.07, 0.07, 0.07))).outliers
     assert {one.reason for one in odd} == {NOT_ROUND}
     assert min(math.dist(one.position[:2], place) for one in odd) < 0.06
 
 
 @pytest.mark.parametrize("place", PLACES)
 def test_cable_is_told_by_its_outline(place: tuple[float, float]) -> None:
-    odd = look(red("cylinder", (*place, 0.01), (0.02, 0.02, 0.2), roll=math.pi / 2)).odd
+    odd = look(red("cylinder", (*place, 0.01), (0.02, 0.02, 0.2), roll=math.pi / 2)).outliers
     assert {one.reason for one in odd} == {NOT_ROUND}
 
 
@@ -81,8 +81,8 @@ def test_thin_cable_is_reported_beside_balls(eye: CameraConfig) -> None:
             beside = [ball(x, y) for x, y in OTHERS if math.dist((x, y), place) > 0.17]
             detector = Detector(around)
             assert len(detector.detect(draw.render([cable, *beside]).colour, camera)) == len(beside)
-            assert [one.reason for one in detector.odd] in ([THIN], [NOT_ROUND] * (width > 0.006)), (width, place)
-            assert math.dist(detector.odd[0].position[:2], place) < 0.06
+            assert [one.reason for one in detector.outliers] in ([THIN], [NOT_ROUND] * (width > 0.006)), (width, place)
+            assert math.dist(detector.outliers[0].position[:2], place) < 0.06
 
 
 def test_picture_full_of_red_specks_shows_no_cable() -> None:
@@ -93,18 +93,18 @@ def test_picture_full_of_red_specks_shows_no_cable() -> None:
         noisy[rng.random(picture.shape[:2]) < share] = (20, 20, 200)
         detector = Detector(AROUND)
         detector.detect(noisy, CAMERA)
-        assert THIN not in {one.reason for one in detector.odd}
+        assert THIN not in {one.reason for one in detector.outliers}
 
 
 @pytest.mark.parametrize("place", [(0.60, -0.30), (0.20, -0.35), (0.62, -0.25)])
 def test_disc_away_from_the_axis_is_told_by_its_shape(place: tuple[float, float]) -> None:
     for diameter in (0.06, 0.0624):  # the second one is as large in the picture as a ball
-        odd = look(red("cylinder", (*place, 0.0005), (diameter, diameter, 0.001)), others=False).odd
+        odd = look(red("cylinder", (*place, 0.0005), (diameter, diameter, 0.001)), others=False).outliers
         assert [one.reason for one in odd] == [FLAT]
 
 
 def test_disc_below_the_camera_is_told_by_its_size_beside_balls() -> None:
-    odd = look(red("cylinder", (0.40, 0.0, 0.0005), (0.06, 0.06, 0.001))).odd
+    odd = look(red("cylinder", (0.40, 0.0, 0.0005), (0.06, 0.06, 0.001))).outliers
     assert len(odd) == 1 and "smaller than a ball on the table" in odd[0].reason
 
 
@@ -112,15 +112,15 @@ def test_disc_below_the_camera_is_told_by_its_size_beside_balls() -> None:
 @pytest.mark.parametrize("others", [True, False])
 @pytest.mark.parametrize("height", [0.079, 0.09])
 def test_ball_on_top_of_something_looks_too_large(place: tuple[float, float], height: float, others: bool) -> None:
-    odd = look(ball(*place, height), others=others).odd
+    odd = look(ball(*place, height), others=others).outliers
     assert len(odd) == 1 and "larger than a ball on the table: it lies higher" in odd[0].reason
 
 
 @pytest.mark.parametrize("place", PLACES)
 def test_of_a_stack_neither_ball_is_offered(place: tuple[float, float]) -> None:
     detector = look(ball(*place), ball(*place, 0.09))
-    assert detector.odd
-    frame = markers([], AROUND, 1, odd=detector.odd)
+    assert detector.outliers
+    frame = markers([], AROUND, 1, odd=detector.outliers)
     assert all(marker.text for marker in frame.markers)
 
 
@@ -134,8 +134,8 @@ def test_of_a_stack_neither_ball_is_offered_where_the_camera_sees_it_from_the_si
     picture = Renderer(around, camera=camera).render([ball(*place), ball(*place, 0.09), *beside]).colour
     detector = Detector(around)
     assert len(detector.detect(picture, camera)) == len(beside)
-    assert sorted("it lies higher" in one.reason for one in detector.odd) == [False, True]
-    assert any(math.dist(one.position[:2], place) < 0.01 for one in detector.odd), "the lower one is where it is"
+    assert sorted("it lies higher" in one.reason for one in detector.outliers) == [False, True]
+    assert any(math.dist(one.position[:2], place) < 0.01 for one in detector.outliers), "the lower one is where it is"
 
 
 @pytest.mark.parametrize("gap", [0.0, 0.006])
@@ -149,7 +149,7 @@ def test_three_balls_that_carry_one_are_not_offered_and_without_it_they_are(gap:
             assert len(found) == 3, (place, turn)
             detector = Detector(AROUND)
             assert detector.detect(draw.render([*lower, top]).colour, CAMERA) == [], (place, turn)
-            assert {one.reason for one in detector.odd} == {COVERED}
+            assert {one.reason for one in detector.outliers} == {COVERED}
 
 
 @pytest.mark.parametrize("blur", [0.6, 1.3])
@@ -161,7 +161,7 @@ def test_three_balls_that_touch_are_offered_in_a_picture_that_is_blurred(blur: f
     for outline in silhouettes(CAMERA, places, 0.03, 64):
         cv2.fillConvexPoly(picture, np.rint(outline).astype(np.int32), (25, 35, 200))
     detector = Detector(AROUND, DetectorOptions(outline_offset_px=1.0))
-    assert len(detector.detect(cv2.GaussianBlur(picture, (0, 0), blur), CAMERA)) == len(places), detector.odd
+    assert len(detector.detect(cv2.GaussianBlur(picture, (0, 0), blur), CAMERA)) == len(places), detector.outliers
 
 
 @pytest.mark.parametrize("eye", [AROUND.camera, SIDE])
@@ -175,7 +175,7 @@ def test_balls_that_touch_do_not_lie_on_each_other(eye: CameraConfig, others: bo
         turned = [about + (complex(*place) - about) * np.exp(1j * turn) for place in touching]
         beside = [ball(x, y) for x, y in OTHERS[1:]] if others else []
         picture = draw.render([*(ball(z.real, z.imag) for z in turned), *beside]).colour
-        assert len(detector.detect(picture, camera)) == len(touching) + len(beside) and detector.odd == []
+        assert len(detector.detect(picture, camera)) == len(touching) + len(beside) and detector.outliers == []
 
 
 def painted(camera: Pinhole, places: list[tuple[float, float]], wider: list[float], higher: list[float]) -> np.ndarray:
@@ -200,7 +200,7 @@ def test_outline_of_a_ball_far_away_may_be_off_by_as_many_pixels_as_that_of_one_
     places = [(0.10, -0.40), (0.10, 0.10), (0.20, -0.20), (0.60, -0.10)]
     detector = Detector(around)
     found = detector.detect(painted(camera, places, wider, higher), camera)
-    assert len(found) == len(places), detector.odd
+    assert len(found) == len(places), detector.outliers
     assert all(min(math.dist(one.position[:2], place) for one in found) < 0.003 for place in places)
 
 
@@ -215,7 +215,7 @@ def test_ball_on_top_of_something_looks_too_large_from_the_side(
     detector = Detector(around)
     picture = Renderer(around, camera=camera).render([ball(*place, height), *beside]).colour
     assert len(detector.detect(picture, camera)) == len(beside)
-    assert ["it lies higher" in one.reason for one in detector.odd] == [True]
+    assert ["it lies higher" in one.reason for one in detector.outliers] == [True]
 
 
 @pytest.mark.parametrize("places", [
@@ -235,7 +235,7 @@ def test_what_looks_much_larger_than_a_ball_is_told_though_it_may_fall(
     place: tuple[float, float], diameter: float, below: float,
 ) -> None:
     detector = look(red("sphere", (*place, below + diameter / 2), (diameter, diameter, diameter)))
-    assert detector.too_large == 1 and detector.odd == []
+    assert detector.too_large == 1 and detector.outliers == []
     assert _remark(detector, "eye") == "1 round red thing looks much larger than a ball on the table"
     assert look().too_large == 0 and _remark(look(), "eye") == ""
 
@@ -258,7 +258,7 @@ def test_red_thing_above_the_horizon_has_no_place_on_the_table(height: int, dept
         found = detector.detect(picture, camera)
     else:
         found = detector.detect_in_depth(picture, np.full(picture.shape[:2], depth, np.float32), camera)
-    assert found == [] and markers(found, AROUND, 0, odd=detector.odd).markers == []
+    assert found == [] and markers(found, AROUND, 0, odd=detector.outliers).markers == []
 
 
 def test_what_is_odd_is_rejected_with_the_reason_of_the_detector() -> None:
@@ -266,7 +266,7 @@ def test_what_is_odd_is_rejected_with_the_reason_of_the_detector() -> None:
     validation = Validation(AROUND, Anywhere())  # type: ignore[arg-type]
     told = []
     for k in range(10):
-        verdict = validation.judge(markers([], AROUND, 1 + k * 100_000_000, odd=detector.odd), CAMERA)
+        verdict = validation.validate(markers([], AROUND, 1 + k * 100_000_000, odd=detector.outliers), CAMERA)
         assert verdict.targets == [] and [why for _, why in verdict.refused] == [NOT_ROUND]
         told.append([one.reason for one in verdict.rejections])
     assert [reasons for reasons in told if reasons] == [[NOT_ROUND]] and told[0] == [], "not what falls past"

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from applications.pick_place.contact_check import Recheck, Recording
+from applications.pick_place.contact_check import ContactCheck, RecordedMotion
 from common.application import find_application
 from common.config import load_cell
 from common.messages import GripperState, Header, JointState, Pose, PoseArray, Vector3
@@ -23,8 +23,8 @@ SECOND = 1_000_000_000
 
 
 @cache
-def recheck() -> Recheck:
-    return Recheck(CELL)
+def recheck() -> ContactCheck:
+    return ContactCheck(CELL)
 
 
 def at(x: float, y: float, z: float) -> Array:
@@ -52,23 +52,23 @@ def fingers(second: float, name: str, *, holding: bool) -> GripperState:
 
 def test_way_through_a_ball_touches_it_then() -> None:
     joints = arm(at(0.5, -0.25, 0.04), at(0.5, -0.25, 0.3), at(0.5, -0.25, 0.04), at(0.5, 0.1, 0.04))
-    contacts = recheck().contacts(Recording(joints, [], [truth(0, "table", *BALL)]))
+    contacts = recheck().contacts(RecordedMotion(joints, [], [truth(0, "table", *BALL)]))
     assert {(contact.time, contact.pair[1]) for contact in contacts} == {(2.0, "ball")}  # one finger after the other
 
 
 @pytest.mark.parametrize("label", ["falling", "elsewhere"])
 def test_way_over_a_ball_or_where_none_lies_touches_nothing(label: str) -> None:
     high = arm(at(0.5, -0.2, 0.2), at(0.5, 0.2, 0.2))
-    assert recheck().contacts(Recording(high, [], [truth(0, "table", *BALL)])) == []
+    assert recheck().contacts(RecordedMotion(high, [], [truth(0, "table", *BALL)])) == []
     low = arm(at(0.5, -0.2, 0.04), at(0.5, 0.0, 0.04))
-    assert recheck().contacts(Recording(low, [], [truth(0, label, *BALL)])) == []
+    assert recheck().contacts(RecordedMotion(low, [], [truth(0, label, *BALL)])) == []
 
 
 def test_way_into_the_table_or_the_box_touches_it() -> None:
     balls = [truth(0, "elsewhere", 0, 0, -0.7)]
     for low, high, name in ((at(0.5, 0.0, -0.02), at(0.5, 0.0, 0.2), "table"),
                             (at(0.55, 0.17, 0.03), at(0.55, 0.17, 0.3), "box_wall_right")):
-        contacts = recheck().contacts(Recording(arm(high, low), [], balls))
+        contacts = recheck().contacts(RecordedMotion(arm(high, low), [], balls))
         assert [contact.pair[1] for contact in contacts] == [name]
 
 
@@ -76,13 +76,13 @@ def test_ball_that_is_taken_lifts_off_the_table_with_the_hand_and_may_touch_it_o
     down, up, across = at(0.5, 0.0, 0.03), at(0.5, 0.0, 0.2), at(0.5, -0.3, 0.2)
     taken = [truth(0, "table", *BALL), truth(1, "held", *BALL)]
     grips = [fingers(1, "close", holding=True)]
-    assert recheck().contacts(Recording(arm(up, down, up, across), grips, taken)) == []
+    assert recheck().contacts(RecordedMotion(arm(up, down, up, across), grips, taken)) == []
     dragged = arm(up, down, at(0.5, -0.15, 0.025), across)
-    assert {c.pair for c in recheck().contacts(Recording(dragged, grips, taken))} == {("ball", "table")}
+    assert {c.pair for c in recheck().contacts(RecordedMotion(dragged, grips, taken))} == {("ball", "table")}
 
 
 def test_what_is_repeated_counts_once() -> None:
-    recording = Recording()
+    recording = RecordedMotion()
     fold = RunAggregator("panda", find_application("pick_place"), listeners=recording.listeners())
     for second in (0, 0, 1):
         fold.on("scene_balls", truth(second, "table", *BALL), 0.0, 0)

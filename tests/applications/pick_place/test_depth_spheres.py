@@ -51,7 +51,7 @@ def look(things: list[WorldObject], noise: float = 0.0) -> tuple[Detector, np.nd
 @pytest.mark.parametrize(("noise", "most"), [(0.0, 0.001), (0.002, 0.005)])
 def test_balls_are_found_where_they_are_stacked_or_not(name: str, noise: float, most: float) -> None:
     detector, found = look([thing(at) for at in LAYOUTS[name]], noise)
-    assert len(found) == len(LAYOUTS[name]) and detector.odd == []
+    assert len(found) == len(LAYOUTS[name]) and detector.outliers == []
     assert all(np.linalg.norm(found - np.array(at), axis=1).min() < most for at in LAYOUTS[name])
 
 
@@ -65,7 +65,7 @@ def test_one_that_is_hidden_below_another_is_found_once_that_is_gone() -> None:
 
 def test_cube_is_reported_and_is_no_ball() -> None:
     detector, found = look([thing((0.5, -0.1, 0.025), "box", 0.05, 0.05, 0.05), thing((0.3, 0.1, R))])
-    assert len(found) == 1 and [one.reason for one in detector.odd] == [NOT_ROUND]
+    assert len(found) == 1 and [one.reason for one in detector.outliers] == [NOT_ROUND]
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.002])
@@ -76,7 +76,7 @@ def test_cube_is_reported_and_is_no_ball() -> None:
 ])
 def test_what_is_flat_is_reported_and_is_no_ball(shape: str, size: tuple[float, float, float], noise: float) -> None:
     detector, found = look([thing((0.4, 0.0, size[2] / 2), shape, *size), thing((0.3, 0.2, R))], noise)
-    assert len(found) == 1 and [one.reason for one in detector.odd] == [NOT_ROUND]
+    assert len(found) == 1 and [one.reason for one in detector.outliers] == [NOT_ROUND]
 
 
 def test_balls_on_a_large_red_cloth_are_found_and_no_more_is_tried_than_it_takes(
@@ -95,16 +95,16 @@ def test_what_is_odd_without_depth_is_told_again_after_a_look_with_it() -> None:
     view = Renderer(AROUND, camera=CAMERA).render([thing(at) for at in PYRAMID])
     detector = Detector(AROUND)
     detector.detect(view.colour, CAMERA)
-    without = detector.odd
+    without = detector.outliers
     detector.detect_in_depth(view.colour, view.depth_within(0.1, 2.0), CAMERA)
-    assert without and not detector.odd
+    assert without and not detector.outliers
     detector.detect(view.colour, CAMERA)
-    assert detector.odd == without
+    assert detector.outliers == without
 
 
 def test_nothing_red_gives_nothing() -> None:
     detector, found = look([])
-    assert len(found) == 0 and detector.odd == [] and detector.blind == ""
+    assert len(found) == 0 and detector.outliers == [] and detector.blind == ""
 
 
 def test_the_upper_one_is_taken_first_whatever_lies_nearer() -> None:
