@@ -14,8 +14,8 @@ from common.perception.depth import point_cloud
 from common.perception.depth_drivers import CameraLost, DepthSource, find_camera_driver, require_frame_shape
 from common.perception.image import array_to_image
 from common.perception.pinhole import Pinhole, camera_in_mount
-from common.process.reopening import Gone, Reopening, keep_open
 from common.process.service import main
+from common.process.timing import DeviceGone, Reopening, run_with_reopening
 from common.transport.bus import Bus
 
 CLOSING = 5.0  # [s] timeout for closing a camera
@@ -39,7 +39,7 @@ async def run(bus: Bus, config: Config) -> None:
     requested, frame = config.world.camera, config.world.camera.frame
     await bus.ready()
 
-    async def send(camera: DepthSource) -> Gone:
+    async def send(camera: DepthSource) -> DeviceGone:
         """Publish frames until the camera is lost."""
         loop, sent, last, newest = asyncio.get_running_loop(), 0, -math.inf, 0
         lens = camera.lens
@@ -48,7 +48,7 @@ async def run(bus: Bus, config: Config) -> None:
             try:
                 shot = await asyncio.to_thread(camera.read)
             except CameraLost as error:
-                return Gone(f"camera {config.driver}: {error}", sent)
+                return DeviceGone(f"camera {config.driver}: {error}", sent)
             require_frame_shape(shot, lens, field, config.driver)
             since = (loop.time() - last) * config.rate  # periods since the last frame was due
             if since < 0.5:
@@ -66,12 +66,12 @@ async def run(bus: Bus, config: Config) -> None:
                 points.put(point_cloud(shot.colour, shot.depth, pinhole, header))
             sent += 1
 
-    async def open_and_send() -> Gone:
+    async def open_and_send() -> DeviceGone:
         try:
             size = (requested.width, requested.height)
             camera = await asyncio.to_thread(driver.open_camera, options, size, config.rate)
         except CameraLost as error:
-            return Gone(f"camera {config.driver}: {error}")
+            return DeviceGone(f"camera {config.driver}: {error}")
         # Not closed on cancellation: a thread may still wait for a frame in `read`.
         lost = await send(camera)
         try:
@@ -81,7 +81,7 @@ async def run(bus: Bus, config: Config) -> None:
             bus.log.warning("camera %s does not close after it was lost", config.driver)
         return lost
 
-    await keep_open(open_and_send, config, bus.log)
+    await run_with_reopening(open_and_send, config, bus.log)
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ from common import topics
 from common.clock import Clock
 from common.config import load_cell, service_config
 from common.kept_file import STANDING_VARIABLE
-from common.process import task_memory
+from common.process import task_runner
 from common.process.in_process import running_service
 from common.process.task_runner import run_task
 from common.transport.bus import Bus
@@ -117,7 +117,7 @@ async def test_what_a_task_knows_of_what_it_let_go_outlives_it(damaged, monkeypa
     kept.write_text(damaged)
     async with running_service(LocalNetwork(), run, CONFIG, name="smart_pick_place"):
         assert tasks[2].memory == ReleasePositions()
-    assert f"what was done before is not known: {kept} cannot be read: it is damaged" in caplog.text
+    assert f"the memory of the task is lost: {kept} cannot be read: it is damaged" in caplog.text
 
 
 async def test_memory_that_a_task_begins_with_stays_where_none_was_kept_and_is_written_as_soon_as_it_can_be(
@@ -126,7 +126,7 @@ async def test_memory_that_a_task_begins_with_stays_where_none_was_kept_and_is_w
     in_the_way = tmp_path / "standing"
     in_the_way.write_text("no folder")
     monkeypatch.setenv(STANDING_VARIABLE, str(in_the_way / "cell"))
-    monkeypatch.setattr(task_memory, "SAVE_AGAIN", 0.01)
+    monkeypatch.setattr(task_runner, "SAVE_RETRY", 0.01)
     begun, later = ReleasePositions(places=[(0.5, 0.2, 0.095)]), ReleasePositions(places=[(0.5, 0.3, 0.035)])
     tasks: list[PickPlace] = []
 

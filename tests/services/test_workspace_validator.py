@@ -15,8 +15,8 @@ from common.config import Grasp, Surroundings, load_cell
 from common.messages import Header, Marker, MarkerArray, Pose, TFMessage, TransformStamped, Vector3
 from common.perception.pinhole import Pinhole
 from common.process.in_process import running_service
-from common.process.wiring import wiring
 from common.robot.transforms import matrix_to_pose
+from common.supervision.wiring import wiring
 from common.transport.local import LocalNetwork
 from services.workspace_validator import Config, run
 
