@@ -20,7 +20,7 @@ from common.messages import JointState, PlanningScene
 from common.planning.collision import CollisionWorld
 from common.planning.obstacles import ObstacleCache
 from common.planning.robot_geometry import RobotGeometry
-from common.process.persist import persist
+from common.process.timing import call_until_answered
 from common.robot.model import RobotModel
 from common.topics import Request, Topic
 from common.transport.reader import Reader
@@ -245,7 +245,7 @@ def _started(task: m.TaskStatus | None, motion: m.MotionStatus | None) -> bool:
 
 async def _insist(bus: SimulatedBus, request: Request[Any, Any], message: m.Message) -> None:
     """Ask until there is an answer, whatever it is."""
-    await persist(bus.client(request), message, PERSON_TIMEOUT, lambda error: None, lambda problem: None)
+    await call_until_answered(bus.client(request), message, PERSON_TIMEOUT, lambda error: None, lambda problem: None)
 
 
 class ClearanceCheck:

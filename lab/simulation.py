@@ -28,7 +28,7 @@ from common.kept_file import STATE_VARIABLE
 from common.messages import SupervisorStatus, TaskStatus
 from common.sources import drawn_from
 from common.supervision.launch import Launch
-from common.supervision.operation import supervise
+from common.supervision.lifecycle import supervise
 from common.supervision.supervisor import Supervisor
 from common.transport.bus import Bus
 from common.transport.codec import decode, decode_attachment
@@ -219,7 +219,7 @@ class Simulation:
         supervisor = Supervisor(self.cell, launch, lambda name, line: self._say(line), make_child=make_child)
         # Which is put only while somebody listens.
         bus.raw_subscriber(f"{self.cell.name}/{topics.LOG.expression}", lambda sample: None)
-        supervisor.begin()
+        supervisor.start()
         ready = asyncio.Event()
 
         async def work(_bus: Bus) -> None:
