@@ -66,7 +66,7 @@ def test_a_camera_on_the_hand_sees_what_it_sees_from_home(monkeypatch: pytest.Mo
     statuses = [SimpleNamespace(name=entry.name, pid=1) for entry in cell.services.values()]
     bus: Any = SimpleNamespace(clock=SimpleNamespace(speed=1.0))
     supervisor: Any = SimpleNamespace(statuses=statuses)
-    agent.chaos_in(bus, cell, supervisor, all_topics(), 1, 6.0, until_ended=True)
+    agent.create_chaos(bus, cell, supervisor, all_topics(), 1, 6.0, until_ended=True)
     assert may(SlipGate(worlds[0]), 0.40, -0.05) and not may(SlipGate(worlds[0]), 0.40, -0.60)
 
 
