@@ -8,7 +8,7 @@ from common.config import load_cell
 from common.errors import ConfigError
 from lab.campaign import run_seeds
 from lab.faults import SKEW, SPEEDS, make_plan
-from lab.observed_arm import with_observed_arm
+from lab.observers import with_observed_arm
 from lab.simulation import LIMIT, Outcome, Simulation
 from tests.simulated.known_bugs import BUGS, RARE, found_within
 
