@@ -18,7 +18,7 @@ from typing import Any
 import msgpack
 from mcap.reader import make_reader
 
-from applications.pick_place.recheck import Recheck, Recording
+from applications.pick_place.contact_check import Recheck, Recording
 from common.application import find_application
 from common.config import load_cell
 from common.transport.codec import decode

@@ -17,7 +17,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from applications.pick_place.recheck import Contact, Recheck, Recording
+from applications.pick_place.contact_check import Contact, Recheck, Recording
 from common.application import find_application
 from common.config import load_cell
 from common.transport.bus import Bus

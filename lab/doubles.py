@@ -16,12 +16,10 @@ from common import topics
 from common.application import find_application
 from common.config import Cell, Motion, Parameters, RobotConfig, ServiceEntry
 from common.errors import ConfigError, Refused
-from common.planning.free_axes import chooses, solve_in
-from common.planning.ik import solve_ik
-from common.planning.pipeline import trajectory_message
+from common.planning.ik import controls_full_pose, solve_ik, solve_region_ik
 from common.planning.planners.joint_move import straight_profile
 from common.planning.problem import Region
-from common.planning.retiming import TimedPath, join
+from common.planning.trajectory import TimedPath, join, trajectory_message
 from common.robot.model import RobotModel
 from common.robot.transforms import pose_to_matrix
 from common.transport.bus import Bus
@@ -96,11 +94,11 @@ def waypoints(robot: RobotModel, start: Array, goal: object) -> list[Array]:
     found = [start]
     for pose in poses:
         T = pose_to_matrix(pose)
-        if chooses(robot) or not isinstance(goal, m.PoseGoal):
+        if controls_full_pose(robot) or not isinstance(goal, m.PoseGoal):
             q = solve_ik(robot, T, found[-1])
         else:
             region = Region(T, np.zeros(3), goal.tilt_tolerance, goal.yaw_tolerance)
-            q = solve_in(robot, region, found[-1], restarts=20)
+            q = solve_region_ik(robot, region, found[-1], restarts=20)
         if q is None:
             raise Refused("no_ik", f"({pose.position.x:.3f}, {pose.position.y:.3f}, {pose.position.z:.3f}) is out of "
                                    "reach")

@@ -225,7 +225,7 @@ class FaultInjector:
         """Put damaged messages and nonsense under every key, and send nonsense requests."""
         host, random = self._host, self._random
         bus = SimulatedBus(session, STRANGER, host.cell.name, host.clock, host.requests)
-        known = {**topics.platform_topics(), **find_application(host.cell.application).topics}
+        known = {**topics.platform_topics(), **find_application(host.cell.application).topics_by_key}
         keys = [key for key in known if topics.SERVICE not in key]
         bad = [
             BadMessages(0.0, "corrupt", key, form=FORMS[int(random.integers(len(FORMS)))],

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from common import topics
-from common.application import all_topics, bring_in
+from common.application import all_topics, import_topics
 from common.config import Cell
 from common.errors import DecodeError
 from common.messages import SupervisorStatus
@@ -153,7 +153,7 @@ class CustomTopics:
 
     def topics(self) -> dict[str, Any]:
         """Every topic by its key before it is renamed; the messages of all modules are known from now on."""
-        return {**all_topics(), **bring_in(self.modules)}
+        return {**all_topics(), **import_topics(self.modules)}
 
     def kinds(self, known: Mapping[str, Any]) -> dict[str, str]:
         """Kinds of topics by key in the cell."""

@@ -105,7 +105,7 @@ def convert(message: Message) -> tuple[str, dict[str, Any]]:
 @cache
 def _kinds() -> list[Kind]:
     """Those of applications first: their messages derive from what any message may be."""
-    own = [kind for found in applications() for kind in found.find("recording", "FOXGLOVE") or ()]
+    own = [kind for found in applications() for kind in found.foxglove or ()]
     return [*own, *KINDS]
 
 

@@ -7,12 +7,17 @@ import asyncio
 import cv2
 from pydantic import Field
 
+from applications.outlining.contour_choice import Following, NoSuchContour, annotate_contours, parse_choice
 from applications.outlining.contours import ContourOptions, Picture, find_contours
-from applications.outlining.contours_choice import NoSuchContour, parse_choice
-from applications.outlining.contours_drawing import annotate_contours
-from applications.outlining.contours_following import Following
-from applications.outlining.messages import Contour, Contours, OutlineSelect, OutlineSelection
-from applications.outlining.topics import CONTOUR_IMAGE, CONTOURS, OUTLINE_SELECT
+from applications.outlining.topics import (
+    CONTOUR_IMAGE,
+    CONTOURS,
+    OUTLINE_SELECT,
+    Contour,
+    Contours,
+    OutlineSelect,
+    OutlineSelection,
+)
 from common import topics
 from common.errors import ConfigError, Refused
 from common.messages import Image

@@ -5,10 +5,8 @@ from __future__ import annotations
 import asyncio
 from collections import deque
 
-from applications.outlining.messages import Contours
-from applications.outlining.perceived_solids import perceived_solids
-from applications.outlining.scene import planning_scene, require_apart
-from applications.outlining.topics import CONTOURS
+from applications.outlining.solids import perceived_solids, planning_scene, require_apart
+from applications.outlining.topics import CONTOURS, Contours
 from common import topics
 from common.config import Parameters, RobotConfig, Surroundings
 from common.messages import Image, PlanningScene

@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from applications.pick_place.perceived import PerceivedScene
-from applications.pick_place.tracks import SceneParameters
-from applications.pick_place.views import Seen, Views, ViewsParameters
+from applications.pick_place.detections import Seen, Views, ViewsParameters
+from applications.pick_place.perceived_scene import PerceivedScene, SceneParameters
 from common import topics
 from common.config import RobotConfig, Surroundings
 from common.errors import ConfigError

@@ -11,11 +11,10 @@ from functools import lru_cache
 import cv2
 from pydantic import Field
 
-from applications.pick_place.annotation import annotate
-from applications.pick_place.detector import Detection, Detector, DetectorOptions, rehearse
-from applications.pick_place.odd import Odd
+from applications.pick_place.detector import Detection, Detector, DetectorOptions, annotate, rehearse
+from applications.pick_place.outliers import Odd
+from applications.pick_place.perceived_scene import Place
 from applications.pick_place.topics import DETECTED_OBJECTS, DETECTION_IMAGE, DETECTION_MASK
-from applications.pick_place.tracks import Place
 from common import topics
 from common.config import Surroundings
 from common.config.basics import Rgb

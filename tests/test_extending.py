@@ -322,14 +322,14 @@ def test_task_of_one_file_goes_on_with_what_is_in_the_hand(folder: Path) -> None
     assert (plan.goal.pose.position.x, plan.goal.pose.position.y) == config.to
 
 
-def test_application_that_is_no_module_or_has_no_status_is_refused_by_name(
+def test_application_that_is_no_module_or_declares_none_is_refused_by_name(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(folder)
     with pytest.raises(ConfigError, match=r"application: 'my_pkg\.move_ball' cannot be imported"):
         load_cell("cube.yaml", ["application=my_pkg.move_ball"])
-    with pytest.raises(ConfigError, match="is no application: its topics have no STATUS"):
-        _ = find_application("my_pkg.over_home").status
+    with pytest.raises(ConfigError, match="is no application: the module has no APPLICATION"):
+        find_application("my_pkg.over_home")
 
 
 def start(line: str, folder: Path, env: dict[str, str]) -> subprocess.Popen[str]:

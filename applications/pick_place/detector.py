@@ -1,7 +1,8 @@
-"""Find balls of known size and colour in a picture."""
+"""Find balls of known size and color in an image."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, NamedTuple
 
@@ -10,21 +11,9 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field, model_validator
 
-from applications.pick_place.blobs import (
-    Blob,
-    Mask,
-    Outline,
-    Traced,
-    all_of,
-    find_blobs,
-    long_ones,
-    middles,
-    small_blobs,
-)
-from applications.pick_place.depth_balls import find_in_depth
-from applications.pick_place.fit import Fit, fit_each, fit_spheres
-from applications.pick_place.masks import Colours, Masks, RedMasks
-from applications.pick_place.odd import (
+from applications.pick_place.ball_places import Resting, is_table, shows_table
+from applications.pick_place.depth_spheres import find_in_depth
+from applications.pick_place.outliers import (
     BELOW,
     BLURRED,
     COVERED,
@@ -42,8 +31,21 @@ from applications.pick_place.odd import (
     sized,
     unlike,
 )
-from applications.pick_place.resting import Resting, is_table, shows_table
-from applications.pick_place.separation import separate
+from applications.pick_place.segmentation import (
+    Blob,
+    Colours,
+    Mask,
+    Masks,
+    Outline,
+    RedMasks,
+    Traced,
+    all_of,
+    find_blobs,
+    long_ones,
+    middles,
+    small_blobs,
+)
+from applications.pick_place.sphere_fit import Fit, fit_each, fit_spheres, separate
 from common.config import CameraConfig, Parameters, Surroundings, Tunable
 from common.perception.depth import Depth
 from common.perception.illumination import BoolMask, blank_image_reason, blue_share, looked_at
@@ -428,3 +430,20 @@ def rehearse(surroundings: Surroundings, options: DetectorOptions) -> None:
     for outline in silhouettes(camera, places, radius, 32):
         cv2.fillConvexPoly(picture, np.rint(outline).astype(np.int32), (0, 0, 255))
     detector.detect(picture, camera)
+
+
+WHOLE, PARTIAL = (0, 255, 0), (0, 200, 255)
+
+
+def annotate(picture: Picture, detections: Sequence[Detection]) -> Picture:
+    """A copy of the bgr8 picture with the outline, the centre and the place [m] of each detection."""
+    shown = picture.copy()
+    for d in detections:
+        color = PARTIAL if d.partial else WHOLE
+        points = np.rint(np.clip(d.outline, -4000, 20000) * 16).astype(np.int32)
+        cv2.polylines(shown, [points], True, color, 1, cv2.LINE_AA, 4)
+        u, v = (round(value) for value in d.pixel)
+        cv2.drawMarker(shown, (u, v), color, cv2.MARKER_CROSS, 9, 1)
+        label = f"{d.position[0]:.3f} {d.position[1]:+.3f}{' partial' if d.partial else ''}"
+        cv2.putText(shown, label, (u - 40, v - 26), cv2.FONT_HERSHEY_SIMPLEX, 0.35, (0, 0, 0), 1, cv2.LINE_AA)
+    return shown

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from applications.pick_place.perceived import PerceivedScene
+from applications.pick_place.perceived_scene import PerceivedScene, SceneParameters
 from applications.pick_place.topics import VALIDATED_TARGETS
-from applications.pick_place.tracks import SceneParameters
 from common import topics
 from common.config import RobotConfig, Surroundings, Tunable
 from common.errors import ConfigError
@@ -17,8 +16,6 @@ from common.process.planning_scene import SceneWriter
 from common.robot.model import RobotModel
 from common.transport.bus import Bus
 
-REPLACES = ("camera_simulator", "vision_detector", "workspace_validator", "scene_manager")
-SETTINGS = ("world.count=1", "motion.velocity_scaling=0.6", "motion.acceleration_scaling=1.0")
 WORLD = "world"
 
 

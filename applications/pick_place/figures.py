@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from recording.report.history import RunHistory
 
 
-class Figures(application.Figures):
+class PickPlaceFigures(application.Figures):
     """Those of every run, and what was detected and offered as a target."""
 
     COUNTED = "placed"

@@ -14,6 +14,7 @@ from applications.pick_place.topics import (
 )
 from common.messages import TaskStatus
 from common.topics import Topic
+from page.application import ApplicationPage
 from page.labels import Labels
 from page.layers import Layer
 from page.nodes import FLAT, Markers, points_of, ring
@@ -21,9 +22,6 @@ from page.rejections import Place, RejectedPlaces
 
 if TYPE_CHECKING:
     import viser
-
-STATES = {"GRASPING": "Taking", "PLACING": "Placing"}
-LATENCY = "Picture to targets"
 
 TARGET = (70, 220, 110)
 REJECTED = (255, 90, 200)
@@ -112,3 +110,9 @@ class Workspace(Layer):
     def show(self, topic: Topic[Any], message: Any) -> None:
         """Show these shapes and no others."""
         self.markers.show(message)
+
+
+PAGE = ApplicationPage(
+    layers=(Targets, Rejected, Workspace), states={"GRASPING": "Taking", "PLACING": "Placing"},
+    latency="Picture to targets", counters=counters,
+)

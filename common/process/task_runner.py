@@ -15,7 +15,7 @@ from common.process.task_memory import Memory
 from common.robot.model import RobotModel
 from common.robot.transforms import matrix_to_pose
 from common.sources import monotonic, new_id
-from common.tasks.deciding import TaskConfig
+from common.tasks.decisions import TaskConfig
 from common.tasks.engine import Task
 from common.tasks.stages import Command, View, without_far
 from common.tasks.watchdogs import LOOK_PERIOD, LivenessWatchdog

@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 from common import messages as m
-from common.tasks.deciding import Deciding, V
+from common.tasks.decisions import Deciding, V
 from common.tasks.stages import MISSES, Command, Execution, Grip, Look, Move, Report, Stage
 
 # Refusals that have nothing to do with the motion.

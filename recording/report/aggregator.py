@@ -48,7 +48,7 @@ class RunAggregator:
         """
         self.figures: Figures = figures_of(application)(robot, pictured=gathering is not None)
         self.summary = Summary(cell, seed, speed, self.figures, containers,
-                               fills=application is not None and application.fills)
+                               fills=application is not None and application.fills_containers)
         self.gathering = gathering
         self.status: TaskStatus | None = None
         self._topics: dict[str, Topic[Any]] = {}
@@ -56,10 +56,11 @@ class RunAggregator:
         summary = self.summary
         if application is not None:
             self._hear(application.status, self._on_status)
-            decided_by, rejected = (application.find("topics", name) for name in ("DECIDED_BY", "REJECTED"))
-            if isinstance(decided_by, Topic):
+            assert application.topics is not None
+            decided_by, rejected = application.topics.decided_by, application.topics.rejected
+            if decided_by is not None:
                 self._hear(decided_by, self._on_decided)
-            if isinstance(rejected, Topic):
+            if rejected is not None:
                 self._hear(rejected, summary.on_rejections)
                 if gathering is not None:
                     self._hear(rejected, gathering.on_rejections)

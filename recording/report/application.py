@@ -30,7 +30,7 @@ class Section(NamedTuple):
 class Figures:
     """What is said of a run where its application says nothing else.
 
-    An application derives from it, in its part `figures`, a class of this name, and says only what differs.
+    An application names a subclass as `Application.figures` and overrides only what differs.
     """
 
     COUNTED: ClassVar[str] = "done"  # what became of that which a task counts
@@ -51,7 +51,7 @@ class Figures:
         return {}
 
     def exposed(self, message: Any) -> int:
-        """Stamp [ns] of the picture by which a message of DECIDED_BY was decided; 0 for none."""
+        """Stamp [ns] of the picture by which a message of `decided_by` was decided; 0 for none."""
         return int(message.header.stamp)
 
     def blocks(self) -> dict[str, Any]:
@@ -89,7 +89,7 @@ class Figures:
 
 def figures_of(application: Application | None) -> type[Figures]:
     """The class with which an application tells of its runs."""
-    found = application.find("figures", "Figures") if application else None
+    found = application.figures if application else None
     return found if isinstance(found, type) and issubclass(found, Figures) else Figures
 
 

@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
-from applications.outlining.messages import OutlinePoints, OutlineStatus
-from applications.pick_place.messages import PickPlaceStatus
+from applications.outlining.topics import OutlinePoints, OutlineStatus
+from applications.pick_place.topics import PickPlaceStatus
 from cli.main import app
 from common import messages as m
 from common.transport.codec import encode
@@ -232,11 +232,13 @@ def test_an_outline_is_compared_with_what_was_traced(tmp_path):
 def test_an_application_of_ones_own_is_told_of_in_its_own_words(tmp_path, monkeypatch):
     (tmp_path / "own_words").mkdir()
     (tmp_path / "own_words" / "polish.py").write_text(
-        "from common import messages as m\nfrom recording.report import application\n"
+        "from common import messages as m\nfrom common.application import Application, ApplicationTopics\n"
+        "from recording.report import application\n"
         "from common.topics import Topic\n\n"
         "class PolishStatus(m.TaskStatus):\n    pass\n\n"
         'STATUS = Topic("polish_status", PolishStatus, "state", "how smooth it is")\n\n'
-        'class Figures(application.Figures):\n    COUNTED = "polished"\n'
+        'class Figures(application.Figures):\n    COUNTED = "polished"\n\n'
+        "APPLICATION = Application(topics=ApplicationTopics(status=STATUS), figures=Figures)\n"
     )
     (tmp_path / "cell.yaml").write_text(
         "cell: shop\nrobot: panda\nworld: balls\npipeline: lerp\napplication: own_words.polish\n"

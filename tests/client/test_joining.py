@@ -9,8 +9,7 @@ from typing import Any
 
 import pytest
 
-from applications.pick_place.messages import PickPlaceStatus
-from applications.pick_place.topics import PICK_PLACE_STATUS
+from applications.pick_place.topics import PICK_PLACE_STATUS, PickPlaceStatus
 from common.client import joining
 from common.client.cell import Cell
 from common.client.hearing import NothingHeard
@@ -152,7 +151,9 @@ async def test_task_of_an_application_of_ones_own_is_heard_when_its_module_is_na
 ) -> None:
     monkeypatch.syspath_prepend(tmp_path)
     (tmp_path / "own").mkdir()
-    (tmp_path / "own" / "application.py").write_text(f"from {__name__} import OWN as STATUS\n")
+    (tmp_path / "own" / "application.py").write_text(
+        f"from common.application import Application, ApplicationTopics\nfrom {__name__} import OWN\n"
+        "APPLICATION = Application(topics=ApplicationTopics(status=OWN))\n")
 
     async def tells(bus: Bus, config: None) -> None:
         out = bus.writer(OWN)

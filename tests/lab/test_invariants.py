@@ -117,8 +117,10 @@ def test_application_judges_the_truth_when_its_task_says_done_and_not_before(tmp
     (tmp_path / "judging").mkdir()
     (tmp_path / "judging" / "task.py").write_text(
         "from common.messages import TaskStatus\nfrom common.topics import Topic\n"
+        "from common.application import Application, ApplicationTopics\n"
         "STATUS = Topic('judging_status', TaskStatus, 'state', '')\n"
-        "def wrong_in(truth):\n    return ', '.join(thing.id for thing in truth.objects)\n")
+        "def misplaced(truth):\n    return ', '.join(thing.id for thing in truth.objects)\n"
+        "APPLICATION = Application(topics=ApplicationTopics(status=STATUS), truth_check=misplaced)\n")
     monkeypatch.syspath_prepend(tmp_path)
     cell = load_cell("panda").model_copy(update={"application": "judging.task"})
     for state, broken in (("ERROR", False), ("DONE", True)):

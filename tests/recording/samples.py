@@ -9,7 +9,7 @@ from pathlib import Path
 import msgpack
 import pytest
 
-from applications.pick_place.messages import PickPlaceStatus
+from applications.pick_place.topics import PickPlaceStatus
 from common.messages import Header, JointState, Message
 from recording import writer
 from recording.sample import Sample

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from applications.outlining.messages import OutlinePoints
-from applications.pick_place.messages import PickPlaceStatus
+from applications.outlining.topics import OutlinePoints
+from applications.pick_place.topics import PickPlaceStatus
 from common import messages as m
 from common.messages import Header, Image, Message, Pose, Quaternion, Vector3
 from common.perception.image import array_to_image

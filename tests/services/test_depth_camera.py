@@ -25,7 +25,7 @@ from common.perception.depth import depth_of
 from common.perception.depth_drivers import RgbdFrame
 from common.perception.image import image_to_array
 from common.perception.pinhole import Pinhole
-from common.planning.seeing import cloud_points
+from common.planning.camera_obstacles import cloud_points
 from common.process.in_process import running_service
 from common.process.wiring import wiring
 from common.sim.interface import load_world

@@ -8,7 +8,7 @@ import contextlib
 import sys
 from unittest.mock import patch
 
-from applications.pick_place.perceived import PerceivedScene
+from applications.pick_place.perceived_scene import PerceivedScene
 from common import topics
 from common.config import load_cell
 from common.control.controller import TrajectoryController

@@ -6,8 +6,7 @@ import asyncio
 
 import pytest
 
-from applications.pick_place.messages import PickPlaceStatus
-from applications.pick_place.topics import PICK_PLACE_STATUS
+from applications.pick_place.topics import PICK_PLACE_STATUS, PickPlaceStatus
 from common import topics
 from common.client.operator_motion import MotionFailed, OperatorMotion
 from common.errors import RemoteError

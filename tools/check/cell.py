@@ -64,9 +64,10 @@ def check_files(cell: Cell) -> list[Finding]:
         seen = seen_from_home(cell)
     except ConfigError as told:
         return [*of_robot, refusal(told)]
+    checks = find_application(cell.application).checks
     place = " from home" if cell.world.on_hand else ""
     return [*of_robot, *_each(lambda: check_world(seen, find_application(cell.application), place)),
-            *_of_application(seen, "quick")]
+            *_of_application(checks.quick if checks else None, seen)]
 
 
 def seen_from_home(cell: Cell, robot: RobotModel | None = None) -> Cell:
@@ -93,14 +94,12 @@ def check_model(cell: Cell) -> Iterator[Finding]:
         yield refusal(told)
         return
     yield from arm.check_poses()
-    found = find_application(cell.application).find("checks", "reach")
-    if found is not None:
-        yield from _each(lambda: found(seen_from_home(cell, arm.robot), arm))
+    checks = find_application(cell.application).checks
+    yield from _of_application(checks.reach if checks else None, seen_from_home(cell, arm.robot), arm)
 
 
-def _of_application(cell: Cell, name: str) -> list[Finding]:
-    found = find_application(cell.application).find("checks", name)
-    return [] if found is None else _each(lambda: found(cell))
+def _of_application(check: Callable[..., Iterator[Finding]] | None, *args: object) -> list[Finding]:
+    return _each(lambda: check(*args)) if check is not None else []
 
 
 def _each(look: Callable[[], Iterator[Finding]]) -> list[Finding]:

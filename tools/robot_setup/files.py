@@ -158,7 +158,7 @@ def world_layout(template: str) -> Layout:
         ConfigError: it lays out none by reach.
     """
     application = find_application(load_cell(template).application)
-    layout: Layout | None = application.find("reach", "fitted")
+    layout: Layout | None = application.fit_world
     if layout is None:
         raise ConfigError("--like", template, f"is for {application.name}, which lays out no world by reach")
     return layout

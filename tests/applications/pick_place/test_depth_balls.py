@@ -8,10 +8,10 @@ import itertools
 import numpy as np
 import pytest
 
-from applications.pick_place import depth_balls
+from applications.pick_place import depth_spheres as depth_balls
 from applications.pick_place.choice import Choice, Target, lies_below
 from applications.pick_place.detector import Detector
-from applications.pick_place.odd import NOT_ROUND
+from applications.pick_place.outliers import NOT_ROUND
 from common import messages as m
 from common.config import Surroundings, load_cell
 from common.messages import Color, Pose, Vector3, WorldObject

@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from applications.pick_place.annotation import annotate
-from applications.pick_place.detector import Detector, DetectorOptions, rehearse
+from applications.pick_place.detector import Detector, DetectorOptions, annotate, rehearse
 from common.config import Container, Surroundings
 from common.perception.pinhole import Pinhole
 from common.perception.sphere import ray_distances, silhouette, sphere_in_view

@@ -7,10 +7,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from applications.pick_place.perceived import PerceivedScene
-from applications.pick_place.region import MOST_HIDDEN, Region, looking_poses
-from applications.pick_place.remembered import HIDDEN, Remembered
-from applications.pick_place.tracks import SceneParameters, Sighting, Tracks
+from applications.pick_place.ball_places import MOST_HIDDEN, Region, looking_poses
+from applications.pick_place.detections import HIDDEN, Remembered
+from applications.pick_place.perceived_scene import PerceivedScene, SceneParameters, Sighting, Tracks
 from common import messages as m
 from common.config import Surroundings, load_cell
 from common.perception.occlusion import Occlusion, RobotSilhouettes

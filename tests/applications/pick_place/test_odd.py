@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 import pytest
 
+from applications.pick_place.detections import Validation
 from applications.pick_place.detector import Detector, DetectorOptions
-from applications.pick_place.odd import COVERED, FLAT, NOT_ROUND, THIN
-from applications.pick_place.validation import Validation
+from applications.pick_place.outliers import COVERED, FLAT, NOT_ROUND, THIN
 from common.config import CameraConfig, Surroundings, load_cell
 from common.messages import Color, Vector3, WorldObject
 from common.perception.pinhole import Pinhole

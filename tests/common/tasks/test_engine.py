@@ -7,7 +7,7 @@ import pytest
 from common import messages as m
 from common.config import load_cell
 from common.errors import ConfigError
-from common.tasks.deciding import TaskConfig
+from common.tasks.decisions import TaskConfig
 from common.tasks.engine import Task
 from common.tasks.stages import Command, Grip, Look, Move, View
 from common.tasks.watchdogs import Patience

@@ -10,7 +10,7 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from applications.pick_place.messages import PickPlaceStatus
+from applications.pick_place.topics import PickPlaceStatus
 from common.errors import DecodeError
 from common.messages import Image, StopRequest
 from common.transport.codec import (

@@ -5,9 +5,9 @@ from types import ModuleType
 
 import pytest
 
-from applications.pick_place.messages import PickPlaceStatus
+from applications.pick_place.topics import PickPlaceStatus
 from common import topics
-from common.application import Application
+from common.application import Application, ApplicationTopics, find_application
 from common.messages import Header, MotionStatus, Pose, PoseArray, TaskStatus, WorldObject, WorldObjects
 from common.topics import Topic
 from recording.report.aggregator import RunAggregator, recorded_application
@@ -26,30 +26,32 @@ from recording.report.summary import describe
     ],
 )
 def test_progress_in_one_line(values: dict[str, object], line: str) -> None:
-    fold = RunAggregator("panda", Application("pick_place"))
+    fold = RunAggregator("panda", find_application("pick_place"))
     assert fold.progress == "the task has not spoken yet"
     fold.on("pick_place_status", PickPlaceStatus.model_validate(values), 0.0, 0)
     assert fold.progress == line
 
 
 def test_every_application_is_heard_on_its_status_and_on_what_it_decides_by() -> None:
-    heard = {topic.key for topic in RunAggregator("panda", Application("pick_place")).topics}
+    heard = {topic.key for topic in RunAggregator("panda", find_application("pick_place")).topics}
     assert heard == {"pick_place_status", "validated_targets", "rejected_targets", "motion/status", "scene_objects",
                      "scene_balls"}
     assert "joint_states" not in heard
-    assert {"outline_status", "contour_path"} <= {t.key for t in RunAggregator("ur5", Application("outlining")).topics}
+    outlining = RunAggregator("ur5", find_application("outlining"))
+    assert {"outline_status", "contour_path"} <= {t.key for t in outlining.topics}
 
 
 def test_a_frame_is_as_old_as_its_stamp_on_the_cells_clock() -> None:
     gathering = RunHistory()
-    fold = RunAggregator("panda", Application("pick_place"), speed=5.0, gathering=gathering)
+    fold = RunAggregator("panda", find_application("pick_place"), speed=5.0, gathering=gathering)
     fold.on("validated_targets", PoseArray(header=Header(stamp=1_000_000_000)), 1.0, 1_100_000_000)
     assert gathering.latencies == [20.0]
     assert fold.summary.as_dict()["frame_to_target_ms"] == {"p50": 20.0, "p99": 20.0}
 
 
 def test_the_application_of_a_recording_is_told_by_its_status() -> None:
-    assert recorded_application(["joint_states", "outline_status"]) == Application("outlining")
+    found = recorded_application(["joint_states", "outline_status"])
+    assert found is not None and found.name == "outlining"
     assert recorded_application(["joint_states"]) is None
 
 
@@ -60,11 +62,12 @@ class MoveStatus(TaskStatus):
 @pytest.fixture
 def own() -> Application:
     module = ModuleType("my_pkg.move")
-    module.STATUS = Topic("move_status", MoveStatus, "state", "state")  # type: ignore[attr-defined]
+    status = Topic("move_status", MoveStatus, "state", "state")
+    module.APPLICATION = Application(topics=ApplicationTopics(status=status))  # type: ignore[attr-defined]
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(sys.modules, "my_pkg", ModuleType("my_pkg"))
         patch.setitem(sys.modules, "my_pkg.move", module)
-        yield Application("my_pkg.move")
+        yield find_application("my_pkg.move")
 
 
 def test_an_application_of_ones_own_has_a_summary_without_saying_anything(own: Application) -> None:
@@ -88,7 +91,7 @@ def test_truth_names_its_containers_where_there_are_several() -> None:
 
 
 def test_objects_tell_the_truth_where_they_say_what_becomes_of_them() -> None:
-    fold = RunAggregator("panda", Application("pick_place"))
+    fold = RunAggregator("panda", find_application("pick_place"))
     fold.on("scene_objects", WorldObjects(), 0.0, 0)
     assert fold.summary.as_dict()["truth"] == {"in_box": 0, "on_table": 0, "elsewhere": 0, "containers": {}}
     fold.on("scene_balls", PoseArray(poses=[Pose()], labels=["box"]), 0.0, 0)  # all that older recordings tell

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from applications.pick_place.messages import PickPlaceStatus
+from applications.pick_place.topics import PickPlaceStatus
 from common import messages as m
 from recording.report import charts
 from recording.report.history import MOST_LINES, RunHistory

@@ -11,11 +11,11 @@ from typing import Any, ClassVar
 
 import pytest
 
-from applications.outlining.messages import (
+from applications.outlining.topics import (
+    OUTLINE_SELECT,
     OutlineSelect,
     OutlineSelection,
 )
-from applications.outlining.topics import OUTLINE_SELECT
 from common import messages as m
 from common import topics
 from common.clock import Clock

@@ -13,22 +13,24 @@ import yaml
 from websockets.asyncio.client import connect
 from websockets.exceptions import InvalidStatus
 
-from applications.outlining.messages import (
+from applications.outlining.page import choose
+from applications.outlining.topics import (
+    CONTOUR_PATH,
+    CONTOURS,
+    OUTLINE_STATUS,
     Contour,
     Contours,
     OutlinePoints,
     OutlineSelect,
     OutlineStatus,
 )
-from applications.outlining.page import choose
-from applications.outlining.topics import CONTOUR_PATH, CONTOURS, OUTLINE_STATUS
-from applications.pick_place.messages import PickPlaceStatus
 from applications.pick_place.topics import (
     DETECTED_OBJECTS,
     DETECTION_IMAGE,
     PICK_PLACE_STATUS,
     REJECTED_TARGETS,
     WORKSPACE_MARKERS,
+    PickPlaceStatus,
 )
 from common import messages as m
 from common import topics
@@ -288,11 +290,13 @@ async def test_application_without_a_page_gets_the_buttons_and_words_of_every_ta
 ) -> None:
     (tmp_path / "apps").mkdir()
     (tmp_path / "apps" / "moving.py").write_text("""
+from common.application import Application, ApplicationTopics
 from common.messages import TaskStatus
 from common.topics import Topic
 class MovingStatus(TaskStatus):
     pass
 STATUS = Topic("moving_status", MovingStatus, "state", "how far the moving is")
+APPLICATION = Application(topics=ApplicationTopics(status=STATUS))
 """)
     monkeypatch.syspath_prepend(tmp_path)
     members = Members(services=["trajectory_executor", "viewer", "mover"], task="mover", application="apps.moving")

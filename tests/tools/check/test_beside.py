@@ -15,6 +15,7 @@ async def test_what_modules_of_a_person_print_is_no_part_of_what_was_found(tmp_p
     (tmp_path / "loud.py").write_text("""
 import os
 from tools.check import warning
+from common.application import Application, ApplicationTopics, Checks
 from common.messages import TaskStatus
 from common.topics import Topic
 print("hello")
@@ -22,11 +23,12 @@ os.system("echo hello from a program")
 STATUS = Topic("loud_status", TaskStatus, "state", "")
 def quick(cell):
     yield warning("the cell is loud", "whisper")
+APPLICATION = Application(topics=ApplicationTopics(status=STATUS), checks=Checks(quick=quick))
 """, encoding="utf-8")
     (tmp_path / "loud_app").mkdir()
-    for name in ("__init__", "topics", "checks"):
-        (tmp_path / "loud_app" / f"{name}.py").write_text("from loud import STATUS, quick\n", encoding="utf-8")
-    cell = load_cell("panda").model_copy(update={"application": "loud_app.checks"})
+    (tmp_path / "loud_app" / "__init__.py").touch()
+    (tmp_path / "loud_app" / "app.py").write_text("from loud import APPLICATION\n", encoding="utf-8")
+    cell = load_cell("panda").model_copy(update={"application": "loud_app.app"})
     path = os.pathsep.join([str(tmp_path), ROOT])
     found = await warnings_in_subprocess(cell, {**os.environ, "PYTHONPATH": path})
     assert any("the cell is loud" in each.line for each in found)
