@@ -12,7 +12,8 @@ from lab.network import GOOD_LINKS, LinkQuality
 
 Kind = Literal[
     "crash", "restart", "cut", "router lost", "stalled", "late goal", "operator", "clock step", "operator stop",
-    "speed change", "supervisor lost", "second instance", "malformed messages", "late start", "abandoned goal", "takeover",
+    "speed change", "supervisor lost", "second instance", "malformed messages", "late start", "abandoned goal",
+    "takeover",
 ]
 Party = Literal["", "client", "server"]
 
@@ -57,18 +58,19 @@ OTHER_SPEED = 0.3  # share of those runs
 class Fault:
     """One fault.
 
-    Kinds: `crash` ends a process without running `finally`; `restart` sends SIGTERM; `cut` breaks a link, `router lost`
-    all links; `stalled` delays a link; `late goal` delays the request or reply of a goal; `operator` stops the task,
-    moves the arm and starts the task again; `clock step` sets the host's system clock; `operator stop` stops or pauses
-    the robot, crashes task or executor or both, and may start the task again; `speed change` sets the speed for a while;
-    `supervisor lost` ends the supervisor without `finally`, then starts the cell again; `second instance` starts a
-    service that is up; `malformed messages` puts undecodable payloads under all keys; `late start` stops the robot while
-    a start is on its way; `abandoned goal` cancels a motion request before it arrives; `takeover` takes motion ownership,
-    jogs the arm and starts the task.
+    - `crash` ends a process without running `finally`, `restart` sends SIGTERM.
+    - `cut` breaks a link, `router lost` breaks all; `stalled` delays a link, `late goal` a goal request or its reply.
+    - `clock step` sets the host's system clock.
+    - `supervisor lost` ends the supervisor without `finally`, then starts the cell again.
+    - `second instance` starts a service that is up; `malformed messages` puts undecodable payloads under all keys.
+    - `operator` stops the task, moves the arm and starts the task again. `operator stop` stops or pauses the robot,
+      crashes task or executor or both, and may start the task again. `speed change` sets the speed for a while.
+      `late start` stops the robot while a start is on its way. `abandoned goal` cancels a motion request before it
+      arrives. `takeover` takes motion ownership, jogs the arm and starts the task.
 
     Attributes:
         at: cell time after the cell is ready [s].
-        kind: see above.
+        kind: one of these.
         target: process name; empty for the router, an operator, the supervisor and the system clock.
         during_goal: hit the client or the server of the next plan or goal instead of the target; for `late goal`,
             whether the request (client) or the reply (server) is late.

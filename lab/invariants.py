@@ -206,8 +206,8 @@ class Invariants:
         if isinstance(request, WITH_ID):
             known = self._by_id.setdefault(request.id, request)
             if self._checks.fails(known is request or known == request, ONCE):
-                self._checks.report(ONCE, f"{request.id} is the id of two different requests: {type(known).__name__} and "
-                                          f"{type(request).__name__}")
+                self._checks.report(ONCE, f"{request.id} is the id of two different requests: "
+                                          f"{type(known).__name__} and {type(request).__name__}")
         self.motion.on_request(service, request)
         if isinstance(request, WorldEdit):
             self._world.on_edit_requested()

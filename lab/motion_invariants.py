@@ -28,7 +28,7 @@ from lab.loop import Incarnation, current_incarnation
 GOALS = (ExecuteRequest, GripperCommand)
 ENDED = ("succeeded", "aborted", "cancelled")
 STOPS = ("stop", "pause", "hold")
-OPERATOR = "person"  # name of the operator model's sessions
+OPERATOR = "operator"  # name of the operator model's sessions
 EXECUTOR, RATE = "trajectory_executor", 100.0  # [Hz] control rate if the cell sets none
 MOST_BROKEN = 5  # violations that are reported
 OLDEST = 2.3  # [s] from the first request of a motion to its start, clock errors included; later ones are refused
@@ -188,13 +188,14 @@ class MotionInvariants:
             self._check_permission(fastest, float(step.max()), dq, now)
 
     def _check_step(
-        self, limits: Limits, fastest: Vector, last: tuple[Vector, Vector, float], passed: float, step: Vector, dq: Vector
+        self, limits: Limits, fastest: Vector, last: tuple[Vector, Vector, float], passed: float, step: Vector,
+        dq: Vector,
     ) -> None:
         """Check the change of position and velocity against the set-point before."""
         checks = self._checks
         if checks.fails((step <= fastest * min(passed, self._cycle) + 1e-3).all(), LIMITS):
             checks.report(LIMITS, f"a step of {step.max():.4f} rad in {passed * 1e3:.1f} ms")
-        velocity = 0.0 * last[1] if passed > self._cycle else last[1]  # after a late cycle motion starts from standstill
+        velocity = 0.0 * last[1] if passed > self._cycle else last[1]  # after a late cycle: from standstill
         change = np.abs(dq - velocity)
         if checks.fails((change <= 1.1 * limits.braking * max(passed, self._cycle / CYCLES) + 1e-3).all(), LIMITS):
             checks.report(LIMITS, f"velocity changes by {change.max():.3f} rad/s in {passed * 1e3:.1f} ms")
@@ -260,8 +261,9 @@ class MotionInvariants:
             accepted = answer.state != "rejected"
             before = self._accepted.setdefault((instance, request.id), accepted)
             if checks.fails(before == accepted, ONCE):
-                checks.report(ONCE, f"{request.id} was {'accepted' if before else 'rejected'}, then requested again and "
-                                    f"{answer.state}: {answer.message}")
+                decision = "accepted" if before else "rejected"
+                checks.report(ONCE, f"{request.id} was {decision}, then requested again and {answer.state}: "
+                                    f"{answer.message}")
 
     def on_answer(self, service: str, request: Message, answer: Message) -> None:
         """Check that a requested hold took effect, unless it is for a goal that is over."""

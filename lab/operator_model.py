@@ -28,7 +28,7 @@ from lab.loop import Incarnation, context_of
 from lab.processes import SimulatedBus, SimulatedHost
 
 POLL = 0.1  # [s] between checks of a condition
-OPERATOR, PAGE = "person", "page"
+OPERATOR, PAGE = "operator", "page"
 EXECUTOR = "trajectory_executor"
 SPEED = f"services.{EXECUTOR}.speed_scaling"
 SLOWEST, SLOW = 0.1, 0.4  # speed that an operator sets, share of the full speed
@@ -257,8 +257,8 @@ async def _call_until_answered(bus: SimulatedBus, request: Request[Any, Any], me
 class ClearanceCheck:
     """Checks whether a jogged arm stays clear of obstacles.
 
-    Nothing checks a jogged arm for obstacles, and a simulated one passes through solids. From inside a solid there is no
-    plan, so the arm could never leave it.
+    Nothing checks a jogged arm for obstacles, and a simulated one passes through solids. From inside a solid there is
+    no plan, so the arm could never leave it.
     """
 
     def __init__(self, cell: Cell) -> None:
@@ -268,7 +268,9 @@ class ClearanceCheck:
         self._gripper = cell.robot.gripper.links if cell.robot.gripper else []
         self._padding = cell.motion.object_padding
 
-    def clear(self, state: m.JointState, scene: m.PlanningScene, velocities: Mapping[str, float], seconds: float) -> bool:
+    def clear(
+        self, state: m.JointState, scene: m.PlanningScene, velocities: Mapping[str, float], seconds: float
+    ) -> bool:
         """Return whether the arm is free of collisions now and along its motion.
 
         Args:
