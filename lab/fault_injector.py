@@ -26,7 +26,7 @@ from lab.processes import SimulatedBus, SimulatedHost, SimulatedProcess
 POLL = 0.1  # [s] between checks of a condition
 LATEST = 0.3  # [s] after which a process crashes that has not reached the turn of its crash
 NEXT_GOAL = 1.5  # [s] to wait for the next goal
-TURN = 0.0005  # [s] that stands for a loop turn where a fault waits for a goal
+TURN = 0.0005  # [s] equivalent of a loop turn where a fault waits for a goal
 GOALS = (topics.MOTION_EXECUTE.key, topics.GRIPPER_COMMAND.key)
 PLAN = topics.MOTION_PLAN.key
 STRANGER = "stranger"

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 EPOCH_NS = 1_767_225_600_000_000_000  # wall time at which a simulation starts: 2026-01-01, UTC
-CLOCK_READ_NS = 20_000  # work that a read of the clock within a computing call stands for [ns]
+CLOCK_READ_NS = 20_000  # assumed work between two reads of the clock within a computing call [ns]
 CALL_MEAN, CALL_MOST = 0.01, 0.5  # [s] random duration of a call in a thread, in addition to its clock reads
 
 

@@ -141,7 +141,7 @@ class SimulatedNetwork(LocalNetwork):
             if links.late and self._chance() < links.late:
                 self.counted["late"] += 1
                 delay += links.late_delay * self._chance()
-        # The router sends all tokens in one order, whoever owns them.
+        # The router sends all tokens in one order, for all sessions.
         link = target if lane == "token" else source, target, lane, key
         self._deliver(link, source, delay, call)
         if links.duplicated and lane in ("stream", "reliable") and self._chance() < links.duplicated:

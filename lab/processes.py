@@ -183,7 +183,7 @@ class SimulatedHost:
 
 
 class _Ending:
-    """Whether and why a process was told to end."""
+    """Whether and why a process is asked to end."""
 
     reason = ""
 

@@ -94,7 +94,7 @@ class SimulatedSupervisor:
     async def restart(self) -> None:
         """Kill the supervisor; return when its services have ended and a new one has started them again.
 
-        The new one reads the system clock anew.
+        The new one reads the system clock again.
         """
         old, host = self.current, self._host
         old.lost = True
