@@ -99,7 +99,7 @@ def main() -> None:
                           and not any(detector.resting.shows_container(eye.pinhole, pixel) for pixel in shape)
                           for shape in shapes])
         clear = places[whole & ~hidden.touches(places, around.ball_radius)]
-        odd = [one for one in detector.odd if not hidden.touches([one.position], around.ball_radius)[0]]
+        odd = [one for one in detector.outliers if not hidden.touches([one.position], around.ball_radius)[0]]
         lamp = light.lights["lamp"]
         told = f"{lamp.illuminance:.0f} lx, {lamp.temperature:.0f} K"
         wrong = []

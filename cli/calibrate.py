@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from cli import options
-from cli.place import UP, Place, Verbs
+from cli.target import RUNNING, CellTarget, CommandGroup
 from common.errors import ConfigError, UnknownName
 from common.terminal import echo
 
 if TYPE_CHECKING:
     from tools.calibration.board import Board
 
-app = Verbs("Calibrate a real camera with a ChArUco board.")
+app = CommandGroup("Calibrate a real camera with a ChArUco board.")
 
 BOARD_FORMATS = (".png", ".pdf")
 SOURCE_HELP = "device number or path, video file, or folder of images"
@@ -187,7 +187,7 @@ def collect(
     key: Annotated[str, typer.Option("--key", metavar="KEY", help="of the camera's pictures")] = "camera/image_raw",
     views: Annotated[str, typer.Option("--views", metavar="N", help="that are wanted")] = "15",
     squares: Squares = "7x5", square: Square = "0.036", marker: Marker = "0", dictionary: Dictionary = "4x4_50",
-    at: Place = UP,
+    at: CellTarget = RUNNING,
 ) -> None:
     """Keep pictures of the board, with the joints, of a cell that is up: whenever the arm rests in a new pose.
 

@@ -19,7 +19,7 @@ from common.errors import RequestFailed
 from common.planning.collision import CollisionWorld
 from common.planning.obstacles import ObstacleCache
 from common.planning.robot_geometry import RobotGeometry
-from common.process.persist import persist
+from common.process.timing import call_until_answered
 from common.robot.model import RobotModel
 from common.topics import Request, Topic
 from common.transport.reader import Reader
@@ -251,7 +251,7 @@ def _started(task: m.TaskStatus | None, motion: m.MotionStatus | None) -> bool:
 
 async def _call_until_answered(bus: SimulatedBus, request: Request[Any, Any], message: m.Message) -> None:
     """Repeat a request until there is any answer."""
-    await persist(bus.client(request), message, TIMEOUT, lambda error: None, lambda problem: None)
+    await call_until_answered(bus.client(request), message, TIMEOUT, lambda error: None, lambda problem: None)
 
 
 class ClearanceCheck:

@@ -13,7 +13,7 @@ from typing import Any
 from common import topics
 from common.clock import Clock
 from common.supervision.launch import Launch
-from common.supervision.operation import supervise
+from common.supervision.lifecycle import supervise
 from common.supervision.supervisor import Supervisor
 from common.transport.bus import Bus
 from lab.processes import SimulatedBus, SimulatedHost, SimulatedProcess
@@ -81,7 +81,7 @@ class SimulatedSupervisor:
         supervisor = Supervisor(cell, launch, lambda name, line: self._log(line), make_child=make_child)
         # Log lines are published only while there is a subscriber.
         bus.raw_subscriber(f"{cell.name}/{topics.LOG.expression}", lambda sample: None)
-        supervisor.begin()
+        supervisor.start()
         ready = asyncio.Event()
 
         async def work(_bus: Bus) -> None:

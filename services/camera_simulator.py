@@ -11,8 +11,8 @@ from common import topics
 from common.config import RobotConfig, Run, Scenery, Surroundings, Tunable
 from common.messages import Image, WorldObjects
 from common.perception.image import array_to_image
-from common.process.pace import Pace
 from common.process.service import main
+from common.process.timing import LoopRate
 from common.sim.camera import CameraParameters, Lens, SimulatedCamera
 from common.sim.rendering import Picture, add_image_noise
 from common.transport.bus import Bus
@@ -53,7 +53,7 @@ async def run(bus: Bus, config: Config) -> None:
     if joints is not None:
         await joints.next()
     infos.put(camera.info(bus.header(frame)))
-    pace = Pace(bus, lambda: bus.clock.wall_rate(config.rate, config.max_rate))
+    pace = LoopRate(bus, lambda: bus.clock.wall_rate(config.rate, config.max_rate))
     sent: Image | None = None
     shown: Picture | None = None
     while True:

@@ -12,8 +12,8 @@ from common.config import RobotConfig, Run, Scenery, Surroundings, Tunable
 from common.messages import JointState, WorldObjects
 from common.perception.depth import point_cloud
 from common.perception.image import array_to_image
-from common.process.pace import Pace
 from common.process.service import main
+from common.process.timing import LoopRate
 from common.sim.camera import CameraParameters, SimulatedCamera
 from common.sim.depth_sensor import DepthSensorParameters, simulate_depth
 from common.sim.ray_caster import View
@@ -58,7 +58,7 @@ async def run(bus: Bus, config: Config) -> None:
     await truth.next()
     await joints.next()
     infos.put(camera.info(bus.header(frame)))
-    pace = Pace(bus, lambda: bus.clock.wall_rate(config.rate, config.max_rate))
+    pace = LoopRate(bus, lambda: bus.clock.wall_rate(config.rate, config.max_rate))
     while True:
         header = bus.header(frame)  # the instant of exposure: of picture, depth and points alike
         world = truth.latest or WorldObjects()

@@ -12,7 +12,7 @@ from common import topics
 from common.config import load_cell, service_config
 from common.errors import ConfigError
 from common.process.in_process import running_service
-from common.process.wiring import owned_in, require_one_owner, wiring_of
+from common.supervision.wiring import owned_in, require_one_owner, wiring_of
 from common.transport import ownership
 from common.transport.local import LocalNetwork
 from lab.observers import Trace

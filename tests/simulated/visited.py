@@ -14,7 +14,7 @@ from unittest.mock import patch
 
 import typer
 
-from cli.operation.operation import Operation
+from cli.session.session import CellSession
 from common import topics
 from common.application import find_application
 from common.config import Cell, load_cell
@@ -95,11 +95,11 @@ class SimulatedCell:
 @contextmanager
 def no_processes() -> Iterator[None]:
     """Inside, `zencell run` in this process runs its cell on the virtual clock; all the rest of it is as it is."""
-    with patch.object(Operation, "run_to_end", _run_to_end):
+    with patch.object(CellSession, "run_to_end", _run_to_end):
         yield
 
 
-def _run_to_end(operation: Operation) -> int:
+def _run_to_end(operation: CellSession) -> int:
     async def work(bus: Bus) -> None:
         collector = Collector(bus, operation.fold, 0.0, lambda line: None)
         async with beside(collector.run()):
