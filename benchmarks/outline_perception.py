@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from applications.outlining.contours import ContourOptions, find_contours, is_hole
-from applications.outlining.duplicates import simplified, without_duplicates
+from applications.outlining.solids import simplified, without_duplicates
 from applications.outlining.top_face import TopFaceOptions, top_face
 from common.config import Surroundings, World, check, config_root, load_robot, read_yaml
 from common.messages import Header, JointState, WorldObject

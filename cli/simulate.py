@@ -43,9 +43,9 @@ def simulate(
     from common.config import load_cell
     from common.errors import ConfigError
     from common.process.environment import usable_cores
+    from lab.campaign import seeds_of
     from lab.doubles import settings_of, with_doubles
-    from lab.telling import seeds_of
-    from lab.watched_arm import with_watched_arm
+    from lab.observers import with_observed_arm
 
     if seeds is not None and seed is not None:
         raise ConfigError("--seed", seed, "does not go with --seeds")
@@ -61,7 +61,7 @@ def simulate(
     if doubles:
         given = (*settings_of(loaded.application), *(overrides or ()))
         loaded = with_doubles(load_cell(cell, given, world=world))
-    with_watched_arm(loaded)  # says in one line what cannot be simulated
+    with_observed_arm(loaded)  # says in one line what cannot be simulated
     if one is None:
         raise typer.Exit(_campaign(loaded, several, faults, at_a_time, longest))
     raise typer.Exit(_single(loaded, one, faults, trace, longest))
@@ -69,23 +69,23 @@ def simulate(
 
 def _single(cell: Cell, seed: int, faults: bool, file: str | None, limit: float) -> int:
     """Run one seed and tell of all that happened; the exit code."""
+    from lab.campaign import format_outcome
+    from lab.observers import Trace
     from lab.simulation import Simulation
-    from lab.telling import told
-    from lab.trace import Trace
-    from recording.own import Own
-    from recording.telling import about, require_new
+    from recording.capture import CustomTopics
+    from recording.summary import about, require_new
 
     trace = None
     if file is not None:
         require_new(Path(file), "--trace")
-        trace = Trace(Path(file), about(cell.name), Own.of(cell))
-    simulation = Simulation(cell, seed, faults=faults, limit=limit, digest=True, trace=trace, tell=echo)
+        trace = Trace(Path(file), about(cell.name), CustomTopics.of(cell))
+    simulation = Simulation(cell, seed, faults=faults, limit=limit, digest=True, trace=trace, log=echo)
     try:
         outcome = simulation.run()
     finally:
         if trace is not None:
             trace.close("simulated")
-    for line in told(outcome):
+    for line in format_outcome(outcome):
         echo(line)
     if trace is not None:
         echo(f"recorded {trace.messages:,} messages: {file}")
@@ -97,8 +97,7 @@ def _campaign(cell: Cell, seeds: Sequence[int], faults: bool, jobs: int, limit: 
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    from lab.campaign import Tally, run_seeds
-    from lab.telling import reason, table
+    from lab.campaign import Tally, failure_reason, run_seeds, table
 
     tally, interrupted = Tally(), False
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
@@ -109,7 +108,7 @@ def _campaign(cell: Cell, seeds: Sequence[int], faults: bool, jobs: int, limit: 
             for outcome in run_seeds(cell, seeds, faults, jobs, limit):
                 tally.add(outcome)
                 if not outcome.ok or outcome.crashes:
-                    line = f"seed {outcome.seed}: {reason(outcome)}"
+                    line = f"seed {outcome.seed}: {failure_reason(outcome)}"
                     console.print(line, markup=False, highlight=False, soft_wrap=True)
                 progress.update(bar, advance=1, description=f"{cell.name} {tally.done} DONE")
         except KeyboardInterrupt:

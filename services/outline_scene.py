@@ -5,10 +5,8 @@ from __future__ import annotations
 import asyncio
 from collections import deque
 
-from applications.outlining.messages import Contours
-from applications.outlining.perceived_solids import perceived_solids
-from applications.outlining.scene import planning_scene, require_apart
-from applications.outlining.topics import CONTOURS
+from applications.outlining.solids import perceived_solids, planning_scene, require_apart
+from applications.outlining.topics import CONTOURS, Contours
 from common import topics
 from common.config import Parameters, RobotConfig, Surroundings
 from common.messages import Image, PlanningScene
@@ -55,7 +53,7 @@ async def run(bus: Bus, config: Config) -> None:
     out = SceneWriter(bus)
     home = HomeWatch(config.robot.named_poses["home"])
     kept: deque[Image] = deque(maxlen=KEPT)
-    left_out = SkippedFrames(bus.log, "a picture")
+    left_out = SkippedFrames(bus.log, "image")
     await out.begin(planning_scene(config.world, [], 0))
     await bus.ready()
 

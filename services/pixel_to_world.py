@@ -6,9 +6,8 @@ import asyncio
 from collections import OrderedDict
 
 from applications.outlining.contours import is_hole
-from applications.outlining.messages import MAX_POINTS, Contours, OutlinePoints
 from applications.outlining.top_face import TopFace, TopFaceOptions, top_face
-from applications.outlining.topics import CONTOUR_POINTS, CONTOURS
+from applications.outlining.topics import CONTOUR_POINTS, CONTOURS, MAX_POINTS, Contours, OutlinePoints
 from common import topics
 from common.config import Surroundings
 from common.errors import ZencellError

@@ -186,7 +186,7 @@ async def control(
     updates = bus.writer(topics.SCENE_OBJECT_UPDATES) if simulated else None
     objects = bus.writer(topics.SCENE_OBJECTS) if simulated else None
     application = config.members.application
-    views = find_application(application).views if simulated and application else {}
+    views = find_application(application).truth_views if simulated and application else {}
     called = [(bus.writer(topic), view) for topic, view in views.items()]  # the truth in the application's words
 
     def too_late(header: Header) -> Refused | None:

@@ -11,11 +11,10 @@ from functools import lru_cache
 import cv2
 from pydantic import Field
 
-from applications.pick_place.annotation import annotate
-from applications.pick_place.detector import Detection, Detector, DetectorOptions, rehearse
-from applications.pick_place.odd import Odd
+from applications.pick_place.detector import Detection, Detector, DetectorOptions, annotate, warm_up
+from applications.pick_place.outliers import Outlier
+from applications.pick_place.perceived_scene import Place
 from applications.pick_place.topics import DETECTED_OBJECTS, DETECTION_IMAGE, DETECTION_MASK
-from applications.pick_place.tracks import Place
 from common import topics
 from common.config import Surroundings
 from common.config.basics import Rgb
@@ -49,7 +48,7 @@ class Config(DetectorOptions):
 
 def markers(
     detections: list[Detection], around: Surroundings, stamp: int, remark: str = "", blind: str = "",
-    odd: Sequence[Odd] = (),
+    odd: Sequence[Outlier] = (),
 ) -> MarkerArray:
     """The message of what was found in the frame that was exposed at `stamp`, or of why that tells nothing.
 
@@ -110,9 +109,9 @@ async def run(bus: Bus, config: Config) -> None:
     kept: deque[Image] = deque(maxlen=KEPT)
     news = asyncio.Event()
     detector = Detector(config.world, config)
-    left_out = SkippedFrames(bus.log, "a picture")
+    left_out = SkippedFrames(bus.log, "image")
     await bus.acquire_keys()
-    rehearse(config.world, config)
+    warm_up(config.world, config)
     await bus.ready()
 
     async def watch_depths() -> None:
@@ -152,7 +151,8 @@ async def run(bus: Bus, config: Config) -> None:
                 detections = await asyncio.to_thread(detector.detect_in_depth, picture, depth, camera)
             remark = _remark(detector, bus.service)
             try:
-                found.put(markers(detections, config.world, image.header.stamp, remark, detector.blind, detector.odd))
+                found.put(markers(
+                    detections, config.world, image.header.stamp, remark, detector.blind, detector.outliers))
             except FrameError as error:
                 left_out.note(error)
             if shown.matched:

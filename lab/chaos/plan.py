@@ -1,4 +1,4 @@
-"""Which faults happen to a cell, and when: the same seed makes the same plan. Nothing happens here."""
+"""Fault plans for cells of real processes. The same seed makes the same plan; `agent` carries it out."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ Form = Literal["", "truncated", "flipped", "noise", "wrong type", "huge"]
 
 PER_MINUTE = 30.0  # faults per minute of wall time
 MOST_PER_MINUTE = 600.0
-CELL_SECONDS = 80.0  # of cell time in which a run sees faults; what comes after is left to it to finish
+CELL_SECONDS = 80.0  # of cell time with faults in a run; the task then has time to finish
 LEAST_GAP = 0.05  # [s] between two faults
-LEFT_STOPPED = 0.25  # share of what is stopped that stays so until a watchdog takes notice
-HOLDING = 0.4  # share of the faults of processes that wait for an object in the hand
-STATELESS_FORMS: tuple[Form, ...] = ("noise", "wrong type", "huge")  # for which no real message is needed
+LEFT_STOPPED = 0.25  # share of stopped processes that stay so until a watchdog kills them
+HOLDING = 0.4  # share of the faults of processes that wait until the gripper holds an object
+STATELESS_FORMS: tuple[Form, ...] = ("noise", "wrong type", "huge")  # need no real message
 
 LABELS: dict[Kind, str] = {
     "kill": "kill -9", "restart": "SIGTERM", "freeze": "SIGSTOP", "delay": "short SIGSTOPs",
-    "corrupt": "damaged messages on", "replay": "old messages on", "drop": "what is held slips",
+    "corrupt": "damaged messages on", "replay": "old messages on", "drop": "held object slips",
 }
 
 _WEIGHTS: dict[Kind, float] = {
@@ -36,15 +36,15 @@ class Fault:
     """One fault.
 
     Attributes:
-        at: when [s, wall time] from the cell being up.
-        kind: kill -9, SIGTERM, SIGSTOP for a time, short stops in a row, damaged messages, old messages, an object
-            that slips out of the fingers.
-        target: name of the process, or key without the cell; empty for an object.
-        seconds: how long it lasts, where it lasts; infinite for what stays stopped.
+        at: time after the cell is up [s, wall time].
+        kind: kill -9, SIGTERM, SIGSTOP for a while, short SIGSTOPs, damaged messages, old messages, or an object
+            that slips out of the gripper.
+        target: process name, or key without the cell; empty for an object.
+        seconds: duration; infinite for a process that stays stopped [s].
         form: of damaged messages.
-        count: messages, or stops in a row.
-        seed: of everything else that is random about it.
-        holding: whether it waits for an object in the hand.
+        count: number of messages or stops.
+        seed: decides the rest.
+        holding: whether it waits until the gripper holds an object.
     """
 
     at: float
@@ -58,10 +58,10 @@ class Fault:
 
     @property
     def detail(self) -> str:
-        """How it is done, for people: "2.1 s", "12 truncated"; may be empty."""
+        """Parameters as text: "2.1 s", "12 truncated"; may be empty."""
         match self.kind:
             case "freeze":
-                text = f"{self.seconds:.1f} s" if math.isfinite(self.seconds) else "until it is noticed"
+                text = f"{self.seconds:.1f} s" if math.isfinite(self.seconds) else "until a watchdog acts"
             case "delay":
                 text = f"{self.count} x {self.seconds:.2f} s"
             case "corrupt":
@@ -70,15 +70,15 @@ class Fault:
                 text = f"{self.count}, {self.seconds:.1f} s late"
             case _:
                 text = ""
-        return ", ".join(part for part in (text, "something in the hand" if self.holding else "") if part)
+        return ", ".join(part for part in (text, "while holding an object" if self.holding else "") if part)
 
     @property
     def what(self) -> str:
-        """What is done and how: "kill -9", "SIGSTOP: 2.1 s"."""
+        """Kind and parameters: "kill -9", "SIGSTOP: 2.1 s"."""
         return ": ".join(part for part in (LABELS[self.kind], self.detail) if part)
 
     def __str__(self) -> str:
-        """As "SIGSTOP camera_simulator: 2.1 s"."""
+        """Return the fault as "SIGSTOP camera_simulator: 2.1 s"."""
         action = f"{LABELS[self.kind]} {self.target}".rstrip()
         return ": ".join(part for part in (action, self.detail) if part)
 
@@ -86,14 +86,14 @@ class Fault:
 def faults(
     seed: int, processes: Sequence[str], keys: Sequence[str], *, objects: bool, per_minute: float = PER_MINUTE
 ) -> Iterator[Fault]:
-    """Faults without end, in order.
+    """Yield faults without end, in order of time.
 
     Args:
         seed: of the plan.
-        processes: that can be killed and stopped.
-        keys: of topics and requests under which bad messages are put.
-        objects: whether there is something that can slip out of a hand.
-        per_minute: of wall time, on average.
+        processes: that may be killed and stopped.
+        keys: of topics and requests that may get bad messages.
+        objects: whether the gripper holds objects that can slip.
+        per_minute: mean number per minute of wall time.
     """
     rng = np.random.default_rng(seed)
     kinds = [kind for kind in get_args(Kind) if objects or kind != "drop"]
@@ -110,7 +110,7 @@ def plan(
     seed: int, processes: Sequence[str], keys: Sequence[str], *, objects: bool, seconds: float,
     per_minute: float = PER_MINUTE,
 ) -> list[Fault]:
-    """The faults of the first `seconds` [s, wall time]; see `faults`."""
+    """Return the faults of the first `seconds` [s, wall time]; see `faults`."""
     endless = faults(seed, processes, keys, objects=objects, per_minute=per_minute)
     return list(takewhile(lambda fault: fault.at <= seconds, endless))
 

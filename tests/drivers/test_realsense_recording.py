@@ -150,4 +150,4 @@ async def test_file_that_is_no_recording_or_lacks_depth_is_told_and_tried_again(
     async with running_service(net, real_depth_camera.run, config_of(file=str(file)), name="camera"):
         async with asyncio.timeout(30):
             line = (await log.next()).message
-    assert line.startswith(f"camera realsense: {file}: ") and "it is opened again in" in line and "\n" not in line
+    assert line.startswith(f"camera realsense: {file}: ") and "opening it again in" in line and "\n" not in line

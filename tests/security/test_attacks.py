@@ -32,7 +32,7 @@ from common.transport.endpoint import MAX_BYTES, MAX_OTHER_BYTES, client_config,
 from common.transport.session import RawSample
 from common.transport.zenoh_session import connect
 from page.access import ROLES, tokens_in
-from recording.reading import Recording
+from recording.reader import Recording
 from security.certificates import Authority
 from tests.harness import RunningCell, command_line, environment, until
 from tests.security.holders import REFUSED, Heard, Holder

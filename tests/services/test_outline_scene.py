@@ -8,8 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from applications.outlining.contours import ContourOptions, find_contours
-from applications.outlining.messages import Contour, Contours
-from applications.outlining.topics import CONTOURS
+from applications.outlining.topics import CONTOURS, Contour, Contours
 from common import messages as m
 from common import topics
 from common.clock import Clock

@@ -8,8 +8,8 @@ from common.config import load_cell
 from common.errors import ConfigError
 from lab.campaign import run_seeds
 from lab.faults import SKEW, SPEEDS, make_plan
+from lab.observers import with_observed_arm
 from lab.simulation import LIMIT, Outcome, Simulation
-from lab.watched_arm import with_watched_arm
 from tests.simulated.known_bugs import BUGS, RARE, found_within
 
 pytestmark = pytest.mark.timeout(600)  # some seconds of work, on a machine that may be busy
@@ -78,7 +78,7 @@ def test_every_plan_has_three_crashes_a_cut_and_wrong_clocks():
         kinds = [fault.kind for fault in plan.faults]
         assert kinds.count("crash") >= 3 and kinds.count("cut") >= 1 and kinds.count("late goal") >= 2
         assert [fault.at for fault in plan.faults] == sorted(fault.at for fault in plan.faults)
-        assert plan.weather.loss > 0 and plan.weather.hiccup > 0 and plan.weather.doubled > 0 and plan.weather.late > 0
+        assert plan.links.loss > 0 and plan.links.hiccup > 0 and plan.links.duplicated > 0 and plan.links.late > 0
         assert plan.shuffled and plan.speed in (1.0, *SPEEDS)
         assert all(abs(skew) <= SKEW for _, skew in plan.skews) and len(plan.skews) == 3
 
@@ -96,4 +96,4 @@ def test_real_arm_cannot_be_simulated(tmp_path, monkeypatch):
     (tmp_path / "steel.py").rename(tmp_path / "of" / "steel.py")
     monkeypatch.syspath_prepend(str(tmp_path))
     with pytest.raises(ConfigError, match="is a real arm"):
-        with_watched_arm(load_cell("panda", ["robot.hardware.backend=of.steel"]))
+        with_observed_arm(load_cell("panda", ["robot.hardware.backend=of.steel"]))

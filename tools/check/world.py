@@ -18,7 +18,7 @@ from common.perception.pinhole import Pinhole
 from common.sim.footprints import overlap, within
 from common.sim.objects import Solid, initial_pose, solid_of
 from common.sim.table import Table, tables
-from tools.check.finding import Finding, error, warning
+from tools.check import Finding, error, warning
 
 Array = NDArray[np.float64]
 
@@ -82,7 +82,7 @@ def _pictures(
 
 
 def _seen(camera: Pinhole, points: Array) -> NDArray[np.bool_]:
-    return camera.in_picture(camera.project(points))
+    return camera.in_image(camera.project(points))
 
 
 def _corners(thing: ObjectConfig, solid: Solid) -> Array:

@@ -6,8 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from applications.outlining.perceived_solids import PerceivedSolid
-from applications.outlining.scene import collision_object, planning_scene
+from applications.outlining.solids import PerceivedSolid, collision_object, planning_scene
 from common.config import Surroundings, load_cell
 from common.messages import Color, PlanningScene
 from common.perception.camera_input import FrameError
