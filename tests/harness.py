@@ -1,4 +1,4 @@
-"""Start cells and commands of zencell in tests and benchmarks, as processes or within this process; leave none behind."""
+"""Start cells and commands of zencell for tests and benchmarks, as processes or within this one; leave none behind."""
 
 from __future__ import annotations
 
