@@ -13,7 +13,7 @@ import numpy as np
 from common import messages as m
 from common import topics
 from common.client.operator_motion import MotionFailed, OperatorMotion
-from common.control.jogging import DEADMAN, STANDS
+from common.control.jogging import BRAKING_TIME, DEADMAN
 from common.errors import RequestFailed
 from common.process.persist import persist
 from common.topics import Request, Topic
@@ -148,7 +148,7 @@ class Persons:
             if state is None or scene is None:
                 return False
             age = max(0.0, (bus.header().stamp - state.header.stamp) * 1e-9)
-            rests = (JOG_LATE + DEADMAN + STANDS) * speed
+            rests = (JOG_LATE + DEADMAN + BRAKING_TIME) * speed
             return age < JOG_LATE * speed and sight.clear(state, scene, velocities, age + rests)
 
         await _insist(bus, topics.MOTION_OWN, m.OwnRequest(act="take", owner=m.UNKNOWN_OPERATOR, over=True))

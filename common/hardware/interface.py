@@ -185,9 +185,11 @@ class WorldBackend(Protocol):
     """The simulated world around simulated hardware. A cell with real hardware has none.
 
     While `suspended`, another thread changes the world; in the control cycle it stands still. `deferred` is a step
-    that takes longer than a cycle: the executor runs it in a thread if it has set `defers_steps`.
+    that takes longer than a cycle: the executor runs it in a thread if it has set `defers_steps`. `restored` says
+    whether the world was found as it was before a restart.
     """
 
+    restored: bool
     suspended: bool
     defers_steps: bool
     deferred: Callable[[], None] | None
