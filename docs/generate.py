@@ -20,7 +20,7 @@ from common import topics
 from common.application import all_topics
 from common.config.tunables import bounds_of, is_tunable
 from common.planning.planners import load_planner
-from common.process.wiring import owned_in, wiring, wiring_of
+from common.supervision.wiring import owned_in, wiring, wiring_of
 from docs import reference
 from docs.seed_parameters import CAMERA, CONTROLLER, VALIDATOR, SeedParameter
 

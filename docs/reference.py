@@ -13,11 +13,11 @@ from pydantic import BaseModel
 import zencell
 from cli.main import app
 from common.application import all_topics
-from common.client.arm import Arm, Hand
+from common.client.arm import Arm, Gripper
 from common.client.cell import Cell, World
-from common.client.hearing import Camera
 from common.client.parameters import Parameters
 from common.client.scene import Scene
+from common.client.subscriptions import Camera
 from common.client.task import TaskControl
 from common.config.tunables import bounds_of
 from common.messages import schema
@@ -26,7 +26,7 @@ from common.topics import Request
 MADE = "Made by `python -m docs.generate`; a test keeps it current."
 WIDTH = 90  # of a line of code that can be read without scrolling
 PARTS = {  # of the client, as a program gets at each
-    "Cell": Cell, "cell.arm": Arm, "cell.gripper": Hand, "cell.camera()": Camera, "cell.task": TaskControl,
+    "Cell": Cell, "cell.arm": Arm, "cell.gripper": Gripper, "cell.camera()": Camera, "cell.task": TaskControl,
     "cell.param": Parameters, "cell.scene": Scene, "cell.world": World,
 }
 

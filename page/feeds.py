@@ -11,6 +11,7 @@ from common.application import Application
 from common.messages import Image, Message, Rejections
 from common.remapping import Remapping
 from common.topics import Request, Topic
+from page.application import page_of
 
 if TYPE_CHECKING:
     from common.transport.bus import Bus
@@ -117,26 +118,23 @@ class Topics:
         self, application: Application | None, parts: Iterable[HasTopics], keys: Sequence[Mapping[str, str]] = ()
     ) -> None:
         """Look at what an application and parts of the page say, and what services call otherwise by their `keys`."""
+        found, page = application.topics if application is not None else None, page_of(application)
+        self.status: Topic[Any] | None = found.status if found is not None else None
 
-        def named(part: str, name: str) -> Any:
-            return application.find(part, name) if application is not None else None
+        def everywhere(*wanted: Topic[Any] | None) -> list[Topic[Any]]:
+            return [each for topic in wanted if topic is not None for each in under_all_keys(topic, keys)]
 
-        self.status: Topic[Any] | None = named("topics", "STATUS")
-
-        def everywhere(*found: Topic[Any] | None) -> list[Topic[Any]]:
-            return [each for topic in found if topic is not None for each in under_all_keys(topic, keys)]
-
-        self.rejected: list[Topic[Rejections]] = everywhere(named("topics", "REJECTED"))
-        self.detected: list[Topic[Any]] = everywhere(named("topics", "DETECTED"))
-        self.decided_by: list[Topic[Any]] = everywhere(named("topics", "DECIDED_BY"))
+        self.rejected: list[Topic[Rejections]] = everywhere(found.rejected if found else None)
+        self.detected: list[Topic[Any]] = everywhere(found.detected if found else None)
+        self.decided_by: list[Topic[Any]] = everywhere(found.decided_by if found else None)
         self.images: dict[str, list[Topic[Image]]] = {
             LIVE: everywhere(topics.CAMERA_IMAGE, topics.DEPTH_CAMERA_IMAGE),
-            ANNOTATED: everywhere(named("topics", "ANNOTATED")),
-            MASK: everywhere(named("topics", "MASK")),
+            ANNOTATED: everywhere(found.annotated if found else None),
+            MASK: everywhere(found.mask if found else None),
             DEPTH: everywhere(topics.DEPTH_CAMERA_DEPTH),
         }
-        self.requests: Sequence[Request[Any, Any]] = named("page", "REQUESTS") or ()
-        controls = getattr(named("page", "Controls"), "TOPICS", ())
+        self.requests: Sequence[Request[Any, Any]] = page.requests
+        controls = getattr(page.controls, "TOPICS", ())
         shown = [topic for part in parts for topic in part.TOPICS]
         pictures = [topic for each in self.images.values() for topic in each]
         self.on_demand: list[Topic[Any]] = [*pictures, *controls, *shown]

@@ -17,10 +17,10 @@ from common.messages import CameraInfo, Image, JointState
 from common.perception.camera_file import CameraFile
 from common.robot.model import RobotModel
 from tools.calibration.board import Board
-from tools.calibration.calibration import ViewResidual
 from tools.calibration.hand_eye import LEAST_VIEWS, calibrate_hand_eye
-from tools.calibration.record import with_hand_eye
-from tools.calibration.views import AXES, ViewCollector, load_views
+from tools.calibration.intrinsics import ViewResidual
+from tools.calibration.report import with_hand_eye
+from tools.calibration.views import AXES, HandEyeCollector, load_views
 
 Mount = Literal["hand", "beside"]
 
@@ -61,7 +61,7 @@ class HandEye:
         """
         self.folder, self._board, self.mount = folder_of(name), board, mount
         self._robot = RobotModel.load(robot)
-        self._collector = ViewCollector(self.folder, self._robot, robot.name, board)
+        self._collector = HandEyeCollector(self.folder, self._robot, robot.name, board)
 
     @property
     def count(self) -> int:

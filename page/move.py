@@ -185,7 +185,7 @@ class MovePanel:
 
     def _reach(self, now: float) -> None:
         """Look whether the arm can be at the marker, and once that rests why not."""
-        from common.planning.ik import solve_ik, why_no_ik
+        from common.planning.ik import explain_ik_failure, solve_ik
 
         if not self.marker or (seed := self.numbers.joints()) is None:
             return
@@ -201,7 +201,8 @@ class MovePanel:
                                        else "The arm cannot be there.", "good" if there else "bad")
         else:
             self._reached = (pose, before[1], True)
-            self._html.content = _line(f"The arm cannot be there: {why_no_ik(self._robot, target, seed)}", "bad")
+            why = explain_ik_failure(self._robot, target, seed)
+            self._html.content = _line(f"The arm cannot be there: {why}", "bad")
 
     def _state(self) -> tuple[MotionStatus | None, MotionOwner | None]:
         return self._console.latest(topics.MOTION_STATUS), self._console.latest(topics.MOTION_OWNER)

@@ -26,6 +26,7 @@ from common.errors import ZencellError
 from common.messages import Image, PointCloud2, Rejections, TaskStatus
 from common.topics import Topic
 from page import words
+from page.application import page_of
 from page.arm_panel import ArmPanel
 from page.console import Console
 from page.doors import VISITOR
@@ -121,7 +122,7 @@ class Page:
         console.doors.need(STOP, "stop", "STOP")
         console.doors.need(HOLD, "operate", "jogs")
         self._arm = ArmPanel(gui, console)
-        make = application.find("page", "Controls") if application is not None else None
+        make = page_of(application).controls
         self._controls = make(gui, console) if make is not None else None
         self._news = News(self._controls, feeds.latest) if self._controls is not None else None
         panel = gui.add_panel()

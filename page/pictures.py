@@ -12,8 +12,8 @@ import viser
 from numpy.typing import NDArray
 
 from common.messages import Image
+from common.perception.camera_input import FrameError
 from common.perception.image import ImageError, image_to_array
-from common.perception.intake import Unusable
 from page.console import Desk
 from page.feeds import ANNOTATED, DEPTH, LIVE, MASK
 from page.markup import block, span
@@ -50,7 +50,7 @@ def depth_picture(image: Image, widest: int = WIDEST) -> tuple[Picture, str]:
     where.
 
     Raises:
-        Unusable: the message is no depth image.
+        FrameError: the message is no depth image.
     """
     import cv2
 
@@ -116,7 +116,7 @@ class PicturePanel:
                 rgb, said = depth_picture(image)
             else:
                 rgb = rgb_picture(image)
-        except (ImageError, Unusable) as error:
+        except (ImageError, FrameError) as error:
             self._notes[name].content = block(span(error, "bad"), f"{name} picture", pictures=self._count[name])
             return None
         self._count[name] += 1

@@ -11,9 +11,8 @@ from common import topics
 from common.messages import Image, Message, MotionStatus, Rejections, TaskStatus
 from common.topics import Topic
 from page.past import OFTEN, OFTEN_KEPT, SELDOM, Event
-from recording.decoding import Decoder
-from recording.reading import Recording
-from recording.sample import RecordingError, Sample
+from recording.reader import Recording
+from recording.sample import Decoder, RecordingError, Sample
 
 M = TypeVar("M", bound=Message)
 

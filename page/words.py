@@ -1,10 +1,4 @@
-"""What states and codes are called on the page. An application brings words of its own in its part `page`:
-
-    STATES = {"SORTING": "Sorting"}                   # of its task, beside IDLE, HOMING, DONE and ERROR
-    LATENCY = "Picture to targets"                    # what the age of DECIDED_BY is called
-    def counters(status: TaskStatus, rejected: int) -> dict[str, object]:            # the figures below the state
-    def progress(status: TaskStatus, motion: MotionStatus | None) -> float:          # 0 to 1, of the bar
-"""
+"""Labels of states and codes on the page; an application adds its own in `page.application.ApplicationPage`."""
 
 from __future__ import annotations
 
@@ -17,6 +11,7 @@ from common.application import Application
 from common.client.operator_motion import AT_REST
 from common.errors import NoResponder, RemoteError, ZencellError
 from common.messages import GripperState, MotionStatus, PlanResponse, RobotStatus, TaskStatus
+from page.application import page_of
 from page.markup import BAD, BUSY, GOOD, OFF
 
 STATES = {"IDLE": "Waiting", "HOMING": "Going home", "DONE": "Done", "ERROR": "Failed"}
@@ -83,11 +78,8 @@ class TaskWords:
     @classmethod
     def of(cls, application: Application | None) -> TaskWords:
         """The words of an application."""
-        page = application.part("page") if application is not None else None
-        return cls(
-            {**STATES, **getattr(page, "STATES", {})}, getattr(page, "counters", counters),
-            getattr(page, "progress", progress), getattr(page, "LATENCY", cls.latency),
-        )
+        page = page_of(application)
+        return cls({**STATES, **page.states}, page.counters or counters, page.progress or progress, page.latency)
 
     def state(self, status: TaskStatus | None) -> tuple[str, str]:
         """What the task does, in words, and how that is."""

@@ -13,10 +13,9 @@ from common.errors import ConfigError
 from common.messages import CameraInfo
 from common.perception.camera_file import CameraFile, Rectifier, require_size
 from common.perception.image import array_to_image
-from common.perception.sources import Source, open_source
-from common.process.pace import Pace
-from common.process.reopening import Gone, Reopening, keep_open
+from common.perception.image_sources import Source, open_source
 from common.process.service import main
+from common.process.timing import DeviceGone, LoopRate, Reopening, run_with_reopening
 from common.transport.bus import Bus
 
 
@@ -59,7 +58,7 @@ async def run(bus: Bus, config: Config) -> None:
     i = calibrated(config)
     rectify, d = Rectifier(i), [0.0] * 5 if config.rectify else i.distortion.tolist()
     k = [i.fx, 0.0, i.cx, 0.0, i.fy, i.cy, 0.0, 0.0, 1.0]
-    pace = Pace(bus, lambda: config.rate)
+    pace = LoopRate(bus, lambda: config.rate)
     await bus.ready()
 
     async def send(source: Source) -> int:
@@ -84,7 +83,7 @@ async def run(bus: Bus, config: Config) -> None:
                 await pace.wait()
         return count
 
-    async def use() -> Gone | None:
+    async def use() -> DeviceGone | None:
         source = await asyncio.to_thread(open_source, config.source, (i.width, i.height), config.rate, loop=config.loop)
         sent = 0
         if source is not None:
@@ -93,9 +92,9 @@ async def run(bus: Bus, config: Config) -> None:
             source.close()
             if not source.live:
                 return None
-        return Gone(f"camera {config.source} gives no picture", sent)
+        return DeviceGone(f"camera {config.source} gives no picture", sent)
 
-    await keep_open(use, config, bus.log)
+    await run_with_reopening(use, config, bus.log)
     bus.log.info("%s has come to its end", config.source)
     await asyncio.Event().wait()  # other services still look at the last picture
 

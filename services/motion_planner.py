@@ -28,13 +28,13 @@ from common.messages import (
     PlanResponse,
     PointCloud2,
 )
+from common.planning.camera_obstacles import Camera, CameraMessages, CameraObstacles, JointHistory, PointsOptions
 from common.planning.pipeline import PlanningPipeline
-from common.planning.points import PointObstacle
+from common.planning.point_obstacles import PointObstacle
 from common.planning.problem import Cancel
-from common.planning.seeing import Camera, JointHistory, PointsOptions, Seeing, Seen
-from common.planning.watching import NotWatched, SceneMonitor
-from common.process.pace import NICENESS, come_last
-from common.process.planning_helper import Helper, HelperLost, fork_helpers
+from common.planning.scene_monitor import NotMonitored, SceneMonitor
+from common.process.environment import NICENESS, lower_thread_priority
+from common.process.planning_worker import PlanningWorker, WorkerDied, fork_workers
 from common.process.service import main
 from common.robot.finger_joints import measured_width
 from common.robot.model import RobotModel
@@ -66,7 +66,7 @@ class Config(Parameters):
 Planner = Callable[..., Awaitable[PlanResponse]]  # of request, scene, joints, width and what makes obstacles of points
 
 
-async def run(bus: Bus, config: Config, helpers: Sequence[Helper] = ()) -> None:
+async def run(bus: Bus, config: Config, helpers: Sequence[PlanningWorker] = ()) -> None:
     """Serve plan requests on the newest planning scene, from the newest joint states unless a start is given."""
     scenes = bus.reader(topics.PLANNING_SCENE)
     states = bus.reader(topics.JOINT_STATES)
@@ -93,14 +93,14 @@ async def run(bus: Bus, config: Config, helpers: Sequence[Helper] = ()) -> None:
     async def handle(request: PlanRequest) -> PlanResponse:
         try:
             response, scene, width = await plan(request)
-        except HelperLost as lost:
+        except WorkerDied as lost:
             bus.log.error("%s: %s is planned again, by one fewer from now on", lost, request.stage or request.id)
             return await handle(request)
         response.header = bus.header()
         if response.trajectory is not None:
             response.trajectory.header = bus.header()
             if watcher is not None:
-                watcher.monitor.note(request, scene, response.trajectory, width)
+                watcher.monitor.add_plan(request, scene, response.trajectory, width)
             display.put(response.trajectory)
         else:
             bus.log.warning("%s [%s]", response.message, response.error)
@@ -141,8 +141,8 @@ def _load(config: Config) -> PlanningPipeline:
 
 
 async def _by_helper(
-    helper: Helper, request: PlanRequest, scene: PlanningScene, current: list[float] | None, width: float | None,
-    see: Callable[[], list[PointObstacle]] | None,
+    helper: PlanningWorker, request: PlanRequest, scene: PlanningScene, current: list[float] | None,
+    width: float | None, see: Callable[[], list[PointObstacle]] | None,
 ) -> PlanResponse:
     assert see is None
     return await helper.plan(request, scene, current, width)
@@ -168,7 +168,7 @@ class Crew:
         stays = True
         try:
             yield planner
-        except HelperLost:
+        except WorkerDied:
             stays = False
             raise
         finally:
@@ -204,7 +204,7 @@ class Watcher:
                 self._woken.clear()
                 try:
                     await self._look()
-                except NotWatched as error:
+                except NotMonitored as error:
                     self._bus.log.warning("the motion that runs is not watched: %s", error)
                 except RequestFailed as error:
                     self._bus.log.warning("%s", error)
@@ -223,11 +223,11 @@ class Watcher:
         if status is not None and self._answer is not None and self._answer.header.stamp > status.header.stamp:
             status = self._answer
         if status is None or scene is None or status.state != "active" or not status.id:
-            self.monitor.forget()
+            self.monitor.unfollow()
             return
         if status.id != self.monitor.goal:
             await self._follow(status)
-        problem, held = self.monitor.in_the_way(scene, status.progress), HOLDER in status.held_by
+        problem, held = self.monitor.find_obstruction(scene, status.progress), HOLDER in status.held_by
         if bool(problem) == held:
             return
         request = HoldRequest(hold=bool(problem), reason=problem, by=HOLDER, goal=status.id)
@@ -240,14 +240,14 @@ class Watcher:
             self._bus.log.info("the arm goes on: nothing is in its way any more")
 
     async def _follow(self, status: MotionStatus) -> None:
-        if self.monitor.knows(status.plan):
+        if self.monitor.has_plan(status.plan):
             self.monitor.follow(status.id, status.plan)
             return
         try:
             asked = await self._followed.call(FollowedRequest(id=status.id), REQUEST_TIMEOUT)
         except RemoteError as error:  # it is over by now
-            self.monitor.forget(status.id)
-            raise NotWatched(str(error)) from None
+            self.monitor.unfollow(status.id)
+            raise NotMonitored(str(error)) from None
         self.monitor.follow(status.id, asked.plan, asked.trajectory)
 
 
@@ -258,23 +258,23 @@ class Eyes:
         self._bus, self._options = bus, options
         self._readers = [_readers(bus, camera) for camera in options.cameras]
         self._poses, self._states = bus.reader(topics.TF_STATIC), bus.reader(topics.JOINT_STATES)
-        self._loaded: list[tuple[Seeing, JointHistory]] = []
+        self._loaded: list[tuple[CameraObstacles, JointHistory]] = []
 
     def load(self, pipeline: PlanningPipeline) -> None:
         """Take over the robot."""
-        seeing = Seeing(pipeline.robot, pipeline.geometry, self._options)
+        seeing = CameraObstacles(pipeline.robot, pipeline.geometry, self._options)
         self._loaded.append((seeing, JointHistory(pipeline.robot)))
 
     async def follow(self) -> None:
         """Note where the robot is, for as long as the service runs."""
         async for state in self._states:
-            self._loaded[0][1].note(state)
+            self._loaded[0][1].add(state)
 
     def look(self, scene: PlanningScene, stage: str) -> Callable[[], list[PointObstacle]]:
         """What makes obstacles, in a thread, of what has come until now."""
         (seeing, joints), now, poses = self._loaded[0], self._bus.clock.now_ns(), self._poses.latest
         seen = [
-            Seen(camera, pictures.latest, None if infos is None else infos.latest)
+            CameraMessages(camera, pictures.latest, None if infos is None else infos.latest)
             for camera, (pictures, infos) in zip(self._options.cameras, self._readers, strict=True)
         ]
 
@@ -308,7 +308,7 @@ async def _plan(
     cancel = Cancel()
 
     def plan() -> PlanResponse:
-        come_last()
+        lower_thread_priority()
         points = [] if see is None else see()
         return pipeline.plan(request, scene, current, cancel, points, width)
 
@@ -323,4 +323,4 @@ async def _plan(
 
 
 if __name__ == "__main__":
-    main(partial(run, helpers=fork_helpers(NICENESS)), Config)
+    main(partial(run, helpers=fork_workers(NICENESS)), Config)

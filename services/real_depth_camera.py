@@ -11,12 +11,11 @@ from pydantic import Field
 from common import topics
 from common.config import Surroundings, Tunable
 from common.perception.depth import point_cloud
-from common.perception.depth_sources import CameraGone, DepthSource, find_driver, require_whole
+from common.perception.depth_drivers import CameraLost, DepthSource, find_camera_driver, require_frame_shape
 from common.perception.image import array_to_image
-from common.perception.mounted import in_mount
-from common.perception.pinhole import Pinhole
-from common.process.reopening import Gone, Reopening, keep_open
+from common.perception.pinhole import Pinhole, camera_in_mount
 from common.process.service import main
+from common.process.timing import DeviceGone, Reopening, run_with_reopening
 from common.transport.bus import Bus
 
 CLOSING = 5.0  # [s] after which a camera that hangs is left to itself
@@ -36,21 +35,21 @@ async def run(bus: Bus, config: Config) -> None:
     images, depths = bus.writer(topics.DEPTH_CAMERA_IMAGE), bus.writer(topics.DEPTH_CAMERA_DEPTH)
     points, infos = bus.writer(topics.DEPTH_CAMERA_POINTS), bus.writer(topics.DEPTH_CAMERA_INFO)
     field = f"services.{bus.service}.driver"
-    driver, options = find_driver(config.driver, config.options, field)
+    driver, options = find_camera_driver(config.driver, config.options, field)
     wanted, frame = config.world.camera, config.world.camera.frame
     await bus.ready()
 
-    async def send(camera: DepthSource) -> Gone:
+    async def send(camera: DepthSource) -> DeviceGone:
         """Send what the camera gives until it gives no more."""
         loop, sent, last, newest = asyncio.get_running_loop(), 0, -math.inf, 0
         lens = camera.lens
-        known = Pinhole(lens.fx, lens.fy, lens.cx, lens.cy, lens.width, lens.height, in_mount(wanted))
+        known = Pinhole(lens.fx, lens.fy, lens.cx, lens.cy, lens.width, lens.height, camera_in_mount(wanted))
         while True:
             try:
                 shot = await asyncio.to_thread(camera.read)
-            except CameraGone as error:
-                return Gone(f"camera {config.driver}: {error}", sent)
-            require_whole(shot, lens, field, config.driver)
+            except CameraLost as error:
+                return DeviceGone(f"camera {config.driver}: {error}", sent)
+            require_frame_shape(shot, lens, field, config.driver)
             since = (loop.time() - last) * config.rate  # periods since the last picture was due
             if since < 0.5:
                 continue  # it is read at its own pace, or old pictures would wait in there
@@ -66,11 +65,11 @@ async def run(bus: Bus, config: Config) -> None:
                 points.put(point_cloud(shot.colour, shot.depth, known, header))
             sent += 1
 
-    async def use() -> Gone:
+    async def use() -> DeviceGone:
         try:
             camera = await asyncio.to_thread(driver.open_camera, options, (wanted.width, wanted.height), config.rate)
-        except CameraGone as error:
-            return Gone(f"camera {config.driver}: {error}")
+        except CameraLost as error:
+            return DeviceGone(f"camera {config.driver}: {error}")
         # Not closed when this is cancelled: a thread may still be waiting for a picture in there.
         gone = await send(camera)
         try:
@@ -80,7 +79,7 @@ async def run(bus: Bus, config: Config) -> None:
             bus.log.warning("camera %s does not let go of what is gone", config.driver)
         return gone
 
-    await keep_open(use, config, bus.log)
+    await run_with_reopening(use, config, bus.log)
 
 
 if __name__ == "__main__":

@@ -79,7 +79,7 @@ class Publishers:
         if simulated:
             self._writers["objects"] = bus.writer(topics.SCENE_OBJECTS)
         application = config.members.application
-        views = find_application(application).views if simulated and application else {}
+        views = find_application(application).truth_views if simulated and application else {}
         self._views = [(bus.writer(topic), view) for topic, view in views.items()]  # the truth in application messages
 
     def put(self, status: MotionStatus | MotionOwner) -> None:

@@ -5,20 +5,16 @@ from __future__ import annotations
 import numpy as np
 from pydantic import Field
 
-from applications.outlining.messages import OutlinePoints
-from applications.outlining.perceived_solids import PerceivedSolid
-from applications.outlining.scene import planning_scene
-from applications.outlining.topics import CONTOUR_PATH
+from applications.outlining.solids import PerceivedSolid, planning_scene
+from applications.outlining.topics import CONTOUR_PATH, OutlinePoints
 from common import topics
 from common.config import Parameters, RobotConfig, Surroundings, Tunable
 from common.messages import Header, Pose, Vector3, WorldObject
-from common.process.pace import Pace
 from common.process.planning_scene import SceneWriter
+from common.process.timing import LoopRate
 from common.scene.home import HomeWatch
 from common.transport.bus import Bus
 
-REPLACES = ("depth_camera", "contour_detector", "pixel_to_world", "duplicate_remover", "outline_scene")
-SETTINGS = ("motion.velocity_scaling=0.6", "motion.acceleration_scaling=1.0")
 WORLD = "world"
 
 
@@ -51,7 +47,7 @@ async def run(bus: Bus, config: Config) -> None:
     home = HomeWatch(config.robot.named_poses["home"])
     await out.begin(planning_scene(config.world, [], 0))
     await bus.ready()
-    pace = Pace(bus, lambda: bus.clock.wall_rate(config.rate, 30.0))
+    pace = LoopRate(bus, lambda: bus.clock.wall_rate(config.rate, 30.0))
     while True:
         objects, state, stamp = truth.latest, joints.latest, bus.header().stamp
         if state is not None:

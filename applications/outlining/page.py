@@ -9,15 +9,24 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
-from applications.outlining.contours_choice import middle_of
-from applications.outlining.messages import Contour, OutlineSelect, OutlineSelection, OutlineStatus
-from applications.outlining.topics import CONTOUR_PATH, CONTOURS, OUTLINE_SELECT, OUTLINE_STATUS
+from applications.outlining.contour_choice import middle_of
+from applications.outlining.topics import (
+    CONTOUR_PATH,
+    CONTOURS,
+    OUTLINE_SELECT,
+    OUTLINE_STATUS,
+    Contour,
+    OutlineSelect,
+    OutlineSelection,
+    OutlineStatus,
+)
 from common import topics
 from common.config import Fixture
 from common.messages import CollisionObject, MotionStatus, TaskStatus
 from common.perception.pinhole import CameraError, Pinhole
 from common.terminal import printable
 from common.topics import Topic
+from page.application import ApplicationPage
 from page.layers import Layer
 from page.nodes import FLAT, add_line, points_of, rgb_of
 
@@ -27,11 +36,6 @@ if TYPE_CHECKING:
     from page.console import Console
 
 Array = NDArray[np.float64]
-
-STATES = {"SELECTING": "Waiting for a choice", "PLANNING": "Planning", "APPROACHING": "Approaching",
-          "TRACING": "Tracing", "RETREATING": "Retreating"}
-LATENCY = "Picture to path"
-REQUESTS = (OUTLINE_SELECT,)
 
 LARGEST = "Largest"
 OUTLINE = (255, 140, 40)
@@ -233,3 +237,11 @@ def _top(thing: CollisionObject) -> float:
     """Height [m] of the top of an upright object."""
     sizes = thing.dimensions
     return thing.pose.position.z + (sizes[0] if thing.shape == "sphere" else sizes[-1] / 2)
+
+
+PAGE = ApplicationPage(
+    layers=(Outline, ContourChoice), controls=Controls, requests=(OUTLINE_SELECT,),
+    states={"SELECTING": "Waiting for a choice", "PLANNING": "Planning", "APPROACHING": "Approaching",
+            "TRACING": "Tracing", "RETREATING": "Retreating"},
+    latency="Picture to path", counters=counters, progress=progress,
+)

@@ -1,29 +1,26 @@
-"""A double of perception, for simulations: says what lies on the table and in the container, and needs no picture."""
+"""Replacement of the perception in simulations: reports the objects on the table and in containers, without images."""
 
 from __future__ import annotations
 
 from pydantic import Field
 
-from applications.pick_place.perceived import PerceivedScene
+from applications.pick_place.perceived_scene import PerceivedScene, SceneParameters
 from applications.pick_place.topics import VALIDATED_TARGETS
-from applications.pick_place.tracks import SceneParameters
 from common import topics
 from common.config import RobotConfig, Surroundings, Tunable
 from common.errors import ConfigError
 from common.messages import Header, Marker, MarkerArray, Pose, PoseArray, Vector3, WorldObject
-from common.perception.mounted import Mounted
-from common.process.pace import Pace
+from common.perception.pinhole import MountedCamera
 from common.process.planning_scene import SceneWriter
+from common.process.timing import LoopRate
 from common.robot.model import RobotModel
 from common.transport.bus import Bus
 
-REPLACES = ("camera_simulator", "vision_detector", "workspace_validator", "scene_manager")
-SETTINGS = ("world.count=1", "motion.velocity_scaling=0.6", "motion.acceleration_scaling=1.0")
 WORLD = "world"
 
 
 class Config(SceneParameters):
-    """How often is looked."""
+    """How often the scene is published."""
 
     robot: RobotConfig
     world: Surroundings
@@ -31,24 +28,24 @@ class Config(SceneParameters):
 
 
 def marker(index: int, thing: WorldObject) -> Marker:
-    """An object as a detector that sees everything would tell of it."""
+    """Return an object as the marker of a perfect detector."""
     return Marker(ns="ball", id=index, type="sphere", pose=Pose(position=thing.pose.position), scale=thing.size,
                   color=thing.color)
 
 
 async def run(bus: Bus, config: Config) -> None:
-    """Keep the planning scene as `scene_manager` does, and offer all that lies on the table to the task."""
+    """Publish the planning scene as `scene_manager` does, and everything on the table as targets."""
     truth, joints = bus.reader(topics.SCENE_OBJECTS), bus.reader(topics.JOINT_STATES)
     gripper = bus.reader(topics.GRIPPER_STATE)
     validated, out = bus.writer(VALIDATED_TARGETS), SceneWriter(bus)
     robot = RobotModel.load(config.robot)
-    camera = Mounted(config.world.camera, robot).at()
+    camera = MountedCamera(config.world.camera, robot).at()
     if config.robot.gripper is None:
         raise ConfigError("robot.gripper", ..., "is missing: what takes objects needs one")
     scene = PerceivedScene(config, config.world, config.robot.gripper, config.robot.tcp_link)
     await out.begin(scene.scene())
     await bus.ready()
-    pace = Pace(bus, lambda: bus.clock.wall_rate(config.rate, 50.0))
+    pace = LoopRate(bus, lambda: bus.clock.wall_rate(config.rate, 50.0))
     while True:
         state, measured, objects = gripper.latest, joints.latest, truth.latest
         q = robot.order(measured.name, measured.position) if measured else None

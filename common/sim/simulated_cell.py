@@ -21,7 +21,7 @@ from common.hardware.interface import (
     Vector,
 )
 from common.messages import Header, SceneUpdate, WorldEdit, WorldEditReply, WorldObjects
-from common.perception.mounted import from_home
+from common.perception.pinhole import cameras_at_home
 from common.robot.model import RobotModel
 from common.scene.workspace import WorkspaceBounds, reach_reason
 from common.sim.interface import FeltWorld, GraspTolerances, SimulatedWorld, StandingObject, load_world
@@ -59,7 +59,7 @@ def create_world(
     Raises:
         ConfigError: no layout was found, or the simulator cannot be used.
     """
-    objects = layout(from_home(world, robot), seed, lambda x, y, z: _within_reach(robot, (x, y, z), grasp, bounds))
+    objects = layout(cameras_at_home(world, robot), seed, lambda x, y, z: _within_reach(robot, (x, y, z), grasp, bounds))
     return load_world(world, objects, tolerances, gripper)
 
 

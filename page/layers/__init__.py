@@ -1,6 +1,6 @@
 """What the 3D scene is made of: layers, each shown and hidden by a tick of its own, found by name as planners are.
 
-Those of this package are in every cell; an application brings its own in its part `page`, and a person names theirs as
+Those of this package are in every cell; an application brings its own in `Application.page`, and a user names theirs as
 `services.viewer.layers: [my_pkg.my_layer]`. Such a module has one or more classes derived from `Layer`, or is a layer
 itself:
 
@@ -27,6 +27,7 @@ from common.application import Application, applications
 from common.errors import ConfigError, UnknownName
 from common.messages import JointTrajectory
 from common.topics import Topic
+from page.application import page_of
 from page.feeds import under_all_keys
 
 if TYPE_CHECKING:
@@ -113,10 +114,10 @@ def find_layers(
     Raises:
         ConfigError: a module cannot be imported, or has no layer.
     """
-    parts = [application.part("page")] if application is not None else []
     found: dict[str, type[Layer]] = {}
-    for module in [*map(_import, FIRST), *(part for part in parts if part is not None), *map(_import_own, own)]:
-        found |= layers_in(module)  # one of a name that is there already takes its place
+    for brought in [*(layers_in(_import(name)) for name in FIRST), named(page_of(application).layers),
+                    *(layers_in(_import_own(name)) for name in own)]:
+        found |= brought  # a layer replaces one of the same name
     for module in map(_import, LAST):
         found = found | {name: kind for name, kind in layers_in(module).items() if name not in found}
     if keys:
@@ -128,13 +129,21 @@ def find_layers(
 
 def layers_in(module: ModuleType) -> dict[str, type[Layer]]:
     """The layers that a module brings; the names of those that do not come with the project begin with the module's."""
-    prefix = "" if module.__name__.partition(".")[0] in ("page", "applications") else f"{module.__name__}."
     classes = [kind for kind in vars(module).values()
                if isinstance(kind, type) and issubclass(kind, Layer) and kind.__module__ == module.__name__]
-    found = {prefix + (kind.NAME or re.sub(r"(?<!^)(?=[A-Z])", "_", kind.__name__).lower()): kind for kind in classes}
+    found = named(classes)
     if callable(getattr(module, "show", None)) and hasattr(module, "TOPICS") and hasattr(module, "LABEL"):
         says = {name: vars(module)[name] for name in SAYS if hasattr(module, name)}
         found[module.__name__] = type("OwnLayer", (Layer,), says)
+    return found
+
+
+def named(classes: Iterable[type[Layer]]) -> dict[str, type[Layer]]:
+    """Layers by name; names of layers that are not part of the project start with the name of their module."""
+    found = {}
+    for kind in classes:
+        prefix = "" if kind.__module__.partition(".")[0] in ("page", "applications") else f"{kind.__module__}."
+        found[prefix + (kind.NAME or re.sub(r"(?<!^)(?=[A-Z])", "_", kind.__name__).lower())] = kind
     return found
 
 
@@ -146,7 +155,7 @@ def layers_shown(wanted: Mapping[str, bool], here: Layers) -> dict[str, bool]:
     """
     unknown = [name for name in wanted if name not in here and "." not in name]
     if unknown:
-        elsewhere = {name for other in applications() if (part := other.part("page")) for name in layers_in(part)}
+        elsewhere = {name for other in applications() for name in named(page_of(other).layers)}
         for name in unknown:
             if name not in elsewhere:
                 raise UnknownName("layer", name, list(here))

@@ -45,14 +45,14 @@ class Truth(Layer):
 
     def show(self, topic: Topic[Any], message: Any) -> None:
         """Show these objects and no others; of more than there is room for, the first."""
-        from common.sim.objects import look_of  # brings shapes, which only a scene needs
+        from common.sim.objects import appearance_of  # brings shapes, which only a scene needs
 
         self._things, work = {}, 0
         for thing in message.objects:
             work += len(thing.polygon) ** 2
             if work <= _MOST_WORK:
                 self._things[thing.id] = thing
-        looks = {name: look_of(thing)[:_COLOR] for name, thing in self._things.items()}
+        looks = {name: appearance_of(thing)[:_COLOR] for name, thing in self._things.items()}
         for name in [name for name, (look, _) in self._nodes.items() if looks.get(name) != look]:
             if name in self._drags:
                 self._drags.pop(name).stop()

@@ -11,7 +11,7 @@ from tests.harness import Zencell, free_domain
 SERVICE = '''"""A tiny service."""
 import asyncio, os, sys
 from applications.pick_place.topics import PICK_PLACE_STATUS
-from applications.pick_place.messages import PickPlaceStatus
+from applications.pick_place.topics import PickPlaceStatus
 from common import topics
 from common.config import Parameters
 from common.errors import ConfigError

@@ -7,9 +7,9 @@ import pytest
 
 from common import topics
 from common.messages import Header, Image, PointCloud2
+from common.perception.camera_input import FrameError
 from common.perception.depth import point_cloud
 from common.perception.image import array_to_image
-from common.perception.intake import Unusable
 from common.perception.pinhole import Pinhole
 from page.layers.points import thinned
 from page.layers.reach import shell_of
@@ -60,7 +60,7 @@ def test_near_depths_are_red_far_ones_blue_and_none_black() -> None:
     assert first[0] > 100 > first[2] and last[2] > last[0]
     assert picture[20, 50].tolist() == [0, 0, 0]
     assert said == "red 0.416 m, blue 1.184 m and farther"
-    with pytest.raises(Unusable, match="is no depth image"):
+    with pytest.raises(FrameError, match="is no depth image"):
         depth_picture(Image(header=Header(), height=2, width=2, encoding="bgr8", data=bytes(12)))
 
 

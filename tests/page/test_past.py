@@ -20,7 +20,7 @@ from page.past import MOST_BYTES, SECONDS, Memory
 from page.recorded import RecordedPast, Watch, recordings_in
 from page.timeline import Timeline
 from recording.sample import RecordingError, Sample
-from recording.writing import RecordingWriter
+from recording.writer import RecordingWriter
 
 NAMES = {"DONE": "Done"}
 

@@ -32,7 +32,7 @@ from common.transport.credentials import ROUTER_NAME, Credentials, credentials_o
 from common.transport.endpoint import MOST_BYTES, MOST_BYTES_BESIDES, client_config, router_config
 from common.transport.session import RawSample
 from page.access import ROLES, tokens_in
-from recording.reading import Recording
+from recording.reader import Recording
 from security.certificates import Authority
 from tests.harness import RunningCell, command_line, environment, until
 from tests.security.holders import REFUSED, Heard, Holder

@@ -9,12 +9,12 @@ import yaml
 from common import topics
 from common.config import Surroundings
 from common.errors import ConfigError
-from common.perception import sources
+from common.perception import image_sources as sources
 from common.perception.camera_file import CameraFile, Rectifier
 from common.perception.image import image_to_array
-from common.perception.sources import Video, open_source
+from common.perception.image_sources import Video, open_source
 from common.process.in_process import running_service
-from common.process.wiring import wiring
+from common.supervision.wiring import wiring
 from common.transport.local import LocalNetwork
 from services import camera_opencv
 from services.camera_opencv import Config, calibrated, run
@@ -141,7 +141,7 @@ async def test_a_device_that_vanishes_is_told_and_opened_again(monkeypatch, intr
             while device.opened < 5 or len(seen) < 3:
                 seen.add(value_of(await asyncio.wait_for(images.next(), 10)))
     lines = [record.getMessage() for record in caplog.records]
-    assert lines[0] == "camera 0 gives no picture; it is opened again in 0.01 s"
+    assert lines[0] == "camera 0 gives no picture; opening it again in 0.01 s"
     assert lines[1].endswith("in 0.02 s")
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from applications.outlining.messages import OutlinePoints
+from applications.outlining.topics import OutlinePoints
 from applications.pick_place.topics import REJECTED_TARGETS, WORKSPACE_MARKERS
 from common import topics
 from common.config import Parameters, World

@@ -22,8 +22,8 @@ from common.messages import (
     StopRequest,
 )
 from common.process.in_process import running_service
-from common.process.wiring import wiring
 from common.robot.model import RobotModel
+from common.supervision.wiring import wiring
 from common.transport.bus import Bus
 from common.transport.local import LocalNetwork
 from services import trajectory_executor

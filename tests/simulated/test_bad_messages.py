@@ -8,7 +8,7 @@ import pytest
 
 from common import topics
 from common.config import Cell, load_cell
-from common.process.wiring import owned_in, wiring_of
+from common.supervision.wiring import owned_in, wiring_of
 from common.transport.bus import Bus
 from lab.chaos.agent import Chaos
 from lab.chaos.plan import Fault, Form

@@ -56,7 +56,7 @@ class Way:
         SEEN.update(self.seen)
         held = await until(self.motion, lambda m: "scene_monitor" in m.held_by and m.message.startswith("held"), 2.0)
         assert held.id == status.id and held.progress < 0.6 and held.plan and held.scene_stamp
-        assert "ball is in the way of panda_" in held.message
+        assert "ball obstructs panda_" in held.message
         return held
 
     def _ball(self, trajectory: JointTrajectory) -> CollisionObject:

@@ -5,21 +5,29 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from applications.outlining.contours import ContourOptions, channel_of, find_contours, is_hole
-from applications.outlining.contours_choice import (
+from applications.outlining.contour_choice import (
+    CHOSEN,
     NAMES,
+    ContourTracker,
     NoSuchContour,
+    annotate_contours,
     choose,
     colour_name,
     described,
     parse_choice,
 )
-from applications.outlining.contours_drawing import CHOSEN, annotate_contours
-from applications.outlining.contours_following import Following
-from applications.outlining.contours_refinement import normals, refine
-from applications.outlining.duplicates import simplified
-from applications.outlining.evening import SHORTEST, evened
-from applications.outlining.messages import Contours, OutlineSelect
+from applications.outlining.contours import (
+    SHORTEST,
+    ContourOptions,
+    channel_of,
+    find_contours,
+    is_hole,
+    normals,
+    refine,
+    smoothed,
+)
+from applications.outlining.solids import simplified
+from applications.outlining.topics import Contours, OutlineSelect
 from common.errors import DecodeError
 from common.messages import Color, Header
 from common.transport.codec import decode, encode
@@ -168,7 +176,7 @@ def test_noise_of_the_picture_is_evened_out_and_corners_stay_sharp(shape, turns,
     even, off = outlined(shape, 12.0)
     assert off.mean() < 0.08 and off.max() < 0.6
     assert len(simplified(even, 0.2)) < turns, "an outline that zigzags is not followed at an even speed"
-    monkeypatch.setattr("applications.outlining.evening.SHORTEST", np.inf)
+    monkeypatch.setattr("applications.outlining.contours.SHORTEST", np.inf)
     rough, off_rough = outlined(shape, 12.0)
     assert off.mean() < 0.7 * off_rough.mean() and len(simplified(rough, 0.2)) > turns
 
@@ -179,14 +187,14 @@ def test_noise_of_the_picture_is_evened_out_and_corners_stay_sharp(shape, turns,
 def test_without_noise_a_contour_stays_as_it_is_and_with_it_details_do(shape, monkeypatch):
     clean, _ = outlined(shape, 0.0)
     _, off = outlined(shape, 12.0)
-    monkeypatch.setattr("applications.outlining.evening.SHORTEST", np.inf)
+    monkeypatch.setattr("applications.outlining.contours.SHORTEST", np.inf)
     assert np.array_equal(outlined(shape, 0.0)[0], clean)
     assert off.mean() < 1.1 * outlined(shape, 12.0)[1].mean()
 
 
 def test_contour_that_is_too_short_to_be_evened_out_stays_as_it_is():
     few = np.random.default_rng(0).normal(0, 5, (SHORTEST - 1, 2))
-    assert evened(few) is few
+    assert smoothed(few) is few
 
 
 def test_normals_point_out_of_the_object_at_its_edge_and_into_a_hole():
@@ -258,7 +266,7 @@ def test_colours_have_the_names_people_give_them(rgb, name):
 
 def test_the_chosen_object_is_followed_and_not_exchanged_for_another():
     here = find_contours(picture((20, 20, 30, 30, RED), (80, 60, 20, 20, BLUE)), SEED)
-    following = Following(OutlineSelect())
+    following = ContourTracker(OutlineSelect())
     chosen, said = following.find(here)
     assert colour_name(here[chosen].color) == "red" and not said
     moved = find_contours(picture((25, 22, 30, 30, RED), (80, 60, 20, 20, BLUE), (100, 5, 50, 50, GREEN)), SEED)
@@ -269,14 +277,14 @@ def test_the_chosen_object_is_followed_and_not_exchanged_for_another():
 
 
 def test_a_choice_that_can_not_be_is_tried_again_and_a_refused_one_changes_nothing():
-    following = Following(OutlineSelect(rule="colour", colour="blue"))
+    following = ContourTracker(OutlineSelect(rule="colour", colour="blue"))
     assert following.find(find_contours(picture((20, 20, 30, 30, RED)), SEED))[0] == -1
     both = find_contours(picture((20, 20, 30, 30, RED), (80, 60, 20, 20, BLUE)), SEED)
     assert colour_name(both[following.find(both)[0]].color) == "blue"
     with pytest.raises(NoSuchContour):
         following.select(both, OutlineSelect(rule="index", index=9))
     assert colour_name(both[following.find(both)[0]].color) == "blue"
-    assert Following(None).find(both) == (-1, f"no object is chosen; choices: {described(both)}")
+    assert ContourTracker(None).find(both) == (-1, f"no object is chosen; choices: {described(both)}")
 
 
 def test_annotation_draws_the_chosen_contour_and_leaves_the_picture_alone():

@@ -8,9 +8,16 @@ from typing import Any
 
 import pytest
 
-from applications.outlining.messages import OutlinePoints, OutlineSelect, OutlineSelection, OutlineStatus
 from applications.outlining.page import choose
-from applications.outlining.topics import CONTOUR_PATH, OUTLINE_SELECT, OUTLINE_STATUS
+from applications.outlining.topics import (
+    CONTOUR_PATH,
+    OUTLINE_SELECT,
+    OUTLINE_STATUS,
+    OutlinePoints,
+    OutlineSelect,
+    OutlineSelection,
+    OutlineStatus,
+)
 from common import messages as m
 from common import topics
 from common.config import Members

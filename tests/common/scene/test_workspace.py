@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from applications.pick_place.resting import Resting
+from applications.pick_place.ball_places import BallGeometry
 from common.config import Grasp, Surroundings, check, load_cell
 from common.errors import ConfigError
 from common.perception.pinhole import Pinhole
@@ -137,14 +137,14 @@ def test_the_cache_forgets_the_longest_unused(robot, monkeypatch):
 @pytest.mark.parametrize("dx", [-0.033, 0.033])
 @pytest.mark.parametrize("dy", [-0.033, 0.033])
 def test_every_ball_in_the_box_is_inside_the_container_by_its_ray(dx, dy, z):
-    assert Resting.of(around).shows_container(camera, camera.project((0.55 + dx, 0.25 + dy, z)))
+    assert BallGeometry.of(around).shows_container(camera, camera.project((0.55 + dx, 0.25 + dy, z)))
 
 
 def test_balls_beside_the_box_are_not_inside():
     c = around.container
     reach = c.half_side + 0.04 + around.ball_radius
     for x, y in ((c.x - reach, c.y), (c.x, c.y - reach), (c.x + reach, c.y + reach)):
-        assert not Resting.of(around).shows_container(camera, camera.project((x, y, 0.03)))
+        assert not BallGeometry.of(around).shows_container(camera, camera.project((x, y, 0.03)))
 
 
 @given(st.floats(0, 639), st.floats(0, 479))
@@ -156,4 +156,4 @@ def test_the_ray_test_agrees_with_points_along_the_ray(u, v):
     within = (np.abs(along - (c.x, c.y, 0.0)) <= (h, h, 0.125)).all(axis=1) & (along[:, 2] >= 0)
     grazing = (np.abs(along - (c.x, c.y, 0.0)) <= (h + 0.001, h + 0.001, 0.126)).all(axis=1) & (along[:, 2] >= -0.001)
     if within.any() or not grazing.any():
-        assert Resting.of(around).shows_container(camera, (u, v)) == bool(within.any())
+        assert BallGeometry.of(around).shows_container(camera, (u, v)) == bool(within.any())

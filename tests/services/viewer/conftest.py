@@ -11,11 +11,11 @@ from typing import Any, ClassVar
 
 import pytest
 
-from applications.outlining.messages import (
+from applications.outlining.topics import (
+    OUTLINE_SELECT,
     OutlineSelect,
     OutlineSelection,
 )
-from applications.outlining.topics import OUTLINE_SELECT
 from common import messages as m
 from common import topics
 from common.clock import Clock
@@ -47,7 +47,7 @@ class SceneDouble:
         self.goal_pose = m.Pose(position=m.Vector3(x=0.4, z=0.5))
         self.calls: list[tuple[str, tuple[Any, ...]]] = []
         self.visible = dict(shown)
-        self.begun = False  # is fed, and heard
+        self.started = False  # is fed, and heard
         SceneDouble.made.append(self)
 
     def __getattr__(self, name: str) -> Callable[..., None]:
@@ -55,7 +55,7 @@ class SceneDouble:
 
     def set_shown(self, layer: str, on: bool) -> None:
         self.visible[layer] = on
-        self.begun = True
+        self.started = True
 
     def told(self, name: str) -> list[tuple[Any, ...]]:
         return [arguments for called, arguments in self.calls if called == name]
@@ -129,7 +129,7 @@ def config_of(cell: Cell, **changes: object) -> viewer.Config:
 
 
 @asynccontextmanager
-async def page_of(cell: str, serve: bool = True, **changes: object) -> AsyncIterator[Played]:
+async def build_report(cell: str, serve: bool = True, **changes: object) -> AsyncIterator[Played]:
     """A viewer among played services."""
     net = LocalNetwork()
     played = Played(net, net.bus("played", cell="test", clock=Clock()))
@@ -147,7 +147,7 @@ async def page_of(cell: str, serve: bool = True, **changes: object) -> AsyncIter
 
 @pytest.fixture
 async def panda() -> AsyncIterator[Played]:
-    async with page_of("panda") as played:
+    async with build_report("panda") as played:
         yield played
 
 
