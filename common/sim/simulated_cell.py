@@ -59,7 +59,8 @@ def create_world(
     Raises:
         ConfigError: no layout was found, or the simulator cannot be used.
     """
-    objects = layout(cameras_at_home(world, robot), seed, lambda x, y, z: _within_reach(robot, (x, y, z), grasp, bounds))
+    seen = cameras_at_home(world, robot)
+    objects = layout(seen, seed, lambda x, y, z: _within_reach(robot, (x, y, z), grasp, bounds))
     return load_world(world, objects, tolerances, gripper)
 
 
