@@ -108,7 +108,7 @@ class DeviceFault:
         """Return why the device cannot be commanded, or None."""
         return Refused("hardware_fault", self.reason) if self.reason else None
 
-    def take_note(self) -> str:
+    def pop_log_line(self) -> str:
         """Return a line for the log if the fault has changed since the last call; else ""."""
         if self.reason == self._noted:
             return ""
@@ -134,7 +134,7 @@ class PayloadReporter:
             self._sent = held
             self._order = self._arm.order("payload", *self._payload.with_held(held))
 
-    def take_note(self) -> str:
+    def pop_log_line(self) -> str:
         """Return a line for the log if it could not be sent since the last call; else ""."""
         if self._arm is None or not self._order or (outcome := self._arm.outcome(self._order)) is None:
             return ""

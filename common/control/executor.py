@@ -189,8 +189,8 @@ class Executor:
 
     def _report_changes(self, report: Report, header: Header) -> None:
         report.robot = self._changes.robot(header, robot_fields(self._controlled, self._arm_fault.reason), self._late)
-        report.notes = [*filter(None, (self._arm_fault.take_note(), self._gripper_fault.take_note(),
-                                       self.arm.take_note(), self._payload.take_note()))]
+        report.notes = [*filter(None, (self._arm_fault.pop_log_line(), self._gripper_fault.pop_log_line(),
+                                       self.arm.pop_log_line(), self._payload.pop_log_line()))]
         report.owner = self.authority.changed_owner(header)
         report.motion = self.changed_motion(header)
         if self.gripper is not None:

@@ -166,7 +166,7 @@ class Assessment:
 class GoalMemory(Generic[S]):
     """The newest states of the last goals; refused goals do not displace followed ones.
 
-    All but the newest are kept as JSON, which takes a sixth of the memory.
+    All but the newest are stored as JSON, which takes a sixth of the memory.
     """
 
     def __init__(self, most: int = REMEMBERED) -> None:

@@ -240,7 +240,7 @@ def _not_writable(path: Path, error: OSError) -> ConfigError:
 
 @contextlib.asynccontextmanager
 async def exclusive_lock(record: Path, holder: str) -> AsyncIterator[None]:
-    """Hold the lock of a record, and of the files beside it, against other processes.
+    """Hold the lock of a record, and of the other files of the cell, against other processes.
 
     The kernel releases it when this process ends, also by SIGKILL.
 

@@ -1,7 +1,7 @@
 """Jogging: joint or tool velocities that an operator keeps sending. When they cease, the arm comes to rest.
 
 The arm brakes `DEADMAN` after the newest command and is at rest `BRAKING_TIME` later, so it is moved no faster than
-that allows. After a refusal or an interruption, commands count again only after a pause: an operator who kept the
+that allows. After a refusal or an interruption, commands count again only after a pause: an operator who held the
 button pressed over a stop must release it first.
 """
 

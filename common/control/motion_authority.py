@@ -1,8 +1,8 @@
 """Who may move the arm now: the owner of the motion, interlocks, and what a stop, a hold and a hand-over do.
 
-One task, operator or script owns the motion at a time; motions of all others are refused. A request for a motion that
-has no owner owns it until that motion ends; a request for ownership lasts until it is given back. Stops and holds need
-no ownership; an operator's stop ends it.
+One task, operator or script owns the motion at a time; motions of all others are refused. A requester of a motion that
+has no owner owns it until that motion ends; requested ownership lasts until it is returned. Stops and holds need no
+ownership; an operator's stop ends it.
 """
 
 from __future__ import annotations

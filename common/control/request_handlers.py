@@ -49,7 +49,7 @@ class Settings(Protocol):
 
 
 class WorldThread:
-    """Runs changes of the simulated world that take long in a thread; in the control cycle the world stands still."""
+    """Runs long changes of the simulated world in a thread; the control cycle does not advance it meanwhile."""
 
     def __init__(self, world: WorldBackend) -> None:
         """Change this world."""

@@ -16,7 +16,7 @@ from common.hardware.interface import HardwareFault, Limits, Vector
 
 RAMP_SHARE = 0.95  # of the accelerations is for resuming: differences also see the curvature of the path
 JERK_SHARE = 0.85  # the same of jerk, also in a stop: where the rate changes, that of the path is added
-BEHIND = 1e-3  # [rad] between path and set-point at which the goal's time stands still
+BEHIND = 1e-3  # [rad] between path and set-point at which the goal's time stops
 ARRIVED = 1e-6  # [rad] closer, the set-point is on the path
 JITTER = 0.1  # [s] cell time by which the delay of an arm behind its set-points may grow: hosts and networks vary
 RELOCATION_PERIOD = 1.0  # [s] cell time: an arm moved from outside more often than this does not stay where it is held

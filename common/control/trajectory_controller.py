@@ -77,7 +77,7 @@ class TrajectoryController:
         """Whether the set-points are at rest, or there are none because the hardware does not work."""
         return bool(self.reports.fault) or self._limiter.at_rest
 
-    def take_note(self) -> str:
+    def pop_log_line(self) -> str:
         """Return a line for the log if the arm was moved from outside since the last call; else ""."""
         moved, self._moved = self._moved, ""
         return moved

@@ -231,7 +231,7 @@ def test_what_cannot_be_jogged_is_refused_with_the_choices(arm, asked, code, tol
 
 
 def test_joints_and_tool_together_are_a_contradiction(arm):
-    with pytest.raises(Refused, match="do not go together"):
+    with pytest.raises(Refused, match="exclude each other"):
         arm.asked(arm.executor.jog, JogCommand(joints={arm.robot.joint_names[0]: 1.0}, linear=Vector3(x=1.0)))
 
 

@@ -197,7 +197,7 @@ def test_arm_that_is_moved_from_outside_is_held_where_it_is_found_and_says_so(by
     rig.pieces.append([there - moving * STEP * k for k in (3, 2, 1, 0)])
     rig.step()
     assert np.allclose(rig.positions[-1] - there, moving * STEP, atol=STEP**2 * LIMITS.acceleration.max())
-    assert "was moved from outside" in rig.controller.take_note() and not rig.controller.take_note()
+    assert "was moved from outside" in rig.controller.pop_log_line() and not rig.controller.pop_log_line()
     assert "moved from outside" in rig.controller.status.message
     for _ in range(100):
         rig.step()
@@ -244,7 +244,7 @@ def test_arm_that_is_found_in_motion_is_braked_from_where_it_is():
     rig.pieces = [[speed * STEP * k for k in (-2, -1, 0, 1)]]
     for _ in range(100):
         rig.step()
-    assert not rig.velocities[-1].any() and np.all(np.abs(rig.q) < 0.3) and not rig.controller.take_note()
+    assert not rig.velocities[-1].any() and np.all(np.abs(rig.q) < 0.3) and not rig.controller.pop_log_line()
     rig.assert_within(HARD)
 
 

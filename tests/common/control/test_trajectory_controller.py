@@ -97,7 +97,7 @@ def test_goals_that_were_followed_are_remembered_however_many_are_refused(rig, r
 
 
 def test_as_many_goals_are_remembered_as_the_docs_say():
-    said = re.search(r"newest goals by id \((\d+) of", (ROOT / "docs" / "security.md").read_text())
+    said = re.search(r"newest goals by id \((\d+) accepted", (ROOT / "docs" / "security.md").read_text())
     assert said is not None and int(said[1]) == REMEMBERED
     memory = GoalMemory()
     for number in range(REMEMBERED + 1):

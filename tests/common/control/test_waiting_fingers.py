@@ -45,7 +45,7 @@ class Hand(ExecutorRig):
 
     def __init__(self, limits: Limits, trajectory: Make, holding: bool, delay: float = 0.0) -> None:
         super().__init__(limits, LateArm(START, delay, SimulatedFingers(GRIPPER)))
-        self.executor.arm.delay = delay
+        self.executor.arm.history.delay = delay
         self.step()
         if holding:
             self.grip("close", 0.0)
