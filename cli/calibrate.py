@@ -65,7 +65,7 @@ def intrinsics(
 ) -> None:
     """Find focal lengths, centre and distortion from views of the board all over the picture, tilted to each side."""
     from common.config import check
-    from common.perception.image_sources import pictures
+    from common.perception.image_sources import read_images
     from tools.calibration.intrinsics import CollectingOptions, ViewSelector, calibrate_intrinsics
     from tools.calibration.report import camera_from_intrinsics, format_intrinsics
 
@@ -74,7 +74,7 @@ def intrinsics(
                                          "k_coefficients": options.whole("--k-coefficients", k_coefficients, 0)})
     collector = ViewSelector(board_of(squares, square, marker, dictionary), settings)
     terminal = sys.stderr.isatty()
-    for name, picture in pictures(source, parse_size(size), options.number("--seconds", seconds)):
+    for name, picture in read_images(source, parse_size(size), options.number("--seconds", seconds)):
         reason = collector.add(picture, name)
         if terminal:
             part, unseen = collector.coverage()

@@ -109,7 +109,7 @@ async def run(bus: Bus, config: Config) -> None:
     kept: deque[Image] = deque(maxlen=KEPT)
     news = asyncio.Event()
     detector = Detector(config.world, config)
-    left_out = SkippedFrames(bus.log, "a picture")
+    left_out = SkippedFrames(bus.log, "image")
     if not bus.declares_only:
         warm_up(config.world, config)
     await bus.ready()

@@ -82,7 +82,7 @@ class DetectionViews:
         self._names, self._home = robot.joints, HomeWatch(robot.named_poses["home"])
         self._only_at_home = only_at_home
         self._newest: list[CameraDetections | None] = [None for _ in keys]
-        self._left_out = SkippedFrames(log, "a frame of detections")
+        self._left_out = SkippedFrames(log, "frame of detections")
 
     async def watch(self, look: Callable[[int, CameraDetections], Awaitable[None]]) -> None:
         """Call `look` with every frame and the number of its view, one after the other; never returns."""
@@ -152,7 +152,7 @@ class DetectionViews:
         before = self._before.setdefault(number, RobotOcclusion(silhouettes))
         state = self._joints.latest
         q = robot.order(state.name, state.position) if state is not None else None
-        return before.in_picture(camera, frame.header.stamp, q, state.header.stamp if state is not None else 0)
+        return before.in_image(camera, frame.header.stamp, q, state.header.stamp if state is not None else 0)
 
     def _without_cut_off(self, number: int, frame: MarkerArray) -> MarkerArray:
         """Return the frame without detections cut off by its border that another view shows completely."""

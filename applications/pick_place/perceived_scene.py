@@ -265,7 +265,7 @@ class PerceivedScene:
                 on_table.append(thing)
         radius = self.around.ball_radius
         self._tracks.update(on_table, stamp * 1e-9, view, at_times, None if hidden is None else (
-            lambda place: bool(hidden.hides([place], radius)[0])))
+            lambda place: bool(hidden.occludes([place], radius)[0])))
         now = Occupied(stamp, *occupied_slots(in_container, camera, self._slots, radius, self._free))
         if hidden is None:
             self._beside_slots[view] = beside_slots
@@ -286,7 +286,7 @@ class PerceivedScene:
         slots = sorted((before.seen | before.beneath) - now.seen - now.beneath) if before else []
         if not before or not slots:
             return
-        behind = hidden.hides(self._slots[slots], self.around.ball_radius)
+        behind = hidden.occludes(self._slots[slots], self.around.ball_radius)
         kept = {slot for slot, away in zip(slots, behind, strict=True) if away}
         now.seen |= kept & before.seen
         now.beneath |= kept - before.seen

@@ -107,7 +107,7 @@ def _never_asked_again():
             note(str(error))
             await asyncio.Event().wait()
 
-    return patch("common.processes.orders.persist", once)
+    return patch("common.process.orders.persist", once)
 
 
 BUGS = {
@@ -127,7 +127,7 @@ BUGS = {
     "what is in the hand is forgotten": lambda: patch.object(
         PerceivedScene, "feel", lambda self, state, T_world_tcp: None),
     "what day it is asked for at each start": _clock_of_its_own,
-    "goal ids that repeat after a restart": lambda: patch("common.processes.task_runner.new_id", lambda: "0000"),
+    "goal ids that repeat after a restart": lambda: patch("common.process.task_runner.new_id", lambda: "0000"),
 }
 
 
