@@ -115,7 +115,7 @@ class _LoggedReader(Reader[M]):
 
 # The OS would keep the file lock of a simulated process that was killed, and threads run outside the virtual clock.
 RUN_ARGUMENTS: dict[str, dict[str, Any]] = {
-    "services.trajectory_executor": {"file_lock": lambda path, name: nullcontext(), "saver": lambda file: file},
+    "services.trajectory_executor": {"file_lock": lambda path, name: nullcontext(), "saver_for": lambda file: file},
 }
 
 

@@ -8,9 +8,6 @@ import contextlib
 import sys
 from unittest.mock import patch
 
-from common.control.motion_authority import MotionOwnership
-from common.control.trajectory_controller import TrajectoryController
-
 from applications.pick_place.perceived_scene import PerceivedScene
 from common import topics
 from common.config import load_cell
@@ -18,6 +15,8 @@ from common.control import request_handlers
 from common.control.goals import GoalMemory
 from common.control.interlocks import InterlockFile, Record
 from common.control.limiter import Limiter
+from common.control.motion_authority import MotionOwnership
+from common.control.trajectory_controller import TrajectoryController
 from common.time_source import host_ns, wall_ns
 from common.transport import requests
 from common.transport.reader import SequenceFilter
