@@ -50,7 +50,7 @@ from common.messages import (
 from common.perception.pinhole import cameras_at_home
 from common.process.service import main
 from common.robot.model import RobotModel
-from common.scene.workspace import WorkspaceBounds, bounds_told, reach_reason
+from common.scene.workspace import WorkspaceBounds, configured_bounds, unreachable_reason
 from common.sim.interface import GraspTolerances, PhysicalWorld, load_world
 from common.sim.layout import layout
 from common.sim.standing import SavedBeside, Standing, state_file
@@ -107,7 +107,7 @@ def make_cycle(
     start = robot.named("home")
     world = None
     if simulated:
-        bounds = bounds_told(config.reach.told)
+        bounds = configured_bounds(config.reach.told)
         seen = cameras_at_home(config.world, robot)
         objects = layout(
             seen, config.run.seed, lambda x, y, z: within_reach(robot, (x, y, z), config.grasp, bounds))
@@ -141,7 +141,7 @@ def within_reach(
     x, y, z = place
     radius = max(math.hypot(x, y), REACH_MARGIN)
     scales = (1 + off / radius for off in (REACH_MARGIN, -REACH_MARGIN, 0.0))
-    return all(not reach_reason(robot, (s * x, s * y, z), grasp, bounds, explained=False) for s in scales)
+    return all(not unreachable_reason(robot, (s * x, s * y, z), grasp, bounds, explained=False) for s in scales)
 
 
 async def run(bus: Bus, config: Config) -> None:
