@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cli.completing import offers
+from cli import choices as offers
 from common.errors import ConfigError
 from common.terminal import echo
 

@@ -53,7 +53,7 @@ async def run(bus: Bus, config: Config) -> None:
     out = SceneWriter(bus)
     home = HomeMonitor(config.robot.named_poses["home"])
     kept: deque[Image] = deque(maxlen=KEPT)
-    left_out = SkippedFrames(bus.log, "a picture")
+    left_out = SkippedFrames(bus.log, "image")
     await out.begin(planning_scene(config.world, [], 0))
     await bus.ready()
 

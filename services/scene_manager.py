@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from applications.pick_place.detections import Seen, Views, ViewsParameters
+from applications.pick_place.detections import CameraDetections, DetectionViews, ViewsParameters
 from applications.pick_place.perceived_scene import PerceivedScene, SceneParameters
 from common import topics
 from common.config import RobotConfig, Surroundings
@@ -31,7 +31,7 @@ class Config(ViewsParameters, SceneParameters):
 
 async def run(bus: Bus, config: Config) -> None:
     """Publish the planning scene whenever a frame was looked at or the hand closed or opened."""
-    views = Views(bus, config.views, config.world, config.robot, bus.log, only_at_home=config.only_at_home)
+    views = DetectionViews(bus, config.views, config.world, config.robot, bus.log, only_at_home=config.only_at_home)
     joints = bus.reader(topics.JOINT_STATES)
     gripper = bus.reader(topics.GRIPPER_STATE)
     out = SceneWriter(bus)
@@ -39,7 +39,7 @@ async def run(bus: Bus, config: Config) -> None:
     if config.robot.gripper is None:
         raise ConfigError("robot.gripper", ..., "is missing: scene_manager needs a robot with one")
     scene = PerceivedScene(config, config.world, config.robot.gripper, config.robot.tcp_link)
-    left_out = SkippedFrames(bus.log, "a planning scene")
+    left_out = SkippedFrames(bus.log, "planning scene")
     await out.begin(scene.scene())
     await bus.ready()
 
@@ -60,7 +60,7 @@ async def run(bus: Bus, config: Config) -> None:
                 hand()
                 out.put(scene.scene())
 
-    async def look(view: int, seen: Seen) -> None:
+    async def look(view: int, seen: CameraDetections) -> None:
         scene.see(seen.frame, seen.camera, hand(), view, seen.at_times, seen.hidden)
         if scene.crowded:  # none without some of what stands in the way: who waits for a newer one moves nothing
             left_out.note(FrameError("crowded", "more is seen than a planning scene has room for"))

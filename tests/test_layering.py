@@ -275,8 +275,8 @@ def test_circles_are_seen() -> None:
 
 @pytest.mark.parametrize("does", [
     "import services.camera_simulator, common.sim.kinematic",
-    "import common.supervision.supervisor, recording.report.aggregator, cli.operation.operation as o\n"
-    "o.Operation('panda', connect='tcp/127.0.0.1:9')",
+    "import common.supervision.supervisor, recording.report.aggregator, cli.session.session as o\n"
+    "o.CellSession('panda', connect='tcp/127.0.0.1:9')",
 ], ids=["camera", "supervisor"])
 def test_process_that_plans_nothing_loads_no_planner(does: str) -> None:
     told = f"{does}\nimport sys\nprint(*{{'pinocchio', 'coal', 'ompl', 'viser'}} & set(sys.modules))"

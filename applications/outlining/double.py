@@ -10,7 +10,6 @@ from applications.outlining.topics import CONTOUR_PATH, OutlinePoints
 from common import topics
 from common.config import Parameters, RobotConfig, Surroundings, Tunable
 from common.messages import Header, Pose, Vector3, WorldObject
-from common.process.pace import Pace
 from common.process.planning_scene import SceneWriter
 from common.robot.home import HomeMonitor
 from common.transport.bus import Bus
@@ -47,7 +46,7 @@ async def run(bus: Bus, config: Config) -> None:
     home = HomeMonitor(config.robot.named_poses["home"])
     await out.begin(planning_scene(config.world, [], 0))
     await bus.ready()
-    pace = Pace(bus, lambda: bus.clock.wall_rate(config.rate, 30.0))
+    pace = LoopRate(bus, lambda: bus.clock.wall_rate(config.rate, 30.0))
     while True:
         objects, state, stamp = truth.latest, joints.latest, bus.header().stamp
         if state is not None:

@@ -55,7 +55,7 @@ async def test_world_edits_show_in_the_truth_and_bad_ones_are_refused() -> None:
 
 
 async def test_impossible_layout_stops_it_with_the_place() -> None:
-    with pytest.raises(ConfigError, match=r"world\.objects: cannot be laid out: ball_1"):
+    with pytest.raises(ConfigError, match=r"world\.objects: cannot be placed: ball_1"):
         async with executor("world.balls=[[0.55, 0.17]]"):
             pass
 

@@ -16,9 +16,9 @@ from common.perception.depth import depth_of
 from common.perception.pinhole import MountedCamera
 from common.process.camera_reader import CameraReader
 from common.process.in_process import running_service
-from common.process.wiring import wiring
 from common.robot.model import RobotModel
 from common.sim.rendering import Renderer
+from common.supervision.wiring import wiring
 from common.transport.local import LocalNetwork
 from services import depth_camera, robot_state_publisher, vision_detector
 from tests.common.sim.spheres import spheres
