@@ -28,10 +28,10 @@ from common.hardware.loading import is_simulated, load_hardware
 from common.messages import MotionOwner, MotionStatus
 from common.process.service import main
 from common.robot.model import RobotModel
-from common.scene.workspace import WorkspaceBounds, configured_bounds, unreachable_reason
-from common.sim.interface import GraspTolerances, PhysicalWorld, load_world
-from common.sim.layout import layout
-from common.sim.standing import SavedBeside, Standing, state_file
+from common.scene.workspace import configured_bounds
+from common.sim.interface import GraspTolerances, PhysicalWorld
+from common.sim.simulated_cell import SimulatedCell, create_world, matching_state
+from common.sim.standing import SavedBeside, state_file
 from common.transport.bus import Bus
 from common.transport.writer import Writer
 
@@ -112,21 +112,16 @@ def create_executor(bus: Bus, config: Config, store: InterlockStore, simulated: 
     )
     start, world, persisted, saver = robot.named("home"), None, None, None
     if simulated:
-        bounds = configured_bounds(config.reach.told)
-        seen = cameras_at_home(config.world, robot)
-        objects = layout(
-            seen, config.run.seed, lambda x, y, z: within_reach(robot, (x, y, z), config.grasp, bounds))
-        world = load_world(config.world, objects, config.grasp_tolerances, config.robot.gripper)
-        if kept is not None and (
-            kept.simulator != config.world.simulator or kept.layout != world.layout or len(kept.q) != robot.dof
-        ):
-            kept = None
-        if kept is not None:
-            start = np.array(kept.q)
-    physical = world if isinstance(world, PhysicalWorld) else None
-    arm = partial(physical.hardware, robot, limits, start) if physical is not None else None
-    hardware = load_hardware(config.robot, limits, start, arm)
-    if isinstance(hardware, ControlledArm) and speed != 1.0:
+        world = create_world(config.world, config.run.seed, robot, config.grasp, configured_bounds(config.reach.told),
+                             config.grasp_tolerances, config.robot.gripper)
+        if file := state_file(bus.cell):
+            persisted = matching_state(file.load(), config.world.simulator, world, robot.dof)
+            saver = SavedBeside(file) if bus.has_threads else file
+        if persisted is not None:
+            start = np.array(persisted.q)
+    world_arm = partial(world.hardware, robot, limits, start) if isinstance(world, PhysicalWorld) else None
+    hardware = load_hardware(config.robot, limits, start, world_arm)
+    if isinstance(hardware, ControlledArm) and clock.speed != 1.0:
         hardware.close()
         raise ConfigError("speed", clock.speed, "must be 1: the arm has a controller with a clock of its own")
     backend = None if world is None else SimulatedCell(
@@ -140,14 +135,19 @@ def create_executor(bus: Bus, config: Config, store: InterlockStore, simulated: 
     return executor
 
 
-def within_reach(
-    robot: RobotModel, place: tuple[float, float, float], grasp: Grasp, bounds: WorkspaceBounds
-) -> bool:
-    """Whether the arm can take something from a place [m], and from a little nearer and farther as well."""
-    x, y, z = place
-    radius = max(math.hypot(x, y), REACH_MARGIN)
-    scales = (1 + off / radius for off in (REACH_MARGIN, -REACH_MARGIN, 0.0))
-    return all(not unreachable_reason(robot, (s * x, s * y, z), grasp, bounds, explained=False) for s in scales)
+def serve(bus: Bus, config: Config, handlers: RequestHandlers, simulated: bool) -> None:
+    """Declare all requests."""
+    bus.keep_parameters = handlers.save_speed
+    bus.serve(topics.MOTION_EXECUTE, handlers.execute)
+    bus.serve(topics.MOTION_FOLLOWED, handlers.followed)
+    bus.serve(topics.MOTION_STOP, handlers.stop, most=MAX_STOPS, crowded=handlers.stop_for_unread)
+    bus.serve(topics.MOTION_HOLD, handlers.hold)
+    bus.serve(topics.MOTION_OWN, handlers.own)
+    bus.serve(topics.ROBOT_COMMAND, handlers.order)
+    if config.robot.gripper:
+        bus.serve(topics.GRIPPER_COMMAND, handlers.command_gripper)
+    if simulated:
+        bus.serve(topics.WORLD_EDIT, handlers.edit)
 
 
 async def run(bus: Bus, config: Config) -> None:

@@ -32,7 +32,7 @@ class CameraReader:
             return
         async for message in self._tf:
             self._cameras.moving.add(message)
-            self._news.set()
+            self._tf_changed.set()
 
     def moves(self, frame_id: str = "") -> bool:
         """Return whether the camera of that frame, by default the one of camera_info, is mounted on the robot."""

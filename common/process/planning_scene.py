@@ -51,7 +51,7 @@ class SceneWriter:
     async def _edit(self, edit: SceneEdit) -> SceneEditReply:
         async with self._editing:
             assert self._file is not None and self._perceived is not None
-            perceived = [thing.id for thing in self._perceived.objects]
+            perceived = [each.id for each in self._perceived.objects]
             changed = self._added.apply(edit, perceived)
             if changed is not self._added:
                 try:

@@ -61,8 +61,8 @@ class RobotModel:
         self.jerk: Array = np.array(config.jerk_limits, dtype=float)
         for name, low, high, speed in zip(self.joint_names, self.lower, self.upper, self.velocity, strict=True):
             if not (np.isfinite(low) and np.isfinite(high) and low < high and 0 < speed < np.inf):
-                field, value = ("position_limits", [low, high]) if config.position_limits else ("urdf", config.urdf)
-                raise ConfigError(f"robot.{field}", value, f"has no usable limits for joint {name}")
+                source = ("position_limits", [low, high]) if config.position_limits else ("urdf", config.urdf)
+                raise ConfigError(f"robot.{source[0]}", source[1], f"has no usable limits for joint {name}")
         self._links = _link_frames(self.model)
         self._full_links = _link_frames(full_model)
         names = list(full_model.names)[1:]

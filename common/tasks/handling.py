@@ -134,7 +134,7 @@ class Handling(Task[View]):
         """Continue with a held object; with an empty gripper go home, look and choose."""
         assert view.gripper is not None and view.q is not None and view.scene is not None
         away = max(abs(a - b) for a, b in zip(view.q, self._home, strict=True)) > HOME_TOLERANCE
-        if self.status.state == "DONE":  # whatever is put there now: nobody has asked for more
+        if self.status.state == "DONE":  # no operator asked for more
             return
         if view.holding and view.gripper.outcome in MISSES:  # another object than intended
             self.queue += [self._open(None), *self.back_off(view.let_go())]
