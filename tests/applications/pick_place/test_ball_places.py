@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from applications.pick_place.ball_places import Resting
+from applications.pick_place.ball_places import BallGeometry
 from common.config import Surroundings
 from common.perception.pinhole import Pinhole
 
@@ -19,7 +19,7 @@ OUTSIDE = [(BOX.x - OFF, BOX.y, 0.03), (BOX.x, BOX.y - OFF, 0.03), (BOX.x + OFF,
 
 @pytest.mark.parametrize(("position", "inside"), [*((p, True) for p in INSIDE), *((p, False) for p in OUTSIDE)])
 def test_ray_to_a_ball_shows_whether_it_is_in_the_container(position, inside):
-    assert Resting.of(AROUND).shows_container(CAMERA, CAMERA.project(position)) == inside
+    assert BallGeometry.of(AROUND).shows_container(CAMERA, CAMERA.project(position)) == inside
 
 
 @given(st.floats(0, 639), st.floats(0, 479))
@@ -31,4 +31,4 @@ def test_ray_test_agrees_with_points_along_the_ray(u, v):
     larger = (h + 0.001, h + 0.001, 0.126)
     grazing = (np.abs(along - (BOX.x, BOX.y, 0.0)) <= larger).all(axis=1) & (along[:, 2] >= -0.001)
     if within.any() or not grazing.any():
-        assert Resting.of(AROUND).shows_container(CAMERA, (u, v)) == bool(within.any())
+        assert BallGeometry.of(AROUND).shows_container(CAMERA, (u, v)) == bool(within.any())
