@@ -1,4 +1,4 @@
-"""What is in the hand is let slip only where a cell can see it afterwards and take it again."""
+"""When chaos lets the held object slip: it must stay visible and reachable."""
 
 import math
 from types import SimpleNamespace
@@ -11,25 +11,25 @@ from common.config import World, load_cell
 from common.messages import Header, Pose, Vector3, WorldObject, WorldObjects
 from drivers.mujoco.scene import OBJECT, TIMESTEP, set_contact
 from lab.chaos import agent
-from lab.chaos.plan import SlipGate, thrown
+from lab.chaos.slip_gate import SlipGate, thrown
 
 RADIUS, EVERY = 0.03, 20_000_000  # [m], [ns]
 PHYSICS = load_cell("panda", ["world.simulator=mujoco"]).world
 
 
 def held_at(x: float, y: float, stamp: int, state: str = "held") -> WorldObjects:
-    """A ball, 25 cm above the table."""
-    thing = WorldObject.model_validate({
+    """A ball 25 cm above the table."""
+    ball = WorldObject.model_validate({
         "id": "ball", "shape": "sphere", "state": state, "pose": Pose(position=Vector3(x=x, y=y, z=0.25)),
         "size": Vector3(x=2 * RADIUS, y=2 * RADIUS, z=2 * RADIUS)})
-    return WorldObjects(header=Header(stamp=stamp), objects=[thing])
+    return WorldObjects(header=Header(stamp=stamp), objects=[ball])
 
 
-def may(slipping: SlipGate, x: float, y: float, vx: float = 0.0, vy: float = 0.0) -> bool:
-    """What is said of a ball that is there now and came there at a speed [m/s]."""
+def may_slip(gate: SlipGate, x: float, y: float, vx: float = 0.0, vy: float = 0.0) -> bool:
+    """Whether a ball at (x, y) [m] with this velocity [m/s] may slip."""
     step = EVERY * 1e-9
-    slipping.may(held_at(x - vx * step, y - vy * step, EVERY))
-    return slipping.may(held_at(x, y, 2 * EVERY))
+    gate.may(held_at(x - vx * step, y - vy * step, EVERY))
+    return gate.may(held_at(x, y, 2 * EVERY))
 
 
 @pytest.mark.parametrize(("x", "y", "vx", "vy", "allowed"), [
@@ -37,28 +37,28 @@ def may(slipping: SlipGate, x: float, y: float, vx: float = 0.0, vy: float = 0.0
     (0.60, -0.20, 0.4, 0.0, False), (0.60, -0.20, -0.4, 0.0, True), (0.40, -0.40, 0.0, -0.3, False),
     (0.55, 0.25, 0.0, 0.0, True), (0.55, 0.12, 0.0, 0.0, False), (0.50, -0.05, 0.0, 0.4, False),
 ])
-def test_with_physics_it_has_to_stop_in_the_picture_and_clear_of_walls(
+def test_with_physics_the_object_must_stop_in_view_and_clear_of_walls(
     x: float, y: float, vx: float, vy: float, allowed: bool,
 ) -> None:
-    assert may(SlipGate(PHYSICS), x, y, vx, vy) == allowed
+    assert may_slip(SlipGate(PHYSICS), x, y, vx, vy) == allowed
 
 
-def test_where_things_fall_straight_only_the_place_counts() -> None:
+def test_in_the_kinematic_world_only_the_position_counts() -> None:
     world = load_cell("panda").world
-    assert SlipGate(world).may(held_at(0.60, -0.20, EVERY)) and may(SlipGate(world), 0.60, -0.20, 2.0)
-    assert not may(SlipGate(world), 0.55, 0.12)
+    assert SlipGate(world).may(held_at(0.60, -0.20, EVERY)) and may_slip(SlipGate(world), 0.60, -0.20, 2.0)
+    assert not may_slip(SlipGate(world), 0.55, 0.12)
 
 
-def test_nothing_slips_before_it_is_known_how_fast_the_hand_goes() -> None:
-    slipping = SlipGate(PHYSICS)
-    assert not slipping.may(None) and not slipping.may(held_at(0.4, -0.2, EVERY, "table"))
-    assert not slipping.may(held_at(0.4, -0.2, EVERY))
-    assert slipping.may(held_at(0.4, -0.2, 2 * EVERY)) and slipping.may(held_at(0.4, -0.2, 2 * EVERY))
-    assert not slipping.may(held_at(0.4, -0.2, 20 * EVERY)), "what was known was too long ago"
-    assert slipping.may(held_at(0.4, -0.2, 21 * EVERY))
+def test_no_slip_before_the_velocity_is_known() -> None:
+    gate = SlipGate(PHYSICS)
+    assert not gate.may(None) and not gate.may(held_at(0.4, -0.2, EVERY, "table"))
+    assert not gate.may(held_at(0.4, -0.2, EVERY))
+    assert gate.may(held_at(0.4, -0.2, 2 * EVERY)) and gate.may(held_at(0.4, -0.2, 2 * EVERY))
+    assert not gate.may(held_at(0.4, -0.2, 20 * EVERY)), "the observation before is too old"
+    assert gate.may(held_at(0.4, -0.2, 21 * EVERY))
 
 
-def test_a_camera_on_the_hand_sees_what_it_sees_from_home(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_camera_on_the_gripper_counts_from_the_home_pose(monkeypatch: pytest.MonkeyPatch) -> None:
     cell = load_cell("panda", ["world.simulator=mujoco",
                                "world.camera={mount: tcp, position: [0.06, 0.0, -0.1], rpy: [0, 0, 1.5708]}"])
     worlds: list[World] = []
@@ -66,12 +66,12 @@ def test_a_camera_on_the_hand_sees_what_it_sees_from_home(monkeypatch: pytest.Mo
     statuses = [SimpleNamespace(name=entry.name, pid=1) for entry in cell.services.values()]
     bus: Any = SimpleNamespace(clock=SimpleNamespace(speed=1.0))
     supervisor: Any = SimpleNamespace(statuses=statuses)
-    agent.chaos_in(bus, cell, supervisor, all_topics(), 1, 6.0, until_ended=True)
-    assert may(SlipGate(worlds[0]), 0.40, -0.05) and not may(SlipGate(worlds[0]), 0.40, -0.60)
+    agent.create_chaos(bus, cell, supervisor, all_topics(), 1, 6.0, until_ended=True)
+    assert may_slip(SlipGate(worlds[0]), 0.40, -0.05) and not may_slip(SlipGate(worlds[0]), 0.40, -0.60)
 
 
 @pytest.mark.parametrize("speed", [0.2, 0.5, 0.9])
-def test_a_ball_gets_as_far_as_is_reckoned(speed: float) -> None:
+def test_predicted_distance_matches_physics(speed: float) -> None:
     mujoco = pytest.importorskip("mujoco", reason="make setup EXTRAS=physics")
     spec = mujoco.MjSpec()
     spec.option.timestep = TIMESTEP
