@@ -84,6 +84,11 @@ def test_the_command_line_is_thin() -> None:
     assert sum(lines.values()) < 4200, sorted(lines.items(), key=lambda item: -item[1])[:5]
 
 
+def test_the_controller_knows_no_simulation() -> None:
+    """The simulated world is behind the hardware seam: with real hardware the executor has none."""
+    assert offences(sources("common/control", "common/hardware"), ("common.sim",)) == []
+
+
 def test_tests_do_not_import_benchmarks() -> None:
     assert offences(sources("tests"), ("benchmarks",)) == []
 
