@@ -55,6 +55,7 @@ containers: setup  ## build the image and run a cell in containers; needs a cont
 check: setup
 	$(BIN)/ruff check .
 	$(BIN)/mypy
+	$(BIN)/lint-imports
 
 audit: setup  ## known vulnerabilities of the dependencies, where the database can be reached
 	.ci/audit $(BIN)

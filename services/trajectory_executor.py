@@ -28,7 +28,7 @@ from common.hardware.loading import is_simulated, load_hardware
 from common.messages import MotionOwner, MotionStatus
 from common.process.service import main
 from common.robot.model import RobotModel
-from common.scene.workspace import bounds_told
+from common.scene.workspace import configured_bounds
 from common.sim.interface import GraspTolerances, PhysicalWorld
 from common.sim.simulated_cell import SimulatedCell, create_world, matching_state
 from common.sim.standing import SavedBeside, state_file
@@ -112,7 +112,7 @@ def create_executor(bus: Bus, config: Config, store: InterlockStore, simulated: 
     )
     start, world, persisted, saver = robot.named("home"), None, None, None
     if simulated:
-        world = create_world(config.world, config.run.seed, robot, config.grasp, bounds_told(config.reach.told),
+        world = create_world(config.world, config.run.seed, robot, config.grasp, configured_bounds(config.reach.told),
                              config.grasp_tolerances, config.robot.gripper)
         if file := state_file(bus.cell):
             persisted = matching_state(file.load(), config.world.simulator, world, robot.dof)

@@ -8,7 +8,7 @@ from common import topics
 from common.errors import ConfigError, Refused
 from common.kept_file import KeptFile, Unreadable, lasting_folder
 from common.messages import PlanningScene, SceneEdit, SceneEditReply
-from common.scene.added import AddedSolids, id_of
+from common.scene.added_solids import AddedSolids, added_id
 from common.transport.bus import Bus
 
 
@@ -52,7 +52,7 @@ class SceneWriter:
         async with self._editing:
             assert self._file is not None and self._perceived is not None
             perceived = [each.id for each in self._perceived.objects]
-            changed = self._added.edited(edit, perceived)
+            changed = self._added.apply(edit, perceived)
             if changed is not self._added:
                 try:
                     await asyncio.to_thread(self._file.save, changed)
@@ -61,6 +61,6 @@ class SceneWriter:
                                               "change would be lost at a restart and was not made") from None
                 self._added = changed
                 self.put(self._perceived)
-                self._bus.log.info("%s %s%s", "added" if edit.op == "add" else "removed", id_of(edit.id),
+                self._bus.log.info("%s %s%s", "added" if edit.op == "add" else "removed", added_id(edit.id),
                                    edit.owner and f", by {edit.owner}")
-            return SceneEditReply(id=id_of(edit.id), ids=self._added.ids)
+            return SceneEditReply(id=added_id(edit.id), ids=self._added.ids)

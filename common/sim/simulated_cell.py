@@ -23,7 +23,7 @@ from common.hardware.interface import (
 from common.messages import Header, SceneUpdate, WorldEdit, WorldEditReply, WorldObjects
 from common.perception.pinhole import cameras_at_home
 from common.robot.model import RobotModel
-from common.scene.workspace import WorkspaceBounds, reach_reason
+from common.scene.workspace import WorkspaceBounds, unreachable_reason
 from common.sim.interface import FeltWorld, GraspTolerances, SimulatedWorld, StandingObject, load_world
 from common.sim.layout import layout
 from common.sim.standing import Standing
@@ -71,7 +71,7 @@ def _within_reach(
     x, y, z = position
     radius = max(math.hypot(x, y), REACH_MARGIN)
     scales = (1 + off / radius for off in (REACH_MARGIN, -REACH_MARGIN, 0.0))
-    return all(not reach_reason(robot, (s * x, s * y, z), grasp, bounds, explained=False) for s in scales)
+    return all(not unreachable_reason(robot, (s * x, s * y, z), grasp, bounds, explained=False) for s in scales)
 
 
 def matching_state(state: Standing | None, simulator: str, world: SimulatedWorld, dof: int) -> Standing | None:

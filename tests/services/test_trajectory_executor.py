@@ -28,7 +28,7 @@ from common.planning.ik import solve_ik
 from common.process.in_process import running_service
 from common.robot.model import RobotModel
 from common.robot.transforms import tool_down
-from common.scene.workspace import reach_reason
+from common.scene.workspace import unreachable_reason
 from common.sim.interface import StandingObject
 from common.sim.kinematic import KinematicWorld
 from common.sim.standing import Standing, StateFile, state_file
@@ -336,7 +336,7 @@ async def test_random_layout_is_within_reach_also_at_positions_detected_a_few_mi
     found = await random_balls("seed=20", "world.count=8")
     for p in (pose.position for pose in found.poses):
         for scale in (1 + off / float(np.hypot(p.x, p.y)) for off in (-0.005, 0.005)):
-            assert not reach_reason(robot, (p.x * scale, p.y * scale, p.z), cell.grasp)
+            assert not unreachable_reason(robot, (p.x * scale, p.y * scale, p.z), cell.grasp)
 
 
 async def test_cycles_continue_while_an_edit_of_the_world_is_computed(monkeypatch) -> None:

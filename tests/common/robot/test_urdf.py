@@ -29,9 +29,9 @@ HAND = link("palm", BOX) + link("thumb") + joint("palm", "thumb", "fixed", "0.1 
 
 @pytest.fixture
 def make(tmp_path):
-    """A robot of an arm with one joint, and files beside it."""
+    """Create a robot of an arm with one joint, and its files."""
 
-    def made(arm: str = ARM, hand: str = HAND, **changes: object) -> RobotModel:
+    def create(arm: str = ARM, hand: str = HAND, **changes: object) -> RobotModel:
         (tmp_path / "arm.urdf").write_text(f'<robot name="arm">{arm}</robot>')
         (tmp_path / "hand.urdf").write_text(f'<robot name="hand">{hand}</robot>')
         values = {
@@ -40,14 +40,14 @@ def make(tmp_path):
         }
         return RobotModel.load(check(RobotConfig, values | changes, "robot"))
 
-    return made
+    return create
 
 
 def mounted(folder: Path, **changes: object) -> list[dict[str, object]]:
     return [{"urdf": str(folder / "hand.urdf"), "parent_link": "arm", "position": [0, 0, 0.2], **changes}]
 
 
-def test_base_stands_where_the_robot_file_says_with_everything_on_it(make):
+def test_base_pose_of_the_robot_file_moves_the_complete_robot(make):
     at_origin, moved = make(), make(base_position=[1.0, -0.5, 0.75], base_rpy=[0.1, -0.2, 0.7])
     T_world_base = transform(rpy_to_matrix(0.1, -0.2, 0.7), (1.0, -0.5, 0.75))
     for name, T in at_origin.link_poses([0.3]).items():
@@ -58,17 +58,17 @@ def test_base_stands_where_the_robot_file_says_with_everything_on_it(make):
     assert (at_origin.world_frames, moved.world_frames) == (["", "world", "base"], ["", "world"])
 
 
-def test_world_is_none_of_the_links(make):
+def test_world_is_not_a_link_of_the_robot(make):
     robot = make(base_position=[0, 0, 1])
     assert set(robot.link_names) == {"base", "arm"} and robot.link_parents == {"arm": "base"}
 
 
-def test_where_the_description_stands_the_base_is_not_what_counts(make):
+def test_base_pose_of_the_description_is_ignored(make):
     robot = make(arm=link("world") + joint("world", "base", "fixed", "5 5 5") + ARM, base_position=[0, 0, 1])
     assert np.allclose(robot.link_poses([0.0])["base"][:3, 3], (0, 0, 1))
 
 
-def test_a_joint_that_turns_on_and_on_ends_after_a_full_turn_or_where_the_robot_file_says(make):
+def test_continuous_joint_gets_limits_of_a_full_turn_or_of_the_robot_file(make):
     turning = ARM.replace('type="revolute"', 'type="continuous"').replace('lower="-2" upper="2" ', "")
     robot = make(turning)
     assert (robot.dof, robot.lower.tolist(), robot.upper.tolist()) == (1, [-2 * np.pi], [2 * np.pi])
@@ -76,13 +76,13 @@ def test_a_joint_that_turns_on_and_on_ends_after_a_full_turn_or_where_the_robot_
     assert (narrow.lower.tolist(), narrow.upper.tolist()) == ([-1.0], [3.0])
 
 
-def test_a_fixed_joint_may_be_called_as_a_link_is(make):
+def test_fixed_joint_may_have_the_name_of_a_link(make):
     robot = make(ARM + link("stand") + joint("arm", "stand", "fixed").replace('"arm_stand"', '"stand"'))
     assert "stand" in robot.link_names
     assert robot.link_poses([0.3])["stand"][2, 3] == pytest.approx(1.0)
 
 
-def test_attachment_hangs_on_its_link_and_tcp_on_the_attachment(make, tmp_path):
+def test_attachment_is_fixed_to_its_link_and_the_tcp_to_the_attachment(make, tmp_path):
     tcp = {"link": "tip", "parent": "thumb", "position": [0, 0, 0.05], "rpy": [0, np.pi / 2, 0]}
     robot = make(attachments=mounted(tmp_path, rpy=[0, 0, np.pi / 2]), tcp=tcp, tcp_link="")
     assert robot.link_parents == {"arm": "base", "palm": "arm", "thumb": "palm", "tip": "thumb"}
@@ -95,7 +95,7 @@ def test_attachment_hangs_on_its_link_and_tcp_on_the_attachment(make, tmp_path):
     ("changes", "message"),
     [
         ({"base_link": "nowhere"}, "robot.base_link.*nowhere.*choices: base, arm"),
-        ({"base_link": "arm"}, "robot.base_link.*hangs on base, by joint base_arm, which moves"),
+        ({"base_link": "arm"}, "robot.base_link.*its parent is base and joint base_arm moves"),
         ({"tcp": {"link": "tip", "parent": "elbow"}, "tcp_link": ""}, "robot.tcp.parent.*elbow.*choices: base, arm"),
         ({"tcp": {"link": "arm", "parent": "base"}}, "robot.tcp.link.*is a link of the URDF already"),
         ({"tcp": {"link": "tip", "parent": "arm"}}, "tcp_link is arm, but tcp defines tip"),
@@ -106,7 +106,7 @@ def test_attachment_hangs_on_its_link_and_tcp_on_the_attachment(make, tmp_path):
         ({"position_limits": [[0.5, 1]]}, "robot.named_poses.home.*must be within 0.5 to 1"),
     ],
 )
-def test_parts_that_do_not_fit_are_refused_with_field_and_choice(make, changes, message):
+def test_parts_that_do_not_fit_are_refused_with_field_and_choices(make, changes, message):
     with pytest.raises(ConfigError, match=message):
         make(**changes)
 
@@ -115,8 +115,8 @@ def test_parts_that_do_not_fit_are_refused_with_field_and_choice(make, changes, 
     ("hand", "changes", "message"),
     [
         (HAND, {"parent_link": "elbow"}, r"robot.attachments.0.parent_link.*elbow.*choices: base, arm"),
-        (HAND, {"urdf": "gone.urdf"}, r"robot.attachments.0.urdf.*gone.urdf.*is not there"),
-        (link("arm"), {}, r"robot.attachments.0.urdf.*has a link arm, which the robot has already"),
+        (HAND, {"urdf": "gone.urdf"}, r"robot.attachments.0.urdf.*gone.urdf.*is missing"),
+        (link("arm"), {}, r"robot.attachments.0.urdf.*has a link arm, which the robot already has"),
         (link("one") + link("two"), {}, r"robot.attachments.0.urdf.*must have one root, not one, two"),
         ("<link", {}, r"robot.attachments.0.urdf.*does not parse"),
     ],
@@ -126,7 +126,7 @@ def test_attachments_that_do_not_fit_are_refused(make, tmp_path, hand, changes, 
         make(hand=hand, attachments=mounted(tmp_path, **changes))
 
 
-def test_mesh_beside_an_attachment_is_found_from_anywhere(make, tmp_path):
+def test_mesh_next_to_an_attachment_is_found_from_any_folder(make, tmp_path):
     corners = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)]
     faces = [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)]
     text = "".join(
@@ -139,7 +139,7 @@ def test_mesh_beside_an_attachment_is_found_from_anywhere(make, tmp_path):
     assert len(robot.full_geometry(pin.GeometryType.COLLISION).geometryObjects) == 3
 
 
-def test_files_beside_a_robot_file_are_found_from_anywhere(tmp_path):
+def test_files_next_to_a_robot_file_are_found_from_any_folder(tmp_path):
     robot = (find_file("robots", "ur5").parent / "robotiq_2f85.urdf").read_text()
     (tmp_path / "mine.urdf").write_text(robot)
     (tmp_path / "mine.yaml").write_text("urdf: mine.urdf\nsrdf: package://a/b.srdf\nattachments: [{urdf: mine.urdf}]")
@@ -148,7 +148,7 @@ def test_files_beside_a_robot_file_are_found_from_anywhere(tmp_path):
     assert read["srdf"] == "package://a/b.srdf"
 
 
-def test_panda_is_the_same_as_its_description_alone():
+def test_merged_panda_equals_its_description():
     robot = RobotModel.load(load_cell("panda").robot)
     share = next(folder for folder in robot.package_folders if (folder / "example-robot-data").is_dir())
     alone = pin.buildModelFromUrdf(str(share / robot.config.urdf.removeprefix("package://")))
@@ -163,7 +163,7 @@ def test_panda_is_the_same_as_its_description_alone():
     assert robot.world_frames == ["", "world", "panda_link0"]
 
 
-def test_ur5_stands_on_its_pillar_and_reaches_the_block():
+def test_ur5_is_on_its_pillar_and_reaches_the_block():
     robot = RobotModel.load(check(RobotConfig, read_robot(find_file("robots", "ur5"))))
     assert np.allclose(robot.link_poses(robot.named("home"))["base_link"][:3, 3], (0, 0, 0.75))
     assert np.allclose(robot.velocity, np.pi, atol=1e-5) and robot.groups == ["ur_manipulator"]

@@ -7,8 +7,7 @@ import pytest
 
 from common.config import Surroundings
 from common.perception.pinhole import Pinhole
-from common.scene.fixtures import container_panels
-from common.scene.slots import occupied_slots, slot_positions
+from common.scene.fixtures import container_panels, occupied_slots, slot_positions
 
 AROUND = Surroundings()
 CAMERA = Pinhole.from_config(AROUND.camera)
@@ -26,7 +25,7 @@ def test_balls_in_all_slots_touch_neither_each_other_nor_the_walls() -> None:
 
 
 @pytest.mark.parametrize("filled", range(9))
-def test_slots_are_told_from_the_pixels_of_the_balls_on_top(filled: int) -> None:
+def test_occupied_slots_follow_from_the_pixels_of_the_top_balls(filled: int) -> None:
     taken = set(range(filled))
     visible = [k for k in taken if k + 4 not in taken]
     jitter = np.random.default_rng(filled).uniform(-5, 5, (len(visible), 2))
@@ -34,7 +33,7 @@ def test_slots_are_told_from_the_pixels_of_the_balls_on_top(filled: int) -> None
     assert occupied_slots(pixels, CAMERA, SLOTS, AROUND.ball_radius) == (set(visible), taken - set(visible))
 
 
-def test_nothing_is_hidden_in_a_slot_that_is_known_to_be_free_but_what_is_seen_there_is() -> None:
+def test_free_slot_holds_no_occluded_ball_but_a_seen_one() -> None:
     low, high = (tuple(pixel) for pixel in CAMERA.project(SLOTS[[0, 4]]).reshape(-1, 2).tolist())
     assert occupied_slots([high], CAMERA, SLOTS, AROUND.ball_radius, free={0}) == ({4}, set())
     assert occupied_slots([low, high], CAMERA, SLOTS, AROUND.ball_radius, free={0}) == ({0, 4}, set())

@@ -1,66 +1,66 @@
-/* What the tool keeps to: numbers n x - least, of a direction fixed to the tool or of the tool point, that must not be
-   negative. Along a curve they are bounded as distances are in edges.h. States that break one are projected: steps by the
+/* Tool constraints: numbers n x - least, of a direction fixed to the tool or of the tool point, that must not be negative.
+   Along a curve they are bounded as distances are in edges.h. States that violate one are projected: steps by the
    pseudo-inverse of the Jacobian, after Berenson, Srinivasa, Ferguson, Kuffner, "Manipulation planning on constraint
    manifolds" (ICRA 2009). */
-#ifndef ZK_KEEP_H
-#define ZK_KEEP_H
+#ifndef ZK_CONSTRAINTS_H
+#define ZK_CONSTRAINTS_H
 
 #include "edges.h"
 
-#define MOST_LOOKS 20000    /* at one curve; what is not proved then is taken for broken */
-#define MOST_PROJECTIONS 30 /* steps */
+#define MAX_EVALUATIONS 20000    /* on one curve; what is not proved then counts as a violation */
+#define MAX_PROJECTIONS 30 /* steps */
 #define LONGEST_PROJECTION 0.5 /* [rad], [m] in one joint and step */
 
-/* Shares of the slack that states may use, and what is proved between them: as PLANNING_SHARES in constraints.py. */
-#define KEPT_STATE 0.25
-#define KEPT_LINE 0.5
+/* Shares of the slack that states may use, and that are proved between them: PLANNING_SHARES in constraints.py. */
+#define STATE_SHARE 0.25
+#define LINE_SHARE 0.5
 
-/* x of a kept number after `forward`, world. */
-static inline void kept_point(const scratch *c, const kept *k, double *x) {
-    const pose *T = &c->T[c->w->keep_tool];
+/* x of a constraint after `forward`, world. */
+static inline void constrained_point(const scratch *c, const constraint *k, double *x) {
+    const pose *T = &c->T[c->w->constrained_joint];
     if (k->direction)
         rotate(T->R, k->at, x);
     else
-        act(T, c->w->keep_tip, x);
+        act(T, c->w->constrained_tip, x);
 }
 
-static inline double kept_value(const scratch *c, const kept *k) {
+static inline double constraint_value(const scratch *c, const constraint *k) {
     double x[3];
-    kept_point(c, k, x);
+    constrained_point(c, k, x);
     return dot3(k->n, x) - k->least;
 }
 
-static int keeps_state(scratch *c, const double *q) {
+static int state_satisfies(scratch *c, const double *q) {
     const world *w = c->w;
-    if (!w->keeps) return 1;
+    if (!w->constraints) return 1;
     forward(c, q);
-    for (int i = 0; i < w->keeps; i++)
-        if (!(kept_value(c, &w->keep[i]) >= -KEPT_STATE * w->keep[i].slack)) return 0;
+    for (int i = 0; i < w->constraints; i++)
+        if (!(constraint_value(c, &w->constraint[i]) >= -STATE_SHARE * w->constraint[i].slack)) return 0;
     return 1;
 }
 
-/* Whether all is kept to along a curve, but for shares of the slack; else `hit_at` says where it is not. */
-static int keeps_curve(scratch *c, const curve *e, double accepted, double proved) {
+/* Whether a curve satisfies all constraints up to shares of the slack; else `hit_at` is where it does not. */
+static int curve_satisfies(scratch *c, const curve *e, double accepted, double proved) {
     const world *w = c->w;
-    double M[2], K[2], q[MOST_JOINTS], dq[MOST_JOINTS], t = 0;
-    bounds(w, e, w->keep_tool, 0, w->keep_lever, &M[0], &K[0]);
-    bounds(w, e, w->keep_tool, 0, w->turn_lever, &M[1], &K[1]);
-    for (int look = 0; look < MOST_LOOKS; look++) {
+    double M[2], K[2], q[MAX_JOINTS], dq[MAX_JOINTS], t = 0;
+    bounds(w, e, w->constrained_joint, 0, w->constrained_lever, &M[0], &K[0]);
+    bounds(w, e, w->constrained_joint, 0, w->turn_lever, &M[1], &K[1]);
+    for (int n = 0; n < MAX_EVALUATIONS; n++) {
         double step = INFINITY;
         c->hit_at = t;
         at_time(w, e, t, q, dq);
         forward(c, q);
         twists(c, dq);
-        for (int i = 0; i < w->keeps; i++) {
-            const kept *k = &w->keep[i];
+        for (int i = 0; i < w->constraints; i++) {
+            const constraint *k = &w->constraint[i];
             double x[3], dx[3];
-            kept_point(c, k, x);
+            constrained_point(c, k, x);
             double s = dot3(k->n, x) - k->least;
             if (!(s >= -accepted * k->slack)) return 0;
-            cross3(c->spin[w->keep_tool], x, dx);
+            cross3(c->spin[w->constrained_joint], x, dx);
             if (!k->direction)
-                for (int m = 0; m < 3; m++) dx[m] += c->slide[w->keep_tool][m];
-            step = fmin(step, lasts(s + proved * k->slack, -dot3(k->n, dx), K[k->direction], M[k->direction]));
+                for (int m = 0; m < 3; m++) dx[m] += c->slide[w->constrained_joint][m];
+            step = fmin(step, time_to_zero(s + proved * k->slack, -dot3(k->n, dx), K[k->direction], M[k->direction]));
         }
         t += step;
         if (t >= 1) return 1;
@@ -68,20 +68,20 @@ static int keeps_curve(scratch *c, const curve *e, double accepted, double prove
     return 0;
 }
 
-static int keeps_line(scratch *c, const double *a, const double *b) {
+static int line_satisfies(scratch *c, const double *a, const double *b) {
     curve e;
-    if (!c->w->keeps) return 1;
+    if (!c->w->constraints) return 1;
     line_curve(c->w, a, b, &e);
-    return keeps_curve(c, &e, KEPT_STATE, KEPT_LINE);
+    return curve_satisfies(c, &e, STATE_SHARE, LINE_SHARE);
 }
 
-/* How far [rad], [m] a number is from where it is projected to, a little inside of its bound, and what one unit of each
-   joint adds to it. Returns whether it is broken. */
-static int broken(const scratch *c, const kept *k, double *left, double *row) {
+/* Returns whether a constraint is violated, and sets the distance [rad], [m] to where it is projected to, a little inside
+   its bound, and the change of the constraint by one unit of each joint. */
+static int violation(const scratch *c, const constraint *k, double *left, double *row) {
     const world *w = c->w;
-    const joint *J = &w->joint[w->keep_tool];
+    const joint *J = &w->joint[w->constrained_joint];
     double x[3], s, sine = 1;
-    kept_point(c, k, x);
+    constrained_point(c, k, x);
     s = dot3(k->n, x) - k->least;
     if (s >= 0) return 0;
     *left = k->inside - s;
@@ -108,14 +108,14 @@ static int broken(const scratch *c, const kept *k, double *left, double *row) {
     return 1;
 }
 
-/* Moves q, within the limits, to where all is kept to; 0 where it gets stuck. */
+/* Moves q, within the limits, to where all constraints are satisfied; 0 if it gets stuck. */
 static int project(scratch *c, double *q) {
     const world *w = c->w;
-    double J[MOST_KEPT][MOST_JOINTS], A[MOST_KEPT][MOST_KEPT], x[MOST_KEPT];
-    for (int n = 0; n < MOST_PROJECTIONS; n++) {
+    double J[MAX_CONSTRAINTS][MAX_JOINTS], A[MAX_CONSTRAINTS][MAX_CONSTRAINTS], x[MAX_CONSTRAINTS];
+    for (int n = 0; n < MAX_PROJECTIONS; n++) {
         int rows = 0;
         forward(c, q);
-        for (int i = 0; i < w->keeps; i++) rows += broken(c, &w->keep[i], &x[rows], J[rows]);
+        for (int i = 0; i < w->constraints; i++) rows += violation(c, &w->constraint[i], &x[rows], J[rows]);
         if (!rows) return 1;
         for (int r = 0; r < rows; r++) { /* (J J' + damping) x = left, by Cholesky's factors */
             for (int k = 0; k <= r; k++) {
@@ -131,7 +131,7 @@ static int project(scratch *c, double *q) {
             A[r][r] = 1 / sqrt(fmax(A[r][r], 1e-12));
             x[r] *= A[r][r];
         }
-        double step[MOST_JOINTS], most = 0;
+        double step[MAX_JOINTS], most = 0;
         for (int r = rows - 1; r >= 0; r--) {
             for (int k = r + 1; k < rows; k++) x[r] -= A[k][r] * x[k];
             x[r] *= A[r][r];

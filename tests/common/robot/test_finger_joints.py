@@ -1,4 +1,4 @@
-"""Our own description of the gripper against its data sheet, and against the numbers in the robot file."""
+"""Joint positions of grippers by their width: the Robotiq 2F-85 against its data sheet, turning and sliding jaws."""
 
 import xml.etree.ElementTree as ET
 
@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from common.config import GripperConfig, RobotConfig, check, find_file, read_robot
+from common.errors import ConfigError
 from common.robot.finger_joints import driven_position, finger_positions, finger_velocities, width_at
 from common.robot.model import RobotModel
 from common.robot.transforms import invert
@@ -24,7 +25,7 @@ KNUCKLE = st.floats(0.0, 0.8)
 
 
 def in_flange(width: float) -> dict[str, np.ndarray]:
-    """(4, 4) poses of the links in tool0 with the fingers at a width."""
+    """(4, 4) poses of the links in tool0 with the gripper at a width."""
     others = dict(zip(GRIPPER.joints, finger_positions(GRIPPER, width), strict=True))
     poses = ROBOT.link_poses(HOME, others)
     return {link: invert(poses["tool0"]) @ T for link, T in poses.items()}
@@ -46,7 +47,7 @@ def corners(link: str, width: float) -> np.ndarray:
 
 
 @given(WIDTHS)
-def test_pads_are_as_far_apart_as_the_width_says(width):
+def test_distance_of_the_pads_is_the_width(width):
     left, right = corners("robotiq_85_left_finger_tip_link", width), corners("robotiq_85_right_finger_tip_link", width)
     assert left[:, 0].min() == pytest.approx(width / 2, abs=1e-5)
     assert right[:, 0].max() == pytest.approx(-width / 2, abs=1e-5)
@@ -59,13 +60,13 @@ def test_pads_stay_parallel(width):
         assert np.allclose(poses[f"robotiq_85_{side}_finger_tip_link"][:3, :3], np.eye(3), atol=1e-6)
 
 
-def test_closed_fingers_end_163_mm_from_the_flange_at_the_tool_centre_point():
+def test_closed_gripper_ends_163_mm_from_the_flange_at_the_tcp():
     tips = np.concatenate([corners(f"robotiq_85_{side}_finger_tip_link", 0.0) for side in ("left", "right")])
     assert tips[:, 2].max() == pytest.approx(0.163, abs=1e-5)
     assert np.allclose(in_flange(0.0)["gripper_tcp"][:3, 3], (0, 0, 0.163))
 
 
-def test_open_fingers_are_85_mm_apart_and_end_13_mm_nearer():
+def test_open_gripper_is_85_mm_wide_and_13_mm_shorter():
     tips = corners("robotiq_85_left_finger_tip_link", 0.085)
     assert finger_positions(GRIPPER, 0.085) == pytest.approx([0.0] * 6, abs=1e-5)
     assert 0.163 - tips[:, 2].max() == pytest.approx(0.0132, abs=2e-4)
@@ -73,7 +74,7 @@ def test_open_fingers_are_85_mm_apart_and_end_13_mm_nearer():
 
 @given(WIDTHS)
 def test_inner_knuckles_close_the_parallelogram(width):
-    """The end of the inner bar stays at one place of the finger tip: else the linkage could not move so."""
+    """The end of the inner bar has a fixed position in the finger tip, or the linkage could not move like this."""
     along = np.array([0.0368916, 0.0, 0.0436478, 1.0])
     poses = in_flange(width)
     for side, sign in (("left", 1), ("right", -1)):
@@ -83,7 +84,7 @@ def test_inner_knuckles_close_the_parallelogram(width):
 
 
 @given(KNUCKLE)
-def test_width_and_knuckle_are_inverse_and_the_ends_are_those_of_the_data_sheet(knuckle):
+def test_width_and_knuckle_are_inverse_and_reach_the_ends_of_the_data_sheet(knuckle):
     width = width_at(GRIPPER, knuckle)
     assert -1e-9 <= width <= 0.085 + 1e-5
     assert driven_position(GRIPPER, width) == pytest.approx(knuckle, abs=1e-9)
@@ -98,7 +99,7 @@ def test_joint_velocities_are_the_slope_of_the_positions(width, rate):
     assert np.allclose(finger_velocities(GRIPPER, width, rate), (after - before) / (2 * step) * rate, atol=1e-6)
 
 
-def test_joints_and_mimics_of_the_robot_file_are_those_of_the_description():
+def test_joints_and_mimics_of_the_robot_file_match_the_description():
     joints = {joint.get("name"): joint for joint in ET.fromstring(ROBOT.urdf).iter("joint")}
     driven = GRIPPER.joints[0]
     assert joints[driven].find("mimic") is None
@@ -108,7 +109,7 @@ def test_joints_and_mimics_of_the_robot_file_are_those_of_the_description():
     assert all(name in GRIPPER.joints for name, joint in joints.items() if joint.find("mimic") is not None)
 
 
-def test_planning_holds_the_fingers_closed():
+def test_gripper_is_locked_closed_for_planning():
     closed = dict(zip(GRIPPER.joints, finger_positions(GRIPPER, 0.0), strict=True))
     assert {name: pytest.approx(value, abs=1e-6) for name, value in closed.items()} == CONFIG.locked_joints
 
@@ -129,6 +130,32 @@ def test_sliding_fingers_each_move_half_the_width():
         ({"named_widths": {"wide": 0.1}}, r"wide is 0\.1 m, more than max_width"),
     ],
 )
-def test_gripper_that_does_not_fit_itself_is_refused(change, message):
+def test_inconsistent_gripper_is_refused(change, message):
     with pytest.raises(ValueError, match=message):
         GripperConfig.model_validate(GRIPPER.model_dump() | change)
+
+
+def turning_jaw(opens: int, **values: object) -> GripperConfig:
+    jaw = {"radius": 0.08, "angle": -0.3, "closed": 0.2, "opens": opens}
+    base = {"joints": ["jaw"], "links": ["tip"], "max_width": 0.07, "jaw": jaw}
+    return check(GripperConfig, base | values, "gripper")
+
+
+@pytest.mark.parametrize("opens", [1, -1])
+@pytest.mark.parametrize("width", [0.0, 0.02, 0.05, 0.07])
+def test_width_and_position_of_a_turning_jaw_are_inverse(opens: int, width: float) -> None:
+    gripper = turning_jaw(opens)
+    at = driven_position(gripper, width)
+    assert width_at(gripper, at) == pytest.approx(width) and opens * (at - 0.2) >= 0.0
+    after, before = driven_position(gripper, width + 1e-5), driven_position(gripper, width - 1e-5)
+    assert finger_velocities(gripper, width, 0.1) == [pytest.approx(0.1 * (after - before) / 2e-5, rel=1e-3)]
+
+
+@pytest.mark.parametrize(("wrong", "message"), [
+    ({"max_width": 0.2}, "gripper.jaw opens by 0.1036 m at most, max_width is 0.2 m"),
+    ({"closed": 0.1}, "gripper.closed is of fingers that slide"),
+    ({"joints": ["jaw", "other"]}, "gripper.jaw is of one joint"),
+])
+def test_impossible_turning_jaw_is_refused(wrong: dict[str, object], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        turning_jaw(1, **wrong)
