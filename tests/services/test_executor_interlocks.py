@@ -7,10 +7,10 @@ import os
 import pytest
 
 from common import topics
+from common.atomic_file import RUNTIME_VARIABLE, STATE_VARIABLE
 from common.control import interlocks
 from common.control.interlocks import InterlockFile
 from common.errors import ConfigError, RemoteError
-from common.kept_file import STANDING_VARIABLE, STATE_VARIABLE
 from common.messages import (
     GripperCommand,
     HoldRequest,
@@ -187,7 +187,7 @@ async def test_safety_stop_of_the_arm_persists_until_an_operator_has_it_recover(
 async def test_executor_that_cannot_write_its_file_does_not_start(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").write_text("")
     monkeypatch.setenv(STATE_VARIABLE, str(tmp_path / "file"))
-    monkeypatch.setenv(STANDING_VARIABLE, str(tmp_path))
+    monkeypatch.setenv(RUNTIME_VARIABLE, str(tmp_path))
     with pytest.raises(ConfigError, match=r"ZENCELL_STATE: .* cannot be written"):
         async with executor():
             pass

@@ -10,11 +10,11 @@ import pytest
 
 from applications.pick_place.topics import SCENE_BALLS
 from common import topics
+from common.atomic_file import STATE_VARIABLE
 from common.clock import Clock
 from common.config import load_cell
 from common.control.executor import Executor
 from common.errors import ConfigError, RemoteError, UnknownName
-from common.kept_file import STATE_VARIABLE
 from common.messages import (
     ExecuteRequest,
     GripperCommand,
