@@ -65,7 +65,7 @@ async def not_called(_: ExecuteRequest) -> MotionStatus:
 
 @pytest.fixture(autouse=True)
 def _decide_soon(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ownership, "MEET", 0.05)  # while the arm still moves
+    monkeypatch.setattr(ownership, "CONFLICT_SECONDS", 0.05)  # while the arm still moves
 
 
 async def moving(end: Callable[[MovingArm], Awaitable[None]]) -> MovingArm:
