@@ -47,7 +47,7 @@ class CameraInfo(Message):
     distortion_model: Label = "plumb_bob"
     d: list[Finite] = Field([], max_length=64)
     k: list[Finite] = Field(min_length=9, max_length=9)
-    without_robot: bool = Field(False, description="its images are rendered without the robot: they show what is behind")
+    without_robot: bool = Field(False, description="images are rendered without the robot and show what is behind it")
 
     @model_validator(mode="after")
     def _require_focal_lengths(self) -> CameraInfo:
