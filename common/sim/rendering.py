@@ -21,8 +21,8 @@ from common.perception.pinhole import Pinhole
 from common.perception.sphere import silhouette
 from common.robot.transforms import pose_to_matrix
 from common.scene.fixtures import container_panels
-from common.sim.lighting import white_level
 from common.sim.objects import appearance_of, solid_of_message
+from common.sim.photometry import white_level
 from common.sim.ray_caster import Mesh, View, cast, empty_view
 from common.sim.solids import fixture_mesh, primitive, transformed
 from common.sim.table import tables

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from common.config import Scenery
 from common.perception.pinhole import Pinhole
-from common.sim.lighting import CUTOFF, ambient, lamps, tint
+from common.sim.photometry import CUTOFF, ambient, lamps, tint
 from common.sim.ray_caster import View
 
 Array = NDArray[np.float64]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from common.perception.illumination import amplify_green, green_gain, sampled_pixels
-from common.sim.lighting import tint
+from common.sim.photometry import tint
 
 TABLE, RED = (0.10, 0.35, 0.55), (0.10, 0.15, 1.0)  # blue, green, red
 

@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
 
-from common.sim.lighting import REFERENCE, tint
-from common.sim.sensor import EXPOSURE, Sensor, SensorParameters, grey_balance
+from common.sim.photometry import EXPOSURE, REFERENCE, Sensor, SensorParameters, grey_balance, tint
 
 DAY = np.full(3, REFERENCE)
 
