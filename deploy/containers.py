@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from common.atomic_file import STATE_VARIABLE
 from common.clock import KEPT_VARIABLE
 from common.config import Cell, load_cell, names_of
-from common.kept_file import STATE_VARIABLE
 
 IMAGE = "zencell"
 ROUTER, ROUTER_PORT = "router", 7447

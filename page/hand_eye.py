@@ -10,9 +10,9 @@ from typing import Literal
 
 import numpy as np
 
+from common.atomic_file import state_folder
 from common.config import RobotConfig
 from common.errors import ConfigError
-from common.kept_file import lasting_folder
 from common.messages import CameraInfo, Image, JointState
 from common.perception.camera_file import CameraFile
 from common.robot.model import RobotModel
@@ -37,7 +37,7 @@ def folder_of(name: str) -> Path:
     """
     if not _NAME.fullmatch(name):
         raise ConfigError("Called", name, "must be letters, digits, '_' and '-', at most 40")
-    return lasting_folder() / "hand_eye" / name
+    return state_folder() / "hand_eye" / name
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,8 @@ from typing import Any
 from applications.pick_place.topics import VALIDATED_TARGETS
 from common import topics
 from common.transport.bus import Bus
-from common.transport.connect import connect
 from common.transport.endpoint import endpoint_of
+from common.transport.zenoh_session import connect
 
 
 def write(what: str, **values: Any) -> None:

@@ -7,11 +7,11 @@ import os
 import pytest
 
 from common import topics
+from common.atomic_file import RUNTIME_VARIABLE, STATE_VARIABLE
 from common.clock import Clock
 from common.control import interlocks
 from common.control.interlocks import InterlockFile
 from common.errors import ConfigError, RemoteError
-from common.kept_file import STANDING_VARIABLE, STATE_VARIABLE
 from common.messages import (
     GripperCommand,
     HoldRequest,
@@ -171,7 +171,7 @@ async def test_executor_that_cannot_keep_what_persons_decide_does_not_start(
 ) -> None:
     (tmp_path / "file").write_text("")
     monkeypatch.setenv(STATE_VARIABLE, str(tmp_path / "file"))
-    monkeypatch.setenv(STANDING_VARIABLE, str(tmp_path))
+    monkeypatch.setenv(RUNTIME_VARIABLE, str(tmp_path))
     with pytest.raises(ConfigError, match=r"ZENCELL_STATE: .* cannot be written"):
         async with executor():
             pass

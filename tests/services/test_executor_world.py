@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from common import topics
+from common.atomic_file import STATE_VARIABLE
 from common.config import load_cell
 from common.errors import ConfigError, RemoteError
-from common.kept_file import STATE_VARIABLE
 from common.messages import (
     Vector3,
     WorldEdit,

@@ -15,7 +15,7 @@ from typing import Protocol
 _HOST_CLOCK = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)
 
 
-class Sources(Protocol):
+class TimeSource(Protocol):
     """A clock that never goes back, one that says what day it is, and ids."""
 
     def monotonic_ns(self) -> int:
@@ -35,7 +35,7 @@ def _host_ns() -> int:
     return time.clock_gettime_ns(_HOST_CLOCK)
 
 
-class Machine:
+class SystemTimeSource:
     """The clocks of this machine, and ids that nobody can guess."""
 
     monotonic_ns = staticmethod(time.monotonic_ns)
@@ -45,7 +45,7 @@ class Machine:
 
 
 class _Chosen:
-    sources: Sources = Machine()
+    sources: TimeSource = SystemTimeSource()
 
 
 def monotonic() -> float:
@@ -74,10 +74,33 @@ def new_id(count: int = 4) -> str:
 
 
 @contextmanager
-def drawn_from(sources: Sources) -> Iterator[None]:
+def use_time_source(sources: TimeSource) -> Iterator[None]:
     """Inside, everything in this process takes time and ids from there."""
     before, _Chosen.sources = _Chosen.sources, sources
     try:
         yield
     finally:
         _Chosen.sources = before
+
+
+class WatchdogClock:
+    """Counts the time [s] in which this process ran, from readings of a clock that come in a known rhythm.
+
+    At most `longest` counts between two readings: a suspended process, or one that waited long for a processor, could
+    neither receive nor send meanwhile, and must not take others for silent.
+    """
+
+    def __init__(self, longest: float) -> None:
+        """Start at 0; at most `longest` [s] counts between two readings."""
+        self.now = 0.0
+        self.late = 0.0  # delay of the newest reading beyond that [s]
+        self._longest = longest
+        self._before: float | None = None
+
+    def advance(self, now: float) -> float:
+        """Return the running time after a reading of the clock [s, monotonic]."""
+        passed = 0.0 if self._before is None else max(0.0, now - self._before)
+        self._before = now
+        self.late = max(0.0, passed - self._longest)
+        self.now += min(passed, self._longest)
+        return self.now

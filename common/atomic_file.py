@@ -17,12 +17,12 @@ from common.errors import ConfigError, ZencellError
 R = TypeVar("R", bound=BaseModel)
 
 STATE_VARIABLE = "ZENCELL_STATE"  # folder for what is kept: what persons decided, how the simulated world stands
-STANDING_VARIABLE = "ZENCELL_STANDING"  # folder for what is kept until the cell's end alone, as how the world stands
+RUNTIME_VARIABLE = "ZENCELL_STANDING"  # folder for what is kept until the cell's end alone, as how the world stands
 LARGEST = 1_000_000  # [bytes]
 ROOM = 128 * 1024  # [bytes] that each file takes: more than the largest record there can be
 
 
-def lasting_folder(environ: Mapping[str, str] = os.environ) -> Path:
+def state_folder(environ: Mapping[str, str] = os.environ) -> Path:
     """The folder for what is kept: ZENCELL_STATE, else one in the person's home.
 
     Raises:
@@ -37,9 +37,9 @@ def lasting_folder(environ: Mapping[str, str] = os.environ) -> Path:
         raise ConfigError(STATE_VARIABLE, ..., told) from None
 
 
-def standing_folder(environ: Mapping[str, str] = os.environ) -> Path | None:
+def runtime_folder(environ: Mapping[str, str] = os.environ) -> Path | None:
     """The folder for what outlives a service, but not the cell; None where nobody has said one: then it is not kept."""
-    folder = environ.get(STANDING_VARIABLE) or environ.get(STATE_VARIABLE)
+    folder = environ.get(RUNTIME_VARIABLE) or environ.get(STATE_VARIABLE)
     return Path(folder) if folder else None
 
 
@@ -64,7 +64,7 @@ def open_regular(path: Path, flags: int) -> int:
     raise OSError(errno.EINVAL, "it is not a regular file")
 
 
-class KeptFile(Generic[R]):
+class AtomicFile(Generic[R]):
     """A record that is always whole: a new file takes the place of the old one, which is the next new one.
 
     Both have room for any record from the start: a disk that becomes full later still takes what is decided.
