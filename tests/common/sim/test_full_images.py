@@ -33,13 +33,13 @@ def is_arm(seen):
     return (np.abs(seen.colour.astype(int) - round(255 * ARM[0])) <= 1).all(axis=2)
 
 
-def test_at_home_the_arm_is_not_before_the_objects(view, robot):
+def test_arm_at_home_occludes_no_object(view, robot):
     seen = view.render(OBJECTS, joints(robot, robot.named("home")))
     assert not is_arm(seen).any()
     np.testing.assert_array_equal(seen.colour, seen_world("w5")[1])
 
 
-def test_the_arm_hides_what_is_below_it_and_is_where_its_kinematics_say(view, robot):
+def test_arm_is_rendered_at_its_kinematic_pose(view, robot):
     seen = view.render(OBJECTS, joints(robot, OVER))
     arm = is_arm(seen)
     assert arm.any() and seen.depth[arm].max() < 1.75
@@ -48,7 +48,7 @@ def test_the_arm_hides_what_is_below_it_and_is_where_its_kinematics_say(view, ro
     assert arm[v, u] and seen.depth[v, u] == pytest.approx(2.75 - wrist[2], abs=0.12)
 
 
-def test_only_what_changed_is_cast_again(view, robot):
+def test_unchanged_scene_returns_the_same_view(view, robot):
     home = joints(robot, robot.named("home"))
     first = view.render(OBJECTS, home)
     assert view.render(OBJECTS, home.model_copy(update={"position": [p + 1e-6 for p in home.position]})) is first
@@ -58,12 +58,12 @@ def test_only_what_changed_is_cast_again(view, robot):
     assert (fewer.colour != first.colour).any()
 
 
-def test_without_a_whole_joint_state_there_is_no_arm(view, robot):
+def test_incomplete_joint_state_shows_no_arm(view, robot):
     part = JointState(header=Header(), name=robot.joint_names[:3], position=OVER[:3])
     assert not is_arm(view.render(OBJECTS, part)).any() and not is_arm(view.render(OBJECTS, None)).any()
 
 
-def test_links_have_the_shapes_of_the_description(robot):
+def test_link_shapes_come_from_the_urdf(robot):
     shapes = robot_shapes(robot)
     assert {"forearm_link", "wrist_3_link", "robotiq_85_base_link"} <= set(shapes)
     forearm = shapes["forearm_link"].reshape(-1, 3)
@@ -78,12 +78,12 @@ def test_primitive_shapes_have_their_size(shape, size):
     np.testing.assert_allclose(np.ptp(corners, axis=0), size, rtol=0.01)
 
 
-def test_shapes_without_triangles_are_refused():
+def test_shapes_without_triangles_are_rejected():
     with pytest.raises(ValueError, match="no triangles for a Halfspace"):
         triangles(coal.Halfspace(np.array([0.0, 0, 1]), 0.0))
 
 
-def test_noise_and_missing_depth_are_as_asked_for():
+def test_depth_noise_and_dropout_have_the_configured_statistics():
     depth = np.full((200, 200), 1.5, np.float32)
     depth[0, 0] = np.nan
     noisy = add_depth_noise(depth, np.random.default_rng(1), 0.002, 0.1)

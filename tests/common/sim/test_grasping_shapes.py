@@ -78,7 +78,7 @@ class Rig:
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_fingers_close_until_they_touch_the_object(shape: str) -> None:
+def test_fingers_close_to_the_width_of_the_object(shape: str) -> None:
     thing, wide = SHAPES[shape]
     rig = Rig(thing)
     assert rig.grasp(0.4, 0.0, 0.02) == "thing_1"
@@ -87,7 +87,7 @@ def test_fingers_close_until_they_touch_the_object(shape: str) -> None:
 
 
 @given(yaw=st.floats(-math.pi, math.pi))
-def test_a_box_between_the_fingers_is_as_wide_as_it_is_along_them(yaw: float) -> None:
+def test_width_of_a_rotated_box_is_its_extent_between_the_pads(yaw: float) -> None:
     rig = Rig({"shape": "box", "size": [0.03, 0.05], "height": 0.04})
     assert rig.grasp(0.4, 0.0, 0.02, yaw) == "thing_1"
     # The pads are 20 mm wide: what of the box lies between them is no wider than its outline there.
@@ -96,24 +96,24 @@ def test_a_box_between_the_fingers_is_as_wide_as_it_is_along_them(yaw: float) ->
     assert across - 1e-6 <= rig.width <= 0.03 * s + 0.05 * c + 1e-6
 
 
-def test_a_thing_that_is_wider_than_the_fingers_open_is_not_taken() -> None:
+def test_object_wider_than_the_opening_is_not_grasped() -> None:
     rig = Rig({"shape": "box", "size": [0.1, 0.1], "height": 0.04})
     assert rig.grasp(0.4, 0.0, 0.02) == "" and rig.width == 0.0 and rig.thing().state == "table"
 
 
 @pytest.mark.parametrize("off", [(0.021, 0, 0), (0, 0.024, 0), (0, 0, 0.021)])
-def test_fingers_beside_a_cube_close_on_air(off: tuple[float, float, float]) -> None:
+def test_fingers_next_to_a_cube_close_on_nothing(off: tuple[float, float, float]) -> None:
     rig = Rig(CUBE)
     assert rig.grasp(0.4 + off[0], off[1], 0.02 + off[2]) == "" and rig.width == 0.0
 
 
-def test_the_wall_of_a_large_ring_is_taken_with_one_finger_within_it() -> None:
+def test_wall_of_a_large_ring_is_grasped() -> None:
     rig = Rig({"shape": "ring", "radius": 0.1, "inner_radius": 0.085, "height": 0.03})
     assert rig.grasp(0.4, 0.0925, 0.02) == "thing_1"
     assert rig.width == pytest.approx(0.015, abs=1e-3)
 
 
-def test_a_held_object_keeps_its_place_and_turn_in_the_hand() -> None:
+def test_held_object_keeps_its_pose_in_the_gripper() -> None:
     rig = Rig({**CUBE, "yaw": 0.3})
     rig.grasp(0.403, 0.0, 0.025, 0.3)
     T_tcp_cube = invert(rig.hand) @ rig.pose()
@@ -127,7 +127,7 @@ def test_a_held_object_keeps_its_place_and_turn_in_the_hand() -> None:
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_an_object_that_is_let_go_lies_below_the_hand_on_the_table(shape: str) -> None:
+def test_released_object_lies_below_the_gripper(shape: str) -> None:
     rig = Rig(SHAPES[shape][0])
     rig.grasp(0.4, 0.0, 0.02)
     rig.world.take_events()
@@ -139,7 +139,7 @@ def test_an_object_that_is_let_go_lies_below_the_hand_on_the_table(shape: str) -
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_an_object_that_is_dropped_into_a_container_lies_in_it_and_is_counted_there(shape: str) -> None:
+def test_released_object_lies_in_the_container_below(shape: str) -> None:
     rig = Rig(SHAPES[shape][0])
     rig.grasp(0.4, 0.0, 0.02)
     rig.put_down(0.6, -0.3)
@@ -149,7 +149,7 @@ def test_an_object_that_is_dropped_into_a_container_lies_in_it_and_is_counted_th
     assert thing.pose.position.z == pytest.approx(0.005 + thing.size.z / 2)
 
 
-def test_a_cube_that_falls_on_a_cube_lies_on_it_and_falls_when_that_is_taken_away() -> None:
+def test_stacked_cube_falls_when_its_support_is_removed() -> None:
     rig = Rig(CUBE, {**CUBE, "x": 0.3})
     rig.grasp(0.4, 0.0, 0.02)
     rig.put_down(0.303, 0.0)
@@ -160,7 +160,7 @@ def test_a_cube_that_falls_on_a_cube_lies_on_it_and_falls_when_that_is_taken_awa
     assert rig.thing().pose.position.z == pytest.approx(0.02) and rig.thing().state == "table"
 
 
-def test_a_cube_whose_middle_is_not_carried_lies_beside_what_it_fell_on() -> None:
+def test_cube_with_unsupported_center_lies_next_to_the_other() -> None:
     rig = Rig(CUBE, {**CUBE, "x": 0.3})
     rig.grasp(0.4, 0.0, 0.02)
     rig.put_down(0.325, 0.0)
@@ -168,7 +168,7 @@ def test_a_cube_whose_middle_is_not_carried_lies_beside_what_it_fell_on() -> Non
     assert z == pytest.approx(0.02) and math.hypot(x - 0.3, y) >= 0.04 - 1e-6
 
 
-def test_a_cube_that_is_let_go_tilted_lies_flat_on_its_nearest_side() -> None:
+def test_tilted_cube_settles_on_its_nearest_side() -> None:
     rig = Rig(CUBE)
     rig.grasp(0.4, 0.0, 0.02)
     tilted = tool_down(0.3, 0.1, 0.3)
@@ -183,14 +183,14 @@ def test_a_cube_that_is_let_go_tilted_lies_flat_on_its_nearest_side() -> None:
     assert (roll, pitch) == pytest.approx((0.0, 0.0), abs=1e-9) and rig.pose()[2, 3] == pytest.approx(0.02)
 
 
-def test_a_cube_beyond_the_table_is_out_of_sight() -> None:
+def test_cube_released_off_the_table_is_elsewhere() -> None:
     rig = Rig(CUBE)
     rig.grasp(0.4, 0.0, 0.02)
     rig.put_down(1.1, 0.0)
     assert rig.thing().state == "elsewhere" and rig.pose()[2, 3] < -0.5
 
 
-def test_what_finds_no_room_beside_what_is_in_a_container_lies_on_it() -> None:
+def test_object_without_room_in_a_container_lies_on_top() -> None:
     large = {"shape": "box", "size": [0.12, 0.06], "height": 0.05}
     rig = Rig({**large, "x": 0.6, "y": 0.3}, {**large, "x": 0.3})
     rig.edit("move", (0.6, 0.3), id="thing_1")
@@ -201,7 +201,7 @@ def test_what_finds_no_room_beside_what_is_in_a_container_lies_on_it() -> None:
     assert sorted(round(thing.pose.position.z, 3) for thing in lying) == [0.03, 0.08]
 
 
-def test_spheres_and_a_cube_in_one_container_do_not_reach_into_each_other() -> None:
+def test_sphere_and_cube_in_one_container_do_not_overlap() -> None:
     rig = Rig({"shape": "sphere", "radius": 0.03}, {**CUBE, "x": 0.6, "y": 0.3})
     assert rig.thing("thing_2").container == "left"
     rig.grasp(0.4, 0.0, 0.03)
@@ -230,7 +230,7 @@ def wedge(tmp_path: Path) -> Path:
     return world
 
 
-def test_a_mesh_beside_the_file_of_the_world_is_gripped_carried_dropped_and_counted(wedge: Path) -> None:
+def test_mesh_from_a_file_is_grasped_and_placed(wedge: Path) -> None:
     config = load_cell("panda", world=str(wedge)).world
     rig = Rig()
     rig.world = KinematicWorld(config)
@@ -242,13 +242,13 @@ def test_a_mesh_beside_the_file_of_the_world_is_gripped_carried_dropped_and_coun
     assert (thing.state, thing.container) == ("contained", "tray") and len(thing.triangles) == 8
 
 
-def test_a_mesh_that_is_not_there_is_named(wedge: Path) -> None:
+def test_missing_mesh_file_is_named(wedge: Path) -> None:
     (wedge.parent / "wedge.stl").unlink()
     with pytest.raises(ConfigError, match=r"world\.objects\.wedge\.mesh: .*wedge\.stl' is a mesh that cannot be read"):
         KinematicWorld(load_cell("panda", world=str(wedge)).world)
 
 
-def test_a_mesh_that_was_added_is_found_after_a_restart(wedge: Path) -> None:
+def test_added_mesh_is_restored(wedge: Path) -> None:
     config = load_cell("panda", world=str(wedge)).world
     world = KinematicWorld(config)
     world.edit(WorldEdit(op="add", like="wedge", position=Vector3(x=0.3, y=0.2)), 0.0)
@@ -260,7 +260,7 @@ def test_a_mesh_that_was_added_is_found_after_a_restart(wedge: Path) -> None:
 # --- edits ---
 
 
-def test_an_object_of_any_shape_is_added_with_size_and_colour() -> None:
+def test_objects_of_any_shape_are_added_with_size_and_color() -> None:
     rig = Rig(CUBE)
     size, blue = Vector3(x=0.05, y=0.03, z=0.02), Color(r=0, g=0, b=1)
     assert rig.edit("add", (0.3, 0.2), shape="box", size=size, color=blue, yaw=0.5) == "box_1"
@@ -282,14 +282,14 @@ def test_an_object_of_any_shape_is_added_with_size_and_colour() -> None:
     ({"like": "thing_7"}, "unknown_id", "choices: thing_1"),
     ({"id": "thing_1"}, "id_exists", "thing_1"),
 ])
-def test_what_cannot_be_added_is_refused_and_changes_nothing(fields: dict[str, Any], code: str, text: str) -> None:
+def test_invalid_shape_is_refused_without_effect(fields: dict[str, Any], code: str, text: str) -> None:
     rig = Rig(CUBE)
     with pytest.raises(Refused) as refusal:
         rig.edit("add", (0.3, 0.2), **fields)
     assert refusal.value.code == code and text in str(refusal.value) and rig.world.ids == ["thing_1"]
 
 
-def test_a_held_cube_slips_out_of_the_fingers() -> None:
+def test_dropped_cube_slips_out_of_the_fingers() -> None:
     rig = Rig(CUBE)
     rig.grasp(0.4, 0.0, 0.02)
     rig.tick(tool_down(0.4, -0.2, 0.2))
@@ -299,7 +299,7 @@ def test_a_held_cube_slips_out_of_the_fingers() -> None:
     assert rig.thing().state == "table" and rig.pose()[1, 3] == pytest.approx(-0.2, abs=0.01)
 
 
-def test_what_was_added_and_what_falls_is_found_after_a_restart() -> None:
+def test_added_and_falling_objects_are_restored() -> None:
     rig = Rig(CUBE)
     rig.edit("add", (0.3, 0.2), shape="cylinder", size=Vector3(x=0.04, z=0.05))
     rig.grasp(0.4, 0.0, 0.02)
@@ -321,7 +321,7 @@ def test_what_was_added_and_what_falls_is_found_after_a_restart() -> None:
 # --- simulators by name ---
 
 
-def test_the_simulator_is_found_by_name_and_a_wrong_name_lists_the_choices() -> None:
+def test_unknown_simulator_lists_the_choices() -> None:
     world = Rig(CUBE).config
     assert isinstance(load_world(world, world.objects), KinematicWorld)
     with pytest.raises(UnknownName, match="unknown simulator 'physics'; choices: kinematic"):

@@ -47,7 +47,7 @@ def is_color(picture: Any, rgb: tuple[float, float, float]) -> Any:
 
 @pytest.mark.parametrize("plain", [True, False])
 @pytest.mark.parametrize("shape", THINGS)
-def test_an_object_is_seen_where_its_surface_is(shape: str, plain: bool) -> None:
+def test_object_covers_its_projection(shape: str, plain: bool) -> None:
     seen = thing(**THINGS[shape], yaw=0.4)
     view = Renderer(AROUND, plain=plain).render([seen])
     blue = is_color(view.colour, BLUE)
@@ -64,7 +64,7 @@ def test_an_object_is_seen_where_its_surface_is(shape: str, plain: bool) -> None
         assert blue[middle[1], middle[0]] == (shape != "ring"), "one looks through a ring"
 
 
-def test_what_is_nearer_hides_what_is_farther_whatever_their_shapes() -> None:
+def test_nearer_object_occludes_regardless_of_shape() -> None:
     below, above = thing(shape="box", size=[0.2, 0.2, 0.02]), spheres([(0.45, -0.1, 0.05)]).objects[0]
     u, v = np.rint(CAMERA.project([0.45, -0.1, 0.08])).astype(int)
     renderer = Renderer(AROUND, plain=True)
@@ -75,27 +75,27 @@ def test_what_is_nearer_hides_what_is_farther_whatever_their_shapes() -> None:
     assert not is_color(renderer.render([above, lifted]).colour, red).any()
 
 
-def test_fixtures_are_seen_in_their_colour_and_a_plain_table_is_grey() -> None:
+def test_fixtures_have_their_color_except_a_plain_table() -> None:
     u, v = np.rint(CAMERA.project([0.6, 0.2, 0.3])).astype(int)
     plain, full = (Renderer(AROUND, plain=plain).render([]).colour for plain in (True, False))
     assert is_color(plain, POST.color)[v, u] and is_color(full, POST.color)[v, u]
     assert not is_color(plain, TABLE.color).any() and is_color(full, TABLE.color).any()
 
 
-def test_what_is_held_is_hidden_in_a_plain_picture_and_shown_in_a_full_one() -> None:
+def test_held_object_is_hidden_in_plain_images_only() -> None:
     held = thing(**THINGS["box"]).model_copy(update={"state": "held"})
     assert not is_color(Renderer(AROUND, plain=True).render([held]).colour, BLUE).any()
     assert is_color(Renderer(AROUND).render([held]).colour, BLUE).any()
 
 
-def test_depth_is_that_of_the_top_of_a_thing() -> None:
+def test_depth_of_an_object_is_that_of_its_top() -> None:
     view = Renderer(AROUND).render([thing(**THINGS["cylinder"])])
     u, v = np.rint(CAMERA.project([0.45, -0.1, 0.08])).astype(int)
     assert view.depth[v, u] == pytest.approx(0.8 - 0.08, abs=1e-4)
     assert view.depth[10, 10] == pytest.approx(0.8, abs=1e-4)
 
 
-def test_colour_and_turn_of_a_thing_are_news_for_a_camera() -> None:
+def test_changed_color_or_rotation_is_rendered_again() -> None:
     renderer = Renderer(AROUND, plain=True)
     first = renderer.render([thing(**THINGS["box"])]).colour
     assert (renderer.render([thing(**THINGS["box"], yaw=0.5)]).colour != first).any()
@@ -104,7 +104,7 @@ def test_colour_and_turn_of_a_thing_are_news_for_a_camera() -> None:
     np.testing.assert_array_equal(renderer.render([thing(**THINGS["box"])]).colour, first)
 
 
-def test_spheres_that_lie_as_before_are_drawn_as_before_and_not_worked_out_again(
+def test_unchanged_spheres_are_cached(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     worked_out = []
@@ -130,7 +130,7 @@ def test_spheres_that_lie_as_before_are_drawn_as_before_and_not_worked_out_again
 
 
 @pytest.mark.parametrize("shape", ["box", "cylinder", "prism", "ring"])
-def test_an_object_of_a_recording_from_before_has_a_pose_and_a_size(shape: str) -> None:
+def test_object_of_an_old_recording_gets_pose_and_size(shape: str) -> None:
     now = thing(**THINGS[shape], yaw=0.4, z=0.1)
     before = WorldObject.model_validate({
         "id": "thing", "shape": shape, "outline": now.outline, "hole": now.hole, "base": now.base,
@@ -140,7 +140,7 @@ def test_an_object_of_a_recording_from_before_has_a_pose_and_a_size(shape: str) 
     assert before.size.z == pytest.approx(now.size.z)
 
 
-def test_objects_without_a_place_are_laid_out_apart_by_the_seed() -> None:
+def test_objects_without_a_position_are_placed_by_the_seed() -> None:
     things = [{"id": f"{shape}_{i}", **THINGS[shape]} for shape in THINGS for i in range(2)]
     world = World.model_validate({"fixtures": [TABLE], "containers": {"tray": {}}, "objects": things})
     found = layout(world, 3, lambda x, y, z: math.hypot(x, y) < 0.7)
@@ -159,12 +159,12 @@ def test_objects_without_a_place_are_laid_out_apart_by_the_seed() -> None:
     {"shape": "mesh", "vertices": [(0.0, 0.0, 0.0)] * 3, "triangles": [(0, 1, -1)]},
     {"shape": "prism"}, {"shape": "prism", "polygon": [(0.0, 0.0), (1.0, 0.0)]},
 ])
-def test_object_that_has_no_shape_is_no_message(wrong):
+def test_object_without_a_valid_shape_is_rejected(wrong):
     with pytest.raises(DecodeError, match=r"WorldObjects\.objects\.0"):
         decode(WorldObjects, msgpack.packb({"objects": [{"id": "a", **wrong}]}))
 
 
-def test_shapes_that_are_not_seen_any_more_are_not_kept() -> None:
+def test_cache_drops_shapes_that_are_no_longer_visible() -> None:
     renderer = Renderer(AROUND)
     for k in range(20):
         renderer.render([thing(shape="box", size=[0.05, 0.05, 0.02 + 0.001 * k])])

@@ -15,14 +15,14 @@ def red(picture):
     return (np.abs(picture.astype(int) - RED) < 12).all(axis=2)
 
 
-def test_an_empty_table_is_grey_with_a_grid_every_40_pixels():
+def test_plain_table_is_grey_with_a_grid_every_40_pixels():
     picture = draw_spheres([], camera, surroundings)
     assert picture.shape == (480, 640, 3) and picture.dtype == np.uint8
     assert (picture[300, 300] == 128).all() and (picture[320, 301] == 108).all() and (picture[301, 320] == 108).all()
     assert not red(picture).any()
 
 
-def test_the_box_is_drawn_where_the_camera_sees_its_rim():
+def test_plain_container_is_drawn_at_its_projected_rim():
     picture = draw_spheres([], camera, surroundings).astype(int)
     orange = (picture[..., 2] > 200) & (picture[..., 0] < 90)
     v, u = np.nonzero(orange)
@@ -33,7 +33,7 @@ def test_the_box_is_drawn_where_the_camera_sees_its_rim():
     assert u.max() < 320, "the box stands at +y, which is left in the picture"
 
 
-def test_every_pixel_of_a_ball_lies_on_a_ray_that_meets_it():
+def test_plain_sphere_covers_exactly_the_pixels_whose_rays_meet_it():
     center = np.array((0.6, -0.35, 0.03))
     v, u = np.nonzero(red(draw_spheres([center], camera, surroundings)))
     distance, _ = ray_distances(camera.directions(np.column_stack([u, v])), center[None] - camera.position)
@@ -43,7 +43,7 @@ def test_every_pixel_of_a_ball_lies_on_a_ray_that_meets_it():
     assert area - 230 < len(u) < area - 90, "the white rim takes the outermost pixel all the way round"
 
 
-def test_what_is_nearer_hides_what_is_farther_in_any_order():
+def test_nearer_sphere_occludes_in_any_order():
     low, high = (0.55, 0.25, 0.035), (0.55, 0.25, 0.095)
     one, other = (draw_spheres(order, camera, surroundings) for order in ([low, high], [high, low]))
     np.testing.assert_array_equal(one, other)
@@ -51,14 +51,14 @@ def test_what_is_nearer_hides_what_is_farther_in_any_order():
     assert red(draw_spheres([low, high], camera, surroundings))[v, u]
 
 
-def test_the_outline_has_a_white_rim_of_two_pixels():
+def test_plain_sphere_has_a_white_rim_of_two_pixels():
     picture = draw_spheres([(0.4, 0.0, 0.03)], camera, surroundings, rim_width=2)
     profile = picture[245, 320:350].astype(float)
     whiteness = (profile.min(axis=1) - 128).clip(0) / 127
     assert whiteness.sum() == pytest.approx(2, abs=0.3)
 
 
-def test_noise_and_brightness_change_the_picture_as_told():
+def test_image_noise_and_brightness_have_the_configured_statistics():
     plain = draw_spheres([(0.4, 0, 0.03)], camera, surroundings).astype(float)
     rng = np.random.default_rng(1)
     noisy = draw_spheres([(0.4, 0, 0.03)], camera, surroundings, noise_std=8, brightness=20, rng=rng).astype(float)
@@ -66,18 +66,18 @@ def test_noise_and_brightness_change_the_picture_as_told():
     assert background.mean() == pytest.approx(20, abs=0.2) and background.std() == pytest.approx(8, abs=0.2)
 
 
-def test_noise_of_the_same_seed_is_the_same():
+def test_image_noise_is_determined_by_the_seed():
     pictures = [draw_spheres([], camera, surroundings, noise_std=5, rng=np.random.default_rng(3)) for _ in range(2)]
     np.testing.assert_array_equal(*pictures)
 
 
-def test_a_ball_out_of_view_or_above_the_camera_changes_nothing():
+def test_invisible_sphere_changes_nothing():
     empty = draw_spheres([], camera, surroundings)
     beyond = [(2.0, 0, 0.03), (0.4, 0, 0.9), (0.4, 0, 0.79)]
     np.testing.assert_array_equal(draw_spheres(beyond, camera, surroundings), empty)
 
 
-def test_balls_have_the_colour_of_the_surroundings():
+def test_spheres_have_the_configured_color():
     blue = surroundings.model_copy(update={"ball_color": (0.0, 0.0, 1.0)})
     u, v = camera.project((0.4, 0.1, 0.03)).round().astype(int)
     assert draw_spheres([(0.4, 0.1, 0.03)], camera, blue)[v, u].tolist() == [255, 0, 0]

@@ -77,7 +77,7 @@ class Rig:
 # --- grasping ---
 
 
-def test_balls_rest_on_the_table_with_ids_in_order():
+def test_initial_balls_rest_on_the_table_with_ids_in_order():
     where = Rig([(0.5, 0.0), (0.6, 0.1)]).where()
     assert list(where) == ["ball_1", "ball_2"]
     assert where["ball_2"][0] == "table" and np.allclose(where["ball_2"][1], [0.6, 0.1, R])
@@ -87,7 +87,7 @@ def test_balls_rest_on_the_table_with_ids_in_order():
     yaw=st.floats(-math.pi, math.pi), across=st.floats(-0.0099, 0.0099), sideways=st.floats(-0.0119, 0.0119),
     above=st.floats(-0.0099, 0.0099),
 )
-def test_ball_between_the_fingers_is_grasped_and_centred_between_them(yaw, across, sideways, above):
+def test_ball_between_the_fingers_is_grasped_and_centered(yaw, across, sideways, above):
     rig = Rig()
     # Tool x and y axes at this yaw, with the tool pointing down.
     hand = tool_down(0.5, 0.0, R + above, yaw)
@@ -99,13 +99,13 @@ def test_ball_between_the_fingers_is_grasped_and_centred_between_them(yaw, acros
 
 
 @pytest.mark.parametrize("off", [(0.011, 0, 0), (0, 0.013, 0), (0, 0, 0.011), (0, 0.05, 0), (0.2, 0, 0)])
-def test_fingers_beside_the_ball_close_on_air(off):
+def test_fingers_next_to_the_ball_close_on_nothing(off):
     rig = Rig()
     assert rig.grasp(0.5 + off[0], 0.0 + off[1], R + off[2]) == ""
     assert rig.width == 0.0 and rig.where()["ball_1"][0] == "table" and rig.events() == []
 
 
-def test_hand_that_comes_down_with_closed_fingers_grasps_nothing():
+def test_closed_fingers_grasp_nothing():
     rig = Rig()
     rig.tick(width=0.03)
     rig.tick(tool_down(0.5, 0.0, R))
@@ -119,7 +119,7 @@ def test_only_one_ball_is_grasped():
     assert [label for label, _ in rig.where().values()] == ["held", "table"]
 
 
-def test_held_ball_moves_rigidly_with_the_hand():
+def test_held_ball_moves_rigidly_with_the_gripper():
     rig = Rig()
     rig.grasp(0.502, 0.0, 0.035)
     grip = rig.hand[:3, :3].T @ (rig.where()["ball_1"][1] - rig.hand[:3, 3])
@@ -128,7 +128,7 @@ def test_held_ball_moves_rigidly_with_the_hand():
     assert np.allclose(rig.where()["ball_1"][1], turned[:3, :3] @ grip + turned[:3, 3])
 
 
-def test_grasp_and_rest_are_told_in_the_words_of_the_seed():
+def test_grasp_and_rest_are_published_as_remove_and_add():
     rig = Rig()
     rig.grasp(0.5, 0.0)
     assert rig.events() == ["remove:ball_1"]
@@ -142,7 +142,7 @@ def test_grasp_and_rest_are_told_in_the_words_of_the_seed():
 # --- letting go ---
 
 
-def test_ball_falls_as_gravity_says_and_lies_where_it_was_let_go():
+def test_released_ball_falls_under_gravity_to_the_point_below():
     rig = Rig()
     rig.grasp(0.5, 0.0)
     rig.release(0.3, -0.1, 0.5)
@@ -155,7 +155,7 @@ def test_ball_falls_as_gravity_says_and_lies_where_it_was_let_go():
     assert rig.where()["ball_1"][0] == "table" and np.allclose(rig.where()["ball_1"][1], [0.3, -0.1, R])
 
 
-def test_fingers_must_open_beyond_the_ball_to_let_go():
+def test_release_needs_an_opening_beyond_the_tolerance():
     rig = Rig()
     rig.grasp(0.5, 0.0)
     rig.tick(width=GRIP + 0.001)
@@ -173,7 +173,7 @@ def test_long_tick_lands_the_ball():
     assert rig.where()["ball_1"][0] == "table"
 
 
-def test_eight_balls_fill_the_box_in_two_layers_and_the_ninth_lies_beside_it():
+def test_eight_balls_fill_the_container_and_the_ninth_lies_outside():
     spots = [(0.3 + 0.07 * i, -0.3 + 0.07 * j) for i in range(3) for j in range(3)]
     rig = Rig(spots)
     for x, y in spots:
@@ -187,14 +187,14 @@ def test_eight_balls_fill_the_box_in_two_layers_and_the_ninth_lies_beside_it():
     assert label == "table" and max(abs(ninth[0] - 0.55), abs(ninth[1] - 0.25)) >= 0.08 + R - 1e-9
 
 
-def test_ball_in_the_box_takes_the_slot_below_it():
+def test_ball_takes_the_nearest_slot_of_the_container():
     rig = Rig()
     rig.grasp(0.5, 0.0)
     rig.put_down(0.55 + 0.02, 0.25 - 0.02)
     assert np.allclose(rig.where()["ball_1"][1], [0.55 + 0.033, 0.25 - 0.033, 0.005 + R])
 
 
-def test_ball_let_go_above_another_rolls_to_the_nearest_free_place():
+def test_ball_released_above_another_rolls_to_the_nearest_free_position():
     rig = Rig([(0.5, 0.0), (0.3, 0.0)])
     rig.grasp(0.5, 0.0)
     rig.put_down(0.31, 0.0)
@@ -202,7 +202,7 @@ def test_ball_let_go_above_another_rolls_to_the_nearest_free_place():
     assert label == "table" and 2 * R <= np.hypot(*(place[:2] - (0.3, 0.0))) < 2 * R + 0.005
 
 
-def test_ball_let_go_on_the_rim_of_the_table_stays_and_beyond_it_is_elsewhere():
+def test_ball_released_beyond_the_table_edge_is_elsewhere():
     rig = Rig([(0.5, 0.0), (0.6, 0.0)])
     rig.grasp(0.5, 0.0)
     rig.put_down(0.5, 0.499)
@@ -213,7 +213,7 @@ def test_ball_let_go_on_the_rim_of_the_table_stays_and_beyond_it_is_elsewhere():
     assert rig.count("elsewhere") == 1 and rig.events()[-1] == "remove:ball_2"
 
 
-def test_ball_let_go_beside_the_wall_keeps_clear_of_it():
+def test_ball_released_at_a_container_wall_keeps_clear_of_it():
     rig = Rig()
     rig.grasp(0.5, 0.0)
     rig.put_down(0.55, 0.25 - 0.09)
@@ -221,7 +221,7 @@ def test_ball_let_go_beside_the_wall_keeps_clear_of_it():
     assert label == "table" and place[1] <= 0.25 - 0.08 - R + 1e-9
 
 
-def test_ball_taken_from_under_another_lets_it_sink():
+def test_removing_a_lower_ball_lowers_the_one_above():
     spots = [(0.3 + 0.07 * i, -0.2) for i in range(5)]
     rig = Rig(spots)
     for x, y in spots:
@@ -239,7 +239,7 @@ def test_ball_taken_from_under_another_lets_it_sink():
 # --- edits ---
 
 
-def test_added_ball_gets_the_next_free_id_and_lies_on_the_table():
+def test_added_ball_gets_the_next_free_id():
     rig = Rig([(0.5, 0.0), (0.6, 0.0)])
     rig.edit("remove", "ball_1")
     assert rig.edit("add", at=(0.4, 0.2)) == "ball_1"
@@ -248,7 +248,7 @@ def test_added_ball_gets_the_next_free_id_and_lies_on_the_table():
     assert rig.events() == ["remove:ball_1", "add:ball_1", "add:ball_3"]
 
 
-def test_moved_ball_is_told_as_removed_and_added():
+def test_moved_ball_is_published_as_removed_and_added():
     rig = Rig()
     assert rig.edit("move", "ball_1", (0.4, 0.2)) == "ball_1"
     assert rig.events() == ["remove:ball_1", "add:ball_1"]
@@ -256,7 +256,7 @@ def test_moved_ball_is_told_as_removed_and_added():
 
 
 @pytest.mark.parametrize("op", ["move", "remove", "reset"])
-def test_held_ball_can_be_taken_out_of_the_fingers(op):
+def test_edit_takes_a_held_ball_out_of_the_fingers(op):
     rig = Rig()
     rig.grasp(0.5, 0.0)
     rig.edit(op, "ball_1", (0.3, 0.0) if op == "move" else None)
@@ -265,7 +265,7 @@ def test_held_ball_can_be_taken_out_of_the_fingers(op):
     assert rig.width == 0.0, "the fingers close on air"
 
 
-def test_ball_added_above_the_box_lies_in_a_slot_until_it_is_full():
+def test_balls_added_above_the_container_fill_its_slots():
     rig = Rig()
     for _ in range(8):
         rig.edit("add", at=BOX)
@@ -275,7 +275,7 @@ def test_ball_added_above_the_box_lies_in_a_slot_until_it_is_full():
     assert refusal.value.code == "container_full"
 
 
-def test_reset_brings_the_first_layout_back():
+def test_reset_restores_the_initial_layout():
     rig = Rig([(0.5, 0.0), (0.6, 0.0)])
     first = {name: tuple(position) for name, (_, position) in rig.where().items()}
     rig.grasp(0.5, 0.0)
@@ -302,7 +302,7 @@ def test_reset_brings_the_first_layout_back():
         ("remove", "", None, "unknown_id", "choices"),
     ],
 )
-def test_edit_that_can_not_be_is_refused_and_changes_nothing(op, name, at, code, text):
+def test_invalid_ball_edit_is_refused_without_effect(op, name, at, code, text):
     rig = Rig([(0.5, 0.0), (0.3, 0.3)])
     before, version = str(rig.where()), rig.world.version
     with pytest.raises(Refused) as refusal:
@@ -311,7 +311,7 @@ def test_edit_that_can_not_be_is_refused_and_changes_nothing(op, name, at, code,
     assert str(rig.where()) == before and rig.world.version == version and rig.events() == []
 
 
-def test_place_to_which_a_ball_is_falling_is_taken():
+def test_rest_position_of_a_falling_ball_is_occupied():
     rig = Rig([(0.5, 0.0), (0.3, 0.0)])
     rig.grasp(0.5, 0.0)
     rig.release(0.4, 0.2)
@@ -320,16 +320,16 @@ def test_place_to_which_a_ball_is_falling_is_taken():
 
 
 @pytest.mark.parametrize("place", [(0.55, 0.17), (1.1, 0.0)])
-def test_layout_that_can_not_be_is_a_configuration_error(place):
+def test_impossible_position_is_a_configuration_error(place):
     with pytest.raises(ConfigError, match=r"world\.objects"):
         Rig([(0.5, 0.0), place])
 
 
-def test_ball_of_the_layout_may_lie_in_the_box():
+def test_initial_ball_may_lie_in_the_container():
     assert Rig([BOX]).where()["ball_1"][0] == "box"
 
 
-def test_nothing_new_is_said_while_nothing_moves():
+def test_version_is_constant_at_rest():
     rig = Rig()
     version = rig.world.version
     rig.settle()
@@ -409,7 +409,7 @@ TestAnythingHappens.settings = settings(max_examples=60, stateful_step_count=25,
 # --- a ball that slips ---
 
 
-def test_a_held_ball_slips_out_of_fingers_that_stay_closed_and_lies_where_it_fell():
+def test_dropped_ball_slips_out_of_closed_fingers():
     rig = Rig()
     rig.grasp(0.5, 0.0)
     rig.tick(tool_down(0.4, -0.1, 0.2))
@@ -421,7 +421,7 @@ def test_a_held_ball_slips_out_of_fingers_that_stay_closed_and_lies_where_it_fel
     assert rig.world.held == ""
 
 
-def test_a_ball_that_slips_above_the_box_lies_in_it():
+def test_ball_dropped_above_the_container_lies_in_it():
     rig = Rig()
     rig.grasp(0.5, 0.0)
     rig.tick(tool_down(*BOX, 0.2))
@@ -431,7 +431,7 @@ def test_a_ball_that_slips_above_the_box_lies_in_it():
 
 
 @pytest.mark.parametrize("name", ["", "ball_1"])
-def test_nothing_slips_out_of_an_empty_hand(name):
+def test_drop_without_a_held_ball_is_refused(name):
     rig = Rig()
     with pytest.raises(Refused, match="between the fingers") as refused:
         rig.edit("drop", name)
@@ -439,7 +439,7 @@ def test_nothing_slips_out_of_an_empty_hand(name):
     assert rig.where()["ball_1"][0] == "table"
 
 
-def test_world_takes_no_more_objects_than_can_be_told_of(monkeypatch) -> None:
+def test_number_of_objects_and_corners_is_limited(monkeypatch) -> None:
     assert edits.MAX_OBJECTS <= 1000, "of messages"
     monkeypatch.setattr(edits, "MAX_OBJECTS", 3)
     world = Rig().world
@@ -458,7 +458,7 @@ def test_world_takes_no_more_objects_than_can_be_told_of(monkeypatch) -> None:
         world.edit(WorldEdit(**cylinder_or_ring, position=Vector3(x=0.4, y=0.2)), 0.0)
 
 
-def test_cross_section_with_many_corners_that_point_inwards_is_refused() -> None:
+def test_large_concave_cross_section_is_refused() -> None:
     world = Rig().world
     asked = {"op": "add", "shape": "prism", "size": Vector3(x=0.04, y=0.04, z=0.02)}
     angles = np.linspace(0.0, 2 * math.pi, 1000, endpoint=False)
@@ -477,7 +477,7 @@ def test_cross_section_with_many_corners_that_point_inwards_is_refused() -> None
     ({"shape": "sphere", "size": Vector3(x=1e7)}, "no_size"),
     ({"shape": "box", "position": Vector3(x=1e7, y=-1e7)}, "too_far"),
 ])
-def test_what_no_message_could_tell_of_is_refused(asked: dict[str, object], code: str) -> None:
+def test_shapes_and_positions_beyond_message_limits_are_refused(asked: dict[str, object], code: str) -> None:
     given = {"op": "add", "size": Vector3(x=0.04, y=0.04, z=0.02), "position": Vector3(x=0.3), **asked}
     world = Rig().world
     with pytest.raises(Refused) as refused:
@@ -485,7 +485,7 @@ def test_what_no_message_could_tell_of_is_refused(asked: dict[str, object], code
     assert refused.value.code == code
 
 
-def test_inner_radius_of_what_is_no_ring_says_nothing() -> None:
+def test_inner_radius_is_ignored_except_for_rings() -> None:
     world = Rig().world
     name = world.edit(WorldEdit(op="add", shape="cylinder", size=Vector3(x=0.04, y=0.04, z=0.02), inner_radius=1e9,
                                 position=Vector3(x=0.3)), 0.0)

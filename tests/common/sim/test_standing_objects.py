@@ -41,7 +41,7 @@ def solids(world: KinematicWorld) -> dict[str, WorldObject]:
 
 
 @pytest.mark.parametrize("name", WORLDS)
-def test_every_object_of_the_worlds_can_be_moved_and_keeps_its_shape(name: str) -> None:
+def test_every_object_can_be_moved_and_keeps_its_shape(name: str) -> None:
     world = world_of(name)
     for thing, before in solids(world).items():
         x, y, z = centre_of(before)
@@ -55,7 +55,7 @@ def test_every_object_of_the_worlds_can_be_moved_and_keeps_its_shape(name: str) 
         assert after.model_copy(update=where) == before
 
 
-def test_move_is_news_and_what_is_refused_is_none() -> None:
+def test_only_successful_moves_are_published() -> None:
     world = world_of("w5")
     version = world.version
     move(world, "red_cylinder", 0.5, 0.05)
@@ -81,7 +81,7 @@ def test_move_is_news_and_what_is_refused_is_none() -> None:
         ("add", "green_box", (0.5, 0.3), "id_exists", "green_box"),
     ],
 )
-def test_what_can_not_be_is_refused_in_one_line_and_changes_nothing(
+def test_invalid_object_edit_is_refused_without_effect(
     op: str, name: str, at: tuple[float, float] | None, code: str, text: str
 ) -> None:
     world = world_of("w5")
@@ -93,7 +93,7 @@ def test_what_can_not_be_is_refused_in_one_line_and_changes_nothing(
     assert solids(world) == before
 
 
-def test_object_on_the_ground_may_stand_anywhere_but_not_in_a_fixture() -> None:
+def test_object_on_the_ground_may_be_anywhere_outside_fixtures() -> None:
     post = ObjectConfig(id="post", shape="cylinder", x=1.5, y=1.5, radius=0.05, height=0.3)
     world = KinematicWorld(config_of("w2").model_copy(update={"objects": [post]}))
     move(world, "post", -3.0, 2.0)
@@ -106,7 +106,7 @@ def places(world: KinematicWorld) -> dict[str, tuple[float, ...]]:
     return {name: centre_of(thing) for name, thing in solids(world).items()}
 
 
-def test_reset_and_restore_bring_objects_back_to_where_they_were() -> None:
+def test_reset_and_restore_recover_positions() -> None:
     world = world_of("w5")
     first = places(world)
     move(world, "red_cylinder", 0.5, 0.05)
@@ -120,7 +120,7 @@ def test_reset_and_restore_bring_objects_back_to_where_they_were() -> None:
 
 
 @given(st.floats(-2, 2), st.floats(-2, 2), st.floats(0, math.pi), st.floats(0.1, 1.5))
-def test_squares_overlap_where_a_point_of_one_is_within_the_other(x: float, y: float, yaw: float, s: float) -> None:
+def test_squares_overlap_iff_they_share_a_point(x: float, y: float, yaw: float, s: float) -> None:
     turn = np.array([[math.cos(yaw), math.sin(yaw)], [-math.sin(yaw), math.cos(yaw)]])
     other = (s * (SQUARE - 0.5)) @ turn + (x, y)
     grid = np.stack(np.meshgrid(*[np.linspace(-0.5, 0.5, 41)] * 2), axis=-1).reshape(-1, 2)
@@ -133,20 +133,20 @@ def test_squares_overlap_where_a_point_of_one_is_within_the_other(x: float, y: f
         assert not overlap(SQUARE, other) and not overlap(other, SQUARE)
 
 
-def test_touching_is_no_overlap_and_lying_within_is() -> None:
+def test_touching_is_no_overlap_but_containment_is() -> None:
     assert not overlap(SQUARE, SQUARE + np.array([1.0, 0.0]))
     assert overlap(SQUARE, SQUARE)
     assert overlap(SQUARE, 0.2 * SQUARE + 0.4) and overlap(0.2 * SQUARE + 0.4, SQUARE)
     assert within(SQUARE, SQUARE) and within(0.2 * SQUARE, SQUARE) and not within(SQUARE + 0.01, SQUARE)
 
 
-def test_object_fits_into_the_corner_of_another() -> None:
+def test_square_fits_into_a_concave_corner() -> None:
     corner = np.array([(0, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 2)], dtype=float)
     assert not overlap(corner, 0.9 * SQUARE + 1.05)
     assert overlap(corner, SQUARE + 0.95)
 
 
-def test_two_outlines_with_many_corners_cost_as_many_looks_as_there_are_corners(monkeypatch) -> None:
+def test_overlap_of_large_outlines_takes_bounded_work(monkeypatch) -> None:
     angles = np.linspace(0.0, 2 * math.pi, 60, endpoint=False)
     star = np.column_stack([np.cos(angles), np.sin(angles)]) * np.where(np.arange(60) % 2, 1.0, 0.5)[:, None]
     calls = Counter()
