@@ -151,14 +151,14 @@ def test_work_and_memory_for_a_view_are_bounded(monkeypatch, caplog):
     wall = np.array([[(-9.0, -9.0, 1.0), (9.0, -9.0, 1.0), (0.0, 12.0, 1.0)]])
     meshes = [Mesh(wall - (0, 0, 1e-3 * i), (i / 999, 0.0, 0.0)) for i in range(1000)]
     pixels: list[int] = []
-    spans = ray_caster._spans
+    spans = ray_caster.pixel_spans
 
     def counted(*arguments):
         found = spans(*arguments)
         pixels.append(int((found[3] - found[2] + 1).sum()))
         return found
 
-    monkeypatch.setattr(ray_caster, "_spans", counted)
+    monkeypatch.setattr(ray_caster, "pixel_spans", counted)
     monkeypatch.setattr(ray_caster, "BATCH_PIXELS", 20_000)
     view = cast(meshes, CAMERA, empty_view(CAMERA, GREY))
     assert view.depth[24, 32] == pytest.approx(1.0, rel=1e-6), "the first of them are seen"

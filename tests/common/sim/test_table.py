@@ -11,7 +11,7 @@ from common.sim.table import Slots, Table
 PILLAR = Fixture(id="pillar", shape="cylinder", dimensions=[0.05, 0.2], position=(0.3, 0.3, 0.1))
 BEAM = Fixture(id="beam", dimensions=[0.4, 0.02, 0.1], position=(0.3, -0.3, 0.05), rpy=(0.0, 0.0, math.pi / 4))
 SHELF = Fixture(id="shelf", dimensions=[0.4, 0.4, 0.02], position=(0.8, 0.0, 0.5))
-NOBODY = np.empty((0, 2))
+NO_SPHERES = np.empty((0, 2))
 
 
 @pytest.fixture(scope="module")
@@ -24,9 +24,11 @@ def furnished(world_config: World) -> World:
     [((0.3, 0.3), "pillar"), ((0.379, 0.3), "pillar"), ((0.381, 0.3), ""), ((0.4, -0.2), "beam"), ((0.4, -0.4), ""),
      ((0.8, 0.0), ""), ((0.55, 0.25), "box"), ((0.55, 0.141), "box"), ((0.55, 0.139), "")],
 )
-def test_fixtures_and_containers_on_the_table_block_spheres(furnished: World, place: tuple[float, float], blocker: str) -> None:
+def test_fixtures_and_containers_on_the_table_block_spheres(
+    furnished: World, place: tuple[float, float], blocker: str
+) -> None:
     assert Table(furnished, 0.03).blocked(*place) == blocker
-    assert Table(furnished, 0.03).free(np.array([place]), NOBODY)[0] == (not blocker)
+    assert Table(furnished, 0.03).free(np.array([place]), NO_SPHERES)[0] == (not blocker)
 
 
 @given(x=st.floats(0.0, 1.0), y=st.floats(-0.5, 0.5), seed=st.integers(0, 99))

@@ -14,7 +14,7 @@ def forgotten():
 
 def chosen(monkeypatch, *, named="", egl=False, osmesa=False):
     monkeypatch.setenv(gl.VARIABLE, named)
-    monkeypatch.setattr(gl, "_has_egl", lambda: egl)
+    monkeypatch.setattr(gl, "has_egl", lambda: egl)
     monkeypatch.setattr(gl.ctypes.util, "find_library", lambda name: "libOSMesa.so.8" if osmesa else None)
     return gl.select_gl()
 
@@ -45,7 +45,7 @@ def test_missing_library_means_no_egl(monkeypatch):
         raise OSError(f"{name}: cannot open shared object file")
 
     monkeypatch.setattr(gl.ctypes, "CDLL", missing)
-    assert not gl._has_egl()
+    assert not gl.has_egl()
 
 
 def test_single_thread_runs_all_calls_on_one_thread():

@@ -87,7 +87,7 @@ class Rig:
         return p.x, p.y, p.z
 
     def push(self, name: str, *velocity: float) -> None:
-        cell, data = self.world._built
+        cell, data = self.world.simulation
         at = cell.objects[name].dof
         data.qvel[at: at + len(velocity)] = velocity
 
@@ -205,7 +205,7 @@ def test_gripper_joints_follow_the_driven_one(cell: str) -> None:
     rig = Rig(cell=cell)
     gripper = rig.robot.config.gripper
     assert gripper is not None
-    model, data = rig.world._built
+    model, data = rig.world.simulation
     for share in (0.2, 0.7):
         rig.grip(share * gripper.max_width, gripper.max_effort, 3.0)
         wanted = finger_positions(gripper, share * gripper.max_width)
@@ -262,7 +262,7 @@ def test_edits_add_move_remove_and_reset() -> None:
     rig.wait(0.1)
     added = rig.world.edit(WorldEdit(op="add", shape="ring", size=Vector3(x=0.06, y=0.06, z=0.03), inner_radius=0.02,
                                      position=Vector3(x=0.6, y=-0.2), mass=0.25), rig.now)
-    cell, _ = rig.world._built
+    cell, _ = rig.world.simulation
     assert cell.model.body_mass[cell.objects[added].body] == pytest.approx(0.25)
     rig.wait(0.5)
     assert rig.place(added) == pytest.approx((0.6, -0.2, 0.015), abs=1e-3) and rig.place()[0] == pytest.approx(0.45)
@@ -363,7 +363,7 @@ def test_held_object_is_restored_at_rest() -> None:
     assert saved["thing_1"].details["qvel"][1] == 1.0
     rig.begin(rig.set_point)
     rig.world.restore(saved)
-    cell, data = rig.world._built
+    cell, data = rig.world.simulation
     assert not data.qvel[cell.objects["thing_1"].dof:][:6].any()
 
 
@@ -400,7 +400,7 @@ def test_missing_mujoco_is_an_error_that_names_the_extra(monkeypatch: pytest.Mon
 
 def test_joint_forces_respect_effort_limits() -> None:
     rig = Rig()
-    model, data = rig.world._built
+    model, data = rig.world.simulation
     limits = rig.robot.model.effortLimit
     rig.arm.write(rig.set_point + 0.5, 0 * rig.set_point, rig.now)
     rig.wait(0.05)
