@@ -204,7 +204,7 @@ def test_what_is_no_key_is_not_played(topic: str, tmp_path: Path, capsys: pytest
     assert app.execute(["play", str(tmp_path / "run.mcap")]) == 2
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 1
-    assert "which is no key to publish under" in lines[0]
+    assert "which is not a key" in lines[0]
 
 
 def test_text_of_a_recording_steers_neither_terminal_nor_page(

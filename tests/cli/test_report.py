@@ -297,7 +297,7 @@ def test_a_recording_that_was_cut_is_reported_as_far_as_it_goes(tmp_path, capsys
 @pytest.mark.parametrize(
     ("content", "code", "wanted"),
     [
-        (None, 2, ["there is no such file"]),
+        (None, 2, ["no such file"]),
         (b"", 2, ["says nothing about a run"]),
         (b"PK\x03\x04 a picture book", 2, ["is no MCAP file"]),
         ("empty", 2, ["says nothing about a run", "joint_states"]),
