@@ -167,7 +167,7 @@ def test_no_file_is_read_that_a_recording_names(
     assert app.execute(["report", str(path)]) == 0, capsys.readouterr().err
     assert not [file for file in opened if "secret" in file]
     page = path.with_suffix(".html").read_text()
-    assert "no file is read that a recording names" in page or "not shown, since the cell is not here" in page
+    assert "a file named in a recording is not read" in page or "missing, since the cell is not installed" in page
 
 
 TOPICS = ["..", "../../up", "/etc/passwd", ".hidden", "a/b", "a_b", "nul\0", "x" * 300, EVIL, "", "con/../../x"]

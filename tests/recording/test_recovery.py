@@ -112,6 +112,6 @@ def test_disk_that_is_full_leaves_nothing_and_is_told_in_one_line(
     source, target = tmp_path / "a.mcap", tmp_path / "b.mcap"
     source.write_bytes(whole)
     fill_disk(monkeypatch, 600)
-    with pytest.raises(RecordingError, match="b.mcap: cannot be written, the disk is full; the incomplete file was"):
+    with pytest.raises(RecordingError, match=r"b.mcap: cannot be written, the disk is full; the incomplete file was"):
         recover(source, target)
     assert list(tmp_path.iterdir()) == [source]
