@@ -18,7 +18,7 @@ import os
 from collections.abc import Mapping
 from pathlib import Path
 
-from common import sources
+from common import time_source as sources
 
 SPEED_VARIABLE = "ZENCELL_SPEED"
 EPOCH_VARIABLE = "ZENCELL_EPOCH"

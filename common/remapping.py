@@ -13,7 +13,7 @@ from typing import Any
 
 from common.errors import ConfigError
 
-OF_EACH = ("log", "counters", "param")  # first parts of keys that each service has for itself
+PER_SERVICE_KEYS = ("log", "counters", "param")  # first parts of keys that each service has for itself
 LONGEST_CELL = 100  # characters of a cell's name
 SERVICE_NAME = re.compile(r"[A-Za-z_]\w*")
 _KEY = re.compile(r"[^\s/*$?#|]+(/[^\s/*$?#|]+)*")
@@ -41,7 +41,7 @@ class Remapping:
 
     def key(self, own: str) -> str:
         """The key in the cell of a key in the service's own words."""
-        if own.partition("/")[0] in OF_EACH:
+        if own.partition("/")[0] in PER_SERVICE_KEYS:
             return own
         self._asked.add(own)
         found = _pattern(self._table, own)
@@ -70,7 +70,7 @@ def _pattern(table: Mapping[str, str], own: str) -> str | None:
     return max(fitting, key=len, default=None)
 
 
-def checked_table(field: str, given: object) -> dict[str, str]:
+def validate_table(field: str, given: object) -> dict[str, str]:
     """A table of keys as it stands in a cell file.
 
     Raises:
@@ -88,6 +88,6 @@ def _checked(field: str, given: Mapping[Any, Any]) -> Iterator[tuple[str, str]]:
                 raise ConfigError(field, text, "is no key such as camera/image_raw, nor a beginning such as camera/*")
         if own.endswith("*") != key.endswith("*"):
             raise ConfigError(field, {own: key}, "must have * at both ends or at none")
-        if own.partition("/")[0] in OF_EACH:
+        if own.partition("/")[0] in PER_SERVICE_KEYS:
             raise ConfigError(field, own, "is a key of all services, which keeps its name")
         yield own, key

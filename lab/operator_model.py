@@ -14,7 +14,7 @@ from common import messages as m
 from common import topics
 from common.client.operator_motion import MotionFailed, OperatorMotion
 from common.config import Cell
-from common.control.jogging import DEADMAN, STANDS
+from common.control.jogging import BRAKING_TIME, DEADMAN
 from common.errors import RequestFailed
 from common.planning.collision import CollisionWorld
 from common.planning.obstacles import ObstacleCache
@@ -153,7 +153,7 @@ class OperatorModel:
             if state is None or scene is None:
                 return False
             age = max(0.0, (bus.header().stamp - state.header.stamp) * 1e-9)
-            until_standstill = (JOG_LATE + DEADMAN + STANDS) * speed
+            until_standstill = (JOG_LATE + DEADMAN + BRAKING_TIME) * speed
             return age < JOG_LATE * speed and clearance.clear(state, scene, velocities, age + until_standstill)
 
         take = m.OwnRequest(act="take", owner=m.UNKNOWN_OPERATOR, over=True)

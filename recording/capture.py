@@ -18,15 +18,15 @@ from common.messages import SupervisorStatus
 from common.remapping import Remapping
 from common.transport.codec import decode, decode_attachment
 from common.transport.credentials import secure_folder
-from common.transport.keys import owns_key
 from common.transport.ownership import Owner
+from common.transport.session import owns_key
 from recording.reader import MOST_SPEED, MOST_TEXT
 from recording.sample import Sample, Sequences, message_of
 from recording.writer import RUN, run_of
 
 if TYPE_CHECKING:
     from common.transport.bus import Bus
-    from common.transport.session import Declared, RawSample
+    from common.transport.session import Declaration, RawSample
     from recording.selection import Selection
     from recording.sink import Sink
 
@@ -89,13 +89,13 @@ class Capture:
         self._known = custom.topics()
         self._kinds = custom.kinds(self._known)
         self._run_known = False
-        self._declared: list[Declared] = []
+        self._declared: list[Declaration] = []
 
     async def start(self) -> None:
         """Subscribe; returns when the current values of all states are recorded."""
         expressions = [f"{self._bus.cell}/{key}" for key in self._selection.expressions]
         # Without the cell's file, liveliness tokens show which services have remapped keys.
-        self._declared = [self._bus.raw_watch(owns_key(self._bus.cell), self._on_owner)]
+        self._declared = [self._bus.raw_watch_tokens(owns_key(self._bus.cell), self._on_owner)]
         status = f"{self._bus.cell}/{topics.SUPERVISOR_STATUS.key}"
         self._declared += [self._bus.raw_subscriber(key, self.on_sample) for key in expressions]
         if f"{self._bus.cell}/**" not in expressions and status not in expressions:

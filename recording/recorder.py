@@ -15,10 +15,10 @@ from common.client.foreign import require_messages
 from common.client.keys import published
 from common.supervision.lifecycle import Interrupts
 from common.transport.bus import Bus
-from common.transport.connect import connect as connect_to
 from common.transport.credentials import RECORDER
 from common.transport.endpoint import endpoint_of
-from common.transport.handoff import call_on_loop
+from common.transport.session import call_on_loop
+from common.transport.zenoh_session import connect as connect_to
 from recording.capture import Capture, CustomTopics
 from recording.formatting import about, format_progress, format_result
 from recording.selection import Selection
@@ -37,7 +37,7 @@ class RecordRequest:
     Attributes:
         selection: of the messages.
         output: the file; None names it after cell and time.
-        most_bytes: size after which another file is started.
+        max_bytes: size after which another file is started.
         seconds: duration; None records until a signal.
         gate: whether a supervisor starts the recorder: it is ready before the services start, and ends with them.
         custom: topics of the cell that do not come with the project.
@@ -45,7 +45,7 @@ class RecordRequest:
 
     selection: Selection
     output: Path | None = None
-    most_bytes: int | None = None
+    max_bytes: int | None = None
     seconds: float | None = None
     gate: bool = False
     custom: CustomTopics = field(default_factory=CustomTopics)
@@ -93,7 +93,7 @@ async def record(bus: Bus, request: RecordRequest, echo: Echo, show: Echo | None
         if find_topic(key) is None and "*" not in key:
             await require_messages(bus, key)
     path = request.output or Path(f"{bus.cell}_{time.strftime('%Y%m%d_%H%M%S')}.mcap")
-    writer = SplitWriter(path, about(bus.cell), request.most_bytes)
+    writer = SplitWriter(path, about(bus.cell), request.max_bytes)
     sink = Sink(writer, on_failure=lambda: call_on_loop(loop, interrupts.stop.set))
     capture = Capture(bus, request.selection, sink, request.custom)
     reason = "interrupted"

@@ -15,12 +15,12 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from common.application import message_class
 from common.errors import ZencellError
 from common.messages import Message
-from common.messages.basics import MOST_STAMP
+from common.messages.basics import MAX_STAMP
 
 PREFIX = "application/msgpack;"  # of an encoding; the name of the message class follows
 
 # Any client of the network can invent writers and keys: the most recently seen and the first counted are remembered.
-MOST_WRITERS, MOST_KEYS = 10_000, 1000
+MOST_WRITERS, MAX_KEYS = 10_000, 1000
 HEADER_BYTES = 512  # from the start of a payload, where the header is
 BAD_PAYLOAD = (ValueError, TypeError, msgpack.UnpackException, RecursionError)
 
@@ -87,7 +87,7 @@ def _first_stamp(unpacker: Any) -> int | None:
         if name == "header":
             header = unpacker.unpack()
             stamp = header.get("stamp") if isinstance(header, dict) else None
-            return stamp if isinstance(stamp, int) and 0 <= stamp <= MOST_STAMP else None
+            return stamp if isinstance(stamp, int) and 0 <= stamp <= MAX_STAMP else None
         if name == "transforms":
             return _first_stamp(unpacker) if unpacker.read_array_header() else None
         unpacker.skip()
@@ -139,7 +139,7 @@ class Sequences:
                 del self._newest[next(iter(self._newest))]
         elif sequence <= before:
             return False
-        elif sequence > before + 1 and (key in self.missed or len(self.missed) < MOST_KEYS):
+        elif sequence > before + 1 and (key in self.missed or len(self.missed) < MAX_KEYS):
             self.missed[key] += sequence - before - 1
         return True
 

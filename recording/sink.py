@@ -14,7 +14,7 @@ from recording.writer import SplitWriter
 
 MOST_BYTES = 256 * 1024 * 1024  # of queued payload: ten seconds of the highest camera rates
 MOST_SAMPLES = 200_000  # in the queue
-MOST_KEYS, OTHERS = 1000, "others"  # keys with a count of dropped messages of their own; name of the rest
+MAX_KEYS, OTHERS = 1000, "others"  # keys with a count of dropped messages of their own; name of the rest
 BATCH_SECONDS = 0.1  # between two reads of the queue
 FLUSH_SECONDS = 0.8  # between chunks: together with a batch, a kill costs less than a second
 
@@ -36,18 +36,18 @@ class Sink:
     """
 
     def __init__(
-        self, writer: SplitWriter, *, most_bytes: int = MOST_BYTES, on_failure: Callable[[], None] = lambda: None,
+        self, writer: SplitWriter, *, max_bytes: int = MOST_BYTES, on_failure: Callable[[], None] = lambda: None,
     ) -> None:
         """Start the writing thread.
 
         Args:
             writer: used by this sink only.
-            most_bytes: payload in the queue [bytes].
+            max_bytes: payload in the queue [bytes].
             on_failure: called once in the writing thread when the disk fails; `error` has the reason.
         """
         self.error: RecordingError | None = None
         self._writer = writer
-        self._most = most_bytes
+        self._most = max_bytes
         self._on_failure = on_failure
         self._changed = threading.Condition()
         self._queue: deque[Sample] = deque()
@@ -72,7 +72,7 @@ class Sink:
             self._bytes += len(sample.payload)
 
     def _drop(self, key: str) -> None:
-        self._dropped[key if key in self._dropped or len(self._dropped) < MOST_KEYS else OTHERS] += 1
+        self._dropped[key if key in self._dropped or len(self._dropped) < MAX_KEYS else OTHERS] += 1
 
     def describe(self, name: str, values: Mapping[str, Any]) -> None:
         """Queue a metadata record; thread-safe."""

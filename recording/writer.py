@@ -14,7 +14,7 @@ import msgpack
 from mcap.writer import CompressionType, Writer
 
 from common.messages import SupervisorStatus
-from common.messages.basics import MOST_NAME
+from common.messages.basics import MAX_NAME
 from recording.sample import RecordingError, Sample, schema_of, stamp_of
 
 # Limits of a file: any client of the network can invent keys and writers, and readers refuse files with many more.
@@ -178,7 +178,7 @@ class RecordingWriter:
             if about not in self._known:
                 return None
             writer = ""  # the channel that all further writers share
-        if len(sample.key) > LONGEST_KEY or len(sample.message) > MOST_NAME:
+        if len(sample.key) > LONGEST_KEY or len(sample.message) > MAX_NAME:
             return None
         if (about, writer) not in self._channels:
             self._known.add(about)
@@ -234,19 +234,19 @@ class RecordingWriter:
 
 
 class SplitWriter:
-    """Writes FILE.mcap, or FILE_0.mcap, FILE_1.mcap, ... of about `most_bytes` each.
+    """Writes FILE.mcap, or FILE_0.mcap, FILE_1.mcap, ... of about `max_bytes` each.
 
     Each further file starts with the newest value of every state and the same descriptions, so that it is usable alone.
     """
 
-    def __init__(self, path: Path, about: Mapping[str, Any], most_bytes: int | None = None) -> None:
+    def __init__(self, path: Path, about: Mapping[str, Any], max_bytes: int | None = None) -> None:
         """Create the first file.
 
         Raises:
             RecordingError: it exists already, or cannot be written.
         """
         self._path = path
-        self._most = most_bytes
+        self._most = max_bytes
         self._descriptions: dict[str, Mapping[str, Any]] = {ABOUT: about}
         self._states: dict[tuple[str, str], Sample] = {}
         self._earlier_messages = 0

@@ -110,8 +110,8 @@ async def run(bus: Bus, config: Config) -> None:
     news = asyncio.Event()
     detector = Detector(config.world, config)
     left_out = SkippedFrames(bus.log, "image")
-    if not bus.declares_only:
-        warm_up(config.world, config)
+    await bus.acquire_keys()
+    warm_up(config.world, config)
     await bus.ready()
 
     async def watch_depths() -> None:

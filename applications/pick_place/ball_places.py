@@ -15,7 +15,7 @@ from common.config import Container, Fixture, Surroundings
 from common.perception.occlusion import Occlusion, RobotSilhouettes
 from common.perception.pinhole import Pinhole
 from common.robot.model import RobotModel
-from common.scene.workspace import WorkspaceBounds, outside_reason
+from common.scene.workspace import WorkspaceBounds, out_of_bounds_reason
 
 Array = npt.NDArray[np.float64]
 
@@ -138,7 +138,7 @@ class VisibleTable:
         ]
         self.places = np.array([
             place for place in dict.fromkeys(found)
-            if not outside_reason(bounds, place)
+            if not out_of_bounds_reason(bounds, place)
             and not any(max(abs(place[0] - box.x), abs(place[1] - box.y)) < box.half_side + self.radius
                         for box in around.containers.values())
         ]).reshape(-1, 3)

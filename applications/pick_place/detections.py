@@ -20,8 +20,8 @@ from common.perception.camera_input import FrameError, SkippedFrames, require_ca
 from common.perception.occlusion import Occlusion, RobotOcclusion, RobotSilhouettes
 from common.perception.pinhole import Pinhole
 from common.process.camera_reader import CameraReader
+from common.robot.home import HomeMonitor
 from common.robot.model import RobotModel
-from common.scene.home import HomeWatch
 from common.scene.workspace import INSIDE_CONTAINER, PARTLY_OUT_OF_VIEW, ReachCache
 from common.transport.bus import Bus
 
@@ -79,7 +79,7 @@ class DetectionViews:
         self._robot: tuple[RobotModel, RobotSilhouettes] | None = None
         self._before: dict[int, RobotOcclusion] = {}
         self._views = list(names)
-        self._names, self._home = robot.joints, HomeWatch(robot.named_poses["home"])
+        self._names, self._home = robot.joints, HomeMonitor(robot.named_poses["home"])
         self._only_at_home = only_at_home
         self._newest: list[CameraDetections | None] = [None for _ in keys]
         self._left_out = SkippedFrames(log, "frame of detections")
@@ -92,7 +92,7 @@ class DetectionViews:
             async for frame in self._frames[number]:
                 cameras, stamp = self._cameras[number], frame.header.stamp
                 moves = cameras.moves()
-                if (moves or self._only_at_home) and not self._home.covers(stamp):
+                if (moves or self._only_at_home) and not self._home.was_home(stamp):
                     continue
                 try:
                     require_capacity(len(frame.markers))
@@ -132,7 +132,7 @@ class DetectionViews:
         async for state in self._joints:
             found = dict(zip(state.name, state.position, strict=True))
             if all(name in found for name in self._names):
-                self._home.note([found[name] for name in self._names], state.header.stamp)
+                self._home.add([found[name] for name in self._names], state.header.stamp)
 
     @property
     def robot(self) -> tuple[RobotModel, RobotSilhouettes]:

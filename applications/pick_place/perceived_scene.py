@@ -18,8 +18,7 @@ from common.messages import Color, Marker, Quaternion
 from common.perception.occlusion import Occlusion
 from common.perception.pinhole import Pinhole
 from common.robot.transforms import invert, matrix_to_pose, pose_to_matrix
-from common.scene.fixtures import color_of, fixed_objects
-from common.scene.slots import occupied_slots, slot_positions
+from common.scene.fixtures import color_of, fixed_objects, occupied_slots, slot_positions
 
 Place = tuple[float, float, float]
 Shape = Literal["sphere", "box", "cylinder"]

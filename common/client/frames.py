@@ -11,8 +11,7 @@ from typing import Any
 from common import topics
 from common.client.subscriptions import PATIENCE, NothingReceived
 from common.errors import ZencellError
-from common.robot.transform_history import MOST_FRAMES
-from common.robot.transform_tree import TransformTree
+from common.robot.transform_tree import MAX_FRAMES, TransformTree
 from common.robot.transforms import matrix_to_quaternion, matrix_to_rpy
 from common.transport.bus import Bus
 
@@ -50,7 +49,7 @@ class Frames:
         async for message in self._moving:
             self.tree.update(message)
             self._told |= dict.fromkeys((each.child_frame_id for each in message.transforms), _now())
-            if len(self._told) > 2 * MOST_FRAMES:
+            if len(self._told) > 2 * MAX_FRAMES:
                 self._told = {name: at for name, at in self._told.items() if self.tree.parent_of(name) is not None}
             self._changed.set()
 

@@ -11,7 +11,7 @@ from common.client.part import Part
 from common.client.subscriptions import Subscriptions
 from common.config import check
 from common.messages import CollisionObject, Pose, SceneEdit, SceneEditReply
-from common.scene.added import added
+from common.scene.added_solids import added_solids
 
 TIMEOUT = 5.0  # [s] wall for an answer
 
@@ -56,7 +56,7 @@ class Scene(Part):
 
     async def objects(self) -> list[CollisionObject]:
         """What was added: ids, shapes, dimensions [m] and poses in world."""
-        return added((await self._ear.now(topics.PLANNING_SCENE)).objects)
+        return added_solids((await self._ear.now(topics.PLANNING_SCENE)).objects)
 
     async def _edit(self, asked: dict[str, object]) -> SceneEditReply:
         return await self._ear.bus.client(topics.SCENE_EDIT).call(check(SceneEdit, asked, "scene"), TIMEOUT)

@@ -12,7 +12,7 @@ from common.errors import ZencellError
 from common.messages import CameraInfo, Image, TFMessage
 from common.perception.image import ImageError, image_to_array
 from common.perception.pinhole import CameraError, Pinhole
-from common.robot.transform_history import NoTransform, TransformHistory
+from common.robot.transform_tree import TransformHistory, TransformUnavailable
 
 Pixels = npt.NDArray[np.uint8]
 
@@ -88,7 +88,7 @@ def resolve_camera(
     history = moving if moving is not None else TransformHistory()
     try:
         return Pinhole.from_info(info, history.pose(frame_id or info.header.frame_id, fixed, stamp))
-    except NoTransform as error:
+    except TransformUnavailable as error:
         raise FrameError(error.kind, str(error)) from None
     except CameraError as error:
         raise FrameError("camera", str(error)) from None

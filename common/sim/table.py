@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from common.config import Container, Fixture, Surroundings, World
-from common.scene.slots import slot_positions
+from common.scene.fixtures import slot_positions
 from common.sim.footprints import distances, heights
 
 Array = NDArray[np.float64]

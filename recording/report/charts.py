@@ -18,7 +18,7 @@ from recording.report.history import SAME_PLACE, RunHistory, Span
 
 Array = npt.NDArray[np.float64]
 
-MOST_POINTS = 1200  # of a line: more than the pixels of a page
+MAX_POINTS = 1200  # of a line: more than the pixels of a page
 STATE_COLORS = {"IDLE": "#c9ced6", "DONE": "#5fb35f", "ERROR": "#d64545"}  # of every task
 MOTION_COLORS = {"succeeded": "#5d6a7a", "cancelled": "#e6a229", "aborted": "#d64545", "rejected": "#d64545",
                  "not ended": "#c9ced6"}
@@ -176,10 +176,10 @@ def top_view(run: RunHistory, tool: Array, marks: Mapping[str, Mapping[tuple[int
 
 
 def thinned(times: Array, values: Array) -> npt.NDArray[np.intp]:
-    """Return indices of at most about `MOST_POINTS` samples that include the extremes of each column."""
-    if len(times) <= MOST_POINTS:
+    """Return indices of at most about `MAX_POINTS` samples that include the extremes of each column."""
+    if len(times) <= MAX_POINTS:
         return np.arange(len(times))
-    step = -(-len(times) // MOST_POINTS)
+    step = -(-len(times) // MAX_POINTS)
     selected = set(range(0, len(times), step)) | {len(times) - 1}
     for column in values.T:
         if np.isfinite(column).any():

@@ -4,7 +4,7 @@ import pytest
 
 from common import clock as clocks
 from common.clock import BOOTED_VARIABLE, KEPT_VARIABLE, Clock
-from common.sources import drawn_from
+from common.time_source import use_time_source
 
 HOUR = 3600 * 10**9
 
@@ -33,8 +33,8 @@ class Host:
 
 @pytest.fixture
 def host():
-    with drawn_from(Host()) as _:
-        from common.sources import _Chosen
+    with use_time_source(Host()) as _:
+        from common.time_source import _Chosen
 
         yield _Chosen.sources
 

@@ -16,7 +16,7 @@ from common.errors import ConfigError
 from common.messages import ExecuteRequest, MotionStatus
 from common.process.in_process import running_service
 from common.robot.model import RobotModel
-from common.sources import drawn_from
+from common.time_source import use_time_source
 from common.transport import ownership
 from common.transport.bus import Bus
 from common.transport.local import LocalNetwork
@@ -93,7 +93,7 @@ async def moving(end: Callable[[Arm], Awaitable[None]]) -> Arm:
 
 def on_virtual_time(end: Callable[[Arm], Awaitable[None]]) -> Arm:
     loop = VirtualTimeLoop(1)
-    with drawn_from(loop):
+    with use_time_source(loop):
         try:
             return loop.run_until_complete(moving(end))
         finally:

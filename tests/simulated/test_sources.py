@@ -1,4 +1,4 @@
-"""What a simulation runs asks nobody for time and ids but common/sources.py."""
+"""What a simulation runs asks nobody for time and ids but common/time_source.py."""
 
 import ast
 from pathlib import Path

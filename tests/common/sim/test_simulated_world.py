@@ -32,7 +32,7 @@ class Rig:
         self.width = OPEN
 
     def tick(self, hand=None, width=None, gripping=False):
-        """What ControlCycle does with simulated fingers."""
+        """What Executor does with simulated fingers."""
         self.now += 0.01
         self.hand = self.hand if hand is None else hand
         obstruction = self.world.obstruction(self.hand, self.width)
