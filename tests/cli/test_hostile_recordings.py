@@ -133,7 +133,7 @@ def test_metadata_that_cannot_be_is_one_line(
     assert app.execute(["report", str(path)]) == 2
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 1
-    assert "tells a" in lines[0]
+    assert "which is not" in lines[0]
     assert not STEERING.search(lines[0])
     for each in ("info", "export", "recover"):
         app.execute(verb(each, path))
