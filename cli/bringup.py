@@ -60,7 +60,7 @@ def _operation(
 ) -> CellSession:
     """What is asked for with the options of `run` and `up`, which are these."""
     from common.supervision.lifecycle import interrupt_at_stdin_end
-    from security.requiring import choose
+    from security.preflight import choose
 
     choose(secure)
     operation = CellSession(

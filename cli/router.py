@@ -32,8 +32,8 @@ def config(
         parse_domain,
         router_settings,
     )
-    from security.checking import require_valid
-    from security.requiring import choose
+    from security.preflight import choose
+    from security.validation import require_valid
 
     choose(secure)
     given = os.environ.get(DOMAIN_VARIABLE, DEFAULT_DOMAIN) if domain is None else domain

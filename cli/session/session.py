@@ -85,7 +85,7 @@ class CellSession:
         from common.transport.endpoint import endpoint_of
         from page.access import VIEWER
         from recording.report.aggregator import RunAggregator
-        from security.requiring import require_secured, with_near
+        from security.preflight import require_secured, with_near
         from tools.check.cell import require_safe
 
         self.began = process_start_time()
@@ -151,7 +151,7 @@ class CellSession:
         from common.transport.credentials import RECORDER
         from recording.capture import CustomTopics
         from recording.formatting import require_new
-        from security.requiring import require_recorder
+        from security.preflight import require_recorder
 
         path = Path(file).absolute()
         require_new(path, "--record")
