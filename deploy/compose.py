@@ -18,7 +18,7 @@ from deploy.containers import (
     containers_of,
     router,
 )
-from page.access import TOKEN_VARIABLE
+from security.page_tokens import TOKEN_VARIABLE
 
 HEAD = """\
 # Made by `make deploy` from config/cells: change those, not this file.

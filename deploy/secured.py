@@ -8,7 +8,7 @@ from typing import Any
 from common.transport.credentials import ACCESS, AUTHORITY, OPERATOR, ROUTER_NAME, common_name
 from deploy.compose import lines_of
 from deploy.containers import IMAGE, ROUTER, ROUTER_PORT, cells, containers_of
-from page.access import ROLES, token_file
+from security.page_tokens import ROLES, token_file
 
 HEAD = """\
 # Made by `make deploy`. Laid over compose.yaml; what it mounts is made by

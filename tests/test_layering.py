@@ -22,11 +22,11 @@ PEERS = {
     "applications": {"page", "recording", "tools"},  # its labels and layers, figures, checks: parts others find by name
     "drivers": set(),
     "lab": {"drivers", "recording", "tools"},
-    "page": {"recording", "tools"},
+    "page": {"recording", "security", "tools"},
     "recording": set(),
-    "security": {"page"},
+    "security": set(),
     "tools": set(),
-    "services": {"applications", "page", "tools"},
+    "services": {"applications", "page", "security", "tools"},
 }
 PURE = ("robot", "scene", "planning", "perception", "tasks", "hardware", "sim")
 NOT_PURE = ("asyncio", "zenoh", "common.topics", "common.transport", "common.supervision", "services", "cli")

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from common.supervision.supervisor import Supervisor
     from common.transport.bus import Bus
     from lab.chaos.agent import Chaos
-    from page.serving import Page
+    from page.address import PageAddress
     from recording.report.collector import Collector
 
 T = TypeVar("T")
@@ -82,8 +82,8 @@ class Operation:
             require_modules,
         )
         from common.transport.endpoint import endpoint_of
-        from page.access import VIEWER
         from recording.report.fold import Fold
+        from security.page_tokens import VIEWER
         from security.requiring import require_secured, with_near
         from tools.check.cell import require_safe
 
@@ -117,7 +117,7 @@ class Operation:
         self._supervisor: Supervisor | None = None
         self._collector: Collector | None = None
         self._screen: Screen | None = None
-        self._page: Page | None = None
+        self._page: PageAddress | None = None
         self._watchers: dict[str, list[str]] = {}  # commands by name
         self._disturbance: Disturbance | None = None
         self._chaos: Chaos | None = None
@@ -130,9 +130,9 @@ class Operation:
         Raises:
             ConfigError: there is no page, the port is taken, or host or port cannot be used.
         """
-        from page.serving import page_of
+        from page.address import plan_page
 
-        self._page = page = page_of(self.cell, host, port)
+        self._page = page = plan_page(self.cell, host, port)
         if page is not None:
             overrides = (*self.launch.overrides, *page.overrides)
             self.launch = replace(self.launch, overrides=overrides, extra=page.environment)
@@ -370,7 +370,7 @@ class Operation:
         assert self._collector is not None
         self.summary.ready = time.monotonic() - self.began
         if self._page and self._screen:
-            self._screen.note(f"Open {self._page.address}")
+            self._screen.note(f"Open {self._page.url}")
         self._doubts = asyncio.create_task(self._tell_doubts(), name="doubts")
         if self._disturbance is not None:
             from lab.chaos.setting import chaos_in, keys_of

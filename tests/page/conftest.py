@@ -3,7 +3,7 @@ from collections.abc import Iterator
 import pytest
 import viser
 
-from page.guard import close_server, make_server
+from page.server import close_server, make_server
 from tests.page.scene_cell import Stage
 
 

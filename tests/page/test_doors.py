@@ -8,7 +8,7 @@ import pytest
 
 from common.sources import drawn_from
 from page.access import EVERYTHING
-from page.doors import IDLE, QUIET, Doors, Need, Visitor
+from page.permissions import IDLE, QUIET, Need, PageSession, Permissions
 
 
 class Clock:
@@ -30,7 +30,7 @@ class Rig:
         self.clock = clock
         self.noted: list[str] = []
         self.told: list[str] = []
-        self.doors = Doors(self.noted.append)
+        self.doors = Permissions(self.noted.append)
         self.doors.guarded, self.doors.refused = True, self.told.append
         parts: dict[str, Need] = {"STOP": "stop", "Tab": "look", "Start": "operate", "Knob": "tune", "Take": "take"}
         for part, need in parts.items():
@@ -44,8 +44,8 @@ def rig() -> Iterator[Rig]:
         yield Rig(clock)
 
 
-def visitor(number: int, *roles: str) -> Visitor:
-    return Visitor(number, "10.0.0.5", frozenset({"look", *roles}))
+def visitor(number: int, *roles: str) -> PageSession:
+    return PageSession(number, "10.0.0.5", frozenset({"look", *roles}))
 
 
 def test_each_role_does_its_own_and_everybody_may_stop(rig: Rig) -> None:
@@ -85,6 +85,6 @@ def test_who_did_what_is_noted_once_for_a_slider_on_its_way(rig: Rig) -> None:
 
 def test_where_no_token_is_asked_for_all_is_as_it_was() -> None:
     noted: list[str] = []
-    doors = Doors(noted.append)
+    doors = Permissions(noted.append)
     assert all(doors.admit(None, part) for part in ("Start", "STOP", ""))
     assert not noted and doors.operator == ""

@@ -9,7 +9,7 @@ from common import topics
 from common.application import find_application
 from common.topics import Topic
 from common.transport.local import LocalNetwork
-from page.feeds import Feeds, News, Topics
+from page.feeds import Feeds, Topics, Updater
 from page.layers import find_layers
 
 READ, ON_DEMAND = [topics.GRIPPER_STATE], [CONTOURS, topics.SCENE_OBJECTS, topics.SCENE_OBJECT_UPDATES]
@@ -74,7 +74,7 @@ def test_part_is_told_what_is_new_once_and_no_more_often_than_it_wants() -> None
         def show(self, topic: Topic[Any], message: Any) -> None:
             told.append((topic.key, message))
 
-    news = News(Part(), lambda topic: said.get(topic.key))  # type: ignore[arg-type, return-value]
+    news = Updater(Part(), lambda topic: said.get(topic.key))  # type: ignore[arg-type, return-value]
     said["scene_object_updates"] = m.SceneUpdate(data="add:a")  # an event: told when it comes, by others
     news.tell(1.0)
     assert told == []

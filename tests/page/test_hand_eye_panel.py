@@ -12,7 +12,7 @@ import viser
 
 from common import topics
 from common.config import load_cell
-from page.console import Desk
+from page.console import ActionQueue
 from page.hand_eye import Result
 from page.hand_eye_panel import HandEyePanel
 
@@ -24,7 +24,7 @@ async def test_views_are_of_the_camera_with_which_they_were_begun(
 ) -> None:
     monkeypatch.setenv("ZENCELL_STATE", str(tmp_path))
     asked: list[str] = []
-    console: Any = Desk()
+    console: Any = ActionQueue()
     panel = HandEyePanel(server.gui, console, lambda topic: asked.append(topic.key), [LEFT, RIGHT],
                          load_cell("ur5").robot, on_listen=lambda: None)
     panel._set("name", "wrist")
@@ -60,8 +60,8 @@ async def test_result_and_last_picture_of_views_that_were_left_are_not_those_of_
             assert going_on.wait(10)
             return Result(True, ["good: of before"])
 
-    console: Any = Desk()
-    console.tell = lambda line, _kind="bad": told.append(line)
+    console: Any = ActionQueue()
+    console.notify = lambda line, _kind="bad": told.append(line)
     panel = HandEyePanel(server.gui, console, lambda topic: topic, [LEFT], load_cell("ur5").robot,
                          on_listen=lambda: None)
     for act in (panel._take, panel._calibrate):

@@ -7,9 +7,9 @@ from typing import Any
 import pytest
 
 from common.messages import MotionOwner, MotionStatus
-from page import jog
-from page.doors import BY, Doors
-from page.jog import Jogger
+from page import manual_control as jog
+from page.manual_control import Jogger
+from page.permissions import BY, Permissions
 
 OURS, FREE = MotionOwner(owner=BY, kind="operator", jogging=True), MotionOwner()
 BOBS = MotionOwner(owner="bob", kind="operator", asked=True)
@@ -19,7 +19,7 @@ class Arm:
     """Takes velocities, as far as its owner lets it."""
 
     def __init__(self) -> None:
-        self.doors, self.owner, self.at, self.told = Doors(), FREE, 0.0, list[str]()
+        self.doors, self.owner, self.at, self.told = Permissions(), FREE, 0.0, list[str]()
         self.jogger = Jogger(self, lambda _: {"joints": {"a": 0.1}}, lambda: (MotionStatus(), self.owner), lambda: "")
 
     def jog(self, heard: int, **velocities: Any) -> None:

@@ -10,7 +10,7 @@ from common.config import load_cell, service_config
 from common.config.tunables import describe
 from common.errors import ConfigError
 from common.messages import Parameter
-from page.guard import close_server, make_server
+from page.server import close_server, make_server
 from page.tuning import Knob, group_of, label_of, step_of
 from services import vision_detector
 

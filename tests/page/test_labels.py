@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from page.labels import LETTER, LINE, Labels, grouped
+from page.labels import CONTROL_PATH, LETTER, Labels, grouped
 
 Array = NDArray[np.float64]
 
@@ -43,7 +43,7 @@ def test_labels_apart_stay_apart_and_those_at_one_place_are_lines_of_one(server:
     places = {"a": ("flange", np.zeros(3)), "b": ("hand", np.zeros(3)), "c": ("tool", np.array([wide * 1.1, 0, 0]))}
     labels.show(places, as_pixels)
     assert labels.texts == ["flange\nhand", "tool"]
-    places["b"] = ("hand", np.array([0, -2.1e-3 * LINE, 0]))
+    places["b"] = ("hand", np.array([0, -2.1e-3 * CONTROL_PATH, 0]))
     labels.show(places, as_pixels)
     assert labels.texts == ["flange", "hand", "tool"]
     labels.show({}, as_pixels)

@@ -10,7 +10,7 @@ import viser
 from common import messages as m
 from common.application import find_application, find_topic
 from common.errors import ConfigError, UnknownName
-from page.layers import find_layers, has_something, layers_shown
+from page.layers import find_layers, has_data, shown_layers
 from page.scene import Scene
 from tests.page.scene_cell import Clock, ConsoleDouble, around_of, robot_of
 
@@ -57,7 +57,7 @@ def test_module_with_topics_and_show_is_a_layer(own: Path, server: viser.ViserSe
     (own / "hand_width.py").write_text(OWN)
     layers = find_layers(PANDA, ["page_pkg.hand_width"])
     name = "page_pkg.hand_width"
-    assert (layers[name].LABEL, layers_shown({}, layers)[name]) == ("Width of the hand", False)
+    assert (layers[name].LABEL, shown_layers({}, layers)[name]) == ("Width of the hand", False)
     server.scene.reset()
     said = {"gripper/state": m.GripperState(width=0.04)}
     scene = Scene(
@@ -87,16 +87,16 @@ def test_module_that_is_no_layer_is_refused_by_name(own: Path, text: str, said: 
 
 
 def test_layout_may_speak_of_layers_of_other_cells() -> None:
-    shown = layers_shown({"outline": False, "their.layer": True, "robot": False}, find_layers(PANDA))
+    shown = shown_layers({"outline": False, "their.layer": True, "robot": False}, find_layers(PANDA))
     assert "outline" not in shown and "their.layer" not in shown and not shown["robot"]
     with pytest.raises(UnknownName, match="layer 'outlien'"):
-        layers_shown({"outlien": False}, find_layers(PANDA))
+        shown_layers({"outlien": False}, find_layers(PANDA))
 
 
 def test_layer_is_offered_where_something_is_written_that_it_is_about() -> None:
     layers = find_layers(PANDA)
     def offered(*keys: str) -> set[str]:
-        return {name for name, kind in layers.items() if has_something(kind, keys)}
+        return {name for name, kind in layers.items() if has_data(kind, keys)}
     assert offered() == {"grid"}
     assert offered("tf", "tf_static", "joint_states") == {
         "grid", "robot", "collision_shapes", "reach", "frames", "compared"}

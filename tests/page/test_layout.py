@@ -8,7 +8,7 @@ from common.application import find_application
 from common.config import config_root
 from common.errors import ConfigError
 from common.kept_file import lasting_folder
-from page.layers import find_layers, layers_shown
+from page.layers import find_layers, shown_layers
 from page.layout import TABS, Layout, Viewpoint, load_layout, save_layout
 
 
@@ -16,7 +16,7 @@ def test_layout_of_the_project_can_be_read_and_has_every_panel() -> None:
     layout = load_layout("", print)
     assert set(layout.tabs) == set(TABS)
     assert set(layout.viewpoints) == {"panda", "ur5"}
-    assert layers_shown(layout.layers, find_layers(find_application("outlining")))["robot"]
+    assert shown_layers(layout.layers, find_layers(find_application("outlining")))["robot"]
 
 
 def test_layout_that_is_saved_is_the_users_own_and_the_projects_stays_as_it_is(tmp_path: Path) -> None:

@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from page.console import Desk
-from page.doors import VISITOR, Doors, Visitor
-from page.line import LAST_SEEN, Holder, Line
+from page.console import ActionQueue
+from page.control_socket import LAST_SEEN, ControlSocket, Holder
+from page.permissions import CURRENT_SESSION, PageSession, Permissions
 
 
 class Connection:
@@ -46,23 +46,26 @@ class Held(Holder):
 
 
 @pytest.fixture
-async def line() -> AsyncIterator[tuple[Line, Held, Connection, Doors]]:
+async def line() -> AsyncIterator[tuple[ControlSocket, Held, Connection, Permissions]]:
     """A line that is served, to somebody whose page is open."""
-    doors = Doors()
-    desk, connection, visitor = Desk(doors), Connection(), Visitor(1, "127.0.0.1", frozenset({"look", "operate"}))
-    served = Line(desk)
+    doors = Permissions()
+    actions, connection = ActionQueue(doors), Connection()
+    visitor = PageSession(1, "127.0.0.1", frozenset({"look", "operate"}))
+    served = ControlSocket(actions)
     served.holder = held = Held()
     doors.guarded = True
-    running = [asyncio.create_task(desk.run()), asyncio.create_task(served.serve(connection))]  # type: ignore[arg-type]
+    running = [asyncio.create_task(actions.run()), asyncio.create_task(served.serve(connection))]  # type: ignore[arg-type]
     await connection.say(do="page", what=doors.key_of(visitor))
     yield served, held, connection, doors
     for task in running:
         task.cancel()
     await asyncio.gather(*running, return_exceptions=True)
-    VISITOR.set(None)
+    CURRENT_SESSION.set(None)
 
 
-async def test_words_of_a_press_that_are_all_late_move_nothing(line: tuple[Line, Held, Connection, Doors]) -> None:
+async def test_words_of_a_press_that_are_all_late_move_nothing(
+    line: tuple[ControlSocket, Held, Connection, Permissions],
+) -> None:
     _, held, connection, _ = line
     now = time.monotonic()
     for press, seen in ((1, now - LAST_SEEN - 1), (2, 0.0), (3, now)):
@@ -73,13 +76,13 @@ async def test_words_of_a_press_that_are_all_late_move_nothing(line: tuple[Line,
 
 
 async def test_page_that_was_closed_does_nothing_over_the_line_that_it_left_open(
-    line: tuple[Line, Held, Connection, Doors]
+    line: tuple[ControlSocket, Held, Connection, Permissions]
 ) -> None:
     _, held, connection, doors = line
     async with asyncio.timeout(10):
         await connection.say(do="hold", what="joint:1:+", n=1, at=0.0, seen=time.monotonic())
         await held.presses.get()
-        doors.leave(Visitor(1, "127.0.0.1", frozenset({"look", "operate"})))
+        doors.leave(PageSession(1, "127.0.0.1", frozenset({"look", "operate"})))
         await connection.say(do="hold", what="joint:1:+", n=2, at=0.0, seen=time.monotonic())
         assert "nothing was done" in (await connection.heard.get())["said"]
     assert held.presses.empty()

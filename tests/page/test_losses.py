@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from page.line import LATE, Delays
-from page.losses import BLINK, Loss, Losses
+from page.control_socket import LATE, Delays
+from page.losses import BLINK, Loss, LossDetector
 
 THERE = {"arm": ("no arm", True), "task": ("no task", True)}
 
 
-def seen(*services: str) -> Losses:
-    losses = Losses()
+def seen(*services: str) -> LossDetector:
+    losses = LossDetector()
     assert losses.update(True, services, THERE, 0.0) == []
     return losses
 
 
 def test_what_never_was_is_not_lost_but_started() -> None:
-    assert Losses().update(True, [], {"arm": ("no arm", False)}, 100.0) == []
+    assert LossDetector().update(True, [], {"arm": ("no arm", False)}, 100.0) == []
 
 
 def test_service_that_is_gone_is_told_with_the_time_when_it_went_and_no_more_when_it_is_back() -> None:
@@ -51,7 +51,7 @@ def test_word_that_waited_on_its_way_is_late_whatever_the_clocks_say() -> None:
 
 
 def test_names_that_somebody_makes_up_again_and_again_are_neither_kept_for_ever_nor_all_told() -> None:
-    losses = Losses()
+    losses = LossDetector()
     for number in range(1000):
         losses.update(True, ["camera", f"made up {number:04}"], {}, float(number))
     losses.update(True, ["camera"], {}, 1000.0)

@@ -11,10 +11,10 @@ from common.perception.depth import point_cloud
 from common.perception.image import array_to_image
 from common.perception.intake import Unusable
 from common.perception.pinhole import Pinhole
+from page.camera_panel import depth_image_colors
 from page.layers.points import thinned
 from page.layers.reach import shell_of
 from page.nodes import brightened
-from page.pictures import depth_picture
 from tests.page.scene_cell import Stage, around_of, in_world, robot_of
 
 
@@ -55,13 +55,13 @@ def test_cloud_lies_where_its_camera_is(panda: Stage) -> None:
 def test_near_depths_are_red_far_ones_blue_and_none_black() -> None:
     depth = np.linspace(0.4, 1.2, 4000, dtype=np.float32).reshape(40, 100)
     depth[20, 50] = np.nan
-    picture, said = depth_picture(array_to_image(depth, "32FC1"))
+    picture, said = depth_image_colors(array_to_image(depth, "32FC1"))
     first, last = picture[0, 0].astype(int), picture[-1, -1].astype(int)
     assert first[0] > 100 > first[2] and last[2] > last[0]
     assert picture[20, 50].tolist() == [0, 0, 0]
     assert said == "red 0.416 m, blue 1.184 m and farther"
     with pytest.raises(Unusable, match="is no depth image"):
-        depth_picture(Image(header=Header(), height=2, width=2, encoding="bgr8", data=bytes(12)))
+        depth_image_colors(Image(header=Header(), height=2, width=2, encoding="bgr8", data=bytes(12)))
 
 
 def test_black_gripper_is_seen_and_colours_stay_what_they_are() -> None:

@@ -11,8 +11,8 @@ import viser
 from common.config import load_cell
 from common.messages import JointTrajectory, JointTrajectoryPoint, MotionStatus, PlanResponse
 from common.robot.model import RobotModel
-from page.move import MovePanel
-from page.taught import Taught, save_taught, taught_file
+from page.move_panel import MovePanel
+from page.saved_poses import SavedPoses, save_taught, taught_file
 from tests.page.test_through import Nowhere, Silent
 
 
@@ -42,7 +42,7 @@ async def test_plan_that_comes_when_another_goal_has_been_chosen_is_not_executed
     monkeypatch.setenv("ZENCELL_STATE", str(tmp_path))
     motions, told = Motions(), list[str]()
     robot = RobotModel.load(load_cell("ur5").robot)
-    save_taught(taught_file("cell"), Taught(poses={"one": dict.fromkeys(robot.joint_names, 0.1)}))
+    save_taught(taught_file("cell"), SavedPoses(poses={"one": dict.fromkeys(robot.joint_names, 0.1)}))
     panel = MovePanel(
         server.gui, cast(Any, Silent()), cast(Any, motions), cast(Any, Nowhere()), robot, [], cell="cell",
         planner="", marker=False, tell=lambda line, _kind: told.append(line))

@@ -11,13 +11,13 @@ import viser
 
 from common.messages import Header, Image
 from common.perception.image import ImageError, array_to_image
-from page.arm_panel import ArmPanel
-from page.console import Desk
-from page.doors import Doors, Visitor
-from page.guard import close_server, make_server
-from page.jog import JogPanel
-from page.pictures import rgb_picture
+from page.arm_panel import ControllerPanel
+from page.camera_panel import rgb_image
+from page.console import ActionQueue
+from page.manual_control import JogPanel
+from page.permissions import PageSession, Permissions
 from page.plots import SAMPLE, SECONDS, Limits, PlotPanel
+from page.server import close_server, make_server
 
 LIMITS = Limits(["arm_joint1", "arm_joint2"], np.array([-1.0, 0.0]), np.array([1.0, 4.0]), np.array([2.0, 5.0]))
 
@@ -64,29 +64,29 @@ def test_only_the_last_half_minute_and_no_more_samples_than_are_drawn_are_kept(g
 def test_picture_is_red_where_it_was_and_no_wider_than_is_shown() -> None:
     bgr = np.zeros((100, 1000, 3), np.uint8)
     bgr[:, :, 2] = 200
-    rgb = rgb_picture(array_to_image(bgr, "bgr8"), 500)
+    rgb = rgb_image(array_to_image(bgr, "bgr8"), 500)
     assert rgb.shape == (50, 500, 3) and rgb[25, 250].tolist() == [200, 0, 0]
-    same = rgb_picture(array_to_image(bgr[:, :, ::-1], "rgb8"))
+    same = rgb_image(array_to_image(bgr[:, :, ::-1], "rgb8"))
     assert same[50, 50].tolist() == [200, 0, 0]
-    grey = rgb_picture(array_to_image(np.full((4, 4), 7, np.uint8), "mono8"))
+    grey = rgb_image(array_to_image(np.full((4, 4), 7, np.uint8), "mono8"))
     assert grey.shape == (4, 4, 3) and grey[0, 0].tolist() == [7, 7, 7]
 
 
 @pytest.mark.parametrize(("encoding", "data"), [("bgr8", b"short"), ("32FC1", bytes(64)), ("jpeg", b"")])
 def test_what_is_no_picture_is_refused(encoding: str, data: bytes) -> None:
     with pytest.raises(ImageError):
-        rgb_picture(Image(header=Header(), height=4, width=4, encoding=encoding, data=data))
+        rgb_image(Image(header=Header(), height=4, width=4, encoding=encoding, data=data))
 
 
 async def test_who_only_looks_has_the_arm_do_nothing(gui: viser.GuiApi) -> None:
-    doors, noted = Doors(), []
+    doors, noted = Permissions(), []
     doors.guarded = True
-    desk = Desk(doors)
-    desk.put = noted.append  # type: ignore[method-assign]
+    actions = ActionQueue(doors)
+    actions.put = noted.append  # type: ignore[method-assign]
     before = set(gui._gui_input_handle_from_uuid)
-    ArmPanel(gui, desk)  # type: ignore[arg-type]  # asks nobody here
+    ControllerPanel(gui, actions)  # type: ignore[arg-type]  # asks nobody here
     (buttons,) = set(gui._gui_input_handle_from_uuid) - before
-    roles = {role: doors.admit(Visitor(n, "10.0.0.5", frozenset({"look", role})), buttons)
+    roles = {role: doors.admit(PageSession(n, "10.0.0.5", frozenset({"look", role})), buttons)
              for n, role in enumerate(("look", "tune", "operate"))}
     assert roles == {"look": False, "tune": False, "operate": True}
 
@@ -99,6 +99,6 @@ async def test_who_only_looks_has_the_arm_do_nothing(gui: viser.GuiApi) -> None:
 async def test_what_is_said_of_the_buttons_of_a_joint_names_it_as_it_is_written(
     gui: viser.GuiApi, joints: list[str], said: list[str]
 ) -> None:
-    panel = JogPanel(gui, Desk(), joints, [1.0, 1.0])
+    panel = JogPanel(gui, ActionQueue(), joints, [1.0, 1.0])
     labels = re.findall(r'aria-label="([^"]*)"', panel._html.content)
     assert labels == [f"jog {name}, {way}" for name in said for way in ("minus", "plus")]

@@ -15,9 +15,9 @@ from common import topics
 from common.messages import Message
 from common.perception.image import array_to_image, image_to_array
 from common.topics import Topic
-from page import past as past_module
-from page.past import MOST_BYTES, SECONDS, Memory
-from page.recorded import RecordedPast, Watch, recordings_in
+from page import history as past_module
+from page.history import MOST_BYTES, SECONDS, RecentHistory
+from page.recorded_history import RecordedHistory, EventDetector, recordings_in
 from page.timeline import Timeline
 from recording.sample import RecordingError, Sample
 from recording.writing import RecordingWriter
@@ -34,7 +34,7 @@ def task(state: str, subject: str = "") -> m.TaskStatus:
 
 
 def test_newest_message_of_a_time_is_found_and_what_is_older_than_the_last_minutes_is_gone() -> None:
-    memory = Memory()
+    memory = RecentHistory()
     for step in range(6000):
         memory.note(step * 0.1, topics.JOINT_STATES, joints(step))
     for at in (500.0, 555.55, 599.0):
@@ -46,7 +46,7 @@ def test_newest_message_of_a_time_is_found_and_what_is_older_than_the_last_minut
 
 
 def test_the_newest_of_a_stream_is_there_though_few_are_kept() -> None:
-    memory = Memory()
+    memory = RecentHistory()
     for step in range(3001):
         memory.note(step * 0.01, topics.JOINT_STATES, joints(step))
     last = memory.latest(topics.JOINT_STATES, 30.0)
@@ -55,14 +55,14 @@ def test_the_newest_of_a_stream_is_there_though_few_are_kept() -> None:
 
 
 def test_a_state_that_stays_is_known_for_as_long_as_it_stays() -> None:
-    memory, scene = Memory(), m.PlanningScene(header=m.Header(stamp=1))
+    memory, scene = RecentHistory(), m.PlanningScene(header=m.Header(stamp=1))
     assert memory.note(0.0, topics.PLANNING_SCENE, scene)
     assert not memory.note(500.0, topics.PLANNING_SCENE, scene)
     assert memory.latest(topics.PLANNING_SCENE, 400.0) is scene
 
 
 def test_what_is_looked_back_at_is_what_was_said_and_the_same_as_long_as_it_is_looked_at() -> None:
-    memory = Memory()
+    memory = RecentHistory()
     for step in range(100):
         memory.note(float(step), topics.JOINT_STATES, joints(step))
     found = memory.latest(topics.JOINT_STATES, 41.5)
@@ -72,7 +72,7 @@ def test_what_is_looked_back_at_is_what_was_said_and_the_same_as_long_as_it_is_l
 
 def test_of_large_messages_fewer_minutes_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(past_module, "MOST_TOLD", 10_000)
-    memory = Memory()
+    memory = RecentHistory()
     for step in range(1000):
         memory.note(step * 0.1, topics.JOINT_STATES, joints(step))
     kept = memory.between(topics.JOINT_STATES, -1.0, 100.0)
@@ -82,7 +82,7 @@ def test_of_large_messages_fewer_minutes_are_kept(monkeypatch: pytest.MonkeyPatc
 
 def test_pictures_take_no_more_memory_than_is_allowed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(past_module, "MOST_BYTES", 200_000)
-    memory, rng = Memory(), np.random.default_rng(0)
+    memory, rng = RecentHistory(), np.random.default_rng(0)
     for step in range(60):
         memory.note_picture(float(step), topics.CAMERA_IMAGE, rng.integers(0, 255, (120, 160, 3), dtype=np.uint8))
     assert 0 < memory._bytes <= 200_000 < MOST_BYTES
@@ -91,7 +91,7 @@ def test_pictures_take_no_more_memory_than_is_allowed(monkeypatch: pytest.Monkey
 
 
 def test_picture_that_is_kept_looks_as_it_did() -> None:
-    memory, red = Memory(), np.zeros((48, 64, 3), np.uint8)
+    memory, red = RecentHistory(), np.zeros((48, 64, 3), np.uint8)
     red[..., 0] = 220
     memory.note_picture(1.0, topics.CAMERA_IMAGE, red)
     found = image_to_array(memory.picture(topics.CAMERA_IMAGE, 2.0))
@@ -100,7 +100,7 @@ def test_picture_that_is_kept_looks_as_it_did() -> None:
 
 @pytest.fixture
 def timeline() -> Timeline:
-    memory = Memory()
+    memory = RecentHistory()
     for step in range(1001):
         memory.note(step * 0.1, topics.JOINT_STATES, joints(step))
     for at, words in ((20.0, "Taking"), (50.0, "Placing")):
@@ -146,7 +146,7 @@ def test_events_are_jumped_to_in_both_directions(timeline: Timeline) -> None:
 
 
 def test_what_task_and_motion_say_becomes_events_once() -> None:
-    watch = Watch(NAMES)
+    watch = EventDetector(NAMES)
     assert watch.news(task("GRASPING", "ball_1")) == [("Grasping ball_1", "")]
     assert watch.news(task("GRASPING", "ball_1")) == []
     assert watch.news(task("DONE")) == [("Done", "good")]
@@ -155,7 +155,7 @@ def test_what_task_and_motion_say_becomes_events_once() -> None:
     assert watch.news(aborted) == [] and watch.news(m.MotionStatus(id="h", state="active")) == []
 
 
-class Shelf(Memory):
+class Shelf(RecentHistory):
     """Something to look back at that cannot be read from some time on."""
 
     def __init__(self) -> None:
@@ -202,7 +202,7 @@ def recording(path: Path, cell: str = "panda") -> Path:
 def test_recording_answers_as_the_last_minutes_do(tmp_path: Path) -> None:
     path = recording(tmp_path / "run.mcap")
     wanted = [topics.JOINT_STATES, topics.CAMERA_IMAGE, topics.MOTION_STATUS]
-    past = RecordedPast(path, "panda", wanted, NAMES)
+    past = RecordedHistory(path, "panda", wanted, NAMES)
     try:
         assert (past.start, past.end) == (0.0, pytest.approx(10.0))
         state = past.latest(topics.JOINT_STATES, 5.04)
@@ -223,7 +223,7 @@ def test_what_came_after_the_clock_was_set_back_is_there(tmp_path: Path) -> None
         writer.add(Sample("panda/joint_states", msgpack.packb(joints(second).model_dump()), round(1e18 + second * 1e9),
                           message="JointState", kind="stream", writer="w", sequence=number))
     writer.close()
-    past = RecordedPast(tmp_path / "run.mcap", "panda", [topics.JOINT_STATES], NAMES)
+    past = RecordedHistory(tmp_path / "run.mcap", "panda", [topics.JOINT_STATES], NAMES)
     try:
         for second in (1.0, 2.0, 3.0, 30.0):
             assert past.latest(topics.JOINT_STATES, second + 0.1) == joints(second)
@@ -237,7 +237,7 @@ def test_message_of_another_class_than_its_topic_has_is_none(tmp_path: Path) -> 
         writer.add(Sample("panda/joint_states", msgpack.packb(message.model_dump()), round(1e18 + second * 1e9),
                           message=type(message).__name__, kind="stream", writer="w", sequence=second))
     writer.close()
-    past = RecordedPast(tmp_path / "run.mcap", "panda", [topics.JOINT_STATES], NAMES)
+    past = RecordedHistory(tmp_path / "run.mcap", "panda", [topics.JOINT_STATES], NAMES)
     try:
         assert past.latest(topics.JOINT_STATES, 0.5) == joints(1.0)
         assert past.latest(topics.JOINT_STATES, 1.0) is None
@@ -249,7 +249,7 @@ def test_message_of_another_class_than_its_topic_has_is_none(tmp_path: Path) -> 
 def test_recording_of_another_cell_is_refused(tmp_path: Path) -> None:
     path = recording(tmp_path / "run.mcap", "ur5")
     with pytest.raises(RecordingError, match=r"run.mcap: is of the cell ur5, not of panda"):
-        RecordedPast(path, "panda", [topics.JOINT_STATES], NAMES)
+        RecordedHistory(path, "panda", [topics.JOINT_STATES], NAMES)
 
 
 def test_recordings_of_a_folder_are_offered_the_newest_first(tmp_path: Path) -> None:

@@ -8,19 +8,19 @@ import pytest
 import viser
 
 from common.messages import MotionOwner
-from page.console import Desk
-from page.doors import VISITOR, Doors, Visitor
-from page.task_panel import TaskPanel
+from page.console import ActionQueue
+from page.main_panel import TaskPanel
+from page.permissions import CURRENT_SESSION, PageSession, Permissions
 
-FIRST, SECOND = (Visitor(n, f"10.0.0.{n}", frozenset({"look", "operate"})) for n in (1, 2))
+FIRST, SECOND = (PageSession(n, f"10.0.0.{n}", frozenset({"look", "operate"})) for n in (1, 2))
 
 
-class Owned(Desk):
+class Owned(ActionQueue):
     """The motion is somebody's, whatever is asked for."""
 
     heard = 0
 
-    def __init__(self, doors: Doors, owner: MotionOwner) -> None:
+    def __init__(self, doors: Permissions, owner: MotionOwner) -> None:
         super().__init__(doors)
         self._owner = owner
 
@@ -36,7 +36,7 @@ async def nothing() -> None:
 
 
 def panel_of(server: viser.ViserServer, owner: MotionOwner) -> TaskPanel:
-    doors = Doors()
+    doors = Permissions()
     doors.guarded = True
     return TaskPanel(server.gui, cast(Any, Owned(doors, owner)), cast(Any, None), nothing)
 
@@ -44,22 +44,22 @@ def panel_of(server: viser.ViserServer, owner: MotionOwner) -> TaskPanel:
 async def test_who_takes_the_page_over_is_told_to_all_by_name(server: viser.ViserServer) -> None:
     panel = panel_of(server, MotionOwner())
     for visitor in (FIRST, SECOND):
-        token = VISITOR.set(visitor)
+        token = CURRENT_SESSION.set(visitor)
         assert panel._console.doors.admit(visitor, "anything of the arm") is (visitor is FIRST)
         panel._operate()
         assert panel.note[1:] == (f"{visitor} operates now", "good")
-        VISITOR.reset(token)
-    token = VISITOR.set(SECOND)
+        CURRENT_SESSION.reset(token)
+    token = CURRENT_SESSION.set(SECOND)
     panel._leave()
     assert panel.note[1:] == (f"{SECOND} does not operate", "bad")
-    VISITOR.reset(token)
+    CURRENT_SESSION.reset(token)
 
 
 @pytest.mark.parametrize(("owner", "kind"), [(f"page {FIRST.address}", "bad"), ("", "good")])
 async def test_giving_back_what_another_has_is_no_success(server: viser.ViserServer, owner: str, kind: str) -> None:
     panel = panel_of(server, MotionOwner(owner=owner, kind="operator" if owner else "none", asked=bool(owner)))
-    token = VISITOR.set(SECOND)
+    token = CURRENT_SESSION.set(SECOND)
     await panel._own("give")
     _, line, how = panel.note
     assert how == kind and line.startswith("Nothing to give back") is bool(owner)
-    VISITOR.reset(token)
+    CURRENT_SESSION.reset(token)

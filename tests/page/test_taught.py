@@ -1,4 +1,4 @@
-"""Taught poses in their file."""
+"""SavedPoses poses in their file."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ import pytest
 
 from common.config import check
 from common.errors import ConfigError
-from page.taught import HEADER, Taught, load_taught, save_taught, taught_file
+from page.saved_poses import HEADER, SavedPoses, load_taught, save_taught, taught_file
 
 POSES = {"bin": {"a": 0.25, "b": -1.0}, "über der Kiste": {"b": 0.5, "a": 0.0}}
 
 
 def test_what_was_taught_is_read_again_and_named_in_the_order_of_the_joints() -> None:
     path = taught_file("cell")
-    assert load_taught(path) == Taught()
-    save_taught(path, Taught(poses=POSES))
+    assert load_taught(path) == SavedPoses()
+    save_taught(path, SavedPoses(poses=POSES))
     again = load_taught(path)
     assert again.poses == POSES and path.read_text(encoding="utf-8").startswith(HEADER)
     assert again.named("über der Kiste", ["a", "b"]) == [0.0, 0.5]
@@ -27,13 +27,13 @@ def test_what_was_taught_is_read_again_and_named_in_the_order_of_the_joints() ->
     ("box", ["a", "b"], "choices: bin"), ("bin", ["a"], "another arm")])
 def test_pose_that_there_is_not_is_refused_by_name(name: str, joints: list[str], why: str) -> None:
     with pytest.raises(ConfigError, match=why):
-        Taught(poses=POSES).named(name, joints)
+        SavedPoses(poses=POSES).named(name, joints)
 
 
 @pytest.mark.parametrize("name", ["", " a", "a, b", "x" * 41, "a\nb"])
 def test_name_that_cannot_stand_in_a_row_of_waypoints_is_refused(name: str) -> None:
     with pytest.raises(ConfigError):
-        check(Taught, {"poses": {name: {"a": 0.0}}}, "pose")
+        check(SavedPoses, {"poses": {name: {"a": 0.0}}}, "pose")
 
 
 @pytest.mark.parametrize("text", ["poses: 3", "poses: {bin: {a: .nan}}", "[", "other: {}"])

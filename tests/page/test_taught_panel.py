@@ -9,9 +9,9 @@ import pytest
 import viser
 
 from common.errors import ConfigError
-from page.console import Desk
-from page.taught import Taught, load_taught, save_taught, taught_file
-from page.taught_panel import TaughtPanel
+from page.console import ActionQueue
+from page.saved_poses import SavedPoses, load_taught, save_taught, taught_file
+from page.taught_panel import SavedPosesPanel
 
 JOINTS = ["a", "b"]
 TAKEN = ["goal marker", "home"]
@@ -22,14 +22,15 @@ def folder(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ZENCELL_STATE", str(tmp_path))
 
 
-def panel(server: viser.ViserServer) -> TaughtPanel:
+def panel(server: viser.ViserServer) -> SavedPosesPanel:
     async def nowhere(_names: list[str]) -> None:
         pass
 
-    return TaughtPanel(server.gui, Desk(), "cell", JOINTS, lambda: np.array([1.0, 2.0]), lambda: None, nowhere, TAKEN)
+    return SavedPosesPanel(
+        server.gui, ActionQueue(), "cell", JOINTS, lambda: np.array([1.0, 2.0]), lambda: None, nowhere, TAKEN)
 
 
-def teach(taught: TaughtPanel, name: str) -> None:
+def teach(taught: SavedPosesPanel, name: str) -> None:
     taught._set_name(name)
     taught._teach()
 
@@ -37,7 +38,7 @@ def teach(taught: TaughtPanel, name: str) -> None:
 async def test_pose_in_the_file_whose_name_means_something_else_is_not_offered_twice(
     server: viser.ViserServer,
 ) -> None:
-    save_taught(taught_file("cell"), Taught(poses={name: {"a": 0.0, "b": 0.0} for name in ("bin", "home")}))
+    save_taught(taught_file("cell"), SavedPoses(poses={name: {"a": 0.0, "b": 0.0} for name in ("bin", "home")}))
     taught = panel(server)
     assert taught.names == ["bin"]  # a page on which something is to be chosen from twice the same is blank
     with pytest.raises(ConfigError, match="means something else"):

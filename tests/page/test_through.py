@@ -11,9 +11,9 @@ from common.client.operator_motion import MotionFailed
 from common.config import load_cell
 from common.messages import Inhibit, MotionStatus
 from common.robot.model import RobotModel
-from page.console import Desk
-from page.move import MovePanel
-from page.taught import Taught, save_taught, taught_file
+from page.console import ActionQueue
+from page.move_panel import MovePanel
+from page.saved_poses import SavedPoses, save_taught, taught_file
 
 
 class Motions:
@@ -40,8 +40,8 @@ class Nowhere:
         return lambda *_: None
 
 
-class Silent(Desk):
-    """A desk in a cell that says nothing."""
+class Silent(ActionQueue):
+    """A actions in a cell that says nothing."""
 
     def latest(self, _topic: Any) -> None:
         pass
@@ -53,7 +53,7 @@ async def test_stop_between_two_poses_ends_the_row(
     monkeypatch.setenv("ZENCELL_STATE", str(tmp_path))
     robot, motions, told = RobotModel.load(load_cell("ur5").robot), Motions(), []
     pose = dict.fromkeys(robot.joint_names, 0.1)
-    save_taught(taught_file("cell"), Taught(poses={"one": pose, "two": pose}))
+    save_taught(taught_file("cell"), SavedPoses(poses={"one": pose, "two": pose}))
     panel = MovePanel(
         server.gui, cast(Any, Silent()), motions, cast(Any, Nowhere()), robot, [], cell="cell", planner="",
         marker=False, tell=lambda line, kind: told.append((line, kind)))

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 import viser
 
-from page.console import Desk
-from page.past import Memory
+from page.console import ActionQueue
+from page.history import RecentHistory
 from page.time_panel import THIS, TimePanel
 from page.timeline import Timeline
 from recording.sample import RecordingError
@@ -27,7 +27,7 @@ class Shelf:
         assert self.read[name].wait(10)
         if name == "damaged.mcap":
             raise RecordingError("damaged.mcap: is damaged")
-        past = Memory()
+        past = RecentHistory()
         past.now, past.close = 10.0, lambda: self.closed.append(name)  # type: ignore[method-assign]
         return past
 
@@ -36,8 +36,8 @@ class Panel:
     """A time panel, whom persons and the clock make do something."""
 
     def __init__(self, server: viser.ViserServer, shelf: Shelf) -> None:
-        self.timeline, self.now = Timeline(lambda _topic: None, Memory()), 0.0
-        self.panel = TimePanel(server.gui, Desk(), self.timeline,  # type: ignore[arg-type]
+        self.timeline, self.now = Timeline(lambda _topic: None, RecentHistory()), 0.0
+        self.panel = TimePanel(server.gui, ActionQueue(), self.timeline,  # type: ignore[arg-type]
                                names=lambda: list(shelf.read), open_one=shelf.open)
         assert self.source == THIS
 

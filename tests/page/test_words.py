@@ -18,14 +18,14 @@ from common.messages import (
     ServiceStatus,
     TaskStatus,
 )
-from page import words
+from page import status_text as words
 from page.markup import block, row, span
-from page.words import TaskWords
+from page.status_text import TaskText
 
 
 def test_every_state_has_a_word() -> None:
     for application, states in (("pick_place", TaskState), ("outlining", OutlineState)):
-        assert set(get_args(states)) <= set(TaskWords.of(find_application(application)).states)
+        assert set(get_args(states)) <= set(TaskText.of(find_application(application)).states)
     assert set(words.GOAL_STATES) == set(get_args(GoalState))
     states = get_args(ServiceStatus.model_fields["state"].annotation)
     assert set(words.SERVICE_STATES) == {*states, "gone"}
@@ -48,12 +48,12 @@ def test_every_state_has_a_word() -> None:
 )
 def test_task_is_told_in_words(status: PickPlaceStatus | OutlineStatus | None, said: str) -> None:
     application = "outlining" if isinstance(status, OutlineStatus) else "pick_place"
-    assert TaskWords.of(find_application(application)).state(status)[0] == said
+    assert TaskText.of(find_application(application)).state(status)[0] == said
 
 
 def test_task_of_an_application_without_a_page_is_told_in_words_that_fit_any() -> None:
     status = TaskStatus(state="MOVING_IT", started=True, subject="cube", done=1, total=4, figures={"mean_mm": 0.2})
-    told = TaskWords.of(None)
+    told = TaskText.of(None)
     assert told.state(status)[0] == "Moving it cube" and told.done(status, None) == 0.25
     assert told.counters(status, 0) == {"done": 1, "of": 4, "mean mm": 0.2, "retries": 0, "failures": 0}
 

@@ -11,7 +11,7 @@ from common.config import load_cell
 from common.errors import Refused, RemoteError
 from common.messages import Header, Vector3, WorldEdit, WorldEditReply, WorldObjects
 from common.sim.kinematic import KinematicWorld
-from page.world_edits import NothingToUndo, WorldEdits, free_places, middle_of
+from page.world_editing import NothingToUndo, WorldEditor, free_places, middle_of
 
 Places = dict[str, tuple[float, float, str]]
 
@@ -21,7 +21,7 @@ class World:
 
     def __init__(self, cell: str) -> None:
         self.world = KinematicWorld(load_cell(cell).world)
-        self.edits = WorldEdits(self.ask, self.truth)
+        self.edits = WorldEditor(self.ask, self.truth)
 
     async def ask(self, edit: WorldEdit) -> WorldEditReply:
         try:

@@ -31,7 +31,7 @@ from common.transport.connect import connect
 from common.transport.credentials import ROUTER_NAME, Credentials, credentials_of
 from common.transport.endpoint import MOST_BYTES, MOST_BYTES_BESIDES, client_config, router_config
 from common.transport.session import RawSample
-from page.access import ROLES, tokens_in
+from security.page_tokens import ROLES, read_tokens
 from recording.reading import Recording
 from security.certificates import Authority
 from tests.harness import RunningCell, command_line, environment, until
@@ -556,7 +556,7 @@ def test_no_secret_is_in_anything_that_a_cell_leaves(secured: Secured) -> None:
         lines = key.read_text().splitlines()
         secrets += [line.encode() for line in lines[1:-1]] + [base64.b64decode("".join(lines[1:-1]))]
         assert key.stat().st_mode & 0o777 == 0o600
-    assert tokens_in(secured.folder, "panda").keys() == set(ROLES)
+    assert read_tokens(secured.folder, "panda").keys() == set(ROLES)
     assert len(secrets) > 50
     with Recording(secured.recording) as recording:
         written = [sample.payload for sample in recording.samples()]

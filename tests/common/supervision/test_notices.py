@@ -19,8 +19,8 @@ from common.supervision import operation
 from common.supervision.launch import Launch
 from common.supervision.liveness_watchdog import Elsewhere
 from common.transport.local import LocalNetwork
-from page.guard import close_server, make_server
-from page.health import HealthPanel
+from page.diagnostics import HealthPanel
+from page.server import close_server, make_server
 from security.certificates import Authority
 
 FAR = Notice(urgent=True, message="the certificate of panda.camera ends", host="camera")

@@ -23,14 +23,14 @@ from websockets.asyncio.client import connect as connect_socket
 from common.config import load_cell, service_config
 from common.config.tunables import describe
 from common.errors import ConfigError
-from page import guard
+from page import server as guard
 from page.access import ROLES, TOKEN_VARIABLE
-from page.console import Desk
-from page.doors import Doors, Need
-from page.guard import close_server, make_server
+from page.console import ActionQueue
+from page.permissions import Need, Permissions
+from page.server import close_server, make_server
 from page.viser_inside import client_files
 from services.viewer import Config
-from tests.page.browser_double import CAMERA
+from tests.page.fake_browser import CAMERA
 
 SECRET = "correct-horse-battery"
 PATIENCE = 20.0  # [s]
@@ -343,12 +343,12 @@ def test_published_page_needs_no_token_and_is_served_under_loopback_names_only(m
 
 
 @asynccontextmanager
-async def operated(make: Make) -> AsyncIterator[tuple[viser.ViserServer, Desk, dict[str, str], list[str]]]:
+async def operated(make: Make) -> AsyncIterator[tuple[viser.ViserServer, ActionQueue, dict[str, str], list[str]]]:
     """A page with a button to start, one to stop and an arrow to drag: ids of these by name, and what was done."""
     done: list[str] = []
-    doors = Doors(done.append)
+    doors = Permissions(done.append)
     server = make(tokens={role: f"{role}-token-of-the-page" for role in ROLES}, doors=doors)
-    desk = Desk(doors)
+    desk = ActionQueue(doors)
     running = asyncio.create_task(desk.run())
     needs: dict[str, Need] = {"Start": "operate", "Stop": "stop", "Faster": "tune"}
     ids = {}

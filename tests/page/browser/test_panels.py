@@ -9,7 +9,7 @@ import pytest
 
 from common import topics
 from common.messages import WorldObjects
-from page.world_edits import free_places, middle_of
+from page.world_editing import free_places, middle_of
 from tests.harness import until
 from tests.page.browser.conftest import IN_BROWSER, PATIENCE, Bring, Watched
 from tests.page.browser.test_bar import PANDA, look

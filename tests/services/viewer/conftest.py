@@ -25,7 +25,7 @@ from common.process.in_process import running_service
 from common.transport.bus import Bus
 from common.transport.local import LocalNetwork
 from services import viewer
-from tests.page.browser_double import PATIENCE, BrowserDouble, opened
+from tests.page.fake_browser import PATIENCE, FakeBrowser, opened
 
 TOKEN = "a-token-that-is-long-enough"
 MIN_AREA = "services.vision_detector.min_area"
@@ -152,6 +152,6 @@ async def panda() -> AsyncIterator[Played]:
 
 
 @pytest.fixture
-async def page(panda: Played) -> AsyncIterator[BrowserDouble]:
+async def page(panda: Played) -> AsyncIterator[FakeBrowser]:
     async with opened(panda.port) as browser:
         yield browser

@@ -13,17 +13,17 @@ from common import messages as m
 from common import topics
 from common.errors import Refused
 from common.transport.reader import Reader
-from tests.page.browser_double import PATIENCE, BrowserDouble, opened
+from tests.page.fake_browser import PATIENCE, FakeBrowser, opened
 from tests.services.viewer.conftest import TOKEN, Played, SceneDouble, page_of, until
 
 
-async def aim(page: BrowserDouble, goal: str) -> None:
+async def aim(page: FakeBrowser, goal: str) -> None:
     """Choose a goal, and wait until that is so: a press comes over another connection."""
     await page.set("Goal", goal)
     await page.until(lambda: not page.parts[page.label("Goal marker")]["visible"])
 
 
-async def test_stop_stops_the_arm_and_the_task(panda: Played, page: BrowserDouble) -> None:
+async def test_stop_stops_the_arm_and_the_task(panda: Played, page: FakeBrowser) -> None:
     await page.speak(do="stop", n=3)
     await until(lambda: panda.stops and panda.commands)
     assert (panda.stops, panda.commands) == (["stopped on the page"], ["stop"])
@@ -56,7 +56,7 @@ async def test_stop_that_reaches_nobody_says_so() -> None:
     ("Start", {"state": "DONE", "started": True}, {"Pause": "nothing runs", "Resume": "nothing is paused"}),
 ])
 async def test_task_is_told_what_is_clicked_and_only_what_does_something_is_on(
-    panda: Played, page: BrowserDouble, command: str, state: dict[str, Any], others: dict[str, str]
+    panda: Played, page: FakeBrowser, command: str, state: dict[str, Any], others: dict[str, str]
 ) -> None:
     panda.bus.writer(topics.MOTION_STATUS).put(m.MotionStatus())
     panda.bus.writer(PICK_PLACE_STATUS).put(PickPlaceStatus(**state))
@@ -66,12 +66,12 @@ async def test_task_is_told_what_is_clicked_and_only_what_does_something_is_on(
     assert {label: page.button(label)[1] for label in others} == others
 
 
-async def test_nothing_is_on_before_task_and_arm_say_how_they_are(panda: Played, page: BrowserDouble) -> None:
+async def test_nothing_is_on_before_task_and_arm_say_how_they_are(panda: Played, page: FakeBrowser) -> None:
     await page.until(lambda: "does not say how it is" in page.button("Start")[1])
     assert "the arm does not say" in page.button("Go home")[1]
 
 
-async def test_robot_that_another_holds_goes_on_when_that_is_said_twice(panda: Played, page: BrowserDouble) -> None:
+async def test_robot_that_another_holds_goes_on_when_that_is_said_twice(panda: Played, page: FakeBrowser) -> None:
     panda.holder = "anna"
     panda.bus.writer(PICK_PLACE_STATUS).put(PickPlaceStatus())
     panda.bus.writer(topics.MOTION_STATUS).put(m.MotionStatus(held=True))
@@ -85,7 +85,7 @@ async def test_robot_that_another_holds_goes_on_when_that_is_said_twice(panda: P
 
 
 async def test_what_somebody_else_has_said_since_a_refusal_is_told_before_it_is_overridden(
-    panda: Played, page: BrowserDouble
+    panda: Played, page: FakeBrowser
 ) -> None:
     motion, task = panda.bus.writer(topics.MOTION_STATUS), panda.bus.writer(PICK_PLACE_STATUS)
     task.put(PickPlaceStatus())
@@ -96,14 +96,14 @@ async def test_what_somebody_else_has_said_since_a_refusal_is_told_before_it_is_
         await page.until(lambda: f"the robot is held by {panda.holder}: press Start again for that" in page.text)
 
 
-async def test_who_stopped_the_robot_is_shown_though_no_task_says_so(panda: Played, page: BrowserDouble) -> None:
+async def test_who_stopped_the_robot_is_shown_though_no_task_says_so(panda: Played, page: FakeBrowser) -> None:
     stop = m.Inhibit(kind="stopped", by="anna", reason="smoke", since=0)
     panda.bus.writer(topics.MOTION_STATUS).put(m.MotionStatus(inhibits=[stop]))
     await page.until(lambda: "stopped since 1970-01-01 00:00:00 UTC by anna (smoke)" in page.text)
 
 
 async def test_an_arm_with_a_controller_says_why_it_cannot_be_moved_and_recovers_when_it_is_asked(
-    panda: Played, page: BrowserDouble
+    panda: Played, page: FakeBrowser
 ) -> None:
     robot = panda.bus.writer(topics.ROBOT_STATUS)
     robot.put(m.RobotStatus(mode="fault", message="the bus is off"))
@@ -122,7 +122,7 @@ async def test_an_arm_with_a_controller_says_why_it_cannot_be_moved_and_recovers
     assert [act for act, _ in panda.orders] == ["recover", "enable"] and all(owner for _, owner in panda.orders)
 
 
-async def test_goal_that_is_nowhere_is_told_and_the_service_goes_on(panda: Played, page: BrowserDouble) -> None:
+async def test_goal_that_is_nowhere_is_told_and_the_service_goes_on(panda: Played, page: FakeBrowser) -> None:
     await page.set("Goal", "tool: numbers")
     await page.until(lambda: page.parts[page.label("Tool at [mm]")]["visible"])
     await page.set("Tool at [mm]", [1e11, 0.0, 400.0])
@@ -133,7 +133,7 @@ async def test_goal_that_is_nowhere_is_told_and_the_service_goes_on(panda: Playe
 
 
 async def test_object_that_is_dragged_is_moved_in_the_world_and_a_refusal_is_told(
-    panda: Played, page: BrowserDouble, scenes: list[SceneDouble]
+    panda: Played, page: FakeBrowser, scenes: list[SceneDouble]
 ) -> None:
     moved: list[m.WorldEdit] = []
 
@@ -151,7 +151,7 @@ async def test_object_that_is_dragged_is_moved_in_the_world_and_a_refusal_is_tol
 
 
 async def test_plan_to_the_marker_tells_what_is_in_the_way(
-    panda: Played, page: BrowserDouble, scenes: list[SceneDouble]
+    panda: Played, page: FakeBrowser, scenes: list[SceneDouble]
 ) -> None:
     asked: list[m.PlanRequest] = []
 
@@ -172,7 +172,7 @@ async def test_plan_to_the_marker_tells_what_is_in_the_way(
 
 
 async def test_plan_is_forgotten_when_the_marker_that_it_leads_to_is_moved(
-    panda: Played, page: BrowserDouble, scenes: list[SceneDouble]
+    panda: Played, page: FakeBrowser, scenes: list[SceneDouble]
 ) -> None:
     point = m.JointTrajectoryPoint(time_from_start=1.0, positions=[0.0] * 7, velocities=[0.0] * 7,
                                    accelerations=[0.0] * 7)
@@ -198,7 +198,7 @@ async def jogs_of(reader: Reader[m.JogCommand], count: int) -> list[m.JogCommand
         return [await reader.next() for _ in range(count)]
 
 
-async def ready_to_jog(panda: Played, page: BrowserDouble) -> Reader[m.JogCommand]:
+async def ready_to_jog(panda: Played, page: FakeBrowser) -> Reader[m.JogCommand]:
     reader = panda.bus.reader(topics.MOTION_JOG)
     panda.bus.writer(topics.MOTION_STATUS).put(m.MotionStatus())
     await page.until(lambda: not page.button("Open")[1])
@@ -206,7 +206,7 @@ async def ready_to_jog(panda: Played, page: BrowserDouble) -> Reader[m.JogComman
 
 
 async def test_arm_is_jogged_by_each_word_that_a_button_is_held_and_by_nothing_else(
-    panda: Played, page: BrowserDouble
+    panda: Played, page: FakeBrowser
 ) -> None:
     reader = await ready_to_jog(panda, page)
     held = []
@@ -240,7 +240,7 @@ async def test_arm_comes_to_rest_when_the_page_that_jogs_it_is_closed(panda: Pla
     assert not rest.joints
 
 
-async def test_stop_ends_jogging_until_the_button_is_let_go(panda: Played, page: BrowserDouble) -> None:
+async def test_stop_ends_jogging_until_the_button_is_let_go(panda: Played, page: FakeBrowser) -> None:
     reader, status = await ready_to_jog(panda, page), panda.bus.writer(topics.MOTION_STATUS)
     await page.hold("joint:panda_joint1:+")
     await jogs_of(reader, 1)
@@ -264,7 +264,7 @@ async def test_stop_ends_jogging_until_the_button_is_let_go(panda: Played, page:
     await page.until(lambda: "by anna" in page.said[-1][1])
 
 
-async def test_arm_that_a_task_has_is_not_jogged_and_the_buttons_say_why(panda: Played, page: BrowserDouble) -> None:
+async def test_arm_that_a_task_has_is_not_jogged_and_the_buttons_say_why(panda: Played, page: FakeBrowser) -> None:
     reader = await ready_to_jog(panda, page)
     panda.bus.writer(PICK_PLACE_STATUS).put(PickPlaceStatus(state="GRASPING", started=True))
     await page.until(lambda: "the task has the arm" in page.button("Open")[1])
@@ -292,7 +292,7 @@ async def test_of_two_operators_one_operates_and_the_other_sees_whom_and_takes_o
         assert all(not jog.joints or jog.joints["panda_joint1"] > 0 for jog in [reader.latest] if jog)
 
 
-async def test_fingers_open_by_the_gripper_that_there_is(panda: Played, page: BrowserDouble) -> None:
+async def test_fingers_open_by_the_gripper_that_there_is(panda: Played, page: FakeBrowser) -> None:
     asked: list[m.GripperCommand] = []
 
     async def grip(request: m.GripperCommand) -> m.GripperState:
@@ -310,7 +310,7 @@ async def test_fingers_open_by_the_gripper_that_there_is(panda: Played, page: Br
     assert all(one.header.stamp for one in asked), "one that comes late is refused by when it was decided"
 
 
-async def test_taught_pose_is_a_goal_and_is_kept_for_the_next_page(panda: Played, page: BrowserDouble) -> None:
+async def test_taught_pose_is_a_goal_and_is_kept_for_the_next_page(panda: Played, page: FakeBrowser) -> None:
     asked: list[m.PlanRequest] = []
 
     async def plan(request: m.PlanRequest) -> m.PlanResponse:
@@ -340,7 +340,7 @@ async def test_taught_pose_is_a_goal_and_is_kept_for_the_next_page(panda: Played
         await later.until(lambda: "bin" in later.parts[later.label("Goal")]["options"])
 
 
-async def test_plan_that_was_found_is_executed_once(panda: Played, page: BrowserDouble) -> None:
+async def test_plan_that_was_found_is_executed_once(panda: Played, page: FakeBrowser) -> None:
     found = m.JointTrajectory(header=m.Header(stamp=5), joint_names=["a"], points=[
         m.JointTrajectoryPoint(positions=[float(k)], velocities=[0.0], accelerations=[0.0], time_from_start=float(k))
         for k in range(2)])
@@ -367,7 +367,7 @@ async def test_plan_that_was_found_is_executed_once(panda: Played, page: Browser
 
 
 async def test_plans_of_two_planners_are_shown_beside_each_other_and_either_is_executed(
-    panda: Played, page: BrowserDouble, scenes: list[SceneDouble]
+    panda: Played, page: FakeBrowser, scenes: list[SceneDouble]
 ) -> None:
     asked: list[m.ExecuteRequest] = []
 
@@ -401,7 +401,7 @@ async def test_plans_of_two_planners_are_shown_beside_each_other_and_either_is_e
 
 
 async def test_whose_the_motion_is_is_told_and_it_is_taken_over_when_that_is_said_twice(
-    panda: Played, page: BrowserDouble
+    panda: Played, page: FakeBrowser
 ) -> None:
     asked: list[m.OwnRequest] = []
     anna = m.MotionOwner(owner="anna", kind="operator", asked=True, since=1)
@@ -423,7 +423,7 @@ async def test_whose_the_motion_is_is_told_and_it_is_taken_over_when_that_is_sai
 
 
 async def test_plan_that_was_found_is_played(
-    panda: Played, page: BrowserDouble, scenes: list[SceneDouble]
+    panda: Played, page: FakeBrowser, scenes: list[SceneDouble]
 ) -> None:
     found = m.JointTrajectory(header=m.Header(stamp=5), joint_names=["a"], points=[])
 
@@ -439,7 +439,7 @@ async def test_plan_that_was_found_is_played(
 
 
 async def test_page_looks_back_and_what_moves_the_arm_brings_it_to_now(
-    panda: Played, page: BrowserDouble, scenes: list[SceneDouble]
+    panda: Played, page: FakeBrowser, scenes: list[SceneDouble]
 ) -> None:
     joints, status = panda.bus.writer(topics.JOINT_STATES), panda.bus.writer(PICK_PLACE_STATUS)
 
@@ -465,7 +465,7 @@ async def test_page_looks_back_and_what_moves_the_arm_brings_it_to_now(
     await page.until(lambda: not page.news["past"])
 
 
-async def test_page_guides_a_hand_eye_calibration(panda: Played, page: BrowserDouble) -> None:
+async def test_page_guides_a_hand_eye_calibration(panda: Played, page: FakeBrowser) -> None:
     await page.until(lambda: page.button("Begin")[1] == "give it a name first")
     assert page.button("Take a picture")[1] == "begin first"
     await page.set("Take pictures by itself", False)

@@ -36,11 +36,11 @@ from common.application import find_application
 from common.config import Members, load_cell
 from page.layout import Layout
 from services import viewer
-from tests.page.browser_double import PATIENCE, BrowserDouble, opened
+from tests.page.fake_browser import PATIENCE, FakeBrowser, opened
 from tests.services.viewer.conftest import MIN_AREA, TOKEN, Played, SceneDouble, page_of, until
 
 
-async def test_state_and_counters_are_shown_in_words(panda: Played, page: BrowserDouble) -> None:
+async def test_state_and_counters_are_shown_in_words(panda: Played, page: FakeBrowser) -> None:
     status = PickPlaceStatus(state="GRASPING", started=True, target="track_4", placed=2, targets=7, stage="pre_grasp")
     panda.bus.writer(PICK_PLACE_STATUS).put(status)
     panda.bus.writer(topics.MOTION_STATUS).put(m.MotionStatus(state="active", progress=0.5, held=True))
@@ -64,7 +64,7 @@ async def test_pictures_and_truth_are_read_only_while_a_page_that_shows_them_is_
     await until(lambda: not writers[topics.CAMERA_IMAGE].matched and not objects.matched)
 
 
-async def test_parameter_changed_on_the_page_is_changed_by_the_page(panda: Played, page: BrowserDouble) -> None:
+async def test_parameter_changed_on_the_page_is_changed_by_the_page(panda: Played, page: FakeBrowser) -> None:
     await page.set("min area [px^2]", 300.0)
     await until(lambda: panda.sets)
     assert panda.sets == [({MIN_AREA: 300.0}, "page")]
@@ -73,20 +73,20 @@ async def test_parameter_changed_on_the_page_is_changed_by_the_page(panda: Playe
         page.label("fixed")
 
 
-async def test_parameter_changed_elsewhere_is_shown(panda: Played, page: BrowserDouble) -> None:
+async def test_parameter_changed_elsewhere_is_shown(panda: Played, page: FakeBrowser) -> None:
     await page.until(lambda: page.values[page.label("min area [px^2]")] == 60.0)
     panda.area = 120.0
     await page.until(lambda: page.values[page.label("min area [px^2]")] == 120.0)
 
 
-async def test_refused_parameter_is_told_and_goes_back(panda: Played, page: BrowserDouble) -> None:
+async def test_refused_parameter_is_told_and_goes_back(panda: Played, page: FakeBrowser) -> None:
     await page.set("min area [px^2]", 900.0)
     await page.until(lambda: "900.0 must be less than or equal to 500" in page.text)
     await page.until(lambda: page.values[page.label("min area [px^2]")] == 60.0)
     assert panda.area == 60.0
 
 
-async def test_dead_service_is_red_and_its_return_is_green(panda: Played, page: BrowserDouble) -> None:
+async def test_dead_service_is_red_and_its_return_is_green(panda: Played, page: FakeBrowser) -> None:
     supervisor = panda.bus.writer(topics.SUPERVISOR_STATUS)
 
     def say(**status: object) -> None:
@@ -103,7 +103,7 @@ async def test_dead_service_is_red_and_its_return_is_green(panda: Played, page: 
     await page.until(lambda: 'data-state="ready" data-pid="42" data-restarts="1"' in page.text)
 
 
-async def test_log_lines_are_text_whatever_is_in_them(panda: Played, page: BrowserDouble) -> None:
+async def test_log_lines_are_text_whatever_is_in_them(panda: Played, page: FakeBrowser) -> None:
     odd, log = (panda.bus.writer(topics.of_service(topics.LOG, name)) for name in ("<b>x", "y"))
     await until(lambda: log.matched)
     odd.put(m.LogLine(service="<b>x", level="warning", message="<script>alert(1)</script>"))
@@ -116,7 +116,7 @@ async def test_log_lines_are_text_whatever_is_in_them(panda: Played, page: Brows
 
 
 async def test_odd_messages_leave_the_page_and_the_service_as_they_are(
-    panda: Played, page: BrowserDouble, capfd: pytest.CaptureFixture[str]
+    panda: Played, page: FakeBrowser, capfd: pytest.CaptureFixture[str]
 ) -> None:
     await page.until(lambda: page.label("Planner") and page.label("Speed [%]"))
     speed = page.label("Speed [%]")
@@ -189,7 +189,7 @@ async def test_contour_that_is_clicked_in_the_scene_is_chosen(scenes: list[Scene
 
 
 async def test_layers_are_shown_as_ticked_also_before_the_scene_is_there(
-    panda: Played, page: BrowserDouble, scenes: list[SceneDouble]
+    panda: Played, page: FakeBrowser, scenes: list[SceneDouble]
 ) -> None:
     await until(lambda: scenes and scenes[0].begun)
     assert scenes[0].visible["targets"] and not scenes[0].visible["truth"]
@@ -305,7 +305,7 @@ STATUS = Topic("moving_status", MovingStatus, "state", "how far the moving is")
             page.label("Targets")
 
 
-async def test_rejected_places_are_counted_once(panda: Played, page: BrowserDouble) -> None:
+async def test_rejected_places_are_counted_once(panda: Played, page: FakeBrowser) -> None:
     writer = panda.bus.writer(REJECTED_TARGETS)
     panda.bus.writer(PICK_PLACE_STATUS).put(PickPlaceStatus())
     for x, reason in ((0.9, "too far"), (0.91, "too far"), (0.2, "too near"), (0.5, "inside the container")):
@@ -315,7 +315,7 @@ async def test_rejected_places_are_counted_once(panda: Played, page: BrowserDoub
 
 
 async def test_rejected_places_are_counted_no_more_when_nothing_lies_there_whoever_reset_the_world(
-    panda: Played, page: BrowserDouble
+    panda: Played, page: FakeBrowser
 ) -> None:
     panda.bus.writer(PICK_PLACE_STATUS).put(PickPlaceStatus())
     panda.bus.writer(REJECTED_TARGETS).put(m.Rejections(header=m.Header(stamp=10), rejected=[

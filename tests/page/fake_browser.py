@@ -24,7 +24,7 @@ CAMERA = {
 }
 
 
-class BrowserDouble:
+class FakeBrowser:
     """What a browser would show: `parts` are the fields and texts of the panels by their uuid.
 
     `kinds` are the types of the messages, in the order in which they came; `news` and `said` what came over the line.
@@ -144,7 +144,7 @@ class BrowserDouble:
 
 
 @asynccontextmanager
-async def opened(port: int, token: str = "") -> AsyncIterator[BrowserDouble]:
+async def opened(port: int, token: str = "") -> AsyncIterator[FakeBrowser]:
     """A page that is open inside the block, by somebody who has a token."""
     cookie = {"Cookie": f"zencell-{port}={token}"} if token else None
     async with (
@@ -152,7 +152,7 @@ async def opened(port: int, token: str = "") -> AsyncIterator[BrowserDouble]:
                 subprotocols=[Subprotocol(f"viser-v{viser.__version__}")], additional_headers=cookie) as connection,
         connect(f"ws://127.0.0.1:{port}/line", proxy=None, open_timeout=PATIENCE, additional_headers=cookie) as line,
     ):
-        browser = BrowserDouble(connection, line)
+        browser = FakeBrowser(connection, line)
         listening = {asyncio.create_task(browser.listen()), asyncio.create_task(browser.listen_to_the_line())}
         await browser.say(CAMERA)
         try:
