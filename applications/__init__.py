@@ -1,1 +1,1 @@
-"""What cells are for: one folder is one application. See common/application.py for what lies in one."""
+"""Applications of the project, one package each; `common/application.py` says what one declares."""

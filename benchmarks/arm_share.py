@@ -18,11 +18,11 @@ from typing import Any
 import msgpack
 from mcap.reader import make_reader
 
-from applications.pick_place.recheck import Recheck, Recording
+from applications.pick_place.contact_check import Recheck, Recording
 from common.application import find_application
 from common.config import load_cell
 from common.transport.codec import decode
-from recording.report.fold import Fold
+from recording.report.aggregator import RunAggregator
 
 ENDS = ("succeeded", "aborted", "cancelled")
 KINDS = {"motion/status": "arm", "gripper/state": "fingers"}
@@ -62,8 +62,8 @@ def told(recording: Path) -> str:
 def checked(recording: Path) -> str:
     """What the arm touched, in words."""
     cell, heard = load_cell(CELL), Recording()
-    fold = Fold(CELL, find_application(cell.application), listeners=heard.hears())
-    topics = {topic.key: topic for topic in heard.hears()}
+    fold = RunAggregator(CELL, find_application(cell.application), listeners=heard.listeners())
+    topics = {topic.key: topic for topic in heard.listeners()}
     with recording.open("rb") as file:
         for _, channel, message in make_reader(file).iter_messages():
             key = channel.topic.partition("/")[2]

@@ -20,8 +20,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from common.config import load_cell
+from lab.campaign import seeds_of
 from lab.simulation import Simulation
-from lab.telling import seeds_of
 
 _RTB = importlib.util.find_spec("rtbdata")
 RTB = Path(_RTB.submodule_search_locations[0]) / "xacro" if _RTB and _RTB.submodule_search_locations else None

@@ -19,10 +19,10 @@ from common.perception.camera_file import CameraFile
 from common.robot.transforms import invert, rpy_to_matrix, transform
 from tests.tools.calibration.rendered_boards import BOARD, Lens, many_poses, render
 from tools.calibration import board as calibration_board
-from tools.calibration.board import Sighting
-from tools.calibration.calibration import CollectingOptions, calibrate_intrinsics
+from tools.calibration.board import BoardDetection
 from tools.calibration.camera_pose import calibrate_pose
 from tools.calibration.corners import refine
+from tools.calibration.intrinsics import CollectingOptions, calibrate_intrinsics
 
 Array = npt.NDArray[np.float64]
 Placed = tuple[Array, npt.NDArray[np.bool_]]
@@ -94,7 +94,7 @@ def corner_errors(way: str, lens: Lens, poses: list[Array], pictures: list[Any])
         seen = [BOARD.find(picture, "x") for picture in pictures]
         spent = 1e3 * (time.thread_time() - start) / len(pictures)
     for T, found in zip(poses, seen, strict=True):
-        if isinstance(found, Sighting):
+        if isinstance(found, BoardDetection):
             rotation = cv2.Rodrigues(T[:3, :3])[0]
             truth = cv2.projectPoints(found.points, rotation, T[:3, 3], lens.k, np.array(lens.d))[0][:, 0]
             errors.append(np.linalg.norm(found.pixels - truth, axis=1))
@@ -145,12 +145,12 @@ def calibrations(sets: int) -> None:
         with by(way):
             figures: list[list[float]] = [[] for _ in head]
             for pictures in views:
-                seen = [found for picture in pictures if isinstance(found := BOARD.find(picture, "x"), Sighting)]
+                seen = [found for picture in pictures if isinstance(found := BOARD.find(picture, "x"), BoardDetection)]
                 lens_found = calibrate_intrinsics(seen, CollectingOptions())
                 figures[0].append(100 * max(abs(lens_found.k[0] / lens.fx - 1), abs(lens_found.k[1] / lens.fy - 1)))
                 figures[1].append(lens_found.rms)
             for placed in lying:
-                seen_at = [(T, [s for p in pictures if isinstance(s := BOARD.find(p, "x"), Sighting)])
+                seen_at = [(T, [s for p in pictures if isinstance(s := BOARD.find(p, "x"), BoardDetection)])
                            for T, pictures in placed]
                 for column, count in ((2, 1), (4, 2)):
                     found = calibrate_pose(seen_at[:count], camera).T_world_camera

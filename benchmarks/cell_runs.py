@@ -17,12 +17,12 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from applications.pick_place.recheck import Contact, Recheck, Recording
+from applications.pick_place.contact_check import Contact, Recheck, Recording
 from common.application import find_application
 from common.config import load_cell
 from common.transport.bus import Bus
 from common.transport.codec import decode
-from recording.report.fold import Fold
+from recording.report.aggregator import RunAggregator
 from tests.harness import RunningCell, beside, folder_for
 
 CELL = "panda"
@@ -59,7 +59,7 @@ class Result:
 async def record(bus: Bus, stop: asyncio.Event) -> Recording:
     """What is said about arm, hand and truth until `stop` is set; it is decoded when there is time for that."""
     recording = Recording()
-    fold = Fold(bus.cell, find_application(load_cell(CELL).application), listeners=recording.hears())
+    fold = RunAggregator(bus.cell, find_application(load_cell(CELL).application), listeners=recording.listeners())
     raw: list[tuple[str, bytes]] = []
     heard = {topic.key: topic for topic in fold.topics}
 
@@ -67,7 +67,7 @@ async def record(bus: Bus, stop: asyncio.Event) -> Recording:
         async for sample in bus.raw_reader(f"{bus.cell}/{key}"):
             raw.append((key, sample.payload))
 
-    async with beside(*(keep(topic.key) for topic in recording.hears())):
+    async with beside(*(keep(topic.key) for topic in recording.listeners())):
         await stop.wait()
     for key, payload in raw:
         fold.on(key, decode(heard[key].message, payload), 0.0, 0)

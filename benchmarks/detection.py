@@ -19,7 +19,7 @@ from applications.pick_place.detector import Detector
 from common.config import Surroundings, load_cell
 from common.messages import Color, Pose, Vector3, WorldObject
 from common.perception.pinhole import Pinhole
-from common.perception.sphere import wholly_in_view
+from common.perception.sphere import sphere_in_view
 from common.robot.model import RobotModel
 from common.scene.workspace import reach_reason
 from common.sim.rendering import draw
@@ -62,7 +62,7 @@ def placed(shape: Array, camera: Pinhole, radius: float, rng: np.random.Generato
         turned = (shape - shape.mean(axis=0)) @ np.array([(math.cos(a), math.sin(a)), (-math.sin(a), math.cos(a))])
         points = turned + rng.uniform((0.08, -0.43), (0.72, 0.43))
         balls = np.column_stack([points, np.full(len(points), radius)])
-        if all(wholly_in_view(camera, ball, radius, margin=1) for ball in balls):
+        if all(sphere_in_view(camera, ball, radius, margin=1) for ball in balls):
             return balls
 
 

@@ -22,12 +22,11 @@ from applications.pick_place.detector import Detector, DetectorOptions
 from benchmarks.detection import objects
 from common.config import Cell, Light, Scenery, Surroundings, load_cell
 from common.messages import Header, JointState, WorldObjects
-from common.perception.occlusion import Silhouettes
+from common.perception.occlusion import RobotSilhouettes
 from common.perception.sphere import silhouettes as outlines
 from common.robot.model import RobotModel
-from common.sim.camera import CameraParameters, SimulatedCamera
-from common.sim.lens import Lens
-from drivers.mujoco.gl import chosen_gl
+from common.sim.camera import CameraParameters, Lens, SimulatedCamera
+from drivers.mujoco.gl import select_gl
 
 DISTORTION = [0.08, -0.15, 0.001, -0.001]
 SIDE = {"position": (1.15, 0.0, 0.85), "rpy": (-2.4, 0.0, 1.5708)}  # of docs/detection.md
@@ -77,8 +76,8 @@ def main() -> None:
     around = Surroundings.model_validate({f: getattr(cell.world, f) for f in Surroundings.model_fields})
     around = around.model_copy(update={"cameras": {"camera": camera}, "camera": camera})
     robot = RobotModel.load(cell.robot)
-    silhouettes, detector = Silhouettes(robot, around.ball_radius), Detector(around, DetectorOptions())
-    print(f"drawn by {chosen_gl() or 'rays'}")
+    silhouettes, detector = RobotSilhouettes(robot, around.ball_radius), Detector(around, DetectorOptions())
+    print(f"drawn by {select_gl() or 'rays'}")
     errors: list[tuple[float, str]] = []
     missed, refused, surplus, reported, shown, spent = 0, 0, 0, 0, 0, 0.0
     for number in range(options.scenes):
@@ -87,7 +86,7 @@ def main() -> None:
         sensor = CameraParameters(auto_exposure=True, full_well=10_000, white_balance="off" if number % 2 else "auto")
         eye = SimulatedCamera(around, light, cell.robot, sensor, rng, plain=True,
                               lens=Lens(camera, distorted=True, rectify=True))
-        picture = eye.shoot(WorldObjects(objects=objects(places, around)), joints, 0).colour
+        picture = eye.capture(WorldObjects(objects=objects(places, around)), joints, 0).colour
         q = robot.order(joints.name, joints.position)
         assert q is not None
         hidden = silhouettes.hidden(eye.pinhole, [q])

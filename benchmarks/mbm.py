@@ -35,7 +35,8 @@ from common.config import Cell, load_cell
 from common.messages import CollisionObject, Header, JointGoal, PlanningScene, PlanRequest
 from common.planning.pipeline import PlanningPipeline
 from common.planning.robot_geometry import RobotGeometry
-from common.planning.validation import fine_samples, timed_path
+from common.planning.trajectory import timed_path
+from common.planning.validation import fine_samples
 from common.robot.model import RobotModel
 from common.robot.transforms import matrix_to_pose, pose_to_matrix
 

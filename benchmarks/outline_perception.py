@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from applications.outlining.contours import ContourOptions, find_contours, is_hole
-from applications.outlining.duplicates import simplified, without_duplicates
+from applications.outlining.solids import simplified, without_duplicates
 from applications.outlining.top_face import TopFaceOptions, top_face
 from common.config import Surroundings, World, check, config_root, load_robot, read_yaml
 from common.messages import Header, JointState, WorldObject
@@ -103,7 +103,7 @@ def arm(repeat: int) -> None:
         positions = positions + 0.01
         state = JointState(header=Header(), name=robot.joint_names, position=positions.tolist())
         start = time.perf_counter()
-        camera.see(objects, state)
+        camera.render(objects, state)
         times.append(1e3 * (time.perf_counter() - start))
     print(f"\na frame in which the arm has moved: {min(times[1:]):.0f} ms (at most 200 for 5 Hz)")
     compare_with_embree(meshes, camera.camera, repeat)

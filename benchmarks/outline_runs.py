@@ -17,9 +17,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from applications.outlining.figures import distances
-from applications.outlining.messages import OutlinePoints, OutlineStatus
-from applications.outlining.topics import CONTOUR_PATH, CONTOUR_POINTS, CONTOURS, OUTLINE_STATUS
+from applications.outlining.recording import distances
+from applications.outlining.topics import (
+    CONTOUR_PATH,
+    CONTOUR_POINTS,
+    CONTOURS,
+    OUTLINE_STATUS,
+    OutlinePoints,
+    OutlineStatus,
+)
 from common import topics
 from common.config import Cell, Surroundings, load_cell
 from common.messages import (

@@ -32,7 +32,8 @@ from common.messages import PlanResponse
 from common.planning.collision import interpolate
 from common.planning.pipeline import PlanningPipeline
 from common.planning.robot_geometry import RobotGeometry
-from common.planning.validation import fine_samples, timed_path
+from common.planning.trajectory import timed_path
+from common.planning.validation import fine_samples
 from common.robot.description import package_folders
 from common.robot.transforms import pose_to_matrix
 

@@ -21,7 +21,7 @@ from common.planning.ik import solve_ik
 from common.robot.model import RobotModel
 from common.robot.transforms import tool_down
 from common.sim.interface import load_world
-from drivers.mujoco.contact import TIMESTEP
+from drivers.mujoco.scene import TIMESTEP
 from drivers.mujoco.world import PhysicsWorld
 from tests.simulated.visited import SimulatedCell
 

@@ -19,11 +19,11 @@ from common.messages import Header, JointState, WorldObject
 from common.perception.pinhole import Pinhole
 from common.perception.sphere import silhouette
 from common.robot.model import RobotModel
-from common.sim.depth_sensor import DepthSensorParameters, measured_depth
+from common.sim.depth_sensor import DepthSensorParameters, simulate_depth
 from common.sim.interface import load_world
 from common.sim.lighting import REFERENCE
 from common.sim.sensor import Sensor, SensorParameters
-from drivers.mujoco.gl import chosen_gl
+from drivers.mujoco.gl import select_gl
 from drivers.mujoco.rendering import PhysicsRenderer
 
 EVEN = Scenery(lights={"above": Light(shadow=False)})
@@ -53,15 +53,15 @@ def draw_one(name: str, count: int) -> None:
     objects = load_world(cell.world, cell.world.objects).objects(Header()).objects
     print(f"{name}, {camera.width} x {camera.height}")
     for what, scenery, depth, gl in (
-        ("OpenGL with shadows", Scenery(), False, chosen_gl()), ("the same, and depth", Scenery(), True, chosen_gl()),
-        ("OpenGL without shadows", EVEN, False, chosen_gl()), ("rays, with depth", EVEN, True, ""),
+        ("OpenGL with shadows", Scenery(), False, select_gl()), ("the same, and depth", Scenery(), True, select_gl()),
+        ("OpenGL without shadows", EVEN, False, select_gl()), ("rays, with depth", EVEN, True, ""),
     ):
         renderer = PhysicsRenderer(cell.world, scenery, robot, camera, depth=depth, gl=gl)
         states = [at_home(robot, 0.01 * number) for number in range(2)]
 
         def draw(renderer: PhysicsRenderer = renderer, states: list[JointState] = states) -> object:
             states.reverse()  # it moved: else it would not be drawn again
-            return renderer.see(objects, states[0])
+            return renderer.render(objects, states[0])
 
         print(f"  {what:24} {cost(draw, count)}")
 
@@ -73,7 +73,7 @@ def sense(count: int) -> None:
     sensor = Sensor(SensorParameters(full_well=10_000, auto_exposure=True, white_balance="auto"), rng)
     print(f"  {'sensor, all automatic':24} {cost(lambda: sensor.expose([picture], np.full(3, REFERENCE)), count)}")
     stereo = DepthSensorParameters(baseline=0.075)
-    print(f"  {'depth sensor':24} {cost(lambda: measured_depth(depth, camera, stereo, rng), count)}")
+    print(f"  {'depth sensor':24} {cost(lambda: simulate_depth(depth, camera, stereo, rng), count)}")
 
 
 def errors() -> None:
@@ -81,7 +81,7 @@ def errors() -> None:
     cell = load_cell("panda")
     robot, camera = RobotModel.load(cell.robot), Pinhole.from_config(cell.world.camera)
     objects: list[WorldObject] = load_world(cell.world, cell.world.objects).objects(Header()).objects
-    seen = PhysicsRenderer(cell.world, EVEN, robot, camera, depth=False, gl=chosen_gl()).see(
+    seen = PhysicsRenderer(cell.world, EVEN, robot, camera, depth=False, gl=select_gl()).render(
         objects, at_home(robot, 2.8)).colour.astype(int)
     red = (seen[..., 2] > 60) & (seen[..., 2] > 3 * seen[..., :2].max(axis=2))
     _, _, _, middles = cv2.connectedComponentsWithStats(red.astype(np.uint8))
@@ -99,7 +99,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--pictures", type=int, default=10)
     count = parser.parse_args().pictures
-    print(f"drawn by {chosen_gl() or 'rays'}")
+    print(f"drawn by {select_gl() or 'rays'}")
     for name in ("panda", "ur5"):
         draw_one(name, count)
     print("640 x 480")

@@ -35,7 +35,7 @@ from common.messages import (
 )
 from common.planning.collision import CollisionWorld
 from common.planning.pipeline import PlanningPipeline
-from common.planning.validation import timed_path
+from common.planning.trajectory import timed_path
 from common.robot.model import RobotModel
 from common.robot.transforms import matrix_to_pose
 from common.scene.fixtures import fixture_objects

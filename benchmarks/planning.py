@@ -29,7 +29,8 @@ from common.messages import (
 )
 from common.planning.ik import solve_ik
 from common.planning.pipeline import PlanningPipeline
-from common.planning.validation import fine_samples, timed_path
+from common.planning.trajectory import timed_path
+from common.planning.validation import fine_samples
 from common.robot.model import RobotModel
 from common.robot.transforms import matrix_to_pose, tool_down
 

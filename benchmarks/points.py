@@ -5,10 +5,10 @@
 Ten boxes stand about the robot, seen by two cameras as so many points on their surfaces, a tenth of them on the robot
 itself; or so many primitives stand there, which together are as large. Pairs of random free positions are planned
 through the whole pipeline as configured, the same for all numbers of points. Set-up is all that comes before planning
-in a request: the robot and the scene are taken out, points are thinned, the collision world is made with shapes that
-it has had before. Every trajectory is looked at again at 0.005 rad against the boxes themselves; ends with 1 where one
-collides, but for fewer than 100,000 points, which are too far apart to show the boxes. Times are [ms]: wall, and of the
-process on all processors ("cpu").
+in a request: the robot and the scene are taken out, points are downsampled, the collision world is made with
+shapes that it has had before. Every trajectory is looked at again at 0.005 rad against the boxes themselves; ends
+with 1 where one collides, but for fewer than 100,000 points, which are too far apart to show the boxes. Times are
+[ms]: wall, and of the process on all processors ("cpu").
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from common.messages import CollisionObject, Header, JointGoal, PlanningScene, P
 from common.planning.collision import CollisionWorld, interpolate
 from common.planning.obstacles import ObstacleCache
 from common.planning.pipeline import PlanningPipeline
-from common.planning.points import KnownShapes, PointObstacle, View
+from common.planning.point_obstacles import CameraView, KnownShapeFilter, PointObstacle
 from common.robot.model import RobotModel
 
 Array = NDArray[np.float64]
@@ -45,7 +45,7 @@ class Bench:
         cell = load_cell(robot)
         self.robot, self.padding = RobotModel.load(cell.robot), cell.motion.object_padding
         self.pipeline = PlanningPipeline(self.robot, cell.motion, cell.pipeline)
-        self.known = KnownShapes(self.pipeline.geometry)
+        self.known = KnownShapeFilter(self.pipeline.geometry)
         self.seed, self.pairs = seed, pairs
         self.boxes = self.primitives(BOXES)
         self.home = self.robot.named("home")
@@ -82,7 +82,7 @@ class Bench:
     def _cache(self) -> ObstacleCache:
         return ObstacleCache(self.pipeline.geometry)
 
-    def views(self, count: int) -> list[View]:
+    def views(self, count: int) -> list[CameraView]:
         """So many points on the boxes and on the robot, half of them from each of two cameras."""
         rng, middles = np.random.default_rng(self.seed + 2), np.array([list(_at(box)) for box in self.boxes])
         side = self.boxes[0].dimensions[0]
@@ -93,7 +93,7 @@ class Bench:
         own = rng.uniform(size=count) < 0.1
         links = np.array([T[:3, 3] for T in self.robot.link_poses(self.home).values()])
         points[own] = links[rng.integers(len(links), size=int(own.sum()))]
-        return [View(f"camera_{k}", points[k::2], self.home) for k in range(2)]
+        return [CameraView(f"camera_{k}", points[k::2], self.home) for k in range(2)]
 
     def world(self, scene: PlanningScene, points: list[PointObstacle], cache: ObstacleCache) -> CollisionWorld:
         """The world at home."""

@@ -15,7 +15,6 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from unittest.mock import patch
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,8 +25,7 @@ from common.config import load_cell
 from common.messages import JointGoal, PlanningScene, PlanRequest
 from common.planning import ik
 from common.planning.collision import CollisionWorld
-from common.planning.kernel.library import library
-from common.planning.kernel.world import NoKernel
+from common.planning.kernel.library import library, without_kernel
 from common.planning.pipeline import PlanningPipeline
 from common.robot.model import RobotModel
 
@@ -52,7 +50,7 @@ def comparisons(cell: str) -> dict[str, tuple[Side, Side]]:
         return CollisionWorld(robot, scene, start=robot.named("home"), padding=0.01)
 
     ours = world()
-    with patch("common.planning.obstacles.KernelWorld", side_effect=NoKernel("left out to compare")):
+    with without_kernel():
         theirs = world()
     assert ours.kernel is not None and theirs.kernel is None
     blocked = [(a, b) for a, b in pairs if not ours.edge_free(a, b)]
@@ -69,7 +67,7 @@ def comparisons(cell: str) -> dict[str, tuple[Side, Side]]:
     possible = [(a, b) for a, b in blocked if plan("rrt_connect", a, b)][:6]
 
     def without() -> object:
-        with patch.object(ik, "_arm", return_value=None):
+        with without_kernel():
             return [ik.solve_ik(robot, T, robot.named("home")) for T in poses]
 
     return {

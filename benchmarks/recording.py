@@ -19,7 +19,7 @@ from applications.outlining.topics import CONTOURS
 from applications.pick_place.topics import DETECTED_OBJECTS
 from common import topics
 from common.messages import SupervisorStatus
-from recording.reading import Recording
+from recording.reader import Recording
 from recording.summary import Summary, summarise
 from tests.harness import RunningCell, command_line, environment, folder_for, until
 

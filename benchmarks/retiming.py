@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from common.config import load_cell
 from common.planning.path import SmoothPath, blended_path
 from common.planning.retiming import limited_jerk, parametrise
-from common.planning.timing import BLENDS, LIMIT_SHARE
+from common.planning.waypoint_timing import BLENDS, LIMIT_SHARE
 from common.robot.model import RobotModel
 
 Array = NDArray[np.float64]

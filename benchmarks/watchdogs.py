@@ -14,8 +14,7 @@ from pathlib import Path
 
 import psutil
 
-from applications.pick_place.messages import PickPlaceStatus
-from applications.pick_place.topics import PICK_PLACE_STATUS
+from applications.pick_place.topics import PICK_PLACE_STATUS, PickPlaceStatus
 from common import topics
 from common.messages import MotionStatus, ServiceStatus, SupervisorStatus
 from common.transport.bus import Bus

@@ -65,15 +65,14 @@ def intrinsics(
 ) -> None:
     """Find focal lengths, centre and distortion from views of the board all over the picture, tilted to each side."""
     from common.config import check
-    from common.perception.sources import pictures
-    from tools.calibration.calibration import CollectingOptions, ViewCollector, calibrate_intrinsics
-    from tools.calibration.formatting import intrinsics_told
-    from tools.calibration.record import camera_of
+    from common.perception.image_sources import pictures
+    from tools.calibration.intrinsics import CollectingOptions, ViewSelector, calibrate_intrinsics
+    from tools.calibration.report import camera_from_intrinsics, format_intrinsics
 
     least = options.whole("--views", views, 3) or 3
     settings = check(CollectingOptions, {"least_views": least, "most_views": max(60, least),
                                          "k_coefficients": options.whole("--k-coefficients", k_coefficients, 0)})
-    collector = ViewCollector(board_of(squares, square, marker, dictionary), settings)
+    collector = ViewSelector(board_of(squares, square, marker, dictionary), settings)
     terminal = sys.stderr.isatty()
     for name, picture in pictures(source, parse_size(size), options.number("--seconds", seconds)):
         reason = collector.add(picture, name)
@@ -85,12 +84,12 @@ def intrinsics(
             break
     collector.require_enough()
     found = calibrate_intrinsics(collector.views, settings)
-    camera = camera_of(found, source, str(collector.board.options))
+    camera = camera_from_intrinsics(found, source, str(collector.board.options))
     old = Path(output).expanduser()
     if old.is_file() and "position:" in old.read_text(encoding="utf-8", errors="replace"):
         echo(f"{output} had a pose, which was found with other intrinsics and is gone: calibrate it again")
     camera.save(output)
-    echo(intrinsics_told(found))
+    echo(format_intrinsics(found))
     echo(f"{output} holds the intrinsics; next: zencell calibrate pose SOURCE --intrinsics {output} ...")
 
 
@@ -123,9 +122,8 @@ def pose(
     """
     from common.perception.camera_file import CameraFile
     from common.robot.transforms import rpy_to_matrix, transform
-    from tools.calibration.camera_pose import calibrate_pose, sightings_in
-    from tools.calibration.formatting import pose_told
-    from tools.calibration.record import with_pose
+    from tools.calibration.camera_pose import calibrate_pose, detect_boards_in
+    from tools.calibration.report import format_pose, with_pose
 
     rotations = board_rpy or ["0,0,0"]
     if len(board_position) != len(sources):
@@ -137,12 +135,12 @@ def pose(
     angles = [options.three("--board-rpy", text) for text in rotations]
     camera, board = CameraFile.load(intrinsics_file), board_of(squares, square, marker, dictionary)
     most, limit = options.whole("--pictures", pictures_of_each, 1) or 1, options.number("--seconds", seconds)
-    places = [(transform(rpy_to_matrix(*rpy), position), sightings_in(source, board, camera, most, limit))
+    places = [(transform(rpy_to_matrix(*rpy), position), detect_boards_in(source, board, camera, most, limit))
               for source, position, rpy in zip(sources, positions, angles, strict=True)]
     result = calibrate_pose(places, camera)
     file = output or intrinsics_file
     with_pose(camera, result, sources, positions, angles).save(file)
-    echo(pose_told(result))
+    echo(format_pose(result))
     echo(f"{file} holds intrinsics and pose; a cell takes both with --set world.camera={file}")
 
 
@@ -162,10 +160,9 @@ def hand_eye(
     from typing import get_args
 
     from common.perception.camera_file import CameraFile
-    from tools.calibration.calibration import CalibrationFailed
-    from tools.calibration.formatting import hand_eye_told
     from tools.calibration.hand_eye import LEAST_VIEWS, Mount, calibrate_hand_eye
-    from tools.calibration.record import with_hand_eye
+    from tools.calibration.intrinsics import CalibrationFailed
+    from tools.calibration.report import format_hand_eye, with_hand_eye
     from tools.calibration.views import load_views
 
     if mount not in get_args(Mount):
@@ -177,7 +174,7 @@ def hand_eye(
     result = calibrate_hand_eye(views, camera, "hand" if mount == "hand" else "beside")
     file = output or intrinsics_file
     with_hand_eye(camera, result, folder, said.robot, mount).save(file)
-    echo(hand_eye_told(result))
+    echo(format_hand_eye(result))
     place = "the place on the hand" if mount == "hand" else "pose"
     echo(f"{file} holds intrinsics and {place}; a cell takes both with --set world.camera={file}")
     echo(result.verdict)
@@ -198,12 +195,11 @@ def collect(
     """
     from common.config import load_robot
     from common.robot.model import RobotModel
-    from tools.calibration.collecting import collect_views
-    from tools.calibration.views import ViewCollector
+    from tools.calibration.views import HandEyeCollector, collect_views
 
     model = RobotModel.load(load_robot(robot))
     board, wanted = board_of(squares, square, marker, dictionary), options.whole("--views", views, 1) or 1
-    collector = ViewCollector(Path(folder).expanduser(), model, robot, board)
+    collector = HandEyeCollector(Path(folder).expanduser(), model, robot, board)
     at.visit(lambda bus: collect_views(bus, key, collector, wanted, echo))
     echo(f"{folder} holds {collector.count} views; next: zencell calibrate hand-eye {folder} --intrinsics FILE "
          "--camera hand|beside")

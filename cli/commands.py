@@ -60,8 +60,8 @@ def send(at: Place, request: Request[Any, Any], message: Message, timeout: float
     from common.messages import TaskCommand
 
     async def visit(joined: Client) -> Message:
-        if isinstance(message, TaskCommand) and message.command in ("start", "resume") and message.heard is None:
-            message.heard = await newest_heard(joined.bus)
+        if isinstance(message, TaskCommand) and message.command in ("start", "resume") and message.acknowledged is None:
+            message.acknowledged = await newest_heard(joined.bus)
         answer: Message = await joined.call(request, message, timeout=timeout)
         return answer
 

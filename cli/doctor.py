@@ -16,7 +16,7 @@ def doctor(
 ) -> None:
     """Check this machine and say what to do about what is not well; exit 1 if something fails."""
     from common.transport.endpoint import endpoint_of
-    from tools.doctor.examining import examine
+    from tools.doctor.examination import examine
 
     endpoint = endpoint_of(domain, connect)
     failed = False

@@ -10,11 +10,11 @@ import typer
 from cli.recording import Exclude, File
 from common.errors import ConfigError
 from common.terminal import echo, printable
-from recording.telling import in_bytes, require_new
+from recording.summary import in_bytes, require_new
 
 if TYPE_CHECKING:
-    from recording.decoding import Decoder
-    from recording.reading import Recording
+    from recording.reader import Recording
+    from recording.sample import Decoder
     from recording.selection import Selection
 
 
@@ -32,8 +32,8 @@ def export(
     exclude: Exclude = None,
 ) -> None:
     """Write a recording as what other programs read: Foxglove, tables, pictures, a video."""
-    from recording.decoding import Decoder
-    from recording.reading import Recording
+    from recording.reader import Recording
+    from recording.sample import Decoder
     from recording.selection import Selection
 
     if not (foxglove or csv or images or video):
@@ -63,22 +63,21 @@ def export(
 
 
 def _foxglove(recording: Recording, target: Path, selection: Selection, decoder: Decoder) -> None:
-    from recording.foxglove import export as export_foxglove
+    from recording.foxglove import export_foxglove
 
     count = export_foxglove(recording, target, selection.wants, decoder)
     echo(f"{target}: {count:,} messages, {in_bytes(target.stat().st_size)}, for Foxglove")
 
 
 def _tables(recording: Recording, folder: Path, selection: Selection, decoder: Decoder) -> None:
-    from recording.tables import export as export_tables
+    from recording.export import export_tables
 
     for name, count in export_tables(recording, folder, selection.wants, decoder).items():
         echo(f"{folder / name}: {count:,} rows")
 
 
 def _images(recording: Recording, folder: Path, selection: Selection, decoder: Decoder) -> None:
-    from recording.names import file_names
-    from recording.pictures import export_images, image_topics
+    from recording.export import export_images, file_names, image_topics
 
     if not image_topics(recording, selection.wants):
         raise ConfigError("--images", str(recording.path), "has no pictures among what is to be exported")
@@ -88,7 +87,7 @@ def _images(recording: Recording, folder: Path, selection: Selection, decoder: D
 
 
 def _video(recording: Recording, target: Path, selection: Selection, decoder: Decoder) -> None:
-    from recording.pictures import export_video, image_topics
+    from recording.export import export_video, image_topics
 
     choices = image_topics(recording, selection.wants)
     if len(choices) != 1:

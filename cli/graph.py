@@ -17,7 +17,7 @@ from common.terminal import echo
 if TYPE_CHECKING:
     from common.config import Cell
     from common.supervision.wired import Wired
-    from tools.graph.drawing import Graph
+    from tools.graph import Graph
 
 FORMATS = (".svg", ".dot", ".mmd")
 
@@ -39,7 +39,7 @@ def graph(
     """Draw services and topics of a cell, up or not; while it is up, what is not alive is dashed."""
     from common.config import load_cell
     from security.page_tokens import VIEWER
-    from tools.graph.drawing import graph_of, names
+    from tools.graph import graph_of, names
 
     path = Path(output).expanduser() if output else None
     write = _writer_of(path)
@@ -57,8 +57,7 @@ def graph(
 
 
 def _writer_of(path: Path | None) -> Callable[[Graph], str]:
-    from tools.graph.drawing import dot, mermaid
-    from tools.graph.svg import svg
+    from tools.graph import dot, mermaid, svg
 
     writers = dict(zip(FORMATS, (svg, dot, mermaid), strict=True))
     if path is None:

@@ -50,8 +50,8 @@ def play_(
     """
     from common.remapping import is_cell
     from common.transport.credentials import refuse_to_publish
-    from recording.playing import play, played_of, renaming
-    from recording.reading import Recording
+    from recording.player import play, played_of, renaming
+    from recording.reader import Recording
     from recording.selection import Selection
 
     refuse_to_publish("play")

@@ -16,7 +16,7 @@ from cli.completing import offers
 from cli.place import UP, Place
 from common.errors import ConfigError
 from common.terminal import echo, rewrite
-from recording.telling import contents, in_bytes, require_new
+from recording.summary import contents, in_bytes, require_new
 
 LEAST_FILE = 1.0  # [MB] of a recording that is split
 
@@ -44,14 +44,14 @@ def record_(
     """Record what travels in a cell, all keys if none are given, until Ctrl-C."""
     from common.config import load_cell
     from common.transport.credentials import identity_of_listener
-    from recording.own import Own
-    from recording.recorder import Asked, record, record_gated, require_published
+    from recording.capture import CustomTopics
+    from recording.recorder import RecordRequest, record, record_gated, require_published
     from recording.selection import Selection
 
-    beside, cell = Own.read(own) if own else Own(), at.cell
+    beside, cell = CustomTopics.read(own) if own else CustomTopics(), at.cell
     if cell is not None and cell.endswith((".yaml", ".yml")):
         loaded = load_cell(cell)
-        cell, beside = loaded.name, Own.of(loaded)
+        cell, beside = loaded.name, CustomTopics.of(loaded)
     selection = Selection.of(keys or (), regex, exclude)
     require_published(selection)
     seconds = _positive("--duration", duration)
@@ -60,8 +60,9 @@ def record_(
         raise ConfigError("--max-size", max_size, f"must be {LEAST_FILE:g} or more")
     if output:
         require_new(Path(output))
-    asked = Asked(selection, Path(output) if output else None, None if megabytes is None else round(megabytes * 1e6),
-                  seconds, gate, beside)
+    asked = RecordRequest(
+        selection, Path(output) if output else None, None if megabytes is None else round(megabytes * 1e6), seconds,
+        gate, beside)
     show = rewrite if sys.stderr.isatty() else None
     if gate:
         asyncio.run(record_gated(asked, cell, at.domain, at.connect, echo, show))
@@ -80,7 +81,7 @@ def _positive(option: str, text: str | None) -> float | None:
 
 def info(file: File, as_json: options.Json = False) -> None:
     """Show what is in a recording: each topic with its type, count, rate and size, how long it is, what was lost."""
-    from recording.reading import Recording
+    from recording.reader import Recording
     from recording.summary import summarise
 
     with Recording(Path(file)) as recording:
@@ -99,7 +100,7 @@ def recover(
     ] = None,
 ) -> None:
     """Make a whole file of a recording that was cut by a kill or a full disk."""
-    from recording.recovery import recover as recover_file
+    from recording.reader import recover as recover_file
 
     source = Path(file)
     target = Path(output) if output else source.with_name(f"{source.stem}_recovered.mcap")

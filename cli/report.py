@@ -24,8 +24,8 @@ def report(
     ] = None,
 ) -> None:
     """Write one page about a recorded run: timeline, plans, latency, joints, what was seen, and what went wrong."""
-    from recording.reading import Recording
-    from recording.report.recorded import cut, page_of
+    from recording.reader import Recording
+    from recording.report.build import build_report, cut
     from recording.sample import RecordingError
 
     path = Path(file)
@@ -37,7 +37,7 @@ def report(
     with Recording(path) as recording:
         try:
             with warnings.catch_warnings(action="ignore"):  # of numbers that no picture can show
-                text = page_of(recording, cell)
+                text = build_report(recording, cell)
         except CANNOT_BE_SHOWN as error:
             raise RecordingError(f"{path}: has values that cannot be shown: {type(error).__name__}: {error}") from error
         if not recording.finished:

@@ -131,12 +131,12 @@ def _numbers(bits: int) -> str:
 def owner(at: Place = UP) -> None:
     """Print whose the motion is: nobody else's begins. Stops and holds are everybody's."""
     told = at.join(lambda cell: cell.arm.owner_now())
-    echo(f"the motion is {told.told}{', who jogs the arm' if told.jogging else ''}")
+    echo(f"the motion is {told.description}{', who jogs the arm' if told.jogging else ''}")
 
 
 def _own(at: Place, act: Literal["take", "give"], *, over: bool = False) -> None:
     told = at.join(lambda cell: cell.arm.own(act, over=over, kind="operator"))
-    echo(f"the motion is {told.told}")
+    echo(f"the motion is {told.description}")
 
 
 @app.command()

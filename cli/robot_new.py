@@ -41,11 +41,9 @@ def new(
     """Write a robot file for an arm from its URDF: what it says, what is measured on it, and guesses marked as such."""
     from common.config import names_of
     from common.robot.merging import read_urdf
-    from tools.robot_setup.cell_like import layout_of, write_cell
-    from tools.robot_setup.meshes import folders_of_meshes
+    from tools.robot_setup.files import folders_of_meshes, robot_file, world_layout, write_cell
     from tools.robot_setup.proposal import draft, finish
     from tools.robot_setup.tree import find_wrists, read_tree
-    from tools.robot_setup.writing import robot_file
 
     sources = {"urdf": urdf, "--gripper": gripper}
     urdf, gripper = (_described(each, out, force) for each in (urdf, gripper))
@@ -67,7 +65,7 @@ def new(
         _writable("--cell", Path(cell).expanduser(), force)
         if Path(cell).expanduser().resolve() == path.resolve():
             raise ConfigError("--cell", cell, "is where the robot is written: name another file")
-        layout = layout_of(template)
+        layout = world_layout(template)
     wrists = find_wrists(tree)
     if tip is None and len(wrists) > 1 and not yes:
         longest = max(wrists, key=lambda link: len(tree.above(link)))
@@ -102,7 +100,7 @@ def check(
     from common.config import load_robot
     from common.planning.robot_geometry import RobotGeometry
     from common.robot.model import RobotModel
-    from tools.robot_setup.hand import complaints
+    from tools.robot_setup.end_effector import complaints
     from tools.robot_setup.home import hits
 
     robot = RobotModel.load(load_robot(name))
@@ -148,7 +146,7 @@ def _described(urdf: str, out: str, force: bool) -> str:
     """The URDF, made of a xacro file where it is one."""
     if not urdf.endswith(".xacro"):
         return urdf
-    from tools.robot_setup.xacro import urdf_of_xacro
+    from tools.robot_setup.files import urdf_of_xacro
 
     return urdf_of_xacro(urdf, Path(out).expanduser().parent if out else Path(), overwrite=force)
 

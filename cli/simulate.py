@@ -43,9 +43,9 @@ def simulate(
     from common.config import load_cell
     from common.errors import ConfigError
     from common.process.environment import usable_cores
+    from lab.campaign import seeds_of
     from lab.doubles import settings_of, with_doubles
-    from lab.telling import seeds_of
-    from lab.watched_arm import with_watched_arm
+    from lab.observed_arm import with_observed_arm
 
     if seeds is not None and seed is not None:
         raise ConfigError("--seed", seed, "does not go with --seeds")
@@ -61,7 +61,7 @@ def simulate(
     if doubles:
         given = (*settings_of(loaded.application), *(overrides or ()))
         loaded = with_doubles(load_cell(cell, given, world=world))
-    with_watched_arm(loaded)  # says in one line what cannot be simulated
+    with_observed_arm(loaded)  # says in one line what cannot be simulated
     if one is None:
         raise typer.Exit(_campaign(loaded, several, faults, at_a_time, longest))
     raise typer.Exit(_single(loaded, one, faults, trace, longest))
@@ -69,23 +69,22 @@ def simulate(
 
 def _single(cell: Cell, seed: int, faults: bool, file: str | None, limit: float) -> int:
     """Run one seed and tell of all that happened; the exit code."""
-    from lab.simulation import Simulation
-    from lab.telling import told
-    from lab.trace import Trace
-    from recording.own import Own
-    from recording.telling import about, require_new
+    from lab.campaign import format_outcome
+    from lab.simulation import Simulation, Trace
+    from recording.capture import CustomTopics
+    from recording.summary import about, require_new
 
     trace = None
     if file is not None:
         require_new(Path(file), "--trace")
-        trace = Trace(Path(file), about(cell.name), Own.of(cell))
+        trace = Trace(Path(file), about(cell.name), CustomTopics.of(cell))
     simulation = Simulation(cell, seed, faults=faults, limit=limit, digest=True, trace=trace, tell=echo)
     try:
         outcome = simulation.run()
     finally:
         if trace is not None:
             trace.close("simulated")
-    for line in told(outcome):
+    for line in format_outcome(outcome):
         echo(line)
     if trace is not None:
         echo(f"recorded {trace.messages:,} messages: {file}")
@@ -97,8 +96,7 @@ def _campaign(cell: Cell, seeds: Sequence[int], faults: bool, jobs: int, limit: 
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    from lab.campaign import Tally, run_seeds
-    from lab.telling import reason, table
+    from lab.campaign import Tally, reason, run_seeds, table
 
     tally, interrupted = Tally(), False
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())

@@ -15,7 +15,7 @@ from cli import options
 from cli.place import Place
 from common.application import Application, applications, find_application
 from common.errors import ConfigError
-from common.verbs import BeforeRun
+from common.verbs import BeforeRun, Verbs
 
 if TYPE_CHECKING:
     from common.config import Cell
@@ -107,12 +107,15 @@ class ApplicationVerbs:
         if application.name in self._known:
             return
         self._known.add(application.name)
-        for name, verb in (application.find("verbs", "VERBS") or {}).items():
+        verbs: Verbs | None = application.verbs
+        if verbs is None:
+            return
+        for name, verb in verbs.commands.items():
             group, _, last = name.rpartition(" ")
             (self._groups[group] if group else self._app).command(last)(with_shared_options(verb))
-        if (before := application.find("verbs", "before_run")) is not None:
-            add_options(self._run, before, self._last)
-            BEFORE_RUN.append(before)
+        if verbs.before_run is not None:
+            add_options(self._run, verbs.before_run, self._last)
+            BEFORE_RUN.append(verbs.before_run)
 
 
 BEFORE_RUN: list[Callable[..., BeforeRun]] = []

@@ -1,235 +1,303 @@
-"""Applications: what a cell is for. The platform names none; it finds them.
+"""Applications: what a cell is used for. The platform names none; it finds them by name.
 
-An application is a package of applications, or a dotted module of a person's own, which may be a single file.
-What it brings lies in modules of these names within the package, or else in the file itself:
+An application is a package of `applications/`, an installed entry point of the group `zencell.applications`, or a
+dotted module of the user (a package or a single file). The module declares it as one object:
 
-    topics    its keys as `Topic` and `Request`, with their messages; and, by these names, the ones that all look for:
-                STATUS     on which its task says how far it is: a `Topic` of a `TaskStatus`
-                DECIDED_BY (optional) a stream whose stamp is that of the picture by which the task decides
-                REJECTED   (optional) a `Topic` of `Rejections`: what the task is not offered, and why
-                DETECTED   (optional) a `Topic` of `MarkerArray`: what was found, in world; a rejection of what is found
-                           there no more is over
-                ANNOTATED  (optional) a `Topic` of `Image`: the picture with what was found in it
-                MASK       (optional) a `Topic` of `Image`: white where that was looked for
-                VIEWS      (optional) {Topic: function(WorldObjects) -> message}: truth as the application calls it,
-                           published by whoever simulates the world
-    figures   (optional) what the summary, the report and the recheck say of a run
-    truth     (optional) `wrong_in(WorldObjects) -> str`: what is wrong with where things really are when the task says
-              DONE, in words; empty when nothing is. For the evaluation of a simulated run only
-    page      (optional) labels and layers of the operator's page
-    recording (optional) how its messages are written for other tools, as recording/foxglove.py says
-    verbs     (optional) verbs of the command line, as common/verbs.py says
-    checks    (optional) what `zencell check` finds beside its own, as generators of findings: `quick(cell)`, from the
-                files alone, and `reach(cell, arm)`, with an arm of tools/check/arm.py
-    reach     (optional) for `zencell robot new --cell`:
-                fitted(RobotModel, tree of a cell file) -> that tree with a world in reach of the robot
-    double    (optional) a service, with `Config` and `run`, that stands for its perception in `simulate --doubles`:
-                REPLACES   kinds of the services that it stands for
-                SETTINGS   (optional) of a cell in which it does, as of `--set`: what makes a run short
+    APPLICATION = Application(topics=ApplicationTopics(status=STATUS), grasps=True)
 
-`TASK` in the package itself names the service that decides; without it the cell's `task` does. `GRASPS = True` says
-that the task takes objects in the hand, `FILLS = True` that `done` of its status counts those in containers.
+Parts that take long to import are named instead: `page="my_app.page:PAGE"` is imported when the page is built.
 """
 
 from __future__ import annotations
 
+import copy
 import importlib
-import importlib.util
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
 from functools import cache
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, Generic, TypeVar, overload
 
 from common.errors import ConfigError, UnknownName
 from common.plugins import find_plugin, plugin_names
 
-if TYPE_CHECKING:  # they take longer to load than a person at the command line wants to wait
+if TYPE_CHECKING:  # these imports take too long for the command line and shell completion
     from common.messages import Message, TaskStatus, WorldObjects
     from common.topics import AnyTopic, Request, Topic
 
+T = TypeVar("T")
+
 GROUP = "zencell.applications"
+VARIABLE = "APPLICATION"
 
 
-@dataclass(frozen=True)
+class Lazy(Generic[T]):
+    """A field that holds a part itself, or the reference "package.module:NAME" that is imported on first access."""
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        """Remember under which name the instance stores the value."""
+        self._name, self._stored = name, f"_{name}"
+
+    @overload
+    def __get__(self, instance: None, owner: type) -> None: ...
+
+    @overload
+    def __get__(self, instance: object, owner: type) -> T | None: ...
+
+    def __get__(self, instance: object | None, owner: type) -> T | None:
+        """Return the part; None where the application has none.
+
+        Raises:
+            ConfigError: the reference cannot be imported.
+        """
+        if instance is None:
+            return None  # the default value of the field
+        found = vars(instance)[self._stored]
+        if isinstance(found, str):
+            found = vars(instance)[self._stored] = _imported_part(found, f"application.{self._name}")
+        part: T | None = found
+        return part
+
+    def __set__(self, instance: object, value: T | str | None) -> None:
+        """Store the part or its reference."""
+        vars(instance)[self._stored] = value
+
+
+@dataclass(frozen=True, kw_only=True)
+class ApplicationTopics:
+    """The topics of an application and what the platform uses them for."""
+
+    status: Topic[Any]
+    """State and progress, published by the task; its message derives from `TaskStatus`."""
+    decided_by: Topic[Any] | None = None
+    """Stream whose stamp is that of the image by which the task decides; its age is the perception latency."""
+    rejected: Topic[Any] | None = None
+    """`Rejections`: detections that the task is not offered, with the reason."""
+    detected: Topic[Any] | None = None
+    """`MarkerArray`: detections in world; a rejection ends once nothing is detected there any more."""
+    annotated: Topic[Any] | None = None
+    """`Image`: the camera image with the detections drawn in."""
+    mask: Topic[Any] | None = None
+    """`Image`: white where a pixel has a color that the detector looks for."""
+    truth_views: Mapping[Topic[Any], Callable[[WorldObjects], Message]] = field(default_factory=dict)
+    """Simulated ground truth in the messages of the application; the simulator publishes each under its topic."""
+    declared: Sequence[Topic[Any] | Request[Any, Any]] = ()
+    """All topics and requests of the application, in the order of the documentation."""
+
+    @property
+    def by_key(self) -> dict[str, AnyTopic]:
+        """The application's topics and requests by key, without those of the platform."""
+        from common.topics import Topic, platform_topics
+
+        roles = (getattr(self, each.name) for each in fields(self))
+        found = [*self.declared, *(topic for topic in roles if isinstance(topic, Topic)), *self.truth_views]
+        shared = platform_topics()
+        return {topic.key: topic for topic in found if topic.key not in shared}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Checks:
+    """What `zencell check` finds in a cell of the application, each a generator of `tools.check.finding.Finding`."""
+
+    quick: Callable[..., Iterator[Any]] | None = None
+    """`quick(cell)`: what the files tell."""
+    reach: Callable[..., Iterator[Any]] | None = None
+    """`reach(cell, arm)`: what needs the robot model, with a `tools.check.arm.Arm`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimulationDouble:
+    """A service that replaces the perception of the application in `zencell simulate --doubles`."""
+
+    module: str
+    """Dotted name of the service module, with `Config` and `run`."""
+    replaces: tuple[str, ...]
+    """Kinds of the services that it replaces."""
+    settings: tuple[str, ...] = ()
+    """Values of the cell for such a run, as in `--set`: they make it short."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class Application:
-    """An application by its name in applications, or by that of its own dotted module."""
+    """What an application brings. All but `topics` is optional."""
 
-    name: str
-
-    @property
-    def module(self) -> ModuleType:
-        """The package, or the single file."""
-        return find_plugin(GROUP, self.name, field="application", noun="application")
-
-    def part(self, name: str) -> ModuleType | None:
-        """The module of that name within the package, or None; a single file is all parts of itself."""
-        module = self.module
-        if not hasattr(module, "__path__"):
-            return module
-        full = f"{module.__name__}.{name}"
-        return importlib.import_module(full) if importlib.util.find_spec(full) else None
-
-    def find(self, part: str, name: str) -> Any:
-        """What a part calls by that name, or None."""
-        return getattr(self.part(part), name, None)
-
-    @property
-    def task(self) -> str:
-        """The service that decides; empty when the cell says it."""
-        return str(getattr(self.module, "TASK", ""))
-
-    @property
-    def grasps(self) -> bool:
-        """Whether its task takes objects in the hand, which then may slip."""
-        return bool(getattr(self.module, "GRASPS", False))
-
-    @property
-    def fills(self) -> bool:
-        """Whether what its task has done lies in containers."""
-        return bool(getattr(self.module, "FILLS", False))
+    topics: Lazy[ApplicationTopics] = Lazy()
+    """Its topics; `status` is required."""
+    task: str = ""
+    """Service that decides; empty: the one that the cell file names as `task`, or the application's own module."""
+    grasps: bool = False
+    """Whether the task holds objects with the gripper, which then may slip."""
+    fills_containers: bool = False
+    """Whether `done` of the status counts objects in containers."""
+    default: bool = False
+    """Whether cell files that name a task but no application get this one."""
+    figures: Lazy[Any] = Lazy()
+    """Class derived from `recording.report.application.Figures`: what summary and report show of a run."""
+    foxglove: Lazy[Sequence[Any]] = Lazy()
+    """Converters of its messages for Foxglove, as `recording.foxglove.KINDS`."""
+    truth_check: Lazy[Callable[[WorldObjects], str]] = Lazy()
+    """Returns what is wrong with the simulated world once the task reports DONE, empty for nothing; evaluation only."""
+    page: Lazy[Any] = Lazy()
+    """`page.application.ApplicationPage`: layers, controls and labels on the operator's page."""
+    verbs: Lazy[Any] = Lazy()
+    """`common.verbs.Verbs`: commands of the command line and options of `zencell run`."""
+    checks: Lazy[Checks] = Lazy()
+    """What `zencell check` verifies besides its own checks."""
+    fit_world: Lazy[Callable[..., dict[str, Any]]] = Lazy()
+    """`fit_world(RobotModel, cell tree) -> cell tree` with a world within reach, for `zencell robot new --cell`."""
+    double: SimulationDouble | None = None
+    """Replacement of its perception in fast simulations."""
+    name: str = field(default="", init=False)
+    """Name under which it was found."""
 
     @property
     def status(self) -> Topic[TaskStatus]:
-        """Where the task says how far it is.
+        """Topic on which the task reports its state and progress.
 
         Raises:
-            ConfigError: the module is no application.
+            ConfigError: the application declares none.
         """
         from common.messages import TaskStatus
-        from common.topics import Topic
 
-        found = self.find("topics", "STATUS")
-        if not isinstance(found, Topic) or not issubclass(found.message, TaskStatus):
-            raise ConfigError("application", self.name, "is no application: its topics have no STATUS")
-        return cast("Topic[TaskStatus]", found)
+        if self.topics is None or not issubclass(self.topics.status.message, TaskStatus):
+            raise ConfigError("application", self.name, "declares no topic of a TaskStatus as its status")
+        return self.topics.status
 
     @property
-    def views(self) -> dict[Topic[Any], Callable[[WorldObjects], Message]]:
-        """What the truth is called in the application: a message for each of these topics, made of the world's."""
-        return self.find("topics", "VIEWS") or {}
+    def truth_views(self) -> Mapping[Topic[Any], Callable[[WorldObjects], Message]]:
+        """Simulated ground truth in its own messages, by topic."""
+        return self.topics.truth_views if self.topics is not None else {}
 
     @property
-    def double(self) -> ModuleType | None:
-        """The service that stands for its perception in a simulation, or None."""
-        found = self.part("double")
-        return found if hasattr(found, "REPLACES") else None
-
-    @property
-    def wrong_in(self) -> Callable[[WorldObjects], str] | None:
-        """What is wrong with the truth at the end, in words; None for an application that does not judge it."""
-        found: Callable[[WorldObjects], str] | None = self.find("truth", "wrong_in")
-        return found
-
-    @property
-    def topics(self) -> dict[str, AnyTopic]:
-        """Its own topics by key, in the order of its file."""
-        return _topics_in(self.part("topics"))
+    def topics_by_key(self) -> dict[str, AnyTopic]:
+        """Its own topics and requests by key."""
+        return self.topics.by_key if self.topics is not None else {}
 
 
 def application_names() -> list[str]:
-    """Applications that come with the project."""
+    """Return the names of the installed applications."""
     return plugin_names(GROUP)
 
 
 def applications() -> Iterator[Application]:
-    """Those that come with the project."""
-    return (Application(name) for name in application_names())
+    """Yield the installed applications."""
+    return (_load(name) for name in application_names())
 
 
 def find_application(name: str) -> Application:
-    """The application of that name.
+    """Return the application of that name.
 
     Raises:
-        UnknownName: there is none; lists the choices.
-        ConfigError: a dotted module that cannot be imported.
+        UnknownName: no application has that plain name; lists the choices.
+        ConfigError: a dotted module cannot be imported, or declares no application.
     """
     if "." not in name and name not in application_names():
         raise UnknownName("application", name, application_names())
-    found = Application(name)
-    look_where_one_stands()
-    _ = found.module
-    return found
+    import_from_working_directory()
+    return _load(name)
 
 
-def look_where_one_stands() -> None:
-    """Have modules of a person's own found in the working directory, after all others."""
-    _look_in(str(Path.cwd()))
+def _load(name: str) -> Application:
+    module = find_plugin(GROUP, name, field="application", noun="application")
+    found = getattr(module, VARIABLE, None)
+    if not isinstance(found, Application):
+        raise ConfigError("application", name, f"is no application: the module has no {VARIABLE} = Application(...)")
+    named = copy.copy(found)
+    object.__setattr__(named, "name", name)
+    return named
 
 
-def look_beside(cell: str) -> None:
-    """Have modules found about the file of a cell, after all others."""
-    _look_in(*places_beside(cell))
+def _imported_part(reference: str, field_name: str) -> Any:
+    module, _, name = reference.partition(":")
+    try:
+        return getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError) as error:
+        raise ConfigError(field_name, reference, f"cannot be imported: {error}") from None
 
 
-def places_beside(cell: str) -> list[str]:
-    """The folder of a cell file, and the one around it, where the former is a package; none for a cell's name."""
+def import_from_working_directory() -> None:
+    """Let Python import modules from the working directory, after all others."""
+    _extend_path(str(Path.cwd()))
+
+
+def import_from_folder_of(cell: str) -> None:
+    """Let Python import modules from the folder of a cell file and the folder around it, after all others."""
+    _extend_path(*import_folders(cell))
+
+
+def import_folders(cell: str) -> list[str]:
+    """Return the folder of a cell file and its parent, for a folder that is a package; [] for the name of a cell."""
     if not cell.endswith((".yaml", ".yml")):
         return []
     folder = Path(cell).expanduser().resolve().parent
     return [str(folder), str(folder.parent)]
 
 
-def _look_in(*places: str) -> None:
-    sys.path.extend(place for place in places if place not in sys.path)
+def _extend_path(*folders: str) -> None:
+    sys.path.extend(folder for folder in folders if folder not in sys.path)
 
 
 def application_of_task(task: str) -> str:
-    """The application of a cell file that names only its task; one with a task of its own gets the usual one."""
+    """Return the application of a cell file that names only its task; for a task of the user the default one."""
     for found in applications():
         if found.task == task:
             return found.name
-    return next((found.name for found in applications() if getattr(found.module, "FOR_ANY_TASK", False)), "")
+    return next((found.name for found in applications() if found.default), "")
 
 
 @cache
 def all_topics() -> dict[str, AnyTopic]:
-    """Every topic of the platform and of the applications that come with it, by key."""
+    """Return every topic of the platform and of the installed applications, by key."""
     from common.topics import platform_topics
 
     known = dict(platform_topics())
     for found in applications():
-        known |= found.topics
+        known |= found.topics_by_key
     return known
 
 
 def find_topic(key: str) -> Topic[Any] | Request[Any, Any] | None:
-    """The topic or request of a key, also of one service's log or parameters; None for one that is not known."""
+    """Return the topic or request of a key, also of one service's log or parameters; None for an unknown key."""
     from common.topics import general_key, of_service
 
     topic, service = all_topics().get(general_key(key)), key.partition("/")[2]
     return topic if topic is None or not service.isidentifier() else of_service(topic, service)
 
 
-def bring_in(modules: Iterable[str]) -> dict[str, AnyTopic]:
-    """Topics by key that modules of a person's own bring; their messages are known from now on.
+def import_topics(modules: Iterable[str]) -> dict[str, AnyTopic]:
+    """Import modules of the user and return their topics by key; their messages are known from now on.
 
-    One that cannot be imported brings none: the service that it is says why.
+    A module that cannot be imported contributes none: the service that it implements reports the error.
     """
-    look_where_one_stands()
+    import_from_working_directory()
     found: dict[str, AnyTopic] = {}
     for name in modules:
         with suppress(Exception):
-            found |= {**_topics_in(importlib.import_module(name)), **Application(name).topics}
+            module = importlib.import_module(name)
+            found |= _topics_in(module)
+            if isinstance(declared := getattr(module, VARIABLE, None), Application):
+                found |= declared.topics_by_key
     return found
 
 
 @cache
 def _message_classes() -> dict[str, type[Message]]:
-    """Those of the platform and of the applications that come with it, by name."""
+    """Return the message classes of the installed applications and of the platform by name; the platform's win."""
     from common import messages
+    from common.topics import Topic
 
-    parts = (found.part("messages") for found in applications())
-    modules = [*(part for part in parts if part is not None), messages]  # the platform's win
+    own = {topic.message.__module__ for found in applications() for topic in found.topics_by_key.values()
+           if isinstance(topic, Topic)}
+    modules = [*(sys.modules[name] for name in sorted(own)), messages]
     return {name: found for module in modules for name, found in vars(module).items()
             if isinstance(found, type) and issubclass(found, messages.Message)}
 
 
 def message_class(name: str) -> type[Message] | None:
-    """The message class of that name, of the platform, of an application, or of any module that was imported."""
+    """Return the message class of that name: of the platform, an application, or any imported module."""
     return _message_classes().get(name) or next((found for found in _imported() if found.__name__ == name), None)
 
 
@@ -243,9 +311,8 @@ def _imported() -> Iterator[type[Message]]:
         left += found.__subclasses__()
 
 
-def _topics_in(module: ModuleType | None) -> dict[str, AnyTopic]:
+def _topics_in(module: ModuleType) -> dict[str, AnyTopic]:
     from common.topics import Request, Topic, platform_topics
 
-    found = vars(module).values() if module is not None else ()
     shared = platform_topics()
-    return {t.key: t for t in found if isinstance(t, Topic | Request) and t.key not in shared}
+    return {t.key: t for t in vars(module).values() if isinstance(t, Topic | Request) and t.key not in shared}

@@ -22,6 +22,7 @@ PACKAGES = {
     "zencell.applications": ("applications",),
     "zencell.planners": ("common.planning.planners",),
     "zencell.hardware": ("common.hardware", "drivers"),
+    "zencell.grippers": ("common.hardware", "drivers"),
     "zencell.cameras": ("drivers",),
     "zencell.worlds": ("common.sim", "drivers"),
     "zencell.page": ("page.layers",),

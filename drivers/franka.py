@@ -1,7 +1,7 @@
 """Franka Research 3 by `pylibfranka`, the maker's library (extra `franka`): see docs/robots.md before the first motion.
 
-Joint positions at 1 kHz from a process of its own. The arm itself ends a motion whose set-points cease or jump. Joints
-are unlocked, and the interface is opened, in the arm's own Desk: nothing here can do that. The hand is driven by
+Joint positions at 1 kHz from a process of its own. The arm itself ends a motion whose set-points cease or jump.
+Unlocking the joints and activating the interface (FCI) is done in the arm's Desk, not here. The hand is driven by
 drivers/franka_hand.py.
 """
 
@@ -19,26 +19,26 @@ from pydantic import Field
 
 from common.config import Parameters, RobotConfig
 from common.errors import ConfigError
-from common.hardware.driven_gripper import DrivenGripper
-from common.hardware.driver import DrivenArm
-from common.hardware.fingers import Fingers
+from common.hardware.driven_arm import DrivenArm
 from common.hardware.interface import ArmState, Gripper, Limits, Vector
+from common.hardware.mock import simulated_fingers
 from common.messages import RobotMode
+from drivers import franka_hand
 
 Array = NDArray[np.float64]
 
 RATE = 1000.0  # [Hz] of set-points, in the arm's time
-BLEND = 0.5  # [s] in which a motion comes from where the arm is told to be to its set-points
-SMOOTHED = 20  # set-points whose mean is commanded: the arm judges acceleration and jerk from one to the next
-RESTS = 1e-9  # [rad] that they differ by at most, at rest
-WINDOW = 100  # cycles, of which the one that came soonest tells how far the two clocks are apart
-DRIFT, BEND = 0.1, 1e-3  # share by which they may run apart, and by which that changes in a cycle,
+BLEND = 0.5  # [s] in which a motion leads from the arm's own reference to the set-points
+SMOOTHED = 20  # set-points whose mean is commanded: the arm checks acceleration and jerk from one to the next
+AT_REST = 1e-9  # [rad] largest difference of set-points at rest
+WINDOW = 100  # cycles; the earliest of them shows the offset of the two clocks
+DRIFT, BEND = 0.1, 1e-3  # largest relative drift of the clocks, and its largest change in a cycle,
 BEND_SLOW = 2e-2  # for an arm whose clock is much slower: only simulated ones are
-JUDGED = 0.3  # [s] between two looks at the arm's clock,
-EVEN, GRAIN = 0.98, 0.05  # which is even at so much of the host's; else steps of it by which motions are slower
-LOST = 20  # cycles that the arm does without at most: then it stops by itself
-WAITS = 2.0  # [s] that an act waits for the arm to rest
-DOCILE = {"Idle", "Move"}
+CLOCK_PERIOD = 0.3  # [s] between two checks of the arm's clock,
+FULL_SPEED, SPEED_STEP = 0.98, 0.05  # which counts as equal above the first; below, motions slow down in such steps
+MOST_MISSED = 20  # cycles without a set-point, after which the arm stops by itself
+REST_TIMEOUT = 2.0  # [s] that an act waits for the arm to be at rest
+READY_MODES = {"Idle", "Move"}
 MODES: dict[str, tuple[RobotMode, str]] = {
     "Other": ("off", "is not ready: unlock the joints and activate FCI in Desk"),
     "Guiding": ("freedrive", "is moved by hand, with the buttons at its wrist"),
@@ -48,25 +48,25 @@ MODES: dict[str, tuple[RobotMode, str]] = {
 
 
 class Options(Parameters):
-    """Where the arm is, and how it is driven."""
+    """Address of the arm, and how it is driven."""
 
     host: str = Field(description="address of the controller")
-    ahead: float = Field(0.05, ge=0.01, le=0.5, description="set-points come so early [s]: shorter delays are not felt")
-    realtime: bool = Field(True, description="ask the system for real-time priority; without on a host of few cores "
-                                             "that simulates the arm too")
+    ahead: float = Field(0.05, ge=0.01, le=0.5, description="set-points are sent so early [s]: hides shorter delays")
+    realtime: bool = Field(True, description="ask the system for real-time priority; set to false on a host with few "
+                                             "cores that also simulates the arm")
     world: Literal["real", "simulated"] = Field(
-        "real", description="simulated: cameras and fingers are those of the simulated world, about a real arm or a "
-                            "test host that stands for one"
+        "real", description="simulated: cameras and fingers are those of the simulated world, around a real arm or a "
+                            "test host in its place"
     )
 
 
 def simulated(options: Options) -> bool:
-    """Whether the simulated world goes with the arm."""
+    """Return whether the simulated world belongs to the arm."""
     return options.world == "simulated"
 
 
 def create(robot: RobotConfig, limits: Limits, start: Vector, options: Options) -> DrivenArm:
-    """The arm, wherever it is, and its hand where the robot has a gripper."""
+    """Create the arm, wherever it is, and its hand where the robot has a gripper."""
     try:
         import pylibfranka  # noqa: F401
     except ImportError:
@@ -75,52 +75,53 @@ def create(robot: RobotConfig, limits: Limits, start: Vector, options: Options) 
     if len(limits.names) != 7:
         raise ConfigError("robot.joints", list(limits.names), "must be the seven joints of the arm")
     gripper: Gripper | None = None
-    if robot.gripper is not None:
-        gripper = Fingers(robot.gripper, robot.gripper.max_width) if simulated(options) else DrivenGripper(
-            "drivers.franka_hand", {"host": options.host}, robot.gripper, name=f"hand at {options.host}")
-    return DrivenArm("drivers.franka", options.model_dump(), limits, gripper=gripper, ahead=options.ahead,
+    if simulated(options):
+        gripper = simulated_fingers(robot)
+    elif robot.gripper is not None:
+        gripper = franka_hand.create_gripper(robot.gripper, franka_hand.GripperOptions(host=options.host))
+    return DrivenArm(__name__, options.model_dump(), limits, gripper=gripper, ahead=options.ahead,
                      delay=options.ahead + SMOOTHED / 2 / RATE, name=f"arm at {options.host}")
 
 
 def connect(options: dict[str, Any], limits: Limits) -> FrankaArm:
-    """The arm, from inside the driver's process; raises what the library raises when nobody answers."""
+    """Connect to the arm, inside the driver's process; raise what the library raises when it does not answer."""
     return FrankaArm(Options(**options))
 
 
 class FrankaArm:
-    """The connection to a controller, and the motion that is fed through it while there is one."""
+    """The connection to a controller, and the motion in progress."""
 
-    paces = True
+    paced_by_arm = True
 
     def __init__(self, options: Options) -> None:
-        """Connect; nothing moves, and no motion is begun."""
+        """Connect; no motion starts."""
         import pylibfranka
 
-        self._library, self.hurries = pylibfranka, options.realtime
+        self._library, self.realtime = pylibfranka, options.realtime
         self.rate = RATE  # in the host's time
-        # The process asks for real-time priority itself, and goes on without.
+        # The process asks for real-time priority itself, and continues without.
         self._robot = pylibfranka.Robot(options.host, pylibfranka.RealtimeConfig.kIgnore)
         self._motion: Any = None
         self._state: Any = None
-        self._speed = 1.0  # of the arm's clock
-        self._judged: tuple[float, float] | None = None  # host's time and arm's when that was looked at last
-        self._played = 0.0  # [s] of the arm's time, up to which it was told where to be
-        self._ahead = 0.0  # [s] of the host's time before the arm's, as it is reckoned with
-        self._late: list[float] = []  # [s] by which states came later than that
-        self._drift = self._drifts = 0.0  # share by which the host's clock is taken to be faster: now, and soon
-        self._slow = 0.0  # of that, what is known of an arm whose clock is much slower
+        self._speed = 1.0  # of the arm's clock, relative to the host's
+        self._clock_check: tuple[float, float] | None = None  # host time and arm time of the last check [s]
+        self._played = 0.0  # [s] arm time up to which set-points were sent
+        self._offset = 0.0  # [s] estimated host time minus arm time
+        self._lateness: list[float] = []  # [s] of states, by that estimate
+        self._drift = self._target_drift = 0.0  # relative drift of the host's clock: now, and soon
+        self._slow = 0.0  # known part of the drift of an arm whose clock is much slower
         self._newest: deque[Vector] = deque(maxlen=SMOOTHED + 3)
-        self._off = np.zeros((3, 7))  # the arm's reference less ours, and its derivatives, when the two last parted
-        self._since = BLEND  # [s] ago
-        self._parted = 0  # cycles that are left of it
-        self._told: Vector = np.zeros(7)
+        self._deviation = np.zeros((3, 7))  # arm's reference minus ours, with two derivatives, at the last resume
+        self._since_resume = BLEND  # [s]
+        self._resuming = 0  # cycles left in which the deviation is measured again
+        self._commanded: Vector = np.zeros(7)
         self._error = ""
         self._acts = threading.Lock()
-        self._wanted = 0  # acts that wait for the arm to rest with no motion under way
-        self._free = threading.Event()
+        self._waiting_acts = 0  # acts that wait for the arm to be at rest with no motion in progress
+        self._motion_ended = threading.Event()
 
     def read(self) -> ArmState:
-        """The newest state; it waits for one, for a millisecond.
+        """Wait for the next state, for a millisecond, and return it.
 
         Raises:
             Exception: the arm does not answer.
@@ -135,102 +136,105 @@ class FrankaArm:
                 state = self._robot.read_once()
         self._state = state
         mode, message = self._mode(state)
-        self._judge(time.monotonic(), state.time.to_sec())
+        self._check_clock(time.monotonic(), state.time.to_sec())
         return ArmState(list(state.q), list(state.dq), mode, message, self._speed)
 
-    def _judge(self, now: float, arms: float) -> None:
-        """Look at how fast the arm's clock runs: motions are slower for a slow one, as a simulated arm may have."""
-        if self._judged is None or now - self._judged[0] > JUDGED:
-            before, self._judged = self._judged, (now, arms)
-            if before is not None and 0 < arms - before[1] < 2 * JUDGED:
+    def _check_clock(self, now: float, arms: float) -> None:
+        """Measure the speed of the arm's clock: a slow one, as of a simulated arm, slows motions down."""
+        if self._clock_check is None or now - self._clock_check[0] > CLOCK_PERIOD:
+            before, self._clock_check = self._clock_check, (now, arms)
+            if before is not None and 0 < arms - before[1] < 2 * CLOCK_PERIOD:
                 share = (arms - before[1]) / (now - before[0])
-                self._speed = 1.0 if share > EVEN else max(math.floor(share / GRAIN - 1) * GRAIN, GRAIN)
-                self._slow = 0.0 if share > EVEN else 1 / max(share, GRAIN) - 1
+                if share > FULL_SPEED:
+                    self._speed, self._slow = 1.0, 0.0
+                else:
+                    self._speed = max(math.floor(share / SPEED_STEP - 1) * SPEED_STEP, SPEED_STEP)
+                    self._slow = 1 / max(share, SPEED_STEP) - 1
 
     def _mode(self, state: Any) -> tuple[RobotMode, str]:
         name = state.robot_mode.name
         if name == "Reflex":
-            why = _named(state.current_errors) or _named(state.last_motion_errors) or self._error
-            return "protective_stop", f"has stopped for a reflex ({why}): look why, then `zencell robot recover`"
-        return ("running", "") if name in DOCILE else MODES[name]
+            why = _active_errors(state.current_errors) or _active_errors(state.last_motion_errors) or self._error
+            return "protective_stop", f"has stopped for a reflex ({why}): find the cause, then `zencell robot recover`"
+        return ("running", "") if name in READY_MODES else MODES[name]
 
     def due(self) -> list[float]:
-        """One for each millisecond of the arm's own clock, told in the host's time, but as even as that."""
+        """Return one time per millisecond of the arm's clock, in host time [s], as regular as the arm's clock."""
         now = self._state.time.to_sec()
         late = time.monotonic() - now
         if self._motion is None:
-            self._ahead, self._drift, self._drifts, self._played = late, self._slow, 0.0, now
-            self._late.clear()
+            self._offset, self._drift, self._target_drift, self._played = late, self._slow, 0.0, now
+            self._lateness.clear()
             return [now + late]
-        self._late.append(late - self._ahead)
-        if len(self._late) == WINDOW:
+        self._lateness.append(late - self._offset)
+        if len(self._lateness) == WINDOW:
             most = DRIFT + self._slow
-            self._drifts = min(max(min(self._late) * RATE / WINDOW, -most), most)
-            self._late.clear()
+            self._target_drift = min(max(min(self._lateness) * RATE / WINDOW, -most), most)
+            self._lateness.clear()
         cycles = round((now - self._played) * RATE)
         self._played = now
         times, bend = [], BEND_SLOW if self._slow else BEND
-        for n in reversed(range(min(max(cycles, 1), LOST))):
-            self._drift += min(max(self._slow + self._drifts - self._drift, -bend), bend)
-            self._ahead += self._drift / RATE
-            if self._slow:  # which may have changed: what is yet to come cannot be played
-                self._ahead = max(min(self._ahead, late), self._ahead - self._drift / RATE)
-            times.append(now - n / RATE + self._ahead)
+        for n in reversed(range(min(max(cycles, 1), MOST_MISSED))):
+            self._drift += min(max(self._slow + self._target_drift - self._drift, -bend), bend)
+            self._offset += self._drift / RATE
+            if self._slow:  # the estimate may be wrong: set-points of the future cannot be played
+                self._offset = max(min(self._offset, late), self._offset - self._drift / RATE)
+            times.append(now - n / RATE + self._offset)
         self.rate = RATE / (1 + max(self._drift, 0.0))
         return times
 
     def servo(self, points: list[Vector]) -> None:
-        """Go to the last of the set-points (7,) [rad]; begins a motion where there is none.
+        """Move to the last of the set-points (7,) [rad]; start a motion if there is none.
 
-        What the arm did without it has guessed, as if the acceleration had stayed: from there we come back to our own.
-        What it takes for the velocity and acceleration then is what it judges by, in the cycle after that too.
+        In cycles without a set-point the arm extrapolates with constant acceleration: a blend leads from there back to
+        our curve. The arm checks limits against its extrapolated velocity and acceleration, also in the next cycle.
         """
         step = 1 / RATE
         if len(points) > 1:
-            self._parted = 2
-        if self._wanted and (self._motion is None or self._rests):
+            self._resuming = 2
+        if self._waiting_acts and (self._motion is None or self._at_rest):
             self._end()
-            self._free.set()
+            self._motion_ended.set()
             return
         if self._motion is None:
             self._motion = self._robot.start_joint_position_control(self._library.ControllerMode.JointImpedance)
             self._state, _ = self._motion.readOnce()
             self._played = self._state.time.to_sec()
             self._newest.extend([points[-1]] * (SMOOTHED + 3))
-            self._parted = 1
+            self._resuming = 1
         self._newest.extend(points)
         newest = np.array(self._newest)
-        if self._parted:
-            self._parted -= 1
+        if self._resuming:
+            self._resuming -= 1
             last, before, first = (newest[3 - n:3 - n + SMOOTHED].mean(axis=0) for n in (1, 2, 3))
             own = np.array([last, (last - before) / step, (last - 2 * before + first) / step**2])
             state = self._state
-            self._off, self._since = np.array([state.q_d, state.dq_d, state.ddq_d]) - own, 0.0
-            self._off[1] += self._off[2] * step / 2  # rates of the arm are differences to the cycle before
-        self._since += step
-        self._told = newest[3:].mean(axis=0) + _faded(self._off, self._since)
-        self._motion.writeOnce(self._library.JointPositions(self._told.tolist()))
+            self._deviation, self._since_resume = np.array([state.q_d, state.dq_d, state.ddq_d]) - own, 0.0
+            self._deviation[1] += self._deviation[2] * step / 2  # the arm's rates are differences to the previous cycle
+        self._since_resume += step
+        self._commanded = newest[3:].mean(axis=0) + _faded(self._deviation, self._since_resume)
+        self._motion.writeOnce(self._library.JointPositions(self._commanded.tolist()))
 
     @property
-    def _rests(self) -> bool:
-        return bool(np.all(np.ptp(self._newest, axis=0) <= RESTS))
+    def _at_rest(self) -> bool:
+        return bool(np.all(np.ptp(self._newest, axis=0) <= AT_REST))
 
     def wait(self) -> None:
-        """End a motion, as nothing is followed."""
+        """End the motion, as there are no set-points."""
         self._end()
-        if self._wanted:
-            self._free.set()
+        if self._waiting_acts:
+            self._motion_ended.set()
 
     def _end(self) -> None:
         if self._motion is None:
             return
         motion, self._motion = self._motion, None
-        last = self._library.JointPositions(self._told.tolist())
+        last = self._library.JointPositions(self._commanded.tolist())
         last.motion_finished = True
         motion.writeOnce(last)
 
     def do(self, act: str, value: float = 0.0, *more: float) -> None:
-        """Recovery after a reflex, and the mass of what is held."""
+        """Recover from a reflex, or set the payload."""
         with self._acts:
             if act == "recover":
                 self._robot.automatic_error_recovery()
@@ -241,32 +245,32 @@ class FrankaArm:
                 raise ValueError("it is moved by hand with the buttons at its wrist")
             if act != "payload":
                 raise ValueError(f"it cannot {act}: recover, payload")
-            self._free.clear()
-            self._wanted += 1
+            self._motion_ended.clear()
+            self._waiting_acts += 1
             try:
-                if not self._free.wait(WAITS):
-                    raise ValueError("cannot be told while the arm moves")
+                if not self._motion_ended.wait(REST_TIMEOUT):
+                    raise ValueError("cannot be set while the arm moves")
                 self._robot.set_load(value, list(more) or [0.0, 0.0, 0.0], [0.0] * 9)
             finally:
-                self._wanted -= 1
+                self._waiting_acts -= 1
 
     def close(self) -> None:
-        """Let go of the arm, at rest."""
+        """Release the arm, at rest."""
         self._end()
 
 
-def _faded(off: Array, since: float) -> Vector:
-    """What is left (7,) [rad] of an offset and its first two derivatives (3, 7) after so long [s]: 0 after `BLEND`.
+def _faded(deviation: Array, since: float) -> Vector:
+    """Return the rest (7,) [rad] of a deviation with two derivatives (3, 7) after `since` [s]: 0 after `BLEND`.
 
-    The quintic with these at its begin, and rest at 0 at its end.
+    It is the quintic that starts with these and ends at rest at 0.
     """
     u = min(since / BLEND, 1.0)
     parts = (1 - u**3 * (10 - 15 * u + 6 * u * u), u - u**3 * (6 - 8 * u + 3 * u * u),
              u * u * (1 - u * (3 - 3 * u + u * u)) / 2)
-    return np.asarray(sum(part * BLEND**n * each for n, (part, each) in enumerate(zip(parts, off, strict=True))))
+    return np.asarray(sum(part * BLEND**n * each for n, (part, each) in enumerate(zip(parts, deviation, strict=True))))
 
 
-def _named(errors: Any) -> str:
-    """What of the arm's errors is the case, in words."""
+def _active_errors(errors: Any) -> str:
+    """Return the names of the errors that are set."""
     names = (name for name in dir(errors) if not name.startswith("_") and getattr(errors, name) is True)
     return ", ".join(name.replace("_", " ") for name in names)

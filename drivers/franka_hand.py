@@ -1,20 +1,33 @@
-"""The Franka Hand by `pylibfranka`, from inside its driver's process. It has to be homed once, in Desk."""
+"""The Franka Hand by `pylibfranka` (extra `franka`), inside its driver's process. It must have been homed in Desk."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from common.config import GripperConfig
-from common.hardware.driven_gripper import Fingers
+from pydantic import Field
 
-ANY = 1.0  # [m] that what is grasped may be wider or narrower: the controller judges the width
-HOMED = 0.01  # [m] that the fingers of one that is homed open at least
-MET = 1e-3  # [m] no further apart, fingers have met: where any width will do, the hand takes that for a grasp as well
-NARROWER = 5e-4  # [m] less than the fingers are apart, they are closed
+from common.config import GripperConfig, Parameters
+from common.hardware.driven_gripper import DrivenGripper, FingerState
+
+ANY_WIDTH = 1.0  # [m] tolerance of a grasp: the controller checks the width
+HOMED_OPENING = 0.01  # [m] least maximal width of a homed hand
+FINGERS_MEET = 1e-3  # [m] closer fingers touch each other, which the hand reports as a grasp of any width
+CLOSING = 5e-4  # [m] a command for a width smaller by more than this closes
+
+
+class GripperOptions(Parameters):
+    """Address of the hand."""
+
+    host: str = Field(description="address of the arm's controller")
+
+
+def create_gripper(gripper: GripperConfig, options: GripperOptions) -> DrivenGripper:
+    """Create the hand, in a process of its own."""
+    return DrivenGripper(__name__, options.model_dump(), gripper, name=f"hand at {options.host}")
 
 
 def connect(options: dict[str, Any], config: GripperConfig) -> FrankaHand:
-    """The hand; raises what the library raises when nobody answers."""
+    """Connect to the hand, inside the driver's process; raise what the library raises when it does not answer."""
     return FrankaHand(options["host"], config.speed)
 
 
@@ -25,39 +38,39 @@ class FrankaHand:
         """Connect; nothing moves. `speed` is of the opening between the fingers [m/s]."""
         import pylibfranka
 
-        self._failed = pylibfranka.CommandException
+        self._command_failed = pylibfranka.CommandException
         self._gripper = pylibfranka.Gripper(host)
         self._speed = speed
         self._effort = 0.0
         self._width = 0.0
-        if self._gripper.read_once().max_width < HOMED:
+        if self._gripper.read_once().max_width < HOMED_OPENING:
             raise RuntimeError("the hand is not homed: do that in Desk")
 
-    def read(self) -> Fingers:
-        """The newest state."""
+    def read(self) -> FingerState:
+        """Return the newest state."""
         state = self._gripper.read_once()
         self._width = state.width
-        holding = state.is_grasped and state.width > MET
-        return Fingers(state.width, False, holding, self._effort if holding else 0.0)
+        holding = state.is_grasped and state.width > FINGERS_MEET
+        return FingerState(state.width, False, holding, self._effort if holding else 0.0)
 
     def move(self, width: float, effort: float) -> None:
-        """Open to a width [m]; or close, on whatever is there, and press with an effort [N].
+        """Open to a width [m]; or close on whatever is there, and press with an effort [N].
 
-        Closing on nothing ends where the fingers meet: the hand has no motion that closes to a width and presses on
-        what it meets before that.
+        Without an object, closing ends where the fingers meet: the hand has no motion that closes to a width and
+        presses on what it meets before.
         """
         try:
-            if width < self._width - NARROWER:
+            if width < self._width - CLOSING:
                 self._effort = effort
-                self._gripper.grasp(width, self._speed, effort, ANY, ANY)
+                self._gripper.grasp(width, self._speed, effort, ANY_WIDTH, ANY_WIDTH)
             else:
                 self._gripper.move(width, self._speed)
-        except self._failed:
-            return  # was stopped, or could not: the state says how the fingers stand
+        except self._command_failed:
+            return  # stopped, or impossible: the state shows where the fingers are
 
     def stop(self) -> None:
-        """Have a motion that is under way end."""
+        """End a motion in progress."""
         self._gripper.stop()
 
     def close(self) -> None:
-        """Let go of the hand; what it holds stays held."""
+        """Release the hand; what it holds stays held."""

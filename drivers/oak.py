@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from common.config import Parameters
-from common.perception.depth_sources import CameraGone, Lens, Shot, maker_of
+from common.perception.depth_drivers import CameraLost, Intrinsics, RgbdFrame, import_sdk
 
 PATIENCE = timedelta(seconds=2)  # without a frame after which the camera is gone
 STEREO_SIZE = (640, 400)  # [px] in which it compares its two lenses
@@ -32,34 +32,34 @@ class Oak:
         """Wait for the first pictures, which tell of the lens.
 
         Raises:
-            CameraGone: there are none.
+            CameraLost: there are none.
         """
         self._dai, self._pipeline, self._queue = dai, pipeline, queue
         try:
             frame = self._next()["rgb"]
-        except CameraGone:
+        except CameraLost:
             self.close()
             raise
         k = frame.getTransformation().getIntrinsicMatrix()
-        self.lens = Lens(frame.getWidth(), frame.getHeight(), k[0][0], k[1][1], k[0][2], k[1][2])
+        self.lens = Intrinsics(frame.getWidth(), frame.getHeight(), k[0][0], k[1][1], k[0][2], k[1][2])
 
     def _next(self) -> Any:
         try:
             group = self._queue.get(PATIENCE)
         except RuntimeError as error:  # unplugged: the queue is closed
-            raise CameraGone(str(error)) from None
+            raise CameraLost(str(error)) from None
         if group is None:
-            raise CameraGone(f"no picture within {PATIENCE.total_seconds():g} s")
+            raise CameraLost(f"no picture within {PATIENCE.total_seconds():g} s")
         return group
 
-    def read(self) -> Shot:
+    def read(self) -> RgbdFrame:
         """The next shot, depth and colour of the same instant."""
         group = self._next()
         color = group["rgb"]
         steps = np.asanyarray(group["depth"].getFrame())
         metres = np.where(steps > 0, steps * MILLIMETRE, np.float32(np.nan)).astype(np.float32)
         age = (self._dai.Clock.now() - color.getTimestamp()).total_seconds()  # both by the clock of this machine
-        return Shot(np.array(color.getCvFrame()), metres, max(0.0, age))
+        return RgbdFrame(np.array(color.getCvFrame()), metres, max(0.0, age))
 
     def close(self) -> None:
         """Stop it."""
@@ -68,19 +68,19 @@ class Oak:
 
 
 def open_camera(options: Options, size: tuple[int, int], rate: float) -> Oak:
-    """The camera: see `common.perception.depth_sources`."""
-    dai = maker_of("oak", "depthai")
+    """The camera: see `common.perception.depth_drivers`."""
+    dai = import_sdk("oak", "depthai")
     try:
         device = dai.Device(dai.DeviceInfo(options.device)) if options.device else dai.Device()
     except RuntimeError as error:  # none is plugged in, or somebody else has it
-        raise CameraGone(str(error)) from None
+        raise CameraLost(str(error)) from None
     try:
         pipeline = dai.Pipeline(device)
         queue = _connected(dai, pipeline, device, options, size)
         pipeline.start()
     except RuntimeError as error:  # no such mode, or it was unplugged
         device.close()
-        raise CameraGone(f"{size[0]}x{size[1]} at {options.fps:g} Hz: {error}") from None
+        raise CameraLost(f"{size[0]}x{size[1]} at {options.fps:g} Hz: {error}") from None
     return Oak(dai, pipeline, queue)
 
 

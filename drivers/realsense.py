@@ -12,7 +12,7 @@ from pydantic import Field
 
 from common.config import Parameters
 from common.errors import ConfigError
-from common.perception.depth_sources import CameraGone, Lens, Shot, maker_of
+from common.perception.depth_drivers import CameraLost, Intrinsics, RgbdFrame, import_sdk
 
 PATIENCE = 1000  # [ms] without a frame after which the camera is gone
 REWIND = 10_000  # [ms] without one in which a recording was begun again and again after which it is
@@ -49,20 +49,20 @@ class RealSense:
         if any(i.coeffs):
             raise ConfigError("options.align", align,
                               f"has distortion {list(i.coeffs)}, which depth cannot have: depth")
-        self.lens = Lens(i.width, i.height, i.fx, i.fy, i.ppx, i.ppy)
+        self.lens = Intrinsics(i.width, i.height, i.fx, i.fy, i.ppx, i.ppy)
         colours = profile.get_stream(rs.stream.color).format()
         if colours not in (rs.format.bgr8, rs.format.rgb8):  # a camera gives what it is asked for
             raise ConfigError("options.file", str(colours), "of its colours cannot be read: bgr8 and rgb8 can")
         self._red_first = colours == rs.format.rgb8
 
-    def read(self) -> Shot:
+    def read(self) -> RgbdFrame:
         """The next shot, depth and colour of the same instant."""
         while True:
             try:
                 frames = self._align.process(
                     self._pipeline.wait_for_frames(PATIENCE) if self._playback is None else self._played())
             except RuntimeError as error:  # unplugged, or it hangs
-                raise CameraGone(str(error)) from None
+                raise CameraLost(str(error)) from None
             depth, color = frames.get_depth_frame(), frames.get_color_frame()
             if not depth or not color:
                 continue  # the first frames may lack one of them
@@ -75,7 +75,7 @@ class RealSense:
             ours = color.get_frame_timestamp_domain() == self._rs.timestamp_domain.global_time  # of this machine
             if ours and self._playback is None:
                 age = max(0.0, time.time() - color.get_timestamp() * 1e-3)  # [ms]
-            return Shot(pixels, metres, age)
+            return RgbdFrame(pixels, metres, age)
 
     def _played(self) -> Any:
         """The next frames of the recording, which begins again when it has ended.
@@ -103,20 +103,20 @@ class RealSense:
 
 
 def open_camera(options: Options, size: tuple[int, int], rate: float) -> RealSense:
-    """The camera: see `common.perception.depth_sources`."""
-    rs = maker_of("realsense", "pyrealsense2")
+    """The camera: see `common.perception.depth_drivers`."""
+    rs = import_sdk("realsense", "pyrealsense2")
     config = _recording(rs, options) if options.file else _camera(rs, options, size)
     pipeline = rs.pipeline()
     try:
         profile = pipeline.start(config)
     except RuntimeError as error:  # no such mode, or somebody else has it
         what = options.file or f"{size[0]}x{size[1]} at {options.fps} Hz"
-        raise CameraGone(f"{what}: {error}") from None
+        raise CameraLost(f"{what}: {error}") from None
     try:
         return RealSense(rs, pipeline, config, profile, options.align)
     except RuntimeError as error:  # a recording without one of the two
         pipeline.stop()
-        raise CameraGone(f"{options.file}: {error}") from None
+        raise CameraLost(f"{options.file}: {error}") from None
     except ConfigError:
         pipeline.stop()
         raise
@@ -126,13 +126,13 @@ def _camera(rs: Any, options: Options, size: tuple[int, int]) -> Any:
     """What asks for a camera that is plugged in, and its streams.
 
     Raises:
-        CameraGone: it is not there.
+        CameraLost: it is not there.
     """
     there = [device.get_info(rs.camera_info.serial_number) for device in rs.context().query_devices()]
     if not there:
-        raise CameraGone("no RealSense is plugged in")
+        raise CameraLost("no RealSense is plugged in")
     if options.serial and options.serial not in there:
-        raise CameraGone(f"RealSense {options.serial} is not plugged in; there are: {', '.join(there)}")
+        raise CameraLost(f"RealSense {options.serial} is not plugged in; there are: {', '.join(there)}")
     config = rs.config()  # a new one each time: one that lost its camera stays without
     config.enable_device(options.serial or there[0])
     config.enable_stream(rs.stream.depth, *size, rs.format.z16, options.fps)

@@ -1,30 +1,32 @@
-"""Robotiq's 2F grippers on an arm of Universal Robots, from inside their driver's process.
+"""Robotiq's 2F grippers on an arm of Universal Robots, inside their driver's process.
 
-Their program on the arm's controller (the URCap) listens at a port of its own for lines of text: `SET POS 255 GTO 1` is
-answered by `ack`, `GET POS` by `POS 255`. Registers are those of Robotiq's manual of the 2F-85 and 2F-140, counts from
-0 (open) to 255 (closed); the ends of their travel are a few counts inside. The gripper has to be activated once, at
-the pendant: that moves its fingers.
+Their program on the arm's controller (the URCap) accepts lines of text on a port of its own: the answer to
+`SET POS 255 GTO 1` is `ack`, the answer to `GET POS` is `POS 255`. Registers are those of Robotiq's manual of the
+2F-85 and 2F-140, counts from 0 (open) to 255 (closed); the ends of the travel are a few counts inside. The gripper must
+be activated once, at the pendant: that moves its fingers.
 """
 
 from __future__ import annotations
 
 import socket
 import threading
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
-from common.config import GripperConfig
-from common.hardware.driven_gripper import Fingers
+from pydantic import Field
+
+from common.config import GripperConfig, Parameters
+from common.hardware.driven_gripper import DrivenGripper, FingerState
 
 PORT = 63352
-ANSWERS = 1.0  # [s] in which a line is answered
+TIMEOUT = 1.0  # [s] for the answer to a line
 LONGEST = 256  # bytes of an answer
 ACTIVE = 3  # of STA
-MOVING, ON_OPENING, ON_CLOSING = 0, 1, 2  # of OBJ; 3 is there
+MOVING, HOLDING_OPENING, HOLDING_CLOSING = 0, 1, 2  # of OBJ; 3: at the requested position
 COUNTS = 255
 
 
 class Model(NamedTuple):
-    """Width where it is open [m], counts at both ends, and what 0 and 255 counts of speed and effort stand for."""
+    """Width of the open gripper [m], counts at both ends, and the speeds and efforts of counts 0 and 255."""
 
     stroke: float
     open: int
@@ -39,8 +41,21 @@ MODELS = {
 }
 
 
+class GripperOptions(Parameters):
+    """Address and model of the gripper."""
+
+    host: str = Field(description="address of the arm's controller")
+    model: Literal["2f85", "2f140"] = Field(description="model of the gripper")
+    port: int = Field(PORT, ge=1, le=65535, description="port of the gripper's program (URCap)")
+
+
+def create_gripper(gripper: GripperConfig, options: GripperOptions) -> DrivenGripper:
+    """Create the gripper, in a process of its own."""
+    return DrivenGripper(__name__, options.model_dump(), gripper, name=f"{options.model} at {options.host}")
+
+
 def connect(options: dict[str, Any], config: GripperConfig) -> Robotiq:
-    """The gripper; raises OSError when nobody answers."""
+    """Connect to the gripper, inside the driver's process; raise OSError when it does not answer."""
     return Robotiq(options["host"], MODELS[options["model"]], config.speed, options.get("port", PORT))
 
 
@@ -50,71 +65,71 @@ class Robotiq:
     def __init__(self, host: str, model: Model, speed: float, port: int = PORT) -> None:
         """Connect; nothing moves. `speed` is of the opening between the fingers [m/s]."""
         self._model = model
-        self._socket = socket.create_connection((host, port), ANSWERS)
+        self._socket = socket.create_connection((host, port), TIMEOUT)
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._asking = threading.Lock()  # one line at a time, of `move` and `read`
+        self._line_lock = threading.Lock()  # `move` and `read` send one line at a time
         self._effort = 0.0
         if (state := self._get("STA")) != ACTIVE:
             raise RuntimeError(f"the gripper is not activated (state {state}): do that at the pendant")
-        self._say(f"SET SPE {_counts(speed, model.speeds)}")
+        self._set(f"SET SPE {_counts(speed, model.speeds)}")
 
-    def read(self) -> Fingers:
-        """The newest state.
+    def read(self) -> FingerState:
+        """Return the newest state.
 
         Raises:
             RuntimeError: the gripper has a fault.
         """
         if fault := self._get("FLT"):
             raise RuntimeError(f"the gripper has fault {fault}: see its manual")
-        position, seen = self._get("POS"), self._get("OBJ")
+        position, status = self._get("POS"), self._get("OBJ")
         model = self._model
         share = (model.closed - position) / (model.closed - model.open)
-        holding = seen in (ON_OPENING, ON_CLOSING)
+        holding = status in (HOLDING_OPENING, HOLDING_CLOSING)
         width = min(max(share, 0.0), 1.0) * model.stroke
-        return Fingers(width, seen == MOVING, holding, self._effort if holding else 0.0)
+        return FingerState(width, status == MOVING, holding, self._effort if holding else 0.0)
 
     def move(self, width: float, effort: float) -> None:
-        """Begin to bring the fingers to a width [m]; on what is in the way they press with an effort [N]."""
+        """Start to move the fingers to a width [m]; they press on an object in between with an effort [N]."""
         model = self._model
         share = min(max(width / model.stroke, 0.0), 1.0)
         position = round(model.closed - share * (model.closed - model.open))
         force = _counts(effort, model.efforts)
         least, most = model.efforts
         self._effort = least + (most - least) * force / COUNTS
-        self._say(f"SET POS {position} FOR {force} GTO 1")
+        self._set(f"SET POS {position} FOR {force} GTO 1")
 
     def stop(self) -> None:
-        """Nothing waits for the fingers."""
+        """Do nothing: `move` does not wait for the fingers."""
 
     def close(self) -> None:
-        """Let go of the gripper; what it holds stays held."""
+        """Release the gripper; what it holds stays held."""
         self._socket.close()
 
     def _get(self, register: str) -> int:
-        answer = self._ask(f"GET {register}")
+        answer = self._exchange(f"GET {register}")
         name, _, value = answer.partition(" ")
         if name != register or not value.isdigit():
             raise RuntimeError(f"the gripper answers {answer[:40]!r} to GET {register}")
         return int(value)
 
-    def _say(self, line: str) -> None:
-        answer = self._ask(line)
+    def _set(self, line: str) -> None:
+        answer = self._exchange(line)
         if answer != "ack":
             raise RuntimeError(f"the gripper answers {answer[:40]!r} to {line}")
 
-    def _ask(self, line: str) -> str:
-        """The answer to a line; one to SET may come without an end of line."""
-        with self._asking:
+    def _exchange(self, line: str) -> str:
+        """Return the answer to a line; the answer to SET may have no end of line."""
+        with self._line_lock:
             self._socket.sendall(line.encode() + b"\n")
             answer = b""
             while not answer.endswith(b"\n") and answer != b"ack":
                 try:
-                    more = self._socket.recv(LONGEST)
+                    received = self._socket.recv(LONGEST)
                 except TimeoutError:
                     raise ConnectionError("the gripper's program does not answer") from None
-                if not more or len(answer) > LONGEST:
-                    raise ConnectionError("the gripper's program is gone")
-                answer = (answer + more).lstrip()  # of the end of the line before
+                if not received or len(answer) > LONGEST:
+                    raise ConnectionError("the gripper's program has closed the connection")
+                answer = (answer + received).lstrip()  # of the end of the previous line
         return answer.decode("ascii", "replace").strip()
 
 

@@ -1,7 +1,7 @@
 """Arms of Universal Robots, e-series and CB3, by `ur_rtde` (extra `ur`): see docs/robots.md before the first motion.
 
 `servoJ` at the controller's rate from a process of its own; a watchdog in the arm's own program ends the motion when
-that process or the network dies. Nothing is powered, released or recovered unless somebody asks for it.
+that process or the network dies. The driver powers, releases and recovers the arm only on request of an operator.
 """
 
 from __future__ import annotations
@@ -18,27 +18,27 @@ from pydantic import Field
 
 from common.config import Parameters, RobotConfig
 from common.errors import ConfigError
-from common.hardware.driven_gripper import DrivenGripper
-from common.hardware.driver import DrivenArm
-from common.hardware.fingers import Fingers
+from common.hardware.driven_arm import DrivenArm
 from common.hardware.interface import ArmState, Gripper, Limits, Vector
+from common.hardware.mock import simulated_fingers
 from common.messages import RobotMode
+from drivers import robotiq
 
 MODELS = r"^ur((3|5|10)e?|16e|15|20|30)$"
 CB3 = re.compile(r"^ur(3|5|10)$")
-LATEST = 0.15  # [s] without a new state of the arm, after which it counts as gone
-LOOK = 0.02  # [s] of them that count at most from one look to the next: who was held up has not listened
-WATCHDOG = 10.0  # [Hz] less often, the arm's program ends by itself
-SMOOTHED = 0.02  # [s] whose mean is commanded: between the cycles of who sends them the jerk is up to 5 times as much
-MOVES = 0.02  # [rad/s] faster than this, a joint does not rest
-SETTLES = 0.5  # [s] in which the arm rests once its set-points do
+STATE_TIMEOUT = 0.15  # [s] without a new state of the arm, after which it counts as disconnected
+LONGEST_STEP = 0.02  # [s] that count of the time between two checks: a driver that was held up has not listened
+WATCHDOG = 10.0  # [Hz] below this rate the arm's program ends by itself
+SMOOTHED = 0.02  # [s] whose mean is commanded: between the sender's cycles the jerk is up to 5 times as large
+STANDSTILL = 0.02  # [rad/s] a faster joint is not at rest
+SETTLE_TIMEOUT = 0.5  # [s] for the arm to come to rest once its set-points are at rest
 PROGRAM_RUNS = 2  # of the robot's status bits
-POWER = 30.0  # [s] in which joints are powered, and brakes released
+POWER_TIMEOUT = 30.0  # [s] for powering the joints and releasing the brakes
 VARIABLES = ["timestamp", "actual_q", "actual_qd", "robot_mode", "safety_mode", "safety_status_bits", "runtime_state",
              "target_speed_fraction", "speed_scaling", "robot_status_bits", "actual_digital_input_bits",
              "actual_digital_output_bits"]
 SAFETY: dict[int, tuple[RobotMode, str]] = {
-    3: ("protective_stop", "protective stop: look why, then `zencell robot recover`"),
+    3: ("protective_stop", "protective stop: find the cause, then `zencell robot recover`"),
     4: ("protective_stop", "in recovery mode: move the joints back within their limits at the pendant"),
     5: ("protective_stop", "safeguard stop: the safeguard input is open"),
     6: ("emergency_stop", "the system's emergency stop is pressed"),
@@ -54,94 +54,93 @@ MODES: dict[int, tuple[RobotMode, str]] = {
 
 
 class Options(Parameters):
-    """Where the arm is, and what it is."""
+    """Address and model of the arm, and how it is servoed."""
 
     host: str = Field(description="address of the controller")
-    model: str = Field(pattern=MODELS, description="what it is, as its plate says in small letters")
-    ahead: float = Field(0.05, ge=0.01, le=0.5, description="set-points come so early [s]: shorter delays are not felt")
+    model: str = Field(pattern=MODELS, description="as on its type plate, in small letters")
+    ahead: float = Field(0.05, ge=0.01, le=0.5, description="set-points are sent so early [s]: hides shorter delays")
     lookahead: float = Field(0.03, ge=0.03, le=0.2, description="servoJ smooths over this [s]")
     gain: float = Field(300.0, ge=100, le=2000, description="servoJ follows with this gain")
     world: Literal["real", "simulated"] = Field(
-        "real", description="simulated: cameras and fingers are those of the simulated world, about a real arm or a "
-                            "test host that stands for one"
+        "real", description="simulated: cameras and fingers are those of the simulated world, around a real arm or a "
+                            "test host in its place"
     )
     gripper: Literal["", "2f85", "2f140"] = Field(
-        "", description="Robotiq's gripper at the arm, where the robot file has a gripper section"
+        "", description="Robotiq gripper at the arm, where the robot file has a gripper section without hardware"
     )
 
 
 def simulated(options: Options) -> bool:
-    """Whether the simulated world goes with the arm."""
+    """Return whether the simulated world belongs to the arm."""
     return options.world == "simulated"
 
 
 def create(robot: RobotConfig, limits: Limits, start: Vector, options: Options) -> DrivenArm:
-    """The arm, wherever it is."""
+    """Create the arm, wherever it is."""
     try:
         import rtde_control  # noqa: F401
     except ImportError:
         raise ConfigError("robot.hardware.backend", "ur", "needs the extra `ur`: pip install 'zencell[ur]'") from None
     gripper: Gripper | None = None
-    if robot.gripper is not None and simulated(options):
-        gripper = Fingers(robot.gripper, robot.gripper.max_width)
+    if simulated(options):
+        gripper = simulated_fingers(robot)
     elif robot.gripper is not None and options.gripper:
-        gripper = DrivenGripper(
-            "drivers.robotiq", {"host": options.host, "model": options.gripper}, robot.gripper,
-            name=f"{options.gripper} at {options.host}")
+        gripper = robotiq.create_gripper(
+            robot.gripper, robotiq.GripperOptions(host=options.host, model=options.gripper))
     delay = options.ahead + options.lookahead + Smoothing(rate_of(options.model)).delay
-    return DrivenArm("drivers.ur", options.model_dump(), limits, gripper=gripper, name=f"{options.model} at "
+    return DrivenArm(__name__, options.model_dump(), limits, gripper=gripper, name=f"{options.model} at "
                      f"{options.host}", ahead=options.ahead, delay=delay)
 
 
 def connect(options: dict[str, Any], limits: Limits) -> UrArm:
-    """The arm, from inside the driver's process; raises what the library raises when nobody answers."""
+    """Connect to the arm, inside the driver's process; raise what the library raises when it does not answer."""
     return UrArm(Options(**options), limits)
 
 
 def rate_of(model: str) -> float:
-    """How often its controller wants a set-point [Hz]."""
+    """Return the rate at which the controller of a model takes set-points [Hz]."""
     return 125.0 if CB3.match(model) else 500.0
 
 
 class Smoothing:
-    """The mean of the newest set-points, which the arm is `delay` [s] behind for that."""
+    """The mean of the newest set-points, which delays them by `delay` [s]."""
 
     def __init__(self, rate: float) -> None:
-        """Take set-points that come at a rate [Hz]."""
+        """Smooth set-points that arrive at a rate [Hz]."""
         self._newest: deque[Vector] = deque(maxlen=max(1, round(SMOOTHED * rate)))
         self.delay = (max(1, round(SMOOTHED * rate)) - 1) / (2 * rate)
 
-    def begin(self) -> None:
-        """The arm rests where the next set-point is."""
+    def reset(self) -> None:
+        """Start at the next set-point, at rest."""
         self._newest.clear()
 
-    def after(self, q: Vector) -> Vector:
-        """Where to be (dof,) [rad] now that a set-point has come."""
+    def add(self, q: Vector) -> Vector:
+        """Return the smoothed position (dof,) [rad] after a new set-point."""
         self._newest.append(q)
         return np.asarray(np.mean(self._newest, axis=0))
 
 
-class Silence:
-    """How long [s] nothing was heard by somebody who listened."""
+class SilenceTimer:
+    """Measures for how long [s] nothing new was received while the driver listened."""
 
     def __init__(self) -> None:
-        """Nothing was heard yet."""
-        self._looked, self._silent = -math.inf, 0.0
+        """Start without a message."""
+        self._checked, self._silent = -math.inf, 0.0
 
-    def lasts(self, now: float, heard: bool) -> float:
-        """Its length at a look at some time [s]; of the time since the look before no more than LOOK counts."""
-        self._silent = 0.0 if heard else self._silent + min(now - self._looked, LOOK)
-        self._looked = now
+    def update(self, now: float, received: bool) -> float:
+        """Return the silence [s] at a time [s]; at most LONGEST_STEP counts of the time since the last call."""
+        self._silent = 0.0 if received else self._silent + min(now - self._checked, LONGEST_STEP)
+        self._checked = now
         return self._silent
 
 
 class UrArm:
-    """The three connections to a controller: what it says, the program that moves it, and its dashboard."""
+    """The three connections to a controller: its state, the program that moves the arm, and its dashboard."""
 
-    paces, hurries = False, True
+    paced_by_arm, realtime = False, True
 
     def __init__(self, options: Options, limits: Limits) -> None:
-        """Connect; an arm that is ready gets its program, and rests."""
+        """Connect; an arm that is ready gets its program and stays at rest."""
         import rtde_receive
         from dashboard_client import DashboardClient
 
@@ -153,32 +152,32 @@ class UrArm:
         self._dashboard.connect()
         self._receive = rtde_receive.RTDEReceiveInterface(options.host, self.rate, VARIABLES)
         self._control: Any = None
-        self._using = threading.Lock()  # the control interface, which is not made for two
+        self._control_lock = threading.Lock()  # the control interface is not thread-safe
         self._stamp, self._since = -1.0, time.monotonic()
-        self._states, self._taking = Silence(), Silence()
+        self._no_state, self._not_accepted = SilenceTimer(), SilenceTimer()
         self._freedrive = self._servoing = False
-        self._began = False  # whether the program that was uploaded was seen to run
+        self._program_seen = False  # whether the uploaded program was seen running
         self._ending: threading.Thread | None = None
 
     def read(self) -> ArmState:
-        """The newest state; the program is uploaded where the arm is ready and has none.
+        """Return the newest state; upload the program when the arm is ready and has none.
 
         Raises:
-            ConnectionError: nothing new came for a while.
+            ConnectionError: no new state for STATE_TIMEOUT.
         """
         stamp, now = self._receive.getTimestamp(), time.monotonic()
-        silent = self._states.lasts(now, stamp != self._stamp)
+        silent = self._no_state.update(now, stamp != self._stamp)
         if silent == 0.0:
             self._stamp, self._since = stamp, now
-        elif silent > LATEST:
-            raise ConnectionError(f"no word from the controller for {now - self._since:.2f} s")
+        elif silent > STATE_TIMEOUT:
+            raise ConnectionError(f"no message from the controller for {now - self._since:.2f} s")
         mode, message = self._mode()
         if self._control is not None:
             runs = bool(self._receive.getRobotStatus() & PROGRAM_RUNS)
-            if self._began and not runs and mode in ("running", "freedrive"):
-                mode, message = "idle", "its program has ended, and is begun again"
-            self._began = self._began or runs
-        with self._using:
+            if self._program_seen and not runs and mode in ("running", "freedrive"):
+                mode, message = "idle", "its program has ended, and is restarted"
+            self._program_seen = self._program_seen or runs
+        with self._control_lock:
             if mode == "running" and self._control is None:
                 self._upload()
             elif mode not in ("running", "freedrive") and self._control is not None:
@@ -203,72 +202,73 @@ class UrArm:
         import rtde_control
 
         if self._ending is not None:
-            self._ending.join()  # the registers are for one at a time
-        self._began = False
+            self._ending.join()  # only one program may use the registers
+        self._program_seen = False
         flags = rtde_control.RTDEControlInterface.FLAG_UPLOAD_SCRIPT
         self._control = rtde_control.RTDEControlInterface(self._options.host, self.rate, flags)
         self._control.setWatchdog(WATCHDOG)
 
     def _drop(self) -> None:
         control, self._control, self._servoing = self._control, None, False
-        self._freedrive = False  # it was the program that let go of the joints
-        self._ending = threading.Thread(target=control.disconnect, daemon=True)  # it waits for threads of its own
+        self._freedrive = False  # the program had released the joints
+        self._ending = threading.Thread(target=control.disconnect, daemon=True)  # it waits for its own threads
         self._ending.start()
 
     def due(self) -> list[float]:
-        """One, now: who is late slows down."""
+        """Return one time, now: a late driver slows the motion down."""
         return [time.monotonic()]
 
     def servo(self, points: list[Vector]) -> None:
-        """Go to the last of the set-points (6,) [rad], as it is smoothed, within one period.
+        """Move to the last of the set-points (6,) [rad], smoothed, within one period.
 
         Raises:
-            ConnectionError: the program in the arm does not run any more.
+            ConnectionError: the arm's program does not run any more.
         """
-        with self._using:
+        with self._control_lock:
             if not self._servoing:
-                self._smoothing.begin()
-            q = self._smoothing.after(points[-1]).tolist()
-            taken = self._control is not None and self._control.servoJ(
+                self._smoothing.reset()
+            q = self._smoothing.add(points[-1]).tolist()
+            accepted = self._control is not None and self._control.servoJ(
                 q, 0.0, 0.0, 1 / self.rate, self._options.lookahead, self._options.gain)
-            begun, self._servoing = not self._servoing, True
-        if self._taking.lasts(time.monotonic(), taken or begun) > LATEST:  # else it may be about to say why
-            raise ConnectionError("the arm's program does not take set-points")
+            first, self._servoing = not self._servoing, True
+        # For a moment the arm may be about to report why it does not accept them.
+        if self._not_accepted.update(time.monotonic(), accepted or first) > STATE_TIMEOUT:
+            raise ConnectionError("the arm's program does not accept set-points")
 
     def wait(self) -> None:
-        """Tell the arm's program that we are there."""
-        with self._using:
+        """Keep the watchdog of the arm's program from ending it."""
+        with self._control_lock:
             if self._control is not None:
                 self._control.kickWatchdog()
 
-    def _rest(self) -> None:
+    def _stop_servo(self) -> None:
         if self._control is not None and self._servoing:
             self._control.servoStop(self._deceleration)
             self._servoing = False
 
     def do(self, act: str, value: float = 0.0, *more: float) -> None:
-        """Power and brakes, recovery, freedrive, payload."""
+        """Enable, recover, free-drive, or set the payload."""
         if act in ("enable", "recover"):
             self._enable()
             return
         if act == "freedrive" and value:
-            self._freedrive = True  # from now on nothing is servoed
+            self._freedrive = True  # no set-points from now on
         elif act == "payload":
-            end = time.monotonic() + SETTLES
-            while max(map(abs, self._receive.getActualQd())) > MOVES:
+            end = time.monotonic() + SETTLE_TIMEOUT
+            while max(map(abs, self._receive.getActualQd())) > STANDSTILL:
                 if time.monotonic() > end:
-                    raise ValueError("cannot be told while the arm moves")
+                    raise ValueError("cannot be set while the arm moves")
                 time.sleep(1 / self.rate)
-        with self._using:
+        with self._control_lock:
             if self._control is None:
                 self._freedrive = False
                 raise ValueError(f"cannot {act}: {self._mode()[1] or 'the arm is not ready'}")
             if act == "freedrive":
-                self._rest()
+                self._stop_servo()
                 done = self._control.teachMode() if value else self._control.endTeachMode()
                 self._freedrive = bool(value) and done
             elif act == "payload":
-                self._rest()  # its program takes no other order while it servoes
+                self._stop_servo()  # while it servoes, its program accepts nothing else
                 done = self._control.setPayload(value, list(more) or [0.0, 0.0, 0.0])
             else:
                 raise ValueError(f"it cannot {act}: enable, recover, freedrive, payload")
@@ -282,7 +282,7 @@ class UrArm:
             self._dashboard.unlockProtectiveStop()
         elif safety in SAFETY:
             raise ValueError(SAFETY[safety][1])
-        end = time.monotonic() + POWER
+        end = time.monotonic() + POWER_TIMEOUT
         robot = self._receive.getRobotMode()
         if robot != 7:
             self._dashboard.powerOn()
@@ -294,7 +294,7 @@ class UrArm:
         self._freedrive = False
 
     def close(self) -> None:
-        """Let go of the arm, at rest."""
-        self._rest()
+        """Release the arm, at rest."""
+        self._stop_servo()
         if self._control is not None:
             self._control.stopScript()

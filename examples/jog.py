@@ -8,7 +8,7 @@ from zencell.blocking import Cell
 with Cell(sys.argv[1]) if sys.argv[1:] else Cell.start("panda") as cell:
     arm = cell.arm
     with arm.owned(lease=30.0) as owner:  # neither a task nor anybody else moves it meanwhile
-        print(f"the motion is {owner.told}")
+        print(f"the motion is {owner.description}")
         for axis in ((0.0, 0.0, -0.1), (0.0, 0.0, 0.1)):
             arm.jog(linear=axis, seconds=0.5)  # [m/s] in the base; it stands 0.2 s after the end of this
         arm.jog(angular=(0.0, 0.0, 0.3), frame="tool", seconds=0.5)

@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from lab.network import FAIR, Weather
+from lab.network import GOOD_LINKS, LinkQuality
 
 Kind = Literal[
     "crash", "restart", "cut", "router lost", "stalled", "late goal", "person", "clock step", "ended", "slowed",
@@ -83,17 +83,17 @@ class Fault:
 
 
 @dataclass(frozen=True)
-class Plan:
+class FaultPlan:
     """All that goes wrong in one run, and what is left to chance; clocks by service [s]."""
 
     faults: tuple[Fault, ...] = ()
-    weather: Weather = FAIR
+    weather: LinkQuality = GOOD_LINKS
     skews: tuple[tuple[str, float], ...] = ()
     speed: float = 1.0  # cell time per wall time
     shuffled: bool = False  # the processes take the turns that are due at once in any order
 
 
-def make_plan(seed: int, services: Sequence[str], sooner: float = 1.0, without: Collection[str] = ()) -> Plan:
+def make_plan(seed: int, services: Sequence[str], sooner: float = 1.0, without: Collection[str] = ()) -> FaultPlan:
     """At least three crashes and a cut, messages that change places, are lost and doubled, and clocks that are wrong.
 
     Args:
@@ -125,7 +125,7 @@ def make_plan(seed: int, services: Sequence[str], sooner: float = 1.0, without: 
             kind, target = "router lost", ""
         turns = int(random.integers(AMID_TURNS if amid else MOST_TURNS))
         faults.append(Fault(at, kind, target, amid, turns, seconds))
-    weather = Weather(
+    weather = LinkQuality(
         delay=float(random.uniform(0.0002, 0.004)), hiccup=float(random.uniform(0.0002, 0.002)),
         loss=float(random.uniform(0.0, 0.05)), doubled=float(random.uniform(0.0, 0.02)),
         late=float(random.uniform(0.0, 0.03)),
@@ -140,7 +140,7 @@ def make_plan(seed: int, services: Sequence[str], sooner: float = 1.0, without: 
         faults.append(Fault(float(sooner * ends.uniform(0.0, ENDED_LATEST)), "ended"))
     faults += [fault for fault in _strange(seed, services, sooner) if fault.kind not in without]
     faults.sort(key=lambda fault: fault.at)
-    return Plan(tuple(faults), weather, skews, speed, shuffled=True)
+    return FaultPlan(tuple(faults), weather, skews, speed, shuffled=True)
 
 
 def _strange(seed: int, services: Sequence[str], sooner: float) -> list[Fault]:

@@ -41,8 +41,8 @@ from common.transport.codec import decode
 from common.transport.local import intersects
 from common.transport.session import RawSample
 from lab.doubles import is_double
-from lab.loop import Life, current_life
-from lab.process import Requests
+from lab.loop import Incarnation, current_incarnation
+from lab.processes import RequestLog
 
 Place = tuple[float, float, float]  # x, y, z [m]
 
@@ -107,7 +107,7 @@ class _Goals:
 class Invariants:
     """Looks at all messages, set-points and requests. `broken` says what did not hold, `checked` how many looks."""
 
-    def __init__(self, cell: Cell, requests: Requests, now: Callable[[], float]) -> None:
+    def __init__(self, cell: Cell, requests: RequestLog, now: Callable[[], float]) -> None:
         """Begin without having seen anything; `now` is the virtual time [s]."""
         self.broken: list[str] = []
         self.checked: Counter[str] = Counter()
@@ -116,13 +116,13 @@ class Invariants:
         self._requests, self._now = requests, now
         requests.on_ask, requests.on_serve, requests.on_answer = self._on_ask, self._on_serve, self._on_answer
         application = find_application(cell.application)
-        self._fills, self._wrong_in = application.fills, application.wrong_in
+        self._fills, self._wrong_in = application.fills_containers, application.truth_check
         self._newest_truth = b""  # as it travelled
         self._doubles = {entry.name for entry in cell.services.values() if is_double(entry)}
         self._cycle = CYCLES / rate_of(cell)  # [s] of cell time
-        known: dict[str, AnyTopic] = {**topics.platform_topics(), **application.topics}
+        known: dict[str, AnyTopic] = {**topics.platform_topics(), **application.topics_by_key}
         self._objects = f"{cell.name}/{topics.SCENE_OBJECTS.key}"
-        self._truth = [self._objects, *(f"{cell.name}/{view.key}" for view in application.views)]
+        self._truth = [self._objects, *(f"{cell.name}/{view.key}" for view in application.truth_views)]
         self._messages = {t.message.__name__: t.message for t in known.values()}
         self._log = f"/{topics.LOG.expression.partition('/')[0]}/"
         self._motion = f"{cell.name}/{topics.MOTION_STATUS.key}"
@@ -140,13 +140,13 @@ class Invariants:
         self._decided: dict[str, float] = {}  # by goal: when it was asked for first
         self._asked: dict[str, Message] = {}  # by id
         self._told: dict[tuple[str, str], bool] = {}  # by controller's process and goal: whether it was accepted
-        self._moves: Life | None = None  # the process whose set-points they are
+        self._moves: Incarnation | None = None  # the process whose set-points they are
         self._stray = 0  # set-points that moved without a goal
         self._restless = 0  # set-points that moved although the arm is held
         self._last_word = ""  # of persons: what they told the task, or "stop" to the executor
         self._ended = False  # the arm was stopped or is held, as a person said last
         self._ended_at: float | None = None  # cell time of the first set-point since
-        self._ended_by: Life | None = None  # the process that was told so, which brakes first
+        self._ended_by: Incarnation | None = None  # the process that was told so, which brakes first
         self._unasked = 0  # set-points that moved nevertheless
         self._by_persons: set[str] = set()  # goals
         self._cap = 1.0  # share of the velocity that a person allows
@@ -280,7 +280,7 @@ class Invariants:
         if last is None:
             return
         passed, way = now - last[2], np.abs(q - last[0])
-        before, self._moves = self._moves, current_life()
+        before, self._moves = self._moves, current_incarnation()
         if passed <= 0 or passed > STALL or before is not self._moves:  # another process, or one that stood still
             if self._broke((way <= JUMP * self._cycle / CYCLES).all(), LIMITS):
                 self._tell(LIMITS, f"a jump of {way.max():.3f} rad after {passed:.3f} s")
@@ -310,7 +310,8 @@ class Invariants:
             too_fast = np.abs(dq) > fastest * self._cap + 1e-3
             if self._broke(not too_fast.any(), SLOW):
                 self._tell(SLOW, f"dq {np.round(dq, 3).tolist()} at {self._cap:.0%}")
-        brakes = current_life() is self._ended_by and self._ended_at is not None and now - self._ended_at < AT_REST
+        brakes = (current_incarnation() is self._ended_by and self._ended_at is not None
+                  and now - self._ended_at < AT_REST)
         asked = self._jogged or (goals is not None and goals.active in self._by_persons)
         unasked = self._ended and not brakes and not asked
         self._unasked = self._unasked + 1 if unasked else 0
@@ -355,8 +356,8 @@ class Invariants:
             for speed in _speeds(request):
                 self._cap, self._cap_at = speed, None
         stop = isinstance(request, StopRequest) or (isinstance(request, HoldRequest) and request.hold)
-        if stop and getattr(request, "by", "") == "person" and self._last_word in ENDS:
-            self._ended, self._ended_at, self._ended_by = True, None, current_life()
+        if stop and getattr(request, "by", "") == "operator" and self._last_word in ENDS:
+            self._ended, self._ended_at, self._ended_by = True, None, current_incarnation()
         if isinstance(request, GOALS) and isinstance(answer, MotionStatus | GripperState):
             accepted = answer.state != "rejected"
             before = self._told.setdefault((life, request.id), accepted)

@@ -24,7 +24,7 @@ class Deadlock(RuntimeError):
     """Everybody waits, and nothing will ever happen."""
 
 
-class Life:
+class Incarnation:
     """What belongs together in a loop, such as one process of a cell; it can be cut off in the middle.
 
     Nothing of it runs then: no `finally`, no callback. `revive` lets it go on, so that it can be cleared away.
@@ -39,15 +39,15 @@ class Life:
         self.left: list[tuple[Callable[..., object], tuple[object, ...], Context]] = []  # turns never taken
 
 
-_life: ContextVar[Life | None] = ContextVar("life", default=None)
+_life: ContextVar[Incarnation | None] = ContextVar("life", default=None)
 
 
-def current_life() -> Life | None:
+def current_incarnation() -> Incarnation | None:
     """The life whose turn it is."""
     return _life.get()
 
 
-def context_of(life: Life) -> Context:
+def context_of(life: Incarnation) -> Context:
     """A context of its own for what belongs to a life; whatever is started in it does too."""
     context = Context()
     context.run(_life.set, life)
@@ -71,7 +71,7 @@ class _Future(_Numbered, asyncio.Future[Any]):
     pass
 
 
-class VirtualLoop(base_events.BaseEventLoop):
+class VirtualTimeLoop(base_events.BaseEventLoop):
     """A loop of one thread on a virtual clock, which begins at 0; the seed decides how long calls beside it take.
 
     What would run in another thread runs at once and in one go; its result comes after the time that it is said to
@@ -155,7 +155,7 @@ class VirtualLoop(base_events.BaseEventLoop):
         lives = [handle._context.get(_life) for handle in ready]
         if lives.count(lives[0]) == len(lives):
             return
-        turns: dict[Life | None, list[Any]] = {}
+        turns: dict[Incarnation | None, list[Any]] = {}
         for life, handle in zip(lives, ready, strict=True):
             turns.setdefault(life, []).append(handle)
         for own in turns.values():
@@ -197,7 +197,7 @@ class VirtualLoop(base_events.BaseEventLoop):
         timer._scheduled = True
         return timer
 
-    def end(self, life: Life) -> None:
+    def end(self, life: Incarnation) -> None:
         """Cut a life off: none of its turns is taken any more."""
         life.over = True
         for handle in [handle for handle in self._ready if handle._context.get(_life) is life]:
@@ -207,7 +207,7 @@ class VirtualLoop(base_events.BaseEventLoop):
         for timer in [timer for _, timer in self._scheduled if timer._context.get(_life) is life]:
             timer.cancel()
 
-    def revive(self, life: Life) -> None:
+    def revive(self, life: Incarnation) -> None:
         """Let the turns be taken that were left, so that its tasks can be cancelled; its timers are gone."""
         life.over = False
         left, life.left = life.left, []

@@ -18,15 +18,15 @@ import numpy as np
 
 from common.transport.local import Lane, LocalNetwork, LocalSession, intersects
 from common.transport.session import Declared, OnSample, RawSample
-from lab.loop import VirtualLoop
+from lab.loop import VirtualTimeLoop
 
-Link = tuple["VirtualSession", "VirtualSession", Lane, str]
+Link = tuple["SimulatedSession", "SimulatedSession", Lane, str]
 
 SOON = 1e-9  # [s] between two messages that may not change places
 
 
 @dataclass(frozen=True)
-class Weather:
+class LinkQuality:
     """What links do to what travels on them; delays in [s], the rest shares of the messages.
 
     Attributes:
@@ -46,14 +46,14 @@ class Weather:
     late_delay: float = 1.8
 
 
-FAIR = Weather()
-FOUL = Weather(delay=0.001, hiccup=0.001, loss=0.01, doubled=0.005)
+GOOD_LINKS = LinkQuality()
+POOR_LINKS = LinkQuality(delay=0.001, hiccup=0.001, loss=0.01, doubled=0.005)
 
 
-class VirtualSession(LocalSession):
+class SimulatedSession(LocalSession):
     """A session whose link to the router may be cut, and whose process may end without a word."""
 
-    def __init__(self, network: VirtualNetwork, context: Context, name: str, number: int) -> None:
+    def __init__(self, network: SimulatedNetwork, context: Context, name: str, number: int) -> None:
         """Be connected; callbacks run in the context of the process, which has a name and a number of its own."""
         super().__init__(network)
         self.name, self.life = name, f"{name} {number}"
@@ -86,27 +86,27 @@ class VirtualSession(LocalSession):
             self.context.run(on_change)
 
 
-class VirtualNetwork(LocalNetwork):
+class SimulatedNetwork(LocalNetwork):
     """Where the sessions of one simulated cell meet."""
 
-    def __init__(self, loop: VirtualLoop, seed: int, weather: Weather = FAIR) -> None:
+    def __init__(self, loop: VirtualTimeLoop, seed: int, weather: LinkQuality = GOOD_LINKS) -> None:
         """Bring what is sent in this weather."""
         super().__init__()
         self.counted: Counter[str] = Counter()  # what the weather did
         self.weather = weather
         self.router_lost = False
-        self.on_put: Callable[[VirtualSession, RawSample], None] = lambda session, sample: None
-        self.on_listen: Callable[[VirtualSession, str], None] = lambda session, key: None
+        self.on_put: Callable[[SimulatedSession, RawSample], None] = lambda session, sample: None
+        self.on_listen: Callable[[SimulatedSession, str], None] = lambda session, key: None
         self._loop = loop
         self._random = np.random.default_rng([seed, 3])
         self._drawn: list[float] = []
         self._arrival: dict[Link, float] = {}
-        self._lateness: dict[tuple[VirtualSession, VirtualSession, str], float] = {}  # [s] of the next that is sent
-        self._sessions: list[VirtualSession] = []
+        self._lateness: dict[tuple[SimulatedSession, SimulatedSession, str], float] = {}  # [s] of the next that is sent
+        self._sessions: list[SimulatedSession] = []
 
-    def attach(self, context: Context, name: str, number: int = 0) -> VirtualSession:
+    def attach(self, context: Context, name: str, number: int = 0) -> SimulatedSession:
         """A session of a process."""
-        session = VirtualSession(self, context, name, number)
+        session = SimulatedSession(self, context, name, number)
         session.cut = self.router_lost
         self._sessions.append(session)
         return session
@@ -156,7 +156,7 @@ class VirtualNetwork(LocalNetwork):
     def _delay(self) -> float:
         return -self.weather.delay * math.log1p(-self._chance())
 
-    def _bring(self, link: Link, source: VirtualSession, delay: float, call: Callable[[], None]) -> None:
+    def _bring(self, link: Link, source: SimulatedSession, delay: float, call: Callable[[], None]) -> None:
         sent = max(self._loop.time(), source.stalled_until, link[1].stalled_until)
         due = max(sent + delay, self._arrival.get(link, 0.0) + SOON)
         self._arrival[link] = due
@@ -166,7 +166,9 @@ class VirtualNetwork(LocalNetwork):
             link[1].latest_due = due
         self._arrive_at(due, source, link[1], call)
 
-    def _arrive_at(self, due: float, source: VirtualSession, target: VirtualSession, call: Callable[[], None]) -> None:
+    def _arrive_at(
+        self, due: float, source: SimulatedSession, target: SimulatedSession, call: Callable[[], None]
+    ) -> None:
         links = source.links, target.links
 
         def arrive() -> None:
@@ -177,7 +179,7 @@ class VirtualNetwork(LocalNetwork):
 
     # --- links that are cut, processes that end -----------------------------------------------------------------------
 
-    def cut(self, sessions: Iterable[VirtualSession]) -> None:
+    def cut(self, sessions: Iterable[SimulatedSession]) -> None:
         """Cut the links of sessions; all links stand for a router that is lost."""
         for session in sessions:
             if session.connected:
@@ -190,11 +192,11 @@ class VirtualNetwork(LocalNetwork):
                     self._arrive_at(self._loop.time(), session, session, partial(watcher, token, False))
                 session.tell_connection()
 
-    def stall(self, session: VirtualSession, seconds: float) -> None:
+    def stall(self, session: SimulatedSession, seconds: float) -> None:
         """Have everything that is sent from or to a session from now on come later, but come."""
         session.stalled_until = max(session.stalled_until, self._loop.time() + seconds)
 
-    def hold_up(self, source: VirtualSession, target: VirtualSession, key: str, seconds: float) -> None:
+    def hold_up(self, source: SimulatedSession, target: SimulatedSession, key: str, seconds: float) -> None:
         """Have the next request or answer under a key from one session to another come later by that."""
         self._lateness[source, target, key] = seconds
 
@@ -208,7 +210,7 @@ class VirtualNetwork(LocalNetwork):
         self.router_lost = False
         self.mend(list(self._sessions))
 
-    def mend(self, sessions: Iterable[VirtualSession]) -> None:
+    def mend(self, sessions: Iterable[SimulatedSession]) -> None:
         """Let the links stand again."""
         for session in sessions:
             if session.cut:
@@ -220,7 +222,7 @@ class VirtualNetwork(LocalNetwork):
                 for watcher, token in self._seen_by(session):
                     self._arrive_at(self._loop.time(), session, session, partial(watcher, token, True))
 
-    def detach(self, session: VirtualSession) -> None:
+    def detach(self, session: SimulatedSession) -> None:
         """Take a session out of the network whose process has ended without taking anything back."""
         if session.detached:
             return
@@ -235,7 +237,7 @@ class VirtualNetwork(LocalNetwork):
         self._arrival = {link: due for link, due in self._arrival.items() if session not in link[:2]}
         self._lateness = {link: late for link, late in self._lateness.items() if session not in link[:2]}
 
-    def _lose(self, session: VirtualSession) -> None:
+    def _lose(self, session: SimulatedSession) -> None:
         """Have everybody else hear that a session is gone: its tokens, and what it was asked."""
         for other in [other for other in self._sessions if other is not session and other.connected]:
             for asked in list(other.asking):
@@ -256,7 +258,7 @@ class VirtualNetwork(LocalNetwork):
         self._arrival[link] = due
         self._arrive_at(due, link[1], link[1], call)
 
-    def _seen_by(self, session: VirtualSession) -> list[tuple[Callable[[str, bool], None], str]]:
+    def _seen_by(self, session: SimulatedSession) -> list[tuple[Callable[[str, bool], None], str]]:
         """The tokens of others that the watchers of a session see while its link stands."""
         return [
             (watcher.callback, token)
@@ -268,11 +270,11 @@ class VirtualNetwork(LocalNetwork):
         ]
 
 
-def _of(network: LocalNetwork) -> VirtualNetwork:
-    assert isinstance(network, VirtualNetwork)
+def _of(network: LocalNetwork) -> SimulatedNetwork:
+    assert isinstance(network, SimulatedNetwork)
     return network
 
 
-def _ours(session: LocalSession) -> VirtualSession:
-    assert isinstance(session, VirtualSession)
+def _ours(session: LocalSession) -> SimulatedSession:
+    assert isinstance(session, SimulatedSession)
     return session

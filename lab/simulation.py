@@ -13,7 +13,7 @@ import shutil
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Coroutine, Iterator
+from collections.abc import Callable, Collection, Coroutine, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -25,23 +25,26 @@ from common.application import find_application
 from common.clock import Clock
 from common.config import Cell
 from common.kept_file import STATE_VARIABLE
-from common.messages import TaskStatus
+from common.messages import SupervisorStatus, TaskStatus
 from common.sources import drawn_from
 from common.supervision.launch import Launch
 from common.supervision.operation import supervise
 from common.supervision.supervisor import Supervisor
 from common.transport.bus import Bus
-from common.transport.codec import decode
+from common.transport.codec import decode, decode_attachment
+from common.transport.reader import Newness
 from common.transport.session import RawSample
 from lab.doubles import is_double
-from lab.faults import Plan, make_plan
+from lab.fault_injector import STRANGER, FaultInjector
+from lab.faults import FaultPlan, make_plan
 from lab.invariants import Invariants
-from lab.loop import VirtualLoop
-from lab.misfortune import STRANGER, Misfortune
-from lab.network import VirtualNetwork, VirtualSession
-from lab.process import Host, Requests, VirtualBus, VirtualProcess
-from lab.trace import Trace
-from lab.watched_arm import shown_to, with_watched_arm
+from lab.loop import VirtualTimeLoop
+from lab.network import SimulatedNetwork, SimulatedSession
+from lab.observed_arm import observe_set_points, with_observed_arm
+from lab.processes import RequestLog, SimulatedBus, SimulatedHost, SimulatedProcess
+from recording.capture import CustomTopics
+from recording.sample import Sample, message_of
+from recording.writer import RUN, RecordingWriter, run_of
 
 LIMIT = 300.0  # [s] virtual time in which the task has to end
 LOOK = 0.5  # [s] of virtual time between looks at requests
@@ -92,7 +95,7 @@ class _Up:
     """A supervisor that is there."""
 
     supervisor: Supervisor
-    bus: VirtualBus
+    bus: SimulatedBus
     ready: asyncio.Event  # all services are
     working: asyncio.Task[None]
     lost: bool = False
@@ -124,10 +127,10 @@ class Simulation:
             ConfigError: the cell has a real arm, or is none that can be simulated.
         """
         kept = {key: entry for key, entry in cell.services.items() if entry.name not in LEFT_OUT}
-        self.cell = with_watched_arm(cell.model_copy(update={"services": kept}))
+        self.cell = with_observed_arm(cell.model_copy(update={"services": kept}))
         names = [entry.name for entry in kept.values()]
         doubled = any(is_double(entry) for entry in kept.values())
-        self.plan = make_plan(seed, names, SOONER if doubled else 1.0, without) if faults else Plan()
+        self.plan = make_plan(seed, names, SOONER if doubled else 1.0, without) if faults else FaultPlan()
         self.outcome = Outcome(seed)
         self._limit, self._trace, self._tell, self._visit = limit, trace, tell, visit
         self._failed: Exception | None = None  # of the visit
@@ -138,17 +141,17 @@ class Simulation:
         self._ended = asyncio.Event()
         self._restarts: Counter[str] = Counter()  # of supervisors before
         self._over = False  # what the task says from now on does not count: somebody may have started it again
-        self._loop = VirtualLoop(seed, shuffled=self.plan.shuffled)
-        self._network = VirtualNetwork(self._loop, seed, self.plan.weather)
+        self._loop = VirtualTimeLoop(seed, shuffled=self.plan.shuffled)
+        self._network = SimulatedNetwork(self._loop, seed, self.plan.weather)
         self._network.on_put = self._on_put
-        self._requests = Requests()
+        self._requests = RequestLog()
         self.invariants = Invariants(self.cell, self._requests, self._loop.time)
         self._network.on_listen = lambda session, key: self.invariants.on_listen(session.name, key)
 
     def run(self) -> Outcome:
         """What became of it; what the visit raises is raised."""
         began = time.process_time()
-        with drawn_from(self._loop), shown_to(self.invariants.on_set_point), _state_folder(), _quiet():
+        with drawn_from(self._loop), observe_set_points(self.invariants.on_set_point), _state_folder(), _quiet():
             try:
                 self._loop.run_until_complete(self._run())
             finally:
@@ -171,12 +174,12 @@ class Simulation:
 
     async def _run(self) -> None:
         outcome, clock = self.outcome, Clock(self.plan.speed)
-        host = Host(
+        host = SimulatedHost(
             self._loop, self._network, self.cell, clock, np.random.default_rng([outcome.seed, 4]), self._requests,
             skews=dict(self.plan.skews),
         )
         self._host = host
-        self._misfortune = Misfortune(host, self.plan, outcome.seed, self._status, self._say)
+        self._misfortune = FaultInjector(host, self.plan, outcome.seed, self._status, self._say)
         self._misfortune.lose_supervisor, self._misfortune.persons.leave = self._bring_up_again, self._leave
         self._bring_up()
         playing = asyncio.create_task(self._play())
@@ -207,12 +210,12 @@ class Simulation:
         entries = {entry.name: entry for entry in self.cell.services.values()}
 
         def make_child(name: str, _command: object, _environment: object, on_line: Callable[[str, str], None]) -> Any:
-            return VirtualProcess(host, entries[name], on_line)
+            return SimulatedProcess(host, entries[name], on_line)
 
         launch = Launch(cell=self.cell.name, connect="tcp/127.0.0.1:7447", clock=clock)
         host.started += 1
         session = self._network.attach(contextvars.copy_context(), SUPERVISOR, host.started)
-        bus = VirtualBus(session, SUPERVISOR, self.cell.name, clock, host.requests)
+        bus = SimulatedBus(session, SUPERVISOR, self.cell.name, clock, host.requests)
         supervisor = Supervisor(self.cell, launch, lambda name, line: self._say(line), make_child=make_child)
         # Which is put only while somebody listens.
         bus.raw_subscriber(f"{self.cell.name}/{topics.LOG.expression}", lambda sample: None)
@@ -306,7 +309,7 @@ class Simulation:
             return
         host = self._host
         session = self._network.attach(contextvars.copy_context(), VISITOR)
-        bus = VirtualBus(session, VISITOR, self.cell.name, host.clock, host.requests)
+        bus = SimulatedBus(session, VISITOR, self.cell.name, host.clock, host.requests)
         try:
             await self._visit(bus)
         except Exception as error:
@@ -335,7 +338,7 @@ class Simulation:
             outcome.state, outcome.seconds = "NOT ENDED", self._loop.time()
             outcome.message = f"{status.state} {status.message}".strip()
 
-    def _on_put(self, session: VirtualSession, sample: RawSample) -> None:
+    def _on_put(self, session: SimulatedSession, sample: RawSample) -> None:
         self.outcome.messages += 1
         if self._hash is not None:
             self._hash.update(
@@ -355,7 +358,7 @@ class Simulation:
             else:
                 self._ended.clear()
 
-    async def _clear(self, playing: asyncio.Task[None], host: Host) -> None:
+    async def _clear(self, playing: asyncio.Task[None], host: SimulatedHost) -> None:
         """Leave nothing behind that runs."""
         self._tell = lambda line: None
         up = self._up
@@ -404,3 +407,55 @@ def _quiet() -> Iterator[None]:
         if collecting:
             gc.enable()
             gc.collect()
+
+
+FLUSH_NS = 800_000_000  # of virtual time
+
+
+class Trace:
+    """Writes every message once, at its virtual time."""
+
+    def __init__(self, path: Path, about: Mapping[str, Any], own: CustomTopics) -> None:
+        """Create the file.
+
+        Args:
+            path: of the file.
+            about: what is recorded.
+            own: what there is in the cell beside what comes with the project.
+
+        Raises:
+            RecordingError: it is there already, or cannot be written.
+        """
+        self._writer = RecordingWriter(path, about)
+        self._kinds = own.kinds(own.topics())
+        self._newness: dict[str, Newness] = {}
+        self._run_known = False
+        self._flushed = 0
+
+    @property
+    def messages(self) -> int:
+        """How many were written."""
+        return self._writer.messages
+
+    def add(self, raw: RawSample, now: int) -> None:
+        """Write a message that is put now [ns since the Unix epoch], unless it is put again."""
+        origin = decode_attachment(raw.attachment)
+        if origin is None or not self._newness.setdefault(raw.key, Newness()).is_new(origin):
+            return
+        topic = raw.key.partition("/")[2]
+        if topic == topics.SUPERVISOR_STATUS.key and not self._run_known:
+            self._run_known = True
+            status = decode(SupervisorStatus, raw.payload)
+            self._writer.describe(RUN, run_of(status))
+        kind = self._kinds.get(topics.general_key(topic), "stream")
+        self._writer.add(Sample(
+            raw.key, raw.payload, now, message=message_of(raw.encoding), kind=kind,
+            writer=origin.writer, sequence=origin.sequence, trace=origin.trace,
+        ))
+        if now - self._flushed > FLUSH_NS:
+            self._flushed = now
+            self._writer.flush()
+
+    def close(self, reason: str) -> None:
+        """Write how it ended, and the rest."""
+        self._writer.close({"reason": reason, "missed": {}, "dropped": {}})

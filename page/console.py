@@ -253,7 +253,8 @@ class Console(ActionQueue):
             acknowledged: newest stop or hold known when this was decided; newer ones stay in force. Default: now.
         """
         acknowledged = self.acknowledged if acknowledged is None else acknowledged
-        fields = {"command": command, "by": self.permissions.client_name, "override": override, "heard": acknowledged}
+        fields = {"command": command, "by": self.permissions.client_name, "override": override,
+                  "acknowledged": acknowledged}
         await self.call(topics.TASK_COMMAND, TaskCommand.model_validate(fields))
 
     async def stop(self) -> str:
@@ -285,7 +286,7 @@ class Console(ActionQueue):
 
     def jog(self, acknowledged: int, **velocities: Any) -> None:
         """Move with velocities, as fields of a `JogCommand`, for the next 0.1 s; without any come to a stop."""
-        fields = {"header": self._bus.header(), "owner": self.permissions.client_name, "heard": acknowledged}
+        fields = {"header": self._bus.header(), "owner": self.permissions.client_name, "acknowledged": acknowledged}
         self._jog_writer.put(JogCommand.model_validate(fields | velocities))
 
     # --- parameters ---

@@ -172,7 +172,7 @@ class ControlSocket:
         """Return why this page cannot move the arm, whatever state the arm is in; empty if it can."""
         permissions = self._actions.permissions
         if owner is not None and owner.asked and owner.kind != "task" and owner.owner != permissions.client_name:
-            return f"the motion is {owner.told}: take control of the arm, or wait until it is released"
+            return f"the motion is {owner.description}: take control of the arm, or wait until it is released"
         return permissions.check(CURRENT_SESSION.get(), "operate")
 
     def _handle(self, connection: ServerConnection, data: str | bytes, delay: PressDelay) -> bool:

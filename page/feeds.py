@@ -11,6 +11,7 @@ from common.application import Application
 from common.messages import Image, Message, Rejections
 from common.remapping import Remapping
 from common.topics import Request, Topic
+from page.application import page_of
 
 if TYPE_CHECKING:
     from common.transport.bus import Bus
@@ -117,25 +118,23 @@ class Topics:
         self, application: Application | None, parts: Iterable[HasTopics], keys: Sequence[Mapping[str, str]] = ()
     ) -> None:
         """Collect the topics of an application and of parts of the page, under the remapped `keys` of the services."""
+        found, page = application.topics if application is not None else None, page_of(application)
 
-        def find(part: str, name: str) -> Any:
-            return application.find(part, name) if application is not None else None
+        def remapped(*some: Topic[Any] | None) -> list[Topic[Any]]:
+            return [each for topic in some if topic is not None for each in remapped_topics(topic, keys)]
 
-        def remapped(*found: Topic[Any] | None) -> list[Topic[Any]]:
-            return [each for topic in found if topic is not None for each in remapped_topics(topic, keys)]
-
-        self.status: Topic[Any] | None = find("topics", "STATUS")
-        self.rejected: list[Topic[Rejections]] = remapped(find("topics", "REJECTED"))
-        self.detected: list[Topic[Any]] = remapped(find("topics", "DETECTED"))
-        self.decided_by: list[Topic[Any]] = remapped(find("topics", "DECIDED_BY"))
+        self.status: Topic[Any] | None = found.status if found else None
+        self.rejected: list[Topic[Rejections]] = remapped(found.rejected if found else None)
+        self.detected: list[Topic[Any]] = remapped(found.detected if found else None)
+        self.decided_by: list[Topic[Any]] = remapped(found.decided_by if found else None)
         self.images: dict[str, list[Topic[Image]]] = {
             LIVE: remapped(topics.CAMERA_IMAGE, topics.DEPTH_CAMERA_IMAGE),
-            ANNOTATED: remapped(find("topics", "ANNOTATED")),
-            MASK: remapped(find("topics", "MASK")),
+            ANNOTATED: remapped(found.annotated if found else None),
+            MASK: remapped(found.mask if found else None),
             DEPTH: remapped(topics.DEPTH_CAMERA_DEPTH),
         }
-        self.requests: Sequence[Request[Any, Any]] = find("page", "REQUESTS") or ()
-        controls = getattr(find("page", "Controls"), "TOPICS", ())
+        self.requests: Sequence[Request[Any, Any]] = page.requests
+        controls = getattr(page.controls, "TOPICS", ())
         displayed = [topic for part in parts for topic in part.TOPICS]
         images = [topic for each in self.images.values() for topic in each]
         self.on_demand: list[Topic[Any]] = [*images, *controls, *displayed]

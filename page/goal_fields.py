@@ -136,7 +136,7 @@ class GoalFields:
 
     def check_marker(self, now: float) -> tuple[str, str] | None:
         """Return a new line on whether the arm can reach the marker, with its kind; once it rests with the reason."""
-        from common.planning.ik import solve_ik, why_no_ik
+        from common.planning.ik import explain_ik_failure, solve_ik
 
         if not self.marker or (seed := self._readout.joints()) is None:
             return None
@@ -151,7 +151,7 @@ class GoalFields:
             return ("Goal marker: reachable. Press Plan to check for collisions.", "good") if reachable else (
                 "Goal marker: not reachable.", "bad")
         self._checked = (pose, before[1], True)
-        return f"Goal marker: not reachable: {why_no_ik(self._robot, target, seed)}", "bad"
+        return f"Goal marker: not reachable: {explain_ik_failure(self._robot, target, seed)}", "bad"
 
     def copy_current(self) -> None:
         """Set the numbers to the current pose of the arm."""

@@ -25,9 +25,8 @@ from page.feeds import Latest
 from page.markup import Html, block, buttons, fields, line, press, row, span, table
 
 if TYPE_CHECKING:
-    from tools.calibration.intrinsics import ViewResidual
-
     from tools.calibration.board import Board
+    from tools.calibration.intrinsics import ViewResidual
 
 Mount = Literal["hand", "beside"]
 
@@ -113,10 +112,9 @@ class HandEyeSession:
             CalibrationFailed: too few or inconsistent views.
             ConfigError: the file cannot be written.
         """
-        from tools.calibration.report import with_hand_eye
-
         from common.perception.camera_file import CameraFile
         from tools.calibration.hand_eye import calibrate_hand_eye
+        from tools.calibration.report import with_hand_eye
         from tools.calibration.views import load_views
 
         camera = CameraFile(width=info.width, height=info.height, fx=info.k[0], fy=info.k[4], cx=info.k[2],

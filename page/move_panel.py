@@ -113,7 +113,8 @@ class MovePanel:
         for name, action, label in (
             ("plan", self._plan_goal, "Plan"), ("execute", self._execute, "Execute"),
             ("go", self._plan_and_execute, "Plan and execute"),
-            ("other", self._execute_compared, "Execute compared plan"), ("here", self._goal.copy_current, "Copy current pose"),
+            ("other", self._execute_compared, "Execute compared plan"),
+            ("here", self._goal.copy_current, "Copy current pose"),
         ):
             self._console.on_press(f"move:{name}", action, label)
         self._buttons, self._result = Html(gui), Html(gui)

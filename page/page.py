@@ -1,12 +1,6 @@
 """The operator's page: panels around the 3D scene, updated from the messages of the cell while a browser is connected.
 
-An application extends it in its part `page`: texts for its task (status_text.py), layers of the scene (layers), and
-
-    REQUESTS = (SELECT,)                                   # that its buttons and layers send by `Console.call`
-    class Controls:                                        # its own buttons, below those of every task
-        TOPICS, PERIOD = (CHOICES,), 0.5                   # as in a layer
-        def __init__(self, gui: viser.GuiApi, console: Console) -> None:
-        def show(self, topic: Topic[Any], message: Any) -> None:
+An application extends it by an `ApplicationPage` (application.py).
 """
 
 from __future__ import annotations
@@ -24,6 +18,7 @@ from common.application import Application
 from common.config import Members, RobotConfig
 from common.messages import Rejections, TaskStatus
 from common.topics import Topic
+from page.application import page_of
 from page.camera_panel import CameraPanel
 from page.console import Console
 from page.control_socket import ARM_LOST, HOLD, STOP, TASK_LOST, ControlSocket, LossDetector, PageStatus, summarize
@@ -118,7 +113,7 @@ class Page:
         gui.main_panel.set_width(layout.panel_width)
         self._task = TaskPanel(gui, console, self._text, self._go_home)
         self._controller = ControllerPanel(gui, console)
-        create = application.find("page", "Controls") if application is not None else None
+        create = page_of(application).controls
         self._controls = create(gui, console) if create is not None else None
         self._controls_updater = (
             Updater(self._controls, self._feeds.latest) if self._controls is not None else None)

@@ -13,9 +13,8 @@ from common.topics import Topic
 from page.feeds import Feeds
 from page.history import FAST_PERIOD, FAST_TOPICS, SLOW_PERIOD, Event, RecentHistory
 from page.status_text import state_name
-from recording.decoding import Decoder
-from recording.reading import Recording
-from recording.sample import RecordingError, Sample
+from recording.reader import Recording
+from recording.sample import Decoder, RecordingError, Sample
 
 M = TypeVar("M", bound=Message)
 

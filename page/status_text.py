@@ -1,12 +1,4 @@
-"""Texts of the page for states and errors. An application adds texts of its own in its part `page`:
-
-    STATES = {"SORTING": "Sorting"}                   # of its task, in addition to IDLE, HOMING, DONE and ERROR
-    LATENCY = "Image to targets"                      # label for the age of the messages of DECIDED_BY
-    def counters(status: TaskStatus, rejected: int) -> dict[str, object]:            # figures below the state
-    def progress(status: TaskStatus, motion: MotionStatus | None) -> float:          # 0 to 1, for the progress bar
-
-A text for a state comes with its kind: good, busy, bad or off, which is its color.
-"""
+"""Texts of the page for states and errors. A state also has a kind, which is its color: good, busy, bad, off."""
 
 from __future__ import annotations
 
@@ -19,6 +11,7 @@ from common.application import Application
 from common.client.operator_motion import AT_REST
 from common.errors import NoResponder, RemoteError, ZencellError
 from common.messages import GripperState, MotionStatus, PlanResponse, RobotStatus, TaskStatus
+from page.application import ApplicationPage, page_of
 from page.markup import BAD, BUSY, GOOD, OFF
 
 STATES = {"IDLE": "Waiting", "HOMING": "Moving to home", "DONE": "Done", "ERROR": "Failed"}
@@ -88,16 +81,13 @@ class TaskText:
     states: Mapping[str, str] = field(default_factory=lambda: STATES)
     counters: Callable[[TaskStatus, int], Mapping[str, object]] = counters
     progress: Callable[[TaskStatus, MotionStatus | None], float] = progress
-    latency: str = "Image to decision"
+    latency: str = ApplicationPage.latency
 
     @classmethod
     def of(cls, application: Application | None) -> TaskText:
         """Return the texts of an application."""
-        page = application.part("page") if application is not None else None
-        return cls(
-            {**STATES, **getattr(page, "STATES", {})}, getattr(page, "counters", counters),
-            getattr(page, "progress", progress), getattr(page, "LATENCY", cls.latency),
-        )
+        page = page_of(application)
+        return cls({**STATES, **page.states}, page.counters or counters, page.progress or progress, page.latency)
 
     def state(self, status: TaskStatus | None) -> tuple[str, str]:
         """Return the state of the task and its kind."""

@@ -33,11 +33,10 @@ from common.messages import (
     WorldObjects,
 )
 from common.perception.image import image_to_array
-from recording.decoding import Decoder, schema_of
-from recording.foxglove_scene import of_markers, of_scene, of_world, time_of
-from recording.foxglove_schemas import SCHEMAS
-from recording.reading import Recording, Wanted
-from recording.writing import AppendedFile, NotMade, WritingFailed
+from recording.foxglove_scene import SCHEMAS, of_markers, of_scene, of_world, time_of
+from recording.reader import Recording, Wanted
+from recording.sample import Decoder, schema_of
+from recording.writer import AppendedFile, ExportFailed, WriteFailed
 
 JPEG_QUALITY = 90
 LEVELS = {"debug": 1, "info": 2, "warning": 3, "error": 4, "critical": 5}
@@ -46,7 +45,7 @@ CANNOT_BE_CONVERTED = (ZencellError, ArithmeticError, ValueError, LookupError, T
 CHUNK_BYTES = 1024 * 1024
 
 
-def export(recording: Recording, target: Path, wants: Wanted, decoder: Decoder) -> int:
+def export_foxglove(recording: Recording, target: Path, wants: Wanted, decoder: Decoder) -> int:
     """Number of messages that were written to a new file, which is whole or not there.
 
     Colour pictures become JPEG. What Foxglove has no schema for is written as JSON of its own.
@@ -59,8 +58,8 @@ def export(recording: Recording, target: Path, wants: Wanted, decoder: Decoder) 
         return _written(recording, file, wants, decoder)
     except BaseException as error:
         target.unlink(missing_ok=True)
-        if isinstance(error, WritingFailed):
-            raise NotMade(target, error.why) from None
+        if isinstance(error, WriteFailed):
+            raise ExportFailed(target, error.why) from None
         raise
     finally:
         file.close()
@@ -106,7 +105,7 @@ def convert(message: Message) -> tuple[str, dict[str, Any]]:
 @cache
 def _kinds() -> list[Kind]:
     """Those of applications first: their messages derive from what any message may be."""
-    own = [kind for found in applications() for kind in found.find("recording", "FOXGLOVE") or ()]
+    own = [kind for found in applications() for kind in found.foxglove or ()]
     return [*own, *KINDS]
 
 

@@ -19,12 +19,11 @@ from common.transport.connect import connect as connect_to
 from common.transport.credentials import RECORDER
 from common.transport.endpoint import endpoint_of
 from common.transport.handoff import call_on_loop
-from recording.capturing import Capture
-from recording.files import SplitWriter
-from recording.own import Own
+from recording.capture import Capture, CustomTopics
 from recording.selection import Selection
 from recording.sink import Sink
-from recording.telling import about, outcome, progress
+from recording.summary import about, outcome, progress
+from recording.writer import SplitWriter
 
 SHOW_PERIOD = 0.5  # [s]
 
@@ -32,7 +31,7 @@ Tell = Callable[[str], None]
 
 
 @dataclass(frozen=True)
-class Asked:
+class RecordRequest:
     """What is to be recorded.
 
     Attributes:
@@ -49,7 +48,7 @@ class Asked:
     most_bytes: int | None = None
     seconds: float | None = None
     gate: bool = False
-    own: Own = field(default_factory=Own)
+    own: CustomTopics = field(default_factory=CustomTopics)
 
 
 def require_published(selection: Selection) -> None:
@@ -64,7 +63,7 @@ def require_published(selection: Selection) -> None:
 
 
 async def record_gated(
-    asked: Asked, cell: str | None, domain: str | None, connect: str | None, tell: Tell, show: Tell | None
+    asked: RecordRequest, cell: str | None, domain: str | None, connect: str | None, tell: Tell, show: Tell | None
 ) -> None:
     """Record under a supervisor: be ready before its services are let through, end with its SIGTERM or with it."""
     endpoint = endpoint_of(domain, connect)
@@ -73,7 +72,7 @@ async def record_gated(
         await record(bus, asked, tell, show)
 
 
-async def record(bus: Bus, asked: Asked, tell: Tell, show: Tell | None) -> None:
+async def record(bus: Bus, asked: RecordRequest, tell: Tell, show: Tell | None) -> None:
     """Record in a cell.
 
     Args:

@@ -9,8 +9,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from recording.files import SplitWriter
 from recording.sample import RecordingError, Sample
+from recording.writer import SplitWriter
 
 MOST_BYTES = 256 * 1024 * 1024  # that wait while the disk stalls: ten seconds of the most that cameras send
 MOST_SAMPLES = 200_000
@@ -20,7 +20,7 @@ FLUSH_SECONDS = 0.8  # between chunks: with the batch, a kill costs less than a 
 
 
 @dataclass(frozen=True)
-class Figures:
+class RecordingStats:
     """How a recording goes."""
 
     messages: int
@@ -80,13 +80,13 @@ class Sink:
             self._descriptions.append((name, values))
 
     @property
-    def figures(self) -> Figures:
+    def figures(self) -> RecordingStats:
         """How it goes."""
         with self._changed:
             dropped = dict(self._dropped)
-        return Figures(self._writer.messages, self._writer.size, time.monotonic() - self._began, dropped)
+        return RecordingStats(self._writer.messages, self._writer.size, time.monotonic() - self._began, dropped)
 
-    def close(self, ended: Mapping[str, Any]) -> Figures:
+    def close(self, ended: Mapping[str, Any]) -> RecordingStats:
         """Write what waits and how it ended, close the file, and say how it went; may block.
 
         Raises:

@@ -12,11 +12,17 @@ from applications.pick_place.topics import DETECTED_OBJECTS, DETECTION_IMAGE, DE
 from common import topics
 from common.config import Surroundings
 from common.messages import Color, Header, Image, Marker, MarkerArray, Pose, Quaternion, Vector3
-from common.perception.boxes import BoxDetector, BoxOptions, SeenBox, outlined
+from common.perception.boxes import BoxDetector, BoxOptions, DetectedBox, draw_boxes
+from common.perception.camera_input import (
+    FrameError,
+    SkippedFrames,
+    decode_image,
+    require_capacity,
+    require_in_range,
+)
 from common.perception.depth import DepthError, check_depth, depth_of
-from common.perception.exposure import blindness
+from common.perception.illumination import blank_image_reason
 from common.perception.image import array_to_image
-from common.perception.intake import LeftOut, Unusable, picture_of, require_near, require_room
 from common.process.camera_reader import CameraReader
 from common.process.service import main
 from common.transport.bus import Bus
@@ -31,20 +37,20 @@ class Config(BoxOptions):
     world: Surroundings = Surroundings()
 
 
-def markers(found: list[SeenBox], config: Config, stamp: int, blind: str = "") -> MarkerArray:
+def markers(found: list[DetectedBox], config: Config, stamp: int, blind: str = "") -> MarkerArray:
     """The message of what was found in the picture that was exposed at `stamp`, or of why that tells nothing.
 
     Raises:
-        Unusable: that is more, or farther away, than there is room for.
+        FrameError: that is more, or farther away, than there is room for.
     """
-    require_room(len(found))
-    require_near([box.position for box in found])
+    require_capacity(len(found))
+    require_in_range([box.position for box in found])
     return MarkerArray(header=Header(stamp=stamp, frame_id=WORLD), blind=blind, markers=[
         _marker(index, box, config) for index, box in enumerate(found)
     ])
 
 
-def _marker(index: int, box: SeenBox, config: Config) -> Marker:
+def _marker(index: int, box: DetectedBox, config: Config) -> Marker:
     kind = config.kinds[box.kind]
     (x, y, z), (r, g, b), (u, v) = box.position, kind.color, box.corners.mean(axis=0)
     return Marker(
@@ -63,7 +69,7 @@ async def run(bus: Bus, config: Config) -> None:
     masks = bus.writer(DETECTION_MASK)
     cv2.setNumThreads(1)  # the other cores have other services
     detector = BoxDetector(config)
-    left_out = LeftOut(bus.log, "a picture")
+    left_out = SkippedFrames(bus.log, "a picture")
     kept: deque[Image] = deque(maxlen=KEPT)
     newest, turn = 0, asyncio.Lock()
     await bus.ready()
@@ -76,22 +82,22 @@ async def run(bus: Bus, config: Config) -> None:
         newest = image.header.stamp
         try:
             camera = await cameras.of(image.header)
-            picture, metres = picture_of(image, camera), depth_of(depth)
+            picture, metres = decode_image(image, camera), depth_of(depth)
             check_depth(metres, camera.width, camera.height)
             detector.options = config.model_copy()
             boxes = await asyncio.to_thread(detector.detect, picture, metres, camera)
-        except Unusable as error:
+        except FrameError as error:
             left_out.note(error)
             return
         except DepthError as error:
-            left_out.note(Unusable(error.kind, str(error)))
+            left_out.note(FrameError(error.kind, str(error)))
             return
         try:
-            found.put(markers(boxes, config, image.header.stamp, "" if boxes else blindness(picture)))
-        except Unusable as error:
+            found.put(markers(boxes, config, image.header.stamp, "" if boxes else blank_image_reason(picture)))
+        except FrameError as error:
             left_out.note(error)
         if shown.matched:
-            shown.put(array_to_image(outlined(picture, boxes), "bgr8", image.header))
+            shown.put(array_to_image(draw_boxes(picture, boxes), "bgr8", image.header))
         if masks.matched:
             masks.put(array_to_image(detector.mask(picture), "mono8", image.header))
 

@@ -13,7 +13,7 @@ from common.errors import ConfigError
 from common.messages import CameraInfo
 from common.perception.camera_file import CameraFile, Rectifier, require_size
 from common.perception.image import array_to_image
-from common.perception.sources import Source, open_source
+from common.perception.image_sources import Source, open_source
 from common.process.pace import Pace
 from common.process.reopening import Gone, Reopening, keep_open
 from common.process.service import main

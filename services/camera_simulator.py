@@ -13,9 +13,8 @@ from common.messages import Image, WorldObjects
 from common.perception.image import array_to_image
 from common.process.pace import Pace
 from common.process.service import main
-from common.sim.camera import CameraParameters, SimulatedCamera
-from common.sim.lens import Lens
-from common.sim.rendering import Picture, disturbed
+from common.sim.camera import CameraParameters, Lens, SimulatedCamera
+from common.sim.rendering import Picture, add_image_noise
 from common.transport.bus import Bus
 
 
@@ -63,9 +62,9 @@ async def run(bus: Bus, config: Config) -> None:
         state = joints.latest if joints is not None else None
         if state is not None and camera.is_at(state):
             header = header.model_copy(update={"stamp": state.header.stamp})
-        view = (await asyncio.to_thread(camera.shoot, world, state, header.stamp) if camera.takes_long(world)
-                else camera.shoot(world, state, header.stamp))
-        picture = disturbed(view.colour, config.noise_std, config.brightness, rng)
+        view = (await asyncio.to_thread(camera.capture, world, state, header.stamp) if camera.takes_long(world)
+                else camera.capture(world, state, header.stamp))
+        picture = add_image_noise(view.colour, config.noise_std, config.brightness, rng)
         if sent is None or picture is not shown:
             sent, shown = array_to_image(picture, "bgr8", header), picture
         else:

@@ -7,17 +7,22 @@ import asyncio
 import cv2
 from pydantic import Field
 
+from applications.outlining.contour_choice import Following, NoSuchContour, annotate_contours, parse_choice
 from applications.outlining.contours import ContourOptions, Picture, find_contours
-from applications.outlining.contours_choice import NoSuchContour, parse_choice
-from applications.outlining.contours_drawing import annotate_contours
-from applications.outlining.contours_following import Following
-from applications.outlining.messages import Contour, Contours, OutlineSelect, OutlineSelection
-from applications.outlining.topics import CONTOUR_IMAGE, CONTOURS, OUTLINE_SELECT
+from applications.outlining.topics import (
+    CONTOUR_IMAGE,
+    CONTOURS,
+    OUTLINE_SELECT,
+    Contour,
+    Contours,
+    OutlineSelect,
+    OutlineSelection,
+)
 from common import topics
 from common.errors import ConfigError, Refused
 from common.messages import Image
+from common.perception.camera_input import FrameError, SkippedFrames, decode_color_image
 from common.perception.image import array_to_image
-from common.perception.intake import LeftOut, Unusable, colour_picture
 from common.process.service import main
 from common.transport.bus import Bus
 
@@ -50,7 +55,7 @@ async def run(bus: Bus, config: Config) -> None:
     following = Following(initial_choice(config.select))
     last: tuple[Image, Picture, list[Contour]] | None = None
     told = ""
-    left_out = LeftOut(bus.log, "a picture")
+    left_out = SkippedFrames(bus.log, "a picture")
 
     def publish(selected: int, message: str) -> None:
         nonlocal told
@@ -81,8 +86,8 @@ async def run(bus: Bus, config: Config) -> None:
     await bus.ready()
     async for image in images:
         try:
-            picture = colour_picture(image)
-        except Unusable as error:
+            picture = decode_color_image(image)
+        except FrameError as error:
             left_out.note(error)
             continue
         last = (image, picture, await asyncio.to_thread(find_contours, picture, config.model_copy()))

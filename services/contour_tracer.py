@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from applications.outlining.legs import OutlineView
-from applications.outlining.task import Config, Outline
+from applications.outlining.task import Config, Outline, OutlineView
 from applications.outlining.topics import CONTOUR_PATH, OUTLINE_STATUS
 from common.process.service import main
 from common.process.task_runner import run_task

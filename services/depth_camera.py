@@ -15,9 +15,9 @@ from common.perception.image import array_to_image
 from common.process.pace import Pace
 from common.process.service import main
 from common.sim.camera import CameraParameters, SimulatedCamera
-from common.sim.depth_sensor import DepthSensorParameters, measured_depth
+from common.sim.depth_sensor import DepthSensorParameters, simulate_depth
 from common.sim.ray_caster import View
-from common.sim.rendering import disturbed_depth
+from common.sim.rendering import add_depth_noise
 from common.transport.bus import Bus
 
 
@@ -51,8 +51,8 @@ async def run(bus: Bus, config: Config) -> None:
 
     def look(world: WorldObjects, state: JointState | None, now: int) -> View:
         """What the camera measures."""
-        seen = camera.shoot(world, state, now)
-        return View(seen.colour, measured_depth(seen.depth, camera.pinhole, config, rng))
+        seen = camera.capture(world, state, now)
+        return View(seen.colour, simulate_depth(seen.depth, camera.pinhole, config, rng))
 
     await bus.ready()
     await truth.next()
@@ -67,7 +67,7 @@ async def run(bus: Bus, config: Config) -> None:
             header = header.model_copy(update={"stamp": state.header.stamp})
         seen = await asyncio.to_thread(look, world, state, header.stamp)
         depth = seen.depth_within(config.nearest, config.farthest)
-        depth = disturbed_depth(depth, rng, config.depth_noise_std, config.depth_dropout)
+        depth = add_depth_noise(depth, rng, config.depth_noise_std, config.depth_dropout)
         depths.put(array_to_image(depth, "32FC1", header))  # first: who has the picture has its depth
         images.put(array_to_image(seen.colour, "bgr8", header))
         if points.matched:

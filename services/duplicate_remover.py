@@ -7,10 +7,9 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field, ValidationError
 
-from applications.outlining.duplicates import simplified, without_duplicates
-from applications.outlining.messages import OutlinePoints
+from applications.outlining.solids import simplified, without_duplicates
 from applications.outlining.stage_files import StageFileError, read_coordinates
-from applications.outlining.topics import CONTOUR_PATH, CONTOUR_POINTS
+from applications.outlining.topics import CONTOUR_PATH, CONTOUR_POINTS, OutlinePoints
 from common.config import Parameters, Tunable
 from common.errors import ConfigError
 from common.messages import Pose, Vector3

@@ -28,11 +28,11 @@ from common.messages import (
     PlanResponse,
     PointCloud2,
 )
+from common.planning.camera_obstacles import Camera, CameraMessages, CameraObstacles, JointHistory, PointsOptions
 from common.planning.pipeline import PlanningPipeline
-from common.planning.points import PointObstacle
+from common.planning.point_obstacles import PointObstacle
 from common.planning.problem import Cancel
-from common.planning.seeing import Camera, JointHistory, PointsOptions, Seeing, Seen
-from common.planning.watching import NotWatched, SceneMonitor
+from common.planning.scene_monitor import NotMonitored, SceneMonitor
 from common.process.pace import NICENESS, come_last
 from common.process.planning_helper import Helper, HelperLost, fork_helpers
 from common.process.service import main
@@ -100,7 +100,7 @@ async def run(bus: Bus, config: Config, helpers: Sequence[Helper] = ()) -> None:
         if response.trajectory is not None:
             response.trajectory.header = bus.header()
             if watcher is not None:
-                watcher.monitor.note(request, scene, response.trajectory, width)
+                watcher.monitor.add_plan(request, scene, response.trajectory, width)
             display.put(response.trajectory)
         else:
             bus.log.warning("%s [%s]", response.message, response.error)
@@ -204,7 +204,7 @@ class Watcher:
                 self._woken.clear()
                 try:
                     await self._look()
-                except NotWatched as error:
+                except NotMonitored as error:
                     self._bus.log.warning("the motion that runs is not watched: %s", error)
                 except RequestFailed as error:
                     self._bus.log.warning("%s", error)
@@ -223,11 +223,11 @@ class Watcher:
         if status is not None and self._answer is not None and self._answer.header.stamp > status.header.stamp:
             status = self._answer
         if status is None or scene is None or status.state != "active" or not status.id:
-            self.monitor.forget()
+            self.monitor.unfollow()
             return
         if status.id != self.monitor.goal:
             await self._follow(status)
-        problem, held = self.monitor.in_the_way(scene, status.progress), HOLDER in status.held_by
+        problem, held = self.monitor.find_obstruction(scene, status.progress), HOLDER in status.held_by
         if bool(problem) == held:
             return
         request = HoldRequest(hold=bool(problem), reason=problem, by=HOLDER, goal=status.id)
@@ -240,14 +240,14 @@ class Watcher:
             self._bus.log.info("the arm goes on: nothing is in its way any more")
 
     async def _follow(self, status: MotionStatus) -> None:
-        if self.monitor.knows(status.plan):
+        if self.monitor.has_plan(status.plan):
             self.monitor.follow(status.id, status.plan)
             return
         try:
             asked = await self._followed.call(FollowedRequest(id=status.id), REQUEST_TIMEOUT)
         except RemoteError as error:  # it is over by now
-            self.monitor.forget(status.id)
-            raise NotWatched(str(error)) from None
+            self.monitor.unfollow(status.id)
+            raise NotMonitored(str(error)) from None
         self.monitor.follow(status.id, asked.plan, asked.trajectory)
 
 
@@ -258,23 +258,23 @@ class Eyes:
         self._bus, self._options = bus, options
         self._readers = [_readers(bus, camera) for camera in options.cameras]
         self._poses, self._states = bus.reader(topics.TF_STATIC), bus.reader(topics.JOINT_STATES)
-        self._loaded: list[tuple[Seeing, JointHistory]] = []
+        self._loaded: list[tuple[CameraObstacles, JointHistory]] = []
 
     def load(self, pipeline: PlanningPipeline) -> None:
         """Take over the robot."""
-        seeing = Seeing(pipeline.robot, pipeline.geometry, self._options)
+        seeing = CameraObstacles(pipeline.robot, pipeline.geometry, self._options)
         self._loaded.append((seeing, JointHistory(pipeline.robot)))
 
     async def follow(self) -> None:
         """Note where the robot is, for as long as the service runs."""
         async for state in self._states:
-            self._loaded[0][1].note(state)
+            self._loaded[0][1].add(state)
 
     def look(self, scene: PlanningScene, stage: str) -> Callable[[], list[PointObstacle]]:
         """What makes obstacles, in a thread, of what has come until now."""
         (seeing, joints), now, poses = self._loaded[0], self._bus.clock.now_ns(), self._poses.latest
         seen = [
-            Seen(camera, pictures.latest, None if infos is None else infos.latest)
+            CameraMessages(camera, pictures.latest, None if infos is None else infos.latest)
             for camera, (pictures, infos) in zip(self._options.cameras, self._readers, strict=True)
         ]
 

@@ -5,15 +5,13 @@ from __future__ import annotations
 import asyncio
 from collections import deque
 
-from applications.outlining.messages import Contours
-from applications.outlining.perceived_solids import perceived_solids
-from applications.outlining.scene import planning_scene, require_apart
-from applications.outlining.topics import CONTOURS
+from applications.outlining.solids import perceived_solids, planning_scene, require_apart
+from applications.outlining.topics import CONTOURS, Contours
 from common import topics
 from common.config import Parameters, RobotConfig, Surroundings
 from common.messages import Image, PlanningScene
+from common.perception.camera_input import FrameError, SkippedFrames
 from common.perception.depth import DepthError, check_depth, depth_of
-from common.perception.intake import LeftOut, Unusable
 from common.perception.pinhole import Pinhole
 from common.process.camera_reader import CameraReader
 from common.process.planning_scene import SceneWriter
@@ -35,15 +33,14 @@ def seen(found: Contours, image: Image, camera: Pinhole, around: Surroundings) -
     """What the contours of a picture and its depth show.
 
     Raises:
-        Unusable: they show nothing: where no pixel has a depth it is not known that nothing stands there; or more than
-            there is time for.
+        FrameError: no pixel has a depth, so free space is unknown; or there are more objects than there is time for.
     """
     require_apart(found)
     depth = depth_of(image)
     try:
         check_depth(depth, found.width, found.height)
     except DepthError as error:
-        raise Unusable(error.kind, str(error)) from None
+        raise FrameError(error.kind, str(error)) from None
     return planning_scene(around, perceived_solids(found.contours, depth, camera), found.header.stamp)
 
 
@@ -56,7 +53,7 @@ async def run(bus: Bus, config: Config) -> None:
     out = SceneWriter(bus)
     home = HomeWatch(config.robot.named_poses["home"])
     kept: deque[Image] = deque(maxlen=KEPT)
-    left_out = LeftOut(bus.log, "a picture")
+    left_out = SkippedFrames(bus.log, "a picture")
     await out.begin(planning_scene(config.world, [], 0))
     await bus.ready()
 
@@ -89,7 +86,7 @@ async def run(bus: Bus, config: Config) -> None:
         try:
             camera = await cameras.of(depth.header)
             scene = await asyncio.to_thread(seen, found, depth, camera, config.world)
-        except Unusable as error:
+        except FrameError as error:
             left_out.note(error)
             return
         out.put(scene)

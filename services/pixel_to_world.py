@@ -6,15 +6,14 @@ import asyncio
 from collections import OrderedDict
 
 from applications.outlining.contours import is_hole
-from applications.outlining.messages import MOST_POINTS, Contours, OutlinePoints
 from applications.outlining.top_face import TopFace, TopFaceOptions, top_face
-from applications.outlining.topics import CONTOUR_POINTS, CONTOURS
+from applications.outlining.topics import CONTOUR_POINTS, CONTOURS, MOST_POINTS, Contours, OutlinePoints
 from common import topics
 from common.config import Surroundings
 from common.errors import ZencellError
 from common.messages import Header, Image, Pose, Vector3
+from common.perception.camera_input import FrameError, require_in_range
 from common.perception.depth import check_depth, depth_of
-from common.perception.intake import Unusable, require_near
 from common.perception.pinhole import Pinhole
 from common.process.camera_reader import CameraReader
 from common.process.service import main
@@ -34,16 +33,16 @@ def outline(contours: Contours, image: Image, camera: Pinhole, config: Config) -
     """The outline of the chosen object.
 
     Raises:
-        Unusable, DepthError: one line that says why there is none.
+        FrameError, DepthError: one line that says why there is none.
     """
     depth = depth_of(image)
     check_depth(depth, contours.width, contours.height)
     chosen = contours.contours[contours.selected]
     face = top_face(chosen.pixels, depth, camera, config, hole=is_hole(contours.contours, chosen.index))
     if (count := len(face.outline)) > MOST_POINTS:
-        raise Unusable("crowded", f"its {count} points are more than an outline has room for: is the picture full of "
+        raise FrameError("crowded", f"its {count} points are more than an outline has room for: is the picture full of "
                                   "noise?")
-    require_near(face.outline)
+    require_in_range(face.outline)
     return face
 
 

@@ -11,10 +11,9 @@ from pydantic import Field
 from common import topics
 from common.config import Surroundings, Tunable
 from common.perception.depth import point_cloud
-from common.perception.depth_sources import CameraGone, DepthSource, find_driver, require_whole
+from common.perception.depth_drivers import CameraLost, DepthSource, find_camera_driver, require_frame_shape
 from common.perception.image import array_to_image
-from common.perception.mounted import in_mount
-from common.perception.pinhole import Pinhole
+from common.perception.pinhole import Pinhole, camera_in_mount
 from common.process.reopening import Gone, Reopening, keep_open
 from common.process.service import main
 from common.transport.bus import Bus
@@ -36,7 +35,7 @@ async def run(bus: Bus, config: Config) -> None:
     images, depths = bus.writer(topics.DEPTH_CAMERA_IMAGE), bus.writer(topics.DEPTH_CAMERA_DEPTH)
     points, infos = bus.writer(topics.DEPTH_CAMERA_POINTS), bus.writer(topics.DEPTH_CAMERA_INFO)
     field = f"services.{bus.service}.driver"
-    driver, options = find_driver(config.driver, config.options, field)
+    driver, options = find_camera_driver(config.driver, config.options, field)
     wanted, frame = config.world.camera, config.world.camera.frame
     await bus.ready()
 
@@ -44,13 +43,13 @@ async def run(bus: Bus, config: Config) -> None:
         """Send what the camera gives until it gives no more."""
         loop, sent, last, newest = asyncio.get_running_loop(), 0, -math.inf, 0
         lens = camera.lens
-        known = Pinhole(lens.fx, lens.fy, lens.cx, lens.cy, lens.width, lens.height, in_mount(wanted))
+        known = Pinhole(lens.fx, lens.fy, lens.cx, lens.cy, lens.width, lens.height, camera_in_mount(wanted))
         while True:
             try:
                 shot = await asyncio.to_thread(camera.read)
-            except CameraGone as error:
+            except CameraLost as error:
                 return Gone(f"camera {config.driver}: {error}", sent)
-            require_whole(shot, lens, field, config.driver)
+            require_frame_shape(shot, lens, field, config.driver)
             since = (loop.time() - last) * config.rate  # periods since the last picture was due
             if since < 0.5:
                 continue  # it is read at its own pace, or old pictures would wait in there
@@ -69,7 +68,7 @@ async def run(bus: Bus, config: Config) -> None:
     async def use() -> Gone:
         try:
             camera = await asyncio.to_thread(driver.open_camera, options, (wanted.width, wanted.height), config.rate)
-        except CameraGone as error:
+        except CameraLost as error:
             return Gone(f"camera {config.driver}: {error}")
         # Not closed when this is cancelled: a thread may still be waiting for a picture in there.
         gone = await send(camera)

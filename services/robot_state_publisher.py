@@ -11,7 +11,7 @@ from pydantic import Field
 from common import topics
 from common.config import Parameters, RobotConfig, Surroundings, Tunable
 from common.messages import JointState, RobotDescription, TFMessage, TransformStamped
-from common.perception.mounted import in_mount, mount_links
+from common.perception.pinhole import camera_in_mount, mount_links
 from common.process.service import main
 from common.robot.model import RobotModel
 from common.robot.transforms import pose_fields
@@ -102,7 +102,7 @@ async def run(bus: Bus, config: Config) -> None:
     base = stamped(WORLD, frames.root, frames.T_world_root, stamp)
     mounts = mount_links(config.surroundings, robot)
     cameras = [
-        stamped(mounts.get(name, WORLD), camera.frame, in_mount(camera), stamp)
+        stamped(mounts.get(name, WORLD), camera.frame, camera_in_mount(camera), stamp)
         for name, camera in config.surroundings.cameras.items()
     ]
     fixed = [base, *cameras, *frames.fixed(stamp)]

@@ -8,13 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from applications.pick_place.perceived import PerceivedScene
-from applications.pick_place.tracks import SceneParameters
-from applications.pick_place.views import Seen, Views, ViewsParameters
+from applications.pick_place.detections import Seen, Views, ViewsParameters
+from applications.pick_place.perceived_scene import PerceivedScene, SceneParameters
 from common import topics
 from common.config import RobotConfig, Surroundings
 from common.errors import ConfigError
-from common.perception.intake import LeftOut, Unusable
+from common.perception.camera_input import FrameError, SkippedFrames
 from common.process.planning_scene import SceneWriter
 from common.process.service import main
 from common.robot.model import RobotModel
@@ -40,7 +39,7 @@ async def run(bus: Bus, config: Config) -> None:
     if config.robot.gripper is None:
         raise ConfigError("robot.gripper", ..., "is missing: scene_manager needs a robot with one")
     scene = PerceivedScene(config, config.world, config.robot.gripper, config.robot.tcp_link)
-    left_out = LeftOut(bus.log, "a planning scene")
+    left_out = SkippedFrames(bus.log, "a planning scene")
     await out.begin(scene.scene())
     await bus.ready()
 
@@ -64,7 +63,7 @@ async def run(bus: Bus, config: Config) -> None:
     async def look(view: int, seen: Seen) -> None:
         scene.see(seen.frame, seen.camera, hand(), view, seen.at_times, seen.hidden)
         if scene.crowded:  # none without some of what stands in the way: who waits for a newer one moves nothing
-            left_out.note(Unusable("crowded", "more is seen than a planning scene has room for"))
+            left_out.note(FrameError("crowded", "more is seen than a planning scene has room for"))
         else:
             out.put(scene.scene())
 

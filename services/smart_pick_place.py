@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from applications.pick_place.choice import PickPlaceView
-from applications.pick_place.parameters import Config
+from applications.pick_place.grasping import Config
 from applications.pick_place.task import PickPlace
 from applications.pick_place.topics import PICK_PLACE_STATUS, VALIDATED_TARGETS
 from common.process.service import main

@@ -22,7 +22,7 @@ from common.control.checks import Tolerances
 from common.control.controller import PERIOD
 from common.control.cycle import ControlCycle
 from common.control.decisions import Decisions
-from common.control.inhibits import SOMEBODY, Inhibits, Speed, speed_of
+from common.control.interlocks import Interlocks, Speed, speed_of
 from common.control.jogging import DEADMAN
 from common.control.record_file import record_file
 from common.control.requester import Alone, WhenAlone, objection
@@ -31,6 +31,7 @@ from common.errors import ConfigError, Refused
 from common.hardware.interface import ControlledArm, Limits
 from common.hardware.loading import is_simulated, load_hardware
 from common.messages import (
+    UNKNOWN_OPERATOR,
     ExecuteRequest,
     FollowedRequest,
     GripperCommand,
@@ -46,7 +47,7 @@ from common.messages import (
     WorldEdit,
     WorldEditReply,
 )
-from common.perception.mounted import from_home
+from common.perception.pinhole import cameras_at_home
 from common.process.service import main
 from common.robot.model import RobotModel
 from common.scene.workspace import WorkspaceBounds, bounds_told, reach_reason
@@ -90,7 +91,7 @@ class Config(Parameters):
 
 
 def make_cycle(
-    config: Config, simulated: bool, kept: Standing | None, now: float, inhibits: Inhibits | None = None,
+    config: Config, simulated: bool, kept: Standing | None, now: float, interlocks: Interlocks | None = None,
     period: float = PERIOD, speed: float = 1.0,
 ) -> ControlCycle:
     """The controller with its hardware at the home pose and, when simulated, everything laid out.
@@ -107,7 +108,7 @@ def make_cycle(
     world = None
     if simulated:
         bounds = bounds_told(config.reach.told)
-        seen = from_home(config.world, robot)
+        seen = cameras_at_home(config.world, robot)
         objects = layout(
             seen, config.run.seed, lambda x, y, z: within_reach(robot, (x, y, z), config.grasp, bounds))
         world = load_world(config.world, objects, config.grasp_tolerances, config.robot.gripper)
@@ -126,7 +127,7 @@ def make_cycle(
     cycle = ControlCycle(
         hardware, limits, start,
         tolerances=config.tolerances, gripper=config.robot.gripper, controller=config.robot.controller,
-        kinematics=robot, world=world, inhibits=inhibits, period=period,
+        kinematics=robot, world=world, interlocks=interlocks, period=period,
     )
     if kept is not None:
         cycle.restore(kept, now)
@@ -159,7 +160,7 @@ async def control(bus: Bus, config: Config, ours: contextlib.AsyncExitStack) -> 
     updates = bus.writer(topics.SCENE_OBJECT_UPDATES) if simulated else None
     objects = bus.writer(topics.SCENE_OBJECTS) if simulated else None
     application = config.members.application
-    views = find_application(application).views if simulated and application else {}
+    views = find_application(application).truth_views if simulated and application else {}
     called = [(bus.writer(topic), view) for topic, view in views.items()]  # the truth in the application's words
 
     def too_late(header: Header) -> Refused | None:
@@ -177,8 +178,8 @@ async def control(bus: Bus, config: Config, ours: contextlib.AsyncExitStack) -> 
         return await kept_answer(status)
 
     async def stop(request: StopRequest) -> MotionStatus:
-        if request.by == "person":
-            bus.log.info("stopped by %s: %s", request.owner or SOMEBODY, request.reason)
+        if request.by == "operator":
+            bus.log.info("stopped by %s: %s", request.owner or UNKNOWN_OPERATOR, request.reason)
         return await kept_answer(cycle.authority.stop(request, bus.clock.now()))
 
     noting: list[asyncio.Task[MotionStatus]] = []
@@ -188,7 +189,7 @@ async def control(bus: Bus, config: Config, ours: contextlib.AsyncExitStack) -> 
         for done in [each for each in noting if each.done()]:
             noting.remove(done)
             done.result()
-        if not any(one.by == bus.service for one in inhibits.stops):
+        if not any(one.by == bus.service for one in interlocks.stops):
             bus.log.error("more than %d requests to stop wait: the robot is stopped for all of them", MOST_STOPS)
             unread = StopRequest(owner=bus.service, reason="more requests to stop come than can be read")
             status = cycle.authority.stop(unread, bus.clock.now())
@@ -196,39 +197,39 @@ async def control(bus: Bus, config: Config, ours: contextlib.AsyncExitStack) -> 
         return "the robot is stopped for all of them"
 
     async def hold(request: HoldRequest) -> MotionStatus:
-        before, owned = len(inhibits.all), cycle.authority.owner
+        before, owned = len(interlocks.all), cycle.authority.owner
         status, let_go = cycle.authority.hold(request, bus.clock.now())
-        who = (request.owner or SOMEBODY) if request.by == "person" else request.by
+        who = (request.owner or UNKNOWN_OPERATOR) if request.by == "operator" else request.by
         why = request.reason or "asked to"
         if request.hold and not status.held:
             bus.log.info("%s asked to hold %s, which is over: %s", who, request.goal, why)
         elif request.hold:
             bus.log.info("held by %s: %s", who, why)
-        elif status.inhibits:
-            told = "; ".join(inhibit.told for inhibit in status.inhibits)
-            part = "a part" if let_go or len(status.inhibits) < before else "nothing"
+        elif status.interlocks:
+            told = "; ".join(interlock.description for interlock in status.interlocks)
+            part = "a part" if let_go or len(status.interlocks) < before else "nothing"
             bus.log.info("%s let go of %s: %s; still %s", who, part, why, told)
         else:
             bus.log.info("let go by %s: %s", who, why)
-        for inhibit in let_go:
-            if inhibit.by != who:
-                bus.log.warning("%s let go of what another said: %s", who, inhibit.told)
+        for interlock in let_go:
+            if interlock.by != who:
+                bus.log.warning("%s let go of what another said: %s", who, interlock.description)
         if owned.kind not in ("none", "task", cycle.authority.owner.kind) and owned.owner != who:
-            bus.log.warning("%s has the task move the arm: the motion was %s", who, owned.told)
+            bus.log.warning("%s has the task move the arm: the motion was %s", who, owned.description)
         return await kept_answer(status)
 
     async def kept_answer(status: MotionStatus) -> MotionStatus:
         """The answer, which is given once what was decided outlives us."""
         if problem := await decisions.keep():
             message = f"{status.message}; {problem}".removeprefix("; ")
-            status = status.model_copy(update={"message": message, "inhibits": inhibits.all})
+            status = status.model_copy(update={"message": message, "interlocks": interlocks.all})
         if news := cycle.news_of_motion(bus.header("world")):  # who has the answer may ask for the state next
             motion.put(news)
         return status.model_copy(update={"header": bus.header()})
 
     async def keep_speed() -> None:
-        if config.speed_scaling != (inhibits.speed.scaling if inhibits.speed else configured):
-            inhibits.speed = Speed(scaling=config.speed_scaling, configured=configured)
+        if config.speed_scaling != (interlocks.speed.scaling if interlocks.speed else configured):
+            interlocks.speed = Speed(scaling=config.speed_scaling, configured=configured)
             await decisions.keep()
 
     async def followed(request: FollowedRequest) -> ExecuteRequest:
@@ -244,7 +245,7 @@ async def control(bus: Bus, config: Config, ours: contextlib.AsyncExitStack) -> 
         before = cycle.authority.owner
         now = cycle.authority.own(request, bus.clock.now())
         if now.owner != before.owner and {before.kind, now.kind} != {"none", "task"}:
-            bus.log.info("%s: the motion was %s, it is %s now", request.owner, before.told, now.told)
+            bus.log.info("%s: the motion was %s, it is %s now", request.owner, before.description, now.description)
         if problem := await decisions.keep():
             bus.log.error("%s", problem)
         if news := cycle.authority.news(bus.header("world")):
@@ -268,7 +269,7 @@ async def control(bus: Bus, config: Config, ours: contextlib.AsyncExitStack) -> 
                     told.pop(next(iter(told)))
 
     async def order(request: RobotCommand) -> RobotStatus:
-        who = request.owner or SOMEBODY
+        who = request.owner or UNKNOWN_OPERATOR
         bus.log.info("%s asks the arm: %s", who, request.act + (f" {request.value:g}" if request.value else ""))
         if request.header.stamp and (late := too_late(request.header)):
             raise late  # what has stopped the arm since is not what this recovers from
@@ -325,8 +326,8 @@ async def control(bus: Bus, config: Config, ours: contextlib.AsyncExitStack) -> 
         file.require_writable()
     began = bus.clock.now_ns()  # who had the arm while we waited may have carried out what was decided until now
     decisions = Decisions(file, bus.log)
-    inhibits, configured = decisions.inhibits, config.speed_scaling
-    config.speed_scaling = speed_of(inhibits.speed, configured)
+    interlocks, configured = decisions.interlocks, config.speed_scaling
+    config.speed_scaling = speed_of(interlocks.speed, configured)
     if config.speed_scaling != configured:
         bus.log.warning("speed is at %.0f %%, as it was set while the cell ran: `zencell param set "
                         "services.trajectory_executor.speed_scaling=1` ends that", 100 * config.speed_scaling)
@@ -334,17 +335,17 @@ async def control(bus: Bus, config: Config, ours: contextlib.AsyncExitStack) -> 
     kept = standing_file.load() if standing_file else None
     period = 1 / bus.clock.wall_rate(config.joint_state_rate, MOST_CYCLES)
     cycle = await asyncio.to_thread(
-        make_cycle, config, simulated, kept, bus.clock.now(), inhibits, period * bus.clock.speed,
+        make_cycle, config, simulated, kept, bus.clock.now(), interlocks, period * bus.clock.speed,
         bus.clock.speed,
     )
     cycle.beside = True
-    decisions.on_change = cycle.authority.tell_inhibits
+    decisions.on_change = cycle.authority.report_interlocks
     memory = SavedBeside(standing_file) if standing_file and bus.has_threads else standing_file
     if cycle.restored:
         bus.log.info("the arm and what is about it are as they were")
     alone, task = Alone(), config.members.task
     loop = asyncio.get_running_loop()
-    due, aborted, arm_stopped = loop.time(), "", inhibits.arm_stopped
+    due, aborted, arm_stopped = loop.time(), "", interlocks.arm_stopped
 
     def turn() -> None:
         nonlocal due, aborted, arm_stopped, keeping
@@ -352,8 +353,8 @@ async def control(bus: Bus, config: Config, ours: contextlib.AsyncExitStack) -> 
         report = cycle.step(bus.header("world"))
         for note in report.notes:
             bus.log.warning("%s", note)
-        if inhibits.arm_stopped != arm_stopped:
-            arm_stopped = inhibits.arm_stopped
+        if interlocks.arm_stopped != arm_stopped:
+            arm_stopped = interlocks.arm_stopped
             keeping = asyncio.create_task(decisions.keep(), name="keep")
         move_world()
         if memory is not None and (standing := cycle.standing()) is not None:

@@ -11,18 +11,23 @@ from functools import lru_cache
 import cv2
 from pydantic import Field
 
-from applications.pick_place.annotation import annotate
-from applications.pick_place.detector import Detection, Detector, DetectorOptions, rehearse
-from applications.pick_place.odd import Odd
+from applications.pick_place.detector import Detection, Detector, DetectorOptions, annotate, rehearse
+from applications.pick_place.outliers import Odd
+from applications.pick_place.perceived_scene import Place
 from applications.pick_place.topics import DETECTED_OBJECTS, DETECTION_IMAGE, DETECTION_MASK
-from applications.pick_place.tracks import Place
 from common import topics
 from common.config import Surroundings
 from common.config.basics import Rgb
 from common.messages import Color, Header, Image, Marker, MarkerArray, Pose, Vector3
+from common.perception.camera_input import (
+    FrameError,
+    SkippedFrames,
+    decode_image,
+    require_capacity,
+    require_in_range,
+)
 from common.perception.depth import Depth, DepthError, check_depth, depth_of
 from common.perception.image import array_to_image
-from common.perception.intake import LeftOut, Unusable, picture_of, require_near, require_room
 from common.perception.pinhole import Pinhole
 from common.process.camera_reader import CameraReader
 from common.process.service import main
@@ -50,10 +55,10 @@ def markers(
     What is `odd` is among it with the reason as its text: it stands in the way, and is not to be taken.
 
     Raises:
-        Unusable: that is more, or farther away, than there is room for.
+        FrameError: that is more, or farther away, than there is room for.
     """
-    require_room(len(detections) + len(odd))
-    require_near([*(one.position for one in detections), *(one.position for one in odd)])
+    require_capacity(len(detections) + len(odd))
+    require_in_range([*(one.position for one in detections), *(one.position for one in odd)])
     return MarkerArray(
         header=Header(stamp=stamp, frame_id=WORLD),
         remark=remark,
@@ -104,7 +109,7 @@ async def run(bus: Bus, config: Config) -> None:
     kept: deque[Image] = deque(maxlen=KEPT)
     news = asyncio.Event()
     detector = Detector(config.world, config)
-    left_out = LeftOut(bus.log, "a picture")
+    left_out = SkippedFrames(bus.log, "a picture")
     if not bus.declares_only:
         rehearse(config.world, config)
     await bus.ready()
@@ -123,21 +128,21 @@ async def run(bus: Bus, config: Config) -> None:
                     await news.wait()
         found = next((one for one in kept if one.header.stamp == stamp), None)
         if found is None:
-            raise Unusable("depth", "no depth image of the same time came")
+            raise FrameError("depth", "no depth image of the same time came")
         depth = depth_of(found)
         try:
             check_depth(depth, camera.width, camera.height)
         except DepthError as error:
-            raise Unusable(error.kind, str(error)) from None
+            raise FrameError(error.kind, str(error)) from None
         return depth
 
     async def look() -> None:
         async for image in images:
             try:
                 camera = await cameras.of(image.header)
-                picture = picture_of(image, camera)
+                picture = decode_image(image, camera)
                 depth = await depth_with(image.header.stamp, camera) if config.depth else None
-            except Unusable as error:
+            except FrameError as error:
                 left_out.note(error)
                 continue
             if depth is None:
@@ -147,7 +152,7 @@ async def run(bus: Bus, config: Config) -> None:
             remark = _remark(detector, bus.service)
             try:
                 found.put(markers(detections, config.world, image.header.stamp, remark, detector.blind, detector.odd))
-            except Unusable as error:
+            except FrameError as error:
                 left_out.note(error)
             if shown.matched:
                 shown.put(array_to_image(annotate(picture, detections), "bgr8", image.header))

@@ -8,15 +8,13 @@ from contextlib import suppress
 
 from pydantic import Field
 
-from applications.pick_place.region import MOST_HIDDEN, Region
-from applications.pick_place.remembered import HIDDEN, Remembered
+from applications.pick_place.ball_places import MOST_HIDDEN, Region
+from applications.pick_place.detections import HIDDEN, Remembered, Seen, Validation, Views, ViewsParameters
 from applications.pick_place.topics import (
     REJECTED_TARGETS,
     VALIDATED_TARGETS,
     WORKSPACE_MARKERS,
 )
-from applications.pick_place.validation import Validation
-from applications.pick_place.views import Seen, Views, ViewsParameters
 from common.config import Grasp, RobotConfig, Surroundings, Tunable
 from common.messages import Color, Header, Marker, MarkerArray, Pose, PoseArray, Rejections, Vector3
 from common.messages.geometry import MOST_POSES

@@ -18,7 +18,7 @@ from common import topics
 from common.transport.bus import Bus
 from common.transport.codec import decode_attachment
 from common.transport.session import RawSample
-from recording.stamps import stamp_of
+from recording.sample import stamp_of
 
 GAP = 0.05  # [s] between two joint states
 LOOK = 0.01  # [s] between two looks at what the executor spends

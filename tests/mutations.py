@@ -67,7 +67,7 @@ def _more() -> Iterator[Message]:
         m.ServiceCounters(header=header, service="camera", writes=["a"], received={"a": 1}, dropped={"a": 2}),
         m.ParameterRequest(set={"services.camera_simulator.rate": 10.0, "motion.velocity_scaling": 0.2}),
         m.ParameterReply(service="a", parameters=[m.Parameter(path="a", value=[1, {"b": "c"}], type="list")]),
-        m.MotionStatus(header=header, id="a", state="active", progress=0.5, held_by=["person"]),
+        m.MotionStatus(header=header, id="a", state="active", progress=0.5, held_by=["operator"]),
         m.SupervisorStatus(header=header, cell="panda", services=[m.ServiceStatus(name="a", state="ready", pid=1)]),
         m.Rejections(header=header, rejected=[m.Rejection(position=m.Vector3(), reason="far")]),
         m.Image(header=header, height=2, width=2, encoding="bgr8", data=bytes(12)),

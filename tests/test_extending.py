@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 import viser
 import yaml
+from common.supervision.wiring import wiring
 
 from common import messages as m
 from common.application import find_application
@@ -28,14 +29,13 @@ from common.hardware.loading import find_backend, load_hardware
 from common.messages import CameraInfo, Image, Pose, Vector3, WorldObject, WorldObjects
 from common.planning.planners import load_planner
 from common.process.in_process import running_service
-from common.process.wiring import wiring
 from common.robot.model import RobotModel
 from common.tasks.stages import View
 from common.topics import CAMERA_IMAGE, CAMERA_INFO, GRIPPER_STATE, SCENE_OBJECTS
 from common.transport.codec import decode
 from common.transport.local import LocalNetwork
 from page.server import close_server, make_server
-from recording.reading import Recording
+from recording.reader import Recording
 from tests import pages
 from tests.harness import ask, free_domain
 from tests.page.scene_cell import Stage
@@ -322,14 +322,14 @@ def test_task_of_one_file_goes_on_with_what_is_in_the_hand(folder: Path) -> None
     assert (plan.goal.pose.position.x, plan.goal.pose.position.y) == config.to
 
 
-def test_application_that_is_no_module_or_has_no_status_is_refused_by_name(
+def test_application_that_is_no_module_or_declares_none_is_refused_by_name(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(folder)
     with pytest.raises(ConfigError, match=r"application: 'my_pkg\.move_ball' cannot be imported"):
         load_cell("cube.yaml", ["application=my_pkg.move_ball"])
-    with pytest.raises(ConfigError, match="is no application: its topics have no STATUS"):
-        _ = find_application("my_pkg.over_home").status
+    with pytest.raises(ConfigError, match="is no application: the module has no APPLICATION"):
+        find_application("my_pkg.over_home")
 
 
 def start(line: str, folder: Path, env: dict[str, str]) -> subprocess.Popen[str]:

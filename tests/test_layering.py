@@ -11,8 +11,6 @@ from pathlib import Path
 
 import pytest
 
-from common.topics import Request, Topic
-
 ROOT = Path(__file__).resolve().parent.parent
 ABOVE_COMMON = (
     "applications", "page", "drivers", "recording", "tools", "lab", "security", "services", "cli", "zencell",
@@ -137,9 +135,8 @@ PLATFORM_SERVICES = (
     "camera_opencv", "real_depth_camera", "router",
 )
 APPLICATIONS = [path.parent.name for path in sorted((ROOT / "applications").glob("*/__init__.py"))]
-PARTS_ALL_LOOK_FOR = ("STATUS", "DECIDED_BY", "REJECTED", "DETECTED", "ANNOTATED", "MASK", "VIEWS")
 SHORT_FORMS = (  # where the fields of older world files are read, and the arguments of an older function
-    "common/config/short_forms.py", "common/sim/drawing.py",
+    "common/config/short_forms.py",
 )
 
 
@@ -163,13 +160,13 @@ def application_words() -> set[str]:
     words = {path.stem for path in sources("services") if imported_applications(path)} - set(PLATFORM_SERVICES)
     for name in APPLICATIONS:
         package = importlib.import_module(f"applications.{name}")
-        keys, shapes = (importlib.import_module(f"{package.__name__}.{part}") for part in ("topics", "messages"))
-        own = [value for value in vars(keys).values() if isinstance(value, Topic | Request)]
-        words |= {name, package.TASK}
+        keys = importlib.import_module(f"{package.__name__}.topics")
+        own = list(package.APPLICATION.topics_by_key.values())
+        words |= {name, package.APPLICATION.task}
         words |= {topic.key for topic in own if "_" in topic.key or "/" in topic.key}
-        words |= {key for key, value in vars(keys).items() if value in own and key not in PARTS_ALL_LOOK_FOR}
-        words |= {key for key, value in vars(shapes).items()
-                  if isinstance(value, type) and value.__module__ == shapes.__name__}
+        words |= {key for key, value in vars(keys).items() if value in own}
+        words |= {key for key, value in vars(keys).items()
+                  if isinstance(value, type) and value.__module__ == keys.__name__}
     return words
 
 
@@ -278,7 +275,7 @@ def test_circles_are_seen() -> None:
 
 @pytest.mark.parametrize("does", [
     "import services.camera_simulator, common.sim.kinematic",
-    "import common.supervision.supervisor, recording.report.collector, cli.operation.operation as o\n"
+    "import common.supervision.supervisor, recording.report.aggregator, cli.operation.operation as o\n"
     "o.Operation('panda', connect='tcp/127.0.0.1:9')",
 ], ids=["camera", "supervisor"])
 def test_process_that_plans_nothing_loads_no_planner(does: str) -> None:

@@ -5,10 +5,8 @@ from __future__ import annotations
 import numpy as np
 from pydantic import Field
 
-from applications.outlining.messages import OutlinePoints
-from applications.outlining.perceived_solids import PerceivedSolid
-from applications.outlining.scene import planning_scene
-from applications.outlining.topics import CONTOUR_PATH
+from applications.outlining.solids import PerceivedSolid, planning_scene
+from applications.outlining.topics import CONTOUR_PATH, OutlinePoints
 from common import topics
 from common.config import Parameters, RobotConfig, Surroundings, Tunable
 from common.messages import Header, Pose, Vector3, WorldObject
@@ -17,8 +15,6 @@ from common.process.planning_scene import SceneWriter
 from common.scene.home import HomeWatch
 from common.transport.bus import Bus
 
-REPLACES = ("depth_camera", "contour_detector", "pixel_to_world", "duplicate_remover", "outline_scene")
-SETTINGS = ("motion.velocity_scaling=0.6", "motion.acceleration_scaling=1.0")
 WORLD = "world"
 
 

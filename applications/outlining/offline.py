@@ -8,13 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from applications.outlining.contour_choice import NoSuchContour, choose
 from applications.outlining.contours import ContourOptions, find_contours, is_hole
-from applications.outlining.contours_choice import NoSuchContour, choose
-from applications.outlining.duplicates import simplified, without_duplicates
-from applications.outlining.legs import Legs, OutlineView, closed
-from applications.outlining.messages import Contour, OutlinePoints, OutlineSelect
-from applications.outlining.perceived_solids import PerceivedSolid, perceived_solids
+from applications.outlining.solids import PerceivedSolid, perceived_solids, simplified, without_duplicates
+from applications.outlining.task import Legs, OutlineView, closed
 from applications.outlining.top_face import TopFaceOptions, top_face
+from applications.outlining.topics import Contour, OutlinePoints, OutlineSelect
 from common import messages as m
 from common.errors import ZencellError
 from common.perception.depth import Depth, check_depth

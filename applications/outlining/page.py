@@ -9,15 +9,24 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
-from applications.outlining.contours_choice import middle_of
-from applications.outlining.messages import Contour, OutlineSelect, OutlineSelection, OutlineStatus
-from applications.outlining.topics import CONTOUR_PATH, CONTOURS, OUTLINE_SELECT, OUTLINE_STATUS
+from applications.outlining.contour_choice import middle_of
+from applications.outlining.topics import (
+    CONTOUR_PATH,
+    CONTOURS,
+    OUTLINE_SELECT,
+    OUTLINE_STATUS,
+    Contour,
+    OutlineSelect,
+    OutlineSelection,
+    OutlineStatus,
+)
 from common import topics
 from common.config import Fixture
 from common.messages import CollisionObject, MotionStatus, TaskStatus
 from common.perception.pinhole import CameraError, Pinhole
 from common.terminal import printable
 from common.topics import Topic
+from page.application import ApplicationPage
 from page.layers import Layer
 from page.nodes import FLAT, add_line, points_of, rgb_of
 
@@ -27,11 +36,6 @@ if TYPE_CHECKING:
     from page.console import Console
 
 Array = NDArray[np.float64]
-
-STATES = {"SELECTING": "Waiting for a choice", "PLANNING": "Planning", "APPROACHING": "Approaching",
-          "TRACING": "Tracing", "RETREATING": "Retreating"}
-LATENCY = "Picture to path"
-REQUESTS = (OUTLINE_SELECT,)
 
 LARGEST = "Largest"
 OUTLINE = (255, 140, 40)
@@ -70,7 +74,7 @@ async def choose(console: Console, choice: OutlineSelect) -> None:
     Whoever stops or holds the arm until then has the last word, and of several choices the last one counts.
     """
     console.notify("")
-    heard, stops = console.acknowledged, console.stop_count
+    acknowledged, stops = console.acknowledged, console.stop_count
     chosen = _newest[console] = await console.call(OUTLINE_SELECT, choice)
     status = console.latest(OUTLINE_STATUS)
     if status is not None and (not status.started or status.state in _ENDED):  # else it traces what is chosen by itself
@@ -82,10 +86,10 @@ async def choose(console: Console, choice: OutlineSelect) -> None:
             pass  # the task tells what is wrong with the object
         if _newest[console] is not chosen:  # that one starts the task, if anything
             return
-        if console.stop_count > stops or (console.acknowledged or 0) > (heard or 0):
+        if console.stop_count > stops or (console.acknowledged or 0) > (acknowledged or 0):
             console.notify(f"{chosen.label} is chosen, but not traced: the arm was stopped or held meanwhile", "busy")
             return
-        await console.command("start", acknowledged=heard)
+        await console.command("start", acknowledged=acknowledged)
     console.notify(f"{chosen.label} is chosen", "good")
 
 
@@ -233,3 +237,11 @@ def _top(thing: CollisionObject) -> float:
     """Height [m] of the top of an upright object."""
     sizes = thing.dimensions
     return thing.pose.position.z + (sizes[0] if thing.shape == "sphere" else sizes[-1] / 2)
+
+
+PAGE = ApplicationPage(
+    layers=(Outline, ContourChoice), controls=Controls, requests=(OUTLINE_SELECT,),
+    states={"SELECTING": "Waiting for a choice", "PLANNING": "Planning", "APPROACHING": "Approaching",
+            "TRACING": "Tracing", "RETREATING": "Retreating"},
+    latency="Picture to path", counters=counters, progress=progress,
+)

@@ -1,12 +1,254 @@
-"""Outlines for Foxglove."""
+"""What summaries, reports and Foxglove recordings show of outlining."""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar
 
-from applications.outlining.messages import OutlinePoints
-from common.messages import Color
+import numpy as np
+from numpy.typing import NDArray
+
+from applications.outlining.topics import CONTOUR_PATH, OUTLINE_STATUS, OutlinePoints, OutlineStatus
+from common.config import RobotConfig
+from common.messages import Color, JointState, TaskStatus, WorldObjects
+from common.topics import JOINT_STATES, SCENE_OBJECTS, Topic
 from recording.foxglove_scene import closed_line, entity, update
+from recording.report import application
+
+if TYPE_CHECKING:
+    from recording.report.history import RunHistory
+
+Array = NDArray[np.float64]
+
+BEFORE = ("IDLE", "SELECTING", "PLANNING")
+UNDER_WAY = ("APPROACHING", "TRACING", "RETREATING")
+CLOSED = 1e-3  # [m] first and last place of a closed outline are no farther apart, but for what lies between two looks
+UNHEARD = 2.0  # [s] at begin and end in which the tool may have gone on without a joint state being heard
+MOST_STATES = 100_000  # joint states of one tracing that are kept: a quarter of an hour at 100 Hz
+
+
+class OutlineFigures(application.Figures):
+    """The block "outline" of a summary, and what a report shows of the outline."""
+
+    STATE_COLORS: ClassVar = {
+        "SELECTING": "#e6c229", "PLANNING": "#e6c229", "APPROACHING": "#2f7ed8", "TRACING": "#17a398",
+        "RETREATING": "#8d6cc2", "HOMING": "#8d6cc2",
+    }
+
+    def __init__(self, robot: RobotConfig | None = None, *, pictured: bool = False) -> None:
+        """Start with nothing heard; without a robot only what the task itself tells is known."""
+        super().__init__(robot, pictured=pictured)
+        self.traced = Traced(robot)
+
+    def listeners(self) -> dict[Topic[Any], Callable[[float, Any], None]]:
+        """The task, the contour, the arm and the truth."""
+        traced = self.traced
+        return {
+            OUTLINE_STATUS: lambda _, status: traced.on_status(status),
+            CONTOUR_PATH: lambda _, path: traced.on_path(path),
+            SCENE_OBJECTS: lambda _, truth: traced.on_truth(truth),
+            **({JOINT_STATES: lambda _, state: traced.on_joints(state)} if self.robot is not None else {}),
+        }
+
+    def exposed(self, message: OutlinePoints) -> int:
+        """Stamp of the picture in which a contour was found; what was given by a file is in none."""
+        return 0 if message.given else message.header.stamp
+
+    def blocks(self) -> dict[str, Any]:
+        """How much of what was traced, and how exactly."""
+        return {"outline": self.traced.figures()}
+
+    def progress(self, status: TaskStatus) -> str:
+        """As "TRACING Object_1, 0.400 m"."""
+        assert isinstance(status, OutlineStatus)
+        return f"{status.state} {status.object}, {status.length_m:.3f} m" if status.object else status.state
+
+    def headline(self, summary: Mapping[str, Any]) -> str:
+        """What was traced and how exactly."""
+        outline = summary["outline"]
+        if not outline["object"]:
+            return "nothing outlined"
+        text = f"{outline['object']} outlined: {outline['fraction']:.1%} of {outline['length_m']:.3f} m"
+        for what, name in (("deviation_mm", "the true outline"), ("tracking_mm", "the contour")):
+            if figures := outline[what]:
+                text += f", {figures['mean']:.2f} mm from {name} ({figures['max']:.2f} mm at most)"
+        return text
+
+    def facts(self, summary: Mapping[str, Any]) -> list[tuple[str, str]]:
+        """The same, each by its name."""
+        outline = summary["outline"]
+        traced = f"{outline['fraction']:.1%} of {outline['length_m']:.3f} m"
+        facts = [("outlined", outline["object"] or "nothing"), ("traced", traced)]
+        for what, name in (("deviation_mm", "from the true edge"), ("tracking_mm", "from the contour")):
+            if figures := outline[what]:
+                facts.append((name, f"{figures['mean']:.2f} mm ({figures['max']:.2f} at most)"))
+        return facts
+
+    def picture(self, run: RunHistory, tool: Array) -> application.Section:
+        """The contour that was detected and the way that the tool tip took along it, from above."""
+        return application.Section("outline", "Outline", (
+            f"{self.traced.picture()}<p>{self.traced.figures()['points']} points of the contour; the true edge is "
+            "shown for comparison only.</p>"
+        ))
+
+
+class Traced:
+    """Follows one cell that outlines objects; tells of the newest outline."""
+
+    def __init__(self, robot: RobotConfig | None) -> None:
+        """Start with nothing seen.
+
+        Args:
+            robot: whose tool tip traces; None when that is not known.
+        """
+        self._robot = robot
+        self._status = OutlineStatus()
+        self._path: OutlinePoints | None = None
+        self._truth: WorldObjects | None = None  # when the arm began to approach
+        self._newest_truth: WorldObjects | None = None
+        self._states: list[JointState] = []
+        self._began: int | None = None  # stamps [ns] of the statuses between which the outline was traced
+        self._ended: int | None = None
+
+    def on_status(self, status: OutlineStatus) -> None:
+        """Take note of how far the task is."""
+        before, self._status = self._status.state, status
+        if status.state == before:
+            return
+        if status.state == "APPROACHING":
+            self._states, self._began, self._ended = [], None, None
+            self._truth = self._newest_truth  # a person may move what was traced
+        elif status.state == "TRACING":
+            self._began = status.header.stamp
+        elif before == "TRACING":
+            self._ended = status.header.stamp
+
+    def on_path(self, path: OutlinePoints) -> None:
+        """Take note of the contour; once the arm moves it may hide a part of it."""
+        if path.poses and self._status.state in BEFORE:
+            self._path = path
+
+    def on_truth(self, truth: WorldObjects) -> None:
+        """Take note of where everything really is."""
+        self._newest_truth = truth
+
+    def on_joints(self, state: JointState) -> None:
+        """Take note of where the joints are. Statuses and joint states overtake each other: their stamps decide."""
+        if self._status.state in UNDER_WAY and len(self._states) < MOST_STATES:
+            self._states.append(state)
+
+    def figures(self) -> dict[str, Any]:
+        """The block "outline" of a summary; without deviations where nothing was traced or no truth is known."""
+        times, tips = self._tips()
+        tips[:, 2] -= self._status.standoff
+        path, outlines = self._path_points(), self._outlines()
+        near = [distances(tips, points) for points in outlines] if len(tips) else []
+        return {
+            "object": self._status.object,
+            "points": self._status.points,
+            "fraction": round(self._fraction(tips), 4),
+            "length_m": round(self._status.length_m, 4),
+            "closed": self._status.closed and (self._robot is None or _is_closed(tips, times)),
+            "deviation_mm": _millimetres(min(near, key=lambda d: float(d.mean()), default=None)),
+            "tracking_mm": _millimetres(distances(tips, path) if len(tips) and len(path) > 1 else None),
+        }
+
+    def picture(self) -> str:
+        """The contour, the true edges and the way of the tool tip from above, as an `svg` element."""
+        import matplotlib as mpl
+        from matplotlib.figure import Figure
+
+        from recording.report.charts import LINES, QUIET, STYLE, from_above, svg
+
+        contour, (_, tips), edges = self._path_points(), self._tips(), self._outlines()
+        with mpl.rc_context(STYLE):
+            figure = Figure(figsize=(7.5, 6.0), layout="constrained")
+            axes = figure.subplots()
+            lines = [(edge, QUIET, 0.8, 1.0, "true edge") for edge in edges]
+            lines += [(contour, "#e6a229", 3.0, 0.7, "detected contour")] if len(contour) else []
+            for line, color, width, alpha, label in lines:
+                closed = np.vstack([line, line[:1]])
+                axes.plot(closed[:, 1], closed[:, 0], color=color, linewidth=width, alpha=alpha, label=label)
+            if len(tips):
+                axes.plot(tips[:, 1], tips[:, 0], color=LINES[0], linewidth=1.0, label="traced")
+            shown = [part[:, :2] for part in (contour, tips) if len(part)]
+            if shown:
+                low, high = np.vstack(shown).min(axis=0) - 0.03, np.vstack(shown).max(axis=0) + 0.03
+                axes.set_xlim(low[1], high[1])
+                axes.set_ylim(low[0], high[0])
+            from_above(figure, axes)
+            return svg(figure, "outline")
+
+    def _fraction(self, tips: Array) -> float:
+        """How much of the contour was traced; what the status tells is how much of it was planned."""
+        if self._status.closed or not self._status.length_m or self._robot is None:
+            return self._status.fraction
+        way = float(np.linalg.norm(np.diff(tips, axis=0), axis=1).sum()) if len(tips) > 1 else 0.0
+        return min(self._status.fraction, way / self._status.length_m)
+
+    def _tips(self) -> tuple[Array, Array]:
+        """Times (N + 2,) [s] and places (N, 3) [m] of the tool tip while it traced; the outer times: begin and end."""
+        began, ended = self._began, self._ended
+        if began is None or self._robot is None:
+            return np.zeros(2), np.zeros((0, 3))
+        from common.robot.model import RobotModel  # takes as long to load as all else: only when it is needed
+
+        robot = RobotModel.load(self._robot)
+        stamps, tips = [], []
+        for state in self._states:
+            q = robot.order(state.name, state.position)
+            if q is not None and began <= state.header.stamp and (ended is None or state.header.stamp <= ended):
+                stamps.append(state.header.stamp)
+                tips.append(robot.fk(q)[:3, 3])
+        last = ended if ended is not None else max(stamps, default=began)
+        return 1e-9 * (np.array([began, *stamps, last]) - began), np.array(tips).reshape(-1, 3)
+
+    def _path_points(self) -> Array:
+        poses = self._path.poses if self._path else []
+        return np.array([(p.position.x, p.position.y, p.position.z) for p in poses]).reshape(-1, 3)
+
+    def _outlines(self) -> list[Array]:
+        """Edges (n, 3) [m] of the true top faces, outer and inner."""
+        truth = self._truth or self._newest_truth
+        objects = truth.objects if truth else []
+        edges: list[tuple[Sequence[tuple[float, float]], float]] = []
+        for thing in objects:
+            edges += [(edge, thing.base + thing.height) for edge in (thing.outline, thing.hole) if len(edge) > 2]
+        return [np.column_stack([np.array(edge), np.full(len(edge), top)]) for edge, top in edges]
+
+
+def _is_closed(tips: Array, times: Array) -> bool:
+    """Whether the first and the last place (N, 3) are the same, as well as joint states that come now and then show.
+
+    Between the begin and the first of them, and between the last and the end, the tool may have gone on at the fastest
+    that was seen, for UNHEARD at most; `times` (N + 2,) [s] are those of the places, and outside them begin and end.
+    """
+    if len(tips) < 2:
+        return False
+    steps = np.linalg.norm(np.diff(tips, axis=0), axis=1)
+    gaps = np.diff(times)
+    speed = float((steps / np.maximum(gaps[1:-1], 1e-3)).max())
+    unseen = float(steps.max()) + speed * min(float(gaps[0] + gaps[-1]), UNHEARD)
+    return float(np.linalg.norm(tips[0] - tips[-1])) <= CLOSED + unseen
+
+
+def distances(places: Array, corners: Array) -> Array:
+    """Distance (N,) [m] of places (N, 3) from the closed polyline through corners (M, 3)."""
+    edges = np.roll(corners, -1, axis=0) - corners
+    squares = np.maximum((edges**2).sum(axis=1), 1e-18)
+    nearest = np.empty(len(places))
+    for i, place in enumerate(places):
+        offset = place - corners
+        share = np.clip((offset * edges).sum(axis=1) / squares, 0.0, 1.0)
+        nearest[i] = np.sqrt(((offset - share[:, None] * edges) ** 2).sum(axis=1).min())
+    return nearest
+
+
+def _millimetres(values: Array | None) -> dict[str, float] | None:
+    if values is None:
+        return None
+    return {"mean": round(1e3 * float(values.mean()), 4), "max": round(1e3 * float(values.max()), 4)}
+
 
 COLOR = Color(r=0.1, g=0.9, b=0.3)
 

@@ -15,10 +15,10 @@ import typer
 
 from common.errors import ConfigError
 from common.terminal import echo
-from common.verbs import BeforeRun
+from common.verbs import BeforeRun, Verbs
 
 if TYPE_CHECKING:
-    from applications.outlining.messages import OutlineSelect
+    from applications.outlining.topics import OutlineSelect
     from common.config import Cell
     from common.verbs import Shell
 
@@ -39,8 +39,8 @@ def snapshot(
 
     A cell that is up is asked; else its services are started for it, without the task, and stopped again.
     """
-    from applications.outlining.asking import store
-    from applications.outlining.contours_choice import parse_choice
+    from applications.outlining.contour_choice import parse_choice
+    from applications.outlining.visits import store
 
     shell: Shell = context.obj
     visit = partial(store, folder=Path(folder), wanted=parse_choice(select))
@@ -55,7 +55,7 @@ def outline(
     overrides: list[str] | None = None, world: str | None = None,
 ) -> None:
     """Find the outline in the files of a folder, write its stages there and plan its tracing; nothing moves."""
-    from applications.outlining.contours_choice import parse_choice
+    from applications.outlining.contour_choice import parse_choice
     from common.config import load_cell
 
     wanted = parse_choice(select)
@@ -71,7 +71,7 @@ def select(
     cell: str | None = None, domain: str | None = None, connect: str | None = None,
 ) -> None:
     """Choose the object to outline."""
-    from applications.outlining.contours_choice import parse_choice
+    from applications.outlining.contour_choice import parse_choice
     from applications.outlining.topics import OUTLINE_SELECT
 
     wanted = parse_choice(which)
@@ -79,9 +79,6 @@ def select(
         raise ConfigError("task select", which, "chooses nothing; choices: an index, a label, a colour, or auto")
     shell: Shell = context.obj
     shell.send(OUTLINE_SELECT, wanted, cell, domain, connect)
-
-
-VERBS = {"snapshot": snapshot, "outline": outline, "task select": select}
 
 
 def before_run(
@@ -94,13 +91,13 @@ def before_run(
     """
     if not ask and source is None:
         return BeforeRun(overrides)
-    from applications.outlining import TASK
-    from applications.outlining.asking import CHOOSE_BY_HAND, ask_person, require_terminal
+    from applications.outlining import APPLICATION
     from applications.outlining.stage_files import CLEARED, read_coordinates
+    from applications.outlining.visits import CHOOSE_BY_HAND, ask_person, require_terminal
     from common.config import load_cell
 
     for option, wanted in (("--ask", ask), ("--from", source is not None)):
-        if wanted and load_cell(cell, overrides, world=world).task != TASK:
+        if wanted and load_cell(cell, overrides, world=world).task != APPLICATION.task:
             raise ConfigError(option, cell, f"needs a cell that outlines objects, such as {CELL}")
     if ask and source is not None:
         raise ConfigError("--ask", ..., "and --from are two ways to choose: give one of them")
@@ -114,17 +111,17 @@ def before_run(
 
 def _stages(shell: Shell, cell: Cell, place: Path, wanted: OutlineSelect, *, keep: bool) -> None:
     from applications.outlining import stage_files
-    from applications.outlining.legs import Legs
     from applications.outlining.offline import perceive, plan_outline
-    from applications.outlining.scene import planning_scene
+    from applications.outlining.solids import planning_scene
+    from applications.outlining.task import Legs
     from common.config import Surroundings
-    from common.perception.mounted import Mounted
+    from common.perception.pinhole import MountedCamera
     from common.planning.pipeline import PlanningPipeline
     from common.robot.model import RobotModel
 
     around = cell.section(Surroundings)
     assert isinstance(around, Surroundings)
-    camera = Mounted(around.camera, RobotModel.load(cell.robot)).at()
+    camera = MountedCamera(around.camera, RobotModel.load(cell.robot)).at()
     picture, depth = stage_files.read_pictures(place)
     size, expected = f"{depth.shape[1]}x{depth.shape[0]}", f"{camera.width}x{camera.height}"
     if size != expected:
@@ -149,3 +146,6 @@ def _stages(shell: Shell, cell: Cell, place: Path, wanted: OutlineSelect, *, kee
     for leg, response in plan_outline(pipeline, legs, cleared, label, scene, given=keep):
         echo(f"  {leg.name:<8} {leg.seconds:6.2f} s by {response.planner}, planned in "
                    f"{1e3 * response.seconds:.0f} ms, fraction {response.fraction:.2f}")
+
+
+VERBS = Verbs(commands={"snapshot": snapshot, "outline": outline, "task select": select}, before_run=before_run)

@@ -12,8 +12,8 @@ from typing import Any
 
 from pydantic import BaseModel, FiniteFloat
 
-from applications.pick_place.parameters import Config, HandShape
-from applications.pick_place.remembered import HIDDEN
+from applications.pick_place.detections import HIDDEN
+from applications.pick_place.grasping import Config, HandShape
 from common import messages as m
 from common.config import Container
 from common.robot.transforms import matrix_to_rpy, pose_to_matrix

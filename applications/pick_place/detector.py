@@ -1,7 +1,8 @@
-"""Find balls of known size and colour in a picture."""
+"""Find balls of known size and color in an image."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, NamedTuple
 
@@ -10,21 +11,9 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field, model_validator
 
-from applications.pick_place.blobs import (
-    Blob,
-    Mask,
-    Outline,
-    Traced,
-    all_of,
-    find_blobs,
-    long_ones,
-    middles,
-    small_blobs,
-)
-from applications.pick_place.depth_balls import find_in_depth
-from applications.pick_place.fit import Fit, fit_each, fit_spheres
-from applications.pick_place.masks import Colours, Masks, RedMasks
-from applications.pick_place.odd import (
+from applications.pick_place.ball_places import Resting, is_table, shows_table
+from applications.pick_place.depth_spheres import find_in_depth
+from applications.pick_place.outliers import (
     BELOW,
     BLURRED,
     COVERED,
@@ -42,14 +31,26 @@ from applications.pick_place.odd import (
     sized,
     unlike,
 )
-from applications.pick_place.resting import Resting, is_table, shows_table
-from applications.pick_place.separation import separate
+from applications.pick_place.segmentation import (
+    Blob,
+    Colours,
+    Mask,
+    Masks,
+    Outline,
+    RedMasks,
+    Traced,
+    all_of,
+    find_blobs,
+    long_ones,
+    middles,
+    small_blobs,
+)
+from applications.pick_place.sphere_fit import Fit, fit_each, fit_spheres, separate
 from common.config import CameraConfig, Parameters, Surroundings, Tunable
 from common.perception.depth import Depth
-from common.perception.exposure import blindness
+from common.perception.illumination import BoolMask, blank_image_reason, blue_share, looked_at
 from common.perception.pinhole import Pinhole
 from common.perception.sphere import ray_distances, silhouettes
-from common.perception.white import Chosen, blue_share, looked_at
 
 Array = npt.NDArray[np.float64]
 Picture = npt.NDArray[np.uint8]
@@ -143,7 +144,7 @@ class Detector:
         self.options = options or DetectorOptions()
         self.resting = Resting.of(surroundings)
         self._around = surroundings
-        self._table: tuple[Pinhole, Chosen | None] | None = None  # where the last camera shows it
+        self._table: tuple[Pinhole, BoolMask | None] | None = None  # where the last camera shows it
         self._masks = Masks()
         self._outlines: dict[Traced, Outline] = {}  # of the last picture: what is there again is not worked out again
         self._fits: dict[_Key, list[_Round]] = {}
@@ -175,7 +176,7 @@ class Detector:
         if last and masks.closed is last[0] and camera is last[1] and self.options == last[2]:
             return list(last[3])
         found = [one for one in self._look_at(masks, camera) if not self._is_floor(one, picture, camera)]
-        self.blind = "" if found else blindness(picture)
+        self.blind = "" if found else blank_image_reason(picture)
         self._last = (masks.closed, camera, self.options.model_copy(), found)
         return list(found)
 
@@ -196,7 +197,7 @@ class Detector:
             for middle, contour in middles(closed, self.options.min_contour_area_px)
             if not any(cv2.pointPolygonTest(contour, one.pixel, False) >= 0 for one in found)
         ] + self._thin(narrow, camera))
-        self.blind, self.too_small, self._last = "" if found else blindness(picture), 0, None
+        self.blind, self.too_small, self._last = "" if found else blank_image_reason(picture), 0, None
         return sorted(found, key=lambda d: (d.pixel[1], d.pixel[0]))
 
     def _look_at(self, masks: RedMasks, camera: Pinhole) -> list[Detection]:
@@ -429,3 +430,20 @@ def rehearse(surroundings: Surroundings, options: DetectorOptions) -> None:
     for outline in silhouettes(camera, places, radius, 32):
         cv2.fillConvexPoly(picture, np.rint(outline).astype(np.int32), (0, 0, 255))
     detector.detect(picture, camera)
+
+
+WHOLE, PARTIAL = (0, 255, 0), (0, 200, 255)
+
+
+def annotate(picture: Picture, detections: Sequence[Detection]) -> Picture:
+    """A copy of the bgr8 picture with the outline, the centre and the place [m] of each detection."""
+    shown = picture.copy()
+    for d in detections:
+        color = PARTIAL if d.partial else WHOLE
+        points = np.rint(np.clip(d.outline, -4000, 20000) * 16).astype(np.int32)
+        cv2.polylines(shown, [points], True, color, 1, cv2.LINE_AA, 4)
+        u, v = (round(value) for value in d.pixel)
+        cv2.drawMarker(shown, (u, v), color, cv2.MARKER_CROSS, 9, 1)
+        label = f"{d.position[0]:.3f} {d.position[1]:+.3f}{' partial' if d.partial else ''}"
+        cv2.putText(shown, label, (u - 40, v - 26), cv2.FONT_HERSHEY_SIMPLEX, 0.35, (0, 0, 0), 1, cv2.LINE_AA)
+    return shown

@@ -4,21 +4,18 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from applications.pick_place.perceived import PerceivedScene
+from applications.pick_place.perceived_scene import PerceivedScene, SceneParameters
 from applications.pick_place.topics import VALIDATED_TARGETS
-from applications.pick_place.tracks import SceneParameters
 from common import topics
 from common.config import RobotConfig, Surroundings, Tunable
 from common.errors import ConfigError
 from common.messages import Header, Marker, MarkerArray, Pose, PoseArray, Vector3, WorldObject
-from common.perception.mounted import Mounted
+from common.perception.pinhole import MountedCamera
 from common.process.pace import Pace
 from common.process.planning_scene import SceneWriter
 from common.robot.model import RobotModel
 from common.transport.bus import Bus
 
-REPLACES = ("camera_simulator", "vision_detector", "workspace_validator", "scene_manager")
-SETTINGS = ("world.count=1", "motion.velocity_scaling=0.6", "motion.acceleration_scaling=1.0")
 WORLD = "world"
 
 
@@ -42,7 +39,7 @@ async def run(bus: Bus, config: Config) -> None:
     gripper = bus.reader(topics.GRIPPER_STATE)
     validated, out = bus.writer(VALIDATED_TARGETS), SceneWriter(bus)
     robot = RobotModel.load(config.robot)
-    camera = Mounted(config.world.camera, robot).at()
+    camera = MountedCamera(config.world.camera, robot).at()
     if config.robot.gripper is None:
         raise ConfigError("robot.gripper", ..., "is missing: what takes objects needs one")
     scene = PerceivedScene(config, config.world, config.robot.gripper, config.robot.tcp_link)

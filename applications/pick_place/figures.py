@@ -14,17 +14,17 @@ if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
-    from recording.report.gathering import Gathering
+    from recording.report.history import RunHistory
 
 
-class Figures(application.Figures):
+class PickPlaceFigures(application.Figures):
     """Those of every run, and what was detected and offered as a target."""
 
     COUNTED = "placed"
     STATE_COLORS: ClassVar = {"GRASPING": "#2f7ed8", "PLACING": "#17a398", "HOMING": "#8d6cc2"}
     TRUTH = SCENE_BALLS
 
-    def hears(self) -> dict[Topic[Any], Callable[[float, Any], None]]:
+    def listeners(self) -> dict[Topic[Any], Callable[[float, Any], None]]:
         """Detections and targets, where they are to be shown."""
         self._detections: dict[tuple[int, int], int] = {}  # how often, by place
         self._targets: dict[tuple[int, int], int] = {}
@@ -33,15 +33,15 @@ class Figures(application.Figures):
         return {DETECTED_OBJECTS: self._on_detections, VALIDATED_TARGETS: self._on_targets}
 
     def _on_detections(self, _time: float, found: MarkerArray) -> None:
-        from recording.report.gathering import count_places
+        from recording.report.history import count_places
 
         count_places(self._detections, (marker.pose for marker in found.markers))
 
     def _on_targets(self, _time: float, targets: PoseArray) -> None:
-        from recording.report.gathering import count_places
+        from recording.report.history import count_places
 
         count_places(self._targets, targets.poses)
 
-    def picture(self, run: Gathering, tool: npt.NDArray[np.float64]) -> application.Section | None:
+    def picture(self, run: RunHistory, tool: npt.NDArray[np.float64]) -> application.Section | None:
         """The table from above, with what was detected there."""
-        return application.seen_from_above(run, tool, {"detections": self._detections, "targets": self._targets})
+        return application.top_view_section(run, tool, {"detections": self._detections, "targets": self._targets})

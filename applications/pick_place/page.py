@@ -14,15 +14,13 @@ from applications.pick_place.topics import (
 )
 from common.messages import TaskStatus
 from common.topics import Topic
+from page.application import ApplicationPage
 from page.layers import Layer
 from page.nodes import FLAT, Labels, Markers, points_of, ring
 from page.rejections import RejectedPosition, RejectedPositions
 
 if TYPE_CHECKING:
     import viser
-
-STATES = {"GRASPING": "Taking", "PLACING": "Placing"}
-LATENCY = "Picture to targets"
 
 TARGET = (70, 220, 110)
 REJECTED = (255, 90, 200)
@@ -111,3 +109,9 @@ class Workspace(Layer):
     def show(self, topic: Topic[Any], message: Any) -> None:
         """Show these shapes and no others."""
         self.markers.show(message)
+
+
+PAGE = ApplicationPage(
+    layers=(Targets, Rejected, Workspace), states={"GRASPING": "Taking", "PLACING": "Placing"},
+    latency="Picture to targets", counters=counters,
+)

@@ -9,11 +9,11 @@ import math
 
 from pydantic import BaseModel
 
+from applications.pick_place.ball_places import Looking
 from applications.pick_place.choice import Choice, LetGo, Pick, PickPlaceView, Spot, Spots, same_place
-from applications.pick_place.looking import Looking
-from applications.pick_place.messages import PickPlaceStatus
-from applications.pick_place.parameters import Config
-from applications.pick_place.rows import Rows
+from applications.pick_place.grasping import Config
+from applications.pick_place.motion_sequences import Rows
+from applications.pick_place.topics import PickPlaceStatus
 from common import messages as m
 from common.scene.home import is_home
 from common.tasks.engine import Task

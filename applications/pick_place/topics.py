@@ -1,10 +1,51 @@
-"""Keys of pick and place."""
+"""Messages and topics of pick and place."""
 
 from __future__ import annotations
 
-from applications.pick_place.messages import PickPlaceStatus
+from typing import Any, Literal
+
+from pydantic import computed_field, model_validator
+
 from common import messages as m
+from common.application import ApplicationTopics
+from common.messages.task import TaskStatus
 from common.topics import Topic
+
+TaskState = Literal["IDLE", "GRASPING", "PLACING", "HOMING", "DONE", "ERROR"]
+SEED_NAMES = {"placed": "done", "targets": "total", "target": "subject"}  # on the wire beside those of every task
+
+
+class PickPlaceStatus(TaskStatus):
+    """State and counters of the pick-and-place task. `subject` is the track id of the object in work."""
+
+    state: TaskState = "IDLE"
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_seed_names(cls, values: Any) -> Any:
+        if not isinstance(values, dict):
+            return values
+        given = {name: value for name, value in values.items() if name not in SEED_NAMES}
+        return {SEED_NAMES[name]: value for name, value in values.items() if name in SEED_NAMES} | given
+
+    @computed_field  # type: ignore[prop-decorator]
+    @property
+    def placed(self) -> int:
+        """Objects that were put into the container."""
+        return self.done
+
+    @computed_field  # type: ignore[prop-decorator]
+    @property
+    def targets(self) -> int:
+        """Objects that the task has seen and may take or has taken."""
+        return self.total
+
+    @computed_field  # type: ignore[prop-decorator]
+    @property
+    def target(self) -> str:
+        """Track id of the object in work."""
+        return self.subject
+
 
 SCENE_BALLS = Topic("scene_balls", m.PoseArray, "state", "the truth: where every ball is; simulated hardware only")
 DETECTED_OBJECTS = Topic("detected_objects", m.MarkerArray, "stream", "balls found in the picture, in world")
@@ -19,13 +60,6 @@ WORKSPACE_MARKERS = Topic("workspace_markers", m.MarkerArray, "state",
 PICK_PLACE_STATUS = Topic("pick_place_status", PickPlaceStatus, "state",
                           "IDLE, GRASPING, PLACING, HOMING, DONE or ERROR, and counters")
 
-STATUS = PICK_PLACE_STATUS
-DECIDED_BY = VALIDATED_TARGETS
-REJECTED = REJECTED_TARGETS
-DETECTED = DETECTED_OBJECTS
-ANNOTATED = DETECTION_IMAGE
-MASK = DETECTION_MASK
-
 
 def scene_balls(truth: m.WorldObjects) -> m.PoseArray:
     """The spheres of the simulated world, with their states as labels: what lies in a container is in the box."""
@@ -37,4 +71,9 @@ def scene_balls(truth: m.WorldObjects) -> m.PoseArray:
     )
 
 
-VIEWS = {SCENE_BALLS: scene_balls}
+TOPICS = ApplicationTopics(
+    declared=(SCENE_BALLS, DETECTED_OBJECTS, DETECTION_IMAGE, DETECTION_MASK, VALIDATED_TARGETS, REJECTED_TARGETS,
+              WORKSPACE_MARKERS, PICK_PLACE_STATUS),
+    status=PICK_PLACE_STATUS, decided_by=VALIDATED_TARGETS, rejected=REJECTED_TARGETS, detected=DETECTED_OBJECTS,
+    annotated=DETECTION_IMAGE, mask=DETECTION_MASK, truth_views={SCENE_BALLS: scene_balls},
+)

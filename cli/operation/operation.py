@@ -21,12 +21,12 @@ from common.terminal import printable
 if TYPE_CHECKING:
     from cli.operation.screen import Content, Screen
     from common.config import Cell
-    from common.messages import Inhibit
+    from common.messages import Interlock
     from common.supervision.supervisor import Supervisor
     from common.transport.bus import Bus
     from lab.chaos.agent import Chaos
     from page.address import PageAddress
-    from recording.report.collector import Collector
+    from recording.report.aggregator import Collector
 
 T = TypeVar("T")
 
@@ -82,7 +82,7 @@ class Operation:
             require_modules,
         )
         from common.transport.endpoint import endpoint_of
-        from recording.report.fold import Fold
+        from recording.report.aggregator import RunAggregator
         from security.page_tokens import VIEWER
         from security.requiring import require_secured, with_near
         from tools.check.cell import require_safe
@@ -104,8 +104,9 @@ class Operation:
             kept = {name: entry for name, entry in loaded.services.items() if entry.kind != VIEWER}
             loaded = loaded.model_copy(update={"services": kept})
         self.cell: Cell = loaded
-        self.fold = Fold(loaded.name, find_application(loaded.application), robot=loaded.robot, seed=loaded.run.seed,
-                         speed=self.launch.clock.speed, containers=list(loaded.world.containers))
+        self.fold = RunAggregator(
+            loaded.name, find_application(loaded.application), robot=loaded.robot, seed=loaded.run.seed,
+            speed=self.launch.clock.speed, containers=list(loaded.world.containers))
         self.summary = self.fold.summary
         require_modules(loaded)
         require_safe(loaded)
@@ -147,8 +148,8 @@ class Operation:
             return
         from common.supervision.launch import python_module
         from common.transport.credentials import RECORDER
-        from recording.own import Own
-        from recording.telling import require_new
+        from recording.capture import CustomTopics
+        from recording.summary import require_new
         from security.requiring import require_recorder
 
         path = Path(file).absolute()
@@ -157,7 +158,7 @@ class Operation:
         place = ["--connect", self.launch.connect] if self.launch.connect else ["--domain", str(self.launch.domain)]
         self._watchers[RECORDER] = [
             *python_module("cli.main"), "record", "--cell", self.cell.name, "-o", str(path), *place, "--gate",
-            "--own", str(Own.of(self.cell)),
+            "--own", str(CustomTopics.of(self.cell)),
         ]
 
     def disturb(self, seed: int, per_minute: float, *, until_ended: bool) -> None:
@@ -297,7 +298,7 @@ class Operation:
         return Content(statuses, {name: rate for name, rate in rates.items() if rate}, self.fold.progress)
 
     def _prepare(self, bus: Bus) -> None:
-        from recording.report.collector import Collector
+        from recording.report.aggregator import Collector
 
         assert self._screen is not None
         self._collector = Collector(bus, self.fold, self.began, self._screen.progress)
@@ -313,11 +314,11 @@ class Operation:
         if not self._simulated:
             self._tell_kept(kept)
         if (self._simulated and kept) or (not self.cell.run.autostart and not kept):  # who says `run` says start
-            heard = max((inhibit.since for inhibit in kept), default=0)  # a stop that comes now stays
-            start = TaskCommand(command="start", by=person(), override=bool(kept), heard=heard)
+            acknowledged = max((interlock.since for interlock in kept), default=0)  # a stop that comes now stays
+            start = TaskCommand(command="start", by=person(), override=bool(kept), acknowledged=acknowledged)
             await bus.client(topics.TASK_COMMAND).call(start, START_REQUEST_TIMEOUT)
-            for inhibit in kept:
-                self._note(f"Let go: {self.cell.name} was {inhibit.told}")
+            for interlock in kept:
+                self._note(f"Let go: {self.cell.name} was {interlock.description}")
 
         async def end() -> None:
             if self.first is not None:
@@ -344,22 +345,22 @@ class Operation:
         await beside(self._disturbing(), collector.run())
         return 0
 
-    def _tell_kept(self, kept: list[Inhibit]) -> None:
-        for inhibit in kept:
-            verb = "start" if inhibit.kind == "stopped" else "resume"
-            self._note(f"{self.cell.name} is {inhibit.told}: `zencell task {verb}` lets it go on")
+    def _tell_kept(self, kept: list[Interlock]) -> None:
+        for interlock in kept:
+            verb = "start" if interlock.kind == "stopped" else "resume"
+            self._note(f"{self.cell.name} is {interlock.description}: `zencell task {verb}` lets it go on")
 
     def _note(self, line: str) -> None:
         assert self._screen is not None
         self._screen.note(line)
 
     async def _tell_doubts(self) -> None:
-        from tools.check.beside import NotLooked, doubts_beside
+        from tools.check.cell import QuickCheckFailed, warnings_in_subprocess
 
         try:
-            for found in await doubts_beside(self.cell, self.launch.environment()):
+            for found in await warnings_in_subprocess(self.cell, self.launch.environment()):
                 self._note(f"{found.severity}: {printable(found.line)}")
-        except NotLooked as told:
+        except QuickCheckFailed as told:
             self._note(f"warning: {told}")
 
     async def _disturbing(self) -> None:
@@ -373,12 +374,13 @@ class Operation:
             self._screen.note(f"Open {self._page.url}")
         self._doubts = asyncio.create_task(self._tell_doubts(), name="doubts")
         if self._disturbance is not None:
-            from lab.chaos.setting import chaos_in, keys_of
+            from lab.chaos.agent import create_chaos, keys_of
 
             assert self._supervisor is not None
             seed, per_minute, until_ended = self._disturbance
             known = keys_of(await bus.owners(), [entry.name for entry in self.cell.services.values()])
-            self._chaos = chaos_in(bus, self.cell, self._supervisor, known, seed, per_minute, until_ended=until_ended)
+            self._chaos = create_chaos(
+                bus, self.cell, self._supervisor, known, seed, per_minute, until_ended=until_ended)
         return self._collector
 
 

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from common.config import Cell
-    from common.messages import Inhibit
+    from common.messages import Interlock
     from common.transport.bus import Bus
 
 FIRST_WORD = 2.0  # [s] in which the executor of a cell that is up has said how the robot is
 EXECUTOR, OURSELVES = "trajectory_executor", ("watchdog", "controller", "scene_monitor")
 
 
-async def kept_by_persons(bus: Bus, cell: Cell, note: Callable[[str], None]) -> list[Inhibit]:
+async def kept_by_persons(bus: Bus, cell: Cell, note: Callable[[str], None]) -> list[Interlock]:
     """What persons stopped or hold since before the cell came up; notes when they made it slower."""
     from common import topics
 
@@ -31,4 +31,4 @@ async def kept_by_persons(bus: Bus, cell: Cell, note: Callable[[str], None]) -> 
     if motion.speed_scaling < 1:
         set_it = f"`zencell param set services.{EXECUTOR}.speed_scaling=1`"
         note(f"Motions go at {100 * motion.speed_scaling:.0f} % of their speed: {set_it} ends that")
-    return [inhibit for inhibit in motion.inhibits if inhibit.by not in OURSELVES]
+    return [interlock for interlock in motion.interlocks if interlock.by not in OURSELVES]

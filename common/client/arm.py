@@ -178,17 +178,17 @@ class Arm(Part):
 
     async def move(self, to: Where | Through, *, timeout: float = PATIENCE, **how: Any) -> MotionStatus:
         """Plan and execute: see there. What somebody says while it is planned keeps the arm, whoever that is."""
-        heard = (await self.status()).newest  # what the program itself said just now may still be under way to us
+        acknowledged = (await self.status()).newest  # may miss our last request
         await self.require_free()
-        return await self._follow(await self.plan(to, **how), timeout, heard)
+        return await self._follow(await self.plan(to, **how), timeout, acknowledged)
 
-    async def _follow(self, plan: Plan, timeout: float, heard: int | None = None) -> MotionStatus:
+    async def _follow(self, plan: Plan, timeout: float, acknowledged: int | None = None) -> MotionStatus:
         """Follow a plan; what was said later than `heard` keeps the arm, left out: than now."""
         if not isinstance(plan, Plan) or plan.response.trajectory is None:
             raise ConfigError("plan", plan, "must be a Plan, as `arm.plan(...)` returns it")
         with self._noted():
             return await self._motion.follow(
-                plan.response.trajectory, timeout=timeout, plan=plan.response, heard=heard)
+                plan.response.trajectory, timeout=timeout, plan=plan.response, acknowledged=acknowledged)
 
     @contextlib.contextmanager
     def _noted(self) -> Iterator[None]:
@@ -273,7 +273,7 @@ class Arm(Part):
             if name not in known:
                 raise UnknownName("joint", name, known)
         motion, owners = self._ear.reader(topics.MOTION_STATUS), self._ear.reader(topics.MOTION_OWNER)
-        heard = (await self._ear.newest(topics.MOTION_STATUS)).newest
+        acknowledged = (await self._ear.newest(topics.MOTION_STATUS)).newest
         await self._ear.newest(topics.MOTION_OWNER)
         writer = self._bus.writer(topics.MOTION_JOG)
         clock = asyncio.get_running_loop().time
@@ -281,7 +281,7 @@ class Arm(Part):
         ours = False
         try:
             while (past := clock() - began) < seconds:
-                writer.put(asked.model_copy(update={"header": self._bus.header(), "heard": heard}))
+                writer.put(asked.model_copy(update={"header": self._bus.header(), "acknowledged": acknowledged}))
                 await asyncio.sleep(JOG_PERIOD)
                 now, state = owners.latest, motion.latest
                 assert now is not None and state is not None
@@ -294,10 +294,10 @@ class Arm(Part):
                 elif not goes and not waits:
                     late = ours and not now.jogging
                     why = "" if another else "words of this program came too late" if late else NO_WAY
-                    raise NotJogged(now.told, _kept(state) or why)
+                    raise NotJogged(now.description, _kept(state) or why)
                 ours = ours or goes
         finally:
-            writer.put(JogCommand(header=self._bus.header(), owner=self.owner, heard=heard))
+            writer.put(JogCommand(header=self._bus.header(), owner=self.owner, acknowledged=acknowledged))
         while not ours and clock() - began < UNHEARD:  # that it moves is told a moment after it was asked for
             await asyncio.sleep(JOG_PERIOD)
             now = owners.latest
@@ -307,7 +307,7 @@ class Arm(Part):
             now, state = owners.latest, motion.latest
             assert now is not None and state is not None
             another = now.kind != "none" and now.owner != self.owner
-            raise NotJogged(now.told, _kept(state) or ("" if another else NO_WAY))
+            raise NotJogged(now.description, _kept(state) or ("" if another else NO_WAY))
 
     # --- whose the motion is --------------------------------------------------------------------------------------
 
@@ -393,9 +393,9 @@ class Hand(Part):
         """
         if not (await self._arm.description()).gripper:
             raise MotionFailed("no_gripper", "the robot of this cell has no gripper")
-        heard = (await self._arm.require_free()).newest
+        acknowledged = (await self._arm.require_free()).newest
         asked = check(GripperCommand, {
-            "heard": heard,
+            "acknowledged": acknowledged,
             "header": self._bus.header(), "id": f"{self._owner}-{new_id()}"[-100:], "owner": self._owner,
             "width": width, "effort": force, "expected_width": expected, "width_tolerance": tolerance, "mass": mass,
         }, "gripper")
@@ -448,4 +448,4 @@ def _asked(more: dict[str, Any], **given: Any) -> dict[str, Any]:
 
 def _kept(state: MotionStatus) -> str:
     """Who keeps the arm from moving, in words."""
-    return "; ".join(inhibit.told for inhibit in state.inhibits) or state.message
+    return "; ".join(interlock.description for interlock in state.interlocks) or state.message

@@ -29,7 +29,7 @@ REQUEST_TIMEOUT = 2.0  # [s] wall
 PATIENCE = 10.0  # [s] wall without progress, unless the robot is held
 FIRST_WORD = 0.5  # [s] wall in which a state that there is has arrived
 COME_TO_REST = 1.0  # [s] wall: for a motion that is being stopped
-SOMEBODY, OURSELVES = "person", ("watchdog", "controller", "scene_monitor")  # who gave no name; who lets go by itself
+OURSELVES = ("watchdog", "controller", "scene_monitor")  # release their holds by themselves
 AT_REST = ("IDLE", "DONE", "ERROR")  # states in which a task does not move the robot
 
 A = TypeVar("A", bound=m.Message)
@@ -51,7 +51,7 @@ class OperatorMotion:
     """Moves the robot for a person; any number of these may live in a cell, the executor follows one goal at a time."""
 
     def __init__(
-        self, bus: Bus, tasks: Sequence[Reader[Any]] | None = None, owner: str | Callable[[], str] = SOMEBODY
+        self, bus: Bus, tasks: Sequence[Reader[Any]] | None = None, owner: str | Callable[[], str] = m.UNKNOWN_OPERATOR
     ) -> None:
         """Declare what is asked and heard.
 
@@ -86,7 +86,7 @@ class OperatorMotion:
         return await self._plan.call(request, (request.planning_time or PLANNING_TIME) + SLOWER)
 
     async def move(
-        self, goal: Goal, *, timeout: float = PATIENCE, heard: int | None = None, **more: Any
+        self, goal: Goal, *, timeout: float = PATIENCE, acknowledged: int | None = None, **more: Any
     ) -> m.MotionStatus:
         """The last status of a motion to the goal, once it has succeeded. When cancelled, the robot is stopped.
 
@@ -94,8 +94,8 @@ class OperatorMotion:
             goal: where to.
             more: as `plan` takes it.
             timeout: give up and stop after so long without progress, but for the time that the robot is held [s, wall].
-            heard: `newest` of the motion status as this was asked for, where it is the second or later of a row: what
-                the same person said since keeps the robot. Left out: it is asked for now.
+            acknowledged: `newest` of the motion status as the operator requested this, for later motions of a sequence:
+                newer interlocks of the same operator block it. Default: now.
 
         Raises:
             MotionFailed: a task has the robot, there is no way, or the motion ended otherwise.
@@ -105,29 +105,29 @@ class OperatorMotion:
         response = await self.plan(goal, **more)
         if not response.ok or response.trajectory is None:
             raise MotionFailed(response.error, response.message)
-        known = before.newest if heard is None else heard
+        known = before.newest if acknowledged is None else acknowledged
         return await self._follow(response.trajectory, timeout, known, response)
 
     async def follow(
         self, trajectory: m.JointTrajectory, *, timeout: float = PATIENCE, plan: m.PlanResponse | None = None,
-        heard: int | None = None,
+        acknowledged: int | None = None,
     ) -> m.MotionStatus:
         """The last status of following a trajectory that was planned before, by that plan; as `move` otherwise."""
-        known = (await self.require_free()).newest if heard is None else heard
+        known = (await self.require_free()).newest if acknowledged is None else acknowledged
         return await self._follow(trajectory, timeout, known, plan)
 
     async def _follow(
-        self, trajectory: m.JointTrajectory, timeout: float, heard: int, plan: m.PlanResponse | None = None
+        self, trajectory: m.JointTrajectory, timeout: float, acknowledged: int, plan: m.PlanResponse | None = None
     ) -> m.MotionStatus:
         """As `follow`; what was said later than `heard`, when the motion was asked for, keeps the robot."""
         if not isinstance(timeout, int | float) or not timeout > 0:
             raise ConfigError("timeout", timeout, "must be more than 0 [s]")
         if (await self.require_free()).held:  # with nothing under way, letting go moves nothing, nor does it later
             await self._hold.call(m.HoldRequest(hold=False, reason="a person moves the robot", owner=self._owner(),
-                                                into_stop=True, heard=heard), REQUEST_TIMEOUT)
+                                                into_stop=True, acknowledged=acknowledged), REQUEST_TIMEOUT)
         request = m.ExecuteRequest(
-            header=self._bus.header(), id=_mint(), trajectory=trajectory, owner=self._owner(), heard=heard,
-            plan=plan.id if plan else "", scene_stamp=plan.scene_stamp if plan else 0)
+            header=self._bus.header(), id=_mint(), trajectory=trajectory, owner=self._owner(),
+            acknowledged=acknowledged, plan=plan.id if plan else "", scene_stamp=plan.scene_stamp if plan else 0)
         try:
             answer = await self._execute.call(request, REQUEST_TIMEOUT)
             if answer.state == "rejected":
@@ -149,19 +149,20 @@ class OperatorMotion:
         known, asked = self._motion.latest, wall_ns()
         status = await self._known()
         self._require_no_task()
-        for inhibit in status.inhibits:
-            if inhibit.by not in (self._owner(), SOMEBODY, *OURSELVES):
-                raise MotionFailed(inhibit.kind, f"the robot is {inhibit.told}")
+        for interlock in status.interlocks:
+            if interlock.by not in (self._owner(), m.UNKNOWN_OPERATOR, *OURSELVES):
+                raise MotionFailed(interlock.kind, f"the robot is {interlock.description}")
         try:
             async with asyncio.timeout(COME_TO_REST):
                 while status.state == "active":
                     status = await self._motion.next()
         except TimeoutError:
             raise MotionFailed("busy", f"the robot follows goal {status.id!r}: stop it first") from None
-        heard = max(asked, known.newest if known else 0)  # a program may have said the stop that it then moves after
-        for inhibit in status.inhibits:
-            if inhibit.since > heard and inhibit.by not in OURSELVES:
-                raise MotionFailed(inhibit.kind, f"the robot is {inhibit.told}")
+        # A program may move after a stop of its own.
+        acknowledged = max(asked, known.newest if known else 0)
+        for interlock in status.interlocks:
+            if interlock.since > acknowledged and interlock.by not in OURSELVES:
+                raise MotionFailed(interlock.kind, f"the robot is {interlock.description}")
         return status
 
     async def _known(self) -> m.MotionStatus:

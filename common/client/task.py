@@ -97,12 +97,12 @@ class TaskControl(Part):
         return self._unkept
 
     def _note(self, answer: MotionStatus) -> None:
-        self._unkept = answer.not_kept
+        self._unkept = answer.unsaved
 
     async def _tell(self, command: str, override: bool = False) -> TaskStatus:
-        heard = await newest_heard(self._bus) if command in ("start", "resume") else None
+        acknowledged = await newest_heard(self._bus) if command in ("start", "resume") else None
         asked = TaskCommand.model_validate({
-            "command": command, "by": self._owner, "override": override, "heard": heard})
+            "command": command, "by": self._owner, "override": override, "acknowledged": acknowledged})
         return await self._bus.client(topics.TASK_COMMAND).call(asked, TIMEOUT)
 
     async def topic(self) -> Topic[TaskStatus]:

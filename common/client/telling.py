@@ -64,9 +64,9 @@ async def messages(
 async def _of_topic(bus: Bus, topic: Topic[Any], as_json: bool, save: str) -> AsyncGenerator[str, None]:
     async for message in bus.reader(topic):
         if save:
-            from common.perception.image_files import save_picture
+            from common.perception.image import save_image
 
-            await asyncio.to_thread(save_picture, message, Path(save))
+            await asyncio.to_thread(save_image, message, Path(save))
         yield to_json(message.model_dump()) if as_json else one_line(message.model_dump())
 
 

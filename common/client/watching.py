@@ -174,7 +174,7 @@ def on_demand() -> list[str]:
     """
     from common.topics import DEPTH_CAMERA_POINTS
 
-    drawn = [found.find("topics", "ANNOTATED") for found in applications()]
+    drawn = [found.topics.annotated for found in applications() if found.topics is not None]
     return [topic.key for topic in (*drawn, DEPTH_CAMERA_POINTS) if topic is not None and topic.kind == "stream"]
 
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-from common.application import application_of_task, find_application, look_beside
+from common.application import application_of_task, find_application, import_from_folder_of
 from common.config.basics import Parameters
 from common.config.cell import Cell
 from common.config.checking import check, is_section
@@ -67,7 +67,7 @@ def load_cell(
         ConfigError, UnknownName: one line naming the field, the value and the choices.
     """
     path = find_file("cells", cell)
-    look_beside(cell)
+    import_from_folder_of(cell)
     tree = read_yaml(path)
     parsed = [parse_override(text) for text in expanded(overrides)]
     given = {parts[0]: value for parts, value in parsed if len(parts) == 1}  # which file to read may be overridden

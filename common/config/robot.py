@@ -63,6 +63,13 @@ class PayloadConfig(Section):
         return total, x, y, z
 
 
+class HardwareConfig(Section):
+    """A backend, of the arm or of the gripper: a module of common/hardware or drivers, or a dotted module of yours."""
+
+    backend: str = "mock"
+    options: dict[str, Any] = {}
+
+
 class GripperConfig(Section):
     """A parallel gripper: `width` is the distance between the inner faces of the fingers [m].
 
@@ -91,6 +98,7 @@ class GripperConfig(Section):
     latency: float = Field(0.2, ge=0, le=2, description="from a command until readings must show that fingers move [s]")
     controller: str = Field("gripper_controller", description="name of its controller, the source of its state")
     named_widths: dict[str, Annotated[float, Field(ge=0, le=1)]] = Field({}, description="such as open, closed [m]")
+    hardware: HardwareConfig | None = Field(None, description="backend that moves it; else the arm's backend does")
 
     @model_validator(mode="after")
     def _fits(self) -> GripperConfig:
@@ -156,13 +164,6 @@ class TcpConfig(Section):
     parent: str
     position: Point = Field((0.0, 0.0, 0.0), description="in parent [m]")
     rpy: tuple[Number, Number, Number] = Field((0.0, 0.0, 0.0), description="roll, pitch, yaw [rad], R = Rz Ry Rx")
-
-
-class HardwareConfig(Section):
-    """The backend that moves the joints: a module of common/hardware, or a dotted module of your own."""
-
-    backend: str = "mock"
-    options: dict[str, Any] = {}
 
 
 class RobotConfig(Section):

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from common.control.controller import TrajectoryController
-from common.control.inhibits import SOMEBODY, Inhibits
+from common.control.interlocks import Interlocks
 from common.control.jogging import Jogging
 from common.control.ownership import NOT_OWNER, Ownership
 from common.errors import Refused
 from common.hardware.interface import Vector
 from common.messages import (
+    UNKNOWN_OPERATOR,
     ExecuteRequest,
     GripperCommand,
     GripperState,
     Header,
     HoldRequest,
-    Inhibit,
+    Interlock,
     JogCommand,
     MotionOwner,
     MotionStatus,
@@ -27,21 +28,21 @@ from common.sources import monotonic
 class Authority:
     """What keeps the arm from moving, and who has it move."""
 
-    def __init__(self, arm: TrajectoryController, jogging: Jogging, inhibits: Inhibits) -> None:
-        """Let persons' decisions of before, as `inhibits` have them, hold the arm from the start."""
-        self._arm, self._jogging, self.inhibits = arm, jogging, inhibits
+    def __init__(self, arm: TrajectoryController, jogging: Jogging, interlocks: Interlocks) -> None:
+        """Let persons' decisions of before, as `interlocks` have them, hold the arm from the start."""
+        self._arm, self._jogging, self.interlocks = arm, jogging, interlocks
         self._owners = Ownership()
         self._jogged = False  # until the arm rests
         self._told: tuple[MotionOwner, bool] | None = None
         self._held_goal = ""  # that the scene monitor holds
         self._waits = False  # held by ourselves
-        self.tell_inhibits()
+        self.report_interlocks()
 
     # --- may it begin ---------------------------------------------------------------------------------------------
 
-    def inhibited(self, request: ExecuteRequest | GripperCommand | JogCommand, goal: str = "") -> Refused | None:
+    def interlocked(self, request: ExecuteRequest | GripperCommand | JogCommand, goal: str = "") -> Refused | None:
         """What persons decided that speaks against a motion, or None."""
-        return self.inhibits.objection(goal, request.owner, request.heard)
+        return self.interlocks.objection(goal, request.owner, request.acknowledged)
 
     def others(self, owner: str) -> Refused | None:
         """That the motion is somebody else's, or None."""
@@ -58,8 +59,8 @@ class Authority:
         for again, when the motion has long been another's, it is answered as before; nothing follows from that.
         """
         if status.error == NOT_OWNER and not request.owner and self._owners.now.asked:
-            self.inhibits.stop(StopRequest(reason=status.message, owner=self._owners.now.owner))
-            self.tell_inhibits()
+            self.interlocks.stop(StopRequest(reason=status.message, owner=self._owners.now.owner))
+            self.report_interlocks()
 
     def jog(self, request: JogCommand, objection: Refused | None) -> None:
         """Move the arm while that comes again and again, unless there is an objection.
@@ -67,7 +68,7 @@ class Authority:
         Raises:
             Refused: with the reason. It counts again after a pause.
         """
-        objection = objection or self.inhibited(request)
+        objection = objection or self.interlocked(request)
         if objection is None and self._arm.status.fault:
             objection = Refused("hardware_fault", self._arm.status.fault)
         if objection is None and self._arm.status.held:
@@ -108,17 +109,17 @@ class Authority:
         before = self._owners.take(request, monotonic())
         reason = f"{request.owner} took the motion over{before and f', which was {before}'}"
         if request.over and request.kind != "task":
-            self.inhibits.stop(StopRequest(reason=reason, owner=request.owner))  # also of who is just being restarted
+            self.interlocks.stop(StopRequest(reason=reason, owner=request.owner))  # also of who is just being restarted
         if before or request.over:
             self._end_motion(reason, now)
-            self.tell_inhibits()
+            self.report_interlocks()
         return self.owner
 
     def _end_motion(self, reason: str, now: float) -> None:
         """Bring what moves the arm to rest; its goal never moves again."""
         self.interrupt_jogging()
         if goal := self._arm.goal:
-            self.inhibits.never([goal])
+            self.interlocks.never([goal])
             self._arm.cancel(goal, reason, now)
 
     def disown(self) -> None:
@@ -149,41 +150,42 @@ class Authority:
         A person's stop keeps every other motion from beginning, until it is let go of.
         """
         running, known = self._arm.goal, not request.id or self._arm.knows(request.id)
-        if request.by == "person":
-            self.inhibits.stop(request)
+        if request.by == "operator":
+            self.interlocks.stop(request)
             self._owners.end()
             self.interrupt_jogging()
             if running:
                 self._arm.cancel(running, request.reason, now)
-        stopped = [goal for goal in (running if request.by == "person" or not request.id else "", request.id) if goal]
+        stopped = [goal for goal in (running if request.by == "operator" or not request.id else "", request.id) if goal]
         # One that runs must not come to life again should its request come once more after a restart.
-        self.inhibits.never(goal for goal in stopped if goal == running or not self._arm.knows(goal))
-        self.tell_inhibits()
+        self.interlocks.never(goal for goal in stopped if goal == running or not self._arm.knows(goal))
+        self.report_interlocks()
         status = self._arm.cancel(request.id, request.reason, now)
         if known:
             return status
         return status.model_copy(update={"message": f"{status.message}; it is refused if it comes"})
 
-    def hold(self, request: HoldRequest, now: float = 0.0) -> tuple[MotionStatus, list[Inhibit]]:
+    def hold(self, request: HoldRequest, now: float = 0.0) -> tuple[MotionStatus, list[Interlock]]:
         """The status, and what was let go of; cell time [s].
 
         The arm is being brought to rest on its path, or goes on when nobody holds it; the fingers finish their motion.
         """
-        if request.by != "person" and request.hold and request.goal not in ("", self._arm.goal):
+        if request.by != "operator" and request.hold and request.goal not in ("", self._arm.goal):
             return self._arm.status, []  # that one is over
-        let_go = self.inhibits.hold(request)
+        let_go = self.interlocks.hold(request)
         if request.hold:
             self.interrupt_jogging()
         elif self._hands_over(request):
             owner = self._owners.now
-            if owner.kind not in ("none", "task") and owner.owner != (request.owner or SOMEBODY):
-                self._end_motion(f"{request.owner or SOMEBODY} started the task; the motion was {owner.told}", now)
+            if owner.kind not in ("none", "task") and owner.owner != (request.owner or UNKNOWN_OPERATOR):
+                starter = request.owner or UNKNOWN_OPERATOR
+                self._end_motion(f"{starter} started the task; the motion was {owner.description}", now)
             self._owners.end()  # to whoever moves the robot now: the person, or the task that is started
         if request.by == "scene_monitor":
             self._held_goal = request.goal if request.hold else ""
-        if request.by != "person":
+        if request.by != "operator":
             self._arm.hold(request.hold, request.reason, request.by)
-        self.tell_inhibits()
+        self.report_interlocks()
         return self._arm.status, let_go
 
     def _hands_over(self, request: HoldRequest) -> bool:
@@ -192,24 +194,24 @@ class Authority:
         A start that did not let go of all stops is older than one of them, and starts nothing.
         """
         now = self._owners.now
-        own = now.owner == (request.owner or SOMEBODY)
+        own = now.owner == (request.owner or UNKNOWN_OPERATOR)
         if request.into_stop:
             return own or now.kind == "task"
-        if not request.stops or self.inhibits.stops:
+        if not request.stops or self.interlocks.stops:
             return False
-        return own or (now.asked and now.owner == SOMEBODY) or request.override
+        return own or (now.asked and now.owner == UNKNOWN_OPERATOR) or request.override
 
     def wait(self, wait: bool, reason: str = "") -> None:
         """Bring the arm to rest on its path of our own accord, or let it go on."""
         if wait != self._waits:
             self._waits = wait
             self.interrupt_jogging()
-            self.inhibits.hold_ourselves("controller", wait, reason)
+            self.interlocks.hold_ourselves("controller", wait, reason)
             self._arm.hold(wait, reason, "controller")
-            self.tell_inhibits()
+            self.report_interlocks()
 
-    def tell_inhibits(self) -> None:
+    def report_interlocks(self) -> None:
         """Have the arm held as persons say, and told of all who keep it."""
-        reasons = [hold.reason for hold in self.inhibits.holds]
-        self._arm.inhibits = self.inhibits.all
-        self._arm.hold(bool(reasons), "; ".join(filter(None, reasons)), "person")
+        reasons = [hold.reason for hold in self.interlocks.holds]
+        self._arm.interlocks = self.interlocks.all
+        self._arm.hold(bool(reasons), "; ".join(filter(None, reasons)), "operator")

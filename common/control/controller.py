@@ -26,7 +26,7 @@ from common.control.limiter import Limiter
 from common.errors import Refused
 from common.hardware.interface import HardwareFault, Limits, Vector
 from common.hardware.pace import Pace
-from common.messages import GoalState, Holder, Inhibit, JointTrajectory, MotionStatus
+from common.messages import GoalState, Holder, Interlock, JointTrajectory, MotionStatus
 from common.messages.basics import clean
 
 PERIOD = 0.01  # cell time between cycles, unless told otherwise [s]
@@ -76,7 +76,7 @@ class TrajectoryController:
         self.delay = 0.0  # [s] that the arm is behind its set-points
         self.bridges = 0.0  # [s] between set-points that it fills by itself, as they are sent ahead of time
         self._sent: deque[tuple[float, Vector]] = deque()  # set-points of that time, and one before
-        self.inhibits: list[Inhibit] = []  # that reports tell of
+        self.interlocks: list[Interlock] = []  # that reports tell of
 
     @property
     def status(self) -> MotionStatus:
@@ -86,7 +86,7 @@ class TrajectoryController:
     @property
     def said(self) -> tuple[object, ...]:
         """What the status is made of, but for its progress: nothing else of it is new while this is the same."""
-        return self._status, *self._holds.items(), self.speed_scaling, self.inhibits, self._fault
+        return self._status, *self._holds.items(), self.speed_scaling, self.interlocks, self._fault
 
     @property
     def progress(self) -> float:
@@ -111,7 +111,7 @@ class TrajectoryController:
     def _as_of_now(self, status: MotionStatus) -> MotionStatus:
         now: dict[str, object] = {  # of what `said` has too
             "held": bool(self._holds), "held_by": sorted(self._holds), "speed_scaling": self.speed_scaling,
-            "inhibits": self.inhibits, "fault": self._fault,
+            "interlocks": self.interlocks, "fault": self._fault,
         }
         if status.state != "active" and not status.message:
             if self._fault:
@@ -234,7 +234,7 @@ class TrajectoryController:
             running.stopping, running.reason = True, reason
         return self._report("active", message=f"stopping: {running.reason}")
 
-    def hold(self, hold: bool, reason: str, by: Holder = "person") -> MotionStatus:
+    def hold(self, hold: bool, reason: str, by: Holder = "operator") -> MotionStatus:
         """The status: begin to bring the robot to rest on its path, or let it go on, unless another holds it."""
         if hold:
             self._holds[by] = reason

@@ -16,7 +16,7 @@ from common.control.controller import PERIOD, TrajectoryController
 from common.control.faults import Fault, asked
 from common.control.goals import Judged
 from common.control.gripper_controller import GripperController
-from common.control.inhibits import Inhibits
+from common.control.interlocks import Interlocks
 from common.control.jogging import Jogging, ToolKinematics
 from common.control.payload import Payload
 from common.control.readings import read_fingers, read_joints
@@ -27,7 +27,7 @@ from common.hardware.interface import (
     Hardware,
     HardwareFault,
     Limits,
-    PlacedGripper,
+    PlaceableGripper,
     SimulatedGripper,
     Vector,
 )
@@ -86,10 +86,10 @@ class ControlCycle:
         controller: str = "controller",
         kinematics: ToolKinematics | None = None,
         world: SimulatedWorld | None = None,
-        inhibits: Inhibits | None = None,
+        interlocks: Interlocks | None = None,
         period: float = PERIOD,
     ) -> None:
-        """Control this hardware every `period` [s], unless `inhibits` keep it.
+        """Control this hardware every `period` [s], unless `interlocks` keep it.
 
         `world` comes with simulated hardware only, and then `kinematics` must; without them the tool is not jogged.
 
@@ -135,10 +135,10 @@ class ControlCycle:
         self.restored = False  # whether fingers and world were found as they were before a restart
         self._stood: tuple[int, dict[str, StandingObject]] | None = None  # the objects, as of a version of the world
         self._followed: ExecuteRequest | None = None  # the newest goal that was accepted
-        self._inhibits = inhibits or Inhibits()
+        self._interlocks = interlocks or Interlocks()
         if self._own is not None:
-            self._own.stopped = self._own.stopped or self._inhibits.arm_stopped
-        self.authority = Authority(self._arm, Jogging(limits, kinematics), self._inhibits)
+            self._own.stopped = self._own.stopped or self._interlocks.arm_stopped
+        self.authority = Authority(self._arm, Jogging(limits, kinematics), self._interlocks)
 
     def step(self, header: Header) -> Report:
         """Do one cycle at the header's time and say what is new."""
@@ -154,7 +154,7 @@ class ControlCycle:
         if self._gripper is not None:
             self._meet(self._gripper, now)
         if self._own is not None:
-            self._inhibits.arm_stopped = self._own.stopped
+            self._interlocks.arm_stopped = self._own.stopped
         report.robot = self._news_of_robot(header)
         report.notes = [*filter(None, (self._arm_fault.news(), self._hand_fault.news(), self._arm.news(),
                                        self._payload.news()))]
@@ -204,7 +204,7 @@ class ControlCycle:
     def _meet(self, gripper: GripperController, now: float) -> None:
         """Have fingers that wait for the arm begin; one that they closed ahead of is not brought on."""
         waiting = self._waiting.command
-        stopped = waiting and self.authority.inhibited(waiting, waiting.id)
+        stopped = waiting and self.authority.interlocked(waiting, waiting.id)
         if waiting is not None and stopped:
             self._waiting.drop()
             gripper.call_off(waiting, str(stopped))
@@ -246,7 +246,7 @@ class ControlCycle:
         self._world.restore(state.objects)
         self.restored = True
         fingers = self._hardware.gripper
-        if self._gripper is None or not isinstance(fingers, PlacedGripper) or state.width is None:
+        if self._gripper is None or not isinstance(fingers, PlaceableGripper) or state.width is None:
             return
         fingers.place(state.width)
         told = state.told_width
@@ -254,7 +254,7 @@ class ControlCycle:
             between = self._felt.obstruction(self._kinematics.fk(self._q), state.width)
             self._obstructible.obstruct(between)
             holds = told is not None and told < state.width <= between + PRESSES
-            if self._inhibits.stops and not holds:  # they go on pressing, and on no way
+            if self._interlocks.stops and not holds:  # they go on pressing, and on no way
                 told = state.width
         if told is not None:
             self._gripper.resume(told, now, state.told_effort)
@@ -273,7 +273,7 @@ class ControlCycle:
     ) -> MotionStatus:
         """The state of the goal: active, or rejected with the reason; for a known id what became of it."""
         authority, known = self.authority, self._arm.knows(request.id)
-        objection = (authority.inhibited(request, request.id) or objection or authority.others(request.owner)
+        objection = (authority.interlocked(request, request.id) or objection or authority.others(request.owner)
                      or self._unfit)
         status = self._arm.accept(
             request.id, request.trajectory, now, self._q, objection, judged, request.plan, request.scene_stamp,
@@ -342,7 +342,7 @@ class ControlCycle:
         """
         if self._gripper is None:
             raise Refused("no_gripper", "this robot has no gripper")
-        objection = (self.authority.inhibited(request, request.id) or late
+        objection = (self.authority.interlocked(request, request.id) or late
                      or self.authority.others(request.owner) or self._hand_fault.objection)
         waits = bool(request.after) and request.after == self._arm.goal
         if request.after and not waits and self._arm.fails(request.after):

@@ -6,7 +6,7 @@ import asyncio
 import logging
 from collections.abc import Callable
 
-from common.control.inhibits import Inhibits
+from common.control.interlocks import Interlocks
 from common.control.record_file import RecordFile
 
 TRY_AGAIN = 1.0  # [s] after what was decided could not be written
@@ -22,17 +22,17 @@ class Decisions:
         self._unkept = ""  # why what was decided last is not written
         self._trying: asyncio.Task[None] | None = None
         self.on_change: Callable[[], None] = lambda: None  # what is written, and what is not
-        self.inhibits = Inhibits(self._written)
+        self.interlocks = Interlocks(self._written)
         if problem:
             log.error("%s; the robot counts as stopped: look at the cell, then `zencell task start`", problem)
-        for inhibit in self.inhibits.all:
-            log.warning("%s: `zencell task %s` lets it go", inhibit.told,
-                        "start" if inhibit.kind == "stopped" else "resume")
+        for interlock in self.interlocks.all:
+            log.warning("%s: `zencell task %s` lets it go", interlock.description,
+                        "start" if interlock.kind == "stopped" else "resume")
 
     async def keep(self) -> str:
         """What is wrong, once all that was decided so far is written; empty when it is."""
         async with self._writing:
-            record = self.inhibits.record
+            record = self.interlocks.record
             if record == self._written and not self._unkept:
                 return ""
             before = self._unkept
@@ -41,14 +41,14 @@ class Decisions:
             except OSError as error:
                 why = error.strerror or str(error)
                 self._unkept = f"{self._file.path} cannot be written ({why}): this does not outlive the executor"
-                self.inhibits.note_kept(self._written, why)
+                self.interlocks.note_kept(self._written, why)
                 if self._unkept != before:
                     self._log.error("%s; it is tried again every second", self._unkept)
                 if self._trying is None:
                     self._trying = asyncio.create_task(self._try_again(), name="keep")
             else:
                 self._written, self._unkept = record, ""
-                self.inhibits.note_kept(record)
+                self.interlocks.note_kept(record)
                 if before:
                     self._log.warning("%s is written again: what was decided outlives the executor", self._file.path)
             if before or self._unkept:

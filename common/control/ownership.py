@@ -25,7 +25,7 @@ class Ownership:
         """What speaks against a motion that somebody asks for, or None."""
         if self.now.kind == "none" or self._has(owner):
             return None
-        return Refused(NOT_OWNER, f"the motion is {self.now.told}: who wants it has to take it over")
+        return Refused(NOT_OWNER, f"the motion is {self.now.description}: who wants it has to take it over")
 
     def use(self, owner: str, now: float) -> None:
         """Take note that somebody without an objection begins a motion; wall time [s]."""
@@ -42,8 +42,8 @@ class Ownership:
         before = ""
         if self.now.kind != "none" and not self._is(request):
             if not request.over:
-                raise Refused(NOT_OWNER, f"the motion is {self.now.told}: take it over, if it must be")
-            before = self.now.told
+                raise Refused(NOT_OWNER, f"the motion is {self.now.description}: take it over, if it must be")
+            before = self.now.description
         if before or not self.now.asked:
             self._put(request.owner, request.kind, asked=True)
         self._lease, self._used = request.lease, now

@@ -6,7 +6,7 @@ import os
 from collections.abc import Mapping
 from pathlib import Path
 
-from common.control.inhibits import Record, damaged
+from common.control.interlocks import Record, damaged
 from common.errors import ConfigError
 from common.kept_file import STATE_VARIABLE, KeptFile, Unreadable, lasting_folder
 

@@ -1,4 +1,4 @@
-"""A driver in a process of its own: begun again after a time that doubles whenever it ends, however it ended."""
+"""A vendor's library in a process of its own, which is restarted after a growing pause whenever it ends."""
 
 from __future__ import annotations
 
@@ -12,102 +12,108 @@ from collections.abc import Callable
 from multiprocessing.connection import Connection
 from typing import Any
 
-FIRST_PAUSE, LONGEST_PAUSE = 0.5, 8.0  # [s] before a process that failed is begun again
-ENDS = 2.0  # [s] in which it ends when it is told to
+FIRST_PAUSE, LONGEST_PAUSE = 0.5, 8.0  # [s] before a failed process is restarted
+END_TIMEOUT = 2.0  # [s] for the process to end on request
 
 
 class DriverProcess:
-    """This end of the pipe to the process, which is begun by `keep_up`.
+    """The parent's end of the pipe to a driver process; `keep_running` starts and restarts the process.
 
     Attributes:
-        problem: why the device cannot be used; empty while the process says how it is.
+        problem: why the device cannot be used; empty once the process has reported a state.
     """
 
     def __init__(
-        self, name: str, target: Callable[..., None], args: tuple[object, ...], hear: Callable[[Any], None],
-        lost: Callable[[], None],
+        self, name: str, target: Callable[..., None], args: tuple[object, ...], on_message: Callable[[Any], None],
+        on_end: Callable[[], None],
     ) -> None:
-        """The process runs `target(*args, pipe)`, in which `run` says how it ends; `name` is for people.
+        """Describe a process that runs `target(*args, pipe)`, whose body is `run_driver`; `name` is for messages.
 
-        What it sends comes to `hear`, in a thread beside; when it has ended `lost` is called by whoever finds out.
+        A listener thread passes the messages of the process to `on_message`. After its end, the thread that finds out
+        calls `on_end`.
         """
         self.name, self.problem = name, f"connecting to {name}"
         context = multiprocessing.get_context("spawn")
-        self._begin: Callable[[Connection], multiprocessing.process.BaseProcess] = lambda theirs: context.Process(
-            target=target, args=(*args, theirs), name=f"driver of {name}", daemon=True)
-        self._hear, self._lost = hear, lost
+        self._create: Callable[[Connection], multiprocessing.process.BaseProcess] = lambda child_end: context.Process(
+            target=target, args=(*args, child_end), name=f"driver of {name}", daemon=True)
+        self.on_message, self._on_end = on_message, on_end
         self._process: multiprocessing.process.BaseProcess | None = None
-        self._ours: Connection | None = None
+        self._pipe: Connection | None = None
         self._listener = threading.Thread()
-        self._pause, self._due = FIRST_PAUSE, 0.0
+        self._pause, self._not_before = FIRST_PAUSE, 0.0
 
-    def keep_up(self) -> None:
-        """Begin the process where there is none, or it has ended."""
+    @property
+    def failure(self) -> str:
+        """Why nothing can be sent to the device."""
+        return self.problem or f"{self.name}: its driver has ended"
+
+    def keep_running(self) -> None:
+        """Start the process where there is none, or it has ended."""
         now = time.monotonic()
         if self._process is None:
-            if now < self._due:
+            if now < self._not_before:
                 return
-            self._ours, theirs = multiprocessing.Pipe()
-            self._process = self._begin(theirs)
+            self._pipe, child_end = multiprocessing.Pipe()
+            self._process = self._create(child_end)
             self._process.start()
-            theirs.close()
-            self._listener = threading.Thread(target=self._listen, args=(self._ours,), daemon=True)
+            child_end.close()
+            self._listener = threading.Thread(target=self._listen, args=(self._pipe,), daemon=True)
             self._listener.start()
         elif not self._listener.is_alive():
-            self._end()
-            self.problem = self.problem or f"{self.name}: its driver ended without a word"
-            self._due, self._pause = now + self._pause, min(2 * self._pause, LONGEST_PAUSE)
+            self._reap()
+            self.problem = self.problem or f"{self.name}: its driver ended without a message"
+            self._not_before, self._pause = now + self._pause, min(2 * self._pause, LONGEST_PAUSE)
 
     def send(self, message: tuple[object, ...]) -> bool:
-        """Whether the process is there to take it."""
+        """Return whether the message was sent: False when there is no process."""
         try:
-            if self._ours is None:
+            if self._pipe is None:
                 return False
-            self._ours.send(message)
+            self._pipe.send(message)
         except OSError:
-            return False  # the process is gone, which is seen when it is read
+            return False  # the process has ended; the next read finds out
         return True
 
-    def works(self) -> None:
-        """Take note that the device can be used."""
+    def set_working(self) -> None:
+        """Record that the device can be used."""
         self.problem, self._pause = "", FIRST_PAUSE
 
     def close(self) -> None:
-        """Have the process let go of the device, and end."""
+        """Have the process release the device and end."""
         if self._process is None:
             return
         self.send(("end",))
-        self._process.join(ENDS)
-        self._end()
+        self._process.join(END_TIMEOUT)
+        self._reap()
 
     def _listen(self, pipe: Connection) -> None:
-        """Be the thread that takes what the process tells, whether anybody reads or not, until it has ended."""
+        """Receive messages until the process has ended, even if no caller reads meanwhile."""
         with contextlib.suppress(EOFError, OSError):
             while True:
-                told = pipe.recv()
-                if isinstance(told, tuple) and told[0] == "failed":
-                    self.problem = f"{self.name}: {told[1]}"
+                message = pipe.recv()
+                if isinstance(message, tuple) and message[0] == "failed":
+                    self.problem = f"{self.name}: {message[1]}"
                 else:
-                    self._hear(told)
+                    self.on_message(message)
 
-    def _end(self) -> None:
-        assert self._process is not None and self._ours is not None
+    def _reap(self) -> None:
+        assert self._process is not None and self._pipe is not None
         self._process.join(0.1)
         if self._process.is_alive():
             self._process.kill()
             self._process.join()
-        self._listener.join(ENDS)
-        self._ours.close()
-        self._process, self._ours = None, None
-        self._lost()
+        self._listener.join(END_TIMEOUT)
+        self._pipe.close()
+        self._process, self._pipe = None, None
+        self._on_end()
 
 
-def run(pipe: Connection, work: Callable[[], None]) -> None:
-    """Be the process: do the work until it ends or the other end of the pipe is gone, and say what went wrong."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for those who started us: they tell us when to end
+def run_driver(pipe: Connection, work: Callable[[], None]) -> None:
+    """Run in the driver process: work until it returns or the other end of the pipe is gone; send why it failed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, which ends this process
     try:
         work()
-    except Exception as error:  # of whatever type: the reason is for the person, the process is done
+    except Exception as error:  # of whatever type: the operator gets the reason, the process ends
         with contextlib.suppress(OSError):
             pipe.send(("failed", str(error) or type(error).__name__))
-    os._exit(0)  # a vendor's threads may wait for a device that is gone
+    os._exit(0)  # threads of a vendor's library may wait for a device that is gone

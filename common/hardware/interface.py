@@ -1,17 +1,19 @@
-"""The seam between the controller and whatever moves the joints: small, so that a real arm fits behind it.
+"""The seam between the controller and what moves the joints, the gripper and the simulated world around them.
 
-Times are cell time [s], passed in; a backend keeps no clock of its own. A backend is a module (of this folder, or a
-dotted one of the user's own) with
+Times are cell time [s], passed in: a backend has no clock. An arm backend is a module (in this folder, in drivers/, an
+installed entry point or a dotted module of the user) with
 
-    simulated: bool          # whether the simulated world goes with it; or a function of the options that says so
+    simulated: bool          # whether a simulated world belongs to it; or a function of the options that returns it
     class Options(Parameters)
     def create(robot: RobotConfig, limits: Limits, start: Vector, options: Options) -> Hardware
 
-where `start` is the pose at which a simulated arm begins; a real arm is where it is.
+`start` is the pose at which a simulated arm starts; a real arm is where it is. A gripper backend has `GripperOptions`
+and `create_gripper(gripper: GripperConfig, options: GripperOptions) -> Gripper`; one module may be both.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple, Protocol, runtime_checkable
@@ -20,24 +22,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from common.errors import ZencellError
-from common.messages import RobotMode
+from common.messages import Header, RobotMode, SceneUpdate, WorldEdit, WorldEditReply, WorldObjects
 
 Vector = NDArray[np.float64]
 
 
 class HardwareFault(ZencellError):
-    """Raised by a backend when it cannot read or move: ends the goal, and new ones are rejected until it is gone.
+    """Raised by a backend that cannot read or move. It ends the goal; new goals are rejected until the fault is over.
 
-    What else a backend raises is taken for one; it is told with its type then.
+    The controller treats every other exception of a backend as a fault, too, and reports its type with the message.
     """
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What the joints can do, in the order of `names`; arrays are (dof,) in [rad], [rad/s], [rad/s^2], [rad/s^3].
+    """Limits of the joints, in the order of `names`; arrays are (dof,) in [rad], [rad/s], [rad/s^2], [rad/s^3].
 
-    `deceleration` is what they can do in addition when they are braked for a hold or a stop. `jerk` holds for what the
-    controller adds to a trajectory; without it they reach their acceleration within 10 ms.
+    `deceleration` applies when the arm brakes for a hold or a stop. `jerk` limits what the controller adds to a
+    trajectory; without it joints reach their acceleration within 10 ms.
     """
 
     names: tuple[str, ...]
@@ -50,20 +52,20 @@ class Limits:
 
     @cached_property
     def jerks(self) -> Vector:
-        """Largest change of acceleration (dof,) [rad/s^3]."""
+        """Jerk limit (dof,) [rad/s^3]."""
         return 100.0 * self.acceleration if self.jerk is None else self.jerk
 
     @cached_property
     def braking(self) -> Vector:
-        """Largest change of velocity for a hold or a stop (dof,) [rad/s^2]."""
+        """Deceleration limit of a hold or a stop (dof,) [rad/s^2]."""
         return self.acceleration if self.deceleration is None else np.maximum(self.acceleration, self.deceleration)
 
 
 class ArmState(NamedTuple):
-    """What the arm says of itself: positions [rad], velocities [rad/s], and whether it could be moved.
+    """State reported by the arm's controller: positions [rad], velocities [rad/s], mode.
 
-    `speed` is the share at which its own slider lets it move; `message` says why it cannot be moved; all of it is `age`
-    [s] old.
+    `speed` is the share set by the speed slider of its pendant; `message` says why it cannot be moved; the state is
+    `age` [s] old.
     """
 
     q: list[float]
@@ -93,20 +95,20 @@ class Gripper(Protocol):
         """Start to move the fingers to a width [m], pressing with an effort [N]; replaces a motion under way."""
 
     def read(self, now: float) -> GripperReading:
-        """State of the fingers at a time that does not go back."""
+        """Return the state of the fingers at a time that never decreases."""
 
 
 @runtime_checkable
-class PlacedGripper(Gripper, Protocol):
+class PlaceableGripper(Gripper, Protocol):
     """Simulated fingers."""
 
     def place(self, width: float) -> None:
-        """Be at rest at a width [m]: where the fingers stood when the process before this one ended."""
+        """Set the fingers at rest at a width [m]: where they were when the process before this one ended."""
 
 
 @runtime_checkable
-class SimulatedGripper(PlacedGripper, Protocol):
-    """Fingers that a simulated world without forces can be in the way of."""
+class SimulatedGripper(PlaceableGripper, Protocol):
+    """Simulated fingers that a world without forces can block."""
 
     def obstruct(self, width: float) -> None:
         """Let the fingers close no further than a width [m]; 0 when nothing is between them."""
@@ -118,30 +120,30 @@ class Hardware(Protocol):
     gripper: Gripper | None
 
     def read(self, now: float) -> tuple[Vector, Vector]:
-        """Measured positions (dof,) [rad] and velocities (dof,) [rad/s].
+        """Return measured positions (dof,) [rad] and velocities (dof,) [rad/s].
 
         Raises:
-            HardwareFault: with what is wrong, for the person.
+            HardwareFault: with a message for the operator.
         """
 
     def write(self, positions: Vector, velocities: Vector, now: float) -> None:
         """Send set-points (dof,) [rad], [rad/s].
 
         Raises:
-            HardwareFault: with what is wrong, for the person.
+            HardwareFault: with a message for the operator.
         """
 
     def close(self) -> None:
-        """Let go of the device."""
+        """Release the device."""
 
 
 @runtime_checkable
 class ControlledArm(Hardware, Protocol):
-    """An arm with a controller of its own, which says how it is and does things beside motion.
+    """An arm with a controller of its own, which reports a state and has functions beside motion.
 
-    Its joints are `delay` [s] behind its set-points, `ahead` [s] of it because those are sent early. The latest cycle
-    of its driver so far was `late` by so much [s]. It is `stopped` from when it stops for safety until somebody has it
-    recover, whoever ended the stop; who knows of one from before sets it.
+    The joints follow the set-points after `delay` [s], of which `ahead` [s] because set-points are sent early. `late`
+    is the longest delay of a cycle of its driver so far [s]. `stopped` is True from a safety stop until an operator
+    has the arm recover, even if the stop was ended at the pendant; the executor sets it after its own restart.
     """
 
     ahead: float
@@ -150,18 +152,73 @@ class ControlledArm(Hardware, Protocol):
 
     @property
     def delay(self) -> float:
-        """By which its joints, as they were read last, are behind its set-points [s]; more after a hold-up."""
+        """Delay of the newest joint reading behind the set-points [s]; longer after the driver was held up."""
 
     @property
     def state(self) -> ArmState:
-        """What the arm said last, or that it says nothing."""
+        """Return the newest state, or that the arm is disconnected."""
 
     def order(self, act: str, *values: float) -> int:
-        """Have it do something beside motion: a number to ask about.
+        """Start a function of the arm's controller; return a number for `outcome`.
 
         `enable`, `recover`, `freedrive` (1 or 0), `payload` ([kg], and its centre of mass from the flange, x, y, z
-        [m]), `output` (1 or 0, and which one).
+        [m]), `output` (1 or 0, and its number).
         """
 
     def outcome(self, number: int) -> str | None:
-        """None while it is being done; empty once it was; else why not: asked once more, nothing is known of it."""
+        """Return None while the order runs, then once "" for success or the reason of its failure."""
+
+
+class PersistedState(NamedTuple):
+    """Arm and gripper as they persist over a restart of simulated hardware.
+
+    Joint positions `q` (dof,) [rad], `width` of the fingers [m], and the last commanded width [m] and effort [N].
+    """
+
+    q: Vector
+    width: float | None = None
+    commanded_width: float | None = None
+    commanded_effort: float = 0.0
+
+
+class WorldBackend(Protocol):
+    """The simulated world around simulated hardware. A cell with real hardware has none.
+
+    While `suspended`, another thread changes the world; in the control cycle it stands still. `deferred` is a step
+    that takes longer than a cycle: the executor runs it in a thread if it has set `defers_steps`.
+    """
+
+    suspended: bool
+    defers_steps: bool
+    deferred: Callable[[], None] | None
+
+    def obstruct(self, q: Vector) -> None:
+        """Block the fingers of the arm at q (dof,) [rad] at what is between them."""
+
+    def step(self, now: float, q: Vector, gripper: GripperReading) -> None:
+        """Advance to a cell time [s] with the arm at q (dof,) [rad]: objects are grasped, carried, released, fall."""
+
+    def edit_takes_long(self, request: WorldEdit) -> bool:
+        """Return whether an edit may take longer than a control cycle."""
+
+    def edit(self, request: WorldEdit, now: float) -> WorldEditReply:
+        """Change the world.
+
+        Raises:
+            Refused: with the reason; nothing has changed then.
+        """
+
+    def updates(self, header: Header) -> tuple[list[SceneUpdate], WorldObjects | None]:
+        """Return the events since the last call, and all objects if it is time to publish a change."""
+
+    def save(self, state: PersistedState) -> None:
+        """Persist the world with arm and gripper, if something has changed."""
+
+    def restore(self, stopped: bool) -> PersistedState | None:
+        """Put objects and fingers where they were before a restart; return what the gripper is to continue.
+
+        With `stopped`, fingers that press on nothing stay where they are. None when nothing was persisted.
+        """
+
+    def close(self) -> None:
+        """Write what is not persisted yet."""

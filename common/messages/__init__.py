@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from common.messages.basics import SCHEMA_VERSION, Finite, Fraction, Header, Message, Name, Positive
+from common.messages.basics import SCHEMA_VERSION, UNKNOWN_OPERATOR, Finite, Fraction, Header, Message, Name, Positive
 from common.messages.camera import CameraInfo, Image, Marker, MarkerArray, PointCloud2, Rejection, Rejections
 from common.messages.execution import (
     CLOSED_BEFORE,
@@ -19,7 +19,7 @@ from common.messages.execution import (
     GripperState,
     Holder,
     HoldRequest,
-    Inhibit,
+    Interlock,
     JogCommand,
     MotionOwner,
     MotionStatus,

@@ -3,10 +3,20 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from copy import deepcopy
 from typing import Annotated, Any, ClassVar, Self
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, GetCoreSchemaHandler, JsonValue, PlainValidator
+from pydantic import (
+    AliasChoices,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    GetCoreSchemaHandler,
+    JsonValue,
+    PlainValidator,
+)
 from pydantic_core import CoreSchema
 
 SCHEMA_VERSION = 1
@@ -95,6 +105,23 @@ Label = Annotated[str, Field(max_length=MOST_NAME, pattern=_IN_NAMES)]  # a name
 Text = Annotated[str, Field(max_length=_MOST_TEXT), BeforeValidator(lambda value: _cleaned(value, _MOST_TEXT))]
 Remark = Annotated[str, Field(max_length=_MOST_REMARK), BeforeValidator(lambda value: _cleaned(value, _MOST_REMARK))]
 Plain = Annotated[JsonValue, PlainValidator(_plain)]  # what JSON can say
+# Names of the first releases, which older programs, recordings and record files still hold: read, never written.
+UNKNOWN_OPERATOR = "operator"  # name of an operator who gives none, and `by` of what an operator requests
+FORMER_FIELDS: Mapping[str, str] = {"acknowledged": "heard", "interlocks": "inhibits"}
+_FORMER_OPERATOR = "person"
+
+
+def either_name(field: str) -> AliasChoices:
+    """Return the `validation_alias` of a field that is also read under its former name."""
+    return AliasChoices(field, FORMER_FIELDS[field])
+
+
+def _rename_operator(value: Any) -> Any:
+    return UNKNOWN_OPERATOR if value == _FORMER_OPERATOR else value
+
+
+FormerOperator = BeforeValidator(_rename_operator)  # reads "person" as "operator"
+OperatorName = Annotated[Label, FormerOperator]
 _UNCHANGING = frozenset({str, int, float, bool, bytes, type(None)})
 
 

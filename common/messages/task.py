@@ -6,9 +6,9 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from common.messages.basics import SMALL, Count, Finite, Header, Label, Message, Name, Text
+from common.messages.basics import SMALL, Count, Finite, Header, Label, Message, Name, OperatorName, Text
 from common.messages.camera import Rejection
-from common.messages.execution import Since, Who
+from common.messages.execution import Acknowledged
 
 
 class TaskCommand(Message):
@@ -17,10 +17,10 @@ class TaskCommand(Message):
     most_bytes: ClassVar[int] = SMALL
 
     command: Literal["start", "pause", "resume", "stop"]
-    by: Who = Field("", description="name of the person")
+    by: OperatorName = Field("", description="name of the person")
     override: bool = Field(False, description="start or resume although another person holds the robot; is logged")
-    heard: Since | None = Field(None, description="`since` of the newest inhibit that the person had heard of: later "
-                                                  "ones stay")
+    acknowledged: Acknowledged = Field(
+        None, description="`since` of the newest interlock that the operator has seen: later ones stay")
 
 
 class PlanFigure(Message):

@@ -19,8 +19,8 @@ from pydantic import Field
 
 from common.config import Parameters, Section, Tunable
 from common.config.basics import Length, Rgb
+from common.perception.camera_input import require_in_range
 from common.perception.depth import Depth, Rays, is_valid
-from common.perception.intake import require_near
 from common.perception.pinhole import Pinhole
 
 Array = npt.NDArray[np.float64]
@@ -53,7 +53,7 @@ class BoxOptions(Parameters):
 
 
 @dataclass(frozen=True, eq=False)
-class SeenBox:
+class DetectedBox:
     """A box that was seen: its middle (3,) [m] and its yaw [rad], in world; corners (4, 2) of its top face [px]."""
 
     kind: str
@@ -72,19 +72,19 @@ class BoxDetector:
         self._hues = {name: _hue(kind.color) for name, kind in options.kinds.items()}
         self._rays: tuple[Pinhole, Rays] | None = None
 
-    def detect(self, picture: Picture, depth: Depth, camera: Pinhole) -> list[SeenBox]:
+    def detect(self, picture: Picture, depth: Depth, camera: Pinhole) -> list[DetectedBox]:
         """Boxes in a bgr8 picture (height, width, 3) with depth (height, width) [m], kind by kind.
 
         Raises:
-            Unusable: the camera is none that there can be.
+            FrameError: the camera is none that there can be.
         """
         if self._rays is None or self._rays[0] is not camera:
             pixels = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1)
             self._rays = camera, Rays.through(camera, pixels)
-        require_near(self._rays[1].directions)
+        require_in_range(self._rays[1].directions)
         rays, o, measured = self._rays[1], self.options, is_valid(depth)
         below = np.abs(depth * rays.directions[..., 2])  # the camera [m]
-        found: list[SeenBox] = []
+        found: list[DetectedBox] = []
         for name, coloured in self._coloured(picture):
             kind = o.kinds[name]
             least = 0.999 * FILLED**2 * kind.size[0] * kind.size[1] * camera.fx**2  # [px^2 m^2], of `_boxes`; rounded
@@ -113,7 +113,7 @@ class BoxDetector:
             away = np.abs(hsv[..., 0] - self._hues[name])
             yield name, bright & (np.minimum(away, 180 - away) <= o.hue_tolerance)
 
-    def _boxes(self, name: str, kind: BoxKind, face: Array, camera: Pinhole, border: bool) -> Iterator[SeenBox]:
+    def _boxes(self, name: str, kind: BoxKind, face: Array, camera: Pinhole, border: bool) -> Iterator[DetectedBox]:
         """The boxes with that top face (n, 3) [m]."""
         top = float(np.median(face[:, 2]))
         pixel = (float(camera.position[2]) - top) / camera.fx  # [m]
@@ -140,7 +140,7 @@ class BoxDetector:
                     rim = [[*(at + a * kind.size[0] / 2 * along + b * kind.size[1] / 2 * across), top]
                            for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
                     place = float(at[0]), float(at[1]), top - kind.size[2] / 2
-                    yield SeenBox(name, place, yaw, camera.project(rim), border)
+                    yield DetectedBox(name, place, yaw, camera.project(rim), border)
             return
 
     def _tiles(self, length: float, size: float) -> int:
@@ -149,7 +149,7 @@ class BoxDetector:
         return count if count <= TILES and abs(length - count * size) <= self.options.size_tolerance else 0
 
 
-def outlined(picture: Picture, boxes: list[SeenBox]) -> Picture:
+def draw_boxes(picture: Picture, boxes: list[DetectedBox]) -> Picture:
     """A copy of the bgr8 picture with the top face, the kind and the place [m] of each box."""
     shown = picture.copy()
     for box in boxes:

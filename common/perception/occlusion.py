@@ -30,7 +30,7 @@ BY_ROBOT = "the robot"
 
 
 @dataclass(frozen=True, eq=False)
-class Hidden:
+class Occlusion:
     """What of a picture cannot be judged.
 
     Attributes:
@@ -67,7 +67,7 @@ class Hidden:
         return np.asarray(self.away[v, u] <= reach)
 
 
-class Silhouettes:
+class RobotSilhouettes:
     """The outlines of a robot's links in pictures."""
 
     def __init__(self, robot: RobotModel, carries: float = 0.0) -> None:
@@ -88,7 +88,7 @@ class Silhouettes:
             self._shapes[f"{tool} holds"] = held
         self._links = {name: name.removesuffix(" holds") for name in self._shapes}
 
-    def hidden(self, camera: Pinhole, readings: Sequence[Array], links: Sequence[str] | None = None) -> Hidden:
+    def hidden(self, camera: Pinhole, readings: Sequence[Array], links: Sequence[str] | None = None) -> Occlusion:
         """What the robot hides of a camera's picture, wherever it was among joint positions (dof,) [rad].
 
         Args:
@@ -116,19 +116,19 @@ class Silhouettes:
             away = np.full((rows, columns), camera.width + camera.height)
         else:
             away = cv2.distanceTransform(clear, cv2.DIST_L2, 3) * COARSE
-        return Hidden(camera, away=np.asarray(away, np.float32))
+        return Occlusion(camera, away=np.asarray(away, np.float32))
 
 
-class RobotBefore:
+class RobotOcclusion:
     """What a robot hides of picture after picture of one camera; the same as long as both stand still."""
 
-    def __init__(self, silhouettes: Silhouettes) -> None:
+    def __init__(self, silhouettes: RobotSilhouettes) -> None:
         """Begin without knowing where the joints are."""
         self._silhouettes = silhouettes
         self._readings: deque[tuple[int, Array]] = deque(maxlen=READINGS)
-        self._last: tuple[Pinhole, list[Array], Hidden] | None = None
+        self._last: tuple[Pinhole, list[Array], Occlusion] | None = None
 
-    def in_picture(self, camera: Pinhole, stamp: int, q: Array | None, read: int) -> Hidden | None:
+    def in_picture(self, camera: Pinhole, stamp: int, q: Array | None, read: int) -> Occlusion | None:
         """What it hides of a picture that was taken at `stamp` [ns]; None as long as nobody knows where it is.
 
         Args:

@@ -73,7 +73,7 @@ def ray_distances(directions: Array, centers: Array) -> tuple[Array, Array]:
     return distance, along
 
 
-def wholly_in_view(camera: Pinhole, center: npt.ArrayLike, radius: float, margin: float = 0.0) -> bool:
+def sphere_in_view(camera: Pinhole, center: npt.ArrayLike, radius: float, margin: float = 0.0) -> bool:
     """Whether the whole silhouette of a sphere lies in the picture, at least `margin` [px] inside its border."""
     outline = silhouette(camera, center, radius, 32)
     return len(outline) > 0 and bool(camera.in_picture(outline, margin).all())

@@ -1,4 +1,4 @@
-"""Which links of a robot need not be checked against each other: found by sampling, written as an SRDF."""
+"""Pairs of links that need no collision check: found by sampling, written as an SRDF."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from common.robot.model import RobotModel
 Array = NDArray[np.float64]
 Reason = Literal["Adjacent", "Fixed", "Always", "Never"]
 
-MOSTLY = 0.95  # of the samples
+ALMOST_ALWAYS = 0.95  # of the samples
 
 
 @dataclass(frozen=True)
 class DisabledPair:
     """Two links that are not checked, and why.
 
-    Adjacent: a joint connects them. Fixed: no joint of the group moves one against the other. Always: they touch
-    wherever the robot is; on both sides of one joint nearly wherever it is, as hulls of a wrist do that lie in each
-    other. Never: they came no closer than the margin at any sample.
+    Adjacent: a joint connects them. Fixed: no joint of the group moves one against the other. Always: they touch at
+    every sample; on both sides of one joint at almost every sample, as overlapping hulls of a wrist do. Never: they
+    came no closer than the margin at any sample.
     """
 
     one: str
@@ -37,13 +37,13 @@ class DisabledPair:
 def disabled_pairs(
     robot: RobotModel, *, samples: int = 10000, margin: float = 0.005, rng: np.random.Generator | None = None
 ) -> list[DisabledPair]:
-    """Pairs of links that need no check, in the order of the description. The robot's own SRDF is not looked at.
+    """Return pairs of links that need no check, in the order of the description; ignores the robot's own SRDF.
 
     Args:
         robot: the model; its group is sampled uniformly within the limits, its fingers over their widths.
-        samples: the more, the surer that a pair which never came close never will.
-        margin: pairs that come closer than this [m] at some sample are not among the never colliding.
-        rng: where the samples come from; the same sequence each time when not given.
+        samples: more of them make it more certain that a pair which never came close never will.
+        margin: pairs that come closer than this [m] at some sample are not reported as Never.
+        rng: source of the samples; without it they are the same each time.
     """
     geometry = convex_hulls(robot.full_geometry(pin.GeometryType.COLLISION))
     model = robot.full_model
@@ -63,20 +63,20 @@ def disabled_pairs(
                 geometry.addCollisionPair(pin.CollisionPair(i, j))
     between = [(names[pair.first], names[pair.second]) for pair in geometry.collisionPairs]
     generator = rng if rng is not None else np.random.default_rng(0)
-    configurations = sampled(robot, samples, generator)
+    configurations = sample_configurations(robot, samples, generator)
     close = _hits(model, geometry, configurations, margin)
 
     def least(pair: tuple[str, str]) -> float:
-        """The share of samples at which a pair must touch to be called always touching."""
+        """Return the share of samples at which a pair must touch to be reported as Always."""
         one, other = (bodies[link] for link in pair)
-        return MOSTLY if robot.model.parents[one] == other or robot.model.parents[other] == one else 1.0
+        return ALMOST_ALWAYS if robot.model.parents[one] == other or robot.model.parents[other] == one else 1.0
 
     columns = {pair: [k for k, other in enumerate(between) if other == pair] for pair in between}
     suspects = []
-    for pair, mine in columns.items():
-        if not close[:, mine].any():
+    for pair, own in columns.items():
+        if not close[:, own].any():
             found[pair] = "Never"
-        elif close[:, mine].any(axis=1).mean() >= least(pair):
+        elif close[:, own].any(axis=1).mean() >= least(pair):
             suspects.append(pair)
     if suspects:
         touching = _hits(model, geometry, configurations, 0.0)
@@ -86,8 +86,8 @@ def disabled_pairs(
             for i, one in enumerate(links) for other in links[i + 1:] if (one, other) in found]
 
 
-def sampled(robot: RobotModel, samples: int, rng: np.random.Generator) -> Array:
-    """Random configurations (samples, nq) of the full model: the group and the fingers' width, the rest locked."""
+def sample_configurations(robot: RobotModel, samples: int, rng: np.random.Generator) -> Array:
+    """Return random configurations (samples, nq) of the full model: group and gripper vary, the rest is locked."""
     model = robot.full_model
     configurations = np.tile(robot.full_reference, (samples, 1))
 
@@ -107,7 +107,7 @@ def sampled(robot: RobotModel, samples: int, rng: np.random.Generator) -> Array:
 
 
 def _carrier(robot: RobotModel, link: str, with_geometry: list[str]) -> str:
-    """The nearest link with a shape that a link hangs on."""
+    """Return the nearest parent link that has a shape."""
     parent = robot.link_parents.get(link, "")
     while parent and parent not in with_geometry:
         parent = robot.link_parents.get(parent, "")
@@ -115,7 +115,7 @@ def _carrier(robot: RobotModel, link: str, with_geometry: list[str]) -> str:
 
 
 def _hits(model: pin.Model, geometry: pin.GeometryModel, configurations: Array, margin: float) -> NDArray[np.bool_]:
-    """(N, pairs) whether the shapes of each pair are closer than a margin [m] at each configuration."""
+    """Return (N, pairs) whether the shapes of each pair are closer than a margin [m] at each configuration."""
     data, shapes = model.createData(), pin.GeometryData(geometry)
     for request in shapes.collisionRequests:
         request.security_margin = margin
@@ -127,7 +127,7 @@ def _hits(model: pin.Model, geometry: pin.GeometryModel, configurations: Array, 
 
 
 def srdf(robot: RobotModel, pairs: list[DisabledPair]) -> str:
-    """An SRDF: groups and named poses of the robot file, and the pairs that are not checked."""
+    """Return an SRDF: groups and named poses of the robot file, and the pairs that are not checked."""
     config = robot.config
     root = ET.Element("robot", name=robot.full_model.name)
     ET.SubElement(root, "virtual_joint", name="base", type="fixed", parent_frame="world", child_link=config.base_link)

@@ -1,6 +1,6 @@
 """Robot and obstacles as one pinocchio geometry model, checked with several safety margins.
 
-Building it takes about a millisecond; moving obstacles, allowing pairs and setting margins takes microseconds, so one
+Building it takes about a millisecond; moving obstacles, allowing pairs and setting margins takes microseconds. So one
 bank serves all scenes whose solids have the same shapes. Every margin level has its own pinocchio data and broadphase:
 changing the margin of all pairs for each check would cost more than the check.
 """
@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 
 from common.errors import ZencellError
 from common.messages import CollisionObject
-from common.planning.kernel.world import EXCUSED, KernelWorld, NoKernel
+from common.planning.kernel.library import library
+from common.planning.kernel.world import CONTACT_ALLOWED, KernelUnavailable, KernelWorld
 from common.planning.prism import is_line, prism
 from common.planning.robot_geometry import RobotGeometry, largest
 
@@ -28,13 +29,13 @@ Array = NDArray[np.float64]
 MARGINS = (0.0, 0.001, 0.002, 0.004, 0.008, 0.016, 0.032, 0.064, 0.128)  # [m]
 
 
-class BadShape(ZencellError):
-    """A solid of the scene that has no volume."""
+class InvalidShape(ZencellError):
+    """A solid of the scene without volume, or out of range."""
 
 
 @dataclass(frozen=True)
 class Solid:
-    """A shape of the scene; `joint` is that of the robot model which carries it, 0 for the environment."""
+    """A shape of the scene; `joint` of the robot model carries it, 0 for the environment."""
 
     shape: str
     dimensions: tuple[float, ...]
@@ -43,18 +44,18 @@ class Solid:
     outline: tuple[tuple[float, float], ...] = ()
 
     @classmethod
-    def of(cls, thing: CollisionObject, joint: int = 0, frame: int = 0) -> Solid:
-        """The shape of an object of the scene, wherever it is.
+    def of(cls, item: CollisionObject, joint: int = 0, frame: int = 0) -> Solid:
+        """Return the shape of an object of the scene, without its pose.
 
         Raises:
-            BadShape: the outline of a prism is a line.
+            InvalidShape: the outline of a prism is a line.
         """
-        if thing.shape == "prism" and is_line(thing.outline):
-            raise BadShape(f"{thing.id}: the {len(thing.outline)} points of its outline lie on one line")
-        return cls(thing.shape, tuple(thing.dimensions), joint, frame, tuple(thing.outline))
+        if item.shape == "prism" and is_line(item.outline):
+            raise InvalidShape(f"{item.id}: the {len(item.outline)} points of its outline lie on one line")
+        return cls(item.shape, tuple(item.dimensions), joint, frame, tuple(item.outline))
 
     def geometry(self) -> coal.CollisionGeometry:
-        """The shape as coal knows it."""
+        """Return the shape for coal."""
         if self.shape == "box":
             return coal.Box(*self.dimensions)
         if self.shape == "sphere":
@@ -64,8 +65,8 @@ class Solid:
         return coal.Cylinder(*self.dimensions)
 
 
-def cubes(spheres: Array) -> coal.BVHModelOBBRSS:
-    """A mesh of the cubes about spheres (N, 4), middle and radius [m]."""
+def cube_mesh(spheres: Array) -> coal.BVHModelOBBRSS:
+    """Return a mesh of the cubes about spheres (N, 4), centre and radius [m]."""
     signs = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
     sides = np.array([[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1]])
     sides = np.concatenate([sides, [[2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]]])
@@ -80,7 +81,7 @@ def cubes(spheres: Array) -> coal.BVHModelOBBRSS:
 
 
 class _Level:
-    """Pinocchio's working data for one margin, and what was last set in them."""
+    """Pinocchio's working data for one margin, and the rules last applied to them."""
 
     def __init__(self, robot: pin.Model, geometry: pin.GeometryModel) -> None:
         self.data = pin.GeometryData(geometry)
@@ -100,7 +101,7 @@ class _Level:
 
 
 class Rules:
-    """Which pairs count and how far apart they must be: checked with any of the margins on top."""
+    """Active pairs and their required distances, checked with any of the margins added."""
 
     def __init__(self, bank: ObstacleBank) -> None:
         self._bank = bank
@@ -110,24 +111,24 @@ class Rules:
         self.margins = np.zeros(bank.pair_count)
 
     def set(self, disabled: frozenset[int], margins: Array) -> None:
-        """Disable pairs and set the least distance (pairs,) [m] of the others."""
+        """Disable pairs and set the required distance (pairs,) [m] of the others."""
         if disabled != self.disabled or not np.array_equal(margins, self.margins):
             self.margins_changed()
             self.disabled, self.margins = disabled, margins
 
     def margins_changed(self) -> None:
-        """Have the levels set their margins again before they are used."""
+        """Apply margins again to each level before its next use."""
         self._current = [False] * len(MARGINS)
 
     def shapes_changed(self) -> None:
-        """Have the levels made anew."""
+        """Build each level again before its next use."""
         self._levels = [None] * len(MARGINS)
         self.margins_changed()
 
     def _level(self, index: int) -> _Level:
         level = self._levels[index]
         if level is None:
-            if self is not self._bank.sunk:  # which has no pairs with points
+            if self is not self._bank.penetrating:  # it has no pairs with points
                 self._bank.mesh_points()
             level = self._levels[index] = _Level(self._bank.model, self._bank.geometry)
         if not self._current[index]:
@@ -136,12 +137,12 @@ class Rules:
         return level
 
     def hit(self, q: Array, level: int = 0) -> bool:
-        """Whether any pair is closer at q than its own distance and its share of the level's margin together."""
+        """Return whether any pair is closer at q than its required distance plus its share of the level's margin."""
         broadphase = self._level(level).broadphase
         return bool(pin.computeCollisions(self._bank.model, self._bank.data, broadphase, q, True))
 
     def pairs(self, q: Array, level: int = 0) -> list[int]:
-        """Indices of all pairs that are too close at q. Ten times slower than `hit`."""
+        """Return the indices of all pairs that are too close at q. Ten times slower than `hit`."""
         data = self._level(level).data
         pin.computeCollisions(self._bank.model, self._bank.data, self._bank.geometry, data, q, False)
         active = data.activeCollisionPairs
@@ -154,9 +155,9 @@ class ObstacleBank:
     Attributes:
         first, second: geometry indices of each pair; robot geometries come first, then the solids in their order, then
             the sets of points.
-        near, far, sunk: sets of rules over the same geometry.
-        lever: (dof,) [m] the farthest that a radian of each joint moves any point of the robot or of what is attached.
-        shares: (pairs,) how much closer two things can come, as a share of the way of the point that moves most.
+        near, far, penetrating: sets of rules over the same geometry.
+        lever: (dof,) [m] the farthest that a radian of each joint moves any point of robot or attached objects.
+        shares: (pairs,) how much closer a pair can come, as a share of the path of the point that moves most.
     """
 
     def __init__(self, robot: RobotGeometry, solids: tuple[Solid, ...], point_sets: int = 0) -> None:
@@ -173,9 +174,9 @@ class ObstacleBank:
             )
             indices.append(self.geometry.addGeometryObject(item))
         self._points_from = self.robot_count + len(solids)
-        for number in range(point_sets):  # the kernel takes the points; coal gets them in `mesh_points`
-            nothing = coal.Sphere(1e-6)
-            item = pin.GeometryObject(f"points_{number}", 0, 0, pin.SE3(np.eye(3), np.array([0, 0, -1e3])), nothing)
+        for number in range(point_sets):  # the kernel gets the points; coal gets them in `mesh_points`
+            placeholder = coal.Sphere(1e-6)
+            item = pin.GeometryObject(f"points_{number}", 0, 0, pin.SE3(np.eye(3), np.array([0, 0, -1e3])), placeholder)
             self.geometry.addGeometryObject(item)
         self._spheres: list[Array] = [np.zeros((0, 4))] * point_sets
         self._meshed = self._points_placed = True
@@ -183,7 +184,7 @@ class ObstacleBank:
         environment += range(self._points_from, self._points_from + point_sets)
         held = [(i, solid.joint) for i, solid in zip(indices, solids, strict=True) if solid.joint != 0]
         for link in range(self.robot_count):
-            if robot.joints[link] != 0:  # the base cannot move: what stands beside it is no collision
+            if robot.joints[link] != 0:  # the base cannot move: an object next to it is no collision
                 self._add_pairs(link, environment)
             for index, joint in held:
                 if robot.joints[link] != joint and robot.links[link] not in may_touch_held:
@@ -199,11 +200,11 @@ class ObstacleBank:
         self._kernel: KernelWorld | None = None
         self._kernel_tried = self._kernel_placed = False
         self._width: float | None = None
-        self._fingers_placed = True  # in the kernel, which takes them as they are when it is made
+        self._fingers_placed = True  # in the kernel, which copies them when it is created
         self._levers = list(robot.levers)
         self.near = Rules(self)
         self.far = Rules(self)
-        self.sunk = Rules(self)
+        self.penetrating = Rules(self)
         self.lever = np.zeros(self.model.nq)
         self.shares = np.zeros(self.pair_count)
         self._measure()
@@ -213,7 +214,7 @@ class ObstacleBank:
             self.geometry.addCollisionPair(pin.CollisionPair(one, other))
 
     def place(self, poses: list[Array]) -> None:
-        """Put each solid at its (4, 4) pose in the frame of its joint (the world for the environment)."""
+        """Set each solid's (4, 4) pose in the frame of its joint (the world for the environment)."""
         items: Any = self.geometry.geometryObjects
         moved = False
         for number, (solid, pose) in enumerate(zip(self._solids, poses, strict=True)):
@@ -226,7 +227,7 @@ class ObstacleBank:
             self._measure()
 
     def open_fingers(self, width: float | None) -> None:
-        """Put the fingers' links where they are at a width [m]; None: where the robot file holds them."""
+        """Set the gripper's links to a width [m]; None: as in the robot file."""
         if width == self._width:
             return
         self._width, items = width, self.geometry.geometryObjects
@@ -236,9 +237,9 @@ class ObstacleBank:
         self._measure()
 
     def set_points(self, sets: Sequence[Array]) -> None:
-        """Put spheres (N, 4), middle and radius [m] in the world, into each set of points, without a copy."""
+        """Set the spheres (N, 4), centre and radius [m], world, of each set of points, without a copy."""
         if len(sets) != len(self._spheres):
-            raise ValueError(f"{len(sets)} sets of points for {len(self._spheres)}")
+            raise ValueError(f"got {len(sets)} sets of points, need {len(self._spheres)}")
         if all(new is old for new, old in zip(sets, self._spheres, strict=True)):
             return
         self._spheres = list(sets)
@@ -247,25 +248,25 @@ class ObstacleBank:
             rules.shapes_changed()
 
     def mesh_points(self) -> None:
-        """Show coal each sphere as the cube about it. That takes 30 us each, so only when coal is asked."""
+        """Give coal each sphere as the cube about it. That takes 30 us each, so only if coal is used."""
         if self._meshed:
             return
         self._meshed = True
         items = self.geometry.geometryObjects
         for number, spheres in enumerate(self._spheres):
-            items[self._points_from + number].geometry = cubes(spheres) if len(spheres) else coal.Sphere(1e-6)
+            items[self._points_from + number].geometry = cube_mesh(spheres) if len(spheres) else coal.Sphere(1e-6)
             at = (0, 0, 0) if len(spheres) else (0, 0, -1e3)
             items[self._points_from + number].placement = pin.SE3(np.eye(3), np.array(at, dtype=float))
 
     def near_shapes(self, q: Array, margins: Array, points: Array) -> NDArray[np.bool_]:
-        """(N,) which of points (N, 3), world, are no farther than a margin [m] from robot or solids at q.
+        """Return (N,) which of points (N, 3), world, are within a margin [m] of robot or solids at q.
 
         Args:
             margins: (robot and solids,) [m] of each.
         """
         kernel = self.kernel()
         if kernel is not None:
-            own = np.full(len(self.geometry.geometryObjects), EXCUSED)
+            own = np.full(len(self.geometry.geometryObjects), CONTACT_ALLOWED)
             own[: len(margins)] = margins
             return kernel.near(q, own, points)
         data = pin.GeometryData(self.geometry)
@@ -285,38 +286,40 @@ class ObstacleBank:
         return found
 
     def kernel(self) -> KernelWorld | None:
-        """The same geometry, where solids stand now, in the compiled kernel; None where it cannot be used."""
+        """Return the same geometry in the compiled kernel, with current poses; None if the kernel is unavailable."""
+        if library() is None:
+            return None
         if not self._kernel_tried:
             self._kernel_tried = True
             try:
                 points = range(self._points_from, self._points_from + len(self._spheres))
                 self._kernel = KernelWorld(self.model, self.geometry, self._robot.kernel_shapes, points)
-            except NoKernel:
+            except KernelUnavailable:
                 return None
         if self._kernel is not None and not self._kernel_placed:
             items = self.geometry.geometryObjects
             if not self._fingers_placed:
                 for index, placement, _ in self._robot.opening(self._width):
-                    self._kernel.place(index, placement.homogeneous)
+                    self._kernel.set_pose(index, placement.homogeneous)
             self._fingers_placed = True
             for index in range(self.robot_count, self._points_from):
-                self._kernel.place(index, items[index].placement.homogeneous)
+                self._kernel.set_pose(index, items[index].placement.homogeneous)
             if not self._points_placed:
                 for number, spheres in enumerate(self._spheres):
                     self._kernel.set_points(self._points_from + number, spheres)
                 self._points_placed = True
-            self._kernel.placed()
+            self._kernel.refresh()
         self._kernel_placed = True
         return self._kernel
 
     def distances(self, q: Array, pairs: Sequence[int]) -> Array:
-        """(len(pairs),) [m] at q (dof,), negative by how deep two things are in each other."""
+        """Return (len(pairs),) distances [m] at q (dof,), negative by the penetration depth."""
         data = pin.GeometryData(self.geometry)
         pin.updateGeometryPlacements(self.model, self.data, self.geometry, data, q)
         return np.array([pin.computeDistance(self.geometry, data, i).min_distance for i in pairs], dtype=float)
 
     def _measure(self) -> None:
-        """Levers, and each pair's share: joints between two links alone move them towards each other."""
+        """Update levers and each pair's share: only joints between two links move them towards each other."""
         items = self.geometry.geometryObjects
         held = [self._robot.lever(items[i]) for i in range(self.robot_count, len(items))]
         levers = np.array([*self._levers, *held])
@@ -326,12 +329,12 @@ class ObstacleBank:
         shares = np.max(way / np.maximum(self.lever, 1e-9), axis=1, initial=0.0)
         if not np.array_equal(shares, self.shares):
             self.shares = shares
-            for rules in (self.near, self.far, self.sunk):
+            for rules in (self.near, self.far, self.penetrating):
                 rules.margins_changed()
 
 
 class ObstacleCache:
-    """Banks that were used last, by the shapes in them. A bank belongs to the newest world made with it."""
+    """The banks used last, by their shapes. A bank belongs to the newest world created with it."""
 
     def __init__(self, robot: RobotGeometry, size: int = 8) -> None:
         self.robot = robot
@@ -339,7 +342,7 @@ class ObstacleCache:
         self._banks: OrderedDict[tuple[tuple[Solid, ...], int], ObstacleBank] = OrderedDict()
 
     def bank(self, solids: tuple[Solid, ...], point_sets: int = 0) -> ObstacleBank:
-        """The bank for these shapes and that many sets of points, built when there is none."""
+        """Return the bank for these shapes and this number of point sets; build it if missing."""
         key = (solids, point_sets)
         found = self._banks.get(key)
         if found is None:

@@ -31,11 +31,11 @@ class SmoothPath:
 
     @property
     def end(self) -> Array:
-        """(dof,) the last position [rad]."""
+        """The last position (dof,) [rad]."""
         return np.asarray(self.starts[-1] + 0.5 * (self.d0[-1] + self.d1[-1]) * self.lengths[-1])
 
     def divided(self, step: float) -> SmoothPath:
-        """The same path in pieces in which no joint moves by more than `step` [rad]."""
+        """Return the same path in pieces in which no joint moves by more than `step` [rad]."""
         moves = np.maximum(np.abs(self.d0), np.abs(self.d1)).max(axis=1) * self.lengths
         counts = np.maximum(1, np.ceil(moves / step - 1e-9).astype(int))
         owner = np.repeat(np.arange(len(counts)), counts)
@@ -48,24 +48,24 @@ class SmoothPath:
         return SmoothPath(starts, d0, d0 + slope * lengths[:, None], lengths)
 
     def positions(self, step: float) -> Array:
-        """(N, dof) positions [rad] along the path, no joint moving by more than `step` [rad] between."""
+        """Return (N, dof) positions [rad] along the path, at most `step` [rad] apart in each joint."""
         return np.concatenate([self.divided(step).starts, self.end[None, :]])
 
 
 def distinct(waypoints: Sequence[Array] | Array) -> Array:
-    """(N, dof) waypoints without those that repeat the one before; the last one is kept as it is."""
+    """Return (N, dof) waypoints without those that repeat the one before; the last one stays as it is."""
     points = np.array(waypoints, dtype=float)
-    keep = np.concatenate([[True], np.abs(np.diff(points, axis=0)).max(axis=1) > _SAME])
-    kept: Array = points[keep]
-    kept[-1] = points[-1]
-    return kept
+    differs = np.concatenate([[True], np.abs(np.diff(points, axis=0)).max(axis=1) > _SAME])
+    result: Array = points[differs]
+    result[-1] = points[-1]
+    return result
 
 
 def dense_path(waypoints: Array) -> SmoothPath:
-    """The uniform quadratic B-spline with these control points (N, dof), which starts and ends at the outer ones.
+    """Return the uniform quadratic B-spline with these control points (N, dof), from the first to the last.
 
-    For waypoints that lie close together, such as those of a straight line of the tool: the middles of the edges are
-    met, the waypoints themselves missed by an eighth of the second difference.
+    For waypoints that lie close together, such as those of a straight line of the tool: it passes the middles of the
+    edges, and misses the waypoints by an eighth of the second difference.
     """
     edges = np.diff(waypoints, axis=0)
     if len(edges) == 1:
@@ -80,14 +80,13 @@ def dense_path(waypoints: Array) -> SmoothPath:
 
 
 def blended_path(waypoints: Array, blends: Array, lengths: Array | None = None) -> list[SmoothPath]:
-    """Straight edges with a parabola about each corner; one path for each stretch between corners without a blend.
+    """Return straight edges with a parabola about each corner; one path for each stretch between unblended corners.
 
     Args:
-        waypoints: (N, dof) [rad], each other than the one before.
-        blends: (N,) length taken from both edges at each waypoint; next to 0 means to stop there. Half the
-            shorter edge at most is used; a little less when lengths are given, which may differ by a hair.
-        lengths: (N - 1,) of the edges, by which the path is then measured; their lengths in joint space [rad] when
-            not given.
+        waypoints: (N, dof) [rad], each different from the one before.
+        blends: (N,) length taken from both edges at each waypoint; close to 0 means a stop. At most half the shorter
+            edge is used, a little less with `lengths`, which may differ slightly from the edges.
+        lengths: (N - 1,) of the edges, which then measure the path; by default their lengths in joint space [rad].
     """
     edges = np.diff(waypoints, axis=0)
     spans = np.linalg.norm(edges, axis=1)
@@ -113,14 +112,14 @@ def blended_path(waypoints: Array, blends: Array, lengths: Array | None = None) 
 
 
 _ITERATIONS = 150
-_SHORTEST_LINE = 0.25  # of the longest edge: shorter ones count as this long, or they alone would set the pace
+_SHORTEST_LINE = 0.25  # of the longest edge: shorter ones count as this long, or they alone would limit the steps
 
 
 def smoothed(points: Array, tolerances: Array) -> Array:
-    """Points (N, d) moved by no more than their tolerances (N,) [m] so that the line through them bends least.
+    """Return points (N, d) moved within their tolerances (N,) [m] so that the line through them bends least.
 
-    What bends is the square of the curvature along the line; the first and the last point stay. A convex problem,
-    solved to a few percent by projected gradients with Nesterov's momentum: Beck and Teboulle, "A fast iterative
+    The bend is the square of the curvature along the line; the first and the last point stay. A convex problem, solved
+    to a few percent by projected gradients with Nesterov's momentum: Beck and Teboulle, "A fast iterative
     shrinkage-thresholding algorithm" (2009).
     """
     if len(points) < 3 or not tolerances.any():
@@ -133,7 +132,7 @@ def smoothed(points: Array, tolerances: Array) -> Array:
     radii = tolerances.copy()
     radii[[0, -1]] = 0.0
     radii = radii[:, None]
-    # The gradient changes by no more than this share of a move: by Gershgorin's circles.
+    # Bound of the gradient's change per move, by Gershgorin circles.
     steepest = 2 * float((weights * (before + after) ** 2 * 2).max())
     moved = points.copy()
     ahead, momentum = moved, 1.0

@@ -11,16 +11,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from common.config import Motion, Parameters, Pipeline
 from common.errors import UnknownName
-from common.messages import JointTrajectory, JointTrajectoryPoint, PlanAttempt, PlanningScene, PlanRequest, PlanResponse
-from common.planning.checks import BadRequest, CheckedRequest, check_collisions, check_constraints, check_request
-from common.planning.collision import CollisionWorld, Pair
-from common.planning.constraints import CHECKED, ToolConstraints
-from common.planning.goal_sampling import missed_by
-from common.planning.legs import LEGS, NoOptions, join_legs
-from common.planning.obstacles import BadShape, ObstacleCache
+from common.messages import PlanAttempt, PlanningScene, PlanRequest, PlanResponse
+from common.planning.collision import CollisionWorld
+from common.planning.constraints import VALIDATION_SHARES, ToolConstraints
+from common.planning.goal_sampling import distance_outside
+from common.planning.obstacles import InvalidShape, ObstacleCache
 from common.planning.planners import Plan, load_planner, planner_names
 from common.planning.planners.joint_move import straight_profile
-from common.planning.points import PointObstacle
+from common.planning.point_obstacles import PointObstacle
 from common.planning.problem import (
     NOT_APPLICABLE,
     Cancel,
@@ -29,33 +27,34 @@ from common.planning.problem import (
     Region,
     Result,
     ToolPath,
-    not_timed,
+    timing_failure,
 )
-from common.planning.retiming import (
-    RetimingFailed,
-    TimedPath,
-    TooLong,
-    cubics,
-    join,
-    limited_jerk,
-    require_tellable,
-    stretch,
+from common.planning.request_checks import (
+    BadRequest,
+    CheckedRequest,
+    check_collisions,
+    check_constraints,
+    check_request,
 )
+from common.planning.retiming import RetimingFailed, limited_jerk
 from common.planning.robot_geometry import RobotGeometry
-from common.planning.timing import BLENDS, retime, slowed
+from common.planning.segments import SEGMENTS, NoOptions, join_segments
+from common.planning.trajectory import TimedPath, TooLong, cubics, join, require_sendable, stretch, trajectory_message
 from common.planning.validation import Fault, validate
+from common.planning.waypoint_timing import BLENDS, limit_tool_speed, retime
 from common.robot.model import RobotModel
 from common.sources import monotonic
 
 Array = NDArray[np.float64]
+Planners = dict[str, tuple[Plan, Parameters]]
 
 CHECKS = "request_checks"
-CYCLE = 0.01  # [s] between set-points: acceleration reaches its limit no faster, whatever the arm can do
-FINISHING = 0.1  # of the time for planning, on top of it: for timing and checking a path that was found in time
+CYCLE = 0.01  # [s] between set-points: acceleration reaches its limit no faster, whatever jerk the arm allows
+FINISHING_SHARE = 0.1  # of the planning time, added to it for timing and checking a path that was found in time
 
 
 class PlanningPipeline:
-    """Answers plan requests, one after the other. Not for several threads at once."""
+    """Answers plan requests one after the other. Not thread-safe."""
 
     def __init__(self, robot: RobotModel, motion: Motion, pipeline: Pipeline, *, seed: int = 0) -> None:
         """Load the robot's collision geometry and the planners.
@@ -67,16 +66,21 @@ class PlanningPipeline:
         self._motion = motion
         self._pipeline = pipeline
         self._seed = seed
-        self._planners: dict[str, tuple[Plan, Parameters]] = {}
+        self._planners: Planners = {}
         for entry in pipeline.planners:
             self._planners[entry.name.rpartition(".")[2]] = load_planner(entry.name, entry.options)
-        self._others: dict[str, tuple[Plan, Parameters]] = {}  # of the project; loaded when one is asked for
+        self._other_planners: Planners = {}  # of the project; loaded when a request names one
         self._cache = ObstacleCache(RobotGeometry(robot))
 
     @property
     def planners(self) -> list[str]:
         """Names of the planners in the order in which they are tried."""
         return list(self._planners)
+
+    @property
+    def geometry(self) -> RobotGeometry:
+        """The robot's collision geometry."""
+        return self._cache.robot
 
     def plan(
         self,
@@ -87,59 +91,60 @@ class PlanningPipeline:
         points: Sequence[PointObstacle] = (),
         width: float | None = None,
     ) -> PlanResponse:
-        """A validated trajectory, or the error of the planner that got furthest; never raises for a bad request.
+        """Return a validated trajectory, or the error of the planner that got furthest; a bad request never raises.
 
         Args:
-            request: what is asked for.
-            scene: what is to be avoided.
-            current: (dof,) [rad] where the robot is, used when the request has no start.
+            request: start, goal and options.
+            scene: obstacles and attached objects.
+            current: (dof,) [rad] where the robot is, used if the request has no start.
             cancel: set from another thread to end planning early.
-            points: what cameras saw and the scene does not have.
-            width: between the fingers now [m], used when the request says none; None: as the robot file holds them.
+            points: obstacles that cameras saw and the scene does not have.
+            width: of the gripper now [m], used if the request has none; None: as in the robot file.
         """
         began = monotonic()
         flag = cancel or Cancel()
-        attempts: list[PlanAttempt] = []
         try:
-            planners = self._chosen(request)
+            planners = self._requested_planners(request)
             state = None if current is None else np.asarray(current, dtype=float)
             checked = check_request(self.robot, request, scene, state, self._motion.start_tolerance)
             constraints = check_constraints(self.robot, request, checked)
-            world = self._world(request, scene, checked, constraints, points, width)
+            world = self._checked_world(request, scene, checked, constraints, points, width)
             check_collisions(world, checked)
         except BadRequest as error:
             failure = Result(error=error.code, message=str(error), colliding=error.colliding)
-            return _failed(request, began, CHECKS, failure, attempts)
-        problem = self._problem(request, checked, world, began)
+            return _failure(request, began, CHECKS, failure, [])
+        return self._try_planners(request, scene, self._problem(request, checked, world, began), planners, flag, began)
+
+    def world(
+        self, request: PlanRequest, scene: PlanningScene, start: ArrayLike, width: float | None = None
+    ) -> CollisionWorld:
+        """Return a collision world of a request that shares nothing with `plan`, to check a trajectory again."""
+        geometry = ObstacleCache(self._cache.robot)
+        return self._make_world(request, scene, np.asarray(start, dtype=float), geometry, width=width)
+
+    def _try_planners(
+        self, request: PlanRequest, scene: PlanningScene, problem: Problem, planners: Planners, flag: Cancel,
+        began: float,
+    ) -> PlanResponse:
+        """Return the first trajectory that passes validation, or the failure that got furthest."""
+        attempts: list[PlanAttempt] = []
         best: tuple[str, Result] | None = None
-        last: dict[str, tuple[Plan, Parameters]] = {}
+        fallback: Planners = {}
         if problem.sequence is not None:
-            last = {LEGS: (partial(join_legs, planners=planners), NoOptions())}
-        for name, (plan, options) in {**planners, **last}.items():
-            if name in last and best is not None and best[1].error != NOT_APPLICABLE:
-                break  # there is a planner for sequences
-            failed: dict[int, Result] = {}  # goals of a set to which a line was found that is not good in the end
-            while True:
-                since = monotonic()
-                result = self._ask(plan, replace(problem, failed=failed), options, flag)
-                trajectory = None
-                if not result.error:
-                    trajectory, result = self._finish(problem, result, flag)
-                if result.error != NOT_APPLICABLE:
-                    attempts += _recorded(name, result, monotonic() - since)
-                if trajectory is not None or result.goal is None or flag.reason(problem):
-                    break
-                failed[result.goal] = result
+            fallback = {SEGMENTS: (partial(join_segments, planners=planners), NoOptions())}
+        for name, (plan, options) in {**planners, **fallback}.items():
+            if name in fallback and best is not None and best[1].error != NOT_APPLICABLE:
+                break  # a planner of the pipeline handles sequences
+            trajectory, result = self._try_planner(name, plan, options, problem, flag, attempts)
             if trajectory is not None:
-                message = trajectory_message(self.robot, trajectory)
                 return PlanResponse(
                     id=request.id,
                     ok=True,
-                    trajectory=message,
+                    trajectory=trajectory_message(self.robot, trajectory),
                     planner=result.planner or name,
                     seconds=monotonic() - began,
                     scene_stamp=scene.header.stamp,
-                    goal_index=_reached(problem, trajectory.positions[-1]),
+                    goal_index=_goal_index(problem, trajectory.positions[-1]),
                     fraction=result.fraction,
                     attempts=attempts,
                 )
@@ -148,35 +153,46 @@ class PlanningPipeline:
             if result.error != NOT_APPLICABLE and flag.reason(problem):
                 break
         assert best is not None  # a pipeline has at least one planner
-        return _failed(request, began, best[0], best[1], attempts)
+        return _failure(request, began, best[0], best[1], attempts)
 
-    @property
-    def geometry(self) -> RobotGeometry:
-        """The robot's collision geometry."""
-        return self._cache.robot
+    def _try_planner(
+        self, name: str, plan: Plan, options: Parameters, problem: Problem, flag: Cancel, attempts: list[PlanAttempt]
+    ) -> tuple[TimedPath | None, Result]:
+        """Return the planner's validated trajectory, if any, and its result; record its attempts.
 
-    def world(
-        self, request: PlanRequest, scene: PlanningScene, start: ArrayLike, width: float | None = None
-    ) -> CollisionWorld:
-        """The collision world of a request, apart from those that `plan` uses: to check a trajectory again."""
-        geometry = ObstacleCache(self._cache.robot)
-        return self._make_world(request, scene, np.asarray(start, dtype=float), geometry, width=width)
+        A planner whose line to one of several goals fails later is called again without that goal.
+        """
+        failed: dict[int, Result] = {}
+        while True:
+            since = monotonic()
+            try:
+                result = plan(replace(problem, failed_goals=failed), options, flag)
+            except (RetimingFailed, TooLong) as error:  # some planners time their paths themselves
+                result = timing_failure(error)
+            trajectory = None
+            if not result.error:
+                trajectory, result = self._finish(problem, result, flag)
+            if result.error != NOT_APPLICABLE:
+                attempts += _recorded(name, result, monotonic() - since)
+            if trajectory is not None or result.goal is None or flag.reason(problem):
+                return trajectory, result
+            failed[result.goal] = result
 
-    def _chosen(self, request: PlanRequest) -> dict[str, tuple[Plan, Parameters]]:
-        """The pipeline's planners; or the one that is asked for, with its default options if the pipeline lacks it."""
+    def _requested_planners(self, request: PlanRequest) -> Planners:
+        """Return the pipeline's planners, or the requested one, with default options if the pipeline lacks it."""
         name = request.planner
         if not name:
             return self._planners
         if name in self._planners:
             return {name: self._planners[name]}
-        if name not in self._others:
+        if name not in self._other_planners:
             choices = {*planner_names(), *self._planners}
             if name not in choices:
                 raise BadRequest("unknown_planner", str(UnknownName("planner", name, choices)))
-            self._others[name] = load_planner(name, {})
-        return {name: self._others[name]}
+            self._other_planners[name] = load_planner(name, {})
+        return {name: self._other_planners[name]}
 
-    def _world(
+    def _checked_world(
         self,
         request: PlanRequest,
         scene: PlanningScene,
@@ -189,7 +205,7 @@ class PlanningPipeline:
             return self._make_world(request, scene, checked.start, self._cache, constraints, points, width)
         except UnknownName as error:
             raise BadRequest(f"unknown_{error.what}", str(error)) from None
-        except BadShape as error:
+        except InvalidShape as error:
             raise BadRequest("bad_scene", str(error)) from None
 
     def _make_world(
@@ -235,58 +251,51 @@ class PlanningPipeline:
             jerk=np.minimum(robot.jerk * acceleration, robot.acceleration / CYCLE),
             attempts=request.planning_attempts or motion.planning_attempts,
             deadline=began + budget,
-            latest=began + (1 + FINISHING) * budget,
+            latest=began + (1 + FINISHING_SHARE) * budget,
             rng=np.random.default_rng(self._seed if request.seed is None else abs(request.seed)),
-            beyond=checked.beyond,
+            outside_start=checked.outside_start,
         )
 
-    def _ask(self, plan: Plan, problem: Problem, options: Parameters, flag: Cancel) -> Result:
-        """The planner's answer; some time their paths themselves, and may fail at that."""
-        try:
-            return plan(problem, options, flag)
-        except (RetimingFailed, TooLong) as error:
-            return not_timed(error)
-
     def _finish(self, problem: Problem, result: Result, flag: Cancel) -> tuple[TimedPath | None, Result]:
-        """The timed and validated trajectory and the result, or None and the result with what is wrong."""
-        wrong = result
+        """Return the timed and validated trajectory and the result, or None and the result with its error."""
+        failure = result
         try:
             for timed in self._timings(problem, result):
-                trajectory = timed if problem.beyond is None else _from_beyond(problem, problem.beyond, timed)
+                outside = problem.outside_start
+                trajectory = timed if outside is None else _from_outside(problem, outside, timed)
                 if flag.is_set:
-                    return None, replace(result, error="cancelled", message="planning was ended while a path was timed")
-                require_tellable(trajectory)
+                    return None, replace(result, error="cancelled", message="planning ended while a path was timed")
+                require_sendable(trajectory)
                 fault = self._fault(problem, trajectory)
                 if fault is None:
                     return trajectory, result
                 message = f"validation: {fault.message}"
-                wrong = replace(
+                failure = replace(
                     result, error=fault.code, message=message, waypoint=fault.waypoint, colliding=fault.colliding
                 )
-        except RetimingFailed as error:
-            wrong = replace(result, error="retiming_failed", message=f"retiming: {error}")
-        except TooLong as error:
-            wrong = replace(result, error=error.code, message=str(error))
-        return None, wrong
+        except (RetimingFailed, TooLong) as error:
+            reason = timing_failure(error)
+            failure = replace(result, error=reason.error, message=reason.message)
+        return None, failure
 
     def _timings(self, problem: Problem, result: Result) -> Iterator[TimedPath]:
-        """The planner's own trajectory, or its path timed with smaller and smaller blends."""
+        """Yield the planner's own trajectory, or its path timed with smaller and smaller blends."""
         robot, limit = problem.robot, problem.tool_speed
         if result.trajectory is not None:
-            yield slowed(robot, limited_jerk(result.trajectory, problem.jerk), limit)
+            yield limit_tool_speed(robot, limited_jerk(result.trajectory, problem.jerk), limit)
             return
         scale = self._motion.cartesian_speed_scale if result.tool_line else 1.0
-        for blend in BLENDS[:1] if result.dense or result.way else BLENDS:
+        for blend in BLENDS[:1] if result.dense or result.tool_travel else BLENDS:
             trajectory = retime(problem, result, blend, limit / scale)
             trajectory = stretch(trajectory, scale) if result.tool_line else trajectory
-            yield slowed(robot, trajectory, limit)
+            yield limit_tool_speed(robot, trajectory, limit)
 
     def _fault(self, problem: Problem, trajectory: TimedPath) -> Fault | None:
         fault = validate(
             trajectory,
             problem.robot,
             problem.world,
-            start=problem.start if problem.beyond is None else problem.beyond,
+            start=problem.start if problem.outside_start is None else problem.outside_start,
             velocity=problem.velocity,
             acceleration=problem.acceleration,
             step=self._pipeline.validation_step,
@@ -295,31 +304,31 @@ class PlanningPipeline:
         if fault is not None or constraints is None:
             return fault
         pieces = cubics(trajectory)
-        broken = constraints.first_break(pieces, CHECKED)
-        if broken is None:
+        violation = constraints.first_violation(pieces, VALIDATION_SHARES)
+        if violation is None:
             return None
-        waypoint, t = broken
-        wrong = constraints.told_at(np.array([1, t, t**2, t**3]) @ pieces[waypoint])
-        return Fault("constraint", f"waypoint {waypoint} of {len(trajectory.times)}: {wrong}", waypoint)
+        waypoint, t = violation
+        what = constraints.describe_violation(np.array([1, t, t**2, t**3]) @ pieces[waypoint])
+        return Fault("constraint", f"waypoint {waypoint} of {len(trajectory.times)}: {what}", waypoint)
 
 
-def _from_beyond(problem: Problem, beyond: Array, trajectory: TimedPath) -> TimedPath:
-    """The trajectory, after a straight move to its start from where the robot stands beyond a limit."""
-    inwards = straight_profile(beyond, problem.start, problem.velocity, problem.acceleration, problem.jerk)
-    return join([slowed(problem.robot, inwards, problem.tool_speed), trajectory])
+def _from_outside(problem: Problem, outside: Array, trajectory: TimedPath) -> TimedPath:
+    """Return the trajectory after a straight move to its start from where the robot is outside a limit."""
+    inwards = straight_profile(outside, problem.start, problem.velocity, problem.acceleration, problem.jerk)
+    return join([limit_tool_speed(problem.robot, inwards, problem.tool_speed), trajectory])
 
 
-def _reached(problem: Problem, q: Array) -> int:
-    """Which of several goals to choose from q (dof,) [rad] is at."""
+def _goal_index(problem: Problem, q: Array) -> int:
+    """Return which of several alternative goals is reached at q (dof,) [rad]."""
     choice = problem.sequence[-1].goal if problem.sequence else problem.goal
     if not isinstance(choice, GoalChoice):
         return 0
     T_world_tcp = problem.robot.fk(q)
-    missed = [
-        missed_by(goal, T_world_tcp) if isinstance(goal, Region) else float(np.abs(goal - q).max())
+    distances = [
+        distance_outside(goal, T_world_tcp) if isinstance(goal, Region) else float(np.abs(goal - q).max())
         for goal in choice.goals
     ]
-    return int(np.argmin(missed))
+    return int(np.argmin(distances))
 
 
 def _further(one: Result, other: Result) -> bool:
@@ -327,7 +336,7 @@ def _further(one: Result, other: Result) -> bool:
 
 
 def _recorded(name: str, result: Result, seconds: float) -> list[PlanAttempt]:
-    """The attempts of a planner; its own, and one for the outcome where they do not tell it."""
+    """Return the attempts of a planner: its own, and one for the outcome where they lack it."""
     own = result.attempts
     if own and (not result.error or own[-1].error == result.error):
         return own
@@ -345,36 +354,18 @@ def _recorded(name: str, result: Result, seconds: float) -> list[PlanAttempt]:
     ]
 
 
-def _failed(
+def _failure(
     request: PlanRequest, began: float, planner: str, result: Result, attempts: list[PlanAttempt]
 ) -> PlanResponse:
-    error = "no_planner" if result.error == NOT_APPLICABLE else result.error
     where = f"{request.stage}: {planner}" if request.stage else planner
-    pair: Pair | None = result.colliding
     return PlanResponse(
         id=request.id,
         ok=False,
         planner=planner,
         seconds=monotonic() - began,
         fraction=result.fraction,
-        error=error,
+        error="no_planner" if result.error == NOT_APPLICABLE else result.error,
         message=f"{where}: {result.message}",
-        colliding=pair,
+        colliding=result.colliding,
         attempts=attempts,
     )
-
-
-def trajectory_message(robot: RobotModel, trajectory: TimedPath) -> JointTrajectory:
-    """The message of a trajectory that was found good."""
-    # Validation has just found these numbers finite and in shape: checking each again would take milliseconds.
-    columns = (
-        trajectory.times.tolist(),
-        trajectory.positions.tolist(),
-        trajectory.velocities.tolist(),
-        trajectory.accelerations.tolist(),
-    )
-    points = [
-        JointTrajectoryPoint.model_construct(time_from_start=t, positions=q, velocities=dq, accelerations=ddq)
-        for t, q, dq, ddq in zip(*columns, strict=True)
-    ]
-    return JointTrajectory.model_construct(joint_names=list(robot.joint_names), points=points)

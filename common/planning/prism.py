@@ -1,7 +1,7 @@
-"""Upright prisms as convex shapes: the hull of a cross-section, between two lids of triangles.
+"""Upright prisms as convex shapes: the hull of a cross-section between two lids of triangles.
 
-The hull is computed here and not by coal, whose own fails from 256 corners on: it joins each lid in a fan, which gives
-one corner more neighbours than fit.
+The hull is computed here and not by coal, which fails from 256 corners on: it triangulates each lid as a fan, which
+gives one corner more neighbours than it can store.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 _FLAT = 1e-6  # [m] an outline that spreads less across its longest direction is a line
-_DECIMALS = 7  # points are taken to a tenth of a micrometre: nearer ones would be corners without a direction
+_DECIMALS = 7  # points are rounded to a tenth of a micrometre: closer ones would be corners without a direction
 
 
 def is_line(outline: Sequence[tuple[float, float]]) -> bool:
-    """Whether the points [m] of a cross-section enclose nothing."""
+    """Return whether the points [m] of a cross-section enclose no area."""
     points = np.array(outline, dtype=float)
     return bool(np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[-1] < _FLAT)
 
 
 def prism(outline: Sequence[tuple[float, float]], length: float) -> coal.Convex:
-    """The convex hull of a cross-section [m], as long as given along z [m] and centred there."""
-    import coal  # many need the hull of an outline, and no shape of it
+    """Return the convex hull of a cross-section [m] extruded by a length along z [m], centred."""
+    import coal  # imported here: most callers need the hull of an outline only
 
     hull = convex_hull(np.array(outline, dtype=float))
     count = len(hull)
@@ -48,7 +48,7 @@ def prism(outline: Sequence[tuple[float, float]], length: float) -> coal.Convex:
 
 
 def convex_hull(points: Array) -> Array:
-    """Corners (N, 2) of the convex hull of points (M, 2), anticlockwise: Andrew's monotone chain."""
+    """Return corners (N, 2) of the convex hull of points (M, 2), anticlockwise: Andrew's monotone chain."""
     order = np.unique(np.round(points, _DECIMALS) + 0.0, axis=0).tolist()
     chains = []
     for way in (order, order[::-1]):
@@ -66,7 +66,7 @@ def _twice_area(a: list[float], b: list[float], x: float, y: float) -> float:
 
 
 def _lid(count: int) -> list[tuple[int, int, int]]:
-    """Triangles that cover a convex polygon in zigzag, so that no corner has many neighbours."""
+    """Return triangles that cover a convex polygon in a zigzag, so that no corner has many neighbours."""
     triangles = []
     low, high = 0, count - 1
     while high - low > 1:

@@ -1,4 +1,4 @@
-"""What a planner is asked, and what it answers."""
+"""The input and the output of a planner."""
 
 from __future__ import annotations
 
@@ -11,16 +11,20 @@ from numpy.typing import NDArray
 
 from common.messages import PlanAttempt
 from common.planning.collision import CollisionWorld, Pair
-from common.planning.retiming import RetimingFailed, TimedPath, TooLong
+from common.planning.retiming import RetimingFailed
+from common.planning.trajectory import TimedPath, TooLong
 from common.robot.model import RobotModel
 from common.sources import monotonic
 
 Array = NDArray[np.float64]
 
+NOT_APPLICABLE = "not_applicable"
+MAX_STEPS = 25_000  # poses of the tool for which joint positions are solved
+
 
 @dataclass(frozen=True)
 class Region:
-    """Where the TCP may end: about T_world_tcp (4, 4), within half sides (3,) [m], tilt and yaw [rad]."""
+    """Allowed poses of the TCP: about T_world_tcp (4, 4), within half sides (3,) [m], tilt and yaw [rad]."""
 
     T_world_tcp: Array
     half_sides: Array
@@ -30,11 +34,11 @@ class Region:
 
 @dataclass(frozen=True)
 class ToolPath:
-    """Poses that the TCP passes in straight lines, from the first, at which it is at the start.
+    """Poses that the TCP passes in straight lines; it is at the first of them at the start.
 
     Attributes:
         poses: (N, 4, 4) T_world_tcp.
-        step: way between IK solutions [m]; min_fraction: of the way that must be possible; None: the planner's.
+        step: travel between IK solutions [m]; min_fraction: of the path that must be possible; None: the planner's.
         speed: of the TCP where limits and corners allow it [m/s]; None: as fast as they allow.
     """
 
@@ -54,7 +58,7 @@ class Arc:
 
 
 @dataclass(frozen=True)
-class Part:
+class SequenceItem:
     """One motion of a sequence; the corner to the next is rounded off within `blend_radius` [m] of the goal."""
 
     goal: Array | Region | Arc | GoalChoice
@@ -66,12 +70,12 @@ class Part:
 class GoalSequence:
     """Goals to reach one after the other."""
 
-    parts: tuple[Part, ...]
+    items: tuple[SequenceItem, ...]
 
 
 @dataclass(frozen=True)
 class GoalChoice:
-    """Goals of which any will do."""
+    """Alternative goals: the planner may end at any of them."""
 
     goals: tuple[Array | Region, ...]
 
@@ -85,15 +89,15 @@ class Problem:
 
     Attributes:
         start: (dof,) [rad].
-        goal: (dof,) [rad] for a joint goal, else a region for the TCP, a path that it follows, several goals one after
-            the other, or several of which any will do.
-        beyond: (dof,) [rad] where the robot stands, beyond a limit; it moves straight to the start first.
-        failed: of several goals those, by their numbers from 1, whose lines were found but not good in the end.
-        straight: only a straight line of the TCP will do.
+        goal: (dof,) [rad] for a joint goal, else a region for the TCP, a path that it follows, a sequence of goals, or
+            alternative goals.
+        straight: only a straight line of the TCP is accepted.
         velocity, acceleration, jerk: scaled limits (dof,).
-        attempts: how many tries a sampling planner has.
-        deadline: of the search; latest: when a path that was found in time is timed and checked. Both are on the
-            monotonic clock of common.sources [s].
+        attempts: how many attempts a sampling planner has.
+        deadline: of the search; latest: after which a path that was found in time is no longer timed and checked. Both
+            are on the monotonic clock [s].
+        outside_start: (dof,) [rad] where the robot is, outside a limit; it moves straight to the start first.
+        failed_goals: alternative goals, by their numbers from 1, whose lines were found but rejected later.
     """
 
     robot: RobotModel
@@ -108,17 +112,17 @@ class Problem:
     deadline: float
     latest: float
     rng: np.random.Generator
-    beyond: Array | None = None
-    failed: dict[int, Result] = field(default_factory=dict)
+    outside_start: Array | None = None
+    failed_goals: dict[int, Result] = field(default_factory=dict)
 
     @property
-    def sequence(self) -> tuple[Part, ...] | None:
-        """Goals to reach one after the other, where there are such."""
-        return self.goal.parts if isinstance(self.goal, GoalSequence) else None
+    def sequence(self) -> tuple[SequenceItem, ...] | None:
+        """The items of a sequence of goals, None for any other goal."""
+        return self.goal.items if isinstance(self.goal, GoalSequence) else None
 
     @property
     def tool_speed(self) -> float:
-        """That the TCP may move with [m/s]."""
+        """Speed limit of the TCP [m/s]."""
         constraints = self.world.constraints
         return (constraints and constraints.tool_speed) or math.inf
 
@@ -129,36 +133,36 @@ class Problem:
 
 
 class Cancel:
-    """A flag that another thread may set; planners look at it and at the time that is left."""
+    """A flag that another thread may set; planners check it and the time that is left."""
 
     def __init__(self, word: ctypes.c_int | None = None) -> None:
-        """Not set; `word` is not 0 once it is, and compiled code looks there. It may lie in memory that is shared."""
+        """Start unset. Compiled code reads `word`, which is 0 until then and may lie in shared memory."""
         self.word = ctypes.c_int(0) if word is None else word
 
     def set(self) -> None:
-        """Ask the planner to give up."""
+        """Request that the planner gives up."""
         self.word.value = 1
 
     @property
     def is_set(self) -> bool:
-        """Whether somebody asked."""
+        """Whether the planner was requested to give up."""
         return self.word.value != 0
 
     def reason(self, problem: Problem) -> str:
-        """Why planning must end now: cancelled, timeout, or nothing."""
+        """Return why planning must end now: cancelled, timeout, or ""."""
         if self.is_set:
             return "cancelled"
         return "timeout" if problem.seconds_left <= 0 else ""
 
 
 @dataclass(frozen=True)
-class ToolWay:
+class ToolTravel:
     """How the TCP moves between waypoints that lie close together.
 
     Attributes:
-        lengths: (N - 1,) its way between them [m].
-        cuts: (N,) how much of the way before and after each may be rounded off [m].
-        speed: wanted along the way [m/s], or None.
+        lengths: (N - 1,) travel between them [m].
+        cuts: (N,) how much of the travel before and after each waypoint may be rounded off [m].
+        speed: requested along the path [m/s], or None.
     """
 
     lengths: Array
@@ -168,28 +172,28 @@ class ToolWay:
 
 @dataclass(frozen=True)
 class Result:
-    """A path or a trajectory, or the error of a planner; what it tried is in `attempts`.
+    """A path or a trajectory, or the error of a planner; `attempts` records what it tried.
 
-    `not_applicable` as error says that the planner is not for this kind of goal.
+    The error `not_applicable` means that the planner does not handle this kind of goal.
 
     Attributes:
         waypoints: (N, dof) [rad], to be retimed.
-        dense: the waypoints lie close together: smooth through all of them; else blend at the corners.
+        dense: the waypoints lie close together: smooth through all of them; otherwise blend at the corners.
         tool_line: the TCP follows a straight line (its speed scale applies).
-        cuts: (N,) how much of the edges before and after each waypoint may be rounded off [rad]; None: as is usual.
-        way: the TCP follows a path with corners, at a speed of its own: rounds them and times its way.
+        cuts: (N,) how much of the edges before and after each waypoint may be rounded off [rad]; None: the default.
+        tool_travel: the TCP follows a path with corners at its own speed: round them and time the path by its travel.
         trajectory: already timed; then there are no waypoints.
-        fraction: how much of the way is covered.
+        fraction: how much of the path is covered.
         waypoint, colliding: where and between what a failure was found.
-        planner: which found the way, where others were asked for it.
-        goal: number from 1 of the one of several goals to which its line leads; another may be tried in its place.
+        planner: which found the path, if it called others.
+        goal: number from 1 of the alternative goal that the line leads to; another may be tried instead.
     """
 
     waypoints: Array | None = None
     dense: bool = False
     cuts: Array | None = None
     tool_line: bool = False
-    way: ToolWay | None = None
+    tool_travel: ToolTravel | None = None
     trajectory: TimedPath | None = None
     fraction: float = 0.0
     error: str = ""
@@ -201,19 +205,15 @@ class Result:
     attempts: list[PlanAttempt] = field(default_factory=list)
 
 
-NOT_APPLICABLE = "not_applicable"
-MOST_STEPS = 25_000  # poses of the tool for which joint positions are solved
-
-
-def not_timed(error: RetimingFailed | TooLong) -> Result:
-    """The failure of a planner that times its paths itself."""
+def timing_failure(error: RetimingFailed | TooLong) -> Result:
+    """Return the failure of a planner that times its paths itself."""
     if isinstance(error, TooLong):
         return Result(error=error.code, message=str(error))
     return Result(error="retiming_failed", message=f"retiming: {error}")
 
 
-def too_fine(steps: float) -> Result | None:
-    """The refusal of a way of the tool in so many steps, or None for one that can be followed."""
-    if steps <= MOST_STEPS:
+def check_step_count(steps: float) -> Result | None:
+    """Return the refusal of a tool path with too many steps, or None."""
+    if steps <= MAX_STEPS:
         return None
-    return Result(error="too_long", message=f"the way takes {steps:.3g} steps of the tool, {MOST_STEPS} are the most")
+    return Result(error="too_long", message=f"the path takes {steps:.3g} steps of the tool; the limit is {MAX_STEPS}")

@@ -1,25 +1,25 @@
-"""The fastest timing of a path within velocity and acceleration limits, from rest to rest.
+"""The fastest timing of a path within velocity and acceleration limits, from rest to rest, and limited jerk.
 
 Reachability analysis along the path after Pham & Pham, "A New Approach to Time-Optimal Path Parameterization
 Based on Reachability Analysis" (IEEE T-RO 2018): a backward pass finds the highest speed at each grid point from
 which the end can still be reached, a forward pass goes as fast as that allows. The path's pieces are parabolas and
-the grid ends where they end, so that joint accelerations are linear between grid points and the limits, held at both
-ends of an interval, hold all along it. Between grid points x = (ds/dt)^2 is linear and u = d2s/dt2 constant.
+the grid ends where they end, so joint accelerations are linear between grid points, and limits that hold at both ends
+of an interval hold all along it. Between grid points x = (ds/dt)^2 is linear and u = d2s/dt2 constant.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from common.messages.robot import MOST_POINTS, MOST_SECONDS
-from common.planning.kernel.speeds import fastest
+from common.messages.robot import MOST_POINTS
+from common.planning.kernel.solvers import fastest_speeds
 from common.planning.path import SmoothPath
+from common.planning.trajectory import TimedPath, TooLong, cubics, end_accelerations, join
 from common.sources import monotonic
 
 Array = NDArray[np.float64]
@@ -27,45 +27,16 @@ Array = NDArray[np.float64]
 _TINY = 1e-12
 _REFINEMENTS = 5
 _OVERSHOOT = 1.01  # of the acceleration limits, by the cubics between the states
-_LEAST_INTERVALS = 20  # also on a short path: speed changes at grid points only
-
-
-@dataclass(frozen=True)
-class TimedPath:
-    """States of the joints at times from the start: times (N,) [s], positions, velocities, accelerations (N, dof)."""
-
-    times: Array
-    positions: Array
-    velocities: Array
-    accelerations: Array
-
-    @property
-    def duration(self) -> float:
-        """Seconds from the first to the last state."""
-        return float(self.times[-1])
+_MIN_INTERVALS = 20  # also on a short path: speed changes at grid points only
+_SHARP = 0.02  # of the largest jump of acceleration: a larger jump gets states where it begins and ends
+_SLOPE_CHANGE = 0.2  # of the jerk limit: the same where the acceleration's slope changes by more
+_MIN_GAP = 0.005  # of the averaging time, between two states
+_JERK_MARGIN = 0.02  # share by which a jerk limit may be exceeded
+_ROUNDING = 1e-3  # of the largest jump of acceleration: a smaller one is rounding
 
 
 class RetimingFailed(Exception):
-    """A path that cannot be followed within the limits, which only a broken path or limit brings about."""
-
-
-class TooLong(Exception):
-    """A path whose timing takes more time than there is, or more states than a trajectory may have."""
-
-    def __init__(self, code: str, message: str) -> None:
-        super().__init__(message)
-        self.code = code
-
-
-def require_tellable(trajectory: TimedPath) -> None:
-    """Return when a trajectory can be sent.
-
-    Raises:
-        TooLong: too_long: it has too many states, or takes longer than any motion does.
-    """
-    if (states := len(trajectory.times)) > MOST_POINTS or trajectory.duration > MOST_SECONDS:
-        told = f"the trajectory has {states} states and takes {trajectory.duration:.3g} s"
-        raise TooLong("too_long", f"{told}, {MOST_POINTS} states and {MOST_SECONDS:g} s are the most")
+    """A path that cannot be followed within the limits, which only a broken path or limit causes."""
 
 
 def parametrise(
@@ -77,16 +48,16 @@ def parametrise(
     braking: ArrayLike | None = None,
     deadline: float = math.inf,
 ) -> TimedPath:
-    """The time-optimal trajectory along a path, at rest at both ends.
+    """Return the time-optimal trajectory along a path, at rest at both ends.
 
     Args:
         path: pieces (P, dof).
         velocity, acceleration: limits (dof,) [rad/s], [rad/s^2].
         step: largest joint movement between grid points [rad].
-        speed: highest ds/dt: that of the tool along a path that is measured by the tool's way [m/s]. Or how it follows
-            from the path: (P + 1,) where its pieces meet.
-        braking: limits (dof,) that hold instead of `acceleration` where speed along the path is lost.
-        deadline: on the monotonic clock of common.sources [s], after which no finer grid is begun.
+        speed: highest ds/dt: that of the tool [m/s] along a path measured by the tool's travel; or a function of the
+            path that returns it (P + 1,) where its pieces meet.
+        braking: limits (dof,) that replace `acceleration` where speed along the path is lost.
+        deadline: on the monotonic clock [s], after which no finer grid is tried.
 
     Raises:
         RetimingFailed: no speed is feasible somewhere.
@@ -97,12 +68,12 @@ def parametrise(
     move = float((np.maximum(np.abs(path.d0), np.abs(path.d1)).max(axis=1) * path.lengths).sum())
     if not 0 < move < math.inf:
         raise RetimingFailed(f"the path moves the joints by {move:g} rad")
-    step = min(step, move / _LEAST_INTERVALS)
+    step = min(step, move / _MIN_INTERVALS)
     for _ in range(_REFINEMENTS):
         if monotonic() > deadline:
-            raise TooLong("timeout", "planning was ended while the path was timed")
+            raise TooLong("timeout", "planning ended while the path was timed")
         if (states := len(path.lengths) + move / step) > MOST_POINTS:
-            raise TooLong("too_long", f"the path takes {states:.3g} states, a trajectory has {MOST_POINTS} at most")
+            raise TooLong("too_long", f"the path takes {states:.3g} states; a trajectory has {MOST_POINTS} at most")
         trajectory = _timed(path.divided(step), limit_v, limit_a, limit_b, speed)
         if _overshoot(trajectory, np.maximum(limit_a, limit_b)) <= _OVERSHOOT:
             return trajectory
@@ -129,23 +100,15 @@ def _timed(
     )
 
 
-def end_accelerations(trajectory: TimedPath) -> tuple[Array, Array]:
-    """(N - 1, dof) accelerations at the beginning and the end of the cubics between the states."""
-    h = np.diff(trajectory.times)[:, None]
-    ahead = np.diff(trajectory.positions, axis=0) / h
-    v0, v1 = trajectory.velocities[:-1], trajectory.velocities[1:]
-    return (6 * ahead - 4 * v0 - 2 * v1) / h, (-6 * ahead + 2 * v0 + 4 * v1) / h
-
-
 def _overshoot(trajectory: TimedPath, limit_a: Array) -> float:
-    """Largest acceleration of the cubics as a share of the limits; they meet a bend exactly only where it is flat."""
+    """Return the largest acceleration of the cubics as a share of the limits: cubics only approximate bends."""
     return max(float((np.abs(values) / limit_a).max()) for values in end_accelerations(trajectory))
 
 
 def _profile(
     grid: SmoothPath, limit_v: Array, limit_a: Array, limit_b: Array, speed: float | Array
 ) -> tuple[Array, Array]:
-    """x (N + 1,) at the grid points and u (N,) between them."""
+    """Return x (N + 1,) at the grid points and u (N,) between them."""
     d0, d1, lengths = grid.d0, grid.d1, grid.lengths
     bends = (d1 - d0) / lengths[:, None]
     # Joint accelerations at both ends of an interval, as D u + C x with the x of its beginning.
@@ -157,13 +120,13 @@ def _profile(
     up, down = (np.where(flat, np.inf, np.concatenate([limit, limit]) / safe) for limit in (limit_a, limit_b))
     B = np.where(flat, 0.0, sign * C / safe)  # -down - B x <= u <= up - B x
     most = _highest_x(grid, limit_v, np.minimum(limit_a, limit_b), bends, speed)
-    count, found = len(lengths), fastest(lengths, up, down, B, np.array(most))
+    count, found = len(lengths), fastest_speeds(lengths, up, down, B, np.array(most))
     if isinstance(found, tuple):
         return found
     if found is not None:
         if found < count:
             raise RetimingFailed(f"no feasible speed at grid point {found} of {count}")
-        raise RetimingFailed(f"the path cannot be left at grid point {found - count} of {count}")
+        raise RetimingFailed(f"no feasible speed after grid point {found - count} of {count}")
     highest = _backward(most, lengths, down, B)
     return _forward(highest, lengths, up, B)
 
@@ -171,10 +134,10 @@ def _profile(
 def _highest_x(
     grid: SmoothPath, limit_v: Array, limit_a: Array, bends: Array, speed: float | Array
 ) -> list[float]:
-    """(N + 1,) x at which speed and velocities are within limits, and accelerations at constant speed.
+    """Return (N + 1,) x at which speed and velocities are within limits, and accelerations at constant speed.
 
-    A path may be followed somewhat faster into a bend if the speed changes just right in it; leaving that out makes
-    sure that each point which is reached can be left, also on a coarse grid.
+    A path could be followed somewhat faster into a bend if the speed changed just right in it. Leaving that out ensures
+    that each point that is reached can be left, also on a coarse grid.
     """
     slopes = np.abs(np.concatenate([grid.d0, grid.d1[-1:]]))
     most = np.minimum(((limit_v / np.maximum(slopes, _TINY)) ** 2).min(axis=1), speed**2)
@@ -186,7 +149,7 @@ def _highest_x(
 
 
 def _backward(most: list[float], lengths: Array, A: Array, B: Array) -> list[float]:
-    """(N + 1,) highest x from which the next point's range can be reached, from the end to the start.
+    """Return (N + 1,) the highest x from which the next point's range can be reached, from the end to the start.
 
     x + 2 L u <= next, with the lowest u = max(-A - B x): each line gives x (1 - 2 L B) <= next + 2 L A.
     """
@@ -209,80 +172,56 @@ def _backward(most: list[float], lengths: Array, A: Array, B: Array) -> list[flo
 
 
 def _forward(highest: list[float], lengths: Array, A: Array, B: Array) -> tuple[Array, Array]:
-    """The fastest x and u, from the start to the end."""
+    """Return the fastest x and u, from the start to the end."""
     As, Bs, Ls = A.tolist(), B.tolist(), lengths.tolist()
     x, xs, us = 0.0, [0.0], []
     for i, length in enumerate(Ls):
         u = min(a - b * x for a, b in zip(As[i], Bs[i], strict=True))
         following = min(highest[i + 1], x + 2 * length * u)
         if following < 0 or (following <= 0 and x <= 0):
-            raise RetimingFailed(f"the path cannot be left at grid point {i} of {len(Ls)}")
+            raise RetimingFailed(f"no feasible speed after grid point {i} of {len(Ls)}")
         us.append((following - x) / (2 * length))
         x = following
         xs.append(x)
     return np.array(xs), np.array(us)
 
 
-def stretch(trajectory: TimedPath, scale: float) -> TimedPath:
-    """The same motion slower: times t / s, velocities v s, accelerations a s^2.
-
-    Raises:
-        ValueError: the scale is not within 0 to 1.
-    """
-    if not (0 < scale <= 1 and math.isfinite(scale)):
-        raise ValueError(f"scale {scale:g} is not within 0 to 1")
-    return TimedPath(
-        trajectory.times / scale,
-        trajectory.positions,
-        trajectory.velocities * scale,
-        trajectory.accelerations * scale**2,
-    )
-
-
-_SHARP = 0.02  # of the largest jump of acceleration: at one that is larger states tell where that begins and ends
-_BENDS = 0.2  # of the jerk limit: the same where acceleration's slope changes by more
-_CLOSEST = 0.005  # of the time that is averaged over, between two states
-_KEPT = 0.02  # share of a limit of jerk by which it may be exceeded
-_ROUNDING = 1e-3  # of the largest jump of acceleration: one that is smaller is none
-
-
 def limited_jerk(trajectory: TimedPath, jerk: ArrayLike) -> TimedPath:
-    """The trajectory with limited jerk (dof,) [rad/s^3]: its average over a short time T, by which it takes longer.
+    """Return the trajectory with limited jerk (dof,) [rad/s^3]: its average over a short time T, longer by T.
 
-    An average keeps all bounds of positions, velocities and accelerations, and changes acceleration by no more than
-    twice its peak in T. From the path it is off by at most a T^2 / 24: 0.1 mrad at 5 rad/s^2 and 20 ms. The states lie
-    where the acceleration's slope changes, so that cubics and quintics between them are the same but for a trifle.
-    Where it rests it rests afterwards, too.
+    An average respects all bounds of positions, velocities and accelerations, and changes acceleration by at most twice
+    its peak in T. It leaves the path by at most a T^2 / 24: 0.1 mrad at 5 rad/s^2 and 20 ms. The states lie where the
+    acceleration's slope changes, so cubics and quintics between them hardly differ. Stops of the trajectory remain.
     """
-    rests = np.flatnonzero(np.abs(trajectory.velocities[1:-1]).max(axis=1, initial=0.0) < _TINY) + 1
-    if not len(rests):
+    stops = np.flatnonzero(np.abs(trajectory.velocities[1:-1]).max(axis=1, initial=0.0) < _TINY) + 1
+    if not len(stops):
         return _averaged(trajectory, np.asarray(jerk, dtype=float))
     parts = [
         TimedPath(trajectory.times[a : b + 1] - trajectory.times[a], *(values[a : b + 1] for values in (
             trajectory.positions, trajectory.velocities, trajectory.accelerations)))
-        for a, b in pairwise([0, *rests.tolist(), len(trajectory.times) - 1])
+        for a, b in pairwise([0, *stops.tolist(), len(trajectory.times) - 1])
     ]
     return join([limited_jerk(part, jerk) for part in parts])
 
 
 def _averaged(trajectory: TimedPath, limit: Array) -> TimedPath:
-    """A trajectory that does not rest between its ends, averaged for a limit of jerk (dof,) [rad/s^3]."""
+    """Return a trajectory without stops between its ends, averaged for a jerk limit (dof,) [rad/s^3]."""
     begin, finish = end_accelerations(trajectory)
     still = np.zeros((1, begin.shape[1]))
     jumps = np.abs(np.concatenate([begin, still]) - np.concatenate([still, finish]))
     peaks = np.maximum(np.abs(begin), np.abs(finish)).max(axis=0)
     slopes = (finish - begin) / np.diff(trajectory.times)[:, None]
     span = float((2 * peaks / limit).max())
-    if (np.abs(slopes) <= limit * (1 + _KEPT)).all() and (jumps <= _ROUNDING * span * limit).all():
+    if (np.abs(slopes) <= limit * (1 + _JERK_MARGIN)).all() and (jumps <= _ROUNDING * span * limit).all():
         return trajectory
     bends = np.abs(np.diff(np.concatenate([still, slopes, still]), axis=0))
-    sharp = (jumps > _SHARP * span * limit).any(axis=1) | (bends > _BENDS * limit).any(axis=1)
+    sharp = (jumps > _SHARP * span * limit).any(axis=1) | (bends > _SLOPE_CHANGE * limit).any(axis=1)
     sharp[[0, -1]] = True
     at, end = trajectory.times, trajectory.duration + span
     wanted = np.unique(np.concatenate([at[sharp], at[sharp] + span, at[~sharp] + span / 2]))
     times = [0.0]
     for time in wanted[:-1].tolist():
-        if times[-1] + _CLOSEST * span < time < end - _CLOSEST * span:
+        if times[-1] + _MIN_GAP * span < time < end - _MIN_GAP * span:
             times.append(time)
     t = np.array([*times, end])
     now, before = _with_integral(trajectory, t), _with_integral(trajectory, t - span)
@@ -294,65 +233,18 @@ def _averaged(trajectory: TimedPath, limit: Array) -> TimedPath:
 
 
 def _with_integral(trajectory: TimedPath, times: Array) -> tuple[Array, Array, Array]:
-    """(N, dof) integrals of the way from the start, that way, and its change per second; at rest outside."""
+    """Return (N, dof) the integral of the offset from the start, that offset, and its rate; at rest outside."""
     t, ends = trajectory.times, np.clip(times, 0.0, trajectory.duration)
     i = np.clip(np.searchsorted(t, ends, side="right") - 1, 0, len(t) - 2)
     h = np.diff(t)[:, None]
     pieces = cubics(trajectory)
     pieces[:, 0] -= trajectory.positions[0]
-    whole = (pieces / np.array([1, 2, 3, 4])[:, None]).sum(axis=1) * h
-    sums = np.concatenate([np.zeros((1, whole.shape[1])), np.cumsum(whole, axis=0)])
+    full = (pieces / np.array([1, 2, 3, 4])[:, None]).sum(axis=1) * h
+    sums = np.concatenate([np.zeros((1, full.shape[1])), np.cumsum(full, axis=0)])
     r, h = ((ends - t[i]) / (t[i + 1] - t[i]))[:, None], h[i]
     c0, c1, c2, c3 = pieces[i].transpose(1, 0, 2)
-    way = c0 + r * (c1 + r * (c2 + r * c3))
+    offset = c0 + r * (c1 + r * (c2 + r * c3))
     integral = sums[i] + h * r * (c0 + r * (c1 / 2 + r * (c2 / 3 + r * c3 / 4)))
     beyond = (times - ends)[:, None]
     speed = np.where(beyond == 0.0, (c1 + r * (2 * c2 + 3 * r * c3)) / h, 0.0)
-    return integral + np.maximum(beyond, 0.0) * way, way, speed
-
-
-def join(parts: Sequence[TimedPath]) -> TimedPath:
-    """Trajectories one after the other; each begins at rest where the one before came to rest."""
-    times, last = [parts[0].times], parts[0].duration
-    for part in parts[1:]:
-        times.append(part.times[1:] + last)
-        last += part.duration
-    rest = parts[1:]
-    return TimedPath(
-        np.concatenate(times),
-        np.concatenate([parts[0].positions, *(part.positions[1:] for part in rest)]),
-        np.concatenate([parts[0].velocities, *(part.velocities[1:] for part in rest)]),
-        np.concatenate([parts[0].accelerations, *(part.accelerations[1:] for part in rest)]),
-    )
-
-
-def sample(trajectory: TimedPath, times: ArrayLike) -> Array:
-    """(N, dof) positions at times [s]: cubic Hermite interpolation between states, as the controller does."""
-    t = np.clip(np.asarray(times, dtype=float), 0.0, trajectory.duration)
-    i = np.clip(np.searchsorted(trajectory.times, t, side="right") - 1, 0, len(trajectory.times) - 2)
-    span = (trajectory.times[i + 1] - trajectory.times[i])[:, None]
-    r = (t - trajectory.times[i])[:, None] / span
-    q0, q1 = trajectory.positions[i], trajectory.positions[i + 1]
-    v0, v1 = trajectory.velocities[i] * span, trajectory.velocities[i + 1] * span
-    return np.array(
-        q0 + r * v0 + r**2 * (3 * (q1 - q0) - 2 * v0 - v1) + r**3 * (2 * (q0 - q1) + v0 + v1)
-    )
-
-
-def cubics(trajectory: TimedPath) -> Array:
-    """(N - 1, 4, dof) coefficients c0 + c1 r + c2 r^2 + c3 r^3 between states, r from 0 to 1: what `sample` follows."""
-    span = np.diff(trajectory.times)[:, None]
-    q0, q1 = trajectory.positions[:-1], trajectory.positions[1:]
-    v0, v1 = trajectory.velocities[:-1] * span, trajectory.velocities[1:] * span
-    return np.stack([q0, v0, 3 * (q1 - q0) - 2 * v0 - v1, 2 * (q0 - q1) + v0 + v1], axis=1)
-
-
-def moving_samples(trajectory: TimedPath, step: float) -> tuple[Array, Array]:
-    """(N, dof) positions [rad] and velocities [rad/s] along a trajectory, its joints moving by `step` [rad] between."""
-    pieces = cubics(trajectory)
-    spans = np.diff(trajectory.times)
-    counts = np.maximum(2, np.ceil(np.abs(pieces[:, 1:]).sum(axis=1).max(axis=1) / step).astype(int))
-    owners = np.repeat(np.arange(len(counts)), counts)
-    r = ((np.arange(len(owners)) - np.repeat(np.cumsum(counts) - counts, counts)) / counts[owners])[:, None]
-    c0, c1, c2, c3 = pieces[owners].transpose(1, 0, 2)
-    return c0 + r * (c1 + r * (c2 + r * c3)), (c1 + r * (2 * c2 + 3 * r * c3)) / spans[owners, None]
+    return integral + np.maximum(beyond, 0.0) * offset, offset, speed

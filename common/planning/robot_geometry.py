@@ -1,4 +1,4 @@
-"""The robot's collision geometry, loaded once: convex hulls, pairs that can collide, how far joints move points."""
+"""The robot's collision geometry, loaded once: convex hulls, pairs that can collide, levers of the joints."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from common.robot.model import RobotModel
 
 Array = NDArray[np.float64]
 
-_KEPT = 32  # openings of the fingers
+_CACHED_WIDTHS = 32  # of the gripper
 
 
 class RobotGeometry:
@@ -32,7 +32,7 @@ class RobotGeometry:
         """Load the collision meshes of a robot as hulls.
 
         Raises:
-            ConfigError: a mesh is not there, or the SRDF does not parse.
+            ConfigError: a mesh is missing, or the SRDF does not parse.
         """
         self.robot = robot
         full = convex_hulls(robot.full_geometry(pin.GeometryType.COLLISION))
@@ -42,8 +42,8 @@ class RobotGeometry:
             try:
                 pin.removeCollisionPairs(robot.model, geometry, str(robot.srdf), False)
             except (ValueError, RuntimeError) as error:
-                said = " ".join(str(error).split())
-                raise ConfigError("robot.srdf", str(robot.srdf), f"does not parse: {said}") from None
+                reason = " ".join(str(error).split())
+                raise ConfigError("robot.srdf", str(robot.srdf), f"does not parse: {reason}") from None
         self.geometry = geometry
         self._full_data = robot.full_model.createData()
         self.links: list[str] = [robot.model.frames[item.parentFrame].name for item in geometry.geometryObjects]
@@ -55,16 +55,19 @@ class RobotGeometry:
 
     @cached_property
     def kernel_shapes(self) -> list[Shape]:
-        """The hulls as the compiled kernel wants them.
+        """The hulls as shapes of the compiled kernel.
 
         Raises:
-            NoKernel: one is a shape that it does not know.
+            KernelUnavailable: the kernel does not support one of them.
         """
         return [Shape.of(item.geometry) for item in self.geometry.geometryObjects]
 
     def _moved_by_fingers(self, full: pin.GeometryModel) -> list[tuple[int, int, int, pin.SE3]]:
-        """Hulls that the fingers' joints move: index, joints of the full model that carry it with fingers locked and
-        not, and its placement in the latter."""
+        """Return hulls that the gripper's joints move.
+
+        Each as its index, the joints of the full model that carry it with the gripper locked and not, and its placement
+        in the latter.
+        """
         robot, gripper = self.robot, self.robot.config.gripper
         joints = {robot.full_model.getJointId(name) for name in (gripper.joints if gripper else [])}
         found = []
@@ -75,9 +78,9 @@ class RobotGeometry:
         return found
 
     def finger_placements(self, width: float | None) -> list[tuple[int, pin.SE3]]:
-        """Index of each hull that the fingers move, and its placement in the joint that carries it, at a width [m].
+        """Return the index of each hull that the gripper moves, and its placement in its joint, at a width [m].
 
-        None: where the robot file holds them.
+        None: the width at which the robot file locks the gripper.
         """
         if width is None:
             return [(index, self.geometry.geometryObjects[index].placement) for index, *_ in self._fingers]
@@ -95,7 +98,7 @@ class RobotGeometry:
         ]
 
     def opening(self, width: float | None) -> list[tuple[int, pin.SE3, Array]]:
-        """As `finger_placements`, each with its lever; those of the newest widths are kept."""
+        """Return `finger_placements`, each with its lever; the newest widths are cached."""
         found = self._openings.get(width)
         if found is None:
             found = []
@@ -103,16 +106,16 @@ class RobotGeometry:
                 item = self.geometry.geometryObjects[index]
                 moved = pin.GeometryObject(item.name, item.parentJoint, item.parentFrame, placement, item.geometry)
                 found.append((index, placement, self.lever(moved)))
-            if len(self._openings) >= _KEPT:
+            if len(self._openings) >= _CACHED_WIDTHS:
                 self._openings.pop(next(iter(self._openings)))
             self._openings[width] = found
         return found
 
     def lever(self, item: pin.GeometryObject) -> Array:
-        """(dof,) [m]: while joint j turns by one radian no point of the shape moves farther than lever[j].
+        """Return (dof,) [m]: while joint j turns by one radian, no point of the shape moves farther than lever[j].
 
-        A point lies no farther from a joint's axis than the path to it along the chain of joints between. Zero for
-        joints that do not move the shape.
+        A point is no farther from a joint's axis than the length of the chain of joints to it. Zero for joints that do
+        not move the shape.
         """
         model = self.robot.model
         lever = np.zeros(model.nq)
@@ -131,7 +134,7 @@ class RobotGeometry:
 
 
 def convex_hulls(geometry: pin.GeometryModel) -> pin.GeometryModel:
-    """The same model with a convex hull in place of each mesh: hulls check several times faster."""
+    """Replace each mesh of the model by its convex hull, which checks several times faster, and return the model."""
     for item in geometry.geometryObjects:
         if isinstance(item.geometry, coal.BVHModelBase):
             item.geometry.buildConvexHull(True, "Qt")
@@ -140,7 +143,7 @@ def convex_hulls(geometry: pin.GeometryModel) -> pin.GeometryModel:
 
 
 def _joint_axes(model: pin.Model) -> list[Array | None]:
-    """Unit axis of each revolute joint in its own frame; None for joints that do not turn about one axis."""
+    """Return the unit axis of each revolute joint in its own frame; None for joints that do not turn about one axis."""
     data = model.createData()
     jacobian = np.array(pin.computeJointJacobians(model, data, pin.neutral(model)))
     axes: list[Array | None] = [None]
@@ -151,14 +154,14 @@ def _joint_axes(model: pin.Model) -> list[Array | None]:
 
 
 def _farthest_from_axis(points: Array, axis: Array | None) -> float:
-    """Largest distance [m] of points (N, 3) from an axis through the origin; a prismatic joint moves all by one."""
+    """Return the largest distance [m] of points (N, 3) from an axis through the origin; 1 for a prismatic joint."""
     if axis is None:
         return 1.0
     return float(np.linalg.norm(points - np.outer(points @ axis, axis), axis=1).max())
 
 
 def shape_corners(shape: coal.CollisionGeometry, placement: pin.SE3) -> Array:
-    """(8, 3) corners [m] of the box about a shape, in the frame in which the shape is placed."""
+    """Return (8, 3) corners [m] of the bounding box of a shape, in the frame in which the shape is placed."""
     shape.computeLocalAABB()
     low, high = np.array(shape.aabb_local.min_), np.array(shape.aabb_local.max_)
     corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
@@ -166,5 +169,5 @@ def shape_corners(shape: coal.CollisionGeometry, placement: pin.SE3) -> Array:
 
 
 def largest(levers: Sequence[Array]) -> Array:
-    """(dof,) the largest lever of each joint."""
+    """Return (dof,) the largest lever of each joint."""
     return np.asarray(np.max(np.array(levers), axis=0))

@@ -1,4 +1,4 @@
-"""The last check of a trajectory before it leaves: what a real controller would refuse, and collisions."""
+"""The last check of a trajectory before it is sent: what a real controller would refuse, and collisions."""
 
 from __future__ import annotations
 
@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from common.messages import JointTrajectory
 from common.planning.collision import CollisionWorld, Pair
-from common.planning.retiming import TimedPath, cubics, end_accelerations, sample
+from common.planning.trajectory import TimedPath, cubics, end_accelerations, sample
 from common.robot.model import RobotModel
 
 Array = NDArray[np.float64]
@@ -21,7 +20,7 @@ _CLOSE = 1e-4  # [rad]
 
 @dataclass(frozen=True)
 class Fault:
-    """Why a trajectory may not be executed: `code` for programs, the message for people."""
+    """Why a trajectory may not be executed: code for programs, message for people."""
 
     code: str
     message: str
@@ -39,20 +38,20 @@ def validate(
     acceleration: ArrayLike,
     step: float,
 ) -> Fault | None:
-    """The first fault of a trajectory, or None. That it is free is proved for all of it, where the kernel can do so.
+    """Return the first fault of a trajectory, or None. The kernel proves all of it free where it can.
 
     Args:
         trajectory: states (N, dof).
         robot: the model, for position limits and names.
-        world: what may not be touched; its rule for contact at the start holds here as well.
+        world: obstacles; its rule for contact at the start applies here as well.
         start: (dof,) [rad] where the robot is.
         velocity, acceleration: limits (dof,) [rad/s], [rad/s^2].
-        step: largest joint step between states that are checked for collision where there is no proof [rad].
+        step: largest joint step [rad] between states that are checked for collision where the kernel proves nothing.
     """
     fault = check_numbers(trajectory, robot, start=start, velocity=velocity, acceleration=acceleration)
     if fault is not None:
         return fault
-    proved, hit = world.curves_judged(cubics(trajectory))
+    proved, hit = world.check_cubics(cubics(trajectory))
     if proved:
         return None
     if hit is not None:
@@ -68,7 +67,7 @@ def validate(
 
 
 def fine_samples(trajectory: TimedPath, step: float) -> tuple[Array, NDArray[np.int64]]:
-    """(N, dof) positions along a trajectory, no joint moving by more than `step` [rad] between, and their intervals."""
+    """Return (N, dof) positions along a trajectory at most `step` [rad] apart, and the interval of each."""
     spans = np.diff(trajectory.times)
     speeds = np.abs(trajectory.velocities).max(axis=1)
     moves = np.maximum(
@@ -83,7 +82,7 @@ def fine_samples(trajectory: TimedPath, step: float) -> tuple[Array, NDArray[np.
 
 
 def _outwards(q: Array, lower: Array, upper: Array) -> Array:
-    """(N, dof) [rad] how far positions are beyond a limit and farther out than the ones before; 0 or less for none."""
+    """Return (N, dof) [rad] how far positions exceed a limit and the position before; 0 or less for none."""
     before = np.concatenate([q[:1], q[:-1]])
     excess: Array = np.maximum(np.minimum(lower - 1e-6, before) - q, q - np.maximum(upper + 1e-6, before))
     return excess
@@ -92,7 +91,7 @@ def _outwards(q: Array, lower: Array, upper: Array) -> Array:
 def check_numbers(
     trajectory: TimedPath, robot: RobotModel, *, start: ArrayLike, velocity: ArrayLike, acceleration: ArrayLike
 ) -> Fault | None:
-    """The first fault of a trajectory's numbers: finite, times, start, rest, limits, and that they agree."""
+    """Return the first fault of a trajectory's numbers: finite, times, start, rest, limits, consistency; or None."""
     times, q, dq, ddq = trajectory.times, trajectory.positions, trajectory.velocities, trajectory.accelerations
     limit_v, limit_a = np.asarray(velocity, dtype=float), np.asarray(acceleration, dtype=float)
     if len(times) < 2 or not (len(times) == len(q) == len(dq) == len(ddq)) or q.shape[1] != robot.dof:
@@ -105,7 +104,7 @@ def check_numbers(
     away = np.abs(q[0] - np.asarray(start, dtype=float))
     if (away > _CLOSE).any():
         joint = int(np.argmax(away))
-        return Fault("start_mismatch", f"begins {away[joint]:.4f} rad away from {robot.joint_names[joint]}'s start", 0)
+        return Fault("start_mismatch", f"starts {away[joint]:.4f} rad away from {robot.joint_names[joint]}'s start", 0)
     if max(np.abs(dq[0]).max(), np.abs(dq[-1]).max()) > 1e-6:
         return Fault("not_at_rest", "does not start and end at rest")
     h = spans[:, None]
@@ -117,8 +116,8 @@ def check_numbers(
         ("velocity_limit", np.abs(dq) - (1 + TOLERANCE) * limit_v, lambda j: f"{limit_v[j]:.3f} rad/s"),
         ("velocity_limit", np.abs(peak) - (1 + TOLERANCE) * limit_v, lambda j: f"{limit_v[j]:.3f} rad/s"),
         ("acceleration_limit", np.abs(ddq) - (1 + TOLERANCE) * limit_a, lambda j: f"{limit_a[j]:.3f} rad/s^2"),
-        ("inconsistent", np.abs(begin) - (1 + TOLERANCE) * limit_a - 1e-6 / h, lambda j: "what its states say"),
-        ("inconsistent", np.abs(finish) - (1 + TOLERANCE) * limit_a - 1e-6 / h, lambda j: "what its states say"),
+        ("inconsistent", np.abs(begin) - (1 + TOLERANCE) * limit_a - 1e-6 / h, lambda j: "the limit between states"),
+        ("inconsistent", np.abs(finish) - (1 + TOLERANCE) * limit_a - 1e-6 / h, lambda j: "the limit between states"),
     ]
     for code, excess, limit in checks:
         if (excess > 0).any():
@@ -126,15 +125,3 @@ def check_numbers(
             message = f"waypoint {waypoint} of {len(times)}: {robot.joint_names[joint]} exceeds {limit(joint)}"
             return Fault(code, message, waypoint)
     return None
-
-
-def timed_path(trajectory: JointTrajectory) -> TimedPath:
-    """The arrays of a trajectory message."""
-    points = trajectory.points
-    dof = len(trajectory.joint_names)
-    return TimedPath(
-        np.array([p.time_from_start for p in points]),
-        np.array([p.positions for p in points]).reshape(-1, dof),
-        np.array([p.velocities for p in points]).reshape(-1, dof),
-        np.array([p.accelerations for p in points]).reshape(-1, dof),
-    )

@@ -7,7 +7,7 @@ import asyncio
 from common import topics
 from common.config import Surroundings
 from common.messages import CameraInfo, Header
-from common.perception.intake import Cameras, Unusable
+from common.perception.camera_input import CameraCache, FrameError
 from common.perception.pinhole import Pinhole
 from common.topics import Topic
 from common.transport.bus import Bus
@@ -23,7 +23,7 @@ class CameraReader:
         self._infos, self._statics = bus.reader(info), bus.reader(topics.TF_STATIC)
         self._on_robot = {camera.frame for camera in around.cameras.values() if camera.mount}
         self._tf = bus.reader(topics.TF) if self._on_robot else None
-        self._cameras = Cameras()
+        self._cameras = CameraCache()
         self._news = asyncio.Event()
 
     async def follow(self) -> None:
@@ -53,7 +53,7 @@ class CameraReader:
             own_frame: whether the frame is the camera's; else that of camera_info is meant.
 
         Raises:
-            Unusable: it is not known, or nobody said within a moment where it was.
+            FrameError: it is not known, or nobody said within a moment where it was.
         """
         frame = picture.frame_id if own_frame else ""
         if not self.moves(frame):
@@ -64,7 +64,7 @@ class CameraReader:
                     self._news.clear()
                     try:
                         return self._now(frame, picture.stamp)
-                    except Unusable as error:
+                    except FrameError as error:
                         if error.kind != "early":
                             raise
                     await self._news.wait()

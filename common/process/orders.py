@@ -19,7 +19,6 @@ PLAN_OVERTIME = 5.0  # [s] wall: that a plan may take beyond its planning time
 REFUSED_AGAIN = 0.1  # [s] wall: what is told of the second refusal of a motion in a row; it doubles with each
 LONGEST_REFUSED = 2.0  # [s] wall
 LETS_GO = "lets go"  # of what a person said
-PERSON = "person"  # who says so without a name
 BY_THEMSELVES = ("watchdog", "controller", "scene_monitor")  # let go of their holds: no person does
 
 # A person's stops and holds that were not answered yet, as kind and name of who said so.
@@ -66,7 +65,7 @@ class Orders(Generic[V]):
         self._keeping: Keeping = {}
         self._ended: dict[int, asyncio.Event] = {}  # by the identity of a command: whether it was answered, or is void
         self._refused = 0  # motions in a row
-        self._newest = 0  # `since` of the newest inhibit that we were answered with
+        self._newest = 0  # `since` of the newest interlock that we were answered with
 
     @property
     def serving(self) -> dict[str, bool]:
@@ -79,7 +78,7 @@ class Orders(Generic[V]):
             command.header = self._bus.header()  # of the decision, however often it is sent
         keeps = {keeping: said for keeping, said in self._keeping.items() if not keeping.done()}
         self._asking = {kind: doing for kind, doing in self._asking.items() if not doing.done()}
-        lets_go = isinstance(command, m.HoldRequest) and command.by == "person" and not command.hold
+        lets_go = isinstance(command, m.HoldRequest) and command.by == "operator" and not command.hold
         for kind in _voided(command):
             void = self._asking.pop(kind, None)
             if void is not None:
@@ -87,9 +86,9 @@ class Orders(Generic[V]):
         doing = self._asking[_kind(command)] = group.create_task(
             self._do(command, keeps if lets_go else {}, self._heard_of() if lets_go else None))
         doing.add_done_callback(lambda _: self._over(command))
-        if not lets_go and isinstance(command, m.HoldRequest | m.StopRequest) and command.by == "person":
+        if not lets_go and isinstance(command, m.HoldRequest | m.StopRequest) and command.by == "operator":
             kept = "stopped" if isinstance(command, m.StopRequest) else "held"
-            self._keeping = {**keeps, doing: (kept, command.owner or PERSON)}
+            self._keeping = {**keeps, doing: (kept, command.owner or m.UNKNOWN_OPERATOR)}
 
     async def carried_out(self, asked: list[Command]) -> bool:
         """Whether that was answered, which is not waited for while nobody is there to answer."""
@@ -108,17 +107,18 @@ class Orders(Generic[V]):
             for number in events:
                 self._ended.pop(number, None)
 
-    async def _do(self, command: Command, before: Keeping, heard: int | None) -> m.MotionStatus | None:
+    async def _do(self, command: Command, before: Keeping, acknowledged: int | None) -> m.MotionStatus | None:
         """Send what a command stands for, after what was said before it; what is refused is an answer too.
 
         What lets go does so of what was `heard` of until it was said, and of what was said here before it.
         """
-        heard = wall_ns() if heard is None else heard  # of a robot that is away: what is said while it is asked stays
+        if acknowledged is None:  # a robot that is away: interlocks set while it is asked stay
+            acknowledged = wall_ns()
         if before:  # what lets go must not be overtaken by what it lets go of
             await asyncio.wait(before)
-        if isinstance(command, m.HoldRequest) and command.by == "person" and not command.hold:
-            command.heard = _until(heard, before) if command.heard is None else min(
-                command.heard, max(heard, self._heard_of() or 0))
+        if isinstance(command, m.HoldRequest) and command.by == "operator" and not command.hold:
+            command.acknowledged = _until(acknowledged, before) if command.acknowledged is None else min(
+                command.acknowledged, max(acknowledged, self._heard_of() or 0))
         return await self._send(command)
 
     def _over(self, command: Command) -> None:
@@ -165,7 +165,7 @@ class Orders(Generic[V]):
         return answer
 
     def _heard_of(self) -> int | None:
-        """`since` of the newest inhibit that we know of; None when we know nothing of the robot."""
+        """`since` of the newest interlock that we know of; None when we know nothing of the robot."""
         view = self._look()
         motion = view.motion if view else None
         return self._newest or None if motion is None else max(self._newest, motion.newest)
@@ -175,25 +175,25 @@ def _kind(command: Command) -> str:
     """What a command is of which only the newest counts; a watchdog's hold is not a person's, nor that another's."""
     if not isinstance(command, m.HoldRequest):
         return f"{type(command).__name__} "
-    if command.by == "person":
+    if command.by == "operator":
         return f"{type(command).__name__} person {command.owner}" if command.hold else LETS_GO
     return f"{type(command).__name__} {command.by}"
 
 
-def _until(heard: int, before: Keeping) -> int:
-    """`since` of the newest inhibit to let go of: one that was heard of, or that was answered meanwhile.
+def _until(acknowledged: int, before: Keeping) -> int:
+    """`since` of the newest interlock to let go of: one that was heard of, or that was answered meanwhile.
 
     What somebody else said before those were answered, and all later than that, stays.
     """
     answers = [doing.result() for doing in before if not doing.cancelled() and doing.exception() is None]
-    inhibits = {one.since: one for answer in answers if answer is not None for one in answer.inhibits
+    interlocks = {one.since: one for answer in answers if answer is not None for one in answer.interlocks
                 if one.kind == "stopped" or one.by not in BY_THEMSELVES}
-    for since in sorted(inhibits):
-        if since > heard:
-            if (inhibits[since].kind, inhibits[since].by) not in before.values():
+    for since in sorted(interlocks):
+        if since > acknowledged:
+            if (interlocks[since].kind, interlocks[since].by) not in before.values():
                 break
-            heard = since
-    return heard
+            acknowledged = since
+    return acknowledged
 
 
 def _voided(command: Command) -> tuple[str, ...]:
@@ -202,7 +202,7 @@ def _voided(command: Command) -> tuple[str, ...]:
     By a stop the motion before it, by a person's also what was to let go; by a hold that person's one before it.
     """
     if isinstance(command, m.StopRequest):
-        return f"{m.ExecuteRequest.__name__} ", *((LETS_GO,) if command.by == "person" else ())
+        return f"{m.ExecuteRequest.__name__} ", *((LETS_GO,) if command.by == "operator" else ())
     if not isinstance(command, m.HoldRequest):
         return ()
-    return _kind(command), *((LETS_GO,) if command.by == "person" else ())
+    return _kind(command), *((LETS_GO,) if command.by == "operator" else ())

@@ -10,12 +10,12 @@ from typing import Any, Generic, Protocol, TypeVar
 from common import messages as m
 from common import topics
 from common.errors import Refused, RequestFailed
-from common.process.orders import BY_THEMSELVES, GOAL_TIMEOUT, PERSON, Answered, Orders
+from common.process.orders import BY_THEMSELVES, GOAL_TIMEOUT, Answered, Orders
 from common.process.task_memory import Memory
 from common.robot.model import RobotModel
 from common.robot.transforms import matrix_to_pose
 from common.sources import monotonic, new_id
-from common.tasks.deciding import TaskConfig
+from common.tasks.decisions import TaskConfig
 from common.tasks.engine import Task
 from common.tasks.stages import Command, View, without_far
 from common.tasks.watchdogs import LOOK_PERIOD, LivenessWatchdog
@@ -29,7 +29,7 @@ WAITS = "the arm waits: "
 ENDED = ("DONE", "ERROR")
 NOT_ANSWERED = "trajectory_executor has not answered yet: until it does, this does not outlive the task"
 OWN_PERIOD = 0.2  # [s] wall between two times that the motion is asked for: what came of it is heard meanwhile
-SOMEBODY = ("", PERSON, *BY_THEMSELVES)  # whose holds are nobody's own
+SHARED_HOLDERS = ("", m.UNKNOWN_OPERATOR, *BY_THEMSELVES)  # whose holds are no named operator's
 
 C = TypeVar("C", bound=TaskConfig)
 S = TypeVar("S", bound=m.TaskStatus)
@@ -180,11 +180,11 @@ class TaskRunner(Generic[V]):
         _require_allowed(command, view.motion if view else None, self._owner.latest)
         asked = self._task.command(command.command, view)
         for request in asked:
-            if isinstance(request, m.HoldRequest | m.StopRequest) and request.by == "person":
+            if isinstance(request, m.HoldRequest | m.StopRequest) and request.by == "operator":
                 request.owner = command.by
             if isinstance(request, m.HoldRequest):
                 request.override = command.override and not request.hold
-                request.heard = command.heard
+                request.acknowledged = command.acknowledged
         self._told += asked
         self._woken.set()
         now, answered = self._task.status, await self._orders.carried_out(asked)
@@ -229,11 +229,12 @@ def _require_allowed(command: m.TaskCommand, motion: m.MotionStatus | None, owne
         raise Refused("stopped", f"the robot is {motion.stopped}: start the task to go on")
     if command.override or command.command not in ("start", "resume"):
         return
-    if owner is not None and owner.asked and owner.kind != "task" and owner.owner not in (PERSON, command.by):
-        raise Refused("not_owner", f"the motion is {owner.told}: only they hand it over, unless you override that")
+    unnamed = m.UNKNOWN_OPERATOR
+    if owner is not None and owner.asked and owner.kind != "task" and owner.owner not in (unnamed, command.by):
+        raise Refused("not_owner", f"the motion is {owner.description}: only the owner gives it back; else override")
     if motion is None:
         return
-    others = [inhibit.told for inhibit in motion.inhibits
-              if inhibit.kind == "held" and inhibit.by not in (*SOMEBODY, command.by)]
+    others = [interlock.description for interlock in motion.interlocks
+              if interlock.kind == "held" and interlock.by not in (*SHARED_HOLDERS, command.by)]
     if others:
         raise Refused("held", f"the robot is {'; '.join(others)}: only they let go of it, unless you override that")

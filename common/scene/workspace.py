@@ -13,7 +13,7 @@ import numpy.typing as npt
 from pydantic import Field, model_validator
 
 from common.config import Grasp, Parameters, Tunable, check
-from common.planning.free_axes import about, chooses, solve_down, why_not_in
+from common.planning.ik import controls_full_pose, explain_region_unreachable, pose_region, solve_tool_down_ik
 from common.robot.model import RobotModel
 from common.robot.transforms import tool_down
 
@@ -97,18 +97,19 @@ def chain_reason(
     arm that cannot choose yaw and tilt it is looked at length for what it misses them by, unless it is not `explained`.
     """
     furthest, worst = -1, ""
-    for yaw in yaw_candidates(bounds.yaw_count) if chooses(robot) else (0.0,):
+    for yaw in yaw_candidates(bounds.yaw_count) if controls_full_pose(robot) else (0.0,):
         stage, reason = _chain(robot, position, yaw, grasp, bounds)
         if not reason:
             return ""
         if stage > furthest:
             furthest, worst = stage, reason
-    if chooses(robot) or not explained:
+    if controls_full_pose(robot) or not explained:
         return worst
     x, y, z = position
     low = grasp.height(z)
     T = tool_down(x, y, low + (grasp.approach_clearance, 0.0, 0.0, grasp.lift_height)[furthest])
-    return f"{worst}: {why_not_in(robot, about(robot, T, grasp.tilt(robot.dof)), robot.named('home'))}"
+    region = pose_region(robot, T, grasp.tilt(robot.dof))
+    return f"{worst}: {explain_region_unreachable(robot, region, robot.named('home'))}"
 
 
 def reach_reason(
@@ -209,16 +210,16 @@ def _chain(
     low = grasp.height(z)
     above, top = low + grasp.approach_clearance, low + grasp.lift_height
     tilt = grasp.tilt(robot.dof)
-    turned = f"with any of {bounds.yaw_count} hand orientations" if chooses(robot) else "at any yaw"
+    turned = f"with any of {bounds.yaw_count} hand orientations" if controls_full_pose(robot) else "at any yaw"
     home = robot.named("home")
-    q = solve_down(robot, (x, y, above), yaw, home, tilt=tilt, iterations=_FROM_HOME)
+    q = solve_tool_down_ik(robot, (x, y, above), yaw, home, tilt=tilt, iterations=_FROM_HOME)
     if q is None:
         return 0, f"pre-grasp at ({x:z.3f}, {y:z.3f}, {above:.3f}) has no inverse kinematics {turned}"
     for height in _line(above, low, bounds.line_step):
         q = _next(robot, (x, y, height), yaw, tilt, q, bounds) if q is not None else None
         if q is None:
             return 1, f"straight line down to ({x:z.3f}, {y:z.3f}, {low:.3f}) ends at height {height:.3f} m {turned}"
-    at_grasp = solve_down(robot, (x, y, low), yaw, home, tilt=tilt, iterations=_FROM_HOME)
+    at_grasp = solve_tool_down_ik(robot, (x, y, low), yaw, home, tilt=tilt, iterations=_FROM_HOME)
     if at_grasp is None:
         return 2, f"grasp at ({x:z.3f}, {y:z.3f}, {low:.3f}) has no inverse kinematics {turned}"
     for start in (q, at_grasp):
@@ -240,7 +241,7 @@ def _next(
     robot: RobotModel, place: tuple[float, float, float], yaw: float, tilt: float, q: Array, bounds: WorkspaceBounds
 ) -> Array | None:
     """Joint positions of the next pose of a line, near the last ones; None when there are none."""
-    found = solve_down(robot, place, yaw, q, tilt=tilt, iterations=_FROM_NEAR, upright=False)
+    found = solve_tool_down_ik(robot, place, yaw, q, tilt=tilt, iterations=_FROM_NEAR, upright=False)
     if found is None or float(np.abs(found - q).max()) > bounds.max_joint_step:
         return None
     return found

@@ -14,8 +14,8 @@ from common.messages import WorldObject
 from common.robot.transforms import matrix_to_quaternion, quaternion_to_matrix, transform
 from common.sim.footprints import apart, convex_parts, parts_meet
 from common.sim.interface import StandingObject
-from common.sim.objects import Solid, message_of
-from common.sim.places import Slot
+from common.sim.objects import Solid, object_message
+from common.sim.table import Slot
 
 Array = NDArray[np.float64]
 State = Literal["table", "held", "falling", "contained", "elsewhere"]
@@ -80,7 +80,7 @@ class Body:
     def message(self) -> WorldObject:
         """What there is to say about it."""
         if self.told is None:
-            self.told = message_of(self.name, self.solid, self.T, self.color, state=self.state,
+            self.told = object_message(self.name, self.solid, self.T, self.color, state=self.state,
                                    container=self.container)
         return self.told
 

@@ -46,7 +46,7 @@ class DepthSensorParameters(Parameters):
     )
 
 
-def measured_depth(
+def simulate_depth(
     depth: Depth, camera: Pinhole, config: DepthSensorParameters, rng: np.random.Generator
 ) -> Depth:
     """The depth image (height, width) [m] that such a camera gives of a true one; NaN where it measures nothing.

@@ -23,8 +23,8 @@ def footprint(fixture: Fixture) -> Array:
         a, b = fixture.dimensions[0] / 2, fixture.dimensions[1] / 2
         corners = np.array([(-a, -b), (a, -b), (a, b), (-a, b)])
         return np.asarray(corners @ np.array([[cos, sin], [-sin, cos]]) + (x, y))
-    round_one = fixture.shape != "box" and not any(fixture.rpy[:2])
-    radius = fixture.dimensions[0] if round_one else math.hypot(*fixture.dimensions)
+    cylinder_or_ring = fixture.shape != "box" and not any(fixture.rpy[:2])
+    radius = fixture.dimensions[0] if cylinder_or_ring else math.hypot(*fixture.dimensions)
     return np.asarray(circle(radius) + np.array([x, y]))
 
 

@@ -185,22 +185,22 @@ class Renderer(Protocol):
 
     camera: Pinhole
     needs_arm: bool
-    """Whether the arm is in the picture, so that `see` wants the state of its joints."""
+    """Whether the arm is in the picture, so that `render` wants the state of its joints."""
 
     @property
     def level(self) -> Array:
         """(3,) [lx] of blue, green and red light that the value 255 of a white surface stands for."""
 
-    def look_from(self, camera: Pinhole) -> None:
+    def move_camera(self, camera: Pinhole) -> None:
         """Take the camera elsewhere; its intrinsics stay."""
 
-    def light(self, scenery: Scenery) -> None:
+    def set_light(self, scenery: Scenery) -> None:
         """Take the light of the scenery."""
 
     def takes_long(self, objects: Sequence[WorldObject]) -> bool:
-        """Whether to `see` the objects may take longer than a moment."""
+        """Whether to `render` the objects may take longer than a moment."""
 
-    def see(self, objects: Sequence[WorldObject], joints: JointState | None = None) -> View:
+    def render(self, objects: Sequence[WorldObject], joints: JointState | None = None) -> View:
         """The view of the objects, and of the arm in that state if it is complete; what is "elsewhere" is not seen.
 
         Nothing in it is changed afterwards; when nothing moved it is the same as before.

@@ -25,7 +25,7 @@ from common.sim.footprints import is_convex
 from common.sim.gripping import felt
 from common.sim.interface import GraspTolerances, StandingObject
 from common.sim.news import News
-from common.sim.objects import Solid, pose_of, shaped, solid_of, solid_of_message
+from common.sim.objects import Solid, initial_pose, make_solid, solid_of, solid_of_message
 from common.sim.resting import Ground
 
 if TYPE_CHECKING:
@@ -98,7 +98,8 @@ class KinematicWorld(News):
     @cached_property
     def layout(self) -> dict[str, tuple[float, ...]]:
         """Where everything was at first, (x, y, z) [m] by id."""
-        return {name: tuple(pose_of(thing, self._solids[name])[:3, 3].tolist()) for name, thing in self._first.items()}
+        return {name: tuple(initial_pose(thing, self._solids[name])[:3, 3].tolist())
+                for name, thing in self._first.items()}
 
     def standing(self) -> dict[str, StandingObject]:
         """Everything as it is, for `restore`."""
@@ -333,7 +334,7 @@ class KinematicWorld(News):
     def _lay_out(self) -> None:
         for name, thing in self._first.items():
             solid = self._solids[name]
-            body = Body(name, solid, thing.color, pose_of(thing, solid))
+            body = Body(name, solid, thing.color, initial_pose(thing, solid))
             if solid.shape == "sphere" and thing.x is not None and thing.y is not None and (
                 thing.z == self._config.table_height
             ):
@@ -383,7 +384,7 @@ def _requested(request: WorldEdit) -> Solid:
                                           f"{MOST_BENT} can be")
     if request.shape == "prism" and len(convex_hull(np.array(request.polygon))) < 3:
         raise Refused("no_size", "polygon: encloses nothing")
-    solid = shaped(request.shape, size, inner, request.polygon)
+    solid = make_solid(request.shape, size, inner, request.polygon)
     if solid.reach > FARTHEST:
         raise Refused("no_size", f"size: it would reach {solid.reach:g} m from its middle; {FARTHEST:g} m can be")
     return solid

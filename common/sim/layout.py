@@ -11,7 +11,7 @@ from common.config import CameraConfig, ObjectConfig, World
 from common.errors import ConfigError
 from common.robot.transforms import rpy_to_matrix
 from common.sim.objects import Solid, solid_of
-from common.sim.places import Table
+from common.sim.table import Table
 
 PICTURE_MARGIN = 6.0  # the outline of what is placed stays this far inside the picture [px]
 TRIES = 100  # places drawn for each object before the layout is begun anew
@@ -64,7 +64,7 @@ def random_layout(
         return (
             all(math.dist(place, other) >= world.min_separation for other in others)
             and bool(table[radius].free(np.array([place]), centres, gap, apart=apart)[0])
-            and any(wholly_in_picture(camera, place, world.table_height + radius, radius)
+            and any(sphere_in_image(camera, place, world.table_height + radius, radius)
                     for camera in world.cameras.values())
             and accepts(*place, world.table_height + height)
         )
@@ -112,7 +112,7 @@ def seen_area(world: World, height: float) -> tuple[Place, Place]:
     return (float(low[0]), float(low[1])), (float(high[0]), float(high[1]))
 
 
-def wholly_in_picture(camera: CameraConfig, place: Place, z: float, radius: float) -> bool:
+def sphere_in_image(camera: CameraConfig, place: Place, z: float, radius: float) -> bool:
     """Whether the outline of a sphere with its centre at place, z [m] stays within the picture by the margin.
 
     Seen along one axis of the picture the sphere is a disc, and the tangents to it from the optical centre lie at

@@ -56,7 +56,7 @@ def ambient(scenery: Scenery) -> Array:
     return np.asarray(scenery.ambient * mean)
 
 
-def flat_level(scenery: Scenery) -> Array:
+def white_level(scenery: Scenery) -> Array:
     """(3,) [lx] of blue, green and red light of all lamps together, as if all shone straight at everything."""
     each = (light.illuminance * tint(light.temperature) for light in lamps(scenery))
     return np.asarray(sum(each, ambient(scenery)))

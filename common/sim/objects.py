@@ -177,7 +177,7 @@ def solid_of(thing: ObjectConfig) -> Solid:
         return mesh(load_mesh(thing.id, Path(thing.mesh), thing.scale))
     across = 2 * (thing.radius or 0.0)
     x, y = (thing.size or (across, across))[:2]
-    return shaped(thing.shape, Vector3(x=x, y=y, z=thing.height or 0.0), thing.inner_radius or 0.0, thing.polygon)
+    return make_solid(thing.shape, Vector3(x=x, y=y, z=thing.height or 0.0), thing.inner_radius or 0.0, thing.polygon)
 
 
 def sphere(radius: float) -> Solid:
@@ -185,7 +185,7 @@ def sphere(radius: float) -> Solid:
     return Solid("sphere", np.full(3, -radius), np.full(3, radius), radius=radius)
 
 
-def round_one(shape: Shape, radius: float, inner_radius: float, height: float) -> Solid:
+def cylinder_or_ring(shape: Shape, radius: float, inner_radius: float, height: float) -> Solid:
     """A cylinder, or a ring with an inner radius, along z [m]."""
     hole = circle(inner_radius) if shape == "ring" else _NONE
     size = np.array([radius, radius, height / 2])
@@ -219,7 +219,7 @@ def load_mesh(name: str, path: Path, scale: float) -> Array:
     return triangles
 
 
-def pose_of(thing: ObjectConfig, solid: Solid) -> Array:
+def initial_pose(thing: ObjectConfig, solid: Solid) -> Array:
     """(4, 4) T_world_object at the start."""
     if thing.position is not None:
         return transform(rpy_to_matrix(*thing.rpy), thing.position)
@@ -227,7 +227,7 @@ def pose_of(thing: ObjectConfig, solid: Solid) -> Array:
     return transform(rpy_to_matrix(0.0, 0.0, thing.yaw), (thing.x or 0.0, thing.y or 0.0, height))
 
 
-def message_of(
+def object_message(
     name: str, solid: Solid, T: Array, color: Sequence[float], *, state: str = "table", container: str = ""
 ) -> WorldObject:
     """The solid at a (4, 4) pose as a message."""
@@ -256,27 +256,27 @@ def message_of(
 def world_object(thing: ObjectConfig) -> WorldObject:
     """The object of a world's file as it lies at the start."""
     solid = solid_of(thing)
-    return message_of(thing.id, solid, pose_of(thing, solid), thing.color)
+    return object_message(thing.id, solid, initial_pose(thing, solid), thing.color)
 
 
 def solid_of_message(thing: WorldObject) -> Solid:
     """The shape that a message describes."""
     if thing.shape == "mesh":
         return mesh(np.array(thing.vertices, float)[np.array(thing.triangles, int)].reshape(-1, 3, 3))
-    return shaped(thing.shape, thing.size, thing.inner_radius, thing.polygon)
+    return make_solid(thing.shape, thing.size, thing.inner_radius, thing.polygon)
 
 
-def shaped(shape: Shape, size: Vector3, inner_radius: float, polygon: Sequence[tuple[float, float]]) -> Solid:
+def make_solid(shape: Shape, size: Vector3, inner_radius: float, polygon: Sequence[tuple[float, float]]) -> Solid:
     """A solid that is no mesh, by the size of the box about it, and what else its shape needs."""
     if shape == "sphere":
         return sphere(size.x / 2)
     if shape in ("cylinder", "ring"):
-        return round_one(shape, size.x / 2, inner_radius, size.z)
+        return cylinder_or_ring(shape, size.x / 2, inner_radius, size.z)
     x, y = size.x / 2, size.y / 2
     return prism(shape, np.array([(-x, -y), (x, -y), (x, y), (-x, y)] if shape == "box" else polygon), size.z)
 
 
-def look_of(thing: WorldObject) -> tuple[object, ...]:
+def appearance_of(thing: WorldObject) -> tuple[object, ...]:
     """What tells its shape and colour from others, wherever it is."""
     size, color = thing.size, thing.color
     sizes = tuple(round(value, 7) for value in (size.x, size.y, size.z, thing.inner_radius))

@@ -21,11 +21,11 @@ from common.perception.pinhole import Pinhole
 from common.perception.sphere import silhouette
 from common.robot.transforms import pose_to_matrix
 from common.scene.fixtures import container_panels
-from common.sim.lighting import flat_level
-from common.sim.objects import look_of, solid_of_message
-from common.sim.places import tables
+from common.sim.lighting import white_level
+from common.sim.objects import appearance_of, solid_of_message
 from common.sim.ray_caster import Mesh, View, cast, empty_view
 from common.sim.solids import fixture_mesh, placed, primitive
+from common.sim.table import tables
 
 if TYPE_CHECKING:  # most pictures have no arm in them
     from common.robot.model import RobotModel
@@ -69,7 +69,7 @@ class Renderer:
         """
         self.camera = camera if camera is not None else Pinhole.from_config(around.camera)
         self.needs_arm = robot is not None
-        self.light(scenery or Scenery())
+        self.set_light(scenery or Scenery())
         self._plain, self._rim_width, self._robot, self._around = plain, rim_width, robot, around
         self._shapes = _shapes_of(robot) if robot is not None else {}
         self._meshes: dict[tuple[object, ...], Array] = {}  # triangles of what was seen, in its own frame
@@ -80,11 +80,11 @@ class Renderer:
         self._spheres: dict[tuple[float, ...], _Sphere | None] = {}  # of the last plain picture, by centre and radius
         self._draw_behind()
 
-    def light(self, scenery: Scenery) -> None:
+    def set_light(self, scenery: Scenery) -> None:
         """Take the light of the scenery: nothing looks different, but for who exposes a picture to it."""
-        self.level = flat_level(scenery)
+        self.level = white_level(scenery)
 
-    def look_from(self, camera: Pinhole) -> None:
+    def move_camera(self, camera: Pinhole) -> None:
         """Take the camera elsewhere: from there all is seen anew."""
         if camera.T_world_optical is self.camera.T_world_optical or np.allclose(
                 camera.T_world_optical, self.camera.T_world_optical, rtol=0, atol=STILL_POSE):
@@ -98,11 +98,11 @@ class Renderer:
         self._still = self._seen = self._behind
 
     def takes_long(self, objects: Sequence[WorldObject]) -> bool:
-        """Whether to `see` the objects may take longer than a moment: rays are cast at all but a few spheres."""
+        """Whether to `render` the objects may take longer than a moment: rays are cast at all but a few spheres."""
         slow = len(objects) > FEW or any(thing.shape != "sphere" for thing in objects)
         return bool(self._shapes) or (slow and objects != self._asked)
 
-    def see(self, objects: Sequence[WorldObject], joints: JointState | None = None) -> View:
+    def render(self, objects: Sequence[WorldObject], joints: JointState | None = None) -> View:
         """The view of the objects and of the arm in that state; without a complete state, of the objects alone.
 
         The depth of a plain picture knows neither table nor spheres. What is "elsewhere" is out of sight.
@@ -156,7 +156,7 @@ class Renderer:
         return view
 
     def _mesh(self, thing: WorldObject, known: Mapping[tuple[object, ...], Array]) -> Mesh:
-        look = look_of(thing)
+        look = appearance_of(thing)
         if look not in self._meshes:
             self._meshes[look] = known[look] if look in known else solid_of_message(thing).triangles
         color = (thing.color.r, thing.color.g, thing.color.b)
@@ -172,7 +172,7 @@ class Renderer:
 
 
 def _shapes_of(robot: RobotModel) -> dict[str, Array]:
-    from common.sim.robot_shapes import robot_shapes
+    from common.sim.solids import robot_shapes
 
     return robot_shapes(robot)
 
@@ -201,12 +201,12 @@ def draw(
     objects: Sequence[WorldObject], camera: Pinhole, around: Surroundings, *, noise_std: float = 0.0,
     brightness: float = 0.0, rng: np.random.Generator | None = None, rim_width: float = RIM_WIDTH,
 ) -> Picture:
-    """One plain picture, bgr8 (height, width, 3), of the objects; see `Renderer` and `disturbed`."""
-    picture = Renderer(around, plain=True, camera=camera, rim_width=rim_width).see(objects).colour
-    return disturbed(picture, noise_std, brightness, rng)
+    """One plain picture, bgr8 (height, width, 3), of the objects; see `Renderer` and `add_image_noise`."""
+    picture = Renderer(around, plain=True, camera=camera, rim_width=rim_width).render(objects).colour
+    return add_image_noise(picture, noise_std, brightness, rng)
 
 
-def disturbed(
+def add_image_noise(
     picture: Picture, noise_std: float, brightness: float, rng: np.random.Generator | None = None
 ) -> Picture:
     """The picture with Gaussian noise of that standard deviation, and brightness added to each channel."""
@@ -220,7 +220,7 @@ def disturbed(
     return np.clip(np.rint(values), 0, 255).astype(np.uint8)
 
 
-def disturbed_depth(depth: Depth, rng: np.random.Generator, noise_std: float, dropout: float) -> Depth:
+def add_depth_noise(depth: Depth, rng: np.random.Generator, noise_std: float, dropout: float) -> Depth:
     """The depth image with Gaussian noise [m], and with NaN in a part of its pixels."""
     measured = depth
     if noise_std > 0:

@@ -18,7 +18,7 @@ from common.errors import Refused
 from common.robot.transforms import rpy_to_matrix, transform
 from common.sim.bodies import Block, Body, Rest, State
 from common.sim.footprints import convex_parts, covers_point, footprint, heights, within
-from common.sim.places import Slot, Slots, Table, is_inside, is_over, tables
+from common.sim.table import Slot, Slots, Table, is_inside, is_over, tables
 
 Array = NDArray[np.float64]
 

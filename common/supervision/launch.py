@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from common.application import look_where_one_stands, places_beside
+from common.application import import_folders, import_from_working_directory
 from common.clock import MAX_SPEED, MIN_SPEED, Clock
 from common.config import Cell, ServiceEntry
 from common.errors import ConfigError
@@ -114,7 +114,7 @@ def python_path(inherited: Mapping[str, str] = os.environ, cell: str = "") -> st
         cell: name, or path of a YAML file.
     """
     given = [part for part in inherited.get("PYTHONPATH", "").split(os.pathsep) if part]
-    places = [str(PROJECT_ROOT), *given, str(Path.cwd()), *places_beside(cell)]
+    places = [str(PROJECT_ROOT), *given, str(Path.cwd()), *import_folders(cell)]
     return os.pathsep.join(dict.fromkeys(places))
 
 
@@ -134,7 +134,7 @@ def require_module(key: str, entry: ServiceEntry) -> None:
     Raises:
         ConfigError: it cannot.
     """
-    look_where_one_stands()
+    import_from_working_directory()
     try:
         found = importlib.util.find_spec(entry.module) is not None
     except ModuleNotFoundError:

@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 from common import messages as m
-from common.tasks.deciding import Deciding, V
+from common.tasks.decisions import Deciding, V
 from common.tasks.stages import MISSES, Command, Execution, Grip, Look, Move, Report, Stage
 
 # Refusals that have nothing to do with the motion.
@@ -59,7 +59,7 @@ class Task(Deciding[V]):
                 self.began_anew()
             return [m.HoldRequest(hold=False, reason=reason, stops=command == "start")]
         status.paused = status.started = False
-        return self.stop(view, reason, "person") or [m.StopRequest(reason=reason)]
+        return self.stop(view, reason, "operator") or [m.StopRequest(reason=reason)]
 
     # --- answers ---------------------------------------------------------------------------------------------
 
@@ -126,7 +126,7 @@ class Task(Deciding[V]):
         if not self._found:
             self._found, status.paused = True, view.motion.paused
             if view.motion.paused:
-                status.message = FOUND_HELD + "".join(f"; {one.told}" for one in view.motion.inhibits)
+                status.message = FOUND_HELD + "".join(f"; {one.description}" for one in view.motion.interlocks)
             if view.motion.stopped:  # by a person, whom no restart makes a liar of
                 status.started = status.paused = False
         self._tell_stopped(view.motion.stopped)
@@ -272,7 +272,7 @@ class Task(Deciding[V]):
         """What stays in the way of the motion that runs; empty while nothing does, or it may still go away."""
         assert view.motion is not None and self.running is not None
         ours = view.motion.id == self.running.command.id and view.motion.state == "active"
-        held = [one.reason for one in view.motion.inhibits if one.by == BLOCKED_BY and one.kind == "held"]
+        held = [one.reason for one in view.motion.interlocks if one.by == BLOCKED_BY and one.kind == "held"]
         if not held or not ours or view.trouble or view.motion.paused or self.status.paused:
             self._in_the_way.reset()
             return ""

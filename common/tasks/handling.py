@@ -20,7 +20,7 @@ from common import messages as m
 from common.config import Grasp, Surroundings, Tunable
 from common.robot.transforms import invert, matrix_to_pose, matrix_to_rpy, pose_to_matrix, rpy_to_matrix, tool_down
 from common.scene.home import AT_HOME
-from common.tasks.deciding import TaskConfig
+from common.tasks.decisions import TaskConfig
 from common.tasks.engine import Task
 from common.tasks.stages import MISSES, Cycle, Grip, Look, Move, Place, Stage, View, place_of
 

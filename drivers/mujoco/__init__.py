@@ -40,10 +40,10 @@ def renderer(
 ) -> Renderer:
     """What draws this world for a camera, always with the arm. A plain picture has no depth."""
     require()
-    from drivers.mujoco.gl import chosen_gl
+    from drivers.mujoco.gl import select_gl
     from drivers.mujoco.rendering import PhysicsRenderer
 
-    return PhysicsRenderer(around, scenery, robot(), camera, depth=not plain, gl=chosen_gl())
+    return PhysicsRenderer(around, scenery, robot(), camera, depth=not plain, gl=select_gl())
 
 
 def require() -> None:

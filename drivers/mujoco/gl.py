@@ -27,7 +27,7 @@ _MOST_DEVICES = 16
 
 
 @cache
-def chosen_gl() -> str:
+def select_gl() -> str:
     """`egl`, `osmesa`, or empty where there is neither; MUJOCO_GL chooses where it names one of them or `off`."""
     named = os.environ.get(VARIABLE, "").strip().lower()
     if named in OFF:
@@ -87,7 +87,7 @@ def gl_context(kind: str, width: int, height: int) -> Any:
     return GLContext(width, height)
 
 
-class OneThread:
+class SingleThread:
     """Runs calls on one thread of its own, whoever asks: what belongs to OpenGL belongs to the thread that made it."""
 
     def __init__(self, name: str) -> None:

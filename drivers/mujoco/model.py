@@ -3,7 +3,7 @@
     cell = build_model(RobotModel.load(config.robot), config.world, things)
     data = mujoco.MjData(cell.model)
     cell.set_joints(data, joint_names, positions)
-    cell.set_thing(data, "cup", T_world_cup)
+    cell.set_object(data, "cup", T_world_cup)
     mujoco.mj_forward(cell.model, data)
 
 All frames are the project's: bodies of links are called and placed as in the URDF, world is world. Geoms of group
@@ -25,10 +25,17 @@ from common.config import Surroundings
 from common.errors import ConfigError
 from common.robot.model import RobotModel
 from common.robot.transforms import matrix_to_quaternion, quaternion_to_matrix, transform
-from drivers.mujoco.contact import FIXED, IMPRATIO, ROBOT, TIMESTEP
 from drivers.mujoco.robot import add_robot
-from drivers.mujoco.surroundings import add_cameras, add_surroundings
-from drivers.mujoco.things import Thing, add_thing
+from drivers.mujoco.scene import (
+    FIXED,
+    IMPRATIO,
+    ROBOT,
+    TIMESTEP,
+    SceneObject,
+    add_cameras,
+    add_object,
+    add_surroundings,
+)
 
 Array = NDArray[np.float64]
 
@@ -68,7 +75,7 @@ class CellModel:
         for name, position in zip(names, positions, strict=True):
             data.qpos[self.joints[name]] = position
 
-    def set_thing(self, data: mujoco.MjData, name: str, T: Array) -> None:
+    def set_object(self, data: mujoco.MjData, name: str, T: Array) -> None:
         """Write the pose (4, 4) of an object in world."""
         place = self.things[name]
         x, y, z, w = matrix_to_quaternion(T[:3, :3])
@@ -82,7 +89,7 @@ class CellModel:
 
 
 def build_model(
-    robot: RobotModel, world: Surroundings, things: Sequence[Thing], *, visuals: bool = False
+    robot: RobotModel, world: Surroundings, things: Sequence[SceneObject], *, visuals: bool = False
 ) -> CellModel:
     """The cell: robot, what is fixed, objects and cameras.
 
@@ -106,7 +113,7 @@ def build_model(
     add_robot(spec, robot, visuals)
     add_cameras(spec, world, robot)
     for thing in things:
-        add_thing(spec, thing)
+        add_object(spec, thing)
     gripper = robot.config.gripper
     for name in [*robot.joint_names, *(gripper.joints[:1] if gripper else [])]:
         actuator = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import atexit
 import ctypes
 import logging
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -20,13 +21,12 @@ from common.config import Scenery, Surroundings
 from common.messages import JointState, WorldObject
 from common.perception.pinhole import Pinhole
 from common.robot.model import RobotModel
-from common.sim.lighting import CUTOFF, ambient, flat_level, lamps, tint
-from common.sim.objects import look_of
+from common.sim.lighting import CUTOFF, ambient, lamps, tint, white_level
+from common.sim.objects import appearance_of
 from common.sim.ray_caster import View
 from common.sim.rendering import STILL, STILL_POSE, link_poses
-from drivers.mujoco.drawn import DrawnModel
-from drivers.mujoco.gl import OneThread, gl_context
-from drivers.mujoco.rays import ray_view
+from drivers.mujoco.drawn_model import DrawnModel
+from drivers.mujoco.gl import SingleThread, gl_context
 
 Array = NDArray[np.float64]
 
@@ -56,7 +56,7 @@ class PhysicsRenderer:
             robot: whose visual meshes are seen.
             camera: intrinsics and pose.
             depth: whether depth is asked for: else it is inf.
-            gl: `egl`, `osmesa`, or empty for rays: see `gl.chosen_gl`.
+            gl: `egl`, `osmesa`, or empty for rays: see `gl.select_gl`.
 
         Raises:
             ConfigError: a mesh of the robot is not there.
@@ -64,30 +64,30 @@ class PhysicsRenderer:
         self.camera = camera
         self._around, self._robot, self._depth = around, robot, depth
         self._gl = gl
-        self._thread = OneThread("pictures")
+        self._thread = SingleThread("pictures")
         self._canvas: Canvas | None = None
         self._drawn: DrawnModel | None = None
         self._seen: View | None = None
         self._objects: list[WorldObject] = []
         self._joints: Array | None = None
-        self.light(scenery)
+        self.set_light(scenery)
 
-    def light(self, scenery: Scenery) -> None:
+    def set_light(self, scenery: Scenery) -> None:
         """Take the light of the scenery."""
         self._scenery = scenery.model_copy()
-        self.level = np.maximum(flat_level(scenery), 1e-3)
+        self.level = np.maximum(white_level(scenery), 1e-3)
         self._seen = None
 
-    def look_from(self, camera: Pinhole) -> None:
+    def move_camera(self, camera: Pinhole) -> None:
         """Take the camera elsewhere; its intrinsics stay."""
         if not np.allclose(camera.T_world_optical, self.camera.T_world_optical, rtol=0, atol=STILL_POSE):
             self.camera, self._seen = camera, None
 
     def takes_long(self, objects: Sequence[WorldObject]) -> bool:
-        """Whether to `see` the objects may take longer than a moment: it always may."""
+        """Whether to `render` the objects may take longer than a moment: it always may."""
         return True
 
-    def see(self, objects: Sequence[WorldObject], joints: JointState | None = None) -> View:
+    def render(self, objects: Sequence[WorldObject], joints: JointState | None = None) -> View:
         """The view of the objects and of the arm in that state; what is "elsewhere" is not seen."""
         shown = [thing for thing in objects if thing.state != "elsewhere"]
         positions = None if joints is None else np.array(joints.position)
@@ -98,7 +98,7 @@ class PhysicsRenderer:
         return self._seen
 
     def _draw(self, objects: list[WorldObject], joints: JointState | None) -> View:
-        looks = tuple(look_of(thing) for thing in objects)
+        looks = tuple(appearance_of(thing) for thing in objects)
         if self._drawn is None or self._drawn.looks != looks:
             self._drawn = DrawnModel(self._around, self._robot, objects, self.camera)
             if self._canvas is not None:
@@ -232,3 +232,50 @@ def _same(a: Array | None, b: Array | None) -> bool:
     if a is None or b is None:
         return a is b
     return a.shape == b.shape and bool(np.all(np.abs(a - b) < STILL))
+
+
+# Pictures without OpenGL: a ray through the centre of each pixel, and light without shadows."""
+
+def ray_view(
+    model: mujoco.MjModel, data: mujoco.MjData, camera: Pinhole, scenery: Scenery, level: Array, far: float
+) -> View:
+    """The view of a model in a state, lit as its surfaces are turned to the light.
+
+    Args:
+        model: what there is.
+        data: where it is: its kinematics are done.
+        camera: intrinsics and pose.
+        scenery: the light.
+        level: (3,) [lx] of blue, green and red light that is the value 255.
+        far: how far rays go [m].
+    """
+    v, u = np.mgrid[0:camera.height, 0:camera.width]
+    rays = camera.directions(np.column_stack([u.ravel(), v.ravel()]))
+    count = len(rays)
+    geoms, distances, found = np.full(count, -1, np.int32), np.full(count, -1.0), np.zeros(3 * count)
+    all_groups, eye = np.ones(mujoco.mjNGROUP, np.uint8), camera.position
+    mujoco.mj_multiRay(model, data, eye, rays.ravel(), all_groups, True, -1, geoms, distances, found, count, far)
+    hit, normals = geoms >= 0, found.reshape(-1, 3)
+    normals *= np.where(np.sum(normals * rays, axis=1) > 0, -1.0, 1.0)[:, None]  # on the side that is seen
+    points = camera.position + distances[:, None] * rays
+    light = np.broadcast_to(ambient(scenery), (count, 3)).copy()
+    for lamp in lamps(scenery):
+        way = np.subtract(lamp.aim, lamp.position)
+        length = float(np.linalg.norm(way)) or 1.0
+        if lamp.parallel:
+            towards, strength = np.broadcast_to(-way / length, points.shape), np.ones(count)
+        else:
+            towards = np.asarray(lamp.position) - points
+            away = np.maximum(np.linalg.norm(towards, axis=1), 1e-6)
+            towards = towards / away[:, None]
+            inside = -(towards @ way) / length >= math.cos(math.radians(CUTOFF))
+            strength = inside * (length / away) ** 2
+        turned = np.maximum(np.sum(normals * towards, axis=1), 0.0) * strength
+        light += turned[:, None] * (lamp.illuminance * tint(lamp.temperature))
+    colours = np.zeros((count, 3))
+    colours[hit] = np.asarray(model.geom_rgba)[geoms[hit], 2::-1]
+    colour = np.where(hit[:, None], np.clip(255 * colours * light / level, 0, 255), 0)
+    along = np.asarray(rays @ camera.T_world_optical[:3, 2])
+    depth = np.where(hit, distances * along, np.inf)
+    shape = (camera.height, camera.width)
+    return View(np.rint(colour).astype(np.uint8).reshape(*shape, 3), depth.astype(np.float32).reshape(shape))

@@ -15,9 +15,9 @@ from common.robot.description import find_description
 from common.robot.finger_joints import finger_factors
 from common.robot.merging import WORLD
 from common.robot.model import RobotModel
-from common.robot.transforms import matrix_to_quaternion, rpy_to_matrix, transform
-from drivers.mujoco.contact import COLLIDES, ROBOT, SOLIMP, SOLREF, grips, only_seen, touches
-from drivers.mujoco.kept_meshes import hull_points, visual_arrays
+from common.robot.transforms import rpy_to_matrix, transform
+from drivers.mujoco.mesh_cache import cached_visual_meshes, hull_points
+from drivers.mujoco.scene import COLLIDES, ROBOT, SOLIMP, SOLREF, set_contact, set_finger_contact, visual_only, wxyz
 
 if TYPE_CHECKING:
     from common.robot.visual_meshes import Piece
@@ -44,7 +44,7 @@ def add_robot(spec: mujoco.MjSpec, robot: RobotModel, visuals: bool) -> None:
     for joint in root.findall("joint"):
         joints[_link(joint, "parent")].append(joint)
     seen: defaultdict[str, list[Piece]] = defaultdict(list)
-    for piece in visual_arrays(robot, _TRIANGLES) if visuals else ():
+    for piece in cached_visual_meshes(robot, _TRIANGLES) if visuals else ():
         seen[piece.link].append(piece)
     grippers = robot.config.gripper.links if robot.config.gripper else []
 
@@ -56,15 +56,15 @@ def add_robot(spec: mujoco.MjSpec, robot: RobotModel, visuals: bool) -> None:
         _add_inertia(body, links[name])
         for index, shape in enumerate(links[name].findall("collision")):
             geom = _shape(spec, body, shape, f"{name}.{index}", robot)
-            touches(geom, ROBOT, group=COLLIDES).density = DENSITY
+            set_contact(geom, ROBOT, group=COLLIDES).density = DENSITY
             if name in grippers:
-                grips(geom)
+                set_finger_contact(geom)
         for index, piece in enumerate(seen[name]):
             mesh = spec.add_mesh(name=f"{name}.seen.{index}")
             mesh.uservert, mesh.userface = piece.vertices.ravel(), piece.faces.ravel()
             mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
             rgba = [*(part / 255 for part in piece.color), 1.0]
-            only_seen(body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name, rgba=rgba))
+            visual_only(body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name, rgba=rgba))
         for following in joints[name]:
             add(body, following)
 
@@ -86,12 +86,6 @@ def pose_of_origin(origin: ET.Element | None) -> Array:
     """(4, 4) that an <origin> describes."""
     x, y, z = _numbers(origin, "xyz", "0 0 0")
     return transform(rpy_to_matrix(*_numbers(origin, "rpy", "0 0 0")), (x, y, z))
-
-
-def wxyz(rotation: Array) -> list[float]:
-    """Quaternion w, x, y, z, as MuJoCo has it, of a (3, 3) rotation."""
-    x, y, z, w = matrix_to_quaternion(rotation)
-    return [w, x, y, z]
 
 
 def _place(what: Any, origin: ET.Element | None) -> None:

@@ -22,12 +22,10 @@ from common.sim.bodies import Body
 from common.sim.interface import GraspTolerances, Numbers, StandingObject
 from common.sim.kinematic import KinematicWorld
 from common.sim.news import News
-from drivers.mujoco.arm import PhysicsArm
-from drivers.mujoco.contact import ROBOT, TIMESTEP
+from drivers.mujoco.arm import PhysicsArm, tune
 from drivers.mujoco.model import CellModel, build_model
-from drivers.mujoco.servo import tune
-from drivers.mujoco.things import USUAL_MASS, Thing
-from drivers.mujoco.watching import RESTS, Contacts, Watch, differs, straightened
+from drivers.mujoco.object_states import RESTS, Contacts, Watch, pose_changed, snap_upright
+from drivers.mujoco.scene import ROBOT, TIMESTEP, USUAL_MASS, SceneObject
 
 Array = NDArray[np.float64]
 
@@ -35,7 +33,7 @@ MOST_CAUGHT_UP = 2.0  # [s] of a hold-up; what is longer, the world has stood st
 TOLD = 0.05  # [s] between changes that are told of while something moves
 SLIPPERY = 0.5  # [s] fingers do not touch what a person lets slip, and not before they are clear of it
 QUIET = 1e-6  # [m] or of a quaternion: nothing has moved since the last look
-ASLEEP = 1e-3  # [m/s] or [rad/s]: velocities below are not kept over a restart
+ASLEEP = 1e-3  # [m/s] or [rad/s]: velocities below are not saved over a restart
 
 
 class PhysicsWorld(News):
@@ -98,14 +96,14 @@ class PhysicsWorld(News):
         """Make the model of what there is; joints and objects that were there are where they were, as fast."""
         before = None if self._cell is None else (self._cell, self._data)
         bodies = self._paper.bodies
-        things = [Thing(name, body.solid, body.color, self._masses.get(name, USUAL_MASS))
+        things = [SceneObject(name, body.solid, body.color, self._masses.get(name, USUAL_MASS))
                   for name, body in bodies.items()]
         cell = build_model(self._robot, self._config, things)
         tune(cell, self._robot)
         data = mujoco.MjData(cell.model)
         data.qpos[:] = cell.start
         for name, body in bodies.items():
-            cell.set_thing(data, name, body.T)
+            cell.set_object(data, name, body.T)
         if before is not None:
             _copy(*before, cell, data)
         mujoco.mj_forward(cell.model, data)
@@ -148,10 +146,10 @@ class PhysicsWorld(News):
         if due:  # else the next look tells of it
             self._looked_at = places
         for name, body in bodies.items():
-            T = straightened(cell.pose_of(data, name))
+            T = snap_upright(cell.pose_of(data, name))
             state, container = self._watch.state_of(body, T, name in contacts[2])
             same = (state, container) == (body.state, body.container)
-            if same and not (due and differs(T, body.T)):
+            if same and not (due and pose_changed(T, body.T)):
                 self._news_of(body)
                 continue
             body.T, body.state, body.container = T, state, container
@@ -203,29 +201,29 @@ class PhysicsWorld(News):
         cell, data = self._built
         found = {}
         for name, body in self._paper.bodies.items():
-            kept, at = body.standing(), cell.things[name]
+            saved, at = body.standing(), cell.things[name]
             speeds = data.qvel[at.dof: at.dof + 6]
-            details = {**kept.details, "mass": self._masses.get(name, USUAL_MASS), "slippery": name in self._slippery,
+            details = {**saved.details, "mass": self._masses.get(name, USUAL_MASS), "slippery": name in self._slippery,
                        "qpos": data.qpos[at.qpos: at.qpos + 7].tolist(),
                        "qvel": speeds.tolist() if np.abs(speeds).max() > ASLEEP else [0.0] * 6}
-            found[name] = kept.model_copy(update={"details": details})
+            found[name] = saved.model_copy(update={"details": details})
         return found
 
     def restore(self, objects: Mapping[str, StandingObject]) -> None:
         """Put everything where it was, as fast as it was; what is held stands still, as the arm does that begins."""
         self._paper.restore(objects)
-        self._masses = {name: float(kept.details.get("mass", USUAL_MASS)) for name, kept in objects.items()}
+        self._masses = {name: float(saved.details.get("mass", USUAL_MASS)) for name, saved in objects.items()}
         self._taken = {name for name, body in self._paper.bodies.items() if body.state in ("held", "falling")}
-        self._slippery = {name: -math.inf for name, kept in objects.items() if kept.details.get("slippery")}
+        self._slippery = {name: -math.inf for name, saved in objects.items() if saved.details.get("slippery")}
         self._build()
         cell, data = self._built
-        for name, kept in objects.items():
-            if name in cell.things and "qpos" in kept.details:
+        for name, saved in objects.items():
+            if name in cell.things and "qpos" in saved.details:
                 place = cell.things[name]
-                data.qpos[place.qpos: place.qpos + 7] = kept.details["qpos"]
-                held = kept.details.get("state") == "held"
-                data.qvel[place.dof: place.dof + 6] = [0.0] * 6 if held else kept.details["qvel"]
-            if name in cell.things and kept.details.get("state") == "elsewhere":
+                data.qpos[place.qpos: place.qpos + 7] = saved.details["qpos"]
+                held = saved.details.get("state") == "held"
+                data.qvel[place.dof: place.dof + 6] = [0.0] * 6 if held else saved.details["qvel"]
+            if name in cell.things and saved.details.get("state") == "elsewhere":
                 self._watch.on_floor(name)
         mujoco.mj_forward(cell.model, data)
         self.version += 1
@@ -257,7 +255,7 @@ class PhysicsWorld(News):
         for each in changed:
             place, body = cell.things[each], self._paper.bodies[each]
             body.rest = None
-            cell.set_thing(data, each, body.T)
+            cell.set_object(data, each, body.T)
             data.qvel[place.dof: place.dof + 6] = 0.0
             self._watch.forget(each)
             self._taken.discard(each)

@@ -6,6 +6,7 @@ import math
 
 from applications.pick_place.topics import DETECTION_IMAGE
 from common import messages as m
+from common.application import Application, ApplicationTopics
 from common.process.service import main
 from common.process.task_runner import run_task
 from common.tasks.handling import Handling, HandlingConfig, HandlingStatus
@@ -13,15 +14,12 @@ from common.tasks.stages import View
 from common.topics import Topic
 from common.transport.bus import Bus
 
-GRASPS = FILLS = True  # it takes objects in the hand, and what it has done lies in containers
-
 
 class SortStatus(HandlingStatus):
     """What every task says; `done` are the cubes that are seen in their own box."""
 
 
 STATUS = Topic("sort_cubes_status", SortStatus, "state", "how many cubes are in the box of their colour")
-ANNOTATED = DETECTION_IMAGE  # what the page shows of what was found
 
 
 class Config(HandlingConfig):
@@ -58,7 +56,7 @@ class SortCubes(Handling):
         return [thing for thing in seen if thing.kind in self.p.world.containers]
 
 
-def wrong_in(truth: m.WorldObjects) -> str:
+def find_misplaced(truth: m.WorldObjects) -> str:
     """What is not where it belongs in the end, by truth: `zencell simulate` asks, nothing that decides does."""
     lost = [cube.id for cube in truth.objects if cube.container != ("red" if cube.color.r > cube.color.g else "green")]
     return f"not in their own box: {', '.join(lost)}" if lost else ""
@@ -67,6 +65,14 @@ def wrong_in(truth: m.WorldObjects) -> str:
 async def run(bus: Bus, config: Config) -> None:
     """Be the service of the task."""
     await run_task(bus, config, SortCubes, STATUS, View)
+
+
+APPLICATION = Application(
+    topics=ApplicationTopics(status=STATUS, annotated=DETECTION_IMAGE),
+    grasps=True,  # it holds objects with the gripper
+    fills_containers=True,  # and what it has done lies in containers
+    truth_check=find_misplaced,
+)
 
 
 if __name__ == "__main__":

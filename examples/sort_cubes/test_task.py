@@ -26,7 +26,7 @@ async def heard(status: Reader[TaskStatus], stage: str) -> None:
 
 
 def test_every_cube_is_in_its_own_box_by_truth() -> None:
-    outcome = Simulation(load_cell(CELL, seed=2), 1).run()  # in the end it asks `wrong_in`
+    outcome = Simulation(load_cell(CELL, seed=2), 1).run()  # at the end it calls the truth check
     assert (outcome.state, outcome.done, outcome.total, outcome.crashes) == ("DONE", 4, 4, []), outcome
 
 

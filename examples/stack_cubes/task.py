@@ -8,6 +8,7 @@ from pydantic import Field
 
 from applications.pick_place.topics import DETECTION_IMAGE
 from common import messages as m
+from common.application import Application, ApplicationTopics
 from common.config import Tunable
 from common.process.service import main
 from common.process.task_runner import run_task
@@ -16,7 +17,6 @@ from common.tasks.stages import View
 from common.topics import Topic
 from common.transport.bus import Bus
 
-GRASPS = True  # it takes objects in the hand
 HIGH = 3  # cubes
 
 
@@ -25,7 +25,6 @@ class StackStatus(HandlingStatus):
 
 
 STATUS = Topic("stack_cubes_status", StackStatus, "state", "how many cubes stand upon each other")
-ANNOTATED = DETECTION_IMAGE  # what the page shows of what was found
 
 
 class Config(HandlingConfig):
@@ -77,7 +76,7 @@ def _away(a: m.CollisionObject | m.WorldObject, b: m.CollisionObject | m.WorldOb
     return math.dist((a.pose.position.x, a.pose.position.y), (b.pose.position.x, b.pose.position.y))
 
 
-def wrong_in(truth: m.WorldObjects) -> str:
+def find_misplaced(truth: m.WorldObjects) -> str:
     """What does not stand in the end, by truth: `zencell simulate` asks, nothing that decides does."""
     cubes = sorted(truth.objects, key=lambda cube: cube.pose.position.z)
     for number, cube in enumerate(cubes[:HIGH]):
@@ -90,6 +89,13 @@ def wrong_in(truth: m.WorldObjects) -> str:
 async def run(bus: Bus, config: Config) -> None:
     """Be the service of the task."""
     await run_task(bus, config, StackCubes, STATUS, View)
+
+
+APPLICATION = Application(
+    topics=ApplicationTopics(status=STATUS, annotated=DETECTION_IMAGE),
+    grasps=True,  # it holds objects with the gripper
+    truth_check=find_misplaced,
+)
 
 
 if __name__ == "__main__":

@@ -9,18 +9,22 @@ import math
 import os
 import signal
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import msgpack
 import numpy as np
 
 from common import topics
-from common.application import all_topics
-from common.config import World
+from common.application import all_topics, find_application
+from common.config import Cell, World
 from common.errors import DecodeError, RequestFailed
+from common.hardware.loading import is_simulated
 from common.messages import Message, WorldEdit
 from common.sources import monotonic
+from common.supervision.supervisor import Supervisor
+from common.topics import AnyTopic
+from common.transport.bus import Bus
 from common.transport.codec import (
     DEFAULT_LIMIT,
     Attachment,
@@ -30,13 +34,15 @@ from common.transport.codec import (
     encode_attachment,
     encoding_of,
 )
-from lab.chaos.plan import STATELESS_FORMS, Fault, Form
-from lab.chaos.slipping import Slipping
+from common.transport.keys import ROUTER
+from common.transport.ownership import Owner
+from lab.chaos.plan import CELL_SECONDS, STATELESS_FORMS, Fault, Form, SlipGate, faults, plan
+from tools.check.cell import seen_from_home
 
 if TYPE_CHECKING:
-    from common.topics import AnyTopic
     from common.transport.bus import Bus, Reader
     from common.transport.session import RawSample
+
 
 PATIENCE = 4.0  # [s] that a fault of a process waits for something in the hand
 SLIP_PATIENCE = 20.0  # [s] that an object has to be taken before it slips
@@ -80,7 +86,7 @@ class Chaos:
         self._patience = patience
         self._known = all_topics() if known is None else known
         taken = world is not None
-        self._slipping = Slipping(world) if world is not None else None
+        self._slipping = SlipGate(world) if world is not None else None
         self._gripper = bus.reader(topics.GRIPPER_STATE) if taken else None
         self._objects = bus.reader(topics.SCENE_OBJECTS) if taken else None
         self._edit = bus.client(topics.WORLD_EDIT) if taken else None
@@ -291,3 +297,45 @@ def nonsense(model: type[Message], form: Form, rng: np.random.Generator) -> byte
             decode(model, payload)
         except DecodeError:
             return payload
+
+
+def create_chaos(
+    bus: Bus, cell: Cell, supervisor: Supervisor, known: Mapping[str, AnyTopic], seed: int, per_minute: float, *,
+    until_ended: bool,
+) -> Chaos:
+    """Faults for the processes and keys of a cell that is up.
+
+    Args:
+        bus: of the supervisor.
+        cell: the resolved cell.
+        supervisor: knows the processes.
+        known: topics whose messages may be damaged, by key.
+        seed: of the plan.
+        per_minute: faults per minute of wall time, on average.
+        until_ended: the faults end while a run of the task has time left to finish; else they go on.
+    """
+    ours = [entry.name for entry in cell.services.values()]
+    processes = [status.name for status in supervisor.statuses if status.name in (ROUTER, *ours)]
+    grasps = find_application(cell.application).grasps and cell.task in ours
+    keys = list(known)
+    objects = grasps and is_simulated(cell.robot)
+    if until_ended:
+        seconds = CELL_SECONDS / bus.clock.speed
+        planned = iter(plan(seed, processes, keys, objects=objects, seconds=seconds, per_minute=per_minute))
+    else:
+        planned = faults(seed, processes, keys, objects=objects, per_minute=per_minute)
+
+    def pids() -> dict[str, int]:
+        return {status.name: status.pid for status in supervisor.statuses if status.pid is not None}
+
+    world = seen_from_home(cell).world if objects else None  # a camera on the hand looks from there
+    return Chaos(bus, planned, pids, world, known=known)
+
+
+def keys_of(owners: Iterable[Owner], services: Iterable[str]) -> dict[str, AnyTopic]:
+    """What these services write or answer by its key in the cell, but for their parameters, in the order of the topics.
+
+    Of a key that a service has under another name it is known what it carries by the service's own word for it.
+    """
+    owned = sorted({(owner.own, owner.key) for owner in owners if owner.service in set(services)})
+    return {key: replace(topic, key=key) for word, topic in all_topics().items() for own, key in owned if own == word}

@@ -1,6 +1,6 @@
 """Layers of the 3D scene. Each has a checkbox; layers are found by name.
 
-The modules of this package are in every cell. An application adds layers in its part `page`, and a user adds custom
+The modules of this package are in every cell. An application adds layers in `Application.page`, and a user adds custom
 ones with `services.viewer.layers: [my_pkg.my_layer]`. Such a module has one or more classes derived from `Layer`, or is
 a layer itself:
 
@@ -28,6 +28,7 @@ from common.application import Application, applications
 from common.errors import ConfigError, UnknownName
 from common.messages import JointTrajectory
 from common.topics import Topic
+from page.application import page_of
 from page.feeds import remapped_topics
 
 if TYPE_CHECKING:
@@ -137,10 +138,10 @@ def find_layers(
     Raises:
         ConfigError: a module cannot be imported, or has no layer.
     """
-    part = application.part("page") if application is not None else None
     found: dict[str, type[Layer]] = {}
-    for module in [*map(_import, FIRST), *([part] if part is not None else []), *map(_import_custom, custom)]:
-        found |= layers_in(module)  # a later layer replaces one of the same name
+    for some in [*(layers_in(_import(name)) for name in FIRST), by_name(page_of(application).layers),
+                 *(layers_in(_import_custom(name)) for name in custom)]:
+        found |= some  # a later layer replaces one of the same name
     for module in map(_import, LAST):
         found = found | {name: kind for name, kind in layers_in(module).items() if name not in found}
     if keys:
@@ -151,14 +152,22 @@ def find_layers(
 
 
 def layers_in(module: ModuleType) -> dict[str, type[Layer]]:
-    """Return the layers of a module; names of custom layers start with the name of their module."""
-    prefix = "" if module.__name__.partition(".")[0] in ("page", "applications") else f"{module.__name__}."
+    """Return the layers of a module by name."""
     classes = [kind for kind in vars(module).values()
                if isinstance(kind, type) and issubclass(kind, Layer) and kind.__module__ == module.__name__]
-    found = {prefix + (kind.NAME or re.sub(r"(?<!^)(?=[A-Z])", "_", kind.__name__).lower()): kind for kind in classes}
+    found = by_name(classes)
     if callable(getattr(module, "show", None)) and hasattr(module, "TOPICS") and hasattr(module, "LABEL"):
         attributes = {name: vars(module)[name] for name in ATTRIBUTES if hasattr(module, name)}
         found[module.__name__] = type("ModuleLayer", (Layer,), attributes)
+    return found
+
+
+def by_name(classes: Iterable[type[Layer]]) -> dict[str, type[Layer]]:
+    """Return layers by name; names of custom layers start with the name of their module."""
+    found = {}
+    for kind in classes:
+        prefix = "" if kind.__module__.partition(".")[0] in ("page", "applications") else f"{kind.__module__}."
+        found[prefix + (kind.NAME or re.sub(r"(?<!^)(?=[A-Z])", "_", kind.__name__).lower())] = kind
     return found
 
 
@@ -170,7 +179,7 @@ def shown_layers(configured: Mapping[str, bool], available: Layers) -> dict[str,
     """
     unknown = [name for name in configured if name not in available and "." not in name]
     if unknown:
-        elsewhere = {name for other in applications() if (part := other.part("page")) for name in layers_in(part)}
+        elsewhere = {name for other in applications() for name in by_name(page_of(other).layers)}
         for name in unknown:
             if name not in elsewhere:
                 raise UnknownName("layer", name, list(available))

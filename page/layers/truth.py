@@ -45,14 +45,14 @@ class Truth(Layer):
 
     def show(self, topic: Topic[Any], message: Any) -> None:
         """Replace the displayed objects; beyond `_MAX_WORK` the rest is left out."""
-        from common.sim.objects import look_of  # slow to import, and needed with a scene only
+        from common.sim.objects import appearance_of  # slow to import, and needed with a scene only
 
         self._objects, work = {}, 0
         for thing in message.objects:
             work += len(thing.polygon) ** 2
             if work <= _MAX_WORK:
                 self._objects[thing.id] = thing
-        appearance = {name: look_of(thing)[:_COLOR_FIELDS] for name, thing in self._objects.items()}
+        appearance = {name: appearance_of(thing)[:_COLOR_FIELDS] for name, thing in self._objects.items()}
         for name in [name for name, (shown, _) in self._nodes.items() if appearance.get(name) != shown]:
             if name in self._drags:
                 self._drags.pop(name).stop()

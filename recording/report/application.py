@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from common.config import RobotConfig
-    from recording.report.gathering import Gathering
+    from recording.report.history import RunHistory
 
 Listener = Callable[[float, Any], None]  # is given wall time [s] since the run or its recording began, and a message
 
@@ -30,7 +30,7 @@ class Section(NamedTuple):
 class Figures:
     """What is said of a run where its application says nothing else.
 
-    An application derives from it, in its part `figures`, a class of this name, and says only what differs.
+    An application names a subclass as `Application.figures` and overrides only what differs.
     """
 
     COUNTED: ClassVar[str] = "done"  # what became of that which a task counts
@@ -46,12 +46,12 @@ class Figures:
         """
         self.robot, self.pictured = robot, pictured
 
-    def hears(self) -> dict[Topic[Any], Listener]:
+    def listeners(self) -> dict[Topic[Any], Listener]:
         """Topics that are listened to beside what every run is judged by, each with who is given its messages."""
         return {}
 
     def exposed(self, message: Any) -> int:
-        """Stamp [ns] of the picture by which a message of DECIDED_BY was decided; 0 for none."""
+        """Stamp [ns] of the picture by which a message of `decided_by` was decided; 0 for none."""
         return int(message.header.stamp)
 
     def blocks(self) -> dict[str, Any]:
@@ -66,7 +66,7 @@ class Figures:
     def headline(self, summary: Mapping[str, Any]) -> str:
         """How the run of a summary ended, in a few words."""
         line = f"{summary['placed']} of {summary['targets']} {self.COUNTED}"
-        return f"{line} (truth: {truth_in_words(summary['truth'])})" if summary["truth"] else line
+        return f"{line} (truth: {format_truth(summary['truth'])})" if summary["truth"] else line
 
     def facts(self, summary: Mapping[str, Any]) -> list[tuple[str, str]]:
         """What the head of a report says first: names and values."""
@@ -74,26 +74,26 @@ class Figures:
         facts += [(name, str(value)) for name, value in summary["figures"].items()]
         facts.append(("rejected places", str(len(summary["rejected"]))))
         if summary["truth"]:
-            facts.append(("truth", truth_in_words(summary["truth"])))
+            facts.append(("truth", format_truth(summary["truth"])))
         return facts
 
-    def picture(self, run: Gathering, tool: npt.NDArray[np.float64]) -> Section | None:
+    def picture(self, run: RunHistory, tool: npt.NDArray[np.float64]) -> Section | None:
         """What a report shows of the place of work; None when there is nothing to show.
 
         Args:
             run: what was gathered of the run.
             tool: (n, 3) way of the tool [m]; empty when it is not known.
         """
-        return seen_from_above(run, tool)
+        return top_view_section(run, tool)
 
 
 def figures_of(application: Application | None) -> type[Figures]:
     """The class with which an application tells of its runs."""
-    found = application.find("figures", "Figures") if application else None
+    found = application.figures if application else None
     return found if isinstance(found, type) and issubclass(found, Figures) else Figures
 
 
-def truth_in_words(truth: Mapping[str, Any]) -> str:
+def format_truth(truth: Mapping[str, Any]) -> str:
     """Where everything really lies, as "6 in the box, 1 on the table"."""
     containers = truth["containers"]
     parts = [f"{truth['in_box']} in the box"]
@@ -103,8 +103,8 @@ def truth_in_words(truth: Mapping[str, Any]) -> str:
     return ", ".join([*parts, *([f"{truth['elsewhere']} elsewhere"] if truth["elsewhere"] else [])])
 
 
-def seen_from_above(
-    run: Gathering, tool: npt.NDArray[np.float64], marks: Mapping[str, Mapping[tuple[int, int], int]] | None = None
+def top_view_section(
+    run: RunHistory, tool: npt.NDArray[np.float64], marks: Mapping[str, Mapping[tuple[int, int], int]] | None = None
 ) -> Section | None:
     """The place of work from above; None when nothing was seen there.
 
@@ -113,12 +113,12 @@ def seen_from_above(
         tool: (n, 3) way of the tool [m].
         marks: more places by what they are, in steps of `gathering.SAME_PLACE`, the lowest first.
     """
-    from recording.report import figures
+    from recording.report import charts
 
     marks = {name: places for name, places in (marks or {}).items() if places}
     if not (marks or run.footprints):
         return None
     return Section("top", "From above", (
-        f"{figures.top_view(run, tool, marks)}<p>{len(run.picks)} picked, {len(run.rejections)} rejected. "
+        f"{charts.top_view(run, tool, marks)}<p>{len(run.picks)} picked, {len(run.rejections)} rejected. "
         "The truth is shown for comparison only.</p>"
     ))

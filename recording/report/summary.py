@@ -10,9 +10,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from common.messages import MotionStatus, PlanFigure, Rejection, Rejections, TaskStatus, Vector3
+from common.messages import (
+    MotionStatus,
+    PlanFigure,
+    Rejection,
+    Rejections,
+    TaskStatus,
+    Vector3,
+)
 from recording.report.application import Figures
-from recording.report.truth import Truth
+from recording.report.history import Truth
 
 SAME_PLACE = 0.03  # [m] rejections closer than this are of the same thing
 NOT_LEFT_BEHIND = "inside the container"  # such a detection is of what was placed

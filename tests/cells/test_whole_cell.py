@@ -114,12 +114,12 @@ async def test_it_is_jogged_from_a_terminal_until_that_dies_and_is_nobodys_then(
     finally:
         jogging.kill()
         jogging.wait()
-    assert (await asyncio.to_thread(up.tell, "robot", "owner")).stdout == "the motion is nobody's\n"
+    assert (await asyncio.to_thread(up.tell, "robot", "owner")).stdout == "the motion is free\n"
 
 
 @pytest.mark.parametrize(("arguments", "wanted"), [
-    (["take"], "the motion is .* \\(operator\\) since .* UTC\n"), (["give"], "the motion is nobody's\n"),
-    (["give"], "the motion is nobody's\n"),
+    (["take"], "the motion is .* \\(operator\\) since .* UTC\n"), (["give"], "the motion is free\n"),
+    (["give"], "the motion is free\n"),
     (["jog"], "zencell: jog: needs --joint NAME=V, --linear X,Y,Z or --angular X,Y,Z\n"),
     (["jog", "--linear", "1,2"], "zencell: --linear: '1,2' must be three numbers apart by commas, as 0.3,-0.1,0\n"),
     (["jog", "--joint", "nose=1"], "zencell: unknown joint 'nose'; choices: panda_finger_joint1, .*\n"),

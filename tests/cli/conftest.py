@@ -11,7 +11,7 @@ from tests.harness import Zencell, free_domain
 SERVICE = '''"""A tiny service."""
 import asyncio, os, sys
 from applications.pick_place.topics import PICK_PLACE_STATUS
-from applications.pick_place.messages import PickPlaceStatus
+from applications.pick_place.topics import PickPlaceStatus
 from common import topics
 from common.config import Parameters
 from common.errors import ConfigError
@@ -49,7 +49,7 @@ import asyncio
 from common import topics
 from common.config import Parameters
 from common.errors import Refused
-from common.messages import Image, Inhibit, MotionStatus, TaskStatus
+from common.messages import Image, Interlock, MotionStatus, TaskStatus
 from common.process.service import main
 
 class Config(Parameters):
@@ -63,8 +63,8 @@ async def run(bus, config):
             await asyncio.Event().wait()
         return TaskStatus(header=bus.header(), paused=request.command == "pause")
     async def stop(request):
-        lost = Inhibit(kind="stopped", by="anna", reason="not kept on disk (it is full)", since=1)
-        return MotionStatus(header=bus.header(), inhibits=[lost])
+        lost = Interlock(kind="stopped", by="anna", reason="not saved on disk (it is full)", since=1)
+        return MotionStatus(header=bus.header(), interlocks=[lost])
     images = bus.writer(topics.CAMERA_IMAGE)
     bus.serve(topics.TASK_COMMAND, answer)
     bus.serve(topics.MOTION_STOP, stop)

@@ -16,14 +16,12 @@ from common.transport.bus import Bus
 from common.transport.codec import encode
 from common.transport.local import LocalNetwork
 from common.transport.session import RawSample
-from recording.capturing import Capture
-from recording.decoding import schema_of
-from recording.files import SplitWriter
-from recording.own import Own
-from recording.reading import Recording
-from recording.sample import Sample
+from recording.capture import Capture, CustomTopics
+from recording.reader import Recording
+from recording.sample import Sample, schema_of
 from recording.selection import Selection
 from recording.sink import Sink
+from recording.writer import SplitWriter
 
 TWO_CAMERAS = str(Path(__file__).parents[1] / "data" / "two_cameras.yaml")
 RENAMED = {"camera/*": "left/camera/*"}
@@ -47,7 +45,7 @@ def bus_of(network: LocalNetwork, name: str, renamed: dict[str, str] | None = No
     return Bus(network.session(), service=name, cell="cell", clock=Clock(), topics=renamed)
 
 
-async def kind_of(network: LocalNetwork, own: Own | None, *, ready_first: bool) -> str:
+async def kind_of(network: LocalNetwork, own: CustomTopics | None, *, ready_first: bool) -> str:
     """What a renamed state, first written after the recorder began, is recorded as."""
     kept, recorder = Kept(), bus_of(network, "recorder")
     capture = Capture(recorder, Selection.of(), kept, own)  # type: ignore[arg-type]
@@ -70,8 +68,8 @@ async def test_a_state_under_another_name_that_begins_later_is_recorded_as_a_sta
 
 
 async def test_where_the_cell_is_known_a_renamed_state_is_one_before_its_service_is_ready() -> None:
-    own = Own.of(load_cell(TWO_CAMERAS))
-    assert Own.read(str(own)) == own and not own.modules
+    own = CustomTopics.of(load_cell(TWO_CAMERAS))
+    assert CustomTopics.read(str(own)) == own and not own.modules
     assert await kind_of(LocalNetwork(), own, ready_first=False) == "state"
 
 
@@ -86,7 +84,7 @@ def test_modules_of_a_persons_own_bring_their_messages_and_kinds(
         "SHINE = Topic('gloss', Shine, 'event', 'how it shines')\n")
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
-    own = Own(("brought.polishing", "brought.missing"), ({"gloss": "left/gloss"},))
+    own = CustomTopics(("brought.polishing", "brought.missing"), ({"gloss": "left/gloss"},))
     assert not schema_of("Shine")
     kinds = own.kinds(own.topics())
     assert (kinds["shine"], kinds["left/gloss"], kinds["joint_states"]) == ("state", "event", "stream")

@@ -10,16 +10,15 @@ import pytest
 from common.config import Cell, load_cell, names_of
 from common.errors import ConfigError
 from tests.harness import ask
-from tools.check.cell import quick, refused, thorough
-from tools.check.finding import Finding
-from tools.check.services import wiring
-from tools.check.wiring import Keys, check_wiring
+from tools.check import Finding
+from tools.check.cell import blocking_errors, check_files, check_model
+from tools.check.services import Keys, check_wiring, wiring
 
 ONE = "world.count=1"
 
 
 def found_in(cell: Cell) -> list[Finding]:
-    return [*quick(cell), *thorough(cell)]
+    return [*check_files(cell), *check_model(cell)]
 
 
 QUICK = [
@@ -72,19 +71,20 @@ THOROUGH = [
 @pytest.mark.parametrize(("name", "overrides", "severity", "what", "is_refused"), QUICK)
 def test_mistake_is_told_without_a_model_of_the_robot(name, overrides, severity, what, is_refused):
     cell = load_cell(name, [*([ONE] if name == "panda" else []), *overrides])
-    found = [each for each in quick(cell) if what in each.what]
-    assert [(each.severity, each.refused) for each in found[:1]] == [(severity, is_refused)], quick(cell)
+    found = [each for each in check_files(cell) if what in each.what]
+    assert [(each.severity, each.refused) for each in found[:1]] == [(severity, is_refused)], check_files(cell)
     assert found[0].remedy and "\n" not in found[0].line
-    assert bool(refused(cell)) == is_refused
+    assert bool(blocking_errors(cell)) == is_refused
 
 
 def test_link_that_a_camera_sits_on_and_that_the_robot_has_not_is_told_with_the_choices():
     assert found_in(load_cell(HAND)) == []
-    found = quick(load_cell(HAND, ["world.camera.mount=hand"]))
+    found = check_files(load_cell(HAND, ["world.camera.mount=hand"]))
     assert [(each.severity, each.refused) for each in found] == [("error", True)]
     assert found[0].what.startswith("world.camera.mount: 'hand' is no link of panda; choices: tcp, panda_link0")
     both = str(Path(HAND).with_name("hand_and_fixed.yaml"))
-    assert quick(load_cell(both, ["world.cameras.hand.mount=x"]))[0].what.startswith("world.cameras.hand.mount: 'x' is")
+    (found, *_) = check_files(load_cell(both, ["world.cameras.hand.mount=x"]))
+    assert found.what.startswith("world.cameras.hand.mount: 'x' is")
     with pytest.raises(ConfigError, match="needs position and rpy: where it sits on tcp"):
         load_cell("panda", ["world.camera={mount: tcp}"])
 
@@ -92,8 +92,8 @@ def test_link_that_a_camera_sits_on_and_that_the_robot_has_not_is_told_with_the_
 @pytest.mark.parametrize(("name", "overrides", "severity", "what", "is_refused"), THOROUGH)
 def test_place_or_pose_that_the_arm_cannot_have_is_told(name, overrides, severity, what, is_refused):
     cell = load_cell(name, [ONE, *overrides])
-    found = [each for each in thorough(cell) if what in each.what]
-    assert [(each.severity, each.refused) for each in found] == [(severity, is_refused)], [*thorough(cell)]
+    found = [each for each in check_model(cell) if what in each.what]
+    assert [(each.severity, each.refused) for each in found] == [(severity, is_refused)], [*check_model(cell)]
 
 
 @pytest.mark.parametrize("overrides", [["world.layout=random", "world.count=8"], []])

@@ -18,10 +18,9 @@ from common.errors import DecodeError
 from common.process import environment
 from common.transport.local import LocalNetwork
 from tests.harness import Zencell
-from tools.doctor import configuration, leftovers, machine, network, software
-from tools.doctor.examining import examine
-from tools.doctor.finding import Finding
-from tools.doctor.leftovers import Seen
+from tools.doctor import Finding, examination, machine, network, software
+from tools.doctor.examination import examine
+from tools.doctor.machine import Seen
 
 Disk = namedtuple("Disk", "total used free")
 NOWHERE = "tcp/127.0.0.1:1"
@@ -57,7 +56,7 @@ def test_this_machine_is_examined_and_what_is_not_well_has_a_remedy() -> None:
 def test_exit_code_is_1_when_something_fails(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    looks = "tools.doctor.examining.examine"
+    looks = "tools.doctor.examination.examine"
     monkeypatch.setattr(looks, lambda endpoint: iter([Finding("fail", "the roof", "mend it")]))
     assert app.execute(["doctor"]) == 1
     assert capsys.readouterr().out == "fail  the roof: mend it\n"
@@ -139,15 +138,15 @@ def test_missing_description_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     )
     (tmp_path / "robots" / "wrong.yaml").write_text("{name: wrong}")
     monkeypatch.setenv("ZENCELL_CONFIG", str(tmp_path))
-    it, wrong = configuration.robots()
+    it, wrong = examination.robots()
     not_well(it, "robot it: nowhere.urdf is missing", "pip install", level="fail")
     not_well(wrong, "robot wrong: urdf: is missing", "correct", "wrong.yaml", level="fail")
 
 
 def test_robots_and_cells_that_come_with_us_are_well() -> None:
-    assert [(finding.level, finding.what.split(":")[0]) for finding in configuration.robots()] == [
+    assert [(finding.level, finding.what.split(":")[0]) for finding in examination.robots()] == [
         ("ok", "robot fr3"), ("ok", "robot panda"), ("ok", "robot ur5")]
-    assert [(finding.level, finding.what.split(":")[0]) for finding in configuration.cells()] == [
+    assert [(finding.level, finding.what.split(":")[0]) for finding in examination.cells()] == [
         ("ok", "cell panda"), ("ok", "cell ur5")]
 
 
@@ -162,22 +161,22 @@ def test_cell_that_can_not_be_used_fails(
     text: str, parts: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     root = tmp_path / "config"
-    shutil.copytree(configuration.Path(__file__).resolve().parents[2] / "config", root)
+    shutil.copytree(examination.Path(__file__).resolve().parents[2] / "config", root)
     for path in (root / "cells").iterdir():
         path.unlink()
     (root / "cells" / "mine.yaml").write_text(text)
     monkeypatch.setenv("ZENCELL_CONFIG", str(root))
     monkeypatch.setattr(sys, "path", list(sys.path))
-    (finding,) = configuration.cells()
+    (finding,) = examination.cells()
     not_well(finding, "cell mine", *parts, str(root / "cells" / "mine.yaml"), level="fail")
 
 
 def test_configuration_that_is_not_there_or_empty_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ZENCELL_CONFIG", str(tmp_path / "nowhere"))
-    (finding,) = configuration.cells()
+    (finding,) = examination.cells()
     not_well(finding, "nowhere", "(ZENCELL_CONFIG)", "unset", level="fail")
     monkeypatch.setenv("ZENCELL_CONFIG", str(tmp_path))
-    (finding,) = configuration.cells()
+    (finding,) = examination.cells()
     not_well(finding, "no cell in", level="fail")
 
 
@@ -190,7 +189,7 @@ def test_service_that_can_not_be_imported_fails(folder: Path, monkeypatch: pytes
     monkeypatch.setenv("ZENCELL_CONFIG", str(folder))
     monkeypatch.chdir(folder)
     monkeypatch.setattr(sys, "path", list(sys.path))
-    (finding,) = configuration.cells()
+    (finding,) = examination.cells()
     not_well(finding, "cell tiny", "nothing_of_that_name", "install what is missing", level="fail")
 
 
@@ -268,43 +267,43 @@ def seen(pid: int, ppid: int, command: tuple[str, ...], status: str = "sleeping"
 
 
 def test_cell_that_is_up_is_no_leftover() -> None:
-    findings = list(leftovers.judge([seen(1, 0, ("init",)), seen(10, 1, UP, age=7300), seen(11, 10, SERVICE)]))
+    findings = list(machine.judge([seen(1, 0, ("init",)), seen(10, 1, UP, age=7300), seen(11, 10, SERVICE)]))
     assert [finding.level for finding in findings] == ["ok", "ok"]
     assert findings[0].what == "a cell is up, or comes up: zencell up panda (10), for 2 h"
 
 
 @pytest.mark.parametrize("parent", [seen(1, 0, ("/sbin/init",)), seen(5, 1, ("/usr/bin/tini",), name="tini")])
 def test_service_whose_supervisor_was_killed_is_to_be_killed(parent: Seen) -> None:
-    (finding,) = leftovers.judge([parent, seen(11, parent.pid, SERVICE, "stopped"), seen(12, parent.pid, SERVICE)])
+    (finding,) = machine.judge([parent, seen(11, parent.pid, SERVICE, "stopped"), seen(12, parent.pid, SERVICE)])
     not_well(finding, "without a supervisor: vision_detector (11), vision_detector (12)", "kill -9 11 12")
 
 
 def test_service_of_a_parent_that_can_not_be_seen_is_without_a_supervisor() -> None:
-    (finding,) = leftovers.judge([seen(11, 10, SERVICE)])
+    (finding,) = machine.judge([seen(11, 10, SERVICE)])
     not_well(finding, "kill -9 11")
 
 
 def test_stopped_service_of_a_living_cell_can_go_on() -> None:
-    finding, up = leftovers.judge([seen(10, 1, UP), seen(11, 10, SERVICE, "stopped"), seen(12, 10, SERVICE)])
+    finding, up = machine.judge([seen(10, 1, UP), seen(11, 10, SERVICE, "stopped"), seen(12, 10, SERVICE)])
     not_well(finding, "stopped (SIGSTOP): vision_detector (11)", "kill -CONT 11")
     assert up.level == "ok"
 
 
 def test_stopped_supervisor_can_go_on_or_be_ended() -> None:
-    (finding,) = leftovers.judge([seen(10, 1, UP, "stopped"), seen(11, 10, SERVICE)])
+    (finding,) = machine.judge([seen(10, 1, UP, "stopped"), seen(11, 10, SERVICE)])
     not_well(finding, "a supervisor is stopped", "zencell up panda (10)", "kill -CONT 10", "kill -9 10")
 
 
 def test_old_supervisor_without_services_is_to_be_ended() -> None:
-    (finding,) = leftovers.judge([seen(10, 1, UP)])
+    (finding,) = machine.judge([seen(10, 1, UP)])
     not_well(finding, "a supervisor without services", "kill 10")
-    assert [f.level for f in leftovers.judge([seen(10, 1, UP, age=2.0)])] == ["ok", "ok"]  # it has just begun
+    assert [f.level for f in machine.judge([seen(10, 1, UP, age=2.0)])] == ["ok", "ok"]  # it has just begun
 
 
 def test_other_programs_are_none_of_our_business() -> None:
     others = [seen(2, 1, ("vim", "zencell.txt")), seen(3, 1, ("python", "-m", "services")), seen(4, 1, ()),
               seen(5, 1, (sys.executable, "zencell", "topic", "echo", "tf"))]
-    assert list(leftovers.judge(others)) == [Finding("ok", "no process is left over from an earlier run")]
+    assert list(machine.judge(others)) == [Finding("ok", "no process is left over from an earlier run")]
 
 
 @pytest.mark.slow
@@ -315,12 +314,12 @@ def test_stopped_service_of_a_cell_is_found_until_the_cell_is_gone(zencell: Call
     middle.suspend()
     while middle.status() != psutil.STATUS_STOPPED:  # only its parent is told when that is so, up to 5 ms later
         time.sleep(0.001)
-    (found,) = (f for f in leftovers.processes() if f"middle ({middle.pid})" in f.what)
+    (found,) = (f for f in machine.processes() if f"middle ({middle.pid})" in f.what)
     not_well(found, "stopped (SIGSTOP)", "kill -CONT", str(middle.pid))
     command.process.kill()
     command.end()
     command.until_childless()  # the system wakes it when its supervisor dies
-    assert not [f for f in leftovers.processes() if f"({middle.pid})" in f.what]
+    assert not [f for f in machine.processes() if f"({middle.pid})" in f.what]
 
 
 def test_service_that_outlived_its_supervisor_is_found() -> None:
@@ -332,7 +331,7 @@ def test_service_that_outlived_its_supervisor_is_found() -> None:
         process = psutil.Process(int(shell.stdout.readline()))
         shell.wait()  # now somebody else is its parent
         try:
-            (found,) = (f for f in leftovers.processes() if f"deaf ({process.pid})" in f.what)
+            (found,) = (f for f in machine.processes() if f"deaf ({process.pid})" in f.what)
         finally:
             process.kill()
     not_well(found, "without a supervisor", "kill -9", str(process.pid))

@@ -21,7 +21,7 @@ from common.topics import Topic
 from common.transport.codec import decode
 from common.transport.connect import connect
 from common.transport.endpoint import endpoint_of
-from recording.reading import Recording
+from recording.reader import Recording
 from tests.harness import command_line, environment
 
 DATA = Path(__file__).resolve().parent.parent / "data"

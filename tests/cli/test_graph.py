@@ -6,8 +6,7 @@ import pytest
 
 from cli.main import app
 from common.supervision.wired import Wired
-from tools.graph.drawing import OUTSIDE, Graph, dot, edges, graph_of, mermaid
-from tools.graph.svg import svg
+from tools.graph import OUTSIDE, Graph, dot, edges, graph_of, mermaid, svg
 
 SERVICES = [
     Wired("planner", "Plans.", writes=["display_trajectory"], serves=["motion/plan"], reads=["joint_states"]),

@@ -15,7 +15,7 @@ from common.robot.transforms import invert, rpy_to_matrix, transform
 from tests.cli.conftest import CELL, make_folder
 from tests.harness import place_of
 from tests.tools.calibration.rendered_boards import BOARD, Lens, facing, render
-from tools.calibration.views import ViewCollector
+from tools.calibration.views import HandEyeCollector
 
 LENS = Lens()
 ROBOT = RobotModel.load(load_cell("panda").robot)
@@ -48,14 +48,14 @@ def intrinsics(folder: Path) -> str:
     return file
 
 
-def rest_at(collector: ViewCollector, q: np.ndarray, begin: float) -> None:
+def rest_at(collector: HandEyeCollector, q: np.ndarray, begin: float) -> None:
     for k in range(60):
         collector.joints(begin + 0.01 * k, q)
 
 
 def test_pictures_of_a_resting_arm_in_new_poses_count_and_the_folder_can_be_gone_on_with(tmp_path: Path) -> None:
     first, second = poses(2)
-    collector = ViewCollector(tmp_path / "views", ROBOT, "panda", BOARD)
+    collector = HandEyeCollector(tmp_path / "views", ROBOT, "panda", BOARD)
     assert collector.picture(1.0, picture(first)) == "nobody says where the joints were"
     rest_at(collector, first, 1.0)
     assert collector.picture(1.59, picture(first)) == "" and collector.count == 1
@@ -64,7 +64,7 @@ def test_pictures_of_a_resting_arm_in_new_poses_count_and_the_folder_can_be_gone
     assert collector.picture(1.8, picture(second)) == "the arm moves"
     assert collector.picture(2.19, np.full((480, 640, 3), 90, np.uint8)) == "no marker is seen"
     assert collector.picture(2.19, picture(second)) == "" and "turn the hand further" in collector.hint
-    again = ViewCollector(tmp_path / "views", ROBOT, "panda", BOARD)
+    again = HandEyeCollector(tmp_path / "views", ROBOT, "panda", BOARD)
     assert again.count == 2
     kept = yaml.safe_load((tmp_path / "views" / "joints.yaml").read_text())
     assert kept["robot"] == "panda" and np.allclose(kept["pictures"]["view_001.png"], second, atol=1e-8)
@@ -73,7 +73,7 @@ def test_pictures_of_a_resting_arm_in_new_poses_count_and_the_folder_can_be_gone
 def test_camera_on_the_hand_is_found_from_a_folder_and_written(
     tmp_path: Path, capsys: pytest.CaptureFixture[str],
 ) -> None:
-    collector = ViewCollector(tmp_path / "views", ROBOT, "panda", BOARD)
+    collector = HandEyeCollector(tmp_path / "views", ROBOT, "panda", BOARD)
     for n, q in enumerate(poses(10)):
         rest_at(collector, q, float(n))
         assert collector.picture(n + 0.59, picture(q, n)) == ""

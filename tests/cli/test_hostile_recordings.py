@@ -16,8 +16,8 @@ from mcap.writer import MCAP0_MAGIC
 
 from cli.main import app
 from common.messages import Header, Image, JointState, LogLine
-from recording.names import file_names
-from recording.writing import RUN, RecordingWriter
+from recording.export import file_names
+from recording.writer import RUN, RecordingWriter
 from tests.recording.samples import joints, packed, status
 
 STEERING = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202e]")
@@ -31,8 +31,8 @@ VERBS = ("info", "play", "report", "export", "recover")
 def warm() -> None:
     """What the verbs import is no part of what a recording costs."""
     import recording.foxglove
-    import recording.recovery
-    import recording.report.page  # noqa: F401
+    import recording.reader
+    import recording.report.build  # noqa: F401
 
 
 def verb(name: str, path: Path) -> list[str]:

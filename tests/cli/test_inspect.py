@@ -77,7 +77,7 @@ def test_hz_and_bw_measure(place: Place) -> None:
 
 def test_stop_that_would_not_outlive_the_executor_is_told_to_who_stops(place: Place) -> None:
     told, task = place.ask("task", "stop").stderr.splitlines()
-    assert told == "zencell: stopped since 1970-01-01 00:00:00 UTC by anna (not kept on disk (it is full))"
+    assert told == "zencell: stopped since 1970-01-01 00:00:00 UTC by anna (not saved on disk (it is full))"
     assert "the arm is stopped and stays so until a start; the task did not hear of it" in task
 
 

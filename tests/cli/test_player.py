@@ -16,10 +16,9 @@ from common.messages import Header, Image
 from common.transport.local import LocalNetwork
 from common.transport.session import RawSample
 from recording.player import Player
-from recording.reading import Recording
-from recording.sample import Sample
-from recording.stamps import stamp_of
-from recording.writing import RUN, RecordingWriter
+from recording.reader import Recording
+from recording.sample import Sample, stamp_of
+from recording.writer import RUN, RecordingWriter
 from tests.recording.samples import START, STEP, joints, packed, status, write
 
 

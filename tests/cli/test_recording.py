@@ -15,10 +15,9 @@ from pathlib import Path
 import pytest
 
 from common.client.keyboard import names_of
-from recording.reading import Recording
-from recording.sink import Figures
-from recording.summary import summarise
-from recording.telling import in_bytes, outcome, progress
+from recording.reader import Recording
+from recording.sink import RecordingStats
+from recording.summary import in_bytes, outcome, progress, summarise
 from tests.cli.conftest import CELL, make_folder
 from tests.harness import PATIENCE, Place, Zencell, ask, command_line, environment, free_domain, place_of
 from tests.recording.samples import joints, status, write
@@ -358,7 +357,7 @@ def test_keys_are_told_apart_and_unknown_sequences_are_none() -> None:
 
 
 def test_lines_for_people() -> None:
-    before, now = Figures(10, 1000, 1.0), Figures(1234, 2_001_000, 2.0, {"panda/tf": 3})
+    before, now = RecordingStats(10, 1000, 1.0), RecordingStats(1234, 2_001_000, 2.0, {"panda/tf": 3})
     assert progress(now, before, 2) == "   2.0 s  1,234 messages  2.0 MB  2.0 MB/s  5 lost"
     assert outcome(["a_0.mcap", "a_1.mcap"], now, {"panda/log": 1}) == [
         "recorded 1,234 messages, 2.0 MB, 2.0 s: a_0.mcap to a_1.mcap",

@@ -7,14 +7,14 @@ import cv2
 import numpy as np
 import pytest
 
-from applications.outlining.messages import OutlinePoints, OutlineStatus
-from applications.pick_place.messages import PickPlaceStatus
+from applications.outlining.topics import OutlinePoints, OutlineStatus
+from applications.pick_place.topics import PickPlaceStatus
 from cli.main import app
 from common import messages as m
 from common.transport.codec import encode
-from recording.report import film as filming
+from recording.report import clips
 from recording.sample import Sample
-from recording.writing import RUN, RecordingWriter
+from recording.writer import RUN, RecordingWriter
 
 BEGIN = 1_700_000_000_000_000_000  # [ns]
 ARM = [f"panda_joint{k}" for k in range(1, 8)]
@@ -232,11 +232,13 @@ def test_an_outline_is_compared_with_what_was_traced(tmp_path):
 def test_an_application_of_ones_own_is_told_of_in_its_own_words(tmp_path, monkeypatch):
     (tmp_path / "own_words").mkdir()
     (tmp_path / "own_words" / "polish.py").write_text(
-        "from common import messages as m\nfrom recording.report import application\n"
+        "from common import messages as m\nfrom common.application import Application, ApplicationTopics\n"
+        "from recording.report import application\n"
         "from common.topics import Topic\n\n"
         "class PolishStatus(m.TaskStatus):\n    pass\n\n"
         'STATUS = Topic("polish_status", PolishStatus, "state", "how smooth it is")\n\n'
-        'class Figures(application.Figures):\n    COUNTED = "polished"\n'
+        'class Figures(application.Figures):\n    COUNTED = "polished"\n\n'
+        "APPLICATION = Application(topics=ApplicationTopics(status=STATUS), figures=Figures)\n"
     )
     (tmp_path / "cell.yaml").write_text(
         "cell: shop\nrobot: panda\nworld: balls\npipeline: lerp\napplication: own_words.polish\n"
@@ -375,8 +377,8 @@ def failures(tape, *times):
 
 def test_only_pictures_that_a_film_shows_are_looked_at_and_each_film_has_the_size_of_its_own(tmp_path, monkeypatch):
     tape, looked_at = Tape(tmp_path / "cut.mcap"), []
-    small = filming._small
-    monkeypatch.setattr(filming, "_small", lambda message: looked_at.append(message) or small(message))
+    small = clips._small
+    monkeypatch.setattr(clips, "_small", lambda message: looked_at.append(message) or small(message))
     failures(tape, 10, 50)
     for k in range(60):
         tape.put(k, "camera/image_raw", picture(tape, k, k, *((100, 80) if k < 30 else (80, 60))))
@@ -392,13 +394,13 @@ def test_tall_pictures_are_made_small_and_of_many_cameras_some_are_shown(tmp_pat
     tape = Tape(tmp_path / "run.mcap")
     failures(tape, 2)
     for k in range(3):
-        for camera in range(filming.MOST_CAMERAS + 3):
+        for camera in range(clips.MOST_CAMERAS + 3):
             data = np.full((16384, 1, 3), 100 * k, np.uint8).tobytes()
             tape.put(k, f"{camera}/image_raw", picture(tape, k, 0, 1, 16384, data))
     tape.writer.close({})
     assert app.execute(["report", str(tmp_path / "run.mcap")]) == 0
     found = films_of((tmp_path / "run.html").read_text())
-    assert [(len(film.frames), film.frames[0].shape[:2]) for film in found] == [(3, (480, 1))] * filming.MOST_CAMERAS
+    assert [(len(film.frames), film.frames[0].shape[:2]) for film in found] == [(3, (480, 1))] * clips.MOST_CAMERAS
 
 
 def test_what_had_gone_wrong_before_the_recording_began_has_no_film(tmp_path):

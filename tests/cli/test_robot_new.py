@@ -17,7 +17,7 @@ from common.robot.model import RobotModel
 from lab.simulation import Simulation
 from tests.harness import ask
 from tests.small_arms import nodding, scara
-from tools.robot_setup.fingers import tool_complaints
+from tools.robot_setup.fingers import check_tool_frame
 
 URDF = Path(__file__).parents[1] / "data" / "side_arm.urdf"
 NO_ARM = '<robot name="post"><link name="a"/><link name="b"/><joint name="j" type="fixed">' \
@@ -48,7 +48,7 @@ def test_the_tool_frame_points_out_of_the_hand_although_no_link_of_the_urdf_does
     assert robot.config.tcp is not None and robot.config.gripper is not None
     assert robot.config.gripper.closing_axis == "y"
     assert robot.config.gripper.max_width == pytest.approx(0.08)
-    assert tool_complaints(robot) == []
+    assert check_tool_frame(robot) == []
     poses = robot.link_poses(robot.named("home"))
     T_flange_tcp = np.linalg.inv(poses["flange"]) @ poses[robot.config.tcp_link]
     assert T_flange_tcp[:3, 2] == pytest.approx([1, 0, 0], abs=1e-5)

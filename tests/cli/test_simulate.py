@@ -13,8 +13,8 @@ import pytest
 
 from cli.main import app
 from common.errors import ConfigError
-from lab.telling import listed, seeds_of
-from recording.reading import Recording
+from lab.campaign import listed, seeds_of
+from recording.reader import Recording
 
 pytestmark = pytest.mark.timeout(600)  # some seconds of work, on a machine that may be busy
 SMALL = ["panda", "--set", "world.count=1"]

@@ -20,9 +20,9 @@ import typer
 
 from common.messages import TaskStatus
 from common.topics import Topic
-from common.verbs import BeforeRun
+from common.application import Application, ApplicationTopics
+from common.verbs import BeforeRun, Verbs
 
-TASK = "thing"
 STATUS = Topic("thing_status", TaskStatus, "state", "state")
 
 
@@ -31,14 +31,17 @@ def greet(context: typer.Context, cell: str, overrides: list[str] | None = None,
     typer.echo(f"hello {cell} {overrides} {loud} {type(context.obj).__name__}")
 
 
-VERBS = {"greet": greet, "task greet": greet}
-
-
 def before_run(
     cell: str, overrides: list[str], world: str | None, *,
     wish: Annotated[str, typer.Option("--wish", help="what to wish for")] = "",
 ) -> BeforeRun:
     return BeforeRun([*overrides, f"services.thing.wish={wish}"] if wish else overrides)
+
+
+APPLICATION = Application(
+    topics=ApplicationTopics(status=STATUS), task="thing",
+    verbs=Verbs(commands={"greet": greet, "task greet": greet}, before_run=before_run),
+)
 '''
 
 

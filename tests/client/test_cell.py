@@ -198,7 +198,7 @@ def test_jog_of_a_program_that_was_held_up_says_that_its_words_came_too_late(mon
             monkeypatch.setattr(arm, "JOG_PERIOD", 1.0)  # longer than the arm goes on without a word
 
         holding = asyncio.create_task(hold_up())
-        with pytest.raises(NotJogged, match="nobody's; words of this program came too late"):
+        with pytest.raises(NotJogged, match="free; words of this program came too late"):
             await cell.arm.jog(linear=(0.0, 0.0, 0.05), seconds=10.0)
         await holding
         assert np.abs(await cell.arm.velocities()).max() < 1e-3
@@ -458,7 +458,7 @@ def test_any_key_is_called_and_listened_to() -> None:
             break
         answer = await cell.call("motion/hold", hold=True, owner="program")
         again = await cell.call(topics.MOTION_HOLD, HoldRequest(hold=True, owner="program"))
-        assert answer.held and again.held and [each.by for each in again.inhibits] == ["program"]
+        assert answer.held and again.held and [each.by for each in again.interlocks] == ["program"]
         await cell.arm.release()
         for asked, error, words in (
             (cell.call("motion/hodl"), UnknownName, "motion/hold"),

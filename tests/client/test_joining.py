@@ -9,8 +9,7 @@ from typing import Any
 
 import pytest
 
-from applications.pick_place.messages import PickPlaceStatus
-from applications.pick_place.topics import PICK_PLACE_STATUS
+from applications.pick_place.topics import PICK_PLACE_STATUS, PickPlaceStatus
 from common.client import joining
 from common.client.cell import Cell
 from common.client.hearing import NothingHeard
@@ -90,7 +89,7 @@ async def test_arm_is_stopped_and_task_started_under_the_keys_that_the_program_m
         Cell("two_arms", remapped=LEFT, owner="anna") as left, Cell("two_arms", owner="anna") as right,
     ):
         stopped = await left.arm.stop("smoke")
-        assert [stop.by for stop in (await left.arm.status()).inhibits] == ["anna"]
+        assert [stop.by for stop in (await left.arm.status()).interlocks] == ["anna"]
         assert await joining.newest_heard(left.bus) == stopped.newest > 0 == await joining.newest_heard(right.bus)
         assert left.bus.full_key(await left.task.topic()) == "two_arms/left/pick_place_status"
         await left.task.start()
@@ -152,7 +151,9 @@ async def test_task_of_an_application_of_ones_own_is_heard_when_its_module_is_na
 ) -> None:
     monkeypatch.syspath_prepend(tmp_path)
     (tmp_path / "own").mkdir()
-    (tmp_path / "own" / "application.py").write_text(f"from {__name__} import OWN as STATUS\n")
+    (tmp_path / "own" / "application.py").write_text(
+        f"from common.application import Application, ApplicationTopics\nfrom {__name__} import OWN\n"
+        "APPLICATION = Application(topics=ApplicationTopics(status=OWN))\n")
 
     async def tells(bus: Bus, config: None) -> None:
         out = bus.writer(OWN)

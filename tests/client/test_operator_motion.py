@@ -8,8 +8,7 @@ from typing import Any, cast
 
 import pytest
 
-from applications.pick_place.messages import PickPlaceStatus
-from applications.pick_place.topics import PICK_PLACE_STATUS
+from applications.pick_place.topics import PICK_PLACE_STATUS, PickPlaceStatus
 from common import messages as m
 from common import topics
 from common.client.arm import Arm
@@ -158,37 +157,37 @@ async def test_robot_that_is_held_with_nothing_to_do_is_let_go_first(cell: Cell,
     assert not cell.status.held
 
 
-def said(kind: str, by: str, since: int) -> m.Inhibit:
-    return m.Inhibit.model_validate({"kind": kind, "by": by, "since": since})
+def said(kind: str, by: str, since: int) -> m.Interlock:
+    return m.Interlock.model_validate({"kind": kind, "by": by, "since": since})
 
 
 @pytest.mark.parametrize("kind", ["held", "stopped"])
 async def test_robot_that_another_person_holds_or_stopped_is_left_alone(cell: Cell, kind: str) -> None:
-    cell.say(held=kind == "held", inhibits=[said(kind, "anna", 7)])
+    cell.say(held=kind == "held", interlocks=[said(kind, "anna", 7)])
     with pytest.raises(MotionFailed, match=rf"the robot is {kind} since .* by anna"):
         await OperatorMotion(cell.bus, owner="bert").move(HOME)
     assert cell.asked == []
 
 
 async def test_what_is_said_while_a_motion_is_planned_is_not_known_to_who_asked_for_it_before(cell: Cell) -> None:
-    cell.say(held=True, inhibits=[said("held", "anna", 7)])
+    cell.say(held=True, interlocks=[said("held", "anna", 7)])
     answer = cell.plan
 
     async def stopped(request: m.PlanRequest) -> m.PlanResponse:
-        cell.say(held=True, inhibits=[said("held", "anna", 7), said("stopped", "anna", 8)])
+        cell.say(held=True, interlocks=[said("held", "anna", 7), said("stopped", "anna", 8)])
         return await answer(request)
 
     next(s for s in cell.bus._servers if s.topic is topics.MOTION_PLAN)._handler = stopped
     await OperatorMotion(cell.bus, owner="anna").move(HOME)
     _, hold, execute = cell.asked
-    assert isinstance(hold, m.HoldRequest) and (hold.owner, hold.into_stop, hold.heard) == ("anna", True, 7)
-    assert isinstance(execute, m.ExecuteRequest) and (execute.owner, execute.heard) == ("anna", 7)
+    assert isinstance(hold, m.HoldRequest) and (hold.owner, hold.into_stop, hold.acknowledged) == ("anna", True, 7)
+    assert isinstance(execute, m.ExecuteRequest) and (execute.owner, execute.acknowledged) == ("anna", 7)
 
 
 async def test_what_is_said_between_the_motions_of_a_row_is_not_known_to_the_later_ones(cell: Cell) -> None:
-    cell.say(inhibits=[said("stopped", "anna", 8)])
-    await OperatorMotion(cell.bus, owner="anna").move(HOME, heard=7)
-    assert isinstance(cell.asked[-1], m.ExecuteRequest) and cell.asked[-1].heard == 7
+    cell.say(interlocks=[said("stopped", "anna", 8)])
+    await OperatorMotion(cell.bus, owner="anna").move(HOME, acknowledged=7)
+    assert isinstance(cell.asked[-1], m.ExecuteRequest) and cell.asked[-1].acknowledged == 7
 
 
 async def test_motion_of_somebody_else_is_not_touched(
@@ -212,11 +211,11 @@ async def test_motion_that_is_being_stopped_is_waited_for(cell: Cell, person: Op
 @pytest.mark.parametrize("waited_for", ["motion", "free"])
 async def test_stop_while_the_motion_before_is_waited_for_keeps_the_robot(cell: Cell, waited_for: str) -> None:
     person = OperatorMotion(cell.bus, [], owner="anna")
-    cell.say(id="before", state="active", inhibits=[said("stopped", "anna", 3)])
+    cell.say(id="before", state="active", interlocks=[said("stopped", "anna", 3)])
     asked = asyncio.create_task(person.move(HOME) if waited_for == "motion" else person.require_free())
     for _ in range(50):
         await asyncio.sleep(0)
-    cell.say(state="cancelled", inhibits=[said("stopped", "anna", wall_ns())])
+    cell.say(state="cancelled", interlocks=[said("stopped", "anna", wall_ns())])
     with pytest.raises(MotionFailed, match=r"the robot is stopped since .* by anna"):
         await asked
     assert kinds(cell) == []
@@ -228,7 +227,7 @@ async def test_stop_that_the_same_person_said_before_the_motion_keeps_it_only_un
     moving = asyncio.create_task(person.move(HOME))
     for _ in range(50):
         await asyncio.sleep(0)
-    cell.say(state="cancelled", inhibits=[said("stopped", "anna", since)])
+    cell.say(state="cancelled", interlocks=[said("stopped", "anna", since)])
     assert (await moving).state == "succeeded"
 
 
@@ -240,12 +239,12 @@ async def test_stop_that_a_person_says_while_a_motion_of_a_program_of_theirs_is_
     def stop_meanwhile(request: m.Message) -> None:
         note(request)
         if isinstance(request, m.PlanRequest):
-            cell.say(inhibits=[said("stopped", "anna", since)])
+            cell.say(interlocks=[said("stopped", "anna", since)])
 
     cell.note = stop_meanwhile  # type: ignore[method-assign]
     await arm.move("home")
     execute = cell.asked[-1]
-    assert isinstance(execute, m.ExecuteRequest) and execute.heard is not None and execute.heard < since
+    assert isinstance(execute, m.ExecuteRequest) and execute.acknowledged is not None and execute.acknowledged < since
 
 
 async def test_task_that_begins_meanwhile_is_named(cell: Cell, person: OperatorMotion) -> None:

@@ -15,7 +15,7 @@ from common.errors import ConfigError, RemoteError
 from common.transport.bus import Bus
 from tests.client.test_cell import Over
 from tests.harness import until
-from tests.simulated.test_inhibits import again
+from tests.simulated.test_interlocks import again
 from tests.simulated.visited import SimulatedCell
 
 pytestmark = pytest.mark.timeout(600)  # some seconds of work, on a machine that may be busy
@@ -73,7 +73,7 @@ def test_solid_that_is_added_in_the_way_of_a_motion_has_the_arm_brake_until_it_i
             await until(motion, lambda m: m.state == "active" and m.progress > 0.02)
             await cell.scene.add("wall", *WALL, at=(0.45, -0.1, 0.35))
             held = await until(motion, lambda m: "scene_monitor" in m.held_by and m.message.startswith("held"), 2.0)
-            assert "added/wall is in the way of" in held.message
+            assert "added/wall obstructs" in held.message
             await cell.scene.remove("wall")
             assert (await moving).state == "succeeded"
         raise Over

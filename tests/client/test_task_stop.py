@@ -11,10 +11,10 @@ from common import topics
 from common.client.hearing import Ear
 from common.client.task import ArmOnly, TaskControl, TaskOnly
 from common.errors import Refused, RemoteError, ZencellError
-from common.messages.execution import NOT_KEPT
+from common.messages.execution import NOT_PERSISTED
 from common.transport.local import LocalNetwork
 
-UNKEPT = m.Inhibit(kind="stopped", by="ann", reason=f"{NOT_KEPT}: the disk is full", since=1)
+UNKEPT = m.Interlock(kind="stopped", by="ann", reason=f"{NOT_PERSISTED}: the disk is full", since=1)
 
 
 @pytest.mark.parametrize(("arm", "task", "raised", "said"), [
@@ -33,7 +33,7 @@ async def test_stop_says_who_of_arm_and_task_did_not_take_it(
         told.append("arm")
         if not arm:
             raise Refused("busy", "from the arm")
-        return m.MotionStatus(inhibits=[UNKEPT])
+        return m.MotionStatus(interlocks=[UNKEPT])
 
     async def stop_task(_: m.TaskCommand) -> m.TaskStatus:
         told.append("task")

@@ -115,7 +115,7 @@ def test_what_a_person_stopped_stays_so_when_containers_are_started_again_or_mad
         """Where the arm is, and who stopped it, once the task that was started again has said that it waits."""
         cell.wait_for("the task waits", lambda: heard(cell, "pick_place_status")["message"].startswith("stopped since"),
                       patience)
-        (stop,) = heard(cell, "motion/status")["inhibits"]
+        (stop,) = heard(cell, "motion/status")["interlocks"]
         return heard(cell, "joint_states")["position"], stop
 
     cell.wait_for("the task is ready", lambda: cell.is_ready(task), patience)
@@ -145,4 +145,4 @@ def test_what_a_person_stopped_stays_so_when_containers_are_started_again_or_mad
 
     said(cell, "task", "start")
     cell.wait_for("the arm moves", lambda: heard(cell, "joint_states")["position"] != where, patience)
-    assert heard(cell, "motion/status")["inhibits"] == []
+    assert heard(cell, "motion/status")["interlocks"] == []

@@ -8,7 +8,7 @@ from tests.deploy.engine import require_engine, run
 
 pytestmark = [pytest.mark.container, pytest.mark.timeout(900)]
 
-DRAWS = "from drivers.mujoco.gl import chosen_gl, gl_context; print(chosen_gl()); gl_context('egl', 64, 48).free()"
+DRAWS = "from drivers.mujoco.gl import select_gl, gl_context; print(select_gl()); gl_context('egl', 64, 48).free()"
 
 
 def test_pictures_are_drawn_by_opengl_in_the_image_with_physics() -> None:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from common.config import Parameters, RobotConfig
-from common.hardware.fingers import Fingers
 from common.hardware.interface import ArmState, HardwareFault, Limits, Vector
-from common.hardware.mock import MockHardware
+from common.hardware.mock import MockHardware, SimulatedFingers
 
 simulated = True
 made: list[StoppingArm] = []  # the newest last
@@ -20,7 +19,7 @@ class StoppingArm(MockHardware):
 
     delay = ahead = late = 0.0
 
-    def __init__(self, start: Vector, gripper: Fingers | None) -> None:
+    def __init__(self, start: Vector, gripper: SimulatedFingers | None) -> None:
         """Not stopped."""
         super().__init__(start, gripper)
         self.stopped = False
@@ -52,5 +51,5 @@ class StoppingArm(MockHardware):
 
 def create(robot: RobotConfig, limits: Limits, start: Vector, options: Options) -> StoppingArm:
     """The arm at `start` with open fingers."""
-    made.append(StoppingArm(start, Fingers(robot.gripper, robot.gripper.max_width) if robot.gripper else None))
+    made.append(StoppingArm(start, SimulatedFingers(robot.gripper, robot.gripper.max_width) if robot.gripper else None))
     return made[-1]

@@ -5,14 +5,14 @@ from collections.abc import Callable
 
 import numpy as np
 
-from common.hardware.driver import DrivenArm
+from common.hardware.driven_arm import DrivenArm
 from common.hardware.interface import HardwareFault
 
 PERIOD, TIMEOUT = 0.01, 30.0
 SWING = 1.6  # [s] there and back: it shows, and few stalls of a machine are in it
 FASTEST = 0.2 * np.pi / SWING  # [rad/s] that a joint is swung, halfway there and back
 HELD_UP = (  # a process, by the machine: which one it was decides who says so
-    "the driver was held up", "no word from", "set-points ceased to come", "its program has ended")
+    "the driver was held up", "no message from", "set-points ceased to come", "its program has ended")
 
 
 class Rig:

@@ -13,8 +13,8 @@ import ruckig
 
 from common.config import RobotConfig, load_cell
 from common.control.gripper_controller import GripperController
+from common.hardware.driven_arm import DrivenArm
 from common.hardware.driven_gripper import DrivenGripper
-from common.hardware.driver import DrivenArm
 from common.hardware.interface import HardwareFault, Limits
 from common.hardware.loading import load_hardware
 from common.messages import GripperCommand
@@ -190,7 +190,7 @@ def test_a_controller_that_is_frozen_or_started_again_is_found_again_where_it_st
     rig.until_it_moves()
     host.crash()
     stood = host.stands
-    rig.until("no word") if rig.arm.state.mode == "running" else None
+    rig.until("no message") if rig.arm.state.mode == "running" else None
     host.boot()
     rig.until("")
     assert np.allclose(rig.arm.read(0.0)[0], stood, atol=5e-3), "nothing has moved it"

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 
 from common.config import load_cell
-from common.hardware.driven_gripper import Fingers
+from common.hardware.driven_gripper import FingerState
 from drivers.franka_hand import connect
 
 CONFIG = load_cell("panda").robot.gripper
@@ -42,8 +42,8 @@ def test_fingers_that_met_hold_nothing(monkeypatch: pytest.MonkeyPatch, between:
     library = SimpleNamespace(Gripper=Gripper, CommandException=RuntimeError)
     monkeypatch.setitem(sys.modules, "pylibfranka", library)
     hand = connect({"host": "h"}, CONFIG)
-    assert hand.read() == Fingers(0.08, False, False, 0.0)
+    assert hand.read() == FingerState(0.08, False, False, 0.0)
     hand.move(0.0, 20.0)
-    assert hand.read() == Fingers(between, False, holds, 20.0 if holds else 0.0)
+    assert hand.read() == FingerState(between, False, holds, 20.0 if holds else 0.0)
     hand.move(0.08, 20.0)
     assert not hand.read().holding

@@ -16,7 +16,7 @@ from common.config import check, load_cell
 from common.errors import ConfigError
 from common.messages import Header
 from common.perception.depth import depth_of
-from common.perception.depth_sources import Shot
+from common.perception.depth_drivers import RgbdFrame
 from common.perception.image import image_to_array
 from common.perception.pinhole import Pinhole
 from common.process.in_process import running_service
@@ -33,20 +33,20 @@ BETWEEN = 33.0  # [ms] two shots
 HOLE = np.s_[100:140, 20:60]  # that was not measured
 
 
-def drawn(number: int) -> Shot:
+def drawn(number: int) -> RgbdFrame:
     """What a camera above the objects of a cell sees, of which a part was not measured, from 1 cm further away each."""
     cell = load_cell("ur5", world="w3")
     T = Pinhole.from_config(cell.world.camera).T_world_optical
     objects = load_world(cell.world, cell.world.objects).objects(Header()).objects
     lens = Pinhole(FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, WIDTH, HEIGHT, T)
-    view = Renderer(cell.world, camera=lens).see(objects)
+    view = Renderer(cell.world, camera=lens).render(objects)
     depth = view.depth_within(0.1, 10.0) + np.float32(0.01 * number)
     depth[HOLE] = np.nan
     assert len(np.unique(depth[np.isfinite(depth)])) > 1, "something stands there"
-    return Shot(view.colour, depth)
+    return RgbdFrame(view.colour, depth)
 
 
-def record(file: Path, shots: Sequence[Shot], colours: str = "rgb8", *, depth_too: bool = True) -> None:
+def record(file: Path, shots: Sequence[RgbdFrame], colours: str = "rgb8", *, depth_too: bool = True) -> None:
     """Write shots as the maker's viewer does of a camera: a device made of software, and its recorder."""
     device = rs.software_device()
     lens = rs.intrinsics()

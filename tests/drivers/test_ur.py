@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from common.errors import ConfigError
-from common.hardware.driver import DrivenArm, Reading
+from common.hardware.driven_arm import DrivenArm, Reading
 from common.hardware.interface import Limits
 from common.hardware.loading import is_simulated
 from drivers.ur import Options, create
@@ -94,7 +94,7 @@ def test_a_driver_that_was_held_up_does_not_take_the_arm_for_silent(host: UrHost
         time.sleep(0.2)  # longer than the arm may be silent, and shorter than the driver
         os.kill(driver[0].pid or 0, signal.SIGCONT)
         rig.until_it_moves()
-    assert not [each for each in rig.told[told:] if "no word from the controller" in each]
+    assert not [each for each in rig.told[told:] if "no message from the controller" in each]
     assert multiprocessing.active_children() == driver, "by the same process"
 
 
@@ -117,8 +117,8 @@ def test_a_program_that_ended_is_told_at_once_and_begun_again(
 ) -> None:
     rig.until_it_moves()
     driver = multiprocessing.active_children()
-    heard, hear = list[str](), rig.arm._process._hear
-    monkeypatch.setattr(rig.arm._process, "_hear", lambda told: (heard.append(told.state.message), hear(told)))
+    heard, hear = list[str](), rig.arm._process.on_message
+    monkeypatch.setattr(rig.arm._process, "on_message", lambda told: (heard.append(told.state.message), hear(told)))
     host.tell("end")
     assert rig.wave(2.0) != "", "it comes to rest"
     rig.until_it_moves()
@@ -132,8 +132,8 @@ def test_an_arm_that_comes_to_rest_by_itself_says_so_before_it_rests(
     rig.until_it_moves()
     rig.until("")
     assert rig.swing(SWING / 4) == ""
-    heard, hear = list[Reading](), rig.arm._process._hear
-    monkeypatch.setattr(rig.arm._process, "_hear", lambda told: (heard.append(told), hear(told)))
+    heard, hear = list[Reading](), rig.arm._process.on_message
+    monkeypatch.setattr(rig.arm._process, "on_message", lambda told: (heard.append(told), hear(told)))
     end = time.monotonic() + TIMEOUT
     while not heard or not heard[-1].ceased:  # nobody sends anything
         assert time.monotonic() < end
@@ -163,7 +163,7 @@ def test_a_protective_stop_outlives_the_link_that_told_of_it(host: UrHost, rig: 
     host.tell("protect")
     rig.until("protective stop")
     host.tell("pull 1")
-    rig.until("no word")
+    rig.until("no message")
     host.tell("normal")
     rig.until("was stopped for safety")
     assert rig.done(rig.arm.order("recover")) == ""
@@ -193,7 +193,7 @@ def test_a_pulled_cable_is_told_and_the_arm_found_where_it_stopped(host: UrHost,
     rig.until("")
     host.tell("pull 1")
     problem = rig.wave(3.0)
-    assert "no word" in problem or "does not take" in problem
+    assert "no message" in problem or "does not take" in problem
     rig.until("")
     assert np.allclose(rig.arm.read(0.0)[0], host.tell()["q"], atol=1e-3)
     rig.until_it_moves()

@@ -10,7 +10,7 @@ from common.messages import Pose, Vector3, WorldEdit, WorldEditReply, WorldObjec
 from common.transport.codec import encode, encoding_of
 from common.transport.session import RawSample
 from lab.invariants import OBJECTS, Invariants
-from lab.process import Requests
+from lab.processes import RequestLog
 
 EDIT = WorldEdit(op="move", id="ball_1", position=Vector3(x=0.5))
 
@@ -19,7 +19,7 @@ class Told:
     """Invariants that are told of the world."""
 
     def __init__(self) -> None:
-        self.requests = Requests()
+        self.requests = RequestLog()
         self.invariants = Invariants(load_cell("panda"), self.requests, lambda: 0.0)
 
     def say(self, **places: float) -> list[str]:

@@ -21,8 +21,8 @@ from common.messages import (
 from common.transport.codec import encode
 from common.transport.session import RawSample
 from lab.invariants import ASKED, JUDGED, NEVER, Invariants, _Goals
-from lab.loop import Life, context_of
-from lab.process import Requests
+from lab.loop import Incarnation, context_of
+from lab.processes import RequestLog
 
 MOTION = ExecuteRequest(id="a-1", trajectory=JointTrajectory(joint_names=["j"], points=[]))
 FINGERS = GripperCommand(id="a-1", width=0.04)
@@ -31,7 +31,7 @@ FINGERS = GripperCommand(id="a-1", width=0.04)
 @pytest.fixture
 def seen():
     """What looks, and what it looks at."""
-    requests = Requests()
+    requests = RequestLog()
     return Invariants(load_cell("panda"), requests, lambda: 1.0), requests
 
 
@@ -95,8 +95,8 @@ def test_arm_that_a_person_stopped_brakes_and_rests_and_does_not_move_when_its_p
     invariants, requests = seen
     limits = Limits(("j",), np.array([-3.0]), np.array([3.0]), np.array([1.0]), np.array([1.0]))
     stop = StopRequest(owner="anna")
-    first = context_of(Life("executor"))
-    then = context_of(Life("executor")) if begun_later else first
+    first = context_of(Incarnation("executor"))
+    then = context_of(Incarnation("executor")) if begun_later else first
 
     def move(begin, count):
         q = np.array([0.5])
@@ -117,14 +117,16 @@ def test_application_judges_the_truth_when_its_task_says_done_and_not_before(tmp
     (tmp_path / "judging").mkdir()
     (tmp_path / "judging" / "task.py").write_text(
         "from common.messages import TaskStatus\nfrom common.topics import Topic\n"
+        "from common.application import Application, ApplicationTopics\n"
         "STATUS = Topic('judging_status', TaskStatus, 'state', '')\n"
-        "def wrong_in(truth):\n    return ', '.join(thing.id for thing in truth.objects)\n")
+        "def misplaced(truth):\n    return ', '.join(thing.id for thing in truth.objects)\n"
+        "APPLICATION = Application(topics=ApplicationTopics(status=STATUS), truth_check=misplaced)\n")
     monkeypatch.syspath_prepend(tmp_path)
     cell = load_cell("panda").model_copy(update={"application": "judging.task"})
     for state, broken in (("ERROR", False), ("DONE", True)):
-        invariants = Invariants(cell, Requests(), lambda: 1.0)
+        invariants = Invariants(cell, RequestLog(), lambda: 1.0)
         key, world = "panda/scene_objects", WorldObjects(objects=[WorldObject(id="thing", shape="box")])
         invariants.on_put("executor", "executor 1", RawSample(key, encode(world), "", None))
         invariants.on_end(0, state)
         assert [line.endswith(f"{JUDGED}: thing") for line in invariants.broken] == [True] * broken
-    assert JUDGED not in Invariants(load_cell("panda"), Requests(), lambda: 1.0).checked
+    assert JUDGED not in Invariants(load_cell("panda"), RequestLog(), lambda: 1.0).checked

@@ -6,11 +6,11 @@ import time
 import pytest
 
 from common.sources import drawn_from, monotonic, new_id
-from lab.loop import EPOCH_NS, LOOK_NS, Deadlock, Life, VirtualLoop, context_of
+from lab.loop import EPOCH_NS, LOOK_NS, Deadlock, Incarnation, VirtualTimeLoop, context_of
 
 
 def run(main, seed=1, *, shuffled=False):
-    loop = VirtualLoop(seed, shuffled=shuffled)
+    loop = VirtualTimeLoop(seed, shuffled=shuffled)
     with drawn_from(loop):
         try:
             return loop.run_until_complete(main(loop))
@@ -97,7 +97,7 @@ class Victim:
     """A task of a life of its own that notes what it does."""
 
     def __init__(self, loop):
-        self.life, self.did = Life("victim"), []
+        self.life, self.did = Incarnation("victim"), []
         self.task = context_of(self.life).run(lambda: loop.create_task(self.work()))
 
     async def work(self):
@@ -142,7 +142,7 @@ def test_life_ends_at_the_turn_that_was_said():
 
 def order_of_turns(seed, *, shuffled=True):
     async def main(loop):
-        order, contexts = [], [context_of(Life(name)) for name in "abc"]
+        order, contexts = [], [context_of(Incarnation(name)) for name in "abc"]
         for turn in range(5):
             for name, context in zip("abc", contexts, strict=True):
                 loop.call_soon(order.append, (name, turn), context=context)

@@ -9,23 +9,23 @@ from common.messages import HoldRequest, MotionStatus, SceneUpdate
 from common.sources import drawn_from
 from common.topics import MOTION_HOLD, MOTION_STATUS, SCENE_OBJECT_UPDATES
 from common.transport.bus import Bus
-from lab.loop import VirtualLoop
-from lab.network import FAIR, FOUL, VirtualNetwork, Weather
+from lab.loop import VirtualTimeLoop
+from lab.network import GOOD_LINKS, POOR_LINKS, LinkQuality, SimulatedNetwork
 
 
 class Net:
     """A network with buses that have names."""
 
     def __init__(self, loop, weather):
-        self.loop, self.network, self.sessions = loop, VirtualNetwork(loop, 5, weather), {}
+        self.loop, self.network, self.sessions = loop, SimulatedNetwork(loop, 5, weather), {}
 
     def bus(self, name):
         session = self.sessions[name] = self.network.attach(contextvars.copy_context(), name)
         return Bus(session, service=name, cell="test", clock=Clock())
 
 
-def run(main, weather=FAIR):
-    loop = VirtualLoop(5)
+def run(main, weather=GOOD_LINKS):
+    loop = VirtualTimeLoop(5)
 
     async def whole():
         net = Net(loop, weather)
@@ -62,7 +62,7 @@ def test_events_arrive_late_in_order_and_all_of_them_in_foul_weather():
         reading.cancel()
         return [update.data for update in came], net.network.counted
 
-    came, counted = run(main, FOUL)
+    came, counted = run(main, POOR_LINKS)
     assert came == [f"remove:{number}" for number in range(2000)]
     assert counted["doubled"] and counted["held up"]
 
@@ -222,4 +222,4 @@ def test_requests_are_late_in_such_weather():
             await client.call(HoldRequest(hold=True), timeout=10.0)
         return net.network.counted
 
-    assert 5 <= run(main, Weather(late=0.1))["late"] <= 50
+    assert 5 <= run(main, LinkQuality(late=0.1))["late"] <= 50

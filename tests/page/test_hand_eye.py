@@ -20,7 +20,7 @@ from page.hand_eye import HandEye, folder_of
 from tests.tools.calibration.rendered_boards import BOARD, render
 from tests.tools.calibration.test_hand_eye import LENS, ROBOT, TRUTH, hands, off
 from tools.calibration.board import Board
-from tools.calibration.calibration import CalibrationFailed
+from tools.calibration.intrinsics import CalibrationFailed
 
 CONFIG = load_cell("panda").robot
 INFO = CameraInfo(header=Header(stamp=1, frame_id="eye"), width=LENS.width, height=LENS.height, d=list(LENS.d),

@@ -9,12 +9,12 @@ from typing import Any, cast
 
 import pytest
 import viser
+from page.hand_eye_panel import HandEyePanel
 
 from common import topics
 from common.config import load_cell
 from page.console import ActionQueue
 from page.hand_eye import Result
-from page.hand_eye_panel import HandEyePanel
 
 LEFT, RIGHT = (replace(topics.CAMERA_IMAGE, key=f"{side}/image_raw") for side in ("left", "right"))
 

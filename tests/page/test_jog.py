@@ -22,7 +22,7 @@ class Arm:
         self.doors, self.owner, self.at, self.told = Permissions(), FREE, 0.0, list[str]()
         self.jogger = Jogger(self, lambda _: {"joints": {"a": 0.1}}, lambda: (MotionStatus(), self.owner), lambda: "")
 
-    def jog(self, heard: int, **velocities: Any) -> None:
+    def jog(self, acknowledged: int, **velocities: Any) -> None:
         pass
 
     def word(self, owner: MotionOwner, press: int = 1) -> None:
@@ -39,7 +39,7 @@ def arm(monkeypatch: pytest.MonkeyPatch) -> Arm:
 
 
 @pytest.mark.parametrize(("before", "then", "why"), [
-    (OURS, FREE, "press it again"), (FREE, FREE, "its controller does not take it"), (OURS, BOBS, "is bob's"),
+    (OURS, FREE, "press it again"), (FREE, FREE, "its controller does not take it"), (OURS, BOBS, "owned by bob"),
 ])
 def test_why_the_arm_does_not_move_while_a_button_is_held(
     arm: Arm, before: MotionOwner, then: MotionOwner, why: str

@@ -10,7 +10,6 @@ import viser
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-
 from page.labels import CONTROL_PATH, LETTER, Labels, grouped
 
 Array = NDArray[np.float64]

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from page.control_socket import LATE, Delays
 from page.losses import BLINK, Loss, LossDetector
+
+from page.control_socket import LATE, Delays
 
 THERE = {"arm": ("no arm", True), "task": ("no task", True)}
 

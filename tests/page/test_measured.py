@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from common.perception.intake import Unusable
+from page.layers.points import thinned
+from page.layers.reach import shell_of
 
 from common import topics
 from common.messages import Header, Image, PointCloud2
 from common.perception.depth import point_cloud
 from common.perception.image import array_to_image
-from common.perception.intake import Unusable
 from common.perception.pinhole import Pinhole
 from page.camera_panel import depth_image_colors
-from page.layers.points import thinned
-from page.layers.reach import shell_of
 from page.nodes import brightened
 from tests.page.scene_cell import Stage, around_of, in_world, robot_of
 

@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from applications.outlining.messages import Contour, Contours, OutlinePoints, OutlineSelect
-from applications.outlining.topics import CONTOUR_PATH, CONTOURS
+from applications.outlining.topics import CONTOUR_PATH, CONTOURS, Contour, Contours, OutlinePoints, OutlineSelect
 from common import messages as m
 from common import topics
 from common.perception.pinhole import Pinhole

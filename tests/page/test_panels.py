@@ -8,15 +8,15 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 import viser
+from page.arm_panel import ControllerPanel
+from page.plots import SAMPLE, SECONDS, Limits, PlotPanel
 
 from common.messages import Header, Image
 from common.perception.image import ImageError, array_to_image
-from page.arm_panel import ControllerPanel
 from page.camera_panel import rgb_image
 from page.console import ActionQueue
 from page.manual_control import JogPanel
 from page.permissions import PageSession, Permissions
-from page.plots import SAMPLE, SECONDS, Limits, PlotPanel
 from page.server import close_server, make_server
 
 LIMITS = Limits(["arm_joint1", "arm_joint2"], np.array([-1.0, 0.0]), np.array([1.0, 4.0]), np.array([2.0, 5.0]))

@@ -9,6 +9,7 @@ from typing import Any
 import msgpack
 import numpy as np
 import pytest
+from page.timeline import Timeline
 
 from common import messages as m
 from common import topics
@@ -17,10 +18,9 @@ from common.perception.image import array_to_image, image_to_array
 from common.topics import Topic
 from page import history as past_module
 from page.history import MOST_BYTES, SECONDS, RecentHistory
-from page.recorded_history import RecordedHistory, EventDetector, recordings_in
-from page.timeline import Timeline
+from page.recorded_history import EventDetector, RecordedHistory, recordings_in
 from recording.sample import RecordingError, Sample
-from recording.writing import RecordingWriter
+from recording.writer import RecordingWriter
 
 NAMES = {"DONE": "Done"}
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import viser
 
-from applications.outlining.messages import Contours, OutlinePoints
+from applications.outlining.topics import Contours, OutlinePoints
 from applications.pick_place.topics import VALIDATED_TARGETS
 from common import messages as m
 from common import topics

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 import viser
+from page.taught_panel import SavedPosesPanel
 
 from common.errors import ConfigError
 from page.console import ActionQueue
 from page.saved_poses import SavedPoses, load_taught, save_taught, taught_file
-from page.taught_panel import SavedPosesPanel
 
 JOINTS = ["a", "b"]
 TAKEN = ["goal marker", "home"]

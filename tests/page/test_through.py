@@ -9,7 +9,7 @@ import viser
 
 from common.client.operator_motion import MotionFailed
 from common.config import load_cell
-from common.messages import Inhibit, MotionStatus
+from common.messages import Interlock, MotionStatus
 from common.robot.model import RobotModel
 from page.console import ActionQueue
 from page.move_panel import MovePanel
@@ -25,11 +25,11 @@ class Motions:
     async def require_free(self) -> MotionStatus:
         return self.status
 
-    async def move(self, _goal: Any, *, planner: str = "", heard: int | None = None) -> MotionStatus:
-        if heard is not None and self.status.newest > heard:
+    async def move(self, _goal: Any, *, planner: str = "", acknowledged: int | None = None) -> MotionStatus:
+        if acknowledged is not None and self.status.newest > acknowledged:
             raise MotionFailed("stopped", "the motion was refused")
         self.moved += 1
-        self.status = MotionStatus(inhibits=[Inhibit(kind="stopped", by="anna", since=8)])
+        self.status = MotionStatus(interlocks=[Interlock(kind="stopped", by="anna", since=8)])
         return self.status
 
 

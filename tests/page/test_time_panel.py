@@ -8,11 +8,11 @@ from typing import Any
 
 import pytest
 import viser
+from page.timeline import Timeline
 
 from page.console import ActionQueue
 from page.history import RecentHistory
 from page.time_panel import THIS, TimePanel
-from page.timeline import Timeline
 from recording.sample import RecordingError
 
 

@@ -4,8 +4,8 @@ from typing import get_args
 
 import pytest
 
-from applications.outlining.messages import OutlineState, OutlineStatus
-from applications.pick_place.messages import PickPlaceStatus, TaskState
+from applications.outlining.topics import OutlineState, OutlineStatus
+from applications.pick_place.topics import PickPlaceStatus, TaskState
 from common.application import find_application
 from common.errors import ConfigError, NoResponder, RemoteError, ZencellError
 from common.messages import (

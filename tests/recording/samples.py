@@ -9,11 +9,11 @@ from pathlib import Path
 import msgpack
 import pytest
 
-from applications.pick_place.messages import PickPlaceStatus
+from applications.pick_place.topics import PickPlaceStatus
 from common.messages import Header, JointState, Message
-from recording import writing
+from recording import writer
 from recording.sample import Sample
-from recording.writing import RecordingWriter
+from recording.writer import RecordingWriter
 
 START = 1_700_000_000_000_000_000  # [ns]
 STEP = 10_000_000  # [ns]
@@ -67,7 +67,7 @@ def fill_disk(monkeypatch: pytest.MonkeyPatch, room: int) -> None:
         room -= len(data)
         return real(file, data)
 
-    monkeypatch.setattr(writing.os, "write", limited)
+    monkeypatch.setattr(writer.os, "write", limited)
 
 
 def places(folder: Path) -> Iterator[Path]:

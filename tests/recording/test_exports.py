@@ -14,18 +14,16 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from applications.outlining.messages import OutlinePoints
-from applications.pick_place.messages import PickPlaceStatus
+from applications.outlining.topics import OutlinePoints
+from applications.pick_place.topics import PickPlaceStatus
 from common import messages as m
 from common.messages import Header, Image, Message, Pose, Quaternion, Vector3
 from common.perception.image import array_to_image
-from recording import foxglove, pictures, tables
-from recording.decoding import Decoder
+from recording import export, foxglove
 from recording.foxglove import convert
-from recording.foxglove_schemas import SCHEMAS
-from recording.reading import Recording
-from recording.recovery import recover
-from recording.sample import RecordingError, Sample
+from recording.foxglove_scene import SCHEMAS
+from recording.reader import Recording, recover
+from recording.sample import Decoder, RecordingError, Sample
 from tests.recording.samples import START, STEP, fill_disk, joints, packed, status, write
 
 HEADER = Header(stamp=1_700_000_000_123_456_789, frame_id="world")
@@ -121,7 +119,7 @@ def test_file_for_foxglove_is_whole_and_says_what_was_left_out(tmp_path: Path) -
     source = write(tmp_path / "a.mcap", [joints(0), joints(1), status(2), image(3, PICTURE), foreign()])
     decoder = Decoder()
     with Recording(source) as recording:
-        count = foxglove.export(recording, tmp_path / "f.mcap", lambda topic: True, decoder)
+        count = foxglove.export_foxglove(recording, tmp_path / "f.mcap", lambda topic: True, decoder)
     assert (count, decoder.skipped) == (4, Counter({"mine": 1}))
     with (tmp_path / "f.mcap").open("rb") as file:
         found = [(s.name, c.topic, c.message_encoding, msg.log_time) for s, c, msg in make_reader(file).iter_messages()]
@@ -136,7 +134,7 @@ def test_file_for_foxglove_that_does_not_fit_on_the_disk_is_not_there(
     source = write(tmp_path / "a.mcap", [joints(n) for n in range(100)])
     fill_disk(monkeypatch, 600)
     with Recording(source) as recording, pytest.raises(RecordingError, match=r"f.mcap: cannot be written, the disk is"):
-        foxglove.export(recording, tmp_path / "f.mcap", lambda topic: True, Decoder())
+        foxglove.export_foxglove(recording, tmp_path / "f.mcap", lambda topic: True, Decoder())
     assert list(tmp_path.iterdir()) == [source]
 
 
@@ -152,8 +150,8 @@ def test_messages_whose_class_is_not_here_are_exported_by_the_schema_that_was_re
     recover(cut, tmp_path / "b.mcap")
     decoder = Decoder()
     with Recording(tmp_path / "b.mcap") as recording:
-        assert tables.export(recording, tmp_path / "csv", lambda topic: True, decoder) == {"gloss.csv": 2}
-        assert foxglove.export(recording, tmp_path / "f.mcap", lambda topic: True, decoder) == 2
+        assert export.export_tables(recording, tmp_path / "csv", lambda topic: True, decoder) == {"gloss.csv": 2}
+        assert foxglove.export_foxglove(recording, tmp_path / "f.mcap", lambda topic: True, decoder) == 2
     assert set(decoder.skipped) == {"mine"}
     assert [row["gloss"] for row in table(tmp_path / "csv" / "gloss.csv")] == ["0.0", "0.25"]
     with (tmp_path / "f.mcap").open("rb") as file:
@@ -170,7 +168,7 @@ def table(path: Path) -> list[dict[str, str]]:
 def test_tables_have_a_row_for_each_message_and_a_column_for_each_joint(tmp_path: Path) -> None:
     source = write(tmp_path / "a.mcap", [f(n) for n in range(5) for f in (joints, status)] + [image(9, PICTURE)])
     with Recording(source) as recording:
-        counts = tables.export(recording, tmp_path / "csv", lambda topic: True, Decoder())
+        counts = export.export_tables(recording, tmp_path / "csv", lambda topic: True, Decoder())
     assert counts == {"joint_states.csv": 5, "pick_place_status.csv": 5}
     rows = table(tmp_path / "csv" / "joint_states.csv")
     assert list(rows[0]) == ["time", "stamp", "a.position", "b.position", "a.velocity", "b.velocity"]
@@ -184,7 +182,7 @@ def test_pictures_are_files_with_the_same_pixels(tmp_path: Path) -> None:
     depth = image(1, DEPTH, "32FC1", "panda/depth_camera/depth/image_raw")
     source = write(tmp_path / "a.mcap", [image(0, PICTURE), depth, image(2, PICTURE[..., ::-1].copy(), "rgb8")])
     with Recording(source) as recording:
-        counts = pictures.export_images(recording, tmp_path / "png", lambda topic: True, Decoder())
+        counts = export.export_images(recording, tmp_path / "png", lambda topic: True, Decoder())
     assert counts == {"camera/image_raw": 2, "depth_camera/depth/image_raw": 1}
     for path in sorted((tmp_path / "png" / "camera_image_raw").iterdir()):
         assert np.array_equal(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), PICTURE)
@@ -197,7 +195,7 @@ def test_video_has_every_picture_at_the_rate_of_the_recording(tmp_path: Path) ->
     pixels = np.zeros((64, 80, 3), np.uint8)
     source = write(tmp_path / "a.mcap", [image(n, pixels + np.uint8(20 * n)) for n in range(10)])
     with Recording(source) as recording:
-        count, rate = pictures.export_video(recording, tmp_path / "v.mp4", "camera/image_raw", Decoder())
+        count, rate = export.export_video(recording, tmp_path / "v.mp4", "camera/image_raw", Decoder())
     video = cv2.VideoCapture(str(tmp_path / "v.mp4"))
     assert (count, rate) == (10, 10.0)
     assert (video.get(cv2.CAP_PROP_FRAME_COUNT), video.get(cv2.CAP_PROP_FPS)) == (10, 10)
@@ -223,16 +221,16 @@ def test_video_that_does_not_fit_on_the_disk_is_not_there(tmp_path: Path, monkey
             self.inner.release()
             os.truncate(target, 40)
 
-    monkeypatch.setattr(pictures.cv2, "VideoWriter", Cut)
+    monkeypatch.setattr(export.cv2, "VideoWriter", Cut)
     with Recording(source) as recording, pytest.raises(RecordingError, match=r"v.mp4: cannot be written"):
-        pictures.export_video(recording, target, "camera/image_raw", Decoder())
+        export.export_video(recording, target, "camera/image_raw", Decoder())
     assert list(tmp_path.iterdir()) == [source]
 
 
 def test_video_of_depth_alone_is_refused_in_one_line(tmp_path: Path) -> None:
     source = write(tmp_path / "a.mcap", [image(0, DEPTH, "32FC1")])
     with Recording(source) as recording, pytest.raises(RecordingError, match="has no colour picture"):
-        pictures.export_video(recording, tmp_path / "v.mp4", "camera/image_raw", Decoder())
+        export.export_video(recording, tmp_path / "v.mp4", "camera/image_raw", Decoder())
 
 
 def test_field_that_a_class_has_no_more_is_left_out_of_an_old_recording() -> None:

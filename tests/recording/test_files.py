@@ -11,12 +11,10 @@ from mcap.reader import make_reader
 
 from common.messages import JointState
 from common.remapping import is_cell
-from recording.files import SplitWriter
-from recording.reading import Recording
-from recording.sample import RecordingError, Sample, encoding_of, message_of
-from recording.stamps import Sequences
+from recording.reader import Recording
+from recording.sample import RecordingError, Sample, Sequences, encoding_of, message_of
 from recording.summary import summarise
-from recording.writing import RecordingWriter
+from recording.writer import RecordingWriter, SplitWriter
 from tests.recording.samples import START, STEP, joints, status, write
 
 texts = st.text(st.characters(codec="utf-8", exclude_characters="/"), min_size=1, max_size=8)

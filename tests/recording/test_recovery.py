@@ -6,8 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recording.reading import Recording
-from recording.recovery import recover
+from recording.reader import Recording, recover
 from recording.sample import RecordingError
 from recording.summary import summarise
 from tests.recording.samples import fill_disk, joints, places, status, write

@@ -8,13 +8,10 @@ from random import Random
 
 import pytest
 
-from recording import writing
-from recording.files import SplitWriter
-from recording.reading import Recording
-from recording.sample import RecordingError
+from recording.reader import Recording
+from recording.sample import MOST_WRITERS, RecordingError, Sequences
 from recording.sink import MOST_KEYS, Sink
-from recording.stamps import MOST_WRITERS, Sequences
-from recording.writing import WritingFailed
+from recording.writer import SplitWriter, WriteFailed
 from tests.recording.samples import fill_disk, joints, status
 
 
@@ -35,18 +32,18 @@ def test_everything_offered_is_in_the_file_with_how_it_ended(tmp_path: Path) -> 
 def test_what_does_not_fit_while_the_disk_stalls_is_dropped_and_counted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    disk, writing = threading.Event(), threading.Event()
+    disk, written_to = threading.Event(), threading.Event()
 
     class Stalled(SplitWriter):
         def add(self, sample):
-            writing.set()
+            written_to.set()
             disk.wait()
             return super().add(sample)
 
     size = len(joints(0).payload)
     sink = Sink(Stalled(tmp_path / "a.mcap", {}), most_bytes=3 * size + 1)
     sink.offer(joints(0))
-    assert writing.wait(10)  # the first is on its way to the disk and still counts
+    assert written_to.wait(10)  # the first is on its way to the disk and still counts
     for number in range(1, 6):
         sink.offer(joints(number))
     assert sink.figures.dropped == {"panda/joint_states": 3}
@@ -99,13 +96,13 @@ def test_full_disk_ends_it_with_one_line_and_keeps_whole_chunks(
         room -= taken
         return real(file, data[:taken])  # a disk that fills takes the part that still fits
 
-    monkeypatch.setattr(writing.os, "write", write)
+    monkeypatch.setattr(os, "write", write)
     offered = 0
     while not failed.wait(0.001):
         for _ in range(10):
             sink.offer(joints(offered, payload=os.urandom(5000)))
             offered += 1
-    with pytest.raises(WritingFailed, match=r"a.mcap: recording stopped, the disk is full; .*zencell recover") as error:
+    with pytest.raises(WriteFailed, match=r"a.mcap: recording stopped, the disk is full; .*zencell recover") as error:
         sink.close({})
     assert error.value.exit_code == 1 and "\n" not in str(error.value)
     with Recording(tmp_path / "a.mcap") as recording:
@@ -121,8 +118,8 @@ def test_failure_while_closing_is_told_too(tmp_path: Path, monkeypatch: pytest.M
     def write(file: int, data: memoryview) -> int:
         raise OSError(errno.EIO, "Input/output error")
 
-    monkeypatch.setattr(writing.os, "write", write)
-    with pytest.raises(WritingFailed, match="Input/output error"):
+    monkeypatch.setattr(os, "write", write)
+    with pytest.raises(WriteFailed, match="Input/output error"):
         sink.close({})
 
 
@@ -138,7 +135,7 @@ def test_disk_that_is_full_as_the_next_file_is_due_is_told_in_one_line(
 
     recorded("a.mcap")
     fill_disk(monkeypatch, (tmp_path / "a_0.mcap").stat().st_size - missing)
-    with pytest.raises(WritingFailed, match=r"b_[01].mcap: recording stopped, the disk is full"):
+    with pytest.raises(WriteFailed, match=r"b_[01].mcap: recording stopped, the disk is full"):
         recorded("b.mcap")
 
 

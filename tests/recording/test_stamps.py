@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from common.messages import Header, Image, LogLine, Pose, TFMessage, TransformStamped
-from recording.stamps import restamp, stamp_of
+from recording.sample import restamp, stamp_of
 from tests.recording.samples import packed
 
 TF = TFMessage(transforms=[

@@ -27,13 +27,13 @@ from common import topics
 from common.errors import NoRouter
 from common.topics import of_service
 from common.transport.codec import DEFAULT_LIMIT, decode, decode_attachment, encode
-from common.transport.connect import connect
 from common.transport.credentials import ROUTER_NAME, Credentials, credentials_of
 from common.transport.endpoint import MOST_BYTES, MOST_BYTES_BESIDES, client_config, router_config
 from common.transport.session import RawSample
-from security.page_tokens import ROLES, read_tokens
-from recording.reading import Recording
+from common.transport.zenoh_session import connect
+from recording.reader import Recording
 from security.certificates import Authority
+from security.page_tokens import ROLES, read_tokens
 from tests.harness import RunningCell, command_line, environment, until
 from tests.security.holders import REFUSED, Heard, Holder
 from zencell.blocking import Cell

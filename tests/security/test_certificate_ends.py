@@ -20,7 +20,7 @@ from security.certificates import Authority
 from security.checking import certificate_in, require_valid
 from tests.security.holders import REFUSED, Holder
 from tests.security.test_routers import free_port
-from tools.doctor.certificates import certificates as findings
+from tools.doctor.network import certificates as findings
 
 NAMES = ("router", "operator", "panda.camera")
 PATIENCE = 20.0  # [s] only ever waited for by a test that fails

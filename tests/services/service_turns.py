@@ -13,8 +13,14 @@ import cv2
 import numpy as np
 
 from applications.outlining.contours import ContourOptions, find_contours
-from applications.outlining.messages import Contours, OutlinePoints
-from applications.outlining.topics import CONTOUR_PATH, CONTOUR_POINTS, CONTOURS, OUTLINE_STATUS
+from applications.outlining.topics import (
+    CONTOUR_PATH,
+    CONTOUR_POINTS,
+    CONTOURS,
+    OUTLINE_STATUS,
+    Contours,
+    OutlinePoints,
+)
 from applications.pick_place.topics import DETECTED_OBJECTS, VALIDATED_TARGETS
 from common import messages as m
 from common import topics

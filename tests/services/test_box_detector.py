@@ -11,9 +11,9 @@ from common import messages as m
 from common import topics
 from common.clock import Clock
 from common.config import CameraConfig
-from common.perception.boxes import BoxKind, SeenBox
+from common.perception.boxes import BoxKind, DetectedBox
+from common.perception.camera_input import MAX_DETECTIONS, FrameError
 from common.perception.image import array_to_image, image_to_array
-from common.perception.intake import MOST_THINGS, Unusable
 from common.perception.pinhole import Pinhole
 from common.process.in_process import running_service
 from common.robot.transforms import matrix_to_pose
@@ -104,16 +104,16 @@ async def test_dark_picture_tells_nothing_though_depth_is_measured_in_the_dark_t
 
 
 def test_more_boxes_than_there_is_room_for_are_not_told_of_in_part() -> None:
-    box = SeenBox("red", (0.5, 0.0, 0.02), 0.0, np.zeros((4, 2)), False)
-    assert len(box_detector.markers([box] * MOST_THINGS, CONFIG, 0).markers) == MOST_THINGS
-    with pytest.raises(Unusable, match=f"{MOST_THINGS + 1} things in it are more than"):
-        box_detector.markers([box] * (MOST_THINGS + 1), CONFIG, 0)
+    box = DetectedBox("red", (0.5, 0.0, 0.02), 0.0, np.zeros((4, 2)), False)
+    assert len(box_detector.markers([box] * MAX_DETECTIONS, CONFIG, 0).markers) == MAX_DETECTIONS
+    with pytest.raises(FrameError, match=f"{MAX_DETECTIONS + 1} things in it are more than"):
+        box_detector.markers([box] * (MAX_DETECTIONS + 1), CONFIG, 0)
 
 
 @pytest.mark.parametrize("x", [1.1e7, -math.inf, math.nan])
 def test_box_that_is_farther_away_than_can_be_told_is_not_told_of(x: float) -> None:
-    with pytest.raises(Unusable, match=r"more than 1e\+07 m away"):
-        box_detector.markers([SeenBox("red", (x, 0.0, 0.02), 0.0, np.zeros((4, 2)), False)], CONFIG, 0)
+    with pytest.raises(FrameError, match=r"more than 1e\+07 m away"):
+        box_detector.markers([DetectedBox("red", (x, 0.0, 0.02), 0.0, np.zeros((4, 2)), False)], CONFIG, 0)
 
 
 async def test_picture_with_the_depth_of_another_one_or_of_another_size_is_left_out() -> None:

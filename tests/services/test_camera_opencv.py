@@ -9,10 +9,10 @@ import yaml
 from common import topics
 from common.config import Surroundings
 from common.errors import ConfigError
-from common.perception import sources
+from common.perception import image_sources as sources
 from common.perception.camera_file import CameraFile, Rectifier
 from common.perception.image import image_to_array
-from common.perception.sources import Video, open_source
+from common.perception.image_sources import Video, open_source
 from common.process.in_process import running_service
 from common.process.wiring import wiring
 from common.transport.local import LocalNetwork

@@ -122,15 +122,15 @@ async def test_loop_turns_while_a_picture_takes_long(monkeypatch):
     net, loop = LocalNetwork(), asyncio.get_running_loop()
     tester = net.bus()
     images, truth = tester.reader(topics.CAMERA_IMAGE), tester.writer(topics.SCENE_OBJECTS)
-    entered, go_on, see = asyncio.Event(), threading.Event(), Renderer.see
+    entered, go_on, render = asyncio.Event(), threading.Event(), Renderer.render
 
     def slow(renderer, objects, *rest):
         if any(thing.shape == "box" for thing in objects):
             loop.call_soon_threadsafe(entered.set)
             assert go_on.wait(10)
-        return see(renderer, objects, *rest)
+        return render(renderer, objects, *rest)
 
-    monkeypatch.setattr(Renderer, "see", slow)
+    monkeypatch.setattr(Renderer, "render", slow)
     async with running_service(net, run, config):
         truth.put(balls((0.5, -0.2, 0.03)))
         before = await next_of(images)

@@ -2,8 +2,7 @@ from __future__ import annotations
 
 import asyncio
 
-from applications.outlining.messages import OutlinePoints
-from applications.outlining.topics import CONTOUR_PATH, OUTLINE_STATUS
+from applications.outlining.topics import CONTOUR_PATH, OUTLINE_STATUS, OutlinePoints
 from common import messages as m
 from common import topics
 from common.clock import Clock

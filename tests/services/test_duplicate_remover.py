@@ -7,9 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from applications.outlining.messages import OutlinePoints
 from applications.outlining.stage_files import write_points
-from applications.outlining.topics import CONTOUR_PATH, CONTOUR_POINTS
+from applications.outlining.topics import CONTOUR_PATH, CONTOUR_POINTS, OutlinePoints
 from common.errors import ConfigError
 from common.process.in_process import running_service
 from common.transport.local import LocalNetwork

@@ -52,7 +52,7 @@ async def test_who_has_the_answer_to_a_stop_or_a_hold_finds_it_in_the_state_alre
             await person.hold.call(HoldRequest(hold=hold, owner="ann"))
             assert person.motion.latest.held == hold
         await person.stop.call(StopRequest(owner="ann"))
-        assert [one.by for one in person.motion.latest.inhibits] == ["ann"]
+        assert [one.by for one in person.motion.latest.interlocks] == ["ann"]
 
 
 async def test_restarted_executor_holds_what_a_person_held_and_not_what_a_watchdog_did() -> None:
@@ -61,11 +61,11 @@ async def test_restarted_executor_holds_what_a_person_held_and_not_what_a_watchd
         assert (await person.hold.call(HoldRequest(hold=True, owner="anna"))).held
     async with executor() as person:
         found = await person.see(person.motion, lambda m: True)
-        assert found.held_by == ["person"] and [hold.by for hold in found.inhibits] == ["anna"]
+        assert found.held_by == ["operator"] and [hold.by for hold in found.interlocks] == ["anna"]
         assert (await person.hold.call(HoldRequest(hold=False, owner="bert"))).held
         assert not (await person.hold.call(HoldRequest(hold=False, owner="anna"))).held
     async with executor() as person:
-        assert not (await person.see(person.motion, lambda m: True)).inhibits
+        assert not (await person.see(person.motion, lambda m: True)).interlocks
 
 
 async def test_log_says_whose_hold_stays_when_another_asks_to_let_go(caplog) -> None:
@@ -90,7 +90,8 @@ async def test_log_names_both_when_somebody_starts_the_task_although_another_has
         await person.hold.call(HoldRequest(hold=False, owner="bert", stops=True))
         await person.hold.call(HoldRequest(hold=False, owner="bert", stops=True, override=True))
         told = [text for text in (record.getMessage() for record in caplog.records) if "has the task" in text]
-        assert len(told) == 1 and told[0].startswith("bert has the task move the arm: the motion was anna's (operator)")
+        assert len(told) == 1
+        assert told[0].startswith("bert has the task move the arm: the motion was owned by anna (operator)")
 
 
 async def test_stopped_arm_and_fingers_stay_so_through_restarts_until_somebody_starts_them(robot: RobotModel) -> None:
@@ -119,7 +120,7 @@ async def test_task_whose_fingers_were_kept_from_moving_does_not_go_on_when_the_
         await own.call(OwnRequest(act="give", owner="ann"))
     async with executor() as person:
         refused = await person.command.call(GripperCommand(header=person.bus.header(), id="b", width=0.02))
-        assert refused.error == "stopped" and "by ann (the motion is ann's" in refused.message
+        assert refused.error == "stopped" and "by ann (the motion is owned by ann" in refused.message
 
 
 async def test_robot_is_stopped_when_more_requests_to_stop_come_than_can_be_read(robot: RobotModel) -> None:
@@ -144,7 +145,7 @@ async def test_goal_that_is_stopped_before_it_comes_never_moves_also_after_a_res
     there = move(robot, home, home + 0.2)
     async with executor() as person:
         early = await person.stop.call(StopRequest(id="a", by="requester"))
-        assert early.error == "unknown_goal" and "refused if it comes" in early.message and not early.inhibits
+        assert early.error == "unknown_goal" and "refused if it comes" in early.message and not early.interlocks
         await person.execute.call(person.asks(id="b", trajectory=move(robot, home, home + 0.5, 0.02)))
         await person.see(person.motion, lambda m: m.progress > 0.1)
         await person.stop.call(StopRequest(id="b", by="requester"))
@@ -190,7 +191,7 @@ async def test_second_executor_that_would_keep_the_stops_of_another_cell_in_one_
         await goes_on(person)
         monkeypatch.setenv(STATE_VARIABLE, os.environ["XDG_STATE_HOME"])
         async with executor() as other:
-            assert not (await other.see(other.motion, lambda m: True)).inhibits
+            assert not (await other.see(other.motion, lambda m: True)).interlocks
 
 
 async def test_stop_that_cannot_be_kept_says_so_everywhere_until_it_is(monkeypatch, caplog) -> None:
@@ -210,21 +211,21 @@ async def test_stop_that_cannot_be_kept_says_so_everywhere_until_it_is(monkeypat
         for _ in range(2):
             answer = await person.stop.call(StopRequest(owner="anna", reason="smoke"))
             assert answer.message.count("inhibits.json cannot be written (No space left on device)") == 1
-            assert "not kept on disk (No space left on device)" in answer.stopped and "smoke" in answer.stopped
-        await person.see(person.motion, lambda m: m.not_kept)
+            assert "not saved on disk (No space left on device)" in answer.stopped and "smoke" in answer.stopped
+        await person.see(person.motion, lambda m: m.unsaved)
         held = await person.hold.call(HoldRequest(hold=True, owner="bert"))
-        assert "cannot be written" in held.message and held.not_kept.count("not kept on disk") == 2
+        assert "cannot be written" in held.message and held.unsaved.count("not saved on disk") == 2
         await goes_on(person)
         assert len(told()) == 1, "said once, however often it is tried"
         full = False
-        status = await person.see(person.motion, lambda m: len(m.inhibits) == 2 and not m.not_kept)
+        status = await person.see(person.motion, lambda m: len(m.interlocks) == 2 and not m.unsaved)
         assert status.stopped.endswith("by anna (smoke)")
         assert len(told()) == 2 and told()[1].endswith("is written again: what was decided outlives the executor")
         answer = await person.stop.call(StopRequest(owner="anna", reason="smoke"))
         assert "written" not in answer.message
     async with executor() as person:
         found = await person.see(person.motion, lambda m: True)
-        assert {one.by for one in found.inhibits} == {"anna", "bert"}
+        assert {one.by for one in found.interlocks} == {"anna", "bert"}
 
 
 async def alone(net: LocalNetwork, clock: Clock, given: object, robot: RobotModel) -> tuple[Person, object]:
@@ -265,7 +266,7 @@ async def test_joint_states_go_on_while_a_hold_is_recorded_on_a_disk_that_is_stu
         asked = asyncio.create_task(person.hold.call(HoldRequest(hold=True, owner="anna"), timeout=60))
         await saving.wait()
         await goes_on(person)
-        assert (await person.see(person.motion, lambda m: m.held)).inhibits[0].by == "anna", "it holds at once"
+        assert (await person.see(person.motion, lambda m: m.held)).interlocks[0].by == "anna", "it holds at once"
         assert not asked.done(), "what is answered outlives the executor"
 
 

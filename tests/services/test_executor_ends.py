@@ -20,8 +20,8 @@ from common.sources import drawn_from
 from common.transport import ownership
 from common.transport.bus import Bus
 from common.transport.local import LocalNetwork
-from lab.loop import VirtualLoop
-from lab.watched_arm import shown_to, with_watched_arm
+from lab.loop import VirtualTimeLoop
+from lab.observed_arm import observe_set_points, with_observed_arm
 from services import trajectory_executor
 from services.trajectory_executor import Config
 from tests.common.control.test_limiter import assert_within
@@ -29,7 +29,7 @@ from tests.services.test_trajectory_executor import move
 
 NAME = "trajectory_executor"
 FAST = 1.0  # [rad/s] at which it is to end
-CELL = with_watched_arm(load_cell("panda"))
+CELL = with_observed_arm(load_cell("panda"))
 ROBOT = RobotModel.load(CELL.robot)
 
 
@@ -81,7 +81,7 @@ async def moving(end: Callable[[Arm], Awaitable[None]]) -> Arm:
     arm = Arm(net, person, first, [], asyncio.Event())
     person.raw_subscriber("test/joint_states", lambda sample: arm.told.append(loop.time()))
     config = service_config(CELL, NAME, Config)
-    with shown_to(arm.look):
+    with observe_set_points(arm.look):
         async with running_service(net, trajectory_executor.run, config, name=NAME, clock=clock):
             trajectory = move(ROBOT, ROBOT.named("home"), ROBOT.named("home") + 1.0, scaling=0.9)
             request = ExecuteRequest(header=person.header(), id="far", trajectory=trajectory)
@@ -92,7 +92,7 @@ async def moving(end: Callable[[Arm], Awaitable[None]]) -> Arm:
 
 
 def on_virtual_time(end: Callable[[Arm], Awaitable[None]]) -> Arm:
-    loop = VirtualLoop(1)
+    loop = VirtualTimeLoop(1)
     with drawn_from(loop):
         try:
             return loop.run_until_complete(moving(end))

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from applications.outlining.messages import OutlinePoints
+from applications.outlining.topics import OutlinePoints
 from applications.pick_place.topics import REJECTED_TARGETS, WORKSPACE_MARKERS
 from common import topics
 from common.config import Parameters, World
 from common.config.tunables import apply, checked, leaves, tunable_sections
-from common.messages import Inhibit, PlanRequest, StopRequest
+from common.messages import Interlock, PlanRequest, StopRequest
 from common.robot.transforms import tool_down
 from common.sim.interface import GraspTolerances
 from common.sim.kinematic import KinematicWorld
@@ -87,9 +87,9 @@ def test_a_motion_under_way_is_stopped_after_a_shorter_time() -> None:
 def test_what_is_in_the_way_is_planned_around_after_a_shorter_time(make: Callable[[], Any]) -> None:
     cell = make()
     cell.until("pre-grasp" if isinstance(cell, CellDouble) else "trace")
-    in_the_way = Inhibit(kind="held", by="scene_monitor", reason="a mug is in the way", since=1)
+    in_the_way = Interlock(kind="held", by="scene_monitor", reason="a mug is in the way", since=1)
     cell.motion = cell.motion.model_copy(update={
-        "held": True, "held_by": ["scene_monitor"], "inhibits": [in_the_way]})
+        "held": True, "held_by": ["scene_monitor"], "interlocks": [in_the_way]})
     for _ in range(50):
         cell.step()
     assert cell.task.running is not None

@@ -1,4 +1,4 @@
-"""Cameras on the hand: the simulated one looks from where the joints have it, and readers learn where that was."""
+"""CameraCache on the hand: the simulated one looks from where the joints have it, and readers learn where that was."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ import pytest
 from common import topics
 from common.config import Surroundings, load_cell, service_config
 from common.messages import CameraInfo, Header, JointState, WorldObjects
+from common.perception.camera_input import FrameError
 from common.perception.depth import depth_of
-from common.perception.intake import Unusable
-from common.perception.mounted import Mounted
+from common.perception.pinhole import MountedCamera
 from common.process.camera_reader import CameraReader
 from common.process.in_process import running_service
 from common.process.wiring import wiring
@@ -69,7 +69,7 @@ async def test_depth_of_a_camera_on_the_hand_lies_on_the_table_wherever_the_hand
             while image.header.stamp <= since:
                 image = await depths.next()
             seen, depth = await camera.of(image.header), depth_of(image)
-            np.testing.assert_allclose(seen.T_world_optical, Mounted(AROUND.camera, ROBOT).at(q).T_world_optical,
+            np.testing.assert_allclose(seen.T_world_optical, MountedCamera(AROUND.camera, ROBOT).at(q).T_world_optical,
                                        atol=1e-6)
             rows, columns = np.nonzero(np.isfinite(depth))
             rays = np.stack([(columns - 32) / 34, (rows - 24) / 34, np.ones(len(rows))], axis=1)
@@ -101,9 +101,9 @@ async def test_picture_waits_for_the_transform_of_its_time_and_is_left_out_where
         assert not waiting.done()
         arm.put(joints(1060 * MS, HOME + 0.02))
         found = await waiting
-        expected = Mounted(AROUND.camera, ROBOT).at(HOME + 0.01)
+        expected = MountedCamera(AROUND.camera, ROBOT).at(HOME + 0.01)
         np.testing.assert_allclose(found.T_world_optical, expected.T_world_optical, atol=1e-4)
-        with pytest.raises(Unusable, match="tf does not say yet where 'panda_link7' is") as refused:
+        with pytest.raises(FrameError, match="tf does not say yet where 'panda_link7' is") as refused:
             await camera.of(picture.model_copy(update={"stamp": 9000 * MS}))
         assert refused.value.kind == "early"
 
@@ -116,14 +116,14 @@ async def test_only_cells_with_a_camera_on_the_robot_read_tf() -> None:
 
 def test_camera_that_was_taken_elsewhere_sees_what_one_does_that_always_was_there() -> None:
     things = spheres([(0.4, -0.1, 0.03), (0.5, 0.05, 0.03)]).objects
-    mounted = Mounted(AROUND.camera, ROBOT)
+    mounted = MountedCamera(AROUND.camera, ROBOT)
     there = mounted.at(HOME + 0.1)
     for robot in (None, ROBOT):
         moved = Renderer(AROUND, robot, plain=robot is None, camera=mounted.at())
-        before = moved.see(things, joints(0, HOME)).colour.copy()
-        moved.look_from(there)
+        before = moved.render(things, joints(0, HOME)).colour.copy()
+        moved.move_camera(there)
         fresh = Renderer(AROUND, robot, plain=robot is None, camera=there)
-        seen, expected = moved.see(things, joints(0, HOME)), fresh.see(things, joints(0, HOME))
+        seen, expected = moved.render(things, joints(0, HOME)), fresh.render(things, joints(0, HOME))
         np.testing.assert_array_equal(seen.colour, expected.colour)
         np.testing.assert_array_equal(seen.depth, expected.depth)
         assert not np.array_equal(seen.colour, before)

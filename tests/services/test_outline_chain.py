@@ -6,9 +6,8 @@ from contextlib import AsyncExitStack
 import numpy as np
 import pytest
 
-from applications.outlining.messages import OutlineSelect
 from applications.outlining.top_face import TopFace
-from applications.outlining.topics import CONTOUR_PATH, CONTOUR_POINTS, CONTOURS, OUTLINE_SELECT
+from applications.outlining.topics import CONTOUR_PATH, CONTOUR_POINTS, CONTOURS, OUTLINE_SELECT, OutlineSelect
 from common import topics
 from common.config import (
     CameraConfig,

@@ -8,14 +8,13 @@ import pytest
 from numpy.typing import NDArray
 
 from applications.outlining.contours import ContourOptions, find_contours
-from applications.outlining.messages import Contour, Contours
-from applications.outlining.topics import CONTOURS
+from applications.outlining.topics import CONTOURS, Contour, Contours
 from common import messages as m
 from common import topics
 from common.clock import Clock
 from common.config import Surroundings, load_cell, service_config
+from common.perception.camera_input import FrameError
 from common.perception.image import array_to_image
-from common.perception.intake import Unusable
 from common.perception.pinhole import Pinhole
 from common.process.in_process import running_service
 from common.robot.transforms import matrix_to_pose
@@ -108,13 +107,13 @@ def test_depth_in_millimetres_is_told_by_its_encoding() -> None:
 
 def test_without_any_depth_it_is_not_known_that_nothing_stands_there() -> None:
     image = array_to_image(np.full_like(cube_depth(), np.nan), "32FC1")
-    with pytest.raises(Unusable, match="no valid depth at all"):
+    with pytest.raises(FrameError, match="no valid depth at all"):
         outline_scene.seen(cube_contours(), image, CAMERA, AROUND)
 
 
 def test_depth_of_another_size_than_the_contours_is_left_out() -> None:
     image = array_to_image(cube_depth()[::2, ::2], "32FC1")
-    with pytest.raises(Unusable, match=f"512x384, but the picture is {CAMERA.width}x{CAMERA.height}"):
+    with pytest.raises(FrameError, match=f"512x384, but the picture is {CAMERA.width}x{CAMERA.height}"):
         outline_scene.seen(cube_contours(), image, CAMERA, AROUND)
 
 
@@ -123,21 +122,21 @@ def test_contours_that_lie_over_one_another_again_and_again_are_not_looked_into(
     around = [(-1e12, -1e12), (1e12, -1e12), (1e12, 1e12), (-1e12, 1e12)]
     many = [Contour.model_construct(index=i, label=f"Object_{i}", pixels=around) for i in range(1000)]
     image = array_to_image(cube_depth(), "32FC1")
-    with pytest.raises(Unusable, match="its 1000 contours cover it more than 20 times"):
+    with pytest.raises(FrameError, match="its 1000 contours cover it more than 20 times"):
         outline_scene.seen(found.model_copy(update={"contours": many}), image, CAMERA, AROUND)
 
 
 @pytest.mark.parametrize("change", [{"fx": 1e-6}, {"cy": 1e12}])
 def test_what_would_be_farther_away_than_a_scene_can_tell_is_left_out(change: dict[str, float]) -> None:
     image = array_to_image(cube_depth(), "32FC1")
-    with pytest.raises(Unusable, match=r"more than 1e\+07 m away"):
+    with pytest.raises(FrameError, match=r"more than 1e\+07 m away"):
         outline_scene.seen(cube_contours(), image, replace(CAMERA, **change), AROUND)
 
 
 @pytest.mark.parametrize("change", [{"fx": 1e-6}, {"cy": 1e12}])
 def test_what_would_be_farther_away_than_an_outline_can_tell_has_none(change: dict[str, float]) -> None:
     image = array_to_image(cube_depth(), "32FC1")
-    with pytest.raises(Unusable, match=r"more than 1e\+07 m away"):
+    with pytest.raises(FrameError, match=r"more than 1e\+07 m away"):
         pixel_to_world.outline(cube_contours(), image, replace(CAMERA, **change), pixel_to_world.Config())
 
 

@@ -35,10 +35,10 @@ from common.messages import (
     Vector3,
     WorldObjects,
 )
-from common.perception.intake import Unusable
+from common.perception.camera_input import FrameError
+from common.planning.camera_obstacles import JointHistory, PointsOptions, cloud_points, frame_pose
 from common.planning.collision import CollisionWorld, interpolate
 from common.planning.ik import solve_ik
-from common.planning.seeing import JointHistory, PointsOptions, cloud_points, frame_pose
 from common.process.in_process import running_service
 from common.process.persist import persist
 from common.process.wiring import wiring
@@ -154,7 +154,7 @@ async def planner():
 async def test_without_a_picture_nothing_is_planned(planner) -> None:
     planner.say(START)
     refusal = await planner.refusal()
-    assert refusal.code == "no_points" and "depth_camera/depth/image_raw: nothing came yet" in refusal.message
+    assert refusal.code == "no_points" and "depth_camera/depth/image_raw: no image received yet" in refusal.message
 
 
 async def test_picture_of_a_moment_at_which_the_robot_was_anywhere_is_refused(planner) -> None:
@@ -163,7 +163,7 @@ async def test_picture_of_a_moment_at_which_the_robot_was_anywhere_is_refused(pl
         async with asyncio.timeout(60):
             await planner.depths.next()
         refusal = await planner.refusal()
-        assert refusal.code == "no_state" and "where the robot was" in refusal.message
+        assert refusal.code == "no_state" and "no joint state at the time" in refusal.message
 
 
 async def test_old_picture_is_refused() -> None:
@@ -230,10 +230,10 @@ def test_camera_on_the_robot_is_where_its_link_was() -> None:
     poses = TFMessage(transforms=[stamped("mount", "lens", on_tool, 0), stamped(link, "mount", on_tool, 0)])
     expected = ROBOT.link_poses(START)[link] @ on_tool @ on_tool
     np.testing.assert_allclose(frame_pose("lens", poses, ROBOT, START), expected, atol=1e-12)
-    with pytest.raises(Unusable, match="'nowhere' is; it has: lens, mount"):
+    with pytest.raises(FrameError, match="'nowhere'; its frames: lens, mount"):
         frame_pose("nowhere", poses, ROBOT, START)
     around = TFMessage(transforms=[stamped("a", "b", on_tool, 0), stamped("b", "a", on_tool, 0)])
-    with pytest.raises(Unusable, match="'a' is"):
+    with pytest.raises(FrameError, match="frame 'a'; its"):
         frame_pose("a", around, ROBOT, START)
 
 
@@ -241,7 +241,7 @@ def test_where_the_robot_was_is_between_the_states_about_it() -> None:
     history = JointHistory(ROBOT)
     for stamp, q in ((1.0, START), (1.02, START + 0.02), (1.01, START - 1), (3.0, GOAL)):
         header = Header(stamp=int(stamp * 1e9))
-        history.note(JointState(header=header, name=ROBOT.joint_names, position=list(q)))
+        history.add(JointState(header=header, name=ROBOT.joint_names, position=list(q)))
     np.testing.assert_allclose(history.at(int(1.005e9)), START + 0.005, atol=1e-9)
     np.testing.assert_allclose(history.at(int(1.1e9)), START + 0.02)
     np.testing.assert_allclose(history.at(int(3.05e9)), GOAL)
@@ -255,10 +255,10 @@ def test_clouds_are_read_by_their_fields() -> None:
     cloud = PointCloud2(
         header=Header(), height=2, width=2, fields=["y", "x"], point_step=8, row_step=20, data=rows.tobytes()
     )
-    with pytest.raises(Unusable, match="the cloud has no z; its fields are y, x"):
+    with pytest.raises(FrameError, match="the cloud has no z; its fields are y, x"):
         cloud_points(cloud)
     flat = cloud.model_copy(update={"fields": ["z", "x"]})
-    with pytest.raises(Unusable, match="no y"):
+    with pytest.raises(FrameError, match="no y"):
         cloud_points(flat)
     three = values.repeat(2, axis=2)[..., :3].copy()  # x, x, y
     three = np.ascontiguousarray(three)
@@ -266,7 +266,7 @@ def test_clouds_are_read_by_their_fields() -> None:
         header=Header(), height=2, width=2, fields=["z", "x", "y"], point_step=12, row_step=24, data=three.tobytes()
     )
     np.testing.assert_allclose(cloud_points(whole), [[1, 2, 1], [3, 4, 3], [5, 6, 5]])
-    with pytest.raises(Unusable, match="too few for 2x2"):
+    with pytest.raises(FrameError, match="too few for 2x2"):
         cloud_points(whole.model_copy(update={"data": b"0" * 47}))
-    with pytest.raises(Unusable, match="do not fit"):
+    with pytest.raises(FrameError, match="do not fit"):
         cloud_points(whole.model_copy(update={"row_step": 20}))

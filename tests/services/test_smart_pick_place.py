@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from applications.pick_place.choice import LetGo, PickPlaceView
-from applications.pick_place.parameters import Config
+from applications.pick_place.grasping import Config
 from applications.pick_place.task import PickPlace
 from applications.pick_place.topics import PICK_PLACE_STATUS, VALIDATED_TARGETS
 from common import messages as m

@@ -254,7 +254,7 @@ async def test_joint_states_go_on_while_a_long_trajectory_is_looked_at_and_a_sto
             asked = asyncio.create_task(person.execute.call(person.asks(id="long", trajectory=long)))
             await judging.wait()
             await goes_on(person)
-            await person.stop.call(StopRequest(id="", by="person", owner="anna"))
+            await person.stop.call(StopRequest(id="", by="operator", owner="anna"))
         answer = await asked
         assert (answer.state, answer.error) == ("rejected", "stopped")
         await person.hold.call(HoldRequest(hold=False, stops=True, owner="anna"))

@@ -16,9 +16,8 @@ from common import topics
 from common.config import Cell, load_cell
 from common.errors import RequestFailed
 from common.messages import CollisionObject, FollowedRequest, JointState, MotionStatus, Pose, Vector3, WorldEdit
-from common.planning.retiming import sample
 from common.planning.robot_geometry import RobotGeometry
-from common.planning.validation import timed_path
+from common.planning.trajectory import sample, timed_path
 from common.robot.finger_joints import measured_width
 from common.robot.model import RobotModel
 from common.transport.bus import Bus

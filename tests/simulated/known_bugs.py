@@ -8,19 +8,19 @@ import contextlib
 import sys
 from unittest.mock import patch
 
-from applications.pick_place.perceived import PerceivedScene
+from applications.pick_place.perceived_scene import PerceivedScene
 from common import topics
 from common.config import load_cell
 from common.control.controller import TrajectoryController
 from common.control.goals import GoalMemory
-from common.control.inhibits import Record
+from common.control.interlocks import Record
 from common.control.limiter import Limiter
 from common.control.ownership import Ownership
 from common.control.record_file import RecordFile
 from common.sources import host_ns, wall_ns
 from common.transport import requests
 from common.transport.reader import Newness
-from lab import process
+from lab import processes
 from lab.doubles import settings_of, with_doubles
 from lab.simulation import Simulation
 from services import smart_pick_place, trajectory_executor
@@ -77,13 +77,13 @@ def _two_goals():
 
 
 def _clock_of_its_own():
-    honest = process.SkewedClock.__init__
+    honest = processes.SkewedClock.__init__
 
     def begin(self, like, skew_ns):
         honest(self, like, skew_ns)
         self._offset_ns = wall_ns() - host_ns()
 
-    return patch.object(process.SkewedClock, "__init__", begin)
+    return patch.object(processes.SkewedClock, "__init__", begin)
 
 
 def _waits_without_end():
@@ -107,7 +107,7 @@ def _never_asked_again():
             note(str(error))
             await asyncio.Event().wait()
 
-    return patch("common.process.orders.persist", once)
+    return patch("common.processes.orders.persist", once)
 
 
 BUGS = {
@@ -127,7 +127,7 @@ BUGS = {
     "what is in the hand is forgotten": lambda: patch.object(
         PerceivedScene, "feel", lambda self, state, T_world_tcp: None),
     "what day it is asked for at each start": _clock_of_its_own,
-    "goal ids that repeat after a restart": lambda: patch("common.process.task_runner.new_id", lambda: "0000"),
+    "goal ids that repeat after a restart": lambda: patch("common.processes.task_runner.new_id", lambda: "0000"),
 }
 
 

@@ -8,7 +8,7 @@ import sys
 from unittest.mock import patch
 
 from common.config import load_cell
-from common.control.inhibits import Inhibits, Record
+from common.control.interlocks import Interlocks, Record
 from common.control.record_file import RecordFile
 from common.transport.ownership import Ownership
 from lab.doubles import settings_of, with_doubles
@@ -21,8 +21,8 @@ def _without(**left_out):
 
     def load(self):
         record, problem = honest(self)
-        return record.model_copy(update=left_out | (
-            {"inhibits": [i for i in record.inhibits if i.kind != "held"]} if "inhibits" in left_out else {})), problem
+        stops = {"interlocks": [i for i in record.interlocks if i.kind != "held"]} if "interlocks" in left_out else {}
+        return record.model_copy(update=left_out | stops), problem
 
     return patch.object(RecordFile, "load", load)
 
@@ -35,15 +35,15 @@ def _let_in():
 
 
 def _late_start_counts():
-    return patch("common.control.inhibits._lets_go", lambda request, inhibit: (
-        request.override or (request.stops if inhibit.kind == "stopped" else True)))
+    return patch("common.control.interlocks._lets_go", lambda request, interlock: (
+        request.override or (request.stops if interlock.kind == "stopped" else True)))
 
 
 DECISIONS = {
     "a restart forgets the stop": lambda: patch.object(RecordFile, "load", lambda self: (Record(), "")),
-    "the hold's record is not read": lambda: _without(inhibits=[]),
+    "the hold's record is not read": lambda: _without(interlocks=[]),
     "a remembered stop of an unknown goal is forgotten": lambda: patch.object(
-        Inhibits, "never", lambda self, goals: None),
+        Interlocks, "never", lambda self, goals: None),
     "the speed is forgotten": lambda: patch.object(
         trajectory_executor, "speed_of", lambda kept, configured: configured),
     "a second instance is let in": _let_in,

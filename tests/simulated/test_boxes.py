@@ -12,8 +12,7 @@ from common.config import Cell, load_cell
 from common.messages import GripperState, WorldObjects
 from common.transport.codec import decode
 from common.transport.session import RawSample
-from lab.simulation import Simulation
-from lab.trace import Trace
+from lab.simulation import Simulation, Trace
 
 CELL = """
 cell: boxes

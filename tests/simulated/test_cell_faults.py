@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from applications.pick_place.messages import PickPlaceStatus
-from applications.pick_place.topics import PICK_PLACE_STATUS, SCENE_BALLS
+from applications.pick_place.topics import PICK_PLACE_STATUS, SCENE_BALLS, PickPlaceStatus
 from common import topics
 from common.messages import GripperState, MotionStatus, PoseArray, Vector3, WorldEdit
 from common.transport.bus import Bus

@@ -69,11 +69,11 @@ def test_newest_stop_is_heard_of_before_a_start_is_asked_for():
     async def visit(bus: Bus) -> None:
         assert await newest_heard(bus) == 0
         stopped = await bus.client(topics.MOTION_STOP).call(StopRequest(owner="anna"))
-        await until(bus.reader(topics.MOTION_STATUS), lambda said: bool(said.inhibits))
+        await until(bus.reader(topics.MOTION_STATUS), lambda said: bool(said.interlocks))
         assert await newest_heard(bus) == stopped.newest > 0
-        await bus.client(topics.TASK_COMMAND).call(TaskCommand(command="start", heard=stopped.newest - 1))
+        await bus.client(topics.TASK_COMMAND).call(TaskCommand(command="start", acknowledged=stopped.newest - 1))
         assert await newest_heard(bus) == stopped.newest, "a start that is late lets go of nothing"
-        await bus.client(topics.TASK_COMMAND).call(TaskCommand(command="start", heard=stopped.newest))
+        await bus.client(topics.TASK_COMMAND).call(TaskCommand(command="start", acknowledged=stopped.newest))
 
     assert Simulation(cell_of("panda"), 1, visit=visit).run().ok
 

@@ -8,8 +8,8 @@ from common.config import load_cell
 from common.errors import ConfigError
 from lab.campaign import run_seeds
 from lab.faults import SKEW, SPEEDS, make_plan
+from lab.observed_arm import with_observed_arm
 from lab.simulation import LIMIT, Outcome, Simulation
-from lab.watched_arm import with_watched_arm
 from tests.simulated.known_bugs import BUGS, RARE, found_within
 
 pytestmark = pytest.mark.timeout(600)  # some seconds of work, on a machine that may be busy
@@ -96,4 +96,4 @@ def test_real_arm_cannot_be_simulated(tmp_path, monkeypatch):
     (tmp_path / "steel.py").rename(tmp_path / "of" / "steel.py")
     monkeypatch.syspath_prepend(str(tmp_path))
     with pytest.raises(ConfigError, match="is a real arm"):
-        with_watched_arm(load_cell("panda", ["robot.hardware.backend=of.steel"]))
+        with_observed_arm(load_cell("panda", ["robot.hardware.backend=of.steel"]))

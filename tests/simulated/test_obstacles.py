@@ -56,7 +56,7 @@ class Way:
         SEEN.update(self.seen)
         held = await until(self.motion, lambda m: "scene_monitor" in m.held_by and m.message.startswith("held"), 2.0)
         assert held.id == status.id and held.progress < 0.6 and held.plan and held.scene_stamp
-        assert "ball is in the way of panda_" in held.message
+        assert "ball obstructs panda_" in held.message
         return held
 
     def _ball(self, trajectory: JointTrajectory) -> CollisionObject:
@@ -73,13 +73,13 @@ def test_what_goes_away_lets_the_motion_go_on_but_not_while_a_person_holds_the_a
         held = await way.block()
         await hold.call(HoldRequest(hold=True, owner="anna"))
         SEEN.clear()
-        left = await until(way.motion, lambda m: m.held_by == ["person"], 2.0)
+        left = await until(way.motion, lambda m: m.held_by == ["operator"], 2.0)
         await asyncio.sleep(2.0)
         assert way.motion.latest is not None and way.motion.latest.progress == left.progress
         SEEN.update(way.seen)
         await until(way.motion, lambda m: "scene_monitor" in m.held_by, 2.0)
         await hold.call(HoldRequest(hold=False, owner="anna"))
-        assert (await until(way.motion, lambda m: "person" not in m.held_by)).held
+        assert (await until(way.motion, lambda m: "operator" not in m.held_by)).held
         SEEN.clear()
         assert (await until(way.motion, lambda m: m.progress > 0.9, 10.0)).id == held.id
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from applications.outlining import stage_files
-from applications.outlining.contours_choice import parse_choice
+from applications.outlining.contour_choice import parse_choice
 from applications.outlining.topics import CONTOUR_PATH, CONTOURS, OUTLINE_SELECT
 from applications.outlining.verbs import before_run
 from common import topics

@@ -17,7 +17,7 @@ from common.process.in_process import running_service
 from common.topics import Topic
 from common.transport.local import LocalNetwork
 from common.transport.writer import RawWriter
-from recording.reading import Recording
+from recording.reader import Recording
 from recording.sample import encoding_of
 from tests.simulated.visited import SimulatedCell
 

@@ -15,10 +15,9 @@ from common.process.in_process import running_service
 from common.process.wiring import owned_in, require_one_owner, wiring_of
 from common.transport import ownership
 from common.transport.local import LocalNetwork
-from lab.simulation import Simulation
-from lab.trace import Trace
-from recording.own import Own
-from recording.reading import Recording
+from lab.simulation import Simulation, Trace
+from recording.capture import CustomTopics
+from recording.reader import Recording
 from services import camera_simulator
 
 CELL = str(Path(__file__).parents[1] / "data" / "two_cameras.yaml")
@@ -27,7 +26,7 @@ CELL = str(Path(__file__).parents[1] / "data" / "two_cameras.yaml")
 @pytest.mark.slow
 def test_two_cameras_two_detectors_and_one_scene_clear_a_table_that_neither_camera_sees_wholly(tmp_path: Path) -> None:
     cell = load_cell(CELL)
-    trace = Trace(tmp_path / "run.mcap", {"cell": cell.name}, Own.of(cell))
+    trace = Trace(tmp_path / "run.mcap", {"cell": cell.name}, CustomTopics.of(cell))
     outcome = Simulation(cell, 1, trace=trace).run()
     trace.close("simulated")
     with Recording(tmp_path / "run.mcap") as recording:

@@ -20,11 +20,9 @@ from common.application import find_application
 from common.config import Cell, load_cell
 from common.messages import TaskCommand
 from common.transport.bus import Bus
-from lab.simulation import Outcome, Simulation
-from lab.trace import Trace
-from recording.own import Own
-from recording.report.collector import Collector
-from recording.report.fold import Fold
+from lab.simulation import Outcome, Simulation, Trace
+from recording.capture import CustomTopics
+from recording.report.aggregator import Collector, RunAggregator
 from recording.report.summary import describe
 from tests.harness import beside
 
@@ -54,9 +52,10 @@ class SimulatedCell:
         self.lines: list[str] = []
         self.ended = asyncio.Event()  # the task
         self._visit = visit
-        self._fold = Fold(loaded.name, find_application(loaded.application), robot=loaded.robot, seed=loaded.run.seed,
-                          containers=list(loaded.world.containers))
-        trace = None if record is None else Trace(record, {"cell": loaded.name}, Own.of(loaded))
+        self._fold = RunAggregator(
+            loaded.name, find_application(loaded.application), robot=loaded.robot, seed=loaded.run.seed,
+            containers=list(loaded.world.containers))
+        trace = None if record is None else Trace(record, {"cell": loaded.name}, CustomTopics.of(loaded))
         self._simulation = Simulation(loaded, seed, limit=limit, trace=trace, tell=self.lines.append, visit=self._look)
         self.outcome: Outcome = self._simulation.run()
         if trace is not None:

@@ -58,7 +58,7 @@ class BoardOptions(Parameters):
 
 
 @dataclass(frozen=True, eq=False)
-class Sighting:
+class BoardDetection:
     """Where the inner corners of a board are seen in a picture.
 
     Attributes:
@@ -79,7 +79,7 @@ class Sighting:
 
 
 @dataclass(frozen=True)
-class NotSeen:
+class NoBoard:
     """Why a picture shows no board: `kind` is for counting, the reason for people."""
 
     kind: Literal["nothing", "blurred", "few corners", "other board"]
@@ -162,39 +162,39 @@ class Board:
             cv2.putText(page, text, place, cv2.FONT_HERSHEY_SIMPLEX, scale, 0, max(1, round(0.15 * mm)), cv2.LINE_AA)
         return page, density
 
-    def find(self, picture: Picture, name: str) -> Sighting | NotSeen:
+    def find(self, picture: Picture, name: str) -> BoardDetection | NoBoard:
         """Where the board is in a bgr8 or grey picture, or why it is not seen."""
         grey = np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY), np.uint8) if picture.ndim == 3 else picture
         pixels, ids, marker_pixels, marker_ids = self._detector.detectBoard(grey)
         if marker_ids is None or not len(marker_ids):
-            return _blurred(grey) or NotSeen("nothing", "no marker is seen")
+            return _blurred(grey) or NoBoard("nothing", "no marker is seen")
         markers = {int(number): np.asarray(corners, float).reshape(4, 2)
                    for number, corners in zip(np.ravel(marker_ids), marker_pixels, strict=True)}
         other = self._other_board(markers)
         if other:
-            return NotSeen("other board", other)
+            return NoBoard("other board", other)
         if ids is None or len(ids) < _LEAST_CORNERS or self._board.checkCharucoCornersCollinear(ids):
-            return _blurred(grey) or NotSeen("few corners", f"{0 if ids is None else len(ids)} corners are seen, "
+            return _blurred(grey) or NoBoard("few corners", f"{0 if ids is None else len(ids)} corners are seen, "
                                                             f"{_LEAST_CORNERS} not on one line are needed")
         points, found = self.corners[np.ravel(ids)], np.asarray(pixels, float).reshape(-1, 2)
         other = self._other_length(homography(points[:, :2], found), markers)
         if other:
-            return _blurred(grey) or NotSeen("other board", other)
+            return _blurred(grey) or NoBoard("other board", other)
         low, high = np.maximum(found.min(axis=0) - _WINDOW, 0).astype(int), found.max(axis=0).astype(int) + _WINDOW
         blur = _blur(grey[low[1] : high[1], low[0] : high[0]])
         found, good = refine(grey, self._print, points[:, :2], found, blur)
         if good.sum() < _LEAST_CORNERS or np.linalg.matrix_rank(points[good] - points[good][0], 1e-6) < 2:
-            return _blurred(grey) or NotSeen("few corners", f"{good.sum()} of {len(good)} corners look as they are "
+            return _blurred(grey) or NoBoard("few corners", f"{good.sum()} of {len(good)} corners look as they are "
                                                             f"printed, {_LEAST_CORNERS} not on one line are needed")
         points, found = points[good], found[good]
         H = homography(points[:, :2], found)
         if H is None:
-            return NotSeen("few corners", "the corners that are seen do not say where the board is")
+            return NoBoard("few corners", "the corners that are seen do not say where the board is")
         width, height = self.size
         outer = np.array([[0, 0], [width, 0], [width, height], [0, height]])
         outline = mapped(H, outer)
         size = (grey.shape[1], grey.shape[0])
-        return Sighting(name, size, points, found, blur, outline)
+        return BoardDetection(name, size, points, found, blur, outline)
 
     def _other_board(self, markers: dict[int, Array]) -> str:
         """Why the markers that are seen are those of another board; empty when they fit."""
@@ -250,11 +250,11 @@ def _off(side: int, options: BoardOptions, bits: int) -> float:
     return round(abs(edge - round(edge)) + bits * abs(cell - round(cell)), 6)
 
 
-def _blurred(grey: Picture) -> NotSeen | None:
+def _blurred(grey: Picture) -> NoBoard | None:
     if np.ptp(np.percentile(grey, (1, 99))) < _LEAST_CONTRAST:
         return None
     blur = _blur(grey)
-    return NotSeen("blurred", f"edges are smeared over {blur:.1f} px") if blur > _SMEARED else None
+    return NoBoard("blurred", f"edges are smeared over {blur:.1f} px") if blur > _SMEARED else None
 
 
 def _blur(grey: Picture) -> float:

@@ -11,10 +11,10 @@ import numpy as np
 import numpy.typing as npt
 
 from common.perception.camera_file import CameraFile
-from common.perception.sources import pictures
+from common.perception.image_sources import pictures
 from common.robot.transforms import invert, matrix_to_rpy, transform
-from tools.calibration.board import Board, NotSeen, Sighting
-from tools.calibration.calibration import CalibrationFailed, ViewResidual
+from tools.calibration.board import Board, BoardDetection, NoBoard
+from tools.calibration.intrinsics import CalibrationFailed, ViewResidual
 
 Array = npt.NDArray[np.float64]
 
@@ -63,14 +63,14 @@ class PoseCalibration:
 class _Seen:
     """A sighting with the place of its board: corners in world (n, 3) [m], and in the picture without distortion."""
 
-    sighting: Sighting
+    sighting: BoardDetection
     T_world_board: Array
     points: Array
     ideal: Array  # (n, 1, 2) [px], as a pinhole with the same k would see them
 
 
 def calibrate_pose(
-    places: Sequence[tuple[Array, Sequence[Sighting]]], camera: CameraFile
+    places: Sequence[tuple[Array, Sequence[BoardDetection]]], camera: CameraFile
 ) -> PoseCalibration:
     """The pose that fits the corners of all pictures best; pictures that do not fit the others are dropped.
 
@@ -108,7 +108,7 @@ def calibrate_pose(
     return PoseCalibration(T_world_camera, position, rotation, place, rms, _rms(on_board), pictures, dropped)
 
 
-def sightings_in(source: str, board: Board, camera: CameraFile, most: int, seconds: float) -> list[Sighting]:
+def detect_boards_in(source: str, board: Board, camera: CameraFile, most: int, seconds: float) -> list[BoardDetection]:
     """What is seen of the board in pictures of a source, in so many of them at most.
 
     Args:
@@ -122,10 +122,10 @@ def sightings_in(source: str, board: Board, camera: CameraFile, most: int, secon
         CalibrationFailed: the board is in none; why it is not in most of them.
         ConfigError: the source is nothing that pictures can be read from.
     """
-    seen: list[Sighting] = []
+    seen: list[BoardDetection] = []
     why: list[str] = []
     for name, picture in pictures(source, (camera.width, camera.height), seconds):
-        found, reasons = sightings_of(board, [(f"{source}: {name}", picture)], camera)
+        found, reasons = detect_boards(board, [(f"{source}: {name}", picture)], camera)
         seen, why = seen + found, why + reasons
         if len(seen) >= most:
             break
@@ -135,14 +135,14 @@ def sightings_in(source: str, board: Board, camera: CameraFile, most: int, secon
     return seen
 
 
-def sightings_of(board: Board, pictures: Sequence[tuple[str, npt.NDArray[np.uint8]]], camera: CameraFile,
-                 max_blur: float = 2.5) -> tuple[list[Sighting], list[str]]:
+def detect_boards(board: Board, pictures: Sequence[tuple[str, npt.NDArray[np.uint8]]], camera: CameraFile,
+                 max_blur: float = 2.5) -> tuple[list[BoardDetection], list[str]]:
     """Where the board is seen, and for each picture without it the reason.
 
     Raises:
         CalibrationFailed: a picture has another size than the intrinsics are for.
     """
-    found: list[Sighting] = []
+    found: list[BoardDetection] = []
     reasons: list[str] = []
     for name, picture in pictures:
         height, width = picture.shape[:2]
@@ -150,7 +150,7 @@ def sightings_of(board: Board, pictures: Sequence[tuple[str, npt.NDArray[np.uint
             raise CalibrationFailed(f"{name} is {width}x{height}, but the intrinsics are for "
                                     f"{camera.width}x{camera.height}")
         sighting = board.find(picture, name)
-        if isinstance(sighting, NotSeen):
+        if isinstance(sighting, NoBoard):
             reasons.append(sighting.reason)
         elif sighting.blur > max_blur:
             reasons.append(f"edges are smeared over {sighting.blur:.1f} px")
@@ -159,7 +159,7 @@ def sightings_of(board: Board, pictures: Sequence[tuple[str, npt.NDArray[np.uint
     return found, reasons
 
 
-def _straightened(sighting: Sighting, T_world_board: Array, camera: CameraFile) -> _Seen:
+def _straightened(sighting: BoardDetection, T_world_board: Array, camera: CameraFile) -> _Seen:
     ideal = camera.undistorted(sighting.pixels)
     points = sighting.points @ T_world_board[:3, :3].T + T_world_board[:3, 3]
     return _Seen(sighting, T_world_board, points, ideal[:, None])

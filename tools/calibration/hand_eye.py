@@ -18,8 +18,8 @@ import numpy.typing as npt
 
 from common.perception.camera_file import CameraFile
 from common.robot.transforms import invert, matrix_to_rpy, transform
-from tools.calibration.board import Sighting
-from tools.calibration.calibration import CalibrationFailed, ViewResidual
+from tools.calibration.board import BoardDetection
+from tools.calibration.intrinsics import CalibrationFailed, ViewResidual
 
 Array = npt.NDArray[np.float64]
 Mount = Literal["hand", "beside"]
@@ -37,7 +37,7 @@ GOOD, FAIR = 1e-3, 3e-3  # [m] of uncertainty of the position up to which a cali
 class View:
     """A picture of the board, and the tool centre point in world (4, 4) when it was taken."""
 
-    sighting: Sighting
+    sighting: BoardDetection
     T_world_tcp: Array
 
 

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
 from collections import deque
+from collections.abc import Callable
+from dataclasses import replace
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -13,15 +16,18 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
+from common import topics
 from common.config import Number, Parameters, check, load_robot, read_yaml
-from common.errors import ConfigError
+from common.errors import ConfigError, ZencellError
 from common.messages import Image
 from common.perception.camera_file import CameraFile
+from common.perception.camera_input import FrameError, decode_color_image
 from common.perception.image import ImageError, image_to_array
-from common.perception.intake import Unusable, colour_picture
 from common.robot.model import RobotModel
-from tools.calibration.board import Board, NotSeen
-from tools.calibration.camera_pose import sightings_of
+from common.transport.bus import Bus
+from common.transport.reader import Reader
+from tools.calibration.board import Board, NoBoard
+from tools.calibration.camera_pose import detect_boards
 from tools.calibration.hand_eye import View
 
 Array = npt.NDArray[np.float64]
@@ -43,7 +49,7 @@ class JointsFile(Parameters):
     pictures: dict[str, list[Number]] = Field({}, description="name of a picture: positions of the joints [rad]")
 
 
-class ViewCollector:
+class HandEyeCollector:
     """Takes joints and pictures as they come, and keeps those that a calibration gains from, in a folder."""
 
     def __init__(self, folder: Path, robot: RobotModel, name: str, board: Board) -> None:
@@ -85,8 +91,8 @@ class ViewCollector:
         """Keep a picture as it came: empty if it is, else why not."""
         try:
             grey = image.encoding == "mono8"
-            picture = np.asarray(image_to_array(image), np.uint8) if grey else colour_picture(image)
-        except (ImageError, Unusable) as error:
+            picture = np.asarray(image_to_array(image), np.uint8) if grey else decode_color_image(image)
+        except (ImageError, FrameError) as error:
             return str(error)
         return self.picture(image.header.stamp * 1e-9, np.ascontiguousarray(picture))
 
@@ -101,7 +107,7 @@ class ViewCollector:
         if any(_near(hand, other) for other in self._hands):
             return "the hand was in this pose before"
         sighting = self._board.find(picture, "")
-        if isinstance(sighting, NotSeen):
+        if isinstance(sighting, NoBoard):
             return sighting.reason
         if sighting.blur > MOST_BLUR:
             return f"edges are smeared over {sighting.blur:.1f} px"
@@ -158,7 +164,7 @@ def load_views(
         picture: Any = cv2.imread(str(folder / Path(name).name))
         if picture is None:
             raise ConfigError(f"{folder / JOINTS_FILE}: pictures", name, "is no picture in that folder")
-        found, reasons = sightings_of(board, [(name, picture)], camera, MOST_BLUR)
+        found, reasons = detect_boards(board, [(name, picture)], camera, MOST_BLUR)
         why += [f"{name}: {reason}" for reason in reasons]
         views += [View(sighting, robot.fk(q)) for sighting in found]
     return views, why, said
@@ -204,3 +210,66 @@ def _write(folder: Path, said: JointsFile) -> None:
         part.replace(folder / JOINTS_FILE)
     except OSError as error:
         raise ConfigError("FOLDER", str(folder), f"cannot be written: {error.strerror}") from None
+
+
+# Keeps views of a calibration board from a cell that is up, while a person or a script moves the arm."""
+
+FIRST_PICTURE = 5.0  # [s] of wall time in which one comes
+
+
+class NoImage(ZencellError):
+    """Nobody sends pictures."""
+
+    exit_code = 1
+
+
+async def collect_views(
+    bus: Bus, key: str, collector: HandEyeCollector, wanted: int, report: Callable[[str], None]
+) -> None:
+    """Hand joints and pictures to a collector until it has so many views.
+
+    Args:
+        bus: in the cell.
+        key: of the camera's pictures.
+        collector: decides which count.
+        wanted: views.
+        report: is called with what became of a picture, whenever that is not what it was before.
+
+    Raises:
+        NoImage: none comes.
+    """
+    pictures, joints = bus.reader(replace(topics.CAMERA_IMAGE, key=key)), bus.reader(topics.JOINT_STATES)
+
+    async def take_note() -> None:
+        async for state in joints:
+            q = dict(zip(state.name, state.position, strict=True))
+            if all(name in q for name in collector.joint_names):  # else it is of another robot
+                collector.joints(state.header.stamp * 1e-9, np.array([q[name] for name in collector.joint_names]))
+
+    noting, said = asyncio.create_task(take_note()), ""
+    try:
+        while collector.count < wanted:
+            image = await _next_of(pictures, noting)
+            why = await asyncio.to_thread(collector.look, image)
+            line = why or f"view {collector.count} of {wanted}; {collector.hint}"
+            if line != said:
+                report(line)
+            said = line
+    finally:
+        noting.cancel()
+
+
+async def _next_of(pictures: Reader[Image], noting: asyncio.Task[None]) -> Image:
+    """The next picture.
+
+    Raises:
+        NoImage: none comes.
+    """
+    coming = asyncio.ensure_future(pictures.next())
+    done, _ = await asyncio.wait({coming, noting}, timeout=FIRST_PICTURE, return_when=asyncio.FIRST_COMPLETED)
+    if coming in done:
+        return coming.result()
+    coming.cancel()
+    if noting in done:
+        noting.result()
+    raise NoImage(f"no picture came for {FIRST_PICTURE:g} s: is a camera up, and its key right (--key)?")

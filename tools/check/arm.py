@@ -12,13 +12,12 @@ from common.errors import ConfigError
 from common.messages import PlanningScene
 from common.messages.basics import Header
 from common.planning.collision import CollisionWorld
-from common.planning.free_axes import about, chooses, solve_in, why_not_in
-from common.planning.ik import solve_ik
+from common.planning.ik import controls_full_pose, explain_region_unreachable, pose_region, solve_ik, solve_region_ik
 from common.planning.obstacles import ObstacleCache
 from common.planning.robot_geometry import RobotGeometry
 from common.robot.model import RobotModel
 from common.scene.fixtures import container_panels, fixture_objects
-from tools.check.finding import Finding, error, warning
+from tools.check import Finding, error, warning
 
 Array = NDArray[np.float64]
 
@@ -76,17 +75,17 @@ class Arm:
             for seed in range(SEEDS):
                 rng = np.random.default_rng(seed)
                 start = self.home if seed == 0 else rng.uniform(self.robot.lower, self.robot.upper)
-                if chooses(self.robot):
+                if controls_full_pose(self.robot):
                     q = solve_ik(self.robot, T, start, rng=rng, restarts=RESTARTS)
                 else:
-                    q = solve_in(self.robot, about(self.robot, T, tilt), start, rng=rng, restarts=RESTARTS)
+                    q = solve_region_ik(self.robot, pose_region(self.robot, T, tilt), start, rng=rng, restarts=RESTARTS)
                 if q is None:
                     continue
                 pair = self.touching(q, width)
                 if pair is None:
                     return ""
                 touches = touches or f"{pair[0]} would touch {pair[1]}"
-        return touches or why_not_in(self.robot, about(self.robot, poses[0], tilt), self.home)
+        return touches or explain_region_unreachable(self.robot, pose_region(self.robot, poses[0], tilt), self.home)
 
 
 def require_free_home(config: RobotConfig, around: Surroundings, geometry: RobotGeometry) -> None:

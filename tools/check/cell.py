@@ -1,22 +1,27 @@
-"""All that is looked at in a cell, in two parts: what is quick, and what has a robot's model loaded for it."""
+"""Checks of a cell: from its files within milliseconds, and with a model of its robot."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import asyncio
+import os
+import pickle
+import sys
+from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING
 
 from common.application import find_application
 from common.config import Cell, Surroundings
-from common.errors import ConfigError
+from common.errors import ConfigError, ZencellError
 from common.hardware.loading import is_simulated
 from common.sim.interface import require_simulator
-from tools.check.finding import Finding, refusal
+from common.supervision.launch import python_module
+from tools.check import Finding, refusal
 
 if TYPE_CHECKING:
     from common.robot.model import RobotModel
 
 
-def refused(cell: Cell) -> list[Finding]:
+def blocking_errors(cell: Cell) -> list[Finding]:
     """What nothing may begin with, as far as the robot file tells it: within milliseconds.
 
     What services refuse by themselves as they come up is left to them: their parameters, joints and links of the
@@ -39,17 +44,17 @@ def require_safe(cell: Cell) -> None:
     """
     if is_simulated(cell.robot):
         require_simulator(cell.world.simulator)
-    for found in refused(cell):
+    for found in blocking_errors(cell):
         field, _, rest = found.line.partition(": ")
         raise ConfigError(field, ..., rest)
 
 
-def doubts(cell: Cell) -> list[Finding]:
+def quick_warnings(cell: Cell) -> list[Finding]:
     """What else will not work, as far as it is told quickly."""
-    return [found for found in quick(cell) if not found.refused]
+    return [found for found in check_files(cell) if not found.refused]
 
 
-def quick(cell: Cell) -> list[Finding]:
+def check_files(cell: Cell) -> list[Finding]:
     """What the files tell; a model of the robot is loaded only to see where a camera on it looks from home."""
     from tools.check.robot_file import check_robot_file
     from tools.check.world import check_world
@@ -59,9 +64,10 @@ def quick(cell: Cell) -> list[Finding]:
         seen = seen_from_home(cell)
     except ConfigError as told:
         return [*of_robot, refusal(told)]
+    checks = find_application(cell.application).checks
     place = " from home" if cell.world.on_hand else ""
     return [*of_robot, *_each(lambda: check_world(seen, find_application(cell.application), place)),
-            *_of_application(seen, "quick")]
+            *_of_application(checks.quick if checks else None, seen)]
 
 
 def seen_from_home(cell: Cell, robot: RobotModel | None = None) -> Cell:
@@ -72,13 +78,13 @@ def seen_from_home(cell: Cell, robot: RobotModel | None = None) -> Cell:
     """
     if not cell.world.on_hand:
         return cell
-    from common.perception.mounted import from_home
+    from common.perception.pinhole import cameras_at_home
     from common.robot.model import RobotModel
 
-    return cell.model_copy(update={"world": from_home(cell.world, robot or RobotModel.load(cell.robot))})
+    return cell.model_copy(update={"world": cameras_at_home(cell.world, robot or RobotModel.load(cell.robot))})
 
 
-def thorough(cell: Cell) -> Iterator[Finding]:
+def check_model(cell: Cell) -> Iterator[Finding]:
     """What it takes a model of the robot to tell."""
     from tools.check.arm import Arm
 
@@ -88,14 +94,12 @@ def thorough(cell: Cell) -> Iterator[Finding]:
         yield refusal(told)
         return
     yield from arm.check_poses()
-    found = find_application(cell.application).find("checks", "reach")
-    if found is not None:
-        yield from _each(lambda: found(seen_from_home(cell, arm.robot), arm))
+    checks = find_application(cell.application).checks
+    yield from _of_application(checks.reach if checks else None, seen_from_home(cell, arm.robot), arm)
 
 
-def _of_application(cell: Cell, name: str) -> list[Finding]:
-    found = find_application(cell.application).find("checks", name)
-    return [] if found is None else _each(lambda: found(cell))
+def _of_application(check: Callable[..., Iterator[Finding]] | None, *args: object) -> list[Finding]:
+    return _each(lambda: check(*args)) if check is not None else []
 
 
 def _each(look: Callable[[], Iterator[Finding]]) -> list[Finding]:
@@ -106,3 +110,53 @@ def _each(look: Callable[[], Iterator[Finding]]) -> list[Finding]:
     except ConfigError as told:
         found.append(refusal(told))
     return found
+
+
+NICE = 10  # the cell goes first
+
+
+class QuickCheckFailed(ZencellError):
+    """The process ended without a word of what it found."""
+
+
+async def warnings_in_subprocess(cell: Cell, environ: Mapping[str, str]) -> list[Finding]:
+    """What will not work in a cell, as `tools.check.cell.quick_warnings` tells it; the process dies with the call.
+
+    Args:
+        cell: as it was loaded.
+        environ: of the process; its PYTHONPATH leads to what the cell names.
+
+    Raises:
+        QuickCheckFailed: it failed; what it said of that is on stderr.
+    """
+    process = await asyncio.create_subprocess_exec(
+        *python_module(__name__), stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE, env=environ,
+        start_new_session=True,  # Ctrl-C is for us
+    )
+    try:
+        told, _ = await process.communicate(pickle.dumps(cell))
+    finally:
+        if process.returncode is None:
+            process.kill()
+            await process.wait()
+    if process.returncode:
+        raise QuickCheckFailed(f"the quick check failed (exit code {process.returncode}); see `zencell check`")
+    found: list[Finding] = pickle.loads(told)
+    return found
+
+
+def main() -> None:
+    """Look at the cell from stdin."""
+    from common.process.lifeline import die_when_orphaned
+
+    die_when_orphaned()
+    os.nice(NICE)
+    with os.fdopen(os.dup(1), "wb") as answer:
+        os.dup2(2, 1)  # what a module of a person's own prints is no part of the answer
+        from tools.check.cell import quick_warnings  # not of __main__: Finding is unpickled by this name
+
+        answer.write(pickle.dumps(quick_warnings(pickle.load(sys.stdin.buffer))))
+
+
+if __name__ == "__main__":
+    main()

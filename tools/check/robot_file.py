@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from common.config import GripperConfig, RobotConfig
 from common.robot.finger_joints import driven_position
 from common.robot.merging import merged_urdf
-from tools.check.finding import Finding, error, warning
+from tools.check import Finding, error, warning
 
 TURNS, SLIDES = ("revolute", "continuous"), ("prismatic",)
 SLACK = 1e-3  # [m] or [rad] by which a finger may be asked beyond its limit: rounded numbers of two files

@@ -16,9 +16,9 @@ from common.config import Cell, Container, GripperConfig, ObjectConfig, World
 from common.hardware.loading import is_simulated
 from common.perception.pinhole import Pinhole
 from common.sim.footprints import overlap, within
-from common.sim.objects import Solid, pose_of, solid_of
-from common.sim.places import Table, tables
-from tools.check.finding import Finding, error, warning
+from common.sim.objects import Solid, initial_pose, solid_of
+from common.sim.table import Table, tables
+from tools.check import Finding, error, warning
 
 Array = NDArray[np.float64]
 
@@ -86,7 +86,7 @@ def _seen(camera: Pinhole, points: Array) -> NDArray[np.bool_]:
 
 
 def _corners(thing: ObjectConfig, solid: Solid) -> Array:
-    T = pose_of(thing, solid)
+    T = initial_pose(thing, solid)
     corners: Array = solid.corners @ T[:3, :3].T + T[:3, 3]
     return corners
 
@@ -123,14 +123,14 @@ def _places(world: World, placed: list[ObjectConfig], solids: dict[str, Solid]) 
 
 def _extent(thing: ObjectConfig, solid: Solid) -> tuple[Array, float, float]:
     """Outline from above (N, 2), lowest and highest z [m], world."""
-    T = pose_of(thing, solid)
+    T = initial_pose(thing, solid)
     R, z = T[:3, :3], float(T[2, 3])
     return solid.footprint(R) + T[:2, 3], z + solid.lowest(R), z + solid.highest(R)
 
 
 def _meet(a: ObjectConfig, solid_a: Solid, b: ObjectConfig, solid_b: Solid) -> bool:
     if solid_a.shape == solid_b.shape == "sphere":
-        away = float(np.linalg.norm(pose_of(a, solid_a)[:3, 3] - pose_of(b, solid_b)[:3, 3]))
+        away = float(np.linalg.norm(initial_pose(a, solid_a)[:3, 3] - initial_pose(b, solid_b)[:3, 3]))
         return away < solid_a.radius + solid_b.radius - INTO
     (outline_a, low_a, high_a), (outline_b, low_b, high_b) = _extent(a, solid_a), _extent(b, solid_b)
     return min(high_a, high_b) - max(low_a, low_b) > INTO and _reach_into(outline_a, outline_b)
@@ -157,7 +157,7 @@ def _width(gripper: GripperConfig, thing: ObjectConfig, solid: Solid) -> Iterato
     if solid.shape == "sphere":
         narrowest = 2 * solid.radius
     else:
-        outline = solid.footprint(pose_of(thing, solid)[:3, :3])
+        outline = solid.footprint(initial_pose(thing, solid)[:3, :3])
         turns = np.linspace(0.0, np.pi, 36, endpoint=False)
         along = outline @ np.stack([np.cos(turns), np.sin(turns)])
         narrowest = float(np.ptp(along, axis=0).min())

@@ -1,1 +1,30 @@
-"""What a cell needs of the machine that it runs on, what is in its way, and what to do about it."""
+"""One thing that was looked at."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that was looked at, and what to do when it is not well."""
+
+    level: Literal["ok", "warn", "fail"]
+    what: str
+    remedy: str = ""
+
+
+def ok(what: str) -> Finding:
+    """All is well with something."""
+    return Finding("ok", what)
+
+
+def warn(what: str, remedy: str) -> Finding:
+    """A cell may run, but not as it should."""
+    return Finding("warn", what, remedy)
+
+
+def fail(what: str, remedy: str) -> Finding:
+    """A cell will not run."""
+    return Finding("fail", what, remedy)

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from tools.doctor.finding import Finding, fail, ok, warn
+from tools.doctor import Finding, fail, ok, warn
 
 if TYPE_CHECKING:
     from common.clock import Clock

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import datetime
 import socket
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from tools.doctor.finding import Finding, fail, ok, warn
+from tools.doctor import Finding, fail, ok, warn
 
 ROUTER_MODULE = "services.router"
 VIEWER_MODULE = "services.viewer"
@@ -108,3 +109,24 @@ def foreign_interpreters(commands: dict[int, list[str]]) -> dict[int, str]:
     """By process: the Python that runs it, where that is not this one."""
     here = Path(sys.executable).parent
     return {pid: command[0] for pid, command in commands.items() if Path(command[0]).parent != here}
+
+
+def certificates(now: datetime.datetime | None = None) -> Iterator[Finding]:
+    """Until when those of `ZENCELL_SECURE` are valid; nothing for an open cell."""
+    from common.transport.credentials import secure_folder
+    from common.transport.expiry import ends_in, warning_of
+
+    folder = secure_folder()
+    if folder is None:
+        return
+    at = now or datetime.datetime.now(datetime.UTC)
+    ends = ends_in(folder)
+    if not ends:
+        yield fail(f"{folder} has no certificates that can be read", "make them with `zencell secure init`")
+    found = {name: warning_of(name, until, at) for name, until in ends.items()}
+    for told in found.values():
+        if told is not None:
+            urgent, line = told
+            yield (fail if urgent else warn)(line, f"zencell secure renew {folder}")
+    if ends and not any(found.values()):
+        yield ok(f"{len(ends)} certificates in {folder}, the first ends on {min(ends.values()):%Y-%m-%d}")

@@ -11,7 +11,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from common.planning.free_axes import chooses, solve_down
+from common.planning.ik import controls_full_pose, solve_tool_down_ik
 from common.planning.robot_geometry import RobotGeometry
 from common.robot.model import RobotModel
 
@@ -56,7 +56,7 @@ def find_home(robot: RobotModel, geometry: RobotGeometry) -> Home:
         for radius, height, turn in itertools.product(RADII, heights, _turns(robot)):
             x, y = place(robot, radius * reach, 0.0)
             for seed in seeds:
-                q = solve_down(robot, (x, y, table + height * reach), turn, seed, iterations=60)
+                q = solve_tool_down_ik(robot, (x, y, table + height * reach), turn, seed, iterations=60)
                 if q is not None and not hits(robot, geometry, q):
                     yield _comfort(robot, q, rest, table) + height, q
 
@@ -75,7 +75,7 @@ def find_home(robot: RobotModel, geometry: RobotGeometry) -> Home:
 
 def _turns(robot: RobotModel) -> tuple[float, ...]:
     """Of the tool [rad]: where the arm cannot choose one is as good as the others."""
-    return TURNS if chooses(robot) else TURNS[:1]
+    return TURNS if controls_full_pose(robot) else TURNS[:1]
 
 
 def down_reach(robot: RobotModel, table: float) -> float:
@@ -87,7 +87,8 @@ def down_reach(robot: RobotModel, table: float) -> float:
     for share in np.arange(1.0, 0.1, -0.05):
         x, y = place(robot, float(share) * robot.reach, 0.0)
         at = x, y, table + 2 * LOW * robot.reach
-        if any(solve_down(robot, at, turn, middle, restarts=30, iterations=40) is not None for turn in _turns(robot)):
+        if any(solve_tool_down_ik(robot, at, turn, middle, restarts=30, iterations=40) is not None
+               for turn in _turns(robot)):
             return float(share) * robot.reach
     return 0.0
 
@@ -128,7 +129,7 @@ def _served(robot: RobotModel, geometry: RobotGeometry, home: Array, table: floa
     tried = []
     for (radius, angle), height in itertools.product(PLACES, (LOW, 3 * LOW)):
         at = *place(robot, radius * reach, angle), table + height * robot.reach
-        found = (solve_down(robot, at, turn, home, iterations=STEPS) for turn in _turns(robot))
+        found = (solve_tool_down_ik(robot, at, turn, home, iterations=STEPS) for turn in _turns(robot))
         tried.append(any(
             q is not None and not hits(robot, geometry, q)
             and min(pose[2, 3] for pose in robot.link_poses(q).values()) > table - 0.01 for q in found))

@@ -20,19 +20,30 @@ from common.robot.finger_joints import finger_positions
 from common.robot.merging import read_urdf
 from common.robot.model import RobotModel
 from common.robot.transforms import invert, matrix_to_rpy, transform
+from tools.robot_setup.end_effector import (
+    GripperProposal,
+    complaints,
+    find_flange,
+    find_gripper,
+    flange_links,
+    rotation_between,
+    section,
+)
 from tools.robot_setup.fingers import ALIGNED, link_points
-from tools.robot_setup.flange import find_flange, flange_links, rotation_between
-from tools.robot_setup.hand import Hand, complaints, find_hand, section
 from tools.robot_setup.home import find_home
-from tools.robot_setup.limits import (
+from tools.robot_setup.tree import (
     SPEED,
     TO_ACCELERATION,
     TO_SPEED,
+    Arm,
+    Joint,
+    Tree,
+    find_arm,
     guessed_acceleration,
     guessed_jerk,
     position_range,
+    read_tree,
 )
-from tools.robot_setup.tree import Arm, Joint, Tree, find_arm, read_tree
 
 Array = NDArray[np.float64]
 
@@ -105,10 +116,10 @@ def draft(
     robot = _model(made)
     points = link_points(robot)
     whole = read_tree(ET.fromstring(robot.urdf), urdf)
-    hand: Hand | None = None
+    hand: GripperProposal | None = None
     if fingers:
-        found = find_hand(robot, whole, fingers, points)
-        if isinstance(found, Hand):
+        found = find_gripper(robot, whole, fingers, points)
+        if isinstance(found, GripperProposal):
             hand = found
         else:
             made.lost.append(f"no gripper: {found}")
@@ -178,8 +189,8 @@ def _mount(
 
 def _turned(
     made: Proposal, robot: RobotModel, tree: Tree, arm: Arm, whole: Tree, fingers: list[Joint],
-    points: dict[str, Array], hand: Hand,
-) -> tuple[RobotModel, Hand]:
+    points: dict[str, Array], hand: GripperProposal,
+) -> tuple[RobotModel, GripperProposal]:
     """Turn a mounted gripper so that its fingers point out of the flange."""
     (attachment,) = made.values["attachments"]
     flange, out = find_flange(robot, tree, arm, attachment["parent_link"])
@@ -191,13 +202,13 @@ def _turned(
         return robot, hand
     attachment["rpy"] = [round(value, 6) for value in matrix_to_rpy(rotation_between(points_out, out))]
     robot = _model(made)
-    found = find_hand(robot, whole, fingers, points)
-    assert isinstance(found, Hand)  # as before: it was only turned
+    found = find_gripper(robot, whole, fingers, points)
+    assert isinstance(found, GripperProposal)  # as before: it was only turned
     return robot, found
 
 
 def _tool(
-    made: Proposal, robot: RobotModel, whole: Tree, arm: Arm, hand: Hand | None, points: dict[str, Array],
+    made: Proposal, robot: RobotModel, whole: Tree, arm: Arm, hand: GripperProposal | None, points: dict[str, Array],
     tip: str | None,
 ) -> None:
     """The tool centre point: a link of the URDF that is where it should be, else a frame of its own; the gripper."""
@@ -259,7 +270,7 @@ def _direction(out: Array) -> str:
     return "back into the arm" if out[2] < -ALIGNED else "sideways"
 
 
-def _closes(poses: dict[str, Array], link: str, hand: Hand | None) -> str:
+def _closes(poses: dict[str, Array], link: str, hand: GripperProposal | None) -> str:
     """The axis of a link along which the fingers close; empty where they close between them."""
     if hand is None:
         return "y"
@@ -267,7 +278,7 @@ def _closes(poses: dict[str, Array], link: str, hand: Hand | None) -> str:
     return next((axis for axis, value in zip("xy", closing, strict=False) if abs(value) > ALIGNED), "")
 
 
-def _write_gripper(made: Proposal, hand: Hand, closing: str) -> None:
+def _write_gripper(made: Proposal, hand: GripperProposal, closing: str) -> None:
     made.values["gripper"] = section(hand, closing)
     made.notes["gripper"] = "Widths and tips are measured on the model. GUESSED by the platform: effort, acceleration."
     made.guessed.append("gripper.effort, max_effort, acceleration, jerk: the platform's defaults")

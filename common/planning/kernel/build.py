@@ -1,7 +1,7 @@
-"""How the kernel is compiled: by `setup.py` with ziglang, and by hand with `python -m common.planning.kernel.build`.
+"""Compile the kernel: from `setup.py` with ziglang, and by hand with `python -m common.planning.kernel.build`.
 
-Two libraries come of the same source on x86-64: one for every processor, one for those with AVX2 and FMA. Nothing is
-imported here but what comes with Python: `setup.py` runs this before anything is installed.
+On x86-64 two libraries are built from the same source: one for every processor, one for those with AVX2 and FMA. This
+file imports the standard library only: `setup.py` runs it before anything is installed.
 """
 
 from __future__ import annotations
@@ -16,37 +16,37 @@ from pathlib import Path
 
 FOLDER = Path(__file__).resolve().parent
 NAME = "planning_kernel"
-# No -ffast-math: bounds have to hold, and a comparison with what is no number has to say no.
+# No -ffast-math: bounds must hold, and comparisons with NaN must be false.
 _FLAGS = ("-std=gnu11", "-O3", "-s", "-shared", "-fPIC", "-fvisibility=hidden")
 _ZIG = "ziglang"
 
 
 def _levels(zig: bool) -> dict[str, list[str]]:
-    """Suffix of each library, and the flags that say for which processors it is."""
+    """Return the suffix of each library and the compiler flags of its processors."""
     machine = platform.machine().lower()
     if machine in ("x86_64", "amd64"):
-        if zig:  # which compiles for the processor at hand unless told
+        if zig:  # compiles for this processor by default
             return {"": ["-mcpu=x86_64"], "_avx2": ["-mcpu=x86_64_v3"]}
         return {"": [], "_avx2": ["-mavx2", "-mfma"]}
     return {"": ["-mcpu=generic"] if zig and machine in ("aarch64", "arm64") else []}
 
 
 def compilers() -> list[list[str]]:
-    """Commands that may compile C here, the preferred one first."""
-    own = [command] if (command := os.environ.get("CC", "").split()) and shutil.which(command[0]) else []
+    """Return commands that may compile C on this machine, the preferred one first."""
+    configured = [command] if (command := os.environ.get("CC", "").split()) and shutil.which(command[0]) else []
     zig = [[sys.executable, "-m", _ZIG, "cc"]] if importlib.util.find_spec(_ZIG) else []
-    return own + zig + [[path] for name in ("cc", "gcc", "clang") if (path := shutil.which(name))]
+    return configured + zig + [[path] for name in ("cc", "gcc", "clang") if (path := shutil.which(name))]
 
 
 def build(into: Path, cache: Path) -> list[Path]:
-    """Compile the kernel into a folder; the libraries, or none where no compiler does it.
+    """Compile the kernel into a folder and return the libraries, or none if every compiler fails.
 
     Args:
-        into: a folder that is there.
-        cache: where ziglang may keep what it makes.
+        into: an existing folder.
+        cache: folder for ziglang's files.
     """
     environment = dict(os.environ) | {"ZIG_GLOBAL_CACHE_DIR": str(cache), "ZIG_LOCAL_CACHE_DIR": str(cache)}
-    for old in into.glob(f"{NAME}*.so"):  # a process that has it open keeps it
+    for old in into.glob(f"{NAME}*.so"):  # a process that has it open is not affected
         old.unlink()
     for compiler in compilers():
         running = []
@@ -60,7 +60,7 @@ def build(into: Path, cache: Path) -> list[Path]:
         errors = [process.communicate()[1] for _, process in running]
         if not any(process.returncode for _, process in running):
             return [target for target, _ in running]
-        sys.stderr.write(f"{' '.join(compiler)} does not compile the planning kernel:\n{''.join(errors)[:2000]}\n")
+        sys.stderr.write(f"{' '.join(compiler)} fails to compile the planning kernel:\n{''.join(errors)[:2000]}\n")
         for target, _ in running:
             target.unlink(missing_ok=True)
     return []

@@ -1,8 +1,10 @@
-"""The kernel's library: found beside this file, loaded once, for the processor at hand."""
+"""The kernel's shared library: next to this file, loaded once, in the variant for this processor."""
 
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Iterator
+from contextlib import contextmanager
 from ctypes import c_double, c_int, c_uint64, c_void_p
 from functools import cache
 from pathlib import Path
@@ -55,14 +57,31 @@ def _open(path: Path) -> ctypes.CDLL | None:
 
 
 def library_path() -> Path | None:
-    """The file that `library` loads."""
+    """Return the file that `library` loads, or None."""
     found = library()
     return None if found is None else Path(found._name)
 
 
-@cache
+_disabled: list[bool] = []  # one entry for each active `without_kernel`
+
+
 def library() -> ctypes.CDLL | None:
-    """The library, or None where it was not built, cannot be loaded or is of another version."""
+    """Return the library, or None if it was not built, cannot be loaded or has another version."""
+    return None if _disabled else _load()
+
+
+@contextmanager
+def without_kernel() -> Iterator[None]:
+    """Compute without the kernel meanwhile, as where it was not built: for tests and comparisons."""
+    _disabled.append(True)
+    try:
+        yield
+    finally:
+        _disabled.pop()
+
+
+@cache
+def _load() -> ctypes.CDLL | None:
     plain = _open(FOLDER / f"{NAME}.so")
     if plain is None or not plain.zk_has_avx2():
         return plain

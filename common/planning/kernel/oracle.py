@@ -1,4 +1,4 @@
-"""The kernel against coal: random robots' positions, shapes and edges, and where the two do not agree."""
+"""Compare the kernel with coal at random positions, shapes and edges, and report where they disagree."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from common.planning.kernel.world import KernelWorld
 
 Array = NDArray[np.float64]
 
-DEPTH = 1e-6  # [m] what touches deeper than this must not be called free
-DISTANCE = 1e-6  # [m] within which distances agree
+DEPTH = 1e-6  # [m] shapes that penetrate deeper must not be reported as free
+DISTANCE = 1e-6  # [m] largest difference of distances
 _COAL_TOLERANCE = 1e-10  # coal's own is 1e-6, and its distances of cylinders are wrong by three times that
 
 
 @dataclass
 class Comparison:
-    """What was compared, and how far apart the answers are."""
+    """What was compared, and how far the answers differ."""
 
     states: int = 0
     pairs: int = 0
@@ -43,7 +43,7 @@ class Comparison:
 
 
 def random_shape(rng: np.random.Generator) -> coal.CollisionGeometry:
-    """A sphere, box, cylinder, capsule or hull, of 1 mm to 0.6 m."""
+    """Return a sphere, box, cylinder, capsule or hull of 1 mm to 0.6 m."""
     a, b, c = np.exp(rng.uniform(np.log(0.001), np.log(0.3), 3)).tolist()
     kind = rng.integers(5)
     if kind == 0:
@@ -63,7 +63,7 @@ def random_shape(rng: np.random.Generator) -> coal.CollisionGeometry:
 def random_geometry(
     model: pin.Model, geometry: pin.GeometryModel, rng: np.random.Generator, *, obstacles: int = 6, held: int = 1
 ) -> pin.GeometryModel:
-    """A robot's shapes among random ones; the last joint carries `held` of them."""
+    """Return a robot's shapes among random ones, `held` of which the last joint carries."""
     grown = geometry.copy()
     links = [(i, item.parentJoint) for i, item in enumerate(geometry.geometryObjects)]
     last = model.njoints - 1
@@ -83,7 +83,7 @@ def random_geometry(
 
 
 class Oracle:
-    """Coal's distances of all pairs, as exact as it can."""
+    """Coal's distances of all pairs, as exact as coal can compute them."""
 
     def __init__(self, model: pin.Model, geometry: pin.GeometryModel) -> None:
         self._model, self._geometry = model, geometry
@@ -93,7 +93,7 @@ class Oracle:
             request.gjk_max_iterations = 1000
 
     def distances(self, q: Array) -> Array:
-        """(pairs,) [m] at q; negative where shapes touch."""
+        """Return (pairs,) distances [m] at q; negative where shapes touch."""
         pin.forwardKinematics(self._model, self._data, q)
         pin.updateGeometryPlacements(self._model, self._data, self._geometry, self._shapes)
         pin.computeDistances(self._geometry, self._shapes)
@@ -110,12 +110,12 @@ def compare(
     samples: int = 40,
     margin: float = 0.0,
 ) -> Comparison:
-    """Ask both about random states, and about edges and cubics between them at random places.
+    """Compare both at random states, and on edges and cubics between them at random positions.
 
     Args:
-        states: random positions within the limits; edges: between free ones, long and short.
-        samples: places of each free edge at which coal is asked.
-        margin: distance [m] that pairs must keep.
+        states: number of random positions within the limits; edges: between free ones, long and short.
+        samples: positions of each free edge at which coal checks.
+        margin: required distance [m] of all pairs.
     """
     kernel, oracle, found = KernelWorld(model, geometry), Oracle(model, geometry), Comparison()
     kernel.set_rules(np.full(kernel.pair_count, margin))

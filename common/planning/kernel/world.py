@@ -1,4 +1,4 @@
-"""The robot among obstacles as the kernel knows it, made from pinocchio's models."""
+"""The robot among obstacles in the compiled kernel, built from pinocchio's models."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from common.planning.kernel.library import library
 
 Array = NDArray[np.float64]
 
-EXCUSED = -1e9  # [m] the margin of a pair that may touch
+CONTACT_ALLOWED = -1e9  # [m] margin of a pair that may touch
 _SPHERE, _BOX, _CYLINDER, _CAPSULE, _HULL, _POINTS = range(6)
-_LARGEST = 1e7  # [m] beyond which rounding would count
+_LARGEST = 1e7  # [m] larger shapes would suffer from rounding
 _JOINTS = (
     *(f"JointModel{kind}{axis}" for kind in "RP" for axis in "XYZ"),
     *(f"JointModel{kind}Unaligned" for kind in ("Revolute", "Prismatic")),
 )
 
 
-class NoKernel(ZencellError):
-    """The kernel is not built here, or does not know a joint or a shape."""
+class KernelUnavailable(ZencellError):
+    """The kernel is not built, or does not support a joint or a shape."""
 
 
 @dataclass(frozen=True)
 class Shape:
-    """A shape as the kernel wants it: kind, dimensions (3,), vertices (N, 3) of a hull and a sphere (4,) about them."""
+    """A shape for the kernel: kind, dimensions (3,), vertices (N, 3) of a hull and a sphere (4,) about them."""
 
     kind: int
     size: Array
@@ -42,36 +42,36 @@ class Shape:
 
     @classmethod
     def of(cls, shape: coal.CollisionGeometry) -> Shape:
-        """A shape of coal's.
+        """Convert a coal shape.
 
         Raises:
-            NoKernel: it is none that the kernel knows.
+            KernelUnavailable: the kernel does not support it.
         """
         if isinstance(shape, coal.ShapeBase) and shape.getSweptSphereRadius() > 0:
-            raise NoKernel(f"the planning kernel takes no {type(shape).__name__} with a swept sphere")
-        found = cls._known(shape)
+            raise KernelUnavailable(f"the planning kernel supports no {type(shape).__name__} with a swept sphere")
+        found = cls._converted(shape)
         if not (np.abs(found.size) < _LARGEST).all() or not (np.abs(found.points) < _LARGEST).all():
-            raise NoKernel(f"the planning kernel takes no {type(shape).__name__} of more than {_LARGEST:g} m")
+            raise KernelUnavailable(f"the planning kernel takes no {type(shape).__name__} larger than {_LARGEST:g} m")
         return found
 
     @classmethod
-    def _known(cls, shape: coal.CollisionGeometry) -> Shape:
-        none, nothing = np.zeros((0, 3)), np.zeros(4)
+    def _converted(cls, shape: coal.CollisionGeometry) -> Shape:
+        no_points, no_sphere = np.zeros((0, 3)), np.zeros(4)
         if isinstance(shape, coal.Sphere):
-            return cls(_SPHERE, np.array([shape.radius, 0, 0]), none, nothing)
+            return cls(_SPHERE, np.array([shape.radius, 0, 0]), no_points, no_sphere)
         if isinstance(shape, coal.Box):
-            return cls(_BOX, 2 * np.array(shape.halfSide), none, nothing)
+            return cls(_BOX, 2 * np.array(shape.halfSide), no_points, no_sphere)
         if isinstance(shape, coal.Cylinder | coal.Capsule):
             kind = _CYLINDER if isinstance(shape, coal.Cylinder) else _CAPSULE
-            return cls(kind, np.array([shape.radius, 2 * shape.halfLength, 0]), none, nothing)
+            return cls(kind, np.array([shape.radius, 2 * shape.halfLength, 0]), no_points, no_sphere)
         if isinstance(shape, coal.Convex):
             points = np.array([shape.point(i) for i in range(shape.num_points)], dtype=float)
             return cls(_HULL, np.zeros(3), points, _sphere(points))
-        raise NoKernel(f"the planning kernel takes no {type(shape).__name__}")
+        raise KernelUnavailable(f"the planning kernel does not support a {type(shape).__name__}")
 
 
 class KernelWorld:
-    """Answers of the compiled kernel for one robot among obstacles. Of several threads one is answered at a time.
+    """The compiled kernel for one robot among obstacles. Thread-safe: one call runs at a time.
 
     Pairs are those of the geometry model, in its order.
     """
@@ -87,12 +87,12 @@ class KernelWorld:
 
         Args:
             model: joints; geometry: shapes and pairs.
-            known: the first of the shapes, where they were read before: reading a hull takes a millisecond.
-            points: shapes of the environment that stand for sets of points, empty until `set_points`; they are paired
-                with what moves alone.
+            known: the first of the shapes, if converted before: reading a hull takes a millisecond.
+            points: shapes of the environment that stand for sets of points, empty until `set_points`; paired with
+                moving shapes only.
 
         Raises:
-            NoKernel: there is no library, or something in the models is not known to it.
+            KernelUnavailable: the library is missing, or the kernel does not support a joint or a shape.
         """
         self._world = self._scratch = None
         self._lock = threading.Lock()  # other threads run while the kernel works
@@ -129,18 +129,18 @@ class KernelWorld:
             address(shape.sphere), address(placement),
         )
         if index < 0:
-            raise NoKernel(f"{item.name}: the planning kernel takes no such shape")
+            raise KernelUnavailable(f"{item.name}: the planning kernel does not support this shape")
 
-    def place(self, index: int, pose: Array) -> None:
-        """Put a shape at a (4, 4) pose in the frame of its joint; call `placed` after the last."""
+    def set_pose(self, index: int, pose: Array) -> None:
+        """Set the (4, 4) pose of a shape in the frame of its joint; call `refresh` after the last."""
         if not 0 <= index < self._shape_count:
-            raise IndexError(f"there are {self._shape_count} shapes, none is number {index}")
-        given = np.ascontiguousarray(pose[:3], dtype=float)
+            raise IndexError(f"shape {index} does not exist; there are {self._shape_count}")
+        rows = np.ascontiguousarray(pose[:3], dtype=float)
         with self._lock:
-            self.library.zk_place(self._world, index, address(given))
+            self.library.zk_place(self._world, index, address(rows))
 
     def set_points(self, index: int, spheres: Array) -> None:
-        """Put spheres (N, 4), middle and radius [m] in the world, into a set of points; call `placed` after the last.
+        """Set the spheres (N, 4), centre and radius [m], world, of a set of points; call `refresh` after the last.
 
         Raises:
             ValueError: they are no spheres.
@@ -149,16 +149,16 @@ class KernelWorld:
         if index not in self._points:
             raise IndexError(f"shape {index} is no set of points")
         if given.ndim != 2 or given.shape[1] != 4 or not (np.abs(given) < _LARGEST).all() or (given[:, 3] < 0).any():
-            raise ValueError(f"spheres of shape {given.shape} have to be (N, 4), finite and of radius 0 or more")
+            raise ValueError(f"spheres of shape {given.shape} must be (N, 4), finite and of radius 0 or more")
         with self._lock:
             if not self.library.zk_points(self._world, index, len(given), address(given)):
                 raise MemoryError
 
     def near(self, q: Array, margins: Array, points: Array) -> NDArray[np.bool_]:
-        """(N,) which of points (N, 3), world, are no farther than a margin [m] from any shape with the robot at q.
+        """Return (N,) which of points (N, 3), world, are within a margin [m] of any shape with the robot at q.
 
         Args:
-            margins: (shapes,) of each shape, EXCUSED for those that do not count.
+            margins: (shapes,) of each shape, CONTACT_ALLOWED for those to ignore.
         """
         given, least = self._q(q), np.ascontiguousarray(margins, dtype=float)
         at = np.ascontiguousarray(points, dtype=float)
@@ -169,8 +169,8 @@ class KernelWorld:
             self.library.zk_near(self._scratch, address(given), address(least), len(at), address(at), address(out))
         return out.view(np.bool_)
 
-    def placed(self) -> None:
-        """Take over where obstacles stand now."""
+    def refresh(self) -> None:
+        """Apply the poses and points that were set."""
         with self._lock:
             self.library.zk_refresh(self._scratch)
 
@@ -183,11 +183,11 @@ class KernelWorld:
         origin: ArrayLike = (0, 0, 0),
         leash: float = 0.0,
     ) -> None:
-        """Set the least distance (pairs,) [m] of each pair, EXCUSED for none.
+        """Set the required distance (pairs,) [m] of each pair, CONTACT_ALLOWED for none.
 
         Args:
-            far: what holds in general.
-            near: what holds while the tool point is within `leash` [m] of `origin` (3,), world.
+            far: in general.
+            near: while the tool point is within `leash` [m] of `origin` (3,), world.
             tool: joint that carries the tool point; tip: (3,) the point in that joint's frame.
         """
         arrays = [np.ascontiguousarray(a, dtype=float) for a in (far, tip, origin)]
@@ -200,17 +200,20 @@ class KernelWorld:
                 address(arrays[2]), leash,
             )
 
-    def keep_to(
+    def set_bounds(
         self, tool: int, tip: ArrayLike, directions: ArrayLike, at: Array, n: Array, least: Array, slack: Array,
         inside: Array,
     ) -> None:
-        """Set numbers n x - least (K,) that edges and paths keep from being negative, but for their slack (K,).
+        """Set numbers n x - least (K,) that must not be negative along edges and paths, up to their slack (K,).
 
         Args:
             tool: joint that carries the tool; tip: (3,) the tool point in that joint's frame.
             directions: (K,) whether x is the direction `at` (K, 3), in that joint's frame, else the tool point.
             n: (K, 3) world.
             inside: (K,) where states are projected to: an angle [rad] between `at` and n, or n x - least [m].
+
+        Raises:
+            ValueError: there are too many.
         """
         arrays = [np.ascontiguousarray(a, dtype=float) for a in (at, n, least, slack, inside)]
         place, kinds = np.ascontiguousarray(tip, dtype=float), np.ascontiguousarray(directions, dtype=np.int32)
@@ -218,13 +221,13 @@ class KernelWorld:
             if not self.library.zk_keep(
                 self._world, len(kinds), tool, address(place), address(kinds), *(address(a) for a in arrays)
             ):
-                raise ValueError(f"the planning kernel keeps to no {len(kinds)} numbers")
+                raise ValueError(f"the planning kernel does not support {len(kinds)} bounds")
 
-    def first_break(self, coefficients: Array, accepted: float, proved: float) -> tuple[int, float] | None:
-        """The first of cubics (N, 4, dof), as below, at which what is kept to is broken, and t on it; None for none.
+    def first_violation(self, coefficients: Array, accepted: float, proved: float) -> tuple[int, float] | None:
+        """Return the first of cubics (N, 4, dof), as below, that violates a bound, and t on it; None for none.
 
         Args:
-            accepted: share of the slack that states may use; proved: what is proved between them.
+            accepted: share of the slack that states may use; proved: share that is proved between them.
         """
         given, where = self._cubics(coefficients), c_double()
         with self._lock:
@@ -233,15 +236,15 @@ class KernelWorld:
         return None if piece < 0 else (piece, where.value)
 
     def colliding(self, q: Array) -> int:
-        """Index of a pair that is too close at q (dof,) [rad], -1 when the robot is free."""
+        """Return the index of a pair that is too close at q (dof,) [rad], -1 if the robot is free."""
         given = self._q(q)
         with self._lock:
             return int(self.library.zk_state(self._scratch, address(given)))
 
     def edge_collision(self, a: Array, b: Array) -> tuple[int, float]:
-        """A pair that is too close on the straight line in joint space from a to b, and where: 0 to 1.
+        """Return a pair that is too close on the straight line in joint space from a to b, and where: 0 to 1.
 
-        -1 when the whole line is proved free.
+        The pair is -1 if the complete line is proved free.
         """
         first, last, where = self._q(a), self._q(b), c_double()
         with self._lock:
@@ -249,18 +252,18 @@ class KernelWorld:
         return hit, where.value
 
     def edge_free(self, a: Array, b: Array) -> bool:
-        """Whether the straight line in joint space from a to b (dof,) [rad] is proved free."""
+        """Return whether the straight line in joint space from a to b (dof,) [rad] is proved free."""
         return self.edge_collision(a, b)[0] < 0
 
     def cubics_collision(self, coefficients: Array) -> tuple[int, float]:
-        """The same for cubics (N, 4, dof), c0 + c1 t + c2 t^2 + c3 t^3 with t from 0 to 1: pair, piece + t."""
+        """Return the same for cubics (N, 4, dof), c0 + c1 t + c2 t^2 + c3 t^3 with t from 0 to 1: pair, piece + t."""
         given, where = self._cubics(coefficients), c_double()
         with self._lock:
             hit = int(self.library.zk_cubics(self._scratch, len(given), address(given), byref(where)))
         return hit, where.value
 
     def first_collision(self, path: Array) -> tuple[int, int]:
-        """The first of positions (N, dof) [rad] that is not free, and a pair that is too close there; -1 for none."""
+        """Return the first of positions (N, dof) [rad] that is not free, and a pair too close there; -1 for none."""
         given = np.ascontiguousarray(path, dtype=float)
         if given.ndim != 2 or given.shape[1] != self.dof:
             raise ValueError(f"positions have shape {given.shape}")
@@ -270,9 +273,9 @@ class KernelWorld:
         return index, pair.value
 
     def distances(self, q: Array) -> tuple[Array, Array]:
-        """(pairs,) [m] how far apart points of each pair are at q, and how far a plane holds them apart.
+        """Return (pairs,) [m] an upper and a lower bound of each distance at q: by a pair of points, and by a plane.
 
-        Both are the distance within rounding where shapes are apart. Where they are not the first is 0 or less.
+        Both are the distance within rounding where shapes are apart; otherwise the first is 0 or less.
         """
         given = self._q(q)
         above, below = np.empty(self.pair_count), np.empty(self.pair_count)
@@ -281,21 +284,21 @@ class KernelWorld:
         return above, below
 
     def joint_poses(self, q: Array) -> Array:
-        """(joints, 3, 4) poses of the joints' frames, world."""
+        """Return (joints, 3, 4) poses of the joints' frames, world."""
         given, out = self._q(q), np.empty((self.dof, 3, 4))
         with self._lock:
             self.library.zk_forward(self._scratch, address(given), address(out))
         return out
 
     def counters(self) -> dict[str, int]:
-        """How much was done so far."""
+        """Return how much was computed so far."""
         out = np.zeros(5, dtype=np.int64)
         with self._lock:
             self.library.zk_counters(self._scratch, address(out))
-        return dict(zip(("states", "looks", "searches", "iterations", "edges"), out.tolist(), strict=True))
+        return dict(zip(("states", "checks", "searches", "iterations", "edges"), out.tolist(), strict=True))
 
     def plan(self, *arguments: object) -> int:
-        """See zk_plan in kernel.c; `planner.find_path` asks it."""
+        """Call zk_plan of kernel.c; used by `solvers.find_path`."""
         with self._lock:
             return int(self.library.zk_plan(self._scratch, *arguments))
 
@@ -313,50 +316,50 @@ class KernelWorld:
 
 
 def address(array: NDArray[Any]) -> int:
-    """Where the numbers of an array are; the array has to live as long as they are used."""
+    """Return the address of an array's data; the array must outlive its use."""
     return array.ctypes.data
 
 
 def joints_of(model: pin.Model) -> tuple[CDLL, int]:
-    """The library, and a world in it that has the model's joints and nothing else: to be freed with `zk_free`.
+    """Return the library, and a world in it with only the model's joints, to be freed with `zk_free`.
 
     Raises:
-        NoKernel: there is no library, or a joint is not known to it.
+        KernelUnavailable: the library is missing, or the kernel does not support a joint.
     """
     found = library()
     if found is None:
-        raise NoKernel("the planning kernel is not built")
+        raise KernelUnavailable("the planning kernel is not built")
     kinds, axes = _joints(model)
     parents = np.array(list(model.parents)[1:], dtype=np.int32)
     placements = np.array([placement.homogeneous[:3] for placement in list(model.jointPlacements)[1:]])
     lower, upper = (np.array(limit, dtype=float) for limit in (model.lowerPositionLimit, model.upperPositionLimit))
     world = found.zk_world(model.nq, *(address(a) for a in (parents, kinds, placements, axes, lower, upper)))
     if not world:
-        raise NoKernel(f"the planning kernel takes 31 joints at most, not {model.nq}")
+        raise KernelUnavailable(f"the planning kernel supports at most 31 joints, not {model.nq}")
     return found, int(world)
 
 
 def _joints(model: pin.Model) -> tuple[NDArray[np.int32], Array]:
-    """Kind (joints,) of each joint, 1 turns and 2 slides, and its unit axis (joints, 3) in its own frame."""
+    """Return kind (joints,), 1 revolute and 2 prismatic, and unit axis (joints, 3) of each joint in its own frame."""
     if model.nq != model.njoints - 1 or model.nv != model.nq:
-        raise NoKernel("the planning kernel takes joints of one degree of freedom with limits")
+        raise KernelUnavailable("the planning kernel supports joints of one degree of freedom with limits only")
     data = model.createData()
     jacobian = np.array(pin.computeJointJacobians(model, data, pin.neutral(model))).reshape(6, -1)
     kinds, axes = np.zeros(model.nq, dtype=np.int32), np.zeros((model.nq, 3))
     for joint in range(1, model.njoints):
         if model.joints[joint].shortname() not in _JOINTS:
-            raise NoKernel(f"the planning kernel takes no {model.joints[joint].shortname()}")
+            raise KernelUnavailable(f"the planning kernel does not support a {model.joints[joint].shortname()}")
         column = jacobian[:, model.joints[joint].idx_v]
         turns = np.linalg.norm(column[3:]) > 0.5
         axis = np.array(data.oMi[joint].rotation).T @ (column[3:] if turns else column[:3])
         kinds[joint - 1], axes[joint - 1] = (1 if turns else 2), axis / np.linalg.norm(axis)
         if model.joints[joint].idx_q != joint - 1:
-            raise NoKernel("the planning kernel takes joints in the order of their positions")
+            raise KernelUnavailable("the planning kernel needs joints in the order of their positions")
     return kinds, axes
 
 
 def _sphere(points: Array) -> Array:
-    """(4,) middle and radius [m] of a small sphere about points (N, 3): Ritter's, then moved towards the farthest."""
+    """Return (4,) centre and radius [m] of a small sphere about points (N, 3), moved towards the farthest point."""
     middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
     best, least = middle, float(np.linalg.norm(points - middle, axis=1).max())
     for i in range(1, 200):  # Badoiu and Clarkson, "Smaller core-sets for spheres" (2003)

@@ -14,20 +14,20 @@ Plan = Callable[[Problem, Any, Cancel], Result]
 
 
 def planner_names() -> list[str]:
-    """Planners that come with the project."""
+    """Return the planners of the project."""
     return plugin_names("zencell.planners")
 
 
 def load_planner(name: str, options: Mapping[str, Any]) -> tuple[Plan, Parameters]:
-    """The `plan` function and the checked options of a planner.
+    """Return the `plan` function and the checked options of a planner.
 
     Args:
-        name: a module of this package, or a dotted module of your own.
+        name: a module of this package, or a dotted module of the user.
         options: values for its `Options`.
 
     Raises:
         UnknownName: with the choices.
-        ConfigError: a module that is no planner, or an option that does not fit.
+        ConfigError: the module is no planner, or an option is invalid.
     """
     module = find_plugin("zencell.planners", name, field="pipeline.planners", noun="planner")
     plan, model = getattr(module, "plan", None), getattr(module, "Options", None)

@@ -1,4 +1,4 @@
-"""Point to point in joint space along the straight edge, with limited jerk: for joint goals whose way is free."""
+"""Point to point along the straight edge in joint space, with limited jerk: for joint goals whose edge is free."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from common.config import Parameters
 from common.planning.problem import NOT_APPLICABLE, Cancel, Problem, Result
-from common.planning.retiming import TimedPath
+from common.planning.trajectory import TimedPath, at_rest
 
 Array = NDArray[np.float64]
 
@@ -21,10 +21,10 @@ class Options(Parameters):
 
 
 def plan(problem: Problem, options: Options, cancel: Cancel) -> Result:
-    """A trajectory along the straight edge to a joint goal, or what stands in its way.
+    """Return a trajectory along the straight edge to a joint goal, or what obstructs it.
 
-    All joints move in proportion, so one profile along the edge (ruckig, state to state) times them all, and the states
-    at its phases' ends give cubics between them exactly.
+    All joints move in proportion, so one profile along the edge (ruckig, state to state) times them all. The states at
+    the ends of its phases are joined by exact cubics.
     """
     if not isinstance(problem.goal, np.ndarray) or problem.straight:
         return Result(error=NOT_APPLICABLE, message="joint moves need a joint goal and no straight line of the tool")
@@ -36,23 +36,22 @@ def plan(problem: Problem, options: Options, cancel: Cancel) -> Result:
 
 
 def straight_profile(start: Array, goal: Array, velocity: Array, acceleration: Array, jerk: Array) -> TimedPath:
-    """The fastest jerk-limited trajectory along the straight edge between two positions (dof,) [rad].
+    """Return the fastest jerk-limited trajectory along the straight edge between two positions (dof,) [rad].
 
     Raises:
-        ValueError: ruckig finds no profile, which only limits that are not positive bring about.
+        ValueError: ruckig finds no profile, which only limits that are not positive cause.
     """
     span = goal - start
     moving = np.abs(span) > 1e-9
     if not moving.any():
-        still = np.zeros((2, len(start)))
-        return TimedPath(np.array([0.0, 0.01]), np.array([start, start]), still, still)
-    # The share s of the edge moves with limits at which the first joint meets its own.
+        return at_rest(start)
+    # The limits of the share s of the edge are those at which the first joint reaches its own.
     share = [_MARGIN * float((limit[moving] / np.abs(span[moving])).min()) for limit in (velocity, acceleration, jerk)]
-    given = ruckig.InputParameter(1)
-    given.current_position, given.target_position = [0.0], [1.0]
-    given.max_velocity, given.max_acceleration, given.max_jerk = [share[0]], [share[1]], [share[2]]
+    profile = ruckig.InputParameter(1)
+    profile.current_position, profile.target_position = [0.0], [1.0]
+    profile.max_velocity, profile.max_acceleration, profile.max_jerk = [share[0]], [share[1]], [share[2]]
     found = ruckig.Trajectory(1)
-    outcome = ruckig.Ruckig(1).calculate(given, found)
+    outcome = ruckig.Ruckig(1).calculate(profile, found)
     if outcome != ruckig.Result.Working:
         raise ValueError(f"ruckig finds no profile: {outcome}")
     phases = np.cumsum(found.profiles[0][0].t)

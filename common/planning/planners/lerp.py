@@ -1,4 +1,4 @@
-"""A straight line through joint space in even steps: predictable, and the quickest to compute."""
+"""A straight line through joint space in even steps: predictable and fast to compute."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from common.config import Parameters
-from common.planning.joint_goals import blocked_edge, first_success, joint_goals, line
+from common.planning.joint_goals import joint_goals
+from common.planning.joint_paths import blocked_edge, first_success, line
 from common.planning.problem import Cancel, Problem, Result
 
 Array = NDArray[np.float64]
@@ -21,9 +22,9 @@ class Options(Parameters):
 
 
 def plan(problem: Problem, options: Options, cancel: Cancel) -> Result:
-    """Waypoints evenly spaced between the start and the nearest goal to which the way is free.
+    """Return evenly spaced waypoints from the start to the first goal to which the line is free.
 
-    A collision is named with its waypoint; of several goals, the collision on the line that gets furthest.
+    A failure names the waypoint of the collision; of several goals, on the line that gets furthest.
     """
     goals = joint_goals(problem, cancel, wanted=options.goals)
     if isinstance(goals, Result):

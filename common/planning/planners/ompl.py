@@ -16,19 +16,20 @@ from pydantic import Field
 from common.config import Parameters
 from common.messages import PlanAttempt
 from common.planning.collision import CollisionWorld
-from common.planning.goal_sampling import least_time
-from common.planning.joint_goals import joint_goals, straight_edge
+from common.planning.goal_sampling import min_travel_time
+from common.planning.joint_goals import joint_goals
+from common.planning.joint_paths import straight_edge
 from common.planning.problem import Cancel, Problem, Result
 from common.robot.model import RobotModel
 from common.sources import monotonic
 
 Array = NDArray[np.float64]
 
-ou.setLogLevel(ou.LogLevel.LOG_NONE)  # what went wrong is in the answer
+ou.setLogLevel(ou.LogLevel.LOG_NONE)  # errors are in the response
 
-# PRM and PRM* are left out: they watch for solutions in a thread of their own, which waits for Python for ever.
-# RRT* and Informed RRT* find no way around a wall in seconds.
-# These go on to improve their path until their time is up.
+# PRM and PRM* are missing: they look for solutions in a thread of their own, which waits for Python forever.
+# RRT* and Informed RRT* find no path around a wall within seconds.
+# These improve their path until their time is up.
 _IMPROVING = ("AORRTC", "BITstar")
 
 
@@ -46,7 +47,7 @@ class Options(Parameters):
 
 
 def plan(problem: Problem, options: Options, cancel: Cancel) -> Result:
-    """The straight edge where it is free, else the best of several attempts: to a joint or pose goal."""
+    """Return the straight edge where it is free, else the best of several attempts, to a joint or pose goal."""
     goals = joint_goals(problem, cancel, wanted=options.goals, tries=options.goal_tries)
     if isinstance(goals, Result):
         return goals
@@ -55,6 +56,7 @@ def plan(problem: Problem, options: Options, cancel: Cancel) -> Result:
 
 
 def _best(problem: Problem, options: Options, cancel: Cancel, goals: Sequence[Array]) -> Result:
+    """Return the quickest path of several attempts, or the last failure."""
     best: Array | None = None
     attempts: list[PlanAttempt] = []
     for _ in range(problem.attempts):
@@ -84,11 +86,11 @@ def _best(problem: Problem, options: Options, cancel: Cancel, goals: Sequence[Ar
 
 
 def _cost(path: Array, velocity: Array) -> float:
-    return sum(least_time(a, b, velocity) for a, b in pairwise(path))
+    return sum(min_travel_time(a, b, velocity) for a, b in pairwise(path))
 
 
 class _EdgeValidator(ob.MotionValidator):  # type: ignore[misc]
-    """Asks the collision world about whole edges, which it can prove free with few checks."""
+    """Checks complete edges in the collision world, which proves them free with few checks."""
 
     def __init__(self, si: Any, world: CollisionWorld, dof: int, ended: Callable[[], bool]) -> None:
         super().__init__(si)
@@ -97,8 +99,8 @@ class _EdgeValidator(ob.MotionValidator):  # type: ignore[misc]
         self._ended = ended
 
     def checkMotion(self, a: Any, b: Any, *rest: Any) -> bool:  # noqa: N802 - OMPL's name
-        """Whether the edge between two states is free; none is any longer once planning has to end."""
-        # OMPL's shortcuts know of no time limit: without an edge that is free they are through at once.
+        """Return whether the edge between two states is free; false for all once planning has to end."""
+        # OMPL's shortcuts have no time limit: without a free edge they end at once.
         return not self._ended() and self._world.edge_free(np.array(a[0 : self._dof]), np.array(b[0 : self._dof]))
 
 
@@ -113,7 +115,7 @@ def _space(robot: RobotModel) -> Any:
 
 
 def _attempt(problem: Problem, options: Options, cancel: Cancel, goals: Sequence[Array]) -> Array | None:
-    """One solution of the algorithm, shortened; all of OMPL's state is made anew so that the seed decides it."""
+    """Return one shortened solution; all of OMPL's state is created again so that the seed decides it."""
     dof, world = problem.robot.dof, problem.world
     ou.RNG.setSeed(int(problem.rng.integers(1, 2**31 - 1)))
     space = _space(problem.robot)

@@ -1,4 +1,4 @@
-"""Point to point as an industrial controller does it: synchronised trapezoidal profiles of all joints."""
+"""Point to point with synchronised trapezoidal profiles of all joints, as in an industrial controller."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from common.config import Parameters
-from common.planning.joint_goals import blocked_edge, first_success, joint_goals
+from common.planning.joint_goals import joint_goals
+from common.planning.joint_paths import blocked_edge, first_success
 from common.planning.problem import Cancel, Problem, Result
-from common.planning.retiming import TimedPath
-from common.planning.timing import LIMIT_SHARE
+from common.planning.trajectory import TimedPath, at_rest
+from common.planning.waypoint_timing import LIMIT_SHARE
 
 Array = NDArray[np.float64]
 
@@ -23,11 +24,11 @@ class Options(Parameters):
 
     deceleration: float = Field(1.0, gt=0, le=1, description="as a share of the acceleration limits")
     goals: int = Field(4, ge=1, le=100, description="IK solutions of a pose goal to choose from")
-    steps: int = Field(40, ge=1, le=10000, description="waypoints by which a collision is named")
+    steps: int = Field(40, ge=1, le=10000, description="waypoints in which a collision is counted")
 
 
 def plan(problem: Problem, options: Options, cancel: Cancel) -> Result:
-    """A trajectory to the nearest goal to which the straight edge in joint space is free, or what is in the way."""
+    """Return a trajectory along the straight edge to the first goal it is free to, or the obstruction."""
     goals = joint_goals(problem, cancel, wanted=options.goals)
     if isinstance(goals, Result):
         return goals
@@ -48,9 +49,9 @@ _SHORTEST = 1e-6  # [s] between two states
 
 @dataclass(frozen=True)
 class Trapezoid:
-    """Durations [s] of the three phases and the speed [1/s] in the middle one, in units of the way per second."""
+    """Durations [s] of the three phases and the speed [1/s] in the middle one, as a share of the length per second."""
 
-    speeding: float
+    accelerating: float
     cruising: float
     braking: float
     speed: float
@@ -58,46 +59,45 @@ class Trapezoid:
     @property
     def duration(self) -> float:
         """Seconds from rest to rest."""
-        return self.speeding + self.cruising + self.braking
+        return self.accelerating + self.cruising + self.braking
 
     def at(self, time: float) -> tuple[float, float, float]:
-        """Way, speed and acceleration at a time [s]; at the end of a phase the acceleration is that of the next."""
-        up, down = self.speed / self.speeding, self.speed / self.braking
-        if time < self.speeding:
+        """Return distance, speed and acceleration at a time [s]; at the end of a phase the acceleration of the next."""
+        up, down = self.speed / self.accelerating, self.speed / self.braking
+        if time < self.accelerating:
             return 0.5 * up * time**2, up * time, up
-        if time < self.speeding + self.cruising:
-            return self.speed * (time - 0.5 * self.speeding), self.speed, 0.0
+        if time < self.accelerating + self.cruising:
+            return self.speed * (time - 0.5 * self.accelerating), self.speed, 0.0
         left = self.duration - time
-        whole = self.speed * (0.5 * self.speeding + self.cruising + 0.5 * self.braking)
-        return whole - 0.5 * down * left**2, down * left, -down
+        total = self.speed * (0.5 * self.accelerating + self.cruising + 0.5 * self.braking)
+        return total - 0.5 * down * left**2, down * left, -down
 
 
 def trapezoid(length: float, speed: float, acceleration: float, deceleration: float) -> Trapezoid:
-    """The fastest profile over a length > 0 within a speed, an acceleration and a deceleration, all positive.
+    """Return the fastest profile over a length > 0 within a speed, an acceleration and a deceleration, all positive.
 
-    A way too short to reach the speed has no middle phase: v^2 / 2a + v^2 / 2d = length.
+    A length too short to reach the speed has no middle phase: v^2 / 2a + v^2 / 2d = length.
     """
     top = min(speed, math.sqrt(2 * length / (1 / acceleration + 1 / deceleration)))
-    speeding, braking = top / acceleration, top / deceleration
-    cruising = max(0.0, (length - 0.5 * top * (speeding + braking)) / top)
-    return Trapezoid(speeding, cruising, braking, top)
+    accelerating, braking = top / acceleration, top / deceleration
+    cruising = max(0.0, (length - 0.5 * top * (accelerating + braking)) / top)
+    return Trapezoid(accelerating, cruising, braking, top)
 
 
 def synchronised(start: Array, goal: Array, velocity: Array, acceleration: Array, deceleration: Array) -> TimedPath:
-    """The fastest trajectory between two positions (dof,) [rad] in which all joints share the phases of one profile.
+    """Return the fastest trajectory between two positions (dof,) [rad] with one profile for all joints.
 
-    So the joint that needs longest sets the times, no limit (dof,) is exceeded and the way is a straight edge.
+    The joint that needs longest sets the times, no limit (dof,) is exceeded, and the path is a straight edge.
     """
     span = goal - start
     moving = np.abs(span) > 1e-9
     if not moving.any():
-        still = np.zeros((2, len(start)))
-        return TimedPath(np.array([0.0, 0.01]), np.array([start, start]), still, still)
-    way = np.abs(span[moving])
-    v, a, d = (float((limit[moving] / way).min()) for limit in (velocity, acceleration, deceleration))
+        return at_rest(start)
+    span_moving = np.abs(span[moving])
+    v, a, d = (float((limit[moving] / span_moving).min()) for limit in (velocity, acceleration, deceleration))
     profile = trapezoid(1.0, v, a, d)
     times = [0.0]
-    for time in (profile.speeding, profile.speeding + profile.cruising, profile.duration):
+    for time in (profile.accelerating, profile.accelerating + profile.cruising, profile.duration):
         if time > times[-1] + _SHORTEST:
             times.append(time)
     states = np.array([profile.at(time) for time in times])

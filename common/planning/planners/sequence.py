@@ -1,4 +1,4 @@
-"""Several motions in one trajectory: point to point, straight lines and arcs, with corners rounded off."""
+"""Several motions in one trajectory: point to point, straight lines and arcs, with blended corners."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import pinocchio as pin
 from numpy.typing import NDArray
 from pydantic import Field
 
-from common.planning.joint_goals import blocked, line
+from common.planning.joint_paths import blocked, line
 from common.planning.planners import circ, lin, ptp
-from common.planning.problem import NOT_APPLICABLE, Arc, Cancel, GoalSequence, Part, Problem, Region, Result
-from common.planning.retiming import join
-from common.planning.timing import ToolWaypoints, follow_in_time
+from common.planning.problem import NOT_APPLICABLE, Arc, Cancel, GoalSequence, Problem, Region, Result, SequenceItem
+from common.planning.trajectory import join
+from common.planning.waypoint_timing import ToolWaypoints, time_tool_path
 from common.robot.model import RobotModel
 
 Array = NDArray[np.float64]
@@ -26,108 +26,108 @@ class Options(circ.Options):
 
 
 def plan(problem: Problem, options: Options, cancel: Cancel) -> Result:
-    """One trajectory along all motions, or what ends one of them: nothing is begun that cannot be finished."""
+    """Return one trajectory along all motions, or what ends one of them."""
     if not isinstance(problem.goal, GoalSequence):
         return Result(error=NOT_APPLICABLE, message="a sequence needs a sequence goal")
-    parts = problem.goal.parts
+    items = problem.goal.items
     motions: list[ToolWaypoints] = []
     start = problem.start
-    for number, part in enumerate(parts):
-        single = replace(problem, start=start, goal=part.goal, straight=part.straight)
-        found = _motion(single, part, options, cancel)
+    for number, item in enumerate(items):
+        single = replace(problem, start=start, goal=item.goal, straight=item.straight)
+        found = _motion(single, item, options, cancel)
         if isinstance(found, Result):
-            fraction = (number + found.fraction) / len(parts)
+            fraction = (number + found.fraction) / len(items)
             error = "bad_goal" if found.error == NOT_APPLICABLE else found.error
-            message = f"item {number + 1} of {len(parts)}: {found.message}"
+            message = f"item {number + 1} of {len(items)}: {found.message}"
             return replace(found, error=error, fraction=fraction, message=message)
         motions.append(found)
         start = found.positions[-1]
-    stretches = _blended(problem, parts, motions)
+    stretches = _blended(problem, items, motions)
     if isinstance(stretches, Result):
         return stretches
-    return Result(trajectory=join([follow_in_time(problem, path, options) for path in stretches]), fraction=1.0)
+    return Result(trajectory=join([time_tool_path(problem, path, options) for path in stretches]), fraction=1.0)
 
 
-def _motion(problem: Problem, part: Part, options: Options, cancel: Cancel) -> ToolWaypoints | Result:
-    """Waypoints of a single motion that is free, or what ends it."""
-    if isinstance(part.goal, Arc):
-        return circ.arc_waypoints(problem, part.goal, options, cancel)
-    if part.straight:
-        if not isinstance(part.goal, Region):
+def _motion(problem: Problem, item: SequenceItem, options: Options, cancel: Cancel) -> ToolWaypoints | Result:
+    """Return waypoints of a single motion that is free, or what ends it."""
+    if isinstance(item.goal, Arc):
+        return circ.arc_waypoints(problem, item.goal, options, cancel)
+    if item.straight:
+        if not isinstance(item.goal, Region):
             return Result(error=NOT_APPLICABLE, message="a straight line of the tool needs a pose goal")
-        return lin.line_waypoints(problem, part.goal, options, cancel)
+        return lin.line_waypoints(problem, item.goal, options, cancel)
     result = ptp.plan(problem, ptp.Options(goals=options.goals), cancel)
     if result.trajectory is None:
         return result
     goal = result.trajectory.positions[-1]
-    # As close together as those of lines, so that the corner is found as exactly.
-    rough = _tool(problem.robot, line(problem.start, goal, 20))
-    way = float(np.linalg.norm(np.diff(rough, axis=0), axis=1).sum())
-    steps = max(20, round(way / options.step))
+    # As close together as those of lines, so that the corner is located as exactly.
+    rough = _tool_positions(problem.robot, line(problem.start, goal, 20))
+    length = float(np.linalg.norm(np.diff(rough, axis=0), axis=1).sum())
+    steps = max(20, round(length / options.step))
     return ToolWaypoints(line(problem.start, goal, steps), np.zeros((steps + 1, 2)))
 
 
 def _blended(
-    problem: Problem, parts: tuple[Part, ...], motions: list[ToolWaypoints]
+    problem: Problem, items: tuple[SequenceItem, ...], motions: list[ToolWaypoints]
 ) -> list[ToolWaypoints] | Result:
-    """Stretches between stops, with blends at the corners inside them; or the blend that does not fit or collides."""
+    """Return stretches between stops, with blended corners inside; or the blend that does not fit or collides."""
     stretches: list[ToolWaypoints] = []
     pieces: list[ToolWaypoints] = []
     rest = motions[0]
     for number, following in enumerate(motions[1:], 1):
-        radius = parts[number - 1].blend_radius
-        where = f"blend of items {number} and {number + 1} of {len(parts)}"
-        if radius == 0 or _still(rest) or _still(following):
-            stretches.append(joined([*pieces, rest]))
+        radius = items[number - 1].blend_radius
+        where = f"blend of items {number} and {number + 1} of {len(items)}"
+        if radius == 0 or _is_still(rest) or _is_still(following):
+            stretches.append(concatenated([*pieces, rest]))
             pieces, rest = [], following
             continue
-        tool_before, tool_after = _tool(problem.robot, rest.positions), _tool(problem.robot, following.positions)
+        before, after = (_tool_positions(problem.robot, motion.positions) for motion in (rest, following))
         try:
-            leave = entry(tool_before, tool_after[0], radius)
-            arrive = len(tool_after) - 1 - entry(tool_after[::-1], tool_after[0], radius)
+            leave = blend_entry(before, after[0], radius)
+            arrive = len(after) - 1 - blend_entry(after[::-1], after[0], radius)
         except NoBlend:
             message = f"{where}: blend_radius {radius:g} m reaches beyond the other end of one of them"
-            return Result(error="bad_goal", message=message, waypoint=number, fraction=(number - 1) / len(parts))
+            return Result(error="bad_goal", message=message, waypoint=number, fraction=(number - 1) / len(items))
         corner = blend(rest.positions[leave:], following.positions[: arrive + 1])
         hit = blocked(problem, corner)
         if hit:
-            return replace(hit, message=f"{where}: {hit.message}", fraction=number / len(parts))
-        pieces.append(ToolWaypoints(rest.positions[: leave + 1], rest.ways[: leave + 1]))
-        limited = rest.ways.any() or following.ways.any()
-        ways = _ways(problem.robot, corner) if limited else np.zeros((len(corner), 2))
-        pieces.append(ToolWaypoints(corner, ways))
-        rest = ToolWaypoints(following.positions[arrive:], following.ways[arrive:])
-    stretches.append(joined([*pieces, rest]))
+            return replace(hit, message=f"{where}: {hit.message}", fraction=number / len(items))
+        pieces.append(ToolWaypoints(rest.positions[: leave + 1], rest.travel[: leave + 1]))
+        limited = rest.travel.any() or following.travel.any()
+        travel = _tool_travel(problem.robot, corner) if limited else np.zeros((len(corner), 2))
+        pieces.append(ToolWaypoints(corner, travel))
+        rest = ToolWaypoints(following.positions[arrive:], following.travel[arrive:])
+    stretches.append(concatenated([*pieces, rest]))
     return stretches
 
 
-def _still(motion: ToolWaypoints) -> bool:
+def _is_still(motion: ToolWaypoints) -> bool:
     return bool(np.abs(motion.positions - motion.positions[0]).max() < 1e-6)
 
 
-def _tool(robot: RobotModel, positions: Array) -> Array:
-    """(N, 3) positions of the tool [m]."""
+def _tool_positions(robot: RobotModel, positions: Array) -> Array:
+    """Return (N, 3) positions of the tool [m]."""
     return np.array([robot.fk(q)[:3, 3] for q in positions])
 
 
-def _ways(robot: RobotModel, positions: Array) -> Array:
-    """(N, 2) way [m] and turn [rad] of the tool up to each position."""
+def _tool_travel(robot: RobotModel, positions: Array) -> Array:
+    """Return (N, 2) path length [m] and turn [rad] of the tool up to each position."""
     poses = np.array([robot.fk(q) for q in positions])
-    way = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    length = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     turns = poses[:-1, :3, :3].transpose(0, 2, 1) @ poses[1:, :3, :3]
     turn = [np.linalg.norm(pin.log3(R)) for R in turns]
-    return np.concatenate([np.zeros((1, 2)), np.cumsum(np.stack([way, turn], axis=1), axis=0)])
+    return np.concatenate([np.zeros((1, 2)), np.cumsum(np.stack([length, turn], axis=1), axis=0)])
 
 
 class NoBlend(Exception):
-    """A radius within which one of the motions begins or ends."""
+    """A blend radius that contains the other end of one of the motions."""
 
 
-def entry(tool: Array, corner: Array, radius: float) -> int:
-    """Index of the first of the tool's positions (N, 3) [m] from which on it stays within a radius [m] of a corner.
+def blend_entry(tool: Array, corner: Array, radius: float) -> int:
+    """Return the first index of the tool's positions (N, 3) [m] from which it stays within a radius [m] of a corner.
 
     Raises:
-        NoBlend: it never is farther away.
+        NoBlend: it is never farther away.
     """
     outside = np.flatnonzero(np.linalg.norm(tool - corner, axis=1) > radius)
     if not len(outside):
@@ -136,11 +136,11 @@ def entry(tool: Array, corner: Array, radius: float) -> int:
 
 
 def blend(before: Array, after: Array) -> Array:
-    """(N, dof) positions [rad] that lead from the first of `before` smoothly to the last of `after`.
+    """Return (N, dof) positions [rad] that lead from the first of `before` smoothly to the last of `after`.
 
-    Both motions run at the same time, the one to the corner (which is the last of `before` and the first of `after`)
-    and the other from it, and weight goes over from one to the other by a quintic: q = a + w (b - a). So the path
-    leaves and arrives in the directions of the two motions, and lies between them.
+    Both motions run at the same time, one to the corner (the last of `before` and the first of `after`) and the other
+    from it, and a quintic weight moves from one to the other: q = a + w (b - a). So the path leaves and arrives in the
+    directions of the two motions, and lies between them.
     """
     count = max(len(before), len(after))
     shares = np.linspace(0, 1, count)
@@ -150,7 +150,7 @@ def blend(before: Array, after: Array) -> Array:
 
 
 def resampled(positions: Array, shares: Array) -> Array:
-    """(M, dof) positions at shares (M,) from 0 to 1 of the way through evenly counted ones (N, dof)."""
+    """Return (M, dof) positions at shares (M,), 0 to 1, of the index range of positions (N, dof)."""
     place = shares * (len(positions) - 1)
     i = np.minimum(place.astype(int), max(len(positions) - 2, 0))
     following = np.minimum(i + 1, len(positions) - 1)
@@ -158,10 +158,10 @@ def resampled(positions: Array, shares: Array) -> Array:
     return np.asarray((1 - part) * positions[i] + part * positions[following])
 
 
-def joined(parts: list[ToolWaypoints]) -> ToolWaypoints:
-    """The parts one after the other; each begins where the one before ends."""
-    positions, ways = [parts[0].positions], [parts[0].ways]
+def concatenated(parts: list[ToolWaypoints]) -> ToolWaypoints:
+    """Return the parts one after the other; each starts where the one before ends."""
+    positions, travel = [parts[0].positions], [parts[0].travel]
     for part in parts[1:]:
         positions.append(part.positions[1:])
-        ways.append(part.ways[1:] - part.ways[0] + ways[-1][-1])
-    return ToolWaypoints(np.concatenate(positions), np.concatenate(ways))
+        travel.append(part.travel[1:] - part.travel[0] + travel[-1][-1])
+    return ToolWaypoints(np.concatenate(positions), np.concatenate(travel))

@@ -3,9 +3,9 @@
 Schulman, Duan, Ho, Lee, Awwal, Bradlow, Pan, Patil, Goldberg, Abbeel: "Motion planning with sequential convex
 optimization and convex collision checking" (IJRR 2014), algorithm 1: distances are linearised, violations of the
 clearance are penalised, and a quadratic program is solved within a trust region about the last path. Distances are
-those at the waypoints and the middles of the edges; once these are free and an edge still is not, also those of the
-hulls of links at both ends of an edge, as in the paper: they take several times as long. The programs are dense and
-small, and daqp, an active-set solver, solves them in milliseconds.
+those at the waypoints and the middles of the edges. Once these are free and an edge still is not, distances of the
+links' hulls at both ends of an edge are added, as in the paper: they take several times as long. The programs are dense
+and small; daqp, an active-set solver, solves them in milliseconds.
 """
 
 from __future__ import annotations
@@ -19,21 +19,20 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from common.config import Parameters
-from common.planning.joint_goals import first_success, joint_goals, line
-from common.planning.optimised_path import check_path, evenly_spaced, with_restarts
+from common.planning.joint_goals import joint_goals
+from common.planning.joint_paths import check_path, evenly_spaced, first_success, line, with_restarts
 from common.planning.problem import Cancel, Problem, Result
-from common.planning.proximity import Near, Proximity, joined
-from common.planning.swept import SweptPieces
+from common.planning.proximity import NearPairs, Proximity, SweptEdges, concatenated
 
 Array = NDArray[np.float64]
 
 _OWN_CLEARANCE = 0.01  # [m] between links of the robot
-_BEYOND = 0.05  # [m] more than the clearance, in which pairs are looked for that a step could bring near
+_BEYOND = 0.05  # [m] beyond the clearance, within which a step could bring a pair too close
 _ACCEPTED = 0.25  # share of the expected improvement that a step must bring
 _SHRINK, _GROW = 0.3, 1.5  # of the trust region
 _SMALLEST_TRUST = 1e-3  # [rad]
-_CONVERGED = 1e-3  # of the merit: a smaller expected improvement is none
-_STRICTER = 10.0  # by which the penalty grows when the path has converged and still collides
+_CONVERGED = 1e-3  # of the merit: a smaller expected improvement counts as none
+_STRICTER = 10.0  # factor of the penalty when the path has converged and still collides
 _STRICTEST = 1e4
 _UNBOUNDED = 1e30
 _SLACK = 1e-4  # curvature of the penalty, so that the program is strictly convex
@@ -43,17 +42,17 @@ class Options(Parameters):
     """Size of the problem and limits of the optimisation."""
 
     steps: int = Field(20, ge=3, le=100, description="edges of the path that is optimised")
-    iterations: int = Field(100, ge=1, le=10000, description="quadratic programs, at most")
+    iterations: int = Field(100, ge=1, le=10000, description="limit of quadratic programs")
     trust_region: float = Field(0.1, gt=0, le=3, description="of each joint in the first iteration [rad]")
-    merit: float = Field(10.0, gt=0, le=1e4, description="penalty for a metre that the clearance is violated by")
+    merit: float = Field(10.0, gt=0, le=1e4, description="penalty per metre of violated clearance")
     clearance: float = Field(0.02, ge=0, le=0.5, description="distance to keep from everything [m]")
-    restarts: int = Field(2, ge=0, le=100, description="other first guesses, when the straight edge leads nowhere")
+    restarts: int = Field(2, ge=0, le=100, description="other first guesses, tried when the straight edge fails")
     goals: int = Field(4, ge=1, le=100, description="IK solutions of a pose goal to choose from")
 
 
 @dataclass(frozen=True)
 class _Chain:
-    """How positions that are checked follow from the waypoints that may move.
+    """How the checked positions follow from the waypoints that may move.
 
     Attributes:
         spread: (P, M) so that spread @ waypoints + ends are waypoints and the middles of the edges, in order.
@@ -77,12 +76,12 @@ class _Chain:
 
 
 def plan(problem: Problem, options: Options, cancel: Cancel) -> Result:
-    """A path that the optimisation made free of collision, or what still collides at its end."""
+    """Return a path that the optimisation made free of collision, or what still collides at its end."""
     goals = joint_goals(problem, cancel, wanted=options.goals)
     if isinstance(goals, Result):
         return goals
     proximity = Proximity(problem.world, options.clearance + _BEYOND, own_reach=_OWN_CLEARANCE + _BEYOND, nearest=True)
-    swept = SweptPieces(problem.world, options.clearance)
+    swept = SweptEdges(problem.world, options.clearance)
 
     def attempt(goal: Array) -> Result:
         path = line(problem.start, goal, options.steps)
@@ -95,18 +94,18 @@ def plan(problem: Problem, options: Options, cancel: Cancel) -> Result:
 
 
 def _optimise(
-    problem: Problem, options: Options, proximity: Proximity, swept: SweptPieces, cancel: Cancel, path: Array
+    problem: Problem, options: Options, proximity: Proximity, swept: SweptEdges, cancel: Cancel, path: Array
 ) -> Result:
-    """The path that the optimisation makes of a first guess (steps + 1, dof) [rad], or what is wrong with it."""
+    """Return the path that the optimisation makes of a first guess (steps + 1, dof) [rad], or its collision."""
     chain = _chain(path[0], path[-1], options.steps)
     waypoints = path[1:-1]
     trust, merit = options.trust_region, options.merit
     proximity.forget()
 
-    def measured(waypoints: Array, sweeping: bool) -> Near:
+    def measured(waypoints: Array, sweeping: bool) -> NearPairs:
         positions = chain.positions(waypoints)
         states = proximity.measure(positions)
-        return joined(states, swept.measure(positions[::2])) if sweeping else states
+        return concatenated(states, swept.measure(positions[::2])) if sweeping else states
 
     near = measured(waypoints, False)
     sweeping = bool((near.distance > 0).all())
@@ -115,7 +114,7 @@ def _optimise(
     for iteration in range(options.iterations):
         stop = cancel.reason(problem)
         if stop:
-            return Result(error=stop, message=f"planning was ended after {iteration} iterations")
+            return Result(error=stop, message=f"planning ended after {iteration} iterations")
         following, expected = _step(problem, chain, waypoints, near, trust, merit, options.clearance)
         now = chain.cost(waypoints) + merit * _violation(near, options.clearance)
         if now - expected < _CONVERGED * max(abs(now), 1.0) or trust < _SMALLEST_TRUST:
@@ -158,31 +157,31 @@ def _chain(start: Array, goal: Array, steps: int) -> _Chain:
     )
 
 
-def _violation(near: Near, clearance: float) -> float:
-    """Sum [m] over the positions of the most by which a pair is closer than it should be."""
+def _violation(near: NearPairs, clearance: float) -> float:
+    """Return the sum [m] over the positions of the largest violation of a clearance."""
     worst = np.zeros(int(near.position.max(initial=0)) + 1)
-    np.maximum.at(worst, near.position, _wanted(near, clearance) - near.distance)
+    np.maximum.at(worst, near.position, _clearances(near, clearance) - near.distance)
     return float(worst.sum())
 
 
-def _wanted(near: Near, clearance: float) -> Array:
-    """(K,) distances [m] to keep; links of the robot may be closer to each other."""
+def _clearances(near: NearPairs, clearance: float) -> Array:
+    """Return (K,) required distances [m]; links of the robot may be closer to each other."""
     return np.minimum(clearance, near.reach - _BEYOND)
 
 
 def _step(
-    problem: Problem, chain: _Chain, waypoints: Array, near: Near, trust: float, merit: float, clearance: float
+    problem: Problem, chain: _Chain, waypoints: Array, near: NearPairs, trust: float, merit: float, clearance: float
 ) -> tuple[Array, float]:
-    """Waypoints (M, dof) that are best within the trust region by the linearised distances, and their merit.
+    """Return the best waypoints (M, dof) within the trust region by the linearised distances, and their merit.
 
-    min x (H x I) x / 2 + pull x + merit sum(t) with t >= 0 and distance + gradient (x - waypoints) + t >= wanted,
+    min x (H x I) x / 2 + pull x + merit sum(t) with t >= 0 and distance + gradient (x - waypoints) + t >= clearance,
     where all pairs at a position share its t.
     """
     count, dof = waypoints.shape
-    wanted = _wanted(near, clearance)
+    clearances = _clearances(near, clearance)
     influence = chain.spread[near.position]  # (K, M)
     farthest = trust * np.abs(near.gradient).sum(axis=1) * influence.sum(axis=1)
-    use = (near.distance - farthest < wanted) & (influence.sum(axis=1) > 0)
+    use = (near.distance - farthest < clearances) & (influence.sum(axis=1) > 0)
     rows = (influence[use][:, :, None] * near.gradient[use][:, None, :]).reshape(-1, count * dof)
     places, owner = np.unique(near.position[use], return_inverse=True)
     slacks, pairs = len(places), len(rows)
@@ -193,7 +192,7 @@ def _step(
     f = np.concatenate([chain.pull.ravel(), np.full(slacks, merit)])
     A = np.hstack([rows, np.eye(slacks)[owner]])
     flat = waypoints.ravel()
-    least = wanted[use] - near.distance[use] + rows @ flat
+    least = clearances[use] - near.distance[use] + rows @ flat
     lower = np.maximum(np.tile(problem.robot.lower, count), flat - trust)
     upper = np.minimum(np.tile(problem.robot.upper, count), flat + trust)
     x, _, outcome, _ = daqp.solve(
@@ -203,13 +202,13 @@ def _step(
         np.concatenate([upper, np.full(slacks + pairs, _UNBOUNDED)]),
         np.concatenate([lower, np.zeros(slacks), least]),
     )
-    if outcome < 1:  # the program always has a solution: numbers that spoil it spoil the step only
+    if outcome < 1:  # the program always has a solution: bad numbers spoil this step only
         return waypoints, np.inf
     following = np.asarray(x[: count * dof]).reshape(count, dof)
     linear = replace(near, distance=near.distance + (influence * _dot(near, following - waypoints)).sum(axis=1))
     return following, chain.cost(following) + merit * _violation(linear, clearance)
 
 
-def _dot(near: Near, change: Array) -> Array:
-    """(K, M) what a change of each waypoint (M, dof) [rad] does to each distance [m]."""
+def _dot(near: NearPairs, change: Array) -> Array:
+    """Return (K, M) the effect of a change of each waypoint (M, dof) [rad] on each distance [m]."""
     return np.asarray(near.gradient @ change.T)

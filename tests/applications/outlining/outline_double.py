@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from applications.outlining.legs import OutlineView
-from applications.outlining.messages import OutlinePoints, OutlineStatus
-from applications.outlining.task import Config, Outline
+from applications.outlining.task import Config, Outline, OutlineView
+from applications.outlining.topics import OutlinePoints, OutlineStatus
 from common import messages as m
 from common.config import RobotConfig, Run, check, find_file, read_robot
 

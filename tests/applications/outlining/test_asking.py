@@ -9,10 +9,21 @@ import cv2
 import numpy as np
 import pytest
 
-from applications.outlining import asking, stage_files
-from applications.outlining.asking import ask_person, store
-from applications.outlining.messages import Contour, Contours, OutlinePoints, OutlineSelect, OutlineSelection
-from applications.outlining.topics import CONTOUR_IMAGE, CONTOUR_PATH, CONTOUR_POINTS, CONTOURS, OUTLINE_SELECT
+from applications.outlining import stage_files
+from applications.outlining import visits as asking
+from applications.outlining.topics import (
+    CONTOUR_IMAGE,
+    CONTOUR_PATH,
+    CONTOUR_POINTS,
+    CONTOURS,
+    OUTLINE_SELECT,
+    Contour,
+    Contours,
+    OutlinePoints,
+    OutlineSelect,
+    OutlineSelection,
+)
+from applications.outlining.visits import ask_person, store
 from common import messages as m
 from common import topics
 from common.errors import NoResponder, RequestLost

@@ -5,21 +5,29 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from applications.outlining.contours import ContourOptions, channel_of, find_contours, is_hole
-from applications.outlining.contours_choice import (
+from applications.outlining.contour_choice import (
+    CHOSEN,
     NAMES,
+    Following,
     NoSuchContour,
+    annotate_contours,
     choose,
     colour_name,
     described,
     parse_choice,
 )
-from applications.outlining.contours_drawing import CHOSEN, annotate_contours
-from applications.outlining.contours_following import Following
-from applications.outlining.contours_refinement import normals, refine
-from applications.outlining.duplicates import simplified
-from applications.outlining.evening import SHORTEST, evened
-from applications.outlining.messages import Contours, OutlineSelect
+from applications.outlining.contours import (
+    SHORTEST,
+    ContourOptions,
+    channel_of,
+    evened,
+    find_contours,
+    is_hole,
+    normals,
+    refine,
+)
+from applications.outlining.solids import simplified
+from applications.outlining.topics import Contours, OutlineSelect
 from common.errors import DecodeError
 from common.messages import Color, Header
 from common.transport.codec import decode, encode
@@ -168,7 +176,7 @@ def test_noise_of_the_picture_is_evened_out_and_corners_stay_sharp(shape, turns,
     even, off = outlined(shape, 12.0)
     assert off.mean() < 0.08 and off.max() < 0.6
     assert len(simplified(even, 0.2)) < turns, "an outline that zigzags is not followed at an even speed"
-    monkeypatch.setattr("applications.outlining.evening.SHORTEST", np.inf)
+    monkeypatch.setattr("applications.outlining.contours.SHORTEST", np.inf)
     rough, off_rough = outlined(shape, 12.0)
     assert off.mean() < 0.7 * off_rough.mean() and len(simplified(rough, 0.2)) > turns
 
@@ -179,7 +187,7 @@ def test_noise_of_the_picture_is_evened_out_and_corners_stay_sharp(shape, turns,
 def test_without_noise_a_contour_stays_as_it_is_and_with_it_details_do(shape, monkeypatch):
     clean, _ = outlined(shape, 0.0)
     _, off = outlined(shape, 12.0)
-    monkeypatch.setattr("applications.outlining.evening.SHORTEST", np.inf)
+    monkeypatch.setattr("applications.outlining.contours.SHORTEST", np.inf)
     assert np.array_equal(outlined(shape, 0.0)[0], clean)
     assert off.mean() < 1.1 * outlined(shape, 12.0)[1].mean()
 

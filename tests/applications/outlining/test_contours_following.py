@@ -6,10 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
+from applications.outlining.contour_choice import Following, NoSuchContour, middle_of
 from applications.outlining.contours import ContourOptions, find_contours
-from applications.outlining.contours_choice import NoSuchContour, middle_of
-from applications.outlining.contours_following import Following
-from applications.outlining.messages import Contour, OutlineSelect
+from applications.outlining.topics import Contour, OutlineSelect
 
 
 def square(index: int, u: float, v: float, side: float) -> Contour:

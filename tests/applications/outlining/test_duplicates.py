@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from applications.outlining.duplicates import simplified, without_duplicates
+from applications.outlining.solids import simplified, without_duplicates
 from tests.applications.outlining.outline_scenes import dense, distances
 
 FEW = st.integers(0, 5).map(lambda n: n / 1e3)

@@ -9,19 +9,17 @@ import math
 import numpy as np
 import pytest
 
-from applications.outlining.figures import Figures, Traced, distances
-from applications.outlining.messages import OutlinePoints, OutlineStatus
-from applications.outlining.topics import CONTOUR_PATH, OUTLINE_STATUS
+from applications.outlining.recording import OutlineFigures, Traced, distances
+from applications.outlining.topics import CONTOUR_PATH, OUTLINE_STATUS, OutlinePoints, OutlineStatus
 from common import messages as m
 from common import topics
-from common.application import Application
+from common.application import find_application
 from common.config import load_cell
 from common.planning.ik import solve_ik
 from common.robot.model import RobotModel
 from common.robot.transforms import rpy_to_matrix, transform
 from common.transport.local import LocalNetwork
-from recording.report.collector import Collector
-from recording.report.fold import Fold
+from recording.report.aggregator import Collector, RunAggregator
 from recording.report.summary import describe
 
 CELL = load_cell("ur5")
@@ -148,28 +146,28 @@ def test_distance_from_a_closed_polyline_counts_its_last_side_too() -> None:
 
 
 def test_progress_of_an_outline_in_one_line() -> None:
-    assert Figures().progress(status("TRACING", 1)) == "TRACING Object_1, 0.400 m"
-    assert Figures().progress(OutlineStatus(started=True, state="SELECTING")) == "SELECTING"
+    assert OutlineFigures().progress(status("TRACING", 1)) == "TRACING Object_1, 0.400 m"
+    assert OutlineFigures().progress(OutlineStatus(started=True, state="SELECTING")) == "SELECTING"
 
 
 def test_without_its_robot_what_the_task_tells_is_all_that_is_known() -> None:
-    told = Figures()
-    told.hears()[OUTLINE_STATUS](0.0, status("DONE", 1, closed=True, fraction=0.75))
+    told = OutlineFigures()
+    told.listeners()[OUTLINE_STATUS](0.0, status("DONE", 1, closed=True, fraction=0.75))
     outline = told.blocks()["outline"]
     assert outline["object"] == "Object_1" and outline["closed"] and outline["fraction"] == 0.75
     assert outline["deviation_mm"] is None and outline["tracking_mm"] is None
 
 
 def test_an_outline_that_a_file_gave_is_no_picture() -> None:
-    assert Figures().exposed(path(stamp=5)) == 5
-    assert Figures().exposed(path(stamp=5).model_copy(update={"given": True})) == 0
+    assert OutlineFigures().exposed(path(stamp=5)) == 5
+    assert OutlineFigures().exposed(path(stamp=5).model_copy(update={"given": True})) == 0
 
 
 async def test_collector_follows_an_outline_to_its_end() -> None:
     net = LocalNetwork()
     cell = net.bus("cell", cell="test")
-    fold = Fold("test", Application("outlining"), robot=CELL.robot)
-    assert isinstance(fold.figures, Figures)
+    fold = RunAggregator("test", find_application("outlining"), robot=CELL.robot)
+    assert isinstance(fold.figures, OutlineFigures)
     bus, lines = net.bus("supervisor", cell="test"), asyncio.Queue[str]()
     collector = Collector(bus, fold, 0.0, lines.put_nowait)
     listening = asyncio.create_task(collector.run())

@@ -4,8 +4,8 @@ import math
 
 import pytest
 
-from applications.outlining.messages import OutlinePoints
 from applications.outlining.task import MOST_FORGOTTEN
+from applications.outlining.topics import OutlinePoints
 from common import messages as m
 from common.robot.transforms import pose_to_matrix, rpy_to_matrix
 from tests.applications.outlining.outline_double import (

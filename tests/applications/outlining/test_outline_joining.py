@@ -4,7 +4,7 @@ import tracemalloc
 
 import numpy as np
 
-from applications.outlining.outline_joining import joined
+from applications.outlining.top_face import joined
 
 
 def test_a_gap_far_longer_than_the_edge_of_the_plateau_takes_no_more_room_than_others():

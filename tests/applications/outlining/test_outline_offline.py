@@ -9,12 +9,12 @@ import pytest
 from numpy.typing import NDArray
 
 from applications.outlining.contours import ContourOptions
-from applications.outlining.figures import distances
-from applications.outlining.legs import Legs, TracingParameters
-from applications.outlining.messages import OutlineSelect
 from applications.outlining.offline import Impossible, Perceived, perceive, plan_outline
-from applications.outlining.scene import planning_scene
+from applications.outlining.recording import distances
+from applications.outlining.solids import planning_scene
+from applications.outlining.task import Legs, TracingParameters
 from applications.outlining.top_face import TopFaceOptions
+from applications.outlining.topics import OutlineSelect
 from common import messages as m
 from common.config import Cell, ObjectConfig, Surroundings, load_cell
 from common.perception.depth import DepthError
@@ -43,7 +43,7 @@ def pipeline() -> PlanningPipeline:
 
 def photographed(objects: list[ObjectConfig]) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
     state = m.JointState(header=m.Header(), name=CELL.robot.joints, position=CELL.robot.named_poses["home"])
-    seen = view().see([world_object(thing) for thing in objects], state)
+    seen = view().render([world_object(thing) for thing in objects], state)
     return seen.colour, seen.depth_within(0.10, 2.25)
 
 

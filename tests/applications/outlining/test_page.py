@@ -8,9 +8,16 @@ from typing import Any
 
 import pytest
 
-from applications.outlining.messages import OutlinePoints, OutlineSelect, OutlineSelection, OutlineStatus
 from applications.outlining.page import choose
-from applications.outlining.topics import CONTOUR_PATH, OUTLINE_SELECT, OUTLINE_STATUS
+from applications.outlining.topics import (
+    CONTOUR_PATH,
+    OUTLINE_SELECT,
+    OUTLINE_STATUS,
+    OutlinePoints,
+    OutlineSelect,
+    OutlineSelection,
+    OutlineStatus,
+)
 from common import messages as m
 from common import topics
 from common.config import Members
@@ -19,7 +26,7 @@ from common.transport.local import LocalNetwork
 from page.console import Console
 from page.feeds import Feeds
 
-STOP_BEFORE, STOP_SINCE = (m.Inhibit(kind="stopped", by="page", since=since) for since in (3, 8))
+STOP_BEFORE, STOP_SINCE = (m.Interlock(kind="stopped", by="page", since=since) for since in (3, 8))
 
 
 class Cell:
@@ -47,13 +54,13 @@ class Cell:
         return OutlineSelection(index=0, label=self.labels.pop(0))
 
     async def _command(self, command: m.TaskCommand) -> m.TaskStatus:
-        self.commands.append((command.command, command.heard))
+        self.commands.append((command.command, command.acknowledged))
         return m.TaskStatus()
 
     async def _stop(self, _request: m.StopRequest) -> m.MotionStatus:
         if not self.executor_answers:
             raise Refused("busy", "too much is asked")
-        return m.MotionStatus(inhibits=[STOP_SINCE])
+        return m.MotionStatus(interlocks=[STOP_SINCE])
 
 
 @pytest.fixture
@@ -61,7 +68,7 @@ async def cell() -> Cell:
     cell = Cell()
     await cell.bus.ready()
     cell.status.put(OutlineStatus())
-    cell.motion.put(m.MotionStatus(inhibits=[STOP_BEFORE]))
+    cell.motion.put(m.MotionStatus(interlocks=[STOP_BEFORE]))
     await cell.until(lambda: None not in map(cell.console.latest, (topics.MOTION_STATUS, OUTLINE_STATUS)))
     return cell
 
@@ -92,8 +99,8 @@ async def test_stop_between_choice_and_path_stays_a_stop(cell: Cell, by: str) ->
 
     async def stop() -> None:
         if by == "the command line":
-            cell.motion.put(m.MotionStatus(inhibits=[STOP_BEFORE, STOP_SINCE]))
-            await cell.until(lambda: STOP_SINCE in getattr(cell.console.latest(topics.MOTION_STATUS), "inhibits", ()))
+            cell.motion.put(m.MotionStatus(interlocks=[STOP_BEFORE, STOP_SINCE]))
+            await cell.until(lambda: STOP_SINCE in getattr(cell.console.latest(topics.MOTION_STATUS), "interlocks", ()))
             return
         try:
             await cell.console.stop()

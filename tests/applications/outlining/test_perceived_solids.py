@@ -2,8 +2,7 @@ import numpy as np
 import pytest
 
 from applications.outlining.contours import ContourOptions, find_contours
-from applications.outlining.perceived_solids import perceived_solids
-from applications.outlining.scene import planning_scene
+from applications.outlining.solids import perceived_solids, planning_scene
 from common.config import Surroundings
 from common.sim.objects import world_object
 from tests.applications.outlining.outline_scenes import distances, seen, seen_world, upright, world

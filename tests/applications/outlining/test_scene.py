@@ -6,11 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from applications.outlining.perceived_solids import PerceivedSolid
-from applications.outlining.scene import collision_object, planning_scene
+from applications.outlining.solids import PerceivedSolid, collision_object, planning_scene
 from common.config import Surroundings, load_cell
 from common.messages import Color, PlanningScene
-from common.perception.intake import Unusable
+from common.perception.camera_input import FrameError
 from common.scene.home import HomeWatch
 from common.transport.codec import decode, encode
 
@@ -50,7 +49,7 @@ def test_scene_that_is_as_full_as_it_may_be_can_be_read_and_a_fuller_one_is_not_
     assert len(decode(PlanningScene, encode(planning_scene(around, full, 7))).objects) == 402
     long = replace(solid(), outline=np.resize(round_one.outline, (2001, 2)))
     for crowd in ([*full, solid()], [*full[1:], replace(long, outline=long.outline[:300])], [long]):
-        with pytest.raises(Unusable, match="are more than a planning scene has room for"):
+        with pytest.raises(FrameError, match="are more than a planning scene has room for"):
             planning_scene(around, crowd, 7)
 
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from applications.outlining.contours import ContourOptions, find_contours, is_hole
 from applications.outlining.top_face import TopFaceOptions, rounded, top_face
 from common.perception.depth import DepthError
-from common.sim.depth_sensor import DepthSensorParameters, measured_depth
+from common.sim.depth_sensor import DepthSensorParameters, simulate_depth
 from common.sim.objects import world_object
 from common.sim.ray_caster import Mesh, cast, empty_view
 from common.sim.solids import fixture_mesh
@@ -115,7 +115,7 @@ def test_noise_of_the_depth_hardly_moves_the_outline():
 def test_depth_of_a_stereo_camera_with_its_frayed_edges_hardly_moves_the_outline(name):
     camera, picture, depth = seen_world(name)
     stereo = DepthSensorParameters(baseline=0.075)
-    measured = measured_depth(depth, camera, stereo, np.random.default_rng(1))
+    measured = simulate_depth(depth, camera, stereo, np.random.default_rng(1))
     for face, thing, true in outlines((camera, picture, measured), world(name).objects, FINE):
         assert face.filled > 0
         assert face.top == pytest.approx(thing.base + thing.height, abs=1e-3)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 
 from applications.pick_place.choice import PickPlaceView
-from applications.pick_place.messages import PickPlaceStatus
-from applications.pick_place.parameters import Config
+from applications.pick_place.grasping import Config
 from applications.pick_place.task import PickPlace
+from applications.pick_place.topics import PickPlaceStatus
 from common import messages as m
 from common.config import Surroundings, load_cell
 

@@ -8,10 +8,10 @@ import itertools
 import numpy as np
 import pytest
 
-from applications.pick_place import depth_balls
+from applications.pick_place import depth_spheres as depth_balls
 from applications.pick_place.choice import Choice, Target, lies_below
 from applications.pick_place.detector import Detector
-from applications.pick_place.odd import NOT_ROUND
+from applications.pick_place.outliers import NOT_ROUND
 from common import messages as m
 from common.config import Surroundings, load_cell
 from common.messages import Color, Pose, Vector3, WorldObject
@@ -39,7 +39,7 @@ def thing(at: tuple[float, float, float], shape: str = "sphere", *size: float) -
 
 
 def look(things: list[WorldObject], noise: float = 0.0) -> tuple[Detector, np.ndarray]:
-    view = Renderer(AROUND, camera=CAMERA).see(things)
+    view = Renderer(AROUND, camera=CAMERA).render(things)
     rng = np.random.default_rng(1)
     depth = view.depth_within(0.1, 2.0) + np.float32(noise) * rng.standard_normal(view.depth.shape, dtype=np.float32)
     detector = Detector(AROUND)
@@ -92,7 +92,7 @@ def test_balls_on_a_large_red_cloth_are_found_and_no_more_is_tried_than_it_takes
 
 
 def test_what_is_odd_without_depth_is_told_again_after_a_look_with_it() -> None:
-    view = Renderer(AROUND, camera=CAMERA).see([thing(at) for at in PYRAMID])
+    view = Renderer(AROUND, camera=CAMERA).render([thing(at) for at in PYRAMID])
     detector = Detector(AROUND)
     detector.detect(view.colour, CAMERA)
     without = detector.odd

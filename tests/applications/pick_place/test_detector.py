@@ -9,11 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from applications.pick_place.annotation import annotate
-from applications.pick_place.detector import Detector, DetectorOptions, rehearse
+from applications.pick_place.detector import Detector, DetectorOptions, annotate, rehearse
 from common.config import Container, Surroundings
 from common.perception.pinhole import Pinhole
-from common.perception.sphere import ray_distances, silhouette, wholly_in_view
+from common.perception.sphere import ray_distances, silhouette, sphere_in_view
 from common.robot.transforms import rpy_to_matrix, transform
 from tests.common.sim.spheres import draw_spheres
 
@@ -40,7 +39,7 @@ def moved_into_view(shape, rng):
     shape = np.array(shape) @ turn.T
     while True:
         balls = on_table(shape - shape.mean(axis=0) + rng.uniform(LOW, HIGH))
-        if all(wholly_in_view(camera, ball, 0.03) for ball in balls):
+        if all(sphere_in_view(camera, ball, 0.03) for ball in balls):
             return balls
 
 
@@ -142,10 +141,10 @@ def test_balls_cut_by_the_border_are_found_and_marked_and_disturb_no_other():
             assert np.linalg.norm(balls[:, :2] - place, axis=1).min() < 0.012, "there is a ball wherever one is seen"
             partial += d.partial
         for ball in balls:
-            if wholly_in_view(camera, ball, 0.03, margin=1.5):
+            if sphere_in_view(camera, ball, 0.03, margin=1.5):
                 distances = np.linalg.norm(places - ball[:2], axis=1)
                 assert distances.min() < 0.003 and not found[int(distances.argmin())].partial
-            elif not wholly_in_view(camera, ball, 0.03, margin=-0.5) and len(places):
+            elif not sphere_in_view(camera, ball, 0.03, margin=-0.5) and len(places):
                 distances = np.linalg.norm(places - ball[:2], axis=1)
                 assert distances.min() > 0.02 or found[int(distances.argmin())].partial
     assert partial > 8
@@ -228,7 +227,7 @@ def test_a_tilted_camera_gives_the_same_places():
     rng = np.random.default_rng(4)
     x, y = tilted.on_plane((300, 200), 0.03)
     balls = on_table([(x, y), (x + 0.06, y), (x - 0.06, y + 0.1), (x + 0.03, y - UP), (x - 0.1, y - 0.1)])
-    assert all(wholly_in_view(tilted, ball, 0.03) for ball in balls)
+    assert all(sphere_in_view(tilted, ball, 0.03) for ball in balls)
     check(balls, draw_spheres(balls, tilted, around, noise_std=4, rng=rng), view=tilted)
 
 

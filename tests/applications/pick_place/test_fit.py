@@ -3,8 +3,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from applications.pick_place.blobs import Outline, all_of
-from applications.pick_place.fit import fit_each, fit_spheres, near_points
+from applications.pick_place.segmentation import Outline, all_of
+from applications.pick_place.sphere_fit import fit_each, fit_spheres, near_points
 from common.config import CameraConfig
 from common.perception.pinhole import Pinhole
 from common.perception.sphere import silhouette

@@ -7,13 +7,12 @@ import dataclasses
 import numpy as np
 import pytest
 
-from applications.pick_place.perceived import PerceivedScene
-from applications.pick_place.region import MOST_HIDDEN, Region, looking_poses
-from applications.pick_place.remembered import HIDDEN, Remembered
-from applications.pick_place.tracks import SceneParameters, Sighting, Tracks
+from applications.pick_place.ball_places import MOST_HIDDEN, Region, looking_poses
+from applications.pick_place.detections import HIDDEN, Remembered
+from applications.pick_place.perceived_scene import PerceivedScene, SceneParameters, Sighting, Tracks
 from common import messages as m
 from common.config import Surroundings, load_cell
-from common.perception.occlusion import Hidden, Silhouettes
+from common.perception.occlusion import Occlusion, RobotSilhouettes
 from common.perception.pinhole import Pinhole
 from common.robot.model import RobotModel
 from common.scene.workspace import WorkspaceBounds
@@ -23,7 +22,7 @@ CELL = load_cell("panda")
 AROUND = CELL.section(Surroundings)
 assert isinstance(AROUND, Surroundings)
 CAMERA = Pinhole.from_config(AROUND.camera)
-BLIND = Hidden(CAMERA, "the lens is covered")
+BLIND = Occlusion(CAMERA, "the lens is covered")
 PLACE = (0.4, 0.0, 0.03)
 ELSEWHERE = (0.6, -0.2, 0.03)
 
@@ -74,7 +73,7 @@ def test_what_lies_in_the_container_is_kept_while_the_hand_hides_it() -> None:
 
 def test_arm_is_turned_out_of_the_way_as_little_as_need_be() -> None:
     robot, region = RobotModel.load(CELL.robot), Region(AROUND, WorkspaceBounds())
-    silhouettes = Silhouettes(robot, 0.03)
+    silhouettes = RobotSilhouettes(robot, 0.03)
     within = region.within(CAMERA, silhouettes, robot)
 
     def share(q: object) -> float:

@@ -41,7 +41,7 @@ def errors(picture: np.ndarray, camera: Pinhole = CAMERA) -> list[float]:
 
 @pytest.fixture(scope="module")
 def scene() -> np.ndarray:
-    return Renderer(AROUND, RobotModel.load(CELL.robot), camera=CAMERA).see(balls()).colour
+    return Renderer(AROUND, RobotModel.load(CELL.robot), camera=CAMERA).render(balls()).colour
 
 
 @pytest.mark.parametrize("kelvin", [2700, 4000, 6500, 10_000])
@@ -60,7 +60,7 @@ def test_balls_are_found_to_3_mm_and_none_is_made_up(
 @pytest.mark.parametrize("kelvin", [2700, 3000, 3500])
 def test_the_floor_beside_a_table_does_not_tell_the_light_on_it(kelvin: float, bright: float) -> None:
     camera = Pinhole.from_config(SIDE)
-    picture = Renderer(AROUND, camera=camera).see(balls()).colour
+    picture = Renderer(AROUND, camera=camera).render(balls()).colour
     warm = np.clip(np.rint(picture * tint(kelvin) * bright), 0, 255).astype(np.uint8)
     assert max(errors(warm, camera)) < 0.003
 
@@ -80,7 +80,7 @@ def test_balls_are_found_in_drawn_light_and_shadow(number: int) -> None:
     joints = JointState(header=Header(), name=[*robot.joint_names, *locked], position=[*q.tolist(), *locked.values()])
     sensor = CameraParameters(auto_exposure=True, full_well=10_000)
     eye = SimulatedCamera(AROUND, lit, CELL.robot, sensor, rng, plain=True)
-    assert max(errors(eye.shoot(WorldObjects(objects=balls()), joints, 0).colour)) < 0.003
+    assert max(errors(eye.capture(WorldObjects(objects=balls()), joints, 0).colour)) < 0.003
 
 
 @pytest.mark.parametrize(("color", "count"), [
@@ -109,7 +109,7 @@ def test_balls_in_a_container_are_found_however_warm_and_bright_the_light_is(
     box = AROUND.container.model_copy(update={"color": color})
     around = AROUND.model_copy(update={"container": box, "containers": {"box": box}})
     inside = balls([(box.x - 0.04, box.y - 0.04, 0.035), (box.x + 0.04, box.y + 0.04, 0.035)])
-    picture = Renderer(around, camera=CAMERA).see(inside).colour
+    picture = Renderer(around, camera=CAMERA).render(inside).colour
     warm = np.clip(np.rint(picture * tint(light) * 3.0), 0, 255).astype(np.uint8)
     assert len(Detector(around).detect(warm, CAMERA)) == 2
 
@@ -119,6 +119,6 @@ def test_however_little_green_balls_are_said_to_have_those_in_the_container_are_
     color: tuple[float, float, float],
 ) -> None:
     around, box = AROUND.model_copy(update={"ball_color": color}), AROUND.container
-    picture = Renderer(AROUND, camera=CAMERA).see(balls([(box.x, box.y, 0.035)])).colour
+    picture = Renderer(AROUND, camera=CAMERA).render(balls([(box.x, box.y, 0.035)])).colour
     bright = np.clip(np.rint(picture * 2.0), 0, 255).astype(np.uint8)
     assert len(Detector(around).detect(bright, CAMERA)) == 1

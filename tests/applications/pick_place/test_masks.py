@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from applications.pick_place.masks import Colours, Masks, changed
+from applications.pick_place.segmentation import Colours, Masks, changed
 
 Picture = npt.NDArray[np.uint8]
 WINDOWS = ((0, 120, 80), (10, 255, 255)), ((170, 120, 80), (180, 255, 255))

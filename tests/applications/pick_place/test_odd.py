@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 import pytest
 
+from applications.pick_place.detections import Validation
 from applications.pick_place.detector import Detector, DetectorOptions
-from applications.pick_place.odd import COVERED, FLAT, NOT_ROUND, THIN
-from applications.pick_place.validation import Validation
+from applications.pick_place.outliers import COVERED, FLAT, NOT_ROUND, THIN
 from common.config import CameraConfig, Surroundings, load_cell
 from common.messages import Color, Vector3, WorldObject
 from common.perception.pinhole import Pinhole
@@ -44,7 +44,7 @@ def look(*things: WorldObject, others: bool = True) -> Detector:
     """A detector that saw them, with other balls or alone: of those all are found and nothing beside them."""
     detector = Detector(AROUND)
     beside = [ball(x, y) for x, y in OTHERS] if others else []
-    found = detector.detect(Renderer(AROUND, camera=CAMERA).see([*things, *beside]).colour, CAMERA)
+    found = detector.detect(Renderer(AROUND, camera=CAMERA).render([*things, *beside]).colour, CAMERA)
     assert len(found) == len(beside), found
     assert all(min(math.dist(one.position[:2], place) for place in OTHERS) < 0.003 for one in found)
     return detector
@@ -80,14 +80,14 @@ def test_thin_cable_is_reported_beside_balls(eye: CameraConfig) -> None:
             cable = red("cylinder", (*place, width / 2), (width, width, 0.25), roll=math.pi / 2)
             beside = [ball(x, y) for x, y in OTHERS if math.dist((x, y), place) > 0.17]
             detector = Detector(around)
-            assert len(detector.detect(draw.see([cable, *beside]).colour, camera)) == len(beside)
+            assert len(detector.detect(draw.render([cable, *beside]).colour, camera)) == len(beside)
             assert [one.reason for one in detector.odd] in ([THIN], [NOT_ROUND] * (width > 0.006)), (width, place)
             assert math.dist(detector.odd[0].position[:2], place) < 0.06
 
 
 def test_picture_full_of_red_specks_shows_no_cable() -> None:
     rng = np.random.default_rng(5)
-    picture = Renderer(AROUND, camera=CAMERA).see([ball(x, y) for x, y in OTHERS]).colour.copy()
+    picture = Renderer(AROUND, camera=CAMERA).render([ball(x, y) for x, y in OTHERS]).colour.copy()
     for share in (0.01, 0.1, 0.3, 0.7):
         noisy = picture.copy()
         noisy[rng.random(picture.shape[:2]) < share] = (20, 20, 200)
@@ -131,7 +131,7 @@ def test_of_a_stack_neither_ball_is_offered_where_the_camera_sees_it_from_the_si
 ) -> None:
     camera, around = Pinhole.from_config(SIDE), AROUND.model_copy(update={"camera": SIDE})
     beside = [ball(x, y) for x, y in OTHERS] if others else []
-    picture = Renderer(around, camera=camera).see([ball(*place), ball(*place, 0.09), *beside]).colour
+    picture = Renderer(around, camera=camera).render([ball(*place), ball(*place, 0.09), *beside]).colour
     detector = Detector(around)
     assert len(detector.detect(picture, camera)) == len(beside)
     assert sorted("it lies higher" in one.reason for one in detector.odd) == [False, True]
@@ -145,10 +145,10 @@ def test_three_balls_that_carry_one_are_not_offered_and_without_it_they_are(gap:
         for turn in (0.0, 0.7):
             around = [complex(*place) + away * np.exp(1j * (turn + third * math.tau / 3)) for third in range(3)]
             lower, top = [ball(z.real, z.imag) for z in around], ball(*place, 0.03 + math.sqrt(0.06**2 - away**2))
-            found = Detector(AROUND).detect(draw.see(lower).colour, CAMERA)
+            found = Detector(AROUND).detect(draw.render(lower).colour, CAMERA)
             assert len(found) == 3, (place, turn)
             detector = Detector(AROUND)
-            assert detector.detect(draw.see([*lower, top]).colour, CAMERA) == [], (place, turn)
+            assert detector.detect(draw.render([*lower, top]).colour, CAMERA) == [], (place, turn)
             assert {one.reason for one in detector.odd} == {COVERED}
 
 
@@ -174,7 +174,7 @@ def test_balls_that_touch_do_not_lie_on_each_other(eye: CameraConfig, others: bo
         about = complex(0.48, -0.26)
         turned = [about + (complex(*place) - about) * np.exp(1j * turn) for place in touching]
         beside = [ball(x, y) for x, y in OTHERS[1:]] if others else []
-        picture = draw.see([*(ball(z.real, z.imag) for z in turned), *beside]).colour
+        picture = draw.render([*(ball(z.real, z.imag) for z in turned), *beside]).colour
         assert len(detector.detect(picture, camera)) == len(touching) + len(beside) and detector.odd == []
 
 
@@ -213,7 +213,7 @@ def test_ball_on_top_of_something_looks_too_large_from_the_side(
     camera, around = Pinhole.from_config(SIDE), AROUND.model_copy(update={"camera": SIDE})
     beside = [ball(x, y) for x, y in OTHERS] if others else []
     detector = Detector(around)
-    picture = Renderer(around, camera=camera).see([ball(*place, height), *beside]).colour
+    picture = Renderer(around, camera=camera).render([ball(*place, height), *beside]).colour
     assert len(detector.detect(picture, camera)) == len(beside)
     assert ["it lies higher" in one.reason for one in detector.odd] == [True]
 
@@ -225,7 +225,7 @@ def test_ball_that_leans_on_a_wall_of_the_container_carries_none_that_is_not_the
     places: list[tuple[float, float]],
 ) -> None:
     things = [ball(x, y, 0.035) for x, y in places]
-    found = Detector(AROUND).detect(Renderer(AROUND, camera=CAMERA).see(things).colour, CAMERA)
+    found = Detector(AROUND).detect(Renderer(AROUND, camera=CAMERA).render(things).colour, CAMERA)
     assert len(found) == len(places)
 
 

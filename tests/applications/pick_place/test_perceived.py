@@ -5,8 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from applications.pick_place.perceived import PerceivedScene
-from applications.pick_place.tracks import SceneParameters
+from applications.pick_place.perceived_scene import PerceivedScene, SceneParameters
 from common import messages as m
 from common.config import Surroundings, load_cell
 from common.perception.pinhole import Pinhole

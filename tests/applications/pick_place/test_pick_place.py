@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from applications.pick_place.choice import Pick, Target, finger_clearance
-from applications.pick_place.rows import Rows
+from applications.pick_place.motion_sequences import Rows
 from common import messages as m
 from common.robot.transforms import matrix_to_pose, matrix_to_rpy, pose_to_matrix, rpy_to_matrix, tool_down, transform
 from common.tasks.stages import Move

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from applications.pick_place.recheck import Recheck, Recording
-from common.application import Application
+from applications.pick_place.contact_check import Recheck, Recording
+from common.application import find_application
 from common.config import load_cell
 from common.messages import GripperState, Header, JointState, Pose, PoseArray, Vector3
 from common.planning.ik import solve_ik
 from common.robot.transforms import tool_down
-from recording.report.fold import Fold
+from recording.report.aggregator import RunAggregator
 
 Array = NDArray[np.float64]
 CELL = load_cell("panda")
@@ -83,7 +83,7 @@ def test_ball_that_is_taken_lifts_off_the_table_with_the_hand_and_may_touch_it_o
 
 def test_what_is_repeated_counts_once() -> None:
     recording = Recording()
-    fold = Fold("panda", Application("pick_place"), listeners=recording.hears())
+    fold = RunAggregator("panda", find_application("pick_place"), listeners=recording.listeners())
     for second in (0, 0, 1):
         fold.on("scene_balls", truth(second, "table", *BALL), 0.0, 0)
         fold.on("joint_states", arm(at(0.5, 0.0, 0.2))[0], 0.0, 0)

@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from applications.pick_place.resting import Resting
+from applications.pick_place.ball_places import Resting
 from common.config import Container, Surroundings
 from common.perception.pinhole import Pinhole
 

@@ -3,7 +3,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from applications.pick_place.tracks import SceneParameters, Sighting, Tracks
+from applications.pick_place.perceived_scene import SceneParameters, Sighting, Tracks
 
 
 def at(x: float, y: float, z: float = 0.03, **what: object) -> Sighting:

@@ -1,6 +1,6 @@
 import numpy as np
 
-from applications.pick_place.validation import Validation
+from applications.pick_place.detections import Validation
 from common.config import Surroundings
 from common.messages import Header, Marker, MarkerArray, Pose, Vector3
 from common.perception.pinhole import Pinhole

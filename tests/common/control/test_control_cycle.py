@@ -5,10 +5,9 @@ from applications.pick_place.topics import scene_balls
 from common.config import Fixture, GripperConfig, World
 from common.control.cycle import ControlCycle
 from common.errors import ConfigError, Refused
-from common.hardware.fingers import Fingers
 from common.hardware.interface import GripperReading, HardwareFault
 from common.hardware.lag import LagHardware
-from common.hardware.mock import MockHardware
+from common.hardware.mock import MockHardware, SimulatedFingers
 from common.messages import (
     ExecuteRequest,
     GripperCommand,
@@ -40,7 +39,7 @@ class Gantry:
 
 class Rig:
     def __init__(self, limits, hardware=None, balls=((0.5, 0.0),), **changes):
-        self.hardware = hardware or MockHardware(START, Fingers(GRIPPER, 0.08))
+        self.hardware = hardware or MockHardware(START, SimulatedFingers(GRIPPER, 0.08))
         config = World(fixtures=[TABLE], balls=list(balls))
         self.world = KinematicWorld(config)
         given = {"gripper": GRIPPER, "kinematics": Gantry(), "world": self.world, **changes}
@@ -121,7 +120,7 @@ def test_first_cycle_tells_everything_and_then_only_the_joints(rig):
 
 @pytest.mark.parametrize("make", [MockHardware, lambda start, fingers: LagHardware(start, 0.03, fingers)])
 def test_ball_is_grasped_lifted_carried_and_let_go(limits, rest_to_rest, make):
-    rig = Rig(limits, make(START, Fingers(GRIPPER, 0.08)))
+    rig = Rig(limits, make(START, SimulatedFingers(GRIPPER, 0.08)))
     rig.step()
     assert rig.grip("close", 0.0).state == "active"
     rig.run(1.0)
@@ -235,9 +234,9 @@ def test_progress_is_told_about_ten_times_a_second(rig, rest_to_rest):
 def test_stop_reports_cancelled(rig, rest_to_rest):
     rig.execute("a", rest_to_rest([0, 0], [0.5, 0.5], 2.0))
     rig.run(1.0)
-    assert rig.cycle.authority.stop(StopRequest(id="a", reason="person"), rig.now).state == "active"
+    assert rig.cycle.authority.stop(StopRequest(id="a", reason="enough"), rig.now).state == "active"
     rig.run(0.5)
-    assert (rig.motions[-1].state, rig.motions[-1].message) == ("cancelled", "person")
+    assert (rig.motions[-1].state, rig.motions[-1].message) == ("cancelled", "enough")
     assert not any(rig.joints[-1].velocity)
 
 
@@ -250,7 +249,7 @@ def test_fault_of_the_hardware_is_reported_and_survived(limits, rest_to_rest):
                 raise HardwareFault("cable is off")
             return super().read(now)
 
-    hardware = Flaky(START, Fingers(GRIPPER, 0.08))
+    hardware = Flaky(START, SimulatedFingers(GRIPPER, 0.08))
     rig = Rig(limits, hardware)
     rig.step()
     rig.execute("a", rest_to_rest([0, 0], [0.5, 0.5]))
@@ -270,7 +269,7 @@ class Broken(MockHardware):
     """Hardware that raises what it is given, and counts how often it is asked in vain."""
 
     def __init__(self):
-        super().__init__(START, Fingers(GRIPPER, 0.08))
+        super().__init__(START, SimulatedFingers(GRIPPER, 0.08))
         self.failing, self.error, self.failed = "", None, 0
 
     def ask(self, what):
@@ -412,7 +411,7 @@ def test_gripper_that_fails_brakes_the_arm_which_stays_held_and_refuses_goals(li
 
 
 def test_nothing_moves_before_the_arm_was_read(limits, rest_to_rest):
-    rig = Rig(limits, MockHardware(np.array([0.5, 0.0]), Fingers(GRIPPER, 0.08)))
+    rig = Rig(limits, MockHardware(np.array([0.5, 0.0]), SimulatedFingers(GRIPPER, 0.08)))
     answer = rig.execute("a", rest_to_rest([0, 0], [0.2, 0.2]))
     assert answer.error == "hardware_fault" and "where the arm is" in answer.message
     rig.step()
@@ -420,7 +419,7 @@ def test_nothing_moves_before_the_arm_was_read(limits, rest_to_rest):
 
 
 def test_real_hardware_has_no_world_to_edit(limits):
-    cycle = ControlCycle(MockHardware(START, Fingers(GRIPPER, 0.08)), limits, START, gripper=GRIPPER)
+    cycle = ControlCycle(MockHardware(START, SimulatedFingers(GRIPPER, 0.08)), limits, START, gripper=GRIPPER)
     with pytest.raises(Refused, match="real hardware"):
         cycle.edit(WorldEdit(op="reset"), 1.0)
     cycle.command(GripperCommand(id="close", width=0.0), 1.0)
@@ -459,7 +458,7 @@ def test_fingers_that_nobody_told_anything_stay_where_they_are_after_a_restart(l
     rig.run(0.1)
     standing = rig.cycle.standing()
     assert standing.width == 0.08
-    again = Rig(limits, MockHardware(START, Fingers(GRIPPER, 0.05)))
+    again = Rig(limits, MockHardware(START, SimulatedFingers(GRIPPER, 0.05)))
     again.cycle.restore(standing, again.now)
     again.run(1.0)
     assert {state.width for state in again.grippers} == {0.08}
@@ -496,7 +495,7 @@ def test_hold_for_a_goal_keeps_that_goal_and_ends_with_it(rig, rest_to_rest):
     rig.run(2.0)
     status = rig.motions[-1]
     assert status.state == "active" and not status.paused and "held: mug is in the way of hand" in status.message
-    assert [(one.by, one.reason) for one in status.inhibits] == [("scene_monitor", "mug is in the way of hand")]
+    assert [(one.by, one.reason) for one in status.interlocks] == [("scene_monitor", "mug is in the way of hand")]
     rig.cycle.authority.stop(StopRequest(id="a", by="requester"), rig.now)
     rig.run(0.5)
     assert (rig.motions[-1].state, rig.motions[-1].held) == ("cancelled", False)
@@ -510,7 +509,7 @@ def test_the_scene_monitor_lets_go_of_nobody_elses_hold(rig, rest_to_rest):
     rig.cycle.authority.hold(in_the_way("a"))
     rig.cycle.authority.hold(in_the_way("a", hold=False))
     rig.run(1.0)
-    assert rig.motions[-1].held_by == ["person"] and rig.motions[-1].progress < 0.1
+    assert rig.motions[-1].held_by == ["operator"] and rig.motions[-1].progress < 0.1
     rig.cycle.authority.hold(in_the_way("a"))
     rig.cycle.authority.hold(HoldRequest(hold=False, owner="anna"))
     rig.run(1.0)

@@ -84,7 +84,7 @@ def test_an_arm_with_a_rate_of_its_own_is_told_little_more_jerk_than_there_is_fr
                 stream.put(*sent.pop(0))
             told.append(stream.at(now)[0])
         assert not stream.ceased
-        for name, rows in (("as they come", told), ("smoothed", [smoothing.after(q) for q in told])):
+        for name, rows in (("as they come", told), ("smoothed", [smoothing.add(q) for q in told])):
             jerk = np.abs(np.diff([start] * 3 + rows, n=3, axis=0)).max() / period**3
             most[name] = max(most[name], jerk / LIMITS.jerks[0])
     assert most["smoothed"] <= 1.1 and most["smoothed"] < most["as they come"], most

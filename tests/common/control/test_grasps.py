@@ -10,8 +10,8 @@ from pydantic import ValidationError
 
 from common.config import GripperConfig, load_cell
 from common.control.gripper_controller import GripperController
-from common.hardware.fingers import Fingers
 from common.hardware.interface import GripperReading
+from common.hardware.mock import SimulatedFingers
 from common.messages import CollisionObject, GripperCommand, GripperState, Header, PlanningScene, Pose
 from common.transport.codec import decode, encode
 
@@ -22,7 +22,7 @@ class LateFingers:
     """Fingers that begin to move some time after they were told, and whose readings are old [s]."""
 
     def __init__(self, begin: float, age: float, width: float = 0.08) -> None:
-        self.fingers, self.begin, self.age = Fingers(CONFIG, width), begin, age
+        self.fingers, self.begin, self.age = SimulatedFingers(CONFIG, width), begin, age
         self.told: deque[tuple[float, float, float]] = deque()
         self.past: deque[tuple[float, GripperReading]] = deque()
         self.effort = 0.0

@@ -99,7 +99,7 @@ def test_the_robot_moves_only_when_neither_a_person_nor_a_watchdog_holds_it():
     controller = rig.controller
     controller.hold(True, "paused")
     both = controller.hold(True, "no joint states", "watchdog")
-    assert both.held and both.held_by == ["person", "watchdog"] and "paused; no joint states" in both.message
+    assert both.held and both.held_by == ["operator", "watchdog"] and "paused; no joint states" in both.message
     alone = controller.hold(False, "")
     assert alone.held and alone.held_by == ["watchdog"] and not alone.paused
     assert not controller.hold(False, "", "watchdog").held

@@ -266,18 +266,18 @@ def test_after_a_stop_or_a_hold_who_keeps_asking_moves_nothing_until_they_let_go
 
 def test_who_stopped_the_arm_jogs_it_and_nobody_else(arm):
     joint = {arm.robot.joint_names[0]: 0.2}
-    heard = arm.asked(arm.cycle.authority.stop, StopRequest(owner="ann"), arm.stamp * 1e-9).newest
-    arm.jog(0.3, joints=joint, owner="bob", heard=heard)
+    acknowledged = arm.asked(arm.cycle.authority.stop, StopRequest(owner="ann"), arm.stamp * 1e-9).newest
+    arm.jog(0.3, joints=joint, owner="bob", acknowledged=acknowledged)
     arm.jog(0.3, joints=joint)
     assert arm.rests() and set(arm.refused) == {"stopped", "let_go"}
     arm.run(0.3)
-    arm.jog(0.3, joints=joint, heard=heard)
+    arm.jog(0.3, joints=joint, acknowledged=acknowledged)
     assert not arm.rests()
 
 
 def test_of_two_that_jog_the_first_does(arm):
     arm.jog(0.2, joints={arm.robot.joint_names[0]: 0.2})
-    with pytest.raises(Refused, match=r"the motion is ann's \(operator\)"):
+    with pytest.raises(Refused, match=r"the motion is owned by ann \(operator\)"):
         arm.asked(arm.cycle.jog, JogCommand(owner="bob", joints={arm.robot.joint_names[0]: -0.2}))
 
 
@@ -318,7 +318,7 @@ def test_what_is_given_back_in_a_motion_is_nobody_elses_before_that_has_ended(ar
     arm.own("give")
     arm.step()
     assert arm.cycle.goal == "one" and arm.owner == ("ann", "operator")
-    with pytest.raises(Refused, match=r"the motion is ann's \(operator\)"):
+    with pytest.raises(Refused, match=r"the motion is owned by ann \(operator\)"):
         arm.own(owner="bob")
     arm.run(3.0)
     assert arm.owner == ("", "none")
@@ -344,7 +344,7 @@ def test_a_lease_ends_when_its_owner_says_nothing_more_but_not_in_a_motion(arm):
 
 def test_it_is_not_taken_from_another_unless_that_is_said(arm):
     arm.own()
-    with pytest.raises(Refused, match=r"the motion is ann's \(operator\) since .*: take it over, if it must be"):
+    with pytest.raises(Refused, match=r"the motion is owned by ann \(operator\) since .*: take it over, if it must be"):
         arm.own(owner="bob")
     arm.own(owner="bob", over=True)
     assert arm.owner == ("bob", "operator")
@@ -359,8 +359,8 @@ def test_who_takes_over_from_a_task_stops_it_for_good(arm):
     arm.run(0.5)
     assert arm.rests() and arm.cycle.goal == ""
     assert arm.execute("two").error == "stopped"  # latched: it outlives the executor
-    assert arm.cycle._inhibits.record.inhibits[0].by == "ann"
-    assert arm.execute("three", "ann", heard=arm.stamp + 1).state == "active"
+    assert arm.cycle._interlocks.record.interlocks[0].by == "ann"
+    assert arm.execute("three", "ann", acknowledged=arm.stamp + 1).state == "active"
     arm.run(3.0)
     arm.asked(arm.cycle.authority.hold, HoldRequest(hold=False, owner="ann", stops=True))  # she starts the task
     assert arm.owner == ("", "none") and arm.own(owner="sorting", kind="task").owner == "sorting"
@@ -383,7 +383,7 @@ def test_motion_of_whom_a_start_takes_it_from_comes_to_rest_for_good(arm):
     assert arm.own(owner="sorting", kind="task").owner == "sorting"
     arm.run(0.5)
     assert arm.rests() and arm.cycle.goal == "" and arm.reports[-1].owner is None
-    assert arm.execute("one", "ann").state == "cancelled" and "one" in arm.cycle._inhibits.record.goals
+    assert arm.execute("one", "ann").state == "cancelled" and "one" in arm.cycle._interlocks.record.goals
     assert arm.execute("two").state == "active"
     arm.asked(arm.cycle.authority.hold, HoldRequest(hold=False, owner="bob", stops=True, override=True))
     arm.run(0.5)
@@ -394,9 +394,9 @@ def test_a_start_that_comes_after_a_later_stop_takes_it_from_nobody(arm):
     said = arm.stamp
     arm.run(0.1)
     arm.own(over=True)
-    arm.execute("one", "ann", heard=arm.stamp + 1)
+    arm.execute("one", "ann", acknowledged=arm.stamp + 1)
     arm.run(0.5)
-    late = HoldRequest(hold=False, owner="bob", stops=True, override=True, heard=said)
+    late = HoldRequest(hold=False, owner="bob", stops=True, override=True, acknowledged=said)
     arm.asked(arm.cycle.authority.hold, late, arm.stamp * 1e-9)
     arm.run(0.5)
     assert arm.owner == ("ann", "operator") and arm.cycle.goal == "one" and not arm.rests()
@@ -404,7 +404,7 @@ def test_a_start_that_comes_after_a_later_stop_takes_it_from_nobody(arm):
 
 
 def test_everybodys_start_takes_it_from_who_took_it_without_a_name(arm):
-    arm.own(owner="person")
+    arm.own(owner="operator")
     arm.asked(arm.cycle.authority.hold, HoldRequest(hold=False, owner="bob", stops=True))
     assert arm.owner == ("", "none") and arm.execute("one").state == "active"
 
@@ -413,12 +413,13 @@ def test_who_holds_the_arm_and_then_moves_it_does_not_take_it_from_who_has_it(ar
     hold = arm.cycle.authority.hold
     arm.own()
     arm.asked(hold, HoldRequest(hold=True, owner="bob"))
-    arm.asked(hold, HoldRequest(hold=False, owner="bob", into_stop=True, heard=arm.stamp + 1))
-    assert arm.owner == ("ann", "operator") and arm.execute("one", "bob", heard=arm.stamp + 1).error == "not_owner"
+    arm.asked(hold, HoldRequest(hold=False, owner="bob", into_stop=True, acknowledged=arm.stamp + 1))
+    assert arm.owner == ("ann", "operator")
+    assert arm.execute("one", "bob", acknowledged=arm.stamp + 1).error == "not_owner"
     arm.own("give")
     arm.own(owner="sorting", kind="task")
-    arm.asked(hold, HoldRequest(hold=False, owner="bob", into_stop=True, heard=arm.stamp + 1))
-    assert arm.execute("two", "bob", heard=arm.stamp + 1).state == "active", "a task has it through a pause only"
+    arm.asked(hold, HoldRequest(hold=False, owner="bob", into_stop=True, acknowledged=arm.stamp + 1))
+    assert arm.execute("two", "bob", acknowledged=arm.stamp + 1).state == "active", "a task has it through a pause only"
 
 
 def test_goal_that_was_refused_of_an_operator_and_is_asked_for_again_does_not_stop_the_task_that_was_started(arm):
@@ -431,7 +432,7 @@ def test_goal_that_was_refused_of_an_operator_and_is_asked_for_again_does_not_st
     arm.run(3.0)
     arm.own("give", "sorting")
     arm.own(owner="bob")
-    assert arm.execute("one").error == "not_owner" and not arm.cycle.authority.inhibits.all
+    assert arm.execute("one").error == "not_owner" and not arm.cycle.authority.interlocks.all
 
 
 def test_a_stop_and_a_hold_need_no_ownership_and_a_stop_ends_it(arm):

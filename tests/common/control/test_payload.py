@@ -5,8 +5,8 @@ import pytest
 
 from common.config import GripperConfig
 from common.control.cycle import ControlCycle
-from common.hardware.fingers import Fingers
 from common.hardware.interface import Limits
+from common.hardware.mock import SimulatedFingers
 from common.messages import ExecuteRequest, GripperCommand, Header, JointTrajectory
 from tests.doubles.stopping_arm import StoppingArm
 
@@ -18,7 +18,7 @@ LIMITS = Limits(("shoulder", "elbow"), -3 * TWO, 3 * TWO, 2 * TWO, 10 * TWO)
 class Rig:
     def __init__(self, **gripper: object) -> None:
         config = GripperConfig.model_validate({"joints": ["left", "right"], "links": [], **gripper})
-        self.fingers = Fingers(config, 0.08)
+        self.fingers = SimulatedFingers(config, 0.08)
         self.arm = StoppingArm(0 * TWO, self.fingers)
         self.cycle, self.now, self.notes = ControlCycle(self.arm, LIMITS, 0 * TWO, gripper=config), 10.0, []
         self.run()
@@ -80,7 +80,7 @@ def test_nothing_is_told_where_the_robot_file_says_nothing_and_a_refusal_is_said
 def test_what_came_to_nothing_is_told_again_after_a_motion(rest_to_rest):
     rig = Rig(payload=PAYLOAD)
     rig.fingers.obstruct(0.05)
-    rig.arm.refuses = "cannot be told while the arm moves"
+    rig.arm.refuses = "cannot be set while the arm moves"
     first = rig.told(0.0, expected_width=0.05, mass=0.3)
     rig.arm.refuses = ""
     assert len(first) == 1 and rig.run() == []

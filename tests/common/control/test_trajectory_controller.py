@@ -13,7 +13,7 @@ from common.control.goals import REMEMBERED, GoalMemory
 from common.control.trajectory import Trajectory
 from common.hardware.lag import LagHardware
 from common.hardware.mock import MockHardware
-from common.messages import Header, Inhibit, MotionStatus
+from common.messages import Header, Interlock, MotionStatus
 from tests.drivers.rig import START, STEP, T0, Rig
 from tests.harness import ROOT
 
@@ -107,9 +107,9 @@ def test_as_many_goals_are_remembered_as_the_docs_say():
 
 def test_old_goals_are_remembered_in_full_and_take_little_memory():
     def state(number):
-        inhibit = Inhibit(kind="held", by="anna", reason="an \u00e4rm\n", since=1_700_000_000_000_000_000 + number)
+        interlock = Interlock(kind="held", by="anna", reason="an \u00e4rm\n", since=1_700_000_000_000_000_000 + number)
         return MotionStatus(header=Header(stamp=number), id=f"{number}", state="aborted", progress=1 / 3,
-                            error="path_tolerance", message="joint 3", speed_scaling=0.1, inhibits=[inhibit])
+                            error="path_tolerance", message="joint 3", speed_scaling=0.1, interlocks=[interlock])
 
     memory = GoalMemory()
     tracemalloc.start()

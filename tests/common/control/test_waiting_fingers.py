@@ -11,9 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from common import messages as m
-from common.hardware.fingers import Fingers
 from common.hardware.interface import HardwareFault, Limits, Vector
-from common.hardware.mock import MockHardware
+from common.hardware.mock import MockHardware, SimulatedFingers
 from common.messages import GripperCommand, HoldRequest, StopRequest
 from tests.common.control.test_control_cycle import GRIPPER, START, Rig
 from tests.common.hardware.conftest import Make
@@ -27,7 +26,7 @@ WITHIN = 0.005  # [m]
 class LateArm(MockHardware):
     """At each set-point so much later [s]."""
 
-    def __init__(self, start: Vector, delay: float, gripper: Fingers) -> None:
+    def __init__(self, start: Vector, delay: float, gripper: SimulatedFingers) -> None:
         super().__init__(start, gripper)
         self._delay = delay
         self._sent = [(-math.inf, start, 0.0 * start)]
@@ -45,7 +44,7 @@ class Hand(Rig):
     """The hand above a ball, or with the ball in it and on its way somewhere else."""
 
     def __init__(self, limits: Limits, trajectory: Make, holding: bool, delay: float = 0.0) -> None:
-        super().__init__(limits, LateArm(START, delay, Fingers(GRIPPER, 0.08)))
+        super().__init__(limits, LateArm(START, delay, SimulatedFingers(GRIPPER, 0.08)))
         self.cycle._arm.delay = delay
         self.step()
         if holding:
@@ -151,19 +150,19 @@ def test_arm_that_is_slower_has_the_fingers_begin_later(taking: Callable[[], Han
 def test_held_arm_has_no_fingers_begin_and_goes_on_to_where_they_do(taking: Callable[[], Hand]) -> None:
     hand = taking()
     hand.until(lambda: hand.motion.progress > 0.5)
-    hand.cycle.authority.hold(HoldRequest(hold=True, by="person"), hand.now)
+    hand.cycle.authority.hold(HoldRequest(hold=True, by="operator"), hand.now)
     hand.run(5.0)
     assert hand.width == 0.08 and hand.gripper.id != "close"
-    hand.cycle.authority.hold(HoldRequest(hold=False, by="person"), hand.now)
+    hand.cycle.authority.hold(HoldRequest(hold=False, by="operator"), hand.now)
     hand.until(lambda: hand.gripper.state == "succeeded" and hand.gripper.id == "close")
     assert hand.gripper.outcome == "grasped" and hand.motion.state == "succeeded"
 
 
-@pytest.mark.parametrize("by", ["person", "requester"])
+@pytest.mark.parametrize("by", ["operator", "requester"])
 def test_stop_calls_off_fingers_that_wait(taking: Callable[[], Hand], by: str) -> None:
     hand = taking()
     hand.until(lambda: hand.motion.progress > 0.3)
-    hand.cycle.authority.stop(StopRequest(id="" if by == "person" else "go", by=by), hand.now)
+    hand.cycle.authority.stop(StopRequest(id="" if by == "operator" else "go", by=by), hand.now)
     hand.run(5.0)
     assert hand.width == 0.08 and hand.motion.state == "cancelled"
     assert (hand.grippers[-1].id, hand.grippers[-1].state) == ("close", "cancelled")
@@ -180,11 +179,11 @@ def test_stop_of_what_waits_lets_the_arm_arrive_without_it(taking: Callable[[], 
     assert hand.width == 0.08 and (hand.gripper.id, hand.gripper.state) == ("close", "cancelled")
 
 
-@pytest.mark.parametrize("by", ["person", "requester"])
+@pytest.mark.parametrize("by", ["operator", "requester"])
 def test_stop_as_the_fingers_close_is_told_of_as_a_stop(taking: Callable[[], Hand], by: str) -> None:
     hand = taking()
     hand.until(lambda: hand.gripper.id == "close")
-    hand.cycle.authority.stop(StopRequest(id="" if by == "person" else "go", by=by, reason="enough"), hand.now)
+    hand.cycle.authority.stop(StopRequest(id="" if by == "operator" else "go", by=by, reason="enough"), hand.now)
     hand.until(lambda: hand.motion.state != "active")
     assert (hand.motion.state, hand.motion.error, hand.motion.message) == ("cancelled", "cancelled", "enough")
 
@@ -250,7 +249,7 @@ def test_arm_does_not_go_on_down_with_fingers_that_closed_ahead_of_it(taking: Ca
     hand = taking()
     hand.until(lambda: hand.gripper.id == "close")
     if how == "held":
-        hand.cycle.authority.hold(HoldRequest(hold=True, by="person"), hand.now)
+        hand.cycle.authority.hold(HoldRequest(hold=True, by="operator"), hand.now)
     elif how == "slowed":
         hand.cycle.speed_scaling = 0.1
     else:
@@ -259,7 +258,7 @@ def test_arm_does_not_go_on_down_with_fingers_that_closed_ahead_of_it(taking: Ca
     before = hand.height
     assert (hand.motion.state, hand.motion.error) == ("aborted", m.CLOSED_BEFORE)
     hand.cycle.speed_scaling = 1.0
-    hand.cycle.authority.hold(HoldRequest(hold=False, by="person"), hand.now)
+    hand.cycle.authority.hold(HoldRequest(hold=False, by="operator"), hand.now)
     hand.run(3.0)
     assert hand.height == pytest.approx(before, abs=1e-3) and hand.gripper.state != "active"
 
@@ -270,10 +269,10 @@ def test_arm_does_not_go_on_down_with_fingers_that_were_to_close_on_whatever_is_
     hand = taking()
     hand.command("whatever", width=0.0, lead=CLOSE, within=0.05)
     hand.until(lambda: hand.gripper.id == "whatever")
-    hand.cycle.authority.hold(HoldRequest(hold=True, by="person"), hand.now)
+    hand.cycle.authority.hold(HoldRequest(hold=True, by="operator"), hand.now)
     hand.run(1.0)
     before = hand.height
-    hand.cycle.authority.hold(HoldRequest(hold=False, by="person"), hand.now)
+    hand.cycle.authority.hold(HoldRequest(hold=False, by="operator"), hand.now)
     hand.run(1.0)
     assert hand.motion.error == m.CLOSED_BEFORE and hand.height == pytest.approx(before, abs=1e-3)
 
@@ -281,9 +280,9 @@ def test_arm_does_not_go_on_down_with_fingers_that_were_to_close_on_whatever_is_
 def test_arm_that_is_held_as_it_lets_go_still_arrives(carrying: Callable[[], Hand]) -> None:
     hand = carrying()
     hand.until(lambda: hand.gripper.id == "open")
-    hand.cycle.authority.hold(HoldRequest(hold=True, by="person"), hand.now)
+    hand.cycle.authority.hold(HoldRequest(hold=True, by="operator"), hand.now)
     hand.run(1.0)
-    hand.cycle.authority.hold(HoldRequest(hold=False, by="person"), hand.now)
+    hand.cycle.authority.hold(HoldRequest(hold=False, by="operator"), hand.now)
     hand.until(lambda: hand.motion.state == "succeeded")
 
 

@@ -83,10 +83,10 @@ def test_lag_is_first_order_whatever_the_steps(limits: Limits) -> None:
 def test_arm_of_a_world_takes_the_place_of_mock_alone(limits: Limits) -> None:
     arm: object = object()
     assert load_hardware(robot("mock"), limits, START, lambda: arm) is arm  # type: ignore[arg-type,return-value]
-    with pytest.raises(ConfigError, match=r"'lag' moves the joints itself.*use mock here, or kinematic there"):
+    with pytest.raises(ConfigError, match=r"'lag' moves the joints itself.*set mock here, or kinematic there"):
         load_hardware(robot("lag"), limits, START, lambda: arm)  # type: ignore[arg-type,return-value]
 
 
 def test_world_in_the_place_of_a_backend_says_where_it_is_named() -> None:
-    with pytest.raises(ConfigError, match=r"leave the backend at mock and say world\.simulator: mujoco in the cell"):
+    with pytest.raises(ConfigError, match=r"leave the backend at mock and set world\.simulator: mujoco in the cell"):
         find_backend(robot("mujoco"))

@@ -113,7 +113,7 @@ def test_gripper_that_goes_away_is_a_fault_and_is_found_again() -> None:
     with RobotiqHost() as host:
         driven = Driven(DrivenGripper("drivers.robotiq", options(host), CONFIG, name="a 2f85"))
         assert driven.told("first", 0.02).state == "succeeded"
-    driven.until(lambda _: "the gripper's program is gone" in driven.problem)
+    driven.until(lambda _: "the gripper's program has closed the connection" in driven.problem)
     driven.until(lambda _: "refused" in driven.problem)
     with RobotiqHost(host.port) as again:
         driven.until(lambda _: not driven.problem)

@@ -4,18 +4,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from common.config import GripperConfig
-from common.hardware.fingers import Fingers
+from common.hardware.mock import SimulatedFingers
 
 CONFIG = GripperConfig(joints=["left", "right"], links=[])
 WIDTHS = st.floats(0.0, 0.08)
 
 
-def read(fingers: Fingers, start: float, end: float, step: float = 0.005) -> list[float]:
+def read(fingers: SimulatedFingers, start: float, end: float, step: float = 0.005) -> list[float]:
     return [fingers.read(float(t)).width for t in np.arange(start, end, step)]
 
 
 def test_fingers_close_smoothly_and_stop_at_the_width() -> None:
-    fingers = Fingers(CONFIG, 0.08)
+    fingers = SimulatedFingers(CONFIG, 0.08)
     fingers.command(0.02, 10.0)
     widths = read(fingers, 10.0, 12.0)
     assert widths == sorted(widths, reverse=True) and widths[-1] == 0.02
@@ -26,7 +26,7 @@ def test_fingers_close_smoothly_and_stop_at_the_width() -> None:
 
 @given(st.lists(st.tuples(WIDTHS, st.floats(0.0, 0.5)), min_size=1, max_size=6))
 def test_commands_on_the_way_never_break_limits_and_the_last_is_reached(commands: list[tuple[float, float]]) -> None:
-    fingers, now, before = Fingers(CONFIG, 0.08), 0.0, 0.08
+    fingers, now, before = SimulatedFingers(CONFIG, 0.08), 0.0, 0.08
     for width, wait in [*commands, (commands[-1][0], 2.0)]:
         fingers.command(width, now)
         for _ in range(int(wait / 0.01)):
@@ -40,7 +40,7 @@ def test_commands_on_the_way_never_break_limits_and_the_last_is_reached(commands
 
 @given(obstruction=st.floats(0.01, 0.07), step=st.floats(0.002, 0.3))
 def test_fingers_stop_at_what_is_between_them_and_hold_it(obstruction: float, step: float) -> None:
-    fingers = Fingers(CONFIG, 0.08)
+    fingers = SimulatedFingers(CONFIG, 0.08)
     fingers.command(0.0, 0.0)
     fingers.obstruct(obstruction)
     assert min(read(fingers, 0.0, 2.0, step)) >= obstruction
@@ -49,7 +49,7 @@ def test_fingers_stop_at_what_is_between_them_and_hold_it(obstruction: float, st
 
 
 def test_fingers_that_lose_what_they_hold_close_on() -> None:
-    fingers = Fingers(CONFIG, 0.08)
+    fingers = SimulatedFingers(CONFIG, 0.08)
     fingers.command(0.0, 0.0)
     fingers.obstruct(0.06)
     fingers.read(2.0)
@@ -59,7 +59,7 @@ def test_fingers_that_lose_what_they_hold_close_on() -> None:
 
 
 def test_opening_lets_go() -> None:
-    fingers = Fingers(CONFIG, 0.08)
+    fingers = SimulatedFingers(CONFIG, 0.08)
     fingers.command(0.0, 0.0)
     fingers.obstruct(0.06)
     fingers.read(2.0)
@@ -69,7 +69,7 @@ def test_opening_lets_go() -> None:
 
 
 def test_second_close_command_keeps_the_hold() -> None:
-    fingers = Fingers(CONFIG, 0.08)
+    fingers = SimulatedFingers(CONFIG, 0.08)
     fingers.command(0.0, 0.0)
     fingers.obstruct(0.06)
     fingers.read(2.0)
@@ -78,14 +78,14 @@ def test_second_close_command_keeps_the_hold() -> None:
 
 
 def test_fingers_told_to_be_where_they_are_do_not_move() -> None:
-    fingers = Fingers(CONFIG, 0.08)
+    fingers = SimulatedFingers(CONFIG, 0.08)
     fingers.command(0.08, 0.0)
     assert not fingers.read(0.0).moving
 
 
 @given(WIDTHS, WIDTHS)
 def test_fingers_are_never_faster_than_their_least_time(start: float, end: float) -> None:
-    fingers, least = Fingers(CONFIG, start), CONFIG.least_time(abs(end - start))
+    fingers, least = SimulatedFingers(CONFIG, start), CONFIG.least_time(abs(end - start))
     fingers.command(end, 0.0)
     for share in (0.25, 0.5, 0.75):
         moved = abs(fingers.read(CONFIG.least_time(share * abs(end - start))).width - start)

@@ -12,8 +12,8 @@ import pytest
 from common.config import CameraConfig, Surroundings
 from common.messages import Color, Pose, Quaternion, Vector3, WorldObject
 from common.perception import boxes
-from common.perception.boxes import BoxDetector, BoxKind, BoxOptions, SeenBox
-from common.perception.intake import Unusable
+from common.perception.boxes import BoxDetector, BoxKind, BoxOptions, DetectedBox
+from common.perception.camera_input import FrameError
 from common.perception.pinhole import Pinhole
 from common.sim.rendering import Renderer
 
@@ -34,9 +34,9 @@ def cube(name: str, x: float, y: float, z: float = SIDE / 2, yaw: float = 0.0, s
     )
 
 
-def seen(*cubes: WorldObject, **options: object) -> list[SeenBox]:
+def seen(*cubes: WorldObject, **options: object) -> list[DetectedBox]:
     view = Renderer(AROUND)
-    shown = view.see(list(cubes))
+    shown = view.render(list(cubes))
     detector = BoxDetector(BoxOptions.model_validate({"kinds": KINDS, **options}))
     return detector.detect(shown.colour, np.asarray(shown.depth, np.float32), view.camera)
 
@@ -82,7 +82,7 @@ def test_a_cube_that_another_one_hides_in_part_is_left_out() -> None:
 def test_colours_that_nobody_asked_for_and_pictures_without_depth_show_nothing() -> None:
     assert seen(cube("red", 0.5, 0.0), kinds={"green": KINDS["green"]}) == []
     view = Renderer(AROUND)
-    shown = view.see([cube("red", 0.5, 0.0)])
+    shown = view.render([cube("red", 0.5, 0.0)])
     nothing = np.full(np.shape(shown.depth), np.nan, np.float32)
     assert BoxDetector(BoxOptions(kinds=KINDS)).detect(shown.colour, nothing, view.camera) == []
 
@@ -100,7 +100,7 @@ def test_in_a_picture_full_of_noise_a_cube_is_found_and_specks_are_not_looked_in
     faces = boxes._faces
     monkeypatch.setattr(boxes, "_faces", counted)
     view = Renderer(AROUND)
-    shown = view.see([cube("red", 0.45, -0.15)])
+    shown = view.render([cube("red", 0.45, -0.15)])
     picture = shown.colour.copy()
     picture[::3, ::3][(shown.colour[::3, ::3, 2] < 150)] = (25, 25, 230)
     found = BoxDetector(BoxOptions(kinds=KINDS)).detect(picture, np.asarray(shown.depth, np.float32), view.camera)
@@ -110,6 +110,6 @@ def test_in_a_picture_full_of_noise_a_cube_is_found_and_specks_are_not_looked_in
 def test_camera_that_none_can_be_shows_no_boxes_and_says_so() -> None:
     camera = Pinhole(1e-300, 50.0, 1e5, 24.0, 64, 48, np.eye(4))
     picture, depth = np.full((48, 64, 3), (25, 25, 230), np.uint8), np.full((48, 64), 1.0, np.float32)
-    with pytest.raises(Unusable, match=r"more than 1e\+07 m away"):
+    with pytest.raises(FrameError, match=r"more than 1e\+07 m away"):
         BoxDetector(BoxOptions(kinds={"red": BoxKind(color=(0.9, 0.1, 0.1), size=(0.04, 0.04, 0.04))})).detect(
             picture, depth, camera)

@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 
 from common.messages import Header
+from common.perception.camera_input import FrameError, decode_color_image
 from common.perception.depth import DepthError, Rays, check_depth, depth_of, point_cloud
 from common.perception.image import array_to_image
-from common.perception.intake import Unusable, colour_picture
 from tests.applications.outlining.outline_scenes import seen_world
 
 HEADER = Header(frame_id="camera")
@@ -19,13 +19,13 @@ def test_depth_in_metres_and_in_millimetres_is_the_same():
 
 def test_what_is_no_depth_image_is_refused():
     picture = array_to_image(np.zeros((2, 2, 3), np.uint8), "bgr8", HEADER)
-    with pytest.raises(Unusable, match="'bgr8' is no depth image; choices: 32FC1, 16UC1"):
+    with pytest.raises(FrameError, match="'bgr8' is no depth image; choices: 32FC1, 16UC1"):
         depth_of(picture)
     depth = array_to_image(np.zeros((2, 2), np.float32), "32FC1", HEADER)
-    with pytest.raises(Unusable, match="too few"):
+    with pytest.raises(FrameError, match="too few"):
         depth_of(depth.model_copy(update={"data": b"abc"}))
-    with pytest.raises(Unusable, match="is no colour picture"):
-        colour_picture(depth)
+    with pytest.raises(FrameError, match="is no colour picture"):
+        decode_color_image(depth)
 
 
 def test_sizes_and_a_depth_image_without_depth_are_told():

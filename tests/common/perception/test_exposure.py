@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from common.config import Surroundings, load_cell
-from common.perception.exposure import blindness
+from common.perception.illumination import blank_image_reason
 from common.perception.pinhole import Pinhole
-from common.sim.rendering import Renderer, disturbed
+from common.sim.rendering import Renderer, add_image_noise
 
 AROUND = load_cell("panda").section(Surroundings)
 assert isinstance(AROUND, Surroundings)
@@ -17,10 +17,10 @@ CAMERA = Pinhole.from_config(AROUND.camera)
 
 @pytest.mark.parametrize("plain", [True, False])
 def test_an_empty_table_shows_something_also_in_little_light_and_noise(plain: bool) -> None:
-    picture = Renderer(AROUND, plain=plain, camera=CAMERA).see([]).colour
+    picture = Renderer(AROUND, plain=plain, camera=CAMERA).render([]).colour
     dim = (picture * 0.3).astype(np.uint8)
-    for shown in (picture, dim, disturbed(dim, 8.0, 0.0, np.random.default_rng(1))):
-        assert blindness(shown) == ""
+    for shown in (picture, dim, add_image_noise(dim, 8.0, 0.0, np.random.default_rng(1))):
+        assert blank_image_reason(shown) == ""
 
 
 @pytest.mark.parametrize(("level", "why"), [(0, "dark"), (4, "dark"), (255, "white"), (90, "one colour")])
@@ -29,4 +29,4 @@ def test_a_covered_or_blinded_camera_shows_nothing(level: int, why: str, noise: 
     covered = np.full((480, 640, 3), level, np.uint8)
     covered[100, 100] = 255  # a hot pixel
     if not (noise and why == "white"):
-        assert why in blindness(disturbed(covered, noise, 0.0, np.random.default_rng(1)))
+        assert why in blank_image_reason(add_image_noise(covered, noise, 0.0, np.random.default_rng(1)))

@@ -8,7 +8,7 @@ import pytest
 
 from common.config import Surroundings, load_cell
 from common.messages import Header, JointState
-from common.perception.occlusion import BY_ROBOT, MARGIN, Hidden, RobotBefore, Silhouettes
+from common.perception.occlusion import BY_ROBOT, MARGIN, Occlusion, RobotOcclusion, RobotSilhouettes
 from common.perception.pinhole import Pinhole
 from common.robot.model import RobotModel
 from common.sim.rendering import Renderer
@@ -27,12 +27,12 @@ def robot() -> RobotModel:
 
 @pytest.mark.parametrize("camera", [ABOVE, SIDE], ids=["above", "side"])
 def test_whatever_is_drawn_of_the_arm_is_hidden_and_little_more(robot: RobotModel, camera: Pinhole) -> None:
-    silhouettes, rng = Silhouettes(robot), np.random.default_rng(1)
+    silhouettes, rng = RobotSilhouettes(robot), np.random.default_rng(1)
     renderer, empty = (Renderer(AROUND, one, plain=True, camera=camera) for one in (robot, None))
     for _ in range(4):
         q = robot.named("home") + rng.uniform(-0.6, 0.6, 7)
         state = JointState(header=Header(), name=list(robot.joint_names), position=q.tolist(), velocity=[], effort=[])
-        arm = (renderer.see([], state).colour != empty.see([]).colour).any(axis=2)
+        arm = (renderer.render([], state).colour != empty.render([]).colour).any(axis=2)
         hidden = silhouettes.hidden(camera, [q])
         assert hidden.away is not None
         mask = cv2.resize((hidden.away <= MARGIN).astype(np.uint8), (camera.width, camera.height), interpolation=0) > 0
@@ -41,7 +41,7 @@ def test_whatever_is_drawn_of_the_arm_is_hidden_and_little_more(robot: RobotMode
 
 
 def test_places_below_the_hand_or_out_of_the_picture_are_hidden_and_others_are_not(robot: RobotModel) -> None:
-    hidden = Silhouettes(robot).hidden(ABOVE, [robot.named("home")])
+    hidden = RobotSilhouettes(robot).hidden(ABOVE, [robot.named("home")])
     below, clear, outside = (0.15, 0.0, 0.03), (0.6, 0.1, 0.03), (0.4, 0.6, 0.03)
     assert hidden.hides([below, clear, outside], 0.03).tolist() == [True, False, True]
     assert hidden.touches([below, clear, outside], 0.03).tolist() == [True, False, False]
@@ -53,16 +53,16 @@ def test_a_camera_that_looks_away_from_the_arm_sees_none_of_it(robot: RobotModel
     away = Pinhole(ABOVE.fx, ABOVE.fy, ABOVE.cx, ABOVE.cy, 640, 480, ABOVE.T_world_optical + np.array(
         [[0, 0, 0, 0.3], [0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0]]))
     places = [(0.7, y, 0.03) for y in np.linspace(-0.3, 0.3, 9)]
-    assert not Silhouettes(robot).hidden(away, [q]).hides(places, 0.03).any()
+    assert not RobotSilhouettes(robot).hidden(away, [q]).hides(places, 0.03).any()
 
 
 def test_a_picture_of_which_nothing_can_be_judged_hides_everything() -> None:
-    blind = Hidden(ABOVE, "the lens is covered")
+    blind = Occlusion(ABOVE, "the lens is covered")
     assert blind.everything and blind.hides([(0.4, 0.0, 0.03)])[0] and blind.touches([(0.4, 0.0, 0.03)])[0]
 
 
 def test_what_the_arm_swept_since_the_picture_is_hidden_until_one_is_taken_after_it_stands(robot: RobotModel) -> None:
-    before, home = RobotBefore(Silhouettes(robot)), robot.named("home")
+    before, home = RobotOcclusion(RobotSilhouettes(robot)), robot.named("home")
     turned = home + np.array([1.2, 0, 0, 0, 0, 0, 0])
     below = [(0.15, 0.0, 0.03)]
     first = before.in_picture(ABOVE, 100, home, 100)
@@ -74,4 +74,4 @@ def test_what_the_arm_swept_since_the_picture_is_hidden_until_one_is_taken_after
 
 
 def test_nothing_is_said_as_long_as_nobody_knows_where_the_arm_is(robot: RobotModel) -> None:
-    assert RobotBefore(Silhouettes(robot)).in_picture(ABOVE, 1, None, 0) is None
+    assert RobotOcclusion(RobotSilhouettes(robot)).in_picture(ABOVE, 1, None, 0) is None

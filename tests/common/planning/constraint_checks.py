@@ -23,8 +23,7 @@ from common.messages import (
 )
 from common.planning.collision import CollisionWorld
 from common.planning.ik import solve_ik
-from common.planning.retiming import sample
-from common.planning.validation import timed_path
+from common.planning.trajectory import sample, timed_path
 from common.robot.model import RobotModel
 from common.robot.transforms import tool_down, transform
 

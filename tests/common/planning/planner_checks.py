@@ -7,8 +7,8 @@ import numpy as np
 from common.config import Pipeline
 from common.messages import PlanningScene, PlanRequest, PlanResponse
 from common.planning.pipeline import PlanningPipeline
-from common.planning.retiming import TimedPath
-from common.planning.validation import fine_samples, timed_path
+from common.planning.trajectory import TimedPath, timed_path
+from common.planning.validation import fine_samples
 from tests.common.planning.planning_scenes import CELL, ROBOT, SPREAD, above, scene, solid
 
 AROUND = scene(SPREAD)

@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from common.messages import ArcGoal, PlanRequest, Pose, Vector3
-from common.planning.arcs import NoArc, circle_about, circle_through
+from common.planning.planners.circ import NoArc, circle_about, circle_through
 from common.planning.validation import fine_samples
 from common.robot.transforms import matrix_to_pose, tool_down
 from tests.common.planning.planner_checks import RIGHT, assert_sound, with_planner

@@ -9,7 +9,8 @@ from common.errors import Refused
 from common.hardware.interface import Limits
 from common.planning.pipeline import PlanningPipeline
 from common.planning.planners import planner_names
-from common.planning.validation import timed_path, validate
+from common.planning.trajectory import timed_path
+from common.planning.validation import validate
 from common.robot.transforms import tool_down
 from tests.common.planning.planning_scenes import CELL, HOME, ROBOT, SPREAD, above, scene, to_joints, to_pose
 

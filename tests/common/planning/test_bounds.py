@@ -11,7 +11,8 @@ from common.messages.planning import PlanRequest, PlanResponse
 from common.messages.robot import MOST_POINTS
 from common.planning.path import dense_path
 from common.planning.pipeline import PlanningPipeline
-from common.planning.retiming import TimedPath, TooLong, parametrise, require_tellable
+from common.planning.retiming import parametrise
+from common.planning.trajectory import TimedPath, TooLong, require_sendable
 from common.robot.transforms import matrix_to_pose
 from tests.common.planning.planning_scenes import CELL, HOME, ROBOT, scene
 
@@ -63,14 +64,14 @@ def test_a_way_in_too_many_steps_is_refused_before_one_is_made() -> None:
     place = HERE.position
     there = Pose(position=Vector3(x=place.x - 0.1, y=place.y, z=place.z), orientation=HERE.orientation)
     refused = answer(PathGoal(waypoints=[HERE, there], step=1e-7))
-    assert refused.error == "too_long" and "1e+06 steps of the tool, 25000 are the most" in refused.message
+    assert refused.error == "too_long" and "1e+06 steps of the tool; the limit is 25000" in refused.message
 
 
 def test_steps_finer_than_joint_positions_are_solved_are_refused() -> None:
     place = HERE.position
     there = Pose(position=Vector3(x=place.x - 0.005, y=place.y, z=place.z), orientation=HERE.orientation)
     refused = answer(PathGoal(waypoints=[HERE, there], step=5e-6))
-    assert refused.error == "retiming_failed" and "finer than joint positions are solved" in refused.message
+    assert refused.error == "retiming_failed" and "finer than IK resolves joint positions" in refused.message
 
 
 def test_an_arc_that_goes_round_a_star_is_refused() -> None:
@@ -83,7 +84,7 @@ def test_an_arc_that_goes_round_a_star_is_refused() -> None:
 
 def test_a_path_is_timed_within_the_time_and_the_states_that_there_are() -> None:
     path = dense_path(np.linspace(0, 1, 100)[:, None] * np.ones((1, 3)))
-    with pytest.raises(TooLong, match="planning was ended while the path was timed") as late:
+    with pytest.raises(TooLong, match="planning ended while the path was timed") as late:
         parametrise(path, np.ones(3), np.ones(3), deadline=0.0)
     assert late.value.code == "timeout"
     with pytest.raises(TooLong, match=f"a trajectory has {MOST_POINTS} at most") as long:
@@ -95,4 +96,4 @@ def test_a_path_is_timed_within_the_time_and_the_states_that_there_are() -> None
 def test_what_could_not_be_sent_is_no_answer(states: int, duration: float) -> None:
     rest = np.zeros((states, 7))
     with pytest.raises(TooLong, match="states and takes"):
-        require_tellable(TimedPath(np.linspace(0, duration, states), rest, rest, rest))
+        require_sendable(TimedPath(np.linspace(0, duration, states), rest, rest, rest))

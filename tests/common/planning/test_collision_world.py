@@ -6,7 +6,6 @@ from hypothesis import strategies as st
 from common.errors import UnknownName
 from common.messages import PlanningScene
 from common.planning.collision import CollisionWorld, interpolate
-from common.planning.kernel.library import library
 from common.planning.obstacles import ObstacleCache
 from tests.common.planning.planning_scenes import (
     BLOCK,
@@ -142,14 +141,6 @@ def test_contact_at_the_start_ends_after_the_contact_distance():
     assert lifted.colliding_pair(dragged) == ("ball_0", "table")
 
 
-@pytest.fixture(params=["kernel", "coal"])
-def _either(request, monkeypatch):
-    if request.param == "coal":
-        monkeypatch.setattr("common.planning.obstacles.ObstacleBank.kernel", lambda _: None)
-    elif library() is None:
-        pytest.skip("the planning kernel is not built")
-
-
 def blocked(world, *ends):
     """What each way of asking says of a straight edge; they agree."""
     path = interpolate(ends, 0.005)
@@ -158,7 +149,7 @@ def blocked(world, *ends):
     return None if hit is None else hit.pair
 
 
-@pytest.mark.usefixtures("_either")
+@pytest.mark.usefixtures("backend")
 @pytest.mark.parametrize("overlap", [0.002, 0.0, -0.0005])
 def test_what_is_held_goes_no_deeper_into_what_it_touches_at_the_start(overlap):
     grasp = above(0.50, -0.10, 0.03)
@@ -171,7 +162,7 @@ def test_what_is_held_goes_no_deeper_into_what_it_touches_at_the_start(overlap):
     assert held.colliding_pair(above(0.50, -0.10, 0.029)) == ("ball_0", "table")
 
 
-@pytest.mark.usefixtures("_either")
+@pytest.mark.usefixtures("backend")
 def test_turning_what_is_held_is_motion_too():
     grasp = above(0.50, 0.0, 0.2)
     things = scene(box=False)

@@ -20,12 +20,13 @@ from common.messages import (
     Vector3,
 )
 from common.planning.collision import CollisionWorld
-from common.planning.constraints import CHECKED, PLANNED, ToolConstraints, line
-from common.planning.joint_goals import line as steps_to
-from common.planning.kernel.planner import find_path
+from common.planning.constraints import PLANNING_SHARES, VALIDATION_SHARES, ToolConstraints, edge_cubic
+from common.planning.joint_paths import line as steps_to
+from common.planning.kernel.solvers import find_path
 from common.planning.pipeline import PlanningPipeline
 from common.planning.problem import Cancel, Result
-from common.planning.validation import fine_samples, timed_path
+from common.planning.trajectory import timed_path
+from common.planning.validation import fine_samples
 from common.robot.transforms import matrix_to_pose, rpy_to_matrix, tool_down, transform
 from common.transport.codec import decode, encode
 from tests.common.planning import ur5_scene
@@ -174,31 +175,31 @@ def test_what_is_proved_along_a_curve_holds_at_every_place_of_it(number, compile
         )
         constraints = ToolConstraints(robot, wanted, q)
         if compiled:
-            constraints.hand_to(kernel)
+            constraints.attach_to_kernel(kernel)
         cubic = np.stack([q, *rng.normal(0, rng.choice([0.01, 0.1, 0.3]), (3, robot.dof))])
-        for pieces in (line(q, cubic.sum(axis=0)), cubic[None]):
+        for pieces in (edge_cubic(q, cubic.sum(axis=0)), cubic[None]):
             c = pieces[0]
-            wrong = [constraints.wrong_at(np.array([1, t, t**2, t**3]) @ c, 1.0) for t in np.linspace(0, 1, 200)]
-            for shares in (PLANNED, CHECKED):
-                found = constraints.first_break(pieces, shares)
+            wrong = [constraints.state_violation(np.array([1, t, t**2, t**3]) @ c, 1.0) for t in np.linspace(0, 1, 200)]
+            for shares in (PLANNING_SHARES, VALIDATION_SHARES):
+                found = constraints.first_violation(pieces, shares)
                 if found is None:
                     held += 1
                     assert not any(wrong)
                 else:
                     broken += 1
                     t = found[1]
-                    assert constraints.wrong_at(np.array([1, t, t**2, t**3]) @ c, 0.0)
+                    assert constraints.state_violation(np.array([1, t, t**2, t**3]) @ c, 0.0)
     assert held > 15 and broken > 15
 
 
 def test_upright_may_be_how_the_tool_stands_at_the_start():
     on_its_side = transform(rpy_to_matrix(np.pi / 2, 0.0, 0.0), (0.5, -0.1, 0.4))
     constraints = ToolConstraints(ROBOT, upright(0.1, upright_at_start=True), HOME)
-    assert constraints.wrong_at(HOME) == ""
-    assert constraints.wrong_with(on_its_side)
+    assert constraints.state_violation(HOME) == ""
+    assert constraints.pose_violation(on_its_side)
     leaning = ToolConstraints(ROBOT, upright(0.1, tool_axis=Vector3(y=-2.0), axis=Vector3(z=-5.0)), HOME)
-    assert leaning.wrong_with(on_its_side) == ""
-    assert "tilted by 1.57" in leaning.wrong_at(HOME)
+    assert leaning.pose_violation(on_its_side) == ""
+    assert "tilted by 1.57" in leaning.state_violation(HOME)
 
 
 def test_of_several_goals_one_that_keeps_the_tool_upright_is_taken_else_each_is_told():
@@ -238,7 +239,7 @@ def test_tool_is_never_faster_than_asked_and_as_fast_where_it_may(planner, goal,
     free = driven(ROBOT, PIPELINE.plan(request.model_copy(update={"constraints": None}), EMPTY))
     if free.speeds.max() > speed:
         assert way.speeds.max() > 0.9 * speed
-    if planner in ("rrt_connect", "lerp", "lin") and speed < 0.1:  # slowed only where it is too fast
+    if planner in ("rrt_connect", "lerp", "lin") and speed < 0.1:  # limit_tool_speed only where it is too fast
         length = np.linalg.norm(np.diff(way.places, axis=0), axis=1).sum()
         assert len(way.speeds) * 1e-3 < 1.1 * length / speed + 0.5
 
@@ -278,7 +279,7 @@ def test_way_that_is_not_there_is_looked_for_no_longer_than_asked():
     response = PIPELINE.plan(request, over)
     assert response.error in ("timeout", "no_path")
     assert response.seconds < 0.6
-    why = "found no path that keeps to the constraints; on the straight edge, panda_link5 collides with wall"
+    why = "found no path that satisfies the constraints; on the straight edge, panda_link5 collides with wall"
     assert response.message == f"rrt_connect: RRT-Connect {why}"
     assert response.attempts[-1].message == why
     cancel = Cancel()
@@ -299,8 +300,8 @@ def test_what_one_request_keeps_to_binds_no_other():
     ("place", "why"),
     [
         ((0.05, 0.0, 0.1), "panda_joint4 would be at -3.45, not in -3.07 to -0.07 rad"),
-        ((0.9, 0.0, 0.1), "can be reached: the arm does not get there"),
-        ((1.4, 0.0, 0.1), "it is 1.42 m from the first joint, 1."),
+        ((0.9, 0.0, 0.1), "can be reached: the arm cannot reach it"),
+        ((1.4, 0.0, 0.1), "it is 1.42 m from the first joint; the arm reaches 1."),
     ],
 )
 def test_pose_without_a_solution_is_told_with_what_keeps_the_arm_from_it(place, why):

@@ -5,7 +5,7 @@ import pinocchio as pin
 import pytest
 
 from common.config import RobotConfig, load_cell
-from common.planning.disabled_collisions import disabled_pairs, sampled, srdf
+from common.planning.disabled_collisions import disabled_pairs, sample_configurations, srdf
 from common.planning.robot_geometry import RobotGeometry, convex_hulls
 from common.robot.model import RobotModel
 from tests.common.planning.ur5_scene import ROBOT
@@ -43,7 +43,7 @@ def test_pairs_called_never_do_not_collide_at_other_samples(robot):
             if frozenset((one, names[j])) in never:
                 geometry.addCollisionPair(pin.CollisionPair(j, i))
     data, shapes = robot.full_model.createData(), pin.GeometryData(geometry)
-    for q in sampled(robot, 3000, np.random.default_rng(11)):
+    for q in sample_configurations(robot, 3000, np.random.default_rng(11)):
         assert not pin.computeCollisions(robot.full_model, data, geometry, shapes, q, True)
 
 

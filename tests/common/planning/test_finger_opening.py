@@ -11,14 +11,14 @@ from hypothesis import strategies as st
 
 from common.config import load_cell
 from common.messages import Header, JointState, PlanRequest
+from common.planning.camera_obstacles import JointHistory
 from common.planning.collision import CollisionWorld, interpolate
-from common.planning.kernel import world as kernel_world
 from common.planning.obstacles import ObstacleCache
 from common.planning.pipeline import PlanningPipeline
-from common.planning.points import KnownShapes, View
+from common.planning.point_obstacles import CameraView, KnownShapeFilter
 from common.planning.robot_geometry import RobotGeometry, convex_hulls
-from common.planning.seeing import JointHistory
-from common.planning.validation import fine_samples, timed_path
+from common.planning.trajectory import timed_path
+from common.planning.validation import fine_samples
 from common.robot.finger_joints import finger_positions, measured_width
 from common.robot.model import RobotModel
 from common.robot.transforms import pose_to_matrix
@@ -67,13 +67,8 @@ class Judge:
         return False
 
 
-@pytest.fixture(params=["kernel", "coal"])
-def pipeline(request, monkeypatch):
-    if request.param == "coal":
-        def none(*arguments, **options):
-            raise kernel_world.NoKernel("not here")
-
-        monkeypatch.setattr("common.planning.obstacles.KernelWorld", none)
+@pytest.fixture
+def pipeline(backend):
     return PlanningPipeline(ROBOT, CELL.motion, CELL.pipeline)
 
 
@@ -164,7 +159,7 @@ def test_home_is_free_at_any_opening_of_both_robots():
 
 
 def test_points_on_the_fingers_as_they_stand_are_the_robots_own():
-    known, judge = KnownShapes(HULLS["ur5"]), Judge(UR5, GAP, UR5.config.gripper.max_width)
+    known, judge = KnownShapeFilter(HULLS["ur5"]), Judge(UR5, GAP, UR5.config.gripper.max_width)
     home = UR5.named("home")
     judge.place(home)
     links = [judge.model.frames[item.parentFrame].name for item in judge.hulls.geometryObjects]
@@ -174,12 +169,12 @@ def test_points_on_the_fingers_as_they_stand_are_the_robots_own():
     given = {"margin": 0.005, "object_margin": 0.0}
     assert known.mask(nothing, home, tips, width=0.085, **given).all()
     assert not known.mask(nothing, home, tips, **given).any(), "the robot file holds them closed"
-    view = View("camera", tips, home, 0.085)
+    view = CameraView("camera", tips, home, 0.085)
     assert not len(known.obstacle(view, nothing, margin=0.005, object_margin=0.0).spheres)
     history = JointHistory(UR5)
     names, gripper = [*UR5.joint_names, *UR5.config.gripper.joints], UR5.config.gripper
     for stamp, width in ((10**9, 0.0), (2 * 10**9, 0.085), (2 * 10**9 + 10**7, 0.04)):
-        history.note(JointState(header=Header(stamp=stamp), name=names,
+        history.add(JointState(header=Header(stamp=stamp), name=names,
                                 position=[*home, *finger_positions(gripper, width)]))
     assert history.width(10**9) == pytest.approx(0.0, abs=1e-9) and history.width(3 * 10**9) is None
     assert history.width(2 * 10**9 + 5 * 10**6) == pytest.approx(0.085)

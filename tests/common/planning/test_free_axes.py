@@ -11,8 +11,14 @@ import pytest
 from common.config import Grasp, RobotConfig, check, load_cell
 from common.messages import Header, PlanningScene, PlanRequest, PoseGoal
 from common.planning.disabled_collisions import disabled_pairs, srdf
-from common.planning.free_axes import about, converge_in, solve_down, solve_in, why_not_in
-from common.planning.goal_sampling import missed_by
+from common.planning.goal_sampling import distance_outside
+from common.planning.ik import (
+    converge_to_region,
+    explain_region_unreachable,
+    pose_region,
+    solve_region_ik,
+    solve_tool_down_ik,
+)
 from common.planning.pipeline import PlanningPipeline
 from common.planning.problem import Region
 from common.robot.model import RobotModel
@@ -50,10 +56,10 @@ def test_where_the_tool_was_it_is_brought_back_to_within_the_bounds(
     found = 0
     for _ in range(30):
         region = Region(robot.fk(rng.uniform(robot.lower, robot.upper)), np.zeros(3), *bounds)
-        q = solve_in(robot, region, robot.named("home"), rng=rng, restarts=30)
+        q = solve_region_ik(robot, region, robot.named("home"), rng=rng, restarts=30)
         if q is not None:
             found += 1
-            assert missed_by(region, robot.fk(q)) < 2e-4 and robot.within_limits(q)
+            assert distance_outside(region, robot.fk(q)) < 2e-4 and robot.within_limits(q)
     assert found >= 28
 
 
@@ -63,7 +69,7 @@ def test_of_a_box_of_places_the_near_side_is_taken(arms: dict[str, RobotModel]) 
     T = robot.fk(home)
     T[:3, 3] += (0.05, 0.03, -0.02)
     region = Region(T, np.array([0.02, 0.03, 0.0]), 0.2, math.pi)
-    q = converge_in(robot, region, home, 30)
+    q = converge_to_region(robot, region, home, 30)
     assert q is not None
     away = robot.fk(q)[:3, 3] - T[:3, 3]
     assert away == pytest.approx([-0.02, -0.03, 0.0], abs=1e-3)
@@ -74,23 +80,23 @@ def test_the_tool_is_tilted_only_where_it_must_be(arms: dict[str, RobotModel]) -
     home = robot.named("home")
     tilts = {}
     for x in (0.45, 0.68):
-        q = solve_down(robot, (x, 0.0, 0.05), 0.0, home, tilt=0.35, restarts=5)
+        q = solve_tool_down_ik(robot, (x, 0.0, 0.05), 0.0, home, tilt=0.35, restarts=5)
         assert q is not None
         tilts[x] = math.acos(-robot.fk(q)[2, 2])
     assert tilts[0.45] < 1e-3 and 0.05 < tilts[0.68] <= 0.35 + 1e-3
-    assert solve_down(robot, (0.68, 0.0, 0.05), 0.0, home, restarts=5) is None
+    assert solve_tool_down_ik(robot, (0.68, 0.0, 0.05), 0.0, home, restarts=5) is None
 
 
 def test_the_yaw_that_a_place_wants_is_told_with_the_one_that_can_be_had(arms: dict[str, RobotModel]) -> None:
     robot = arms["nodding"]
     x, y = 0.3, 0.3  # the hand is turned as the arm is: by 45 degrees; at yaw 0 by as much to the other side
-    free = solve_in(robot, about(robot, tool_down(x, y, 0.1), 0.0), robot.named("home"), restarts=5)
+    free = solve_region_ik(robot, pose_region(robot, tool_down(x, y, 0.1), 0.0), robot.named("home"), restarts=5)
     assert free is not None
     turned = tool_down(x, y, 0.1)[:3, :3].T @ robot.fk(free)[:3, :3]
     off = abs(math.degrees(math.atan2(turned[1, 0], turned[0, 0])))
-    told = why_not_in(robot, Region(tool_down(x, y, 0.1), np.zeros(3), 0.0, 0.0), robot.named("home"))
+    told = explain_region_unreachable(robot, Region(tool_down(x, y, 0.1), np.zeros(3), 0.0, 0.0), robot.named("home"))
     said = float(told.partition("nearest is ")[2].split()[0])
-    assert told.startswith("with 4 joints it cannot choose yaw there: nearest is ")
+    assert told.startswith("with 4 joints the arm cannot choose yaw there: nearest is ")
     assert said == pytest.approx(off, abs=5)
 
 
@@ -100,10 +106,10 @@ def test_a_place_that_asks_for_more_tilt_is_refused_with_the_least_that_it_takes
     tilted = upright.model_copy(update={"max_tilt": 1.0})
     place = (0.70, 0.1, 0.03)
     told = reach_reason(robot, place, upright, ANYWHERE)
-    assert "with 4 joints it cannot choose tilt there: nearest is " in told and "0 deg are allowed" in told
+    assert "with 4 joints the arm cannot choose tilt there: nearest is " in told and "0 deg are allowed" in told
     assert 3 < float(told.partition("nearest is ")[2].split()[0]) < 57
     assert reach_reason(robot, place, tilted, ANYWHERE) == ""
-    assert "m is the most" in reach_reason(robot, (1.5, 0.0, 0.03), tilted, ANYWHERE)
+    assert "the arm reaches" in reach_reason(robot, (1.5, 0.0, 0.03), tilted, ANYWHERE)
 
 
 def test_arms_that_can_choose_point_down_unless_something_else_is_set() -> None:
@@ -119,7 +125,7 @@ def test_planners_leave_free_what_the_arm_cannot_choose(
     robot = arms[name]
     pipeline = PlanningPipeline(robot, CELL.motion, CELL.pipeline)
     scene = PlanningScene(header=Header(frame_id="world"), objects=[])
-    start = solve_down(robot, (0.38, -0.2, 0.2), 0.0, robot.named("home"), restarts=5)
+    start = solve_tool_down_ik(robot, (0.38, -0.2, 0.2), 0.0, robot.named("home"), restarts=5)
     assert start is not None
     goal = PoseGoal(pose=matrix_to_pose(tool_down(0.38, -0.2, 0.05, 1.0)), tilt_tolerance=0.35, yaw_tolerance=math.pi)
     response = pipeline.plan(PlanRequest(id="a", start=start.tolist(), goal=goal, straight=straight), scene)
@@ -137,4 +143,4 @@ def test_a_goal_with_a_yaw_that_cannot_be_had_says_so(arms: dict[str, RobotModel
     request = PlanRequest(id="a", start=HOMES["nodding"], goal=goal, planner="rrt_connect")
     response = pipeline.plan(request, PlanningScene(header=Header(frame_id="world"), objects=[]))
     assert response.error == "no_ik"
-    assert "with 4 joints it cannot choose yaw there: nearest is " in response.message
+    assert "with 4 joints the arm cannot choose yaw there: nearest is " in response.message

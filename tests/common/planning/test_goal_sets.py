@@ -145,7 +145,7 @@ def test_what_was_not_looked_at_in_time_is_not_said_to_be_out_of_reach(monkeypat
     monkeypatch.setattr(joint_goals, "sample_goals", once)
     response = PIPELINE.plan(to_any([UNREACHABLE, NEAR], planner="rrt_connect"), TABLE, cancel=flag)
     assert (response.ok, response.error) == (False, "cancelled")
-    assert "planning was ended while 2 goals were sampled" in response.message
+    assert "planning ended while 2 goals were sampled" in response.message
 
 
 @pytest.mark.parametrize("planner", SAMPLING)
@@ -164,6 +164,6 @@ def test_place_yaw_and_posture_in_a_region_are_chosen_by_the_time_that_the_way_t
         return total
 
     chosen = seconds()
-    monkeypatch.setattr(joint_goals, "quicker_goals", lambda problem, goals: sorted(
+    monkeypatch.setattr(joint_goals, "fastest_goals_first", lambda problem, goals: sorted(
         goals, key=lambda q: float((np.abs(q - problem.start) / problem.velocity).max())))
     assert chosen < 0.9 * seconds()

@@ -8,10 +8,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from common.config import load_cell
-from common.planning import ik
 from common.planning.ik import solve_ik
-from common.planning.kernel.ik import KernelArm
-from common.planning.kernel.library import library
+from common.planning.kernel.library import library, without_kernel
+from common.planning.kernel.solvers import KernelArm
 from common.robot.model import RobotModel
 from common.robot.transforms import tool_down
 
@@ -21,11 +20,6 @@ HOME = robot.named("home")
 
 ROBOTS = {"panda": robot, "ur5": RobotModel.load(load_cell("ur5").robot)}
 kernel = pytest.mark.skipif(library() is None, reason="the planning kernel is not built here")
-
-
-@pytest.fixture
-def no_kernel(monkeypatch):
-    monkeypatch.setattr(ik, "_arm", lambda robot: None)
 
 
 def sliding_arm() -> tuple[pin.Model, int]:
@@ -90,14 +84,14 @@ def test_without_the_kernel_solution_puts_the_tcp_at_any_pose_that_was_reached(n
 
 @kernel
 @pytest.mark.parametrize("name", ROBOTS)
-def test_from_a_seed_nearby_the_kernel_and_pinocchio_find_the_same(name, monkeypatch):
+def test_from_a_seed_nearby_the_kernel_and_pinocchio_find_the_same(name):
     model, rng = ROBOTS[name], np.random.default_rng(3)
     ends = rng.uniform(model.lower, model.upper, (50, model.dof))
     seeds = ends + rng.uniform(-0.1, 0.1, ends.shape)
     poses = [model.fk(q) for q in ends]
     found = [solve_ik(model, T, seed) for T, seed in zip(poses, seeds, strict=True)]
-    monkeypatch.setattr(ik, "_arm", lambda robot: None)
-    others = [solve_ik(model, T, seed, restarts=0) for T, seed in zip(poses, seeds, strict=True)]
+    with without_kernel():
+        others = [solve_ik(model, T, seed, restarts=0) for T, seed in zip(poses, seeds, strict=True)]
     apart = [np.abs(q - other).max() for q, other in zip(found, others, strict=True) if other is not None]
     assert len(apart) >= 45 and max(apart) < 0.02
 

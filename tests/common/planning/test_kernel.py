@@ -12,8 +12,8 @@ from common.planning.collision import CollisionWorld, interpolate
 from common.planning.kernel import library
 from common.planning.kernel.build import build, compilers
 from common.planning.kernel.oracle import Oracle, compare, random_geometry
-from common.planning.kernel.planner import find_path
-from common.planning.kernel.world import EXCUSED, KernelWorld, NoKernel
+from common.planning.kernel.solvers import find_path
+from common.planning.kernel.world import CONTACT_ALLOWED, KernelUnavailable, KernelWorld
 from common.planning.path import blended_path
 from common.planning.problem import Cancel
 from common.planning.retiming import parametrise
@@ -132,14 +132,14 @@ def test_cubic_that_bulges_into_a_wall_is_not_free():
     assert kernel.edge_free(np.zeros(1), np.zeros(1))
     assert kernel.cubics_collision(bulge)[0] == 0
     assert kernel.cubics_collision(0.999 * bulge)[0] == -1
-    kernel.set_rules(np.full(1, EXCUSED))
+    kernel.set_rules(np.full(1, CONTACT_ALLOWED))
     assert kernel.cubics_collision(bulge)[0] == -1
 
 
 def test_margin_is_kept_and_pairs_are_excused():
     model, geometry = robot_with((coal.Sphere(0.1), (0, 0, 0)), (coal.Capsule(0.1, 0.3), (0.25, 0, 0)))
     kernel, q = KernelWorld(model, geometry), np.zeros(1)
-    for margin, hit in ((0.0, -1), (0.0499, -1), (0.0501, 0), (EXCUSED, -1)):
+    for margin, hit in ((0.0, -1), (0.0499, -1), (0.0501, 0), (CONTACT_ALLOWED, -1)):
         kernel.set_rules(np.full(1, margin))
         assert kernel.colliding(q) == hit
 
@@ -148,11 +148,11 @@ def test_contact_is_excused_while_the_tool_is_on_its_leash():
     model, geometry = robot_with((coal.Sphere(0.1), (0, 0, 0)), (coal.Box(0.2, 0.2, 0.2), (0.19, 0, 0)))
     kernel = KernelWorld(model, geometry)
     start, away, beyond = np.zeros(1), np.array([-0.5]), np.array([0.03])
-    kernel.set_rules(np.zeros(1), np.full(1, EXCUSED), 1, np.zeros(3), np.zeros(3), 0.02)
+    kernel.set_rules(np.zeros(1), np.full(1, CONTACT_ALLOWED), 1, np.zeros(3), np.zeros(3), 0.02)
     assert kernel.colliding(start) == -1
     assert kernel.edge_free(start, away)  # out of the contact before the leash ends
     assert not kernel.edge_free(start, beyond)
-    kernel.set_rules(np.zeros(1), np.full(1, EXCUSED), 1, np.zeros(3), np.zeros(3), 0.005)
+    kernel.set_rules(np.zeros(1), np.full(1, CONTACT_ALLOWED), 1, np.zeros(3), np.zeros(3), 0.005)
     assert not kernel.edge_free(start, away)
 
 
@@ -165,11 +165,11 @@ def test_first_position_that_collides_is_found_on_a_path():
     assert kernel.first_collision(path[: colliding.index(True)])[0] == -1
 
 
-def test_world_with_a_held_object_says_the_same_with_and_without_the_kernel(monkeypatch):
+def test_world_with_a_held_object_says_the_same_with_and_without_the_kernel():
     held = held_scene(scene(SPREAD), "ball_3")
     fast = CollisionWorld(ROBOT, held, start=HOME, cache=cache())
-    monkeypatch.setattr("common.planning.obstacles.KernelWorld", _not_built)
-    plain = CollisionWorld(ROBOT, held, start=HOME, cache=cache())
+    with library.without_kernel():
+        plain = CollisionWorld(ROBOT, held, start=HOME, cache=cache())
     assert fast.kernel is not None and plain.kernel is None
     rng = np.random.default_rng(3)
     for q in rng.uniform(ROBOT.lower, ROBOT.upper, (150, ROBOT.dof)):
@@ -177,10 +177,6 @@ def test_world_with_a_held_object_says_the_same_with_and_without_the_kernel(monk
         edge = (HOME, HOME + 0.3 * (q - HOME))
         if fast.edge_free(*edge):
             assert all(not plain.collides(x) for x in interpolate(edge, 0.02))
-
-
-def _not_built(*_):
-    raise NoKernel("not built")
 
 
 def test_paths_are_free_end_where_they_should_and_the_seed_decides_them():
@@ -213,11 +209,11 @@ def test_search_without_a_way_out_ends_on_time_and_when_it_is_cancelled():
 
 
 def test_shape_or_joint_that_the_kernel_does_not_know_is_refused():
-    with pytest.raises(NoKernel, match="Cone"):
+    with pytest.raises(KernelUnavailable, match="Cone"):
         KernelWorld(*robot_with((coal.Cone(0.1, 0.2), (0, 0, 0))))
     model = pin.Model()
     model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "base")
-    with pytest.raises(NoKernel, match="one degree of freedom"):
+    with pytest.raises(KernelUnavailable, match="one degree of freedom"):
         KernelWorld(model, pin.GeometryModel())
 
 
@@ -256,17 +252,17 @@ def test_nothing_is_built_without_a_compiler_and_a_library_of_another_version_is
 
 
 def test_options_have_the_layout_of_the_source():
-    from common.planning.kernel import planner
+    from common.planning.kernel import solvers
 
-    assert ctypes.sizeof(planner._Options) == 6 * 8
-    assert ctypes.sizeof(planner._Report) == 7 * 8
+    assert ctypes.sizeof(solvers._Options) == 6 * 8
+    assert ctypes.sizeof(solvers._Report) == 7 * 8
 
 
-def test_paths_are_timed_the_same_with_and_without_the_kernel(monkeypatch):
+def test_paths_are_timed_the_same_with_and_without_the_kernel():
     rng = np.random.default_rng(2)
     path = blended_path(rng.uniform(-1, 1, (6, 7)), np.full(6, 0.2))[0]
     fast = parametrise(path, np.ones(7), np.full(7, 3.0))
-    monkeypatch.setattr("common.planning.retiming.fastest", lambda *_: None)
-    plain = parametrise(path, np.ones(7), np.full(7, 3.0))
+    with library.without_kernel():
+        plain = parametrise(path, np.ones(7), np.full(7, 3.0))
     for one, other in zip(vars(fast).values(), vars(plain).values(), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9)

@@ -11,8 +11,8 @@ import pytest
 from common.messages import PlanningScene
 from common.planning.collision import CollisionWorld
 from common.planning.kernel import library
-from common.planning.kernel.planner import find_path
-from common.planning.kernel.world import KernelWorld, NoKernel
+from common.planning.kernel.solvers import find_path
+from common.planning.kernel.world import KernelUnavailable, KernelWorld
 from tests.common.planning.planning_scenes import HOME, ROBOT, SPREAD, WORLD, cache, scene, solid
 from tests.common.planning.test_kernel import robot_with
 
@@ -80,13 +80,13 @@ def test_joint_that_neither_turns_nor_slides_alone_is_refused(kind):
     if kind == "Composite":
         joint.addJoint(pin.JointModelRZ(), pin.SE3(np.eye(3), np.array([1.0, 0, 0])))
     model.addJoint(0, joint, pin.SE3.Identity(), "joint", ONE, ONE, -ONE, ONE)
-    with pytest.raises(NoKernel, match=kind):
+    with pytest.raises(KernelUnavailable, match=kind):
         KernelWorld(model, geometry)
 
 
 @pytest.mark.parametrize("size", [1e8, 1e155, 1e308])
 def test_shape_so_large_that_rounding_counts_is_refused(size):
-    with pytest.raises(NoKernel, match="more than"):
+    with pytest.raises(KernelUnavailable, match="larger than"):
         KernelWorld(*robot_with((coal.Box(0.2, 0.2, 0.2), (0, 0, 0)), (coal.Sphere(size), (0.05 + size, 0, 0))))
 
 
@@ -99,7 +99,7 @@ def test_scene_with_such_a_shape_is_left_to_coal():
 def test_shape_with_a_swept_sphere_is_refused():
     wall = coal.Box(0.2, 0.2, 0.2)
     wall.setSweptSphereRadius(0.1)
-    with pytest.raises(NoKernel, match="swept"):
+    with pytest.raises(KernelUnavailable, match="swept"):
         KernelWorld(*robot_with((coal.Sphere(0.1), (0, 0, 0)), (wall, (0.25, 0, 0))))
 
 
@@ -126,7 +126,7 @@ def test_search_without_goals_is_refused_and_one_in_tiny_steps_ends_when_it_shou
 
 def test_shape_that_is_not_there_can_not_be_placed():
     with pytest.raises(IndexError):
-        far_from_everything().place(2, np.eye(4))
+        far_from_everything().set_pose(2, np.eye(4))
 
 
 def test_threads_that_ask_the_same_world_get_the_same_answers():

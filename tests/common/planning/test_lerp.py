@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from common.errors import ConfigError
-from common.planning.joint_goals import line
+from common.planning.joint_paths import line
 from common.planning.planners import lerp
 from common.robot.transforms import tool_down
 from tests.common.planning.planner_checks import AROUND, LEFT, RIGHT, assert_sound, wall, with_planner

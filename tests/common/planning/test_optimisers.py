@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 
 from common.planning.collision import CollisionWorld
-from common.planning.joint_goals import line
-from common.planning.optimised_path import evenly_spaced, quintic
+from common.planning.joint_paths import evenly_spaced, line, quintic
 from common.planning.planners.chomp import accelerations, obstacle_gradient
 from common.planning.planners.trajopt import _chain, _step
 from common.planning.problem import Cancel
-from common.planning.proximity import Near, Proximity
+from common.planning.proximity import NearPairs, Proximity
 from tests.common.planning.planner_checks import AROUND, LEFT, RIGHT, assert_sound, wall, with_planner
 from tests.common.planning.planning_scenes import ROBOT, cache, to_joints
 
@@ -48,7 +47,7 @@ def test_cost_of_accelerations_is_zero_for_rest_only():
 
 def test_obstacles_push_within_their_clearance_and_hardest_inside():
     distances = np.array([-0.1, 0.0, 0.1, 0.2])
-    near = Near(np.arange(4), np.arange(4), distances, np.full(4, 0.2), np.ones((4, 1)))
+    near = NearPairs(np.arange(4), np.arange(4), distances, np.full(4, 0.2), np.ones((4, 1)))
     assert np.allclose(obstacle_gradient(near, 4)[:, 0], [-1, -1, -0.5, 0])
 
 
@@ -74,7 +73,7 @@ def test_planner_that_has_too_few_iterations_says_what_still_collides(planner):
 def test_other_guesses_are_counted_when_they_lead_nowhere(planner):
     response = with_planner(planner, iterations=1, restarts=2).plan(to_joints(LEFT, RIGHT), wall(height=2.0))
     assert response.error == "collision"
-    assert response.message.endswith("nor is the way free from 2 other guesses")
+    assert response.message.endswith("2 other first guesses also collide")
 
 
 @pytest.mark.parametrize("planner", ["chomp", "trajopt"])
@@ -121,11 +120,11 @@ def test_shortest_path_is_kept_where_nothing_is_in_the_way_and_left_where_someth
     chain = _chain(np.zeros(7), np.ones(7), 10)
     waypoints = line(np.zeros(7), np.ones(7), 10)[1:-1]
     problem = SimpleNamespace(robot=SimpleNamespace(lower=np.full(7, -3), upper=np.full(7, 3)))
-    nothing = Near(np.zeros(0, dtype=int), np.zeros(0, dtype=int), np.zeros(0), np.zeros(0), np.zeros((0, 7)))
+    nothing = NearPairs(np.zeros(0, dtype=int), np.zeros(0, dtype=int), np.zeros(0), np.zeros(0), np.zeros((0, 7)))
     same, merit = _step(problem, chain, waypoints, nothing, 0.1, 10.0, 0.02)
     assert np.allclose(same, waypoints, atol=1e-6)
     assert merit == pytest.approx(chain.cost(waypoints))
-    something = Near(np.array([10]), np.array([3]), np.array([-0.01]), np.array([0.07]), np.eye(7)[:1])
+    something = NearPairs(np.array([10]), np.array([3]), np.array([-0.01]), np.array([0.07]), np.eye(7)[:1])
     moved, merit = _step(problem, chain, waypoints, something, 0.1, 10.0, 0.02)
     assert moved[4, 0] - waypoints[4, 0] == pytest.approx(0.03, abs=1e-4)
     assert np.allclose(moved[:, 1:], waypoints[:, 1:], atol=1e-6)

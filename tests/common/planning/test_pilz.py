@@ -6,7 +6,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from common.planning.retiming import TimedPath, end_accelerations, sample
+from common.planning.trajectory import TimedPath, end_accelerations, sample
 from common.robot.transforms import tool_down
 from tests.common.planning.planner_checks import AROUND, LEFT, RIGHT, assert_sound, wall, with_planner
 from tests.common.planning.planning_scenes import CELL, ROBOT, last, scene, solid, to_joints, to_pose

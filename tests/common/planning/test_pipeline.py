@@ -5,7 +5,8 @@ from common.config import Motion, Pipeline
 from common.messages import Header, JointGoal, PlanRequest, Pose, Vector3
 from common.planning.collision import CollisionWorld
 from common.planning.pipeline import PlanningPipeline
-from common.planning.validation import Fault, fine_samples, timed_path
+from common.planning.trajectory import timed_path
+from common.planning.validation import Fault, fine_samples
 from common.robot.transforms import tool_down
 from tests.common.planning.planning_scenes import (
     BLOCK,
@@ -113,7 +114,7 @@ def test_start_in_collision_is_refused_with_the_pair_and_the_next_request_is_ser
         (to_joints(above(0.68, 0.0, -0.02), START), "goal_in_collision", "table"),
         (PlanRequest(id="1", start=list(START), goal=JointGoal(named="hom")), "unknown_pose", "did you mean 'home'"),
         (PlanRequest(id="1", start=list(START), goal=JointGoal()), "bad_goal", "neither"),
-        (PlanRequest(id="1", goal=JointGoal(named="home")), "no_state", "joint states"),
+        (PlanRequest(id="1", goal=JointGoal(named="home")), "no_state", "no joint state was received"),
         (to_joints(HOME, START, planner="chom"), "unknown_planner",
          "did you mean 'chomp'?); choices: cartesian, chomp, circ, joint_move, lerp"),
         (to_joints(HOME, START, attach="ball_99"), "unknown_object", "ball_99"),
@@ -138,7 +139,7 @@ def test_what_would_be_held_far_beyond_the_arm_is_refused():
     ball = next(thing.id for thing in with_ball.objects if thing.role == "target")
     far = {"attach": ball, "attach_pose": Pose(position=Vector3(z=1e7))}
     response = PIPELINE.plan(to_joints(HOME, START).model_copy(update=far), with_ball)
-    assert response.error == "bad_scene" and "reaches 1e+07 m from a joint, 100 m are the most" in response.message
+    assert response.error == "bad_scene" and "reaches 1e+07 m from a joint; the limit is 100 m" in response.message
 
 
 def test_scene_in_another_frame_is_refused():

@@ -13,13 +13,13 @@ from common.errors import ConfigError, UnknownName
 from common.messages import PlanningScene, PlanRequest, PlanResponse, Vector3
 from common.planning import retiming
 from common.planning.collision import CollisionWorld
-from common.planning.goal_sampling import missed_by
+from common.planning.goal_sampling import distance_outside
 from common.planning.kernel.library import library
-from common.planning.kernel.world import NoKernel
 from common.planning.pipeline import PlanningPipeline
 from common.planning.planners import load_planner, planner_names
 from common.planning.problem import Cancel, Region
-from common.planning.validation import fine_samples, timed_path
+from common.planning.trajectory import timed_path
+from common.planning.validation import fine_samples
 from common.robot.transforms import tool_down
 from tests.common.planning.planning_scenes import (
     CELL,
@@ -103,11 +103,8 @@ def test_way_around_a_wall_is_found_where_the_straight_edge_is_blocked():
     assert np.allclose(last(response), LEFT, atol=1e-6)
 
 
-def test_ompl_finds_the_way_where_the_kernel_is_not_built(monkeypatch):
-    def not_built(*_):
-        raise NoKernel("not built")
-
-    monkeypatch.setattr("common.planning.obstacles.KernelWorld", not_built)
+@pytest.mark.usefixtures("no_kernel")
+def test_ompl_finds_the_way_where_the_kernel_is_not_built():
     pipeline = PlanningPipeline(ROBOT, CELL.motion, CELL.pipeline)
     response = pipeline.plan(to_joints(LEFT, RIGHT, planning_attempts=1), wall())
     assert_sound(to_joints(LEFT, RIGHT), wall(), response)
@@ -161,15 +158,15 @@ def test_sampled_path_ends_in_the_region_of_the_goal():
     )
     response = PIPELINE.plan(request, wall())
     assert_sound(request, wall(), response)
-    assert missed_by(Region(T, np.full(3, 0.02), 0.25, 3.14), ROBOT.fk(last(response))) < 1e-3
+    assert distance_outside(Region(T, np.full(3, 0.02), 0.25, 3.14), ROBOT.fk(last(response))) < 1e-3
 
 
 def test_region_knows_its_bounds():
     T = tool_down(0.5, 0.0, 0.2, 0.0)
     region = Region(T, np.full(3, 0.02), 0.2, 0.5)
-    assert missed_by(region, tool_down(0.515, 0.0, 0.2, 0.4)) < 0
-    assert missed_by(region, tool_down(0.53, 0.0, 0.2, 0.0)) == pytest.approx(0.01)
-    assert missed_by(region, tool_down(0.5, 0.0, 0.2, 0.6)) == pytest.approx(0.1)
+    assert distance_outside(region, tool_down(0.515, 0.0, 0.2, 0.4)) < 0
+    assert distance_outside(region, tool_down(0.53, 0.0, 0.2, 0.0)) == pytest.approx(0.01)
+    assert distance_outside(region, tool_down(0.5, 0.0, 0.2, 0.6)) == pytest.approx(0.1)
 
 
 def test_straight_line_keeps_the_tool_on_it_and_turns_it_evenly():

@@ -7,7 +7,8 @@ from common.config import Pipeline, load_cell
 from common.messages import ArcGoal, Header, JointGoal, PlanningScene, PlanRequest, PoseGoal, Vector3
 from common.planning.ik import solve_ik
 from common.planning.pipeline import PlanningPipeline
-from common.planning.validation import fine_samples, timed_path
+from common.planning.trajectory import timed_path
+from common.planning.validation import fine_samples
 from common.robot.model import RobotModel
 from common.robot.transforms import matrix_to_pose, tool_down
 from tests.common.planning.planning_scenes import solid

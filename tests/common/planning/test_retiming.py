@@ -9,7 +9,8 @@ from hypothesis.extra.numpy import arrays
 from common.control.trajectory import Trajectory
 from common.planning.path import blended_path, dense_path, distinct
 from common.planning.planners.joint_move import straight_profile
-from common.planning.retiming import TimedPath, join, limited_jerk, parametrise, sample, stretch
+from common.planning.retiming import limited_jerk, parametrise
+from common.planning.trajectory import TimedPath, join, sample, stretch
 
 V = np.array([2.175, 2.175, 2.61])
 A = np.array([15.0, 7.5, 20.0])

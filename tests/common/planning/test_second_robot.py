@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 
 from common.messages import Header
-from common.planning.validation import fine_samples, timed_path
+from common.planning.trajectory import timed_path
+from common.planning.validation import fine_samples
 from tests.common.planning.ur5_scene import HOME, PIPELINE, ROBOT, SCENE, TOP, tip_at, to_home, to_pose
 
 

@@ -3,7 +3,7 @@ import pytest
 from pydantic import ValidationError
 
 from common.messages import ArcGoal, JointGoal, PlanRequest, PoseGoal, SequenceGoal, SequenceItem, Vector3
-from common.planning.planners.sequence import NoBlend, blend, entry, resampled
+from common.planning.planners.sequence import NoBlend, blend, blend_entry, resampled
 from common.planning.problem import Cancel, Result
 from common.planning.validation import fine_samples
 from common.robot.transforms import matrix_to_pose, tool_down
@@ -138,7 +138,7 @@ def test_blend_leaves_and_arrives_in_the_directions_of_the_motions():
 
 def test_entry_is_where_the_tool_stays_within_the_radius():
     tool = np.linspace([0.0, 0, 0], [1.0, 0, 0], 11)
-    assert entry(tool, tool[-1], 0.25) == 8
+    assert blend_entry(tool, tool[-1], 0.25) == 8
     with pytest.raises(NoBlend):
-        entry(tool, tool[-1], 1.5)
+        blend_entry(tool, tool[-1], 1.5)
     assert np.allclose(resampled(tool, np.array([0.0, 0.55, 1.0]))[:, 0], [0, 0.55, 1])

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from common.planning.collision import CollisionWorld
-from common.planning.joint_goals import line
-from common.planning.proximity import Proximity
-from common.planning.swept import SweptPieces
+from common.planning.joint_paths import line
+from common.planning.proximity import Proximity, SweptEdges
 from tests.common.planning.planner_checks import AROUND, LEFT, RIGHT, assert_sound, with_planner
 from tests.common.planning.planning_scenes import ROBOT, above, cache, held_scene, scene, solid, to_joints
 
@@ -29,7 +28,7 @@ def test_what_is_swept_is_as_near_as_any_position_between_the_waypoints(which):
     for _ in range(12):
         a = np.clip(RIGHT + rng.uniform(0, 1) * (LEFT - RIGHT) + rng.normal(0, 0.2, 7), ROBOT.lower, ROBOT.upper)
         b = np.clip(a + rng.normal(0, 0.06, 7), ROBOT.lower, ROBOT.upper)
-        swept = SweptPieces(world, 0.2).measure(np.array([a, b]))
+        swept = SweptEdges(world, 0.2).measure(np.array([a, b]))
         states = Proximity(world, 0.3, nearest=True).measure(line(a, b, 20))
         for pair, distance in zip(swept.pair, swept.distance, strict=True):
             same = world.bank.first[states.pair] == world.bank.first[pair]
@@ -43,7 +42,7 @@ def test_what_is_swept_is_as_near_as_any_position_between_the_waypoints(which):
 def test_step_along_the_gradient_moves_what_is_swept_away():
     world = CollisionWorld(ROBOT, WALL, start=RIGHT, cache=cache())
     path = np.array([above(0.5, -0.25, 0.15), above(0.5, -0.15, 0.15), above(0.5, -0.25, 0.15)])
-    pieces = SweptPieces(world, 0.5)
+    pieces = SweptEdges(world, 0.5)
     near = pieces.measure(path)
     tried = 0
     for position, pair, distance, gradient in zip(near.position, near.pair, near.distance, near.gradient, strict=True):
@@ -65,7 +64,7 @@ def test_blade_between_two_states_is_seen_and_gone_round():
     path = np.array([above(0.5, -0.15, 0.15), above(0.5, 0.16, 0.15)])
     ends = Proximity(world, 0.2).measure(path)
     assert ends.distance.min() > 0
-    near = SweptPieces(world, 0.02).measure(path)
+    near = SweptEdges(world, 0.02).measure(path)
     assert min(near.distance) < -0.02
     assert {world.pair(pair)[1] for pair in near.pair[near.distance < 0]} == {"blade"}
     pipeline = with_planner("trajopt", steps=10)

@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 
 from common.messages import PathGoal, PlanningScene, PlanRequest
 from common.planning.pipeline import PlanningPipeline
-from common.planning.retiming import TimedPath, sample
-from common.planning.validation import timed_path
+from common.planning.trajectory import TimedPath, sample, timed_path
 from common.robot.transforms import matrix_to_pose, tool_down
 from tests.common.planning.planning_scenes import CELL, HOME, ROBOT, above, scene, solid
 
@@ -108,7 +107,7 @@ def test_path_that_leaves_the_reach_is_refused_with_the_point_and_the_reason():
     assert not response.ok
     assert response.error == "no_ik"
     assert response.message.startswith("trace: cartesian: point 3 of 4, at (0.7")
-    assert "does not reach it" in response.message or "limits" in response.message
+    assert "cannot reach it" in response.message or "limits" in response.message
     assert 0.1 < response.fraction < 0.5
 
 

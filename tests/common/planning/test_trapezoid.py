@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from common.planning.planners.ptp import synchronised, trapezoid
-from common.planning.retiming import end_accelerations
+from common.planning.trajectory import end_accelerations
 
 values = st.floats(0.01, 10)
 

@@ -7,7 +7,8 @@ from common.messages import PlanningScene
 from common.planning.collision import CollisionWorld
 from common.planning.kernel.library import library
 from common.planning.path import blended_path
-from common.planning.retiming import TimedPath, parametrise
+from common.planning.retiming import parametrise
+from common.planning.trajectory import TimedPath
 from common.planning.validation import check_numbers, fine_samples, validate
 from tests.common.planning.planning_scenes import HOME, ROBOT, WORLD, above, ball, cache, scene
 

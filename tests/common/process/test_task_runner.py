@@ -8,8 +8,7 @@ from contextlib import asynccontextmanager
 from itertools import pairwise
 from typing import Any
 
-from applications.pick_place.messages import PickPlaceStatus
-from applications.pick_place.topics import PICK_PLACE_STATUS
+from applications.pick_place.topics import PICK_PLACE_STATUS, PickPlaceStatus
 from common import messages as m
 from common import topics
 from common.clock import Clock
@@ -67,13 +66,13 @@ class Executor:
 
     def __init__(self, net: LocalNetwork) -> None:
         self.bus, self.asked = net.bus("trajectory_executor"), asyncio.Queue[m.Message]()
-        self.inhibits: list[m.Inhibit] = []
+        self.interlocks: list[m.Interlock] = []
         for topic in (topics.MOTION_EXECUTE, topics.MOTION_STOP, topics.MOTION_HOLD):
             self.bus.serve(topic, self.note)  # type: ignore[arg-type]
 
     async def note(self, request: m.Message) -> m.MotionStatus:
         self.asked.put_nowait(request)
-        return m.MotionStatus(state="active", inhibits=self.inhibits)
+        return m.MotionStatus(state="active", interlocks=self.interlocks)
 
     async def next(self) -> m.Message:
         async with asyncio.timeout(30):
@@ -83,8 +82,9 @@ class Executor:
     async def let_go(self) -> int | None:
         """Until when what was said is let go of by what is asked next."""
         request = await self.next()
-        assert isinstance(request, m.HoldRequest) and request.model_copy(update={"heard": None}) == HOLD["resume"]
-        return request.heard
+        assert isinstance(request, m.HoldRequest)
+        assert request.model_copy(update={"acknowledged": None}) == HOLD["resume"]
+        return request.acknowledged
 
 
 async def tell(net: LocalNetwork, *commands: str) -> str:
@@ -150,23 +150,24 @@ async def test_start_that_waits_for_an_executor_does_not_let_go_of_what_is_said_
         executor = Executor(net)
         await executor.bus.ready()
         asked = [await executor.next(), await executor.next()]
-        heard = [request.heard for request in asked if isinstance(request, m.HoldRequest)]
-        assert heard[0] is not None and before <= heard[0] <= wall_ns()
+        seen = [request.acknowledged for request in asked if isinstance(request, m.HoldRequest)]
+        assert seen[0] is not None and before <= seen[0] <= wall_ns()
 
 
 async def test_start_that_waits_for_an_answer_lets_go_of_that_but_of_no_stop_that_another_said_in_between() -> None:
     for stopped, lets_go_of in ((0, 2), (1, 0), (3, 2)):
         net, since = LocalNetwork(), 2 * wall_ns()
-        said = [m.Inhibit(kind="held", by="person", since=since + 2)]
-        said += [m.Inhibit(kind="stopped", by="bob", since=since + stopped)] if stopped else []
+        said = [m.Interlock(kind="held", by="operator", since=since + 2)]
+        said += [m.Interlock(kind="stopped", by="bob", since=since + stopped)] if stopped else []
         async with running(net):
             await tell(net, "pause", "resume")
             executor = Executor(net)
-            executor.inhibits = said
+            executor.interlocks = said
             await executor.bus.ready()
             asked = [await executor.next() for _ in range(3)]
-            heard = [request.heard for request in asked if isinstance(request, m.HoldRequest) and not request.hold]
-            assert (heard == [since + lets_go_of]) if lets_go_of else (heard[0] is not None and heard[0] < since)
+            released = [each for each in asked if isinstance(each, m.HoldRequest) and not each.hold]
+            seen = [each.acknowledged for each in released]
+            assert (seen == [since + lets_go_of]) if lets_go_of else (seen[0] is not None and seen[0] < since)
 
 
 async def test_a_resume_lets_go_of_the_pause_that_it_waited_for_whatever_watchdogs_held_meanwhile() -> None:
@@ -174,12 +175,12 @@ async def test_a_resume_lets_go_of_the_pause_that_it_waited_for_whatever_watchdo
     async with running(net):
         await tell(net, "pause", "resume")
         executor = Executor(net)
-        executor.inhibits = [m.Inhibit(kind="held", by="watchdog", since=since),
-                             m.Inhibit(kind="held", by="person", since=since + 1)]
+        executor.interlocks = [m.Interlock(kind="held", by="watchdog", since=since),
+                             m.Interlock(kind="held", by="operator", since=since + 1)]
         await executor.bus.ready()
         asked = [await executor.next() for _ in range(3)]
-        heard = [request.heard for request in asked if isinstance(request, m.HoldRequest) and not request.hold]
-        assert heard == [since + 1]
+        seen = [request.acknowledged for request in asked if isinstance(request, m.HoldRequest) and not request.hold]
+        assert seen == [since + 1]
 
 
 async def test_who_says_what_a_stop_makes_void_at_once_is_not_told_that_it_is_still_asked_for() -> None:

@@ -4,8 +4,7 @@ import asyncio
 import time
 from typing import Literal
 
-from applications.pick_place.messages import PickPlaceStatus
-from applications.pick_place.topics import PICK_PLACE_STATUS
+from applications.pick_place.topics import PICK_PLACE_STATUS, PickPlaceStatus
 from common import topics
 from common.config import Parameters
 from common.errors import ConfigError, Refused

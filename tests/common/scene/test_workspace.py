@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from applications.pick_place.resting import Resting
+from applications.pick_place.ball_places import Resting
 from common.config import Grasp, Surroundings, check, load_cell
 from common.errors import ConfigError
 from common.perception.pinhole import Pinhole

@@ -3,7 +3,7 @@ import pytest
 
 from common.config import CameraConfig
 from common.perception.pinhole import Pinhole
-from common.sim.depth_sensor import DepthSensorParameters, measured_depth
+from common.sim.depth_sensor import DepthSensorParameters, simulate_depth
 
 CAMERA = Pinhole.from_config(CameraConfig(width=320, height=240, cx=159.5, cy=119.5))
 BASELINE = 0.075
@@ -22,7 +22,7 @@ def step(near=0.5, far=0.8):
 
 def measured(depth, seed=0, baseline=BASELINE, **parameters):
     config = DepthSensorParameters(baseline=baseline, **parameters)
-    return measured_depth(depth, CAMERA, config, np.random.default_rng(seed))
+    return simulate_depth(depth, CAMERA, config, np.random.default_rng(seed))
 
 
 def tilted(degrees, middle=1.0):

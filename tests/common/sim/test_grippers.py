@@ -9,7 +9,7 @@ import pytest
 from pydantic import ValidationError
 
 from common.config import GripperConfig, ObjectConfig, SuctionCup, World
-from common.hardware.fingers import Fingers
+from common.hardware.mock import SimulatedFingers
 from common.robot.finger_joints import finger_positions
 from common.robot.transforms import tool_down
 from common.sim.gripping import lies_on
@@ -27,7 +27,7 @@ class Rig:
 
     def __init__(self, gripper: GripperConfig, thing: ObjectConfig) -> None:
         self.world = KinematicWorld(World(count=0), [thing], None, gripper)
-        self.fingers, self.now = Fingers(gripper, gripper.max_width), 100.0
+        self.fingers, self.now = SimulatedFingers(gripper, gripper.max_width), 100.0
 
     def be_at(self, x: float, y: float, z: float, yaw: float = 0.0, width: float | None = None) -> None:
         """Be there and do what was told until it is done."""

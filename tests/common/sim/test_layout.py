@@ -9,7 +9,7 @@ from common.config import World
 from common.errors import ConfigError
 from common.robot.transforms import rpy_to_matrix
 from common.sim.kinematic import KinematicWorld
-from common.sim.layout import layout, wholly_in_picture
+from common.sim.layout import layout, sphere_in_image
 
 
 def anywhere(x: float, y: float, z: float) -> bool:
@@ -74,7 +74,7 @@ def test_ball_in_the_picture_is_seen_with_every_point_of_its_surface(world_confi
     u, v = camera.fx * seen[0] / seen[2] + camera.cx, camera.fy * seen[1] / seen[2] + camera.cy
     inside = min(u.min(), v.min()) >= 7 and u.max() <= 639 - 7 and v.max() <= 479 - 7
     outside = min(u.min(), v.min()) < 5 or u.max() > 639 - 5 or v.max() > 479 - 5
-    assert not (inside or outside) or wholly_in_picture(camera, (x, y), radius, radius) == inside
+    assert not (inside or outside) or sphere_in_image(camera, (x, y), radius, radius) == inside
 
 
 @pytest.mark.parametrize("accepts", [lambda *at: False, lambda x, y, z: math.dist((x, y), (0.4, -0.2)) < 0.05])

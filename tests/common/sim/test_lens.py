@@ -6,9 +6,7 @@ from common.config import CameraConfig, Scenery, load_cell
 from common.errors import ConfigError
 from common.messages import Header, JointState, Pose, Vector3, WorldObject, WorldObjects
 from common.perception.pinhole import Pinhole
-from common.sim.camera import CameraParameters, SimulatedCamera
-from common.sim.lens import Lens
-from common.sim.motion_blur import Movement, joints_before, times
+from common.sim.camera import CameraParameters, Lens, ObjectMotion, SimulatedCamera, joints_ago, times
 
 BARREL = [-0.25, 0.08, 0.001, -0.0005, 0.0]
 BENT = CameraConfig(d=BARREL)
@@ -76,7 +74,7 @@ def sphere(x, stamp):
 
 
 def test_what_moves_was_elsewhere_within_the_exposure():
-    movement = Movement()
+    movement = ObjectMotion()
     for number in range(3):
         movement.take(sphere(0.4 + 0.01 * number, 100_000_000 * number))  # 0.1 m/s, at ten pictures a second
     now = 200_000_000
@@ -86,7 +84,7 @@ def test_what_moves_was_elsewhere_within_the_exposure():
 
 
 def test_what_was_put_elsewhere_did_not_fly_there():
-    movement = Movement()
+    movement = ObjectMotion()
     movement.take(sphere(0.0, 0))
     movement.take(sphere(0.6, 50_000_000))
     assert movement.objects(0.02, 50_000_000)[0].pose.position.x == pytest.approx(0.6)
@@ -94,8 +92,8 @@ def test_what_was_put_elsewhere_did_not_fly_there():
 
 def test_joints_were_where_their_velocities_say():
     state = JointState(header=Header(), name=["a", "b"], position=[1.0, 2.0], velocity=[0.5, 0.0])
-    assert joints_before(state, 0.1).position == pytest.approx([0.95, 2.0])
-    assert joints_before(state, 0.0) is state
+    assert joints_ago(state, 0.1).position == pytest.approx([0.95, 2.0])
+    assert joints_ago(state, 0.0) is state
 
 
 def test_times_of_an_exposure_are_even_and_end_with_it():
@@ -111,9 +109,9 @@ def camera(**parameters):
 def test_what_moves_is_blurred_along_its_way_by_as_much_as_it_moved():
     still, moving = camera(), camera(sub_exposures=5)
     for one in (still, moving):
-        table = one.shoot(WorldObjects(), None, 0).colour.astype(int)
-        one.shoot(sphere(0.40, 0), None, 0)
-        picture = one.shoot(sphere(0.56, 80_000_000), None, 80_000_000).colour.astype(int)  # 2 m/s along x
+        table = one.capture(WorldObjects(), None, 0).colour.astype(int)
+        one.capture(sphere(0.40, 0), None, 0)
+        picture = one.capture(sphere(0.56, 80_000_000), None, 80_000_000).colour.astype(int)  # 2 m/s along x
         changed = np.argwhere(np.abs(picture - table).max(axis=2) > 8)
         rows = np.ptp(changed[np.abs(changed[:, 1] - 320) < 3][:, 0])
         if one is still:
@@ -125,7 +123,7 @@ def test_what_moves_is_blurred_along_its_way_by_as_much_as_it_moved():
 def test_light_that_changes_is_seen_at_once():
     config = CameraParameters()
     one = SimulatedCamera(CELL.world, Scenery(), CELL.robot, config, np.random.default_rng(0), plain=True)
-    bright = one.shoot(WorldObjects(), None, 0).colour
+    bright = one.capture(WorldObjects(), None, 0).colour
     config.ambient = 20.0
-    dark = one.shoot(WorldObjects(), None, 0).colour
+    dark = one.capture(WorldObjects(), None, 0).colour
     assert dark.mean() == pytest.approx(bright.mean() * 370 / 500, rel=0.02)

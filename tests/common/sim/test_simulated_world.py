@@ -452,10 +452,10 @@ def test_world_takes_no_more_objects_than_can_be_told_of(monkeypatch) -> None:
     world.edit(WorldEdit(**small, position=Vector3(x=0.7)), 0.0)
     monkeypatch.setattr(kinematic, "MOST_OBJECTS", 100)
     monkeypatch.setattr(kinematic, "MOST_CORNERS", 500)
-    round_one = {"op": "add", "shape": "cylinder", "size": Vector3(x=0.01, y=0.01, z=0.01)}
-    world.edit(WorldEdit(**round_one, position=Vector3(x=0.3, y=0.2)), 0.0)
+    cylinder_or_ring = {"op": "add", "shape": "cylinder", "size": Vector3(x=0.01, y=0.01, z=0.01)}
+    world.edit(WorldEdit(**cylinder_or_ring, position=Vector3(x=0.3, y=0.2)), 0.0)
     with pytest.raises(Refused, match="at most 500"):
-        world.edit(WorldEdit(**round_one, position=Vector3(x=0.4, y=0.2)), 0.0)
+        world.edit(WorldEdit(**cylinder_or_ring, position=Vector3(x=0.4, y=0.2)), 0.0)
 
 
 def test_cross_section_with_many_corners_that_point_inwards_is_refused() -> None:

@@ -7,7 +7,7 @@ import pytest
 from common import messages as m
 from common.config import load_cell
 from common.errors import ConfigError
-from common.tasks.deciding import TaskConfig
+from common.tasks.decisions import TaskConfig
 from common.tasks.engine import Task
 from common.tasks.stages import Command, Grip, Look, Move, View
 from common.tasks.watchdogs import Patience
@@ -330,9 +330,9 @@ def test_grasp_of_something_else_is_let_go_and_what_slips_is_told() -> None:
 
 def blocked(cell: Cell, *held_by: m.Holder) -> None:
     """The arm is held by these, the scene monitor with its reason."""
-    inhibits = [m.Inhibit(kind="held", by=by, reason="mug is in the way of hand", since=1) for by in held_by]
+    interlocks = [m.Interlock(kind="held", by=by, reason="mug is in the way of hand", since=1) for by in held_by]
     cell.motion = cell.motion.model_copy(update={
-        "held": bool(held_by), "held_by": list(held_by), "inhibits": inhibits})
+        "held": bool(held_by), "held_by": list(held_by), "interlocks": interlocks})
 
 
 def test_motion_goes_on_when_what_was_in_its_way_goes_away_and_is_planned_anew_when_it_stays() -> None:
@@ -360,7 +360,7 @@ def test_motion_goes_on_when_what_was_in_its_way_goes_away_and_is_planned_anew_w
 def test_what_is_in_the_way_changes_nothing_while_a_person_holds_or_the_planner_is_gone() -> None:
     cell = Cell()
     cell.until("reach")
-    blocked(cell, "scene_monitor", "person")
+    blocked(cell, "scene_monitor", "operator")
     for _ in range(30):
         assert cell.step() == []
     blocked(cell, "scene_monitor")

@@ -5,8 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from applications.pick_place.messages import PickPlaceStatus
-from applications.pick_place.topics import PICK_PLACE_STATUS
+from applications.pick_place.topics import PICK_PLACE_STATUS, PickPlaceStatus
 from common import topics
 from common.errors import NoResponder
 from common.messages import Image, LogLine, TaskCommand, TaskStatus

@@ -11,8 +11,7 @@ from contextlib import suppress
 import msgpack
 import pytest
 
-from applications.pick_place.messages import PickPlaceStatus
-from applications.pick_place.topics import PICK_PLACE_STATUS, REJECTED_TARGETS
+from applications.pick_place.topics import PICK_PLACE_STATUS, REJECTED_TARGETS, PickPlaceStatus
 from common import topics
 from common.messages import Image, LogLine, Rejections, TFMessage
 from common.process.log import BusLog

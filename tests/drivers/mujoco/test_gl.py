@@ -7,23 +7,23 @@ from drivers.mujoco import gl
 
 @pytest.fixture(autouse=True)
 def forgotten():
-    gl.chosen_gl.cache_clear()
+    gl.select_gl.cache_clear()
     yield
-    gl.chosen_gl.cache_clear()
+    gl.select_gl.cache_clear()
 
 
 def chosen(monkeypatch, *, named="", egl=False, osmesa=False):
     monkeypatch.setenv(gl.VARIABLE, named)
     monkeypatch.setattr(gl, "_has_egl", lambda: egl)
     monkeypatch.setattr(gl.ctypes.util, "find_library", lambda name: "libOSMesa.so.8" if osmesa else None)
-    return gl.chosen_gl()
+    return gl.select_gl()
 
 
 def test_egl_is_taken_before_osmesa_and_rays_where_there_is_neither(monkeypatch, caplog):
     assert chosen(monkeypatch, egl=True, osmesa=True) == "egl"
-    gl.chosen_gl.cache_clear()
+    gl.select_gl.cache_clear()
     assert chosen(monkeypatch, osmesa=True) == "osmesa"
-    gl.chosen_gl.cache_clear()
+    gl.select_gl.cache_clear()
     assert chosen(monkeypatch) == ""
     assert "apt-get install libegl1 libgl1-mesa-dri libopengl0" in caplog.text
 
@@ -49,7 +49,7 @@ def test_a_machine_without_the_library_has_no_egl(monkeypatch):
 
 
 def test_calls_from_any_thread_run_on_the_same_one():
-    run, found = gl.OneThread("test"), set()
+    run, found = gl.SingleThread("test"), set()
     found.add(run(threading.get_ident))
     other = threading.Thread(target=lambda: found.add(run(threading.get_ident)))
     other.start()

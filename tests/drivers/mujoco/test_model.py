@@ -15,9 +15,9 @@ from common.robot.model import RobotModel
 from common.robot.transforms import pose_to_matrix, transform
 from common.sim.kinematic import KinematicWorld
 from common.sim.objects import solid_of, solid_of_message
-from drivers.mujoco.kept_meshes import kept
+from drivers.mujoco.mesh_cache import cached_arrays
 from drivers.mujoco.model import CellModel, build_model
-from drivers.mujoco.things import Thing
+from drivers.mujoco.scene import SceneObject
 
 SHAPES = [
     {"id": "ball", "shape": "sphere", "radius": 0.03, "x": 0.3, "y": 0.0},
@@ -29,9 +29,9 @@ SHAPES = [
 ]
 
 
-def thing_of_message(told: WorldObject) -> Thing:
+def thing_of_message(told: WorldObject) -> SceneObject:
     """The object that a message tells of, which says no mass."""
-    return Thing(told.id, solid_of_message(told), (told.color.r, told.color.g, told.color.b))
+    return SceneObject(told.id, solid_of_message(told), (told.color.r, told.color.g, told.color.b))
 
 
 def model_of(cell: str, visuals: bool = False) -> tuple[RobotModel, CellModel]:
@@ -62,7 +62,7 @@ def test_many_objects_do_not_touch_each_other_before_they_are_put_anywhere() -> 
     box = solid_of(ObjectConfig.model_validate({"id": "box", "shape": "box", "size": [0.02, 0.02], "height": 0.02,
                                                 "x": 0.0, "y": 0.0}))
     made = build_model(RobotModel.load(config.robot), config.world, [
-        Thing(f"box_{k}", box, (1.0, 0.0, 0.0)) for k in range(100)])
+        SceneObject(f"box_{k}", box, (1.0, 0.0, 0.0)) for k in range(100)])
     data = mujoco.MjData(made.model)
     data.qpos[:] = made.start
     mujoco.mj_forward(made.model, data)
@@ -90,7 +90,7 @@ def test_nothing_touches_at_home_but_what_stands_on_something(cell: str) -> None
     data = mujoco.MjData(made.model)
     data.qpos[:] = made.start
     for number, name in enumerate(made.things):
-        made.set_thing(data, name, transform(np.eye(3), (5.0 + number, 0.0, 1.0)))
+        made.set_object(data, name, transform(np.eye(3), (5.0 + number, 0.0, 1.0)))
     mujoco.mj_forward(made.model, data)
     assert data.ncon == 0
 
@@ -111,14 +111,14 @@ def test_what_can_not_be_kept_is_made_anew(monkeypatch: pytest.MonkeyPatch, tmp_
     (tmp_path / "file").write_text("not a folder")
     monkeypatch.setenv("ZENCELL_CACHE", str(tmp_path / "file"))
     for _ in range(2):
-        assert kept("hull", [b"some"], lambda: {"points": np.ones(3)})["points"].sum() == 3
+        assert cached_arrays("hull", [b"some"], lambda: {"points": np.ones(3)})["points"].sum() == 3
 
 
 def test_cut_short_file_of_a_mesh_is_made_anew(kept_meshes: Path) -> None:
-    made = kept("hull", [b"cut"], lambda: {"points": np.ones(3)})
+    made = cached_arrays("hull", [b"cut"], lambda: {"points": np.ones(3)})
     newest = max(kept_meshes.rglob("hull-*.npz"), key=lambda path: path.stat().st_mtime_ns)
     newest.write_bytes(newest.read_bytes()[:40])
-    assert kept("hull", [b"cut"], lambda: {"points": np.ones(3)})["points"] == pytest.approx(made["points"])
+    assert cached_arrays("hull", [b"cut"], lambda: {"points": np.ones(3)})["points"] == pytest.approx(made["points"])
 
 
 @pytest.mark.parametrize("shape", SHAPES, ids=lambda shape: shape["id"])
@@ -131,7 +131,7 @@ def test_every_shape_rests_as_it_was_put(shape: dict[str, object]) -> None:
     data = mujoco.MjData(made.model)
     data.qpos[:] = made.start
     before = pose_to_matrix(told.pose)
-    made.set_thing(data, told.id, before)
+    made.set_object(data, told.id, before)
     for _ in range(500):
         mujoco.mj_step(made.model, data)
     after = made.pose_of(data, told.id)

@@ -11,7 +11,7 @@ import pytest
 
 from common.config import World, load_cell
 from common.errors import ConfigError, Refused
-from common.hardware.interface import Gripper, Limits, PlacedGripper
+from common.hardware.interface import Gripper, Limits, PlaceableGripper
 from common.messages import Header, Vector3, WorldEdit, WorldObject
 from common.planning.ik import solve_ik
 from common.robot.finger_joints import finger_positions
@@ -196,7 +196,7 @@ def test_fingers_that_open_against_something_do_not_push_the_arm_away() -> None:
     rig.move(rig.above(0.45, 0.0, 0.1))
     rig.move(rig.above(0.45, 0.0, 0.05))
     rig.grip(GRIPPER.max_width, GRIPPER.effort, 2.0)
-    assert rig.fingers.read(rig.now).width < GRIPPER.max_width - 0.01, "they are kept from opening"
+    assert rig.fingers.read(rig.now).width < GRIPPER.max_width - 0.01, "they are saved from opening"
     assert np.abs(rig.arm.read(rig.now)[0] - rig.set_point).max() < 5e-3
 
 
@@ -228,12 +228,12 @@ def test_what_is_found_again_moves_on_as_it_did() -> None:
     rig = Rig({**BALL, "x": 0.3}, CUBE)
     rig.push("thing_1", 0.3, 0.1)
     rig.wait(0.3)
-    kept, before = rig.world.standing(), rig.place()
-    kept = {name: type(each).model_validate(each.model_dump()) for name, each in kept.items()}
+    saved, before = rig.world.standing(), rig.place()
+    saved = {name: type(each).model_validate(each.model_dump()) for name, each in saved.items()}
     rig.wait(0.3)
     after = rig.place()
     rig.begin(rig.robot.named("home"))
-    rig.world.restore(kept)
+    rig.world.restore(saved)
     rig.now += 1000.0
     rig.wait(0.01)
     assert rig.place() == pytest.approx(before, abs=5e-3)
@@ -246,10 +246,10 @@ def test_what_was_held_over_a_restart_is_still_held() -> None:
     rig.move(rig.above(0.45, 0.0, 0.03))
     rig.grip(0.0)
     rig.move(rig.above(0.45, 0.0, 0.2))
-    kept, width = rig.world.standing(), rig.fingers.read(rig.now).width
+    saved, width = rig.world.standing(), rig.fingers.read(rig.now).width
     rig.begin(rig.set_point)
-    rig.world.restore(kept)
-    assert isinstance(rig.fingers, PlacedGripper)
+    rig.world.restore(saved)
+    assert isinstance(rig.fingers, PlaceableGripper)
     rig.fingers.place(width)
     rig.fingers.command(0.0, rig.now, 5.0)
     rig.wait(1.0)
@@ -333,11 +333,11 @@ def test_what_slips_over_a_restart_is_not_flung_away_by_the_fingers_that_are_wit
     rig.grip(0.0)
     rig.world.edit(WorldEdit(op="drop"), rig.now)
     rig.wait(0.15)
-    kept, width = rig.world.standing(), rig.fingers.read(rig.now).width
+    saved, width = rig.world.standing(), rig.fingers.read(rig.now).width
     assert width < 0.04, "the fingers are within the ball"
     rig.begin(rig.set_point)
-    rig.world.restore({name: type(each).model_validate(each.model_dump()) for name, each in kept.items()})
-    assert isinstance(rig.fingers, PlacedGripper)
+    rig.world.restore({name: type(each).model_validate(each.model_dump()) for name, each in saved.items()})
+    assert isinstance(rig.fingers, PlaceableGripper)
     rig.fingers.place(width)
     rig.grip(0.0, seconds=3.0)
     lies_there_and_can_be_taken_again(rig)
@@ -359,10 +359,10 @@ def test_what_was_carried_over_a_restart_stands_still_with_the_arm() -> None:
     rig.grip(0.0)
     rig.move(rig.above(0.45, 0.0, 0.2))
     rig.push("thing_1", 0.0, 1.0)
-    kept = rig.world.standing()
-    assert kept["thing_1"].details["qvel"][1] == 1.0
+    saved = rig.world.standing()
+    assert saved["thing_1"].details["qvel"][1] == 1.0
     rig.begin(rig.set_point)
-    rig.world.restore(kept)
+    rig.world.restore(saved)
     cell, data = rig.world._built
     assert not data.qvel[cell.things["thing_1"].dof:][:6].any()
 

@@ -10,7 +10,7 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from applications.pick_place.messages import PickPlaceStatus
+from applications.pick_place.topics import PickPlaceStatus
 from common.errors import DecodeError
 from common.messages import Image, StopRequest
 from common.transport.codec import (
@@ -26,9 +26,8 @@ from common.transport.codec import (
 from common.transport.ownership import Owner
 from common.transport.reader import Newness
 from common.transport.session import RawSample
-from lab.chaos.agent import damaged, next_damaged, nonsense
+from lab.chaos.agent import damaged, keys_of, next_damaged, nonsense
 from lab.chaos.plan import CELL_SECONDS, LABELS, Fault, Form, Kind, faults, plan
-from lab.chaos.setting import keys_of
 
 PROCESSES = ["router", "motion_planner", "trajectory_executor", "smart_pick_place"]
 KEYS = ["camera/image_raw", "gripper/state", "motion/plan"]

@@ -9,9 +9,9 @@ import pytest
 from common.application import all_topics
 from common.config import World, load_cell
 from common.messages import Header, Pose, Vector3, WorldObject, WorldObjects
-from drivers.mujoco.contact import THING, TIMESTEP, touches
-from lab.chaos import setting
-from lab.chaos.slipping import Slipping, thrown
+from drivers.mujoco.scene import OBJECT, TIMESTEP, set_contact
+from lab.chaos import agent
+from lab.chaos.plan import SlipGate, thrown
 
 RADIUS, EVERY = 0.03, 20_000_000  # [m], [ns]
 PHYSICS = load_cell("panda", ["world.simulator=mujoco"]).world
@@ -25,7 +25,7 @@ def held_at(x: float, y: float, stamp: int, state: str = "held") -> WorldObjects
     return WorldObjects(header=Header(stamp=stamp), objects=[thing])
 
 
-def may(slipping: Slipping, x: float, y: float, vx: float = 0.0, vy: float = 0.0) -> bool:
+def may(slipping: SlipGate, x: float, y: float, vx: float = 0.0, vy: float = 0.0) -> bool:
     """What is said of a ball that is there now and came there at a speed [m/s]."""
     step = EVERY * 1e-9
     slipping.may(held_at(x - vx * step, y - vy * step, EVERY))
@@ -40,17 +40,17 @@ def may(slipping: Slipping, x: float, y: float, vx: float = 0.0, vy: float = 0.0
 def test_with_physics_it_has_to_stop_in_the_picture_and_clear_of_walls(
     x: float, y: float, vx: float, vy: float, allowed: bool,
 ) -> None:
-    assert may(Slipping(PHYSICS), x, y, vx, vy) == allowed
+    assert may(SlipGate(PHYSICS), x, y, vx, vy) == allowed
 
 
 def test_where_things_fall_straight_only_the_place_counts() -> None:
     world = load_cell("panda").world
-    assert Slipping(world).may(held_at(0.60, -0.20, EVERY)) and may(Slipping(world), 0.60, -0.20, 2.0)
-    assert not may(Slipping(world), 0.55, 0.12)
+    assert SlipGate(world).may(held_at(0.60, -0.20, EVERY)) and may(SlipGate(world), 0.60, -0.20, 2.0)
+    assert not may(SlipGate(world), 0.55, 0.12)
 
 
 def test_nothing_slips_before_it_is_known_how_fast_the_hand_goes() -> None:
-    slipping = Slipping(PHYSICS)
+    slipping = SlipGate(PHYSICS)
     assert not slipping.may(None) and not slipping.may(held_at(0.4, -0.2, EVERY, "table"))
     assert not slipping.may(held_at(0.4, -0.2, EVERY))
     assert slipping.may(held_at(0.4, -0.2, 2 * EVERY)) and slipping.may(held_at(0.4, -0.2, 2 * EVERY))
@@ -62,12 +62,12 @@ def test_a_camera_on_the_hand_sees_what_it_sees_from_home(monkeypatch: pytest.Mo
     cell = load_cell("panda", ["world.simulator=mujoco",
                                "world.camera={mount: tcp, position: [0.06, 0.0, -0.1], rpy: [0, 0, 1.5708]}"])
     worlds: list[World] = []
-    monkeypatch.setattr(setting, "Chaos", lambda bus, plan, pids, world, known: worlds.append(world))
+    monkeypatch.setattr(agent, "Chaos", lambda bus, plan, pids, world, known: worlds.append(world))
     statuses = [SimpleNamespace(name=entry.name, pid=1) for entry in cell.services.values()]
     bus: Any = SimpleNamespace(clock=SimpleNamespace(speed=1.0))
     supervisor: Any = SimpleNamespace(statuses=statuses)
-    setting.chaos_in(bus, cell, supervisor, all_topics(), 1, 6.0, until_ended=True)
-    assert may(Slipping(worlds[0]), 0.40, -0.05) and not may(Slipping(worlds[0]), 0.40, -0.60)
+    agent.chaos_in(bus, cell, supervisor, all_topics(), 1, 6.0, until_ended=True)
+    assert may(SlipGate(worlds[0]), 0.40, -0.05) and not may(SlipGate(worlds[0]), 0.40, -0.60)
 
 
 @pytest.mark.parametrize("speed", [0.2, 0.5, 0.9])
@@ -75,10 +75,10 @@ def test_a_ball_gets_as_far_as_is_reckoned(speed: float) -> None:
     mujoco = pytest.importorskip("mujoco", reason="make setup EXTRAS=physics")
     spec = mujoco.MjSpec()
     spec.option.timestep = TIMESTEP
-    touches(spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[5, 5, 0.1]), THING)
+    set_contact(spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[5, 5, 0.1]), OBJECT)
     body = spec.worldbody.add_body(pos=[0, 0, 0.25])
     body.add_freejoint()
-    touches(body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[RADIUS, 0, 0], mass=0.05), THING)
+    set_contact(body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[RADIUS, 0, 0], mass=0.05), OBJECT)
     model = spec.compile()
     data = mujoco.MjData(model)
     data.qvel[0] = speed

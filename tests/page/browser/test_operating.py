@@ -10,10 +10,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from applications.outlining.messages import OutlineStatus
-from applications.outlining.topics import CONTOURS, OUTLINE_STATUS
-from applications.pick_place.messages import PickPlaceStatus
-from applications.pick_place.topics import PICK_PLACE_STATUS
+from applications.outlining.topics import CONTOURS, OUTLINE_STATUS, OutlineStatus
+from applications.pick_place.topics import PICK_PLACE_STATUS, PickPlaceStatus
 from common import topics
 from common.messages import (
     JointState,

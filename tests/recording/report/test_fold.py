@@ -5,14 +5,14 @@ from types import ModuleType
 
 import pytest
 
-from applications.pick_place.messages import PickPlaceStatus
+from applications.pick_place.topics import PickPlaceStatus
 from common import topics
-from common.application import Application
+from common.application import Application, ApplicationTopics, find_application
 from common.messages import Header, MotionStatus, Pose, PoseArray, TaskStatus, WorldObject, WorldObjects
 from common.topics import Topic
-from recording.report.application import Figures, figures_of, truth_in_words
-from recording.report.fold import Fold, application_in
-from recording.report.gathering import Gathering
+from recording.report.aggregator import RunAggregator, recorded_application
+from recording.report.application import Figures, figures_of, format_truth
+from recording.report.history import RunHistory
 from recording.report.summary import describe
 
 
@@ -26,31 +26,33 @@ from recording.report.summary import describe
     ],
 )
 def test_progress_in_one_line(values: dict[str, object], line: str) -> None:
-    fold = Fold("panda", Application("pick_place"))
+    fold = RunAggregator("panda", find_application("pick_place"))
     assert fold.progress == "the task has not spoken yet"
     fold.on("pick_place_status", PickPlaceStatus.model_validate(values), 0.0, 0)
     assert fold.progress == line
 
 
 def test_every_application_is_heard_on_its_status_and_on_what_it_decides_by() -> None:
-    heard = {topic.key for topic in Fold("panda", Application("pick_place")).topics}
+    heard = {topic.key for topic in RunAggregator("panda", find_application("pick_place")).topics}
     assert heard == {"pick_place_status", "validated_targets", "rejected_targets", "motion/status", "scene_objects",
                      "scene_balls"}
     assert "joint_states" not in heard
-    assert {"outline_status", "contour_path"} <= {t.key for t in Fold("ur5", Application("outlining")).topics}
+    outlining = RunAggregator("ur5", find_application("outlining"))
+    assert {"outline_status", "contour_path"} <= {t.key for t in outlining.topics}
 
 
 def test_a_frame_is_as_old_as_its_stamp_on_the_cells_clock() -> None:
-    gathering = Gathering()
-    fold = Fold("panda", Application("pick_place"), speed=5.0, gathering=gathering)
+    gathering = RunHistory()
+    fold = RunAggregator("panda", find_application("pick_place"), speed=5.0, gathering=gathering)
     fold.on("validated_targets", PoseArray(header=Header(stamp=1_000_000_000)), 1.0, 1_100_000_000)
     assert gathering.latencies == [20.0]
     assert fold.summary.as_dict()["frame_to_target_ms"] == {"p50": 20.0, "p99": 20.0}
 
 
 def test_the_application_of_a_recording_is_told_by_its_status() -> None:
-    assert application_in(["joint_states", "outline_status"]) == Application("outlining")
-    assert application_in(["joint_states"]) is None
+    found = recorded_application(["joint_states", "outline_status"])
+    assert found is not None and found.name == "outlining"
+    assert recorded_application(["joint_states"]) is None
 
 
 class MoveStatus(TaskStatus):
@@ -60,15 +62,16 @@ class MoveStatus(TaskStatus):
 @pytest.fixture
 def own() -> Application:
     module = ModuleType("my_pkg.move")
-    module.STATUS = Topic("move_status", MoveStatus, "state", "state")  # type: ignore[attr-defined]
+    status = Topic("move_status", MoveStatus, "state", "state")
+    module.APPLICATION = Application(topics=ApplicationTopics(status=status))  # type: ignore[attr-defined]
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(sys.modules, "my_pkg", ModuleType("my_pkg"))
         patch.setitem(sys.modules, "my_pkg.move", module)
-        yield Application("my_pkg.move")
+        yield find_application("my_pkg.move")
 
 
 def test_an_application_of_ones_own_has_a_summary_without_saying_anything(own: Application) -> None:
-    fold = Fold("mine", own)
+    fold = RunAggregator("mine", own)
     assert figures_of(own) is Figures
     fold.on("move_status", MoveStatus(state="LIFTING", done=0, total=1, subject="cube", started=True), 1.0, 0)
     assert fold.progress == "0 of 1 done - LIFTING cube"
@@ -82,13 +85,13 @@ def test_an_application_of_ones_own_has_a_summary_without_saying_anything(own: A
 
 def test_truth_names_its_containers_where_there_are_several() -> None:
     truth = {"in_box": 3, "on_table": 1, "elsewhere": 0, "containers": {"box": 3}}
-    assert truth_in_words(truth) == "3 in the box, 1 on the table"
+    assert format_truth(truth) == "3 in the box, 1 on the table"
     truth = {"in_box": 3, "on_table": 1, "elsewhere": 2, "containers": {"left": 1, "right": 2}}
-    assert truth_in_words(truth) == "1 in left, 2 in right, 1 on the table, 2 elsewhere"
+    assert format_truth(truth) == "1 in left, 2 in right, 1 on the table, 2 elsewhere"
 
 
 def test_objects_tell_the_truth_where_they_say_what_becomes_of_them() -> None:
-    fold = Fold("panda", Application("pick_place"))
+    fold = RunAggregator("panda", find_application("pick_place"))
     fold.on("scene_objects", WorldObjects(), 0.0, 0)
     assert fold.summary.as_dict()["truth"] == {"in_box": 0, "on_table": 0, "elsewhere": 0, "containers": {}}
     fold.on("scene_balls", PoseArray(poses=[Pose()], labels=["box"]), 0.0, 0)  # all that older recordings tell

@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
 
-from applications.pick_place.messages import PickPlaceStatus
+from applications.pick_place.topics import PickPlaceStatus
 from common import messages as m
-from recording.report import figures
-from recording.report.gathering import MOST_LINES, Gathering
+from recording.report import charts
+from recording.report.history import MOST_LINES, RunHistory
 
 
 def status(state, target="", **values):
@@ -12,7 +12,7 @@ def status(state, target="", **values):
 
 
 def test_states_of_the_task_follow_each_other_without_gaps():
-    run = Gathering()
+    run = RunHistory()
     for time, state, target in ((1, "IDLE", ""), (2, "IDLE", ""), (3, "GRASPING", "ball_1"), (5, "GRASPING", "ball_2"),
                                 (6, "DONE", "")):
         run.on_task(time, status(state, target))
@@ -23,7 +23,7 @@ def test_states_of_the_task_follow_each_other_without_gaps():
 
 
 def test_failures_are_events_but_for_those_from_before_the_recording_or_another_life_of_the_task():
-    run = Gathering()
+    run = RunHistory()
     for time, failures, retries in ((1, 4, 1), (2, 4, 1), (3, 4, 2), (4, 5, 2), (5, 0, 0), (6, 1, 0), (7, 1, 0)):
         run.on_task(time, status("GRASPING", "ball_1", failures=failures, retries=retries, message=f"at {time}"))
     assert [(e.time, e.what, e.note) for e in run.failures] == [
@@ -31,7 +31,7 @@ def test_failures_are_events_but_for_those_from_before_the_recording_or_another_
 
 
 def test_a_motion_lasts_from_its_first_status_to_the_one_that_ends_it():
-    run = Gathering()
+    run = RunHistory()
     for time, goal, state in ((0, "", "none"), (1, "a", "active"), (2, "a", "active"), (3, "a", "succeeded"),
                               (4, "a", "succeeded"), (5, "b", "active"), (6, "b", "aborted")):
         error = "limit" if state == "aborted" else ""
@@ -45,7 +45,7 @@ def test_a_motion_lasts_from_its_first_status_to_the_one_that_ends_it():
 
 
 def test_a_pick_is_where_the_target_was_seen_last():
-    run = Gathering()
+    run = RunHistory()
     place = m.CollisionObject(id="ball_1", role="target", shape="sphere", dimensions=[0.03],
                               pose=m.Pose(position=m.Vector3(x=0.4, y=-0.1, z=0.03)))
     run.on_scene(1, m.PlanningScene(header=m.Header(frame_id="world"), objects=[place]))
@@ -59,7 +59,7 @@ def test_a_pick_is_where_the_target_was_seen_last():
 
 
 def test_holding_and_pausing_are_spans():
-    run = Gathering()
+    run = RunHistory()
     for time, held in ((1, False), (2, True), (3, True), (4, False), (6, True)):
         run.on_motion(time, m.MotionStatus(held=held))
     run.on_task(1, status("GRASPING", paused=True))
@@ -69,7 +69,7 @@ def test_holding_and_pausing_are_spans():
 
 
 def test_a_service_that_was_started_again_is_an_event():
-    run = Gathering()
+    run = RunHistory()
     for time, restarts in ((1, 0), (2, 0), (3, 1), (4, 1)):
         one = m.ServiceStatus(name="vision_detector", state="ready", restarts=restarts, message="died: SIGKILL")
         run.on_services(time, m.SupervisorStatus(cell="panda", services=[one]))
@@ -77,7 +77,7 @@ def test_a_service_that_was_started_again_is_an_event():
 
 
 def test_only_warnings_and_errors_are_kept_and_not_too_many():
-    run = Gathering()
+    run = RunHistory()
     for k in range(MOST_LINES + 5):
         run.on_log(k, m.LogLine(service="a", level="info", message="fine"))
         run.on_log(k, m.LogLine(service="a", level="error", message="bad"))
@@ -85,7 +85,7 @@ def test_only_warnings_and_errors_are_kept_and_not_too_many():
 
 
 def test_joints_are_taken_by_name_and_states_without_them_left_out():
-    run = Gathering()
+    run = RunHistory()
     header = m.Header()
     run.on_joints(1, m.JointState(header=header, name=["f", "b", "a"], position=[9, 2, 1], velocity=[0, 4, 3]))
     run.on_joints(2, m.JointState(header=header, name=["b"], position=[2]))
@@ -96,7 +96,7 @@ def test_joints_are_taken_by_name_and_states_without_them_left_out():
 
 
 def test_what_slides_is_not_told_in_radians():
-    text = figures.joints(np.arange(2.0), np.zeros((2, 1)), np.zeros((2, 1)), ["lift"], None)
+    text = charts.joints(np.arange(2.0), np.zeros((2, 1)), np.zeros((2, 1)), ["lift"], None)
     assert "position [rad or m]" in text and "speed [rad/s or m/s]" in text
 
 
@@ -104,7 +104,7 @@ def test_what_slides_is_not_told_in_radians():
 def test_a_footprint_is_the_solid_from_above(shape, dimensions):
     turned = m.Pose(position=m.Vector3(x=1, y=2), orientation=m.Quaternion(z=np.sqrt(0.5), w=np.sqrt(0.5)))
     thing = m.CollisionObject(id="t", role="fixture", shape=shape, dimensions=dimensions, pose=turned)
-    run = Gathering()
+    run = RunHistory()
     run.on_scene(0, m.PlanningScene(header=m.Header(), objects=[thing]))
     extent = np.ptp(run.footprints["t"].corners, axis=0)
     assert extent == pytest.approx([0.2, 0.4] if shape == "box" else [0.2, 0.2], abs=1e-9)
@@ -115,6 +115,6 @@ def test_long_curves_are_thinned_but_keep_their_extremes():
     times = np.linspace(0, 60, 6001)
     values = np.sin(times)[:, None] * 0.1
     values[1234], values[4321] = 3.0, -2.0
-    kept = figures.thinned(times, values)
-    assert len(kept) <= figures.MOST_POINTS + 4 and {1234, 4321, 6000} <= set(kept.tolist())
-    assert figures.thinned(times[:50], values[:50]).tolist() == list(range(50))
+    kept = charts.thinned(times, values)
+    assert len(kept) <= charts.MOST_POINTS + 4 and {1234, 4321, 6000} <= set(kept.tolist())
+    assert charts.thinned(times[:50], values[:50]).tolist() == list(range(50))

@@ -4,7 +4,7 @@ import math
 from hypothesis import given
 from hypothesis import strategies as st
 
-from applications.pick_place.messages import PickPlaceStatus
+from applications.pick_place.topics import PickPlaceStatus
 from common.messages import (
     Header,
     MotionStatus,
@@ -17,8 +17,8 @@ from common.messages import (
     WorldObjects,
 )
 from recording.report.application import Figures
+from recording.report.history import Truth
 from recording.report.summary import Rejected, Summary, describe, percentile
-from recording.report.truth import Truth
 
 PLAN = PlanFigure(planner="cartesian", seconds=0.01, fraction=1.0, attempts=1)
 

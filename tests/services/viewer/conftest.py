@@ -11,11 +11,11 @@ from typing import Any, ClassVar
 
 import pytest
 
-from applications.outlining.messages import (
+from applications.outlining.topics import (
+    OUTLINE_SELECT,
     OutlineSelect,
     OutlineSelection,
 )
-from applications.outlining.topics import OUTLINE_SELECT
 from common import messages as m
 from common import topics
 from common.clock import Clock
@@ -129,7 +129,7 @@ def config_of(cell: Cell, **changes: object) -> viewer.Config:
 
 
 @asynccontextmanager
-async def page_of(cell: str, serve: bool = True, **changes: object) -> AsyncIterator[Played]:
+async def serve_page(cell: str, serve: bool = True, **changes: object) -> AsyncIterator[Played]:
     """A viewer among played services."""
     net = LocalNetwork()
     played = Played(net, net.bus("played", cell="test", clock=Clock()))
@@ -147,7 +147,7 @@ async def page_of(cell: str, serve: bool = True, **changes: object) -> AsyncIter
 
 @pytest.fixture
 async def panda() -> AsyncIterator[Played]:
-    async with page_of("panda") as played:
+    async with serve_page("panda") as played:
         yield played
 
 

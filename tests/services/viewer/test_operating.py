@@ -7,14 +7,13 @@ from typing import Any
 
 import pytest
 
-from applications.pick_place.messages import PickPlaceStatus
-from applications.pick_place.topics import PICK_PLACE_STATUS
+from applications.pick_place.topics import PICK_PLACE_STATUS, PickPlaceStatus
 from common import messages as m
 from common import topics
 from common.errors import Refused
 from common.transport.reader import Reader
 from tests.page.fake_browser import PATIENCE, FakeBrowser, opened
-from tests.services.viewer.conftest import TOKEN, Played, SceneDouble, page_of, until
+from tests.services.viewer.conftest import TOKEN, Played, SceneDouble, serve_page, until
 
 
 async def aim(page: FakeBrowser, goal: str) -> None:
@@ -32,7 +31,7 @@ async def test_stop_stops_the_arm_and_the_task(panda: Played, page: FakeBrowser)
 
 
 async def test_arm_is_stopped_though_no_task_answers_and_that_is_told(panda: Played) -> None:
-    async with page_of("panda", serve=False) as alone:
+    async with serve_page("panda", serve=False) as alone:
         alone.bus.serve(topics.MOTION_STOP, alone.stop)
         async with opened(alone.port) as page:
             await page.speak(do="stop", n=1)
@@ -42,7 +41,7 @@ async def test_arm_is_stopped_though_no_task_answers_and_that_is_told(panda: Pla
 
 
 async def test_stop_that_reaches_nobody_says_so() -> None:
-    async with page_of("panda", serve=False) as played, opened(played.port) as page:
+    async with serve_page("panda", serve=False) as played, opened(played.port) as page:
         await page.speak(do="stop", n=7)
         line = "NOT stopped: nobody answers motion/stop now"
         await page.until(lambda: line in page.text and page.said == [(7, line, "bad")])
@@ -90,15 +89,15 @@ async def test_what_somebody_else_has_said_since_a_refusal_is_told_before_it_is_
     motion, task = panda.bus.writer(topics.MOTION_STATUS), panda.bus.writer(PICK_PLACE_STATUS)
     task.put(PickPlaceStatus())
     for since, panda.holder in ((5, "anna"), (9, "bob")):
-        motion.put(m.MotionStatus(held=True, inhibits=[m.Inhibit(kind="held", by=panda.holder, since=since)]))
+        motion.put(m.MotionStatus(held=True, interlocks=[m.Interlock(kind="held", by=panda.holder, since=since)]))
         await page.until(lambda: f"UTC by {panda.holder}" in page.text)
         await page.press("Start")
         await page.until(lambda: f"the robot is held by {panda.holder}: press Start again for that" in page.text)
 
 
 async def test_who_stopped_the_robot_is_shown_though_no_task_says_so(panda: Played, page: FakeBrowser) -> None:
-    stop = m.Inhibit(kind="stopped", by="anna", reason="smoke", since=0)
-    panda.bus.writer(topics.MOTION_STATUS).put(m.MotionStatus(inhibits=[stop]))
+    stop = m.Interlock(kind="stopped", by="anna", reason="smoke", since=0)
+    panda.bus.writer(topics.MOTION_STATUS).put(m.MotionStatus(interlocks=[stop]))
     await page.until(lambda: "stopped since 1970-01-01 00:00:00 UTC by anna (smoke)" in page.text)
 
 
@@ -244,8 +243,8 @@ async def test_stop_ends_jogging_until_the_button_is_let_go(panda: Played, page:
     reader, status = await ready_to_jog(panda, page), panda.bus.writer(topics.MOTION_STATUS)
     await page.hold("joint:panda_joint1:+")
     await jogs_of(reader, 1)
-    stop = m.Inhibit(kind="stopped", by="page", since=7)
-    status.put(m.MotionStatus(inhibits=[stop]))
+    stop = m.Interlock(kind="stopped", by="page", since=7)
+    status.put(m.MotionStatus(interlocks=[stop]))
     await page.until(lambda: "stopped since" in page.text)
     await page.hold("joint:panda_joint1:+")
     assert not (await jogs_of(reader, 1))[0].joints
@@ -256,8 +255,8 @@ async def test_stop_ends_jogging_until_the_button_is_let_go(panda: Played, page:
         while reader.latest is None or not reader.latest.joints:  # pressed anew: one's own stop
             await page.hold("joint:panda_joint1:+", press=2)
             await asyncio.sleep(0.04)
-    assert reader.latest.heard == 7
-    status.put(m.MotionStatus(inhibits=[stop.model_copy(update={"by": "anna", "since": 8})]))
+    assert reader.latest.acknowledged == 7
+    status.put(m.MotionStatus(interlocks=[stop.model_copy(update={"by": "anna", "since": 8})]))
     await page.until(lambda: "by anna" in page.text)
     await page.speak(do="release")
     await page.hold("joint:panda_joint1:+", press=3)
@@ -275,7 +274,7 @@ async def test_arm_that_a_task_has_is_not_jogged_and_the_buttons_say_why(panda: 
 
 async def test_of_two_operators_one_operates_and_the_other_sees_whom_and_takes_over() -> None:
     async with (
-        page_of("panda", token=TOKEN) as played,
+        serve_page("panda", token=TOKEN) as played,
         opened(played.port, TOKEN) as first, opened(played.port, TOKEN) as second,
     ):
         reader = await ready_to_jog(played, first)
@@ -336,7 +335,7 @@ async def test_taught_pose_is_a_goal_and_is_kept_for_the_next_page(panda: Played
     await page.press("Plan")
     await until(lambda: asked)
     assert asked[0].goal == m.JointGoal(positions=q)
-    async with page_of("panda") as again, opened(again.port) as later:
+    async with serve_page("panda") as again, opened(again.port) as later:
         await later.until(lambda: "bin" in later.parts[later.label("Goal")]["options"])
 
 
@@ -409,16 +408,16 @@ async def test_whose_the_motion_is_is_told_and_it_is_taken_over_when_that_is_sai
     async def own(request: m.OwnRequest) -> m.MotionOwner:
         asked.append(request)
         if not request.over:
-            raise Refused("not_owner", f"the motion is {anna.told}")
+            raise Refused("not_owner", f"the motion is {anna.description}")
         return m.MotionOwner(owner=request.owner, kind="operator", asked=True)
 
     panda.bus.serve(topics.MOTION_OWN, own)
     panda.bus.writer(topics.MOTION_OWNER).put(anna)
-    await page.until(lambda: "anna&#x27;s (operator)" in page.text and "anna's (operator)" in page.news["kept"])
+    await page.until(lambda: all("owned by anna (operator)" in shown for shown in (page.text, page.news["kept"])))
     await page.press("Take")
     await page.until(lambda: "press Take again for that" in page.text)
     await page.press("Take")
-    await page.until(lambda: "The motion is page" in page.text)
+    await page.until(lambda: "The motion is owned by page" in page.text)
     assert [(one.act, one.over, one.owner) for one in asked] == [("take", False, "page"), ("take", True, "page")]
 
 

@@ -6,7 +6,7 @@ from common.config import check
 from common.errors import ConfigError
 from common.robot.transforms import invert, rpy_to_matrix, transform
 from tests.tools.calibration.rendered_boards import BOARD, Lens, facing, render
-from tools.calibration.board import Board, BoardOptions, NotSeen, Sighting
+from tools.calibration.board import Board, BoardDetection, BoardOptions, NoBoard
 
 LENS = Lens()
 
@@ -22,7 +22,7 @@ def expected(lens, points, T_camera_board):
 def test_corners_are_found_to_a_twentieth_of_a_pixel(pose):
     T = facing(BOARD, *pose)
     found = BOARD.find(render(BOARD, LENS, T), "a picture")
-    assert isinstance(found, Sighting) and len(found.points) == 24
+    assert isinstance(found, BoardDetection) and len(found.points) == 24
     errors = np.linalg.norm(found.pixels - expected(LENS, found.points, T), axis=1)
     assert np.sqrt((errors**2).mean()) < 0.03 and errors.max() < 0.08
 
@@ -31,7 +31,7 @@ def test_frame_of_the_board_is_lower_left_with_z_towards_the_reader():
     T_world_board = transform(rpy_to_matrix(0, 0, 0), (0.3, -0.1, 0.0))
     T_world_camera = transform(rpy_to_matrix(np.pi, 0, -np.pi / 2), (0.4, 0.0, 0.6))  # looks down; right is -y
     found = BOARD.find(render(BOARD, Lens(d=()), invert(T_world_camera) @ T_world_board), "a picture")
-    assert isinstance(found, Sighting)
+    assert isinstance(found, BoardDetection)
     right = found.pixels[np.argmax(found.points[:, 0])] - found.pixels[np.argmin(found.points[:, 0])]
     assert right[1] < -100  # +x of world is up in that picture
 
@@ -44,7 +44,7 @@ def test_page_has_the_size_that_it_says_and_shows_the_board():
         height, width = page.shape
         whole = np.pad(page, ((0, -height % 4), (0, -width % 4)), constant_values=255)
         found = board.find(cv2.resize(whole, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA), "the page")
-        assert isinstance(found, Sighting) and len(found.points) == (options.columns - 1) * (options.rows - 1)
+        assert isinstance(found, BoardDetection) and len(found.points) == (options.columns - 1) * (options.rows - 1)
         margin = (width - options.columns * options.square * density) / 2
         edges = np.array([margin, height - margin]) + found.points[:, :2] * density * (1, -1)
         np.testing.assert_allclose(found.pixels, edges / 4 - 0.5, atol=0.06)
@@ -62,7 +62,7 @@ def test_page_has_the_size_that_it_says_and_shows_the_board():
 def test_another_board_is_told_apart(printed, kind, told):
     board = Board(printed)
     found = BOARD.find(render(board, LENS, facing(board, 0, 0, 0.4, 0.2, 0.2)), "a picture")
-    assert isinstance(found, NotSeen) and found.kind == kind and told in found.reason
+    assert isinstance(found, NoBoard) and found.kind == kind and told in found.reason
 
 
 def test_a_picture_without_the_board_and_a_blurred_one_say_so():
@@ -84,7 +84,7 @@ def test_covered_corners_are_left_out_and_the_others_stay_where_they_are():
     whole = BOARD.find(picture, "x")
     cv2.circle(picture, tuple(int(v) for v in whole.pixels.mean(axis=0)), 45, (90, 120, 180), -1)
     found = BOARD.find(picture, "x")
-    assert isinstance(found, Sighting) and 8 <= len(found.points) < len(whole.points)
+    assert isinstance(found, BoardDetection) and 8 <= len(found.points) < len(whole.points)
     assert np.linalg.norm(found.pixels - expected(LENS, found.points, T), axis=1).max() < 0.1
 
 
@@ -92,7 +92,7 @@ def test_light_that_falls_off_to_one_side_moves_no_corner():
     T = facing(BOARD, 0.02, 0.01, 0.5, 0.3, -0.2)
     dim = render(BOARD, LENS, T) * np.linspace(1.0, 0.35, 640)[:, None]
     found = BOARD.find(np.clip(dim, 0, 255).astype(np.uint8), "x")
-    assert isinstance(found, Sighting) and len(found.points) == 24
+    assert isinstance(found, BoardDetection) and len(found.points) == 24
     assert np.linalg.norm(found.pixels - expected(LENS, found.points, T), axis=1).max() < 0.08
 
 

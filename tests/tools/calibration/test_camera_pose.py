@@ -7,8 +7,8 @@ import pytest
 from common.perception.camera_file import CameraFile
 from common.robot.transforms import invert, rpy_to_matrix, transform
 from tests.tools.calibration.rendered_boards import BOARD, Lens, render
-from tools.calibration.calibration import CalibrationFailed
-from tools.calibration.camera_pose import calibrate_pose, sightings_of
+from tools.calibration.camera_pose import calibrate_pose, detect_boards
+from tools.calibration.intrinsics import CalibrationFailed
 
 LENS = Lens()
 CAMERA = CameraFile(width=640, height=480, fx=LENS.fx, fy=LENS.fy, cx=LENS.cx, cy=LENS.cy, d=list(LENS.d))
@@ -22,7 +22,7 @@ def lying(x, y, yaw, z=0.0):
 def seen_at(T_world_board, count=3, seed=0):
     pictures = [(f"picture {seed + k}", render(BOARD, LENS, invert(T_WORLD_CAMERA) @ T_world_board, seed=seed + k))
                 for k in range(count)]
-    found, reasons = sightings_of(BOARD, pictures, CAMERA)
+    found, reasons = detect_boards(BOARD, pictures, CAMERA)
     assert not reasons
     return T_world_board, found
 
@@ -62,7 +62,7 @@ def test_a_board_that_stands_upright_and_turned_serves_as_well():
     looks_ahead = transform(rpy_to_matrix(-np.pi / 2, 0, -np.pi / 2), (0.0, 0.0, 0.5))  # along +x, upright
     stands = transform(rpy_to_matrix(np.pi / 2, 0, -np.pi / 2 + 0.3), (0.7, 0.12, 0.4))
     pictures = [("a", render(BOARD, LENS, invert(looks_ahead) @ stands))]
-    found = calibrate_pose([(stands, sightings_of(BOARD, pictures, CAMERA)[0])], CAMERA)
+    found = calibrate_pose([(stands, detect_boards(BOARD, pictures, CAMERA)[0])], CAMERA)
     distance, angle = errors(found, looks_ahead)
     assert distance < 2e-3 and angle < 0.1
 
@@ -85,6 +85,6 @@ def test_no_board_and_another_size_are_one_line():
     with pytest.raises(CalibrationFailed, match="no picture shows the board"):
         calibrate_pose([(np.eye(4), [])], CAMERA)
     with pytest.raises(CalibrationFailed, match="a is 320x240, but the intrinsics are for 640x480"):
-        sightings_of(BOARD, [("a", np.zeros((240, 320, 3), np.uint8))], CAMERA)
-    found, reasons = sightings_of(BOARD, [("a", np.zeros((480, 640, 3), np.uint8))], CAMERA)
+        detect_boards(BOARD, [("a", np.zeros((240, 320, 3), np.uint8))], CAMERA)
+    found, reasons = detect_boards(BOARD, [("a", np.zeros((480, 640, 3), np.uint8))], CAMERA)
     assert not found and reasons == ["no marker is seen"]

@@ -9,9 +9,9 @@ from common.perception.camera_file import CameraFile
 from common.robot.model import RobotModel
 from common.robot.transforms import invert, rpy_to_matrix, transform
 from tests.tools.calibration.rendered_boards import BOARD, Lens, facing, render
-from tools.calibration.board import Sighting
-from tools.calibration.calibration import CalibrationFailed
+from tools.calibration.board import BoardDetection
 from tools.calibration.hand_eye import View, calibrate_hand_eye
+from tools.calibration.intrinsics import CalibrationFailed
 
 LENS = Lens()
 CAMERA = CameraFile(width=LENS.width, height=LENS.height, fx=LENS.fx, fy=LENS.fy, cx=LENS.cx, cy=LENS.cy,
@@ -43,11 +43,11 @@ def seen(mount: str, T_world_tcp: np.ndarray, seed: int, *, noise: float = 0.1, 
     T = invert(A) @ (invert(T_world_tcp) if mount == "hand" else T_world_tcp) @ B
     if drawn:
         sighting = BOARD.find(render(BOARD, LENS, T, seed=seed), f"p{seed}")
-        assert isinstance(sighting, Sighting)
+        assert isinstance(sighting, BoardDetection)
         return View(sighting, T_world_tcp)
     pixels = cv2.projectPoints(BOARD.corners, cv2.Rodrigues(T[:3, :3])[0], T[:3, 3], LENS.k, np.array(LENS.d))[0][:, 0]
     pixels = pixels + np.random.default_rng(seed).normal(0, noise, pixels.shape)
-    return View(Sighting(f"p{seed}", (640, 480), BOARD.corners, pixels, 0.5, pixels[:4]), T_world_tcp)
+    return View(BoardDetection(f"p{seed}", (640, 480), BOARD.corners, pixels, 0.5, pixels[:4]), T_world_tcp)
 
 
 def off(found: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
@@ -124,6 +124,6 @@ def test_joints_say_where_the_hand_was(seed):
         seen_at = invert(T @ truth) @ board
         pixels = cv2.projectPoints(BOARD.corners, cv2.Rodrigues(seen_at[:3, :3])[0], seen_at[:3, 3], LENS.k,
                                    np.array(LENS.d))[0][:, 0]
-        views.append(View(Sighting(f"p{n}", (640, 480), BOARD.corners, pixels, 0.5, pixels[:4]), T))
+        views.append(View(BoardDetection(f"p{n}", (640, 480), BOARD.corners, pixels, 0.5, pixels[:4]), T))
     result = calibrate_hand_eye(views, CAMERA, "hand")
     assert off(result.T_mount_camera, truth)[0] < 1e-4

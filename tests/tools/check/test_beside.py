@@ -1,4 +1,4 @@
-"""The quick look at a cell that a process of its own takes."""
+"""The quick check at a cell that a process of its own takes."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ import os
 from pathlib import Path
 
 from common.config import load_cell
-from tools.check.beside import doubts_beside
-from tools.check.cell import doubts
+from tools.check.cell import quick_warnings, warnings_in_subprocess
 
 ROOT = str(Path(__file__).resolve().parents[3])
 
@@ -15,7 +14,8 @@ ROOT = str(Path(__file__).resolve().parents[3])
 async def test_what_modules_of_a_person_print_is_no_part_of_what_was_found(tmp_path: Path) -> None:
     (tmp_path / "loud.py").write_text("""
 import os
-from tools.check.finding import warning
+from tools.check import warning
+from common.application import Application, ApplicationTopics, Checks
 from common.messages import TaskStatus
 from common.topics import Topic
 print("hello")
@@ -23,16 +23,17 @@ os.system("echo hello from a program")
 STATUS = Topic("loud_status", TaskStatus, "state", "")
 def quick(cell):
     yield warning("the cell is loud", "whisper")
+APPLICATION = Application(topics=ApplicationTopics(status=STATUS), checks=Checks(quick=quick))
 """, encoding="utf-8")
     (tmp_path / "loud_app").mkdir()
-    for name in ("__init__", "topics", "checks"):
-        (tmp_path / "loud_app" / f"{name}.py").write_text("from loud import STATUS, quick\n", encoding="utf-8")
-    cell = load_cell("panda").model_copy(update={"application": "loud_app.checks"})
+    (tmp_path / "loud_app" / "__init__.py").touch()
+    (tmp_path / "loud_app" / "app.py").write_text("from loud import APPLICATION\n", encoding="utf-8")
+    cell = load_cell("panda").model_copy(update={"application": "loud_app.app"})
     path = os.pathsep.join([str(tmp_path), ROOT])
-    found = await doubts_beside(cell, {**os.environ, "PYTHONPATH": path})
+    found = await warnings_in_subprocess(cell, {**os.environ, "PYTHONPATH": path})
     assert any("the cell is loud" in each.line for each in found)
 
 
 async def test_quick_look_finds_beside_what_it_finds_here() -> None:
     cell = load_cell("panda")
-    assert await doubts_beside(cell, {**os.environ, "PYTHONPATH": ROOT}) == doubts(cell)
+    assert await warnings_in_subprocess(cell, {**os.environ, "PYTHONPATH": ROOT}) == quick_warnings(cell)

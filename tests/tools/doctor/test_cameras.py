@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from tools.doctor import cameras
+from tools.doctor import software
 
 
 def plugged(sys: Path, port: str, **told: str) -> None:
@@ -22,14 +22,14 @@ def video(sys: Path, number: int, name: str, index: int) -> None:
 def test_cameras_that_are_plugged_in_are_told_with_what_reads_them(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(cameras, "find_spec", lambda package: object() if package == "depthai" else None)
+    monkeypatch.setattr(software, "find_spec", lambda package: object() if package == "depthai" else None)
     plugged(tmp_path, "2-1", idVendor="8086", product="Intel(R) RealSense(TM) Depth Camera 435i", serial="0123")
     plugged(tmp_path, "2-2", idVendor="03e7", product="Luxonis Device")
     plugged(tmp_path, "2-3", idVendor="8086", product="AX211 Bluetooth")
     plugged(tmp_path, "2-4")
     for number, name, index in ((10, "HD Webcam", 0), (2, "Other", 0), (11, "HD Webcam", 1)):
         video(tmp_path, number, name, index)
-    realsense, oak, *others = cameras.cameras(tmp_path)
+    realsense, oak, *others = software.cameras(tmp_path)
     assert realsense.level == "warn" and "435i 0123: pyrealsense2 is not installed" in realsense.what
     assert "zencell[realsense]" in realsense.remedy
     assert (oak.level, oak.what) == ("ok", "depth camera OAK Luxonis Device (driver: oak of real_depth_camera)")
@@ -45,9 +45,9 @@ def test_depth_camera_is_not_told_once_more_as_one_that_gives_only_pictures(tmp_
         interface = tmp_path / "bus/usb/devices" / port / f"{port}:1.0"
         interface.mkdir()
         (tmp_path / f"class/video4linux/video{number}/device").symlink_to(interface)
-    assert [finding.what[:22] for finding in cameras.cameras(tmp_path)] == [
+    assert [finding.what[:22] for finding in software.cameras(tmp_path)] == [
         "depth camera RealSense", "camera /dev/video1: at"]
 
 
 def test_where_there_are_none_nothing_is_told(tmp_path: Path) -> None:
-    assert list(cameras.cameras(tmp_path)) == []
+    assert list(software.cameras(tmp_path)) == []

@@ -13,8 +13,8 @@ from common.robot.finger_joints import finger_positions, width_at
 from common.robot.model import RobotModel
 from common.robot.transforms import invert
 from tests.small_arms import scara
-from tools.robot_setup.fingers import link_points, links_moved, tool_complaints
-from tools.robot_setup.hand import complaints
+from tools.robot_setup.end_effector import complaints
+from tools.robot_setup.fingers import check_tool_frame, link_points, links_moved
 from tools.robot_setup.proposal import Proposal, draft
 
 Array = NDArray[np.float64]
@@ -26,14 +26,14 @@ def config_of(name: str) -> RobotConfig:
 
 @pytest.mark.parametrize("name", names_of("robots"))
 def test_the_robots_that_come_with_the_project_say_what_is_so(name: str) -> None:
-    assert tool_complaints(RobotModel.load(config_of(name))) == []
+    assert check_tool_frame(RobotModel.load(config_of(name))) == []
 
 
 def test_a_width_that_is_not_the_fingers_is_told() -> None:
     config = config_of("panda")
     assert config.gripper is not None
     wide = config.model_copy(update={"gripper": config.gripper.model_copy(update={"mimic": [1.0, 0.5]})})
-    (told,) = tool_complaints(RobotModel.load(wide))
+    (told,) = check_tool_frame(RobotModel.load(wide))
     assert told == "gripper.max_width: the fingers open by 0.0600 m, not by 0.08 m"
 
 

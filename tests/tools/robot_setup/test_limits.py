@@ -9,8 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from common.errors import ConfigError
-from tools.robot_setup.limits import guessed_acceleration, guessed_jerk, position_range
-from tools.robot_setup.tree import Joint
+from tools.robot_setup.tree import Joint, guessed_acceleration, guessed_jerk, position_range
 
 
 def joint(kind: str, lower: float | None = None, upper: float | None = None) -> Joint:

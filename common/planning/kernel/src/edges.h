@@ -285,7 +285,7 @@ static int proved_leashed(scratch *c, int i, double inside, double tip, double t
     int ok = proved(c, i, large, t0, from, to, since, until);
     if ((inside > 0 ? w->near[i] : w->far[i]) != small || (ok && *since <= from && *until >= to)) return ok;
     double time = tip > 0 ? fabs(inside) / tip : INFINITY, a = -INFINITY, b = INFINITY;
-    if (small > EXCUSED && !proved(c, i, small, t0, from, to, &a, &b)) return ok;
+    if (small > CONTACT_ALLOWED && !proved(c, i, small, t0, from, to, &a, &b)) return ok;
     *since = fmin(*since, fmax(a, t0 - time)), *until = fmax(*until, fmin(b, t0 + time));
     return 1;
 }
@@ -373,7 +373,7 @@ static int curve_free(scratch *c, const curve *e) {
     int used = 0, head = 0, tail = 1;
     if (!grow(c, w->groups, 64)) return 0;
     for (int g = 0; g < w->groups; g++) /* entries below zero are groups */
-        if (w->group[g].far > EXCUSED || w->group[g].near > EXCUSED) c->list[used++] = -1 - g;
+        if (w->group[g].far > CONTACT_ALLOWED || w->group[g].near > CONTACT_ALLOWED) c->list[used++] = -1 - g;
     c->span[0] = (span){0.0, 1.0, 0, used};
     while (head < tail) {
         span s = c->span[head++];
@@ -406,7 +406,7 @@ static int curve_free(scratch *c, const curve *e) {
             for (int m = 0; m < count; m++) {
                 int i = members[m], ok;
                 if (entry < 0) {
-                    if (w->far[i] <= EXCUSED && w->near[i] <= EXCUSED) continue;
+                    if (w->far[i] <= CONTACT_ALLOWED && w->near[i] <= CONTACT_ALLOWED) continue;
                     pair_bounds(c, e, i);
                 }
                 if (w->excuses && w->near[i] != w->far[i])
@@ -455,7 +455,7 @@ static int around_free(scratch *c, const double *q, const double *away) {
     for (int g = 0; g < w->groups; g++) {
         const group *G = &w->group[g];
         double most = inside > 0 ? G->near : inside < 0 ? G->far : fmax(G->near, G->far);
-        if (most <= EXCUSED) continue;
+        if (most <= CONTACT_ALLOWED) continue;
         double Mb = 0, Kb = 0;
         bounds(w, &e, G->spheres.a, G->spheres.common, w->body[G->spheres.a].reach, &M, &K);
         if (G->moving && !G->spheres.fixed)
@@ -465,7 +465,7 @@ static int around_free(scratch *c, const double *q, const double *away) {
         for (int k = 0; k < G->count; k++) {
             int i = w->member[G->first + k];
             double margin = inside > 0 ? w->near[i] : inside < 0 ? w->far[i] : fmax(w->near[i], w->far[i]);
-            if (margin <= EXCUSED) continue;
+            if (margin <= CONTACT_ALLOWED) continue;
             pair_bounds(c, &e, i);
             c->checks++;
             double far = margin + TOUCHING + c->bound[i][0], need = margin + TOUCHING + c->bound[i][2];

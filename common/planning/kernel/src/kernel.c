@@ -252,7 +252,7 @@ API int zk_pairs(world *w, int count, const int *first, const int *second) {
     return 1;
 }
 
-/* Margins [m] of the pairs, EXCUSED or less for none, far from the start and near it: within `leash` [m] of `origin` by
+/* Margins [m] of the pairs, CONTACT_ALLOWED or less for none, far from the start and near it: within `leash` [m] of `origin` by
    the tool point at `tip` (3,) in the frame of joint `tool`. near may be NULL. */
 API void zk_rules(world *w, const double *far, const double *near, int tool, const double *tip, const double *origin,
                   double leash) {
@@ -260,7 +260,7 @@ API void zk_rules(world *w, const double *far, const double *near, int tool, con
     memcpy(w->near, near ? near : far, sizeof(double) * w->pairs);
     for (int g = 0; g < w->groups; g++) {
         group *G = &w->group[g];
-        G->far = G->near = EXCUSED;
+        G->far = G->near = CONTACT_ALLOWED;
         for (int k = 0; k < G->count; k++) {
             G->far = fmax(G->far, w->far[w->member[G->first + k]]);
             G->near = fmax(G->near, w->near[w->member[G->first + k]]);
@@ -360,7 +360,7 @@ API int zk_thin(int count, const double *points, const uint8_t *skip, double sid
 }
 
 /* Sets a 1 in `out` (count,) for each of points (count, 3), world, that is no farther than a margin [m] from any shape
-   where the robot is at q. margins: of each shape, EXCUSED for those that do not count. */
+   where the robot is at q. margins: of each shape, CONTACT_ALLOWED for those that do not count. */
 API void zk_near(scratch *c, const double *q, const double *margins, int count, const double *points, uint8_t *out) {
     const world *w = c->w;
     double reach[MOST_JOINTS], axis[3] = {0, 0, 1}; /* squares of how far from their middles bodies count */
@@ -370,7 +370,7 @@ API void zk_near(scratch *c, const double *q, const double *margins, int count, 
     for (int i = 0; i < w->shapes; i++) {
         int j = w->shape[i].joint;
         double far = w->body[j].sphere + margins[i];
-        if (j && margins[i] > EXCUSED) reach[j] = fmax(reach[j], far * far);
+        if (j && margins[i] > CONTACT_ALLOWED) reach[j] = fmax(reach[j], far * far);
     }
     for (int k = 0; k < count; k++) {
         const double *at = points + 3 * (size_t)k;
@@ -383,7 +383,7 @@ API void zk_near(scratch *c, const double *q, const double *margins, int count, 
         for (int i = 0; i < w->shapes && !out[k]; i++) {
             const shape *B = &w->shape[i];
             double margin = margins[i], far = B->sphere + margin;
-            if (margin <= EXCUSED || B->kind == POINTS || !(near >> B->joint & 1)) continue;
+            if (margin <= CONTACT_ALLOWED || B->kind == POINTS || !(near >> B->joint & 1)) continue;
             sub3(at, c->middle[i], d);
             if (dot3(d, d) > far * far) continue;
             const pose *T = shape_pose(c, i);

@@ -5,7 +5,7 @@
 #include "points.h"
 
 #define MOST_JOINTS 32 /* the first stands for the world */
-#define EXCUSED (-1e9) /* [m] a margin that every distance keeps */
+#define CONTACT_ALLOWED (-1e9) /* [m] a margin that every distance keeps */
 #define HOT 8
 #define TOUCHING 1e-9  /* [m] shapes this close touch: what cannot be told apart from contact is contact */
 
@@ -304,7 +304,7 @@ static inline int pair_free(scratch *c, int i, double margin) {
 /* Whether the pairs that touched last keep their margins where the robot is now. */
 static inline int hot_free(scratch *c, const double *margin) {
     for (int k = 0; k < HOT && c->hot[k] >= 0; k++)
-        if (margin[c->hot[k]] > EXCUSED && !pair_free(c, c->hot[k], margin[c->hot[k]])) {
+        if (margin[c->hot[k]] > CONTACT_ALLOWED && !pair_free(c, c->hot[k], margin[c->hot[k]])) {
             remember(c, c->hot[k]);
             return 0;
         }
@@ -322,12 +322,12 @@ static int state_free(scratch *c, const double *q) {
     for (int g = 0; g < w->groups; g++) {
         const group *G = &w->group[g];
         double most = starting ? G->near : G->far;
-        if (most <= EXCUSED) continue;
+        if (most <= CONTACT_ALLOWED) continue;
         c->checks++;
         if (group_clear(c, G, most + TOUCHING)) continue;
         for (int k = 0; k < G->count; k++) {
             int i = w->member[G->first + k];
-            if (margin[i] <= EXCUSED || pair_free(c, i, margin[i])) continue;
+            if (margin[i] <= CONTACT_ALLOWED || pair_free(c, i, margin[i])) continue;
             remember(c, i);
             return 0;
         }

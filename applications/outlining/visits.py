@@ -1,0 +1,215 @@
+"""Visits to a cell that outlines: the person at the terminal is asked which object; what the camera sees is stored."""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
+
+from applications.outlining import stage_files
+from applications.outlining.contour_choice import NoSuchContour, described, middle_of, parse_choice
+from applications.outlining.topics import (
+    CONTOUR_IMAGE,
+    CONTOUR_PATH,
+    CONTOUR_POINTS,
+    CONTOURS,
+    OUTLINE_SELECT,
+    Contours,
+    OutlinePoints,
+    OutlineSelect,
+    OutlineSelection,
+)
+from common import topics
+from common.errors import ConfigError, NoResponder, RemoteError, RequestFailed, RequestLost, ZencellError
+from common.perception.camera_input import decode_color_image
+from common.perception.depth import depth_of
+from common.perception.image import image_to_array
+from common.terminal import printable
+
+if TYPE_CHECKING:
+    from common.messages import Image
+    from common.transport.bus import Bus, Reader
+    from common.transport.requests import Client
+
+TRIES = 3  # of a choice
+AGAIN_WITHIN = 5.0  # [s]
+TIMEOUT = 30.0  # [s] for a picture and its outline
+KEPT = 100  # pictures of which contours and points are known until their path comes
+ALL_WITHIN = 3.0  # [s, cell time] after the first picture for a contour to be chosen
+CHOOSE_BY_HAND = ("services.contour_detector.select=none", "services.contour_tracer.selection_timeout=0")
+
+M = TypeVar("M", Contours, OutlinePoints)
+
+
+class NoOutline(ZencellError):
+    """The picture was stored, but it has no outline."""
+
+    exit_code = 1
+
+
+def require_terminal() -> None:
+    """Return when somebody can be asked.
+
+    Raises:
+        ConfigError: nobody can.
+    """
+    if not sys.stdin.isatty():
+        raise ConfigError("--ask", ..., "needs a terminal; without one choose with `zencell task select N`")
+
+
+async def ask_person(bus: Bus, folder: Path) -> None:
+    """Store the picture with its contours in a folder, and ask until one of them is chosen."""
+    contours, images = bus.reader(CONTOURS), bus.reader(CONTOUR_IMAGE)
+    select = bus.client(OUTLINE_SELECT)
+    found, image = await _drawn(contours, images)
+    path = folder / f"{bus.cell}_contours.png"
+    await _keep(path, image)
+    say(f"{path} shows them: {described(found.contours)}")
+    while True:
+        say("outline which one? ", end="")
+        try:
+            wanted = parse_choice(await _line())
+            if wanted is not None:
+                if wanted.index is not None and wanted.index < len(found.contours):
+                    wanted.at = middle_of(found.contours[wanted.index])  # in the picture that the person looks at
+                answer = await _chosen(select, wanted)
+                say(f"{answer.label} is chosen")
+                return
+        except NoSuchContour as error:
+            say(str(error))
+        except RemoteError as error:
+            say(error.message)
+        except RequestFailed as error:
+            say(str(error))
+
+
+async def _chosen(select: Client[OutlineSelect, OutlineSelection], wanted: OutlineSelect) -> OutlineSelection:
+    """The answer to a choice, which is made again where its answer was lost: that chooses the same."""
+    for _ in range(TRIES - 1):
+        with suppress(RequestLost):
+            return await select.call(wanted)
+        with suppress(NoResponder):  # the link to the router may be what was lost
+            await select.wait_available(AGAIN_WITHIN)
+    return await select.call(wanted)
+
+
+def say(text: str, end: str = "\n") -> None:
+    """Show a text to the person."""
+    sys.stdout.write(printable(text) + end)
+    sys.stdout.flush()
+
+
+async def _drawn(contours: Reader[Contours], images: Reader[Image]) -> tuple[Contours, Image]:
+    """The first contours that there are, and the picture into which they were drawn: another may count otherwise."""
+    found, image = await contours.next(), await images.next()
+    while not found.contours or found.header.stamp != image.header.stamp:
+        if not found.contours:
+            say("no contour in the picture yet")
+        if not found.contours or found.header.stamp < image.header.stamp:
+            found = await contours.next()
+        else:
+            image = await images.next()
+    return found, image
+
+
+async def _keep(path: Path, image: Image) -> None:
+    import cv2
+
+    written, data = cv2.imencode(".png", image_to_array(image))
+    assert written  # a picture of 8 bits can be
+    try:
+        await asyncio.to_thread(path.write_bytes, data.tobytes())
+    except OSError as error:
+        raise ConfigError("--ask", str(path), f"cannot be written: {error.strerror or error}") from None
+
+
+async def _line() -> str:
+    """The next line from the terminal. Read without a thread, which could not be ended by Ctrl-C.
+
+    Raises:
+        ConfigError: there will be none.
+    """
+    loop, arrived = asyncio.get_running_loop(), asyncio.Event()
+    loop.add_reader(sys.stdin.fileno(), arrived.set)
+    try:
+        await arrived.wait()
+    finally:
+        loop.remove_reader(sys.stdin.fileno())
+    line = sys.stdin.readline()  # a terminal gives whole lines
+    if not line:
+        raise ConfigError("--ask", ..., "nothing was chosen")
+    return line.strip()
+
+
+async def store(bus: Bus, folder: Path, wanted: OutlineSelect | None) -> str:
+    """Put a picture, its depth and the stages of its outline into a folder; returns what was stored.
+
+    Raises:
+        NoOutline: there is a picture and no outline in it.
+        StageFileError: a file cannot be written.
+    """
+    pictures, depths = bus.reader(topics.DEPTH_CAMERA_IMAGE), bus.reader(topics.DEPTH_CAMERA_DEPTH)
+    contours, points, paths = bus.reader(CONTOURS), bus.reader(CONTOUR_POINTS), bus.reader(CONTOUR_PATH)
+    seen, found, cleared = dict[int, Contours](), dict[int, OutlinePoints](), dict[int, OutlinePoints]()
+    more = asyncio.Event()
+    noting: list[asyncio.Task[None]] = []
+    try:
+        async with asyncio.timeout(TIMEOUT):
+            first = await pictures.next()
+            chosen_at = -1  # stamp of the newest picture that may have had another choice
+            if wanted is not None and wanted.rule != "auto":
+                await contours.next()
+                await _chosen(bus.client(OUTLINE_SELECT), wanted)
+                chosen_at = max(each.latest.header.stamp for each in (pictures, contours) if each.latest is not None)
+            noting += [asyncio.create_task(_note(*each, more))  # what comes while files are written, too
+                       for each in ((points, found), (paths, cleared))]
+            noting.append(asyncio.create_task(_note(contours, seen, more)))
+            picture, depth = await _pair(pictures, depths, chosen_at)
+            # Beside the loop: of what comes while it is held up all but the newest would be lost.
+            await asyncio.to_thread(stage_files.write_pictures, folder, decode_color_image(picture), depth_of(depth))
+            while True:
+                more.clear()
+                since = [path for stamp, path in sorted(cleared.items()) if stamp >= picture.header.stamp]
+                # All of the path's own picture: in another the object may have another label.
+                whole = [path for path in since if path.poses and path.header.stamp in seen.keys() & found.keys()]
+                if whole:
+                    break
+                late = [path for path in since if path.header.stamp - first.header.stamp > ALL_WITHIN * 1e9]
+                if late and late[-1].message and not late[-1].poses:
+                    raise NoOutline(f"{late[-1].message}; the picture is in {folder}")
+                await more.wait()
+    except TimeoutError:
+        raise NoOutline(f"no outline came within {TIMEOUT:g} s: does the cell have a depth camera?") from None
+    finally:
+        for task in noting:
+            task.cancel()
+    path, stamp = whole[0], whole[0].header.stamp
+    chosen = next((contour for contour in seen[stamp].contours if contour.label == path.object), None)
+    if chosen is not None:
+        stage_files.write_points(folder / stage_files.PIXELS, chosen.pixels)
+    stage_files.write_points(folder / stage_files.COORDINATES, _points(found[stamp]))
+    stage_files.write_points(folder / stage_files.CLEARED, _points(path))
+    return f"{path.object}, {len(path.poses)} points: the picture and the stages are in {folder}"
+
+
+async def _note(reader: Reader[M], kept: dict[int, M], more: asyncio.Event) -> None:
+    """Keep the newest messages by the stamps of their pictures."""
+    async for message in reader:
+        kept[message.header.stamp] = message
+        while len(kept) > KEPT:
+            del kept[next(iter(kept))]
+        more.set()
+
+
+async def _pair(pictures: Reader[Image], depths: Reader[Image], after: int) -> tuple[Image, Image]:
+    """A picture later than a stamp, and the depth image that was taken with it."""
+    while True:
+        picture, depth = await pictures.next(), depths.latest
+        if depth is not None and depth.header.stamp == picture.header.stamp > after:
+            return picture, depth
+
+
+def _points(outline: OutlinePoints) -> list[tuple[float, float, float]]:
+    return [(p.position.x, p.position.y, p.position.z) for p in outline.poses]

@@ -1,0 +1,200 @@
+"""Whether the arm touched anything on the way that it really took, among the balls where they really were."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from applications.pick_place.topics import SCENE_BALLS
+from common import topics
+from common.config import Cell, Surroundings
+from common.messages import CollisionObject, GripperState, JointState, PlanningScene, Pose, PoseArray
+from common.planning.collision import CollisionWorld, Pair, interpolate
+from common.planning.obstacles import ObstacleCache
+from common.planning.robot_geometry import RobotGeometry
+from common.robot.finger_joints import measured_width
+from common.robot.model import RobotModel
+from common.robot.transforms import invert, matrix_to_pose
+from common.scene.fixtures import fixed_objects
+from common.topics import Topic
+
+Array = NDArray[np.float64]
+S = TypeVar("S", JointState, GripperState, PoseArray)
+
+STEP = 0.01  # [rad] between the positions that are checked
+AT_HAND = 0.04  # [m] a ball nearer than this to the tool centre point is what the fingers close on or let go
+ABOUT = 0.16  # [m] from where the fingers move: within it they may touch that ball
+
+
+@dataclass
+class Recording:
+    """What a cell said about arm, hand and truth, in the order in which it came; what comes again counts once."""
+
+    joints: list[JointState] = field(default_factory=list)
+    grips: list[GripperState] = field(default_factory=list)
+    balls: list[PoseArray] = field(default_factory=list)
+
+    def listeners(self) -> dict[Topic[Any], Callable[[float, Any], None]]:
+        """What a fold is to hand over."""
+        return {
+            topics.JOINT_STATES: lambda _, state: _keep(self.joints, state),
+            topics.GRIPPER_STATE: lambda _, state: _keep(self.grips, state),
+            SCENE_BALLS: lambda _, balls: _keep(self.balls, balls),
+        }
+
+
+def _keep(kept: list[S], message: S) -> None:
+    if not kept or message.header.stamp > kept[-1].header.stamp:  # a state comes again each second
+        kept.append(message)
+
+
+@dataclass(frozen=True)
+class Contact:
+    """A pair that touched, and when: cell time [s] since the first joint state."""
+
+    time: float
+    pair: Pair
+
+    def __str__(self) -> str:
+        return f"{self.pair[0]} - {self.pair[1]} at {self.time:.2f} s"
+
+
+@dataclass(frozen=True)
+class _Window:
+    """Samples first to last, in which the gripper's links may touch a ball: they take it, or have let it go."""
+
+    ball: str
+    first: int
+    last: int
+
+
+class Recheck:
+    """Checks recordings of one cell."""
+
+    def __init__(self, cell: Cell, step: float = STEP) -> None:
+        """Load the robot's hulls; positions are checked every `step` [rad]."""
+        self._step = step
+        self.robot = RobotModel.load(cell.robot)
+        self.cache = ObstacleCache(RobotGeometry(self.robot))
+        self.around = Surroundings.model_validate(cell.section(Surroundings).model_dump())
+        assert cell.robot.gripper is not None
+        self.gripper, self.gripper_links = cell.robot.gripper, cell.robot.gripper.links
+        self.checked = 0  # positions so far
+
+    def contacts(self, recording: Recording) -> list[Contact]:
+        """Every pair that touched on the way, once for each time that it did.
+
+        The ball in the hand moves with it and counts as part of the arm; it may touch what it touches when it is taken
+        until it was lifted by 2 cm. A ball that falls is left out.
+        """
+        stamps = np.array([state.header.stamp for state in recording.joints])
+        path = np.array([self.robot.order(s.name, s.position) for s in recording.joints])
+        places = np.array([self.robot.fk(q)[:3, 3] for q in path])
+        windows = list(self._windows(recording, stamps, places))
+        found: list[Contact] = []
+        for truth, first, last in self._spans(recording, stamps):
+            cuts = {first, last}
+            for window in windows:
+                cuts |= {cut for cut in (window.first, window.last) if first < cut < last}
+            for begin, end in pairwise(sorted(cuts)):
+                allowed = [
+                    (link, w.ball) for w in windows if w.first <= begin and end <= w.last for link in self.gripper_links
+                ]
+                widths = [measured_width(self.gripper, state.name, state.position)
+                          for state in recording.joints[begin : end + 1]]
+                world = self._world(truth, path, stamps, first, allowed, _widest(widths))
+                for index, pair in self._touching(world, path[begin : end + 1]):
+                    found.append(Contact((stamps[begin + index] - stamps[0]) * 1e-9, pair))
+        return found
+
+    def _touching(self, world: CollisionWorld, states: Array) -> Iterator[tuple[int, Pair]]:
+        """Index of the state after which something touches, and what, once for each time."""
+        pieces = [interpolate([a, b], self._step)[1:] for a, b in pairwise(states)]
+        fine = np.concatenate([states[:1], *pieces])
+        owners = np.concatenate([[0], *(np.full(len(piece), i) for i, piece in enumerate(pieces))]).astype(int)
+        self.checked += len(fine)
+        at = 0
+        while at < len(fine) and (hit := world.first_collision(fine[at:])) is not None:
+            at += hit.index
+            yield int(owners[at]), hit.pair
+            while at < len(fine) and world.collides(fine[at]):
+                at += 1
+
+    def _spans(self, recording: Recording, stamps: NDArray[np.int64]) -> Iterator[tuple[PoseArray, int, int]]:
+        """Truths between which only the hand and falling balls move, with the first and last sample of each."""
+        kept: list[PoseArray] = []
+        for balls in recording.balls:
+            if not kept or _resting(balls) != _resting(kept[-1]):
+                kept.append(balls)
+        starts = [max(0, int(np.searchsorted(stamps, b.header.stamp, side="right")) - 1) for b in kept]
+        starts[0] = 0
+        for balls, first, last in zip(kept, starts, [*starts[1:], len(stamps) - 1], strict=True):
+            if last > first:
+                yield balls, first, last
+
+    def _windows(
+        self, recording: Recording, stamps: NDArray[np.int64], places: Array
+    ) -> Iterator[_Window]:
+        """The balls that the fingers closed on or let go, while the hand was about them."""
+        truth = iter(recording.balls)
+        balls = next(truth)
+        following = next(truth, None)
+        before = ""
+        for state in recording.grips:
+            if not state.id or state.id == before:
+                continue
+            before = state.id
+            while following is not None and following.header.stamp <= state.header.stamp:
+                balls, following = following, next(truth, None)
+            at = min(len(stamps) - 1, int(np.searchsorted(stamps, state.header.stamp)))
+            about = np.linalg.norm(places - places[at], axis=1) < ABOUT
+            first = at - int(np.argmin(about[at::-1])) + 1 if not about[: at + 1].all() else 0
+            last = at + int(np.argmin(about[at:])) - 1 if not about[at:].all() else len(stamps) - 1
+            for name, pose in zip(balls.ids, balls.poses, strict=True):
+                if np.linalg.norm(places[at] - [pose.position.x, pose.position.y, pose.position.z]) < AT_HAND:
+                    yield _Window(name, first, last)
+
+    def _world(
+        self, truth: PoseArray, path: Array, stamps: NDArray[np.int64], first: int, allowed: list[Pair],
+        width: float | None,
+    ) -> CollisionWorld:
+        held = next((i for i, label in enumerate(truth.labels) if label == "held"), None)
+        objects = fixed_objects(self.around)
+        for i, name in enumerate(truth.ids):
+            if truth.labels[i] in ("table", "box", "held"):
+                objects.append(CollisionObject(
+                    id=name, role="target", shape="sphere", dimensions=[self.around.ball_radius], pose=truth.poses[i]))
+        grip: Pose | None = None
+        if held is not None:
+            p = truth.poses[held].position
+            T_world_ball = np.eye(4)
+            T_world_ball[:3, 3] = p.x, p.y, p.z
+            at = min(len(stamps) - 1, int(np.searchsorted(stamps, truth.header.stamp)))
+            T_tcp_ball = invert(self.robot.fk(path[at])) @ T_world_ball
+            T_tcp_ball[:3, :3] = np.eye(3)  # a ball has no orientation
+            grip = matrix_to_pose(T_tcp_ball)
+        return CollisionWorld(
+            self.robot, PlanningScene(header=truth.header, objects=objects), start=path[first], padding=0.0,
+            allowed=allowed, attach=truth.ids[held] if held is not None else "", attach_pose=grip, cache=self.cache,
+            width=width,
+        )
+
+
+def _widest(widths: Sequence[float | None]) -> float | None:
+    """Of measured widths [m]; None where one is not known."""
+    known = [width for width in widths if width is not None]
+    return max(known) if known and len(known) == len(widths) else None
+
+
+def _resting(balls: PoseArray) -> tuple[object, ...]:
+    """Which ball is held, and where the others lie."""
+    return tuple(
+        (name, label, None if label == "held" else (p.position.x, p.position.y, p.position.z))
+        for name, label, p in zip(balls.ids, balls.labels, balls.poses, strict=True)
+        if label in ("table", "box", "held")
+    )

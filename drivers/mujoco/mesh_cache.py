@@ -1,0 +1,86 @@
+"""Meshes of a robot as MuJoCo takes them. They are read once and cached, by their content, in the folder of caches."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import tempfile
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from common.mesh_files import triangles_of
+from common.robot.model import RobotModel
+
+CACHE_VARIABLE = "ZENCELL_CACHE"  # folder for what can be made again; else zencell in that of the user
+_FORMAT = b"1"  # of what is cached_arrays: another number is made anew
+if TYPE_CHECKING:
+    from common.robot.visual_meshes import Piece
+
+Arrays = dict[str, NDArray[Any]]
+
+
+def cache_folder() -> Path:
+    """Where what can be made again is cached_arrays: it need not be there."""
+    if named := os.environ.get(CACHE_VARIABLE):
+        return Path(named)
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "zencell"
+
+
+def hull_points(path: Path) -> NDArray[np.float64]:
+    """(n, 3) points of a mesh file, each once, in its own units: its convex hull is what collides.
+
+    Raises:
+        ConfigError: it cannot be read.
+    """
+    def read() -> Arrays:
+        return {"points": np.unique(triangles_of("robot.urdf", path).reshape(-1, 3), axis=0)}
+
+    return cached_arrays("hull", [path.read_bytes()], read)["points"]
+
+
+def cached_visual_meshes(robot: RobotModel, triangles: int) -> list[Piece]:
+    """What is seen of all links with about so many triangles: see `common.robot.visual_meshes`."""
+    from common.robot.visual_meshes import Piece, seen_shapes, visual_pieces  # brings trimesh
+
+    files = [shape.path.read_bytes() for shape in seen_shapes(robot) if shape.path is not None]
+
+    def make() -> Arrays:
+        made: Arrays = {}
+        for number, piece in enumerate(visual_pieces(robot, triangles)):
+            red, green, blue = piece.color
+            name = f"{number}|{piece.link}|{red}|{green}|{blue}"
+            made[f"{name}|vertices"], made[f"{name}|faces"] = piece.vertices, piece.faces
+        return made
+
+    found = cached_arrays("visual", [robot.urdf.encode(), str(triangles).encode(), *files], make)
+    pieces = {}
+    for name, vertices in found.items():
+        number, link, red, green, blue, what = name.split("|")
+        if what == "vertices":
+            faces = found[name.removesuffix(what) + "faces"]
+            pieces[int(number)] = Piece(link, (int(red), int(green), int(blue)), vertices, faces)
+    return [pieces[number] for number in sorted(pieces)]
+
+
+def cached_arrays(kind: str, content: list[bytes], make: Callable[[], Arrays]) -> Arrays:
+    """What was made of the content before, or is made now and cached_arrays where that can be done."""
+    digest = hashlib.sha256(_FORMAT)
+    for part in content:
+        digest.update(len(part).to_bytes(8, "little") + part)
+    path = cache_folder() / "meshes" / f"{kind}-{digest.hexdigest()[:32]}.npz"
+    with contextlib.suppress(OSError, ValueError, EOFError, zipfile.BadZipFile), path.open("rb") as file:
+        return dict(np.load(file, allow_pickle=False))
+    made = make()
+    with contextlib.suppress(OSError):  # a folder that cannot be written to: made anew next time
+        path.parent.mkdir(parents=True, exist_ok=True)
+        descriptor, name = tempfile.mkstemp(dir=path.parent, suffix=".npz")
+        with os.fdopen(descriptor, "wb") as file:
+            np.savez(file, **made)  # type: ignore[arg-type]
+        os.replace(name, path)
+    return made

@@ -1,0 +1,229 @@
+"""Objects in a model: free bodies with the mass and the shape that they have."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from common.config import CameraConfig, Container, Fixture, Surroundings
+from common.config.objects import TCP
+from common.robot.model import RobotModel
+from common.robot.transforms import matrix_to_quaternion, rpy_to_matrix
+from common.sim.footprints import convex_parts
+from common.sim.objects import Solid
+from common.sim.resting import FLOOR_BELOW_TABLE
+
+Array = NDArray[np.float64]
+
+RING_PIECES = 16  # convex pieces of a ring
+USUAL_MASS = 0.1  # [kg] where nobody says
+
+
+@dataclass(frozen=True, eq=False)
+class SceneObject:
+    """An object: its shape in its own frame, its colour and its mass [kg]."""
+
+    id: str
+    solid: Solid
+    color: tuple[float, float, float]
+    mass: float = USUAL_MASS
+
+
+def add_object(spec: mujoco.MjSpec, thing: SceneObject) -> None:
+    """Put an object into a model: a free body `thing:ID` at the origin."""
+    body = spec.worldbody.add_body(name=f"thing:{thing.id}")
+    body.add_freejoint(name=f"thing:{thing.id}")
+    geoms = _geoms(spec, body, thing)
+    volume = sum(volume for _, volume in geoms)
+    for geom, part in geoms:
+        geom.mass = thing.mass * part / volume
+        geom.rgba = [*thing.color, 1.0]
+        set_contact(geom, OBJECT)
+
+
+def _geoms(spec: mujoco.MjSpec, body: Any, thing: SceneObject) -> list[tuple[Any, float]]:
+    """Convex geoms, each with its volume [m^3]."""
+    solid, kinds = thing.solid, mujoco.mjtGeom
+    if solid.shape == "sphere":
+        return [(body.add_geom(type=kinds.mjGEOM_SPHERE, size=[solid.radius, 0.0, 0.0]), 1.0)]
+    if solid.shape in ("box", "cylinder"):
+        size, middle = solid.size / 2, (solid.low + solid.high) / 2
+        if solid.shape == "box":
+            return [(body.add_geom(type=kinds.mjGEOM_BOX, size=size, pos=middle), 1.0)]
+        return [(body.add_geom(type=kinds.mjGEOM_CYLINDER, size=[size[0], size[2], 0.0], pos=middle), 1.0)]
+    made = []
+    for number, points in enumerate(convex_pieces(solid)):
+        mesh = spec.add_mesh(name=f"thing:{thing.id}.{number}")
+        mesh.uservert = points.ravel()
+        mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
+        made.append((body.add_geom(type=kinds.mjGEOM_MESH, meshname=mesh.name), _volume(points)))
+    return made
+
+
+def convex_pieces(solid: Solid) -> list[Array]:
+    """Points (n, 3) [m] of convex pieces of a solid.
+
+    A prism is cut into triangles where it is not convex, a ring into wedges; of a mesh each connected part is taken for
+    its convex hull.
+    """
+    if solid.shape == "mesh":
+        return _connected(solid.mesh)
+    heights = np.array([solid.low[2], solid.high[2]])
+    if solid.shape == "ring":
+        outer, inner = float(solid.high[0]), solid.inner_radius
+        angles = np.linspace(0.0, 2 * math.pi, RING_PIECES + 1)
+        sections = []
+        for a, b in pairwise(angles):
+            way = np.array([[math.cos(t), math.sin(t)] for t in (a, (a + b) / 2, b)])
+            sections.append(np.concatenate([outer * way, inner * way[::-2]]))
+    else:
+        sections = [np.asarray(part) for part in convex_parts(solid.section)]
+    return [np.concatenate([np.column_stack([section, np.full(len(section), z)]) for z in heights])
+            for section in sections]
+
+
+def _connected(triangles: Array) -> list[Array]:
+    """Points (n, 3) of each connected part of triangles (n, 3, 3)."""
+    points, corners = np.unique(triangles.reshape(-1, 3), axis=0, return_inverse=True)
+    corners = corners.reshape(-1, 3)
+    lowest = np.arange(len(points))
+    while True:
+        least = lowest[corners].min(axis=1)
+        before = lowest.copy()
+        for column in range(3):
+            np.minimum.at(lowest, corners[:, column], least)
+        if (lowest == before).all():
+            break
+    return [part for label in np.unique(lowest) if len(part := points[lowest == label]) >= 4]
+
+
+def _volume(points: Array) -> float:
+    """About that of what is convex [m^3]: a share of the box about it is enough to part a mass."""
+    return float(np.prod(np.maximum(np.ptp(points, axis=0), 1e-6)))
+
+
+# How things touch: the numbers of MuJoCo's solver, and who meets whom. docs/physics.md says where they come from."""
+
+TIMESTEP = 0.002  # [s]
+IMPRATIO = 10.0  # friction is stiffer than contact: what is held does not creep
+SOLREF = (0.004, 1.0)  # time constant [s], damping: MuJoCo's own 0.02 squeezes fingers 11 mm into what they hold
+SOLIMP = (0.95, 0.99, 0.001, 0.5, 2.0)
+SLIDING, TORSION, ROLLING = 1.0, 0.01, 0.001  # coefficient, [m], [m]: without rolling friction nothing round stops
+FINGER_SLIDING = 1.5  # rubber pads
+CONDIM = 6  # sliding, torsion and rolling
+
+ROBOT, FIXED, OBJECT, HIDDEN = 1, 2, 4, 0  # what meets what; a robot meets itself only in its planner's mind
+_MEETS = {ROBOT: 0, FIXED: ROBOT, OBJECT: ROBOT | FIXED | OBJECT, HIDDEN: 0}
+
+# Groups of shapes, for who draws them: what is only seen, and what only collides.
+SEEN, COLLIDES = 2, 3
+
+
+def wxyz(rotation: Array) -> list[float]:
+    """Quaternion w, x, y, z, as MuJoCo has it, of a (3, 3) rotation."""
+    x, y, z, w = matrix_to_quaternion(rotation)
+    return [w, x, y, z]
+
+
+def set_contact(geom: Any, kind: int, *, group: int = 0) -> Any:
+    """The geom (of an MjSpec) with the contact of its kind."""
+    geom.contype, geom.conaffinity, geom.group = kind, _MEETS[kind], group
+    geom.condim = CONDIM if kind == OBJECT else 3
+    geom.friction, geom.solref, geom.solimp = (SLIDING, TORSION, ROLLING), SOLREF, SOLIMP
+    return geom
+
+
+def set_finger_contact(geom: Any) -> Any:
+    """The geom of a finger with the contact of its pads, which counts more than that of what it holds."""
+    geom.friction = (FINGER_SLIDING, TORSION, ROLLING)
+    geom.condim, geom.priority = CONDIM, 1
+    return geom
+
+
+def visual_only(geom: Any) -> Any:
+    """The geom without contact and mass."""
+    geom.contype = geom.conaffinity = HIDDEN
+    geom.group, geom.mass, geom.density = SEEN, 0.0, 0.0
+    return geom
+
+
+# What never moves in a model: fixtures, containers, the floor; and the cameras."""
+
+STANDS = 0.3  # [m] a fixture whose bottom is so far below the highest top stands on the floor
+FLOOR_COLOR = (0.62, 0.62, 0.60, 1.0)
+_OPTICAL_TO_GL = np.diag([1.0, -1.0, -1.0])  # an optical frame looks along z with y down, MuJoCo's along -z with y up
+
+
+def add_surroundings(spec: mujoco.MjSpec, world: Surroundings) -> None:
+    """Put what is fixed into a model: a body `fixture:ID` or `container:ID` for each, and the floor."""
+    kinds = {"box": mujoco.mjtGeom.mjGEOM_BOX, "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
+             "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER}
+    for fixture in world.fixtures:
+        body = spec.worldbody.add_body(name=f"fixture:{fixture.id}", pos=fixture.position,
+                                       quat=wxyz(rpy_to_matrix(*fixture.rpy)))
+        d = fixture.dimensions
+        size = {"box": [side / 2 for side in d], "sphere": [d[0], 0.0, 0.0],
+                "cylinder": [d[0], d[-1] / 2, 0.0]}[fixture.shape]
+        geom = body.add_geom(name=f"fixture:{fixture.id}", type=kinds[fixture.shape], size=size,
+                             rgba=[*fixture.color, 1.0])
+        set_contact(geom, FIXED)
+    for container in world.containers.values():
+        _add_container(spec, container, world.table_height)
+    floor = spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[5.0, 5.0, 0.1],
+                                    pos=[0.0, 0.0, floor_height(world)], rgba=FLOOR_COLOR)
+    set_contact(floor, FIXED)
+
+
+def floor_height(world: Surroundings) -> float:
+    """z of the floor [m]: where fixtures stand, or below the table."""
+    extents = [_extent(fixture) for fixture in world.fixtures]
+    top, bottom = max((high for _, high in extents), default=0.0), min((low for low, _ in extents), default=0.0)
+    return bottom if top - bottom > STANDS else min(bottom, world.table_height) - FLOOR_BELOW_TABLE
+
+
+def _extent(fixture: Fixture) -> tuple[float, float]:
+    """Heights [m] between which it certainly lies."""
+    d, up = fixture.dimensions, np.abs(rpy_to_matrix(*fixture.rpy)[2])
+    half = {"box": float(up @ np.resize(d, 3)) / 2, "sphere": d[0],
+            "cylinder": float(up[2] * d[-1] / 2 + math.hypot(up[0], up[1]) * d[0])}[fixture.shape]
+    return fixture.position[2] - half, fixture.position[2] + half
+
+
+def _add_container(spec: mujoco.MjSpec, c: Container, table: float) -> None:
+    """Five panels: a floor, and walls from the table up."""
+    body = spec.worldbody.add_body(name=f"container:{c.id}", pos=[c.x, c.y, table])
+    half, thick, middle = c.half_side, c.wall_thickness / 2, c.wall_height / 2
+    off = half - thick
+    panels = [((0.0, 0.0, c.floor_thickness / 2), (half, half, c.floor_thickness / 2))]
+    panels += [((sign * off, 0.0, middle), (thick, half, middle)) for sign in (-1, 1)]
+    panels += [((0.0, sign * off, middle), (half - 2 * thick, thick, middle)) for sign in (-1, 1)]
+    for number, (at, size) in enumerate(panels):
+        geom = body.add_geom(name=f"container:{c.id}.{number}", type=mujoco.mjtGeom.mjGEOM_BOX, pos=at, size=size,
+                             rgba=[*c.color, 1.0])
+        set_contact(geom, FIXED)
+
+
+def add_cameras(spec: mujoco.MjSpec, world: Surroundings, robot: RobotModel | None) -> None:
+    """Put the cameras of the world into a model, by their names, on their mounts."""
+    for name, camera in world.cameras.items():
+        body: Any = spec.worldbody
+        if camera.mount and robot is not None:
+            body = spec.body(robot.config.tcp_link if camera.mount == TCP else camera.mount)
+        body.add_camera(name=name, pos=camera.position, quat=camera_quaternion(rpy_to_matrix(*camera.rpy)),
+                        fovy=field_of_view(camera), resolution=[camera.width, camera.height])
+
+
+def camera_quaternion(rotation: NDArray[np.float64]) -> list[float]:
+    """w, x, y, z of a MuJoCo camera whose optical frame has this (3, 3) rotation."""
+    return wxyz(rotation @ _OPTICAL_TO_GL)
+
+
+def field_of_view(camera: CameraConfig) -> float:
+    """Vertical [deg]; whose principal point is off the middle, or whose pixels are not square, is not in it."""
+    return math.degrees(2 * math.atan(camera.height / (2 * camera.fy)))

@@ -1,0 +1,345 @@
+"""What a person decided: who lets go of what, what outlives the process, and a record that nobody can read."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from common.control.interlocks import MOST, MOST_GOALS, SLOWEST, Interlocks, Record, Speed, speed_of
+from common.control.record_file import RecordFile, record_file
+from common.errors import ConfigError
+from common.kept_file import lasting_folder
+from common.messages import HoldRequest, MotionStatus, StopRequest
+
+T0 = 1_700_000_000_000_000_000
+
+
+def at(*times: int) -> Callable[[], int]:
+    left = list(times)
+    return lambda: left.pop(0) if len(left) > 1 else left[0]
+
+
+def made(record: Record | None = None) -> Interlocks:
+    return Interlocks(record, at(T0))
+
+
+def held(interlocks: Interlocks) -> list[str]:
+    return sorted(hold.by for hold in interlocks.holds)
+
+
+def test_a_hold_is_let_go_by_its_owner_only_and_one_without_a_name_by_everybody() -> None:
+    interlocks = made()
+    for owner in ("anna", "bert", ""):
+        interlocks.hold(HoldRequest(hold=True, owner=owner, reason="lunch"))
+    assert held(interlocks) == ["anna", "bert", "operator"]
+    assert [gone.by for gone in interlocks.hold(HoldRequest(hold=False, owner="bert"))] == ["bert", "operator"]
+    interlocks.hold(HoldRequest(hold=False))
+    interlocks.hold(HoldRequest(hold=False, owner="bert", stops=True))
+    assert held(interlocks) == ["anna"]
+    assert [gone.by for gone in interlocks.hold(HoldRequest(hold=False, owner="bert", override=True))] == ["anna"]
+    assert interlocks.all == []
+
+
+def test_a_stop_is_let_go_by_a_start_of_anybody_and_not_by_a_resume_of_its_owner() -> None:
+    interlocks = made()
+    interlocks.stop(StopRequest(owner="anna", reason="fire"))
+    interlocks.hold(HoldRequest(hold=False, owner="anna"))
+    refused = interlocks.objection("a")
+    assert refused is not None and refused.code == "stopped"
+    assert str(refused) == "stopped since 2023-11-14 22:13:20 UTC by anna (fire)"
+    interlocks.hold(HoldRequest(hold=False, owner="bert", stops=True))
+    assert interlocks.objection("a") is None
+
+
+def test_what_was_decided_before_a_stop_neither_lets_go_of_it_nor_moves() -> None:
+    interlocks = made()
+    interlocks.stop(StopRequest(owner="anna"))
+    acknowledged = interlocks.stops[0].since
+    assert interlocks.objection("go there", "anna", acknowledged) is None, "who stopped it moves it, knowing that"
+    assert interlocks.objection("go there", "bert", acknowledged) and interlocks.objection("go there", "", acknowledged)
+    interlocks.stop(StopRequest(owner="anna"))
+    interlocks.hold(HoldRequest(hold=False, stops=True, override=True, acknowledged=acknowledged))
+    assert interlocks.objection("go there", "anna", acknowledged) and interlocks.objection("go there", "anna")
+    interlocks.hold(HoldRequest(hold=False, stops=True, acknowledged=interlocks.stops[0].since))
+    assert interlocks.objection("task") is None
+
+
+def test_hold_that_its_owner_turns_into_a_stop_still_keeps_everybody_else() -> None:
+    interlocks = made()
+    interlocks.hold(HoldRequest(hold=True, owner="anna"))
+    since = interlocks.holds[0].since
+    interlocks.hold(HoldRequest(hold=False, owner="anna", into_stop=True, acknowledged=since))
+    assert not interlocks.holds and interlocks.objection("task")
+    assert interlocks.objection("go there", "anna", since) is None
+
+
+@given(times=st.lists(st.integers(0, 2 * T0), min_size=2, max_size=8))
+def test_a_later_word_has_a_later_time_whatever_the_clock_does_also_after_a_restart(times: list[int]) -> None:
+    interlocks, seen = Interlocks(None, at(*times)), []
+    for number in range(len(times)):
+        interlocks.stop(StopRequest(owner=f"{number % 3}"))
+        seen.append(max(stop.since for stop in interlocks.stops))
+        interlocks.hold(HoldRequest(hold=False, stops=True))
+        interlocks = Interlocks(Record.model_validate_json(interlocks.record.model_dump_json()), at(*times[number:]))
+    assert seen == sorted(set(seen))
+
+
+def test_holds_of_watchdog_and_controller_are_no_part_of_the_record() -> None:
+    interlocks = made()
+    interlocks.hold(HoldRequest(hold=True, by="watchdog", reason="no joint states"))
+    interlocks.hold_ourselves("controller", True, "the task is gone")
+    interlocks.hold(HoldRequest(hold=True, owner="watchdog"))
+    assert [one.by for one in interlocks.all] == ["watchdog", "watchdog", "controller"]
+    assert [one.by for one in made(interlocks.record).all] == ["watchdog"]
+    interlocks.hold(HoldRequest(hold=False, by="watchdog"))
+    assert held(interlocks) == ["watchdog"], "a person who calls himself so"
+
+
+def test_goals_that_were_stopped_never_move_and_are_not_remembered_without_end() -> None:
+    interlocks = made()
+    interlocks.never(str(number) for number in range(MOST_GOALS + 5))
+    again = made(interlocks.record)
+    assert again.objection("5") and again.objection(str(MOST_GOALS + 4)) and not again.objection("4")
+
+
+def test_so_many_persons_that_they_share_an_entry_still_hold_the_robot() -> None:
+    interlocks = made()
+    for number in range(MOST + 9):
+        interlocks.hold(HoldRequest(hold=True, owner=f"{number}", reason="x" * 1000))
+    assert len(interlocks.all) == MOST + 1
+    for number in range(MOST + 9):
+        interlocks.hold(HoldRequest(hold=False, owner=f"{number}"))
+    assert held(interlocks) == ["others"]
+    assert interlocks.hold(HoldRequest(hold=False, override=True)) and not interlocks.all
+
+
+@pytest.mark.parametrize(("kept", "configured", "now"), [
+    (None, 0.5, 0.5), (Speed(scaling=0.05, configured=1.0), 1.0, 0.05), (Speed(scaling=1.0, configured=0.2), 0.2, 1.0),
+    (Speed(scaling=1.0, configured=1.0), 0.2, 0.2), (Speed(scaling=0.05, configured=1.0), 0.2, 0.05),
+])
+def test_speed_that_was_set_is_kept_and_the_slower_when_another_was_configured_since(
+    kept: Speed | None, configured: float, now: float
+) -> None:
+    assert speed_of(kept, configured) == now
+
+
+# --- the file ---
+
+
+def test_what_was_saved_is_found_again(tmp_path: Path) -> None:
+    interlocks = made()
+    interlocks.stop(StopRequest(owner="anna", reason="fire"))
+    interlocks.never(["a"])
+    interlocks.speed, interlocks.arm_stopped = Speed(scaling=0.05, configured=1.0), True
+    file = record_file("panda", {"ZENCELL_STATE": str(tmp_path / "new" / "folder")})
+    file.require_writable()
+    assert file.load() == (Record(), "")
+    file.save(interlocks.record)
+    assert file.load() == (interlocks.record, "")
+
+
+def test_save_that_is_cut_off_anywhere_leaves_the_record_before_it(tmp_path: Path) -> None:
+    file, interlocks = RecordFile(tmp_path / "r"), made()
+    interlocks.stop(StopRequest(owner="anna"))
+    file.save(interlocks.record)
+    for size in (0, 10, 200):
+        (tmp_path / "r.new").write_bytes((tmp_path / "r").read_bytes()[:size])
+        assert file.load() == (interlocks.record, "")
+
+
+class PowerCut(Exception):
+    pass
+
+
+def step_or_cut(steps: Iterator[int], step: Callable[..., Any], *args: Any, **named: Any) -> Any:
+    if next(steps, None) is None:
+        raise PowerCut
+    return step(*args, **named)
+
+
+@pytest.mark.parametrize("step", range(12))
+def test_save_that_is_cut_off_between_any_two_steps_leaves_one_of_both_records_and_room_for_the_next(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, full_disk: Callable[[], None], step: int
+) -> None:
+    file, interlocks = RecordFile(tmp_path / "r"), made()
+    file.require_writable()
+    interlocks.stop(StopRequest(owner="anna"))
+    file.save(interlocks.record)
+    before = interlocks.record
+    interlocks.stop(StopRequest(owner="bert"))
+    steps = iter(range(step))
+    with monkeypatch.context() as patched:
+        for name in ("open", "write", "fsync", "unlink", "link", "replace"):
+            patched.setattr(os, name, partial(step_or_cut, steps, getattr(os, name)))
+        with suppress(PowerCut):
+            file.save(interlocks.record)
+    assert file.load() in ((before, ""), (interlocks.record, ""))
+    full_disk()
+    again = RecordFile(tmp_path / "r")
+    again.require_writable()
+    again.save(interlocks.record)
+    assert again.load() == (interlocks.record, "")
+
+
+@pytest.fixture
+def full_disk(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
+    """Has no more room from the call on than the files have."""
+    honest = os.write
+
+    def write(descriptor: int, data: bytes) -> int:
+        if os.lseek(descriptor, 0, os.SEEK_CUR) + len(data) > os.fstat(descriptor).st_size:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return honest(descriptor, data)
+
+    return lambda: monkeypatch.setattr(os, "write", write)
+
+
+def largest() -> Interlocks:
+    interlocks = made()
+    for number in range(MOST + 1):
+        interlocks.stop(StopRequest(owner=f"{number}".rjust(120, "\U0001f916"), reason="\U0001f916" * 300))
+    interlocks.never(f"{number}".rjust(120, "\U0001f916") for number in range(MOST_GOALS))
+    interlocks.speed = Speed(scaling=1 / 3, configured=2 / 3)
+    return interlocks
+
+
+def test_disk_that_becomes_full_takes_any_record_again_and_again(
+    tmp_path: Path, full_disk: Callable[[], None]
+) -> None:
+    file, interlocks = RecordFile(tmp_path / "r"), made()
+    file.require_writable()
+    full_disk()
+    for state in (largest(), interlocks, largest()):
+        file.save(state.record)
+        assert file.load() == (state.record, "")
+    file.require_writable()
+    assert file.load() == (largest().record, ""), "also for the next executor"
+    assert {entry.name for entry in tmp_path.iterdir()} == {"r", "r.new"}
+
+
+def test_record_that_was_written_without_room_is_read_and_has_it_from_then_on(
+    tmp_path: Path, full_disk: Callable[[], None]
+) -> None:
+    path, interlocks = tmp_path / "r", made()
+    interlocks.stop(StopRequest(owner="anna"))
+    path.write_text(interlocks.record.model_dump_json(indent=1))
+    (tmp_path / "r.new").write_bytes(b"")
+    file = RecordFile(path)
+    file.require_writable()
+    assert file.load() == (interlocks.record, "")
+    full_disk()
+    file.save(largest().record)
+    file.save(interlocks.record)
+    assert file.load() == (interlocks.record, "")
+
+
+@pytest.mark.parametrize("left", [(), ("r.new",), ("r",)])
+def test_disk_that_is_full_from_the_start_is_refused_in_one_line(
+    tmp_path: Path, full_disk: Callable[[], None], left: tuple[str, ...]
+) -> None:
+    for name in left:
+        (tmp_path / name).write_text(Record().model_dump_json())
+    full_disk()
+    with pytest.raises(ConfigError, match=r"cannot be written \(No space left on device\): stops") as caught:
+        RecordFile(tmp_path / "r").require_writable()
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("kind", ["second name of the record", "link to another file", "pipe"])
+def test_what_else_lies_in_the_place_of_the_next_record_is_never_written_over(tmp_path: Path, kind: str) -> None:
+    file, other = RecordFile(tmp_path / "r"), tmp_path / "other"
+    file.save(largest().record)
+    other.write_text("mine")
+    new = tmp_path / "r.new"
+    {"second name of the record": lambda: os.link(tmp_path / "r", new), "pipe": lambda: os.mkfifo(new),
+     "link to another file": lambda: new.symlink_to(other)}[kind]()
+    file.require_writable()
+    assert file.load() == (largest().record, "") and other.read_text() == "mine"
+
+
+def test_record_that_cannot_be_read_stays_to_be_looked_at_until_something_is_decided(tmp_path: Path) -> None:
+    path = tmp_path / "r"
+    path.write_bytes(b"{")
+    RecordFile(path).require_writable()
+    assert path.read_bytes() == b"{"
+
+
+def test_what_is_not_kept_is_told_so_and_what_was_before_is_not() -> None:
+    interlocks = made()
+    interlocks.stop(StopRequest(owner="anna", reason="smoke"))
+    kept = interlocks.record
+    interlocks.stop(StopRequest(owner="bert", reason="fire"))
+    interlocks.hold(HoldRequest(hold=True, by="watchdog", reason="no joint states"))
+    interlocks.note_kept(kept, "No space left on device")
+    status = MotionStatus(interlocks=interlocks.all)
+    lost = "not saved on disk (No space left on device), lost if the executor ends"
+    assert [one.reason for one in status.interlocks] == ["smoke", f"{lost}; fire", "no joint states"]
+    assert status.unsaved.endswith(f"by bert ({lost}; fire)")
+    assert interlocks.record.interlocks[1].reason == "fire"
+    interlocks.note_kept(interlocks.record)
+    assert not MotionStatus(interlocks=interlocks.all).unsaved
+
+
+MANY = json.dumps({"interlocks": [{"kind": "held", "by": f"p{number}", "since": 1} for number in range(40)]}).encode()
+
+
+@pytest.mark.parametrize("content", [
+    b"", b"{", b"\xff" * 99, b'{"version": 2}', b'{"version": 1, "interlocks": [{}]}', MANY,
+    b'{"newest": 9223372036854775807}', b'{"newest": -1}', b'{"newest": 1e30}',
+    b'{"interlocks": [{"kind": "stopped", "by": "a", "since": 9223372036854775807}]}',
+])
+def test_record_that_cannot_be_read_counts_as_stopped_and_slow(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "r"
+    path.write_bytes(content)
+    record, problem = RecordFile(path).load()
+    assert problem.startswith(f"{path} cannot be read: ")
+    interlocks = Interlocks(record)
+    refused = interlocks.objection("a")
+    assert refused is not None and str(path) in str(refused) and speed_of(interlocks.speed, 1.0) == SLOWEST
+    assert interlocks.arm_stopped, "nobody knows that it was not"
+    interlocks.hold(HoldRequest(hold=False, stops=True))
+    assert interlocks.objection("a") is None
+
+
+@pytest.mark.parametrize("kind", ["link to nothing", "pipe", "folder", "link in a circle"])
+def test_what_is_no_file_in_the_place_of_the_record_counts_as_stopped_and_keeps_nobody_waiting(
+    tmp_path: Path, kind: str
+) -> None:
+    path = tmp_path / "r"
+    {"link to nothing": lambda: path.symlink_to(tmp_path / "gone"), "pipe": lambda: os.mkfifo(path),
+     "folder": path.mkdir, "link in a circle": lambda: path.symlink_to(path)}[kind]()
+    record, problem = RecordFile(path).load()
+    assert problem.startswith(f"{path} cannot be read: ") and "\n" not in problem
+    assert Interlocks(record).objection("a")
+
+
+def test_link_to_a_record_is_read(tmp_path: Path) -> None:
+    interlocks = made()
+    interlocks.stop(StopRequest(owner="anna"))
+    RecordFile(tmp_path / "there").save(interlocks.record)
+    (tmp_path / "r").symlink_to(tmp_path / "there")
+    assert RecordFile(tmp_path / "r").load() == (interlocks.record, "")
+
+
+def test_folder_that_cannot_be_written_is_refused_in_one_line(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    for folder in (tmp_path / "file", tmp_path / "file" / "below"):
+        with pytest.raises(ConfigError, match=r"^ZENCELL_STATE: '.*' cannot be written \(.*\): stops") as caught:
+            RecordFile(folder / "r").require_writable()
+        assert "\n" not in str(caught.value)
+
+
+def test_the_folder_is_the_one_that_was_named_or_one_that_lasts() -> None:
+    assert lasting_folder({"ZENCELL_STATE": "/data", "XDG_STATE_HOME": "/x"}) == Path("/data")
+    assert lasting_folder({"ZENCELL_STATE": "", "XDG_STATE_HOME": "/x"}) == Path("/x/zencell")
+    assert lasting_folder({}) == Path.home() / ".local" / "state" / "zencell"

@@ -1,0 +1,117 @@
+"""Moving an arm of Universal Robots by hand, without its library: what of it is over when its program is."""
+
+from __future__ import annotations
+
+import sys
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from common.hardware.interface import Limits
+from drivers.ur import LONGEST_STEP, STATE_TIMEOUT, Options, SilenceTimer, UrArm
+
+SIX = np.ones(6)
+LIMITS = Limits(tuple("abcdef"), -6 * SIX, 6 * SIX, 3 * SIX, 5 * SIX, 10 * SIX, 500 * SIX)
+OFF, RUNNING, NORMAL, PROTECTIVE_STOP = 3, 7, 1, 3
+
+
+class Controller:
+    """What the three connections of the library say and do; the pendant sets `mode`, `safety` and `program`."""
+
+    FLAG_UPLOAD_SCRIPT = 1
+
+    def __init__(self) -> None:
+        self.mode, self.safety, self.stamp = RUNNING, NORMAL, 0.0
+        self.by_hand, self.program = False, True
+
+    def getTimestamp(self) -> float:  # noqa: N802
+        self.stamp += 0.002
+        return self.stamp
+
+    def teachMode(self) -> bool:  # noqa: N802
+        self.by_hand = True
+        return True
+
+    def endTeachMode(self) -> bool:  # noqa: N802
+        self.by_hand = False
+        return True
+
+    def disconnect(self) -> None:
+        self.by_hand = False
+
+    def __getattr__(self, name: str) -> object:
+        answers = {"getRobotMode": self.mode, "getSafetyMode": self.safety, "getRobotStatus": 1 | self.program << 1,
+                   "getTargetSpeedFraction": 1.0, "getActualQ": [0.0] * 6, "getActualQd": [0.0] * 6}
+        return lambda *_: answers.get(name, 0)
+
+
+@pytest.fixture
+def controller(monkeypatch: pytest.MonkeyPatch) -> Controller:
+    made = Controller()
+    for module, name in (("rtde_receive", "RTDEReceiveInterface"), ("dashboard_client", "DashboardClient"),
+                         ("rtde_control", "RTDEControlInterface")):
+        kind = type(name, (), {"__new__": lambda cls, *_: made, "FLAG_UPLOAD_SCRIPT": 1})
+        monkeypatch.setitem(sys.modules, module, SimpleNamespace(**{name: kind}))
+    return made
+
+
+@pytest.fixture
+def arm(controller: Controller) -> UrArm:
+    arm = UrArm(Options(host="h", model="ur5e"), LIMITS)
+    assert arm.read().mode == "running"
+    return arm
+
+
+def test_arm_that_could_not_be_moved_by_hand_is_not_said_to_be_once_it_is_powered_at_the_pendant(
+    controller: Controller, arm: UrArm
+) -> None:
+    controller.mode = OFF
+    assert arm.read().mode == "off"
+    with pytest.raises(ValueError, match="cannot freedrive: the joints are without power"):
+        arm.do("freedrive", 1.0)
+    controller.mode = RUNNING
+    assert arm.read().mode == "running" and not controller.by_hand
+
+
+def test_a_protective_stop_ends_freedrive_also_when_it_is_unlocked_at_the_pendant(
+    controller: Controller, arm: UrArm
+) -> None:
+    arm.do("freedrive", 1.0)
+    assert arm.read().mode == "freedrive" and controller.by_hand
+    controller.safety = PROTECTIVE_STOP
+    assert arm.read().mode == "protective_stop"
+    controller.safety = NORMAL
+    assert arm.read().mode == "running"
+    arm.do("freedrive", 1.0)
+    assert arm.read().mode == "freedrive"
+    arm.do("freedrive", 0.0)
+    assert arm.read().mode == "running" and not controller.by_hand
+
+
+def test_a_program_that_is_ended_at_the_pendant_ends_freedrive(controller: Controller, arm: UrArm) -> None:
+    arm.do("freedrive", 1.0)
+    assert arm.read().mode == "freedrive"
+    controller.program, controller.by_hand = False, False
+    state = arm.read()
+    assert (state.mode, state.message) == ("idle", "its program has ended, and is restarted")
+    controller.program = True
+    assert arm.read().mode == "running"
+
+
+# --- for how long nothing new was received ---
+
+
+def test_silence_grows_with_the_time_listened_and_ends_with_a_message() -> None:
+    silence = SilenceTimer()
+    assert silence.update(10.0, True) == 0.0
+    lengths = [silence.update(10.0 + 0.002 * n, False) for n in range(1, 101)]
+    assert lengths[-1] == pytest.approx(0.2) and lengths[70] <= STATE_TIMEOUT < lengths[80]
+    assert silence.update(10.3, True) == 0.0
+
+
+def test_time_in_which_the_driver_was_held_up_is_no_silence() -> None:
+    silence = SilenceTimer()
+    silence.update(10.0, True)
+    assert silence.update(11.0, False) == LONGEST_STEP
+    assert silence.update(11.002, False) == pytest.approx(LONGEST_STEP + 0.002)
