@@ -220,18 +220,18 @@ class HandEyePanel:
         session = self._session
         inactive = "" if session is not None else "start a calibration first"
         self._buttons.set(block(buttons(
-            press("Start" if session is None else "Start another", "eye:begin",
+            press("Start calibration" if session is None else "Start another", "eye:begin",
                   "" if self._values["name"] else "enter a name first"),
             press("Capture view", "eye:take", inactive or ("an image is being processed" if self._busy else "")),
             press("Calibrate", "eye:calibrate", inactive or (session.too_few if session is not None else "")),
-            press("End", "eye:end", inactive)), "hand-eye orders"))
+            press("End calibration", "eye:end", inactive)), "hand-eye orders"))
         self._html.set(self._status())
 
     def _status(self) -> str:
         """Return progress, the result for the last image, and the result of the calibration as HTML."""
         session = self._session
         if session is None:
-            return block(span("Fix a board in view of the camera, enter a name and press Start. Then jog the arm, and "
+            return block(span("Fix a board in view of the camera, enter a name and press Start calibration. Then jog the arm, and "
                               "tilt the gripper to all sides between views.", "dim"), "hand-eye", views=0)
         rotations = {f"rotation {axis}": f"{degrees:.0f}°" for axis, degrees in session.rotations.items()}
         missing = session.missing

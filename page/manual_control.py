@@ -186,7 +186,7 @@ class JogPanel:
         """
         self._joints, self._limits = list(joints), list(limits)
         self._mode, self._speed = JOINTS, INITIAL_SPEED / 100
-        mode = gui.add_dropdown("Jog", [JOINTS, *FRAMES], initial_value=JOINTS, hint="joints, or the tool along axes")
+        mode = gui.add_dropdown("Jog mode", [JOINTS, *FRAMES], initial_value=JOINTS, hint="joints, or the tool along axes")
         actions.on_change(mode, self._set_mode)
         speed = gui.add_slider("Jog speed [%]", 1, 100, 1, INITIAL_SPEED, hint=(
             "100 % is 250 mm/s and 1 rad/s for the tool, and the velocity limit for a joint"))

@@ -145,7 +145,7 @@ class Permissions:
         now, before = monotonic(), self._operating
         free = before is None or before == session or now - self._last_operation >= OPERATE_TIMEOUT
         if not free and permission != "take":
-            return f"{before} has control: press Take control, or wait until it is released"
+            return f"{before} has control: press Take page control, or wait until it is released"
         if not claim:
             return ""
         if before != session:

@@ -243,5 +243,5 @@ PAGE = ApplicationPage(
     layers=(Outline, ContourChoice), controls=Controls, requests=(OUTLINE_SELECT,),
     states={"SELECTING": "Waiting for a choice", "PLANNING": "Planning", "APPROACHING": "Approaching",
             "TRACING": "Tracing", "RETREATING": "Retreating"},
-    latency="Picture to path", counters=counters, progress=progress,
+    latency="Image to path", counters=counters, progress=progress,
 )

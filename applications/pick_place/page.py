@@ -112,6 +112,6 @@ class Workspace(Layer):
 
 
 PAGE = ApplicationPage(
-    layers=(Targets, Rejected, Workspace), states={"GRASPING": "Taking", "PLACING": "Placing"},
-    latency="Picture to targets", counters=counters,
+    layers=(Targets, Rejected, Workspace), states={"GRASPING": "Grasping", "PLACING": "Placing"},
+    latency="Image to targets", counters=counters,
 )

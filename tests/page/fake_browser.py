@@ -1,4 +1,4 @@
-"""A page without a browser: speaks viser's protocol, knows what is shown, and clicks."""
+"""A fake browser: speaks viser's protocol, keeps what is shown, and clicks."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ CAMERA = {
 
 
 class FakeBrowser:
-    """What a browser would show: `parts` are the fields and texts of the panels by their uuid.
+    """What a browser would show: `parts` are the fields and texts of the panels by uuid.
 
-    `kinds` are the types of the messages, in the order in which they came; `news` and `said` what came over the line.
+    `kinds` are the types of viser's messages in their order; `status` and `results` come over the control socket.
     """
 
-    def __init__(self, connection: ClientConnection, line: ClientConnection) -> None:
-        self._connection, self._line = connection, line
-        self.news: dict[str, Any] = {}
-        self.said: list[tuple[int, str, str]] = []
-        self._known = asyncio.Event()  # which of the pages this is
+    def __init__(self, connection: ClientConnection, control: ClientConnection) -> None:
+        self._connection, self._control = connection, control
+        self.status: dict[str, Any] = {}
+        self.results: list[tuple[int, str, str]] = []
+        self._known = asyncio.Event()  # the key of this page was sent
         self.parts: dict[str, dict[str, Any]] = {}
         self.values: dict[str, Any] = {}
         self.kinds: list[str] = []
@@ -42,19 +42,19 @@ class FakeBrowser:
 
     @property
     def text(self) -> str:
-        """Everything that the panels say, as HTML."""
+        """The HTML of all panels."""
         return "\n".join(str(part.get("content", "")) for part in self.parts.values())
 
     def label(self, label: str) -> str:
-        """The uuid of the one field that is called so."""
+        """Return the uuid of the only field with this label."""
         found = [uuid for uuid, part in self.parts.items()
                  if label == part.get("label") or label in (part.get("options") or ())]
         if len(found) != 1:
-            raise LookupError(f"{label!r}: {len(found)} fields are called so")
+            raise LookupError(f"{label!r}: {len(found)} fields have this label")
         return found[0]
 
     async def listen(self) -> None:
-        """Take in what the server says."""
+        """Receive viser's messages."""
         async for data in self._connection:
             assert isinstance(data, bytes)
             size = int.from_bytes(data[8:16], "little")
@@ -63,30 +63,30 @@ class FakeBrowser:
                 self._take(message)
             self._changed.set()
 
-    async def listen_to_the_line(self) -> None:
-        """Take in what comes beside."""
-        async for data in self._line:
-            words = json.loads(data)
-            self.news = words.get("news", self.news)
-            if "said" in words:
-                self.said.append((words["n"], words["said"], words["kind"]))
+    async def listen_to_control(self) -> None:
+        """Receive messages of the control socket."""
+        async for data in self._control:
+            message = json.loads(data)
+            self.status = message.get("status", self.status)
+            if "result" in message:
+                self.results.append((message["n"], message["result"], message["kind"]))
             self._changed.set()
 
-    async def speak(self, **words: Any) -> None:
-        """Say something over the line, as the script of the page does."""
+    async def send(self, **message: Any) -> None:
+        """Send a message over the control socket, as overlay.js does."""
         await asyncio.wait_for(self._known.wait(), PATIENCE)
-        await self._line.send(json.dumps(words))
+        await self._control.send(json.dumps(message))
 
     async def hold(self, what: str, press: int = 1) -> None:
-        """Say once that a button of our own is held down, since a press of that number."""
-        await self.until(lambda: self.news)
-        await self.speak(do="hold", what=what, n=press, at=1e3 * time.monotonic(), seen=self.news["time"])
+        """Send one message that a button is held down by this press."""
+        await self.until(lambda: self.status)
+        await self.send(do="hold", what=what, n=press, at=1e3 * time.monotonic(), seen=self.status["time"])
 
     def button(self, label: str) -> tuple[str, str]:
-        """Name of the button of our own that is called so, and why it is off."""
+        """Return the name of the button with this label, and why it is disabled."""
         found = re.findall(rf'<button [^>]*data-(?:press|hold)="([^"]+)"([^>]*)>{re.escape(label)}</button>', self.text)
         if len(found) != 1:
-            raise LookupError(f"{label!r}: {len(found)} buttons are called so")
+            raise LookupError(f"{label!r}: {len(found)} buttons have this label")
         why = re.search(r'title="([^"]*)"', found[0][1])
         return found[0][0], html.unescape(why[1]) if why else ""
 
@@ -106,7 +106,7 @@ class FakeBrowser:
             self.parts.pop(uuid, None)
 
     async def until(self, condition: Callable[[], object]) -> None:
-        """Return as soon as what is shown fulfils a condition."""
+        """Wait for a condition on what is shown."""
         async with asyncio.timeout(PATIENCE):
             while True:
                 self._changed.clear()
@@ -118,43 +118,44 @@ class FakeBrowser:
                 await self._changed.wait()
 
     async def set(self, label: str, value: Any) -> None:
-        """Give a field a value, or click a button."""
+        """Set a field, or click a button of viser."""
         await self.until(lambda: self.label(label))
         uuid = self.label(label)
-        await self.say({"type": "GuiUpdateMessage", "uuid": uuid, "updates": {"value": value}})
+        await self.send_viser({"type": "GuiUpdateMessage", "uuid": uuid, "updates": {"value": value}})
 
     async def _introduce(self, key: str) -> None:
-        await self._line.send(json.dumps({"do": "page", "what": key}))
+        await self._control.send(json.dumps({"do": "page", "what": key}))
         self._known.set()
 
     async def press(self, label: str) -> None:
-        """Click a button of our own as soon as it is on."""
+        """Click a button of `markup` as soon as it is enabled."""
         await self.until(lambda: not self.button(label)[1])
-        await self.speak(do="press", what=self.button(label)[0])
+        await self.send(do="press", what=self.button(label)[0])
 
     async def click(self, label: str) -> None:
-        """Click a button, also one of a group."""
+        """Click a button of viser, also one of a group."""
         await self.until(lambda: self.label(label))
-        grouped = "options" in self.parts[self.label(label)]
-        await self.set(label, label if grouped else True)
+        group_labels = "options" in self.parts[self.label(label)]
+        await self.set(label, label if group_labels else True)
 
-    async def say(self, message: dict[str, Any]) -> None:
-        """Send a message as it is."""
+    async def send_viser(self, message: dict[str, Any]) -> None:
+        """Send a message to viser."""
         await self._connection.send(msgspec.msgpack.encode(message))
 
 
 @asynccontextmanager
 async def opened(port: int, token: str = "") -> AsyncIterator[FakeBrowser]:
-    """A page that is open inside the block, by somebody who has a token."""
+    """A page that is open inside the block."""
     cookie = {"Cookie": f"zencell-{port}={token}"} if token else None
     async with (
         connect(f"ws://127.0.0.1:{port}/", proxy=None, max_size=None, open_timeout=PATIENCE,
                 subprotocols=[Subprotocol(f"viser-v{viser.__version__}")], additional_headers=cookie) as connection,
-        connect(f"ws://127.0.0.1:{port}/line", proxy=None, open_timeout=PATIENCE, additional_headers=cookie) as line,
+        connect(f"ws://127.0.0.1:{port}/control", proxy=None, open_timeout=PATIENCE,
+                additional_headers=cookie) as control,
     ):
-        browser = FakeBrowser(connection, line)
-        listening = {asyncio.create_task(browser.listen()), asyncio.create_task(browser.listen_to_the_line())}
-        await browser.say(CAMERA)
+        browser = FakeBrowser(connection, control)
+        listening = {asyncio.create_task(browser.listen()), asyncio.create_task(browser.listen_to_control())}
+        await browser.send_viser(CAMERA)
         try:
             yield browser
         finally:

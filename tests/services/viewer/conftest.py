@@ -37,10 +37,10 @@ async def until(condition: Callable[[], object]) -> None:
             await asyncio.sleep(0.005)
 
 
-class SceneDouble:
+class FakeScene:
     """Stands for the 3D scene, whose meshes take seconds to read."""
 
-    made: ClassVar[list[SceneDouble]] = []
+    made: ClassVar[list[FakeScene]] = []
 
     def __init__(self, *arguments: Any, shown: Mapping[str, bool]) -> None:
         self.layers, self.console, self.latest = arguments[3:6]
@@ -48,7 +48,7 @@ class SceneDouble:
         self.calls: list[tuple[str, tuple[Any, ...]]] = []
         self.visible = dict(shown)
         self.begun = False  # is fed, and heard
-        SceneDouble.made.append(self)
+        FakeScene.made.append(self)
 
     def __getattr__(self, name: str) -> Callable[..., None]:
         return lambda *arguments: self.calls.append((name, arguments))
@@ -62,11 +62,11 @@ class SceneDouble:
 
 
 @pytest.fixture(autouse=True)
-def scenes(monkeypatch: pytest.MonkeyPatch) -> list[SceneDouble]:
-    monkeypatch.setattr("page.scene.Scene", SceneDouble)
-    monkeypatch.setattr(viewer, "START_PATIENCE", 0.0)
-    monkeypatch.setattr(SceneDouble, "made", [])
-    return SceneDouble.made
+def scenes(monkeypatch: pytest.MonkeyPatch) -> list[FakeScene]:
+    monkeypatch.setattr("page.scene.Scene", FakeScene)
+    monkeypatch.setattr(viewer, "STARTUP_TIMEOUT", 0.0)
+    monkeypatch.setattr(FakeScene, "made", [])
+    return FakeScene.made
 
 
 @dataclass

@@ -39,15 +39,15 @@ from common.config import Members, load_cell
 from page.layout import Layout
 from services import viewer
 from tests.page.fake_browser import PATIENCE, FakeBrowser, opened
-from tests.services.viewer.conftest import MIN_AREA, TOKEN, Played, SceneDouble, serve_page, until
+from tests.services.viewer.conftest import MIN_AREA, TOKEN, FakeScene, Played, serve_page, until
 
 
 async def test_state_and_counters_are_shown_in_words(panda: Played, page: FakeBrowser) -> None:
     status = PickPlaceStatus(state="GRASPING", started=True, target="track_4", placed=2, targets=7, stage="pre_grasp")
     panda.bus.writer(PICK_PLACE_STATUS).put(status)
     panda.bus.writer(topics.MOTION_STATUS).put(m.MotionStatus(state="active", progress=0.5, held=True))
-    await page.until(lambda: "Taking track_4" in page.text and "pre grasp" in page.text)
-    await page.until(lambda: 'data-held="True"' in page.text and "held on its path" in page.text)
+    await page.until(lambda: "Grasping track_4" in page.text and "pre grasp" in page.text)
+    await page.until(lambda: 'data-held="True"' in page.text and "held" in page.text)
     assert '<div data-field="placed"><b>2</b>' in page.text and '<div data-field="targets"><b>7</b>' in page.text
 
 
@@ -58,9 +58,9 @@ async def test_pictures_and_truth_are_read_only_while_a_page_that_shows_them_is_
     async with opened(panda.port) as page:
         await until(lambda: all(writer.matched for writer in writers.values()))
         assert not objects.matched
-        await page.set("Truth (simulated hardware)", True)
+        await page.set("Ground truth (simulation)", True)
         await until(lambda: objects.matched)
-        await page.set("With what was found", False)
+        await page.set("Detections overlay", False)
         await until(lambda: not writers[DETECTION_IMAGE].matched)
         assert writers[topics.CAMERA_IMAGE].matched
     await until(lambda: not writers[topics.CAMERA_IMAGE].matched and not objects.matched)
@@ -70,7 +70,7 @@ async def test_parameter_changed_on_the_page_is_changed_by_the_page(panda: Playe
     await page.set("min area [px^2]", 300.0)
     await until(lambda: panda.sets)
     assert panda.sets == [({MIN_AREA: 300.0}, "page")]
-    await page.until(lambda: f"{MIN_AREA} is 300.0 now" in page.text)
+    await page.until(lambda: f"{MIN_AREA} set to 300.0" in page.text)
     with pytest.raises(LookupError):
         page.label("fixed")
 
@@ -98,9 +98,9 @@ async def test_dead_service_is_red_and_its_return_is_green(panda: Played, page: 
     say(state="ready", pid=41)
     await page.until(lambda: 'data-service="vision_detector" data-state="ready" data-pid="41"' in page.text)
     say(state="restarting", restarts=1, message="killed by SIGKILL")
-    await page.until(lambda: 'class="bad">● died' in page.text and "killed by SIGKILL" in page.text)
+    await page.until(lambda: 'class="bad">● crashed' in page.text and "killed by SIGKILL" in page.text)
     say(state="starting", pid=42, restarts=1)
-    await page.until(lambda: 'class="bad">● starts again' in page.text)
+    await page.until(lambda: 'class="bad">● restarting' in page.text)
     say(state="ready", pid=42, restarts=1)
     await page.until(lambda: 'data-state="ready" data-pid="42" data-restarts="1"' in page.text)
 
@@ -113,7 +113,7 @@ async def test_log_lines_are_text_whatever_is_in_them(panda: Played, page: FakeB
     assert "<script>" not in page.text
     log.put(m.LogLine(service="y", level="info", message="a quiet line"))
     await page.until(lambda: "a quiet line" in page.text)
-    await page.set("Show", "warning")
+    await page.set("Minimum level", "warning")
     await page.until(lambda: "a quiet line" not in page.text)
 
 
@@ -123,16 +123,16 @@ async def test_odd_messages_leave_the_page_and_the_service_as_they_are(
     await page.until(lambda: page.label("Planner") and page.label("Speed [%]"))
     speed = page.label("Speed [%]")
     for value in ("fast", None, [1], float("nan"), 1e300):
-        await page.say({"type": "GuiUpdateMessage", "uuid": speed, "updates": {"value": value}})
-    await page.say({"type": "GuiUpdateMessage", "uuid": page.label("Planner"), "updates": {"value": "Explode"}})
-    await page.say({"type": "GuiUpdateMessage", "uuid": page.label("Show"), "updates": {"value": "nothing"}})
+        await page.send_viser({"type": "GuiUpdateMessage", "uuid": speed, "updates": {"value": value}})
+    for label, value in (("Planner", "Explode"), ("Minimum level", "nothing")):
+        await page.send_viser({"type": "GuiUpdateMessage", "uuid": page.label(label), "updates": {"value": value}})
     for updates in ({"update_cb": []}, {"removed": True}, {"value": 20.0, "label": "Speed"}):
-        await page.say({"type": "GuiUpdateMessage", "uuid": speed, "updates": updates})
+        await page.send_viser({"type": "GuiUpdateMessage", "uuid": speed, "updates": updates})
     panda.bus.writer(DETECTION_IMAGE).put(m.Image(
         header=m.Header(), height=4, width=4, encoding="bgr8", data=b"short"))
     for words in ({}, {"do": "explode"}, {"do": "press"}, {"do": "press", "what": 2000 * "x"}, {"do": "hold", "at": 1}):
-        await page.speak(**words)
-    await page.speak(do="press", what="pause")
+        await page.send(**words)
+    await page.send(do="press", what="pause")
     await until(lambda: panda.commands)
     assert panda.commands == ["pause"]
     capfd.readouterr()  # viser prints what it could not convert
@@ -151,8 +151,8 @@ async def test_saved_layout_opens_with_what_was_on(tmp_path: Path) -> None:
     file = tmp_path / "layout.yaml"
     file.write_text("tabs: [Log, View]\n")
     async with serve_page("panda", layout=str(file)) as played, opened(played.port) as page:
-        await page.set("Frames", True)
-        await page.set("Show", "error")
+        await page.set("Frames (TF)", True)
+        await page.set("Minimum level", "error")
         await page.click("Save layout")
         await page.until(lambda: f"Saved in {file}" in page.text)
         saved = Layout.model_validate(yaml.safe_load(file.read_text()))
@@ -181,7 +181,7 @@ async def test_chosen_object_is_traced_once_its_path_is_known() -> None:
         await page.until(lambda: "Object_1 is chosen" in page.text)
 
 
-async def test_contour_that_is_clicked_in_the_scene_is_chosen(scenes: list[SceneDouble]) -> None:
+async def test_contour_that_is_clicked_in_the_scene_is_chosen(scenes: list[FakeScene]) -> None:
     async with serve_page("ur5") as played:
         await until(lambda: scenes and scenes[0].begun)
         console, wanted = scenes[0].console, OutlineSelect(rule="index", index=1)
@@ -191,7 +191,7 @@ async def test_contour_that_is_clicked_in_the_scene_is_chosen(scenes: list[Scene
 
 
 async def test_layers_are_shown_as_ticked_also_before_the_scene_is_there(
-    panda: Played, page: FakeBrowser, scenes: list[SceneDouble]
+    panda: Played, page: FakeBrowser, scenes: list[FakeScene]
 ) -> None:
     await until(lambda: scenes and scenes[0].begun)
     assert scenes[0].visible["targets"] and not scenes[0].visible["truth"]
@@ -199,7 +199,7 @@ async def test_layers_are_shown_as_ticked_also_before_the_scene_is_there(
     await until(lambda: not scenes[0].visible["targets"])
 
 
-async def test_scene_is_told_what_the_cell_says_while_somebody_looks(panda: Played, scenes: list[SceneDouble]) -> None:
+async def test_scene_is_told_what_the_cell_says_while_somebody_looks(panda: Played, scenes: list[FakeScene]) -> None:
     told = m.MarkerArray(header=m.Header(), markers=[])
     panda.bus.writer(WORKSPACE_MARKERS).put(told)
     await until(lambda: scenes)
@@ -209,28 +209,28 @@ async def test_scene_is_told_what_the_cell_says_while_somebody_looks(panda: Play
 
 
 async def test_rejection_that_came_before_the_scene_is_shown_in_it(
-    scenes: list[SceneDouble], monkeypatch: pytest.MonkeyPatch
+    scenes: list[FakeScene], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     go = threading.Event()
 
-    def slow(*arguments: object, **options: Any) -> SceneDouble:
+    def slow(*arguments: object, **options: Any) -> FakeScene:
         assert go.wait(PATIENCE)
-        return SceneDouble(*arguments, **options)
+        return FakeScene(*arguments, **options)
 
     monkeypatch.setattr("page.scene.Scene", slow)
     async with serve_page("panda") as played, opened(played.port) as page:
         rejected = m.Rejections(header=m.Header(), rejected=[m.Rejection(position=m.Vector3(x=1.0), reason="too far")])
         played.bus.writer(REJECTED_TARGETS).put(rejected)
-        await page.speak(do="press", what="pause")  # the page is there before the scene is
+        await page.send(do="press", what="pause")  # the page is there before the scene is
         await until(lambda: played.commands)
         go.set()
-        await until(lambda: scenes and scenes[0].told("happened") == [(REJECTED_TARGETS, rejected)])
+        await until(lambda: scenes and scenes[0].told("handle_event") == [(REJECTED_TARGETS, rejected)])
 
 
 async def test_meshes_are_read_when_the_cell_is_up_or_somebody_looks(
-    scenes: list[SceneDouble], monkeypatch: pytest.MonkeyPatch
+    scenes: list[FakeScene], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(viewer, "START_PATIENCE", 1e6)
+    monkeypatch.setattr(viewer, "STARTUP_TIMEOUT", 1e6)
     cell = load_cell("panda")
     async with serve_page("panda") as played:
         await played.bus.alive.wait("viewer")
@@ -247,7 +247,7 @@ async def test_meshes_are_read_when_the_cell_is_up_or_somebody_looks(
 
 async def test_line_is_closed_to_other_pages_and_to_who_has_no_token() -> None:
     async with serve_page("panda", token=TOKEN) as played:
-        address = f"ws://127.0.0.1:{played.port}/line"
+        address = f"ws://127.0.0.1:{played.port}/control"
         for status, headers in ((401, {}), (403, {"Cookie": f"zencell-{played.port}={TOKEN}", "Origin": "http://a.b"})):
             with pytest.raises(InvalidStatus) as refused:
                 async with connect(address, proxy=None, additional_headers=headers):

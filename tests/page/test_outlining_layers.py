@@ -1,4 +1,4 @@
-"""Contours lie on what they are the contours of; a click on a pin chooses."""
+"""Contours on their objects, and selection of an object by a click."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from common import topics
 from common.perception.pinhole import Pinhole
 from tests.page.scene_cell import WORLD, Stage, around_of, at, scene_of
 
-TOP = 1.06  # of the object [m]; it stands on a base of 1 m
+TOP = 1.06  # of the object [m]; the base is 1 m high
 
 
 def square(x: float, y: float, z: float, half: float = 0.03) -> np.ndarray[Any, np.dtype[np.float64]]:
@@ -47,7 +47,7 @@ def nodes(stage: Stage) -> dict[str, Any]:
     return {node.name.rsplit("/", 1)[1]: node for node in stage.layer("contours").nodes}
 
 
-def test_contour_lies_on_the_top_of_its_object(stage: Stage) -> None:
+def test_contour_is_on_top_of_its_object(stage: Stage) -> None:
     stage.say(topics.PLANNING_SCENE, scene_of(prism("yellow_1", 0.5)))
     points = square(0.5, 0.0, TOP)
     stage.say(CONTOURS, contours(("yellow_1", points)))
@@ -56,7 +56,7 @@ def test_contour_lies_on_the_top_of_its_object(stage: Stage) -> None:
     np.testing.assert_allclose(line[:, 1], np.roll(points, -1, axis=0), atol=0.003)
 
 
-def test_contour_without_an_object_lies_on_the_fixture_below_it(stage: Stage) -> None:
+def test_contour_without_an_object_is_on_the_fixture_below(stage: Stage) -> None:
     points = square(0.5, 0.1, 1.0)
     stage.say(CONTOURS, contours(("green_1", points)))
     np.testing.assert_allclose(nodes(stage)["0_line"].points[:, 0], points, atol=0.003)
@@ -70,7 +70,7 @@ def test_contour_moves_when_its_object_becomes_known(stage: Stage) -> None:
     assert nodes(stage)["0_line"].points[0, 0, 2] == pytest.approx(TOP, abs=0.003)
 
 
-def test_of_a_picture_full_of_noise_the_largest_contours_and_the_chosen_one_are_offered(stage: Stage) -> None:
+def test_largest_contours_and_the_selected_one_are_offered_in_noise(stage: Stage) -> None:
     many = contours(*((f"Object_{i}", square(0.4 + 1e-3 * i, 0.0, 1.0, half=0.01)) for i in range(300)), selected=7)
     for contour in many.contours:
         contour.area = float(contour.index)
@@ -78,7 +78,7 @@ def test_of_a_picture_full_of_noise_the_largest_contours_and_the_chosen_one_are_
     assert {int(name.partition("_")[0]) for name in nodes(stage)} == {7, *range(201, 300)}
 
 
-def test_each_contour_has_a_pin_and_a_label_and_the_chosen_one_is_white(stage: Stage) -> None:
+def test_each_contour_has_a_pin_and_a_label_and_the_selected_one_is_white(stage: Stage) -> None:
     stage.say(CONTOURS,
         contours(("red_1", square(0.45, 0, 1.0)), ("blue_1", square(0.55, 0, 1.0)), selected=1)
     )
@@ -88,7 +88,7 @@ def test_each_contour_has_a_pin_and_a_label_and_the_chosen_one_is_white(stage: S
     np.testing.assert_allclose(shown["0_pin"].position[:2], [0.45, 0.0], atol=0.002)
 
 
-async def test_click_on_a_pin_chooses_its_contour(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_click_on_a_pin_selects_its_contour(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
     chosen: list[OutlineSelect] = []
     monkeypatch.setattr("applications.outlining.page.choose", lambda _console, choice: chosen.append(choice))
     shown = contours(("red_1", square(0.45, 0, 1.0)), ("blue_1", square(0.55, 0, 1.0)))
@@ -107,7 +107,7 @@ def test_same_contours_are_not_sent_again(stage: Stage) -> None:
     assert not sent
 
 
-def test_contours_of_a_camera_that_is_not_known_or_distorted_are_left_out(ur5: Stage) -> None:
+def test_contours_of_an_unknown_or_distorted_camera_are_left_out(ur5: Stage) -> None:
     found = contours(("red_1", square(0.45, 0, 1.0)))
     ur5.say(CONTOURS, found)
     assert nodes(ur5) == {}
@@ -117,7 +117,7 @@ def test_contours_of_a_camera_that_is_not_known_or_distorted_are_left_out(ur5: S
     assert nodes(ur5) == {}
 
 
-def test_outline_is_closed_and_goes_when_there_is_none(stage: Stage) -> None:
+def test_outline_is_a_closed_line_and_is_removed_without_points(stage: Stage) -> None:
     poses = [at(*point) for point in square(0.5, 0, TOP).tolist()]
     stage.say(CONTOUR_PATH, OutlinePoints(header=WORLD, poses=poses, object="yellow_1"))
     node = stage.layer("outline").node
