@@ -18,7 +18,7 @@ from typing import Any
 import msgpack
 from mcap.reader import make_reader
 
-from applications.pick_place.contact_check import Recheck, Recording
+from applications.pick_place.contact_check import ContactCheck, RecordedMotion
 from common.application import find_application
 from common.config import load_cell
 from common.transport.codec import decode
@@ -61,7 +61,7 @@ def told(recording: Path) -> str:
 
 def checked(recording: Path) -> str:
     """What the arm touched, in words."""
-    cell, heard = load_cell(CELL), Recording()
+    cell, heard = load_cell(CELL), RecordedMotion()
     fold = RunAggregator(CELL, find_application(cell.application), listeners=heard.listeners())
     topics = {topic.key: topic for topic in heard.listeners()}
     with recording.open("rb") as file:
@@ -69,7 +69,7 @@ def checked(recording: Path) -> str:
             key = channel.topic.partition("/")[2]
             if key in topics:
                 fold.on(key, decode(topics[key].message, message.data), 0.0, 0)
-    recheck = Recheck(cell, STEP)
+    recheck = ContactCheck(cell, STEP)
     contacts = recheck.contacts(heard)
     return "; ".join([f"{len(contacts)} contacts in {recheck.checked:,} positions", *map(str, contacts)])
 

@@ -17,7 +17,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from applications.pick_place.contact_check import Contact, Recheck, Recording
+from applications.pick_place.contact_check import Contact, ContactCheck, RecordedMotion
 from common.application import find_application
 from common.config import load_cell
 from common.transport.bus import Bus
@@ -56,9 +56,9 @@ class Result:
         return self.exit_code == 0 and self.in_box == self.balls and not self.contacts
 
 
-async def record(bus: Bus, stop: asyncio.Event) -> Recording:
+async def record(bus: Bus, stop: asyncio.Event) -> RecordedMotion:
     """What is said about arm, hand and truth until `stop` is set; it is decoded when there is time for that."""
-    recording = Recording()
+    recording = RecordedMotion()
     fold = RunAggregator(bus.cell, find_application(load_cell(CELL).application), listeners=recording.listeners())
     raw: list[tuple[str, bytes]] = []
     heard = {topic.key: topic for topic in fold.topics}
@@ -84,7 +84,7 @@ async def run_once(label: str, balls: int, speed: float, options: list[str], fol
             stop.set()
             recorded = await recording
         summary = cell.summary
-    recheck = Recheck(load_cell(CELL))
+    recheck = ContactCheck(load_cell(CELL))
     contacts = await asyncio.to_thread(recheck.contacts, recorded)
     steps = [max(abs(a - b) for a, b in zip(p.position[:7], q.position[:7], strict=True))
              for p, q in zip(recorded.joints, recorded.joints[1:], strict=False)]

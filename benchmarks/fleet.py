@@ -37,10 +37,9 @@ from common.application import all_topics
 from common.messages import Header, Image
 from common.topics import Topic
 from common.transport.codec import encode
-from common.transport.connect import connect
 from common.transport.endpoint import client_config, endpoint_of
 from common.transport.session import RawSample
-from common.transport.zenoh_session import ZenohSession
+from common.transport.zenoh_session import ZenohSession, connect
 from tests.harness import RunningCell, free_domain
 
 CELL = "panda"
@@ -142,7 +141,7 @@ def write(endpoint: str, names: list[str], spoken: list[Spoken], parent: Connect
     os._exit(0)
 
 
-class Ear:
+class Subscriptions:
     """Times and gaps of what comes in."""
 
     def __init__(self) -> None:
@@ -169,7 +168,7 @@ class Ear:
 def read(endpoint: str, names: list[str], parent: Connection) -> None:
     """Be a process that hears some cells: told to begin, it counts; told to stop, it sends what it found."""
     sys.setswitchinterval(0.0005)
-    ear = Ear()
+    ear = Subscriptions()
     sessions = _sessions(endpoint, names)
     for name, session in sessions.items():
         session.subscriber(f"{name}/**", ear.hear)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from cli import options
-from cli.place import UP, Place
+from cli.target import RUNNING, CellTarget
 from common.errors import ConfigError
 from common.terminal import echo
 
@@ -27,16 +27,16 @@ def pub(
     rate: Rate = DEFAULT_RATE,
     once: Once = False,
     count: options.Count = None,
-    at: Place = UP,
+    at: CellTarget = RUNNING,
 ) -> None:
     """Publish a message until Ctrl-C, N times or once; a stamp that is left out is the cell's time of each message.
 
     A state can be asked for while this runs. A key of your own services takes any JSON; {"base64": "..."} is bytes.
     """
     from common.client.publishing import checked, publish, writers_of
-    from common.transport.credentials import refuse_to_publish
+    from common.transport.credentials import require_open_cell
 
-    refuse_to_publish("topic pub")
+    require_open_cell("topic pub")
     period = 1 / options.rate(rate)
     most = 1 if once else options.whole("--count", count, 1)
     topic = _publishable(key)

@@ -11,9 +11,9 @@ from typing import Annotated
 
 import typer
 
+from cli import choices as offers
 from cli import options
-from cli.completing import offers
-from cli.place import UP, Place
+from cli.target import RUNNING, CellTarget
 from common.errors import ConfigError
 from common.terminal import echo, rewrite
 from recording.summary import contents, in_bytes, require_new
@@ -37,13 +37,13 @@ def record_(
     max_size: Annotated[
         str | None, typer.Option("--max-size", metavar="MB", help="begin another file, FILE_1.mcap, after so much")
     ] = None,
-    at: Place = UP,
+    at: CellTarget = RUNNING,
     gate: Annotated[bool, typer.Option("--gate", hidden=True, help="under a supervisor: wait for a line")] = False,
     own: Annotated[str, typer.Option("--own", hidden=True, help="under a supervisor: what is in the cell's file")] = "",
 ) -> None:
     """Record what travels in a cell, all keys if none are given, until Ctrl-C."""
     from common.config import load_cell
-    from common.transport.credentials import identity_of_listener
+    from common.transport.credentials import observer_identity
     from recording.capture import CustomTopics
     from recording.recorder import RecordRequest, record, record_gated, require_published
     from recording.selection import Selection
@@ -67,7 +67,7 @@ def record_(
     if gate:
         asyncio.run(record_gated(asked, cell, at.domain, at.connect, echo, show))
     else:
-        replace(at, cell=cell).visit(lambda bus: record(bus, asked, echo, show), identity=identity_of_listener())
+        replace(at, cell=cell).visit(lambda bus: record(bus, asked, echo, show), identity=observer_identity())
 
 
 def _positive(option: str, text: str | None) -> float | None:

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 import viser
-from common.perception.camera_input import FrameError
 from numpy.typing import NDArray
 
 from common.messages import Image
+from common.perception.camera_input import FrameError
 from common.perception.image import ImageError, image_to_array
 from page.console import ActionQueue
 from page.feeds import ANNOTATED, DEPTH, LIVE, MASK

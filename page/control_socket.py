@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from websockets.exceptions import ConnectionClosed
 
-from common.sources import monotonic
+from common.time_source import monotonic
 from page.permissions import CURRENT_SESSION
 from page.status_text import USER_ERRORS, TaskText, error_text, motion_text
 

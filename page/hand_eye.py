@@ -15,9 +15,9 @@ import numpy as np
 import viser
 
 from common import topics
+from common.atomic_file import state_folder
 from common.config import RobotConfig, check
 from common.errors import ConfigError
-from common.kept_file import lasting_folder
 from common.messages import CameraInfo, Image, JointState
 from common.topics import Topic
 from page.console import Console
@@ -45,7 +45,7 @@ def views_folder(name: str) -> Path:
     """
     if not _NAME.fullmatch(name):
         raise ConfigError("Calibration name", name, "must be letters, digits, '_' and '-', at most 40")
-    return lasting_folder() / "hand_eye" / name
+    return state_folder() / "hand_eye" / name
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ class HandEyeSession:
     def missing(self) -> str:
         """Text of what is missing; empty if nothing is."""
         missing = REQUIRED_VIEWS - self.count
-        if missing <= 0 and self._collector.turns.min() >= REQUIRED_ROTATION:
+        if missing <= 0 and self._collector.rotation_ranges.min() >= REQUIRED_ROTATION:
             return ""
         views = f"{missing} more views" if missing > 1 else "one more view" if missing == 1 else "some more views"
         return f"{views}: {self._collector.hint}"
@@ -93,7 +93,7 @@ class HandEyeSession:
         """Range of rotation of the gripper about each of its axes [degrees]."""
         from tools.calibration.views import AXES
 
-        return {axis: math.degrees(turn) for axis, turn in zip(AXES, self._collector.turns, strict=True)}
+        return {axis: math.degrees(turn) for axis, turn in zip(AXES, self._collector.rotation_ranges, strict=True)}
 
     def add_joints(self, state: JointState) -> None:
         """Add joint states."""
@@ -103,7 +103,7 @@ class HandEyeSession:
 
     def add_image(self, image: Image) -> str:
         """Add an image as a view; return why it is rejected, or an empty text."""
-        return self._collector.look(image)
+        return self._collector.add(image)
 
     def calibrate(self, info: CameraInfo) -> Result:
         """Calibrate with all views and write the camera file for a cell. Takes seconds.
@@ -138,9 +138,9 @@ class HandEyeSession:
     @property
     def too_few(self) -> str:
         """Why a calibration is not possible yet; empty if it is."""
-        from tools.calibration.hand_eye import LEAST_VIEWS
+        from tools.calibration.hand_eye import MIN_VIEWS
 
-        return "" if self.count >= LEAST_VIEWS else f"{LEAST_VIEWS} views are needed"
+        return "" if self.count >= MIN_VIEWS else f"{MIN_VIEWS} views are needed"
 
 
 class HandEyePanel:
@@ -231,8 +231,9 @@ class HandEyePanel:
         """Return progress, the result for the last image, and the result of the calibration as HTML."""
         session = self._session
         if session is None:
-            return block(span("Fix a board in view of the camera, enter a name and press Start calibration. Then jog the arm, and "
-                              "tilt the gripper to all sides between views.", "dim"), "hand-eye", views=0)
+            return block(span(
+                "Fix a board in view of the camera, enter a name and press Start calibration. Then jog the arm, and "
+                "tilt the gripper to all sides between views.", "dim"), "hand-eye", views=0)
         rotations = {f"rotation {axis}": f"{degrees:.0f}°" for axis, degrees in session.rotations.items()}
         missing = session.missing
         todo = line(f"Missing: {missing}", "busy") if missing else line("Complete: press Calibrate", "good")

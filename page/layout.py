@@ -12,9 +12,9 @@ import viser
 import yaml
 from pydantic import Field
 
+from common.atomic_file import state_folder
 from common.config import Section, check, config_root, read_yaml
 from common.errors import ConfigError, ZencellError
-from common.kept_file import lasting_folder
 from page.diagnostics import LogLevel
 from page.layers import Layers, has_data, shown_layers
 from page.markup import Html, block, span, swatch, text
@@ -68,7 +68,7 @@ class Layout(Section):
 
 def layout_file(configured: str) -> Path:
     """Return the path of the layout: the configured one, or that of this user."""
-    return Path(configured).expanduser() if configured else lasting_folder() / FILE
+    return Path(configured).expanduser() if configured else state_folder() / FILE
 
 
 def _user_layout() -> Path | None:

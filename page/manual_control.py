@@ -22,7 +22,7 @@ from common.config import check
 from common.control.jogging import PAUSE
 from common.messages import UNKNOWN_OPERATOR, GripperCommand, MotionOwner, MotionStatus
 from common.robot.transforms import matrix_to_rpy
-from common.sources import monotonic, new_id
+from common.time_source import monotonic, new_id
 from page.control_socket import HoldHandler
 from page.diagnostics import short_names
 from page.markup import Html, block, buttons, hold, live, press, text
@@ -186,7 +186,8 @@ class JogPanel:
         """
         self._joints, self._limits = list(joints), list(limits)
         self._mode, self._speed = JOINTS, INITIAL_SPEED / 100
-        mode = gui.add_dropdown("Jog mode", [JOINTS, *FRAMES], initial_value=JOINTS, hint="joints, or the tool along axes")
+        mode = gui.add_dropdown(
+            "Jog mode", [JOINTS, *FRAMES], initial_value=JOINTS, hint="joints, or the tool along axes")
         actions.on_change(mode, self._set_mode)
         speed = gui.add_slider("Jog speed [%]", 1, 100, 1, INITIAL_SPEED, hint=(
             "100 % is 250 mm/s and 1 rad/s for the tool, and the velocity limit for a joint"))

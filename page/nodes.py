@@ -88,7 +88,7 @@ def brightened(color: Rgb) -> Rgb:
 def add_solid(scene: viser.SceneApi, name: str, solid: CollisionObject) -> Solid | None:
     """Add a solid of the planning scene at its pose in the parent node; return None for a degenerate prism."""
     from common.planning.prism import convex_hull  # slow to import, and needed with a scene only
-    from common.sim.solids import upright
+    from common.sim.solids import extrude
 
     color, opacity = rgb_of(solid.color), solid.color.a if solid.color.a < 1 else None
     pose: dict[str, Any] = {"opacity": opacity, "position": position_of(solid.pose), "wxyz": wxyz_of(solid.pose)}
@@ -102,7 +102,7 @@ def add_solid(scene: viser.SceneApi, name: str, solid: CollisionObject) -> Solid
     hull = convex_hull(np.array(solid.outline))
     if len(hull) < 3:
         return None
-    triangles = upright(hull, np.empty((0, 2)), -sizes[0] / 2, sizes[0] / 2)
+    triangles = extrude(hull, np.empty((0, 2)), -sizes[0] / 2, sizes[0] / 2)
     return add_triangles(scene, name, triangles, color, **pose, **shadow)
 
 

@@ -13,9 +13,9 @@ import yaml
 from numpy.typing import NDArray
 from pydantic import Field
 
+from common.atomic_file import state_folder
 from common.config import Section, check, read_yaml
 from common.errors import ConfigError, ZencellError
-from common.kept_file import lasting_folder
 from page.markup import Html, block, buttons, line, press, span, text
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ class SavedPoses(Section):
 
 def poses_file(cell: str) -> Path:
     """Return the path of the saved poses of a cell."""
-    return lasting_folder() / f"{cell}.poses.yaml"
+    return state_folder() / f"{cell}.poses.yaml"
 
 
 def load_poses(path: Path) -> SavedPoses:

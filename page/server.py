@@ -26,7 +26,7 @@ from websockets.exceptions import WebSocketException
 from websockets.http11 import Request, Response
 
 from common.errors import ConfigError
-from common.sources import monotonic
+from common.time_source import monotonic
 from page.access import Access, Answer, gateways
 from page.address import is_loopback, listen_error, open_socket
 from page.permissions import CURRENT_SESSION, PageSession, Permissions

@@ -7,7 +7,7 @@ import asyncio
 import cv2
 from pydantic import Field
 
-from applications.outlining.contour_choice import Following, NoSuchContour, annotate_contours, parse_choice
+from applications.outlining.contour_choice import ContourTracker, NoSuchContour, annotate_contours, parse_choice
 from applications.outlining.contours import ContourOptions, Picture, find_contours
 from applications.outlining.topics import (
     CONTOUR_IMAGE,
@@ -52,10 +52,10 @@ async def run(bus: Bus, config: Config) -> None:
     images = bus.reader(topics.DEPTH_CAMERA_IMAGE)
     found, shown = bus.writer(CONTOURS), bus.writer(CONTOUR_IMAGE)
     cv2.setNumThreads(1)  # the other cores have other services
-    following = Following(initial_choice(config.select))
+    following = ContourTracker(initial_choice(config.select))
     last: tuple[Image, Picture, list[Contour]] | None = None
     told = ""
-    left_out = SkippedFrames(bus.log, "a picture")
+    left_out = SkippedFrames(bus.log, "image")
 
     def publish(selected: int, message: str) -> None:
         nonlocal told

@@ -104,7 +104,8 @@ async def run(bus: Bus, config: Config) -> None:
     control = ControlSocket(console)
     status = feeds.reader(read.status) if read.status is not None else None
     motions = OperatorMotion(bus, [status] if status is not None else [], owner=lambda: permissions.client_name)
-    folder = None if bus.declares_only else secure_folder()
+    await bus.acquire_keys()
+    folder = secure_folder()
     server = make_server(
         config.host, config.port, config.token, published=config.published, secured=folder is not None,
         tokens=read_tokens(folder, bus.cell) if folder is not None else None, permissions=permissions,

@@ -11,8 +11,8 @@ from functools import lru_cache
 import cv2
 from pydantic import Field
 
-from applications.pick_place.detector import Detection, Detector, DetectorOptions, annotate, rehearse
-from applications.pick_place.outliers import Odd
+from applications.pick_place.detector import Detection, Detector, DetectorOptions, annotate, warm_up
+from applications.pick_place.outliers import Outlier
 from applications.pick_place.perceived_scene import Place
 from applications.pick_place.topics import DETECTED_OBJECTS, DETECTION_IMAGE, DETECTION_MASK
 from common import topics
@@ -48,7 +48,7 @@ class Config(DetectorOptions):
 
 def markers(
     detections: list[Detection], around: Surroundings, stamp: int, remark: str = "", blind: str = "",
-    odd: Sequence[Odd] = (),
+    odd: Sequence[Outlier] = (),
 ) -> MarkerArray:
     """The message of what was found in the frame that was exposed at `stamp`, or of why that tells nothing.
 
@@ -109,9 +109,9 @@ async def run(bus: Bus, config: Config) -> None:
     kept: deque[Image] = deque(maxlen=KEPT)
     news = asyncio.Event()
     detector = Detector(config.world, config)
-    left_out = SkippedFrames(bus.log, "a picture")
-    if not bus.declares_only:
-        rehearse(config.world, config)
+    left_out = SkippedFrames(bus.log, "image")
+    await bus.acquire_keys()
+    warm_up(config.world, config)
     await bus.ready()
 
     async def watch_depths() -> None:
@@ -151,7 +151,8 @@ async def run(bus: Bus, config: Config) -> None:
                 detections = await asyncio.to_thread(detector.detect_in_depth, picture, depth, camera)
             remark = _remark(detector, bus.service)
             try:
-                found.put(markers(detections, config.world, image.header.stamp, remark, detector.blind, detector.odd))
+                found.put(markers(
+                    detections, config.world, image.header.stamp, remark, detector.blind, detector.outliers))
             except FrameError as error:
                 left_out.note(error)
             if shown.matched:

@@ -8,8 +8,15 @@ from contextlib import suppress
 
 from pydantic import Field
 
-from applications.pick_place.ball_places import MOST_HIDDEN, Region
-from applications.pick_place.detections import HIDDEN, Remembered, Seen, Validation, Views, ViewsParameters
+from applications.pick_place.ball_places import MOST_HIDDEN, VisibleTable
+from applications.pick_place.detections import (
+    HIDDEN,
+    CameraDetections,
+    DetectionViews,
+    OccludedTargets,
+    Validation,
+    ViewsParameters,
+)
 from applications.pick_place.topics import (
     REJECTED_TARGETS,
     VALIDATED_TARGETS,
@@ -41,15 +48,15 @@ class Config(ViewsParameters, WorkspaceBounds):
     )
 
 
-class Watched:
+class OcclusionReport:
     """Says what the newest pictures do not show of where things may lie."""
 
     def __init__(self, around: Surroundings, bounds: WorkspaceBounds) -> None:
         """Begin; the table is divided up when something is hidden for the first time."""
         self._around, self._bounds = around, bounds
-        self._region: Region | None = None
+        self._region: VisibleTable | None = None
 
-    def unseen(self, seen: list[Seen], views: Views, most: float) -> tuple[str, bool]:
+    def unseen(self, seen: list[CameraDetections], views: DetectionViews, most: float) -> tuple[str, bool]:
         """In words, empty where at most that share of the table is hidden; and whether nothing is seen at all.
 
         Of several views all are needed: what only one of them sees is not known without it.
@@ -61,19 +68,19 @@ class Watched:
             return "", False
         if len(hiding) == len(seen) and all(hidden.everything for hidden in hiding):
             return hiding[0].by, True
-        self._region = self._region or Region(self._around, self._bounds)
+        self._region = self._region or VisibleTable(self._around, self._bounds)
         robot, silhouettes = views.robot
         share = self._region.hidden((self._region.within(one.camera, silhouettes, robot), one.hidden) for one in seen)
         by = " and ".join(dict.fromkeys(hidden.by for hidden in hiding))
         return (f"{by} hides {100 * share:.0f} % of the table within reach" if share > most else ""), False
 
 
-def hiding(seen: list[Seen], radius: float) -> Callable[[tuple[float, float, float]], bool] | None:
+def hiding(seen: list[CameraDetections], radius: float) -> Callable[[tuple[float, float, float]], bool] | None:
     """Whether a place is hidden in all views, for what is as large as that [m]; None where any shows everything."""
     hidden = [one.hidden for one in seen if one.hidden is not None]
     if len(hidden) < len(seen) or not hidden:
         return None
-    return lambda place: all(bool(one.hides([place], radius)[0]) for one in hidden)
+    return lambda place: all(bool(one.occludes([place], radius)[0]) for one in hidden)
 
 
 def shells(config: Config, header: Header) -> MarkerArray:
@@ -96,13 +103,13 @@ def shells(config: Config, header: Header) -> MarkerArray:
 
 async def run(bus: Bus, config: Config) -> None:
     """Judge every frame with what is known; the inverse kinematics of new places is worked out beside that."""
-    views = Views(bus, config.views, config.world, config.robot, bus.log)
+    views = DetectionViews(bus, config.views, config.world, config.robot, bus.log)
     validated, rejected = bus.writer(VALIDATED_TARGETS), bus.writer(REJECTED_TARGETS)
     markers = bus.writer(WORKSPACE_MARKERS)
     reach = ReachCache(RobotModel.load(config.robot), config.grasp, config)
     validation = Validation(config.world, reach, forget_after=config.forget_after)
 
-    watched, remembered, radius = Watched(config.world, config), Remembered(), config.world.ball_radius
+    watched, remembered, radius = OcclusionReport(config.world, config), OccludedTargets(), config.world.ball_radius
 
     def show() -> None:
         markers.put(shells(config, bus.header(WORLD)))
@@ -111,13 +118,13 @@ async def run(bus: Bus, config: Config) -> None:
     bus.on_parameters(show)
     places: list[tuple[float, float, float]] = []
     work, idle = asyncio.Event(), asyncio.Event()
-    unfinished: list[Seen] = []  # sent without the places that were still worked on
+    unfinished: list[CameraDetections] = []  # sent without the places that were still worked on
     await bus.ready()
 
-    def send(seen: list[Seen]) -> None:
+    def send(seen: list[CameraDetections]) -> None:
         nonlocal unfinished
         validation.forget_after = config.forget_after
-        verdict = validation.judge_all([(one.frame, one.camera) for one in seen])
+        verdict = validation.validate_views([(one.frame, one.camera) for one in seen])
         unfinished = seen if verdict.unknown else []
         header = Header(stamp=min(one.frame.header.stamp for one in seen), frame_id=WORLD)
         kept = remembered.hidden(verdict.targets, [place for place, _ in verdict.refused], hiding(seen, radius))
@@ -133,7 +140,7 @@ async def run(bus: Bus, config: Config) -> None:
         for one in verdict.rejections:
             bus.log.info("rejected (%s, %s): %s", f"{one.position.x:z.3f}", f"{one.position.y:z.3f}", one.reason)
 
-    async def look(_view: int, _seen: Seen) -> None:
+    async def look(_view: int, _seen: CameraDetections) -> None:
         seen = views.newest()
         places[:] = [place for one in seen for place in validation.unknown(one.frame, one.camera)]
         if places:

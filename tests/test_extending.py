@@ -18,7 +18,6 @@ import numpy as np
 import pytest
 import viser
 import yaml
-from common.supervision.wiring import wiring
 
 from common import messages as m
 from common.application import find_application
@@ -30,6 +29,7 @@ from common.messages import CameraInfo, Image, Pose, Vector3, WorldObject, World
 from common.planning.planners import load_planner
 from common.process.in_process import running_service
 from common.robot.model import RobotModel
+from common.supervision.wiring import wiring
 from common.tasks.stages import View
 from common.topics import CAMERA_IMAGE, CAMERA_INFO, GRIPPER_STATE, SCENE_OBJECTS
 from common.transport.codec import decode
@@ -353,4 +353,4 @@ def test_layer_of_ours_is_drawn_on_the_page(folder: Path) -> None:
 def test_service_that_is_no_module_is_refused_by_name(folder: Path) -> None:
     told = tell("zencell service my_pkg.farthest_target --cell panda", folder)
     assert told.returncode == 2
-    assert told.stderr.count("\n") == 1 and "'my_pkg.farthest_target' is not a module that can be found" in told.stderr
+    assert told.stderr.count("\n") == 1 and "'my_pkg.farthest_target' is not a module on the search path" in told.stderr

@@ -136,7 +136,7 @@ LARGEST_TURN = 1 / 6  # of the circle of hues, by which an object may look anoth
 COLOURFUL = 0.25  # saturation from which on a hue says something
 
 
-class Following:
+class ContourTracker:
     """The choice, and the object it fell upon: found again in each picture by its place and size.
 
     It is looked for as it was last seen, and as it was when it was chosen: what is seen while the arm hides more and

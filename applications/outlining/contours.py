@@ -18,14 +18,14 @@ from common.messages import Color
 
 Array = npt.NDArray[np.float64]
 
-RUN = 6  # points to each side with which a point of a noisy contour is evened out
+RUN = 6  # points to each side with which a point of a noisy contour is smoothed out
 SHORTEST = 80  # contours with fewer points are left as they are
-NOISE = 0.05, 0.14  # [px] likewise those with less, and with more, which is detail; measured, see `evened`
+NOISE = 0.05, 0.14  # [px] likewise those with less, and with more, which is detail; measured, see `smoothed`
 WHITE = 1.1  # times what each point does by itself, so much may be noise: what is more goes on as a wave does
 FITS = 1.7  # times the noise, so far from the points may be what is put through them: else there is some detail
 
 
-def evened(points: Array) -> Array:
+def smoothed(points: Array) -> Array:
     """The points of a closed contour (n, 2) [px] without the noise that moves each by itself.
 
     That is noise of the picture, and edges that were drawn from few samples for each pixel. It is how far the points of
@@ -121,7 +121,7 @@ def refine(channel: npt.NDArray[np.uint8], chain: npt.NDArray[np.int32], *, hole
     weights = np.full(len(along), STEP)
     weights[[0, -1]] = STEP / 2
     offset = np.where(clear, np.clip(share @ weights - REACH, -1.0, 1.5), 0.5)
-    return evened(np.asarray(chain + offset[:, None] * out))
+    return smoothed(np.asarray(chain + offset[:, None] * out))
 
 
 def _sample(channel: npt.NDArray[np.uint8], at: Array) -> Array:
@@ -137,7 +137,7 @@ def _sample(channel: npt.NDArray[np.uint8], at: Array) -> Array:
 
 Picture = npt.NDArray[np.uint8]
 Channel = Literal["saturation", "maximum", "grey"]
-MOST, MOST_POINTS, MOST_ALONG_ONE = 1000, 100_000, 65_536  # contours and points that a message has room for
+MOST, MAX_POINTS, MOST_ALONG_ONE = 1000, 100_000, 65_536  # contours and points that a message has room for
 
 
 class ContourOptions(Parameters):
@@ -210,7 +210,7 @@ def _with_room(
     for index in sorted(wanted, key=lambda i: -areas[i]):  # a thin ring is before its hole, which is as large
         size = lengths[index]
         inside = parents[index] in kept or parents[index] < 0
-        if inside and size <= MOST_ALONG_ONE and points + size <= MOST_POINTS and len(kept) < MOST:
+        if inside and size <= MOST_ALONG_ONE and points + size <= MAX_POINTS and len(kept) < MOST:
             kept.add(index)
             points += size
     return sorted(kept)

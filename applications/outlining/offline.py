@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from applications.outlining.contour_choice import NoSuchContour, choose
 from applications.outlining.contours import ContourOptions, find_contours, is_hole
 from applications.outlining.solids import PerceivedSolid, perceived_solids, simplified, without_duplicates
-from applications.outlining.task import Legs, OutlineView, closed
+from applications.outlining.task import MotionSegments, OutlineView, closed
 from applications.outlining.top_face import TopFaceOptions, top_face
 from applications.outlining.topics import Contour, OutlinePoints, OutlineSelect
 from common import messages as m
@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 
 
-class Impossible(ZencellError):
+class OutlineError(ZencellError):
     """An outline that cannot be found or traced; ends a command with exit code 1."""
 
     exit_code = 1
@@ -59,7 +59,7 @@ def perceive(
         tolerance: of the third [m].
 
     Raises:
-        Impossible: no contour fits the choice.
+        OutlineError: no contour fits the choice.
         DepthError: the depth does not tell where the object is.
     """
     check_depth(depth, picture.shape[1], picture.shape[0])
@@ -67,7 +67,7 @@ def perceive(
     try:
         chosen = choose(contours, wanted)
     except NoSuchContour as error:
-        raise Impossible(str(error)) from None
+        raise OutlineError(str(error)) from None
     hole = is_hole(contours, chosen.index)
     face = top_face(chosen.pixels, depth, camera, face_options, hole=hole)
     cleared = simplified(without_duplicates(face.outline), tolerance)
@@ -78,7 +78,7 @@ def perceive(
 
 
 def plan_outline(
-    pipeline: PlanningPipeline, legs: Legs, points: Array, label: str, scene: m.PlanningScene, *, given: bool
+    pipeline: PlanningPipeline, legs: MotionSegments, points: Array, label: str, scene: m.PlanningScene, *, given: bool
 ) -> list[tuple[Move, m.PlanResponse]]:
     """All motions of outlining points (n, 3) [m], from home to home, each planned from the end of the one before.
 
@@ -91,13 +91,13 @@ def plan_outline(
         given: the points need not go round anything in the scene.
 
     Raises:
-        Impossible: the first motion that cannot be planned says why.
+        OutlineError: the first motion that cannot be planned says why.
     """
     poses = [m.Pose(position=m.Vector3(x=x, y=y, z=z)) for x, y, z in points.tolist()]
     path = OutlinePoints(header=scene.header, poses=poses, object=label, given=given)
     solid = OutlineView(now=0.0, path=path, scene=scene).solid()
     if solid is None:
-        raise Impossible(f"{label}: nothing in the planning scene lies within the outline")
+        raise OutlineError(f"{label}: nothing in the planning scene lies within the outline")
     end: Sequence[float] = pipeline.robot.named("home").tolist()
     planned = []
     for leg in legs.outline(closed(path), solid, Cycle(label)):
@@ -106,7 +106,7 @@ def plan_outline(
             allowed_collisions=leg.touches,
         ), scene)
         if not response.ok:
-            raise Impossible(f"{label}: {response.message}")
+            raise OutlineError(f"{label}: {response.message}")
         leg.trajectory = response.trajectory
         end = leg.end()
         planned.append((leg, response))

@@ -38,7 +38,7 @@ class OutlineFigures(application.Figures):
     def __init__(self, robot: RobotConfig | None = None, *, pictured: bool = False) -> None:
         """Start with nothing heard; without a robot only what the task itself tells is known."""
         super().__init__(robot, pictured=pictured)
-        self.traced = Traced(robot)
+        self.traced = TraceEvaluation(robot)
 
     def listeners(self) -> dict[Topic[Any], Callable[[float, Any], None]]:
         """The task, the contour, the arm and the truth."""
@@ -92,7 +92,7 @@ class OutlineFigures(application.Figures):
         ))
 
 
-class Traced:
+class TraceEvaluation:
     """Follows one cell that outlines objects; tells of the newest outline."""
 
     def __init__(self, robot: RobotConfig | None) -> None:

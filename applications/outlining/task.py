@@ -16,7 +16,7 @@ from common.config import GripperConfig, Number, Parameters, Tunable
 from common.robot.transforms import matrix_to_pose, rpy_to_matrix, transform
 from common.tasks.decisions import TaskConfig
 from common.tasks.engine import Task
-from common.tasks.stages import Cycle, Grip, Look, Move, Place, Stage, View, place_of
+from common.tasks.stages import AwaitImage, Cycle, Grip, Move, Place, Stage, View, place_of
 
 NEAR = 0.01  # [m] an object that was perceived is this exact
 
@@ -100,7 +100,7 @@ class TracingParameters(Parameters):
 
 
 @dataclass(frozen=True)
-class Legs:
+class MotionSegments:
     """Builds the motions; knows heights and speed, nothing of what happens."""
 
     p: TracingParameters
@@ -115,7 +115,7 @@ class Legs:
         above = m.PoseGoal(pose=self._pose((x, y, z + self.p.approach_clearance)))
         down = m.PoseGoal(pose=self._pose(points[0]))
         return [
-            Move("approach", "APPROACHING", cycle, goal=above, fresh=True, whole=True),
+            Move("approach", "APPROACHING", cycle, goal=above, needs_fresh_image=True, needs_full_plan=True),
             Move("descend", "APPROACHING", cycle, goal=down, straight=True, touches=touches),
             Move("trace", "TRACING", cycle, goal=trace, touches=touches),
             Move("retreat", "RETREATING", cycle, goal=above, straight=True, touches=touches),
@@ -166,7 +166,7 @@ class Outline(Task[OutlineView]):
         """Start from nothing known: see `Task`."""
         super().__init__(config, status, prefix, speed)
         self.status.standoff = config.standoff
-        self._legs = Legs(config, self.gripper)
+        self._segments = MotionSegments(config, self.gripper)
         self._home = config.robot.named_poses["home"]
         self._cycle = Cycle()
         self._traced = False
@@ -197,7 +197,7 @@ class Outline(Task[OutlineView]):
         """Take the chosen contour once the planning scene holds its object; give up after a while without one."""
         self.status.state, self.status.stage = "SELECTING", ""
         path = view.path
-        if path is not None and min(view.stamps) < self.look_after:
+        if path is not None and min(view.stamps) < self.images_after:
             path = None
         solid = view.solid()
         unseen = "no contour came from the camera" if path is None else self.unseen(view)
@@ -215,7 +215,7 @@ class Outline(Task[OutlineView]):
         self.status.message = problem
         # Waiting for a person or for pictures is by the clock on the wall, also in a fast cell.
         limit = self.p.picture_timeout if unseen else self.p.selection_timeout
-        waited = self.patience.lasts(bool(unseen), view.now)
+        waited = self.wait_timer.elapsed(bool(unseen), view.now)
         if 0 < limit * self.speed < waited:
             self.fail(problem, view)
 
@@ -224,7 +224,7 @@ class Outline(Task[OutlineView]):
         assert view.gripper is not None
         points, cycle = closed(path), Cycle(path.object)
         try:
-            motions = self._legs.outline(points, solid, cycle)
+            motions = self._segments.outline(points, solid, cycle)
         except ValidationError:  # a path may be all that a message of it can hold
             self.fail(f"the contour of {path.object} has too many points, or lies too far away", view)
             return
@@ -235,9 +235,9 @@ class Outline(Task[OutlineView]):
         self._cycle = cycle
         self._path, self._named = path, _places(view)
         if view.gripper.width > SHUT:
-            self.row.append(Grip("close", "PLANNING", self._cycle, width=0.0))
-        self.row += [*motions, Look()]
-        self.patience.reset()
+            self.queue.append(Grip("close", "PLANNING", self._cycle, width=0.0))
+        self.queue += [*motions, AwaitImage()]
+        self.wait_timer.reset()
 
     def _is_home(self, view: OutlineView) -> bool:
         assert view.q is not None
@@ -245,7 +245,7 @@ class Outline(Task[OutlineView]):
 
     # --- what happened ---------------------------------------------------------------------------------------
 
-    def began_anew(self) -> None:
+    def on_restart(self) -> None:
         """Forget the outline of before."""
         self.status.closed = self._traced = False
 
@@ -259,13 +259,13 @@ class Outline(Task[OutlineView]):
         if move.name == "trace":
             self.status.fraction = response.fraction
 
-    def may_begin(self, stage: Stage, view: OutlineView) -> bool:
+    def may_start(self, stage: Stage, view: OutlineView) -> bool:
         """Without a fresh picture nothing begins, nor where it shows the contour elsewhere than was planned."""
-        if isinstance(stage, Move) and stage.fresh and self.unseen(view):
+        if isinstance(stage, Move) and stage.needs_fresh_image and self.unseen(view):
             self.clear()
-            self.patience.reset()
+            self.wait_timer.reset()
             return False
-        if isinstance(stage, Move) and stage.fresh and self._path and not same_place(self._path, view.path):
+        if isinstance(stage, Move) and stage.needs_fresh_image and self._path and not same_place(self._path, view.path):
             self.displaced(stage, view, f"{self.status.subject or 'the contour'} is not where it was")
             return False
         if isinstance(stage, Move):
@@ -291,7 +291,7 @@ class Outline(Task[OutlineView]):
             self.fail(problem, view)
             return
         self.clear()
-        self.patience.reset()
+        self.wait_timer.reset()
         self.status.failures += 1
         self._returned, self.status.message = False, problem
 
@@ -308,7 +308,7 @@ class Outline(Task[OutlineView]):
             self._recover(view)
         elif move is self._up:
             self.clear()
-            self.row += [self._legs.home(self._cycle), Look()]
+            self.queue += [self._segments.home(self._cycle), AwaitImage()]
         elif not self._error and self._is_new(response.colliding or (), view):
             self.displaced(move, view, response.message)
         elif not self._error:
@@ -328,7 +328,7 @@ class Outline(Task[OutlineView]):
         self.status.failures += 1
         first, self._error = self._error, self._error or message
         self.status.message = self._error
-        self.patience.reset()
+        self.wait_timer.reset()
         if self.running is not None:  # the fingers are still closing: they may finish
             return
         if first:
@@ -342,8 +342,8 @@ class Outline(Task[OutlineView]):
         """Up and home, from wherever the arm is."""
         self.clear()
         up = self._up = self.retreat(view, self._excused, self.p.approach_clearance)
-        up.state, up.cycle, up.whole = "RETREATING", self._cycle, True
-        self.row += [up, self._legs.home(self._cycle), Look()]
+        up.state, up.cycle, up.needs_full_plan = "RETREATING", self._cycle, True
+        self.queue += [up, self._segments.home(self._cycle), AwaitImage()]
 
     def _give_up(self, message: str) -> None:
         self._error, self._excused = "", None

@@ -302,7 +302,7 @@ def _to_the_pixel(contour: Array) -> bool:
 
 
 def _smoothed(contour: Array) -> Array:
-    """A closed contour whose steps from pixel to pixel are evened out."""
+    """A closed contour whose steps from pixel to pixel are smoothed out."""
     return np.asarray(sum(np.roll(contour, k, axis=0) for k in range(-2, 3)) / 5)
 
 

@@ -40,10 +40,10 @@ def snapshot(
     A cell that is up is asked; else its services are started for it, without the task, and stopped again.
     """
     from applications.outlining.contour_choice import parse_choice
-    from applications.outlining.visits import store
+    from applications.outlining.visits import store_stages
 
     shell: Shell = context.obj
-    visit = partial(store, folder=Path(folder), wanted=parse_choice(select))
+    visit = partial(store_stages, folder=Path(folder), wanted=parse_choice(select))
     echo(shell.visit(visit, cell, overrides, world, seed, domain, connect))
 
 
@@ -93,7 +93,7 @@ def before_run(
         return BeforeRun(overrides)
     from applications.outlining import APPLICATION
     from applications.outlining.stage_files import CLEARED, read_coordinates
-    from applications.outlining.visits import CHOOSE_BY_HAND, ask_person, require_terminal
+    from applications.outlining.visits import CHOOSE_BY_HAND, ask_operator, require_terminal
     from common.config import load_cell
 
     for option, wanted in (("--ask", ask), ("--from", source is not None)):
@@ -103,7 +103,7 @@ def before_run(
         raise ConfigError("--ask", ..., "and --from are two ways to choose: give one of them")
     if ask:
         require_terminal()
-        return BeforeRun([*CHOOSE_BY_HAND, *overrides], partial(ask_person, folder=Path.cwd()))
+        return BeforeRun([*CHOOSE_BY_HAND, *overrides], partial(ask_operator, folder=Path.cwd()))
     file = (Path(source or "") / CLEARED).absolute()
     read_coordinates(file)
     return BeforeRun([f"services.duplicate_remover.coordinates={json.dumps(str(file))}", *overrides])
@@ -113,7 +113,7 @@ def _stages(shell: Shell, cell: Cell, place: Path, wanted: OutlineSelect, *, kee
     from applications.outlining import stage_files
     from applications.outlining.offline import perceive, plan_outline
     from applications.outlining.solids import planning_scene
-    from applications.outlining.task import Legs
+    from applications.outlining.task import MotionSegments
     from common.config import Surroundings
     from common.perception.pinhole import MountedCamera
     from common.planning.pipeline import PlanningPipeline
@@ -142,7 +142,7 @@ def _stages(shell: Shell, cell: Cell, place: Path, wanted: OutlineSelect, *, kee
     assert parameters.robot.gripper is not None  # the tracer needs one as well
     pipeline = PlanningPipeline(RobotModel.load(cell.robot), cell.motion, cell.pipeline, seed=cell.run.seed)
     scene = planning_scene(around, found.solids, 1)
-    legs = Legs(parameters, parameters.robot.gripper)
+    legs = MotionSegments(parameters, parameters.robot.gripper)
     for leg, response in plan_outline(pipeline, legs, cleared, label, scene, given=keep):
         echo(f"  {leg.name:<8} {leg.seconds:6.2f} s by {response.planner}, planned in "
                    f"{1e3 * response.seconds:.0f} ms, fraction {response.fraction:.2f}")

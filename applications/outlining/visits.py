@@ -59,30 +59,30 @@ def require_terminal() -> None:
         raise ConfigError("--ask", ..., "needs a terminal; without one choose with `zencell task select N`")
 
 
-async def ask_person(bus: Bus, folder: Path) -> None:
+async def ask_operator(bus: Bus, folder: Path) -> None:
     """Store the picture with its contours in a folder, and ask until one of them is chosen."""
     contours, images = bus.reader(CONTOURS), bus.reader(CONTOUR_IMAGE)
     select = bus.client(OUTLINE_SELECT)
     found, image = await _drawn(contours, images)
     path = folder / f"{bus.cell}_contours.png"
-    await _keep(path, image)
-    say(f"{path} shows them: {described(found.contours)}")
+    await _write_image(path, image)
+    print_line(f"{path} shows them: {described(found.contours)}")
     while True:
-        say("outline which one? ", end="")
+        print_line("outline which one? ", end="")
         try:
             wanted = parse_choice(await _line())
             if wanted is not None:
                 if wanted.index is not None and wanted.index < len(found.contours):
                     wanted.at = middle_of(found.contours[wanted.index])  # in the picture that the person looks at
                 answer = await _chosen(select, wanted)
-                say(f"{answer.label} is chosen")
+                print_line(f"{answer.label} is chosen")
                 return
         except NoSuchContour as error:
-            say(str(error))
+            print_line(str(error))
         except RemoteError as error:
-            say(error.message)
+            print_line(error.message)
         except RequestFailed as error:
-            say(str(error))
+            print_line(str(error))
 
 
 async def _chosen(select: Client[OutlineSelect, OutlineSelection], wanted: OutlineSelect) -> OutlineSelection:
@@ -95,7 +95,7 @@ async def _chosen(select: Client[OutlineSelect, OutlineSelection], wanted: Outli
     return await select.call(wanted)
 
 
-def say(text: str, end: str = "\n") -> None:
+def print_line(text: str, end: str = "\n") -> None:
     """Show a text to the person."""
     sys.stdout.write(printable(text) + end)
     sys.stdout.flush()
@@ -106,7 +106,7 @@ async def _drawn(contours: Reader[Contours], images: Reader[Image]) -> tuple[Con
     found, image = await contours.next(), await images.next()
     while not found.contours or found.header.stamp != image.header.stamp:
         if not found.contours:
-            say("no contour in the picture yet")
+            print_line("no contour in the picture yet")
         if not found.contours or found.header.stamp < image.header.stamp:
             found = await contours.next()
         else:
@@ -114,7 +114,7 @@ async def _drawn(contours: Reader[Contours], images: Reader[Image]) -> tuple[Con
     return found, image
 
 
-async def _keep(path: Path, image: Image) -> None:
+async def _write_image(path: Path, image: Image) -> None:
     import cv2
 
     written, data = cv2.imencode(".png", image_to_array(image))
@@ -143,7 +143,7 @@ async def _line() -> str:
     return line.strip()
 
 
-async def store(bus: Bus, folder: Path, wanted: OutlineSelect | None) -> str:
+async def store_stages(bus: Bus, folder: Path, wanted: OutlineSelect | None) -> str:
     """Put a picture, its depth and the stages of its outline into a folder; returns what was stored.
 
     Raises:

@@ -15,71 +15,70 @@ from common.config import Container, Fixture, Surroundings
 from common.perception.occlusion import Occlusion, RobotSilhouettes
 from common.perception.pinhole import Pinhole
 from common.robot.model import RobotModel
-from common.scene.workspace import WorkspaceBounds, outside_reason
+from common.scene.workspace import WorkspaceBounds, out_of_bounds_reason
 
 Array = npt.NDArray[np.float64]
 
 
 def is_table(fixture: Fixture, height: float) -> bool:
-    """Whether the upper side of a fixture is a table at a height [m]."""
+    """Return whether the top of a fixture is a table at a height [m]."""
     top = fixture.position[2] + fixture.dimensions[2] / 2 if fixture.shape == "box" else None
     return top is not None and abs(top - height) < 1e-3
 
 
 def shows_table(around: Surroundings, camera: Pinhole, pixels: Array) -> npt.NDArray[np.bool_]:
-    """Through which pixels (..., 2) a table would be seen if nothing were before it: (...)."""
+    """Return for pixels (..., 2) whether they would show a table with nothing in front of it (...)."""
     places = camera.on_plane(pixels, around.table_height)
     shown = np.zeros(places.shape[:-1], bool)
     for fixture in around.fixtures:
         if is_table(fixture, around.table_height):
-            beside = np.abs(places - fixture.position[:2])  # nan above the horizon, and no table there
+            beside = np.abs(places - fixture.position[:2])  # NaN above the horizon: no table there
             shown |= (beside <= np.array(fixture.dimensions[:2]) / 2).all(axis=-1)
     return shown
 
 
 @dataclass(frozen=True)
-class Resting:
-    """Known size of the balls and the heights at which their centres can be, in world [m]."""
+class BallGeometry:
+    """Radius of the balls and the heights at which their centers can be, in world [m]."""
 
     radius: float
     table_height: float
     container: Container
 
     @classmethod
-    def of(cls, surroundings: Surroundings) -> Resting:
-        """What the surroundings say."""
+    def of(cls, surroundings: Surroundings) -> BallGeometry:
+        """Take the geometry from the surroundings."""
         return cls(surroundings.ball_radius, surroundings.table_height, surroundings.container)
 
     @property
     def plane(self) -> float:
-        """z of the centres of balls on the table [m]."""
+        """Height of the center of a ball on the table [m]."""
         return self.table_height + self.radius
 
     @property
     def layers(self) -> list[float]:
-        """z of the centres in each layer of the container, from below [m]."""
+        """Heights of the ball centers in each layer of the container, lowest first [m]."""
         lowest = self.table_height + self.container.floor_thickness + self.radius
         return [lowest + 2 * self.radius * layer for layer in range(self.container.layers)]
 
     @property
     def stack_height(self) -> float:
-        """z of the top of a full container's uppermost ball, or of its walls where these are higher [m]."""
+        """Height of the top of a full container: of its uppermost ball, or of its walls if they are higher [m]."""
         stack = self.container.floor_thickness + 2 * self.radius * self.container.layers
         return self.table_height + max(stack, self.container.wall_height)
 
     def meets_container(self, origin: npt.ArrayLike, direction: npt.ArrayLike) -> bool:
-        """Whether a ray meets the volume of the container up to the stack height.
+        """Return whether a ray meets the container's volume up to the stack height, by the slab method.
+
+        The ray is inside between the last entry into and the first exit from the three pairs of planes.
 
         Args:
             origin: (3,) in world [m].
             direction: (3,) in world, of any length.
-
-        The slab method: the ray is inside between the last entry into and the first exit from the three pairs of
-        planes.
         """
         o, d = np.asarray(origin, dtype=float).tolist(), np.asarray(direction, dtype=float).tolist()
         entry, leave = 0.0, math.inf
-        for at, along, (low, high) in zip(o, d, self._slabs, strict=True):  # three numbers: far quicker than arrays
+        for at, along, (low, high) in zip(o, d, self._slabs, strict=True):  # scalars are much faster than arrays here
             if abs(along) < 1e-12:
                 if not low <= at <= high:
                     return False
@@ -89,25 +88,25 @@ class Resting:
         return entry <= leave
 
     def shows_container(self, camera: Pinhole, pixel: Sequence[float] | Array) -> bool:
-        """Whether the ray through a pixel (u, v) meets the volume of the container up to the stack height."""
+        """Return whether the ray through a pixel (u, v) meets the container's volume up to the stack height."""
         return self.meets_container(*camera.ray(pixel))
 
     @cached_property
     def _slabs(self) -> tuple[tuple[float, float], ...]:
-        """From where to where the volume of the container reaches along each axis [m]."""
+        """Extent of the container's volume along each axis [m]."""
         c, h = self.container, self.container.half_side
         return (c.x - h, c.x + h), (c.y - h, c.y + h), (self.table_height, self.stack_height)
 
     def heights(self, camera: Pinhole, pixel: Sequence[float] | Array) -> list[float]:
-        """z [m] at which the centre of a ball seen at a pixel can be."""
+        """Return the heights [m] that the center of a ball seen at a pixel can have."""
         if not self.shows_container(camera, pixel):
             return [self.plane]
-        # Heights that differ by a few millimetres cannot be told apart by how large a ball looks.
+        # Heights that differ by a few millimeters cannot be told apart by the apparent size of a ball.
         apart = all(abs(z - self.plane) > self.radius / 3 for z in self.layers)
         return [self.plane, *self.layers] if apart else self.layers
 
     def can_lie(self, center: npt.ArrayLike) -> bool:
-        """Whether a ball can lie with its centre at (x, y, z) [m] in world: above the table only between the walls."""
+        """Return whether a ball can lie with its center at (x, y, z) [m] in world: higher ones only between walls."""
         x, y, z = np.asarray(center, dtype=float)
         if z < self.plane + self.radius:
             return True
@@ -117,17 +116,18 @@ class Resting:
 
 Bools = npt.NDArray[np.bool_]
 
-MOST_HIDDEN = 0.02  # part of the table within reach that may be hidden while it counts as seen
-STEP = 0.02  # [m] between the places that stand for the table
+MOST_HIDDEN = 0.02  # fraction of the reachable table that may be occluded while it counts as seen
+STEP = 0.02  # [m] grid of positions that represent the table
 
 
-class Region:
-    """Places (n, 3) [m] in world at which a ball may lie within reach, and which of them a camera can see at all."""
+class VisibleTable:
+    """Positions (n, 3) [m] in world where a ball may lie within reach, and which of them each camera can see."""
 
     def __init__(self, around: Surroundings, bounds: WorkspaceBounds) -> None:
-        """Spread places over the tables, within the bounds and clear of the containers."""
+        """Spread positions over the tables, within the bounds and outside of the containers."""
         self.radius = around.ball_radius
-        self._resting = [Resting(around.ball_radius, around.table_height, box) for box in around.containers.values()]
+        self._resting = [BallGeometry(around.ball_radius, around.table_height, box)
+                         for box in around.containers.values()]
         plane = around.table_height + around.ball_radius
         found = [
             (x, y, plane)
@@ -138,14 +138,14 @@ class Region:
         ]
         self.places = np.array([
             place for place in dict.fromkeys(found)
-            if not outside_reason(bounds, place)
+            if not out_of_bounds_reason(bounds, place)
             and not any(max(abs(place[0] - box.x), abs(place[1] - box.y)) < box.half_side + self.radius
                         for box in around.containers.values())
         ]).reshape(-1, 3)
         self._seen_by: dict[int, tuple[Pinhole, Bools]] = {}
 
     def within(self, camera: Pinhole, silhouettes: RobotSilhouettes, robot: RobotModel) -> Bools:
-        """(n,) the places that a camera sees while neither container nor the robot's foot is before them."""
+        """(n,) positions that a camera sees past the container and the robot's base."""
         known = self._seen_by.get(id(camera))
         if known is not None and known[0] is camera:
             return known[1]
@@ -154,33 +154,33 @@ class Region:
         pixels = camera.project(self.places)
         depth = np.maximum(camera.to_camera(self.places)[:, 2], 1e-3)
         margin = max(camera.fx, camera.fy) * self.radius / depth + 2
-        seen = np.array([camera.in_picture(pixel, float(away)) for pixel, away in zip(pixels, margin, strict=True)])
+        seen = np.array([camera.in_image(pixel, float(away)) for pixel, away in zip(pixels, margin, strict=True)])
         behind = np.array([any(r.shows_container(camera, pixel) for r in self._resting) for pixel in pixels])
-        foot = silhouettes.hidden(camera, [robot.named("home")], [robot.config.base_link])
-        found: Bools = seen & ~behind & ~foot.hides(self.places, self.radius)
+        foot = silhouettes.occlusion(camera, [robot.named("home")], [robot.config.base_link])
+        found: Bools = seen & ~behind & ~foot.occludes(self.places, self.radius)
         self._seen_by[id(camera)] = camera, found
         return found
 
     def hidden(self, views: Iterable[tuple[Bools, Occlusion | None]]) -> float:
-        """The share of what any of several views can see that none of them shows now.
+        """Return the fraction of the positions visible to any view that no view shows now.
 
         Args:
-            views: of each what it can see at all, and what is hidden in it now.
+            views: of each view the positions it can see at all, and its current occlusion.
         """
         all_of_it = np.zeros(len(self.places), bool)
         shown = np.zeros(len(self.places), bool)
         for within, hidden in views:
             all_of_it |= within
-            shown |= within if hidden is None else within & ~hidden.hides(self.places, self.radius)
+            shown |= within if hidden is None else within & ~hidden.occludes(self.places, self.radius)
         return float(np.mean(~shown[all_of_it])) if all_of_it.any() else 0.0
 
 
-def looking_poses(
-    robot: RobotModel, cameras: Sequence[Pinhole], region: Region, most: float, carries: float
+def find_viewing_poses(
+    robot: RobotModel, cameras: Sequence[Pinhole], region: VisibleTable, most: float, carries: float
 ) -> list[list[float]]:
-    """Joint positions [rad] from which cameras see the table past the robot: home turned about the first joint.
+    """Return joint positions [rad] in which cameras see the table past the arm: home rotated about the first joint.
 
-    The least turn first, of those that hide as little as may be; else the one that hides least.
+    Smallest rotation first, of those below the occlusion limit; else the one with the smallest occlusion.
     """
     silhouettes, home = RobotSilhouettes(robot, carries), robot.named("home")
     within = [region.within(camera, silhouettes, robot) for camera in cameras]
@@ -190,7 +190,7 @@ def looking_poses(
         q[0] += turn
         if robot.within_limits(q):
             share = region.hidden(
-                (seen, silhouettes.hidden(camera, [q])) for seen, camera in zip(within, cameras, strict=True))
+                (seen, silhouettes.occlusion(camera, [q])) for seen, camera in zip(within, cameras, strict=True))
             found.append((share, q.tolist()))
     good = [q for share, q in found if share <= most]
     return good or [min(found)[1]] if found else []
@@ -201,30 +201,30 @@ def _steps(middle: float, half: float) -> list[float]:
     return [round(middle - half + (k + 0.5) * 2 * half / count, 6) for k in range(count)]
 
 
-MOST = 4  # poses that are tried one after the other
+MOST = 4  # poses to try one after the other
 
 
-class Looking:
-    """Joint positions [rad] from which the cameras see past the arm, the nearest to home first."""
+class ViewingPoses:
+    """Joint positions [rad] in which the cameras see past the arm, nearest to home first."""
 
     def __init__(self, config: Config) -> None:
-        """Begin without any: they take some hundredths of a second to find."""
+        """Start without any; finding them takes some hundredths of a second."""
         self._config = config
         self._poses: list[list[float]] | None = None
         self._tried = 0
 
     def next(self) -> list[float]:
-        """The next one to try; empty when all were tried and something was hidden still."""
+        """Return the next pose to try; empty when all were tried and something is still occluded."""
         poses = self._all()
         self._tried += 1
         return poses[self._tried - 1] if self._tried <= len(poses) else []
 
     def best(self) -> list[float]:
-        """The first of them; empty without any."""
+        """Return the first pose; empty without any."""
         return next(iter(self._all()), [])
 
     def found(self) -> None:
-        """Everything was seen, or is to be tried anew: the next time it begins with the first again."""
+        """Start with the first pose the next time: everything is visible, or all poses may be tried again."""
         self._tried = 0
 
     def _all(self) -> list[list[float]]:
@@ -233,7 +233,7 @@ class Looking:
             return [list(p.look_from)]
         if self._poses is None:
             cameras = [Pinhole.from_config(camera) for camera in p.world.cameras.values() if not camera.mount]
-            region = Region(p.world, WorkspaceBounds())
+            region = VisibleTable(p.world, WorkspaceBounds())
             radius = p.world.ball_radius
-            self._poses = looking_poses(RobotModel.load(p.robot), cameras, region, MOST_HIDDEN, radius)[:MOST]
+            self._poses = find_viewing_poses(RobotModel.load(p.robot), cameras, region, MOST_HIDDEN, radius)[:MOST]
         return self._poses

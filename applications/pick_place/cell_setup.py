@@ -22,7 +22,7 @@ from common.planning.ik import controls_full_pose, solve_tool_down_ik
 from common.planning.robot_geometry import RobotGeometry
 from common.robot.model import RobotModel
 from common.robot.transforms import tool_down
-from common.scene.workspace import ReachCache, WorkspaceBounds, bounds_told, reach_reason, yaw_candidates
+from common.scene.workspace import ReachCache, WorkspaceBounds, configured_bounds, unreachable_reason, yaw_candidates
 from common.sim.layout import layout
 from common.sim.objects import initial_pose, solid_of
 from common.sim.table import is_inside
@@ -30,11 +30,11 @@ from tools.check import Finding, error, warning
 from tools.check.arm import Arm
 from tools.robot_setup.home import hits
 
-ALONG = 0.03  # [m] by which the place above a container may be missed: half of place_pos_tol
+ALONG = 0.03  # [m] tolerated offset of the position above a container: half of place_pos_tol
 
 
 def quick(cell: Cell) -> Iterator[Finding]:
-    """What detectors would not find, and containers that do not take what is there."""
+    """Find objects that the detectors would not detect, and containers without room for the objects."""
     things = cell.world.objects if is_simulated(cell.robot) else []
     detectors = _detectors(cell)
     of_others = any(entry.module.rpartition(".")[0] != "services" for entry in cell.services.values())
@@ -49,7 +49,7 @@ def quick(cell: Cell) -> Iterator[Finding]:
 
 
 def _detectors(cell: Cell) -> dict[str, tuple[DetectorOptions, CameraConfig]]:
-    """What the cell's detectors of balls are told, and through which camera they look, by their names."""
+    """Return parameters and camera of the cell's ball detectors by name."""
     found = {}
     for entry in cell.services.values():
         if entry.kind == "vision_detector":
@@ -101,7 +101,7 @@ def _in_a_window(hsv: tuple[int, int, int], o: DetectorOptions) -> bool:
 
 
 def _area(at: np.ndarray, radius: float, config: CameraConfig) -> float:
-    """Of the picture of a sphere within its outermost pixels [px^2], as contours have it; 0 behind the camera."""
+    """Image area of a sphere inside its outermost pixels [px^2], as contours measure it; 0 behind the camera."""
     distance = float(Pinhole.from_config(config).to_camera(at)[2])
     if distance <= 0:
         return 0.0
@@ -122,23 +122,23 @@ def _room(name: str, container: Container, radius: float) -> Iterator[Finding]:
 
 
 def reach(cell: Cell, arm: Arm) -> Iterator[Finding]:
-    """Objects that the arm cannot take from where they lie, and containers above which it cannot be.
+    """Find objects out of the arm's reach, and containers that the tool cannot be above.
 
     Raises:
-        ConfigError: bounds that do not fit, or no random layout within reach.
+        ConfigError: inconsistent bounds, or no random layout within reach.
     """
-    bounds = bounds_told(cell.section(Reach).told)  # type: ignore[attr-defined]
+    bounds = configured_bounds(cell.section(Reach).told)  # type: ignore[attr-defined]
     cache = ReachCache(arm.robot, cell.grasp, bounds)
     gripper = cell.robot.gripper
     width = gripper.max_width if gripper is not None and gripper.joints else None
     tilt = cell.grasp.tilt(arm.robot.dof)
-    turned = f"with any of {bounds.yaw_count} hand orientations" if controls_full_pose(arm.robot) else "at any yaw"
+    turned = f"with any of {bounds.yaw_count} gripper orientations" if controls_full_pose(arm.robot) else "at any yaw"
     turns = [yaw + (math.pi / 2 if gripper is not None and gripper.closing_axis == "x" else 0.0)
              for yaw in (yaw_candidates(bounds.yaw_count) if controls_full_pose(arm.robot) else [0.0])]
     things = []
     if is_simulated(cell.robot):
         layout(cell.world, cell.run.seed,
-               lambda x, y, z: not reach_reason(arm.robot, (x, y, z), cell.grasp, bounds, explained=False))
+               lambda x, y, z: not unreachable_reason(arm.robot, (x, y, z), cell.grasp, bounds, explained=False))
         things = [thing for thing in cell.world.objects if thing.placed]
     for thing in things:
         x, y, z = (float(value) for value in initial_pose(thing, solid_of(thing))[:3, 3])
@@ -165,32 +165,32 @@ def reach(cell: Cell, arm: Arm) -> Iterator[Finding]:
 
 
 VALIDATOR = "workspace_validator"
-STEP = 0.04  # of the grid of places that are tried [m]
-ROOM = 0.015  # more than a ball that fingers leave when open [m]
+STEP = 0.04  # grid of the positions that are tried [m]
+ROOM = 0.015  # clearance between a ball and the open fingers [m]
 BALL, SMALLEST = 0.03, 0.01  # radius [m]
 BALLS = 7
-# Half the picture that the camera has of the table [m], a little less; the box and its slots are as they always are.
+# Half of the table area that the camera sees [m], a little less; container and slots have their default size.
 SEEN_X, SEEN_Y = 0.34, 0.46
-CLEAR = 0.16  # from the middle of the box to that of a ball [m]
-ENOUGH = 45  # places of the grid, of which seven balls need not fill many
-# Heights of approach, lift and release: an arm that is too short for the first has lower ones.
+CLEAR = 0.16  # from the center of the container to a ball [m]
+ENOUGH = 45  # grid positions needed for seven balls and a container
+# Heights of approach, lift and release: lower ones for an arm too short for the first.
 GRASPS: tuple[dict[str, float], ...] = (
     {}, {"approach_clearance": 0.06, "lift_height": 0.08, "drop_z": 0.2},
     {"approach_clearance": 0.04, "lift_height": 0.06, "drop_z": 0.18},
 )
-NEAREST = 0.12  # to the axis of the base, where the arm itself is not in the way [m]
-RING = 0.08  # width of a ring of places about the base, all of which are to be free [m]
+NEAREST = 0.12  # distance to the base axis at which the arm itself is not in collision [m]
+RING = 0.08  # width of a ring of positions around the base [m]
 
 Place = tuple[float, float]
 
 
 def fit_world(robot: RobotModel, cell: dict[str, Any]) -> dict[str, Any]:
-    """The tree of a cell file, with a world in reach of the robot, heights of grasps and bounds of the workspace.
+    """Return the tree of a cell file with a world in reach of the robot, grasp heights and workspace bounds.
 
-    Balls lie at random places, another for each seed, in a picture whose middle is that of what is reached.
+    The balls get random positions, different for each seed; the image is centered on the reachable area.
 
     Raises:
-        ConfigError: the robot grasps nothing, or reaches too little.
+        ConfigError: the robot has no usable gripper, or reaches too little.
     """
     gripper = robot.config.gripper
     if gripper is None:
@@ -229,7 +229,7 @@ def fit_world(robot: RobotModel, cell: dict[str, Any]) -> dict[str, Any]:
 
 
 def _reached(robot: RobotModel, grasp: Grasp, bounds: WorkspaceBounds, radius: float) -> list[Place]:
-    """Places on the table in front of the arm from which it takes a ball."""
+    """Return the positions on the table in front of the arm from which it can take a ball."""
     most = min(robot.reach, 1.0)
     found = []
     for x in np.arange(0.12, most, STEP):
@@ -237,13 +237,13 @@ def _reached(robot: RobotModel, grasp: Grasp, bounds: WorkspaceBounds, radius: f
             place = round(float(x), 3), round(float(y), 3)
             if math.hypot(*place) >= most or abs(y) >= 0.6:
                 continue
-            if not reach_reason(robot, (*place, radius), grasp, bounds, explained=False):
+            if not unreachable_reason(robot, (*place, radius), grasp, bounds, explained=False):
                 found.append(place)
     return found
 
 
 def _is_free(robot: RobotModel, geometry: RobotGeometry, place: tuple[float, float, float], grasp: Grasp) -> bool:
-    """Whether the arm is clear of itself as it takes something there, with one turn of the hand, coming from home."""
+    """Return whether the arm grasps there without self-collision, coming from home, with any gripper yaw."""
     x, y, z = place
     at, home, tilt = (x, y, grasp.height(z)), robot.named("home"), grasp.tilt(robot.dof)
     found = (solve_tool_down_ik(robot, at, yaw, home, tilt=tilt, iterations=20)
@@ -252,7 +252,7 @@ def _is_free(robot: RobotModel, geometry: RobotGeometry, place: tuple[float, flo
 
 
 def _free_from(reached: list[Place], free: list[bool]) -> float:
-    """The radius [m] of the first ring of places about the base in which the arm is in its own way hardly anywhere."""
+    """Return the radius [m] of the first ring around the base in which grasps are almost all free of self-collision."""
     away = [math.hypot(*place) for place in reached]
     for nearest in np.arange(NEAREST, max(away, default=NEAREST), STEP):
         ring = [clear for clear, radius in zip(free, away, strict=True) if nearest <= radius < nearest + RING]
@@ -262,7 +262,7 @@ def _free_from(reached: list[Place], free: list[bool]) -> float:
 
 
 def _box(robot: RobotModel, reached: list[Place], grasp: Grasp) -> tuple[Place, float] | None:
-    """Where the box stands, at the side of the picture, and x of the middle of the picture; None without room."""
+    """Return the container's position at the side of the image, and x of the image center; None without room."""
     best: tuple[float, Place, float] | None = None
     for middle in np.arange(0.2, 0.9, STEP):
         seen = [place for place in reached if abs(place[0] - middle) < SEEN_X and abs(place[1]) < SEEN_Y]
@@ -277,7 +277,7 @@ def _box(robot: RobotModel, reached: list[Place], grasp: Grasp) -> tuple[Place, 
 
 
 def _released(robot: RobotModel, place: Place, grasp: Grasp) -> bool:
-    """Whether the tool comes above the box, coming from home."""
+    """Return whether the tool can be above the container, coming from home."""
     at, tilt = (*place, grasp.drop_z), grasp.tilt(robot.dof) if controls_full_pose(robot) else RELEASED
     return solve_tool_down_ik(robot, at, 0.0, robot.named("home"), tilt=tilt, restarts=20, iterations=40) is not None
 

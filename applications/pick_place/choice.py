@@ -1,6 +1,6 @@
-"""Which ball comes next, and which way the hand is turned for it.
+"""Choose the next ball and the gripper yaws for it.
 
-The nearest that is seen, validated, not given up, and that the open fingers can reach between its neighbours.
+The next ball is the nearest one that is seen, validated, not abandoned, and free for the open fingers.
 """
 
 from __future__ import annotations
@@ -17,34 +17,34 @@ from applications.pick_place.grasping import Config, HandShape
 from common import messages as m
 from common.config import Container
 from common.robot.transforms import matrix_to_rpy, pose_to_matrix
-from common.scene.slots import column_at, low_columns
+from common.scene.fixtures import column_at, low_columns
 from common.scene.workspace import yaw_candidates
 from common.tasks.engine import appeared
 from common.tasks.stages import Cycle, Place, View, place_of
-from common.tasks.watchdogs import Patience
+from common.tasks.watchdogs import DwellTimer
 
 Spot = tuple[float, float]  # (x, y) [m]
 Spots = list[Spot]
-YawRange = tuple[float, float]  # its middle, and how far it reaches to either side [rad]
+YawRange = tuple[float, float]  # center and half width [rad]
 FULL = "the container is full"
-FINE = 36  # yaws in half a turn at which it is looked whether the hand is clear
-TIPS = 0.012  # [m] by which finger tips reach below the middle of what they grip
-SAME_PLACE = 0.02  # [m] what is hidden and a track that is nearer are one object
-EMPTY_FOR = 0.5  # [s] a container in which nothing is seen for so long is empty
-SETTLING = 1.5  # [s] from letting go until the ball lies in the container and was seen there
+FINE = 36  # yaws per half turn at which the gripper's clearance is checked
+TIPS = 0.012  # [m] reach of the finger tips below the center of a gripped object
+SAME_PLACE = 0.02  # [m] an occluded target and a track closer than this are one object
+EMPTY_FOR = 0.5  # [s] without detections after which a container is empty
+SETTLING = 1.5  # [s] from the release until the ball is at rest in the container and was seen there
 
 
 @dataclass
 class Target:
-    """An object that was seen: its place [m] in world, and its track id in the planning scene.
+    """A detected object: its position [m] in world, and its track id in the planning scene.
 
-    `size` (x, y) [m] and `yaw` [rad] are those of a box seen from above; what is round has none. `grip_effort` [N]
-    and `mass` [kg] are those of the planning scene, 0 where it says none.
+    `size` (x, y) [m] and `yaw` [rad] are set for a box, seen from above. `grip_effort` [N] and `mass` [kg] are those of
+    the planning scene, 0 for unknown.
     """
 
     id: str
     position: Place
-    radius: float = 0.0  # of the circle about it seen from above [m]
+    radius: float = 0.0  # of the circle around it, seen from above [m]
     size: tuple[float, float] | None = None
     yaw: float = 0.0
     grip_effort: float = 0.0
@@ -52,7 +52,7 @@ class Target:
 
     @classmethod
     def of(cls, thing: m.CollisionObject) -> Target:
-        """An object of the planning scene."""
+        """Create a target from an object of the planning scene."""
         d = thing.dimensions
         if thing.shape != "box":
             return cls(thing.id, place_of(thing.pose), d[0], grip_effort=thing.grip_effort, mass=thing.mass)
@@ -61,7 +61,7 @@ class Target:
         return cls(thing.id, place_of(thing.pose), radius, (d[0], d[1]), yaw, thing.grip_effort, thing.mass)
 
     def width(self, yaw: float) -> float | None:
-        """Between fingers that are turned by `yaw` [rad] [m]; None where its size is not known."""
+        """Return the finger width for a gripper yaw [rad] [m]; None for unknown size."""
         if self.size is None:
             return 2 * self.radius or None
         return self.size[1] if abs(math.cos(yaw - self.yaw)) > math.sqrt(0.5) else self.size[0]
@@ -69,33 +69,33 @@ class Target:
 
 @dataclass(eq=False)
 class Pick(Cycle):
-    """Taking one object to the container, and the yaws that are still to be tried for it."""
+    """One object on its way to the container, and the gripper yaws still to try."""
 
     target: Target = field(kw_only=True)
     yaws: list[float] = field(default_factory=list, kw_only=True)
-    ranges: list[YawRange] = field(default_factory=list, kw_only=True)  # of the hand, for what is round
-    yaw: float = field(default=0.0, kw_only=True)  # of the hand, of those the one that is tried
-    again: bool = field(default=False, kw_only=True)  # there was no way to it from another posture of the arm
-    apart: bool = field(default=False, kw_only=True)  # it was asked for a way to any of the yaws once
-    over: Spot | None = field(default=None, kw_only=True)  # where it is let go; without, anywhere above the container
+    ranges: list[YawRange] = field(default_factory=list, kw_only=True)  # gripper yaws, for round objects
+    yaw: float = field(default=0.0, kw_only=True)  # gripper yaw of the current attempt
+    again: bool = field(default=False, kw_only=True)  # planning failed from another arm posture before
+    apart: bool = field(default=False, kw_only=True)  # a plan to any of the yaws was requested once
+    over: Spot | None = field(default=None, kw_only=True)  # release position; None: anywhere above the container
     first_error: str = ""
 
     def __post_init__(self) -> None:
-        """Its subject is the target."""
+        """Use the target's id as the subject."""
         self.subject = self.target.id
 
 
-class LetGo(BaseModel):
-    """Where the last was let go above each column of the container: its centre [m] once it lies, world."""
+class ReleasePositions(BaseModel):
+    """Center of the last ball released above each column of the container, at rest [m], world."""
 
     places: list[tuple[FiniteFloat, FiniteFloat, FiniteFloat]] = []
 
 
 @dataclass
-class GivenUp:
-    """An object that is left alone until something changes on the table where `spots` are.
+class AbandonedTarget:
+    """An object that is ignored until something changes on the table, given as `spots`.
 
-    One to which there was no way is tried once more, from another posture of the arm: then it is `open` meanwhile.
+    After a failed plan it gets one retry from another arm posture; `open` is set for the retry.
     """
 
     target: Target
@@ -107,80 +107,80 @@ class GivenUp:
 
 @dataclass
 class PickPlaceView(View):
-    """What the task knows, and `seen`: the places that were validated in the newest picture."""
+    """View with `seen`, the validated targets of the newest image."""
 
     seen: m.PoseArray | None = None
 
     @property
     def targets(self) -> list[Place]:
-        """Where something was seen that may be taken, in world [m]."""
+        """Positions of the targets in world [m]."""
         if self.seen is None:
             return []
         places = [place_of(pose) for pose in self.seen.poses]
         if not self.seen.labels:
             return places
-        # What is hidden and was taken meanwhile is still in the picture's memory, but no more in the planning scene.
+        # An occluded ball taken meanwhile is still a remembered target, but no longer in the planning scene.
         known = [ball.position for ball in self.balls()]
         return [place for place, label in zip(places, self.seen.labels, strict=True)
                 if label != HIDDEN or any(math.dist(place[:2], one[:2]) <= SAME_PLACE for one in known)]
 
     @property
     def blind(self) -> str:
-        """Why nothing is seen at all; empty when something is."""
+        """Why the camera sees nothing at all; empty when it sees something."""
         return f"nothing can be seen: {self.seen.unseen}" if self.seen is not None and self.seen.blind else ""
 
     @property
     def stamps(self) -> tuple[float, ...]:
-        """When the picture was taken of which the targets are, and that of which the planning scene is [s]."""
+        """Times of the images of the targets and of the planning scene [s]."""
         return (self.seen.header.stamp * 1e-9 if self.seen else 0.0), self.scene_stamp
 
     def balls(self) -> list[Target]:
-        """Balls on the table according to the planning scene, reachable or not."""
+        """Return the balls on the table according to the planning scene, reachable or not."""
         return [Target.of(thing) for thing in self.objects("target")]
 
     def spots(self, but: Target | None, radius: float) -> Spots:
-        """(x, y) of the balls on the table, without the one in work."""
+        """Return (x, y) of the balls on the table except one."""
         return [b.position[:2] for b in self.others(but, radius)]
 
     def others(self, but: Target | None, radius: float) -> list[Target]:
-        """Balls on the table, without the one in work."""
+        """Return the balls on the table except one."""
         return [b for b in self.balls() if but is None or not same_place(b.position, but.position, radius)]
 
 
 class Choice:
-    """Chooses targets and remembers which places were missed or given up."""
+    """Chooses targets; remembers failed grasps and abandoned objects."""
 
     def __init__(
         self, config: Config, container: Container, radius: float, counted: Callable[[], int] = lambda: 0
     ) -> None:
-        """Start with nothing given up.
+        """Start with nothing abandoned.
 
         Args:
-            config: shape of the open fingers, what counts as moved, and how often a place is tried.
-            container: where balls go.
+            config: shape of the open fingers, motion threshold, retries.
+            container: destination.
             radius: of a ball [m].
-            counted: how many balls are known to have come into the container, seen there now or not.
+            counted: number of balls known to be in the container, visible or not.
         """
         self.p, self.container, self.radius, self._counted = config, container, radius, counted
         self._misses: list[tuple[Place, int]] = []
-        self._given_up: list[GivenUp] = []
-        self._judged_by: dict[str, Any] = {}  # values of the parameters
-        self._empty = Patience()
-        self._expected = (0, 0.0)  # balls that will be in the container soon, and until when that is only expected
-        self.let_go = LetGo()
+        self._given_up: list[AbandonedTarget] = []
+        self._judged_by: dict[str, Any] = {}  # parameter values
+        self._empty = DwellTimer()
+        self._expected = (0, 0.0)  # balls expected in the container, and until when they count unseen [s]
+        self.let_go = ReleasePositions()
 
     def next(self, view: PickPlaceView, origin: Sequence[float], under_way: Sequence[Pick]) -> Pick | None:
-        """The nearest ball to `origin` (x, y) that can be taken, with its yaws; None when there is none now."""
+        """Return the nearest takable ball to `origin` (x, y) with its yaws; None when there is none."""
         spots = view.spots(None, self.radius)
         moved, judged_by = self.p.moved, self.p.model_dump(exclude={"robot", "run", "world", "grasp"})
-        if judged_by != self._judged_by:  # what was impossible may not be so any more
+        if judged_by != self._judged_by:  # changed parameters may make it possible
             self._given_up, self._judged_by = [], judged_by
-        # Only while the table stays as it was: one ball less may be all that was needed.
+        # Only while the table is unchanged: one ball less may be enough.
         self._given_up = [
             g for g in self._given_up if not appeared(spots, g.spots, moved) and not appeared(g.spots, spots, moved)
         ]
         full = self._is_full(view, bool(under_way))
-        if not full:  # it was emptied, or only expected to be full
+        if not full:  # emptied, or only expected to be full
             self._given_up = [g for g in self._given_up if g.reason != FULL]
         balls = view.balls()
         candidates = [ball for ball in balls if self._is_open(ball, view, under_way) and not lies_below(ball, balls)]
@@ -203,15 +203,15 @@ class Choice:
         return None
 
     def held(self, name: str, view: PickPlaceView) -> Pick:
-        """What is left of a pick whose object is in the hand: a restart or a failure has left nothing else of it."""
+        """Return the rest of a pick whose object is already held, after a restart or a failure."""
         pick = Pick(target=Target(name, view.tool), over=self._over(view.tool, view, []))
-        pick.begun = True
+        pick.started = True
         return pick
 
     def _over(self, place: Place, view: PickPlaceView, under_way: Sequence[Pick]) -> Spot:
-        """(x, y) in the container above which there is most room, of those the nearest to a place [m].
+        """Return the (x, y) above the lowest columns of the container, nearest to a position [m].
 
-        An arm that lets go wherever it comes first heaps up a pile that leans to its side.
+        Always releasing at the nearest point would pile the balls up on one side.
         """
         lie = self._lie(view)
         for over in (pick.over for pick in under_way):
@@ -221,29 +221,29 @@ class Choice:
         return min(low, key=lambda column: math.dist(column, place[:2]))
 
     def _lie(self, view: PickPlaceView) -> list[Place]:
-        """What lies in the container, as it is seen and as it was let go, until that is seen to be empty.
+        """Return what lies in the container: detections and recorded releases, until it is seen empty.
 
-        What leans on others may look as if it lay on the floor, where it was let go above another one.
+        A ball leaning on others may look as if it lay on the floor although it was released above another one.
         """
         seen = [place_of(thing.pose) for thing in view.objects("contained")]
         empty = not seen and 0 < view.scene_stamp >= self._expected[1] and not _hidden(view)
-        if self._empty.lasts(empty, view.scene_stamp) >= EMPTY_FOR and empty and self.let_go.places:
-            self.let_go = LetGo()
+        if self._empty.elapsed(empty, view.scene_stamp) >= EMPTY_FOR and empty and self.let_go.places:
+            self.let_go = ReleasePositions()
         return [*seen, *self.let_go.places]
 
     def _top(self, over: Spot, lie: Sequence[Place]) -> float:
-        """Height [m] of one more above those that lie there."""
+        """Height of the center of one more ball on top of a column [m]."""
         below = [z for x, y, z in lie if math.dist((x, y), over) < self.radius]
         return max(below, default=self.p.world.table_height - self.radius) + 2 * self.radius
 
     def once_more(self) -> bool:
-        """Open again what no plan was found for, each once while the table stays as it is; whether there is any."""
+        """Allow one retry for every target without a plan; return whether there is any."""
         again = [g for g in self._given_up if g.retry]
         for g in again:
             g.retry, g.open = False, True
         return bool(again)
 
-    def _given_up_at(self, place: Place) -> GivenUp | None:
+    def _given_up_at(self, place: Place) -> AbandonedTarget | None:
         return next((g for g in self._given_up if same_place(g.target.position, place, self.radius)), None)
 
     def _is_open(self, ball: Target, view: PickPlaceView, under_way: Sequence[Pick]) -> bool:
@@ -253,7 +253,7 @@ class Choice:
         return seen and not taken and (left is None or left.open)
 
     def _is_full(self, view: PickPlaceView, carrying: bool) -> bool:
-        """Whether no slot is left, counting what is on its way into the container."""
+        """Return whether no slot is left, including the ball on its way."""
         return self._contained(view) + int(carrying) >= 4 * self.container.layers
 
     def _contained(self, view: PickPlaceView) -> int:
@@ -263,15 +263,15 @@ class Choice:
         return max(min(len(lie), sure), count if view.scene_stamp < until else 0)
 
     def released(self, pick: Pick, view: PickPlaceView) -> None:
-        """A ball was let go above the container, where it will be seen when it has come to rest."""
-        over = column_at(self.container, view.tool[:2])  # where there was no way to above another, anywhere
+        """Record the release of a ball above the container; it is seen there once it is at rest."""
+        over = column_at(self.container, view.tool[:2])  # the fallback goal is anywhere above it
         place = (*over, self._top(over, self._lie(view)))
-        self.let_go = LetGo(places=[*(other for other in self.let_go.places if other[:2] != over), place])
+        self.let_go = ReleasePositions(places=[*(other for other in self.let_go.places if other[:2] != over), place])
         self._expected = self._contained(view) + 1, view.now + SETTLING
         self._forget(pick.target)
 
     def missed(self, target: Target, view: PickPlaceView, problem: str) -> None:
-        """The fingers did not take there what was seen; after `max_retries` retries the place is given up."""
+        """Record a failed grasp; after `max_retries` retries the position is abandoned."""
         count = 1 + next((n for p, n in self._misses if same_place(p, target.position, self.radius)), 0)
         self._forget(target)
         if count > self.p.max_retries:
@@ -283,13 +283,13 @@ class Choice:
         self._misses = [(p, n) for p, n in self._misses if not same_place(p, target.position, self.radius)]
 
     def give_up(self, target: Target, reason: str, view: PickPlaceView, *, retry: bool = False) -> None:
-        """Leave a ball alone until something changes on the table, or until it is opened for a retry."""
+        """Ignore a ball until something changes on the table, or until its retry."""
         if (left := self._given_up_at(target.position)) is not None:
             self._given_up.remove(left)
-        self._given_up.append(GivenUp(target, reason, view.spots(None, self.radius), retry))
+        self._given_up.append(AbandonedTarget(target, reason, view.spots(None, self.radius), retry))
 
     def rejections(self) -> list[m.Rejection]:
-        """What is given up now, and why."""
+        """Return the abandoned objects with the reasons."""
         return [
             m.Rejection(position=m.Vector3(x=g.target.position[0], y=g.target.position[1], z=g.target.position[2]),
                         reason=g.reason)
@@ -298,17 +298,17 @@ class Choice:
 
 
 def _hidden(view: PickPlaceView) -> bool:
-    """Whether part of what the picture should show cannot be seen in it, the container perhaps."""
+    """Return whether part of the image is occluded, perhaps the container."""
     return view.seen is None or bool(view.seen.unseen)
 
 
 def same_place(a: Place, b: Place, radius: float) -> bool:
-    """Whether two places are of one ball: two balls are never closer than their diameter, one above the other too."""
+    """Return whether two positions belong to one ball: different balls are at least a diameter apart."""
     return math.dist(a[:2], b[:2]) < radius and abs(a[2] - b[2]) < radius
 
 
 def lies_below(ball: Target, balls: Sequence[Target]) -> bool:
-    """Whether another one lies on a ball: that is taken first."""
+    """Return whether another ball lies on this one; that one is taken first."""
     x, y, z = ball.position
     return any(
         b.position[2] - z > 0.5 * ball.radius and math.dist(b.position[:2], (x, y)) < 0.98 * (b.radius + ball.radius)
@@ -320,15 +320,15 @@ def finger_clearance(
     shape: HandShape, center: Sequence[float], yaw: float, neighbours: Sequence[Sequence[float]], radius: float,
     container: Container | None = None,
 ) -> float:
-    """Least gap [m] between the open fingers and any neighbour, negative when they overlap.
+    """Return the smallest gap [m] between the open fingers and any neighbor; negative for overlap.
 
-    The fingers open along the tool's y axis, which for the tool pointing down and yaw 0 is the -y axis of the world.
+    The fingers open along the tool's y axis: the -y axis of world for a tool pointing down at yaw 0.
 
     Args:
         shape: the fingers.
         center: (x, y) of the object to take [m], world.
         yaw: of the tool about world z [rad].
-        neighbours: (x, y) of other balls [m], world, and the radius of each if it is not that of the others.
+        neighbours: (x, y) of other balls [m], world, followed by a radius that differs from `radius`.
         radius: of the balls [m].
         container: an open box whose walls must be cleared as well.
     """
@@ -348,7 +348,7 @@ def finger_clearance(
 
 
 def _container_gap(shape: HandShape, center: Sequence[float], c: float, s: float, container: Container) -> float:
-    """Gap between the corners of the fingers and the container's outer square, negative inside."""
+    """Return the gap between the fingers' corners and the container's outer square [m]; negative inside."""
     best = math.inf
     for along in (-shape.finger_outer, -shape.finger_inner, shape.finger_inner, shape.finger_outer):
         for lateral in (-shape.finger_half_width, shape.finger_half_width):
@@ -364,9 +364,9 @@ def grasp_yaws(
     shape: HandShape, center: Sequence[float], neighbours: Sequence[Sequence[float]], radius: float,
     container: Container | None = None, yaws: Sequence[float] | None = None,
 ) -> list[float]:
-    """Yaws [rad] with clear fingers, the least turn first; empty when the neighbours leave no room.
+    """Return the yaws [rad] with clear fingers, smallest rotation first; empty when there is no room.
 
-    `yaws` are those that the object itself allows; any without them.
+    `yaws` restricts the candidates to those that the object allows.
     """
     near = [n for n in neighbours if math.dist(n[:2], center[:2]) < shape.finger_outer + 2 * radius + 0.05]
     return [
@@ -377,7 +377,7 @@ def grasp_yaws(
 
 
 def yaw_ranges(clear: Sequence[float]) -> list[YawRange]:
-    """Ranges in a full turn of the hand that `clear` is about, of `yaw_candidates(FINE)`: those next to each other."""
+    """Group yaws of `yaw_candidates(FINE)` into contiguous ranges of a full turn."""
     if len(clear) == FINE:
         return [(0.0, math.pi)]
     step = math.pi / FINE
@@ -392,13 +392,13 @@ def yaw_ranges(clear: Sequence[float]) -> list[YawRange]:
 
 
 def yaws_of(target: Target, shape: HandShape) -> list[float] | None:
-    """Yaws [rad] of the hand at which its pads lie flat on two sides of a box that fits between them.
+    """Return the yaws [rad] at which the finger pads lie flat on two faces of a box that fits between them.
 
-    None for what is round, which is taken at any, and for a cup, which takes anything so.
+    None for a round object and for a suction cup: any yaw will do.
     """
     if target.size is None or not shape.finger_inner:
         return None
-    # At the yaw of the box the fingers close along its y axis, a quarter turn from there along its x axis.
+    # At the box's yaw the fingers close along its y axis, a quarter turn from there along its x axis.
     fitting = [target.yaw + turn for width, turn in ((target.size[1], 0.0), (target.size[0], math.pi / 2))
                if width <= 2 * (shape.finger_inner - shape.min_clearance)]
     turned = [math.remainder(yaw, math.pi) for yaw in fitting]  # a parallel gripper repeats after half a turn

@@ -1,4 +1,4 @@
-"""Whether the arm touched anything on the way that it really took, among the balls where they really were."""
+"""Check a recorded motion for contacts of the arm with the balls where they really were."""
 
 from __future__ import annotations
 
@@ -26,21 +26,21 @@ from common.topics import Topic
 Array = NDArray[np.float64]
 S = TypeVar("S", JointState, GripperState, PoseArray)
 
-STEP = 0.01  # [rad] between the positions that are checked
-AT_HAND = 0.04  # [m] a ball nearer than this to the tool centre point is what the fingers close on or let go
-ABOUT = 0.16  # [m] from where the fingers move: within it they may touch that ball
+STEP = 0.01  # [rad] between the joint positions that are checked
+AT_HAND = 0.04  # [m] a ball closer to the tool center point than this is the one that the fingers grasp or release
+ABOUT = 0.16  # [m] distance from the gripper command within which the fingers may touch that ball
 
 
 @dataclass
-class Recording:
-    """What a cell said about arm, hand and truth, in the order in which it came; what comes again counts once."""
+class RecordedMotion:
+    """Recorded joint states, gripper states and ground truth, in order of arrival; repeated states count once."""
 
     joints: list[JointState] = field(default_factory=list)
     grips: list[GripperState] = field(default_factory=list)
     balls: list[PoseArray] = field(default_factory=list)
 
     def listeners(self) -> dict[Topic[Any], Callable[[float, Any], None]]:
-        """What a fold is to hand over."""
+        """Return the listeners for the run aggregator."""
         return {
             topics.JOINT_STATES: lambda _, state: _keep(self.joints, state),
             topics.GRIPPER_STATE: lambda _, state: _keep(self.grips, state),
@@ -49,13 +49,13 @@ class Recording:
 
 
 def _keep(kept: list[S], message: S) -> None:
-    if not kept or message.header.stamp > kept[-1].header.stamp:  # a state comes again each second
+    if not kept or message.header.stamp > kept[-1].header.stamp:  # a state is published again each second
         kept.append(message)
 
 
 @dataclass(frozen=True)
 class Contact:
-    """A pair that touched, and when: cell time [s] since the first joint state."""
+    """A pair in contact and its time: cell time [s] since the first joint state."""
 
     time: float
     pair: Pair
@@ -66,31 +66,31 @@ class Contact:
 
 @dataclass(frozen=True)
 class _Window:
-    """Samples first to last, in which the gripper's links may touch a ball: they take it, or have let it go."""
+    """Samples `first` to `last` in which the gripper's links may touch a ball, because they grasp or release it."""
 
     ball: str
     first: int
     last: int
 
 
-class Recheck:
+class ContactCheck:
     """Checks recordings of one cell."""
 
     def __init__(self, cell: Cell, step: float = STEP) -> None:
-        """Load the robot's hulls; positions are checked every `step` [rad]."""
+        """Load the robot's hulls; joint positions are checked every `step` [rad]."""
         self._step = step
         self.robot = RobotModel.load(cell.robot)
         self.cache = ObstacleCache(RobotGeometry(self.robot))
         self.around = Surroundings.model_validate(cell.section(Surroundings).model_dump())
         assert cell.robot.gripper is not None
         self.gripper, self.gripper_links = cell.robot.gripper, cell.robot.gripper.links
-        self.checked = 0  # positions so far
+        self.checked = 0  # joint positions checked so far
 
-    def contacts(self, recording: Recording) -> list[Contact]:
-        """Every pair that touched on the way, once for each time that it did.
+    def contacts(self, recording: RecordedMotion) -> list[Contact]:
+        """Return every pair in contact, once for each time.
 
-        The ball in the hand moves with it and counts as part of the arm; it may touch what it touches when it is taken
-        until it was lifted by 2 cm. A ball that falls is left out.
+        A held ball counts as part of the arm; until it is lifted by 2 cm it may touch what it touched at the grasp. A
+        falling ball is ignored.
         """
         stamps = np.array([state.header.stamp for state in recording.joints])
         path = np.array([self.robot.order(s.name, s.position) for s in recording.joints])
@@ -113,7 +113,7 @@ class Recheck:
         return found
 
     def _touching(self, world: CollisionWorld, states: Array) -> Iterator[tuple[int, Pair]]:
-        """Index of the state after which something touches, and what, once for each time."""
+        """Yield the index of the state before a contact and the pair, once for each contact."""
         pieces = [interpolate([a, b], self._step)[1:] for a, b in pairwise(states)]
         fine = np.concatenate([states[:1], *pieces])
         owners = np.concatenate([[0], *(np.full(len(piece), i) for i, piece in enumerate(pieces))]).astype(int)
@@ -125,8 +125,8 @@ class Recheck:
             while at < len(fine) and world.collides(fine[at]):
                 at += 1
 
-    def _spans(self, recording: Recording, stamps: NDArray[np.int64]) -> Iterator[tuple[PoseArray, int, int]]:
-        """Truths between which only the hand and falling balls move, with the first and last sample of each."""
+    def _spans(self, recording: RecordedMotion, stamps: NDArray[np.int64]) -> Iterator[tuple[PoseArray, int, int]]:
+        """Yield ground truths between which only held and falling balls move, with their first and last sample."""
         kept: list[PoseArray] = []
         for balls in recording.balls:
             if not kept or _resting(balls) != _resting(kept[-1]):
@@ -138,9 +138,9 @@ class Recheck:
                 yield balls, first, last
 
     def _windows(
-        self, recording: Recording, stamps: NDArray[np.int64], places: Array
+        self, recording: RecordedMotion, stamps: NDArray[np.int64], places: Array
     ) -> Iterator[_Window]:
-        """The balls that the fingers closed on or let go, while the hand was about them."""
+        """Yield the balls that the fingers grasp or release, and the samples around it."""
         truth = iter(recording.balls)
         balls = next(truth)
         following = next(truth, None)
@@ -186,13 +186,13 @@ class Recheck:
 
 
 def _widest(widths: Sequence[float | None]) -> float | None:
-    """Of measured widths [m]; None where one is not known."""
+    """Return the largest measured width [m]; None if one is unknown."""
     known = [width for width in widths if width is not None]
     return max(known) if known and len(known) == len(widths) else None
 
 
 def _resting(balls: PoseArray) -> tuple[object, ...]:
-    """Which ball is held, and where the others lie."""
+    """Return which ball is held, and the positions of the others."""
     return tuple(
         (name, label, None if label == "held" else (p.position.x, p.position.y, p.position.z))
         for name, label, p in zip(balls.ids, balls.labels, balls.poses, strict=True)

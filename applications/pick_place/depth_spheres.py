@@ -1,7 +1,7 @@
-"""Balls of known size in the depth of what has their colour: where they really are, stacked or not.
+"""Find balls of known size in a depth image, stacked or not, by votes for their centers.
 
-Each point of a sphere's surface says where its centre is: one radius behind it along the normal. Points of one ball
-agree on that, whatever hides the rest of it or touches it; where many agree is a ball, which is fitted to its points.
+Each point on a sphere puts its center one radius behind it along the normal. The points of one ball agree, whatever
+occludes or touches the rest of it. A center with many votes is fitted to its points.
 """
 
 from __future__ import annotations
@@ -18,23 +18,23 @@ from common.perception.pinhole import Pinhole
 
 Array = npt.NDArray[np.float64]
 
-WINDOW = 5  # [px] over which depth is averaged before normals are taken
-JUMP = 0.015  # [m] neighbours further apart than this belong to different things
-CELL = 0.01  # [m] of the grid in which votes are counted
-GATE = 0.006  # [m] a point this near to a ball's surface is of it
-AGREEING = 0.65  # part of the points on its surface that put the centre there
-SPREAD = 0.7  # of the votes of a ball's points, as part of their own, at most: on what is flat they are as far apart
-MISSES = 20  # in a row that are no ball: what is left is something else, such as a red cloth
-LEAST = 0.15  # part of a whole ball's points that must be seen
-GATES = (0.012, 0.009, 0.006, 0.005, 0.004, 0.004, 0.004)  # [m] in each step of Gauss-Newton
+WINDOW = 5  # [px] over which depth is averaged before normals are computed
+JUMP = 0.015  # [m] neighbors farther apart belong to different objects
+CELL = 0.01  # [m] grid in which votes are counted
+GATE = 0.006  # [m] a point closer to a ball's surface than this belongs to it
+AGREEING = 0.65  # fraction of the points on the surface that must vote for the center
+SPREAD = 0.7  # largest spread of the votes relative to that of the points: on a flat object both are equal
+MISSES = 20  # consecutive centers that are no ball: the rest is something else, such as a red cloth
+LEAST = 0.15  # fraction of a complete ball's points that must be visible
+GATES = (0.012, 0.009, 0.006, 0.005, 0.004, 0.004, 0.004)  # [m] in each Gauss-Newton step
 
 
-def find_in_depth(mask: Mask, depth: Depth, camera: Pinhole, radius: float) -> Array:
-    """Centres (n, 3) [m] in world of balls in a picture.
+def find_balls_in_depth(mask: Mask, depth: Depth, camera: Pinhole, radius: float) -> Array:
+    """Return the centers (n, 3) of balls [m] in world.
 
     Args:
-        mask: (height, width) where the picture has the colour of balls.
-        depth: (height, width) [m], NaN or 0 where there is none.
+        mask: (height, width), nonzero where a pixel has the color of the balls.
+        depth: (height, width) [m], NaN or 0 where unknown.
         camera: that took both.
         radius: of the balls [m].
     """
@@ -54,7 +54,7 @@ def find_in_depth(mask: Mask, depth: Depth, camera: Pinhole, radius: float) -> A
 def _votes(
     red: npt.NDArray[np.bool_], depth: Depth, camera: Pinhole, corner: tuple[int, int], radius: float
 ) -> tuple[Array, Array]:
-    """Points (n, 3) of what is red, and where each puts the centre of its ball (n, 3) [m], world."""
+    """Return points (n, 3) on red pixels, and the ball center that each votes for (n, 3) [m], world."""
     weight = cv2.blur(red.astype(np.float32), (WINDOW, WINDOW))
     smooth = cv2.blur(np.where(red, depth, np.float32(0)), (WINDOW, WINDOW)) / np.maximum(weight, 1e-6)
     v, u = np.mgrid[0 : red.shape[0], 0 : red.shape[1]]
@@ -73,7 +73,7 @@ def _votes(
 
 
 def _balls(points: Array, votes: Array, camera: Pinhole, radius: float) -> Iterator[Array]:
-    """Centres (3,) [m] on which many votes agree, the most agreed on first."""
+    """Yield centers (3,) [m] with many votes, the most voted for first."""
     misses = 0
     while len(points) and misses < MISSES:
         cells = np.floor(votes / CELL).astype(np.int64)
@@ -90,7 +90,7 @@ def _balls(points: Array, votes: Array, camera: Pinhole, radius: float) -> Itera
         whole = np.pi * camera.fx * camera.fy * (radius / depth) ** 2
         if np.count_nonzero(own) >= LEAST * whole:
             agreeing = np.linalg.norm(votes[own] - center, axis=1) < 1.5 * CELL
-            # On what is flat each point has a centre of its own, however small it is.
+            # On a flat object each point votes for a center of its own, however small it is.
             if np.mean(agreeing) >= AGREEING and _spread(votes[own]) <= SPREAD * _spread(points[own]):
                 misses = 0
                 yield center
@@ -103,12 +103,12 @@ def _balls(points: Array, votes: Array, camera: Pinhole, radius: float) -> Itera
 
 
 def _spread(points: Array) -> float:
-    """How far points (n, 3) are from their middle [m]: half of them are nearer."""
+    """Return the median distance of points (n, 3) from their median [m]."""
     return float(np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1)))
 
 
 def _fitted(points: Array, center: Array, radius: float) -> Array:
-    """The centre of the sphere through the points that are near to its surface."""
+    """Return the center of the sphere through the points near its surface."""
     for gate in GATES:
         away = points - center
         distance = np.linalg.norm(away, axis=1)

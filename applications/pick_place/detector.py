@@ -11,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field, model_validator
 
-from applications.pick_place.ball_places import Resting, is_table, shows_table
-from applications.pick_place.depth_spheres import find_in_depth
+from applications.pick_place.ball_places import BallGeometry, is_table, shows_table
+from applications.pick_place.depth_spheres import find_balls_in_depth
 from applications.pick_place.outliers import (
     BELOW,
     BLURRED,
@@ -25,7 +25,7 @@ from applications.pick_place.outliers import (
     MOST_UNLIKE,
     NOT_ROUND,
     THIN,
-    Odd,
+    Outlier,
     covered,
     oval,
     sized,
@@ -37,40 +37,40 @@ from applications.pick_place.segmentation import (
     Mask,
     Masks,
     Outline,
+    OutlineKey,
     RedMasks,
-    Traced,
     all_of,
+    blob_centers,
     find_blobs,
-    long_ones,
-    middles,
+    long_components,
     small_blobs,
 )
 from applications.pick_place.sphere_fit import Fit, fit_each, fit_spheres, separate
 from common.config import CameraConfig, Parameters, Surroundings, Tunable
 from common.perception.depth import Depth
-from common.perception.illumination import BoolMask, blank_image_reason, blue_share, looked_at
+from common.perception.illumination import BoolMask, blank_image_reason, blue_share, sampled_pixels
 from common.perception.pinhole import Pinhole
 from common.perception.sphere import ray_distances, silhouettes
 
 Array = npt.NDArray[np.float64]
 Picture = npt.NDArray[np.uint8]
 
-_ROUND = 0.96  # part of an outline that must fit for a blob to be one ball
-_BRIGHT = 60  # [0..255] of green from which on it tells a colour together with blue, also where red is clipped
-_WARMEST = 0.25  # part of the blue, compared with green, that is left in light of 2700 K
-_LEAST_BLUE = 0.15  # of it in light in which balls still show some: that of 2400 K has less
-_LEAST_GREEN = 0.05  # of a ball's colour: what is given for less is no measure of its blue
-_TURNS_RED = 0.25, 0.9  # green of a container, compared with red, of which it looks red when that is clipped
-_LEAST_TABLE = 0.1  # part of a picture that shows the table, at least, for it to tell the colour of the light
+_ROUND = 0.96  # fraction of an outline that must fit for a blob to be one ball
+_BRIGHT = 60  # [0..255] green from which its ratio to blue is reliable, also where red is clipped
+_WARMEST = 0.25  # blue relative to green that remains in light of 2700 K
+_LEAST_BLUE = 0.15  # the same in light in which balls still show some blue: at 2400 K there is less
+_LEAST_GREEN = 0.05  # of a ball's color; below this its blue cannot be judged
+_TURNS_RED = 0.25, 0.9  # green relative to red of a container that looks red where red is clipped
+_LEAST_TABLE = 0.1  # smallest fraction of the image that shows the table, to measure the color of the light
 
 Hue = Annotated[int, Field(ge=0, le=180)]
 Byte = Annotated[int, Field(ge=0, le=255)]
 Hsv = tuple[Hue, Byte, Byte]
-_Key = tuple[Traced, tuple[float, float], float]  # of a blob: its outline, its centre [px], the offset expected [m]
+_Key = tuple[OutlineKey, tuple[float, float], float]  # of a blob: outline, center [px], expected offset [m]
 
 
 class DetectorOptions(Parameters):
-    """How red is told from the rest. HSV as OpenCV has it: hue 0 to 180, saturation and value 0 to 255."""
+    """How red is separated from other colors. HSV as in OpenCV: hue 0 to 180, saturation and value 0 to 255."""
 
     hsv_red_lo1: Tunable[Hsv] = Field((0, 120, 8), description="lower end of the first window: hue, saturation, value")
     hsv_red_hi1: Tunable[Hsv] = Field((10, 255, 255), description="upper end of the first window")
@@ -98,13 +98,13 @@ class DetectorOptions(Parameters):
 
 @dataclass(frozen=True)
 class Detection:
-    """A ball that was seen.
+    """A detected ball.
 
     Attributes:
-        position: (3,) where the ray of its centre meets the plane of the centres of balls on the table [m], world.
-        pixel: (u, v) where its centre is seen [px].
-        area: of the blob that it is part of, divided by the balls in it [px^2].
-        partial: reaches over the border of the picture.
+        position: (3,) intersection of the ray of its center with the plane of ball centers on the table [m], world.
+        pixel: (u, v) of its center [px].
+        area: of its blob, divided by the number of balls in it [px^2].
+        partial: extends beyond the border of the image.
         outline: (n, 2) its fitted silhouette [px].
     """
 
@@ -117,59 +117,59 @@ class Detection:
 
 @dataclass(frozen=True)
 class _Seen:
-    center: Array  # (3,) relative to the optical centre [m]
+    center: Array  # (3,) relative to the optical center [m]
     area: float  # [px^2]
-    border: Array  # (m, 2) pixels of its blob at the border of the picture
+    border: Array  # (m, 2) pixels of its blob at the border of the image
 
 
 class _Round(NamedTuple):
-    """How well one sphere fits a blob: where it is relative to the optical centre [m], off by so much [m]."""
+    """Fit of one sphere to a blob: center relative to the optical center [m], and its offset [m]."""
 
     center: Array
     offset: float
-    close: float  # part of the outline that fits
-    oval: float  # by which it is longer one way [m]
+    close: float  # fraction of the outline that fits
+    oval: float  # by which it is longer in one direction [m]
 
 
 class Detector:
-    """Finds balls: the same picture always gives the same detections."""
+    """Finds balls; the same image always gives the same detections."""
 
     def __init__(self, surroundings: Surroundings, options: DetectorOptions | None = None) -> None:
         """Prepare for balls of the surroundings' size.
 
         Args:
             surroundings: radius of the balls, table, container.
-            options: colour windows and sizes; they may change between pictures.
+            options: color windows and sizes; they may change between images.
         """
         self.options = options or DetectorOptions()
-        self.resting = Resting.of(surroundings)
+        self.resting = BallGeometry.of(surroundings)
         self._around = surroundings
         self._table: tuple[Pinhole, BoolMask | None] | None = None  # where the last camera shows it
         self._masks = Masks()
-        self._outlines: dict[Traced, Outline] = {}  # of the last picture: what is there again is not worked out again
+        self._outlines: dict[OutlineKey, Outline] = {}  # of the last image, reused while a blob stays the same
         self._fits: dict[_Key, list[_Round]] = {}
-        self.blind = ""  # why the last picture tells nothing
-        self.odd: list[Odd] = []  # what is red in the last picture and no ball on the table
-        self.too_small = 0  # blobs in the last picture that were not looked at, but for those in the container
-        self.too_large = 0  # round blobs in it that look larger than a stack, but for those in the container
+        self.blind = ""  # why the last image is unusable
+        self.outliers: list[Outlier] = []  # red objects in the last image that are no balls on the table
+        self.too_small = 0  # blobs of the last image below the minimum area, outside of the container
+        self.too_large = 0  # round blobs of the last image larger than a ball on a stack, outside of the container
         self._last: tuple[Mask, Pinhole, DetectorOptions, list[Detection]] | None = None
 
     def masks(self, picture: Picture, camera: Pinhole) -> RedMasks:
-        """What is red in a bgr8 picture. The masks are not to be written to.
+        """Return what is red in a bgr8 image. The masks must not be written to.
 
-        The colour of the light is that of the table: beside it a camera at the side sees the floor, of another colour.
+        The color of the light is measured on the table: around it a camera at the side sees a floor of another color.
         """
         o = self.options
         windows = (o.hsv_red_lo1, o.hsv_red_hi1), (o.hsv_red_lo2, o.hsv_red_hi2)
         if self._table is None or self._table[0] is not camera:
-            table = shows_table(self._around, camera, looked_at(camera.height, camera.width))
+            table = shows_table(self._around, camera, sampled_pixels(camera.height, camera.width))
             self._table = camera, table if table.mean() >= _LEAST_TABLE else None
         return self._masks.of(picture, Colours(windows, o.morph_kernel_px), self._table[1])
 
     def detect(self, picture: Picture, camera: Pinhole) -> list[Detection]:
-        """Balls in a bgr8 picture (height, width, 3), nearest to the upper left corner first.
+        """Return the balls in a bgr8 image (height, width, 3), nearest to the upper left corner first.
 
-        A picture that is the last one again, as drawn ones without noise often are, is not looked at again.
+        An image equal to the last one, as simulated ones without noise often are, is not processed again.
         """
         masks = self.masks(picture, camera)
         last = self._last
@@ -181,20 +181,20 @@ class Detector:
         return list(found)
 
     def detect_in_depth(self, picture: Picture, depth: Depth, camera: Pinhole) -> list[Detection]:
-        """The same by a picture with depth (height, width) [m]: balls are where they are, on the table or on others."""
+        """Return balls with the depth image (height, width) [m]: at their true position, on the table or on others."""
         fine, closed, narrow = self.masks(picture, camera)
-        centers = find_in_depth(fine, depth, camera, self.resting.radius)
+        centers = find_balls_in_depth(fine, depth, camera, self.resting.radius)
         found = []
         if len(centers):
             pixels, outlines = camera.project(centers), silhouettes(camera, centers, self.resting.radius, 32)
-            inside = np.asarray(camera.in_picture(outlines).all(axis=1))
+            inside = np.asarray(camera.in_image(outlines).all(axis=1))
             area = cv2.countNonZero(fine) / len(centers)
             for center, pixel, outline, whole in zip(centers.tolist(), pixels.tolist(), outlines, inside, strict=True):
                 place, seen = (center[0], center[1], center[2]), (pixel[0], pixel[1])
                 found.append(Detection(place, seen, area, not whole, outline))
-        self.odd = self._on_table(camera, [
-            self._odd(np.array(middle), camera, NOT_ROUND)
-            for middle, contour in middles(closed, self.options.min_contour_area_px)
+        self.outliers = self._on_table(camera, [
+            self._outlier(np.array(middle), camera, NOT_ROUND)
+            for middle, contour in blob_centers(closed, self.options.min_contour_area_px)
             if not any(cv2.pointPolygonTest(contour, one.pixel, False) >= 0 for one in found)
         ] + self._thin(narrow, camera))
         self.blind, self.too_small, self._last = "" if found else blank_image_reason(picture), 0, None
@@ -208,43 +208,43 @@ class Detector:
         blobs = find_blobs(closed, fine, camera, self.options.min_contour_area_px, self._outlines)
         self._outlines = {blob.traced: blob.outline for blob in blobs}
         small = small_blobs(closed, self.options.min_contour_area_px)
-        # What shows of a ball below others in the container is small, too.
+        # A ball below others in the container shows little of itself, too.
         self.too_small = sum(not self.resting.shows_container(camera, pixel) for pixel in small)
-        # Of a ball straight below the camera. How much larger one looks that lies higher is a length, which hardly
-        # grows with the distance: what tells that from the side, too, is this, not how much a pixel is over there.
+        # Pixel size for a ball straight below the camera. A ball that lies higher looks larger by a length that hardly
+        # grows with the distance, so this size is also the measure for a camera at the side.
         pixel_size = abs(float(camera.position[2]) - self.resting.plane) / camera.fx
         offset = self.options.outline_offset_px * pixel_size
         seen: list[_Seen] = []
-        self.odd, self.too_large = self._thin(narrow, camera), 0
+        self.outliers, self.too_large = self._thin(narrow, camera), 0
         alone, crowded, offsets = self._alone(blobs, camera, offset, pixel_size)
         seen += alone
         spread = 1.0 * pixel_size
-        for blob in crowded:  # balls that touch, hide each other or reach over the border
-            if offsets:  # all outlines of a picture are off by as many pixels: balls that stand alone say by how many
+        for blob in crowded:  # balls that touch, occlude each other or cross the border
+            if offsets:  # all outlines of an image have the same offset in pixels, measured on single balls
                 there = self._pixel_size(camera, blob.centroid)
                 offset, spread = float(np.median(offsets)) * there, 0.2 * there
             centers = separate(blob.outline, closed, camera, self.resting, offset)
             if len(centers):
                 fit = fit_spheres(blob.outline, centers, self.resting.radius, offset=offset, offset_std=spread)
                 if not self._is_explained(blob, fit.owner, camera):
-                    self.odd += [self._odd(camera.project(center + camera.position), camera, NOT_ROUND)
+                    self.outliers += [self._outlier(camera.project(center + camera.position), camera, NOT_ROUND)
                                  for center in fit.centers]
                     continue
                 reasons = self._higher(blob, fit, camera, fine, offset if offsets else None, pixel_size)
                 if reasons:
-                    self.odd += [self._odd(camera.project(center + camera.position), camera, reason)
+                    self.outliers += [self._outlier(camera.project(center + camera.position), camera, reason)
                                  for center, reason in zip(fit.centers, reasons, strict=True)]
                     continue
                 seen += [_Seen(center, blob.area / len(centers), blob.border) for center in fit.centers]
             elif not len(blob.border):
-                self.odd.append(self._odd(blob.centroid, camera, NOT_ROUND))
-        self.odd = self._on_table(camera, self.odd)
+                self.outliers.append(self._outlier(blob.centroid, camera, NOT_ROUND))
+        self.outliers = self._on_table(camera, self.outliers)
         return sorted(self._detections(seen, camera), key=lambda d: (d.pixel[1], d.pixel[0]))
 
     def _pixel_size(self, camera: Pinhole, pixel: Array) -> float:
-        """How much one pixel is of a ball on the table that is seen at a pixel [m]: from the side more of one far away.
+        """Size of one pixel on a ball on the table seen at a pixel [m]; for a side camera it grows with distance.
 
-        Above the horizon, where none is, it is that of one straight below.
+        Above the horizon it is that of a ball straight below.
         """
         center = np.append(camera.on_plane(pixel, self.resting.plane), self.resting.plane)
         depth = float(camera.to_camera(center)[2])
@@ -253,13 +253,13 @@ class Detector:
     def _alone(
         self, blobs: list[Blob], camera: Pinhole, offset: float, pixel_size: float
     ) -> tuple[list[_Seen], list[Blob], list[float]]:
-        """Blobs that are one ball wholly in view, blobs that are not round, and the offsets of the former [px].
+        """Return blobs that are one complete ball, blobs that are not round, and the offsets of the former [px].
 
-        What is round but as large as no ball looks where it can lie is left out: it is something else, or falling.
+        A round blob larger than any ball can look there is ignored: it is something else, or falling.
         """
         crowded: list[Blob] = []
         tried: list[tuple[Blob, _Key]] = []
-        starts: dict[_Key, list[Array]] = {}  # of what was not in the last picture
+        starts: dict[_Key, list[Array]] = {}  # of blobs that were not in the last image
         fits: dict[_Key, list[_Round]] = {}
         for blob in blobs:
             center = camera.on_plane(blob.centroid, self.resting.plane)
@@ -300,9 +300,9 @@ class Detector:
                 self.too_large += not self.resting.shows_container(camera, blob.centroid)
                 continue
             if abs(best.offset - offset) > self.options.max_offset_px * pixel_size:
-                self.odd.append(self._odd(blob.centroid, camera, sized(best.offset, offset)))
+                self.outliers.append(self._outlier(blob.centroid, camera, sized(best.offset, offset)))
             elif best.oval > MOST_OVAL * there and not self.resting.shows_container(camera, blob.centroid):
-                self.odd.append(self._odd(blob.centroid, camera, FLAT))
+                self.outliers.append(self._outlier(blob.centroid, camera, FLAT))
             else:
                 alone.append(_Seen(best.center, blob.area, blob.border))
                 offsets.append(best.offset / there)
@@ -311,12 +311,12 @@ class Detector:
         for k in np.flatnonzero(unlike(np.array(offsets), MOST_UNLIKE))[::-1].tolist():
             pixel = camera.project(alone[k].center + camera.position)
             if not self.resting.shows_container(camera, pixel):
-                self.odd.append(self._odd(pixel, camera, sized(offsets[k] * sizes[k], usual * sizes[k])))
+                self.outliers.append(self._outlier(pixel, camera, sized(offsets[k] * sizes[k], usual * sizes[k])))
                 del alone[k], offsets[k]
         return alone, crowded, offsets
 
     def _is_explained(self, blob: Blob, owner: npt.NDArray[np.intp], camera: Pinhole) -> bool:
-        """Whether a blob is nothing but its balls, as far as its outline shows; one in the container may be."""
+        """Return whether the balls explain the outline of their blob; blobs in the container are exempt."""
         if self.resting.shows_container(camera, blob.centroid):
             return True
         return float(np.mean(owner >= 0)) >= EXPLAINED
@@ -324,9 +324,9 @@ class Detector:
     def _higher(
         self, blob: Blob, fit: Fit, camera: Pinhole, fine: Mask, usual: float | None, pixel_size: float
     ) -> list[str]:
-        """Why the balls of a blob are not to be taken: one lies on others. Empty if none does.
+        """Return why the balls of a blob must not be taken because one lies on others; empty if none does.
 
-        `usual` is the offset of balls that stand alone [m]; without any, that of the ball that looks smallest is.
+        `usual` is the offset of single balls [m]; without any, that of the ball that looks smallest.
         """
         if len(blob.border) or self.resting.shows_container(camera, blob.centroid):
             return []
@@ -345,9 +345,9 @@ class Detector:
         return [sized(float(offsets[k]), usual) if k == upper else BELOW for k in range(len(offsets))]
 
     def _is_floor(self, seen: Detection, picture: Picture, camera: Pinhole) -> bool:
-        """Whether what was found in the container has its colour: overexposed in warm light an orange one is red.
+        """Return whether a detection in the container is its floor: an overexposed orange floor is red in warm light.
 
-        Green and blue are not clipped then: balls have more blue than that, in any light that leaves some.
+        Green and blue are not clipped then: balls have more blue than the floor, in any light with some blue.
         """
         least = self._blue_of_balls
         if least is None or not self.resting.shows_container(camera, seen.pixel):
@@ -360,7 +360,7 @@ class Detector:
                     and self._blue_of_light(picture) >= _LEAST_BLUE)
 
     def _blue_of_light(self, picture: Picture) -> float:
-        """The blue of the light, compared with its green, as the table shows it: 1 in daylight, 0 where none tells."""
+        """Blue of the light relative to its green, measured on the table: 1 in daylight, 0 when unknown."""
         table = next((fixture for fixture in self._around.fixtures
                       if is_table(fixture, self._around.table_height)), None)
         if table is None or self._table is None or self._table[1] is None or min(table.color[1:]) <= 0:
@@ -369,28 +369,28 @@ class Detector:
 
     @property
     def _blue_of_balls(self) -> float | None:
-        """The blue, compared with green, that is at least to be seen of balls in warm light.
+        """Smallest blue relative to green that balls show in warm light.
 
-        None where the container never looks like one: it is neither orange nor brown, or has as much blue.
+        None if the container never looks like a ball: it is neither orange nor brown, or has as much blue.
         """
         red, green, blue = self.resting.container.color
         _, green_of_ball, blue_of_ball = self._around.ball_color
         least = 0.5 * _WARMEST * min(1.0, blue_of_ball / max(green_of_ball, _LEAST_GREEN))
         return least if _TURNS_RED[0] <= green / max(red, 1e-3) <= _TURNS_RED[1] and blue <= least * green else None
 
-    def _thin(self, narrow: Mask, camera: Pinhole) -> list[Odd]:
-        """What is long and thin."""
+    def _thin(self, narrow: Mask, camera: Pinhole) -> list[Outlier]:
+        """Return long, thin red objects."""
         least = LONG * 2 * self.resting.radius
-        return [self._odd(np.array(pixel), camera, THIN)
-                for pixel in long_ones(narrow, camera, self.resting.table_height, least)]
+        return [self._outlier(np.array(pixel), camera, THIN)
+                for pixel in long_components(narrow, camera, self.resting.table_height, least)]
 
-    def _on_table(self, camera: Pinhole, odd: list[Odd]) -> list[Odd]:
-        """Those that are not in the container, nor above the horizon, where no ray meets the table."""
-        return [one for one in odd
+    def _on_table(self, camera: Pinhole, outliers: list[Outlier]) -> list[Outlier]:
+        """Return the outliers outside of the container and below the horizon, where a ray meets the table."""
+        return [one for one in outliers
                 if np.isfinite(one.position).all() and not self.resting.shows_container(camera, one.pixel)]
 
-    def _odd(self, pixel: Array, camera: Pinhole, reason: str) -> Odd:
-        return Odd.at(camera, pixel, self.resting.plane, reason)
+    def _outlier(self, pixel: Array, camera: Pinhole, reason: str) -> Outlier:
+        return Outlier.at(camera, pixel, self.resting.plane, reason)
 
     def _detections(self, seen: list[_Seen], camera: Pinhole) -> list[Detection]:
         if not seen:
@@ -399,7 +399,7 @@ class Detector:
         pixels = camera.project(centers)
         places = camera.on_plane(pixels, self.resting.plane)
         outlines = silhouettes(camera, centers, self.resting.radius, 32)
-        inside = np.asarray(camera.in_picture(outlines).all(axis=1))
+        inside = np.asarray(camera.in_image(outlines).all(axis=1))
         return [
             Detection(
                 position=(float(places[k, 0]), float(places[k, 1]), self.resting.plane),
@@ -413,16 +413,16 @@ class Detector:
         ]
 
     def _cut(self, seen: _Seen, camera: Pinhole) -> bool:
-        """Whether the picture's border cuts through the ball: its blob touches it there."""
+        """Return whether the image border cuts through the ball: its blob touches it there."""
         if not len(seen.border):
             return False
         distance, _ = ray_distances(camera.directions(seen.border), seen.center[None])
         return bool((distance < self.resting.radius).any())
 
 
-def rehearse(surroundings: Surroundings, options: DetectorOptions) -> None:
-    """Look at a made-up picture: what is set up when it is first used does not hold up the first real one."""
-    radius, plane = surroundings.ball_radius, Resting.of(surroundings).plane
+def warm_up(surroundings: Surroundings, options: DetectorOptions) -> None:
+    """Process a synthetic image, so that one-time initialization does not delay the first real one."""
+    radius, plane = surroundings.ball_radius, BallGeometry.of(surroundings).plane
     camera = Pinhole.from_config(CameraConfig(position=(0, 0, plane + 25 * radius), rpy=(np.pi, 0, 0)))
     picture = np.full((camera.height, camera.width, 3), 128, np.uint8)
     detector = Detector(surroundings, options)
@@ -436,7 +436,7 @@ WHOLE, PARTIAL = (0, 255, 0), (0, 200, 255)
 
 
 def annotate(picture: Picture, detections: Sequence[Detection]) -> Picture:
-    """A copy of the bgr8 picture with the outline, the centre and the place [m] of each detection."""
+    """Return a copy of the bgr8 image with outline, center and position [m] of each detection."""
     shown = picture.copy()
     for d in detections:
         color = PARTIAL if d.partial else WHOLE

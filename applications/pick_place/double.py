@@ -1,4 +1,4 @@
-"""A double of perception, for simulations: says what lies on the table and in the container, and needs no picture."""
+"""Replacement of the perception in simulations: reports the objects on the table and in containers, without images."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from common.config import RobotConfig, Surroundings, Tunable
 from common.errors import ConfigError
 from common.messages import Header, Marker, MarkerArray, Pose, PoseArray, Vector3, WorldObject
 from common.perception.pinhole import MountedCamera
-from common.process.pace import Pace
 from common.process.planning_scene import SceneWriter
+from common.process.timing import LoopRate
 from common.robot.model import RobotModel
 from common.transport.bus import Bus
 
@@ -20,7 +20,7 @@ WORLD = "world"
 
 
 class Config(SceneParameters):
-    """How often is looked."""
+    """How often the scene is published."""
 
     robot: RobotConfig
     world: Surroundings
@@ -28,13 +28,13 @@ class Config(SceneParameters):
 
 
 def marker(index: int, thing: WorldObject) -> Marker:
-    """An object as a detector that sees everything would tell of it."""
+    """Return an object as the marker of a perfect detector."""
     return Marker(ns="ball", id=index, type="sphere", pose=Pose(position=thing.pose.position), scale=thing.size,
                   color=thing.color)
 
 
 async def run(bus: Bus, config: Config) -> None:
-    """Keep the planning scene as `scene_manager` does, and offer all that lies on the table to the task."""
+    """Publish the planning scene as `scene_manager` does, and everything on the table as targets."""
     truth, joints = bus.reader(topics.SCENE_OBJECTS), bus.reader(topics.JOINT_STATES)
     gripper = bus.reader(topics.GRIPPER_STATE)
     validated, out = bus.writer(VALIDATED_TARGETS), SceneWriter(bus)
@@ -45,7 +45,7 @@ async def run(bus: Bus, config: Config) -> None:
     scene = PerceivedScene(config, config.world, config.robot.gripper, config.robot.tcp_link)
     await out.begin(scene.scene())
     await bus.ready()
-    pace = Pace(bus, lambda: bus.clock.wall_rate(config.rate, 50.0))
+    pace = LoopRate(bus, lambda: bus.clock.wall_rate(config.rate, 50.0))
     while True:
         state, measured, objects = gripper.latest, joints.latest, truth.latest
         q = robot.order(measured.name, measured.position) if measured else None

@@ -1,4 +1,4 @@
-"""What is said of a run of pick and place: how many were placed, and what the detector saw on the table."""
+"""Figures of a pick-and-place run: objects placed, and detections on the table."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ if TYPE_CHECKING:
 
 
 class PickPlaceFigures(application.Figures):
-    """Those of every run, and what was detected and offered as a target."""
+    """Figures of every run, and the positions of detections and targets."""
 
     COUNTED = "placed"
     STATE_COLORS: ClassVar = {"GRASPING": "#2f7ed8", "PLACING": "#17a398", "HOMING": "#8d6cc2"}
     TRUTH = SCENE_BALLS
 
     def listeners(self) -> dict[Topic[Any], Callable[[float, Any], None]]:
-        """Detections and targets, where they are to be shown."""
-        self._detections: dict[tuple[int, int], int] = {}  # how often, by place
+        """Return listeners for detections and targets, if they are plotted."""
+        self._detections: dict[tuple[int, int], int] = {}  # counts by position
         self._targets: dict[tuple[int, int], int] = {}
         if not self.pictured:
             return {}
@@ -43,5 +43,5 @@ class PickPlaceFigures(application.Figures):
         count_places(self._targets, targets.poses)
 
     def picture(self, run: RunHistory, tool: npt.NDArray[np.float64]) -> application.Section | None:
-        """The table from above, with what was detected there."""
+        """Return the top view of the table with the detections."""
         return application.top_view_section(run, tool, {"detections": self._detections, "targets": self._targets})

@@ -1,4 +1,4 @@
-"""What can be set of the pick-and-place task."""
+"""Parameters of the pick-and-place task."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ PLACES = {"finger_inner": "gripper.fingers.inner", "finger_outer": "gripper.fing
           "finger_half_width": "gripper.fingers.half_width"}
 
 
-RELEASED = 0.9  # [rad] that a hand may be tilted above a container where the arm cannot choose: what it lets go falls
+RELEASED = 0.9  # [rad] tilt allowed above a container for an arm with few joints: a released object falls
 
 
 class HandShape(Parameters):
-    """The open fingers as seen from above: two rectangles beside the object, in the frame of the tool centre point.
+    """The open fingers seen from above: two rectangles next to the object, in the frame of the tool center point.
 
-    Their shape is that of the robot file's gripper; one that is set here is taken in its place for one version more.
+    Their default is the shape of the robot file's gripper. Setting a shape here is deprecated.
     """
 
     finger_inner: Tunable[float] = Field(0.040, gt=0, le=0.2, description="centre to inner finger face, open [m]")
@@ -35,7 +35,7 @@ class HandShape(Parameters):
 
 
 class Config(TaskConfig):
-    """How the task behaves; times are cell time unless they say wall."""
+    """Parameters of the task; times are cell time unless they say wall."""
 
     world: Surroundings
     grasp: Grasp
@@ -90,8 +90,8 @@ class Config(TaskConfig):
 
 
 def shaped_as(gripper: GripperConfig, hand: HandShape) -> HandShape:
-    """The hand with the shape of a gripper's fingers, where it was given no other."""
-    if gripper.cup is not None:  # two halves of the square about it
+    """Return the hand with the gripper's finger shape, where its own shape was not set."""
+    if gripper.cup is not None:  # two halves of the square around it
         inner, depth, half_width = 0.0, gripper.cup.lip_radius, gripper.cup.lip_radius
     else:
         inner, depth, half_width = gripper.finger_inner, gripper.fingers.depth, gripper.fingers.half_width

@@ -1,9 +1,9 @@
-"""What has the colour of balls and is none that lies on the table: told by its outline and by how large it looks.
+"""Detect red objects that are no ball on the table, by the shape and the apparent size of their outline.
 
-The outline of a sphere of known size at a known place is known; that of a cube or a can is another one, and a cable may
-be too thin to have one. A disc, such as the picture of a ball on a sheet, is seen as an ellipse of another shape the
-further it is off the axis of a camera; straight below it cannot be told from a ball. A ball on top of something looks
-larger than one on the table; where others hide its outline, it hides what could be seen between them.
+The outline of a sphere of known size and position is known; a cube or a can has another one, and a cable may be too
+thin for one. A disc, such as a printed ball, is an ellipse of another shape the farther it is off the camera axis;
+straight below the camera it looks like a ball. A ball on top of something looks larger than one on the table. Where
+others occlude its outline, it covers the gaps between them.
 """
 
 from __future__ import annotations
@@ -26,42 +26,42 @@ FLAT = "it is not as round as a ball there: flat, such as a picture of one"
 THIN = "it is long and thinner than a ball, such as a cable"
 BELOW = "it is seen together with one that lies higher, as on it"
 COVERED = "something lies on it and its neighbours: between them no table is seen"
-EXPLAINED = 0.8  # part of the outline of a blob that lies on those of its balls, at least
-MOST_OVAL = 0.55  # [px] by which the outline of a ball may be longer one way than the other
-MOST_UNLIKE = 0.5  # [px] by which balls of one picture may differ in how large they look
-LONG = 2.0  # diameters of a ball: what shows of one beside the arm or another ball is shorter
-NEIGHBOURS = 3.5  # radii between the centres of balls that may carry one, at most: 2 sqrt(3)
-GAP = 8  # [px] of the table that three balls leave to be seen, at least, for one on them to be told
-BLURRED = 0.3  # [px] by which balls are taken for larger than their outlines say, so that a gap is surely one
-SEEN = 0.3  # part of a gap that is not red where nothing lies on it, at least
-FALLING = 0.006  # [m] what looks so much larger is higher than a stack: it falls, or hangs in the hand
-FEWEST = 3  # balls by which it is told how large they look
+EXPLAINED = 0.8  # smallest fraction of a blob's outline that its balls must explain
+MOST_OVAL = 0.55  # [px] by which the outline of a ball may be longer in one direction
+MOST_UNLIKE = 0.5  # [px] by which the apparent sizes of balls in one image may differ
+LONG = 2.0  # ball diameters; the visible part of a ball next to the arm or another ball is shorter
+NEIGHBOURS = 3.5  # largest distance between the centers of balls that may carry another, in radii: 2 sqrt(3)
+GAP = 8  # [px] smallest visible gap between three balls that proves no ball lies on them
+BLURRED = 0.3  # [px] by which the balls are enlarged, so that a gap is certain
+SEEN = 0.3  # fraction of a gap that is not red if nothing lies on it
+FALLING = 0.006  # [m] an object that looks this much larger is above any stack: falling, or held
+FEWEST = 3  # balls needed to measure the usual apparent size
 
 
 @dataclass(frozen=True)
-class Odd:
-    """What is red and no ball on the table: about where (3,) [m] in world, at which pixel, and why."""
+class Outlier:
+    """A red object that is no ball on the table: approximate position (3,) [m] in world, pixel, and reason."""
 
     position: tuple[float, float, float]
     pixel: tuple[float, float]
     reason: str
 
     @classmethod
-    def at(cls, camera: Pinhole, pixel: Array, plane: float, reason: str) -> Odd:
-        """What is seen at a pixel, as if it lay at the height of balls on the table."""
+    def at(cls, camera: Pinhole, pixel: Array, plane: float, reason: str) -> Outlier:
+        """Return the outlier seen at a pixel, at the height of balls on the table."""
         x, y = camera.on_plane(pixel, plane).tolist()
         return cls((x, y, plane), (float(pixel[0]), float(pixel[1])), reason)
 
 
 def oval(outline: Outline, center: Array, camera: Pinhole) -> float:
-    """By how much an outline is longer one way than across it, compared with a sphere there [m].
+    """Return by how much an outline is longer in one direction, compared with a sphere there [m].
 
-    The second harmonic of how far the points are outside of the silhouette, about its middle. A shadow, which eats one
-    side, is in the first.
+    This is the second harmonic of the points' distance from the silhouette around its center. A shadow on one side only
+    affects the first.
 
     Args:
-        outline: all round.
-        center: (3,) of the sphere that fits it, relative to the optical centre [m].
+        outline: complete outline.
+        center: (3,) of the fitted sphere, relative to the optical center [m].
         camera: the camera.
     """
     distance, _ = ray_distances(outline.rays, center[None])
@@ -72,7 +72,7 @@ def oval(outline: Outline, center: Array, camera: Pinhole) -> float:
 
 
 def sized(offset: float, usual: float) -> str:
-    """Why an outline that is further out than usual [m] is not that of a ball on the table."""
+    """Return why an outline with this offset, compared with the usual one [m], is no ball on the table."""
     away = 1e3 * (offset - usual)
     if away > 0:
         return f"it looks {away:.1f} mm larger than a ball on the table: it lies higher, as on another one"
@@ -80,19 +80,19 @@ def sized(offset: float, usual: float) -> str:
 
 
 def unlike(offsets: Array, most: float) -> npt.NDArray[np.bool_]:
-    """(n,) which outlines are further out or in than those of the others [px]; none where there are too few to tell."""
+    """(n,) outlines whose offset differs from that of the others [px]; none if there are too few."""
     if len(offsets) < FEWEST:
         return np.zeros(len(offsets), bool)
     return np.asarray(np.abs(offsets - np.median(offsets)) > most)
 
 
 def covered(centers: Array, radius: float, red: Mask, camera: Pinhole) -> bool:
-    """Whether something lies on three of the balls of a blob: what they leave to be seen between them is red.
+    """Return whether something lies on three of a blob's balls: the gap between them is red.
 
     Args:
-        centers: (n, 3) relative to the optical centre [m].
-        radius: of the balls, as far as they are red at most [m]: what is blurred closes a gap.
-        red: what is red, not closed.
+        centers: (n, 3) relative to the optical center [m].
+        radius: largest red extent of the balls [m]: blur closes a gap.
+        red: red pixels, before closing.
         camera: the camera.
     """
     places = centers + camera.position
@@ -116,7 +116,7 @@ def covered(centers: Array, radius: float, red: Mask, camera: Pinhole) -> bool:
         for outline in outlines:
             cv2.fillConvexPoly(free, outline - corner, 0)
         part = red[corner[1]:corner[1] + height, corner[0]:corner[0] + width]
-        if part.shape != free.shape:  # it reaches out of the picture
+        if part.shape != free.shape:  # outside of the image
             continue
         gap = cv2.countNonZero(free)
         if gap >= GAP and cv2.countNonZero(cv2.subtract(free, part)) < SEEN * gap:

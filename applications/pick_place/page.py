@@ -1,4 +1,4 @@
-"""Pick and place on the operator's page: its words, the targets, what was rejected, and how far the arm reaches."""
+"""Pick and place on the operator's page: targets, rejections, and reach of the arm."""
 
 from __future__ import annotations
 
@@ -24,32 +24,32 @@ if TYPE_CHECKING:
 
 TARGET = (70, 220, 110)
 REJECTED = (255, 90, 200)
-_WIDER = 1.35  # than what lies there, a ring is
-_STILL = 1e-3  # [m] detections tremble by less
+_WIDER = 1.35  # radius of a ring relative to the ball
+_STILL = 1e-3  # [m] noise of detections
 
 
 def counters(status: TaskStatus, rejected: int) -> dict[str, object]:
-    """The figures of the task by their names."""
+    """Figures of the task by label."""
     return {"placed": status.done, "targets": status.total, "rejected": rejected, "retries": status.retries,
             "failures": status.failures}
 
 
 class Targets(Layer):
-    """A ring about each target."""
+    """A ring around each target."""
 
     LABEL = "Targets"
     LEGEND = (("target", TARGET),)
     TOPICS = (VALIDATED_TARGETS,)
 
     def build(self) -> None:
-        """Start without any."""
+        """Start without targets."""
         self._ring = ring(_WIDER * self.stage.around.ball_radius)
-        # A mesh each: their shader is that of everything else, and a browser without a graphics card needs a moment
-        # for one of their own.
+        # One mesh each: they share the shader of everything else; a shader of their own takes a browser
+        # without a graphics card a moment.
         self.nodes: list[viser.MeshHandle] = []
 
     def show(self, topic: Topic[Any], message: Any) -> None:
-        """Show these targets and no others."""
+        """Show these targets only."""
         at = points_of(message.poses)
         while len(self.nodes) > len(at):
             self.nodes.pop().remove()
@@ -62,7 +62,7 @@ class Targets(Layer):
 
 
 class Rejected(Layer):
-    """A ring and the reason at each place from which something was rejected, until nothing is there any more."""
+    """A ring and the reason at each rejected position, until nothing is detected there any more."""
 
     LABEL = "Rejected, with the reason"
     LEGEND = (("rejected", REJECTED),)
@@ -70,15 +70,15 @@ class Rejected(Layer):
     PERIOD = 0.5
 
     def build(self) -> None:
-        """Start without any."""
+        """Start without rejections."""
         self._ring = ring(_WIDER * self.stage.around.ball_radius)
         self.rejected = RejectedPositions()
-        self.nodes: dict[RejectedPosition, tuple[str, viser.MeshHandle]] = {}  # with the name of the label
+        self.nodes: dict[RejectedPosition, tuple[str, viser.MeshHandle]] = {}  # with the name of its label
         self._count = 0
         self.labels = Labels(self.scene, self.root, scale=0.75)
 
     def show(self, topic: Topic[Any], message: Any) -> None:
-        """Add rejections; forget those where a target is, or where nothing has been detected for a while."""
+        """Add rejections; remove those at a target, or without a detection for a while."""
         self.rejected.update(message)
         for place in [place for place in self.nodes if place not in self.rejected.positions]:
             self.nodes.pop(place)[1].remove()
@@ -92,22 +92,22 @@ class Rejected(Layer):
 
     @property
     def reasons(self) -> list[str]:
-        """The reasons that are shown, oldest first."""
+        """Displayed reasons, oldest first."""
         return [place.reason for place in self.rejected.positions]
 
 
 class Workspace(Layer):
-    """The reachable shell and the excluded column."""
+    """The reachable shell and the excluded column around the base."""
 
     LABEL = "Workspace"
     TOPICS = (WORKSPACE_MARKERS,)
 
     def build(self) -> None:
-        """Start without them."""
+        """Start without shapes."""
         self.markers = Markers(self.scene, self.root)
 
     def show(self, topic: Topic[Any], message: Any) -> None:
-        """Show these shapes and no others."""
+        """Show these shapes only."""
         self.markers.show(message)
 
 

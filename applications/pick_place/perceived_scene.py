@@ -11,23 +11,22 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from applications.pick_place.ball_places import Resting
+from applications.pick_place.ball_places import BallGeometry
 from common import messages as m
 from common.config import GripperConfig, Parameters, Surroundings, Tunable
 from common.messages import Color, Marker, Quaternion
 from common.perception.occlusion import Occlusion
 from common.perception.pinhole import Pinhole
 from common.robot.transforms import invert, matrix_to_pose, pose_to_matrix
-from common.scene.fixtures import color_of, fixed_objects
-from common.scene.slots import occupied_slots, slot_positions
+from common.scene.fixtures import color_of, fixed_objects, occupied_slots, slot_positions
 
 Place = tuple[float, float, float]
 Shape = Literal["sphere", "box", "cylinder"]
-Hides = Callable[[Place], bool]  # whether a place cannot be judged in a picture
+Hides = Callable[[Place], bool]  # whether a position is occluded in an image
 
-AHEAD = 5.0  # [s] what was seen later than that after a frame was told of by a clock that is wrong
-MOST = 200  # objects that are tracked: with what is made of them, a planning scene has room for few more
-WIDTH_SLACK = 0.01  # [m] by which the fingers' width and the seen size of what they hold may differ
+AHEAD = 5.0  # [s] detections this far ahead of a frame have a wrong clock
+MOST = 200  # tracked objects; with those derived from them, a planning scene has little more room
+WIDTH_SLACK = 0.01  # [m] tolerated difference between finger width and detected size of a held object
 
 
 class SceneParameters(Parameters):
@@ -48,9 +47,9 @@ class SceneParameters(Parameters):
 
 @dataclass(frozen=True)
 class Sighting:
-    """What one detection says of an object: where it is [m], world, what it is, and how large and of which colour.
+    """One detection of an object: position [m] in world, kind, shape, size and color.
 
-    `size` is that of the box about it along its own axes [m].
+    `size` is that of its bounding box along its own axes [m].
     """
 
     position: Place
@@ -62,7 +61,7 @@ class Sighting:
 
     @classmethod
     def of(cls, marker: Marker) -> Sighting | None:
-        """What a marker says; None for one that is no object: words, and what has no size."""
+        """Convert a marker; None for text and for markers without a size."""
         p, s = marker.pose.position, marker.scale
         if marker.type == "text" or min(s.x, s.y, s.z) <= 0:
             return None
@@ -70,12 +69,12 @@ class Sighting:
 
     @property
     def dimensions(self) -> list[float]:
-        """As a planning scene has them: of a box x, y, z, of a sphere its radius, of a cylinder radius and length."""
+        """Dimensions as in a planning scene: box x, y, z; sphere radius; cylinder radius and length."""
         x, y, z = self.size
         return {"sphere": [x / 2], "cylinder": [x / 2, z], "box": [x, y, z]}[self.shape]
 
     def across(self, width: float, slack: float) -> bool:
-        """Whether fingers that hold it may be so far apart [m]."""
+        """Return whether fingers that hold it may have this width [m]."""
         x, y, _ = self.size
         least, most = (min(x, y), math.hypot(x, y)) if self.shape == "box" else (x, x)
         return least - slack <= width <= most + slack
@@ -83,7 +82,7 @@ class Sighting:
 
 @dataclass
 class Track:
-    """One object: where it is, in world [m], how often it was seen, when last [s] and in which view, and what then."""
+    """One object: position in world [m], number of detections, time [s], view and content of the last one."""
 
     id: str
     position: Place
@@ -94,29 +93,29 @@ class Track:
 
 
 class Tracks:
-    """Matches detections to known objects of their kind, one to one, nearest pairs first."""
+    """Matches detections to known objects of the same kind, one to one, nearest pairs first."""
 
     def __init__(self, parameters: SceneParameters) -> None:
-        """Start with no objects; the parameters may change between frames."""
+        """Start without objects; the parameters may change between frames."""
         self.p = parameters
         self._tracks: list[Track] = []
         self._count = 0
-        self.crowded = False  # whether something of the last frame found no room
-        self._looked: dict[int, float] = {}  # of views that look at times: when last [s]
-        self._hides: dict[int, tuple[float, Hides | None]] = {}  # of the others: when they looked last [s], what hides
+        self.crowded = False  # whether the last frame had more objects than fit
+        self._looked: dict[int, float] = {}  # last frame of cameras that look at times [s]
+        self._hides: dict[int, tuple[float, Hides | None]] = {}  # of other cameras: last frame [s], its occlusion
 
     def update(
         self, sightings: Sequence[Sighting], now: float, view: int = 0, at_times: bool = False,
         hides: Hides | None = None,
     ) -> None:
-        """Take in all detections of one frame.
+        """Process all detections of one frame.
 
         Args:
             sightings: of the frame.
             now: when it was taken [s].
-            view: which of several views it is of.
-            at_times: that one looks at times only: what it showed is known until it looks again.
-            hides: what of the frame cannot be judged: what was known there is known as long as nobody sees the place.
+            view: number of the view.
+            at_times: the view looks at times only: its objects stay known until it looks again.
+            hides: which positions are occluded in the frame: objects there stay known.
         """
         if at_times:
             self._looked[view] = now
@@ -152,22 +151,22 @@ class Tracks:
             self._tracks.append(Track(f"track_{self._count}", sighting.position, 1, now, sighting, view))
 
     def _is_hidden(self, track: Track, now: float) -> bool:
-        """Whether nobody who looks now can tell whether it is there."""
+        """Return whether its position is occluded in all current views."""
         looking = [hides for at, hides in self._hides.values() if now - at <= self.p.forget_after]
         return bool(looking) and all(hides is not None and hides(track.position) for hides in looking)
 
     def _unseen_for(self, track: Track, now: float) -> float:
-        """For how long nobody has seen it who looked [s]."""
+        """Return for how long the views that could see it have not detected it [s]."""
         return self._looked.get(track.view, now) - track.last_seen
 
     def confirmed(self) -> list[Track]:
-        """Objects that were seen often enough to be believed."""
+        """Return the objects detected often enough to be published."""
         return [t for t in self._tracks if t.seen >= self.p.confirm_frames]
 
     def take(self, position: Place, radius: float, width: float = 0.0) -> Track | None:
-        """The object nearest to a position, within `radius` [m], which is no longer tracked after this.
+        """Remove and return the object nearest to a position, within `radius` [m].
 
-        One that fits between fingers which are `width` [m] apart, if they tell that and there is one.
+        Objects that fit between fingers of this `width` [m] are preferred.
         """
         within = [t for t in self._tracks if math.dist(t.position, position) <= radius]
         fitting = [t for t in within if t.sighting.across(width, WIDTH_SLACK)] if width > 0 else []
@@ -178,22 +177,22 @@ class Tracks:
         return near
 
     def new_id(self) -> str:
-        """An id for an object that was never seen on the table."""
+        """Return an id for an object that was never detected on the table."""
         self._count += 1
         return f"track_{self._count}"
 
 
 Array = NDArray[np.float64]
 
-GREY = m.Color(r=0.6, g=0.6, b=0.6)  # of what is not seen
-LEVEL = 0.005  # [m] what is seen so little above the table lies on it
-MOST_BESIDE = 50  # objects in containers that are in no slot
-AT_REST = 0.5  # [s] for which something is seen in a slot before it is taken to lie there
+GREY = m.Color(r=0.6, g=0.6, b=0.6)  # color of what is not seen
+LEVEL = 0.005  # [m] an object this little above the table lies on it
+MOST_BESIDE = 50  # objects in containers but in no slot
+AT_REST = 0.5  # [s] for which a slot must look occupied before the object counts as at rest
 
 
 @dataclass
 class Occupied:
-    """Slots in which a view showed something at a stamp [ns], and those beneath that it could not show."""
+    """Slots that a view shows occupied at a stamp [ns], and slots below them that it cannot see."""
 
     stamp: int
     seen: set[int]
@@ -201,7 +200,7 @@ class Occupied:
 
 
 class PerceivedScene:
-    """Keeps what was seen and felt, and says it as a planning scene."""
+    """Combines detections and gripper states into a planning scene."""
 
     def __init__(
         self, parameters: SceneParameters, around: Surroundings, gripper: GripperConfig, tcp_link: str
@@ -209,15 +208,15 @@ class PerceivedScene:
         """Start with the fixtures alone.
 
         Args:
-            parameters: of the tracking; they may change meanwhile.
-            around: fixtures, containers, and how large balls are, of which the first container has slots.
-            gripper: its links may touch what is held.
-            tcp_link: what is held moves with this link.
+            parameters: of the tracking; they may change at runtime.
+            around: fixtures, containers, and the radius of balls; the first container has slots for them.
+            gripper: its links may touch the held object.
+            tcp_link: link that the held object moves with.
         """
         self.around, self.gripper, self.tcp_link = around, gripper, tcp_link
         self.p, self._tracks = parameters, Tracks(parameters)
         self._fixed = fixed_objects(around)
-        self._resting = [replace(Resting.of(around), container=box) for box in around.containers.values()]
+        self._resting = [replace(BallGeometry.of(around), container=box) for box in around.containers.values()]
         self._with_slots = next((box.container for box in self._resting), None)
         self._slots = slot_positions(around.container, around.ball_radius, around.table_height).reshape(-1, 3)
         self._in_slots = [
@@ -226,20 +225,20 @@ class PerceivedScene:
         ]
         self._occupied: dict[int, Occupied] = {}  # by view
         self._lasts: set[int] = set()  # views that look at times
-        self._free: set[int] = set()  # slots in which nothing was when the hand took something, nor came to rest since
-        self._since: dict[int, int] = {}  # stamp since which something is seen in a slot
-        self._beside_slots: dict[int, list[Sighting]] = {}  # what else lies in the container, by view
+        self._free: set[int] = set()  # slots empty at the last grasp, without an object at rest since
+        self._since: dict[int, int] = {}  # stamp since which a slot looks occupied
+        self._beside_slots: dict[int, list[Sighting]] = {}  # other objects in containers, by view
         self._held: m.AttachedObject | None = None
         self._changed_hands_at = 0
         self._stamp = 0
 
     def see(self, detections: m.MarkerArray, camera: Pinhole, T_world_tcp: Array | None, view: int = 0,
             at_times: bool = False, hidden: Occlusion | None = None) -> None:
-        """Take in the detections of one frame, of one of several views.
+        """Process the detections of one frame of one view.
 
-        A frame that was taken before the hand last closed or opened still shows what is in the hand now on the table:
-        it is left out. So is anything seen where the hand holds a ball. What a camera showed that looks `at_times` is
-        known until it looks again; what is `hidden` in the picture, until somebody sees that place.
+        Frames taken before the last gripper change still show the held object on the table and are skipped. Detections
+        at the held object are ignored. Objects of a view that looks `at_times` stay known until it looks again; objects
+        in the `hidden` part of an image until a view shows their positions.
         """
         stamp = detections.header.stamp
         if stamp <= self._changed_hands_at:
@@ -265,7 +264,7 @@ class PerceivedScene:
                 on_table.append(thing)
         radius = self.around.ball_radius
         self._tracks.update(on_table, stamp * 1e-9, view, at_times, None if hidden is None else (
-            lambda place: bool(hidden.hides([place], radius)[0])))
+            lambda place: bool(hidden.occludes([place], radius)[0])))
         now = Occupied(stamp, *occupied_slots(in_container, camera, self._slots, radius, self._free))
         if hidden is None:
             self._beside_slots[view] = beside_slots
@@ -275,40 +274,40 @@ class PerceivedScene:
                 self._beside_slots[view] = beside_slots
         self._occupied[view] = now
         self._since = {slot: self._since.get(slot, stamp) for slot in self._occupied_slots(beneath=False)}
-        # What falls and rolls is seen in one slot after the other, and is in none of them when the next covers it.
+        # A falling or rolling object appears in one slot after another, and in none of them once another covers it.
         self._free -= {slot for slot, since in self._since.items() if (stamp - since) * 1e-9 >= AT_REST}
         if at_times:
             self._lasts.add(view)
 
     def _keep_hidden(self, view: int, now: Occupied, hidden: Occlusion) -> None:
-        """Slots in which something was and which cannot be judged now stay as they were."""
+        """Keep the state of occupied slots that are occluded now."""
         before = self._occupied.get(view)
         slots = sorted((before.seen | before.beneath) - now.seen - now.beneath) if before else []
         if not before or not slots:
             return
-        behind = hidden.hides(self._slots[slots], self.around.ball_radius)
+        behind = hidden.occludes(self._slots[slots], self.around.ball_radius)
         kept = {slot for slot, away in zip(slots, behind, strict=True) if away}
         now.seen |= kept & before.seen
         now.beneath |= kept - before.seen
 
     def feel(self, gripper: m.GripperState, T_world_tcp: Array | None) -> None:
-        """Take in whether the hand holds something: the nearest ball moves into it with its id, or leaves it."""
+        """Process a change of the gripper: the nearest object becomes the held one with its id, or it is released."""
         if gripper.holding == (self._held is not None) or (gripper.holding and T_world_tcp is None):
             return
         self._changed_hands_at = gripper.header.stamp
         if not gripper.holding or T_world_tcp is None:
             self._held = None
             return
-        # What was let go may be seen while it still hangs or falls, as high as if it lay on another one. One ball more
-        # has come into the container then, not two. Before the first picture nothing is known to be free.
+        # A released object may be seen while it falls, as high as if it lay on another one. It is one more object in
+        # the container then, not two. Before the first image no slot is known to be free.
         self._free = set(range(len(self._slots))) - self._occupied_slots() if self._occupied else set()
         x, y, z = (float(v) for v in T_world_tcp[:3, 3])
         track = self._tracks.take((x, y, z), self.p.match_radius, gripper.width if self.gripper.cup is None else 0.0)
-        # The fingers have centred it between them; along them and along the tool it lies where it was seen.
+        # The fingers centered it between them; along the fingers and along the tool it is where it was detected.
         offset = np.zeros(3)
         if track is not None:
             offset = (invert(T_world_tcp) @ np.array([*track.position, 1.0]))[:3]
-            # A cup holds it as it lay, by its top.
+            # A cup holds it by its top, where it was.
             below = np.zeros(3)
             if self.gripper.cup is not None:
                 below[2] = track.position[2] - self.around.table_height
@@ -326,11 +325,11 @@ class PerceivedScene:
 
     @property
     def crowded(self) -> bool:
-        """Whether more was seen than a planning scene has room for: then it does not hold all."""
+        """Whether more was detected than a planning scene can hold."""
         return self._tracks.crowded or any(len(things) > MOST_BESIDE for things in self._beside_slots.values())
 
     def scene(self) -> m.PlanningScene:
-        """What is believed now; its stamp is that of the newest frame in it."""
+        """Return the planning scene; its stamp is that of its newest frame."""
         table = [self._object(t.id, "target", t.sighting, _pose(t)) for t in self._tracks.confirmed()]
         seen = self._occupied_slots(beneath=False)
         contained = [self._in_slots[k] if k in seen else self._in_slots[k].model_copy(update={"unseen": True})
@@ -338,7 +337,7 @@ class PerceivedScene:
         beside: list[Sighting] = []
         for things in self._beside_slots.values():
             beside = things if len(things) > len(beside) else beside
-        contained += [  # as the view has it that shows most of them
+        contained += [  # of the view that shows most of them
             self._object(f"contained_{k + 1}", "contained", thing, _pose(Track("", thing.position, 0, 0.0, thing)))
             for k, thing in enumerate(beside[:MOST_BESIDE])
         ]
@@ -351,7 +350,7 @@ class PerceivedScene:
         )
 
     def _below(self, table: list[m.CollisionObject]) -> list[m.CollisionObject]:
-        """Columns under what stands above the table: something carries it, though a camera above sees none of that."""
+        """Return columns below objects above the table: something supports them, invisible to a camera above."""
         columns = []
         for thing in table:
             gap = thing.pose.position.z - thing.dimensions[-1] / 2 - self.around.table_height
@@ -364,7 +363,7 @@ class PerceivedScene:
         return columns
 
     def _occupied_slots(self, *, beneath: bool = True) -> set[int]:
-        """Slots in which any view shows something now, with those that have to carry it or without."""
+        """Return the slots that any current view shows occupied, with or without the ones below that carry them."""
         return {slot for view, one in self._occupied.items() for slot in one.seen | (one.beneath if beneath else set())
                 if view in self._lasts or (self._stamp - one.stamp) * 1e-9 <= self.p.forget_after}
 
@@ -375,7 +374,7 @@ class PerceivedScene:
         })
 
     def _object(self, name: str, role: str, thing: Sighting, pose: m.Pose) -> m.CollisionObject:
-        """A solid of the planning scene, with shape, size and colour as they were seen."""
+        """Return an object of the planning scene with the detected shape, size and color."""
         return m.CollisionObject.model_validate({
             "id": name, "role": role, "shape": thing.shape, "dimensions": thing.dimensions, "pose": pose,
             "color": thing.color, "grip_effort": self.around.grip_efforts.get(thing.kind, 0.0),

@@ -16,22 +16,22 @@ from common.perception.pinhole import Pinhole
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.uint8]
 Contour = npt.NDArray[np.int32]
-Part = tuple[Contour, bool]  # a contour, and whether it is that of a hole
-Traced = tuple[tuple[bytes, bool], ...]  # the parts of an outline
+Part = tuple[Contour, bool]  # a contour, and whether it bounds a hole
+OutlineKey = tuple[tuple[bytes, bool], ...]  # the contours of an outline as bytes: equal for an unchanged blob
 
-_REACH = 3  # contour points to either side from which the direction of the outline is taken
-MOST_NARROW = 0.05  # part of a picture that may be narrow for what is long in it to be told
-_LEAST_POINTS = 16  # shorter contours are specks or pin holes
+_REACH = 3  # contour points to either side for the direction of the outline
+MOST_NARROW = 0.05  # fraction of an image that may be narrow; above it the image is noise
+_LEAST_POINTS = 16  # shorter contours are noise
 
 
 @dataclass(frozen=True)
 class Outline:
-    """Points on the edge of something red, as rays; the edge of the picture is not an edge of it.
+    """Points on the edge of a red region as rays; the border of the image is no edge.
 
     Attributes:
         pixels: (n, 2) [px].
-        rays: (n, 3) unit vectors in world, from the optical centre.
-        inward: (n, 3) unit vectors in world, perpendicular to the ray and to the edge, into the red.
+        rays: (n, 3) unit vectors in world, from the optical center.
+        inward: (n, 3) unit vectors in world, perpendicular to the ray and to the edge, into the red region.
     """
 
     pixels: Array
@@ -42,12 +42,12 @@ class Outline:
         return len(self.pixels)
 
     def take(self, which: npt.NDArray[np.bool_] | npt.NDArray[np.intp]) -> Outline:
-        """The points that an index or boolean array picks."""
+        """Return the points selected by an index or boolean array."""
         return Outline(self.pixels[which], self.rays[which], self.inward[which])
 
 
 def all_of(outlines: Sequence[Outline]) -> tuple[Outline, npt.NDArray[np.intp]]:
-    """The points of one or more outlines as one, and the index of the outline that each is of (n,)."""
+    """Concatenate outlines; also return the index of each point's outline (n,)."""
     pixels, rays, inward = (np.concatenate([getattr(each, name) for each in outlines])
                             for name in ("pixels", "rays", "inward"))
     return Outline(pixels, rays, inward), np.repeat(np.arange(len(outlines)), [len(each) for each in outlines])
@@ -60,32 +60,31 @@ class Blob:
     Attributes:
         area: inside its outer edge [px^2].
         centroid: (2,) of its area [px].
-        outline: of the regions of the finer mask within it, holes included.
-        border: (m, 2) its pixels at the border of the picture [px].
-        traced: the pixels of its outline, as they were followed.
+        outline: of the regions of the finer mask within it, including holes.
+        border: (m, 2) its pixels at the border of the image [px].
+        traced: key of its outline.
     """
 
     area: float
     centroid: Array
     outline: Outline
     border: Array
-    traced: Traced = ()
+    traced: OutlineKey = ()
 
 
 def find_blobs(
-    closed: Mask, fine: Mask, camera: Pinhole, min_area: float, known: Mapping[Traced, Outline] | None = None
+    closed: Mask, fine: Mask, camera: Pinhole, min_area: float, known: Mapping[OutlineKey, Outline] | None = None
 ) -> list[Blob]:
-    """Blobs of the closed mask of at least `min_area` [px^2], outlined by the finer mask from before closing.
+    """Return blobs of the closed mask of at least `min_area` [px^2], with outlines from the mask before closing.
 
-    Closing bridges the gaps between near neighbours and fills notches: what a ball looks like is in the finer mask.
+    Closing bridges gaps between near neighbors and fills notches; the mask before shows the true shape of a ball.
 
     Args:
-        closed: what is red, closed.
-        fine: what is red, before closing.
+        closed: red pixels after closing.
+        fine: red pixels before closing.
         camera: the camera.
-        min_area: smaller blobs are left out [px^2].
-        known: outlines of the same camera's last picture by what was traced: that of a blob which is there again is
-            the very same one.
+        min_area: smaller blobs are ignored [px^2].
+        known: outlines of the camera's last image by key; an unchanged blob gets the identical object.
     """
     outer, _ = cv2.findContours(closed, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     large = [(np.asarray(c, np.int32), area) for c in outer if (area := cv2.contourArea(c)) >= min_area]
@@ -116,14 +115,14 @@ def find_blobs(
 
 
 def small_blobs(closed: Mask, min_area: float) -> list[tuple[float, float]]:
-    """Where there are blobs of less than `min_area` [px^2] in the closed mask: centres (u, v) [px]."""
+    """Return the centers (u, v) [px] of blobs below `min_area` [px^2] in the closed mask."""
     outer, _ = cv2.findContours(closed, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
     small = [np.asarray(c).reshape(-1, 2).mean(axis=0) for c in outer if cv2.contourArea(c) < min_area]
     return [(float(u), float(v)) for u, v in small]
 
 
-def middles(closed: Mask, min_area: float) -> list[tuple[tuple[float, float], Contour]]:
-    """Blobs of at least `min_area` [px^2] in the closed mask: the middle (u, v) [px] and the outer edge of each."""
+def blob_centers(closed: Mask, min_area: float) -> list[tuple[tuple[float, float], Contour]]:
+    """Return center (u, v) [px] and outer edge of blobs of at least `min_area` [px^2] in the closed mask."""
     outer, _ = cv2.findContours(closed, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     found = []
     for contour in outer:
@@ -133,16 +132,16 @@ def middles(closed: Mask, min_area: float) -> list[tuple[tuple[float, float], Co
     return found
 
 
-def long_ones(narrow: Mask, camera: Pinhole, plane: float, least: float) -> list[tuple[float, float]]:
-    """Where a mask of narrow things has one that is long: a pixel (u, v) on it, in the middle of its outline [px].
+def long_components(narrow: Mask, camera: Pinhole, plane: float, least: float) -> list[tuple[float, float]]:
+    """Return a central pixel (u, v) [px] of each long component in a mask of narrow regions.
 
     Args:
         narrow: the mask.
         camera: the camera.
-        plane: height at which its length is taken [m].
-        least: shorter ones are left out [m].
+        plane: height at which the length is measured [m].
+        least: shorter components are ignored [m].
     """
-    if cv2.countNonZero(narrow) > MOST_NARROW * narrow.size:  # specks all over, of which some are long by chance
+    if cv2.countNonZero(narrow) > MOST_NARROW * narrow.size:  # noise, of which some parts are long by chance
         return []
     outer, _ = cv2.findContours(narrow, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     long = [np.asarray(c).reshape(-1, 2).astype(float) for c in outer if max(cv2.boundingRect(c)[2:]) >= _LEAST_POINTS]
@@ -165,7 +164,7 @@ def _off_border(pixels: Array, camera: Pinhole) -> npt.NDArray[np.bool_]:
 
 
 def _outlines(blobs: Sequence[Sequence[Part]], camera: Pinhole) -> list[Outline]:
-    """One outline for each blob, of all its parts; the rays are computed for all of them at once."""
+    """Return one outline for each blob; the rays of all blobs are computed at once."""
     pixels, normals, sizes = [np.empty((0, 2))], [np.empty((0, 2))], []
     for parts in blobs:
         sizes.append(0)
@@ -186,18 +185,18 @@ def _outlines(blobs: Sequence[Sequence[Part]], camera: Pinhole) -> list[Outline]
 
 
 def _inward(contour: Contour, camera: Pinhole, *, is_hole: bool) -> tuple[Array, Array]:
-    """Points (n, 2) of a contour that are not at the border of the picture, and directions (n, 2) into the red [px]."""
+    """Return contour points (n, 2) off the image border, and directions (n, 2) into the red region [px]."""
     points = contour.reshape(-1, 2).astype(float)
     round_again = np.concatenate([points[-_REACH:], points, points[:_REACH]])
     along = round_again[2 * _REACH :] - round_again[: -2 * _REACH]
     turned = along[:, ::-1] * (-1.0, 1.0)
-    # Turning a quarter leads into the area that a contour with positive orientation encloses: for the edge of a hole
-    # that is the hole.
+    # A quarter turn points into the area enclosed by a contour with positive orientation: for the edge of a hole,
+    # the hole.
     if (cv2.contourArea(contour, oriented=True) > 0) == is_hole:
         turned = -turned
     keep = np.abs(turned).sum(axis=1) > 0
     clear = _off_border(points, camera)
-    if not clear.all():  # a direction taken across the border of the picture is not that of the outline
+    if not clear.all():  # a direction computed across the image border is not that of the outline
         keep &= clear & np.roll(clear, _REACH) & np.roll(clear, -_REACH)
     return points[keep], turned[keep]
 
@@ -207,7 +206,7 @@ Window = tuple[tuple[int, int, int], tuple[int, int, int]]  # lower and upper en
 Rectangle = tuple[slice, slice]  # rows and columns
 
 _SQUARE = np.ones((2, 2), np.uint8)
-_MOST = 0.5  # of a picture: where more has changed, all of it is looked at
+_MOST = 0.5  # fraction of the image; above it the complete image is processed
 
 
 @dataclass(frozen=True)
@@ -219,7 +218,7 @@ class Colours:
 
 
 class RedMasks(NamedTuple):
-    """What is red, 255 where it is: opened; then closed; and what is too narrow to outlive opening."""
+    """Red pixels (255) after opening, after closing as well, and those too narrow to remain after opening."""
 
     opened: Mask
     closed: Mask
@@ -230,25 +229,25 @@ class RedMasks(NamedTuple):
 class _Known:
     picture: Picture
     colours: Colours
-    gain: float  # of green, for the colour of the light
+    gain: float  # of green, to correct the color of the light
     table: BoolMask | None
     masks: RedMasks
 
 
 class Masks:
-    """Masks of one picture after the other: for each the same as if it were the first."""
+    """Masks of successive images; only changed parts are computed, with the same result."""
 
     def __init__(self) -> None:
-        """Nothing was seen yet."""
+        """Start without an image."""
         self._known: _Known | None = None
 
     def of(self, picture: Picture, colours: Colours, table: BoolMask | None = None) -> RedMasks:
-        """What is red in a bgr8 picture. The masks are not to be written to.
+        """Return what is red in a bgr8 image. The masks must not be written to.
 
         Args:
-            picture: the picture.
+            picture: the image.
             colours: what counts as red.
-            table: where it is shown, see `green_gain`: the very same array as long as it is there.
+            table: where the table is visible, see `green_gain`; pass the identical array while it stays the same.
         """
         known, part = self._known, None
         if known is not None and known.colours == colours and known.picture.shape == picture.shape:
@@ -260,7 +259,7 @@ class Masks:
             masks = _masks(amplify_green(picture, gain), colours)
             self._known = _Known(picture.copy(), colours, gain, table, masks)
             return masks
-        reach = 4 * (colours.kernel_px // 2) + 2  # of erosion and dilation, twice: so far a pixel acts on the masks
+        reach = 4 * (colours.kernel_px // 2) + 2  # range over which a pixel affects the masks
         inner, outer = _grown(part, reach, picture), _grown(part, 2 * reach, picture)
         masks = RedMasks(*(mask.copy() for mask in known.masks))
         known.picture[part] = picture[part]
@@ -274,7 +273,7 @@ class Masks:
 
 
 def changed(before: Picture, after: Picture) -> Rectangle | None:
-    """The rectangle in which two pictures of one shape differ; None where they do not."""
+    """Return the rectangle in which two images of the same shape differ; None if they are equal."""
     other = _words(before) != _words(after)
     rows = np.flatnonzero(other.any(axis=1))
     if not len(rows):
@@ -287,7 +286,7 @@ def changed(before: Picture, after: Picture) -> Rectangle | None:
 
 
 def _words(picture: Picture) -> npt.NDArray[np.unsignedinteger]:
-    """The rows of a picture as long words, which are compared sooner than bytes; their last axis is its width."""
+    """Return the rows of an image as 64-bit words, which compare faster than bytes."""
     flat = np.ascontiguousarray(picture).reshape(len(picture), -1)
     return flat.view(np.uint64) if flat.shape[1] % 8 == 0 else flat
 
@@ -312,6 +311,6 @@ def _masks(picture: Picture, colours: Colours) -> RedMasks:
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (colours.kernel_px, colours.kernel_px))
     opened = cv2.morphologyEx(red, cv2.MORPH_OPEN, kernel)
     closed = cv2.morphologyEx(opened, cv2.MORPH_CLOSE, kernel)
-    # Not the rim of what outlived, nor specks: noise has no squares of four pixels in a row.
+    # Exclude the rim of what remains, and noise: it has no 2x2 squares in a row.
     narrow = cv2.morphologyEx(cv2.subtract(red, cv2.dilate(opened, kernel)), cv2.MORPH_OPEN, _SQUARE)
     return RedMasks(*(np.asarray(mask, np.uint8) for mask in (opened, closed, narrow)))

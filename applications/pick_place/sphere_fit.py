@@ -1,4 +1,11 @@
-"""Fit spheres of known radius to outlines, and separate blobs that consist of several balls."""
+"""Fit spheres of known radius to outlines, and separate blobs that consist of several balls.
+
+The unknowns of a fit are the horizontal position of each sphere, whose height is known, and one common offset: a
+segmented outline lies a little inside or outside of the true one, by the same amount for every ball.
+
+To separate a blob, each point of its outline votes for the center of a sphere that it could belong to: known radius,
+inwards. The votes of one ball meet, also when others occlude or touch it.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +15,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from applications.pick_place.ball_places import Resting
+from applications.pick_place.ball_places import BallGeometry
 from applications.pick_place.segmentation import Mask, Outline
 from common.perception.pinhole import Pinhole
 from common.perception.sphere import ray_distances, silhouettes
@@ -17,15 +24,15 @@ Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.intp]
 BoolMask = npt.NDArray[np.bool_]
 
-_FACING = 0.6  # cosine between the inward normal of the outline and the direction to the centre
+_FACING = 0.6  # cosine between the inward normal of the outline and the direction to the center
 
 
 @dataclass(frozen=True)
 class Fit:
-    """Spheres and how well an outline supports them.
+    """Fitted spheres and their support by an outline.
 
     Attributes:
-        centers: (k, 3) relative to the optical centre [m].
+        centers: (k, 3) relative to the optical center [m].
         offset: of the outline from the silhouettes, positive outside [m].
         owner: (n,) index of the sphere that each point of the outline belongs to, -1 for none.
     """
@@ -37,29 +44,29 @@ class Fit:
 
 @dataclass(frozen=True)
 class _Misfit:
-    """Points against spheres: (n, k) arrays."""
+    """Distances between points and spheres: (n, k) arrays."""
 
-    beyond: Array  # outside of the silhouette [m]; infinite where the outline faces another way than the sphere would
-    distance: Array  # of the ray from the centre [m]
-    along: Array  # how far along the ray it passes the centre [m]
+    beyond: Array  # outside of the silhouette [m]; infinite where the outline faces another direction than the sphere
+    distance: Array  # of the ray from the center [m]
+    along: Array  # position along the ray closest to the center [m]
 
 
 def _compare(outline: Outline, centers: Array, radius: float) -> _Misfit:
     distance, along = ray_distances(outline.rays, centers)
-    # The rays are perpendicular to the inward normals, so this is the product with the direction to the centre.
+    # The rays are perpendicular to the inward normals, so this is the product with the direction to the center.
     facing = outline.inward @ centers.T > _FACING * distance
     return _Misfit(np.where(facing, distance - radius, np.inf), distance, along)
 
 
 def _gradients(outline: Outline, misfit: _Misfit, centers: Array, which: Index, owner: Index) -> Array:
-    """(m, 2) change of the distances of points from the silhouettes of their owners with the owners' x and y."""
+    """(m, 2) derivative of the points' distance from their owner's silhouette by the owner's x and y."""
     away = centers[owner, :2] - misfit.along[which, owner][:, None] * outline.rays[which, :2]
     gradients: Array = away / misfit.distance[which, owner][:, None]
     return gradients
 
 
 def near_points(outline: Outline, centers: Array, radius: float, gate: float) -> BoolMask:
-    """(n, k) which points of an outline lie within the gate [m] of the silhouettes of spheres and face as these do."""
+    """(n, k) outline points within the gate [m] of the spheres' silhouettes that face the same direction."""
     chosen: BoolMask = np.abs(_compare(outline, centers, radius).beyond) < gate
     return chosen
 
@@ -74,19 +81,19 @@ def fit_spheres(
     gates: tuple[float, ...] = (6e-3, 4e-3, 2.5e-3, 2.5e-3, 2e-3),
     point_std: float = 8e-4,
 ) -> Fit:
-    """Gauss-Newton on all spheres and the offset from first centres: one step for each gate.
+    """Fit all spheres and the offset by Gauss-Newton: one step for each gate.
 
-    In each step every point belongs to the sphere whose silhouette it is nearest to, if it lies within the gate.
+    In each step every point within the gate belongs to the sphere with the nearest silhouette.
 
     Args:
         outline: all edges of a blob.
-        centers: (k, 3) first guess relative to the optical centre [m]; heights are kept.
+        centers: (k, 3) initial values relative to the optical center [m]; heights stay.
         radius: of all spheres [m].
         offset: expected offset of the outline [m].
-        offset_std: how sure that is [m].
-        gates: how far off a point may be in each step [m].
-        point_std: how exact a point of the outline is [m]: what the expected offset is weighed against. Neighbouring
-            points err together, so this is twice the scatter that one sees.
+        offset_std: its standard deviation [m].
+        gates: largest distance of a point in each step [m].
+        point_std: standard deviation of a point [m], weighed against the expected offset. Errors of neighboring
+            points are correlated, so it is twice the visible scatter.
     """
     c = centers.astype(float)
     count, delta = len(c), offset
@@ -130,20 +137,20 @@ def fit_each(
     close: float,
     hold_offset: bool = False,
 ) -> tuple[Array, Array, Array]:
-    """Fit many spheres in one go, each to points of its own and with an offset of its own.
+    """Fit many independent spheres at once, each to its own points and with its own offset.
 
     Args:
-        outline: the points of all.
-        owner: (n,) index of the sphere that each point is fitted to, in ascending order, with one or more for each.
-        centers: (k, 3) first guesses relative to the optical centre [m]; heights are kept.
+        outline: points of all spheres.
+        owner: (n,) index of each point's sphere, ascending, with at least one point for each sphere.
+        centers: (k, 3) initial values relative to the optical center [m]; heights stay.
         radius: of all spheres [m].
-        offset: of the outline, to start from [m].
-        hold_offset: find the places only.
-        gates: how far off a point may be in each step [m].
-        close: how far off a point may be in the end [m].
+        offset: initial offset of the outline [m].
+        hold_offset: fit the positions only.
+        gates: largest distance of a point in each step [m].
+        close: largest distance of a fitting point at the end [m].
 
     Returns:
-        (k, 3) centres [m], (k,) offsets [m], (k,) the part of the points of each that is close.
+        (k, 3) centers [m], (k,) offsets [m], (k,) fraction of each sphere's points that fit.
     """
     sizes = np.bincount(owner, minlength=len(centers))
     starts = np.cumsum(sizes) - sizes
@@ -152,7 +159,7 @@ def fit_each(
     free = 2 if hold_offset else 3
 
     def compare() -> tuple[Array, Array, Array]:
-        """How far points are beyond their silhouette [m], and how their distance changes with its x and y."""
+        """Return the points' distance beyond their silhouettes [m], and its derivatives by x and y."""
         x, y, z = c.T[:, owner]
         along = rx * x + ry * y + rz * z
         distance = np.sqrt(np.maximum(x * x + y * y + z * z - along * along, 1e-18))
@@ -181,30 +188,30 @@ def fit_each(
     return c, delta, np.add.reduceat((np.abs(beyond) < close).astype(float), starts) / sizes
 
 
-_CELL = 0.003  # of the grid in which votes are counted [m]
-_LEAST_VOTES = 0.06  # at a peak, as part of the votes of a whole outline
-_LEAST_SUPPORT = 0.14  # part of a whole outline that a ball must show
-_NEAR = 2.0e-3  # a point this near to a silhouette belongs to it [m]
-_HIDDEN = 0.05  # part of a whole outline that shows of a ball though another one is before it, at most
-_COVERED = 0.85  # part of a ball's silhouette that must be red
-_MOST_GOING_ON = 0.45  # part of the surroundings of a ball that may be red for no known reason
+_CELL = 0.003  # grid in which votes are counted [m]
+_LEAST_VOTES = 0.06  # at a peak, as a fraction of the votes of a complete outline
+_LEAST_SUPPORT = 0.14  # visible fraction of a complete outline that a ball needs
+_NEAR = 2.0e-3  # a point closer to a silhouette than this belongs to it [m]
+_HIDDEN = 0.05  # largest visible fraction of the outline of an occluded ball
+_COVERED = 0.85  # fraction of a ball's silhouette that must be red
+_MOST_GOING_ON = 0.45  # fraction of a ball's surroundings that may be red without an explanation
 _MOST_CANDIDATES = 40
 
 
 @dataclass(frozen=True)
 class _Candidate:
-    center: Array  # (3,) relative to the optical centre [m]
+    center: Array  # (3,) relative to the optical center [m]
     points: BoolMask  # of the outline that belong to it
-    support: int  # how many these are
-    whole: float  # points that its whole outline has
+    support: int  # their number
+    whole: float  # number of points of its complete outline
 
 
-def separate(outline: Outline, mask: Mask, camera: Pinhole, resting: Resting, offset: float) -> Array:
-    """First guesses of the balls in a blob: (k, 3) centres relative to the optical centre [m].
+def separate(outline: Outline, mask: Mask, camera: Pinhole, resting: BallGeometry, offset: float) -> Array:
+    """Return initial values for the balls in a blob: (k, 3) centers relative to the optical center [m].
 
     Args:
         outline: of the blob.
-        mask: red pixels of the whole picture.
+        mask: red pixels of the complete image.
         camera: the camera.
         resting: radius and possible heights of the balls.
         offset: expected offset of the outline from the silhouettes [m].
@@ -233,8 +240,8 @@ def separate(outline: Outline, mask: Mask, camera: Pinhole, resting: Resting, of
     return kept
 
 
-def _votes(outline: Outline, camera: Pinhole, resting: Resting, offset: float) -> Array:
-    """(n, 2) where each point puts the centre, on the plane of the balls on the table [m], world."""
+def _votes(outline: Outline, camera: Pinhole, resting: BallGeometry, offset: float) -> Array:
+    """(n, 2) center that each point votes for, in the plane of ball centers on the table [m], world."""
     drop = resting.plane - camera.position[2]
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = np.abs(drop / outline.rays[:, 2])
@@ -248,8 +255,8 @@ def _votes(outline: Outline, camera: Pinhole, resting: Resting, offset: float) -
     return kept
 
 
-def _peaks(votes: Array, camera: Pinhole, resting: Resting) -> Array:
-    """(m, 2) places at which many votes meet, the most voted for first [m], world."""
+def _peaks(votes: Array, camera: Pinhole, resting: BallGeometry) -> Array:
+    """(m, 2) positions with many votes, the most voted for first [m], world."""
     if not len(votes):
         return np.empty((0, 2))
     low = votes.min(axis=0) - 3 * _CELL
@@ -259,7 +266,7 @@ def _peaks(votes: Array, camera: Pinhole, resting: Resting) -> Array:
         return np.empty((0, 2))
     counts = np.bincount(np.ravel_multi_index((cells[:, 0], cells[:, 1]), shape), minlength=int(shape.prod()))
     smooth = cv2.GaussianBlur(counts.reshape(shape).astype(np.float32), (7, 7), 1.2)
-    # A cell that holds all votes of a spread of one cell keeps about a tenth of them after smoothing.
+    # A cell with all votes, spread by one cell, keeps about a tenth of them after smoothing.
     least = 0.1 * _LEAST_VOTES * _whole_outline(camera, resting.radius, -float(resting.plane - camera.position[2]))
     highest = cv2.dilate(smooth, np.ones((5, 5), np.uint8))
     rows, columns = np.nonzero((smooth >= highest) & (smooth > least))
@@ -269,14 +276,14 @@ def _peaks(votes: Array, camera: Pinhole, resting: Resting) -> Array:
 
 
 def _whole_outline(camera: Pinhole, radius: float, distance: float) -> float:
-    """Points that the contour of a whole ball at a distance has: a circle takes 4 sqrt(2) steps for each radius."""
+    """Return the contour length of a complete ball at a distance [px]: a circle takes 4 sqrt(2) steps per radius."""
     return 5.66 * radius / max(distance, radius) * (camera.fx + camera.fy) / 2
 
 
 def _refined(
-    places: Array, outline: Outline, camera: Pinhole, resting: Resting, offset: float
+    places: Array, outline: Outline, camera: Pinhole, resting: BallGeometry, offset: float
 ) -> list[_Candidate]:
-    """Candidates near places (k, 2), each at the height that fits best; places that few points support give none."""
+    """Return candidates near positions (k, 2), each at the height that fits best, if enough points support it."""
     radius = resting.radius + offset
     starts, place_of = [], []
     for index, place in enumerate(places):
@@ -310,9 +317,9 @@ def _refined(
 
 
 def _clashes(candidate: _Candidate, chosen: list[_Candidate], outline: Outline, radius: float) -> bool:
-    """Whether a candidate is one of the chosen again, inside of one, or would hide what is seen of one, or one of it.
+    """Return whether a candidate equals or intersects a chosen one, or one would occlude visible edges of the other.
 
-    Solid balls on a table are apart.
+    Solid balls do not intersect.
     """
     for other in chosen:
         distance = float(np.linalg.norm(candidate.center - other.center))
@@ -326,21 +333,21 @@ def _clashes(candidate: _Candidate, chosen: list[_Candidate], outline: Outline, 
 
 
 def _is_before(upper: _Candidate, lower: _Candidate, outline: Outline, radius: float) -> bool:
-    """Whether one would hide edges that are seen of the other."""
+    """Return whether one would occlude visible edges of the other."""
     distance, _ = ray_distances(outline.rays[lower.points], upper.center[None])
     return bool(np.count_nonzero(distance < radius - 2 * _NEAR) > _HIDDEN * lower.whole)
 
 
 def _red_at(pixels: Array, mask: Mask, camera: Pinhole) -> tuple[BoolMask, BoolMask]:
-    """Which pixels are in the picture, and which of all are red in it; in the shape of the pixels, without (u, v)."""
+    """Return for pixels (..., 2) whether they are in the image, and whether they are red."""
     nearest = np.rint(np.where(np.isfinite(pixels), pixels, -1.0)).astype(int)
-    seen = np.asarray(camera.in_picture(nearest))
+    seen = np.asarray(camera.in_image(nearest))
     u, v = (np.where(seen, nearest[..., axis], 0) for axis in (0, 1))
     return seen, seen & (mask[v, u] > 0)
 
 
 def _are_red(centers: Array, mask: Mask, camera: Pinhole, radius: float) -> BoolMask:
-    """(k,) whether what balls there would cover of the picture is red."""
+    """(k,) whether the image is red where the balls would be."""
     places = centers + camera.position
     outlines, middles = silhouettes(camera, places, 0.82 * radius, 16), camera.project(places)[:, None]
     rings = [middles + part * (outlines - middles) for part in (0.25, 0.55, 0.8, 1.0)]
@@ -351,12 +358,12 @@ def _are_red(centers: Array, mask: Mask, camera: Pinhole, radius: float) -> Bool
 
 
 def _end(centers: Array, mask: Mask, camera: Pinhole, radius: float) -> BoolMask:
-    """(k,) whether balls end where they should: what is red around them is other balls. Larger things go on and on."""
+    """(k,) whether the balls end where they should: the red around them belongs to other balls."""
     rings = silhouettes(camera, centers + camera.position, 1.15 * radius, 32)
     _, red = _red_at(rings, mask, camera)
     distance, _ = ray_distances(camera.directions(rings.reshape(-1, 2)), centers)
     inside = (distance < 1.05 * radius).reshape(*rings.shape[:2], len(centers))
-    inside[np.arange(len(centers)), :, np.arange(len(centers))] = False  # itself explains nothing
+    inside[np.arange(len(centers)), :, np.arange(len(centers))] = False  # a ball does not explain its own surroundings
     going_on = red & ~inside.any(axis=2)
     good: BoolMask = np.count_nonzero(going_on, axis=1) <= _MOST_GOING_ON * rings.shape[1]
     return good

@@ -12,11 +12,11 @@ from common.messages.task import TaskStatus
 from common.topics import Topic
 
 TaskState = Literal["IDLE", "GRASPING", "PLACING", "HOMING", "DONE", "ERROR"]
-SEED_NAMES = {"placed": "done", "targets": "total", "target": "subject"}  # on the wire beside those of every task
+SEED_NAMES = {"placed": "done", "targets": "total", "target": "subject"}  # also on the wire
 
 
 class PickPlaceStatus(TaskStatus):
-    """State and counters of the pick-and-place task. `subject` is the track id of the object in work."""
+    """State and counters of the pick-and-place task. `subject` is the track id of the current object."""
 
     state: TaskState = "IDLE"
 
@@ -31,7 +31,7 @@ class PickPlaceStatus(TaskStatus):
     @computed_field  # type: ignore[prop-decorator]
     @property
     def placed(self) -> int:
-        """Objects that were put into the container."""
+        """Objects placed in the container."""
         return self.done
 
     @computed_field  # type: ignore[prop-decorator]
@@ -43,7 +43,7 @@ class PickPlaceStatus(TaskStatus):
     @computed_field  # type: ignore[prop-decorator]
     @property
     def target(self) -> str:
-        """Track id of the object in work."""
+        """Track id of the current object."""
         return self.subject
 
 
@@ -62,7 +62,7 @@ PICK_PLACE_STATUS = Topic("pick_place_status", PickPlaceStatus, "state",
 
 
 def scene_balls(truth: m.WorldObjects) -> m.PoseArray:
-    """The spheres of the simulated world, with their states as labels: what lies in a container is in the box."""
+    """Return the spheres of the simulated world with their states as labels; "box" for those in a container."""
     balls = [thing for thing in truth.objects if thing.shape == "sphere"]
     return m.PoseArray(
         header=truth.header, poses=[m.Pose(position=ball.pose.position) for ball in balls],

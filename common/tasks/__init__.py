@@ -1,1 +1,1 @@
-"""The engine of every task: rows of stages, planning ahead, watching, hold and stop, failure, restart."""
+"""Engine of every task: a queue of stages, planned ahead, monitored, and decided again after a failure or restart."""

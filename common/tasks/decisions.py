@@ -1,6 +1,6 @@
-"""What a task decides, with the usual answer to each question; `common/tasks/engine.py` does what was decided.
+"""What a task decides: hooks with defaults, and helpers for them. `common/tasks/engine.py` executes the decisions.
 
-A task of one's own says in `decide` what comes next, and of the rest only what is different in it.
+A task of the user implements `decide` and overrides other hooks only where it differs.
 """
 
 from __future__ import annotations
@@ -14,20 +14,20 @@ from pydantic import BaseModel, Field
 from common import messages as m
 from common.config import GripperConfig, Parameters, RobotConfig, Run, Tunable
 from common.errors import ConfigError
-from common.tasks.stages import Command, Execution, Grip, Look, Move, Stage, View
-from common.tasks.watchdogs import FrameAge, Patience
+from common.tasks.stages import AwaitImage, Command, Execution, Grip, Move, Stage, View
+from common.tasks.watchdogs import DwellTimer, ImageAge
 
 V = TypeVar("V", bound=View)
 
 MOST_FAILURES = 10
-PAUSE, LONGEST_PAUSE = 0.25, 2.0  # [s] after the second failure in a row, doubled with each more, and at most
-OVERTIME = 30.0  # [s] a motion that takes so much longer than planned is stopped
+PAUSE, LONGEST_PAUSE = 0.25, 2.0  # [s] after the second failure in a row; doubled with each further one
+OVERTIME = 30.0  # [s] a motion that takes this much longer than planned is stopped
 RETREAT = 0.1  # [m] upwards
-MOVED = 0.005  # [m] what stands this far from where anything stood before is new there
+MOVED = 0.005  # [m] an object farther than this from every earlier one is new
 
 
 class TaskConfig(Parameters):
-    """What every task needs; times are cell time unless they say wall. A task adds parameters and sections."""
+    """Parameters of every task; times are cell time unless they say wall. A task adds parameters and sections."""
 
     robot: RobotConfig
     run: Run
@@ -47,17 +47,17 @@ class TaskConfig(Parameters):
     )
 
 
-class Deciding(Generic[V]):
-    """What a task says, what it decides, and what helps it to: `decide` is its own, all else has a default."""
+class TaskDecisions(Generic[V]):
+    """Hooks and helpers of a task. Only `decide` has no default."""
 
     p: TaskConfig
     status: m.TaskStatus
 
     def __init_subclass__(cls, **given: object) -> None:
-        """Refuse a method that would take the place of one that is not meant for it.
+        """Reject a private method that would override one of the engine.
 
         Raises:
-            TypeError: names it.
+            TypeError: names the method.
         """
         super().__init_subclass__(**given)
         for base in cls.__mro__[1:]:
@@ -68,49 +68,49 @@ class Deciding(Generic[V]):
                                         "choose another")
 
     def __init__(self, config: TaskConfig, status: m.TaskStatus, prefix: str, speed: float = 1.0) -> None:
-        """Start from nothing known.
+        """Start with nothing known.
 
         Args:
-            config: read where it is used: it may change meanwhile.
-            status: an empty one.
-            prefix: begins every id that is minted here; unlike that of any other process.
-            speed: cell time that passes per wall time.
+            config: parameters; read where they are used, since they may change at runtime.
+            status: an empty status.
+            prefix: start of every id that this task creates; unique per process.
+            speed: cell time per wall time.
         """
         self.p, self.status, self.prefix, self.speed = config, status, prefix, speed
         self.status.started = config.run.autostart
-        self.row: deque[Stage] = deque()
+        self.queue: deque[Stage] = deque()
         self.running: Execution | None = None
-        self._opening: Execution | None = None  # what was let go is free of the fingers, which open on
-        self._shut = False  # fingers that closed about nothing ahead of the arm have to be opened before what is next
-        self._early: Execution | None = None  # of the fingers, which wait for the motion that runs to be nearly over
-        self._held_up = False  # the arm was as fingers closed early: the next ones close once it stands
-        self.patience = Patience()
-        self.look_after = 0.0  # only a picture that is later decides [s]
-        self._frames = FrameAge(speed)
+        self._opening: Execution | None = None  # gripper command whose object is released while the fingers still open
+        self._shut = False  # fingers closed on nothing before the arm arrived: open them before the next decision
+        self._early: Execution | None = None  # gripper command that waits for the end of the running motion
+        self._held_up = False  # the arm was stopped by fingers that closed early: the next ones close at standstill
+        self.wait_timer = DwellTimer()
+        self.images_after = 0.0  # only a later image may decide [s]
+        self._frames = ImageAge(speed)
         self._planning: tuple[Move, str] | None = None
-        self._in_the_way = Patience()
+        self._in_the_way = DwellTimer()
         self._stopping = False
-        self._found = False  # whether the robot was looked at, or a person has said what to do
+        self._found = False  # whether the robot state was read, or an operator sent a command
         self._began: float | None = None
         self._minted = 0
         self._failures_in_a_row = self._done_before = 0
-        self._again_at = -math.inf  # not before this is anything tried after failures [s]
+        self._again_at = -math.inf  # no new attempt before this time [s]
 
-    # --- what a task decides ---------------------------------------------------------------------------------
+    # --- hooks -----------------------------------------------------------------------------------------------
 
     def decide(self, view: V) -> None:
-        """With nothing under way: append what comes next to `row`, or say in `status.state` that it is DONE."""
+        """Append the next stages to `queue`, or set `status.state` to DONE; called while nothing runs."""
         raise NotImplementedError
 
     def decide_ahead(self, running: Stage, view: V) -> None:
-        """While a stage runs: append what is to follow, so that it is planned meanwhile."""
+        """Append stages that follow the running one, so that they are planned meanwhile."""
 
     def note(self, view: V) -> None:
-        """With each step: bring the counters of the status up to date."""
+        """Update the counters of the status; called in each step."""
 
-    def may_begin(self, stage: Stage, view: V) -> bool:
-        """Whether a stage that is planned may begin now; if not, it waits, or `clear` has thrown the row away."""
-        if not isinstance(stage, Move) or not stage.fresh:
+    def may_start(self, stage: Stage, view: V) -> bool:
+        """Return whether a planned stage may start now; else it waits, or `clear` has emptied the queue."""
+        if not isinstance(stage, Move) or not stage.needs_fresh_image:
             return True
         waits = f"{stage.name} waits"
         if unseen := self.unseen(view):
@@ -121,82 +121,82 @@ class Deciding(Generic[V]):
         return True
 
     def outdated(self, stage: Stage, view: V) -> str:
-        """Why what runs makes no sense any more: the arm is stopped then, and all decided anew. Empty while it does."""
+        """Return why the running motion has no purpose any more; the arm is stopped then. Empty: it has."""
         return ""
 
     def planned(self, move: Move, response: m.PlanResponse) -> None:
-        """Take note of the answer to a plan request, good or bad."""
+        """Handle the answer to a plan request, successful or not."""
 
     def succeeded(self, stage: Stage, view: V) -> None:
-        """Take note of what a stage has done."""
+        """Handle the success of a stage."""
 
     def missed(self, stage: Grip, view: V) -> None:
-        """The fingers closed on nothing, or on what is not as wide as expected: open, back off and look again."""
+        """Handle a grasp that closed on nothing or on an unexpected width: open, back off and look again."""
         self.status.retries += 1
         self.fail(f"{stage.name}: {stage.problem}", view, go_home=False)
         if self.status.state != "ERROR":
-            self.row += [Grip("open", stage.state, width=self.gripper.max_width), *self.back_off(view.let_go())]
+            self.queue += [Grip("open", stage.state, width=self.gripper.max_width), *self.back_off(view.let_go())]
 
     def forgotten(self, stage: Stage, view: V) -> None:
-        """A controller that was started again knows nothing of a stage that it had begun."""
+        """Handle a restarted controller that no longer knows the stage it had started."""
         self.fail(f"{stage.name} was forgotten by the controller", view)
 
     def displaced(self, stage: Stage, view: V, problem: str) -> None:
-        """The robot is not where the plan began: by hand, or by a controller that has forgotten how it got there."""
-        self.fail(problem, view, go_home=False)  # all it needs is a new plan
+        """Handle a robot that is not where the plan starts: moved by hand, or its controller was restarted."""
+        self.fail(problem, view, go_home=False)  # it only needs a new plan
 
     def obstructed(self, stage: Stage, view: V, problem: str) -> None:
-        """Something came in the way of a motion and stays there: what is held is brought on around it."""
+        """Handle an obstacle that stays on the path: a held object is carried around it."""
         self.fail(problem, view, go_home=not view.holding)
 
     def plan_failed(self, move: Move, response: m.PlanResponse, view: V) -> None:
-        """There is no way: free the arm from what it stands against, or go home and decide anew."""
-        if self.stands_against(move, response):
+        """Handle a motion without a plan: free the arm from a contact, or go home and decide again."""
+        if self.starts_in_contact(move, response):
             self.fail(response.message, view, go_home=False)
             if self.status.state != "ERROR":
-                self.row += self.back_off(view, response.colliding)
+                self.queue += self.back_off(view, response.colliding)
         else:
-            # What runs is sound; what was to follow is decided anew when it has ended.
+            # The running stage is still valid; what follows is decided again when it has ended.
             self.fail(response.message, view, go_home=self.running is None and move.name != "home")
 
     def fail(self, message: str, view: V, *, go_home: bool = True) -> None:
-        """Count a failure, throw the row away and, where it helps, go home to look again."""
-        go_home = go_home and self._early is None  # what the fingers began ends first
+        """Count a failure, clear the queue and, where it helps, go home to look again."""
+        go_home = go_home and self._early is None  # a started gripper command ends first
         self.clear()
-        self.look_after = view.now
+        self.images_after = view.now
         self.status.message = message
         self.status.failures += 1
         self._failures_in_a_row += 1
-        if self._failures_in_a_row >= self.most_failures:
+        if self._failures_in_a_row >= self.failure_limit:
             self.status.state = "ERROR"
             self.status.message = f"{message}; that makes {self._failures_in_a_row} failures in a row"
         elif go_home:
-            self.row += [self.home(view), Look()]
-        if self._failures_in_a_row > 1:  # what is known may be older than the world: let it come
+            self.queue += [self.home(view), AwaitImage()]
+        if self._failures_in_a_row > 1:  # the known scene may be outdated: wait for a new one
             self._again_at = view.now + min(PAUSE * 2 ** (self._failures_in_a_row - 2), LONGEST_PAUSE)
 
-    def began_anew(self) -> None:
-        """A person has started it once more after its end."""
+    def on_restart(self) -> None:
+        """Handle a start by the operator after DONE or ERROR."""
 
     @property
     def memory(self) -> BaseModel | None:
-        """What cannot be seen or felt again and is to outlive a restart: replaced by another when it changes."""
+        """State that camera and gripper cannot restore after a restart; replaced by a new object when it changes."""
         return None
 
     def remember(self, memory: BaseModel) -> None:
-        """Go on from the memory that the task had before it was started again."""
+        """Continue from the memory of the task before its restart."""
         raise NotImplementedError
 
     def home(self, view: V) -> Move:
-        """To the pose from which everything is seen, with whatever is held."""
+        """Return the motion to the home pose, from which the cameras see everything, with a held object."""
         return Move("home", "HOMING", goal=m.JointGoal(named="home"), carries=view.holding)
 
     def back_off(self, view: V, contact: tuple[str, str] | None = None) -> list[Stage]:
-        """Away from where the hand is, whatever it touches there, to where everything is seen."""
-        return [self.retreat(view, contact), self.home(view), Look()]
+        """Return the stages that lead from the current pose, contacts allowed, to the home pose, and look again."""
+        return [self.retreat(view, contact), self.home(view), AwaitImage()]
 
     def retreat(self, view: V, contact: tuple[str, str] | None = None, height: float = RETREAT) -> Move:
-        """Straight up from where the tool is, whatever the hand touches there now."""
+        """Return a motion straight up from the tool's position; the gripper may touch objects that it touches now."""
         assert view.tcp is not None
         at = view.tcp.position
         pose = view.tcp.model_copy(update={"position": m.Vector3(x=at.x, y=at.y, z=at.z + height)})
@@ -205,42 +205,42 @@ class Deciding(Generic[V]):
                     touches=[*touches, *([contact] if contact else [])])
 
     def obstacles(self, move: Move, view: V) -> list[tuple[float, float]]:
-        """(x, y) [m] of what stood in the way when a motion was planned; another one there has it planned anew."""
+        """(x, y) [m] of the objects that matter for a motion; a new one has it planned again."""
         subject = move.cycle.subject if move.cycle else ""
         return [(o.pose.position.x, o.pose.position.y) for o in view.objects("target") if o.id != subject]
 
     def request(self, move: Move, start: list[float], view: V) -> m.PlanRequest:
-        """What is asked of the planner for a motion; an empty `start` is where the robot is."""
+        """Return the plan request of a motion; an empty `start` means the current joint positions."""
         return m.PlanRequest(
-            id=self.mint(), stage=move.name, start=start, goal=move.goal, straight=move.straight,
+            id=self.new_id(), stage=move.name, start=start, goal=move.goal, straight=move.straight,
             allowed_collisions=move.touches, attach=move.attach or view.attached if move.carries else "",
             attach_pose=move.attach_pose, release=not move.carries, planning_time=self.p.planning_time,
         )
 
     def time_limit(self, stage: Stage) -> float:
-        """A stage that takes longer is stopped [s]."""
+        """Time after which a stage is stopped [s]."""
         return OVERTIME + (stage.seconds if isinstance(stage, Move) else 0.0)
 
     @property
-    def most_failures(self) -> int:
-        """So many in a row, and it gives up."""
+    def failure_limit(self) -> int:
+        """Number of failures in a row after which the task gives up."""
         return MOST_FAILURES
 
     @property
     def moved(self) -> float:
-        """What stands this far from where anything stood before is new there [m]."""
+        """Distance from every earlier object at which an object is new [m]."""
         return MOVED
 
-    # --- what helps to decide --------------------------------------------------------------------------------
+    # --- helpers ---------------------------------------------------------------------------------------------
 
     @property
-    def under_way(self) -> list[Stage]:
-        """What arm and fingers do: of fingers that begin before the arm stands the status tells once it does."""
-        return [one.stage for one in (self.running, self._early) if one is not None and one.begun]
+    def active_stages(self) -> list[Stage]:
+        """Stages of arm and gripper that have started; an early gripper command counts once it moves."""
+        return [one.stage for one in (self.running, self._early) if one is not None and one.started]
 
     @property
-    def waits_for_the_arm(self) -> str:
-        """Name of the stage of fingers that were asked to begin before the arm stands; they may have, untold."""
+    def deferred_grip(self) -> str:
+        """Name of the gripper stage that was sent before the arm is at standstill; it may have started. Empty: none."""
         return self._early.stage.name if self._early is not None else ""
 
     @property
@@ -248,48 +248,48 @@ class Deciding(Generic[V]):
         """The robot's gripper.
 
         Raises:
-            ConfigError: it has none.
+            ConfigError: the robot has none.
         """
         if self.p.robot.gripper is None:
             raise ConfigError("robot.gripper", ..., "is missing: the task needs a robot with one")
         return self.p.robot.gripper
 
     def unseen(self, view: V) -> str:
-        """Why the newest picture cannot be decided by; empty when it can."""
+        """Return why the newest image cannot be used to decide; empty when it can."""
         return self._frames.problem(view.now, view.stamps, self.p.frame_timeout, self.p.clock_tolerance)
 
-    def sees(self, view: V) -> bool:
-        """Whether there is a picture to decide by, which is later than what was done since; else the status says so."""
+    def has_fresh_image(self, view: V) -> bool:
+        """Return whether a usable image is newer than `images_after`; the status reports an unusable one."""
         if unseen := self.unseen(view):
             self.status.message = unseen
-        return not unseen and min(view.stamps) > self.look_after
+        return not unseen and min(view.stamps) > self.images_after
 
-    def stands_against(self, move: Move, response: m.PlanResponse) -> bool:
-        """Whether a plan failed because the arm touches something where it stands, from which a retreat may free it."""
+    def starts_in_contact(self, move: Move, response: m.PlanResponse) -> bool:
+        """Return whether a plan failed because the arm touches something at its start; a retreat may free it."""
         collides = response.error == "start_in_collision" and response.colliding is not None
         return collides and self.running is None and move.name != "retreat"
 
     def end(self, state: Literal["DONE", "ERROR"], message: str = "") -> None:
-        """That is the end, until a person starts it once more."""
+        """End the task until an operator starts it again."""
         self.clear()
         self.status.state, self.status.stage, self.status.message = state, "", message
 
     def clear(self) -> None:
-        """Throw the row away; what runs goes on."""
-        self.row.clear()
+        """Empty the queue; the running stage continues."""
+        self.queue.clear()
         self._planning = None
 
     def stop(self, view: V, reason: str, by: Literal["operator", "requester"] = "requester") -> list[Command]:
-        """Throw the row away and bring the arm to rest; fingers finish what they began."""
+        """Empty the queue and stop the arm; a started gripper command continues."""
         self.clear()
-        self.look_after = view.now
+        self.images_after = view.now
         if self.running is None or not self.running.moves_arm:
             return []
         running, self.running, self._stopping = self.running, None, True
         self.status.moving_seconds += running.moving
         return [m.StopRequest(id=running.command.id, reason=reason, by=by)]
 
-    def mint(self) -> str:
-        """An id that nobody else has."""
+    def new_id(self) -> str:
+        """Return a new unique id."""
         self._minted += 1
         return f"{self.prefix}-{self._minted}"

@@ -1,11 +1,10 @@
-"""The task engine: what is known goes in, requests for motion come out. A task of one's own only decides.
+"""The task engine: takes what is known, returns requests for motion. A task of the user only decides.
 
-One row of stages is worked off from the left. Motions further right are planned while the one on the left runs, each
-from where the one before it ends. When reality differs from the plan (the fingers closed on nothing, what was held
-fell, the scene changed, a controller refused) the rest of the row is thrown away and decided anew from what is seen
-and held, which is also how a task carries on after it was started again in the middle of a run.
+The engine works through one queue of stages. It plans later motions while the first stage runs, each from the end of
+the motion before. When reality differs from the plan (empty grasp, lost object, changed scene, rejected command) it
+clears the queue, and the task decides again from what is seen and held. A restarted task continues the same way.
 
-The engine has no clock and no network: it is fed with `step`, `command` and the `on_...` methods.
+The engine has no clock and no network: `step`, `command` and the `on_...` methods feed it.
 """
 
 from __future__ import annotations
@@ -15,36 +14,36 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 from common import messages as m
-from common.tasks.decisions import Deciding, V
-from common.tasks.stages import MISSES, Command, Execution, Grip, Look, Move, Report, Stage
+from common.tasks.decisions import TaskDecisions, V
+from common.tasks.stages import MISSES, AwaitImage, Command, Execution, Grip, Move, Report, Stage
 
-# Refusals that have nothing to do with the motion.
+# Rejections that say nothing about the motion itself: the task decides again.
 ANEW = ("busy", "stale_request", "clock_ahead", "stopped", "not_owner")
 START = ": start to go on"
-BLOCKED_BY = "scene_monitor"  # holds the arm while something is in the way
+BLOCKED_BY = "scene_monitor"  # source of the hold while an obstacle blocks the path
 NO_ARM = "the arm cannot be moved: "
 FOUND_HELD = "the robot was found held; resume or start to go on"
-FINGERS_OFF = 0.003  # [m] by which fingers may stand elsewhere than a motion was planned with
-LOOSE = 0.5e-3  # [m] by which fingers must have opened before they hold nothing any more
-AHEAD = 1.0  # [s] before the end of a motion fingers are asked to wait for it: until then the row may change
-CLOSE_WITHIN = 0.05  # [m] of it they may begin to close: they touch nothing before it
-OPENED_BY = 0.5  # of a motion that began while the fingers opened: then they have
-MOST_FIGURES = 200  # plans that a status tells of: a cell may run for days
+FINGERS_OFF = 0.003  # [m] tolerated difference between the finger width now and the one of the plan
+LOOSE = 0.5e-3  # [m] opening after which the fingers hold nothing any more
+AHEAD = 1.0  # [s] before the end of a motion: earliest time to send a gripper command that waits for it
+CLOSE_WITHIN = 0.05  # [m] from the end of the motion the fingers may start to close, touching nothing
+OPENED_BY = 0.5  # progress of a motion at which fingers that open during it must have opened
+MOST_FIGURES = 200  # plans kept in a status: a cell may run for days
 
 
-class Task(Deciding[V]):
-    """State machine of a task. Override `decide`, and of the rest what is different in yours.
+class Task(TaskDecisions[V]):
+    """State machine of a task. Implement `decide`; override other hooks where the task differs.
 
-    What it may use: `row`, to which `decide` appends stages; `running`, what is under way; `status`; `patience`, for
-    what it waits for; and all of `Deciding`.
+    A task uses `queue` (to which `decide` appends stages), `running` (the running stage), `status`, `wait_timer` (time
+    spent waiting) and all of `TaskDecisions`.
     """
 
-    # --- what a person says ----------------------------------------------------------------------------------
+    # --- commands of the operator ----------------------------------------------------------------------------
 
     def command(self, command: str, view: V) -> list[Command]:
-        """Start, pause, resume or stop: a pause holds the arm on its path, from which it goes on; a stop ends that."""
+        """Start, pause, resume or stop. A pause holds the arm on its path; a stop ends the motion."""
         status = self.status
-        self.patience.reset()
+        self.wait_timer.reset()
         self._found = True
         if command == "pause":
             status.paused = True
@@ -56,7 +55,7 @@ class Task(Deciding[V]):
                 status.state, status.message = "IDLE", ""
                 self._began, self._failures_in_a_row = None, 0
                 self._again_at = -math.inf
-                self.began_anew()
+                self.on_restart()
             return [m.HoldRequest(hold=False, reason=reason, stops=command == "start")]
         status.paused = status.started = False
         return self.stop(view, reason, "operator") or [m.StopRequest(reason=reason)]
@@ -64,25 +63,25 @@ class Task(Deciding[V]):
     # --- answers ---------------------------------------------------------------------------------------------
 
     def on_plan(self, response: m.PlanResponse, view: V) -> None:
-        """Take in the answer to a plan request."""
+        """Handle the answer to a plan request."""
         if self._planning is None or self._planning[1] != response.id:
-            return  # of a row that was thrown away meanwhile
+            return  # a plan for a cleared queue
         move, _ = self._planning
         self._planning = None
         self._note_plan(response)
         self.planned(move, response)
         if response.ok and response.trajectory is not None and response.trajectory.points:
             move.trajectory, move.plan, move.scene_stamp = response.trajectory, response.id, response.scene_stamp
-        elif move.otherwise and move in self.row and not response.error.startswith("start_"):
-            at = self.row.index(move)
-            self.row.remove(move)
-            for stage in reversed(move.otherwise):
-                self.row.insert(at, stage)
+        elif move.fallback and move in self.queue and not response.error.startswith("start_"):
+            at = self.queue.index(move)
+            self.queue.remove(move)
+            for stage in reversed(move.fallback):
+                self.queue.insert(at, stage)
         else:
             self.plan_failed(move, response, view)
 
     def _note_plan(self, response: m.PlanResponse) -> None:
-        """Count it in the figures: its time always, its planner when it brought a trajectory."""
+        """Record its time, and its planner when it returned a trajectory."""
         self.status.planning_seconds += response.seconds
         if response.ok and response.trajectory is not None:
             self.status.plans.append(m.PlanFigure(
@@ -92,19 +91,19 @@ class Task(Deciding[V]):
             del self.status.plans[:-MOST_FIGURES]
 
     def on_goal(self, answer: Report, view: V) -> None:
-        """Take in the answer to execute or to a gripper command: accepted, or refused with a reason."""
+        """Handle the answer to an execute or gripper request: accepted, or rejected with a reason."""
         begun = next((one for one in (self.running, self._early) if one and one.command.id == answer.id), None)
         if begun is None or begun.accept(answer):
             return
         stage = begun.stage
-        if begun is self._early:  # then not before the arm is there
+        if begun is self._early:  # then send it when the arm is at rest
             assert isinstance(stage, Grip)
             self._early, stage.early = None, False
             if self.running is not None:
-                self.row.appendleft(stage)
+                self.queue.appendleft(stage)
             return
         self.running = None
-        # What somebody else asked for, or that it came too late, is no failure: it is decided anew.
+        # Rejected because of another client or a late request, not because of the motion: no failure.
         if answer.error in ANEW:
             self._decide_anew(f"{stage.name} has to wait: {answer.message}", view)
             return
@@ -117,7 +116,7 @@ class Task(Deciding[V]):
     # --- the step --------------------------------------------------------------------------------------------
 
     def step(self, view: V) -> list[Command]:
-        """What to ask for now, given what is known."""
+        """Return the requests to send now."""
         status = self.status
         if view.missing:
             status.message = f"waiting for {', '.join(view.missing)}"
@@ -127,13 +126,13 @@ class Task(Deciding[V]):
             self._found, status.paused = True, view.motion.paused
             if view.motion.paused:
                 status.message = FOUND_HELD + "".join(f"; {one.description}" for one in view.motion.interlocks)
-            if view.motion.stopped:  # by a person, whom no restart makes a liar of
+            if view.motion.stopped:  # an operator stopped it: a restart must not undo that
                 status.started = status.paused = False
         self._tell_stopped(view.motion.stopped)
         if self._began is None and status.started:
             self._began = view.now
         if self._early is not None and view.gripper.id == self._early.command.id:
-            self._early.begun = self._early.begun or view.gripper.state != "cancelled"
+            self._early.started = self._early.started or view.gripper.state != "cancelled"
         commands = self._watch(view)
         self._stopping = self._stopping and view.motion.state == "active"
         if view.motion.fault and not commands and self.running is None:
@@ -144,15 +143,15 @@ class Task(Deciding[V]):
         if waits or view.motion.stopped or commands or self._stopping or view.now < self._again_at:
             self._count(view)
             return commands
-        while self.running is None and self.row and isinstance(self.row[0], Look):
-            self.row.popleft()
-            self.look_after = view.now
+        while self.running is None and self.queue and isinstance(self.queue[0], AwaitImage):
+            self.queue.popleft()
+            self.images_after = view.now
         if self.running is not None:
             self.decide_ahead(self.running.stage, view)
-        elif not (self.row or self._early or view.motion.state == "active" or view.gripper.moving):
-            shut, self._shut = self._shut, False  # not before what a task before this one began has ended
+        elif not (self.queue or self._early or view.motion.state == "active" or view.gripper.moving):
+            shut, self._shut = self._shut, False  # not before the gripper command of an earlier task process has ended
             if shut and not view.holding:
-                self.row.append(Grip("open", status.state, width=self.gripper.max_width))
+                self.queue.append(Grip("open", status.state, width=self.gripper.max_width))
             else:
                 self.decide(view)
         if status.state not in ("DONE", "ERROR"):
@@ -173,18 +172,18 @@ class Task(Deciding[V]):
             self.status.message = ""
 
     def _watch(self, view: V) -> list[Command]:
-        """Follow the stage that runs: its end, its failure, and what falls out of the hand."""
+        """Monitor the running stage: its end, its failure, and the loss of a held object."""
         if self.running is None:
             self._watch_early(view)
             return self._watch_opening(view)
         assert view.motion is not None and view.gripper is not None
         running, stage = self.running, self.running.stage
         running.count(view.now, view.motion)
-        if self._early is not None:  # what they wait is no time of theirs
+        if self._early is not None:  # waiting does not count against its time limit
             self._early.counted = view.now
         outcome = running.outcome(view.motion, view.gripper)
         limit = self.time_limit(stage)
-        if running.let_go(view.gripper):  # the arm may leave while they open on
+        if running.let_go(view.gripper):  # the arm may leave while the fingers continue to open
             self.running, self._opening = None, running
             self.status.moving_seconds += running.moving
             self.succeeded(stage, view)
@@ -194,10 +193,10 @@ class Task(Deciding[V]):
             self._ended(stage, running.report(view.motion, view.gripper), view)
         elif outcome == "forgotten":
             self.running = None
-            if self._early is not None and isinstance(self._early.stage, Grip):  # where it is let go nobody knows
+            if self._early is not None and isinstance(self._early.stage, Grip):  # the release position is unknown now
                 self._early = replace(self._early, stage=replace(self._early.stage, holds=None))
             self.forgotten(stage, view)
-        elif running.moves_arm and stage.carries and not view.holding and not (self._early and self._early.begun):
+        elif running.moves_arm and stage.carries and not view.holding and not (self._early and self._early.started):
             stop = self.stop(view, "what it held fell")
             slipped = f": {view.gripper.message}" if view.gripper.outcome == "slipping" else ""
             self.fail(f"what the hand held fell during {stage.name}{slipped}", view, go_home=False)
@@ -214,24 +213,24 @@ class Task(Deciding[V]):
             stop = self.stop(view, blocked)
             self.obstructed(stage, view, f"{stage.name}: {blocked}")
             return stop
-        elif stage.carries and view.gripper.outcome == "slipping":  # it may still arrive
+        elif stage.carries and view.gripper.outcome == "slipping":  # the object may still arrive
             self.status.message = f"{stage.name}: {view.gripper.message}"
         return self._watch_opening(view)
 
     def _watch_early(self, view: V) -> None:
-        """Follow fingers whose arm did not arrive: what they let go is, and what they hold is decided about anew."""
+        """Monitor a gripper command whose motion ended without success: a release counts, a grasp is decided again."""
         if (early := self._early) is None:
             return
         assert view.motion is not None and view.gripper is not None
         early.count(view.now, view.motion)
-        if view.motion.state == "active":  # it comes to rest
+        if view.motion.state == "active":  # until it is at standstill
             return
         if view.motion.id == getattr(early.command, "after", ""):
             early.wait_no_more(view.motion, view.gripper)
         outcome = early.outcome(view.motion, view.gripper)
         if outcome == "running" and early.spent <= self.time_limit(early.stage):
             return
-        self._early, self.look_after = None, view.now
+        self._early, self.images_after = None, view.now
         stage, reported = early.stage, early.report(view.motion, view.gripper)
         if outcome != "ended" or not isinstance(stage, Grip):
             return
@@ -243,7 +242,7 @@ class Task(Deciding[V]):
             self.fail(f"{stage.name} {reported.state}: {reported.message}", view)
 
     def _watch_opening(self, view: V) -> list[Command]:
-        """Follow fingers that open while the arm leaves already; one that they would not let through is stopped."""
+        """Monitor fingers that open while the arm already leaves; stop the arm if they do not open in time."""
         opening, running = self._opening, self.running
         if opening is None:
             return []
@@ -256,11 +255,11 @@ class Task(Deciding[V]):
             why = "the fingers have not opened yet"
         else:
             self._opening, why = None, f"the fingers did not open: {view.gripper.message}"
-        if state in ("succeeded", "cancelled"):  # by whom the fingers were told something else, that one answers for it
+        if state in ("succeeded", "cancelled"):  # whoever commanded the gripper since then handles the result
             return []
         stop = self.stop(view, why)
         self._opening = None
-        if state == "active" and self.running is None:  # as a stage of its own, which takes as long as one may
+        if state == "active" and self.running is None:  # continue as an open stage with its full time limit
             assert isinstance(opening.stage, Grip)
             self.running = replace(opening, stage=Grip("open", opening.stage.state, width=opening.stage.width))
             self.status.message = why
@@ -269,35 +268,35 @@ class Task(Deciding[V]):
         return stop
 
     def _blocked(self, view: V) -> str:
-        """What stays in the way of the motion that runs; empty while nothing does, or it may still go away."""
+        """Return what blocks the running motion for longer than `obstacle_patience`; empty for nothing."""
         assert view.motion is not None and self.running is not None
         ours = view.motion.id == self.running.command.id and view.motion.state == "active"
         held = [one.reason for one in view.motion.interlocks if one.by == BLOCKED_BY and one.kind == "held"]
         if not held or not ours or view.trouble or view.motion.paused or self.status.paused:
             self._in_the_way.reset()
             return ""
-        return held[0] if self._in_the_way.lasts("in the way", view.now) >= self.p.obstacle_patience else ""
+        return held[0] if self._in_the_way.elapsed("in the way", view.now) >= self.p.obstacle_patience else ""
 
     def _decide_anew(self, message: str, view: V) -> None:
         self.clear()
-        self.look_after = view.now
+        self.images_after = view.now
         self.status.message = message
 
     def _ended(self, stage: Stage, reported: Report, view: V) -> None:
         holds = stage.holds if isinstance(stage, Grip) else None
         if reported.state == "cancelled" and isinstance(stage, Move):
             self.clear()
-            if view.motion is not None and view.motion.stopped:  # by a person who did not reach us
+            if view.motion is not None and view.motion.stopped:  # the operator's stop was not addressed to this task
                 self.status.started = False
                 return
             self.status.paused = True
             self.status.message = f"{stage.name} was stopped from outside ({reported.message}); resume to go on"
-        elif reported.state == "cancelled":  # somebody else told the fingers something: no failure either
+        elif reported.state == "cancelled":  # another client commanded the gripper: no failure
             self._decide_anew(f"{stage.name} was cancelled: {reported.message}", view)
         elif isinstance(stage, Grip) and holds and isinstance(reported, m.GripperState) and reported.outcome in MISSES:
             stage.problem = reported.message
             self.missed(stage, view)
-        elif reported.error in ("hardware_fault", m.CLOSED_BEFORE) and isinstance(stage, Move):  # it is not to blame
+        elif reported.error in ("hardware_fault", m.CLOSED_BEFORE) and isinstance(stage, Move):  # not its fault
             self._held_up = reported.error == m.CLOSED_BEFORE
             self._decide_anew(f"{stage.name} {reported.state}: {reported.message}", view)
         elif reported.state != "succeeded":
@@ -312,13 +311,13 @@ class Task(Deciding[V]):
             if self._early is not None and view.motion is not None and view.gripper is not None:
                 self.running, self._early = self._early, None
                 self.running.wait_no_more(view.motion, view.gripper)
-                self.running.begun = True
+                self.running.started = True
                 self._tell_stage(self.running.stage)
 
-    # --- planning and doing ----------------------------------------------------------------------------------
+    # --- planning and execution ------------------------------------------------------------------------------
 
     def _plan_ahead(self, view: V) -> Iterator[Command]:
-        """Ask for the first motion that has no trajectory, from where the one before it ends."""
+        """Request a plan for the first motion without a trajectory, from the end of the motion before it."""
         if self._planning is not None:
             return
         running = self.running.stage if self.running else None
@@ -327,7 +326,7 @@ class Task(Deciding[V]):
         for grip in (running, self._early.stage if self._early else None):
             if width is not None and isinstance(grip, Grip):
                 width = grip.width_after(width)
-        for move in self.row:
+        for move in self.queue:
             if width is not None and isinstance(move, Grip):
                 width = move.width_after(width)
             if not isinstance(move, Move):
@@ -343,21 +342,21 @@ class Task(Deciding[V]):
             end = move.end()
 
     def _advance(self, view: V) -> Iterator[Command]:
-        """Begin the next stage when the one before it has ended and its motion is planned and still right."""
+        """Start the next stage once the one before has ended and its plan is still valid."""
         if self.running is not None:
             yield from self._begin_early(self.running, view)
-        if self.running is not None or self._early is not None or not self.row:
+        if self.running is not None or self._early is not None or not self.queue:
             return
-        stage = self.row[0]
+        stage = self.queue[0]
         if stage.carries and not view.holding:
             self.fail(f"what the hand held fell before {stage.name}", view, go_home=False)
             return
-        if (isinstance(stage, Move) and not self._is_planned(stage)) or not self.may_begin(stage, view):
+        if (isinstance(stage, Move) and not self._is_planned(stage)) or not self.may_start(stage, view):
             return
         if isinstance(stage, Move) and (
             appeared(self.obstacles(stage, view), stage.planned_around, self.moved) or self._fingers_differ(stage, view)
         ):
-            for later in self.row:
+            for later in self.queue:
                 if isinstance(later, Move):
                     later.trajectory = None
             self._planning = None
@@ -366,8 +365,8 @@ class Task(Deciding[V]):
         yield self._begin(stage, view)
 
     def _begin_early(self, running: Execution, view: V) -> Iterator[Command]:
-        """Have the fingers begin before the arm stands: until then they touch nothing, or let nothing go."""
-        stage, arm = (self.row[0] if self.row else None), running.stage
+        """Send a gripper command before the arm is at standstill; the executor starts it just before the end."""
+        stage, arm = (self.queue[0] if self.queue else None), running.stage
         if not (isinstance(stage, Grip) and stage.early and isinstance(arm, Move)) or self._opening or self._early:
             return
         if stage.holds and self._held_up:
@@ -377,10 +376,10 @@ class Task(Deciding[V]):
         if motion.id != running.command.id or motion.state != "active":
             return
         left = (1.0 - motion.progress) * arm.seconds
-        if left <= AHEAD * motion.speed_scaling and stage.carries == view.holding and self.may_begin(stage, view):
-            self.row.popleft()
+        if left <= AHEAD * motion.speed_scaling and stage.carries == view.holding and self.may_start(stage, view):
+            self.queue.popleft()
             self._early = self._execution(stage, view)
-            self._early.begun = False
+            self._early.started = False
             command = self._early.command
             assert isinstance(command, m.GripperCommand)
             command.after = running.command.id
@@ -392,7 +391,7 @@ class Task(Deciding[V]):
             yield command
 
     def _width(self, view: V) -> float | None:
-        """Between the fingers now, or soon where they are opening [m]; None without any."""
+        """Finger width now, or after a running opening [m]; None for a gripper without finger joints."""
         gripper = self.p.robot.gripper
         if gripper is None or not gripper.joints or view.gripper is None:
             return None
@@ -402,14 +401,14 @@ class Task(Deciding[V]):
         return min(max(width, 0.0), gripper.max_width)
 
     def _fingers_differ(self, move: Move, view: V) -> bool:
-        """Whether the fingers stand elsewhere than planned; about what they hold they may be closer."""
+        """Return whether the fingers are not as planned; on a held object they may be closer."""
         width, planned = self._width(view), move.planned_width
         if width is None or planned is None:
             return False
         return width > planned + FINGERS_OFF or (width < planned - FINGERS_OFF and not move.carries)
 
     def _begin(self, stage: Stage, view: V) -> Command:
-        self.row.popleft()
+        self.queue.popleft()
         self.running = self._execution(stage, view)
         self._tell_stage(stage)
         return self.running.command
@@ -423,27 +422,29 @@ class Task(Deciding[V]):
         if isinstance(stage, Move):
             assert stage.trajectory is not None
             command = m.ExecuteRequest(
-                id=self.mint(), trajectory=stage.trajectory, plan=stage.plan, scene_stamp=stage.scene_stamp)
+                id=self.new_id(), trajectory=stage.trajectory, plan=stage.plan, scene_stamp=stage.scene_stamp)
         else:
             assert isinstance(stage, Grip)
-            command = m.GripperCommand(id=self.mint(), width=stage.width, effort=stage.effort, mass=stage.mass)
+            command = m.GripperCommand(id=self.new_id(), width=stage.width, effort=stage.effort, mass=stage.mass)
             if stage.expected_width is not None:
                 command.expected_width, command.width_tolerance = stage.expected_width, stage.width_tolerance
         if stage.cycle is not None:
-            stage.cycle.begun = True
+            stage.cycle.started = True
         begun = Execution(stage, command, view.now)
         assert view.motion is not None and view.gripper is not None
         if isinstance(stage, Grip):
-            self._opening = None  # it replaces that
+            self._opening = None  # the new command replaces it
             begun.held = view.gripper.width if view.holding else None
         begun.before = begun.report(view.motion, view.gripper).id
         return begun
 
     def _is_planned(self, move: Move) -> bool:
-        whole = [s for s in self.row if isinstance(s, Move) and s.cycle is move.cycle] if move.whole else [move]
-        return all(stage.trajectory is not None for stage in whole)
+        needed = [move]
+        if move.needs_full_plan:
+            needed = [stage for stage in self.queue if isinstance(stage, Move) and stage.cycle is move.cycle]
+        return all(stage.trajectory is not None for stage in needed)
 
 
 def appeared(now: list[tuple[float, float]], before: list[tuple[float, float]], moved: float) -> bool:
-    """Whether something stands now where nothing stood before; what went away is in nobody's way."""
+    """Return whether an object is now where none was before; objects that disappeared do not matter."""
     return any(all(math.dist(p, q) > moved for q in before) for p in now)

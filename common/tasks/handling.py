@@ -1,8 +1,8 @@
-"""Objects that a camera saw are brought somewhere else: what any task of that kind does the same way.
+"""Base of tasks that move detected objects from one position to another.
 
-A task of one's own says in `choose` which object comes next, and in `destination` where the one in the hand is to
-stand. From there on all is done here: gripping a box by its faces, carrying it, putting it down, looking again from
-home, going on with what is in the hand after a restart, and leaving alone for a while what does not work.
+A task of the user implements `choose` (which object is next) and `destination` (where the held object goes). This
+module does the rest: grip a box by its faces, carry it, put it down, look again from home, continue with a held object
+after a restart, and skip an object for a while after a failed attempt.
 """
 
 from __future__ import annotations
@@ -18,27 +18,27 @@ from pydantic import Field
 
 from common import messages as m
 from common.config import Grasp, Surroundings, Tunable
+from common.robot.home import HOME_TOLERANCE
 from common.robot.transforms import invert, matrix_to_pose, matrix_to_rpy, pose_to_matrix, rpy_to_matrix, tool_down
-from common.scene.home import AT_HOME
 from common.tasks.decisions import TaskConfig
 from common.tasks.engine import Task
-from common.tasks.stages import MISSES, Cycle, Grip, Look, Move, Place, Stage, View, place_of
+from common.tasks.stages import MISSES, AwaitImage, Cycle, Grip, Move, Place, Stage, View, place_of
 
 Array = npt.NDArray[np.float64]
 
-DROP = 0.004  # [m] what is put down is let go so far above what it is to stand on
+DROP = 0.004  # [m] height above the support at which an object is released
 SQUARE = 0.002  # [m] a box whose sides differ by less looks the same after a quarter turn
-ASIDE = 0.08  # [m] from the middle of anything else there is room to put something down
+ASIDE = 0.08  # [m] free distance from every object to put something down
 
 
 class HandlingStatus(m.TaskStatus):
-    """What a task says that brings objects somewhere."""
+    """Status of a task that moves objects."""
 
     state: Literal["IDLE", "GRASPING", "PLACING", "HOMING", "DONE", "ERROR"] = "IDLE"
 
 
 class HandlingConfig(TaskConfig):
-    """How objects are taken and put down; times are cell time unless they say wall."""
+    """Parameters of grasping and placing; times are cell time unless they say wall."""
 
     world: Surroundings
     grasp: Grasp
@@ -54,67 +54,67 @@ class HandlingConfig(TaskConfig):
 
 
 class Handling(Task[View]):
-    """Takes objects and puts them down, one after the other, looking from home in between."""
+    """Moves objects one after the other and looks from home in between."""
 
     p: HandlingConfig
 
     def __init__(self, config: HandlingConfig, status: m.TaskStatus, prefix: str, speed: float = 1.0) -> None:
-        """Start from nothing known: see `Task`."""
+        """Start with nothing known: see `Task`."""
         super().__init__(config, status, prefix, speed)
-        self._tries: Counter[str] = Counter()  # by object: how often it did not work
-        self._problem = ""  # with the last of them
+        self._tries: Counter[str] = Counter()  # failed attempts by object id
+        self._problem = ""  # reason of the last failed attempt
         self._home = config.robot.named_poses["home"]
 
-    # --- what a task of one's own says ---------------------------------------------------------------------------
+    # --- implemented by the task ---------------------------------------------------------------------------------
 
     def choose(self, view: View) -> None:
-        """With an empty hand, at home, with a fresh picture: `bring` one of what is seen, `finish`, or `lack`."""
+        """With empty gripper, at home and with a fresh image: call `bring`, `finish` or `lack`."""
         raise NotImplementedError
 
     def destination(self, thing: m.CollisionObject, view: View) -> m.Pose | None:
-        """Where the middle of what is in the hand is to be, in world; None puts it aside, to be seen first."""
+        """Return the pose of the held object's center in world; None puts it aside, to be seen first."""
         raise NotImplementedError
 
-    # --- what it may say so with ---------------------------------------------------------------------------------
+    # --- used by the task ----------------------------------------------------------------------------------------
 
     def bring(self, things: Sequence[m.CollisionObject], view: View) -> None:
-        """Take the first of these that failed least often to its destination; after too many tries that is the end."""
+        """Queue the object with the fewest failed attempts; end with ERROR after too many."""
         thing = min(things, key=lambda one: self._tries[one.id])
         if self._tries[thing.id] >= self.p.most_tries:
             x, y, _ = place_of(thing.pose)
             self.end("ERROR", f"{thing.kind or thing.id} at ({x:.3f}, {y:.3f}): {self._problem}")
             return
-        self.patience.reset()
-        self.row += self._take(thing, view)
+        self.wait_timer.reset()
+        self.queue += self._take(thing, view)
 
     def finish(self, view: View, **figures: float) -> None:
-        """It is done, if it looks so for a while; with the task's own figures."""
-        if self.patience.lasts("done", view.scene_stamp) >= self.p.settle:
+        """End with DONE once this holds for the settling time; `figures` go into the status."""
+        if self.wait_timer.elapsed("done", view.scene_stamp) >= self.p.settle:
             self.status.figures.update(figures)
             self.end("DONE")
 
     def lack(self, what: str, view: View) -> None:
-        """Something is missing: wait for it a while, then give up."""
+        """Report that something is missing, and end with ERROR after a while."""
         self.status.message = what
-        if self.patience.lasts(what, view.scene_stamp) >= self.p.give_up:
+        if self.wait_timer.elapsed(what, view.scene_stamp) >= self.p.give_up:
             self.end("ERROR", what)
 
     def shown(self, view: View) -> bool:
-        """Whether the scene shows all that was done so far: else it is too early to count."""
-        return self.running is None and not view.holding and view.scene_stamp > self.look_after
+        """Return whether the scene includes everything done so far, so that counting is valid."""
+        return self.running is None and not view.holding and view.scene_stamp > self.images_after
 
     def container_of(self, thing: m.CollisionObject) -> str:
-        """The id of the container over or in which a thing is; empty when it is none's."""
+        """Return the id of the container that an object is in or above; empty for none."""
         x, y, _ = place_of(thing.pose)
         return next((name for name, box in self.p.world.containers.items()
                      if max(abs(x - box.x), abs(y - box.y)) < box.half_side), "")
 
     def inside(self, container: str, view: View) -> list[m.CollisionObject]:
-        """What is seen in a container."""
+        """Return the detected objects in a container."""
         return [thing for thing in view.objects("contained") if self.container_of(thing) == container]
 
     def room_in(self, container: str, thing: m.CollisionObject, view: View) -> m.Pose:
-        """Above the corner of a container that is furthest from what lies in it, clear of its walls."""
+        """Return the pose above the corner of a container farthest from its contents, clear of its walls."""
         box, others = self.p.world.containers[container], [place_of(o.pose) for o in self.inside(container, view)]
         corners = [(box.x + dx, box.y + dy) for dx in (-box.slot_offset, box.slot_offset)
                    for dy in (-box.slot_offset, box.slot_offset)]
@@ -123,47 +123,47 @@ class Handling(Task[View]):
         return m.Pose(position=m.Vector3(x=x, y=y, z=z))
 
     def on_top(self, thing: m.CollisionObject, below: m.CollisionObject) -> m.Pose:
-        """On another thing, turned as that is."""
+        """Return the pose of an object on top of another, with the same orientation."""
         x, y, z = place_of(below.pose)
         return below.pose.model_copy(update={"position": m.Vector3(x=x, y=y, z=z + (height_of(below) + height_of(
             thing)) / 2)})
 
-    # --- what is decided -----------------------------------------------------------------------------------------
+    # --- decisions -----------------------------------------------------------------------------------------------
 
     def decide(self, view: View) -> None:
-        """Bring on what is in the hand; with an empty one go home, look, and choose."""
+        """Continue with a held object; with an empty gripper go home, look and choose."""
         assert view.gripper is not None and view.q is not None and view.scene is not None
-        away = max(abs(a - b) for a, b in zip(view.q, self._home, strict=True)) > AT_HOME
-        if self.status.state == "DONE":  # whatever is put there now: nobody has asked for more
+        away = max(abs(a - b) for a, b in zip(view.q, self._home, strict=True)) > HOME_TOLERANCE
+        if self.status.state == "DONE":  # no operator asked for more
             return
-        if view.holding and view.gripper.outcome in MISSES:  # it is not what was to be taken
-            self.row += [self._open(None), *self.back_off(view.let_go())]
-        elif view.holding and not view.scene.header.stamp:  # what stands around is seen from home only
-            self.row += [self.home(view), Look()] if away else []
+        if view.holding and view.gripper.outcome in MISSES:  # another object than intended
+            self.queue += [self._open(None), *self.back_off(view.let_go())]
+        elif view.holding and not view.scene.header.stamp:  # the surroundings are only seen from home
+            self.queue += [self.home(view), AwaitImage()] if away else []
         elif view.holding:
-            if view.scene.attached:  # else the planning scene has not caught up yet
+            if view.scene.attached:  # else the planning scene is not up to date yet
                 held = view.scene.attached[0].object
-                self.row += self._put(held, held.pose, Cycle(held.id), view)
+                self.queue += self._put(held, held.pose, Cycle(held.id), view)
         elif away:
-            self.row += self.back_off(view)
-        elif self.sees(view):
+            self.queue += self.back_off(view)
+        elif self.has_fresh_image(view):
             self.status.state, self.status.stage, self.status.subject, self.status.message = "IDLE", "", "", ""
             self.choose(view)
 
     def plan_failed(self, move: Move, response: m.PlanResponse, view: View) -> None:
-        """Another turn of the hand, or another object, may do better."""
+        """Record the attempt: another gripper orientation or object may succeed."""
         if move.cycle is not None:
             self._note_try(move.cycle, response.message)
         super().plan_failed(move, response, view)
 
     def missed(self, stage: Grip, view: View) -> None:
-        """Open, back off and look again."""
+        """Record the attempt, then open, back off and look again."""
         if stage.cycle is not None:
             self._note_try(stage.cycle, stage.problem)
         super().missed(stage, view)
 
     def succeeded(self, stage: Stage, view: View) -> None:
-        """What was put down is no longer one that did not work."""
+        """Clear the failed attempts of an object that was put down."""
         if stage.name == "release" and stage.cycle is not None:
             del self._tries[stage.cycle.subject]
 
@@ -171,14 +171,14 @@ class Handling(Task[View]):
         self._tries[cycle.subject] += 1
         self._problem = problem
 
-    def began_anew(self) -> None:
-        """What did not work before may do so now."""
+    def on_restart(self) -> None:
+        """Allow objects with failed attempts again."""
         self._tries.clear()
 
-    # --- its stages ----------------------------------------------------------------------------------------------
+    # --- stages --------------------------------------------------------------------------------------------------
 
     def _take(self, thing: m.CollisionObject, view: View) -> list[Stage]:
-        """Open, above it, straight down, close, up; then what follows from there on."""
+        """Open, move above the object, descend, close, lift; then the stages of `_put`."""
         x, y, z = place_of(thing.pose)
         yaw, width = self._grips(thing)[self._tries[thing.id] % 2]
         low, cycle = self.p.grasp.height(z), Cycle(thing.id)
@@ -187,7 +187,7 @@ class Handling(Task[View]):
         above = _raised(T_world_tcp, self.p.grasp.approach_clearance)
         return [
             self._open(cycle),
-            Move("pre-grasp", "GRASPING", cycle, goal=_at(above), whole=True, fresh=True),
+            Move("pre-grasp", "GRASPING", cycle, goal=_at(above), needs_full_plan=True, needs_fresh_image=True),
             Move("descend", "GRASPING", cycle, goal=_at(T_world_tcp), straight=True, touches=self._fingers_on(thing)),
             Grip("close", "GRASPING", cycle, width=0.0, holds=True, effort=thing.grip_effort, mass=thing.mass,
                  expected_width=width, width_tolerance=self.p.width_tolerance),
@@ -197,7 +197,7 @@ class Handling(Task[View]):
         ]
 
     def _put(self, thing: m.CollisionObject, held: m.Pose, cycle: Cycle, view: View) -> list[Stage]:
-        """Across, straight down, let go; up, home, and look."""
+        """Move above the destination, lower, release, move up, go home and look."""
         goal = self.destination(thing, view) if thing.kind else None
         goal = goal or self._aside(thing, view)
         tools = sorted(self._tools(thing, held, goal), key=lambda tool: abs(_yaw(tool)))
@@ -213,18 +213,18 @@ class Handling(Task[View]):
             Grip("release", "PLACING", cycle, width=self.gripper.max_width, carries=True, holds=False),
             Move("up", "HOMING", cycle, goal=_at(above), straight=True, touches=self._fingers_on(thing)),
             Move("home", "HOMING", cycle, goal=m.JointGoal(named="home")),
-            Look(),
+            AwaitImage(),
         ]
 
     def _under(self, thing: m.CollisionObject, goal: m.Pose, view: View) -> list[m.CollisionObject]:
-        """What a thing may come to stand on where it is to be."""
+        """Return the objects that may support an object at its destination."""
         x, y, z = place_of(goal)
         lowest = z - height_of(thing) / 2 + DROP
         return [other for other in view.objects("target") if other.id != thing.id and top_of(other) <= lowest
                 and math.dist((x, y), place_of(other.pose)[:2]) < _reach(thing) + _reach(other)]
 
     def _tools(self, thing: m.CollisionObject, held: m.Pose, goal: m.Pose) -> Iterator[Array]:
-        """Poses (4, 4) of the tool with which a thing is where it is to be, turned in any way that looks the same."""
+        """Yield tool poses (4, 4) that place an object at its goal, for all rotations in which it looks the same."""
         turns = 4 if thing.shape != "box" or abs(thing.dimensions[0] - thing.dimensions[1]) < SQUARE else 2
         for turn in range(turns):
             turned = pose_to_matrix(goal)
@@ -232,7 +232,7 @@ class Handling(Task[View]):
             yield turned @ invert(pose_to_matrix(held))
 
     def _grips(self, thing: m.CollisionObject) -> list[tuple[float, float | None]]:
-        """Yaws [rad] of the tool, and the width between the fingers there [m]: on two faces of a box, or the others."""
+        """Return tool yaws [rad] and finger widths [m] for two opposite faces of a box, and for the other two."""
         turn = math.pi / 2 if self.gripper.closing_axis == "x" else 0.0
         if thing.shape != "box":
             width = 2 * thing.dimensions[0]
@@ -245,7 +245,7 @@ class Handling(Task[View]):
         return [fitting[0], fitting[-1]]
 
     def _aside(self, thing: m.CollisionObject, view: View) -> m.Pose:
-        """The nearest free place on the table to where the hand is now, within easy reach."""
+        """Return the free position on the table nearest to the tool, within easy reach."""
         x, y, _ = view.tool
         far = min(max(math.hypot(x, y), 0.40), 0.55)  # [m] from the base axis
         others = [place_of(o.pose) for role in ("target", "contained") for o in view.objects(role)]
@@ -256,7 +256,7 @@ class Handling(Task[View]):
         return m.Pose(position=m.Vector3(x=at[0], y=at[1], z=self.p.world.table_height + height_of(thing) / 2))
 
     def _half(self, place: Place) -> float:
-        """How far what has its middle there reaches if it is a container [m]."""
+        """Half side of the container centered at a position [m]; 0 where there is none."""
         return next((box.half_side for box in self.p.world.containers.values() if (box.x, box.y) == place[:2]), 0.0)
 
     def _open(self, cycle: Cycle | None) -> Grip:
@@ -267,17 +267,17 @@ class Handling(Task[View]):
 
 
 def height_of(thing: m.CollisionObject) -> float:
-    """Of what stands upright [m]."""
+    """Height of an upright object [m]."""
     return 2 * thing.dimensions[0] if thing.shape == "sphere" else thing.dimensions[-1]
 
 
 def top_of(thing: m.CollisionObject) -> float:
-    """Height of the top of what stands upright, in world [m]."""
+    """Height of the top of an upright object, in world [m]."""
     return thing.pose.position.z + height_of(thing) / 2
 
 
 def _reach(thing: m.CollisionObject) -> float:
-    """Of the circle about it, seen from above [m]."""
+    """Radius of the circle around an object, seen from above [m]."""
     return math.hypot(*thing.dimensions[:2]) / 2 if thing.shape == "box" else thing.dimensions[0]
 
 

@@ -1,4 +1,4 @@
-"""What a task's row is made of, one stage in the hands of the controllers, and what a task knows when it decides."""
+"""Stages of a task's queue, their execution by the controllers, and the view of the cell that a task decides by."""
 
 from __future__ import annotations
 
@@ -14,86 +14,86 @@ Command = m.PlanRequest | m.ExecuteRequest | m.GripperCommand | m.StopRequest | 
 Report = m.MotionStatus | m.GripperState
 
 OVER = ("succeeded", "aborted", "cancelled")
-MISSES = ("too_wide", "too_narrow", "empty")  # outcomes of a grasp that did not take what was expected
-FARTHEST = 1e4  # [m] that what a task looks at is away at most, and large
-FREE = 0.01  # [m] by which fingers are further apart than about what they held, when it falls as if they stood still
+MISSES = ("too_wide", "too_narrow", "empty")  # outcomes of a grasp that took nothing or something unexpected
+FARTHEST = 1e4  # [m] objects farther away or larger than this are ignored
+FREE = 0.01  # [m] opening beyond the held width at which a released object falls freely
 
 
 @dataclass(eq=False)
 class Cycle:
-    """What some stages of a row are for: one object, for example. An application adds what it has to remember."""
+    """What several stages belong to, for example one object. An application adds what it must remember."""
 
-    subject: str = ""  # what the status calls it
-    begun: bool = False
+    subject: str = ""  # name in the status
+    started: bool = False
 
 
 @dataclass(eq=False)
 class Stage:
-    """A piece of a row: `state` and `name` are what the status says while it lasts."""
+    """An element of the queue; `state` and `name` are reported in the status while it runs."""
 
     name: str
     state: str
     cycle: Cycle | None = None
-    carries: bool = field(default=False, kw_only=True)  # needs something in the hand from its begin to its end
+    carries: bool = field(default=False, kw_only=True)  # something must be held from start to end
 
 
 @dataclass(eq=False)
 class Move(Stage):
-    """A motion of the arm; `trajectory` is there once it was planned, around what stood at `planned_around`.
+    """A motion of the arm; planning sets `trajectory` and the other results.
 
-    Where there is no way, the stages of `otherwise` take its place: such as one motion for each goal of a sequence.
+    If no plan is found, the stages in `fallback` replace it, for example one motion for each goal of a sequence.
     """
 
     goal: Goal = field(kw_only=True)
     straight: bool = field(default=False, kw_only=True)
-    touches: list[tuple[str, str]] = field(default_factory=list, kw_only=True)  # pairs that may touch in it
-    attach: str = field(default="", kw_only=True)  # id of what it carries; empty: of what is in the hand
-    attach_pose: m.Pose | None = field(default=None, kw_only=True)  # in the tool's frame, when not held yet
-    fresh: bool = field(default=False, kw_only=True)  # begins only while pictures come
-    whole: bool = field(default=False, kw_only=True)  # begins only once all of its cycle is planned
-    otherwise: list[Stage] = field(default_factory=list, kw_only=True)
+    touches: list[tuple[str, str]] = field(default_factory=list, kw_only=True)  # pairs that may touch during the motion
+    attach: str = field(default="", kw_only=True)  # id of the carried object; empty: the one in the gripper
+    attach_pose: m.Pose | None = field(default=None, kw_only=True)  # in the tool frame, while it is not held yet
+    needs_fresh_image: bool = field(default=False, kw_only=True)  # starts only while images arrive
+    needs_full_plan: bool = field(default=False, kw_only=True)  # starts only once all motions of its cycle are planned
+    fallback: list[Stage] = field(default_factory=list, kw_only=True)
     trajectory: m.JointTrajectory | None = field(default=None, init=False)
-    planned_around: list[tuple[float, float]] = field(default_factory=list, init=False)  # (x, y) [m]
-    planned_width: float | None = field(default=None, init=False)  # between the fingers on the way [m]
+    planned_around: list[tuple[float, float]] = field(default_factory=list, init=False)  # (x, y) of objects [m]
+    planned_width: float | None = field(default=None, init=False)  # finger width during the motion [m]
     plan: str = field(default="", init=False)  # id of the request that the trajectory answers
-    scene_stamp: int = field(default=0, init=False)  # of the planning scene that it was planned on [ns]
+    scene_stamp: int = field(default=0, init=False)  # of the planning scene used [ns]
 
     def end(self) -> list[float]:
-        """Joint positions [rad] at its end; empty when it is not planned."""
+        """Joint positions at its end [rad]; empty without a plan."""
         return self.trajectory.points[-1].positions if self.trajectory else []
 
     @property
     def seconds(self) -> float:
-        """How long it takes, cell time."""
+        """Planned duration, cell time [s]."""
         return self.trajectory.points[-1].time_from_start if self.trajectory else 0.0
 
 
 @dataclass(eq=False)
 class Grip(Stage):
-    """A motion of the fingers to a width [m]; `holds` says whether something must be between them at its end.
+    """A motion of the fingers to a width [m]; `holds` tells whether an object must be held at its end.
 
-    What is between them then must be as wide as expected, where that is known; `problem` says how it was not.
+    A held object must have the expected width, if that is known; `problem` tells how it differs.
     """
 
     width: float = field(kw_only=True)
     holds: bool | None = field(default=None, kw_only=True)
     expected_width: float | None = field(default=None, kw_only=True)  # [m]
     width_tolerance: float = field(default=0.01, kw_only=True)  # of expected_width [m]
-    early: bool = field(default=False, kw_only=True)  # begins by the time that the motion before it comes to rest
-    effort: float = field(default=0.0, kw_only=True)  # [N]; 0: the gripper's own default
-    mass: float = field(default=0.0, kw_only=True)  # of what is held then [kg]; 0: not known
+    early: bool = field(default=False, kw_only=True)  # may start before the arm is at standstill
+    effort: float = field(default=0.0, kw_only=True)  # [N]; 0: the gripper's default
+    mass: float = field(default=0.0, kw_only=True)  # of the object held then [kg]; 0: unknown
     problem: str = field(default="the fingers closed on nothing", init=False)
 
     def width_after(self, before: float) -> float:
-        """The most that the fingers may be apart at its end [m], from where they were before."""
+        """Largest possible finger width at its end [m], given the width before."""
         if not self.holds:
             return self.width
         return before if self.expected_width is None else min(self.expected_width + self.width_tolerance, before)
 
 
 @dataclass(eq=False)
-class Look(Stage):
-    """What was seen up to here decides nothing any more: what follows is decided by a later picture."""
+class AwaitImage(Stage):
+    """Only a later image may decide what follows; images up to here are outdated."""
 
     name: str = "look"
     state: str = ""
@@ -101,25 +101,25 @@ class Look(Stage):
 
 @dataclass(eq=False)
 class Execution:
-    """A stage that was begun: `command` was sent and may have been accepted. Times are cell time [s].
+    """A started stage: `command` was sent and may have been accepted. Times are cell time [s].
 
-    While the arm is held no time counts, and at a share of its speed only that share of it.
+    Time counts in proportion to the speed scaling, and not while the arm is held.
     """
 
     stage: Stage
     command: m.ExecuteRequest | m.GripperCommand
-    counted: float  # up to when; from the begin on
-    before: str = ""  # id of the goal that its controller told of then
-    moving: float = 0.0  # in motion so far
-    spent: float = 0.0  # as if the motion were at full speed: what time-outs go by
-    accepted: int | None = None  # stamp of the answer that accepted it; an older report knows nothing of it
-    begun: bool = True  # else it waits for the arm
-    held: float | None = None  # between the fingers as it began, where they held something [m]
-    over: Report | None = None  # the answer, when it told of the end already: it was asked for more than once
+    counted: float  # time up to which `moving` and `spent` are counted
+    before: str = ""  # id of the goal that the controller reported at the start
+    moving: float = 0.0  # time in motion
+    spent: float = 0.0  # time scaled to full speed; time limits compare with this
+    accepted: int | None = None  # stamp of the answer that accepted it; older reports do not include it
+    started: bool = True  # False while it waits for the arm
+    held: float | None = None  # finger width at the start while holding an object [m]
+    over: Report | None = None  # answer that already reported the end, because the request was repeated
 
     @property
     def moves_arm(self) -> bool:
-        """Whether the arm moves, and not the fingers."""
+        """Whether the arm moves, not the fingers."""
         return isinstance(self.command, m.ExecuteRequest)
 
     def count(self, now: float, motion: m.MotionStatus) -> None:
@@ -131,7 +131,7 @@ class Execution:
         self.spent += passed * (motion.speed_scaling if self.moves_arm else 1.0)
 
     def accept(self, answer: Report) -> bool:
-        """Take in the answer to the command: whether it was accepted."""
+        """Handle the answer to the command; return whether it was accepted."""
         if answer.state != "rejected":
             self.accepted = max(self.accepted or 0, answer.header.stamp)
         if answer.state in OVER:
@@ -139,16 +139,16 @@ class Execution:
         return answer.state != "rejected"
 
     def wait_no_more(self, motion: m.MotionStatus, gripper: m.GripperState) -> None:
-        """Fingers that waited for the arm began, or never will, by the time that its end was told of.
+        """Update a waiting gripper command once the motion it waits for has ended.
 
-        A report of that very time knows it already.
+        A report of the same time already includes the result.
         """
-        if self.accepted is not None and gripper.id in (self.before, self.command.id):  # nobody else told them anything
+        if self.accepted is not None and gripper.id in (self.before, self.command.id):  # no other client commanded it
             self.accepted = max(self.accepted, motion.header.stamp - 1)
-        self.begun = self.begun or (gripper.id == self.command.id and gripper.state != "cancelled")
+        self.started = self.started or (gripper.id == self.command.id and gripper.state != "cancelled")
 
     def outcome(self, motion: m.MotionStatus, gripper: m.GripperState) -> Literal["running", "ended", "forgotten"]:
-        """What the controllers say of it; forgotten once they accepted it and tell of another goal."""
+        """Return what the controllers report; "forgotten" once an accepted goal is replaced by another."""
         reported = self.report(motion, gripper)
         if reported.id == self.command.id:
             return "ended" if reported.state in OVER else "running"
@@ -156,13 +156,13 @@ class Execution:
         return "forgotten" if later else "running"
 
     def let_go(self, gripper: m.GripperState) -> bool:
-        """Whether fingers that go on opening are clear of what they held already."""
+        """Return whether opening fingers are already clear of the released object."""
         if self.held is None or gripper.id != self.command.id or gripper.state != "active" or gripper.holding:
             return False
         return isinstance(self.stage, Grip) and self.stage.holds is False and gripper.width >= self.held + FREE
 
     def report(self, motion: m.MotionStatus, gripper: m.GripperState) -> Report:
-        """The report of the controller that the command went to; its answer, when it tells of a later goal already."""
+        """Return the controller's report; the recorded answer when the controller already reports a later goal."""
         reported = motion if self.moves_arm else gripper
         return self.over if self.over is not None and reported.id not in (self.command.id, self.before) else reported
 
@@ -171,8 +171,8 @@ def _is_near(thing: m.CollisionObject) -> bool:
     return max(*map(abs, place_of(thing.pose)), *thing.dimensions) <= FARTHEST
 
 
-def without_far(scene: m.PlanningScene) -> m.PlanningScene:
-    """The scene without what is so far away, or so large, that no message has room for a motion there."""
+def within_range(scene: m.PlanningScene) -> m.PlanningScene:
+    """Return the scene without objects too far away or too large for any motion."""
     objects = [thing for thing in scene.objects if _is_near(thing)]
     attached = [thing for thing in scene.attached if _is_near(thing.object)]
     if len(objects) + len(attached) == len(scene.objects) + len(scene.attached):
@@ -182,9 +182,9 @@ def without_far(scene: m.PlanningScene) -> m.PlanningScene:
 
 @dataclass
 class View:
-    """What a task knows at an instant: only what was perceived or reported. An application adds what it reads.
+    """What a task knows at one time, from perception and reports only. An application adds the topics it reads.
 
-    `now` and stamps are cell time [s]; `q` is where the joints are [rad], `tcp` the pose of the tool in world.
+    `now` and stamps are cell time [s]; `q` joint positions [rad]; `tcp` pose of the tool in world.
     """
 
     now: float
@@ -193,47 +193,47 @@ class View:
     motion: m.MotionStatus | None = None
     q: list[float] | None = None
     tcp: m.Pose | None = None
-    trouble: str = ""  # why no motion may begin
+    trouble: str = ""  # why no motion may start
 
     def __post_init__(self) -> None:
-        """Leave out what no motion is for."""
+        """Drop objects that are out of range."""
         if self.scene is not None:
-            self.scene = without_far(self.scene)
+            self.scene = within_range(self.scene)
 
     @property
     def missing(self) -> list[str]:
-        """Topics that have not said anything yet, without which nothing can be done."""
+        """Topics without a message yet; nothing can be decided before."""
         known = {"gripper/state": self.gripper, "planning_scene": self.scene, "joint_states": self.q,
                  "motion/status": self.motion}
         return [key for key, value in known.items() if value is None]
 
     @property
     def stamps(self) -> tuple[float, ...]:
-        """When the newest picture was taken [s], as each of those says by whom it is decided."""
+        """Times of the newest images [s], one for each source that the task decides by."""
         return (self.scene_stamp,)
 
     @property
     def scene_stamp(self) -> float:
-        """Time of the newest frame that the planning scene holds [s]."""
+        """Time of the newest image in the planning scene [s]."""
         return self.scene.header.stamp * 1e-9 if self.scene else 0.0
 
     @property
     def tool(self) -> Place:
-        """Where the tool centre point is, in world [m]; the origin as long as nobody has said."""
+        """Position of the tool center point in world [m]; the origin while unknown."""
         return place_of(self.tcp) if self.tcp else (0.0, 0.0, 0.0)
 
     @property
     def attached(self) -> str:
-        """Id of the object in the hand according to the planning scene, or an empty string."""
+        """Id of the held object in the planning scene; empty for none."""
         return self.scene.attached[0].object.id if self.scene and self.scene.attached else ""
 
     @property
     def holding(self) -> bool:
-        """Whether the gripper reports something between its fingers."""
+        """Whether the gripper reports a held object."""
         return self.gripper is not None and self.gripper.holding
 
     def let_go(self) -> Self:
-        """The same, as it will be when the fingers have opened: what moved with the tool stays where it is."""
+        """Return the view after opening the fingers: a held object stays where it is."""
         gripper = self.gripper and self.gripper.model_copy(update={"holding": False})
         if self.scene is None or self.tcp is None:
             return replace(self, gripper=gripper)
@@ -247,10 +247,10 @@ class View:
         return replace(self, gripper=gripper, scene=scene)
 
     def objects(self, role: str) -> list[m.CollisionObject]:
-        """Objects of the planning scene with that role."""
+        """Return the objects of the planning scene with a role."""
         return [o for o in self.scene.objects if o.role == role] if self.scene else []
 
 
 def place_of(pose: m.Pose) -> Place:
-    """The position of a pose [m]."""
+    """Position of a pose [m]."""
     return pose.position.x, pose.position.y, pose.position.z

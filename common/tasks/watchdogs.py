@@ -1,9 +1,8 @@
-"""What a task watches while the arm moves: that those it relies on are there, and that its pictures are fresh.
+"""Watchdogs of a task: services that it depends on, freshness of images, and how long a condition lasts.
 
-It relies on joint states that keep coming, on a planner, and on an executor. Without them the arm is held on its path,
-and goes on along the same path when they are back. It could finish a motion that was planned; but without joint states
-nobody sees where it is, and without a planner nobody could bring it away from where something goes wrong. A hold loses
-nothing and does nothing twice.
+A task needs joint states, a planner and an executor. While one is missing the arm is held on its path and resumes the
+same path later. Without joint states its position is unknown; without a planner no retreat is possible. A hold loses
+nothing and repeats nothing.
 """
 
 from __future__ import annotations
@@ -11,51 +10,51 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from common import messages as m
-from common.waking import Waking
+from common.time_source import WatchdogClock
 
-LOOK_PERIOD = 0.05  # [s] the longest time between two looks of a task that is not late itself
-USUAL_GAPS = 4  # joint states that come slowly are missed after so many of their usual gaps
-SLOWEST_GAP = 2.0  # [s] a longer one is a silence
-REMEMBERED = 2.0  # [s] for which our own lateness counts: who waits for a processor is seldom alone
-STEADY = 0.2  # [s] a camera's clock that is this much further ahead than was said is worth saying so again
-HOPS = 2  # processes between the robot and us, each as late as we are
+LOOK_PERIOD = 0.05  # [s] longest period between two updates of a task that runs on time
+USUAL_GAPS = 4  # joint states are missing after this many of their usual periods
+SLOWEST_GAP = 2.0  # [s] a longer gap is an outage, not a rate
+REMEMBERED = 2.0  # [s] for which an own delay counts: other processes were probably delayed as well
+STEADY = 0.2  # [s] change of a camera clock's lead that is reported again
+HOPS = 2  # processes between robot and task, each assumed as late as this one
 
 
 class LivenessWatchdog:
-    """Judges by our own waking time whether those are there that the task relies on. Times are wall time [s]."""
+    """Checks on the process uptime clock whether the needed services are there. Times are wall time [s]."""
 
     def __init__(self, received: Callable[[], int], timeout: Callable[[], float]) -> None:
-        """Begin without having heard anything, which is no trouble yet.
+        """Start without any joint state, which is no fault yet.
 
         Args:
-            received: how many joint states came so far.
-            timeout: after how long without one the arm is held [s].
+            received: number of joint states so far.
+            timeout: time without joint states after which the arm is held [s].
         """
         self.trouble = ""  # why the arm must not move now
         self._received, self._timeout = received, timeout
-        self._awake = Waking(2 * LOOK_PERIOD)
+        self._awake = WatchdogClock(2 * LOOK_PERIOD)
         self._count: int | None = None
-        self._heard = 0.0  # waking time
-        self._gap = 0.0  # usual time between two joint states
+        self._heard = 0.0  # process uptime
+        self._gap = 0.0  # usual period of joint states
         self._late = self._late_at = 0.0
         self._seen: set[str] = set()
-        self._holding: bool | None = None  # not known until the robot was looked at
+        self._holding: bool | None = None  # unknown until the first motion status
 
     def look(self, now: float, serving: dict[str, bool], motion: m.MotionStatus | None) -> list[m.HoldRequest]:
-        """What to ask of the executor; `trouble` says what is the matter.
+        """Return the hold requests to send; `trouble` tells what is missing.
 
         Args:
-            now: what the clock says [s, monotonic].
-            serving: by the name of a service, whether it answers requests now.
-            motion: what is known of the robot's motion.
+            now: monotonic clock [s].
+            serving: by service name, whether it answers requests.
+            motion: newest motion status.
         """
         self._seen |= {name for name, there in serving.items() if there}
         gone = [name for name, there in serving.items() if not there and name in self._seen]
-        silent = self._joints_are_missing(self._awake.look(now))
+        silent = self._joints_are_missing(self._awake.advance(now))
         self.trouble = f"{' and '.join(gone)} {'is' if len(gone) == 1 else 'are'} gone" if gone else silent
         if motion is None:
             return []
-        if self._holding is None:  # by the task before this one
+        if self._holding is None:  # set by the task process before this one
             self._holding = "watchdog" in motion.held_by
         if self.trouble and motion.state == "active" and not self._holding:
             self._holding = True
@@ -80,49 +79,49 @@ class LivenessWatchdog:
         return f"no joint states for {1e3 * self._timeout():.0f} ms" if awake - self._heard > patience else ""
 
 
-class FrameAge:
-    """Judges pictures by when they were taken. Tolerances are wall time [s], stamps cell time [s]."""
+class ImageAge:
+    """Checks the age of images by their stamps. Tolerances are wall time [s], stamps cell time [s]."""
 
     def __init__(self, speed: float) -> None:
-        """Judge in a cell whose time passes `speed` times as fast as that on the wall."""
+        """Check in a cell whose time runs `speed` times as fast as wall time."""
         self._speed = speed
-        self._ahead: float | None = None  # as it was last said [s, wall]
+        self._ahead: float | None = None  # last reported lead of the camera clock [s, wall]
 
     def problem(self, now: float, stamps: tuple[float, ...], frame_timeout: float, clock_tolerance: float) -> str:
-        """Why pictures that were taken then cannot be decided by now; empty when they can.
+        """Return why images cannot be used to decide; empty when they can.
 
-        A picture that is late by the clock on the wall is later still by that of a fast cell.
+        Wall-time delays grow with the speed of the cell.
 
         Args:
             now: cell time.
-            stamps: when the newest picture was taken, as each of those says who looked at it.
-            frame_timeout: one of this age is too old.
-            clock_tolerance: one that is this far in the future was stamped by a clock that cannot be relied on.
+            stamps: times of the newest images, one for each source.
+            frame_timeout: age from which an image is too old.
+            clock_tolerance: lead from which a camera clock is unusable.
         """
         ahead = (max(stamps) - now) / self._speed
         if ahead > clock_tolerance:
-            if self._ahead is None or abs(ahead - self._ahead) > STEADY:  # else it would be told with each picture
+            if self._ahead is None or abs(ahead - self._ahead) > STEADY:  # else every image would change the message
                 self._ahead = ahead
             return f"the camera's clock is {self._ahead:.1f} s ahead"
         self._ahead = None
         return "" if now - min(stamps) < frame_timeout * self._speed else "no fresh picture"
 
 
-class Patience:
-    """For how long the same reason to wait has lasted."""
+class DwellTimer:
+    """Measures for how long the same reason has been given without interruption."""
 
     def __init__(self) -> None:
-        """Begin without a reason."""
+        """Start without a reason."""
         self._since: tuple[object, float] | None = None
 
-    def lasts(self, reason: object, now: float) -> float:
-        """How long ago that reason was given for the first time, with no other since [s]."""
+    def elapsed(self, reason: object, now: float) -> float:
+        """Return the time since this reason was first given [s]; another reason restarts the timer."""
         if self._since is None or self._since[0] != reason:
             self._since = reason, now
         return now - self._since[1]
 
     def reset(self) -> None:
-        """Begin anew."""
+        """Restart the timer."""
         self._since = None
 
 

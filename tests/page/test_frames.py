@@ -13,7 +13,7 @@ from common import messages as m
 from common import topics
 from common.config import CameraConfig
 from common.perception.pinhole import Pinhole
-from common.robot.transform_history import MOST_FRAMES
+from common.robot.transform_tree import MAX_FRAMES
 from common.robot.transforms import matrix_to_pose, pose_to_matrix, rpy_to_matrix, transform
 from page.figure import Transforms
 from tests.page.scene_cell import Stage, around_of, at, in_world
@@ -105,7 +105,7 @@ def test_number_of_frames_is_bounded_and_the_newest_are_displayed(frames: Frames
     for number in range(4):
         frames.stage.say(topics.TF, chain([f"{number}/{i}" for i in range(1000)]))
     frames.say(("world", "base", POSE))
-    assert len(frames.stage.view.stage.transforms.newest) == MOST_FRAMES and len(frames.layer._nodes) <= 500
+    assert len(frames.stage.view.stage.transforms.newest) == MAX_FRAMES and len(frames.layer._nodes) <= 500
     assert frames.pose("base") is not None and frames.pose("0/1") is None and frames.pose("3/1") is not None
 
 

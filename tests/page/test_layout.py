@@ -5,9 +5,9 @@ from pathlib import Path
 import pytest
 
 from common.application import find_application
+from common.atomic_file import state_folder
 from common.config import config_root
 from common.errors import ConfigError
-from common.kept_file import lasting_folder
 from page.layers import find_layers, shown_layers
 from page.layout import TABS, Layout, Viewpoint, load_layout, save_layout
 
@@ -23,7 +23,7 @@ def test_default_layout_has_every_tab() -> None:
 def test_layout_is_saved_for_the_user_and_the_default_is_unchanged() -> None:
     before = (config_root() / "viewer.yaml").read_text()
     path = save_layout("", Layout(dark=False))
-    assert path.is_relative_to(lasting_folder()) and not load_layout("", print).dark
+    assert path.is_relative_to(state_folder()) and not load_layout("", print).dark
     assert (config_root() / "viewer.yaml").read_text() == before
 
 

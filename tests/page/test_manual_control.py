@@ -10,7 +10,7 @@ import pytest
 import viser
 
 from common.messages import MotionOwner, MotionStatus
-from common.sources import drawn_from
+from common.time_source import use_time_source
 from page.console import ActionQueue
 from page.manual_control import Jogger, JogPanel
 from page.permissions import PAGE, Permissions
@@ -39,7 +39,7 @@ class Arm:
 @pytest.fixture
 def arm() -> Iterator[Arm]:
     clock = Clock()
-    with drawn_from(clock):
+    with use_time_source(clock):
         yield Arm(clock)
 
 

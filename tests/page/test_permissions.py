@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from common.sources import drawn_from
+from common.time_source import use_time_source
 from page.permissions import LOG_INTERVAL, OPERATE_TIMEOUT, PageSession, Permission, Permissions
 from security.page_tokens import ALL_ROLES
 
@@ -41,7 +41,7 @@ class Fixture:
 @pytest.fixture
 def page() -> Iterator[Fixture]:
     clock = Clock()
-    with drawn_from(clock):
+    with use_time_source(clock):
         yield Fixture(clock)
 
 

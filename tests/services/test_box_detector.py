@@ -106,7 +106,7 @@ async def test_dark_picture_tells_nothing_though_depth_is_measured_in_the_dark_t
 def test_more_boxes_than_there_is_room_for_are_not_told_of_in_part() -> None:
     box = DetectedBox("red", (0.5, 0.0, 0.02), 0.0, np.zeros((4, 2)), False)
     assert len(box_detector.markers([box] * MAX_DETECTIONS, CONFIG, 0).markers) == MAX_DETECTIONS
-    with pytest.raises(FrameError, match=f"{MAX_DETECTIONS + 1} things in it are more than"):
+    with pytest.raises(FrameError, match=f"{MAX_DETECTIONS + 1} objects in it are more than"):
         box_detector.markers([box] * (MAX_DETECTIONS + 1), CONFIG, 0)
 
 

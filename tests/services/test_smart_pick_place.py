@@ -5,16 +5,16 @@ from typing import Any
 
 import pytest
 
-from applications.pick_place.choice import LetGo, PickPlaceView
+from applications.pick_place.choice import PickPlaceView, ReleasePositions
 from applications.pick_place.grasping import Config
 from applications.pick_place.task import PickPlace
 from applications.pick_place.topics import PICK_PLACE_STATUS, VALIDATED_TARGETS
 from common import messages as m
 from common import topics
+from common.atomic_file import RUNTIME_VARIABLE
 from common.clock import Clock
 from common.config import load_cell, service_config
-from common.kept_file import STANDING_VARIABLE
-from common.process import task_memory
+from common.process import task_runner
 from common.process.in_process import running_service
 from common.process.task_runner import run_task
 from common.transport.bus import Bus
@@ -95,7 +95,7 @@ async def test_status_is_a_state_that_a_late_reader_gets() -> None:
 
 @pytest.mark.parametrize("damaged", ["{", '{"places": [[0.5, 0.2, NaN]]}', '{"places": 3}', "[]"])
 async def test_what_a_task_knows_of_what_it_let_go_outlives_it(damaged, monkeypatch, tmp_path, caplog) -> None:
-    monkeypatch.setenv(STANDING_VARIABLE, str(tmp_path))
+    monkeypatch.setenv(RUNTIME_VARIABLE, str(tmp_path))
     tasks: list[PickPlace] = []
 
     class Seen(PickPlace):
@@ -108,16 +108,16 @@ async def test_what_a_task_knows_of_what_it_let_go_outlives_it(damaged, monkeypa
 
     kept, places = tmp_path / "test.smart_pick_place.json", [(0.5, 0.2, 0.095)]
     async with running_service(LocalNetwork(), run, CONFIG, name="smart_pick_place"):
-        tasks[0].remember(LetGo(places=places))
+        tasks[0].remember(ReleasePositions(places=places))
         async with asyncio.timeout(10):
             while not kept.exists():  # noqa: ASYNC110  # nobody tells
                 await asyncio.sleep(0.01)
     async with running_service(LocalNetwork(), run, CONFIG, name="smart_pick_place"):
-        assert tasks[1].memory == LetGo(places=places)
+        assert tasks[1].memory == ReleasePositions(places=places)
     kept.write_text(damaged)
     async with running_service(LocalNetwork(), run, CONFIG, name="smart_pick_place"):
-        assert tasks[2].memory == LetGo()
-    assert f"what was done before is not known: {kept} cannot be read: it is damaged" in caplog.text
+        assert tasks[2].memory == ReleasePositions()
+    assert f"the memory of the task is lost: {kept} cannot be read: it is damaged" in caplog.text
 
 
 async def test_memory_that_a_task_begins_with_stays_where_none_was_kept_and_is_written_as_soon_as_it_can_be(
@@ -125,9 +125,9 @@ async def test_memory_that_a_task_begins_with_stays_where_none_was_kept_and_is_w
 ) -> None:
     in_the_way = tmp_path / "standing"
     in_the_way.write_text("no folder")
-    monkeypatch.setenv(STANDING_VARIABLE, str(in_the_way / "cell"))
-    monkeypatch.setattr(task_memory, "SAVE_AGAIN", 0.01)
-    begun, later = LetGo(places=[(0.5, 0.2, 0.095)]), LetGo(places=[(0.5, 0.3, 0.035)])
+    monkeypatch.setenv(RUNTIME_VARIABLE, str(in_the_way / "cell"))
+    monkeypatch.setattr(task_runner, "SAVE_RETRY", 0.01)
+    begun, later = ReleasePositions(places=[(0.5, 0.2, 0.095)]), ReleasePositions(places=[(0.5, 0.3, 0.035)])
     tasks: list[PickPlace] = []
 
     class Begun(PickPlace):
@@ -148,7 +148,7 @@ async def test_memory_that_a_task_begins_with_stays_where_none_was_kept_and_is_w
         in_the_way.unlink()
         while not kept.exists():  # noqa: ASYNC110
             await asyncio.sleep(0.01)
-    assert LetGo.model_validate_json(kept.read_text()) == later
+    assert ReleasePositions.model_validate_json(kept.read_text()) == later
     assert caplog.text.count("cannot be written") == 1
 
 

@@ -30,9 +30,9 @@ class Skew:
 
 def clocks(endpoint: str) -> Iterator[Finding]:
     """Whether the clocks agree, for each cell that is up at an endpoint."""
-    from common.client.joining import somebody_listens
+    from common.client.joining import is_listening
 
-    if not somebody_listens(endpoint):
+    if not is_listening(endpoint):
         return
     for cell, skews in sorted(asyncio.run(_all_skews(endpoint)).items()):
         yield from judged(cell, skews)
@@ -93,7 +93,7 @@ async def skews_of(bus: Bus, clock: Clock, services: set[str]) -> dict[str, Skew
 async def _all_skews(endpoint: str) -> dict[str, dict[str, Skew]]:
     from common.client.joining import TOOL, alive, cell_clock
     from common.errors import NoRouter
-    from common.transport.connect import connect
+    from common.transport.zenoh_session import connect
 
     services: dict[str, set[str]] = {}
     try:

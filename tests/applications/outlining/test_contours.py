@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from applications.outlining.contour_choice import (
     CHOSEN,
     NAMES,
-    Following,
+    ContourTracker,
     NoSuchContour,
     annotate_contours,
     choose,
@@ -20,11 +20,11 @@ from applications.outlining.contours import (
     SHORTEST,
     ContourOptions,
     channel_of,
-    evened,
     find_contours,
     is_hole,
     normals,
     refine,
+    smoothed,
 )
 from applications.outlining.solids import simplified
 from applications.outlining.topics import Contours, OutlineSelect
@@ -194,7 +194,7 @@ def test_without_noise_a_contour_stays_as_it_is_and_with_it_details_do(shape, mo
 
 def test_contour_that_is_too_short_to_be_evened_out_stays_as_it_is():
     few = np.random.default_rng(0).normal(0, 5, (SHORTEST - 1, 2))
-    assert evened(few) is few
+    assert smoothed(few) is few
 
 
 def test_normals_point_out_of_the_object_at_its_edge_and_into_a_hole():
@@ -266,7 +266,7 @@ def test_colours_have_the_names_people_give_them(rgb, name):
 
 def test_the_chosen_object_is_followed_and_not_exchanged_for_another():
     here = find_contours(picture((20, 20, 30, 30, RED), (80, 60, 20, 20, BLUE)), SEED)
-    following = Following(OutlineSelect())
+    following = ContourTracker(OutlineSelect())
     chosen, said = following.find(here)
     assert colour_name(here[chosen].color) == "red" and not said
     moved = find_contours(picture((25, 22, 30, 30, RED), (80, 60, 20, 20, BLUE), (100, 5, 50, 50, GREEN)), SEED)
@@ -277,14 +277,14 @@ def test_the_chosen_object_is_followed_and_not_exchanged_for_another():
 
 
 def test_a_choice_that_can_not_be_is_tried_again_and_a_refused_one_changes_nothing():
-    following = Following(OutlineSelect(rule="colour", colour="blue"))
+    following = ContourTracker(OutlineSelect(rule="colour", colour="blue"))
     assert following.find(find_contours(picture((20, 20, 30, 30, RED)), SEED))[0] == -1
     both = find_contours(picture((20, 20, 30, 30, RED), (80, 60, 20, 20, BLUE)), SEED)
     assert colour_name(both[following.find(both)[0]].color) == "blue"
     with pytest.raises(NoSuchContour):
         following.select(both, OutlineSelect(rule="index", index=9))
     assert colour_name(both[following.find(both)[0]].color) == "blue"
-    assert Following(None).find(both) == (-1, f"no object is chosen; choices: {described(both)}")
+    assert ContourTracker(None).find(both) == (-1, f"no object is chosen; choices: {described(both)}")
 
 
 def test_annotation_draws_the_chosen_contour_and_leaves_the_picture_alone():

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from applications.outlining.contour_choice import Following, NoSuchContour, middle_of
+from applications.outlining.contour_choice import ContourTracker, NoSuchContour, middle_of
 from applications.outlining.contours import ContourOptions, find_contours
 from applications.outlining.topics import Contour, OutlineSelect
 
@@ -18,7 +18,7 @@ def square(index: int, u: float, v: float, side: float) -> Contour:
 
 def test_object_that_the_arm_hid_bit_by_bit_is_found_again_when_it_is_whole() -> None:
     whole = square(0, 100, 100, 100)
-    following = Following(OutlineSelect())
+    following = ContourTracker(OutlineSelect())
     assert following.find([whole]) == (0, "")
     for side in (80, 60, 45, 35, 27, 20):
         part = square(0, 100, 100, side)
@@ -30,7 +30,7 @@ def test_object_that_the_arm_hid_bit_by_bit_is_found_again_when_it_is_whole() ->
 @pytest.mark.parametrize(("by_person", "found"), [(False, (1, "")), (True, (-1, "Object_0 is not seen any more"))])
 def test_part_that_was_chosen_by_itself_while_the_arm_hid_the_rest_becomes_the_whole(by_person, found) -> None:
     part, others = square(0, 110, 110, 20), [square(0, 300, 100, 200), square(1, 100, 100, 100)]
-    following = Following(OutlineSelect())
+    following = ContourTracker(OutlineSelect())
     assert following.find([part]) == (0, "")
     if by_person:
         following.select([part], OutlineSelect())
@@ -54,7 +54,7 @@ FRAME = [(0, 50, 400, 380, RED), (50, 100, 300, 280, GREY)]
 
 @pytest.mark.parametrize("inner", [(150, 180, 100, 100, RED), (60, 110, 280, 260, RED)], ids=["small", "large"])
 def test_hole_in_which_the_chosen_object_lay_is_not_taken_for_it(inner: tuple[int, int, int, int, Any]) -> None:
-    following = Following(OutlineSelect())
+    following = ContourTracker(OutlineSelect())
     assert following.find(drawn(*FRAME, inner)) == (2, "")
     assert following.find(drawn(*FRAME))[0] == -1
     assert following.find(drawn(*FRAME, inner)) == (2, "")
@@ -63,17 +63,17 @@ def test_hole_in_which_the_chosen_object_lay_is_not_taken_for_it(inner: tuple[in
 @pytest.mark.parametrize("arm", [200, 130], ids=["much", "little"])
 def test_object_that_goes_on_outside_of_the_picture_is_not_chosen_when_the_arm_hid_that(arm: int) -> None:
     whole = (0, 100, 300, 100, RED)
-    following = Following(OutlineSelect())
+    following = ContourTracker(OutlineSelect())
     assert following.find(drawn(whole, (0, 100, arm, 100, GREY))) == (0, "")
     assert following.find(drawn(whole))[0] == -1
     assert following.find(drawn(whole, (0, 100, arm, 100, GREY))) == (0, "")
-    by_index = Following(OutlineSelect(rule="index", index=0))
+    by_index = ContourTracker(OutlineSelect(rule="index", index=0))
     assert [by_index.find(drawn(whole))[0] for _ in range(2)] == [0, 0]
 
 
 @pytest.mark.parametrize("size", [60, 160])
 def test_object_of_another_colour_in_its_place_is_not_the_chosen_one(size: int) -> None:
-    following = Following(OutlineSelect(rule="colour", colour="red"))
+    following = ContourTracker(OutlineSelect(rule="colour", colour="red"))
     red, green = ((230 - s // 2, 230 - s // 2, s, s, colour) for s, colour in ((60, RED), (size, GREEN)))
     assert following.find(drawn(red)) == (0, "")
     assert following.find(drawn(green))[0] == -1
@@ -83,7 +83,7 @@ def test_object_of_another_colour_in_its_place_is_not_the_chosen_one(size: int) 
 def test_what_was_seen_somewhere_is_chosen_there_however_the_newest_picture_counts() -> None:
     seen = [square(0, 100, 300, 50), square(1, 400, 100, 50)]
     now = [square(0, 300, 400, 50), square(1, 101, 300, 50), square(2, 400, 100, 50)]
-    following = Following(None)
+    following = ContourTracker(None)
     for contour, index in zip(seen, (1, 2), strict=True):
         choice = OutlineSelect(rule="index", index=contour.index, at=middle_of(contour))
         assert following.select(now, choice).index == index == following.find(now)[0]
@@ -95,11 +95,11 @@ def test_of_an_object_and_the_hole_in_its_middle_the_one_of_that_number_is_chose
     contours = [square(0, 100, 100, 100), square(1, 130, 131, 40)]
     for contour in contours:
         choice = OutlineSelect(rule="index", index=contour.index, at=middle_of(contour))
-        assert Following(None).select(contours, choice) is contour
+        assert ContourTracker(None).select(contours, choice) is contour
 
 
 def test_object_that_moves_and_grows_slowly_stays_chosen() -> None:
-    following = Following(OutlineSelect())
+    following = ContourTracker(OutlineSelect())
     following.find([square(0, 100, 100, 50)])
     for step in range(1, 12):
         moved = square(1, 100 + 20 * step, 100, 50 + 5 * step)

@@ -9,7 +9,7 @@ import math
 import numpy as np
 import pytest
 
-from applications.outlining.recording import OutlineFigures, Traced, distances
+from applications.outlining.recording import OutlineFigures, TraceEvaluation, distances
 from applications.outlining.topics import CONTOUR_PATH, OUTLINE_STATUS, OutlinePoints, OutlineStatus
 from common import messages as m
 from common import topics
@@ -51,9 +51,9 @@ def truth(shift: float = 0.0) -> m.WorldObjects:
     return m.WorldObjects(objects=[other, cube])
 
 
-def traced(standoff: float = 0.0, off: float = 0.0, there: m.WorldObjects | None = None) -> Traced:
+def traced(standoff: float = 0.0, off: float = 0.0, there: m.WorldObjects | None = None) -> TraceEvaluation:
     """A square that was traced at its corners, `off` [m] outside of it in x; `there` is what really was there."""
-    follower = Traced(CELL.robot)
+    follower = TraceEvaluation(CELL.robot)
     follower.on_path(path())
     follower.on_truth(there or truth())
     follower.on_status(status("APPROACHING", 10, standoff=standoff))
@@ -115,7 +115,7 @@ def test_outline_that_ends_elsewhere_is_not_closed() -> None:
 def test_outline_whose_first_moments_nobody_heard_is_closed_where_the_speed_allows_it() -> None:
     def heard(missing: float, end: float) -> bool:
         """Whether a square that is traced at 0.05 m/s until `end` [s] counts as closed without its first states."""
-        follower, second = Traced(CELL.robot), 1_000_000_000
+        follower, second = TraceEvaluation(CELL.robot), 1_000_000_000
         follower.on_path(path())
         follower.on_status(status("APPROACHING", 0))
         follower.on_status(status("TRACING", second))
@@ -132,7 +132,7 @@ def test_outline_whose_first_moments_nobody_heard_is_closed_where_the_speed_allo
 
 
 def test_nothing_traced_and_no_truth_give_no_deviation() -> None:
-    empty = Traced(CELL.robot).figures()
+    empty = TraceEvaluation(CELL.robot).figures()
     assert (empty["deviation_mm"], empty["tracking_mm"], empty["closed"], empty["object"]) == (None, None, False, "")
     follower = traced(there=m.WorldObjects())
     assert follower.figures()["deviation_mm"] is None
@@ -192,7 +192,7 @@ async def test_collector_follows_an_outline_to_its_end() -> None:
 
 
 def test_trace_that_was_interrupted_counts_as_far_as_it_went_however_much_was_planned() -> None:
-    follower = Traced(CELL.robot)
+    follower = TraceEvaluation(CELL.robot)
     follower.on_path(path())
     follower.on_status(status("TRACING", 20))
     for k, (x, y) in enumerate(SQUARE[:2]):

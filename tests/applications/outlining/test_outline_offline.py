@@ -9,10 +9,10 @@ import pytest
 from numpy.typing import NDArray
 
 from applications.outlining.contours import ContourOptions
-from applications.outlining.offline import Impossible, Perceived, perceive, plan_outline
+from applications.outlining.offline import OutlineError, Perceived, perceive, plan_outline
 from applications.outlining.recording import distances
 from applications.outlining.solids import planning_scene
-from applications.outlining.task import Legs, TracingParameters
+from applications.outlining.task import MotionSegments, TracingParameters
 from applications.outlining.top_face import TopFaceOptions
 from applications.outlining.topics import OutlineSelect
 from common import messages as m
@@ -54,7 +54,7 @@ def perceived(objects: list[ObjectConfig], select: OutlineSelect | None = None) 
 
 def planned(found: Perceived, *, given: bool = False, **parameters: float) -> list[tuple[str, m.PlanResponse]]:
     assert CELL.robot.gripper is not None
-    legs = Legs(TracingParameters(**parameters), CELL.robot.gripper)
+    legs = MotionSegments(TracingParameters(**parameters), CELL.robot.gripper)
     scene = planning_scene(AROUND, found.solids, 1)
     motions = plan_outline(pipeline(), legs, found.cleared, found.label, scene, given=given)
     return [(leg.name, response) for leg, response in motions]
@@ -78,17 +78,17 @@ def test_every_world_is_outlined_from_its_picture_to_its_last_motion(name: str) 
 
 
 def test_object_out_of_reach_is_named_with_the_reason() -> None:
-    with pytest.raises(Impossible, match=r"Object_0: approach: .*reach"):
+    with pytest.raises(OutlineError, match=r"Object_0: approach: .*reach"):
         planned(perceived([TALL]))
 
 
 def test_picture_without_an_object_has_no_outline() -> None:
-    with pytest.raises(Impossible, match="no contour"):
+    with pytest.raises(OutlineError, match="no contour"):
         perceived([])
 
 
 def test_contour_that_is_not_there_is_refused_with_the_choices() -> None:
-    with pytest.raises(Impossible, match=r"no contour 7; choices: 0 \(Object_0, yellow\)"):
+    with pytest.raises(OutlineError, match=r"no contour 7; choices: 0 \(Object_0, yellow\)"):
         perceived(list(CELL.world.objects), OutlineSelect(rule="index", index=7))
 
 
@@ -103,6 +103,6 @@ def test_points_that_were_given_are_traced_wherever_they_are() -> None:
     found = perceived(list(CELL.world.objects))
     moved = Perceived(found.label, found.contours, found.pixels, found.coordinates,
                       found.cleared + np.array([0.0, 0.15, 0.05]), found.solids)
-    with pytest.raises(Impossible, match="nothing in the planning scene"):
+    with pytest.raises(OutlineError, match="nothing in the planning scene"):
         planned(moved)
     assert len(planned(moved, given=True)) == 5

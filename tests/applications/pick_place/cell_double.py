@@ -36,7 +36,7 @@ class CellDouble:
         self.requests: list[m.Message] = []
         self.unplannable = lambda request: ""  # noqa: E731 - replaced by tests
         self.slips = 0  # closes that will hold nothing
-        self.odd = 0  # closes that will hold something wider than it was seen
+        self.outliers = 0  # closes that will hold something wider than it was seen
         self.camera_on = True
         self.camera_ahead = 0.0  # [s] its clock
         self.late = 0  # motions that will reach the controller too late
@@ -175,8 +175,8 @@ class CellDouble:
         self.gripper = m.GripperState(
             header=m.Header(stamp=int(self.now * 1e9)), id=request.id, state="succeeded", holding=bool(self.held),
             width=0.06 if self.held else request.width)
-        if self.held and self.odd and request.width < 0.06:
-            self.odd -= 1
+        if self.held and self.outliers and request.width < 0.06:
+            self.outliers -= 1
             self.gripper = self.gripper.model_copy(update={
                 "state": "aborted", "outcome": "too_wide", "width": 0.075, "message": "the fingers closed on a brick"})
 

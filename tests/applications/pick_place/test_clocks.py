@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from common import messages as m
-from common.tasks.watchdogs import FrameAge
+from common.tasks.watchdogs import ImageAge
 from tests.applications.outlining.outline_double import OutlineDouble
 from tests.applications.pick_place.cell_double import CellDouble
 
@@ -20,18 +20,18 @@ def motions(cell: CellDouble | OutlineDouble) -> list[m.Message]:
     (100.0, ""), (99.1, ""), (98.9, "no fresh picture"), (100.15, ""), (101.3, AHEAD)
 ])
 def test_picture_is_judged_by_its_age_and_by_how_far_it_is_in_the_future(stamp: float, problem: str) -> None:
-    assert FrameAge(1.0).problem(100.0, (stamp,), 1.0, 0.2) == problem
+    assert ImageAge(1.0).problem(100.0, (stamp,), 1.0, 0.2) == problem
 
 
 def test_tolerances_are_wall_time_whatever_the_speed() -> None:
-    pictures = FrameAge(5.0)
+    pictures = ImageAge(5.0)
     assert pictures.problem(100.0, (95.5, 100.9), 1.0, 0.2) == ""
     assert pictures.problem(100.0, (94.9, 100.0), 1.0, 0.2) == "no fresh picture"
     assert pictures.problem(100.0, (100.0, 106.5), 1.0, 0.2) == AHEAD
 
 
 def test_skew_that_trembles_is_not_told_anew_with_each_picture() -> None:
-    pictures = FrameAge(1.0)
+    pictures = ImageAge(1.0)
     assert len({pictures.problem(100.0, (101.3 + 0.02 * (k % 5),), 1.0, 0.2) for k in range(20)}) == 1
 
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from applications.pick_place.detector import Detector, DetectorOptions, annotate, rehearse
+from applications.pick_place.detector import Detector, DetectorOptions, annotate, warm_up
 from common.config import Container, Surroundings
 from common.perception.pinhole import Pinhole
 from common.perception.sphere import ray_distances, silhouette, sphere_in_view
@@ -337,5 +337,5 @@ def test_what_was_found_in_a_picture_does_not_depend_on_the_pictures_before(seed
 def test_rehearsal_is_possible_wherever_the_table_is(height):
     found = []
     with patch.object(Detector, "detect", lambda self, picture, camera: found.append(DETECT(self, picture, camera))):
-        rehearse(around.model_copy(update={"table_height": height}), DetectorOptions())
+        warm_up(around.model_copy(update={"table_height": height}), DetectorOptions())
     assert [len(balls) for balls in found] == [3]

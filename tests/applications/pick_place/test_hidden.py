@@ -7,8 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from applications.pick_place.ball_places import MOST_HIDDEN, Region, looking_poses
-from applications.pick_place.detections import HIDDEN, Remembered
+from applications.pick_place.ball_places import MOST_HIDDEN, VisibleTable, find_viewing_poses
+from applications.pick_place.detections import HIDDEN, OccludedTargets
 from applications.pick_place.perceived_scene import PerceivedScene, SceneParameters, Sighting, Tracks
 from common import messages as m
 from common.config import Surroundings, load_cell
@@ -52,7 +52,7 @@ def test_what_one_view_hides_and_another_one_sees_empty_is_forgotten() -> None:
 
 
 def test_target_is_remembered_while_hidden_and_not_beside_a_new_detection_of_it() -> None:
-    remembered = Remembered()
+    remembered = OccludedTargets()
     assert remembered.hidden([PLACE, ELSEWHERE], [], None) == []
     assert remembered.hidden([ELSEWHERE], [], at_place) == [PLACE]
     assert remembered.hidden([(0.41, 0.0, 0.03)], [], at_place) == []
@@ -72,14 +72,14 @@ def test_what_lies_in_the_container_is_kept_while_the_hand_hides_it() -> None:
 
 
 def test_arm_is_turned_out_of_the_way_as_little_as_need_be() -> None:
-    robot, region = RobotModel.load(CELL.robot), Region(AROUND, WorkspaceBounds())
+    robot, region = RobotModel.load(CELL.robot), VisibleTable(AROUND, WorkspaceBounds())
     silhouettes = RobotSilhouettes(robot, 0.03)
     within = region.within(CAMERA, silhouettes, robot)
 
     def share(q: object) -> float:
-        return region.hidden([(within, silhouettes.hidden(CAMERA, [np.asarray(q)]))])
+        return region.hidden([(within, silhouettes.occlusion(CAMERA, [np.asarray(q)]))])
 
-    poses = looking_poses(robot, [CAMERA], region, MOST_HIDDEN, 0.03)
+    poses = find_viewing_poses(robot, [CAMERA], region, MOST_HIDDEN, 0.03)
     assert share(robot.named("home")) > 0.1 >= MOST_HIDDEN >= share(poses[0])
     assert share(poses[0]) <= MOST_HIDDEN and abs(poses[0][0]) == min(abs(q[0]) for q in poses)
     assert region.hidden([(within, BLIND)]) == 1.0 and region.hidden([(within, BLIND), (within, None)]) == 0.0

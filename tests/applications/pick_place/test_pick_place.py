@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from applications.pick_place.choice import Pick, Target, finger_clearance
-from applications.pick_place.motion_sequences import Rows
+from applications.pick_place.motion_sequences import MotionSequences
 from common import messages as m
 from common.robot.transforms import matrix_to_pose, matrix_to_rpy, pose_to_matrix, rpy_to_matrix, tool_down, transform
 from common.tasks.stages import Move
@@ -181,7 +181,7 @@ def test_grasp_asks_for_what_was_seen_as_hard_as_the_scene_says() -> None:
     assert (close.expected_width, close.width_tolerance, close.effort) == (0.06, 0.004, 0.0)
     bar = m.CollisionObject(id="bar", role="target", shape="box", dimensions=[0.05, 0.03, 0.02], grip_effort=2.0,
                             pose=matrix_to_pose(transform(rpy_to_matrix(0, 0, 0.3), (0.4, 0.0, 0.01))))
-    rows = Rows(cell.task.p, cell.task.gripper)
+    rows = MotionSequences(cell.task.p, cell.task.gripper)
     for yaw, width in ((0.3, 0.03), (0.3 - math.pi / 2, 0.05), (0.3 - math.pi, 0.03)):
         row = rows.pick_and_place(Pick(target=Target.of(bar), yaws=[yaw]))
         close = next(stage for stage in row if stage.name == "close")
@@ -190,7 +190,7 @@ def test_grasp_asks_for_what_was_seen_as_hard_as_the_scene_says() -> None:
 
 def test_grasp_of_what_is_not_as_wide_as_it_was_seen_is_let_go_and_retried() -> None:
     cell = CellDouble([(0.40, -0.30)])
-    cell.odd = 2
+    cell.outliers = 2
     cell.until("open")
     assert cell.task.status.message == "the fingers closed on a brick at (0.400, -0.300)"
     cell.until("DONE")
@@ -202,7 +202,7 @@ def test_grasp_of_what_is_not_as_wide_as_it_was_seen_is_let_go_and_retried() -> 
 
 def test_what_is_never_as_wide_as_it_was_seen_is_given_up() -> None:
     cell = CellDouble([(0.40, -0.30)], max_retries=2)
-    cell.odd = 1000
+    cell.outliers = 1000
     cell.until("DONE")
     assert (cell.contained, cell.task.status.retries) == (0, 3)
     assert cell.task.status.skipped[0].reason == "the fingers closed on a brick 3 times"
@@ -210,7 +210,7 @@ def test_what_is_never_as_wide_as_it_was_seen_is_given_up() -> None:
 
 def test_what_was_not_to_be_taken_is_let_go_by_a_task_that_finds_it_in_the_hand() -> None:
     cell = CellDouble([(0.40, -0.30)])
-    cell.odd = 1
+    cell.outliers = 1
     cell.until("open")
     cell.tell("stop")
     for _ in range(10):
@@ -462,7 +462,7 @@ def test_whatever_slips_falls_moves_or_restarts_every_ball_ends_in_the_container
             cell.slips = 1
         elif event == "drop" and cell.held and cell.task.status.stage in ("lift", "across"):
             # Once the fingers are to let go it is above the container, where this arm jumps to only at the end.
-            over = cell.task.waits_for_the_arm == "release"
+            over = cell.task.deferred_grip == "release"
             if not over and all(abs(cell.tcp[0] - p[0]) + abs(cell.tcp[1] - p[1]) > 0.1 for p in cell.balls.values()):
                 cell.drop()
         elif event == "move" and cell.balls:
@@ -487,7 +487,7 @@ def test_an_arm_that_cannot_choose_is_left_any_clear_yaw_and_some_tilt_and_other
     ball, brick = Target("ball", (0.4, -0.3, 0.03), 0.03), Target("brick", (0.4, -0.3, 0.03), 0.03, (0.04, 0.03), 0.5)
     many = cell.task.p.robot
     for robot, thing, tilt, yaw in ((many, ball, 0.0, 0.0), (few, ball, 0.35, 0.4), (few, brick, 0.35, 0.0)):
-        rows = Rows(cell.task.p.model_copy(update={"robot": robot, "joined": False}), cell.task.gripper)
+        rows = MotionSequences(cell.task.p.model_copy(update={"robot": robot, "joined": False}), cell.task.gripper)
         row = rows.pick_and_place(Pick(target=thing, yaws=[0.5], ranges=[(-1.0, 0.2), (0.3, 0.4)]))
         goals = {stage.name: stage.goal for stage in row if isinstance(stage, Move)}
         descend, over = goals["descend"], goals["pre-grasp"]

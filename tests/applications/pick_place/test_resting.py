@@ -3,11 +3,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from applications.pick_place.ball_places import Resting
+from applications.pick_place.ball_places import BallGeometry
 from common.config import Container, Surroundings
 from common.perception.pinhole import Pinhole
 
-resting = Resting.of(Surroundings())
+resting = BallGeometry.of(Surroundings())
 camera = Pinhole.from_config(Surroundings().camera)
 
 
@@ -18,7 +18,7 @@ def test_heights_are_those_of_the_table_and_of_the_layers():
 
 
 def test_walls_higher_than_the_stack_count():
-    assert Resting(0.03, 0.1, Container(wall_height=0.3)).stack_height == pytest.approx(0.4)
+    assert BallGeometry(0.03, 0.1, Container(wall_height=0.3)).stack_height == pytest.approx(0.4)
 
 
 unit = st.floats(-1, 1)
@@ -55,5 +55,5 @@ def test_a_pixel_of_the_box_may_show_any_layer_and_one_of_the_table_only_the_tab
     c = resting.container
     assert resting.heights(camera, camera.project((c.x, c.y, 0.03))) == pytest.approx([0.035, 0.095])
     assert resting.heights(camera, camera.project((0.4, -0.3, 0.03))) == pytest.approx([0.03])
-    thick = Resting(0.03, 0.0, Container(floor_thickness=0.04))
+    thick = BallGeometry(0.03, 0.0, Container(floor_thickness=0.04))
     assert thick.heights(camera, camera.project((c.x, c.y, 0.03))) == pytest.approx([0.03, 0.07, 0.13])

@@ -38,7 +38,7 @@ def frame(*places, stamp=0, partial=False):
 def test_detections_are_sorted_into_targets_rejections_and_what_is_not_known_yet():
     places = frame((0.4, 0.05), (0.4, -0.2), (0.65, 0.0), (0.55, 0.25))
     judge = validation()
-    verdict = judge.judge(places, camera)
+    verdict = judge.validate(places, camera)
     assert verdict.targets == [(0.4, 0.05, 0.03)]
     assert [one.reason for one in verdict.rejections] == ["too far to the right"]
     assert verdict.unknown == [(0.65, 0.0, 0.03)] == judge.unknown(places, camera)
@@ -46,7 +46,7 @@ def test_detections_are_sorted_into_targets_rejections_and_what_is_not_known_yet
 
 
 def test_partly_out_of_view_comes_before_reach_and_the_container_before_that():
-    verdict = validation().judge(frame((0.4, 0.05), (0.55, 0.25), partial=True), camera)
+    verdict = validation().validate(frame((0.4, 0.05), (0.55, 0.25), partial=True), camera)
     assert [one.reason for one in verdict.rejections] == ["partly out of view"]
     assert verdict.inside == 1 and not verdict.targets
 
@@ -55,7 +55,7 @@ def test_a_place_is_told_once_and_again_after_it_was_empty_for_a_while():
     judge = validation(forget_after=2.0)
 
     def told(stamp, *places):
-        return len(judge.judge(frame(*places, stamp=int(stamp * SECOND)), camera).rejections)
+        return len(judge.validate(frame(*places, stamp=int(stamp * SECOND)), camera).rejections)
 
     assert told(0, (0.4, -0.2)) == 1
     assert told(1.5, (0.4, -0.201)) == 0
@@ -67,13 +67,13 @@ def test_a_place_is_told_once_and_again_after_it_was_empty_for_a_while():
 
 
 def test_two_places_are_told_apart_when_balls_touch():
-    verdict = validation().judge(frame((0.4, -0.2), (0.4, -0.26)), camera)
+    verdict = validation().validate(frame((0.4, -0.2), (0.4, -0.26)), camera)
     assert len(verdict.rejections) == 2
 
 
 def test_judging_a_frame_again_tells_nothing_twice():
     judge, seen = validation(), frame((0.4, -0.2), (0.4, 0.1))
-    first, second = judge.judge(seen, camera), judge.judge(seen, camera)
+    first, second = judge.validate(seen, camera), judge.validate(seen, camera)
     assert first.targets == second.targets and len(first.rejections) == 1 and not second.rejections
 
 
@@ -81,13 +81,13 @@ def test_the_pixel_decides_what_is_in_the_container_when_there_is_one():
     place = camera.on_plane(camera.project((0.583, 0.283, 0.095)), 0.03)
     seen = frame((float(place[0]), float(place[1])))
     assert np.hypot(*(place - (0.583, 0.283))) > 0.02, "the top layer is seen far from where it is"
-    assert validation().judge(seen, camera).inside == 1
+    assert validation().validate(seen, camera).inside == 1
 
 
 def test_what_is_no_target_is_told_in_words_as_long_as_it_is_seen():
     judge = validation()
     small = frame((0.4, 0.05), (0.4, -0.2)).model_copy(update={"remark": "2 red blobs are smaller than 400"})
     for _ in range(2):  # the rejection is told once, the remark with each frame
-        verdict = judge.judge_all([(small, camera)])
+        verdict = judge.validate_views([(small, camera)])
         assert verdict.remark == "2 red blobs are smaller than 400, and 1 of 2 was rejected, too far to the right"
-    assert judge.judge_all([(frame((0.4, 0.05)), camera)]).remark == ""
+    assert judge.validate_views([(frame((0.4, 0.05)), camera)]).remark == ""

@@ -15,9 +15,9 @@ from common.clock import Clock
 from common.errors import Refused
 from common.process.in_process import running_service
 from common.process.task_runner import TaskRunner
-from common.sources import wall_ns
 from common.tasks.stages import Command, View
 from common.tasks.watchdogs import LivenessWatchdog
+from common.time_source import wall_ns
 from common.transport.bus import Bus
 from common.transport.local import LocalNetwork
 
@@ -98,7 +98,7 @@ async def tell(net: LocalNetwork, *commands: str) -> str:
 async def test_person_is_told_that_what_they_said_was_kept_by_nobody_yet() -> None:
     net = LocalNetwork()
     async with running(net):
-        assert "does not outlive the task" in await tell(net, "stop")
+        assert "is lost when the task ends" in await tell(net, "stop")
         await (executor := Executor(net)).bus.ready()
         await executor.next()
         assert "outlive" not in await tell(net, "pause")

@@ -28,12 +28,12 @@ class Take(Fetch):
         if self.status.state == "DONE":
             return
         if view.holding:
-            self.row += [Move("bring", "BRINGING", goal=THERE, carries=True),
+            self.queue += [Move("bring", "BRINGING", goal=THERE, carries=True),
                          Grip("release", "BRINGING", width=0.08, holds=False, carries=True, early=True)]
         elif self.status.state == "BRINGING":
             self.end("DONE")
         else:
-            self.row += [
+            self.queue += [
                 Move("reach", "REACHING", goal=THERE),
                 Grip("close", "REACHING", width=0.0, holds=True, early=True, expected_width=SEEN),
                 Move("bring", "BRINGING", goal=THERE, carries=True),
@@ -271,7 +271,7 @@ def test_fingers_that_refuse_let_the_arm_arrive_and_are_asked_once_more_then(err
 def test_fingers_that_hold_already_are_not_asked_to_wait() -> None:
     hand = Hand()
     hand.gripper = m.GripperState(width=SEEN, holding=True)
-    hand.task.row += [Move("reach", "REACHING", goal=THERE),
+    hand.task.queue += [Move("reach", "REACHING", goal=THERE),
                       Grip("close", "REACHING", width=0.0, holds=True, early=True, expected_width=SEEN)]
     for _ in range(10):
         hand.step()
@@ -301,7 +301,7 @@ def test_what_is_let_go_by_an_arm_that_does_not_arrive_is_let_go_once(releasing:
     releasing.fingers(0.08, holding=False)
     for _ in range(3):
         releasing.step()
-    assert releasing.task.did[2:] == ["release"] and not releasing.task.under_way
+    assert releasing.task.did[2:] == ["release"] and not releasing.task.active_stages
 
 
 def test_what_is_let_go_after_a_long_pause_by_an_arm_that_does_not_arrive_is_let_go(closing: Hand) -> None:

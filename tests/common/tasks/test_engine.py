@@ -9,8 +9,8 @@ from common.config import load_cell
 from common.errors import ConfigError
 from common.tasks.decisions import TaskConfig
 from common.tasks.engine import Task
-from common.tasks.stages import Command, Grip, Look, Move, View
-from common.tasks.watchdogs import Patience
+from common.tasks.stages import AwaitImage, Command, Grip, Move, View
+from common.tasks.watchdogs import DwellTimer
 
 CELL = load_cell("panda")
 THERE = m.PoseGoal(pose=m.Pose(position=m.Vector3(x=0.4, z=0.3)))
@@ -20,13 +20,13 @@ class Fetch(Task[View]):
     """Takes what lies in front of it, once."""
 
     def decide(self, view: View) -> None:
-        if not self.sees(view):
+        if not self.has_fresh_image(view):
             return
         if view.holding:
             self.end("DONE", "it is in the hand")
         else:
-            self.row += [Move("reach", "REACHING", goal=THERE), Grip("close", "REACHING", width=0.0, holds=True),
-                         Move("lift", "LIFTING", goal=THERE, carries=True), Look()]
+            self.queue += [Move("reach", "REACHING", goal=THERE), Grip("close", "REACHING", width=0.0, holds=True),
+                         Move("lift", "LIFTING", goal=THERE, carries=True), AwaitImage()]
 
 
 class Cell:
@@ -117,7 +117,7 @@ def test_what_follows_a_look_is_decided_by_a_later_picture() -> None:
     cell.finish()
     view = cell.view
     assert cell.task.step(view) == [] and cell.task.status.state == "LIFTING", "its picture is from before"
-    assert cell.task.look_after == view.now
+    assert cell.task.images_after == view.now
 
 
 @pytest.mark.parametrize("where", ["during", "before"])
@@ -161,7 +161,7 @@ def test_what_appears_beside_the_way_has_the_motions_planned_anew() -> None:
 
 def test_failure_sends_the_arm_home_and_too_many_in_a_row_are_an_error() -> None:
     cell = Cell()
-    for _ in range(cell.task.most_failures - 1):
+    for _ in range(cell.task.failure_limit - 1):
         cell.until("reach")
         cell.finish("aborted")
         cell.until("home")
@@ -186,7 +186,7 @@ def test_plans_that_are_refused_for_some_seconds_do_not_use_up_all_tries_at_once
 
     cell.answer = refuse  # type: ignore[method-assign]
     cell.until("lift")
-    assert 5 <= cell.task.status.failures < cell.task.most_failures
+    assert 5 <= cell.task.status.failures < cell.task.failure_limit
     assert cell.now - began < 10.0
 
 
@@ -276,14 +276,14 @@ def test_task_that_needs_a_gripper_says_so_of_a_robot_without_one() -> None:
 
 def test_no_id_is_minted_twice() -> None:
     cell = Cell()
-    assert len({cell.task.mint() for _ in range(1000)}) == 1000
+    assert len({cell.task.new_id() for _ in range(1000)}) == 1000
 
 
 def test_patience_counts_from_when_a_reason_was_given_first() -> None:
-    patience = Patience()
-    assert [patience.lasts("a", 1.0), patience.lasts("a", 3.0), patience.lasts("b", 4.0)] == [0.0, 2.0, 0.0]
+    patience = DwellTimer()
+    assert [patience.elapsed("a", 1.0), patience.elapsed("a", 3.0), patience.elapsed("b", 4.0)] == [0.0, 2.0, 0.0]
     patience.reset()
-    assert patience.lasts("b", 9.0) == 0.0
+    assert patience.elapsed("b", 9.0) == 0.0
 
 
 def test_motions_are_planned_with_the_fingers_as_they_will_stand() -> None:
@@ -374,7 +374,7 @@ def test_what_is_carried_is_brought_on_from_where_it_was_stopped() -> None:
     blocked(cell, "scene_monitor")
     for _ in range(12):
         cell.step()
-    assert not cell.task.row, "not home: it is decided anew from here"
+    assert not cell.task.queue, "not home: it is decided anew from here"
 
 
 def test_motion_is_asked_for_with_its_plan_and_the_scene_of_it() -> None:
@@ -396,7 +396,7 @@ class Drop(Task[View]):
 
     def decide(self, view: View) -> None:
         if view.holding:
-            self.row += [Grip("release", "DROPPING", width=0.08, carries=True, holds=False),
+            self.queue += [Grip("release", "DROPPING", width=0.08, carries=True, holds=False),
                          Move("leave", "LEAVING", goal=THERE), Grip("close", "LEAVING", width=0.0, holds=True)]
 
 
@@ -441,7 +441,7 @@ def test_arm_waits_on_its_way_for_fingers_that_have_not_opened_by_half_of_it() -
     assert not any(isinstance(c, m.StopRequest) for c in cell.step())
     cell.motion = cell.motion.model_copy(update={"progress": 0.5})
     (stop,) = cell.step()
-    assert isinstance(stop, m.StopRequest) and stop.id == cell.motion.id and not cell.task.row
+    assert isinstance(stop, m.StopRequest) and stop.id == cell.motion.id and not cell.task.queue
     cell.motion = cell.motion.model_copy(update={"state": "cancelled"})
     cell.step()
     assert running(cell) == "open" and cell.task.status.message == "the fingers have not opened yet"

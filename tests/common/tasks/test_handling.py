@@ -58,7 +58,7 @@ def view(*objects: m.CollisionObject, now: float = 10.0, q: list[float] | None =
 
 def row(of: Gather, seen: View) -> list[object]:
     of.decide(seen)
-    return list(of.row)
+    return list(of.queue)
 
 
 def move(stages: list[object], name: str) -> Move:
@@ -99,8 +99,8 @@ def test_cube_ends_where_it_is_to_be_from_wherever_it_was_gripped() -> None:
 def test_what_it_is_put_on_may_be_touched_and_nothing_else() -> None:
     below, beside = box("below", 0.4, 0.2, z=-0.02), box("beside", 0.4, 0.23)
     of = task()
-    of.row.extend(of._put(box("a", 0.5, 0.0), m.Pose(), Cycle("a"), view(below, beside)))
-    assert move(list(of.row), "lower").touches == [("a", "below")]
+    of.queue.extend(of._put(box("a", 0.5, 0.0), m.Pose(), Cycle("a"), view(below, beside)))
+    assert move(list(of.queue), "lower").touches == [("a", "below")]
 
 
 def test_with_a_thing_in_the_hand_it_is_brought_on_and_not_taken_again() -> None:

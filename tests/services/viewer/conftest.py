@@ -47,7 +47,7 @@ class FakeScene:
         self.goal_pose = m.Pose(position=m.Vector3(x=0.4, z=0.5))
         self.calls: list[tuple[str, tuple[Any, ...]]] = []
         self.visible = dict(shown)
-        self.begun = False  # is fed, and heard
+        self.started = False  # is fed, and heard
         FakeScene.made.append(self)
 
     def __getattr__(self, name: str) -> Callable[..., None]:
@@ -55,7 +55,7 @@ class FakeScene:
 
     def set_shown(self, layer: str, on: bool) -> None:
         self.visible[layer] = on
-        self.begun = True
+        self.started = True
 
     def told(self, name: str) -> list[tuple[Any, ...]]:
         return [arguments for called, arguments in self.calls if called == name]

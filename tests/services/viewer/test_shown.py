@@ -183,7 +183,7 @@ async def test_chosen_object_is_traced_once_its_path_is_known() -> None:
 
 async def test_contour_that_is_clicked_in_the_scene_is_chosen(scenes: list[FakeScene]) -> None:
     async with serve_page("ur5") as played:
-        await until(lambda: scenes and scenes[0].begun)
+        await until(lambda: scenes and scenes[0].started)
         console, wanted = scenes[0].console, OutlineSelect(rule="index", index=1)
         await asyncio.to_thread(lambda: console.put(lambda: choose(console, wanted)))  # as viser does
         await until(lambda: played.selects)
@@ -193,7 +193,7 @@ async def test_contour_that_is_clicked_in_the_scene_is_chosen(scenes: list[FakeS
 async def test_layers_are_shown_as_ticked_also_before_the_scene_is_there(
     panda: Played, page: FakeBrowser, scenes: list[FakeScene]
 ) -> None:
-    await until(lambda: scenes and scenes[0].begun)
+    await until(lambda: scenes and scenes[0].started)
     assert scenes[0].visible["targets"] and not scenes[0].visible["truth"]
     await page.set("Targets", False)
     await until(lambda: not scenes[0].visible["targets"])
