@@ -8,8 +8,8 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from page.guard import close_server, make_server
-from page.health import HealthPanel
+from page.server import close_server, make_server
+from page.diagnostics import HealthPanel
 from rich.console import Console
 
 from cli.top import render
