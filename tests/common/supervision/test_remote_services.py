@@ -8,8 +8,6 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from page.server import close_server, make_server
-from page.diagnostics import HealthPanel
 from rich.console import Console
 
 from cli.top import render
@@ -22,6 +20,8 @@ from common.supervision.lifecycle import publish_status
 from common.supervision.liveness_watchdog import MOST_ELSEWHERE, MOST_NOTICES, RemoteServices
 from common.transport.codec import decode, encode
 from common.transport.local import LocalNetwork
+from page.diagnostics import HealthPanel
+from page.server import close_server, make_server
 from security.certificates import Authority
 
 FAR = Notice(urgent=True, message="the certificate of panda.camera ends", host="camera")
