@@ -150,7 +150,7 @@ class CellSession:
         from common.supervision.launch import module_command
         from common.transport.credentials import RECORDER
         from recording.capture import CustomTopics
-        from recording.summary import require_new
+        from recording.formatting import require_new
         from security.requiring import require_recorder
 
         path = Path(file).absolute()
