@@ -134,14 +134,15 @@ class KinematicWorld(WorldEvents):
 
     def takes_long(self, width: float, gripping: bool) -> bool:
         """Whether the next `tick` may take longer than a control cycle, since it searches for a rest position."""
-        if self._is_simple:
+        if self.is_simple:
             return False
         if held := self.held:
             return width > self._bodies[held].width + self._tolerances.release
         return gripping and bool(self._between)
 
     @property
-    def _is_simple(self) -> bool:
+    def is_simple(self) -> bool:
+        """Whether searches for rest positions are fast: few objects, all spheres."""
         return len(self._bodies) <= FEW and all(body.solid.shape == "sphere" for body in self._bodies.values())
 
     def tick(self, now: float, T_world_tcp: Array, width: float, gripping: bool) -> None:
@@ -235,7 +236,7 @@ class KinematicWorld(WorldEvents):
 
     def edit_takes_long(self, request: WorldEdit) -> bool:
         """Whether an edit may take longer than a control cycle."""
-        return not self._is_simple or request.shape not in (None, "sphere") or any(
+        return not self.is_simple or request.shape not in (None, "sphere") or any(
             solid.shape != "sphere" for solid in self._solids.values())
 
     def edit(self, request: WorldEdit, now: float) -> str:

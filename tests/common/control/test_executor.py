@@ -156,7 +156,7 @@ def test_backend_with_an_unsuitable_gripper_is_a_configuration_error(limits, fin
 
 def test_long_step_of_the_world_is_deferred_and_the_arm_continues(rig, monkeypatch):
     rig.cell.defers_steps = True
-    monkeypatch.setattr(KinematicWorld, "_is_plain", False)
+    monkeypatch.setattr(KinematicWorld, "is_simple", False)
     rig.grip("close", 0.0)
     while rig.cell.deferred is None:
         rig.step()

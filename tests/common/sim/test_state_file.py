@@ -27,7 +27,8 @@ OPEN, GRIP, R = 0.08, 0.06, 0.03
 
 def a_state(number: int) -> SimulationState:
     return SimulationState(layout={"ball_1": (0.4, -0.3, 0.03)}, q=[0.1 * number] * 7, width=0.01 * number,
-                           commanded_width=None, objects={"ball_1": ObjectSnapshot(pose=(0.4, -0.3, 0.01 * number, 0, 0, 0, 1))})
+                           commanded_width=None,
+                           objects={"ball_1": ObjectSnapshot(pose=(0.4, -0.3, 0.01 * number, 0, 0, 0, 1))})
 
 
 def the_world(config: World) -> KinematicWorld:
