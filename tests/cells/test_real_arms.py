@@ -63,7 +63,7 @@ async def check_told(cell: RunningCell) -> None:
 
 
 @on_ur
-async def test_an_outline_is_traced_through_a_protective_stop_and_a_pulled_cable(tmp_path: Path) -> None:
+async def test_outline_survives_a_protective_stop_and_a_pulled_cable(tmp_path: Path) -> None:
     with UrHost("127.0.0.51", q=HOME) as host, outliner(tmp_path, host) as cell:
         async with cell.listen() as bus:
             robot, motion = bus.reader(topics.ROBOT_STATUS), bus.reader(topics.MOTION_STATUS)
@@ -88,7 +88,7 @@ async def test_an_outline_is_traced_through_a_protective_stop_and_a_pulled_cable
 
 
 @on_ur
-async def test_an_outline_is_traced_through_a_cable_that_is_out_for_long_and_a_controller_that_is_rebooted(
+async def test_outline_survives_a_long_disconnection_and_a_controller_reboot(
     tmp_path: Path,
 ) -> None:
     with UrHost("127.0.0.52", q=HOME) as host, outliner(tmp_path, host) as cell:
@@ -111,7 +111,7 @@ async def test_an_outline_is_traced_through_a_cable_that_is_out_for_long_and_a_c
 
 
 @on_ur
-async def test_an_outline_is_traced_at_thirty_percent_of_the_slider(tmp_path: Path) -> None:
+async def test_outline_is_traced_at_thirty_percent_of_the_speed_slider(tmp_path: Path) -> None:
     with UrHost("127.0.0.53", q=HOME) as host, outliner(tmp_path, host) as cell:
         host.tell("slider 0.3")
         async with cell.listen() as bus:
@@ -133,7 +133,7 @@ def picker(folder: Path) -> RunningCell:
 
 @on_franka
 @pytest.mark.timeout(600)
-async def test_balls_are_brought_through_a_reflex_silences_and_a_controller_that_is_started_again(
+async def test_balls_are_placed_despite_a_reflex_silences_and_a_controller_restart(
     tmp_path: Path,
 ) -> None:
     with FrankaHost() as host, picker(tmp_path) as cell:

@@ -23,7 +23,7 @@ async def until_all_are_up(cell: RunningCell) -> None:
         await bus.alive.wait(SERVICES[-1], 60.0)
 
 
-def test_a_cell_that_is_up_knows_them_by_their_names(tmp_path: Path) -> None:
+def test_running_cell_lists_several_services_of_a_kind_by_name(tmp_path: Path) -> None:
     with RunningCell(tmp_path, "up", CELL, "--set", "autostart=false") as cell:
         asyncio.run(until_all_are_up(cell))
         place = Place(tmp_path, cell.domain)

@@ -24,7 +24,7 @@ async def newest_counters(bus: Bus, told: dict[str, ServiceCounters]) -> None:
         told[counters.service] = counters
 
 
-async def test_a_slow_and_a_frozen_subscriber_keep_nobody_from_anything(tmp_path: Path) -> None:
+async def test_slow_and_frozen_subscribers_block_no_service(tmp_path: Path) -> None:
     told: dict[str, ServiceCounters] = {}
     settings = ("autostart=false", "world.count=2", "services.camera_simulator.rate=30")
     with RunningCell(tmp_path, "up", "panda", "--speed", "5", *(f"--set={one}" for one in settings)) as cell:

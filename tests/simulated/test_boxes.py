@@ -62,7 +62,7 @@ class Heard:
 
 
 @pytest.mark.slow
-def test_boxes_are_taken_by_their_narrow_sides_and_lie_in_the_container(cell: Cell) -> None:
+def test_boxes_are_grasped_at_their_narrow_sides_and_placed_in_the_container(cell: Cell) -> None:
     heard = Heard()
     outcome = Simulation(cell, 2, trace=cast(Trace, heard)).run()
     assert (outcome.state, outcome.done, outcome.total) == ("DONE", 2, 2), outcome

@@ -49,7 +49,7 @@ async def assert_rests(cell: SimulatedCell, bus: Bus) -> None:
     assert await assert_still(cell, joints, bus.clock.now_ns()) == first
 
 
-def test_stopped_robot_stays_where_it_is_whoever_starts_again_until_a_person_starts_it() -> None:
+def test_stopped_robot_stays_stopped_over_restarts_until_an_operator_starts_it() -> None:
     async def visit(cell: SimulatedCell, bus: Bus) -> None:
         motion, status = bus.reader(topics.MOTION_STATUS), bus.reader(PICK_PLACE_STATUS)
         await moving(cell, bus, status, "pre-grasp")
@@ -86,7 +86,7 @@ def test_stopped_robot_stays_where_it_is_whoever_starts_again_until_a_person_sta
 
 
 @pytest.mark.slow
-def test_hold_of_a_person_and_the_speed_outlive_executor_and_task_and_nobody_else_lets_go() -> None:
+def test_operators_hold_and_speed_survive_restarts_and_only_the_operator_releases_them() -> None:
     path = "services.trajectory_executor.speed_scaling"
 
     async def visit(cell: SimulatedCell, bus: Bus) -> None:

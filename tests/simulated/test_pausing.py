@@ -65,7 +65,7 @@ async def pause_in_motion(cell: SimulatedCell, bus: Bus, stage: str) -> Any:
 
 
 @pytest.mark.slow
-def test_panda_paused_on_its_way_goes_on_and_puts_every_ball_in_the_box() -> None:
+def test_paused_panda_resumes_and_places_every_ball() -> None:
     async def visit(cell: SimulatedCell, bus: Bus) -> None:
         await pause_in_motion(cell, bus, "across")
 
@@ -77,7 +77,7 @@ def test_panda_paused_on_its_way_goes_on_and_puts_every_ball_in_the_box() -> Non
 
 
 @pytest.mark.slow
-def test_ur5_paused_in_mid_trace_goes_on_with_the_same_trace() -> None:
+def test_ur5_paused_while_tracing_resumes_the_same_trace() -> None:
     async def visit(cell: SimulatedCell, bus: Bus) -> None:
         status = await pause_in_motion(cell, bus, "trace")
         assert status.closed and (status.object, status.failures) == ("Object_0", 0)
@@ -87,7 +87,7 @@ def test_ur5_paused_in_mid_trace_goes_on_with_the_same_trace() -> None:
     assert summary["seconds"]["moving"] < summary["seconds"]["task"]
 
 
-def test_task_service_that_dies_while_paused_leaves_the_robot_held_until_somebody_says_resume() -> None:
+def test_robot_stays_held_when_a_paused_task_dies_until_resume() -> None:
     async def visit(cell: SimulatedCell, bus: Bus) -> None:
         joints, motion = bus.reader(topics.JOINT_STATES), bus.reader(topics.MOTION_STATUS)
         status = bus.reader(PICK_PLACE_STATUS)
@@ -109,7 +109,7 @@ def test_task_service_that_dies_while_paused_leaves_the_robot_held_until_somebod
 
 
 @pytest.mark.slow
-def test_stopped_robot_is_brought_home_by_a_person_and_the_task_starts_again() -> None:
+def test_operator_moves_a_stopped_robot_home_and_starts_the_task() -> None:
     async def visit(cell: SimulatedCell, bus: Bus) -> None:
         joints, motion = bus.reader(topics.JOINT_STATES), bus.reader(topics.MOTION_STATUS)
         status = bus.reader(PICK_PLACE_STATUS)

@@ -18,7 +18,7 @@ def under_way(status: MotionStatus) -> bool:
     return status.state == "active" and status.progress > 0.2
 
 
-def test_the_arm_is_held_while_the_planner_is_dead_and_the_same_motion_goes_on_when_it_is_back() -> None:
+def test_arm_is_held_while_the_planner_is_down_and_then_resumes() -> None:
     async def visit(cell: SimulatedCell, bus: Bus) -> None:
         motion, status = bus.reader(topics.MOTION_STATUS), bus.reader(PICK_PLACE_STATUS)
         before = await until(motion, under_way, 60)

@@ -46,7 +46,7 @@ def place(tmp_path: Path) -> Iterator[Place]:
     made.end()
 
 
-async def test_stop_outlives_supervisor_and_executor_that_are_killed_and_up_says_so(place: Place) -> None:
+async def test_stop_survives_killed_supervisor_and_executor(place: Place) -> None:
     command = place.start("up", *PANDA)
     async with connect(cell="panda", service="watcher", endpoint=endpoint_of(place.domain), timeout=PATIENCE) as bus:
         motion = bus.reader(topics.MOTION_STATUS)

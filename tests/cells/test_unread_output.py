@@ -42,7 +42,7 @@ def full_pipe() -> tuple[int, int]:
 
 @pytest.mark.parametrize("kind", ["full", "dead"])
 @pytest.mark.parametrize("options", [(), ("--log-json",)])
-async def test_cell_whose_lines_nobody_reads_works_and_can_be_ended(
+async def test_cell_with_unread_output_works_and_can_be_stopped(
     tmp_path: Path, kind: str, options: tuple[str, ...]
 ) -> None:
     read, write = full_pipe()
@@ -110,7 +110,7 @@ class Terminal:
 
 
 @pytest.mark.parametrize(("verb", "how"), [("up", "Ctrl-S"), ("run", "looks away")])
-async def test_terminal_that_takes_nothing_holds_nothing_up(tmp_path: Path, verb: str, how: str) -> None:
+async def test_blocked_terminal_does_not_block_the_cell(tmp_path: Path, verb: str, how: str) -> None:
     file = tmp_path / "with_chatty.yaml"
     cell_file = yaml.safe_load((ROOT / "config" / "cells" / "panda.yaml").read_text())
     file.write_text(yaml.safe_dump({**cell_file, "services": {**cell_file["services"], "tests.cells.chatty": {}}},

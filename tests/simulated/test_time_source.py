@@ -17,7 +17,7 @@ REAL = tuple(f"common/{name}.py" for name in (  # of real arms and cameras, whic
 OF_THE_MACHINE = {"time", "uuid", "secrets", "random", "datetime"}
 
 
-def test_simulated_code_takes_time_and_ids_from_one_place():
+def test_simulated_code_takes_time_and_ids_from_the_time_source():
     files = [path for room in ROOMS for path in (ROOT / room).rglob("*.py")]
     files += [ROOT / name for name in SINGLE]
     files = [path for path in files if str(path.relative_to(ROOT)) not in REAL]

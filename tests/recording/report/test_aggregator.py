@@ -25,14 +25,14 @@ from recording.report.summary import describe
         ({"paused": True, "started": True}, "0 of 0 placed - IDLE (paused)"),
     ],
 )
-def test_progress_in_one_line(values: dict[str, object], line: str) -> None:
+def test_progress_is_one_line(values: dict[str, object], line: str) -> None:
     fold = RunAggregator("panda", find_application("pick_place"))
     assert fold.progress == "no task status received yet"
     fold.on("pick_place_status", PickPlaceStatus.model_validate(values), 0.0, 0)
     assert fold.progress == line
 
 
-def test_every_application_is_heard_on_its_status_and_on_what_it_decides_by() -> None:
+def test_topics_include_status_and_decisions_of_each_application() -> None:
     heard = {topic.key for topic in RunAggregator("panda", find_application("pick_place")).topics}
     assert heard == {"pick_place_status", "validated_targets", "rejected_targets", "motion/status", "scene_objects",
                      "scene_balls"}
@@ -41,7 +41,7 @@ def test_every_application_is_heard_on_its_status_and_on_what_it_decides_by() ->
     assert {"outline_status", "contour_path"} <= {t.key for t in outlining.topics}
 
 
-def test_a_frame_is_as_old_as_its_stamp_on_the_cells_clock() -> None:
+def test_frame_age_is_measured_in_cell_time() -> None:
     history = RunHistory()
     fold = RunAggregator("panda", find_application("pick_place"), speed=5.0, history=history)
     fold.on("validated_targets", PoseArray(header=Header(stamp=1_000_000_000)), 1.0, 1_100_000_000)
@@ -49,7 +49,7 @@ def test_a_frame_is_as_old_as_its_stamp_on_the_cells_clock() -> None:
     assert fold.summary.as_dict()["frame_to_target_ms"] == {"p50": 20.0, "p99": 20.0}
 
 
-def test_the_application_of_a_recording_is_told_by_its_status() -> None:
+def test_application_of_a_recording_is_found_by_its_status() -> None:
     found = recorded_application(["joint_states", "outline_status"])
     assert found is not None and found.name == "outlining"
     assert recorded_application(["joint_states"]) is None
@@ -70,7 +70,7 @@ def own() -> Application:
         yield find_application("my_pkg.move")
 
 
-def test_an_application_of_ones_own_has_a_summary_without_saying_anything(own: Application) -> None:
+def test_custom_application_has_a_default_summary(own: Application) -> None:
     fold = RunAggregator("mine", own)
     assert figures_of(own) is Figures
     fold.on("move_status", MoveStatus(state="LIFTING", done=0, total=1, subject="cube", started=True), 1.0, 0)
@@ -83,14 +83,14 @@ def test_an_application_of_ones_own_has_a_summary_without_saying_anything(own: A
     assert describe(figures, fold.figures)[:2] == ["mine: DONE, 1 of 1 done", "  moved_m 0.3"]
 
 
-def test_truth_names_its_containers_where_there_are_several() -> None:
+def test_truth_names_several_containers() -> None:
     truth = {"in_box": 3, "on_table": 1, "elsewhere": 0, "containers": {"box": 3}}
     assert format_truth(truth) == "3 in the box, 1 on the table"
     truth = {"in_box": 3, "on_table": 1, "elsewhere": 2, "containers": {"left": 1, "right": 2}}
     assert format_truth(truth) == "1 in left, 2 in right, 1 on the table, 2 elsewhere"
 
 
-def test_objects_tell_the_truth_where_they_say_what_becomes_of_them() -> None:
+def test_world_objects_with_state_are_the_truth() -> None:
     fold = RunAggregator("panda", find_application("pick_place"))
     fold.on("scene_objects", WorldObjects(), 0.0, 0)
     assert fold.summary.as_dict()["truth"] == {"in_box": 0, "on_table": 0, "elsewhere": 0, "containers": {}}
