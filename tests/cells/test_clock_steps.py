@@ -1,4 +1,4 @@
-"""Somebody sets the system clock of a host while a cell runs on it: real processes whose system clock is a file's."""
+"""The system clock of a host is set while a cell runs: real processes that read it from a file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The UR5 cell as a person at a terminal meets it: a snapshot, a choice, a question."""
+"""The UR5 cell from a terminal: snapshot, selection of an object, a question."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def test_missing_object_is_rejected_with_choices_and_another_is_selected(up: Run
             started = up.tell("task", "start")
             assert started.returncode == 0, started.stderr
             status = bus.reader(OUTLINE_STATUS)
-            await until(status, lambda told: told.object == label and told.stage == "approach", 60)
+            await until(status, lambda s: s.object == label and s.stage == "approach", 60)
 
     asyncio.run(begin())
     up.interrupt()

@@ -1,4 +1,4 @@
-"""The Panda cell as a person starts it: processes, the closed loop, figures, what is read from outside, the end."""
+"""The Panda cell with real processes: start, closed loop, figures, external clients, end."""
 
 from __future__ import annotations
 
@@ -107,10 +107,10 @@ async def test_terminal_jogs_the_arm_and_releases_it_when_killed(up: RunningCell
             await until(joints, lambda j: largest_way(first, j) > 0.05)
             jogging.kill()
             await until(owner, lambda o: o.kind == "none" and not o.jogging)
-            rests = await joints.next()
-            later = await until(joints, lambda j: j.header.stamp > rests.header.stamp + 1_000_000_000)
+            at_rest = await joints.next()
+            later = await until(joints, lambda j: j.header.stamp > at_rest.header.stamp + 1_000_000_000)
             # Brakes end where rounding of a ramp puts them: some 1e-31 rad from one message to the next.
-            assert largest_way(rests, later) < 1e-12 and max(map(abs, later.velocity)) < 1e-12
+            assert largest_way(at_rest, later) < 1e-12 and max(map(abs, later.velocity)) < 1e-12
     finally:
         jogging.kill()
         jogging.wait()

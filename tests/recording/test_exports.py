@@ -138,7 +138,7 @@ def test_foxglove_file_that_does_not_fit_on_the_disk_is_removed(
     assert list(tmp_path.iterdir()) == [source]
 
 
-def told(number: int) -> Sample:
+def custom_message(number: int) -> Sample:
     """A message whose class is not here, with the schema that was recorded."""
     values = {"header": {"stamp": START + number, "frame_id": "w"}, "gloss": number / 4, "raw": b"\xff\x00"}
     return Sample("panda/gloss", msgpack.packb(values), START + number * STEP, message="Gloss", writer="polisher.1",
@@ -146,7 +146,7 @@ def told(number: int) -> Sample:
 
 
 def test_messages_of_unknown_classes_are_exported_by_their_recorded_schema(tmp_path: Path) -> None:
-    cut = write(tmp_path / "a.mcap", [told(0), told(1), foreign()])
+    cut = write(tmp_path / "a.mcap", [custom_message(0), custom_message(1), foreign()])
     recover(cut, tmp_path / "b.mcap")
     decoder = Decoder()
     with Recording(tmp_path / "b.mcap") as recording:

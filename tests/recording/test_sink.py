@@ -108,7 +108,7 @@ def test_full_disk_ends_the_recording_and_leaves_complete_chunks(
     with Recording(tmp_path / "a.mcap") as recording:
         assert not recording.finished
         assert recording.layout.complete == recording.layout.size <= 40_000
-    sink.offer(joints(0))  # what still comes is let go
+    sink.offer(joints(0))  # later samples are dropped
 
 
 def test_failure_while_closing_is_raised(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

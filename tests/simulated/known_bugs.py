@@ -1,4 +1,4 @@
-"""Ten bugs to put back, one at a time, into code that was cured of them; and after how many seeds each is found.
+"""Known bugs, each put back into the fixed code, and the number of seeds until a simulation finds it.
 
 `python -m tests.simulated.known_bugs [MOST]` prints the table.
 """
@@ -140,7 +140,7 @@ def cell_with(bug):
 
 
 def found_within(bug, most):
-    """The number of seeds that were run until one told of the bug, and what it told; None when none did."""
+    """Return the number of seeds until the bug is found, and its report; None if it is not."""
     cell = cell_with(bug)
     for seed in range(1, most + 1):
         with BUGS[bug]():

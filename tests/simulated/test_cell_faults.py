@@ -1,4 +1,4 @@
-"""Processes that die at the worst moments, and a table that somebody else changes: every ball ends where it should."""
+"""Processes that die at bad moments, and edits of the world during a run: every ball ends where it should."""
 
 from __future__ import annotations
 
@@ -94,6 +94,6 @@ def test_unreachable_ball_is_reported_and_the_run_ends_done() -> None:
     summary = SimulatedCell("panda", [f"world.balls={balls}", camera]).summary
     assert summary["state"] == "DONE"
     assert summary["truth"] == {"in_box": 8, "on_table": 4, "elsewhere": 0, "containers": {"box": 8}}
-    told = {place["reason"].partition(":")[0] for place in summary["rejected"]}
-    assert told == set(places) - {"", "inside the container"}
+    reasons = {place["reason"].partition(":")[0] for place in summary["rejected"]}
+    assert reasons == set(places) - {"", "inside the container"}
     assert len(summary["rejected"]) == 4

@@ -33,7 +33,7 @@ def outcome_of(name: str, seed: int, faults: bool = True) -> Outcome:
 @pytest.mark.parametrize(("name", "seed"), [
     ("panda", 1), ("ur5", 1),
     ("panda", 21),  # a start is on its way when the robot is held
-    ("panda", 5848),  # the task hears of what it let go only when that was seen to lie there already
+    ("panda", 5848),  # the released object is detected before the task receives the release
     ("ur5", 31),  # the robot is held for good while the next executor waits for the end of another
     ("ur5", 39),  # the arm moves meanwhile
 ])
@@ -62,7 +62,7 @@ def test_run_that_an_operator_leaves_stopped_ends_at_standstill():
         left.append(outcome.state)
         if left[-1] == "LEFT":
             break
-    assert left[-1] == "LEFT" and set(left[:-1]) <= {"DONE"}  # which another person had started again
+    assert left[-1] == "LEFT" and set(left[:-1]) <= {"DONE"}  # another operator had started it again
 
 
 def test_start_must_acknowledge_the_newest_stop():
@@ -72,7 +72,7 @@ def test_start_must_acknowledge_the_newest_stop():
         await until(bus.reader(topics.MOTION_STATUS), lambda said: bool(said.interlocks))
         assert await newest_interlock(bus) == stopped.newest > 0
         await bus.client(topics.TASK_COMMAND).call(TaskCommand(command="start", acknowledged=stopped.newest - 1))
-        assert await newest_interlock(bus) == stopped.newest, "a start that is late lets go of nothing"
+        assert await newest_interlock(bus) == stopped.newest, "a late start releases nothing"
         await bus.client(topics.TASK_COMMAND).call(TaskCommand(command="start", acknowledged=stopped.newest))
 
     assert Simulation(cell_of("panda"), 1, visit=visit).run().ok
@@ -92,8 +92,8 @@ def test_same_seed_is_the_same_run_with_doubles():
 @pytest.mark.slow
 @pytest.mark.parametrize("bug", DECISIONS)
 def test_interlock_bug_is_found_within_tens_of_seeds(bug):
-    [seed], told = found_in("panda", bug, range(1, 401), enough=1)  # the rarest is seen in one of thirty
-    assert told.startswith("BROKEN"), f"{seed}: {told}"
+    [seed], report = found_in("panda", bug, range(1, 401), enough=1)  # the rarest is seen in one of thirty
+    assert report.startswith("BROKEN"), f"{seed}: {report}"
 
 
 def test_only_the_double_may_read_the_ground_truth():

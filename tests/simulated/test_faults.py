@@ -20,7 +20,7 @@ PANDA = load_cell("panda", ["world.count=2"])
 
 @cache
 def outcome_of(name: str, seed: int) -> Outcome:
-    """Run once, whoever asks."""
+    """Run each cell and seed once."""
     return Simulation(PANDA if name == "panda" else load_cell(name), seed, faults=True, digest=True).run()
 
 

@@ -33,7 +33,7 @@ def test_camera_on_the_arm_clears_the_table_with_images_taken_in_motion() -> Non
             off.extend(min(math.dist(spot, (p.x, p.y)) for spot in spots) for one in frame.markers
                        if moving and not one.partial and (p := one.pose.position))
 
-    # Seldom enough for the pose at the time of the picture to be far from those that tf tells.
+    # Rare enough that the pose at exposure differs from those in tf.
     seldom = "services.robot_state_publisher.rate=12"
     cell = SimulatedCell(HAND, ["world.count=2", seldom], visit=visit)
     outcome, summary = cell.outcome, cell.summary
@@ -54,7 +54,7 @@ def test_objects_out_of_view_keep_their_ids_and_are_counted_once() -> None:
             if status.latest is not None and status.latest.state == "DONE":
                 return
 
-    # The fixed camera, which goes on looking, never sees the second one.
+    # The fixed camera never sees the second one.
     spots = "world.spots=[[0.52, -0.04], [0.40, 0.30]]"
     outcome = SimulatedCell(BOTH, [spots, "world.count=2"], visit=visit, seed=2).outcome
     assert (outcome.state, outcome.done) == ("DONE", 2), outcome
@@ -65,8 +65,8 @@ def test_objects_out_of_view_keep_their_ids_and_are_counted_once() -> None:
 def test_object_moved_out_of_view_is_grasped_at_its_new_position() -> None:
     async def visit(cell: SimulatedCell, bus: Bus) -> None:
         status = bus.reader(PICK_PLACE_STATUS)
-        async for told in status:
-            if told.stage == "across":
+        async for update in status:
+            if update.stage == "across":
                 break
         lying = {o.id for o in (await bus.reader(topics.SCENE_OBJECTS).next()).objects if o.state == "table"}
         await bus.client(topics.WORLD_EDIT).call(WorldEdit.model_validate(

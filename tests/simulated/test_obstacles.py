@@ -1,4 +1,4 @@
-"""Things that come in the way of running motions in whole cells: the arm brakes, waits, goes on or is planned anew."""
+"""Obstacles in the path of running motions in complete cells: the arm brakes, waits, resumes or is replanned."""
 
 from __future__ import annotations
 

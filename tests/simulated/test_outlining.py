@@ -1,4 +1,4 @@
-"""The UR5 cell: an outline that was seen, one that a person chose or wrote, and what cannot be outlined."""
+"""The UR5 cell: detected, selected and edited outlines, and outlines that cannot be traced."""
 
 from __future__ import annotations
 
@@ -52,8 +52,8 @@ def test_selected_object_is_outlined() -> None:
 def test_edited_coordinates_are_traced(tmp_path: Path) -> None:
     smaller = [[0.5 + dx, dy, 1.105] for dx, dy in ((-0.03, -0.03), (0.03, -0.03), (0.03, 0.03), (-0.03, 0.03))]
     stage_files.write_points(tmp_path / stage_files.CLEARED, smaller)
-    told = before_run("ur5", [], None, source=str(tmp_path)).overrides  # of `run ur5 --from`
-    outline = SimulatedCell("ur5", told).summary["outline"]
+    overrides = before_run("ur5", [], None, source=str(tmp_path)).overrides  # of `run ur5 --from`
+    outline = SimulatedCell("ur5", overrides).summary["outline"]
     assert outline["closed"] and outline["points"] == 4
     assert outline["length_m"] == pytest.approx(0.24)
     assert outline["tracking_mm"]["max"] < 0.15
@@ -73,6 +73,6 @@ def test_unreachable_outline_ends_with_an_error_and_the_arm_at_home(objects: str
     assert summary["state"] == "ERROR"
     assert summary["seconds"]["moving"] < 4  # cell time: the fingers at most
     assert summary["seconds"]["first_motion"] is None
-    told = [line for line in cell.lines if "  ERROR contour_tracer: " in line]
-    assert len(told) == 1 and said in told[0]
+    errors = [line for line in cell.lines if "  ERROR contour_tracer: " in line]
+    assert len(errors) == 1 and said in errors[0]
     assert "Traceback" not in cell.text

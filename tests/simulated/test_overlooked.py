@@ -1,4 +1,4 @@
-"""An empty result is no success: what was seen and not taken is said, and what was left unsaid is told apart."""
+"""Objects that a task detected but did not grasp are reported; unexplained ones fail the run."""
 
 import pytest
 

@@ -115,6 +115,6 @@ def test_long_curves_are_thinned_and_keep_their_extremes():
     times = np.linspace(0, 60, 6001)
     values = np.sin(times)[:, None] * 0.1
     values[1234], values[4321] = 3.0, -2.0
-    kept = charts.thinned(times, values)
-    assert len(kept) <= charts.MAX_POINTS + 4 and {1234, 4321, 6000} <= set(kept.tolist())
+    indices = charts.thinned(times, values)
+    assert len(indices) <= charts.MAX_POINTS + 4 and {1234, 4321, 6000} <= set(indices.tolist())
     assert charts.thinned(times[:50], values[:50]).tolist() == list(range(50))

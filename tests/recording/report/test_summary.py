@@ -63,9 +63,9 @@ def test_of_invented_rejections_the_newest_are_listed() -> None:
         summary.on_rejections(0.0, Rejections(header=Header(), rejected=[at(i, number) for i in range(1000)]))
         for plans in ([PLAN] * 1000, []):
             summary.on_status(status("IDLE", number, plans=plans))
-    told = summary.as_dict()
-    assert len(told["rejected"]) == 1000 and {each["position"][1] for each in told["rejected"]} == {11.0}
-    assert len(told["plans"]) == 10_000
+    values = summary.as_dict()
+    assert len(values["rejected"]) == 1000 and {each["position"][1] for each in values["rejected"]} == {11.0}
+    assert len(values["plans"]) == 10_000
 
 
 @given(st.lists(st.tuples(st.floats(-1, 1), st.floats(-1, 1)), max_size=20))
@@ -112,7 +112,7 @@ def test_truth_counts_objects_by_location() -> None:
     truth.on_labels(balls("box", "box", "table", "held", "falling"))
     assert truth.counted() == {"in_box": 2, "on_table": 1, "elsewhere": 2, "containers": {"box": 2, "tray": 0}}
     assert not truth.settled
-    truth.on_objects(WorldObjects())  # of a recording from before balls were objects: nobody lies there
+    truth.on_objects(WorldObjects())  # of an old recording, in which balls are no objects
     assert truth.counted() == {"in_box": 2, "on_table": 1, "elsewhere": 2, "containers": {"box": 2, "tray": 0}}
     truth.on_labels(balls("box"))
     assert truth.settled

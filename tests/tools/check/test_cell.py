@@ -1,4 +1,4 @@
-"""The quick check at a cell that a process of its own takes."""
+"""Quick checks of a cell in a subprocess."""
 
 from __future__ import annotations
 
