@@ -87,7 +87,7 @@ def _clock_of_its_own():
 
 
 def _waits_without_end():
-    async def ask(self, payload, seconds, timeout):
+    async def send(self, payload, seconds, timeout):
         future = self._loop.create_future()
 
         def settle(reply):
@@ -96,7 +96,7 @@ def _waits_without_end():
         self._session.get(self._key, settle, lambda: None, payload=payload, timeout=1e9)
         return await future
 
-    return patch.object(requests.Client, "_ask", ask)
+    return patch.object(requests.Client, "_send", send)
 
 
 def _never_asked_again():

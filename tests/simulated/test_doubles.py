@@ -101,7 +101,14 @@ def test_only_the_double_may_read_the_ground_truth():
         assert "no deciding service reads the ground truth" in outcome_of("panda", 1).broken[0]
 
 
-def test_application_without_a_double_is_rejected():
-    cell = load_cell("panda").model_copy(update={"application": "tests.simulated.box_detector"})
+def test_application_without_a_double_is_rejected(tmp_path, monkeypatch):
+    (tmp_path / "no_double").mkdir()
+    (tmp_path / "no_double" / "app.py").write_text(
+        "from common.application import Application, ApplicationTopics\n"
+        "from common.messages import TaskStatus\nfrom common.topics import Topic\n"
+        "STATUS = Topic('no_double_status', TaskStatus, 'state', '')\n"
+        "APPLICATION = Application(topics=ApplicationTopics(status=STATUS))\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    cell = load_cell("panda").model_copy(update={"application": "no_double.app"})
     with pytest.raises(ConfigError, match="--doubles"):
         with_doubles(cell)

@@ -9,7 +9,7 @@ FOLDERS = ("common/control", "common/hardware", "common/planning", "common/perce
 SINGLE = (
     "common/clock.py", "common/process/task_runner.py", "common/process/task_requests.py", "common/process/timing.py",
     "common/transport/bus.py", "common/transport/reader.py", "common/transport/writer.py",
-    "common/transport/requests.py", "common/transport/tokens.py", "common/transport/trace.py",
+    "common/transport/requests.py", "common/transport/tokens.py",
     "common/supervision/supervisor.py", "common/supervision/lifecycle.py",
 )
 REAL = tuple(f"common/{name}.py" for name in (  # of real arms and cameras, which no simulation has
