@@ -21,7 +21,7 @@ from common.messages import (
     WorldEdit,
     WorldObjects,
 )
-from common.sim.interface import StandingObject
+from common.sim.interface import ObjectSnapshot
 from common.sim.kinematic import KinematicWorld
 from common.transport.codec import decode, encode
 from tests.common.control.rig import GRIPPER, START, TABLE, ExecutorRig, mock
@@ -201,7 +201,7 @@ def test_objects_of_physics_are_saved_as_of_the_same_moment_as_the_arm(limits, r
         version, ids, layout, held = 1, [], {}, "ball"  # it reports moving objects only now and then
 
         def standing(self):
-            return {"ball": StandingObject(pose=tuple(hardware.last[0]))}
+            return {"ball": ObjectSnapshot(pose=tuple(hardware.last[0]))}
 
         def objects(self, header):
             return WorldObjects(header=header)
