@@ -168,7 +168,7 @@ def test_long_step_of_the_world_is_deferred_and_the_arm_continues(limits, monkey
         rig.step()
     before, saved = len(rig.joints), len(rig.saver.states)
     with monkeypatch.context() as patched:
-        for name in ("tick", "obstruction", "objects", "take_events", "standing"):
+        for name in ("tick", "obstruction", "objects", "take_events", "snapshot"):
             owner = next(cls for cls in KinematicWorld.__mro__ if name in vars(cls))
             patched.delattr(owner, name)  # any call would fail
         rig.run(0.2)
@@ -200,7 +200,7 @@ def test_objects_of_physics_are_saved_as_of_the_same_moment_as_the_arm(limits, r
     class Physics:
         version, ids, layout, held = 1, [], {}, "ball"  # it reports moving objects only now and then
 
-        def standing(self):
+        def snapshot(self):
             return {"ball": ObjectSnapshot(pose=tuple(hardware.last[0]))}
 
         def objects(self, header):
