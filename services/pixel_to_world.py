@@ -1,4 +1,4 @@
-"""Turns the chosen contour into the outline of the object's top face in world, with the depth of its pixels."""
+"""Convert the selected contour to the outline of the object's top face in world, by the depth of its pixels."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from common.process.service import main
 from common.transport.bus import Bus
 
 WORLD = "world"
-KEPT = 4  # depth images that wait for the contours of their picture
+KEPT = 4  # depth images that wait for the contours of their image
 
 
 class Config(TopFaceOptions):
@@ -30,10 +30,10 @@ class Config(TopFaceOptions):
 
 
 def outline(contours: Contours, image: Image, camera: Pinhole, config: Config) -> TopFace:
-    """The outline of the chosen object.
+    """Return the outline of the selected object.
 
     Raises:
-        FrameError, DepthError: one line that says why there is none.
+        FrameError, DepthError: one line that tells why there is none.
     """
     depth = depth_of(image)
     check_depth(depth, contours.width, contours.height)
@@ -47,12 +47,12 @@ def outline(contours: Contours, image: Image, camera: Pinhole, config: Config) -
 
 
 async def run(bus: Bus, config: Config) -> None:
-    """Answer the contours of each picture with an outline, or with why there is none."""
+    """Publish an outline for the contours of each image, or why there is none."""
     contours, depths = bus.reader(CONTOURS), bus.reader(topics.DEPTH_CAMERA_DEPTH)
     cameras = CameraReader(bus, config.world, topics.DEPTH_CAMERA_INFO)
     out = bus.writer(CONTOUR_POINTS)
     images: OrderedDict[int, Image] = OrderedDict()
-    waiting: Contours | None = None  # contours whose depth image has not come yet
+    waiting: Contours | None = None  # contours whose depth image has not arrived yet
     told = ""
     await bus.ready()
 

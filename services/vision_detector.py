@@ -1,4 +1,4 @@
-"""Finds the balls in the picture and says where they are in the world."""
+"""Detect balls in camera images and publish their positions in world."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ from common.process.camera_reader import CameraReader
 from common.process.service import main
 from common.transport.bus import Bus
 
-KEPT = 5  # depth images that wait for their pictures
-PATIENCE = 0.3  # [s, wall time] for which a picture waits for its depth
+KEPT = 5  # depth images that wait for their color images
+PATIENCE = 0.3  # [s, wall time] for which a color image waits for its depth image
 WORLD = "world"
 
 
 class Config(DetectorOptions):
-    """How red is told from the rest."""
+    """How red is separated from other colors."""
 
     world: Surroundings
     depth: bool = Field(False, description="pictures come with depth, on depth_camera/depth/image_raw: balls are where "
@@ -50,12 +50,12 @@ def markers(
     detections: list[Detection], around: Surroundings, stamp: int, remark: str = "", blind: str = "",
     odd: Sequence[Outlier] = (),
 ) -> MarkerArray:
-    """The message of what was found in the frame that was exposed at `stamp`, or of why that tells nothing.
+    """Return the message with the detections in the image with this stamp, or why it is unusable.
 
-    What is `odd` is among it with the reason as its text: it stands in the way, and is not to be taken.
+    An `odd` object is included with the reason as its text: an obstacle, and no target.
 
     Raises:
-        FrameError: that is more, or farther away, than there is room for.
+        FrameError: more detections, or farther ones, than fit.
     """
     require_capacity(len(detections) + len(odd))
     require_in_range([*(one.position for one in detections), *(one.position for one in odd)])
@@ -74,7 +74,7 @@ def markers(
     )
 
 
-@lru_cache(maxsize=64)  # what lies still is described once
+@lru_cache(maxsize=64)  # a marker of an object at rest is created once
 def _marker(
     index: int, position: Place, pixel: tuple[float, float], partial: bool, radius: float, color: Rgb, odd: str = "",
 ) -> Marker:
@@ -87,7 +87,7 @@ def _marker(
 
 
 def _remark(detector: Detector, service: str) -> str:
-    """What there is in the last picture that is too small or too large to be a ball; empty without."""
+    """Describe red blobs of the last image that are too small or too large for a ball; empty without any."""
     parts = []
     if count := detector.too_small:
         parts.append(f"{count} red {'blob is' if count == 1 else 'blobs are'} smaller than "
@@ -99,12 +99,12 @@ def _remark(detector: Detector, service: str) -> str:
 
 
 async def run(bus: Bus, config: Config) -> None:
-    """Look at every picture as it comes; what cannot be looked at is dropped, counted and told once."""
+    """Process every image; unusable ones are dropped, counted and reported once."""
     images = bus.reader(topics.CAMERA_IMAGE)
     cameras = CameraReader(bus, config.world)
     found, shown = bus.writer(DETECTED_OBJECTS), bus.writer(DETECTION_IMAGE)
     masks = bus.writer(DETECTION_MASK)
-    cv2.setNumThreads(1)  # the other cores have other services
+    cv2.setNumThreads(1)  # other services use the other cores
     depths = bus.reader(topics.DEPTH_CAMERA_DEPTH) if config.depth else None
     kept: deque[Image] = deque(maxlen=KEPT)
     news = asyncio.Event()

@@ -1,4 +1,4 @@
-"""Offers the detections that the arm can take to the task, and says why it does not offer the others."""
+"""Offer the detections within reach to the task, and report why others are rejected."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from common.scene.workspace import ReachCache, WorkspaceBounds
 from common.transport.bus import Bus
 
 WORLD = "world"
-PATIENCE = 0.008  # wall time for which a frame with new places waits for their inverse kinematics [s]
+PATIENCE = 0.008  # [s, wall time] for which a frame waits for the inverse kinematics of new positions
 
 
 class Config(ViewsParameters, WorkspaceBounds):
@@ -49,17 +49,17 @@ class Config(ViewsParameters, WorkspaceBounds):
 
 
 class OcclusionReport:
-    """Says what the newest pictures do not show of where things may lie."""
+    """Reports which part of the table the newest images do not show."""
 
     def __init__(self, around: Surroundings, bounds: WorkspaceBounds) -> None:
-        """Begin; the table is divided up when something is hidden for the first time."""
+        """Start; the grid of the table is created on the first occlusion."""
         self._around, self._bounds = around, bounds
         self._region: VisibleTable | None = None
 
     def unseen(self, seen: list[CameraDetections], views: DetectionViews, most: float) -> tuple[str, bool]:
-        """In words, empty where at most that share of the table is hidden; and whether nothing is seen at all.
+        """Return a description, empty while at most this fraction is occluded, and whether nothing is visible at all.
 
-        Of several views all are needed: what only one of them sees is not known without it.
+        All views are needed: what only one of them sees is unknown without it.
         """
         if missing := views.missing():
             return f"no picture comes from {' and '.join(missing)}", False
@@ -76,7 +76,7 @@ class OcclusionReport:
 
 
 def hiding(seen: list[CameraDetections], radius: float) -> Callable[[tuple[float, float, float]], bool] | None:
-    """Whether a place is hidden in all views, for what is as large as that [m]; None where any shows everything."""
+    """Return whether a position is occluded in all views, for an object of this radius [m]; None: nothing is."""
     hidden = [one.hidden for one in seen if one.hidden is not None]
     if len(hidden) < len(seen) or not hidden:
         return None
@@ -84,7 +84,7 @@ def hiding(seen: list[CameraDetections], radius: float) -> Callable[[tuple[float
 
 
 def shells(config: Config, header: Header) -> MarkerArray:
-    """The reachable shell, and the column about the base axis that is left out of it."""
+    """Return the reachable shell, and the excluded column around the base axis."""
     height = config.max_height - config.min_height
     inner = max(config.min_radius, config.singularity_radius)
     cylinders = (("reachable shell", config.max_radius, (0.2, 0.8, 0.3)), ("excluded column", inner, (0.9, 0.2, 0.2)))
@@ -102,7 +102,7 @@ def shells(config: Config, header: Header) -> MarkerArray:
 
 
 async def run(bus: Bus, config: Config) -> None:
-    """Judge every frame with what is known; the inverse kinematics of new places is worked out beside that."""
+    """Validate every frame with the known reachability; compute that of new positions concurrently."""
     views = DetectionViews(bus, config.views, config.world, config.robot, bus.log)
     validated, rejected = bus.writer(VALIDATED_TARGETS), bus.writer(REJECTED_TARGETS)
     markers = bus.writer(WORKSPACE_MARKERS)
@@ -118,7 +118,7 @@ async def run(bus: Bus, config: Config) -> None:
     bus.on_parameters(show)
     places: list[tuple[float, float, float]] = []
     work, idle = asyncio.Event(), asyncio.Event()
-    unfinished: list[CameraDetections] = []  # sent without the places that were still worked on
+    unfinished: list[CameraDetections] = []  # sent without the positions that were still being computed
     await bus.ready()
 
     def send(seen: list[CameraDetections]) -> None:
@@ -128,7 +128,7 @@ async def run(bus: Bus, config: Config) -> None:
         unfinished = seen if verdict.unknown else []
         header = Header(stamp=min(one.frame.header.stamp for one in seen), frame_id=WORLD)
         kept = remembered.hidden(verdict.targets, [place for place, _ in verdict.refused], hiding(seen, radius))
-        # Of several crowded views not all can be told of: what is left out is nobody's target for now.
+        # Several crowded views may not fit: the rest is offered later.
         verdict.targets, kept = verdict.targets[:MOST_POSES], kept[: max(0, MOST_POSES - len(verdict.targets))]
         poses = [Pose(position=Vector3(x=x, y=y, z=z)) for x, y, z in [*verdict.targets, *kept]]
         labels = [*("" for _ in verdict.targets), *(HIDDEN for _ in kept)] if kept else []
@@ -146,7 +146,7 @@ async def run(bus: Bus, config: Config) -> None:
         if places:
             idle.clear()
             work.set()
-            with suppress(TimeoutError):  # what is not known by then goes out with a later frame
+            with suppress(TimeoutError):  # the rest goes out with a later frame
                 async with asyncio.timeout(PATIENCE):  # wait_for of Python 3.11 can lose a cancellation
                     await idle.wait()
         send(seen)
