@@ -27,7 +27,7 @@ from common.process.camera_reader import CameraReader
 from common.process.service import main
 from common.transport.bus import Bus
 
-KEPT = 5  # depth images that wait for their color images
+BUFFERED = 5  # depth images that wait for their color images
 WORLD = "world"
 
 
@@ -70,13 +70,13 @@ async def run(bus: Bus, config: Config) -> None:
     cv2.setNumThreads(1)  # other services use the other cores
     detector = BoxDetector(config)
     left_out = SkippedFrames(bus.log, "a picture")
-    kept: deque[Image] = deque(maxlen=KEPT)
+    buffered: deque[Image] = deque(maxlen=BUFFERED)
     newest, turn = 0, asyncio.Lock()
     await bus.ready()
 
     async def look(image: Image | None) -> None:
         nonlocal newest
-        depth = next((one for one in kept if image is not None and one.header.stamp == image.header.stamp), None)
+        depth = next((one for one in buffered if image is not None and one.header.stamp == image.header.stamp), None)
         if image is None or depth is None or image.header.stamp == newest:
             return
         newest = image.header.stamp
@@ -103,7 +103,7 @@ async def run(bus: Bus, config: Config) -> None:
 
     async def watch_depths() -> None:
         async for depth in depths:
-            kept.append(depth)
+            buffered.append(depth)
             async with turn:
                 await look(images.latest)
 

@@ -54,11 +54,11 @@ async def run(bus: Bus, config: Config) -> None:
     cv2.setNumThreads(1)  # other services use the other cores
     following = ContourTracker(initial_choice(config.select))
     last: tuple[Image, Picture, list[Contour]] | None = None
-    told = ""
+    last_warning = ""
     left_out = SkippedFrames(bus.log, "a picture")
 
     def publish(selected: int, message: str) -> None:
-        nonlocal told
+        nonlocal last_warning
         if last is None:
             return
         image, picture, contours = last
@@ -67,9 +67,9 @@ async def run(bus: Bus, config: Config) -> None:
             message=message,
         ))
         shown.put(array_to_image(annotate_contours(picture, contours, selected), "bgr8", image.header))
-        if message and message != told:
+        if message and message != last_warning:
             bus.log.warning("%s", message)
-        told = message
+        last_warning = message
 
     async def select(wanted: OutlineSelect) -> OutlineSelection:
         if last is None:

@@ -35,8 +35,8 @@ def cleared(poses: list[Pose], tolerance: float) -> list[Pose]:
     if not poses:
         return poses
     places = np.array([(p.position.x, p.position.y, p.position.z) for p in poses])
-    kept = simplified(without_duplicates(places), tolerance)
-    return [Pose(position=Vector3(x=x, y=y, z=z)) for x, y, z in kept.tolist()]
+    simplified_places = simplified(without_duplicates(places), tolerance)
+    return [Pose(position=Vector3(x=x, y=y, z=z)) for x, y, z in simplified_places.tolist()]
 
 
 def points_of(file: Path) -> list[Pose]:

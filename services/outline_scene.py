@@ -19,7 +19,7 @@ from common.process.service import main
 from common.scene.home import HomeWatch
 from common.transport.bus import Bus
 
-KEPT = 5  # depth images that wait for their contours
+BUFFERED = 5  # depth images that wait for their contours
 
 
 class Config(Parameters):
@@ -52,7 +52,7 @@ async def run(bus: Bus, config: Config) -> None:
     joints = bus.reader(topics.JOINT_STATES)
     out = SceneWriter(bus)
     home = HomeWatch(config.robot.named_poses["home"])
-    kept: deque[Image] = deque(maxlen=KEPT)
+    buffered: deque[Image] = deque(maxlen=BUFFERED)
     left_out = SkippedFrames(bus.log, "a picture")
     await out.begin(planning_scene(config.world, [], 0))
     await bus.ready()
@@ -65,7 +65,7 @@ async def run(bus: Bus, config: Config) -> None:
 
     async def watch_depth() -> None:
         async for image in depths:
-            kept.append(image)
+            buffered.append(image)
             await look(contours.latest)
 
     async def watch_contours() -> None:
@@ -79,7 +79,7 @@ async def run(bus: Bus, config: Config) -> None:
         nonlocal newest
         if found is None or found.header.stamp == newest or not home.covers(found.header.stamp):
             return
-        depth = next((image for image in kept if image.header.stamp == found.header.stamp), None)
+        depth = next((image for image in buffered if image.header.stamp == found.header.stamp), None)
         if depth is None:
             return
         newest = found.header.stamp

@@ -33,8 +33,8 @@ from common.process.camera_reader import CameraReader
 from common.process.service import main
 from common.transport.bus import Bus
 
-KEPT = 5  # depth images that wait for their color images
-PATIENCE = 0.3  # [s, wall time] for which a color image waits for its depth image
+BUFFERED = 5  # depth images that wait for their color images
+DEPTH_WAIT = 0.3  # [s, wall time] for which a color image waits for its depth image
 WORLD = "world"
 
 
@@ -106,8 +106,8 @@ async def run(bus: Bus, config: Config) -> None:
     masks = bus.writer(DETECTION_MASK)
     cv2.setNumThreads(1)  # other services use the other cores
     depths = bus.reader(topics.DEPTH_CAMERA_DEPTH) if config.depth else None
-    kept: deque[Image] = deque(maxlen=KEPT)
-    news = asyncio.Event()
+    buffered: deque[Image] = deque(maxlen=BUFFERED)
+    arrived = asyncio.Event()
     detector = Detector(config.world, config)
     left_out = SkippedFrames(bus.log, "a picture")
     if not bus.declares_only:
@@ -117,16 +117,16 @@ async def run(bus: Bus, config: Config) -> None:
     async def watch_depths() -> None:
         if depths is not None:
             async for depth in depths:
-                kept.append(depth)
-                news.set()
+                buffered.append(depth)
+                arrived.set()
 
     async def depth_with(stamp: int, camera: Pinhole) -> Depth:
         with suppress(TimeoutError):
-            async with asyncio.timeout(PATIENCE):
-                while all(one.header.stamp != stamp for one in kept):
-                    news.clear()
-                    await news.wait()
-        found = next((one for one in kept if one.header.stamp == stamp), None)
+            async with asyncio.timeout(DEPTH_WAIT):
+                while all(one.header.stamp != stamp for one in buffered):
+                    arrived.clear()
+                    await arrived.wait()
+        found = next((one for one in buffered if one.header.stamp == stamp), None)
         if found is None:
             raise FrameError("depth", "no depth image of the same time came")
         depth = depth_of(found)

@@ -31,7 +31,7 @@ from common.scene.workspace import ReachCache, WorkspaceBounds
 from common.transport.bus import Bus
 
 WORLD = "world"
-PATIENCE = 0.008  # [s, wall time] for which a frame waits for the inverse kinematics of new positions
+IK_WAIT = 0.008  # [s, wall time] for which a frame waits for the inverse kinematics of new positions
 
 
 class Config(ViewsParameters, WorkspaceBounds):
@@ -44,7 +44,7 @@ class Config(ViewsParameters, WorkspaceBounds):
         MOST_HIDDEN, ge=0, le=1, description="part of the table within reach that may be hidden while it counts as seen"
     )
     forget_after: Tunable[float] = Field(
-        2.0, ge=0, le=3600, description="a rejection is told again once its place was empty for so long [s, cell time]"
+        2.0, ge=0, le=3600, description="time unseen after which a rejection is reported again [s, cell time]"
     )
 
 
@@ -124,20 +124,20 @@ async def run(bus: Bus, config: Config) -> None:
     def send(seen: list[CameraDetections]) -> None:
         nonlocal unfinished
         validation.forget_after = config.forget_after
-        verdict = validation.validate_views([(one.frame, one.camera) for one in seen])
-        unfinished = seen if verdict.unknown else []
+        result = validation.validate_views([(one.frame, one.camera) for one in seen])
+        unfinished = seen if result.unknown else []
         header = Header(stamp=min(one.frame.header.stamp for one in seen), frame_id=WORLD)
-        kept = remembered.hidden(verdict.targets, [place for place, _ in verdict.refused], hiding(seen, radius))
+        occluded = remembered.hidden(result.targets, [place for place, _ in result.refused], hiding(seen, radius))
         # Several crowded views may not fit: the rest is offered later.
-        verdict.targets, kept = verdict.targets[:MOST_POSES], kept[: max(0, MOST_POSES - len(verdict.targets))]
-        poses = [Pose(position=Vector3(x=x, y=y, z=z)) for x, y, z in [*verdict.targets, *kept]]
-        labels = [*("" for _ in verdict.targets), *(HIDDEN for _ in kept)] if kept else []
+        result.targets, occluded = result.targets[:MOST_POSES], occluded[: max(0, MOST_POSES - len(result.targets))]
+        poses = [Pose(position=Vector3(x=x, y=y, z=z)) for x, y, z in [*result.targets, *occluded]]
+        labels = [*("" for _ in result.targets), *(HIDDEN for _ in occluded)] if occluded else []
         unseen, blind = watched.unseen(seen, views, config.may_hide)
-        validated.put(PoseArray(header=header, poses=poses, labels=labels, remark=verdict.remark, unseen=unseen,
+        validated.put(PoseArray(header=header, poses=poses, labels=labels, remark=result.remark, unseen=unseen,
                                 blind=blind))
-        if verdict.rejections:
-            rejected.put(Rejections(header=header, rejected=verdict.rejections))
-        for one in verdict.rejections:
+        if result.rejections:
+            rejected.put(Rejections(header=header, rejected=result.rejections))
+        for one in result.rejections:
             bus.log.info("rejected (%s, %s): %s", f"{one.position.x:z.3f}", f"{one.position.y:z.3f}", one.reason)
 
     async def look(_view: int, _seen: CameraDetections) -> None:
@@ -147,7 +147,7 @@ async def run(bus: Bus, config: Config) -> None:
             idle.clear()
             work.set()
             with suppress(TimeoutError):  # the rest goes out with a later frame
-                async with asyncio.timeout(PATIENCE):  # wait_for of Python 3.11 can lose a cancellation
+                async with asyncio.timeout(IK_WAIT):  # wait_for of Python 3.11 can lose a cancellation
                     await idle.wait()
         send(seen)
 

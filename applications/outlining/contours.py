@@ -184,12 +184,12 @@ def find_contours(picture: Picture, options: ContourOptions) -> list[Contour]:
         return []
     parents = [int(parent) for parent in hierarchy[0, :, 3]]
     areas = [float(cv2.contourArea(chain)) for chain in chains]
-    kept = _with_room([i for i, area in enumerate(areas) if area >= options.min_area],
+    selected = _with_room([i for i, area in enumerate(areas) if area >= options.min_area],
                       [len(chain) for chain in chains], areas, parents)
-    index_of = {-1: -1} | {old: new for new, old in enumerate(kept)}
+    index_of = {-1: -1} | {old: new for new, old in enumerate(selected)}
     height, width = above.shape
     found = []
-    for index, old in enumerate(kept):
+    for index, old in enumerate(selected):
         chain = np.asarray(chains[old].reshape(-1, 2), np.int32)
         hole = _is_hole(parents, old)
         points = refine(channel, chain, hole=hole) if options.subpixel else chain.astype(float)
@@ -206,14 +206,14 @@ def _with_room(
     wanted: Sequence[int], lengths: Sequence[int], areas: Sequence[float], parents: Sequence[int]
 ) -> list[int]:
     """Return the largest contours that fit into a message; a contour needs the one around it."""
-    kept, points = set[int](), 0
+    selected, points = set[int](), 0
     for index in sorted(wanted, key=lambda i: -areas[i]):  # a thin ring comes before its hole of the same area
         size = lengths[index]
-        inside = parents[index] in kept or parents[index] < 0
-        if inside and size <= MOST_ALONG_ONE and points + size <= MOST_POINTS and len(kept) < MOST:
-            kept.add(index)
+        inside = parents[index] in selected or parents[index] < 0
+        if inside and size <= MOST_ALONG_ONE and points + size <= MOST_POINTS and len(selected) < MOST:
+            selected.add(index)
             points += size
-    return sorted(kept)
+    return sorted(selected)
 
 
 def is_hole(contours: Sequence[Contour], index: int) -> bool:

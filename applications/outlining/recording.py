@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 BEFORE = ("IDLE", "SELECTING", "PLANNING")
 UNDER_WAY = ("APPROACHING", "TRACING", "RETREATING")
 CLOSED = 1e-3  # [m] distance of first and last point of a closed outline, besides the motion between two joint states
-UNHEARD = 2.0  # [s] at start and end without joint states, in which the tool may have moved on
+MAX_GAP = 2.0  # [s] at start and end without joint states, in which the tool may have moved on
 MOST_STATES = 100_000  # joint states of one outline: a quarter of an hour at 100 Hz
 
 
@@ -224,14 +224,14 @@ def _is_closed(tips: Array, times: Array) -> bool:
     """Return whether the first and the last position (N, 3) are equal, within what the joint states can show.
 
     Between the start and the first joint state, and between the last one and the end, the tool may have moved at its
-    highest observed speed, for UNHEARD at most. `times` (N + 2,) [s]: start, those of the positions, end.
+    highest observed speed, for MAX_GAP at most. `times` (N + 2,) [s]: start, those of the positions, end.
     """
     if len(tips) < 2:
         return False
     steps = np.linalg.norm(np.diff(tips, axis=0), axis=1)
     gaps = np.diff(times)
     speed = float((steps / np.maximum(gaps[1:-1], 1e-3)).max())
-    unseen = float(steps.max()) + speed * min(float(gaps[0] + gaps[-1]), UNHEARD)
+    unseen = float(steps.max()) + speed * min(float(gaps[0] + gaps[-1]), MAX_GAP)
     return float(np.linalg.norm(tips[0] - tips[-1])) <= CLOSED + unseen
 
 

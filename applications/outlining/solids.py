@@ -29,10 +29,10 @@ def without_duplicates(points: npt.ArrayLike) -> Array:
     p = np.asarray(points, dtype=float)
     if len(p) < 2:
         return p
-    kept = p[np.concatenate([[True], np.linalg.norm(np.diff(p, axis=0), axis=1) > SAME])]
-    if len(kept) > 1 and np.linalg.norm(kept[-1] - kept[0]) <= SAME:
-        kept = kept[:-1]
-    return np.asarray(kept)
+    distinct = p[np.concatenate([[True], np.linalg.norm(np.diff(p, axis=0), axis=1) > SAME])]
+    if len(distinct) > 1 and np.linalg.norm(distinct[-1] - distinct[0]) <= SAME:
+        distinct = distinct[:-1]
+    return np.asarray(distinct)
 
 
 def simplified(points: npt.ArrayLike, tolerance: float) -> Array:

@@ -44,14 +44,14 @@ class OutlineView(View):
         if self.path is None or self.scene is None or self.scene.header.stamp < self.path.header.stamp:
             return None
         places = [place_of(pose) for pose in self.path.poses]
-        beside = {o.id: sum(_beside(o, at) for at in places) for o in self.scene.objects if o.role == "target"}
+        near_counts = {o.id: sum(_is_near(o, at) for at in places) for o in self.scene.objects if o.role == "target"}
         if self.path.given:
-            return max((name for name, count in beside.items() if count), key=beside.__getitem__, default="")
-        around = [o for o in self.scene.objects if beside.get(o.id) == len(places)]
+            return max((name for name, count in near_counts.items() if count), key=near_counts.__getitem__, default="")
+        around = [o for o in self.scene.objects if near_counts.get(o.id) == len(places)]
         return min(around, key=_area).id if around else None
 
 
-def _beside(thing: m.CollisionObject, place: Place) -> bool:
+def _is_near(thing: m.CollisionObject, place: Place) -> bool:
     """Return whether a position lies within the bounding box of an upright prism."""
     at = thing.pose.position
     xs, ys = zip(*thing.outline, strict=True) if thing.outline else ((0.0,), (0.0,))

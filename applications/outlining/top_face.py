@@ -146,7 +146,7 @@ class TopFace:
     """The outline (n, 3) [m] in world, heights [m] of top and surroundings, and how it was found.
 
     `base` is None when nothing lower around the object is within the camera's range. `filled` counts contour pixels
-    without depth; `upright` tells whether the walls are.
+    without depth; `upright`: whether the walls are.
     """
 
     outline: Array
@@ -200,8 +200,8 @@ def top_face(
     tolerance = max(options.top_tolerance, 4 * _noise(cut.heights, core))
     about = core if not hole else core & (cv2.dilate(cut.hole, np.ones((2 * AROUND + 1,) * 2, np.uint8)) > 0)
     top = _plateau(cut.heights[about if about.any() else core], tolerance)
-    beside = _heights_beside(contour, out, depth, camera)
-    lower = beside[beside < top - tolerance]
+    around = _heights_around(contour, out, depth, camera)
+    lower = around[around < top - tolerance]
     base = float(np.median(lower)) if len(lower) else None
     level = np.abs(cut.heights - top) <= tolerance
     edge = _edge_of_hole(cut, level) if hole else _edge_of_plateau(cut, level)
@@ -260,7 +260,7 @@ def _plateau(heights: Array, tolerance: float) -> float:
     return top
 
 
-def _heights_beside(contour: Array, out: Array, depth: Depth, camera: Pinhole) -> Array:
+def _heights_around(contour: Array, out: Array, depth: Depth, camera: Pinhole) -> Array:
     """Height [m] a little outside of each contour point (n,); NaN where unknown."""
     cells = np.rint(contour + OUTSIDE * out).astype(int)
     height, width = depth.shape
@@ -275,7 +275,7 @@ def _heights_beside(contour: Array, out: Array, depth: Depth, camera: Pinhole) -
 
 
 def _edges(contour: Array, camera: Pinhole, top: float, base: float | None, edge: Array, *, hole: bool) -> Array:
-    """Return the outline (n, 3) [m] at the height `top` of an upright object that stands at `base`."""
+    """Return the outline (n, 3) [m] at the height `top` of an upright object on a support at `base`."""
     rays = Rays.through(camera, contour)
     at_top = rays.at_height(np.full(len(contour), top))
     if base is None:

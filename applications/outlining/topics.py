@@ -88,7 +88,7 @@ class OutlinePoints(PoseArray):
     """Outline of the selected object's top face, closed: the last point is followed by the first.
 
     The stamp is that of the image. Without a selected object, or without a known outline, there are no poses, and
-    `message` tells why.
+    `message` has the reason.
     """
 
     most_bytes: ClassVar[int] = 4 * 1024 * 1024

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import sys
+from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
@@ -36,7 +37,7 @@ if TYPE_CHECKING:
 TRIES = 3  # of a selection request
 AGAIN_WITHIN = 5.0  # [s] for the connection to recover
 TIMEOUT = 30.0  # [s] for an image and its outline
-KEPT = 100  # images whose contours and points are cached until their path arrives
+CACHED = 100  # images whose contours and points are cached until their path arrives
 ALL_WITHIN = 3.0  # [s, cell time] after the first image for a contour to be selected
 CHOOSE_BY_HAND = ("services.contour_detector.select=none", "services.contour_tracer.selection_timeout=0")
 
@@ -59,7 +60,7 @@ def require_terminal() -> None:
         raise ConfigError("--ask", ..., "needs a terminal; without one choose with `zencell task select N`")
 
 
-async def ask_operator(bus: Bus, folder: Path) -> None:
+async def ask_operator(bus: Bus, folder: Path, read_line: Callable[[], Awaitable[str]] | None = None) -> None:
     """Store the image with its contours in a folder, and ask until one of them is selected."""
     contours, images = bus.reader(CONTOURS), bus.reader(CONTOUR_IMAGE)
     select = bus.client(OUTLINE_SELECT)
@@ -70,7 +71,7 @@ async def ask_operator(bus: Bus, folder: Path) -> None:
     while True:
         print_line("outline which one? ", end="")
         try:
-            wanted = parse_choice(await _line())
+            wanted = parse_choice(await (read_line or _line)())
             if wanted is not None:
                 if wanted.index is not None and wanted.index < len(found.contours):
                     wanted.at = middle_of(found.contours[wanted.index])  # in the image that the operator sees
@@ -144,7 +145,7 @@ async def _line() -> str:
 
 
 async def store_stages(bus: Bus, folder: Path, wanted: OutlineSelect | None) -> str:
-    """Store an image, its depth and the stages of its outline in a folder; return a line that tells what was stored.
+    """Store an image, its depth and the stages of its outline in a folder; return a line that names them.
 
     Raises:
         NoOutline: the image has no outline.
@@ -194,12 +195,12 @@ async def store_stages(bus: Bus, folder: Path, wanted: OutlineSelect | None) -> 
     return f"{path.object}, {len(path.poses)} points: the picture and the stages are in {folder}"
 
 
-async def _note(reader: Reader[M], kept: dict[int, M], more: asyncio.Event) -> None:
+async def _note(reader: Reader[M], cache: dict[int, M], more: asyncio.Event) -> None:
     """Cache the newest messages by the stamps of their images."""
     async for message in reader:
-        kept[message.header.stamp] = message
-        while len(kept) > KEPT:
-            del kept[next(iter(kept))]
+        cache[message.header.stamp] = message
+        while len(cache) > CACHED:
+            del cache[next(iter(cache))]
         more.set()
 
 

@@ -167,7 +167,7 @@ class Choice:
         self._judged_by: dict[str, Any] = {}  # parameter values
         self._empty = DwellTimer()
         self._expected = (0, 0.0)  # balls expected in the container, and until when they count unseen [s]
-        self.let_go = ReleasePositions()
+        self.releases = ReleasePositions()
 
     def next(self, view: PickPlaceView, origin: Sequence[float], under_way: Sequence[Pick]) -> Pick | None:
         """Return the nearest takable ball to `origin` (x, y) with its yaws; None when there is none."""
@@ -193,7 +193,7 @@ class Choice:
             if full:
                 self.give_up(ball, FULL, view)
             elif not yaws:
-                self.give_up(ball, "no turn of the hand clears what stands beside it", view)
+                self.give_up(ball, "its neighbors leave no room for the fingers at any yaw", view)
             else:
                 again = self._given_up_at(ball.position) is not None
                 clear = [] if flat is not None else grasp_yaws(
@@ -227,16 +227,16 @@ class Choice:
         """
         seen = [place_of(thing.pose) for thing in view.objects("contained")]
         empty = not seen and 0 < view.scene_stamp >= self._expected[1] and not _hidden(view)
-        if self._empty.elapsed(empty, view.scene_stamp) >= EMPTY_FOR and empty and self.let_go.places:
-            self.let_go = ReleasePositions()
-        return [*seen, *self.let_go.places]
+        if self._empty.elapsed(empty, view.scene_stamp) >= EMPTY_FOR and empty and self.releases.places:
+            self.releases = ReleasePositions()
+        return [*seen, *self.releases.places]
 
     def _top(self, over: Spot, lie: Sequence[Place]) -> float:
         """Height of the center of one more ball on top of a column [m]."""
         below = [z for x, y, z in lie if math.dist((x, y), over) < self.radius]
         return max(below, default=self.p.world.table_height - self.radius) + 2 * self.radius
 
-    def once_more(self) -> bool:
+    def allow_retries(self) -> bool:
         """Allow one retry for every target without a plan; return whether there is any."""
         again = [g for g in self._given_up if g.retry]
         for g in again:
@@ -266,7 +266,8 @@ class Choice:
         """Record the release of a ball above the container; it is seen there once it is at rest."""
         over = column_at(self.container, view.tool[:2])  # the fallback goal is anywhere above it
         place = (*over, self._top(over, self._lie(view)))
-        self.let_go = ReleasePositions(places=[*(other for other in self.let_go.places if other[:2] != over), place])
+        others = (other for other in self.releases.places if other[:2] != over)
+        self.releases = ReleasePositions(places=[*others, place])
         self._expected = self._contained(view) + 1, view.now + SETTLING
         self._forget(pick.target)
 

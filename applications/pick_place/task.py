@@ -51,7 +51,7 @@ class PickPlace(Task[PickPlaceView]):
         """Carry a held object to the container, take the nearest ball, or end."""
         assert view.gripper is not None
         if view.holding and view.gripper.outcome in MISSES:  # another object than intended
-            self._let_go(view)
+            self._drop(view)
         elif view.holding:
             if view.attached:  # else the planning scene is not up to date yet
                 self.queue += self._sequences.place_held(self._choice.held(view.attached, view), view.tool)
@@ -65,7 +65,7 @@ class PickPlace(Task[PickPlaceView]):
         waiting = any(stage.cycle is not None and not stage.cycle.started for stage in self.queue)
         if running.name == "across" and self._around.on_hand:
             if not any(isinstance(stage, AwaitImage) for stage in self.queue):
-                self.queue += [self.home(view.let_go()), AwaitImage()]
+                self.queue += [self.home(view.released()), AwaitImage()]
         elif running.name == "across" and not waiting:
             self._queue_next(view)
 
@@ -84,7 +84,7 @@ class PickPlace(Task[PickPlaceView]):
         running = _pick_of(self.running.stage) if self.running else None
         box = self._around.container
         cycle = self._choice.next(view, (box.x, box.y) if running else view.tool, [running] if running else [])
-        if cycle is None and not running and self._choice.once_more():
+        if cycle is None and not running and self._choice.allow_retries():
             # Whether the last descent has a plan depends on the arm posture above it.
             self.queue.append(Move("home", "HOMING", Cycle(), goal=m.JointGoal(named="home")))
             return True
@@ -195,8 +195,8 @@ class PickPlace(Task[PickPlaceView]):
         """Return whether nothing runs and nothing prevents the next decision."""
         assert view.motion is not None
         idle = self.running is None and not self.queue and view.motion.state != "active"
-        kept = self.status.paused or view.motion.held or view.motion.fault or view.motion.stopped
-        return idle and self.status.started and not kept
+        blocked = self.status.paused or view.motion.held or view.motion.fault or view.motion.stopped
+        return idle and self.status.started and not blocked
 
     def on_restart(self) -> None:
         """Try all viewing poses again: the obstacle may be gone."""
@@ -207,12 +207,12 @@ class PickPlace(Task[PickPlaceView]):
     @property
     def memory(self) -> ReleasePositions:
         """Release positions: a ball leaning on others may look as if it lay on the floor."""
-        return self._choice.let_go
+        return self._choice.releases
 
     def remember(self, memory: BaseModel) -> None:
         """Restore the release positions."""
         assert isinstance(memory, ReleasePositions)
-        self._choice.let_go = memory
+        self._choice.releases = memory
 
     def succeeded(self, stage: Stage, view: PickPlaceView) -> None:
         """Count a released ball."""
@@ -231,12 +231,12 @@ class PickPlace(Task[PickPlaceView]):
         self.status.retries += 1
         x, y, _ = pick.target.position
         self.status.message = f"{stage.problem} at ({x:.3f}, {y:.3f})"
-        self._choice.missed(pick.target, view.let_go(), stage.problem)
-        self._let_go(view)
+        self._choice.missed(pick.target, view.released(), stage.problem)
+        self._drop(view)
 
-    def _let_go(self, view: PickPlaceView) -> None:
+    def _drop(self, view: PickPlaceView) -> None:
         self.clear()
-        self.queue += [self._sequences.open(), *self.back_off(view.let_go())]
+        self.queue += [self._sequences.open(), *self.back_off(view.released())]
         if view.seen is not None and view.seen.unseen and (pose := self._viewing.best()):
             # The gripper occludes the ball that it did not take; the ball may have moved.
             self.queue += [Move("look", "HOMING", goal=m.JointGoal(positions=pose)), AwaitImage()]

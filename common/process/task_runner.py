@@ -170,7 +170,7 @@ class TaskRunner(Generic[V]):
         """The holds to ask for, because something is missing or is back again; the view has what is missing."""
         if self._watchdog is None:
             return []
-        holds = self._watchdog.look(monotonic(), self._orders.serving, view.motion)
+        holds = self._watchdog.update(monotonic(), self._orders.serving, view.motion)
         view.trouble = self._watchdog.trouble
         return holds
 

@@ -18,7 +18,7 @@ from common.tasks.decisions import TaskDecisions, V
 from common.tasks.stages import MISSES, AwaitImage, Command, Execution, Grip, Move, Report, Stage
 
 # Rejections that say nothing about the motion itself: the task decides again.
-ANEW = ("busy", "stale_request", "clock_ahead", "stopped", "not_owner")
+NOT_ITS_FAULT = ("busy", "stale_request", "clock_ahead", "stopped", "not_owner")
 START = ": start to go on"
 BLOCKED_BY = "scene_monitor"  # source of the hold while an obstacle blocks the path
 NO_ARM = "the arm cannot be moved: "
@@ -28,7 +28,7 @@ LOOSE = 0.5e-3  # [m] opening after which the fingers hold nothing any more
 AHEAD = 1.0  # [s] before the end of a motion: earliest time to send a gripper command that waits for it
 CLOSE_WITHIN = 0.05  # [m] from the end of the motion the fingers may start to close, touching nothing
 OPENED_BY = 0.5  # progress of a motion at which fingers that open during it must have opened
-MOST_FIGURES = 200  # plans kept in a status: a cell may run for days
+MOST_FIGURES = 200  # plans in a status: a cell may run for days
 
 
 class Task(TaskDecisions[V]):
@@ -48,7 +48,7 @@ class Task(TaskDecisions[V]):
         if command == "pause":
             status.paused = True
             return [m.HoldRequest(hold=True, reason="the task is paused")]
-        reason = f"the task was told to {command}"
+        reason = f"the operator sent {command} to the task"
         if command in ("start", "resume"):
             status.started, status.paused = status.started or command == "start", False
             if command == "start" and status.state in ("DONE", "ERROR"):
@@ -92,11 +92,11 @@ class Task(TaskDecisions[V]):
 
     def on_goal(self, answer: Report, view: V) -> None:
         """Handle the answer to an execute or gripper request: accepted, or rejected with a reason."""
-        begun = next((one for one in (self.running, self._early) if one and one.command.id == answer.id), None)
-        if begun is None or begun.accept(answer):
+        execution = next((one for one in (self.running, self._early) if one and one.command.id == answer.id), None)
+        if execution is None or execution.accept(answer):
             return
-        stage = begun.stage
-        if begun is self._early:  # then send it when the arm is at rest
+        stage = execution.stage
+        if execution is self._early:  # then send it when the arm is at rest
             assert isinstance(stage, Grip)
             self._early, stage.early = None, False
             if self.running is not None:
@@ -104,8 +104,8 @@ class Task(TaskDecisions[V]):
             return
         self.running = None
         # Rejected because of another client or a late request, not because of the motion: no failure.
-        if answer.error in ANEW:
-            self._decide_anew(f"{stage.name} has to wait: {answer.message}", view)
+        if answer.error in NOT_ITS_FAULT:
+            self._decide_again(f"{stage.name} has to wait: {answer.message}", view)
             return
         problem = f"{stage.name} was refused: {answer.message}"
         if isinstance(answer, m.MotionStatus) and answer.error == "start_mismatch":
@@ -128,7 +128,7 @@ class Task(TaskDecisions[V]):
                 status.message = FOUND_HELD + "".join(f"; {one.description}" for one in view.motion.interlocks)
             if view.motion.stopped:  # an operator stopped it: a restart must not undo that
                 status.started = status.paused = False
-        self._tell_stopped(view.motion.stopped)
+        self._report_stopped(view.motion.stopped)
         if self._began is None and status.started:
             self._began = view.now
         if self._early is not None and view.gripper.id == self._early.command.id:
@@ -165,7 +165,7 @@ class Task(TaskDecisions[V]):
             self._failures_in_a_row = 0
         self._done_before = self.status.done
 
-    def _tell_stopped(self, stopped: str) -> None:
+    def _report_stopped(self, stopped: str) -> None:
         if stopped and self.status.state not in ("DONE", "ERROR"):
             self.status.message = stopped + START
         elif self.status.message.endswith(START):
@@ -183,7 +183,7 @@ class Task(TaskDecisions[V]):
             self._early.counted = view.now
         outcome = running.outcome(view.motion, view.gripper)
         limit = self.time_limit(stage)
-        if running.let_go(view.gripper):  # the arm may leave while the fingers continue to open
+        if running.has_released(view.gripper):  # the arm may leave while the fingers continue to open
             self.running, self._opening = None, running
             self.status.moving_seconds += running.moving
             self.succeeded(stage, view)
@@ -226,7 +226,7 @@ class Task(TaskDecisions[V]):
         if view.motion.state == "active":  # until it is at standstill
             return
         if view.motion.id == getattr(early.command, "after", ""):
-            early.wait_no_more(view.motion, view.gripper)
+            early.motion_ended(view.motion, view.gripper)
         outcome = early.outcome(view.motion, view.gripper)
         if outcome == "running" and early.spent <= self.time_limit(early.stage):
             return
@@ -273,11 +273,11 @@ class Task(TaskDecisions[V]):
         ours = view.motion.id == self.running.command.id and view.motion.state == "active"
         held = [one.reason for one in view.motion.interlocks if one.by == BLOCKED_BY and one.kind == "held"]
         if not held or not ours or view.trouble or view.motion.paused or self.status.paused:
-            self._in_the_way.reset()
+            self._obstructed.reset()
             return ""
-        return held[0] if self._in_the_way.elapsed("in the way", view.now) >= self.p.obstacle_patience else ""
+        return held[0] if self._obstructed.elapsed("in the way", view.now) >= self.p.obstacle_patience else ""
 
-    def _decide_anew(self, message: str, view: V) -> None:
+    def _decide_again(self, message: str, view: V) -> None:
         self.clear()
         self.images_after = view.now
         self.status.message = message
@@ -292,13 +292,13 @@ class Task(TaskDecisions[V]):
             self.status.paused = True
             self.status.message = f"{stage.name} was stopped from outside ({reported.message}); resume to go on"
         elif reported.state == "cancelled":  # another client commanded the gripper: no failure
-            self._decide_anew(f"{stage.name} was cancelled: {reported.message}", view)
+            self._decide_again(f"{stage.name} was cancelled: {reported.message}", view)
         elif isinstance(stage, Grip) and holds and isinstance(reported, m.GripperState) and reported.outcome in MISSES:
             stage.problem = reported.message
             self.missed(stage, view)
         elif reported.error in ("hardware_fault", m.CLOSED_BEFORE) and isinstance(stage, Move):  # not its fault
             self._held_up = reported.error == m.CLOSED_BEFORE
-            self._decide_anew(f"{stage.name} {reported.state}: {reported.message}", view)
+            self._decide_again(f"{stage.name} {reported.state}: {reported.message}", view)
         elif reported.state != "succeeded":
             self.fail(f"{stage.name} {reported.state}: {reported.message}", view)
         elif isinstance(stage, Grip) and holds and not view.holding:
@@ -310,9 +310,9 @@ class Task(TaskDecisions[V]):
             self.succeeded(stage, view)
             if self._early is not None and view.motion is not None and view.gripper is not None:
                 self.running, self._early = self._early, None
-                self.running.wait_no_more(view.motion, view.gripper)
+                self.running.motion_ended(view.motion, view.gripper)
                 self.running.started = True
-                self._tell_stage(self.running.stage)
+                self._report_stage(self.running.stage)
 
     # --- planning and execution ------------------------------------------------------------------------------
 
@@ -410,10 +410,10 @@ class Task(TaskDecisions[V]):
     def _begin(self, stage: Stage, view: V) -> Command:
         self.queue.popleft()
         self.running = self._execution(stage, view)
-        self._tell_stage(stage)
+        self._report_stage(stage)
         return self.running.command
 
-    def _tell_stage(self, stage: Stage) -> None:
+    def _report_stage(self, stage: Stage) -> None:
         self.status.state, self.status.stage = stage.state, stage.name
         self.status.subject = stage.cycle.subject if stage.cycle else ""
 
@@ -430,13 +430,13 @@ class Task(TaskDecisions[V]):
                 command.expected_width, command.width_tolerance = stage.expected_width, stage.width_tolerance
         if stage.cycle is not None:
             stage.cycle.started = True
-        begun = Execution(stage, command, view.now)
+        execution = Execution(stage, command, view.now)
         assert view.motion is not None and view.gripper is not None
         if isinstance(stage, Grip):
             self._opening = None  # the new command replaces it
-            begun.held = view.gripper.width if view.holding else None
-        begun.before = begun.report(view.motion, view.gripper).id
-        return begun
+            execution.held = view.gripper.width if view.holding else None
+        execution.before = execution.report(view.motion, view.gripper).id
+        return execution
 
     def _is_planned(self, move: Move) -> bool:
         needed = [move]

@@ -70,9 +70,9 @@ class Move(Stage):
 
 @dataclass(eq=False)
 class Grip(Stage):
-    """A motion of the fingers to a width [m]; `holds` tells whether an object must be held at its end.
+    """A motion of the fingers to a width [m]; `holds`: whether an object must be held at its end.
 
-    A held object must have the expected width, if that is known; `problem` tells how it differs.
+    A held object must have the expected width, if that is known; `problem` describes the difference.
     """
 
     width: float = field(kw_only=True)
@@ -138,7 +138,7 @@ class Execution:
             self.over = answer
         return answer.state != "rejected"
 
-    def wait_no_more(self, motion: m.MotionStatus, gripper: m.GripperState) -> None:
+    def motion_ended(self, motion: m.MotionStatus, gripper: m.GripperState) -> None:
         """Update a waiting gripper command once the motion it waits for has ended.
 
         A report of the same time already includes the result.
@@ -155,7 +155,7 @@ class Execution:
         later = self.accepted is not None and reported.header.stamp > self.accepted
         return "forgotten" if later else "running"
 
-    def let_go(self, gripper: m.GripperState) -> bool:
+    def has_released(self, gripper: m.GripperState) -> bool:
         """Return whether opening fingers are already clear of the released object."""
         if self.held is None or gripper.id != self.command.id or gripper.state != "active" or gripper.holding:
             return False
@@ -232,7 +232,7 @@ class View:
         """Whether the gripper reports a held object."""
         return self.gripper is not None and self.gripper.holding
 
-    def let_go(self) -> Self:
+    def released(self) -> Self:
         """Return the view after opening the fingers: a held object stays where it is."""
         gripper = self.gripper and self.gripper.model_copy(update={"holding": False})
         if self.scene is None or self.tcp is None:

@@ -1,4 +1,4 @@
-"""Watchdogs of a task: services that it depends on, freshness of images, and how long a condition lasts.
+"""Watchdogs of a task: services that it depends on, freshness of images, and the duration of a condition.
 
 A task needs joint states, a planner and an executor. While one is missing the arm is held on its path and resumes the
 same path later. Without joint states its position is unknown; without a planner no retreat is possible. A hold loses
@@ -34,14 +34,14 @@ class LivenessWatchdog:
         self._received, self._timeout = received, timeout
         self._awake = Waking(2 * LOOK_PERIOD)
         self._count: int | None = None
-        self._heard = 0.0  # process uptime
+        self._last_joints = 0.0  # process uptime
         self._gap = 0.0  # usual period of joint states
         self._late = self._late_at = 0.0
         self._seen: set[str] = set()
         self._holding: bool | None = None  # unknown until the first motion status
 
-    def look(self, now: float, serving: dict[str, bool], motion: m.MotionStatus | None) -> list[m.HoldRequest]:
-        """Return the hold requests to send; `trouble` tells what is missing.
+    def update(self, now: float, serving: dict[str, bool], motion: m.MotionStatus | None) -> list[m.HoldRequest]:
+        """Return the hold requests to send; `trouble` names what is missing.
 
         Args:
             now: monotonic clock [s].
@@ -69,14 +69,14 @@ class LivenessWatchdog:
             self._late, self._late_at = self._awake.late, awake
         new = self._received() - (self._count or 0)
         if new > 0:
-            gap = (awake - self._heard) / new
+            gap = (awake - self._last_joints) / new
             if self._count is not None and gap <= SLOWEST_GAP:
                 self._gap += (0.1 if self._gap else 1.0) * (gap - self._gap)
-            self._count, self._heard = self._received(), awake
+            self._count, self._last_joints = self._received(), awake
         if self._count is None:
             return ""
-        patience = max(self._timeout(), USUAL_GAPS * self._gap) + HOPS * self._late
-        return f"no joint states for {1e3 * self._timeout():.0f} ms" if awake - self._heard > patience else ""
+        limit = max(self._timeout(), USUAL_GAPS * self._gap) + HOPS * self._late
+        return f"no joint states for {1e3 * self._timeout():.0f} ms" if awake - self._last_joints > limit else ""
 
 
 class ImageAge:

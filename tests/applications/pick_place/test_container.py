@@ -71,9 +71,10 @@ def test_what_is_let_go_above_a_column_falls_clear_of_the_walls_however_large_it
     radius: float, wide: float, flat: bool,
 ) -> None:
     task = CellDouble([], place_pos_tol=wide).task
-    box, size = task.p.world.container, (math.sqrt(2) * radius, math.sqrt(2) * radius) if flat else None
+    sequences, box = MotionSequences(task.p, task.gripper), task.p.world.container
+    size = (math.sqrt(2) * radius, math.sqrt(2) * radius) if flat else None
     over = box.x + box.slot_offset, box.y - box.slot_offset
-    goal = task._rows._across(Pick(target=Target("t", (0.4, -0.3, 0.03), radius, size), over=over), 0.0).goal
+    goal = sequences.across(Pick(target=Target("t", (0.4, -0.3, 0.03), radius, size), over=over), 0.0).goal
     assert isinstance(goal, m.PoseGoal)
     at, side = goal.pose.position, goal.position_tolerance
     inside = box.half_side - box.wall_thickness

@@ -67,7 +67,7 @@ def test_what_lies_in_the_container_is_kept_while_the_hand_hides_it() -> None:
                     pixel=(u, v))
     for k in range(20):
         frame = m.MarkerArray(header=m.Header(stamp=int(1e9 + k * 1e8)), markers=[ball] if k < 2 else [])
-        scene.see(frame, CAMERA, None, hidden=BLIND if k >= 2 else None)
+        scene.update_detections(frame, CAMERA, None, hidden=BLIND if k >= 2 else None)
     assert [thing.role for thing in scene.scene().objects].count("contained") == 1
 
 

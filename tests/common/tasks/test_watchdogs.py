@@ -33,7 +33,7 @@ class Setting:
         while self.now < end - 1e-9:
             self.now += step
             self.came += step * self.rate
-            self.asked += self.watchdog.look(self.now, dict(self.there), self.motion)
+            self.asked += self.watchdog.update(self.now, dict(self.there), self.motion)
         return [hold.hold for hold in self.asked[before:]]
 
 
