@@ -31,7 +31,7 @@ from common.perception.image import array_to_image
 from common.perception.pinhole import Pinhole
 from common.process.camera_reader import CameraReader
 from common.process.service import main
-from common.transport.bus import Bus
+from common.transport.bus import Bus, Reader
 
 BUFFERED = 5  # depth images that wait for their color images
 DEPTH_WAIT = 0.3  # [s, wall time] for which a color image waits for its depth image
@@ -98,35 +98,33 @@ def _remark(detector: Detector, service: str) -> str:
     return ", and ".join(parts)
 
 
-async def run(bus: Bus, config: Config) -> None:
-    """Process every image; unusable ones are dropped, counted and reported once."""
-    images = bus.reader(topics.CAMERA_IMAGE)
-    cameras = CameraReader(bus, config.world)
-    found, shown = bus.writer(DETECTED_OBJECTS), bus.writer(DETECTION_IMAGE)
-    masks = bus.writer(DETECTION_MASK)
-    cv2.setNumThreads(1)  # other services use the other cores
-    depths = bus.reader(topics.DEPTH_CAMERA_DEPTH) if config.depth else None
-    buffered: deque[Image] = deque(maxlen=BUFFERED)
-    arrived = asyncio.Event()
-    detector = Detector(config.world, config)
-    left_out = SkippedFrames(bus.log, "a picture")
-    if not bus.declares_only:
-        warm_up(config.world, config)
-    await bus.ready()
+class DepthBuffer:
+    """The newest depth images, found by the stamps of their color images."""
 
-    async def watch_depths() -> None:
-        if depths is not None:
-            async for depth in depths:
-                buffered.append(depth)
-                arrived.set()
+    def __init__(self, reader: Reader[Image]) -> None:
+        """Buffer what a reader receives."""
+        self._reader = reader
+        self._images: deque[Image] = deque(maxlen=BUFFERED)
+        self._arrived = asyncio.Event()
 
-    async def depth_with(stamp: int, camera: Pinhole) -> Depth:
+    async def collect(self) -> None:
+        """Receive depth images; never returns."""
+        async for image in self._reader:
+            self._images.append(image)
+            self._arrived.set()
+
+    async def at(self, stamp: int, camera: Pinhole) -> Depth:
+        """Return the depth image with a stamp; wait for it up to `DEPTH_WAIT`.
+
+        Raises:
+            FrameError: it did not arrive, or does not fit the camera.
+        """
         with suppress(TimeoutError):
             async with asyncio.timeout(DEPTH_WAIT):
-                while all(one.header.stamp != stamp for one in buffered):
-                    arrived.clear()
-                    await arrived.wait()
-        found = next((one for one in buffered if one.header.stamp == stamp), None)
+                while all(image.header.stamp != stamp for image in self._images):
+                    self._arrived.clear()
+                    await self._arrived.wait()
+        found = next((image for image in self._images if image.header.stamp == stamp), None)
         if found is None:
             raise FrameError("depth", "no depth image of the same time came")
         depth = depth_of(found)
@@ -136,12 +134,27 @@ async def run(bus: Bus, config: Config) -> None:
             raise FrameError(error.kind, str(error)) from None
         return depth
 
+
+async def run(bus: Bus, config: Config) -> None:
+    """Process every image; unusable ones are dropped, counted and reported once."""
+    images = bus.reader(topics.CAMERA_IMAGE)
+    cameras = CameraReader(bus, config.world)
+    found, shown = bus.writer(DETECTED_OBJECTS), bus.writer(DETECTION_IMAGE)
+    masks = bus.writer(DETECTION_MASK)
+    cv2.setNumThreads(1)  # other services use the other cores
+    depths = DepthBuffer(bus.reader(topics.DEPTH_CAMERA_DEPTH)) if config.depth else None
+    detector = Detector(config.world, config)
+    left_out = SkippedFrames(bus.log, "a picture")
+    if not bus.declares_only:
+        warm_up(config.world, config)
+    await bus.ready()
+
     async def look() -> None:
         async for image in images:
             try:
                 camera = await cameras.of(image.header)
                 picture = decode_image(image, camera)
-                depth = await depth_with(image.header.stamp, camera) if config.depth else None
+                depth = await depths.at(image.header.stamp, camera) if depths is not None else None
             except FrameError as error:
                 left_out.note(error)
                 continue
@@ -162,7 +175,8 @@ async def run(bus: Bus, config: Config) -> None:
 
     async with asyncio.TaskGroup() as group:
         group.create_task(cameras.follow())
-        group.create_task(watch_depths())
+        if depths is not None:
+            group.create_task(depths.collect())
         group.create_task(look())
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 from contextlib import suppress
+from typing import Any
 
 from pydantic import Field
 
@@ -17,6 +18,7 @@ from applications.pick_place.detections import (
     Validation,
     ViewsParameters,
 )
+from applications.pick_place.perceived_scene import Place
 from applications.pick_place.topics import (
     REJECTED_TARGETS,
     VALIDATED_TARGETS,
@@ -101,6 +103,13 @@ def shells(config: Config, header: Header) -> MarkerArray:
     )
 
 
+def targets(visible: list[Place], occluded: list[Place], **fields: Any) -> PoseArray:
+    """Return targets as a message with these other fields; labels only if some targets are occluded."""
+    poses = [Pose(position=Vector3(x=x, y=y, z=z)) for x, y, z in [*visible, *occluded]]
+    labels = [*("" for _ in visible), *(HIDDEN for _ in occluded)] if occluded else []
+    return PoseArray(poses=poses, labels=labels, **fields)
+
+
 async def run(bus: Bus, config: Config) -> None:
     """Validate every frame with the known reachability; compute that of new positions concurrently."""
     views = DetectionViews(bus, config.views, config.world, config.robot, bus.log)
@@ -111,17 +120,17 @@ async def run(bus: Bus, config: Config) -> None:
 
     watched, remembered, radius = OcclusionReport(config.world, config), OccludedTargets(), config.world.ball_radius
 
-    def show() -> None:
+    def publish_shells() -> None:
         markers.put(shells(config, bus.header(WORLD)))
 
-    show()
-    bus.on_parameters(show)
+    publish_shells()
+    bus.on_parameters(publish_shells)
     places: list[tuple[float, float, float]] = []
     work, idle = asyncio.Event(), asyncio.Event()
     unfinished: list[CameraDetections] = []  # sent without the positions that were still being computed
     await bus.ready()
 
-    def send(seen: list[CameraDetections]) -> None:
+    def publish(seen: list[CameraDetections]) -> None:
         nonlocal unfinished
         validation.forget_after = config.forget_after
         result = validation.validate_views([(one.frame, one.camera) for one in seen])
@@ -130,17 +139,14 @@ async def run(bus: Bus, config: Config) -> None:
         occluded = remembered.hidden(result.targets, [place for place, _ in result.refused], hiding(seen, radius))
         # Several crowded views may not fit: the rest is offered later.
         result.targets, occluded = result.targets[:MOST_POSES], occluded[: max(0, MOST_POSES - len(result.targets))]
-        poses = [Pose(position=Vector3(x=x, y=y, z=z)) for x, y, z in [*result.targets, *occluded]]
-        labels = [*("" for _ in result.targets), *(HIDDEN for _ in occluded)] if occluded else []
         unseen, blind = watched.unseen(seen, views, config.may_hide)
-        validated.put(PoseArray(header=header, poses=poses, labels=labels, remark=result.remark, unseen=unseen,
-                                blind=blind))
+        validated.put(targets(result.targets, occluded, header=header, remark=result.remark, unseen=unseen, blind=blind))
         if result.rejections:
             rejected.put(Rejections(header=header, rejected=result.rejections))
         for one in result.rejections:
             bus.log.info("rejected (%s, %s): %s", f"{one.position.x:z.3f}", f"{one.position.y:z.3f}", one.reason)
 
-    async def look(_view: int, _seen: CameraDetections) -> None:
+    async def validate(_view: int, _seen: CameraDetections) -> None:
         seen = views.newest()
         places[:] = [place for one in seen for place in validation.unknown(one.frame, one.camera)]
         if places:
@@ -149,9 +155,9 @@ async def run(bus: Bus, config: Config) -> None:
             with suppress(TimeoutError):  # the rest goes out with a later frame
                 async with asyncio.timeout(IK_WAIT):  # wait_for of Python 3.11 can lose a cancellation
                     await idle.wait()
-        send(seen)
+        publish(seen)
 
-    async def work_out() -> None:
+    async def compute_reach() -> None:
         while True:
             await work.wait()
             work.clear()
@@ -159,11 +165,11 @@ async def run(bus: Bus, config: Config) -> None:
                 await asyncio.to_thread(reach.reason, places.pop(0))
             idle.set()
             if unfinished:
-                send(unfinished)
+                publish(unfinished)
 
     async with asyncio.TaskGroup() as group:
-        group.create_task(views.watch(look))
-        group.create_task(work_out())
+        group.create_task(views.watch(validate))
+        group.create_task(compute_reach())
 
 
 if __name__ == "__main__":

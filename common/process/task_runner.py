@@ -17,8 +17,8 @@ from common.robot.transforms import matrix_to_pose
 from common.sources import monotonic, new_id
 from common.tasks.decisions import TaskConfig
 from common.tasks.engine import Task
+from common.tasks.monitoring import LOOK_PERIOD, LivenessWatchdog
 from common.tasks.stages import Command, View, within_range
-from common.tasks.watchdogs import LOOK_PERIOD, LivenessWatchdog
 from common.topics import Topic
 from common.transport.bus import Bus
 from common.transport.reader import Reader

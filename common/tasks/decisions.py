@@ -14,8 +14,7 @@ from pydantic import BaseModel, Field
 from common import messages as m
 from common.config import GripperConfig, Parameters, RobotConfig, Run, Tunable
 from common.errors import ConfigError
-from common.tasks.stages import AwaitImage, Command, Execution, Grip, Move, Stage, View
-from common.tasks.watchdogs import DwellTimer, ImageAge
+from common.tasks.stages import AwaitImage, Command, DwellTimer, Execution, Grip, ImageAge, Move, Stage, View
 
 V = TypeVar("V", bound=View)
 

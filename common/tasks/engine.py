@@ -11,31 +11,29 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import replace
 
 from common import messages as m
-from common.tasks.decisions import TaskDecisions, V
-from common.tasks.stages import MISSES, AwaitImage, Command, Execution, Grip, Move, Report, Stage
+from common.tasks.decisions import V
+from common.tasks.monitoring import ExecutionMonitor
+from common.tasks.stages import AwaitImage, Command, Execution, Grip, Move, Report, Stage
 
 # Rejections that say nothing about the motion itself: the task decides again.
 NOT_ITS_FAULT = ("busy", "stale_request", "clock_ahead", "stopped", "not_owner")
 START = ": start to go on"
-BLOCKED_BY = "scene_monitor"  # source of the hold while an obstacle blocks the path
 NO_ARM = "the arm cannot be moved: "
 FOUND_HELD = "the robot was found held; resume or start to go on"
 FINGERS_OFF = 0.003  # [m] tolerated difference between the finger width now and the one of the plan
 LOOSE = 0.5e-3  # [m] opening after which the fingers hold nothing any more
 AHEAD = 1.0  # [s] before the end of a motion: earliest time to send a gripper command that waits for it
 CLOSE_WITHIN = 0.05  # [m] from the end of the motion the fingers may start to close, touching nothing
-OPENED_BY = 0.5  # progress of a motion at which fingers that open during it must have opened
 MOST_FIGURES = 200  # plans in a status: a cell may run for days
 
 
-class Task(TaskDecisions[V]):
+class Task(ExecutionMonitor[V]):
     """State machine of a task. Implement `decide`; override other hooks where the task differs.
 
     A task uses `queue` (to which `decide` appends stages), `running` (the running stage), `status`, `wait_timer` (time
-    spent waiting) and all of `TaskDecisions`.
+    spent waiting) and all hooks and helpers of `TaskDecisions`.
     """
 
     # --- commands of the operator ----------------------------------------------------------------------------
@@ -171,149 +169,6 @@ class Task(TaskDecisions[V]):
         elif self.status.message.endswith(START):
             self.status.message = ""
 
-    def _watch(self, view: V) -> list[Command]:
-        """Monitor the running stage: its end, its failure, and the loss of a held object."""
-        if self.running is None:
-            self._watch_early(view)
-            return self._watch_opening(view)
-        assert view.motion is not None and view.gripper is not None
-        running, stage = self.running, self.running.stage
-        running.count(view.now, view.motion)
-        if self._early is not None:  # waiting does not count against its time limit
-            self._early.counted = view.now
-        outcome = running.outcome(view.motion, view.gripper)
-        limit = self.time_limit(stage)
-        if running.has_released(view.gripper):  # the arm may leave while the fingers continue to open
-            self.running, self._opening = None, running
-            self.status.moving_seconds += running.moving
-            self.succeeded(stage, view)
-        elif outcome == "ended":
-            self.running = None
-            self.status.moving_seconds += running.moving
-            self._ended(stage, running.report(view.motion, view.gripper), view)
-        elif outcome == "forgotten":
-            self.running = None
-            if self._early is not None and isinstance(self._early.stage, Grip):  # the release position is unknown now
-                self._early = replace(self._early, stage=replace(self._early.stage, holds=None))
-            self.forgotten(stage, view)
-        elif running.moves_arm and stage.carries and not view.holding and not (self._early and self._early.started):
-            stop = self.stop(view, "what it held fell")
-            slipped = f": {view.gripper.message}" if view.gripper.outcome == "slipping" else ""
-            self.fail(f"what the hand held fell during {stage.name}{slipped}", view, go_home=False)
-            return stop
-        elif running.spent > limit:
-            stop = self.stop(view, "it takes too long")
-            self.fail(f"{stage.name} took longer than {round(limit, 2):g} s", view)
-            return stop
-        elif running.moves_arm and (why := self.outdated(stage, view)):
-            stop = self.stop(view, why)
-            self.status.message = f"{stage.name}: {why}"
-            return stop
-        elif blocked := self._blocked(view):
-            stop = self.stop(view, blocked)
-            self.obstructed(stage, view, f"{stage.name}: {blocked}")
-            return stop
-        elif stage.carries and view.gripper.outcome == "slipping":  # the object may still arrive
-            self.status.message = f"{stage.name}: {view.gripper.message}"
-        return self._watch_opening(view)
-
-    def _watch_early(self, view: V) -> None:
-        """Monitor a gripper command whose motion ended without success: a release counts, a grasp is decided again."""
-        if (early := self._early) is None:
-            return
-        assert view.motion is not None and view.gripper is not None
-        early.count(view.now, view.motion)
-        if view.motion.state == "active":  # until it is at standstill
-            return
-        if view.motion.id == getattr(early.command, "after", ""):
-            early.motion_ended(view.motion, view.gripper)
-        outcome = early.outcome(view.motion, view.gripper)
-        if outcome == "running" and early.spent <= self.time_limit(early.stage):
-            return
-        self._early, self.images_after = None, view.now
-        stage, reported = early.stage, early.report(view.motion, view.gripper)
-        if outcome != "ended" or not isinstance(stage, Grip):
-            return
-        if stage.holds is False and reported.state == "succeeded" and not view.holding:
-            self.succeeded(stage, view)
-        elif stage.holds and isinstance(reported, m.GripperState) and reported.outcome in MISSES:
-            self._shut = True
-        elif reported.error == "hardware_fault":
-            self.fail(f"{stage.name} {reported.state}: {reported.message}", view)
-
-    def _watch_opening(self, view: V) -> list[Command]:
-        """Monitor fingers that open while the arm already leaves; stop the arm if they do not open in time."""
-        opening, running = self._opening, self.running
-        if opening is None:
-            return []
-        assert view.motion is not None and view.gripper is not None
-        state = view.gripper.state if view.gripper.id == opening.command.id else "cancelled"
-        if state == "active":
-            ours = running is not None and running.moves_arm and view.motion.id == running.command.id
-            if not ours or view.motion.progress < OPENED_BY:
-                return []
-            why = "the fingers have not opened yet"
-        else:
-            self._opening, why = None, f"the fingers did not open: {view.gripper.message}"
-        if state in ("succeeded", "cancelled"):  # whoever commanded the gripper since then handles the result
-            return []
-        stop = self.stop(view, why)
-        self._opening = None
-        if state == "active" and self.running is None:  # continue as an open stage with its full time limit
-            assert isinstance(opening.stage, Grip)
-            self.running = replace(opening, stage=Grip("open", opening.stage.state, width=opening.stage.width))
-            self.status.message = why
-        else:
-            self.fail(why, view)
-        return stop
-
-    def _blocked(self, view: V) -> str:
-        """Return what blocks the running motion for longer than `obstacle_patience`; empty for nothing."""
-        assert view.motion is not None and self.running is not None
-        ours = view.motion.id == self.running.command.id and view.motion.state == "active"
-        held = [one.reason for one in view.motion.interlocks if one.by == BLOCKED_BY and one.kind == "held"]
-        if not held or not ours or view.trouble or view.motion.paused or self.status.paused:
-            self._obstructed.reset()
-            return ""
-        return held[0] if self._obstructed.elapsed("in the way", view.now) >= self.p.obstacle_patience else ""
-
-    def _decide_again(self, message: str, view: V) -> None:
-        self.clear()
-        self.images_after = view.now
-        self.status.message = message
-
-    def _ended(self, stage: Stage, reported: Report, view: V) -> None:
-        holds = stage.holds if isinstance(stage, Grip) else None
-        if reported.state == "cancelled" and isinstance(stage, Move):
-            self.clear()
-            if view.motion is not None and view.motion.stopped:  # the operator's stop was not addressed to this task
-                self.status.started = False
-                return
-            self.status.paused = True
-            self.status.message = f"{stage.name} was stopped from outside ({reported.message}); resume to go on"
-        elif reported.state == "cancelled":  # another client commanded the gripper: no failure
-            self._decide_again(f"{stage.name} was cancelled: {reported.message}", view)
-        elif isinstance(stage, Grip) and holds and isinstance(reported, m.GripperState) and reported.outcome in MISSES:
-            stage.problem = reported.message
-            self.missed(stage, view)
-        elif reported.error in ("hardware_fault", m.CLOSED_BEFORE) and isinstance(stage, Move):  # not its fault
-            self._held_up = reported.error == m.CLOSED_BEFORE
-            self._decide_again(f"{stage.name} {reported.state}: {reported.message}", view)
-        elif reported.state != "succeeded":
-            self.fail(f"{stage.name} {reported.state}: {reported.message}", view)
-        elif isinstance(stage, Grip) and holds and not view.holding:
-            self.missed(stage, view)
-        elif holds is False and view.holding:
-            self.fail("the fingers opened and still hold something", view)
-        else:
-            self._held_up = self._held_up and not holds
-            self.succeeded(stage, view)
-            if self._early is not None and view.motion is not None and view.gripper is not None:
-                self.running, self._early = self._early, None
-                self.running.motion_ended(view.motion, view.gripper)
-                self.running.started = True
-                self._report_stage(self.running.stage)
-
     # --- planning and execution ------------------------------------------------------------------------------
 
     def _plan_ahead(self, view: V) -> Iterator[Command]:
@@ -412,10 +267,6 @@ class Task(TaskDecisions[V]):
         self.running = self._execution(stage, view)
         self._report_stage(stage)
         return self.running.command
-
-    def _report_stage(self, stage: Stage) -> None:
-        self.status.state, self.status.stage = stage.state, stage.name
-        self.status.subject = stage.cycle.subject if stage.cycle else ""
 
     def _execution(self, stage: Stage, view: V) -> Execution:
         command: m.ExecuteRequest | m.GripperCommand

@@ -16,6 +16,7 @@ Report = m.MotionStatus | m.GripperState
 OVER = ("succeeded", "aborted", "cancelled")
 MISSES = ("too_wide", "too_narrow", "empty")  # outcomes of a grasp that took nothing or something unexpected
 FARTHEST = 1e4  # [m] objects farther away or larger than this are ignored
+STEADY = 0.2  # [s] change of a camera clock's lead that is reported again
 FREE = 0.01  # [m] opening beyond the held width at which a released object falls freely
 
 
@@ -254,3 +255,49 @@ class View:
 def place_of(pose: m.Pose) -> Place:
     """Position of a pose [m]."""
     return pose.position.x, pose.position.y, pose.position.z
+
+
+class ImageAge:
+    """Checks the age of images by their stamps. Tolerances are wall time [s], stamps cell time [s]."""
+
+    def __init__(self, speed: float) -> None:
+        """Check in a cell whose time runs `speed` times as fast as wall time."""
+        self._speed = speed
+        self._ahead: float | None = None  # last reported lead of the camera clock [s, wall]
+
+    def problem(self, now: float, stamps: tuple[float, ...], frame_timeout: float, clock_tolerance: float) -> str:
+        """Return why images cannot be used to decide; empty when they can.
+
+        Wall-time delays grow with the speed of the cell.
+
+        Args:
+            now: cell time.
+            stamps: times of the newest images, one for each source.
+            frame_timeout: age from which an image is too old.
+            clock_tolerance: lead from which a camera clock is unusable.
+        """
+        ahead = (max(stamps) - now) / self._speed
+        if ahead > clock_tolerance:
+            if self._ahead is None or abs(ahead - self._ahead) > STEADY:  # else every image would change the message
+                self._ahead = ahead
+            return f"the camera's clock is {self._ahead:.1f} s ahead"
+        self._ahead = None
+        return "" if now - min(stamps) < frame_timeout * self._speed else "no fresh picture"
+
+
+class DwellTimer:
+    """Measures for how long the same reason has been given without interruption."""
+
+    def __init__(self) -> None:
+        """Start without a reason."""
+        self._since: tuple[object, float] | None = None
+
+    def elapsed(self, reason: object, now: float) -> float:
+        """Return the time since this reason was first given [s]; another reason restarts the timer."""
+        if self._since is None or self._since[0] != reason:
+            self._since = reason, now
+        return now - self._since[1]
+
+    def reset(self) -> None:
+        """Restart the timer."""
+        self._since = None

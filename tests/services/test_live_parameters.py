@@ -50,7 +50,8 @@ def test_what_was_given_up_is_tried_again_when_a_parameter_changes() -> None:
     change(cell.task.p, **{"hand.min_clearance": 0.05, "grace": 600.0})
     for _ in range(20):
         cell.step()
-    assert [r.reason for r in cell.task.status.skipped] == ["its neighbors leave no room for the fingers at any yaw"] * 2
+    reasons = [rejection.reason for rejection in cell.task.status.skipped]
+    assert reasons == ["its neighbors leave no room for the fingers at any yaw"] * 2
     change(cell.task.p, **{"hand.min_clearance": 0.003})
     cell.until("DONE")
     assert cell.contained == 2

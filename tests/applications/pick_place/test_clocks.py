@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from common import messages as m
-from common.tasks.watchdogs import ImageAge
+from common.tasks.stages import ImageAge
 from tests.applications.outlining.outline_double import OutlineDouble
 from tests.applications.pick_place.cell_double import CellDouble
 

@@ -8,7 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from applications.pick_place.choice import Pick, Target
+from applications.pick_place.choice import Pick
+from applications.pick_place.grasping import Target
+from applications.pick_place.motion_sequences import MotionSequences
 from common import messages as m
 from tests.applications.pick_place.cell_double import SEVEN, CellDouble
 

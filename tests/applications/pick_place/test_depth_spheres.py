@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from applications.pick_place import depth_spheres as depth_balls
-from applications.pick_place.choice import Choice, Target, lies_below
+from applications.pick_place.choice import Choice, lies_below
 from applications.pick_place.detector import Detector
+from applications.pick_place.grasping import Target
 from applications.pick_place.outliers import NOT_ROUND
 from common import messages as m
 from common.config import Surroundings, load_cell

@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from applications.pick_place.choice import Target, finger_clearance, grasp_yaws, yaws_of
-from applications.pick_place.grasping import Config, HandShape
+from applications.pick_place.grasping import Config, HandShape, Target, finger_clearance, grasp_yaws, yaws_of
 from common.config import Container, load_cell, service_config
 from common.robot.transforms import tool_down
 from common.scene.workspace import yaw_candidates

@@ -6,7 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from applications.pick_place.choice import Pick, Target, finger_clearance
+from applications.pick_place.choice import Pick
+from applications.pick_place.grasping import Target, finger_clearance
 from applications.pick_place.motion_sequences import MotionSequences
 from common import messages as m
 from common.robot.transforms import matrix_to_pose, matrix_to_rpy, pose_to_matrix, rpy_to_matrix, tool_down, transform

@@ -9,8 +9,7 @@ from common.config import load_cell
 from common.errors import ConfigError
 from common.tasks.decisions import TaskConfig
 from common.tasks.engine import Task
-from common.tasks.stages import AwaitImage, Command, Grip, Move, View
-from common.tasks.watchdogs import DwellTimer
+from common.tasks.stages import AwaitImage, Command, DwellTimer, Grip, Move, View
 
 CELL = load_cell("panda")
 THERE = m.PoseGoal(pose=m.Pose(position=m.Vector3(x=0.4, z=0.3)))

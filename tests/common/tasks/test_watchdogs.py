@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from common import messages as m
-from common.tasks.watchdogs import LOOK_PERIOD, LivenessWatchdog
+from common.tasks.monitoring import LOOK_PERIOD, LivenessWatchdog
 from tests.applications.outlining.outline_double import OutlineDouble
 from tests.applications.pick_place.cell_double import CellDouble
 
