@@ -140,7 +140,8 @@ async def run(bus: Bus, config: Config) -> None:
         # Several crowded views may not fit: the rest is offered later.
         result.targets, occluded = result.targets[:MOST_POSES], occluded[: max(0, MOST_POSES - len(result.targets))]
         unseen, blind = watched.unseen(seen, views, config.may_hide)
-        validated.put(targets(result.targets, occluded, header=header, remark=result.remark, unseen=unseen, blind=blind))
+        validated.put(targets(
+            result.targets, occluded, header=header, remark=result.remark, unseen=unseen, blind=blind))
         if result.rejections:
             rejected.put(Rejections(header=header, rejected=result.rejections))
         for one in result.rejections:

@@ -71,7 +71,7 @@ class OutlineDouble:
         tcp = m.Pose(position=m.Vector3(x=0.5, z=1.1))
         return OutlineView(self.now, scene, self.gripper, self.motion, list(self.q), tcp, path=self.path)
 
-    def tell(self, command: str) -> list[m.Message]:
+    def command(self, command: str) -> list[m.Message]:
         """Say something to the task; what it asks for is answered."""
         asked: list[m.Message] = list(self.task.command(command, self.view()))
         for request in asked:
@@ -112,7 +112,7 @@ class OutlineDouble:
             refused = m.MotionStatus(id=request.id, state="rejected", error="stale_request", message="it is 10 s old")
             self.task.on_goal(refused, self.view())
         elif isinstance(request, m.ExecuteRequest) and request.trajectory.header.frame_id == self.unanswered:
-            self.unanswered, self.q = "", [0.3, *HOME[1:]]  # it began, was started again, and is asked once more
+            self.unanswered, self.q = "", [0.3, *HOME[1:]]  # restarted after its start, asked again
             self.restart_controller()
             refused = m.MotionStatus(id=request.id, state="rejected", error="start_mismatch", message="it is elsewhere")
             self.task.on_goal(refused, self.view())
@@ -142,7 +142,7 @@ class OutlineDouble:
             {"header": m.Header(stamp=self.stamp), "id": request.id, "state": state, "message": message})
 
     def restart_controller(self) -> None:
-        """The controller is another process now, which knows of no motion; the arm stands where it was."""
+        """Restart the controller: it knows no motion; the arm stays where it is."""
         self._ends.clear()
         self.motion = m.MotionStatus(header=m.Header(stamp=self.stamp + 1))
 

@@ -1,4 +1,4 @@
-"""A cell without a network: answers the task's requests at once, with a world of its own."""
+"""A fake pick-and-place cell without a network: answers requests at once and simulates its world."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from common.config import Surroundings, load_cell
 
 CELL = load_cell("panda")
 SEVEN = [tuple(spot) for spot in CELL.world.spots[:7]]
-MOTION, FINGERS, LEAD = 0.45, 0.25, 0.1  # [s] that each takes, and by which those begin before the arm stands
+MOTION, FINGERS, LEAD = 0.45, 0.25, 0.1  # [s] durations, and lead of the fingers before standstill
 
 
 class CellDouble:
@@ -27,7 +27,7 @@ class CellDouble:
         self.unreachable: list[tuple[float, float]] = []
         self.held: str = ""
         self.contained = 0
-        self.beneath = 0  # more of them, that nobody sees
+        self.beneath = 0  # more of them, occluded
         self.fell: list[tuple[float, float, float]] = []  # where the first of them lie, of those that fell
         self.now = 100.0
         self.tcp = (0.3, 0.0, 0.5)
@@ -44,7 +44,7 @@ class CellDouble:
         self._arrival = 0.0
         self._ends: list[m.ExecuteRequest] = []
         self._waiting: m.GripperCommand | None = None  # for the arm
-        self._fingers: tuple[m.GripperCommand, float] | None = None  # what they were told, and when they have done it
+        self._fingers: tuple[m.GripperCommand, float] | None = None  # their command and its end
         self._goals: dict[str, m.Pose] = {}
 
     def restart(self) -> None:
@@ -77,7 +77,7 @@ class CellDouble:
             "pose": m.Pose(position=m.Vector3(x=p[0], y=p[1], z=p[2])), "unseen": unseen,
         })
 
-    def tell(self, command: str) -> list[m.Message]:
+    def command(self, command: str) -> list[m.Message]:
         """Say something to the task; what it asks for is answered."""
         asked: list[m.Message] = list(self.task.command(command, self.view()))
         for request in asked:
