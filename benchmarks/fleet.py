@@ -142,7 +142,7 @@ def write(endpoint: str, names: list[str], spoken: list[Spoken], parent: Connect
     os._exit(0)
 
 
-class Ear:
+class Subscriptions:
     """Times and gaps of what comes in."""
 
     def __init__(self) -> None:
@@ -169,7 +169,7 @@ class Ear:
 def read(endpoint: str, names: list[str], parent: Connection) -> None:
     """Be a process that hears some cells: told to begin, it counts; told to stop, it sends what it found."""
     sys.setswitchinterval(0.0005)
-    ear = Ear()
+    ear = Subscriptions()
     sessions = _sessions(endpoint, names)
     for name, session in sessions.items():
         session.subscriber(f"{name}/**", ear.hear)

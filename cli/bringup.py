@@ -8,8 +8,8 @@ from typing import Annotated, Any
 import typer
 
 from cli import options, verbs
-from cli.operation.operation import Operation
-from common.supervision.share import Share
+from cli.session.session import CellSession
+from common.supervision.multi_host import HostOptions
 
 Speed = Annotated[str, typer.Option("--speed", metavar="X", help="cell time per wall time, 0.1 to 10")]
 NoViewer = Annotated[bool, typer.Option("--no-viewer", help="without the operator's page")]
@@ -57,19 +57,19 @@ def _operation(
     until_stdin_ends: UntilStdinEnds = False,
     *,
     until_ended: bool,
-) -> Operation:
+) -> CellSession:
     """What is asked for with the options of `run` and `up`, which are these."""
-    from common.supervision.interrupts import end_with_stdin
+    from common.supervision.lifecycle import interrupt_at_stdin_end
     from security.requiring import choose
 
     choose(secure)
-    operation = Operation(
+    operation = CellSession(
         cell, overrides, world=world, seed=options.whole("--seed", seed, 0), speed=options.number("--speed", speed),
         domain=domain, connect=connect, no_viewer=no_viewer, summary=summary, log_json=log_json,
-        share=Share(listen, link, only, without),
+        share=HostOptions(listen, link, only, without),
     )
     if until_stdin_ends:
-        end_with_stdin()
+        interrupt_at_stdin_end()
     operation.serve_page(viewer_host, viewer_port)
     operation.record_to(record)
     disturbance = options.whole("--chaos", chaos, 0)

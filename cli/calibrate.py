@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from cli import options
-from cli.place import UP, Place, Verbs
+from cli.target import RUNNING, CellTarget, CommandGroup
 from common.errors import ConfigError, UnknownName
 from common.terminal import echo
 
 if TYPE_CHECKING:
     from tools.calibration.board import Board
 
-app = Verbs("Calibrate a real camera with a ChArUco board.")
+app = CommandGroup("Calibrate a real camera with a ChArUco board.")
 
 BOARD_FORMATS = (".png", ".pdf")
 SOURCE_HELP = "device number or path, video file, or folder of images"
@@ -65,7 +65,7 @@ def intrinsics(
 ) -> None:
     """Find focal lengths, centre and distortion from views of the board all over the picture, tilted to each side."""
     from common.config import check
-    from common.perception.image_sources import pictures
+    from common.perception.image_sources import read_images
     from tools.calibration.intrinsics import CollectingOptions, ViewSelector, calibrate_intrinsics
     from tools.calibration.report import camera_from_intrinsics, format_intrinsics
 
@@ -74,7 +74,7 @@ def intrinsics(
                                          "k_coefficients": options.whole("--k-coefficients", k_coefficients, 0)})
     collector = ViewSelector(board_of(squares, square, marker, dictionary), settings)
     terminal = sys.stderr.isatty()
-    for name, picture in pictures(source, parse_size(size), options.number("--seconds", seconds)):
+    for name, picture in read_images(source, parse_size(size), options.number("--seconds", seconds)):
         reason = collector.add(picture, name)
         if terminal:
             part, unseen = collector.coverage()
@@ -187,7 +187,7 @@ def collect(
     key: Annotated[str, typer.Option("--key", metavar="KEY", help="of the camera's pictures")] = "camera/image_raw",
     views: Annotated[str, typer.Option("--views", metavar="N", help="that are wanted")] = "15",
     squares: Squares = "7x5", square: Square = "0.036", marker: Marker = "0", dictionary: Dictionary = "4x4_50",
-    at: Place = UP,
+    at: CellTarget = RUNNING,
 ) -> None:
     """Keep pictures of the board, with the joints, of a cell that is up: whenever the arm rests in a new pose.
 

@@ -9,8 +9,8 @@ from typing import Annotated
 
 import typer
 
+from cli import choices as offers
 from cli import options
-from cli.completing import offers
 from common.errors import UnknownName
 from common.terminal import echo
 
@@ -59,17 +59,17 @@ def service(
     from common.supervision.launch import (
         ROUTER_MODULE,
         Launch,
-        place_of,
-        python_module,
-        python_path,
+        module_command,
+        pythonpath,
         require_module,
+        router_location,
     )
     from common.transport.keys import ROUTER
 
-    number, endpoint = place_of(domain, connect)
+    number, endpoint = router_location(domain, connect)
     launch = Launch(cell, tuple(overrides or ()), world, options.whole("--seed", seed, 0), number, endpoint)
     if name == ROUTER:
-        command = [*python_module(ROUTER_MODULE), "--domain", str(number)]
+        command = [*module_command(ROUTER_MODULE), "--domain", str(number)]
     else:
         entries = {known: ServiceEntry(name=known, module=f"services.{known}") for known in service_names()}
         for entry in load_cell(cell, launch.overrides, world=world, seed=launch.seed).services.values():
@@ -81,4 +81,4 @@ def service(
         entry = entries.get(name) or ServiceEntry(name=name.rpartition(".")[2], module=name)
         require_module(name, entry)
         command = launch.service_command(entry, gate=False)
-    os.execvpe(command[0], command, {**os.environ, "PYTHONPATH": python_path(cell=cell)})
+    os.execvpe(command[0], command, {**os.environ, "PYTHONPATH": pythonpath(cell=cell)})

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from cli import choices as offers
 from cli import options
-from cli.completing import offers
-from cli.place import UP, Place, Verbs
+from cli.target import RUNNING, CellTarget, CommandGroup
 from common.errors import ConfigError, UnknownName
 from common.terminal import echo
 
@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from common.messages import Message, WorldEdit
     from common.topics import Request
 
-task = Verbs("Tell the task what to do.")
-world = Verbs("Change the simulated world.")
+task = CommandGroup("Tell the task what to do.")
+world = CommandGroup("Change the simulated world.")
 
 TIMEOUT = 5.0  # [s]
 X = Annotated[str, typer.Argument(metavar="X", help="[m] in world")]
@@ -35,7 +35,7 @@ def call(
                             autocompletion=offers.requests)
     ],
     body: Annotated[str, typer.Argument(metavar="JSON", help="its fields; `zencell topic info KEY` has an example")],
-    at: Place = UP,
+    at: CellTarget = RUNNING,
     timeout: Annotated[str, typer.Option("--timeout", metavar="S", help="[s]")] = f"{TIMEOUT:g}",
 ) -> None:
     """Send a request and print the answer as JSON; exit 1 with one line if there is none."""
@@ -54,14 +54,14 @@ def call(
     send(at, request, message, seconds)
 
 
-def send(at: Place, request: Request[Any, Any], message: Message, timeout: float = TIMEOUT) -> None:
+def send(at: CellTarget, request: Request[Any, Any], message: Message, timeout: float = TIMEOUT) -> None:
     """Send a request to a cell that is up and print the answer as JSON."""
-    from common.client.joining import newest_heard
+    from common.client.joining import newest_interlock
     from common.messages import TaskCommand
 
     async def visit(joined: Client) -> Message:
         if isinstance(message, TaskCommand) and message.command in ("start", "resume") and message.acknowledged is None:
-            message.acknowledged = await newest_heard(joined.bus)
+            message.acknowledged = await newest_interlock(joined.bus)
         answer: Message = await joined.call(request, message, timeout=timeout)
         return answer
 
@@ -71,37 +71,37 @@ def send(at: Place, request: Request[Any, Any], message: Message, timeout: float
 # --- task -------------------------------------------------------------------------------------------------------
 
 
-def _task(at: Place, tell: Callable[[TaskControl], Awaitable[Message]]) -> None:
+def _task(at: CellTarget, tell: Callable[[TaskControl], Awaitable[Message]]) -> None:
     async def visit(joined: Client) -> Message:
         try:
             return await tell(joined.task)
         finally:
-            if joined.task.unkept:
-                echo(f"zencell: {joined.task.unkept}", err=True)
+            if joined.task.unsaved:
+                echo(f"zencell: {joined.task.unsaved}", err=True)
 
     at.answer(visit)
 
 
 @task.command()
-def start(override: options.Override = False, at: Place = UP) -> None:
+def start(override: options.Override = False, at: CellTarget = RUNNING) -> None:
     """Start the task of a cell that waits or was stopped, or start it again; a robot that you hold is let go."""
     _task(at, lambda task: task.start(override=override))
 
 
 @task.command()
-def pause(at: Place = UP) -> None:
+def pause(at: CellTarget = RUNNING) -> None:
     """Bring the robot to rest on its path at once and hold it there."""
     _task(at, lambda task: task.pause())
 
 
 @task.command()
-def resume(override: options.Override = False, at: Place = UP) -> None:
+def resume(override: options.Override = False, at: CellTarget = RUNNING) -> None:
     """Let the robot go on along its path after a pause of yours."""
     _task(at, lambda task: task.resume(override=override))
 
 
 @task.command()
-def stop(at: Place = UP) -> None:
+def stop(at: CellTarget = RUNNING) -> None:
     """Stop the robot, give up its motion, and wait for a start, also if the task does not answer."""
     _task(at, lambda task: task.stop())
 
@@ -111,7 +111,7 @@ def home(
     planner: Annotated[
         str, typer.Option("--planner", metavar="NAME", help="use only this one", autocompletion=offers.planners)
     ] = "",
-    at: Place = UP,
+    at: CellTarget = RUNNING,
 ) -> None:
     """Plan a way home and go there, while no task has the robot; Ctrl-C stops the robot."""
     at.answer(lambda cell: cell.arm.move("home", planner=planner))
@@ -132,7 +132,7 @@ def _triple(option: str, text: str, names: str) -> dict[str, float]:
     return dict(zip(names, found * (3 // len(found)), strict=True))
 
 
-def _edit(at: Place, values: dict[str, Any]) -> None:
+def _edit(at: CellTarget, values: dict[str, Any]) -> None:
     from common import topics
     from common.config import check
     from common.messages import WorldEdit
@@ -153,7 +153,7 @@ def add(
         "--size", metavar="X,Y,Z", help="of the box about it [m]; one number for all three")] = "",
     color: Annotated[str, typer.Option("--color", metavar="R,G,B", help="0 to 1 each")] = "",
     yaw: Annotated[str, typer.Option("--yaw", metavar="RAD", help="[rad]")] = "",
-    at: Place = UP,
+    at: CellTarget = RUNNING,
 ) -> None:
     """Put one more object on the table."""
     values: dict[str, Any] = {"op": "add", "id": name, "position": _position(x, y), "like": like}
@@ -169,18 +169,18 @@ def add(
 
 
 @world.command(context_settings=NEGATIVE_NUMBERS)
-def move(name: Id, x: X, y: Y, at: Place = UP) -> None:
+def move(name: Id, x: X, y: Y, at: CellTarget = RUNNING) -> None:
     """Put an object elsewhere."""
     _edit(at, {"op": "move", "id": name, "position": _position(x, y)})
 
 
 @world.command()
-def remove(name: Id, at: Place = UP) -> None:
+def remove(name: Id, at: CellTarget = RUNNING) -> None:
     """Take an object away."""
     _edit(at, {"op": "remove", "id": name})
 
 
 @world.command()
-def reset(at: Place = UP) -> None:
+def reset(at: CellTarget = RUNNING) -> None:
     """Bring the first layout back."""
     _edit(at, {"op": "reset"})

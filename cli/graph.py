@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from cli import choices as offers
 from cli import options
-from cli.completing import offers
-from cli.place import Place
+from cli.target import CellTarget
 from common.errors import ConfigError
 from common.terminal import echo
 
 if TYPE_CHECKING:
     from common.config import Cell
-    from common.supervision.wired import Wired
+    from common.supervision.wiring import ServiceWiring
     from tools.graph import Graph
 
 FORMATS = (".svg", ".dot", ".mmd")
@@ -44,7 +44,7 @@ def graph(
     path = Path(output).expanduser() if output else None
     write = _writer_of(path)
     loaded = load_cell(cell, overrides or ())
-    presence = Place(domain=domain, connect=connect).look().get(loaded.name)
+    presence = CellTarget(domain=domain, connect=connect).look().get(loaded.name)
     services = [each for each in _wired_services(loaded) if not (no_viewer and each.name == VIEWER)]
     made = graph_of(loaded.name, services, presence.ready if presence else None)
     text = write(made)
@@ -67,15 +67,15 @@ def _writer_of(path: Path | None) -> Callable[[Graph], str]:
     return writers[path.suffix]
 
 
-def _wired_services(cell: Cell) -> list[Wired]:
-    """The services of a cell in start order; one that cannot be wired is drawn without its keys."""
-    from common.supervision.wired import Unwired, Wired, wired
+def _wired_services(cell: Cell) -> list[ServiceWiring]:
+    """The services of a cell in start order; one that cannot be wire_service is drawn without its keys."""
+    from common.supervision.wiring import ServiceWiring, WiringFailed, wire_service
 
     found = []
     for entry in cell.services.values():
         try:
-            found.append(wired(cell, entry))
-        except Unwired as error:
+            found.append(wire_service(cell, entry))
+        except WiringFailed as error:
             echo(f"zencell: {error}", err=True)
-            found.append(Wired(entry.name, ""))
+            found.append(ServiceWiring(entry.name, ""))
     return found

@@ -22,7 +22,6 @@ from cli import (
     commands,
     completion,
     doctor,
-    exporting,
     graph,
     new,
     node,
@@ -40,7 +39,10 @@ from cli import (
     topic,
     verbs,
 )
-from cli.place import Verbs
+from cli import (
+    export as exporting,
+)
+from cli.target import CommandGroup
 from common.errors import RequestFailed, ZencellError
 from common.terminal import echo, printable
 
@@ -48,8 +50,8 @@ NO_HOME = "Could not determine home directory."  # what pathlib says of ~NAME/..
 EXIT_FAILED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 1, 2, 130
 
 
-class CommandLine(Verbs):
-    """Verbs whose errors come out as one line: exit code 1 for what failed, 2 for bad input, 130 for Ctrl-C."""
+class CommandLine(CommandGroup):
+    """CommandGroup whose errors come out as one line: exit code 1 for what failed, 2 for bad input, 130 for Ctrl-C."""
 
     def __call__(self, *args: Any, **kwargs: Any) -> None:
         """Run the verb that the process's arguments name and end the process with its code."""

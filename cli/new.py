@@ -10,8 +10,8 @@ from typing import Annotated
 
 import typer
 
-from cli.completing import offers
-from cli.completing.model_sources import ROOT
+from cli import choices as offers
+from cli.model_sources import ROOT
 from common.errors import ConfigError, UnknownName
 from common.terminal import echo
 

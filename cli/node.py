@@ -8,12 +8,12 @@ from typing import Annotated
 
 import typer
 
+from cli import choices as offers
 from cli import options
-from cli.completing import offers
-from cli.place import Place, Verbs
+from cli.target import CellTarget, CommandGroup
 from common.terminal import echo
 
-app = Verbs("Services: who is ready, and what each has to do with.")
+app = CommandGroup("Services: who is ready, and what each has to do with.")
 
 
 @app.command("list")
@@ -27,7 +27,7 @@ def list_(
     from common.client.joining import alive
     from common.errors import NoResponder
 
-    found = Place(domain=domain, connect=connect).visit(alive)
+    found = CellTarget(domain=domain, connect=connect).visit(alive)
     shown = [(name, service) for name, service in found if cell in (None, name)]
     if not shown:
         raise NoResponder(f"{cell or '*'}/alive/*")
@@ -50,11 +50,11 @@ def info(
 ) -> None:
     """Show what a service reads, writes, serves and calls, its parameters, and how it is while a cell is up."""
     from common.client.service import described, find, lines, parameters_of
-    from common.supervision.wired import wired
+    from common.supervision.wiring import wire_service
 
-    cells = Place(domain=domain, connect=connect).look()
+    cells = CellTarget(domain=domain, connect=connect).look()
     loaded, entry = find(service, cell, cells)
-    found, presence = wired(loaded, entry), cells.get(loaded.name)
+    found, presence = wire_service(loaded, entry), cells.get(loaded.name)
     parameters, why = asyncio.run(parameters_of(found, loaded.name, presence, domain, connect))
     if why is not None:
         echo(f"zencell: {why}; what follows is from the cell file", err=True)

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from cli.completing import offers
+from cli import choices as offers
 from common.errors import ConfigError
 
 MOST_PER_SECOND = 1000.0  # messages or lines

@@ -6,12 +6,12 @@ from typing import Annotated
 
 import typer
 
+from cli import choices as offers
 from cli import options
-from cli.completing import offers
-from cli.place import UP, Place, Verbs
+from cli.target import RUNNING, CellTarget, CommandGroup
 from common.terminal import echo
 
-app = Verbs("Parameters of running services: what there is, and changing it.")
+app = CommandGroup("Parameters of running services: what there is, and changing it.")
 
 LONGEST_VALUE = 28  # characters of a value in a table
 
@@ -31,7 +31,7 @@ def list_(
         str | None, typer.Argument(metavar="SERVICE", help="of one; of all if not given",
                                    autocompletion=offers.services)
     ] = None,
-    at: Place = UP,
+    at: CellTarget = RUNNING,
     as_json: options.Json = False,
 ) -> None:
     """List parameters: path, value, whether a change needs a restart, range, and what it is."""
@@ -55,7 +55,7 @@ def list_(
 
 
 @app.command()
-def get(path: PathArgument, at: Place = UP, as_json: options.Json = False) -> None:
+def get(path: PathArgument, at: CellTarget = RUNNING, as_json: options.Json = False) -> None:
     """Print the value of a parameter as YAML; with --json everything that is known of it."""
     from common.client.parameters import look_up
     from common.config import yaml_line
@@ -66,7 +66,7 @@ def get(path: PathArgument, at: Place = UP, as_json: options.Json = False) -> No
 
 
 @app.command("set", context_settings={"ignore_unknown_options": True})
-def set_(assignments: Assignments, at: Place = UP) -> None:
+def set_(assignments: Assignments, at: CellTarget = RUNNING) -> None:
     """Change parameters at once, all of them or none, and say what was changed."""
     from common.client.parameters import change
     from common.config import expanded, parse_override, yaml_line
@@ -88,7 +88,7 @@ def dump(
     ] = None,
     everything: Annotated[bool, typer.Option("--all", help="what is as by default, too")] = False,
     output: Annotated[str, typer.Option("-o", "--output", metavar="FILE", help="write there, not here")] = "",
-    at: Place = UP,
+    at: CellTarget = RUNNING,
 ) -> None:
     """Write what differs from the defaults as YAML in the shape of a cell file; `--set @FILE` reads it back."""
     from common.client.parameters import dumped

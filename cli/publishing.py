@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from cli import options
-from cli.place import UP, Place
+from cli.target import RUNNING, CellTarget
 from common.errors import ConfigError
 from common.terminal import echo
 
@@ -27,7 +27,7 @@ def pub(
     rate: Rate = DEFAULT_RATE,
     once: Once = False,
     count: options.Count = None,
-    at: Place = UP,
+    at: CellTarget = RUNNING,
 ) -> None:
     """Publish a message until Ctrl-C, N times or once; a stamp that is left out is the cell's time of each message.
 

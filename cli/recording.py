@@ -11,9 +11,9 @@ from typing import Annotated
 
 import typer
 
+from cli import choices as offers
 from cli import options
-from cli.completing import offers
-from cli.place import UP, Place
+from cli.target import RUNNING, CellTarget
 from common.errors import ConfigError
 from common.terminal import echo, rewrite
 from recording.summary import contents, in_bytes, require_new
@@ -37,7 +37,7 @@ def record_(
     max_size: Annotated[
         str | None, typer.Option("--max-size", metavar="MB", help="begin another file, FILE_1.mcap, after so much")
     ] = None,
-    at: Place = UP,
+    at: CellTarget = RUNNING,
     gate: Annotated[bool, typer.Option("--gate", hidden=True, help="under a supervisor: wait for a line")] = False,
     own: Annotated[str, typer.Option("--own", hidden=True, help="under a supervisor: what is in the cell's file")] = "",
 ) -> None:

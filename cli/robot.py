@@ -7,13 +7,13 @@ from typing import Annotated, Any, Literal
 
 import typer
 
+from cli import choices as offers
 from cli import options, robot_new
-from cli.completing import offers
-from cli.place import UP, Place, Verbs
+from cli.target import RUNNING, CellTarget, CommandGroup
 from common.errors import ConfigError
 from common.terminal import echo
 
-app = Verbs("Prepare a robot, ask its controller, jog it.")
+app = CommandGroup("Prepare a robot, ask its controller, jog it.")
 app.command()(robot_new.new)
 app.command()(robot_new.check)
 
@@ -55,7 +55,7 @@ def collisions(
 
 
 @app.command()
-def status(at: Place = UP) -> None:
+def status(at: CellTarget = RUNNING) -> None:
     """Print what the arm's own controller says: mode, why it cannot be moved, speed slider."""
     told = at.join(lambda cell: cell.arm.robot())
     echo(f"{told.mode}{f': {told.message}' if told.message else ''}")
@@ -63,19 +63,19 @@ def status(at: Place = UP) -> None:
          f"inputs {told.inputs:#b}, outputs {told.outputs:#b}")
 
 
-def _order(at: Place, act: str, value: float = 0.0, **more: Any) -> None:
+def _order(at: CellTarget, act: str, value: float = 0.0, **more: Any) -> None:
     told = at.join(lambda cell: cell.arm.order(act, value, **more))
     echo(f"{told.mode}{f': {told.message}' if told.message else ''}")
 
 
 @app.command()
-def enable(at: Place = UP) -> None:
+def enable(at: CellTarget = RUNNING) -> None:
     """Power the joints and release the brakes."""
     _order(at, "enable")
 
 
 @app.command()
-def recover(at: Place = UP) -> None:
+def recover(at: CellTarget = RUNNING) -> None:
     """Let the arm be moved again after it has stopped to protect somebody or itself."""
     _order(at, "recover")
 
@@ -83,7 +83,7 @@ def recover(at: Place = UP) -> None:
 @app.command()
 def freedrive(
     state: Annotated[str, typer.Argument(metavar="on|off", help="whether it is moved by hand")],
-    at: Place = UP,
+    at: CellTarget = RUNNING,
 ) -> None:
     """Have the arm be moved by hand, or end that."""
     if state not in ("on", "off"):
@@ -96,7 +96,7 @@ def payload(
     mass: Annotated[str, typer.Argument(metavar="KG", help="mass of what the tool carries, with its fingers")],
     com: Annotated[
         str, typer.Option("--com", metavar="X,Y,Z", help="its centre of mass, from the flange [m]")] = "0,0,0",
-    at: Place = UP,
+    at: CellTarget = RUNNING,
 ) -> None:
     """Tell the arm's controller what the tool carries."""
     x, y, z = options.three("--com", com)
@@ -107,7 +107,7 @@ def payload(
 def io(
     output: Annotated[str | None, typer.Argument(metavar="OUTPUT", help="number of a digital output")] = None,
     state: Annotated[str | None, typer.Argument(metavar="on|off", help="what it becomes")] = None,
-    at: Place = UP,
+    at: CellTarget = RUNNING,
 ) -> None:
     """Print the digital inputs and outputs of the arm's controller, or set an output."""
     if output is None:
@@ -128,13 +128,13 @@ def _numbers(bits: int) -> str:
 
 
 @app.command()
-def owner(at: Place = UP) -> None:
+def owner(at: CellTarget = RUNNING) -> None:
     """Print whose the motion is: nobody else's begins. Stops and holds are everybody's."""
     told = at.join(lambda cell: cell.arm.owner_now())
     echo(f"the motion is {told.description}{', who jogs the arm' if told.jogging else ''}")
 
 
-def _own(at: Place, act: Literal["take", "give"], *, over: bool = False) -> None:
+def _own(at: CellTarget, act: Literal["take", "give"], *, over: bool = False) -> None:
     told = at.join(lambda cell: cell.arm.own(act, over=over, kind="operator"))
     echo(f"the motion is {told.description}")
 
@@ -143,14 +143,14 @@ def _own(at: Place, act: Literal["take", "give"], *, over: bool = False) -> None
 def take(
     over: Annotated[bool, typer.Option("--over", help="from whoever has it: what they move comes to rest, and a task "
                                                       "waits for `zencell task start`")] = False,
-    at: Place = UP,
+    at: CellTarget = RUNNING,
 ) -> None:
     """Have the motion until you give it back: neither a task nor anybody else moves the robot meanwhile."""
     _own(at, "take", over=over)
 
 
 @app.command()
-def give(at: Place = UP) -> None:
+def give(at: CellTarget = RUNNING) -> None:
     """Give the motion back. Nothing moves by that."""
     _own(at, "give")
 
@@ -165,7 +165,7 @@ def jog(
     ] = None,
     frame: Annotated[str, typer.Option("--frame", metavar="base|tool|world", help="whose axes those are")] = "base",
     seconds: Annotated[str, typer.Option("--seconds", metavar="S", help="for so long, at most a minute")] = "1",
-    at: Place = UP,
+    at: CellTarget = RUNNING,
 ) -> None:
     """Move the arm by hand for a while: at most 0.25 m/s, and it stands 0.2 s after Ctrl-C or the end of this."""
     from common.client.arm import check_seconds

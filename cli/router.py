@@ -6,11 +6,11 @@ import json
 import os
 
 from cli import options
-from cli.place import Verbs
-from common.supervision.share import Share
+from cli.target import CommandGroup
+from common.supervision.multi_host import HostOptions
 from common.terminal import echo
 
-app = Verbs("What a cell's router is told.")
+app = CommandGroup("What a cell's router is told.")
 
 HEAD = "// A router for work cells, as `zencell up` would start it: zenohd --config THIS_FILE\n"
 
@@ -38,7 +38,7 @@ def config(
     choose(secure)
     given = os.environ.get(DOMAIN_VARIABLE, DEFAULT_DOMAIN) if domain is None else domain
     number = parse_domain(given, DOMAIN_VARIABLE if domain is None else "--domain")
-    launch = Share(listen, link).linked(Launch(cell="", domain=number))
+    launch = HostOptions(listen, link).linked(Launch(cell="", domain=number))
     endpoints = launch.listen or (endpoint_of(number),)
     folder = secure_folder()
     if folder is None:

@@ -7,16 +7,16 @@ from typing import Annotated, Any, Literal, cast
 import typer
 
 from cli import options
-from cli.place import UP, Place, Verbs
+from cli.target import RUNNING, CellTarget, CommandGroup
 from common.terminal import echo
 
-app = Verbs("Add solids that motion keeps away from though nobody perceives them.")
+app = CommandGroup("Add solids that motion keeps away from though nobody perceives them.")
 
 Name = Annotated[str, typer.Argument(metavar="NAME", help="of your own; in the scene it is added/NAME")]
 
 
 @app.command("list")
-def list_(at: Place = UP, as_json: options.Json = False) -> None:
+def list_(at: CellTarget = RUNNING, as_json: options.Json = False) -> None:
     """List what was added; `zencell topic echo planning_scene` has all that motion keeps away from."""
     from common.messages.schema import to_json
 
@@ -35,7 +35,7 @@ def add(
     middle: Annotated[str, typer.Argument(metavar="X,Y,Z", help="its middle in world [m]")],
     rpy: Annotated[str, typer.Option("--rpy", metavar="R,P,Y", help="roll, pitch, yaw [rad]")] = "0,0,0",
     color: Annotated[str, typer.Option("--color", metavar="R,G,B", help="0 to 1 each")] = "",
-    at: Place = UP,
+    at: CellTarget = RUNNING,
 ) -> None:
     """Add a solid, until it is removed: it stays through restarts. An arm on its way into it brakes."""
     from common.client.goals import pose
@@ -50,7 +50,7 @@ def add(
 
 
 @app.command()
-def remove(name: Name, at: Place = UP) -> None:
+def remove(name: Name, at: CellTarget = RUNNING) -> None:
     """Take out what was added, by whomever."""
     left = at.join(lambda cell: cell.scene.remove(name))
     echo(f"still added: {', '.join(left) or 'nothing'}")

@@ -9,11 +9,11 @@ from typing import Annotated
 import typer
 
 from cli import options
-from cli.place import Verbs
-from common.supervision.share import Share
+from cli.target import CommandGroup
+from common.supervision.multi_host import HostOptions
 from common.terminal import echo
 
-app = Verbs("Certificates for a cell's processes, and who may do what.")
+app = CommandGroup("Certificates for a cell's processes, and who may do what.")
 
 DAYS = 365
 SHOWN = ("writes", "reads", "answers", "asks", "passes on")
@@ -133,7 +133,7 @@ def check(
     for given in cells or names_of("cells"):
         cell = load_cell(given, overrides or (), world=world, seed=number)
         again = renewal(folder, given)
-        rights = rights_in(cell, [entry.name for entry in Share(only=only).part_of(cell).services.values()])
+        rights = rights_in(cell, [entry.name for entry in HostOptions(only=only).part_of(cell).services.values()])
         if not only_rules:
             processes = [process for process in rights if not only or process != RECORDER]
             names = [ROUTER_NAME, *([] if only else [OPERATOR]), *(common_name(cell.name, one) for one in processes)]

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from cli import options
-from cli.place import UP, Place, Verbs
+from cli.target import RUNNING, CellTarget, CommandGroup
 from common import terminal
 
 if TYPE_CHECKING:
     from common.transport.bus import Bus
 
-app = Verbs("Frames: where one is in another, and the tree that they make.")
+app = CommandGroup("Frames: where one is in another, and the tree that they make.")
 
 Rate = Annotated[str, typer.Option("--rate", metavar="HZ", help="lines per second")]
 Once = Annotated[bool, typer.Option("--once", help="one line, then end")]
@@ -28,7 +28,7 @@ def echo(
     once: Once = False,
     rate: Rate = "1",
     count: options.Count = None,
-    at: Place = UP,
+    at: CellTarget = RUNNING,
     as_json: options.Json = False,
 ) -> None:
     """Show the pose of B in A: position, quaternion x y z w, and roll, pitch, yaw in degrees."""
@@ -45,7 +45,7 @@ def echo(
 
 
 @app.command()
-def frames(at: Place = UP, as_json: options.Json = False) -> None:
+def frames(at: CellTarget = RUNNING, as_json: options.Json = False) -> None:
     """Show the tree of frames, and which of them move."""
     from common.client.frames import Frames
 

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from cli import choices as offers
 from cli import options, publishing
-from cli.completing import offers
-from cli.place import UP, Place, Verbs
+from cli.target import RUNNING, CellTarget, CommandGroup
 from common import terminal
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from common.topics import Topic
     from common.transport.bus import Bus
 
-app = Verbs("Topics: what there is, what it carries, what comes and how often.")
+app = CommandGroup("Topics: what there is, what it carries, what comes and how often.")
 
 AnyKey = Annotated[
     str, typer.Argument(metavar="KEY", help="as in `zencell topic list`", autocompletion=offers.keys)
@@ -26,7 +26,7 @@ AnyKey = Annotated[
 
 
 @app.command("list")
-def list_(at: Place = UP, as_json: options.Json = False) -> None:
+def list_(at: CellTarget = RUNNING, as_json: options.Json = False) -> None:
     """List all topics: key, kind, message, who writes or serves it in a cell, and what it is.
 
     Asked are the cells that are up; while there are none, those of the configuration.
@@ -41,14 +41,14 @@ def list_(at: Place = UP, as_json: options.Json = False) -> None:
             terminal.echo(f"{known.key:<20} {kind:<8} {message:<17} {known.writer:<22} {doc}".rstrip())
 
 
-def _known(at: Place) -> dict[str, Known]:
+def _known(at: CellTarget) -> dict[str, Known]:
     from common.client.keys import known_keys
 
     return known_keys(at.cell, at.domain, at.connect)
 
 
 @app.command()
-def info(key: AnyKey, at: Place = UP, as_json: options.Json = False) -> None:
+def info(key: AnyKey, at: CellTarget = RUNNING, as_json: options.Json = False) -> None:
     """Show what a topic carries, field by field; for a request also the answer and an example to call it with.
 
     Who writes or serves it is asked of the cells that are up; while there are none, of those of the configuration.
@@ -68,7 +68,7 @@ def info(key: AnyKey, at: Place = UP, as_json: options.Json = False) -> None:
 @app.command()
 def echo(
     key: options.PublishedKey,
-    at: Place = UP,
+    at: CellTarget = RUNNING,
     count: options.Count = None,
     as_json: options.Json = False,
     save: Annotated[
@@ -86,20 +86,21 @@ def echo(
 
 
 def _show(
-    at: Place, lines: Callable[[Bus], AsyncGenerator[str, None]], topic: Topic[Any] | None, key: str, count: str | None
+    at: CellTarget, lines: Callable[[Bus], AsyncGenerator[str, None]], topic: Topic[Any] | None, key: str,
+    count: str | None,
 ) -> None:
     """Write lines about a topic, or about a foreign key when that is None.
 
     Raises:
         SilentKey: the key is foreign and no cell is up that could know it.
-        NothingUp: no cell is up.
+        NoCellRunning: no cell is up.
     """
     from common.client.foreign import SilentKey
-    from common.client.joining import NothingUp
+    from common.client.joining import NoCellRunning
 
     try:
         at.show(lines, options.whole("--count", count, 1))
-    except NothingUp as error:
+    except NoCellRunning as error:
         if topic is None:
             raise SilentKey(key, f"and there is {error}") from None
         raise
@@ -108,7 +109,7 @@ def _show(
 def _measured(kind: str, doc: str) -> None:
     """Add a verb that shows figures of a topic."""
     def verb(
-        key: options.PublishedKey, at: Place = UP, count: options.Count = None, as_json: options.Json = False
+        key: options.PublishedKey, at: CellTarget = RUNNING, count: options.Count = None, as_json: options.Json = False
     ) -> None:
         from common.client.keys import published_or_foreign
         from common.client.telling import figures

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, get_type_hints
 import typer
 
 from cli import options
-from cli.place import Place
+from cli.target import CellTarget
 from common.application import Application, applications, find_application
 from common.errors import ConfigError
 from common.verbs import BeforeRun, Verbs
@@ -40,20 +40,20 @@ class CommandShell:
         """Send a request to a cell that is up and print the answer as JSON."""
         from cli.commands import send
 
-        send(Place(cell, domain, connect), request, message)
+        send(CellTarget(cell, domain, connect), request, message)
 
     def visit(
         self, visit: Callable[[Bus], Awaitable[T]], cell: str, overrides: list[str] | None, world: str | None,
         seed: str | None, domain: str | None, connect: str | None,
     ) -> T:
         """What a visit to a cell returns: to one that is up, or one that is brought up for it without its task."""
-        from cli.operation.operation import Operation
+        from cli.session.session import CellSession
         from common.config import load_cell
-        from common.supervision.launch import place_of, require_free_port
+        from common.supervision.launch import require_free_port, router_location
         from common.transport.endpoint import endpoint_of
         from common.transport.router import PortInUse
 
-        number, endpoint = place_of(domain, connect)
+        number, endpoint = router_location(domain, connect)
         try:
             if endpoint is None:
                 require_free_port(endpoint_of(number))
@@ -62,8 +62,8 @@ class CommandShell:
             is_up = True
         if is_up:
             name = load_cell(cell, tuple(overrides or ()), world=world).name
-            return Place(name, domain, connect).visit(visit)
-        operation = Operation(cell, overrides, world=world, seed=options.whole("--seed", seed, 0), domain=domain,
+            return CellTarget(name, domain, connect).visit(visit)
+        operation = CellSession(cell, overrides, world=world, seed=options.whole("--seed", seed, 0), domain=domain,
                               connect=connect, no_viewer=True)
         operation.leave_out(operation.cell.task)
         return operation.visit(visit)

@@ -2,7 +2,7 @@
 
 import sys
 
-from zencell import MotionFailed, NotJogged
+from zencell import JogFailed, MotionFailed
 from zencell.blocking import Cell
 
 with Cell(sys.argv[1]) if sys.argv[1:] else Cell.start("panda") as cell:
@@ -19,6 +19,6 @@ with Cell(sys.argv[1]) if sys.argv[1:] else Cell.start("panda") as cell:
     arm.hold("an operator enters")
     try:
         arm.jog(linear=(0.1, 0.0, 0.0), seconds=0.5)
-    except (MotionFailed, NotJogged) as error:
+    except (MotionFailed, JogFailed) as error:
         print(error)
     arm.release()

@@ -2,7 +2,7 @@
 
 import sys
 
-from zencell import NothingHeard, UnknownName
+from zencell import NothingReceived, UnknownName
 from zencell.blocking import Cell
 
 AREA = "vision_detector.min_contour_area_px"
@@ -22,5 +22,5 @@ with Cell(sys.argv[1]) if sys.argv[1:] else Cell.start("panda", overrides=["worl
         print(error)
     try:
         cell.objects(least=30, timeout=0.5)
-    except NothingHeard as error:
+    except NothingReceived as error:
         print(error)

@@ -8,8 +8,8 @@ from collections.abc import Iterable
 
 import viser
 
+from common.client.rates import Rates
 from common.messages import LogLine, ServiceCounters, SupervisorStatus
-from common.supervision.rates import Rates
 from page import words
 from page.console import Desk
 from page.layout import LogLevel

@@ -9,18 +9,18 @@ import time
 from collections.abc import AsyncIterator, Callable
 from typing import TYPE_CHECKING, Protocol
 
-from common.client.joining import somebody_listens
-from common.client.keyboard import Keys
+from common.client.joining import is_listening
 from common.client.publishing import writers_of
 from common.clock import Clock
 from common.errors import ConfigError
 from common.remapping import is_key
-from common.supervision.interrupts import Interrupts
+from common.supervision.lifecycle import Interrupts
 from common.transport.bus import Bus
 from common.transport.connect import connect as connect_to
 from common.transport.endpoint import endpoint_of
 from common.transport.router import open_router
 from common.transport.zenoh_session import close_bounded
+from recording.keyboard import Keys
 from recording.reader import Recording
 from recording.sample import RecordingError, encoding_of, restamp
 from recording.selection import Playhead, Selection
@@ -275,7 +275,7 @@ async def play(
 @contextlib.asynccontextmanager
 async def _router(endpoint: str, *, may_start: bool) -> AsyncIterator[bool]:
     """A router at the endpoint during the block; whether it is our own."""
-    if not may_start or await asyncio.to_thread(somebody_listens, endpoint):
+    if not may_start or await asyncio.to_thread(is_listening, endpoint):
         yield False
         return
     session = await asyncio.to_thread(open_router, [endpoint])

@@ -11,9 +11,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from common.application import find_topic
-from common.client.foreign import require_heard
+from common.client.foreign import require_messages
 from common.client.keys import published
-from common.supervision.interrupts import Interrupts
+from common.supervision.lifecycle import Interrupts
 from common.transport.bus import Bus
 from common.transport.connect import connect as connect_to
 from common.transport.credentials import RECORDER
@@ -91,7 +91,7 @@ async def record(bus: Bus, asked: RecordRequest, tell: Tell, show: Tell | None) 
         _end_with_stdin(interrupts)
     for key in asked.selection.keys:
         if find_topic(key) is None and "*" not in key:
-            await require_heard(bus, key)
+            await require_messages(bus, key)
     path = asked.output or Path(f"{bus.cell}_{time.strftime('%Y%m%d_%H%M%S')}.mcap")
     writer = SplitWriter(path, about(bus.cell), asked.most_bytes)
     sink = Sink(writer, on_failure=lambda: call_on_loop(loop, interrupts.stop.set))

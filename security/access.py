@@ -33,7 +33,7 @@ MESSAGES = [
 
 
 class Declares(Protocol):
-    """What a service has declared (common.process.wiring)."""
+    """What a service has declared (common.supervision.wiring)."""
 
     reads: set[Topic[Any]]
     writes: set[Topic[Any]]

@@ -95,9 +95,9 @@ def require_recorder(launch: Launch, cell: Cell) -> None:
 
 def _require_rules(launch: Launch, services: Sequence[str], folder: Path) -> None:
     # In a process of its own: what the services import would stay in this one for as long as the cell is up.
-    from common.supervision.launch import python_module
+    from common.supervision.launch import module_command
 
-    command = [*python_module("cli.main"), "secure", "check", str(folder), "--only-rules", "--cell", launch.cell,
+    command = [*module_command("cli.main"), "secure", "check", str(folder), "--only-rules", "--cell", launch.cell,
                "--only", ",".join(services)]
     for text in launch.overrides:
         command += ["--set", text]

@@ -7,9 +7,8 @@ from collections.abc import Collection
 
 from common.config import Cell
 from common.errors import ZencellError
-from common.process.wiring import Wiring, require_one_owner, wiring_of
 from common.supervision.launch import require_modules
-from common.supervision.wired import Unwired
+from common.supervision.wiring import Wiring, WiringFailed, require_one_owner, wiring_of
 from common.transport.credentials import RECORDER, SUPERVISOR
 from page.access import VIEWER
 from security.access import Rights, rights_of, rights_of_recorder, rights_of_supervisor
@@ -24,7 +23,7 @@ def rights_in(cell: Cell, names: Collection[str] | None = None) -> dict[str, Rig
 
     Raises:
         ConfigError: one of them cannot be configured so, or two of them write or serve one key.
-        Unwired: one of them does not get so far.
+        WiringFailed: one of them does not get so far.
     """
     require_modules(cell)
     apart = cell.model_copy(update={"services": {
@@ -43,7 +42,7 @@ def rights_in(cell: Cell, names: Collection[str] | None = None) -> dict[str, Rig
             except ZencellError:
                 raise
             except Exception as error:  # whatever a service does that cannot run so
-                raise Unwired(entry.name, error) from error
+                raise WiringFailed(entry.name, error) from error
         return found
 
     wirings = asyncio.run(find())

@@ -1,5 +1,5 @@
 """One process each: a thin shell that declares, is ready, loops, asks and publishes. What it thinks is in common/."""
 
-from common.process.environment import start_light
+from common.process.environment import set_startup_variables
 
-start_light()
+set_startup_variables()

@@ -33,8 +33,8 @@ from common.planning.pipeline import PlanningPipeline
 from common.planning.point_obstacles import PointObstacle
 from common.planning.problem import Cancel
 from common.planning.scene_monitor import NotMonitored, SceneMonitor
-from common.process.pace import NICENESS, come_last
-from common.process.planning_helper import Helper, HelperLost, fork_helpers
+from common.process.environment import NICENESS, lower_thread_priority
+from common.process.planning_worker import PlanningWorker, WorkerDied, fork_workers
 from common.process.service import main
 from common.robot.finger_joints import measured_width
 from common.robot.model import RobotModel
@@ -66,7 +66,7 @@ class Config(Parameters):
 Planner = Callable[..., Awaitable[PlanResponse]]  # of request, scene, joints, width and what makes obstacles of points
 
 
-async def run(bus: Bus, config: Config, helpers: Sequence[Helper] = ()) -> None:
+async def run(bus: Bus, config: Config, helpers: Sequence[PlanningWorker] = ()) -> None:
     """Serve plan requests on the newest planning scene, from the newest joint states unless a start is given."""
     scenes = bus.reader(topics.PLANNING_SCENE)
     states = bus.reader(topics.JOINT_STATES)
@@ -93,7 +93,7 @@ async def run(bus: Bus, config: Config, helpers: Sequence[Helper] = ()) -> None:
     async def handle(request: PlanRequest) -> PlanResponse:
         try:
             response, scene, width = await plan(request)
-        except HelperLost as lost:
+        except WorkerDied as lost:
             bus.log.error("%s: %s is planned again, by one fewer from now on", lost, request.stage or request.id)
             return await handle(request)
         response.header = bus.header()
@@ -141,8 +141,8 @@ def _load(config: Config) -> PlanningPipeline:
 
 
 async def _by_helper(
-    helper: Helper, request: PlanRequest, scene: PlanningScene, current: list[float] | None, width: float | None,
-    see: Callable[[], list[PointObstacle]] | None,
+    helper: PlanningWorker, request: PlanRequest, scene: PlanningScene, current: list[float] | None,
+    width: float | None, see: Callable[[], list[PointObstacle]] | None,
 ) -> PlanResponse:
     assert see is None
     return await helper.plan(request, scene, current, width)
@@ -168,7 +168,7 @@ class Crew:
         stays = True
         try:
             yield planner
-        except HelperLost:
+        except WorkerDied:
             stays = False
             raise
         finally:
@@ -308,7 +308,7 @@ async def _plan(
     cancel = Cancel()
 
     def plan() -> PlanResponse:
-        come_last()
+        lower_thread_priority()
         points = [] if see is None else see()
         return pipeline.plan(request, scene, current, cancel, points, width)
 
@@ -323,4 +323,4 @@ async def _plan(
 
 
 if __name__ == "__main__":
-    main(partial(run, helpers=fork_helpers(NICENESS)), Config)
+    main(partial(run, helpers=fork_workers(NICENESS)), Config)

@@ -9,8 +9,8 @@ import threading
 from typing import NoReturn
 
 from common.errors import ConfigError, ZencellError
-from common.process.environment import share_memory
-from common.process.lifeline import Lifeline, fail, leave
+from common.process.environment import use_single_memory_arena
+from common.process.lifeline import Lifeline, exit_now, exit_with_error
 from common.process.log import log_to_stderr
 from common.process.service import add_process_options
 from common.transport.credentials import secure_folder
@@ -36,7 +36,7 @@ _READERS = 16  # threads that take what comes: each may wait for somebody who fa
 
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
-        fail(ConfigError(self.prog, message, "cannot be used; --help lists the options"))
+        exit_with_error(ConfigError(self.prog, message, "cannot be used; --help lists the options"))
 
 
 def _read_beside() -> None:
@@ -63,7 +63,7 @@ def main() -> NoReturn:
                              "are known; repeatable")
     add_process_options(parser)
     options = parser.parse_args()
-    share_memory()
+    use_single_memory_arena()
     _read_beside()
     most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
     resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))  # a connection takes three files in a secured router
@@ -76,7 +76,7 @@ def main() -> NoReturn:
     lifeline.on_gate(gate.set)
     while not gate.wait(0.02):
         if stop.is_set():
-            leave(0)
+            exit_now(0)
     try:
         domain = options.domain if options.domain is not None else os.environ.get(DOMAIN_VARIABLE, DEFAULT_DOMAIN)
         endpoints = endpoints_of("--listen", options.listen, LISTEN_VARIABLE) or [endpoint_of(domain)]
@@ -84,7 +84,7 @@ def main() -> NoReturn:
         secured = secure_folder()
         router = Router(endpoints, secured, links, options.small, options.near)
     except ZencellError as error:
-        fail(error)
+        exit_with_error(error)
     log.info("listening at %s", " and ".join(endpoints))
     for endpoint in endpoints:
         if secured is None and not is_loopback(endpoint):
@@ -97,7 +97,7 @@ def main() -> NoReturn:
     closing = threading.Thread(target=router.close, daemon=True)
     closing.start()
     closing.join(_CLOSE_SECONDS)
-    leave(0)
+    exit_now(0)
 
 
 if __name__ == "__main__":

@@ -39,7 +39,7 @@ async def run(bus: Bus, config: Config) -> None:
     if config.robot.gripper is None:
         raise ConfigError("robot.gripper", ..., "is missing: scene_manager needs a robot with one")
     scene = PerceivedScene(config, config.world, config.robot.gripper, config.robot.tcp_link)
-    left_out = SkippedFrames(bus.log, "a planning scene")
+    left_out = SkippedFrames(bus.log, "planning scene")
     await out.begin(scene.scene())
     await bus.ready()
 

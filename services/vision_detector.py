@@ -144,7 +144,7 @@ async def run(bus: Bus, config: Config) -> None:
     cv2.setNumThreads(1)  # other services use the other cores
     depths = DepthBuffer(bus.reader(topics.DEPTH_CAMERA_DEPTH)) if config.depth else None
     detector = Detector(config.world, config)
-    left_out = SkippedFrames(bus.log, "a picture")
+    left_out = SkippedFrames(bus.log, "image")
     if not bus.declares_only:
         warm_up(config.world, config)
     await bus.ready()

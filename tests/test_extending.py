@@ -28,8 +28,8 @@ from common.hardware.loading import find_backend, load_hardware
 from common.messages import CameraInfo, Image, Pose, Vector3, WorldObject, WorldObjects
 from common.planning.planners import load_planner
 from common.process.in_process import running_service
-from common.process.wiring import wiring
 from common.robot.model import RobotModel
+from common.supervision.wiring import wiring
 from common.tasks.stages import View
 from common.topics import CAMERA_IMAGE, CAMERA_INFO, GRIPPER_STATE, SCENE_OBJECTS
 from common.transport.codec import decode
@@ -356,4 +356,4 @@ def test_unknown_service_module_is_rejected_by_name(folder: Path) -> None:
     result = run_command("zencell service my_pkg.farthest_target --cell panda", folder)
     assert result.returncode == 2
     assert result.stderr.count("\n") == 1
-    assert "'my_pkg.farthest_target' is not a module that can be found" in result.stderr
+    assert "'my_pkg.farthest_target' is not a module on the search path" in result.stderr

@@ -9,7 +9,7 @@ from html import escape
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from common.supervision.wired import Wired
+    from common.supervision.wiring import ServiceWiring
 
 
 OUTSIDE = "zencell, you"  # who sends the requests that no service of the cell sends
@@ -22,7 +22,7 @@ class Graph:
     """A cell as services with the keys between them. `alive` is None while the cell is not up."""
 
     cell: str
-    services: list[Wired]  # in start order
+    services: list[ServiceWiring]  # in start order
     kinds: dict[str, str]  # by key: stream, event, state, request; in the order of their writers or callers
     alive: frozenset[str] | None = None
     outside: list[str] = field(default_factory=list)  # requests that no service of the cell sends
@@ -32,7 +32,7 @@ class Graph:
         return self.alive is None or service in self.alive
 
 
-def graph_of(cell: str, services: list[Wired], alive: frozenset[str] | None = None) -> Graph:
+def graph_of(cell: str, services: list[ServiceWiring], alive: frozenset[str] | None = None) -> Graph:
     """The graph of a cell's wired services.
 
     Args:
@@ -41,12 +41,12 @@ def graph_of(cell: str, services: list[Wired], alive: frozenset[str] | None = No
         alive: the services that are ready, when the cell is up.
     """
     from common.application import find_topic
-    from common.supervision.wired import Wired
+    from common.supervision.wiring import ServiceWiring
     from common.topics import SUPERVISOR_STATUS
 
     services = [replace(each, calls=[key for key in each.calls if not key.startswith(PARAMETERS)]) for each in services]
     if any(SUPERVISOR_STATUS.key in each.reads for each in services):
-        services.append(Wired(SUPERVISOR, "", writes=[SUPERVISOR_STATUS.key]))
+        services.append(ServiceWiring(SUPERVISOR, "", writes=[SUPERVISOR_STATUS.key]))
     called = {key for service in services for key in service.calls}
     outside = [key for service in services for key in service.serves if key not in called]
     keys = [key for service in services for key in (*service.writes, *service.calls)] + outside
@@ -209,8 +209,8 @@ def _right_side(graph: Graph, rows: list[Row], bottom: float) -> tuple[list[Box]
 
 def _ending_at(graph: Graph, service: str, rows: list[Row]) -> list[Row]:
     """The rows from which a line goes to a service, from top to bottom."""
-    wired = next(each for each in graph.services if each.name == service)
-    return [row for row in rows if row.key in wired.reads or row.key in wired.serves]
+    wire_service = next(each for each in graph.services if each.name == service)
+    return [row for row in rows if row.key in wire_service.reads or row.key in wire_service.serves]
 
 
 def _lines(graph: Graph, rows: list[Row], readers: list[Box], colours: dict[str, str]) -> list[str]:

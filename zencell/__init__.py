@@ -19,13 +19,13 @@ if _FOLDER not in sys.path:
     sys.path.insert(0, _FOLDER)
 
 if TYPE_CHECKING:
-    from common.client.arm import NotJogged
+    from common.client.arm import JogFailed
     from common.client.cell import Cell
     from common.client.goals import Plan, any_of, pose, region, through
-    from common.client.hearing import NothingHeard
-    from common.client.joining import NothingUp
+    from common.client.joining import NoCellRunning
     from common.client.operator_motion import MotionFailed
     from common.client.starting import NotStarted
+    from common.client.subscriptions import NothingReceived
     from common.errors import (
         ConfigError,
         NoResponder,
@@ -39,11 +39,11 @@ if TYPE_CHECKING:
     from common.messages import Pose
 
 _FROM = {  # imported when they are asked for: the command line starts without them
-    "common.client.arm": ("NotJogged",),
+    "common.client.arm": ("JogFailed",),
     "common.client.cell": ("Cell",),
     "common.client.goals": ("Plan", "any_of", "pose", "region", "through"),
-    "common.client.hearing": ("NothingHeard",),
-    "common.client.joining": ("NothingUp",),
+    "common.client.subscriptions": ("NothingReceived",),
+    "common.client.joining": ("NoCellRunning",),
     "common.client.starting": ("NotStarted",),
     "common.errors": ("ConfigError", "NoResponder", "RemoteError", "RequestFailed", "RequestLost", "RequestTimeout",
                       "UnknownName", "ZencellError"),
@@ -53,9 +53,26 @@ _FROM = {  # imported when they are asked for: the command line starts without t
 _WHERE = {name: module for module, names in _FROM.items() for name in names}
 
 __all__ = [
-    "Cell", "ConfigError", "MotionFailed", "NoResponder", "NotJogged", "NotStarted", "NothingHeard", "NothingUp",
-    "Plan", "Pose", "RemoteError", "RequestFailed", "RequestLost", "RequestTimeout", "UnknownName", "ZencellError",
-    "any_of", "pose", "region", "through",
+    "Cell",
+    "ConfigError",
+    "JogFailed",
+    "MotionFailed",
+    "NoCellRunning",
+    "NoResponder",
+    "NotStarted",
+    "NothingReceived",
+    "Plan",
+    "Pose",
+    "RemoteError",
+    "RequestFailed",
+    "RequestLost",
+    "RequestTimeout",
+    "UnknownName",
+    "ZencellError",
+    "any_of",
+    "pose",
+    "region",
+    "through",
 ]
 
 

@@ -8,9 +8,9 @@ signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 def main() -> None:
     """Run the verb that the process's arguments name and end the process with its code."""
-    from common.process.environment import start_light
+    from common.process.environment import set_startup_variables
 
-    start_light()
+    set_startup_variables()
     from cli.main import app
 
     app()

@@ -1,5 +1,5 @@
 """Where zenoh-cli finds the codec `msgpack`: the package is imported first, and with it the project can be."""
 
-from common.client.zenoh_codec import decode, encode
+from common.client.json_codec import decode, encode
 
 __all__ = ["decode", "encode"]

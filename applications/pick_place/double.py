@@ -11,8 +11,8 @@ from common.config import RobotConfig, Surroundings, Tunable
 from common.errors import ConfigError
 from common.messages import Header, Marker, MarkerArray, Pose, PoseArray, Vector3, WorldObject
 from common.perception.pinhole import MountedCamera
-from common.process.pace import Pace
 from common.process.planning_scene import SceneWriter
+from common.process.timing import LoopRate
 from common.robot.model import RobotModel
 from common.transport.bus import Bus
 
@@ -45,7 +45,7 @@ async def run(bus: Bus, config: Config) -> None:
     scene = PerceivedScene(config, config.world, config.robot.gripper, config.robot.tcp_link)
     await out.begin(scene.scene())
     await bus.ready()
-    pace = Pace(bus, lambda: bus.clock.wall_rate(config.rate, 50.0))
+    pace = LoopRate(bus, lambda: bus.clock.wall_rate(config.rate, 50.0))
     while True:
         state, measured, objects = gripper.latest, joints.latest, truth.latest
         q = robot.order(measured.name, measured.position) if measured else None

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from common import topics
-from common.client.goals import Plan, Point, Through, Where, goal_of, numbers
-from common.client.hearing import Ear, NothingHeard
+from common.client.goals import GoalLike, Plan, Point, WaypointPath, goal_of, numbers
 from common.client.operator_motion import PATIENCE, MotionFailed, OperatorMotion
 from common.client.part import Part
+from common.client.subscriptions import NothingReceived, Subscriptions
 from common.config import check
 from common.errors import ConfigError, RequestLost, RequestTimeout, UnknownName, ZencellError
 from common.messages import (
@@ -51,7 +51,7 @@ ACTIVE = ("active", "none")
 NO_WAY = "the arm cannot go that way, or its controller does not take it in time"
 
 
-class NotJogged(ZencellError):
+class JogFailed(ZencellError):
     """The arm did not go as it was asked to."""
 
     exit_code = 1
@@ -70,7 +70,7 @@ class Arm(Part):
 
     owner: str  # in whose name it is moved
 
-    def __init__(self, ear: Ear, owner: str, tf: Callable[[str, str], Coroutine[Any, Any, Array]]) -> None:
+    def __init__(self, ear: Subscriptions, owner: str, tf: Callable[[str, str], Coroutine[Any, Any, Array]]) -> None:
         """The arm of a cell, moved in the name of `owner`."""
         self._has(owner=owner)
         self._motion = OperatorMotion(ear.bus, owner=owner)
@@ -99,7 +99,7 @@ class Arm(Part):
         dq = dict(zip(state.name, state.velocity or [0.0] * len(state.name), strict=True))
         missing = [name for name in names if name not in q]
         if missing:
-            raise NothingHeard(f"{self._bus.cell}/joint_states of {', '.join(missing)}")
+            raise NothingReceived(f"{self._bus.cell}/joint_states of {', '.join(missing)}")
         return np.array([q[name] for name in names]), np.array([dq[name] for name in names])
 
     async def pose(self, frame: str = "world") -> Array:
@@ -117,8 +117,8 @@ class Arm(Part):
     # --- motion ---------------------------------------------------------------------------------------------------
 
     async def plan(
-        self, to: Where | Through, *, straight: bool = False, via: Point | None = None, around: Point | None = None,
-        speed: float | None = None, touch: Iterable[str] = (), planner: str = "",
+        self, to: GoalLike | WaypointPath, *, straight: bool = False, via: Point | None = None,
+        around: Point | None = None, speed: float | None = None, touch: Iterable[str] = (), planner: str = "",
         constraints: PathConstraints | None = None, **more: Any,
     ) -> Plan:
         """A motion from where the arm is; nothing moves.
@@ -142,7 +142,7 @@ class Arm(Part):
         """
         if straight and (via is not None or around is not None):
             raise ConfigError("straight", straight, "does not go with via or around, which are arcs")
-        if isinstance(to, Through):
+        if isinstance(to, WaypointPath):
             to = to.starting_at(await self.pose())
         goal = goal_of(to, via=via, around=around)
         if names := [touch] if isinstance(touch, str) else list(touch):
@@ -176,7 +176,7 @@ class Arm(Part):
         """
         return await self._follow(plan, timeout)
 
-    async def move(self, to: Where | Through, *, timeout: float = PATIENCE, **how: Any) -> MotionStatus:
+    async def move(self, to: GoalLike | WaypointPath, *, timeout: float = PATIENCE, **how: Any) -> MotionStatus:
         """Plan and execute: see there. What somebody says while it is planned keeps the arm, whoever that is."""
         acknowledged = (await self.status()).newest  # may miss our last request
         await self.require_free()
@@ -249,7 +249,7 @@ class Arm(Part):
 
         Raises:
             ConfigError, UnknownName: what cannot be asked for.
-            NotJogged: the motion does not become ours, or is not any more.
+            JogFailed: the motion does not become ours, or is not any more.
             RequestFailed: nobody says how the robot is.
         """
         check_seconds(seconds)
@@ -294,7 +294,7 @@ class Arm(Part):
                 elif not goes and not waits:
                     late = ours and not now.jogging
                     why = "" if another else "words of this program came too late" if late else NO_WAY
-                    raise NotJogged(now.description, _kept(state) or why)
+                    raise JogFailed(now.description, _kept(state) or why)
                 ours = ours or goes
         finally:
             writer.put(JogCommand(header=self._bus.header(), owner=self.owner, acknowledged=acknowledged))
@@ -307,7 +307,7 @@ class Arm(Part):
             now, state = owners.latest, motion.latest
             assert now is not None and state is not None
             another = now.kind != "none" and now.owner != self.owner
-            raise NotJogged(now.description, _kept(state) or ("" if another else NO_WAY))
+            raise JogFailed(now.description, _kept(state) or ("" if another else NO_WAY))
 
     # --- whose the motion is --------------------------------------------------------------------------------------
 
@@ -361,10 +361,10 @@ class Arm(Part):
         return await self._bus.client(topics.ROBOT_COMMAND).call(asked, POWER)
 
 
-class Hand(Part):
+class Gripper(Part):
     """The fingers, or the suction cup, of which width 0 draws air in."""
 
-    def __init__(self, ear: Ear, owner: str, arm: Arm) -> None:
+    def __init__(self, ear: Subscriptions, owner: str, arm: Arm) -> None:
         """The gripper of a cell, moved in the name of `owner`."""
         self._ear, self._bus, self._owner, self._arm = ear, ear.bus, owner, arm
 

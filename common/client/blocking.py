@@ -17,17 +17,18 @@ import weakref
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from typing import Any, TypeVar
 
-from common.client import arm, cell, hearing, parameters, scene, task
+from common.client import arm, cell, parameters, scene, task
+from common.client import subscriptions as hearing
 from common.errors import ZencellError
 
 T = TypeVar("T")
 
 ENDS = 5.0  # [s] in which what was begun has ended
-WRAPPED = (arm.Arm, arm.Hand, hearing.Camera, parameters.Parameters, task.TaskControl, scene.Scene,
+WRAPPED = (arm.Arm, arm.Gripper, hearing.Camera, parameters.Parameters, task.TaskControl, scene.Scene,
            cell.World)
 
 
-class Loop:
+class LoopThread:
     """A running loop in a thread of its own."""
 
     def __init__(self) -> None:
@@ -94,7 +95,7 @@ class Loop:
 class Blocking:
     """An object whose asynchronous methods are called without `await`."""
 
-    def __init__(self, loop: Loop, inner: Any) -> None:
+    def __init__(self, loop: LoopThread, inner: Any) -> None:
         """Stand for an object that lives on a loop."""
         self.__dict__.update(_loop=loop, _inner=inner, __doc__=inner.__doc__)
 
@@ -125,7 +126,7 @@ class Blocking:
         return iterated(self._loop, self._inner)
 
 
-def given(loop: Loop, value: Any) -> Any:
+def given(loop: LoopThread, value: Any) -> Any:
     """A value as who blocks can use it."""
     if isinstance(value, WRAPPED):
         return Blocking(loop, value)
@@ -138,7 +139,7 @@ def given(loop: Loop, value: Any) -> Any:
     return value
 
 
-def called(loop: Loop, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+def called(loop: LoopThread, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
     """What a function returns that is called on the loop, and awaited there if need be."""
 
     async def work() -> Any:
@@ -151,7 +152,7 @@ def called(loop: Loop, function: Callable[..., Any], *args: Any, **kwargs: Any) 
     return iterated(loop, result) if hasattr(result, "__anext__") else given(loop, result)
 
 
-def iterated(loop: Loop, messages: Any) -> Iterator[Any]:
+def iterated(loop: LoopThread, messages: Any) -> Iterator[Any]:
     """What comes of an asynchronous iterator."""
     found: AsyncIterator[Any] = aiter(messages)
     try:
@@ -166,7 +167,7 @@ def iterated(loop: Loop, messages: Any) -> Iterator[Any]:
 
 
 @contextlib.contextmanager
-def entered(loop: Loop, block: contextlib.AbstractAsyncContextManager[Any]) -> Iterator[Any]:
+def entered(loop: LoopThread, block: contextlib.AbstractAsyncContextManager[Any]) -> Iterator[Any]:
     """An asynchronous context as a plain one."""
     values: list[Any] = []
 
@@ -208,7 +209,7 @@ class Cell(Blocking):
     def open(self) -> Cell:
         """Join it; at the latest when the program ends it is closed."""
         if self._loop is None:
-            self.__dict__["_loop"] = loop = Loop()
+            self.__dict__["_loop"] = loop = LoopThread()
             try:
                 loop.wait(self._inner.__aenter__)
             except BaseException:

@@ -14,15 +14,23 @@ from numpy.typing import NDArray
 
 from common import topics
 from common.application import all_topics, find_topic
-from common.client.arm import Arm, Hand
+from common.client.arm import Arm, Gripper
 from common.client.foreign import require_key
 from common.client.frames import Frames
-from common.client.hearing import Camera, Carried, Ear, NothingHeard, cameras, messages, topic_in
 from common.client.joining import cell_clock, joined, person, supervisor_status
 from common.client.parameters import Parameters
 from common.client.part import Part
 from common.client.scene import Scene
-from common.client.starting import Started
+from common.client.starting import StartedCell
+from common.client.subscriptions import (
+    Camera,
+    Carried,
+    NothingReceived,
+    Subscriptions,
+    cameras,
+    find_live_topic,
+    messages,
+)
 from common.client.task import TaskControl
 from common.config import check
 from common.errors import ConfigError, DecodeError, UnknownName, ZencellError
@@ -52,7 +60,7 @@ def seen(scene: PlanningScene) -> list[CollisionObject]:
 class World(Part):
     """The simulated world; a real one is not changed by saying so."""
 
-    def __init__(self, bus: Bus, ear: Ear) -> None:
+    def __init__(self, bus: Bus, ear: Subscriptions) -> None:
         """The world of a cell."""
         self._bus, self._ear = bus, ear
 
@@ -98,7 +106,7 @@ class Cell(Part):
 
     owner: str
     arm: Arm
-    gripper: Hand
+    gripper: Gripper
     task: TaskControl
     param: Parameters
     scene: Scene
@@ -129,7 +137,7 @@ class Cell(Part):
         # Said now: who is to stop the arm must not learn only then that nobody may be called so.
         self._has(owner=check(StopRequest, {"owner": owner or person()}).owner)
         self._joined = contextlib.AsyncExitStack()
-        self._started: Started | None = None
+        self._started: StartedCell | None = None
         self._bus: Bus | None = None
         self._entered = False
         self._frames: Frames | None = None
@@ -156,7 +164,7 @@ class Cell(Part):
         """
         made = cls(owner=owner, application=application)
         values = [*overrides, f"autostart={str(autostart).lower()}"]
-        made._started = Started(cell, speed=speed, world=world, seed=seed, overrides=values, viewer=viewer,
+        made._started = StartedCell(cell, speed=speed, world=world, seed=seed, overrides=values, viewer=viewer,
                                 domain=domain)
         return made
 
@@ -168,10 +176,10 @@ class Cell(Part):
         return made
 
     def _take(self, bus: Bus) -> None:
-        self._bus, self._ear = bus, Ear(bus)
+        self._bus, self._ear = bus, Subscriptions(bus)
         arm = Arm(self._ear, self.owner, self.tf)
         self._has(
-            arm=arm, gripper=Hand(self._ear, self.owner, arm),
+            arm=arm, gripper=Gripper(self._ear, self.owner, arm),
             task=TaskControl(self._ear, self.owner, self._application), param=Parameters(bus),
             scene=Scene(self._ear, self.owner), world=World(bus, self._ear))
 
@@ -229,7 +237,7 @@ class Cell(Part):
         """All processes of the cell, its speed and seed, as its supervisor has them."""
         status = await supervisor_status(self.bus)
         if status is None:
-            raise NothingHeard(f"{self.name}/{topics.SUPERVISOR_STATUS.key}")
+            raise NothingReceived(f"{self.name}/{topics.SUPERVISOR_STATUS.key}")
         return status
 
     # --- what is seen ---------------------------------------------------------------------------------------------
@@ -259,7 +267,7 @@ class Cell(Part):
             timeout: for so long [s, wall].
 
         Raises:
-            NothingHeard: there are fewer.
+            NothingReceived: there are fewer.
         """
         reader, found = self._ear.reader(topics.PLANNING_SCENE), seen(await self.planning_scene())
         try:
@@ -267,7 +275,8 @@ class Cell(Part):
                 while len(found) < least:
                     found = seen(await reader.next())
         except TimeoutError:
-            raise NothingHeard(f"{self.name}/planning_scene of {least} objects, but of {len(found)}", timeout) from None
+            missing = f"{self.name}/planning_scene with {least} objects, only with {len(found)}"
+            raise NothingReceived(missing, timeout) from None
         return found
 
     async def tf(self, target: str, source: str) -> NDArray[np.float64]:
@@ -275,7 +284,7 @@ class Cell(Part):
 
         Raises:
             UnknownName: a frame that nobody tells of; with the choices.
-            NothingHeard: nobody tells of any, or of one that moves any more.
+            NothingReceived: nobody tells of any, or of one that moves any more.
         """
         target, source = [await self._frame(name) for name in (target, source)]
         known = self._frames
@@ -297,7 +306,7 @@ class Cell(Part):
             return key
         if not isinstance(key, str):
             raise ConfigError("key", key, "must be a key, or its Topic or Request")
-        return find_topic(key) or await topic_in(self.bus, key)
+        return find_topic(key) or await find_live_topic(self.bus, key)
 
     async def call(
         self, key: str | Request[Any, Any], message: Message | Mapping[str, Any] | None = None, *,
@@ -344,7 +353,7 @@ class Cell(Part):
                 the choices.
             ConfigError: it is a request.
             DecodeError: what came is not packed as messages are.
-            NothingHeard: nothing came in time.
+            NothingReceived: nothing came in time.
         """
         topic = None if plain else await self._carried(key)
         if plain:
@@ -360,7 +369,7 @@ class Cell(Part):
                     async with asyncio.timeout(timeout):
                         message = await anext(found)
                 except TimeoutError:
-                    raise NothingHeard(f"{self.name}/{topic.key if topic else key}", timeout or 0.0) from None
+                    raise NothingReceived(f"{self.name}/{topic.key if topic else key}", timeout or 0.0) from None
                 yield message
 
     async def _packed(self, key: str) -> AsyncGenerator[Any]:

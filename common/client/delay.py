@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from common.errors import RequestFailed
 
 if TYPE_CHECKING:
-    from common.client.measuring import DelayFigures
+    from common.client.statistics import DelayFigures
     from common.transport.bus import Bus
 
 PERIOD = 1.0  # [s] between figures
@@ -30,14 +30,14 @@ async def delays(bus: Bus, key: str, foreign: bool) -> AsyncGenerator[tuple[Dela
         NoStamp: something came that has no stamp.
         SilentKey: nothing came on a foreign key.
     """
-    from common.client.foreign import require_heard
+    from common.client.foreign import require_messages
     from common.client.joining import cell_clock
-    from common.client.measuring import Hearing
+    from common.client.statistics import TopicStatistics
 
     full = f"{bus.cell}/{key}"
-    hearing = Hearing(await cell_clock(bus))
+    hearing = TopicStatistics(await cell_clock(bus))
     if foreign:
-        await require_heard(bus, key)
+        await require_messages(bus, key)
     for sample in await bus.raw_get(full, ASK_TIMEOUT):
         hearing.know(sample)
     subscribed = bus.raw_subscriber(full, hearing.arrive)

@@ -75,7 +75,7 @@ async def samples(bus: Bus, key: str) -> AsyncGenerator[RawSample, None]:
         await asyncio.wait({following})
 
 
-async def require_heard(bus: Bus, key: str) -> None:
+async def require_messages(bus: Bus, key: str) -> None:
     """Return when something came on a key: somebody writes it.
 
     Raises:

@@ -9,10 +9,9 @@ from collections.abc import AsyncGenerator, Coroutine
 from typing import Any
 
 from common import topics
-from common.client.hearing import PATIENCE, NothingHeard
+from common.client.subscriptions import PATIENCE, NothingReceived
 from common.errors import ZencellError
-from common.robot.transform_history import MOST_FRAMES
-from common.robot.transform_tree import TransformTree
+from common.robot.transform_tree import MAX_FRAMES, TransformTree
 from common.robot.transforms import matrix_to_quaternion, matrix_to_rpy
 from common.transport.bus import Bus
 
@@ -50,7 +49,7 @@ class Frames:
         async for message in self._moving:
             self.tree.update(message)
             self._told |= dict.fromkeys((each.child_frame_id for each in message.transforms), _now())
-            if len(self._told) > 2 * MOST_FRAMES:
+            if len(self._told) > 2 * MAX_FRAMES:
                 self._told = {name: at for name, at in self._told.items() if self.tree.parent_of(name) is not None}
             self._changed.set()
 
@@ -63,7 +62,7 @@ class Frames:
         """Return when the pose of source in target is known.
 
         Raises:
-            NothingHeard: nothing came at all.
+            NothingReceived: nothing came at all.
             UnknownName, NotConnected: it still is not after a while.
         """
         try:
@@ -79,7 +78,7 @@ class Frames:
         """Return when all that moves between two frames was told anew; at once where nothing does.
 
         Raises:
-            NothingHeard: some of it was not: where it was last is not where it is.
+            NothingReceived: some of it was not: where it was last is not where it is.
         """
         known = {name: self.tree.stamp_of(name) for name in self._moving_between(target, source)}
 
@@ -98,7 +97,7 @@ class Frames:
         """Return when all that moves between two frames was told of lately.
 
         Raises:
-            NothingHeard: some of it was not: where it was last is not where it is.
+            NothingReceived: some of it was not: where it was last is not where it is.
         """
         if old := [name for name in self._moving_between(target, source) if self._told[name] < _now() - PATIENCE]:
             raise self._silence(old)
@@ -106,8 +105,8 @@ class Frames:
     def _moving_between(self, target: str, source: str) -> list[str]:
         return [name for name in self.tree.path(target, source) if name in self._told]
 
-    def _silence(self, frames: list[str]) -> NothingHeard:
-        return NothingHeard(f"{self._cell}/tf of {', '.join(frames)}")
+    def _silence(self, frames: list[str]) -> NothingReceived:
+        return NothingReceived(f"{self._cell}/tf of {', '.join(frames)}")
 
     def _known(self, target: str, source: str) -> bool:
         try:
@@ -118,13 +117,13 @@ class Frames:
 
     def _require_some(self) -> None:
         if not self.tree.frames:
-            raise NothingHeard(f"{self._cell}/tf and {self._cell}/tf_static")
+            raise NothingReceived(f"{self._cell}/tf and {self._cell}/tf_static")
 
     async def gather(self) -> None:
         """Return when every frame that comes regularly is in the tree.
 
         Raises:
-            NothingHeard: nothing came at all.
+            NothingReceived: nothing came at all.
         """
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(PATIENCE):
@@ -139,7 +138,7 @@ async def poses(bus: Bus, target: str, source: str, period: float) -> AsyncGener
     """The figures of the pose of source in target, once it is known, each period [s].
 
     Raises:
-        NothingHeard: it does not become known, or is told of no more.
+        NothingReceived: it does not become known, or is told of no more.
         UnknownName, NotConnected: it does not become known.
     """
     async with Frames(bus) as frames:

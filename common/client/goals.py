@@ -26,7 +26,7 @@ from common.messages import (
 from common.robot.transforms import pose_fields, rpy_to_matrix, transform
 
 Array = NDArray[np.float64]
-Where = AnyGoal | Pose | str | Sequence[float] | Array
+GoalLike = AnyGoal | Pose | str | Sequence[float] | Array
 Point = Sequence[float] | Array
 
 SAYS = ("must be the name of a pose, joint positions, a pose as a matrix (4, 4) or `Pose`, or a goal such as "
@@ -54,13 +54,13 @@ def region(
                             "yaw_tolerance": yaw}, "region")
 
 
-def any_of(*goals: Where) -> GoalSet:
+def any_of(*goals: GoalLike) -> GoalSet:
     """Whichever of the goals is reached best: names, joint positions, poses and regions."""
     return check(GoalSet, {"goals": [goal_of(each) for each in goals]}, "any_of")
 
 
 @dataclass(frozen=True)
-class Through:
+class WaypointPath:
     """Poses to pass in straight lines of the tool; see `through`."""
 
     poses: tuple[Pose, ...]
@@ -71,12 +71,12 @@ class Through:
         return check(PathGoal, {"waypoints": [_pose(start), *self.poses], "tool_speed": self.tool_speed}, "through")
 
 
-def through(*poses: Pose | Array, tool_speed: float | None = None) -> Through:
+def through(*poses: Pose | Array, tool_speed: float | None = None) -> WaypointPath:
     """Straight lines of the tool through poses, from where it is to the last, at a speed [m/s] where there is room."""
-    return Through(tuple(_pose(each) for each in poses), tool_speed)
+    return WaypointPath(tuple(_pose(each) for each in poses), tool_speed)
 
 
-def goal_of(to: Where, *, via: Point | None = None, around: Point | None = None) -> AnyGoal:
+def goal_of(to: GoalLike, *, via: Point | None = None, around: Point | None = None) -> AnyGoal:
     """What is asked of the planner.
 
     Args:

@@ -30,7 +30,7 @@ LOOK_TIMEOUT = 3.0  # [s] to hear who is there: a busy host stands still for a s
 ASK_TIMEOUT = 1.0  # [s]
 
 
-class NothingUp(RequestFailed):
+class NoCellRunning(RequestFailed):
     """There is no cell to look at."""
 
     def __init__(self, endpoint: str, what: str) -> None:
@@ -40,7 +40,7 @@ class NothingUp(RequestFailed):
         self.endpoint = endpoint
 
 
-class SeveralUp(UnknownName):
+class SeveralCellsRunning(UnknownName):
     """It is not clear which cell is meant."""
 
     def __init__(self, cells: Iterable[str]) -> None:
@@ -49,7 +49,7 @@ class SeveralUp(UnknownName):
                      f"{', '.join(self.choices)}",)
 
 
-def somebody_listens(endpoint: str) -> bool:
+def is_listening(endpoint: str) -> bool:
     """Whether something takes connections at an endpoint; True where that cannot be told without Zenoh."""
     protocol, _, address = endpoint.partition("/")
     if protocol in ("udp", "quic"):
@@ -62,18 +62,18 @@ def somebody_listens(endpoint: str) -> bool:
         return False
 
 
-async def until_somebody_listens(endpoint: str, seconds: float) -> None:
+async def wait_for_listener(endpoint: str, seconds: float) -> None:
     """Return when something takes connections there: what Zenoh tries meanwhile would go on after this program's end.
 
     Raises:
-        NothingUp: nothing does.
+        NoCellRunning: nothing does.
     """
     try:
         async with asyncio.timeout(seconds):
-            while not await asyncio.to_thread(somebody_listens, endpoint):  # noqa: ASYNC110 - nothing tells of it
+            while not await asyncio.to_thread(is_listening, endpoint):  # noqa: ASYNC110 - nothing tells of it
                 await asyncio.sleep(PROBE_PERIOD)
     except TimeoutError:
-        raise NothingUp(endpoint, "no router") from None
+        raise NoCellRunning(endpoint, "no router") from None
 
 
 @contextlib.asynccontextmanager
@@ -93,7 +93,7 @@ async def joined(
         secure: folder of certificates; that of the environment when not given.
 
     Raises:
-        NothingUp: there is no router, or no cell.
+        NoCellRunning: there is no router, or no cell.
         UnknownName: several cells are up and none was named.
         ConfigError: no cell can have that name.
     """
@@ -101,7 +101,7 @@ async def joined(
         raise ConfigError("cell", cell, "is no name that a cell can have")
     environ = {**os.environ, SECURE_VARIABLE: secure} if secure else os.environ
     endpoint = endpoint_of(domain, connect, environ)
-    await until_somebody_listens(endpoint, CONNECT_TIMEOUT)
+    await wait_for_listener(endpoint, CONNECT_TIMEOUT)
     try:
         async with contextlib.AsyncExitStack() as stack:
             if cell is None and not any_cell:
@@ -116,14 +116,14 @@ async def joined(
                 secure=secure))
             yield bus
     except NoRouter:
-        raise NothingUp(endpoint, "no router") from None
+        raise NoCellRunning(endpoint, "no router") from None
 
 
 def _only(cells: set[str], endpoint: str) -> str:
     if not cells:
-        raise NothingUp(endpoint, "there is a router and no service")
+        raise NoCellRunning(endpoint, "there is a router and no service")
     if len(cells) > 1:
-        raise SeveralUp(cells)
+        raise SeveralCellsRunning(cells)
     return cells.pop()
 
 
@@ -134,30 +134,30 @@ async def alive(bus: Bus) -> list[tuple[str, str]]:
 
 
 @dataclass(frozen=True)
-class Presence:
+class RunningCell:
     """What there is of a cell that is up."""
 
     ready: frozenset[str]  # services
     status: SupervisorStatus | None  # what its supervisor says, where there is one
 
 
-async def look(domain: str | None, connect: str | None) -> dict[str, Presence]:
+async def look(domain: str | None, connect: str | None) -> dict[str, RunningCell]:
     """The cells that are up, by name; none when nothing is up there, for which nobody is waited for.
 
     Args:
         domain: where, as given to `--domain`.
         connect: where, as given to `--connect`.
     """
-    if not await asyncio.to_thread(somebody_listens, endpoint_of(domain, connect)):
+    if not await asyncio.to_thread(is_listening, endpoint_of(domain, connect)):
         return {}
     ready: dict[str, set[str]] = {}
     try:
         async with joined(any_cell=True, domain=domain, connect=connect) as bus:
             for cell, service in await alive(bus):
                 ready.setdefault(cell, set()).add(service)
-            return {cell: Presence(frozenset(names), await supervisor_status(bus, cell))
+            return {cell: RunningCell(frozenset(names), await supervisor_status(bus, cell))
                     for cell, names in ready.items()}
-    except NothingUp:
+    except NoCellRunning:
         return {}
 
 
@@ -191,7 +191,7 @@ async def cell_clock(bus: Bus) -> Clock:
     return bus.clock
 
 
-async def newest_heard(bus: Bus) -> int:
+async def newest_interlock(bus: Bus) -> int:
     """`since` of the newest stop or hold that can be known now: a start lets go of nothing later, 0 of nothing."""
     newest = 0
     for sample in await bus.raw_get(bus.full_key(topics.MOTION_STATUS), ASK_TIMEOUT):

@@ -8,8 +8,8 @@ from typing import Any
 
 from common.application import all_topics, find_topic
 from common.client.foreign import require_key
-from common.client.hearing import Carried, topic_of_owner
-from common.client.joining import LOOK_TIMEOUT, joined, somebody_listens
+from common.client.joining import LOOK_TIMEOUT, is_listening, joined
+from common.client.subscriptions import Carried, topic_of_owner
 from common.config import load_cell, names_of
 from common.errors import UnknownName
 from common.topics import COUNTERS, LOG, PARAMETERS, SUPERVISOR_STATUS, Topic, general_key
@@ -55,7 +55,7 @@ def known_keys(cell: str | None, domain: str | None, connect: str | None) -> dic
 
 
 async def _live(cell: str | None, domain: str | None, connect: str | None) -> list[Found]:
-    if not await asyncio.to_thread(somebody_listens, endpoint_of(domain, connect)):
+    if not await asyncio.to_thread(is_listening, endpoint_of(domain, connect)):
         return []
     async with joined(any_cell=True, domain=domain, connect=connect) as bus:
         found = [Owner.of(token) for token in await bus.raw_tokens(owns_key(cell or "*"), LOOK_TIMEOUT)]
@@ -63,15 +63,15 @@ async def _live(cell: str | None, domain: str | None, connect: str | None) -> li
 
 
 def _of_files(cell: str | None) -> list[Found]:
-    from common.supervision.wired import Unwired, wired
+    from common.supervision.wiring import WiringFailed, wire_service
 
     found: list[Found] = []
     for name in [cell] if cell else names_of("cells"):
         loaded = load_cell(name)
         for entry in loaded.services.values():
             try:
-                wires = wired(loaded, entry)
-            except Unwired:  # a service of a person's own, which `node info` tells about
+                wires = wire_service(loaded, entry)
+            except WiringFailed:  # a service of a person's own, which `node info` tells about
                 continue
             found += [(key, wires.topics[key], entry.name) for key in (*wires.writes, *wires.serves)]
     return found

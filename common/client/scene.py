@@ -7,11 +7,11 @@ from typing import Literal
 
 from common import topics
 from common.client.goals import Point, array_of, numbers, place
-from common.client.hearing import Ear
 from common.client.part import Part
+from common.client.subscriptions import Subscriptions
 from common.config import check
 from common.messages import CollisionObject, Pose, SceneEdit, SceneEditReply
-from common.scene.added import added
+from common.scene.added_solids import added_solids
 
 TIMEOUT = 5.0  # [s] wall for an answer
 
@@ -19,7 +19,7 @@ TIMEOUT = 5.0  # [s] wall for an answer
 class Scene(Part):
     """Solids that motion keeps away from though nobody perceives them; they stay until they are removed."""
 
-    def __init__(self, ear: Ear, owner: str) -> None:
+    def __init__(self, ear: Subscriptions, owner: str) -> None:
         """The planning scene of a cell, edited in the name of `owner`."""
         self._ear, self._owner = ear, owner
 
@@ -56,7 +56,7 @@ class Scene(Part):
 
     async def objects(self) -> list[CollisionObject]:
         """What was added: ids, shapes, dimensions [m] and poses in world."""
-        return added((await self._ear.now(topics.PLANNING_SCENE)).objects)
+        return added_solids((await self._ear.now(topics.PLANNING_SCENE)).objects)
 
     async def _edit(self, asked: dict[str, object]) -> SceneEditReply:
         return await self._ear.bus.client(topics.SCENE_EDIT).call(check(SceneEdit, asked, "scene"), TIMEOUT)

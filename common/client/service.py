@@ -7,20 +7,20 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from common import topics as keys
-from common.client.hearing import Carried
-from common.client.joining import Presence, joined
+from common.client.joining import RunningCell, joined
+from common.client.subscriptions import Carried
 from common.config import Cell, ServiceEntry, load_cell, names_of, service_names
 from common.config.tunables import describe
 from common.errors import RequestFailed, UnknownName
 from common.messages import Parameter, ParameterRequest, ServiceStatus
-from common.supervision.wired import Wired
+from common.supervision.wiring import ServiceWiring
 from common.transport.keys import ROUTER
 
 ASK_TIMEOUT = 2.0  # [s]
 SIDES = ("reads", "writes", "serves", "calls")
 
 
-def find(service: str, cell: str | None, cells: dict[str, Presence]) -> tuple[Cell, ServiceEntry]:
+def find(service: str, cell: str | None, cells: dict[str, RunningCell]) -> tuple[Cell, ServiceEntry]:
     """The cell that a service belongs to, those that are up first, and its entry there.
 
     Raises:
@@ -41,7 +41,7 @@ def find(service: str, cell: str | None, cells: dict[str, Presence]) -> tuple[Ce
 
 
 async def parameters_of(
-    found: Wired, cell: str, presence: Presence | None, domain: str | None, connect: str | None
+    found: ServiceWiring, cell: str, presence: RunningCell | None, domain: str | None, connect: str | None
 ) -> tuple[list[Parameter], RequestFailed | None]:
     """The parameters as they are in the running service, else as they would be, and why it did not tell its own."""
     why = None
@@ -56,7 +56,9 @@ async def parameters_of(
     return describe(found.config, found.name), why
 
 
-def described(cell: str, found: Wired, presence: Presence | None, parameters: list[Parameter]) -> dict[str, Any]:
+def described(
+    cell: str, found: ServiceWiring, presence: RunningCell | None, parameters: list[Parameter]
+) -> dict[str, Any]:
     """All that is known of a service as JSON can hold it."""
     state = "ready" if presence is not None and found.name in presence.ready else "not running"
     status = ServiceStatus(name=found.name, state="stopped")

@@ -12,10 +12,10 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from common.client.joining import joined, somebody_listens, supervisor_status
+from common.client.joining import is_listening, joined, supervisor_status
 from common.config import load_cell
 from common.errors import RequestFailed, ZencellError
-from common.supervision.launch import python_module, python_path, require_free_port
+from common.supervision.launch import module_command, pythonpath, require_free_port
 from common.transport.endpoint import MAX_DOMAIN, endpoint_of, parse_domain
 from common.transport.router import PortInUse
 
@@ -35,7 +35,7 @@ class NotStarted(ZencellError):
         super().__init__(f"{cell} did not come up: {why}")
 
 
-class Started:
+class StartedCell:
     """A cell that is up inside `async with`: `name` and `domain` say where."""
 
     def __init__(
@@ -55,7 +55,7 @@ class Started:
         self._folder: tempfile.TemporaryDirectory[str] | None = None
         self._log = Path()
 
-    async def __aenter__(self) -> Started:
+    async def __aenter__(self) -> StartedCell:
         cell, overrides, world, seed = self._loaded
         loaded = await asyncio.to_thread(load_cell, cell, overrides, world=world, seed=seed)  # says what is wrong
         self.name = loaded.name
@@ -68,7 +68,7 @@ class Started:
                     raise
         raise AssertionError
 
-    async def _bring_up(self) -> Started:
+    async def _bring_up(self) -> StartedCell:
         self._folder = tempfile.TemporaryDirectory(prefix="zencell-")
         self._log = Path(self._folder.name, "log")
         self._process = await asyncio.to_thread(self._begin)
@@ -86,9 +86,9 @@ class Started:
     def _begin(self) -> subprocess.Popen[bytes]:
         with self._log.open("wb") as out:
             return subprocess.Popen(
-                [*python_module("zencell"), *self._arguments, "--domain", str(self.domain)],
+                [*module_command("zencell"), *self._arguments, "--domain", str(self.domain)],
                 stdin=subprocess.PIPE, stdout=out, stderr=subprocess.STDOUT, start_new_session=True,
-                env={**os.environ, "PYTHONPATH": python_path()})
+                env={**os.environ, "PYTHONPATH": pythonpath()})
 
     async def _until_up(self) -> None:
         """Return when all services are ready.
@@ -103,7 +103,7 @@ class Started:
             await asyncio.sleep(LOOK)
 
     async def _is_up(self) -> bool:
-        if not await asyncio.to_thread(somebody_listens, endpoint_of(self.domain)):
+        if not await asyncio.to_thread(is_listening, endpoint_of(self.domain)):
             return False
         try:
             async with joined(self.name, domain=self.domain) as bus:

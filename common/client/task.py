@@ -10,9 +10,9 @@ from typing import TypeVar
 
 from common import topics
 from common.application import find_application
-from common.client.hearing import Ear, own_word, topic_of_owner
-from common.client.joining import newest_heard
+from common.client.joining import newest_interlock
 from common.client.part import Part
+from common.client.subscriptions import Subscriptions, local_key, topic_of_owner
 from common.errors import RequestFailed, UnknownName, ZencellError
 from common.messages import MotionStatus, StopRequest, TaskCommand, TaskStatus
 from common.topics import Topic
@@ -29,7 +29,7 @@ async def _answer(asked: Awaitable[A]) -> A | RequestFailed:
         return error
 
 
-class ArmOnly(ZencellError):
+class TaskStopFailed(ZencellError):
     """The arm was stopped, though the task could not be told."""
 
     exit_code = 1
@@ -38,7 +38,7 @@ class ArmOnly(ZencellError):
         super().__init__(f"the arm is stopped and stays so until a start; the task did not hear of it: {error}")
 
 
-class TaskOnly(ZencellError):
+class ArmStopFailed(ZencellError):
     """The task has stopped; who moves the arm has refused to be told, or not answered."""
 
     exit_code = 1
@@ -50,7 +50,7 @@ class TaskOnly(ZencellError):
 class TaskControl(Part):
     """What a person may tell the task. `async for status in cell.task` hears of every change, until it is left."""
 
-    def __init__(self, ear: Ear, owner: str, application: str = "") -> None:
+    def __init__(self, ear: Subscriptions, owner: str, application: str = "") -> None:
         """The task of a cell; of an application of one's own, its dotted module is needed to hear of it."""
         self._ear, self._bus, self._owner, self._application = ear, ear.bus, owner, application
         self._unkept = ""
@@ -76,8 +76,8 @@ class TaskControl(Part):
         """Stop the robot, give up its motion, and wait for a start, also if the task does not answer.
 
         Raises:
-            ArmOnly: the arm is stopped, but the task did not hear of it.
-            TaskOnly: the task has stopped; who moves the arm has refused to be told, or not answered.
+            TaskStopFailed: the arm is stopped, but the task did not hear of it.
+            ArmStopFailed: the task has stopped; who moves the arm has refused to be told, or not answered.
             RequestFailed: neither heard of it.
         """
         stop = StopRequest(owner=self._owner)
@@ -85,14 +85,14 @@ class TaskControl(Part):
             _answer(self._bus.client(topics.MOTION_STOP).call(stop, TIMEOUT)), _answer(self._tell("stop")))
         arm, told = await asyncio.shield(self._stopping)  # who is cancelled now has asked all the same
         if isinstance(arm, RequestFailed):
-            raise told if isinstance(told, RequestFailed) else TaskOnly(arm)
+            raise told if isinstance(told, RequestFailed) else ArmStopFailed(arm)
         self._note(arm)
         if isinstance(told, RequestFailed):
-            raise ArmOnly(told)
+            raise TaskStopFailed(told)
         return told
 
     @property
-    def unkept(self) -> str:
+    def unsaved(self) -> str:
         """What the last stop would not outlive, in words."""
         return self._unkept
 
@@ -100,7 +100,7 @@ class TaskControl(Part):
         self._unkept = answer.unsaved
 
     async def _tell(self, command: str, override: bool = False) -> TaskStatus:
-        acknowledged = await newest_heard(self._bus) if command in ("start", "resume") else None
+        acknowledged = await newest_interlock(self._bus) if command in ("start", "resume") else None
         asked = TaskCommand.model_validate({
             "command": command, "by": self._owner, "override": override, "acknowledged": acknowledged})
         return await self._bus.client(topics.TASK_COMMAND).call(asked, TIMEOUT)
@@ -117,7 +117,7 @@ class TaskControl(Part):
         for owner in await self._bus.owners():
             topic = topic_of_owner(owner)
             if isinstance(topic, Topic) and issubclass(topic.message, TaskStatus):
-                if own_word(self._bus, owner) is not None:
+                if local_key(self._bus, owner) is not None:
                     return replace(topic, key=owner.own)
                 found[owner.key] = topic
         if len(found) == 1:

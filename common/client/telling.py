@@ -12,10 +12,11 @@ from typing import Any
 
 import msgpack
 
-from common.client import delay, measuring
-from common.client.foreign import require_heard, samples
-from common.client.hearing import Carried, topic_in
-from common.client.zenoh_codec import decode
+from common.client import delay
+from common.client import statistics as measuring
+from common.client.foreign import require_messages, samples
+from common.client.json_codec import decode
+from common.client.subscriptions import Carried, find_live_topic
 from common.errors import ConfigError
 from common.messages.schema import example_of, fields_of, one_line, to_json
 from common.topics import Topic
@@ -50,7 +51,7 @@ async def messages(
         ConfigError: pictures are to be kept, and the key carries others.
         SilentKey: nothing comes on a key that nobody knows.
     """
-    found = topic or await topic_in(bus, key)
+    found = topic or await find_live_topic(bus, key)
     if save and found is None:
         raise ConfigError("--save", save, f"is for pictures: nobody says what {key} carries")
     if save:
@@ -80,7 +81,7 @@ async def _foreign(bus: Bus, key: str, as_json: bool) -> AsyncGenerator[str, Non
 
 async def _rates(bus: Bus, key: str, foreign: bool, *, in_bytes: bool) -> AsyncGenerator[tuple[Any, str], None]:
     if foreign:
-        await require_heard(bus, key)
+        await require_messages(bus, key)
     async for figures in measuring.windows(bus, f"{bus.cell}/{key}"):
         yield figures, measuring.describe(figures, in_bytes=in_bytes)
 

@@ -1,1 +1,1 @@
-"""The life of a process: start, readiness, health, log, parameters, and the runner of a task."""
+"""The life of a service process: start, readiness, health, log, parameters, and the runner of a task."""

@@ -1,47 +1,58 @@
-"""What a process finds about it: variables that make its start light, and how many processors it may use."""
+"""The environment of a process: variables for a fast start, memory of the C library, processors, thread priority."""
 
+import contextlib
 import ctypes
 import os
+import sys
+import threading
 from pathlib import Path
 
 CONTROL_GROUP = Path("/sys/fs/cgroup")
-_ARENA_MAX = -8  # in malloc.h
+_ARENA_MAX = -8  # M_ARENA_MAX of malloc.h
+NICENESS = 5  # of a thread that computes for long
 
-# Our matrices have six rows: a pool of threads for them costs each process 0.1 CPU seconds as it starts, and gains
-# nothing. pydantic reads the metadata of every installed package for plug-ins, of which we use none.
+# Our matrices have six rows: a thread pool for them costs each process 0.1 CPU seconds at start and gains nothing.
+# pydantic would read the metadata of every installed package to find plug-ins, of which we use none.
 VARIABLES = {"OPENBLAS_NUM_THREADS": "1", "PYDANTIC_DISABLE_PLUGINS": "__all__"}
 
 
-def start_light() -> None:
-    """Set this before numpy and pydantic are loaded; what the environment says already stays."""
+def set_startup_variables() -> None:
+    """Set variables that must be set before numpy and pydantic are imported; variables that are set already stay."""
     for name, value in VARIABLES.items():
         os.environ.setdefault(name, value)
 
 
-def share_memory() -> None:
-    """Have all threads share one store of memory, where the C library can be told so.
+def use_single_memory_arena() -> None:
+    """Make all threads share one malloc arena, where the C library supports it.
 
-    With stores of their own each keeps what once was in it: of a router what waited for a reader that read nothing, of
-    a planner what a plan took on a thread that is hardly used; some MB that stay.
+    An arena keeps its peak size. With one per thread a router would keep the messages once queued for a stalled
+    reader, and a planner the memory of a plan on a rarely used thread: several MB each.
     """
-    if (tell := getattr(ctypes.CDLL(None), "mallopt", None)) is not None:
-        tell(_ARENA_MAX, 1)
+    if (mallopt := getattr(ctypes.CDLL(None), "mallopt", None)) is not None:
+        mallopt(_ARENA_MAX, 1)
 
 
-def give_back() -> None:
-    """Give the system what is free between things that are not, where the C library can be told to: in 0.3 ms.
+def release_free_memory() -> None:
+    """Return free memory to the system, where the C library supports it; takes 0.3 ms.
 
-    What was there for pictures that a busy machine had waiting at once would stay otherwise, a megabyte each.
+    Otherwise the memory of images that queued up on a busy machine would stay allocated, a megabyte each.
     """
-    if (tell := getattr(ctypes.CDLL(None), "malloc_trim", None)) is not None:
-        tell(0)
+    if (malloc_trim := getattr(ctypes.CDLL(None), "malloc_trim", None)) is not None:
+        malloc_trim(0)
 
 
 def usable_cores() -> float:
-    """Processors that this process may use, also within the limit of a control group (v2), as containers have one."""
+    """Return the number of processors for this process, within the limit of its control group (v2) in containers."""
     count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     try:
         quota, period = (CONTROL_GROUP / "cpu.max").read_text(encoding="ascii").split()
     except (OSError, ValueError):
         return count
     return count if quota == "max" else min(count, int(quota) / int(period))
+
+
+def lower_thread_priority() -> None:
+    """Lower the priority of this thread unless it is the main thread, so that images are processed first."""
+    if sys.platform == "linux" and threading.current_thread() is not threading.main_thread():
+        with contextlib.suppress(OSError):  # on other systems only whole processes have a priority
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS)

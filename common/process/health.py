@@ -1,8 +1,8 @@
-"""Whether the service of a container is ready: `python -m common.process.health`, exit code 0 or 1.
+"""Health check of a container: `python -m common.process.health` exits with 0 if its service is ready, else 1.
 
-It asks the router for the service's readiness token, which also vanishes when the process is frozen or cut off. One
-that is frozen it ends, for the engine to start it again. It imports nothing but Zenoh, because it is started every
-few seconds beside every service.
+It looks up the readiness token of the service at the router. The token vanishes also if the process is frozen or
+disconnected. A stopped process is killed, so that the container engine restarts it. This module imports only Zenoh,
+because it is started every few seconds for every service.
 """
 
 from __future__ import annotations
@@ -22,19 +22,22 @@ from common.transport.keys import ROUTER, alive_key
 from common.transport.router import is_reached
 
 TIMEOUT = 1.0  # [s]
-FIRST_PROCESS = Path("/proc/1/cmdline")
+PROC = Path("/proc")
+FIRST_PROCESS = PROC / "1/cmdline"
+FIRST = 1  # process id of the container's init
+CHECKS, PERIOD = 12, 0.25  # stopped in that many checks [s]; counted, because time also passes while nothing runs
 
 
 def first_service() -> str:
-    """Name of the service that is the container's first process; empty when it is something else."""
+    """Return the name of the service that is the container's first process; empty for another program."""
     command = FIRST_PROCESS.read_bytes().decode(errors="replace").replace("\0", " ")
-    # Also where something else restarts it, which is told the command.
+    # The first process may also be a program that restarts the service, with its command as arguments.
     found = re.search(r" -m ([\w.]+)(?: --name (\w+))?", command)
     return (found[2] or found[1].rpartition(".")[2]) if found else ""
 
 
 def is_ready(endpoint: str, cell: str, service: str) -> bool:
-    """Whether the router is there and, for another service than the router, its token too."""
+    """Return whether the router is reached and holds the readiness token of the service."""
     folder = secure_folder()
     name = ROUTER_NAME if service == ROUTER else common_name(cell, service)
     credentials = credentials_of(name, folder) if folder else None
@@ -42,10 +45,10 @@ def is_ready(endpoint: str, cell: str, service: str) -> bool:
 
 
 def main() -> int:
-    """Exit code: 0 when it is ready."""
+    """Check the service and return the exit code."""
     parser = argparse.ArgumentParser(prog="health", description=__doc__.splitlines()[0])
-    parser.add_argument("--cell", default=os.environ.get("ZENCELL_CELL", ""), help="first part of its keys")
-    parser.add_argument("--service", help="that of the container's first process if not given")
+    parser.add_argument("--cell", default=os.environ.get("ZENCELL_CELL", ""), help="name of the cell")
+    parser.add_argument("--service", help="name of the service; default: the container's first process")
     options = parser.parse_args()
     service = options.service or first_service()
     if end_if_frozen():
@@ -58,15 +61,10 @@ def main() -> int:
     return 1
 
 
-PROC = Path("/proc")
-FIRST = 1  # the container's init
-LOOKS, PERIOD = 12, 0.25  # stopped at so many looks [s]: looks and not time, which also passes while nobody runs
-
-
 def stopped_service(parent: int = FIRST) -> int | None:
-    """The process id of a service that was started by `parent` and is stopped; None if there is none.
+    """Return the process id of a stopped service that `parent` started, or None.
 
-    One that a debugger holds does not count, nor does one that something else keeps going, such as watchfiles.
+    A process that a debugger holds does not count, nor one that another program supervises, such as watchfiles.
     """
     for folder in PROC.glob("[0-9]*"):
         try:
@@ -79,11 +77,11 @@ def stopped_service(parent: int = FIRST) -> int | None:
 
 
 def end_if_frozen(parent: int = FIRST, wait: Callable[[float], None] = time.sleep) -> bool:
-    """Kill the service if it is stopped and stays so for three seconds; whether it was killed."""
+    """Kill the service if it stays stopped for three seconds; return whether it was killed."""
     found = stopped_service(parent)
     if found is None:
         return False
-    for _ in range(LOOKS):
+    for _ in range(CHECKS):
         wait(PERIOD)
         if stopped_service(parent) != found:
             return False

@@ -1,4 +1,4 @@
-"""A service inside this process, on a network without ports; for tests, and for whole cells in one process."""
+"""Services inside this process on a network without ports, for tests and for cells in one process."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import TypeVar
 from common.clock import Clock
 from common.config import Parameters
 from common.process.log import BusLog
-from common.process.parameters import serve_parameters
+from common.process.service import serve_parameters
 from common.transport.bus import Bus
 from common.transport.local import LocalNetwork
 
@@ -23,7 +23,7 @@ async def running_service(
     network: LocalNetwork, run: Callable[[Bus, C], Awaitable[None]], config: C, *, name: str = "service",
     cell: str = "test", clock: Clock | None = None, topics: Mapping[str, str] | None = None,
 ) -> AsyncIterator[Bus]:
-    """A service that runs inside the block, from its `ready` on; its crash ends the block and is raised there."""
+    """Run a service inside the block, which starts when it is ready; its crash ends the block and is raised there."""
     session = network.session()
     bus = Bus(session, service=name, cell=cell, clock=clock or Clock(), topics=topics)
     to_topic = BusLog(bus)
@@ -33,12 +33,15 @@ async def running_service(
     body = asyncio.current_task()
     inside = False
 
-    async def life() -> None:
+    async def run_body() -> None:
+        await run(bus, config)
+
+    async def live() -> None:
         nonlocal crash
         try:
             if isinstance(config, Parameters):
                 serve_parameters(bus, config)
-            await bus.run(_coroutine(run, bus, config))
+            await bus.run(run_body())
         except asyncio.CancelledError:
             raise
         except BaseException as error:
@@ -46,7 +49,7 @@ async def running_service(
             if inside and body is not None:
                 body.cancel()
 
-    task = asyncio.create_task(life(), name=f"running {name}")
+    task = asyncio.create_task(live(), name=f"running {name}")
     is_ready = asyncio.create_task(bus.ready_event.wait())
     try:
         await asyncio.wait({task, is_ready}, return_when=asyncio.FIRST_COMPLETED)
@@ -70,7 +73,3 @@ async def running_service(
         session.close()
         if crash is not None:
             raise crash
-
-
-async def _coroutine(run: Callable[[Bus, C], Awaitable[None]], bus: Bus, config: C) -> None:
-    await run(bus, config)

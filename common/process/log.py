@@ -1,4 +1,4 @@
-"""Log lines: `LEVEL service: text` or JSON on stderr, and on the topic `log` for everybody."""
+"""Log lines: `LEVEL service: text` or JSON on stderr, and as messages on the topic `log`."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from typing import Any, Literal, cast
 
 from common import topics
 from common.messages import LogLine
-from common.process.lossy import LossyWriter, told_lost
+from common.process.dropping_writer import DroppingWriter, lost_lines_text
 from common.terminal import printable
 from common.transport.bus import Bus
 from common.transport.handoff import call_on_loop
 
-FLUSH_SECONDS = 0.3  # for what was said last when a process ends
+FLUSH_SECONDS = 0.3  # for the last lines when a process ends
 
 
-class _Human(logging.Formatter):
+class _TextFormatter(logging.Formatter):
     def __init__(self, service: str) -> None:
         super().__init__(f"%(levelname)s {service}: %(message)s")
 
@@ -30,7 +30,7 @@ class _Human(logging.Formatter):
         return printable(super().formatException(ei), keep="\n\t")
 
 
-class _Json(logging.Formatter):
+class _JsonFormatter(logging.Formatter):
     def __init__(self, service: str) -> None:
         super().__init__()
         self._service = service
@@ -47,14 +47,14 @@ class _Json(logging.Formatter):
         return json.dumps(line)
 
 
-class _Lossy(logging.Handler):
-    """Writes lines to stderr as long as somebody reads them, and never waits."""
+class _DroppingHandler(logging.Handler):
+    """Writes lines to stderr and never blocks: lines are dropped while the reader is stalled."""
 
     def __init__(self, formatter: logging.Formatter) -> None:
         super().__init__()
         self.setFormatter(formatter)
-        self._out = LossyWriter(sys.stderr, lambda lines: self.format(logging.LogRecord(
-            __name__, logging.WARNING, "", 0, told_lost(lines), None, None)))
+        self._out = DroppingWriter(sys.stderr, lambda lines: self.format(logging.LogRecord(
+            __name__, logging.WARNING, "", 0, lost_lines_text(lines), None, None)))
 
     def emit(self, record: logging.LogRecord) -> None:
         try:
@@ -67,8 +67,8 @@ class _Lossy(logging.Handler):
 
 
 def log_to_stderr(service: str, *, as_json: bool) -> None:
-    """Write the process's log lines of level info and above to stderr, without ever waiting for who reads them."""
-    handler = _Lossy(_Json(service) if as_json else _Human(service))
+    """Write the process's log lines of level info and above to stderr, without blocking."""
+    handler = _DroppingHandler(_JsonFormatter(service) if as_json else _TextFormatter(service))
     root = logging.getLogger()
     root.handlers[:] = [handler]
     root.setLevel(logging.INFO)
@@ -79,7 +79,7 @@ Level = Literal["debug", "info", "warning", "error", "critical"]
 
 
 class BusLog(logging.Handler):
-    """Puts log lines on the topic `log`, while somebody listens."""
+    """Publishes log lines on the topic `log` while it has subscribers."""
 
     def __init__(self, bus: Bus) -> None:
         super().__init__(logging.INFO)
@@ -87,26 +87,26 @@ class BusLog(logging.Handler):
         self._writer = bus.writer(topics.LOG)
         self._loop = asyncio.get_running_loop()
         self._thread = threading.get_ident()
-        self._putting = threading.local()
+        self._publishing = threading.local()
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Put one line; what putting it logs is not put."""
-        if getattr(self._putting, "now", False):
+        """Publish one line, unless it was logged by publishing another one."""
+        if getattr(self._publishing, "now", False):
             return
         message = record.getMessage()
         if record.exc_info and record.exc_info[1] is not None:
             message += f" ({type(record.exc_info[1]).__name__}: {record.exc_info[1]})"
         level = cast(Level, record.levelname.lower())
         if threading.get_ident() == self._thread:
-            self._put(level, message)
+            self._publish(level, message)
         else:
-            call_on_loop(self._loop, lambda: self._put(level, message))
+            call_on_loop(self._loop, lambda: self._publish(level, message))
 
-    def _put(self, level: Level, message: str) -> None:
-        self._putting.now = True
+    def _publish(self, level: Level, message: str) -> None:
+        self._publishing.now = True
         try:
             if self._writer.matched:
                 header = self._bus.header()
                 self._writer.put(LogLine(header=header, service=self._bus.service, level=level, message=message))
         finally:
-            self._putting.now = False
+            self._publishing.now = False

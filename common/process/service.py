@@ -1,4 +1,4 @@
-"""The life that every service has: parse, connect, declare, be ready, run, and be gone within a second of a signal."""
+"""The life of every service: parse options, connect, declare, report ready, run, exit within a second of a signal."""
 
 from __future__ import annotations
 
@@ -13,14 +13,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Generic, NoReturn, Protocol, TypeVar
 
+from common import topics
 from common.clock import BOOTED_VARIABLE, EPOCH_VARIABLE, KEPT_VARIABLE, SPEED_VARIABLE, Clock
 from common.config import Cell, Parameters, Watchdogs, load_cell, service_config
+from common.config.tunables import apply, checked, describe, values_of
 from common.errors import ConfigError, UnknownName, ZencellError
-from common.process.environment import give_back, share_memory
-from common.process.lifeline import Lifeline, fail, leave
+from common.messages import ParameterReply, ParameterRequest
+from common.process.environment import release_free_memory, use_single_memory_arena
+from common.process.lifeline import Lifeline, LoopWatchdog, exit_now, exit_with_error
 from common.process.log import BusLog, log_to_stderr
-from common.process.loop_watch import LoopWatch
-from common.process.parameters import serve_parameters
 from common.transport.bus import Bus
 from common.transport.credentials import Credentials, common_name, credentials_of, secure_folder
 from common.transport.endpoint import endpoint_of
@@ -35,15 +36,15 @@ Run = Callable[[Bus, P], Coroutine[Any, Any, None]]
 
 CELL_VARIABLE = "ZENCELL_CELL"
 _CLOSE_SECONDS = 0.4
-_PATIENCE_SECONDS = 2.0  # without a router before this is said
-# A thread that computes gives the loop a turn this often: without it a message waits 5 ms for each turn.
+_ROUTER_WARNING_SECONDS = 2.0  # without a router before that is logged
+# A computing thread yields to the loop this often. The default of 5 ms would delay each message by as much.
 _SWITCH_SECONDS = 0.0005
-_GIVE_BACK_SECONDS = 20.0
+_RELEASE_MEMORY_SECONDS = 20.0
 
 
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
-        fail(ConfigError(self.prog, message, "cannot be used; --help lists the options"))
+        exit_with_error(ConfigError(self.prog, message, "is not valid; --help lists the options"))
 
 
 @dataclass(frozen=True)
@@ -57,36 +58,36 @@ class Start(Generic[P]):
     endpoint: str
     watchdogs: Watchdogs
     credentials: Credentials | None = None
-    topics: Mapping[str, str] = field(default_factory=dict)  # keys of the cell by its own words for them
+    topics: Mapping[str, str] = field(default_factory=dict)  # keys of the cell by the names that the service uses
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options that every service process has."""
-    parser.add_argument("--name", help="of this service in the cell, where that is not the name of its module")
+    """Add the options of every service process."""
+    parser.add_argument("--name", help="name of this service in the cell; default: the name of its module")
     parser.add_argument("--cell", help=f"name or YAML file of the cell ({CELL_VARIABLE})")
     parser.add_argument(
         "--set", action="append", default=[], metavar="PATH=VALUE",
-        help="override a value of the cell; @FILE: those of a file",
+        help="override a value of the cell; @FILE: the values of a YAML file",
     )
     parser.add_argument("--world", help="name or YAML file of another world")
-    parser.add_argument("--seed", type=int, help="of everything random")
-    parser.add_argument("--speed", type=float, help=f"of cell time, 0.1 to 10 ({SPEED_VARIABLE})")
+    parser.add_argument("--seed", type=int, help="seed of all random numbers")
+    parser.add_argument("--speed", type=float, help=f"speed of cell time, 0.1 to 10 ({SPEED_VARIABLE})")
     parser.add_argument("--domain", help="0 to 232 (ZENCELL_DOMAIN, 42)")
-    parser.add_argument("--connect", metavar="ENDPOINT", help="router to use instead (ZENCELL_CONNECT)")
+    parser.add_argument("--connect", metavar="ENDPOINT", help="endpoint of another router (ZENCELL_CONNECT)")
     add_process_options(parser)
 
 
 def add_process_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options that every process has, the router too."""
-    parser.add_argument("--gate", action="store_true", help="wait for a line on stdin; its end ends the process")
-    parser.add_argument("--log-json", action="store_true", help="log lines as JSON")
+    """Add the options of every process, the router included."""
+    parser.add_argument("--gate", action="store_true", help="wait for a line on stdin; exit at the end of stdin")
+    parser.add_argument("--log-json", action="store_true", help="write log lines as JSON")
 
 
 def clock_from(speed: float | None, environ: Mapping[str, str] = os.environ) -> Clock:
-    """The clock that was handed down, at the given speed if there is one.
+    """Return the clock that the environment describes, at another speed if one is given.
 
     Raises:
-        ConfigError: speed or epoch cannot be used.
+        ConfigError: speed or epoch are not valid.
     """
     variables = dict(environ)
     if speed is not None:
@@ -96,39 +97,39 @@ def clock_from(speed: float | None, environ: Mapping[str, str] = os.environ) -> 
     except ValueError as error:
         names = (SPEED_VARIABLE, EPOCH_VARIABLE, BOOTED_VARIABLE, KEPT_VARIABLE)
         given = {name: variables[name] for name in names if name in variables}
-        raise ConfigError("speed", given, f"cannot be used: {error}") from None
+        raise ConfigError("speed", given, f"is not valid: {error}") from None
 
 
 def prepare(kind: str, config: type[P], options: argparse.Namespace) -> Start[P]:
     """Resolve everything that a service is started with.
 
     Args:
-        kind: the last part of its module, which is also its name if it is given no other.
-        config: of that module.
+        kind: last part of the name of its module, and its default name.
+        config: parameters class of that module.
         options: of the command line.
 
     Raises:
-        ConfigError, UnknownName: one line that names the field, the value and the choices.
+        ConfigError, UnknownName: one line with the field, the value and the choices.
     """
     chosen = options.cell or os.environ.get(CELL_VARIABLE)
     if not chosen:
-        raise ConfigError("--cell", "", f"must name a cell, also as {CELL_VARIABLE}")
+        raise ConfigError("--cell", "", f"must name a cell; {CELL_VARIABLE} is read too")
     endpoint = endpoint_of(options.domain, options.connect)
     cell = load_cell(chosen, options.set, world=options.world, seed=options.seed)
     name = name_in(cell, kind, options.name)
     folder = secure_folder()
     credentials = credentials_of(common_name(cell.name, name), folder) if folder else None
     clock = clock_from(options.speed)
-    topics = cell.services[name].topics if name in cell.services else {}
+    renamed = cell.services[name].topics if name in cell.services else {}
     return Start(
-        name, cell.name, service_config(cell, name, config), clock, endpoint, cell.watchdogs, credentials, topics)
+        name, cell.name, service_config(cell, name, config), clock, endpoint, cell.watchdogs, credentials, renamed)
 
 
 def name_in(cell: Cell, kind: str, given: str | None) -> str:
-    """The name of a service in a cell; one that the cell does not have goes by its kind.
+    """Return the name of a service in a cell; a service that the cell does not have is named after its kind.
 
     Raises:
-        ConfigError, UnknownName: the cell has none of that name and kind, or has it under other names only.
+        ConfigError, UnknownName: the cell has no service of that name and kind, or needs a name to choose one.
     """
     of_kind = [entry.name for entry in cell.services.values() if entry.kind == kind]
     if given is None:
@@ -143,7 +144,7 @@ def name_in(cell: Cell, kind: str, given: str | None) -> str:
 
 
 def own_name() -> str:
-    """Name of the module that was started with `python -m`."""
+    """Return the name of the module that was started with `python -m`."""
     main_module = sys.modules["__main__"]
     spec = getattr(main_module, "__spec__", None)
     if spec is not None:
@@ -152,13 +153,13 @@ def own_name() -> str:
 
 
 def main(run: Run[P], config: type[P]) -> NoReturn:
-    """Be the service: `run(bus, config)` in a process of its own. Ends the process and does not return.
+    """Run the service `run(bus, config)` in this process, then exit.
 
     Exit codes: 0 after SIGINT, SIGTERM, the end of the supervisor or of `run`; 2 for bad input, with one line on
     stderr; 1 for a crash, with its traceback.
     """
     sys.setswitchinterval(_SWITCH_SECONDS)
-    share_memory()
+    use_single_memory_arena()
     kind = own_name()
     parser = _Parser(prog=kind)
     add_options(parser)
@@ -169,53 +170,54 @@ def main(run: Run[P], config: type[P]) -> NoReturn:
     try:
         start = prepare(kind, config, options)
     except ZencellError as error:
-        fail(error)
-    leave(run_until_stopped(lambda: _live(run, start, lifeline), lifeline))
+        exit_with_error(error)
+    exit_now(run_until_stopped(lambda: _live(run, start, lifeline), lifeline))
 
 
 def run_until_stopped(life: Callable[[], Coroutine[Any, Any, int]], lifeline: Lifeline) -> int:
-    """The exit code of a coroutine that is cancelled when the lifeline says so.
+    """Return the exit code of a coroutine that the lifeline cancels.
 
-    The loop is left as it is afterwards: asyncio's own end would wait for threads that still compute.
+    The loop is not closed afterwards: asyncio.run would wait for threads that still compute.
     """
     loop = asyncio.new_event_loop()
     task = loop.create_task(life())
-    lifeline.on_stop(lambda: call_on_loop(loop, lambda: _drop(task)))
+
+    def cancel() -> None:
+        task.cancel()
+
+    lifeline.on_stop(lambda: call_on_loop(loop, cancel))
     try:
         return loop.run_until_complete(task)
     except asyncio.CancelledError:
         return 0 if lifeline.stopping else 1
 
 
-def _drop(task: asyncio.Task[int]) -> None:
-    task.cancel()
-
-
 async def _live(run: Run[P], start: Start[P], lifeline: Lifeline) -> int:
     session = await _connected(start)
     try:
-        await _gate(lifeline)
+        await _pass_gate(lifeline)
         bus = Bus(session, service=start.name, cell=start.cell, clock=start.clock, topics=start.topics)
         root = logging.getLogger()
         to_topic = BusLog(bus)
         root.addHandler(to_topic)
-        ends = asyncio.create_task(_watch_end(bus, start.credentials))
-        watch = LoopWatch(asyncio.get_running_loop(), lambda: _patience(start.watchdogs, bus.ready_event.is_set()))
-        settling = asyncio.create_task(_settle(bus), name="settle")
+        expiry = asyncio.create_task(_watch_certificate(bus, start.credentials))
+        watchdog = LoopWatchdog(
+            asyncio.get_running_loop(), lambda: _longest_stall(start.watchdogs, bus.ready_event.is_set()))
+        memory = asyncio.create_task(_tidy_memory(bus), name="tidy memory")
         try:
             return await serve(run, bus, start.config, lifeline)
         finally:
-            settling.cancel()
-            watch.stop()
-            ends.cancel()
+            memory.cancel()
+            watchdog.stop()
+            expiry.cancel()
             root.removeHandler(to_topic)
             await bus.close()
     finally:
         await close_bounded(session, _CLOSE_SECONDS)
 
 
-async def _watch_end(bus: Bus, credentials: Credentials | None) -> None:
-    """Log when the certificate of the process is about to end, as the page shows it."""
+async def _watch_certificate(bus: Bus, credentials: Credentials | None) -> None:
+    """Log when the certificate of the process is about to expire, in the same words as the page."""
     if credentials is None:
         return
     watch = EndWatch(credentials.certificate.parent, frozenset([credentials.certificate.stem]))
@@ -225,28 +227,27 @@ async def _watch_end(bus: Bus, credentials: Credentials | None) -> None:
         await asyncio.sleep(PERIOD)
 
 
-async def _settle(bus: Bus) -> None:
-    """Leave out of the garbage collector's looks what is there when the service is ready: modules, models.
+async def _tidy_memory(bus: Bus) -> None:
+    """Exclude modules and models from garbage collection once the service is ready, then release free memory.
 
-    A whole look at them takes 50 ms, in which no set-point leaves. From then on memory that is free goes back now and
-    then.
+    A full collection over them takes 50 ms, in which no set-point is sent.
     """
     await bus.ready_event.wait()
     gc.freeze()
     while True:
-        await asyncio.sleep(_GIVE_BACK_SECONDS)
-        give_back()
+        await asyncio.sleep(_RELEASE_MEMORY_SECONDS)
+        release_free_memory()
 
 
-def _patience(watchdogs: Watchdogs, ready: bool) -> float:
-    """How long the loop may stand still [s]: while it starts, a service may load what it needs in one go."""
+def _longest_stall(watchdogs: Watchdogs, ready: bool) -> float:
+    """Return how long the loop may stall [s]: a service that starts may block it to load what it needs."""
     return watchdogs.loop if ready or not watchdogs.loop else max(watchdogs.loop, watchdogs.start)
 
 
 async def _connected(start: Start[P]) -> ZenohSession:
     opening = asyncio.ensure_future(open_zenoh(start.endpoint, start.credentials))
     try:
-        done, _ = await asyncio.wait({opening}, timeout=_PATIENCE_SECONDS)
+        done, _ = await asyncio.wait({opening}, timeout=_ROUTER_WARNING_SECONDS)
         if not done:
             log.warning("no router at %s yet, waiting for it", start.endpoint)
         return await opening
@@ -254,7 +255,7 @@ async def _connected(start: Start[P]) -> ZenohSession:
         opening.cancel()
 
 
-async def _gate(lifeline: Lifeline) -> None:
+async def _pass_gate(lifeline: Lifeline) -> None:
     if lifeline.gate_open.is_set():
         return
     opened = asyncio.Event()
@@ -263,33 +264,52 @@ async def _gate(lifeline: Lifeline) -> None:
     await opened.wait()
 
 
-class Ending(Protocol):
-    """Says whether and why a service was asked to end."""
+class StopState(Protocol):
+    """Whether and why a service has to stop; a `Lifeline` is one."""
 
     @property
     def stopping(self) -> bool:
-        """Whether it was."""
+        """Whether it has to."""
 
     @property
     def reason(self) -> str:
-        """Why."""
+        """The reason."""
 
 
-async def serve(run: Run[P], bus: Bus, config: P, lifeline: Ending) -> int:
-    """Be the service on a bus; the exit code of its process."""
+async def serve(run: Run[P], bus: Bus, config: P, lifeline: StopState) -> int:
+    """Run the service on a bus and return the exit code of its process."""
     try:
         bus.hold_back()
         serve_parameters(bus, config)
         await bus.run(run(bus, config))
-    except (ConfigError, UnknownName) as error:  # found only by using it: a description that is not there
+    except (ConfigError, UnknownName) as error:  # bad input that shows only in use, such as a missing URDF
         bus.log.error("%s", error)
         return 2
     except asyncio.CancelledError:
         if not lifeline.stopping:
-            bus.log.error("run was cancelled from within")
+            bus.log.error("the service cancelled itself")
             return 1
         bus.log.info("stopped: %s", lifeline.reason)
     except Exception:
         bus.log.exception("crashed")
         return 1
     return 0
+
+
+def serve_parameters(bus: Bus, config: Parameters) -> None:
+    """Serve `param/<service>`: list the parameters, and change them in place between two turns of the loop."""
+    started = values_of(config, bus.service)
+
+    async def handle(request: ParameterRequest) -> ParameterReply:
+        changes = checked(config, bus.service, request.set)
+        if changes and not request.dry_run:
+            lines = [str(change) for change in changes]
+            apply(changes)
+            for line in lines:
+                bus.log.info("%s (by %s)", line, request.by or "unknown operator")
+            bus.parameters_changed()
+            await bus.keep_parameters()
+        parameters = describe(config, bus.service, started)
+        return ParameterReply(header=bus.header(), service=bus.service, parameters=parameters)
+
+    bus.serve(topics.parameters_of(bus.service), handle)

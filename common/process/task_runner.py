@@ -1,4 +1,4 @@
-"""Runs a task: steps it whenever something is heard, and asks for what it wants until somebody answers."""
+"""Runs a task: steps it after each received message, sends its requests, publishes its status, persists its memory."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from typing import Any, Generic, Protocol, TypeVar
 from common import messages as m
 from common import topics
 from common.errors import Refused, RequestFailed
-from common.process.orders import BY_THEMSELVES, GOAL_TIMEOUT, Answered, Orders
-from common.process.task_memory import Memory
+from common.kept_file import KeptFile, Unreadable, standing_folder
+from common.process.task_requests import BY_THEMSELVES, GOAL_TIMEOUT, AnswerHandler, TaskRequests
 from common.robot.model import RobotModel
 from common.robot.transforms import matrix_to_pose
 from common.sources import monotonic, new_id
@@ -24,12 +24,13 @@ from common.transport.bus import Bus
 from common.transport.reader import Reader
 from common.transport.writer import Writer
 
-LONGEST_STEP = LOOK_PERIOD  # [s] wall: time passes too
+LONGEST_STEP = LOOK_PERIOD  # [s] wall: timeouts of the task need steps without messages too
 WAITS = "the arm waits: "
 ENDED = ("DONE", "ERROR")
-NOT_ANSWERED = "trajectory_executor has not answered yet: until it does, this does not outlive the task"
-OWN_PERIOD = 0.2  # [s] wall between two times that the motion is asked for: what came of it is heard meanwhile
-SHARED_HOLDERS = ("", m.UNKNOWN_OPERATOR, *BY_THEMSELVES)  # whose holds are no named operator's
+NOT_ANSWERED = "trajectory_executor has not answered yet: until it does, this is lost when the task ends"
+OWN_PERIOD = 0.2  # [s] wall between two requests for motion authority, in which the new owner is received
+UNNAMED = ("", m.UNKNOWN_OPERATOR, *BY_THEMSELVES)  # owners whose holds any operator may release
+SAVE_RETRY = 2.0  # [s] wall after the memory could not be written
 
 C = TypeVar("C", bound=TaskConfig)
 S = TypeVar("S", bound=m.TaskStatus)
@@ -41,15 +42,15 @@ async def run_task(
     bus: Bus, config: C, make: Callable[[C, S, str, float], Task[V]], status: Topic[S], view: Callable[..., V],
     **reads: Topic[Any],
 ) -> None:
-    """Be the service of a task: step it whenever something is heard, and at least 20 times a second.
+    """Run the service of a task: step it after each received message, and at least 20 times a second.
 
     Args:
         bus: of the service.
         config: of the task.
-        make: the class of the task.
-        status: where it says how far it is.
-        view: the class of what it knows: `View`, or one of the application's own.
-        reads: by the name of a field of that view, the topic whose newest message stands in it.
+        make: class of the task.
+        status: topic of its status.
+        view: class of what it knows: `View`, or a subclass of the application.
+        reads: topics whose newest messages the view holds, by the name of its field.
     """
     scene, gripper = bus.reader(topics.PLANNING_SCENE), bus.reader(topics.GRIPPER_STATE)
     motion, joints = bus.reader(topics.MOTION_STATUS), bus.reader(topics.JOINT_STATES)
@@ -61,7 +62,7 @@ async def run_task(
     measured: m.JointState | None = None
     perceived: m.PlanningScene | None = None
 
-    def look() -> V:
+    def observe() -> V:
         nonlocal measured, perceived
         known.now = bus.clock.now()
         if scene.latest is not None and scene.latest is not perceived:
@@ -80,122 +81,123 @@ async def run_task(
         return known
 
     watchdog = LivenessWatchdog(lambda: joints.received, lambda: config.joint_states_timeout)
-    memory = Memory(bus, task)
-    runner = TaskRunner(bus, task, look, out, lambda: config.planning_time, watchdog, memory)
-    await memory.begin()
+    memory = TaskMemory(bus, task)
+    runner = TaskRunner(bus, task, observe, out, lambda: config.planning_time, watchdog, memory)
+    await memory.load()
     await bus.ready()
     await runner.run((*own.values(), scene, gripper, motion))
 
 
-class Stepped(Answered[V_contra], Protocol[V_contra]):
-    """A state machine that is fed with what is known and answers with what it wants done, as `Task` is."""
+class Steppable(AnswerHandler[V_contra], Protocol[V_contra]):
+    """A state machine that turns what is known into commands; a `Task` is one."""
 
     @property
     def status(self) -> m.TaskStatus:
-        """How far it is."""
+        """Its state and progress."""
 
     def step(self, view: V_contra) -> list[Command]:
-        """What to ask for now."""
+        """Return the commands to send now."""
 
     def command(self, command: str, view: V_contra) -> list[Command]:
-        """Do what a person says."""
+        """Handle a command of an operator and return the commands to send."""
 
 
 class TaskRunner(Generic[V]):
-    """Steps a task, has sent what it asks for, and tells it what persons say and how far it is to others."""
+    """Steps a task, sends its commands, serves the operators' commands, and publishes its status."""
 
     def __init__(
-        self, bus: Bus, task: Stepped[V], look: Callable[[], V], status: Writer[Any],
-        planning_time: Callable[[], float], watchdog: LivenessWatchdog | None = None, memory: Memory | None = None,
+        self, bus: Bus, task: Steppable[V], observe: Callable[[], V], status: Writer[Any],
+        planning_time: Callable[[], float], watchdog: LivenessWatchdog | None = None,
+        memory: TaskMemory | None = None,
     ) -> None:
         """Declare the requests of a task and the command that it serves.
 
         Args:
             bus: of the service.
             task: is stepped.
-            look: what is known now.
-            status: where the task's status goes.
-            planning_time: that the task asks for now [s, wall].
-            watchdog: holds the arm while those are missing that the task relies on.
-            memory: keeps what the task is to know when it is started again.
+            observe: returns the current view.
+            status: publishes the task's status.
+            planning_time: returns the planning time that the task requests [s, wall].
+            watchdog: holds the arm while services or messages that the task depends on are missing.
+            memory: persists what the task has to know after a restart.
         """
-        self._task, self._look, self._status, self._bus = task, look, status, bus
+        self._task, self._observe, self._status, self._bus = task, observe, status, bus
         self._woken = asyncio.Event()
-        self._orders = Orders(bus, task, look, planning_time, self._note, self._woken.set)
+        self._requests = TaskRequests(bus, task, observe, planning_time, self._report, self._woken.set)
         self._own, self._owner = bus.client(topics.MOTION_OWN), bus.reader(topics.MOTION_OWNER)
         self._owning: asyncio.Task[None] | None = None
         self._watchdog, self._memory = watchdog, memory
-        self._told: list[Command] = []
-        self._before: m.TaskStatus | None = None
+        self._commanded: list[Command] = []  # by an operator, to be sent in the next step
+        self._published: m.TaskStatus | None = None
         bus.serve(topics.TASK_COMMAND, self._obey)
 
-    async def run(self, heard: Iterable[Reader[Any]]) -> None:
-        """Step whenever something is heard, and at least 20 times a second, until cancelled."""
+    async def run(self, readers: Iterable[Reader[Any]]) -> None:
+        """Step after each received message, and at least 20 times a second, until cancelled."""
         async with asyncio.TaskGroup() as group:
-            for reader in heard:
+            for reader in readers:
                 group.create_task(self._wake_on(reader))
             while True:
                 with contextlib.suppress(TimeoutError):
                     async with asyncio.timeout(LONGEST_STEP):  # wait_for of Python 3.11 can lose a cancellation
                         await self._woken.wait()
                 self._woken.clear()
-                told, self._told = self._told, []
-                view = self._look()
-                holds = self._mind(view)
-                for command in [*told, *holds, *self._task.step(view)]:
-                    self._orders.begin(group, command)
-                self._tell()
+                commanded, self._commanded = self._commanded, []
+                view = self._observe()
+                holds = self._check_liveness(view)
+                for command in [*commanded, *holds, *self._task.step(view)]:
+                    self._requests.begin(group, command)
+                self._publish()
                 if self._memory is not None:
-                    self._memory.keep(group)
-                self._have_motion(group, view.motion if view else None)
+                    self._memory.save(group)
+                self._claim_motion(group, view.motion if view else None)
 
-    def _have_motion(self, group: asyncio.TaskGroup, motion: m.MotionStatus | None) -> None:
-        """Have the motion of the robot from a start to the end or a stop, if it is nobody else's."""
+    def _claim_motion(self, group: asyncio.TaskGroup, motion: m.MotionStatus | None) -> None:
+        """Take motion authority from a start until the end or a stop, unless another client has it."""
         now, status = self._owner.latest, self._task.status
         if now is None or (self._owning is not None and not self._owning.done()):
             return
-        wanted = status.started and status.state not in ENDED and not (motion and motion.stopped)
+        needed = status.started and status.state not in ENDED and not (motion and motion.stopped)
         ours = now.kind == "task" and now.owner in ("", self._bus.service)
-        if wanted == (ours and now.asked) or not (ours or now.kind == "none"):
+        if needed == (ours and now.asked) or not (ours or now.kind == "none"):
             return
-        asked = m.OwnRequest(act="take" if wanted else "give", owner=self._bus.service, kind="task")
-        self._owning = group.create_task(self._ask_for(asked), name="own")
+        request = m.OwnRequest(act="take" if needed else "give", owner=self._bus.service, kind="task")
+        self._owning = group.create_task(self._request_authority(request), name="own")
 
-    async def _ask_for(self, request: m.OwnRequest) -> None:
-        with contextlib.suppress(RequestFailed):  # of who has it then the motions that are refused tell
+    async def _request_authority(self, request: m.OwnRequest) -> None:
+        with contextlib.suppress(RequestFailed):  # the refusals of motions name the owner
             await self._own.call(request, GOAL_TIMEOUT)
         await asyncio.sleep(OWN_PERIOD)
 
-    def _mind(self, view: V) -> list[m.HoldRequest]:
-        """The holds to ask for, because something is missing or is back again; the view has what is missing."""
+    def _check_liveness(self, view: V) -> list[m.HoldRequest]:
+        """Return holds to request or release because of missing messages or services; the view gets the reason."""
         if self._watchdog is None:
             return []
-        holds = self._watchdog.update(monotonic(), self._orders.serving, view.motion)
+        holds = self._watchdog.update(monotonic(), self._requests.serving, view.motion)
         view.trouble = self._watchdog.trouble
         return holds
 
     async def _obey(self, command: m.TaskCommand) -> m.TaskStatus:
-        self._bus.log.info("told to %s%s", command.command, f" by {command.by}" if command.by else "")
-        view = self._look()
+        self._bus.log.info("command %s%s", command.command, f" by {command.by}" if command.by else "")
+        view = self._observe()
         _require_allowed(command, view.motion if view else None, self._owner.latest)
-        asked = self._task.command(command.command, view)
-        for request in asked:
+        requests = self._task.command(command.command, view)
+        for request in requests:
             if isinstance(request, m.HoldRequest | m.StopRequest) and request.by == "operator":
                 request.owner = command.by
             if isinstance(request, m.HoldRequest):
                 request.override = command.override and not request.hold
                 request.acknowledged = command.acknowledged
-        self._told += asked
+        self._commanded += requests
         self._woken.set()
-        now, answered = self._task.status, await self._orders.carried_out(asked)
+        now, answered = self._task.status, await self._requests.carried_out(requests)
         return m.TaskStatus(
             header=self._bus.header(), state=now.state, paused=now.paused, started=now.started, stage=now.stage,
             message=now.message if answered else NOT_ANSWERED,
         )
 
-    def _tell(self) -> None:
-        """Publish the status when more of it has changed than the time."""
-        now, before = self._task.status, self._before
+    def _publish(self) -> None:
+        """Publish the status if more than its time has changed."""
+        now, before = self._task.status, self._published
         trouble = self._watchdog.trouble if self._watchdog else ""
         if trouble and now.state not in ENDED:
             now.message = f"{WAITS}{trouble}"
@@ -209,9 +211,9 @@ class TaskRunner(Generic[V]):
             self._bus.log.info("%s", f"{now.state} {now.message}".rstrip())
         now.header = self._bus.header()
         self._status.put(now)
-        self._before = now.model_copy(deep=True)
+        self._published = now.model_copy(deep=True)
 
-    def _note(self, problem: str) -> None:
+    def _report(self, problem: str) -> None:
         self._task.status.message = problem
 
     async def _wake_on(self, reader: Reader[Any]) -> None:
@@ -220,13 +222,13 @@ class TaskRunner(Generic[V]):
 
 
 def _require_allowed(command: m.TaskCommand, motion: m.MotionStatus | None, owner: m.MotionOwner | None) -> None:
-    """Return when a person may say that.
+    """Check that the operator may give the command.
 
     Raises:
-        Refused: another person holds the robot or has the motion, or it was stopped and can only be started.
+        Refused: another operator holds the robot or has motion authority, or a stopped robot needs a start.
     """
     if command.command == "resume" and motion is not None and motion.stopped:
-        raise Refused("stopped", f"the robot is {motion.stopped}: start the task to go on")
+        raise Refused("stopped", f"the robot is {motion.stopped}: start the task to continue")
     if command.override or command.command not in ("start", "resume"):
         return
     unnamed = m.UNKNOWN_OPERATOR
@@ -235,6 +237,60 @@ def _require_allowed(command: m.TaskCommand, motion: m.MotionStatus | None, owne
     if motion is None:
         return
     others = [interlock.description for interlock in motion.interlocks
-              if interlock.kind == "held" and interlock.by not in (*SHARED_HOLDERS, command.by)]
+              if interlock.kind == "held" and interlock.by not in (*UNNAMED, command.by)]
     if others:
-        raise Refused("held", f"the robot is {'; '.join(others)}: only they let go of it, unless you override that")
+        raise Refused("held", f"the robot is {'; '.join(others)}: only they can release it, unless you override")
+
+
+class TaskMemory:
+    """What a task has to know after a restart, in a file that lasts as long as the cell is up, if it has a folder."""
+
+    def __init__(self, bus: Bus, task: Task[Any]) -> None:
+        """Start with the memory of a new task; nothing is written yet."""
+        self._bus, self._task = bus, task
+        self._saved = task.memory
+        self._file: KeptFile[Any] | None = None
+        self._saving: asyncio.Task[None] | None = None
+
+    async def load(self) -> None:
+        """Restore the saved memory of the task, if it has one."""
+        folder = standing_folder()
+        if self._saved is None or folder is None:
+            return
+        await self._bus.owned()  # until then another process of this name may still write the file
+        if self._bus.declares_only:
+            return
+        self._file = KeptFile(folder / f"{self._bus.cell}.{self._bus.service}.json", type(self._saved))
+        try:
+            saved = self._file.find()
+        except Unreadable as error:  # the next save replaces it
+            self._bus.log.warning("the memory of the task is lost: %s", error)
+            return
+        if saved is not None:
+            self._saved = saved
+            self._task.remember(saved)
+
+    def save(self, group: asyncio.TaskGroup) -> None:
+        """Write a changed memory in the background; changes during the write are written after it."""
+        now = self._task.memory
+        if self._file is None or now is None or now is self._saved or (self._saving and not self._saving.done()):
+            return
+        self._saving = group.create_task(self._write(self._file), name="memory")
+
+    async def _write(self, file: KeptFile[Any]) -> None:
+        """Write the newest memory, retrying until it succeeds."""
+        warned = False
+        while True:
+            memory = self._task.memory
+            assert memory is not None
+            try:
+                await asyncio.to_thread(file.save, memory)
+            except OSError as error:
+                if not warned:
+                    self._bus.log.warning("%s cannot be written (%s): until it can, a restarted task does not know "
+                                          "what was done since", file.path, error.strerror or error)
+                warned = True
+                await asyncio.sleep(SAVE_RETRY)
+                continue
+            self._saved = memory
+            return

@@ -1,1 +1,1 @@
-"""Whole cells as processes: starting, watching, restarting and ending them, and the figures of a run."""
+"""Cells as groups of processes: starting, watching, restarting and stopping them."""

@@ -1,4 +1,4 @@
-"""One child process: its gate, its lifeline, the lines that it writes, and its end."""
+"""One child process: its gate, its output lines, its exit, and the delay before it is restarted."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from pathlib import Path
 
 import psutil
 
-from common.process.loop_watch import STUCK_EXIT
+from common.process.lifeline import STUCK_EXIT
 
 TAIL_LINES = 50
 LONGEST_LINE = 4000  # [characters] the rest of a longer line is cut
 
 
 class Child:
-    """A process in a session of its own, so that a terminal's Ctrl-C reaches only its parent.
+    """A process in a session of its own, so that Ctrl-C at the terminal reaches only its parent.
 
-    Its stdin is gate and lifeline in one: the process waits for a first line before it begins its work, and ends when
-    stdin is closed, which the kernel does for us however this process ends.
+    Its stdin is both gate and lifeline: the process waits for a first line before it starts its work, and exits when
+    stdin is closed, which the kernel does however this process ends.
     """
 
     def __init__(
@@ -34,9 +34,9 @@ class Child:
         """Describe a process without starting it.
 
         Args:
-            name: what the process is called in logs.
+            name: of the process in logs.
             command: program and arguments.
-            environment: all of its environment.
+            environment: its complete environment.
             on_line: called with the name and each line that the process writes to stdout or stderr.
         """
         self.name = name
@@ -48,8 +48,8 @@ class Child:
         self._process: subprocess.Popen[bytes] | None = None
         self._exited: asyncio.Future[int] | None = None
         self._output = 0  # file descriptor
-        self._rest = b""  # of a line that has not ended yet
-        self._silent = asyncio.Event()  # nothing more can be written
+        self._rest = b""  # of an incomplete line
+        self._output_ended = asyncio.Event()
         self._released = False
 
     @property
@@ -60,17 +60,14 @@ class Child:
 
     @property
     def stopped(self) -> bool:
-        """Whether the process is there but was stopped (SIGSTOP)."""
+        """Whether the process exists but is stopped (SIGSTOP)."""
         with contextlib.suppress(psutil.Error):
             return self.pid is not None and psutil.Process(self.pid).status() == psutil.STATUS_STOPPED
         return False
 
     @property
     def waited(self) -> float:
-        """For how long [s] its first thread, which turns its loop, has been kept waiting for a processor so far.
-
-        0 where the system does not tell.
-        """
+        """Total time [s] that its main thread, which runs its loop, waited for a processor; 0 if unknown."""
         with contextlib.suppress(OSError, ValueError, IndexError):
             return int(Path(f"/proc/{self.pid}/schedstat").read_text().split()[1]) * 1e-9
         return 0.0
@@ -81,13 +78,13 @@ class Child:
         return time.monotonic() - self.started_at
 
     def start(self) -> None:
-        """Start the process, behind its gate; on the running loop."""
-        # Not asyncio's own subprocesses: before Python 3.12 they wait until nobody holds the output open any more,
-        # and a process that ours left behind may do so for ever.
+        """Start the process, behind its gate, on the running loop."""
+        # asyncio's subprocesses wait until every copy of the output pipe is closed (before Python 3.12). A process
+        # that the child left behind may hold one forever.
         self.tail.clear()
         self._released = False
         self._rest = b""
-        self._silent.clear()
+        self._output_ended.clear()
         self.started_at = time.monotonic()
         process = self._process = subprocess.Popen(
             self.command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, bufsize=0,
@@ -104,20 +101,20 @@ class Child:
         ).start()
 
     def release(self) -> None:
-        """Let the process through its gate; without effect the second time."""
+        """Open the gate; a second call has no effect."""
         if self._released or self._process is None or self._process.stdin is None:
             return
         self._released = True
-        with contextlib.suppress(OSError, ValueError):  # it died meanwhile: wait() tells
+        with contextlib.suppress(OSError, ValueError):  # it died meanwhile: wait() returns its exit code
             self._process.stdin.write(b"go\n")
 
     async def wait(self) -> int:
-        """Exit code of the process (minus the signal that killed it), once its last lines were read."""
+        """Return the exit code (minus the signal that killed the process), once its last lines are read."""
         assert self._process is not None and self._exited is not None, "not started"
         code = await asyncio.shield(self._exited)
-        with contextlib.suppress(TimeoutError):  # a stray that moved to another session may hold the pipe open
+        with contextlib.suppress(TimeoutError):  # a grandchild in another session may hold the pipe open
             async with asyncio.timeout(1.0):
-                await self._silent.wait()
+                await self._output_ended.wait()
         self._close()
         return code
 
@@ -128,14 +125,14 @@ class Child:
                 os.kill(self.pid, signal.SIGTERM)
 
     def kill(self) -> None:
-        """End the process and everything that it started, at once (SIGKILL)."""
+        """Kill the process and everything that it started (SIGKILL)."""
         if self.pid is not None:
             _kill_group(self.pid)
 
     def _close(self) -> None:
         assert self._process is not None
-        if not self._silent.is_set():
-            self._fall_silent()
+        if not self._output_ended.is_set():
+            self._end_output()
         for pipe in (self._process.stdin, self._process.stdout):
             if pipe is not None:
                 with contextlib.suppress(OSError):
@@ -149,18 +146,18 @@ class Child:
         except OSError:
             chunk = b""
         if not chunk:
-            self._fall_silent()
+            self._end_output()
             return
         *lines, rest = (self._rest + chunk).split(b"\n")
         self._rest = rest[: 4 * LONGEST_LINE]
         for line in lines:
             self._emit(line)
 
-    def _fall_silent(self) -> None:
+    def _end_output(self) -> None:
         asyncio.get_running_loop().remove_reader(self._output)
         self._emit(self._rest)
         self._rest = b""
-        self._silent.set()
+        self._output_ended.set()
 
     def _emit(self, raw: bytes) -> None:
         line = raw.decode("utf-8", "replace").rstrip()[:LONGEST_LINE]
@@ -170,8 +167,8 @@ class Child:
 
 
 def _await_exit(process: subprocess.Popen[bytes], loop: asyncio.AbstractEventLoop, exited: asyncio.Future[int]) -> None:
-    """Wait for the end of a process, on a thread, and take whatever it left behind with it."""
-    if hasattr(os, "waitid"):  # not everywhere; until it is reaped, nobody else can have its number
+    """Wait on a thread for the end of a process, and kill the processes that it left behind."""
+    if hasattr(os, "waitid"):  # not on every system; its process id is not reused until it is reaped
         with contextlib.suppress(ChildProcessError):
             os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
     else:
@@ -179,12 +176,12 @@ def _await_exit(process: subprocess.Popen[bytes], loop: asyncio.AbstractEventLoo
     _kill_group(process.pid)
     code = process.wait()
 
-    def tell() -> None:
+    def set_code() -> None:
         if not exited.done():
             exited.set_result(code)
 
     with contextlib.suppress(RuntimeError):  # the loop has ended
-        loop.call_soon_threadsafe(tell)
+        loop.call_soon_threadsafe(set_code)
 
 
 def _kill_group(pid: int) -> None:
@@ -193,7 +190,7 @@ def _kill_group(pid: int) -> None:
 
 
 def describe_exit(code: int) -> str:
-    """What an exit code means, for people: "exit code 1", "killed by SIGKILL"."""
+    """Return an exit code in words, such as "exit code 1" or "killed by SIGKILL"."""
     if code == STUCK_EXIT:
         return f"its event loop was stuck, exit code {code}"
     if code >= 0:
@@ -205,7 +202,7 @@ def describe_exit(code: int) -> str:
 
 
 class Backoff:
-    """A delay that doubles with each failure up to a cap, and starts over after a long enough life."""
+    """A delay that doubles with each failure up to a cap, and starts over after a long enough run."""
 
     def __init__(self, first: float = 0.1, factor: float = 2.0, most: float = 5.0, reset_after: float = 10.0) -> None:
         """Start at the shortest delay.
@@ -213,8 +210,8 @@ class Backoff:
         Args:
             first: delay after the first failure [s].
             factor: growth from one failure to the next.
-            most: the delay never exceeds this [s].
-            reset_after: a life at least this long counts as healthy [s].
+            most: longest delay [s].
+            reset_after: a run of at least this time counts as healthy [s].
         """
         self.first = first
         self.factor = factor
@@ -223,7 +220,7 @@ class Backoff:
         self._next = first
 
     def after(self, alive_seconds: float) -> float:
-        """Delay [s] before the next start, for a process that lived this long."""
+        """Return the delay [s] before the next start of a process that ran for `alive_seconds`."""
         if alive_seconds >= self.reset_after:
             self._next = self.first
         delay = self._next

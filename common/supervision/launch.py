@@ -1,4 +1,4 @@
-"""What a cell's processes are started with: command lines, environment, and the router's port."""
+"""Command lines and environment of a cell's processes, and the port of its router."""
 
 from __future__ import annotations
 
@@ -16,7 +16,14 @@ from common.application import import_folders, import_from_working_directory
 from common.clock import MAX_SPEED, MIN_SPEED, Clock
 from common.config import Cell, ServiceEntry
 from common.errors import ConfigError
-from common.transport.endpoint import NEAR_VARIABLE, endpoint_of
+from common.transport.endpoint import (
+    CONNECT_VARIABLE,
+    DEFAULT_DOMAIN,
+    DOMAIN_VARIABLE,
+    NEAR_VARIABLE,
+    endpoint_of,
+    parse_domain,
+)
 
 ROUTER_MODULE = "services.router"
 PROJECT_ROOT = Path(__file__).resolve().parent.parent.parent
@@ -24,24 +31,24 @@ PROJECT_ROOT = Path(__file__).resolve().parent.parent.parent
 
 @dataclass(frozen=True)
 class Launch:
-    """How a cell was asked for; every process resolves the same cell from it."""
+    """The options that a cell was launched with; every process resolves the same cell from them."""
 
     cell: str  # name, or path of a YAML file
     overrides: tuple[str, ...] = ()
     world: str | None = None
     seed: int | None = None
     domain: int = 42
-    connect: str | None = None  # endpoint of a router that runs already
-    listen: tuple[str, ...] = ()  # where our router listens, when not for its own host only
-    link: tuple[str, ...] = ()  # routers of other hosts that it is linked with
-    near: tuple[str, ...] = ()  # where it listens besides, for what we start, by turns
+    connect: str | None = None  # endpoint of a router that already runs
+    listen: tuple[str, ...] = ()  # endpoints of our router for other hosts
+    link: tuple[str, ...] = ()  # endpoints of routers on other hosts that ours links to
+    near: tuple[str, ...] = ()  # additional endpoints of our router for our own processes, in turn
     log_json: bool = False
     clock: Clock = field(default_factory=Clock)
-    extra: Mapping[str, str] = field(default_factory=dict, repr=False)  # environment that no command line may show
+    extra: Mapping[str, str] = field(default_factory=dict, repr=False)  # variables that no command line may show
 
     def router_command(self, small: Sequence[str] = ()) -> list[str]:
-        """Command line of the router; `small` are keys of the cell's own under which nothing large travels."""
-        command = [*python_module(ROUTER_MODULE), "--domain", str(self.domain)]
+        """Return the command line of the router; `small` are keys of the cell that carry only small messages."""
+        command = [*module_command(ROUTER_MODULE), "--domain", str(self.domain)]
         for option, values in (
             ("--listen", self.listen), ("--link", self.link), ("--near", self.near), ("--small", small),
         ):
@@ -50,8 +57,8 @@ class Launch:
         return [*command, *self._process_options()]
 
     def service_command(self, entry: ServiceEntry, *, gate: bool = True) -> list[str]:
-        """Command line of a service, which waits behind its gate unless told otherwise."""
-        command = [*python_module(entry.module), *entry.name_option, "--cell", self.cell]
+        """Return the command line of a service; with `gate` it waits behind its gate."""
+        command = [*module_command(entry.module), *entry.name_option, "--cell", self.cell]
         for text in self.overrides:
             command += ["--set", text]
         if self.world is not None:
@@ -65,14 +72,14 @@ class Launch:
         return ["--gate", "--log-json"] if self.log_json else ["--gate"]
 
     def environment(self, inherited: Mapping[str, str] = os.environ) -> dict[str, str]:
-        """Environment of every process: the caller's, what is extra, where the router is near, clock, and packages."""
+        """Return the environment of every process: inherited and extra variables, near endpoints, clock, PYTHONPATH."""
         near = {NEAR_VARIABLE: f"{endpoint_of(self.domain)}={','.join(self.near)}"} if self.near else {}
         return {**inherited, **self.extra, **near, **self.clock.environment(),
-                "PYTHONPATH": python_path(inherited, self.cell)}
+                "PYTHONPATH": pythonpath(inherited, self.cell)}
 
 
-def clock_of(speed: float, epoch: int | None = None) -> Clock:
-    """A clock of that speed, from now on or from an epoch [ns since the Unix epoch].
+def clock_at_speed(speed: float, epoch: int | None = None) -> Clock:
+    """Return a clock at a speed that starts now or at an epoch [ns since the Unix epoch].
 
     Raises:
         ConfigError: the speed is out of bounds.
@@ -83,16 +90,14 @@ def clock_of(speed: float, epoch: int | None = None) -> Clock:
         raise ConfigError("--speed", speed, f"must be {MIN_SPEED:g} to {MAX_SPEED:g}") from None
 
 
-def place_of(
+def router_location(
     domain: str | None, connect: str | None, environ: Mapping[str, str] = os.environ
 ) -> tuple[int, str | None]:
-    """The domain, and the endpoint of a router that runs already or None, from options and environment.
+    """Return the domain and the endpoint of another router, or None, from options and environment.
 
     Raises:
         ConfigError: one of them is not valid.
     """
-    from common.transport.endpoint import CONNECT_VARIABLE, DEFAULT_DOMAIN, DOMAIN_VARIABLE, endpoint_of, parse_domain
-
     if connect or (domain is None and environ.get(CONNECT_VARIABLE)):
         return DEFAULT_DOMAIN, endpoint_of(None, connect, environ)
     if domain is not None:
@@ -100,14 +105,14 @@ def place_of(
     return parse_domain(environ.get(DOMAIN_VARIABLE, DEFAULT_DOMAIN), DOMAIN_VARIABLE), None
 
 
-def python_module(module: str) -> list[str]:
-    """Command line that runs a module with this interpreter."""
-    # -P: a folder named `services` or `common` where the person stands must not hide the project's own.
+def module_command(module: str) -> list[str]:
+    """Return a command line that runs a module with this interpreter."""
+    # -P: a folder named `services` or `common` in the working directory must not hide the project's own.
     return [sys.executable, "-P", "-m", module]
 
 
-def python_path(inherited: Mapping[str, str] = os.environ, cell: str = "") -> str:
-    """PYTHONPATH of the processes: the project, then the caller's, the working directory, and what is beside a cell.
+def pythonpath(inherited: Mapping[str, str] = os.environ, cell: str = "") -> str:
+    """Return PYTHONPATH of the processes: project, the caller's, working directory, and the folder of a cell file.
 
     Args:
         inherited: the caller's environment.
@@ -119,7 +124,7 @@ def python_path(inherited: Mapping[str, str] = os.environ, cell: str = "") -> st
 
 
 def require_modules(cell: Cell) -> None:
-    """Return when every service of the cell that is not the project's own can be found.
+    """Check that the modules of all services of the cell can be found.
 
     Raises:
         ConfigError: names the first that cannot.
@@ -129,7 +134,11 @@ def require_modules(cell: Cell) -> None:
 
 
 def require_module(key: str, entry: ServiceEntry) -> None:
-    """Return when the module of a service, which goes by `key` in the cell, can be found.
+    """Check that the module of a service can be found.
+
+    Args:
+        key: of the service in the cell file.
+        entry: the service.
 
     Raises:
         ConfigError: it cannot.
@@ -140,25 +149,25 @@ def require_module(key: str, entry: ServiceEntry) -> None:
     except ModuleNotFoundError:
         found = False
     if not found:
-        raise ConfigError(f"services.{key}", entry.module, "is not a module that can be found from here")
+        raise ConfigError(f"services.{key}", entry.module, "is not a module on the search path")
 
 
 def free_endpoints(count: int) -> tuple[str, ...]:
-    """So many endpoints of a secured router on this host only, where nobody listens."""
+    """Return free TLS endpoints of this host, `count` of them."""
     with contextlib.ExitStack() as held:
         probes = [held.enter_context(socket.create_server(("127.0.0.1", 0))) for _ in range(count)]
         return tuple(f"tls/127.0.0.1:{probe.getsockname()[1]}" for probe in probes)
 
 
 def require_free_port(endpoint: str) -> None:
-    """Return when a router can listen at an endpoint of this host.
+    """Check that a router can listen at an endpoint of this host.
 
     Raises:
-        PortInUse: names the domain, the port and, where it can be seen, the process that holds it.
+        PortInUse: names the domain, the port and, if visible, the process that uses it.
     """
     host, _, port = endpoint.partition("/")[2].rpartition(":")
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # connections that just closed do not matter
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # ignore connections that just closed
         try:
             probe.bind((host, int(port)))
         except OSError:
@@ -167,8 +176,8 @@ def require_free_port(endpoint: str) -> None:
             raise PortInUse(endpoint, holder_of(int(port))) from None
 
 
-def process_began() -> float:
-    """When this process was started [s, monotonic], its imports included."""
+def process_start_time() -> float:
+    """Return when this process was started, before its imports [s, monotonic]."""
     import psutil
 
     age = time.time() - psutil.Process().create_time()

@@ -1,7 +1,7 @@
-"""Plain `log` and `counters`, as they were called before each service had keys of its own: for one version more.
+"""Copies of log lines and counters on the plain keys `log` and `counters`, their names before each service had its own.
 
-The supervisor repeats there what services say under their own keys, for plain Zenoh clients; readers of ours leave
-these copies out (`common/transport/copies.py`). It says nothing for another: what came under a wrong key is refused.
+The supervisor publishes them for plain Zenoh clients, for one version more. Our readers skip these copies
+(`common/transport/copies.py`). A message under the key of another service is not copied.
 """
 
 from __future__ import annotations
@@ -11,39 +11,39 @@ from dataclasses import replace
 from typing import Any
 
 from common import topics
-from common.supervision.liveness_watchdog import Elsewhere
+from common.supervision.liveness_watchdog import RemoteServices
 from common.topics import Topic
 from common.transport.bus import Bus
 from common.transport.codec import encode, encoding_of
 from common.transport.copies import COPY, plain_key
 
-LOOK_PERIOD = 1.0  # [s] between looks whether somebody reads there
+MATCH_PERIOD = 1.0  # [s] between checks for subscribers of a plain key
 
 
-async def keep_plain_keys(bus: Bus, elsewhere: Elsewhere) -> None:
-    """Copy log lines and counters to their plain keys while somebody reads there; what is `elsewhere` another copies.
+async def copy_to_plain_keys(bus: Bus, remote: RemoteServices) -> None:
+    """Copy log lines and counters to their plain keys while those have subscribers.
 
     Args:
         bus: of the supervisor.
-        elsewhere: knows the services of others.
+        remote: services whose messages another supervisor copies.
     """
 
-    async def hear() -> None:
+    async def follow_supervisors() -> None:
         async for status in bus.reader(topics.SUPERVISOR_STATUS):
-            elsewhere.hear(status)
+            remote.update(status)
 
-    await asyncio.gather(hear(), *(_copy(bus, topic, elsewhere) for topic in (topics.LOG, topics.COUNTERS)))
+    await asyncio.gather(follow_supervisors(), *(_copy(bus, topic, remote) for topic in (topics.LOG, topics.COUNTERS)))
 
 
-async def _copy(bus: Bus, topic: Topic[Any], elsewhere: Elsewhere) -> None:
+async def _copy(bus: Bus, topic: Topic[Any], remote: RemoteServices) -> None:
     out = bus.raw_publisher(f"{bus.cell}/{plain_key(topic)}", encoding_of(topic.message), reliable=True)
     reader = bus.reader(replace(topic, plain=False), listening=False)
     while True:
         bus.listen(reader, out.matched)
         try:
-            async with asyncio.timeout(LOOK_PERIOD):
+            async with asyncio.timeout(MATCH_PERIOD):
                 message = await reader.next()
         except TimeoutError:
             continue
-        if elsewhere.is_told_here(message.service):
+        if remote.is_copied_here(message.service):
             out.put(encode(message), COPY)

@@ -1,4 +1,4 @@
-"""Starts a cell's processes in order, restarts what dies, and leaves none behind."""
+"""The supervisor of a cell's processes: starts them in order, restarts those that die, and leaves none behind."""
 
 from __future__ import annotations
 
@@ -22,28 +22,28 @@ from common.transport.keys import ROUTER
 
 T = TypeVar("T")
 
-START_TIMEOUT = 15.0  # [s] from being let through the gate to the readiness token
-HEAD_START = 0.5  # [s] between SIGTERM to one service and to the one before it, when it does not end sooner
+START_TIMEOUT = 15.0  # [s] from the opening of a gate to the readiness token
+HEAD_START = 0.5  # [s] at most between SIGTERM to one service and to the one before it
 TERM_TIMEOUT = 5.0  # [s] from SIGTERM to SIGKILL
 STOP_TIMEOUT = 6.5  # [s] after which every service that still runs is killed
 SHOWN_LINES = 5  # last log lines in the error of a service that did not become ready
-CONFIG_EXIT = 2  # a process that ends with this code was configured wrongly: starting it again will not help
+CONFIG_EXIT = 2  # exit code of a process with a bad configuration: a restart would not help
 
 log = logging.getLogger("supervisor")
 
 
 class StartFailed(ZencellError):
-    """The cell did not come up, and not because of a wrong configuration."""
+    """The cell did not come up, for another reason than its configuration."""
 
     exit_code = 1
 
 
 class BadConfiguration(ZencellError):
-    """A process refused its configuration; the message is the line that it printed."""
+    """A process rejected its configuration; the message is the line that it printed."""
 
 
-class AnyChild(Protocol):
-    """What is asked of a process: see `Child`."""
+class ChildProcess(Protocol):
+    """The interface of a process: see `Child`."""
 
     name: str
     tail: deque[str]
@@ -54,11 +54,11 @@ class AnyChild(Protocol):
 
     @property
     def stopped(self) -> bool:
-        """Whether the process is there but was stopped."""
+        """Whether the process exists but is stopped."""
 
     @property
     def waited(self) -> float:
-        """For how long [s] it has been kept waiting for a processor so far."""
+        """Total time [s] that it waited for a processor."""
 
     @property
     def alive_seconds(self) -> float:
@@ -68,25 +68,25 @@ class AnyChild(Protocol):
         """Start the process, behind its gate."""
 
     def release(self) -> None:
-        """Let the process through its gate."""
+        """Open the gate."""
 
     async def wait(self) -> int:
-        """Exit code of the process."""
+        """Return the exit code."""
 
     def terminate(self) -> None:
         """Ask the process to end."""
 
     def kill(self) -> None:
-        """End the process at once."""
+        """Kill the process."""
 
 
-class Watched:
-    """A child, whether it may start and has done so, and how often it died."""
+class SupervisedProcess:
+    """A child process with its state and number of restarts."""
 
-    def __init__(self, child: AnyChild, *, again: bool = True) -> None:
+    def __init__(self, child: ChildProcess, *, again: bool = True) -> None:
         self.child = child
-        self.again = again  # is started again when it ends
-        self.admitted = False
+        self.again = again  # whether it is restarted when it ends
+        self.admitted = False  # whether its gate may open
         self.backoff = Backoff()
         self.ready = asyncio.Event()
         self.gone = asyncio.Event()
@@ -95,66 +95,71 @@ class Watched:
 
 
 class Supervisor:
-    """The processes of a cell: `start` returns when all are ready, `stop` when all are gone.
+    """The processes of a cell: `start` starts them, `admit_all` returns when all are ready, `stop` when all are gone.
 
-    Readiness is told from outside (`mark_alive`), because it travels over the network that the first of the
-    processes, the router, provides.
+    Callers report readiness with `mark_alive`, because readiness tokens travel over the network of the router, which is
+    the first of the processes.
     """
 
     def __init__(
         self, cell: Cell, launch: Launch, on_line: Callable[[str, str], None],
         watchers: Mapping[str, Sequence[str]] = {},
-        make_child: Callable[[str, Sequence[str], Mapping[str, str], Callable[[str, str], None]], AnyChild] = Child,
+        make_child: Callable[[str, Sequence[str], Mapping[str, str], Callable[[str, str], None]], ChildProcess] = Child,
+        start_timeout: float = START_TIMEOUT, term_timeout: float = TERM_TIMEOUT,
     ) -> None:
-        """Prepare the processes without starting any; on the running loop.
+        """Prepare the processes without starting any, on the running loop.
 
         Args:
             cell: the resolved cell; its services are started in their order.
-            launch: how the cell was asked for.
+            launch: options of the launch.
             on_line: called with the name of a process and each line that it writes.
-            watchers: commands, by name, of processes that look on: ready before all services and ended after them,
-                not started again when they end, without which the cell goes on.
+            watchers: commands, by name, of observing processes such as a recorder. They are ready before all services
+                and end after them; they are not restarted, and the cell continues without them.
             make_child: makes a process from its name, command, environment and `on_line`; a simulation has its own.
+            start_timeout: [s] from the opening of a gate to the readiness token.
+            term_timeout: [s] from SIGTERM to SIGKILL.
         """
         environment = launch.environment()
+        self._start_timeout, self._term_timeout = start_timeout, term_timeout
         self._services = [
-            Watched(make_child(name, command, environment, on_line), again=False) for name, command in watchers.items()
+            SupervisedProcess(make_child(name, command, environment, on_line), again=False)
+            for name, command in watchers.items()
         ] + [
-            Watched(make_child(entry.name, launch.service_command(entry), environment, on_line))
+            SupervisedProcess(make_child(entry.name, launch.service_command(entry), environment, on_line))
             for entry in cell.services.values()
         ]
         self._router = None
         if not launch.connect:
             small = small_keys_renamed(entry.topics for entry in cell.services.values())
-            self._router = Watched(make_child(ROUTER, launch.router_command(small), environment, on_line))
+            self._router = SupervisedProcess(make_child(ROUTER, launch.router_command(small), environment, on_line))
         self._all = [self._router, *self._services] if self._router else list(self._services)
         self._by_name = {watched.child.name: watched for watched in self._all}
         self._tasks: set[asyncio.Task[None]] = set()
-        self.failure: asyncio.Future[None] = asyncio.get_running_loop().create_future()  # only ever an exception
+        self.failure: asyncio.Future[None] = asyncio.get_running_loop().create_future()  # gets only an exception
         self._up = False
         self._stopping = asyncio.Event()
-        self.changed = asyncio.Event()  # set whenever `statuses` differs from before
+        self.changed = asyncio.Event()  # set after each change of `statuses`
 
     @property
     def statuses(self) -> list[ServiceStatus]:
-        """All processes as they are now, the router first."""
+        """Current state of all processes, the router first."""
         return [watched.status.model_copy(update={"pid": watched.child.pid}) for watched in self._all]
 
     @property
     def restarts(self) -> dict[str, int]:
-        """How often each process was started again."""
+        """Number of restarts of each process."""
         return {watched.child.name: watched.status.restarts for watched in self._all}
 
-    def begin(self) -> None:
+    def start(self) -> None:
         """Start all processes at once, the services behind their gates, so that their imports overlap."""
         for watched in self._all:
             watched.admitted = watched is self._router
-            task = asyncio.create_task(self._keep(watched), name=f"keep {watched.child.name}")
+            task = asyncio.create_task(self._keep_running(watched), name=f"keep {watched.child.name} running")
             self._tasks.add(task)
-            task.add_done_callback(self._kept)
+            task.add_done_callback(self._on_task_done)
 
     async def reach_router(self, reaching: Awaitable[T]) -> T:
-        """The result of reaching the router, unless a process fails first or it takes too long.
+        """Return the result of connecting to the router, unless a process fails first or it takes too long.
 
         Raises:
             BadConfiguration: a process ended with exit code 2; the message is its last line.
@@ -166,7 +171,7 @@ class Supervisor:
         return reached
 
     async def admit_all(self) -> None:
-        """Let the services through in order, each when those before it are ready; returns when all are.
+        """Open the gates in order, each when the services before it are ready; return when all are ready.
 
         Raises:
             BadConfiguration: a process ended with exit code 2; the message is its last line.
@@ -181,7 +186,7 @@ class Supervisor:
         self._up = True
 
     def mark_alive(self, name: str, alive: bool) -> None:
-        """Take note that the readiness token of a service appeared or vanished; other names are ignored."""
+        """Record that the readiness token of a service appeared or vanished; unknown names are ignored."""
         watched = self._by_name.get(name)
         if watched is None or watched is self._router or not watched.admitted:
             return
@@ -190,50 +195,50 @@ class Supervisor:
         # A token also vanishes when the router dies. Only the end of the process counts as its death.
 
     def mark_connected(self, connected: bool) -> None:
-        """Take note that the connection to the router was made or lost."""
+        """Record whether the router is connected."""
         if self._router and connected and self._router.child.pid is not None:
             self._become_ready(self._router)
 
     @property
-    def kept(self) -> list[ServiceStatus]:
-        """The processes that are started again when they end, once the cell is up; none before and while it stops."""
+    def restartable(self) -> list[ServiceStatus]:
+        """The processes that are restarted when they end; empty before the cell is up and while it stops."""
         if not self._up or self._stopping.is_set():
             return []
         return [watched.status.model_copy(update={"pid": watched.child.pid}) for watched in self._all if watched.again]
 
     @property
     def starting(self) -> list[str]:
-        """Names of the processes on their way to be ready."""
+        """Names of the processes that are not ready yet."""
         return [watched.child.name for watched in self._all if watched.status.state == "starting"]
 
     @property
     def stopped(self) -> list[str]:
-        """Names of those of them that the system does not run (SIGSTOP)."""
+        """Names of those that are stopped (SIGSTOP) before they are ready."""
         return [name for name in self.starting if self._by_name[name].child.stopped]
 
     @property
     def waited(self) -> dict[str, float]:
-        """For how long [s] each of those that are kept has been waiting for a processor so far."""
+        """Total time [s] that each restartable process waited for a processor."""
         return {watched.child.name: watched.child.waited for watched in self._all if watched.again}
 
     def kill(self, name: str, reason: str) -> None:
-        """End a process that is of no use any more; it is started again."""
+        """Kill a process and log the reason; it is restarted."""
         log.error("%s %s; killed", name, reason)
         self._by_name[name].killed_because = reason
         self._by_name[name].child.kill()
 
     async def stop(self, hurry: asyncio.Event | None = None) -> None:
-        """End all processes in reverse order: SIGTERM, then SIGKILL; at once when `hurry` is set."""
+        """End all processes in reverse order: SIGTERM, then SIGKILL, which comes at once when `hurry` is set."""
         self._stopping.set()
         hurry = hurry or asyncio.Event()
         deadline = monotonic() + STOP_TIMEOUT
         ending: set[asyncio.Task[None]] = set()
         for watched in reversed(self._all):
-            # The others say goodbye through the router, and those that look on want to hear it.
+            # Services publish their last messages through the router, and observers record them: both end last.
             if (watched is self._router or not watched.again) and ending:
                 await asyncio.wait(ending, timeout=max(0.0, deadline - 0.5 - monotonic()))
-            latest = monotonic() + TERM_TIMEOUT
-            # Who looks on has its whole time, however long the others took: it may have much to write.
+            latest = monotonic() + self._term_timeout
+            # An observer gets its full timeout, however long the services took: it may have much to write.
             task = asyncio.create_task(self._end(watched, min(deadline, latest) if watched.again else latest, hurry))
             ending.add(task)
             await asyncio.wait({task}, timeout=0 if hurry.is_set() else HEAD_START)
@@ -243,39 +248,34 @@ class Supervisor:
         await asyncio.gather(*self._tasks, return_exceptions=True)
 
     def abandon(self) -> None:
-        """Look after no process any more and leave them as they are, as when this one is killed: for simulations."""
+        """Stop supervising and leave the processes as they are, as if this one were killed; for simulations."""
         for task in self._tasks:
             task.cancel()
 
     # --- one process ----------------------------------------------------------------------------------------------
 
-    async def _keep(self, watched: Watched) -> None:
-        """Start the process again whenever it ends, until the cell stops."""
+    async def _keep_running(self, watched: SupervisedProcess) -> None:
+        """Restart the process whenever it ends, until the cell stops."""
         child = watched.child
         try:
             while not self._stopping.is_set():
                 child.start()
                 if watched.admitted:
                     child.release()
-                if self._stopping.is_set():  # it was asked to end before there was anything to ask
+                if self._stopping.is_set():  # `stop` was called before there was a process
                     child.terminate()
                 self._set(watched, state="starting" if watched.admitted else "waiting")
                 code = await child.wait()
                 if self._stopping.is_set():
                     break
                 watched.ready.clear()
-                if code == CONFIG_EXIT and not self._up:
-                    self._set(watched, state="failed", message=describe_exit(code))
-                    raise BadConfiguration(_last_message(child) or f"{child.name}: {describe_exit(code)}")
+                self._check_fatal(watched, code)
                 if not watched.again:
-                    self._set(watched, state="failed", message=describe_exit(code))
-                    if not self._up:
-                        raise StartFailed(_last_message(child) or f"{child.name}: {describe_exit(code)}")
                     log.error("%s ended (%s)", child.name, describe_exit(code))
                     break
                 delay = watched.backoff.after(child.alive_seconds)
                 message, watched.killed_because = watched.killed_because or describe_exit(code), ""
-                log.warning("%s ended (%s); starting it again in %.1f s", child.name, message, delay)
+                log.warning("%s ended (%s); restarting it in %.1f s", child.name, message, delay)
                 self._set(watched, state="restarting", restarts=watched.status.restarts + 1, message=message)
                 with contextlib.suppress(TimeoutError):
                     async with asyncio.timeout(delay):
@@ -284,15 +284,25 @@ class Supervisor:
             self._set(watched, state="failed" if watched.status.state == "failed" else "stopped")
             watched.gone.set()
 
-    def _kept(self, task: asyncio.Task[None]) -> None:
+    def _check_fatal(self, watched: SupervisedProcess, code: int) -> None:
+        """Raise if the end of a process ends the start of the cell: bad configuration, or an observer that failed."""
+        bad_configuration = code == CONFIG_EXIT and not self._up
+        if not bad_configuration and watched.again:
+            return
+        self._set(watched, state="failed", message=describe_exit(code))
+        if not self._up:
+            error = BadConfiguration if bad_configuration else StartFailed
+            raise error(_last_message(watched.child) or f"{watched.child.name}: {describe_exit(code)}")
+
+    def _on_task_done(self, task: asyncio.Task[None]) -> None:
         if task.cancelled() or self.failure.done():
             return
         if error := task.exception():
             self.failure.set_exception(error)
-            self.failure.exception()  # it may be that nobody waits for it any more
+            self.failure.exception()  # mark it as retrieved: nothing may wait for it any more
 
-    async def _end(self, watched: Watched, deadline: float, hurry: asyncio.Event) -> None:
-        """End one process by the deadline [s, monotonic], or as soon as there is a hurry."""
+    async def _end(self, watched: SupervisedProcess, deadline: float, hurry: asyncio.Event) -> None:
+        """End one process by the deadline [s, monotonic], or as soon as `hurry` is set."""
         if watched.child.pid is not None:
             self._set(watched, state="stopping")
         watched.child.terminate()
@@ -302,32 +312,32 @@ class Supervisor:
         await asyncio.wait({gone, hurried}, timeout=left, return_when=asyncio.FIRST_COMPLETED)
         if not gone.done():
             if watched.child.pid is not None:
-                log.warning("%s does not end; killed", watched.child.name)
+                log.warning("%s did not end in time; killed", watched.child.name)
             watched.child.kill()
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(1.0):
                     await gone
         hurried.cancel()
 
-    async def _unless_failed(self, reaching: Awaitable[T], watched: Watched | None, name: str) -> T:
-        """The result of something that a process has to reach in time, while no process has failed."""
+    async def _unless_failed(self, reaching: Awaitable[T], watched: SupervisedProcess | None, name: str) -> T:
+        """Return the result of `reaching`, a step in the start of a process, within the start timeout."""
         waited = asyncio.ensure_future(reaching)
         try:
             either: set[asyncio.Future[Any]] = {waited, self.failure}
-            await asyncio.wait(either, timeout=START_TIMEOUT, return_when=asyncio.FIRST_COMPLETED)
+            await asyncio.wait(either, timeout=self._start_timeout, return_when=asyncio.FIRST_COMPLETED)
             if self.failure.done():
                 self.failure.result()
             if waited.done():
                 return waited.result()
             tail = list(watched.child.tail)[-SHOWN_LINES:] if watched else []
-            said = "; its last lines:\n  " + "\n  ".join(tail) if tail else "; it said nothing"
+            output = "; its last lines:\n  " + "\n  ".join(tail) if tail else "; it wrote nothing"
             if watched:
-                self._set(watched, state="failed", message=f"not ready within {START_TIMEOUT:g} s")
-            raise StartFailed(f"{name} was not ready within {START_TIMEOUT:g} s{said if watched else ''}")
+                self._set(watched, state="failed", message=f"not ready within {self._start_timeout:g} s")
+            raise StartFailed(f"{name} was not ready within {self._start_timeout:g} s{output if watched else ''}")
         finally:
             waited.cancel()
 
-    def _become_ready(self, watched: Watched) -> None:
+    def _become_ready(self, watched: SupervisedProcess) -> None:
         if watched.ready.is_set():
             return
         watched.ready.set()
@@ -336,20 +346,20 @@ class Supervisor:
             log.info("%s is ready again after %.1f s", watched.child.name, seconds)
         self._set(watched, state="ready", ready_seconds=seconds, message="")
 
-    def _set(self, watched: Watched, **update: object) -> None:
+    def _set(self, watched: SupervisedProcess, **update: object) -> None:
         watched.status = watched.status.model_copy(update=update)
         self.changed.set()
 
 
-def _last_message(child: AnyChild) -> str:
-    """What a process said last, without level and name in front: plain, logged as text, or logged as JSON."""
-    said = [_message_of(line) for line in child.tail]
-    errors = [message for level, message in said if level == "error"]
-    return errors[-1] if errors else said[-1][1] if said else ""
+def _last_message(child: ChildProcess) -> str:
+    """Return the last error, else the last line of a process, without its level and name."""
+    lines = [_message_of(line) for line in child.tail]
+    errors = [message for level, message in lines if level == "error"]
+    return errors[-1] if errors else lines[-1][1] if lines else ""
 
 
 def _message_of(line: str) -> tuple[str, str]:
-    """Level and message of a line; the level is empty where there is none."""
+    """Return level and message of a line of text or JSON; the level is empty if it has none."""
     if line.startswith("{"):
         with contextlib.suppress(ValueError, KeyError):
             value = json.loads(line)

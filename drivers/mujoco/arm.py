@@ -122,9 +122,9 @@ def limit_force(model: mujoco.MjModel, actuator: int, force: float) -> None:
     model.actuator_forcerange[actuator] = (-force, force) if math.isfinite(force) else (0.0, 0.0)
 
 
-# Fingers in the world with physics: driven along a jerk-limited width, with no more force than they were told."""
+# Fingers in the world with physics: driven along a jerk-limited width, with no more force than they were told.
 
-ENCODER = 5  # decimals of what is measured [m], [m/s]
+FINGER_ENCODER = 5  # decimals of what is measured [m], [m/s]
 STILL = 2e-3  # [m/s] fingers that are slower stand
 SHORT = 3e-3  # [m] from the width that they were told, or nearer: they are there
 STALLS = 0.05  # [s] so long they stand short of it, and press then
@@ -165,7 +165,7 @@ class PhysicsFingers:
 
     def read(self, now: float) -> GripperReading:
         """As measured after the last step."""
-        width, rate = round(self._width, ENCODER), round(self._rate, ENCODER)
+        width, rate = round(self._width, FINGER_ENCODER), round(self._rate, FINGER_ENCODER)
         return GripperReading(width, rate, self._moves, self._holds, round(self._force, 1) if self._holds else 0.0)
 
     def place(self, width: float) -> None:

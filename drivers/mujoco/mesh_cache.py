@@ -46,9 +46,9 @@ def hull_points(path: Path) -> NDArray[np.float64]:
 
 def cached_visual_meshes(robot: RobotModel, triangles: int) -> list[Piece]:
     """What is seen of all links with about so many triangles: see `common.robot.visual_meshes`."""
-    from common.robot.visual_meshes import Piece, seen_shapes, visual_pieces  # brings trimesh
+    from common.robot.visual_meshes import Piece, visible_shapes, visual_pieces  # brings trimesh
 
-    files = [shape.path.read_bytes() for shape in seen_shapes(robot) if shape.path is not None]
+    files = [shape.path.read_bytes() for shape in visible_shapes(robot) if shape.path is not None]
 
     def make() -> Arrays:
         made: Arrays = {}

@@ -234,7 +234,7 @@ def _same(a: Array | None, b: Array | None) -> bool:
     return a.shape == b.shape and bool(np.all(np.abs(a - b) < STILL))
 
 
-# Pictures without OpenGL: a ray through the centre of each pixel, and light without shadows."""
+# Pictures without OpenGL: a ray through the centre of each pixel, and light without shadows.
 
 def ray_view(
     model: mujoco.MjModel, data: mujoco.MjData, camera: Pinhole, scenery: Scenery, level: Array, far: float

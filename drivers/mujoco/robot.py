@@ -11,11 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from common.errors import ConfigError
-from common.robot.description import find_description
 from common.robot.finger_joints import finger_factors
-from common.robot.merging import WORLD
 from common.robot.model import RobotModel
 from common.robot.transforms import rpy_to_matrix, transform
+from common.robot.urdf import WORLD, find_description
 from drivers.mujoco.mesh_cache import cached_visual_meshes, hull_points
 from drivers.mujoco.scene import COLLIDES, ROBOT, SOLIMP, SOLREF, set_contact, set_finger_contact, visual_only, wxyz
 

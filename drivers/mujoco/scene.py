@@ -108,7 +108,7 @@ def _volume(points: Array) -> float:
     return float(np.prod(np.maximum(np.ptp(points, axis=0), 1e-6)))
 
 
-# How things touch: the numbers of MuJoCo's solver, and who meets whom. docs/physics.md says where they come from."""
+# How things touch: the numbers of MuJoCo's solver, and who meets whom. docs/physics.md says where they come from.
 
 TIMESTEP = 0.002  # [s]
 IMPRATIO = 10.0  # friction is stiffer than contact: what is held does not creep
@@ -153,7 +153,7 @@ def visual_only(geom: Any) -> Any:
     return geom
 
 
-# What never moves in a model: fixtures, containers, the floor; and the cameras."""
+# What never moves in a model: fixtures, containers, the floor; and the cameras.
 
 STANDS = 0.3  # [m] a fixture whose bottom is so far below the highest top stands on the floor
 FLOOR_COLOR = (0.62, 0.62, 0.60, 1.0)

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Any
 from common import topics
 from common import topics as t
 from common.application import Application, applications
+from common.client.rates import Rates
 from common.config import RobotConfig
 from common.messages import Message, TaskStatus
 from common.sources import monotonic
-from common.supervision.rates import Rates
 from common.topics import Topic
 from recording.report.application import Figures, Listener, figures_of
 from recording.report.summary import Summary

@@ -49,7 +49,7 @@ async def test_processes_that_are_frozen_are_started_again_and_no_other(tmp_path
         summary = cell.summary
         assert not cell.processes()
     assert {name: n for name, n in summary["restarts"].items() if n} == {"vision_detector": 1, "router": 1}
-    assert "vision_detector has not been heard for" in cell.text and "router does not answer for" in cell.text
+    assert "vision_detector has sent nothing for" in cell.text and "router does not answer for" in cell.text
     assert summary["state"] == "DONE"
     assert summary["truth"] == {"in_box": 3, "on_table": 0, "elsewhere": 0, "containers": {"box": 3}}
 

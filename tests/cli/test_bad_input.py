@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from cli.main import app
-from cli.operation.operation import Operation
+from cli.session.session import CellSession
 from tests.harness import ask, command_line, environment
 
 RECORDING = str(Path(__file__).parents[1] / "data" / "panda_first_release.mcap")
@@ -126,13 +126,13 @@ def test_what_the_system_does_not_let_us_do_is_one_line(
 def test_what_became_of_a_run_is_said_although_its_file_cannot_be_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], domain: int
 ) -> None:
-    async def operate(operation: Operation, work: object) -> int:
+    async def operate(operation: CellSession, work: object) -> int:
         folder.rmdir()  # meanwhile
         return 1
 
     folder = tmp_path / "figures"
     folder.mkdir()
-    monkeypatch.setattr(Operation, "_operate", operate)
+    monkeypatch.setattr(CellSession, "_operate", operate)
     assert app.execute(["run", "panda", "--domain", str(domain), "--summary", str(folder / "s.json")]) == 1
     shown = capsys.readouterr()
     assert "panda: IDLE, 0 of 0 placed" in shown.out

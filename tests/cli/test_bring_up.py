@@ -10,13 +10,13 @@ import pytest
 from tests.harness import Zencell
 
 Start = Callable[..., Zencell]
-UP = "zenoh --mode client"  # the last line that `up` writes when all is ready
+RUNNING = "zenoh --mode client"  # the last line that `up` writes when all is ready
 GONE = 3.0  # [s] after its supervisor was killed
 
 
 def test_services_are_let_through_in_order_and_stopped_in_reverse(zencell: Start) -> None:
     command = zencell("up", "tiny.yaml")
-    assert f"tcp/127.0.0.1:{7447 + command.domain}" in command.until(UP)
+    assert f"tcp/127.0.0.1:{7447 + command.domain}" in command.until(RUNNING)
     assert sorted(command.children()) == ["first", "last", "middle", "router"]
     command.interrupt()
     assert command.end() == 0
@@ -33,11 +33,11 @@ def test_what_crashes_at_its_start_or_is_killed_later_is_started_again_and_shown
     command = zencell("up", "tiny.yaml", "--set", "services.middle.behave=crash once")
     command.until("RuntimeError: a bug")
     command.until("middle ended (exit code 1)")
-    command.until(UP)
+    command.until(RUNNING)
     for victim in ("middle", "router"):
         before = command.children()[victim].pid
         command.children()[victim].kill()
-        command.until(f"{victim} ended (killed by SIGKILL); starting it again in ")
+        command.until(f"{victim} ended (killed by SIGKILL); restarting it in ")
         command.until(f"{victim} is ready again")
         assert command.children()[victim].pid != before
     command.interrupt()
@@ -87,7 +87,7 @@ def test_interrupted_before_anything_is_up_no_process_is_left(zencell: Start) ->
 
 def test_a_frozen_service_is_killed_and_a_second_interrupt_does_so_at_once(zencell: Start) -> None:
     command = zencell("up", "tiny.yaml")
-    command.until(UP)
+    command.until(RUNNING)
     command.children()["middle"].send_signal(signal.SIGSTOP)
     command.interrupt()
     command.until("stopped")  # the last one; the middle cannot
@@ -129,7 +129,7 @@ def test_interrupted_run_writes_the_summary(zencell: Start, folder: Path) -> Non
 
 def test_a_port_in_use_names_domain_and_process_and_a_killed_supervisor_leaves_no_process(zencell: Start) -> None:
     first = zencell("up", "tiny.yaml")
-    first.until(UP)
+    first.until(RUNNING)
     second = zencell("up", "tiny.yaml")
     assert second.end() == 2
     (line,) = [line for line in second.lines if line]
@@ -144,7 +144,7 @@ def test_a_port_in_use_names_domain_and_process_and_a_killed_supervisor_leaves_n
 @pytest.mark.slow
 def test_log_lines_as_json(zencell: Start) -> None:
     command = zencell("up", "tiny.yaml", "--log-json")
-    command.until(UP)
+    command.until(RUNNING)
     command.interrupt()
     assert command.end() == 0
     for line in filter(None, command.lines):

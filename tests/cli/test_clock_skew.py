@@ -9,7 +9,7 @@ import pytest
 
 from common.clock import Clock
 from common.config import Parameters
-from common.process.parameters import serve_parameters
+from common.process.service import serve_parameters
 from common.transport.bus import Bus
 from common.transport.local import LocalNetwork
 from tools.doctor.clocks import Skew, judged, skews_of

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from cli import choices as offers
 from cli import completion
-from cli.completing import offers
 from common.application import all_topics
 from common.config import load_cell, service_config, service_names
 from common.planning.planners import planner_names

@@ -25,7 +25,7 @@ from tools.doctor.machine import Seen
 Disk = namedtuple("Disk", "total used free")
 NOWHERE = "tcp/127.0.0.1:1"
 SERVICE = (sys.executable, "-P", "-m", "services.vision_detector", "--cell", "panda", "--domain", "42", "--gate")
-UP = (sys.executable, "/usr/bin/zencell", "up", "panda")
+RUNNING = (sys.executable, "/usr/bin/zencell", "up", "panda")
 
 
 @pytest.fixture
@@ -267,7 +267,7 @@ def seen(pid: int, ppid: int, command: tuple[str, ...], status: str = "sleeping"
 
 
 def test_cell_that_is_up_is_no_leftover() -> None:
-    findings = list(machine.judge([seen(1, 0, ("init",)), seen(10, 1, UP, age=7300), seen(11, 10, SERVICE)]))
+    findings = list(machine.judge([seen(1, 0, ("init",)), seen(10, 1, RUNNING, age=7300), seen(11, 10, SERVICE)]))
     assert [finding.level for finding in findings] == ["ok", "ok"]
     assert findings[0].what == "a cell is up, or comes up: zencell up panda (10), for 2 h"
 
@@ -284,20 +284,20 @@ def test_service_of_a_parent_that_can_not_be_seen_is_without_a_supervisor() -> N
 
 
 def test_stopped_service_of_a_living_cell_can_go_on() -> None:
-    finding, up = machine.judge([seen(10, 1, UP), seen(11, 10, SERVICE, "stopped"), seen(12, 10, SERVICE)])
+    finding, up = machine.judge([seen(10, 1, RUNNING), seen(11, 10, SERVICE, "stopped"), seen(12, 10, SERVICE)])
     not_well(finding, "stopped (SIGSTOP): vision_detector (11)", "kill -CONT 11")
     assert up.level == "ok"
 
 
 def test_stopped_supervisor_can_go_on_or_be_ended() -> None:
-    (finding,) = machine.judge([seen(10, 1, UP, "stopped"), seen(11, 10, SERVICE)])
+    (finding,) = machine.judge([seen(10, 1, RUNNING, "stopped"), seen(11, 10, SERVICE)])
     not_well(finding, "a supervisor is stopped", "zencell up panda (10)", "kill -CONT 10", "kill -9 10")
 
 
 def test_old_supervisor_without_services_is_to_be_ended() -> None:
-    (finding,) = machine.judge([seen(10, 1, UP)])
+    (finding,) = machine.judge([seen(10, 1, RUNNING)])
     not_well(finding, "a supervisor without services", "kill 10")
-    assert [f.level for f in machine.judge([seen(10, 1, UP, age=2.0)])] == ["ok", "ok"]  # it has just begun
+    assert [f.level for f in machine.judge([seen(10, 1, RUNNING, age=2.0)])] == ["ok", "ok"]  # it has just begun
 
 
 def test_other_programs_are_none_of_our_business() -> None:

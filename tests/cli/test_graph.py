@@ -5,13 +5,14 @@ from pathlib import Path
 import pytest
 
 from cli.main import app
-from common.supervision.wired import Wired
+from common.supervision.wiring import ServiceWiring
 from tools.graph import OUTSIDE, Graph, dot, edges, graph_of, mermaid, svg
 
 SERVICES = [
-    Wired("planner", "Plans.", writes=["display_trajectory"], serves=["motion/plan"], reads=["joint_states"]),
-    Wired("executor", "Moves.", writes=["joint_states", "motion/status"], serves=["motion/execute", "world/edit"]),
-    Wired("task", "Decides.", reads=["motion/status", "my/own"], calls=["motion/plan", "motion/execute"]),
+    ServiceWiring("planner", "Plans.", writes=["display_trajectory"], serves=["motion/plan"], reads=["joint_states"]),
+    ServiceWiring("executor", "Moves.", writes=["joint_states", "motion/status"],
+                  serves=["motion/execute", "world/edit"]),
+    ServiceWiring("task", "Decides.", reads=["motion/status", "my/own"], calls=["motion/plan", "motion/execute"]),
 ]
 SVG = "{http://www.w3.org/2000/svg}"
 
@@ -37,7 +38,7 @@ def test_request_that_nobody_in_the_cell_sends_comes_from_outside() -> None:
 
 
 def test_what_the_supervisor_says_comes_from_it_and_parameters_are_left_out() -> None:
-    page = Wired("viewer", "", reads=["supervisor/status"], calls=["param/task", "motion/stop"])
+    page = ServiceWiring("viewer", "", reads=["supervisor/status"], calls=["param/task", "motion/stop"])
     made = graph_of("tiny", [page])
     assert ("supervisor", "key supervisor/status", False, True) in edges(made)
     assert set(made.kinds) == {"motion/stop", "supervisor/status"}

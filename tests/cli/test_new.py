@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from cli.completing import offers
+from cli import choices as offers
 from common.application import find_application
 from common.config import load_cell
 from common.supervision.launch import Launch

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from common.client.keyboard import names_of
+from recording.keyboard import names_of
 from recording.reader import Recording
 from recording.sink import RecordingStats
 from recording.summary import in_bytes, outcome, progress, summarise

@@ -7,9 +7,8 @@ import threading
 import pytest
 from rich.console import Console
 
-from cli.operation.live import MOST_LINES, LiveScreen, render
-from cli.operation.screen import Content
-from cli.operation.screens import JsonScreen, PlainScreen, ScreenHandler, open_screen
+from cli.session.live_table import MOST_LINES, LiveScreen, render
+from cli.session.screens import Content, JsonScreen, PlainScreen, ScreenHandler, open_screen
 from common.messages import ServiceStatus
 
 CONTENT = Content(
@@ -36,7 +35,7 @@ def test_many_lines_on_a_terminal_are_drawn_together_and_those_that_are_too_many
         screen.line("chatty", f"line {number}")
     screen.close()
     shown = [int(number) for number in re.findall(r"chatty: line (\d+)", text.getvalue())]
-    lost = sum(int(number) for number in re.findall(r"(\d+) lines were lost: there were too many", text.getvalue()))
+    lost = sum(int(number) for number in re.findall(r"(\d+) lines were dropped: too many", text.getvalue()))
     assert shown == sorted(shown) and shown[:MOST_LINES - 1] == list(range(MOST_LINES - 1))
     assert len(shown) + lost == 2000
     assert text.getvalue().count(CONTENT.progress) < 200, "the table is not drawn for each line"

@@ -13,7 +13,7 @@ import pytest
 
 from cli.main import app
 from common.errors import ConfigError
-from lab.campaign import listed, seeds_of
+from lab.campaign import format_counts, seeds_of
 from recording.reader import Recording
 
 pytestmark = pytest.mark.timeout(600)  # some seconds of work, on a machine that may be busy
@@ -112,4 +112,4 @@ def test_seeds_are_a_range_or_one():
 
 
 def test_counts_are_listed_with_the_largest_first():
-    assert listed({"a": 1, "b": 2000}) == "b 2,000, a 1"
+    assert format_counts({"a": 1, "b": 2000}) == "b 2,000, a 1"

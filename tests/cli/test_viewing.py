@@ -54,8 +54,8 @@ def test_option_for_a_page_that_there_is_not_is_refused(tmp_path: Path, option: 
 def test_page_is_on_this_machine_alone_unless_asked_for_more(cell: Cell) -> None:
     page = build_report(cell, None, None)
     assert page is not None
-    port = int(page.address.rpartition(":")[2])
-    assert page.address == f"http://127.0.0.1:{port}" and port >= FIRST_PORT
+    port = int(page.serving.rpartition(":")[2])
+    assert page.serving == f"http://127.0.0.1:{port}" and port >= FIRST_PORT
     assert page.overrides == (f"services.viewer.port={port}",)
     assert not page.environment
 
@@ -64,7 +64,7 @@ def test_next_free_port_is_taken_when_none_was_named(cell: Cell, monkeypatch: py
     monkeypatch.setattr("page.access.FIRST_PORT", taken)
     monkeypatch.setattr("page.access.LAST_PORT", taken + 50)
     page = build_report(cell, None, None)
-    assert page is not None and taken < int(page.address.rpartition(":")[2]) <= taken + 50
+    assert page is not None and taken < int(page.serving.rpartition(":")[2]) <= taken + 50
 
 
 def test_two_cells_that_come_up_at_the_same_time_have_pages_of_their_own(cell: Cell) -> None:
@@ -110,7 +110,7 @@ def test_beyond_this_machine_a_token_is_made_that_no_command_line_shows(cell: Ce
     assert page is not None and other is not None
     token = page.environment[TOKEN_VARIABLE]
     assert len(token) > 40 and token != other.environment[TOKEN_VARIABLE]
-    assert page.address.endswith(f"/?token={token}") and "0.0.0.0" not in page.address
+    assert page.serving.endswith(f"/?token={token}") and "0.0.0.0" not in page.address
     assert page.overrides[0] == "services.viewer.host=0.0.0.0"
     assert token not in repr(page.overrides)
 
@@ -120,13 +120,13 @@ def test_page_of_a_secured_cell_has_a_token_on_its_own_machine_too(cell: Cell, m
     assert open_page is not None and not open_page.environment
     monkeypatch.setenv(SECURE_VARIABLE, "certs")
     page = build_report(cell, None, None)
-    assert page is not None and page.address.endswith(f"/?token={page.environment[TOKEN_VARIABLE]}")
+    assert page is not None and page.serving.endswith(f"/?token={page.environment[TOKEN_VARIABLE]}")
 
 
 def test_token_that_a_person_gave_is_not_shown(cell: Cell, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(TOKEN_VARIABLE, "correct-horse-battery")
     page = build_report(cell, "0.0.0.0", None)
-    assert page is not None and "token" not in page.address and not page.environment
+    assert page is not None and "token" not in page.serving and not page.environment
 
 
 VIEWER = '''"""Says the fingerprint of the token that it was given, and serves nothing."""

@@ -5,11 +5,11 @@ import socket
 import pytest
 from rich.console import Console
 
+from cli.top import render
 from common import topics
 from common.application import all_topics
 from common.client.joining import cell_clock
-from common.client.tables import render
-from common.client.watching import MOST_KEYS, Processes, ServiceRow, TopicRow, View, Watch, on_demand, statuses
+from common.client.monitor import MOST_KEYS, CellMonitor, Processes, ServiceRow, TopicRow, View, on_demand, statuses
 from common.clock import Clock
 from common.messages import (
     GripperState,
@@ -36,7 +36,7 @@ def image(clock: Clock) -> Image:
 async def test_topics_show_what_came_and_how_old_it_was() -> None:
     network = LocalNetwork()
     camera = network.bus("camera", clock=CLOCK).writer(topics.CAMERA_IMAGE)
-    async with Watch(network.bus("top"), CLOCK) as watch:
+    async with CellMonitor(network.bus("top"), CLOCK) as watch:
         for _ in range(3):
             camera.put(image(CLOCK))
         (row,) = watch.view().topics
@@ -50,7 +50,7 @@ async def test_repetition_of_an_old_state_says_nothing_of_its_age() -> None:
     network = LocalNetwork()
     gripper = network.bus("executor").writer(topics.GRIPPER_STATE)
     gripper.put(GripperState(header=Header(stamp=5), width=0.0))
-    async with Watch(network.bus("top"), CLOCK) as watch:
+    async with CellMonitor(network.bus("top"), CLOCK) as watch:
         gripper.repeat()
         (row,) = watch.view().topics
         assert (row.messages, row.p50) == (1, None)
@@ -64,7 +64,7 @@ async def test_what_is_made_only_for_listeners_is_not_listened_to() -> None:
     network = LocalNetwork()
     bus = network.bus("camera")
     made = {key: bus.writer(topic) for key, topic in all_topics().items() if isinstance(topic, Topic)}
-    async with Watch(network.bus("top"), CLOCK) as watch:
+    async with CellMonitor(network.bus("top"), CLOCK) as watch:
         assert {key for key, writer in made.items() if not writer.matched} == set(on_demand())
         watch.count(counted("viewer", {"detection_image": 0}), 1.0)
         watch.count(counted("viewer", {"detection_image": 10}), 2.0)
@@ -77,7 +77,7 @@ async def test_services_show_what_their_transport_counted() -> None:
     network = LocalNetwork()
     bus = network.bus("vision")
     await bus.ready()
-    async with Watch(network.bus("top"), CLOCK) as watch:
+    async with CellMonitor(network.bus("top"), CLOCK) as watch:
         watch.count(counted("vision", {"camera/image_raw": 0}), 1.0)
         watch.count(counted("vision", {"camera/image_raw": 20}, dropped={"a": 1, "b": 2}, invalid={"a": 4}), 3.0)
         (row,) = watch.view().services
@@ -90,7 +90,7 @@ async def test_services_show_what_their_transport_counted() -> None:
 async def test_key_of_ones_own_is_listened_to_once_somebody_reads_it() -> None:
     network = LocalNetwork()
     writer = network.bus("mine").raw_writer("test/my/key", "", "event")
-    async with Watch(network.bus("top"), CLOCK) as watch:
+    async with CellMonitor(network.bus("top"), CLOCK) as watch:
         writer.put(b"lost")
         watch.count(counted("mine", {"my/key": 1, "param/mine": 2}), 1.0)
         writer.put(b"heard")
@@ -101,7 +101,7 @@ async def test_key_of_ones_own_is_listened_to_once_somebody_reads_it() -> None:
 @pytest.mark.parametrize("key", ["my//key", "/key", "**", "a b", ""])
 async def test_counts_of_what_is_no_key_are_no_end_of_what_others_count(key: str) -> None:
     network = LocalNetwork()
-    async with Watch(network.bus("top"), CLOCK) as watch:
+    async with CellMonitor(network.bus("top"), CLOCK) as watch:
         watch.count(counted("mine", {key: 1, "my/key": 1}), 1.0)
         network.bus("mine").raw_writer("test/my/key", "", "event").put(b"heard")
         assert [row.topic for row in watch.view().topics] == ["my/key"]
@@ -153,7 +153,7 @@ def test_view_is_json() -> None:
 
 async def test_keys_that_somebody_makes_up_are_listened_to_up_to_a_number() -> None:
     network = LocalNetwork()
-    async with Watch(network.bus("top"), CLOCK) as watch:
+    async with CellMonitor(network.bus("top"), CLOCK) as watch:
         for number in range(10):
             watch.count(counted(f"liar_{number}", {f"mine/{number}/{i}": 1 for i in range(200)}), 1.0)
         assert len(watch._hearing) == MOST_KEYS

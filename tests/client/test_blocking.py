@@ -13,15 +13,15 @@ from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 
 import pytest
 
-from common.client.blocking import Blocking, Cell, Loop, called
+from common.client.blocking import Blocking, Cell, LoopThread, called
 from common.errors import ZencellError
 
 pytestmark = pytest.mark.timeout(30)
 
 
 @pytest.fixture
-def loop() -> Iterator[Loop]:
-    made = Loop()
+def loop() -> Iterator[LoopThread]:
+    made = LoopThread()
     yield made
     made.end()
     assert made.ended and not any(thread.name == "zencell" for thread in threading.enumerate())
@@ -60,7 +60,7 @@ class Thing:
             self.ended = True
 
 
-def test_what_is_awaited_is_called_and_its_errors_are_raised_where_it_was(loop: Loop) -> None:
+def test_what_is_awaited_is_called_and_its_errors_are_raised_where_it_was(loop: LoopThread) -> None:
     thing = Blocking(loop, Thing())
     assert thing.twice(3) == 6 and thing.twice.__doc__ == "Twice of it." and thing.__doc__ == "Says things."
     assert "twice" in dir(thing)
@@ -70,7 +70,7 @@ def test_what_is_awaited_is_called_and_its_errors_are_raised_where_it_was(loop: 
         thing.thrice()
 
 
-def test_async_for_is_for_and_is_closed_when_it_is_left(loop: Loop) -> None:
+def test_async_for_is_for_and_is_closed_when_it_is_left(loop: LoopThread) -> None:
     thing = Thing()
     assert list(Blocking(loop, thing).count(3)) == [0, 1, 2]
     thing.left = False
@@ -79,7 +79,7 @@ def test_async_for_is_for_and_is_closed_when_it_is_left(loop: Loop) -> None:
     assert thing.left
 
 
-def test_async_with_is_with_also_when_it_ends_by_an_error(loop: Loop) -> None:
+def test_async_with_is_with_also_when_it_ends_by_an_error(loop: LoopThread) -> None:
     thing = Thing()
     with Blocking(loop, thing).block() as value:
         assert value == "inside" and thing.entered
@@ -90,7 +90,7 @@ def test_async_with_is_with_also_when_it_ends_by_an_error(loop: Loop) -> None:
 
 
 @pytest.mark.parametrize("when", ["before", "as it is entered"])
-def test_ctrl_c_as_a_block_is_entered_leaves_it(loop: Loop, monkeypatch: pytest.MonkeyPatch, when: str) -> None:
+def test_ctrl_c_as_a_block_is_entered_leaves_it(loop: LoopThread, monkeypatch: pytest.MonkeyPatch, when: str) -> None:
     thing, wait = Thing(), loop.wait
     thing.entered = False
 
@@ -115,7 +115,7 @@ def test_ctrl_c_as_a_block_is_entered_leaves_it(loop: Loop, monkeypatch: pytest.
     assert called(loop, thing.twice, 4) == 8, "and the loop goes on"
 
 
-def test_ctrl_c_cancels_what_is_waited_for_and_waits_for_its_end(loop: Loop) -> None:
+def test_ctrl_c_cancels_what_is_waited_for_and_waits_for_its_end(loop: LoopThread) -> None:
     thing = Thing()
     threading.Timer(0.2, lambda: signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)).start()
     with pytest.raises(KeyboardInterrupt):
@@ -124,7 +124,7 @@ def test_ctrl_c_cancels_what_is_waited_for_and_waits_for_its_end(loop: Loop) -> 
     assert called(loop, thing.twice, 4) == 8, "and the loop goes on"
 
 
-def test_ctrl_c_while_the_loop_is_busy_is_no_different(loop: Loop) -> None:
+def test_ctrl_c_while_the_loop_is_busy_is_no_different(loop: LoopThread) -> None:
     thing = Thing()
     loop._loop.call_soon_threadsafe(time.sleep, 0.5)
     threading.Timer(0.1, lambda: signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)).start()
@@ -134,7 +134,7 @@ def test_ctrl_c_while_the_loop_is_busy_is_no_different(loop: Loop) -> None:
 
 
 def test_who_waits_in_another_thread_is_told_when_the_cell_is_closed() -> None:
-    loop, told = Loop(), list[str]()
+    loop, told = LoopThread(), list[str]()
 
     def wait() -> None:
         try:
@@ -152,7 +152,7 @@ def test_who_waits_in_another_thread_is_told_when_the_cell_is_closed() -> None:
         called(loop, Thing().twice, 1)
 
 
-def test_an_iterator_that_is_collected_as_garbage_on_the_loops_own_thread_holds_nobody_up(loop: Loop) -> None:
+def test_an_iterator_that_is_collected_as_garbage_on_the_loops_own_thread_holds_nobody_up(loop: LoopThread) -> None:
     thing = Thing()
     kept = {"numbers": Blocking(loop, thing).count(100)}
     next(kept["numbers"])

@@ -15,12 +15,12 @@ import pytest
 
 from common import topics
 from common.client import arm
-from common.client.arm import NotJogged
+from common.client.arm import JogFailed
 from common.client.cell import Cell
 from common.client.frames import poses
 from common.client.goals import any_of, pose, region, through
-from common.client.hearing import NothingHeard
 from common.client.operator_motion import MotionFailed
+from common.client.subscriptions import NothingReceived
 from common.config import load_cell
 from common.errors import ConfigError, DecodeError, NoResponder, RemoteError, UnknownName, ZencellError
 from common.messages import (
@@ -177,7 +177,7 @@ def test_stop_of_ones_own_is_ended_by_the_next_motion_and_that_of_others_is_not(
         assert (await cell.gripper.open()).state == "succeeded"
         other = Cell.on(cell.bus, owner="other")
         for seconds in (0.2, 1.0):
-            with pytest.raises(NotJogged, match="lunch"):
+            with pytest.raises(JogFailed, match="lunch"):
                 await other.arm.jog(linear=(0.0, 0.0, 0.1), seconds=seconds)
         stop = cell.bus.client(topics.MOTION_STOP)
         await stop.call(StopRequest(owner="another", reason="in the way"))
@@ -198,7 +198,7 @@ def test_jog_of_a_program_that_was_held_up_says_that_its_words_came_too_late(mon
             monkeypatch.setattr(arm, "JOG_PERIOD", 1.0)  # longer than the arm goes on without a word
 
         holding = asyncio.create_task(hold_up())
-        with pytest.raises(NotJogged, match="free; words of this program came too late"):
+        with pytest.raises(JogFailed, match="nobody's; words of this program came too late"):
             await cell.arm.jog(linear=(0.0, 0.0, 0.05), seconds=10.0)
         await holding
         assert np.abs(await cell.arm.velocities()).max() < 1e-3
@@ -394,7 +394,7 @@ def test_objects_are_those_that_were_seen_and_the_world_is_edited_by_name() -> N
             nearest = min(seen, key=lambda found: np.hypot(
                 found.pose.position.x - each.pose.position.x, found.pose.position.y - each.pose.position.y))
             assert nearest.pose.position.x == pytest.approx(each.pose.position.x, abs=0.01)
-        with pytest.raises(NothingHeard, match="of 3 objects, but of 2"):
+        with pytest.raises(NothingReceived, match="of 3 objects, but of 2"):
             await cell.objects(least=3, timeout=1.0)
         before = {each.id for each in truth}
         ids = await cell.world.add(0.45, -0.1)
@@ -470,7 +470,7 @@ def test_any_key_is_called_and_listened_to() -> None:
         ):
             with pytest.raises(error, match=words):
                 await asked
-        with pytest.raises(NothingHeard, match="scene_object_updates"):
+        with pytest.raises(NothingReceived, match="scene_object_updates"):
             async for _ in cell.listen("scene_object_updates", timeout=0.5):
                 pass
         async for packed in cell.listen("joint_states", plain=True):
@@ -494,7 +494,7 @@ def test_what_nobody_answers_ends_in_the_exception_that_says_so() -> None:
     async def program(cell: Cell) -> None:
         with pytest.raises(NoResponder, match="param/nobody"):
             await cell.call("param/nobody")
-        with pytest.raises(NothingHeard, match="nobody/camera_info"):
+        with pytest.raises(NothingReceived, match="nobody/camera_info"):
             await cell._ear.newest(replace(topics.CAMERA_INFO, key="nobody/camera_info"))
         with pytest.raises(RemoteError, match="controller"):
             await cell.arm.order("enable")
@@ -521,13 +521,13 @@ async def test_where_a_frame_was_when_it_was_last_told_of_is_not_where_it_is(mon
     for _ in range(2):  # also when the other one goes on moving
         where = asyncio.create_task(cell.tf("world", "link"))
         await told(3, "other")
-        with pytest.raises(NothingHeard, match="tf of link within"):
+        with pytest.raises(NothingReceived, match="tf of link within"):
             await where
     shown = poses(cell.bus, "world", "link", 0.01)
     where = asyncio.create_task(anext(shown))
     await told(4, "link", "other")
     assert (await where)["position"][0] == 4
-    with pytest.raises(NothingHeard, match="tf of link within"):
+    with pytest.raises(NothingReceived, match="tf of link within"):
         while True:
             await told(5, "other")
             assert (await anext(shown))["position"][0] == 4
@@ -557,7 +557,7 @@ def test_slip_of_the_hand_is_told_and_changes_nothing() -> None:
             (cell, "parm", "Cell.parm is not there: did you mean 'param'?"),
             (cell, "param", "Cell.param cannot be set"),
             (cell.arm, "speeed", "Arm.speeed is not there"), (cell.arm, "owner", "Arm.owner cannot be set"),
-            (cell.gripper, "wdith", "Hand.wdith"), (cell.task, "pausse", "did you mean 'pause'"),
+            (cell.gripper, "wdith", "Gripper.wdith"), (cell.task, "pausse", "did you mean 'pause'"),
             (cell.world, "ad", "'add'"), (cell.scene, "ad", "'add'"), (cell.param, "sett", "'set'"),
             (await cell.camera(), "imgae", "'image'"),
         ):

@@ -12,8 +12,8 @@ import pytest
 from applications.pick_place.topics import PICK_PLACE_STATUS, PickPlaceStatus
 from common.client import joining
 from common.client.cell import Cell
-from common.client.hearing import NothingHeard
-from common.client.joining import SeveralUp
+from common.client.joining import SeveralCellsRunning
+from common.client.subscriptions import NothingReceived
 from common.clock import Clock
 from common.config import load_cell, service_config
 from common.errors import UnknownName, ZencellError
@@ -29,7 +29,7 @@ LEFT = {"*": "left/*"}
 
 @pytest.mark.parametrize("host", ["a..b", "a" * 80])
 def test_nobody_listens_at_a_name_that_no_host_can_have(host: str) -> None:
-    assert not joining.somebody_listens(f"tcp/{host}:7489")
+    assert not joining.is_listening(f"tcp/{host}:7489")
 
 
 @pytest.fixture
@@ -52,7 +52,7 @@ def net(monkeypatch: pytest.MonkeyPatch) -> LocalNetwork:
             await bus.close()
             session.close()
 
-    monkeypatch.setattr(joining, "until_somebody_listens", listens)
+    monkeypatch.setattr(joining, "wait_for_listener", listens)
     monkeypatch.setattr(joining, "connect_to", connected)
     return network
 
@@ -68,7 +68,7 @@ async def test_the_only_cell_that_is_up_is_meant_and_one_of_several_must_be_name
         async with Cell() as cell:
             assert cell.name == "anna"
         async with running_service(net, stays, None, cell="bert"):
-            with pytest.raises(SeveralUp) as told:
+            with pytest.raises(SeveralCellsRunning) as told:
                 async with Cell():
                     pass
             assert str(told.value) == ("several cells are up: name one, by Cell(NAME) or --cell NAME; "
@@ -90,14 +90,15 @@ async def test_arm_is_stopped_and_task_started_under_the_keys_that_the_program_m
     ):
         stopped = await left.arm.stop("smoke")
         assert [stop.by for stop in (await left.arm.status()).interlocks] == ["anna"]
-        assert await joining.newest_heard(left.bus) == stopped.newest > 0 == await joining.newest_heard(right.bus)
+        assert await joining.newest_interlock(left.bus) == stopped.newest > 0
+        assert await joining.newest_interlock(right.bus) == 0
         assert left.bus.full_key(await left.task.topic()) == "two_arms/left/pick_place_status"
         await left.task.start()
         async with asyncio.timeout(5.0):
             while (await left.arm.status()).stopped:  # noqa: ASYNC110 - the start goes on to the executor
                 await asyncio.sleep(0.01)
         for asked in (right.arm.status(), right.services(), left.services()):
-            with pytest.raises(NothingHeard, match="two_arms/"):
+            with pytest.raises(NothingReceived, match="two_arms/"):
                 await asked
 
 

@@ -12,8 +12,8 @@ from applications.pick_place.topics import PICK_PLACE_STATUS, PickPlaceStatus
 from common import messages as m
 from common import topics
 from common.client.arm import Arm
-from common.client.hearing import Ear
 from common.client.operator_motion import MotionFailed, OperatorMotion
+from common.client.subscriptions import Subscriptions
 from common.errors import ConfigError
 from common.sources import wall_ns
 from common.transport.local import LocalNetwork
@@ -234,7 +234,7 @@ async def test_stop_that_the_same_person_said_before_the_motion_keeps_it_only_un
 async def test_stop_that_a_person_says_while_a_motion_of_a_program_of_theirs_is_planned_keeps_the_robot(
     cell: Cell
 ) -> None:
-    arm, note, since = Arm(Ear(cell.bus), "anna", cast(Any, None)), cell.note, wall_ns()
+    arm, note, since = Arm(Subscriptions(cell.bus), "anna", cast(Any, None)), cell.note, wall_ns()
 
     def stop_meanwhile(request: m.Message) -> None:
         note(request)

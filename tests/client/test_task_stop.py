@@ -8,8 +8,8 @@ import pytest
 
 from common import messages as m
 from common import topics
-from common.client.hearing import Ear
-from common.client.task import ArmOnly, TaskControl, TaskOnly
+from common.client.subscriptions import Subscriptions
+from common.client.task import ArmStopFailed, TaskControl, TaskStopFailed
 from common.errors import Refused, RemoteError, ZencellError
 from common.messages.execution import NOT_PERSISTED
 from common.transport.local import LocalNetwork
@@ -19,8 +19,9 @@ UNKEPT = m.Interlock(kind="stopped", by="ann", reason=f"{NOT_PERSISTED}: the dis
 
 @pytest.mark.parametrize(("arm", "task", "raised", "said"), [
     (True, True, None, ""),
-    (True, False, ArmOnly, "the arm is stopped and stays so until a start; the task did not hear.*from the task"),
-    (False, True, TaskOnly, "the task has stopped; who moves the arm did not take that.*from the arm"),
+    (True, False, TaskStopFailed,
+     "the arm is stopped and stays so until a start; the task did not hear.*from the task"),
+    (False, True, ArmStopFailed, "the task has stopped; who moves the arm did not take that.*from the arm"),
     (False, False, RemoteError, "from the task"),
 ])
 async def test_stop_says_who_of_arm_and_task_did_not_take_it(
@@ -44,14 +45,14 @@ async def test_stop_says_who_of_arm_and_task_did_not_take_it(
     cell.serve(topics.MOTION_STOP, stop_arm)
     cell.serve(topics.TASK_COMMAND, stop_task)
     await cell.ready()
-    control = TaskControl(Ear(person), "ann")
+    control = TaskControl(Subscriptions(person), "ann")
     if raised is None:
         assert (await control.stop()).state == "READY"
     else:
         with pytest.raises(raised, match=said):
             await control.stop()
     assert sorted(told) == ["arm", "task"], "both, whatever the other says"
-    assert ("disk is full" in control.unkept) == arm
+    assert ("disk is full" in control.unsaved) == arm
 
 
 @pytest.mark.parametrize("turns", range(1, 6))
@@ -70,7 +71,7 @@ async def test_stop_that_is_cancelled_reaches_both_all_the_same(turns: int) -> N
     cell.serve(topics.MOTION_STOP, stop_arm)
     cell.serve(topics.TASK_COMMAND, stop_task)
     await cell.ready()
-    control = TaskControl(Ear(person), "ann")
+    control = TaskControl(Subscriptions(person), "ann")
     stopping = asyncio.create_task(control.stop())
     for _ in range(turns):
         await asyncio.sleep(0)

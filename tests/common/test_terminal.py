@@ -10,11 +10,10 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from cli.operation.live import render
-from cli.operation.screen import Content
-from cli.operation.screens import PlainScreen
-from common.client.tables import services_table, topics_table
-from common.client.watching import ServiceRow, TopicRow
+from cli.session.live_table import render
+from cli.session.screens import Content, PlainScreen
+from cli.top import services_table, topics_table
+from common.client.monitor import ServiceRow, TopicRow
 from common.messages import ServiceStatus
 from common.process.log import log_to_stderr
 from common.terminal import echo, printable

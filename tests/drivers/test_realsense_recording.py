@@ -129,7 +129,7 @@ async def test_stamps_of_a_recording_are_of_now(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("options", "told"), [
     ({"file": "/nowhere/table.db3"}, "options.file: '/nowhere/table.db3' is no file"),
-    ({"file": __file__, "serial": "0123"}, "options.serial: '0123' is of a camera; there is a recording too"),
+    ({"file": __file__, "serial": "0123"}, "options.serial: '0123' selects a camera, but options.file "),
 ])
 async def test_recording_that_cannot_be_meant_ends_the_start_with_one_line(options: dict[str, str], told: str) -> None:
     with pytest.raises(ConfigError) as refused:
@@ -150,4 +150,4 @@ async def test_file_that_is_no_recording_or_lacks_depth_is_told_and_tried_again(
     async with running_service(net, real_depth_camera.run, config_of(file=str(file)), name="camera"):
         async with asyncio.timeout(30):
             line = (await log.next()).message
-    assert line.startswith(f"camera realsense: {file}: ") and "it is opened again in" in line and "\n" not in line
+    assert line.startswith(f"camera realsense: {file}: ") and "opening it again in" in line and "\n" not in line

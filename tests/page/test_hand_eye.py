@@ -99,8 +99,8 @@ def resting() -> Arm:
 
 
 @pytest.mark.parametrize(("encoding", "kind", "why"), [
-    ("mono8", np.uint8, "no marker is seen"), ("32FC1", np.float32, "'32FC1' is no colour picture"),
-    ("16UC1", np.uint16, "'16UC1' is no colour picture"), ("bgr8", None, "too few for 64x48")])
+    ("mono8", np.uint8, "no marker is seen"), ("32FC1", np.float32, "'32FC1' is no color image"),
+    ("16UC1", np.uint16, "'16UC1' is no color image"), ("bgr8", None, "too few for 64x48")])
 def test_picture_of_another_kind_is_no_view_and_says_why(encoding: str, kind: type | None, why: str) -> None:
     arm = resting()
     image = (array_to_image(np.zeros((48, 64), kind), encoding) if kind

@@ -11,7 +11,7 @@ from common import topics
 from common.application import all_topics
 from common.config import load_cell
 from common.errors import ConfigError
-from common.process.wiring import wiring_of
+from common.supervision.wiring import wiring_of
 from common.topics import Request, Topic
 from security.access import Rights, access_control, rights_of, rights_of_recorder, rights_of_supervisor
 from security.checking import allowances, require_current

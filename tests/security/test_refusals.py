@@ -13,7 +13,7 @@ from cli.main import app
 from common.config import load_cell
 from common.errors import ConfigError
 from common.supervision.launch import Launch
-from common.supervision.share import Share
+from common.supervision.multi_host import HostOptions
 from common.transport.credentials import ACCESS, ROUTER_NAME
 from security.certificates import Authority
 from security.requiring import require_secured
@@ -138,7 +138,7 @@ def test_rules_of_other_services_are_refused_with_what_is_different(refusal: Ref
 
 
 def test_only_what_this_host_starts_has_to_be_there(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    part = Share(only=["viewer,vision_detector"]).part_of(CELL)  # what the viewer declares depends on the whole cell
+    part = HostOptions(only=["viewer,vision_detector"]).part_of(CELL)  # the viewer's topics depend on the complete cell
     eye = folder.parent / "eye"
     eye.mkdir()
     for name in ("router", "panda.supervisor", "panda.viewer", "panda.vision_detector"):

@@ -11,8 +11,8 @@ from common.messages import Header, Pose, Vector3, WorldObject, WorldObjects
 from common.perception.image import array_to_image, image_to_array
 from common.perception.pinhole import Pinhole
 from common.process.in_process import running_service
-from common.process.wiring import wiring
 from common.sim.rendering import Renderer, draw
+from common.supervision.wiring import wiring
 from common.transport.local import LocalNetwork
 from services.camera_simulator import Config, run
 from tests.common.sim.spheres import spheres

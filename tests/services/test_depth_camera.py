@@ -27,9 +27,9 @@ from common.perception.image import image_to_array
 from common.perception.pinhole import Pinhole
 from common.planning.camera_obstacles import cloud_points
 from common.process.in_process import running_service
-from common.process.wiring import wiring
 from common.sim.interface import load_world
 from common.sim.rendering import Renderer
+from common.supervision.wiring import wiring
 from common.transport.local import LocalNetwork
 from common.transport.reader import Reader
 from services import depth_camera, real_depth_camera
@@ -207,11 +207,11 @@ async def test_a_camera_that_is_unplugged_is_told_and_comes_back(camera: FakeCam
     images, log = bus.reader(topics.DEPTH_CAMERA_IMAGE), bus.reader(topics.LOG)
     camera.plugged = False
     async with running_service(net, real_depth_camera.run, config_of(), name="camera"), asyncio.timeout(30):
-        await told(log, f"camera {DRIVER}: no RealSense is plugged in; it is opened again in 0.01 s")
+        await told(log, f"camera {DRIVER}: no RealSense is plugged in; opening it again in 0.01 s")
         camera.plugged = True
         first = await images.next()
         camera.plugged = False
-        await told(log, f"camera {DRIVER}: Frame didn't arrive within 1000; it is opened again in 0.01 s")
+        await told(log, f"camera {DRIVER}: Frame didn't arrive within 1000; opening it again in 0.01 s")
         camera.plugged = True
         again = await images.next()
         while camera.opened < 2:  # the newest picture from before may not have been read yet
@@ -236,13 +236,13 @@ async def test_mode_that_the_camera_does_not_have_is_told_with_what_was_asked(ca
     log = net.bus().reader(topics.LOG)
     asked = config_of((128, 96))
     async with running_service(net, real_depth_camera.run, asked, name="camera"), asyncio.timeout(30):
-        await told(log, f"camera {DRIVER}: 128x96 at 30 Hz: Couldn't resolve requests; it is opened again in")
+        await told(log, f"camera {DRIVER}: 128x96 at 30 Hz: Couldn't resolve requests; opening it again in")
 
 
 @pytest.mark.parametrize(("given", "told"), [
-    ({"driver": ""}, "services.camera.driver: '' must be one of oak, realsense, or the dotted name of a module of"),
+    ({"driver": ""}, "services.camera.driver: '' must be one of oak, realsense, or the dotted name of a module"),
     ({"driver": "my_pkg.nothing"}, "services.camera.driver: 'my_pkg.nothing' cannot be imported: No module named"),
-    ({"driver": "common.errors"}, "'common.errors' opens no cameras: it has no Options, open_camera"),
+    ({"driver": "common.errors"}, "'common.errors' is no camera driver: it lacks Options, open_camera"),
     ({"options": {"fps": 900}}, "services.camera.options.fps: 900 must be less than or equal to 90"),
     ({"options": {"speed": 3}}, "services.camera.options.speed: "),
 ])
@@ -412,11 +412,11 @@ async def test_oak_that_is_unplugged_is_told_and_comes_back(monkeypatch: pytest.
     fake.plugged = False
     async with running_service(net, real_depth_camera.run, config_of(driver="oak", options={}), name="camera"):
         async with asyncio.timeout(30):
-            await told(log, "camera oak: No available devices; it is opened again in")
+            await told(log, "camera oak: No available devices; opening it again in")
             fake.plugged = True
             await images.next()
             fake.plugged = False
-            await told(log, "camera oak: queue was closed; it is opened again in")
+            await told(log, "camera oak: queue was closed; opening it again in")
             fake.plugged = True
             while not fake.closed:
                 await images.next()

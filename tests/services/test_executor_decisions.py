@@ -8,8 +8,8 @@ import pytest
 
 from common import topics
 from common.clock import Clock
-from common.control import decisions, sole_use
-from common.control.record_file import RecordFile
+from common.control import interlocks
+from common.control.interlocks import InterlockFile
 from common.errors import ConfigError, RemoteError
 from common.kept_file import STANDING_VARIABLE, STATE_VARIABLE
 from common.messages import (
@@ -70,18 +70,18 @@ async def test_restarted_executor_holds_what_a_person_held_and_not_what_a_watchd
 
 async def test_log_says_whose_hold_stays_when_another_asks_to_let_go(caplog) -> None:
     def told():
-        return [text for text in (record.getMessage() for record in caplog.records) if "let go" in text]
+        return [text for text in (record.getMessage() for record in caplog.records) if "released" in text]
 
     async with executor() as person:
         await person.hold.call(HoldRequest(hold=True, owner="anna", reason="lunch"))
         await person.hold.call(HoldRequest(hold=False, owner="bert"))
-        assert len(told()) == 1 and told()[0].startswith("bert let go of nothing: asked to; still held since ")
+        assert len(told()) == 1 and told()[0].startswith("bert released no interlock: on request; still held since ")
         assert told()[0].endswith("by anna (lunch)")
         await person.hold.call(HoldRequest(hold=True, owner="bert"))
         await person.hold.call(HoldRequest(hold=False, owner="bert", reason="done"))
-        assert told()[1].startswith("bert let go of a part: done; still held since ")
+        assert told()[1].startswith("bert released some interlocks: done; still held since ")
         await person.hold.call(HoldRequest(hold=False, owner="anna", reason="done"))
-        assert told()[2:] == ["let go by anna: done"]
+        assert told()[2:] == ["released by anna: done"]
 
 
 async def test_log_names_both_when_somebody_starts_the_task_although_another_has_the_motion(caplog) -> None:
@@ -89,9 +89,9 @@ async def test_log_names_both_when_somebody_starts_the_task_although_another_has
         await person.bus.client(topics.MOTION_OWN).call(OwnRequest(act="take", owner="anna"))
         await person.hold.call(HoldRequest(hold=False, owner="bert", stops=True))
         await person.hold.call(HoldRequest(hold=False, owner="bert", stops=True, override=True))
-        told = [text for text in (record.getMessage() for record in caplog.records) if "has the task" in text]
+        told = [text for text in (record.getMessage() for record in caplog.records) if "starts the task" in text]
         assert len(told) == 1
-        assert told[0].startswith("bert has the task move the arm: the motion was owned by anna (operator)")
+        assert told[0].startswith("bert starts the task: the motion was owned by anna (operator)")
 
 
 async def test_stopped_arm_and_fingers_stay_so_through_restarts_until_somebody_starts_them(robot: RobotModel) -> None:
@@ -145,7 +145,7 @@ async def test_goal_that_is_stopped_before_it_comes_never_moves_also_after_a_res
     there = move(robot, home, home + 0.2)
     async with executor() as person:
         early = await person.stop.call(StopRequest(id="a", by="requester"))
-        assert early.error == "unknown_goal" and "refused if it comes" in early.message and not early.interlocks
+        assert early.error == "unknown_goal" and "it will be refused" in early.message and not early.interlocks
         await person.execute.call(person.asks(id="b", trajectory=move(robot, home, home + 0.5, 0.02)))
         await person.see(person.motion, lambda m: m.progress > 0.1)
         await person.stop.call(StopRequest(id="b", by="requester"))
@@ -180,10 +180,10 @@ async def test_executor_that_cannot_keep_what_persons_decide_does_not_start(
 async def test_second_executor_that_would_keep_the_stops_of_another_cell_in_one_file_is_refused(
     monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sole_use, "PATIENCE", 0.1)
+    monkeypatch.setattr(interlocks, "LOCK_TIMEOUT", 0.1)
     async with executor() as person:
         await person.stop.call(StopRequest(owner="anna"))
-        who = rf"ZENCELL_STATE: .* is in use by trajectory_executor of {CELL}, process {os.getpid()} on .+: a stop"
+        who = rf"ZENCELL_STATE: .* is in use by trajectory_executor of {CELL}, process {os.getpid()} on .+: each would"
         with pytest.raises(ConfigError, match=who) as caught:
             async with executor():
                 pass
@@ -195,8 +195,8 @@ async def test_second_executor_that_would_keep_the_stops_of_another_cell_in_one_
 
 
 async def test_stop_that_cannot_be_kept_says_so_everywhere_until_it_is(monkeypatch, caplog) -> None:
-    monkeypatch.setattr(decisions, "TRY_AGAIN", 0.01)
-    save, full = RecordFile.save, True
+    monkeypatch.setattr(interlocks, "RETRY_PERIOD", 0.01)
+    save, full = InterlockFile.save, True
 
     def refuse(self, record):
         if full:
@@ -207,7 +207,7 @@ async def test_stop_that_cannot_be_kept_says_so_everywhere_until_it_is(monkeypat
         return [record.getMessage() for record in caplog.records if "inhibits.json" in record.getMessage()]
 
     async with executor() as person:
-        monkeypatch.setattr(RecordFile, "save", refuse)
+        monkeypatch.setattr(InterlockFile, "save", refuse)
         for _ in range(2):
             answer = await person.stop.call(StopRequest(owner="anna", reason="smoke"))
             assert answer.message.count("inhibits.json cannot be written (No space left on device)") == 1
@@ -220,7 +220,7 @@ async def test_stop_that_cannot_be_kept_says_so_everywhere_until_it_is(monkeypat
         full = False
         status = await person.see(person.motion, lambda m: len(m.interlocks) == 2 and not m.unsaved)
         assert status.stopped.endswith("by anna (smoke)")
-        assert len(told()) == 2 and told()[1].endswith("is written again: what was decided outlives the executor")
+        assert len(told()) == 2 and told()[1].endswith("is written again: all interlocks persist")
         answer = await person.stop.call(StopRequest(owner="anna", reason="smoke"))
         assert "written" not in answer.message
     async with executor() as person:
@@ -262,7 +262,7 @@ async def test_arm_that_is_alone_finishes_its_motion_unless_told_otherwise(robot
 
 
 async def test_joint_states_go_on_while_a_hold_is_recorded_on_a_disk_that_is_stuck(monkeypatch) -> None:
-    async with executor() as person, blocked(monkeypatch, RecordFile, "save") as saving:
+    async with executor() as person, blocked(monkeypatch, InterlockFile, "save") as saving:
         asked = asyncio.create_task(person.hold.call(HoldRequest(hold=True, owner="anna"), timeout=60))
         await saving.wait()
         await goes_on(person)
@@ -283,7 +283,7 @@ async def test_a_stop_for_safety_outlives_the_executor_until_somebody_has_the_ar
         arm, told = stopping_arm.made[-1], person.bus.reader(topics.ROBOT_STATUS)
         assert (await person.see(told, lambda status: True)).mode == "protective_stop" and arm.stopped
         order = person.bus.client(topics.ROBOT_COMMAND)
-        with pytest.raises(RemoteError, match="before the controller began"):  # of a stop of before
+        with pytest.raises(RemoteError, match="before the executor began"):  # of a stop of before
             await order.call(RobotCommand(header=asked, act="recover", owner="tester"))
         assert arm.stopped
         answer = await order.call(RobotCommand(header=person.bus.header(), act="recover", owner="tester"))

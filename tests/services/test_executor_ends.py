@@ -21,7 +21,7 @@ from common.transport import ownership
 from common.transport.bus import Bus
 from common.transport.local import LocalNetwork
 from lab.loop import VirtualTimeLoop
-from lab.observed_arm import observe_set_points, with_observed_arm
+from lab.observers import observe_set_points, with_observed_arm
 from services import trajectory_executor
 from services.trajectory_executor import Config
 from tests.common.control.test_limiter import assert_within

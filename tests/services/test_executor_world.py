@@ -16,7 +16,7 @@ from common.messages import (
 from common.planning.ik import solve_ik
 from common.robot.model import RobotModel
 from common.robot.transforms import tool_down
-from common.scene.workspace import reach_reason
+from common.scene.workspace import unreachable_reason
 from common.sim.interface import StandingObject
 from common.sim.kinematic import KinematicWorld
 from common.sim.standing import Standing, StateFile, state_file
@@ -55,7 +55,7 @@ async def test_world_edits_show_in_the_truth_and_bad_ones_are_refused() -> None:
 
 
 async def test_impossible_layout_stops_it_with_the_place() -> None:
-    with pytest.raises(ConfigError, match=r"world\.objects: cannot be laid out: ball_1"):
+    with pytest.raises(ConfigError, match=r"world\.objects: cannot be placed: ball_1"):
         async with executor("world.balls=[[0.55, 0.17]]"):
             pass
 
@@ -88,7 +88,7 @@ async def test_random_layout_is_within_reach_also_when_seen_a_few_millimetres_of
         seen = await person.see(person.balls, lambda b: True)
     for p in (pose.position for pose in seen.poses):
         radius = float(np.hypot(p.x, p.y))
-        assert not reach_reason(robot, (p.x * (1 + off / radius), p.y * (1 + off / radius), p.z), cell.grasp)
+        assert not unreachable_reason(robot, (p.x * (1 + off / radius), p.y * (1 + off / radius), p.z), cell.grasp)
 
 
 # --- what is simulated survives the process that simulates it ---

@@ -26,10 +26,10 @@ from common.messages import (
 )
 from common.planning.pipeline import PlanningPipeline
 from common.process.in_process import running_service
-from common.process.planning_helper import HelperLost
-from common.process.wiring import wiring
+from common.process.planning_worker import WorkerDied
 from common.robot.model import RobotModel
 from common.robot.transforms import matrix_to_pose, tool_down
+from common.supervision.wiring import wiring
 from common.transport.local import LocalNetwork
 from services import motion_planner
 
@@ -167,7 +167,7 @@ class HelperDouble:
     async def plan(self, request, scene, current, width):
         self.asked.append(request.id)
         if self.lost:
-            raise HelperLost("the second planner has ended")
+            raise WorkerDied("the planning worker has ended")
         await asyncio.to_thread(self.together.wait, 20)
         return self.pipeline.plan(request, scene, current, None, (), width)
 

@@ -27,10 +27,10 @@ from common.messages import Header, JointState, TFMessage, Vector3, WorldEdit, W
 from common.perception.image import array_to_image, image_to_array
 from common.perception.pinhole import Pinhole
 from common.process.in_process import running_service
-from common.process.wiring import wiring
 from common.robot.transforms import rpy_to_matrix, transform
 from common.sim.kinematic import KinematicWorld
 from common.sim.objects import world_object
+from common.supervision.wiring import wiring
 from common.transport.local import LocalNetwork
 from services import contour_detector, depth_camera, duplicate_remover, pixel_to_world
 from services.robot_state_publisher import stamped

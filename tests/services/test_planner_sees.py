@@ -40,10 +40,10 @@ from common.planning.camera_obstacles import JointHistory, PointsOptions, cloud_
 from common.planning.collision import CollisionWorld, interpolate
 from common.planning.ik import solve_ik
 from common.process.in_process import running_service
-from common.process.persist import persist
-from common.process.wiring import wiring
+from common.process.timing import call_until_answered
 from common.robot.transforms import rpy_to_matrix, transform
 from common.sim.objects import world_object
+from common.supervision.wiring import wiring
 from common.transport.local import LocalNetwork
 from services import depth_camera, motion_planner
 from services.robot_state_publisher import stamped
@@ -196,7 +196,7 @@ async def test_who_asks_before_the_first_picture_asks_again() -> None:
                 raise RemoteError("motion/plan", "no_points", "nothing came yet")
             return "a plan"
 
-    assert await persist(Client(), ACROSS, 1.0, refused=lambda error: error, note=told.append) == "a plan"
+    assert await call_until_answered(Client(), ACROSS, 1.0, refused=lambda error: error, report=told.append) == "a plan"
     assert len(told) == 1
 
 

@@ -9,9 +9,9 @@ from common.clock import Clock
 from common.config import load_cell, service_config
 from common.messages import JointState, TFMessage
 from common.process.in_process import running_service
-from common.process.wiring import wiring
 from common.robot.model import RobotModel
 from common.robot.transforms import pose_to_matrix
+from common.supervision.wiring import wiring
 from common.transport.local import LocalNetwork
 from services import robot_state_publisher
 from services.robot_state_publisher import Config

@@ -100,7 +100,7 @@ async def test_it_follows_a_trajectory_and_signs_with_its_name(robot: RobotModel
 async def test_what_is_added_without_a_shape_is_like_the_first_object_of_the_world() -> None:
     async with executor() as bus:
         edit = bus.client(topics.WORLD_EDIT)
-        with pytest.raises(RemoteError, match="would reach into cube"):
+        with pytest.raises(RemoteError, match="would overlap cube"):
             await edit.call(WorldEdit(op="add", position=Vector3(x=0.5, y=0.0)))
         reply = await edit.call(WorldEdit(op="add", position=Vector3(x=0.5, y=0.2)))
         assert reply.ids == ["cube", "cube_1"]

@@ -14,7 +14,7 @@ from common import topics
 from common.clock import Clock
 from common.config import load_cell, service_config
 from common.kept_file import STANDING_VARIABLE
-from common.process import task_memory
+from common.process import task_runner
 from common.process.in_process import running_service
 from common.process.task_runner import run_task
 from common.transport.bus import Bus
@@ -117,7 +117,7 @@ async def test_release_positions_survive_a_restart(damaged, monkeypatch, tmp_pat
     saved.write_text(damaged)
     async with running_service(LocalNetwork(), run, CONFIG, name="smart_pick_place"):
         assert tasks[2].memory == ReleasePositions()
-    assert f"what was done before is not known: {saved} cannot be read: it is damaged" in caplog.text
+    assert f"the memory of the task is lost: {saved} cannot be read: it is damaged" in caplog.text
 
 
 async def test_initial_memory_is_used_and_saved_as_soon_as_possible(
@@ -126,7 +126,7 @@ async def test_initial_memory_is_used_and_saved_as_soon_as_possible(
     blocker = tmp_path / "standing"
     blocker.write_text("no folder")
     monkeypatch.setenv(STANDING_VARIABLE, str(blocker / "cell"))
-    monkeypatch.setattr(task_memory, "SAVE_AGAIN", 0.01)
+    monkeypatch.setattr(task_runner, "SAVE_RETRY", 0.01)
     initial, later = ReleasePositions(places=[(0.5, 0.2, 0.095)]), ReleasePositions(places=[(0.5, 0.3, 0.035)])
     tasks: list[PickPlace] = []
 

@@ -11,7 +11,7 @@ import pytest
 from applications.pick_place.topics import SCENE_BALLS
 from common import topics
 from common.clock import Clock
-from common.control.cycle import ControlCycle
+from common.control.executor import Executor
 from common.errors import ConfigError, UnknownName
 from common.messages import (
     ExecuteRequest,
@@ -22,8 +22,8 @@ from common.messages import (
     StopRequest,
 )
 from common.process.in_process import running_service
-from common.process.wiring import wiring
 from common.robot.model import RobotModel
+from common.supervision.wiring import wiring
 from common.transport.bus import Bus
 from common.transport.local import LocalNetwork
 from services import trajectory_executor
@@ -250,7 +250,7 @@ async def test_joint_states_go_on_while_a_long_trajectory_is_looked_at_and_a_sto
                                   accelerations=[0.0] * 7) for i in range(4000)]
     long = there.model_copy(update={"points": [*there.points, *still]})
     async with executor() as person:
-        async with blocked(monkeypatch, ControlCycle, "judge") as judging:
+        async with blocked(monkeypatch, Executor, "assess") as judging:
             asked = asyncio.create_task(person.execute.call(person.asks(id="long", trajectory=long)))
             await judging.wait()
             await goes_on(person)

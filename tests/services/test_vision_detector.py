@@ -13,8 +13,8 @@ from common.messages import Header, Image, TFMessage, TransformStamped
 from common.perception.image import array_to_image, image_to_array
 from common.perception.pinhole import Pinhole
 from common.process.in_process import running_service
-from common.process.wiring import wiring
 from common.robot.transforms import matrix_to_pose
+from common.supervision.wiring import wiring
 from common.transport.local import LocalNetwork
 from services.vision_detector import Config, run
 from tests.common.sim.spheres import draw_spheres

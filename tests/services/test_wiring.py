@@ -11,7 +11,7 @@ from common import topics
 from common.application import all_topics
 from common.config import Surroundings, World, load_cell, service_config
 from common.errors import ConfigError
-from common.process.wiring import Wiring, owned_in, require_one_owner, wiring
+from common.supervision.wiring import Wiring, owned_in, require_one_owner, wiring
 
 CELLS = {name: load_cell(name, ["services.viewer.port=0"]) for name in ("panda", "ur5")}
 SERVICES = [(cell, name) for cell, loaded in CELLS.items() for name in loaded.services]

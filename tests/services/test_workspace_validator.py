@@ -15,8 +15,8 @@ from common.config import Grasp, Surroundings, load_cell
 from common.messages import Header, Marker, MarkerArray, Pose, TFMessage, TransformStamped, Vector3
 from common.perception.pinhole import Pinhole
 from common.process.in_process import running_service
-from common.process.wiring import wiring
 from common.robot.transforms import matrix_to_pose
+from common.supervision.wiring import wiring
 from common.transport.local import LocalNetwork
 from services.workspace_validator import Config, run
 
@@ -194,5 +194,5 @@ async def test_frame_with_too_many_detections_is_dropped_and_reported():
         rig.found.put(seen(*crowd, stamp=2_000))
         line = await asyncio.wait_for(reported.get(), 10)
         log.removeHandler(listening)
-        assert line.startswith("a frame of detections left out: 300 objects in it are more than")
+        assert line.startswith("frame of detections skipped: 300 objects in it are more than")
         await rig.answer(seen((0.45, -0.2, 0.03), stamp=3_000), 1)

@@ -5,7 +5,7 @@ from functools import cache
 import pytest
 
 from common import topics
-from common.client.joining import newest_heard
+from common.client.joining import newest_interlock
 from common.config import Cell, load_cell
 from common.errors import ConfigError
 from common.messages import StopRequest, TaskCommand
@@ -67,12 +67,12 @@ def test_run_that_a_person_stops_for_good_ends_with_the_robot_at_rest():
 
 def test_newest_stop_is_heard_of_before_a_start_is_asked_for():
     async def visit(bus: Bus) -> None:
-        assert await newest_heard(bus) == 0
+        assert await newest_interlock(bus) == 0
         stopped = await bus.client(topics.MOTION_STOP).call(StopRequest(owner="anna"))
         await until(bus.reader(topics.MOTION_STATUS), lambda said: bool(said.interlocks))
-        assert await newest_heard(bus) == stopped.newest > 0
+        assert await newest_interlock(bus) == stopped.newest > 0
         await bus.client(topics.TASK_COMMAND).call(TaskCommand(command="start", acknowledged=stopped.newest - 1))
-        assert await newest_heard(bus) == stopped.newest, "a start that is late lets go of nothing"
+        assert await newest_interlock(bus) == stopped.newest, "a start that is late lets go of nothing"
         await bus.client(topics.TASK_COMMAND).call(TaskCommand(command="start", acknowledged=stopped.newest))
 
     assert Simulation(cell_of("panda"), 1, visit=visit).run().ok

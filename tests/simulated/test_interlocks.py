@@ -103,7 +103,7 @@ def test_hold_of_a_person_and_the_speed_outlive_executor_and_task_and_nobody_els
         assert "by anna" in (await until(status, lambda s: s.paused and "found held" in s.message)).message
         await assert_rests(cell, bus)
         for said in ("resume", "start"):
-            with pytest.raises(RemoteError, match=r"held since .* by anna .*: only they let go of it, unless"):
+            with pytest.raises(RemoteError, match=r"held since .* by anna .*: only they can release it, unless"):
                 await command(bus, said, "bert")
         with pytest.raises(MotionFailed):
             await OperatorMotion(bus, [], "bert").move(JointGoal(named="home"))

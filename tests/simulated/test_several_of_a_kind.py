@@ -12,10 +12,11 @@ from common import topics
 from common.config import load_cell, service_config
 from common.errors import ConfigError
 from common.process.in_process import running_service
-from common.process.wiring import owned_in, require_one_owner, wiring_of
+from common.supervision.wiring import owned_in, require_one_owner, wiring_of
 from common.transport import ownership
 from common.transport.local import LocalNetwork
-from lab.simulation import Simulation, Trace
+from lab.observers import Trace
+from lab.simulation import Simulation
 from recording.capture import CustomTopics
 from recording.reader import Recording
 from services import camera_simulator

@@ -7,11 +7,10 @@ ROOT = Path(__file__).resolve().parents[2]
 ROOMS = ("common/control", "common/hardware", "common/planning", "common/perception", "common/robot", "common/scene",
          "common/sim", "common/tasks", "applications")
 SINGLE = (
-    "common/clock.py", "common/process/task_runner.py", "common/process/orders.py", "common/process/persist.py",
-    "common/process/pace.py",
+    "common/clock.py", "common/process/task_runner.py", "common/process/task_requests.py", "common/process/timing.py",
     "common/transport/bus.py", "common/transport/reader.py", "common/transport/writer.py",
     "common/transport/requests.py", "common/transport/tokens.py", "common/transport/trace.py",
-    "common/supervision/supervisor.py", "common/supervision/operation.py",
+    "common/supervision/supervisor.py", "common/supervision/lifecycle.py",
 )
 REAL = tuple(f"common/{name}.py" for name in (  # of real arms and cameras, which no simulation has
     "hardware/driver", "hardware/driver_process", "hardware/driven_gripper"))

@@ -14,13 +14,14 @@ from unittest.mock import patch
 
 import typer
 
-from cli.operation.operation import Operation
+from cli.session.session import CellSession
 from common import topics
 from common.application import find_application
 from common.config import Cell, load_cell
 from common.messages import TaskCommand
 from common.transport.bus import Bus
-from lab.simulation import Outcome, Simulation, Trace
+from lab.observers import Trace
+from lab.simulation import Outcome, Simulation
 from recording.capture import CustomTopics
 from recording.report.aggregator import Collector, RunAggregator
 from recording.report.summary import describe
@@ -56,7 +57,7 @@ class SimulatedCell:
             loaded.name, find_application(loaded.application), robot=loaded.robot, seed=loaded.run.seed,
             containers=list(loaded.world.containers))
         trace = None if record is None else Trace(record, {"cell": loaded.name}, CustomTopics.of(loaded))
-        self._simulation = Simulation(loaded, seed, limit=limit, trace=trace, tell=self.lines.append, visit=self._look)
+        self._simulation = Simulation(loaded, seed, limit=limit, trace=trace, log=self.lines.append, visit=self._look)
         self.outcome: Outcome = self._simulation.run()
         if trace is not None:
             trace.close("simulated")
@@ -94,11 +95,11 @@ class SimulatedCell:
 @contextmanager
 def no_processes() -> Iterator[None]:
     """Inside, `zencell run` in this process runs its cell on the virtual clock; all the rest of it is as it is."""
-    with patch.object(Operation, "run_to_end", _run_to_end):
+    with patch.object(CellSession, "run_to_end", _run_to_end):
         yield
 
 
-def _run_to_end(operation: Operation) -> int:
+def _run_to_end(operation: CellSession) -> int:
     async def work(bus: Bus) -> None:
         collector = Collector(bus, operation.fold, 0.0, lambda line: None)
         async with beside(collector.run()):

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from common.perception.camera_file import CameraFile
-from common.perception.image_sources import pictures
+from common.perception.image_sources import read_images
 from common.robot.transforms import invert, matrix_to_rpy, transform
 from tools.calibration.board import Board, BoardDetection, NoBoard
 from tools.calibration.intrinsics import CalibrationFailed, ViewResidual
@@ -124,7 +124,7 @@ def detect_boards_in(source: str, board: Board, camera: CameraFile, most: int, s
     """
     seen: list[BoardDetection] = []
     why: list[str] = []
-    for name, picture in pictures(source, (camera.width, camera.height), seconds):
+    for name, picture in read_images(source, (camera.width, camera.height), seconds):
         found, reasons = detect_boards(board, [(f"{source}: {name}", picture)], camera)
         seen, why = seen + found, why + reasons
         if len(seen) >= most:

@@ -72,7 +72,7 @@ def _per_view(views: list[ViewResidual]) -> str:
     return "worst: " + ", ".join(f"{view.name} {view.rms:.3f}" for view in worst)
 
 
-# A camera file with what was found, and with how: so that it can be judged later."""
+# A camera file with what was found, and with how: so that it can be judged later.
 
 def camera_from_intrinsics(found: IntrinsicCalibration, source: str, board: str) -> CameraFile:
     """A camera whose intrinsics were found with pictures of a source, of a board that words describe."""

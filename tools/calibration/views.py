@@ -212,7 +212,7 @@ def _write(folder: Path, said: JointsFile) -> None:
         raise ConfigError("FOLDER", str(folder), f"cannot be written: {error.strerror}") from None
 
 
-# Keeps views of a calibration board from a cell that is up, while a person or a script moves the arm."""
+# Keeps views of a calibration board from a cell that is up, while a person or a script moves the arm.
 
 FIRST_PICTURE = 5.0  # [s] of wall time in which one comes
 

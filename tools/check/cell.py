@@ -14,7 +14,7 @@ from common.config import Cell, Surroundings
 from common.errors import ConfigError, ZencellError
 from common.hardware.loading import is_simulated
 from common.sim.interface import require_simulator
-from common.supervision.launch import python_module
+from common.supervision.launch import module_command
 from tools.check import Finding, refusal
 
 if TYPE_CHECKING:
@@ -130,7 +130,7 @@ async def warnings_in_subprocess(cell: Cell, environ: Mapping[str, str]) -> list
         QuickCheckFailed: it failed; what it said of that is on stderr.
     """
     process = await asyncio.create_subprocess_exec(
-        *python_module(__name__), stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE, env=environ,
+        *module_command(__name__), stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE, env=environ,
         start_new_session=True,  # Ctrl-C is for us
     )
     try:

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 
 from common.config import GripperConfig, RobotConfig
 from common.robot.finger_joints import driven_position
-from common.robot.merging import merged_urdf
+from common.robot.urdf import merged_urdf
 from tools.check import Finding, error, warning
 
 TURNS, SLIDES = ("revolute", "continuous"), ("prismatic",)

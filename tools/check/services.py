@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from common.config import Cell
 from common.errors import ConfigError, ZencellError
-from common.supervision.wired import Unwired, wired
+from common.supervision.wiring import WiringFailed, wire_service
 from common.transport import ownership
 from common.transport.ownership import SHARED, Owner
 from tools.check import Finding, error, refusal, warning
@@ -34,10 +34,10 @@ def wiring(cell: Cell) -> Iterator[Finding]:
                     f"name one of {', '.join(cell.services)}")
     for entry in cell.services.values():
         try:
-            each = wired(cell, entry)
+            each = wire_service(cell, entry)
         except ConfigError as told:
             yield refusal(told)
-        except Unwired as told:
+        except WiringFailed as told:
             yield error(str(told), "correct the service, or its parameters", refused=True)
         except ZencellError as told:
             yield error(f"services.{entry.name}: {told}", "correct it", refused=True)

@@ -82,7 +82,7 @@ def _pictures(
 
 
 def _seen(camera: Pinhole, points: Array) -> NDArray[np.bool_]:
-    return camera.in_picture(camera.project(points))
+    return camera.in_image(camera.project(points))
 
 
 def _corners(thing: ObjectConfig, solid: Solid) -> Array:

@@ -30,9 +30,9 @@ class Skew:
 
 def clocks(endpoint: str) -> Iterator[Finding]:
     """Whether the clocks agree, for each cell that is up at an endpoint."""
-    from common.client.joining import somebody_listens
+    from common.client.joining import is_listening
 
-    if not somebody_listens(endpoint):
+    if not is_listening(endpoint):
         return
     for cell, skews in sorted(asyncio.run(_all_skews(endpoint)).items()):
         yield from judged(cell, skews)

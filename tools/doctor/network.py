@@ -52,9 +52,9 @@ def page() -> Finding:
 
 def versions(endpoint: str) -> Iterator[Finding]:
     """Whether the cells that are up speak the same version of the messages, and are run by this Python."""
-    from common.client.joining import somebody_listens
+    from common.client.joining import is_listening
 
-    if not somebody_listens(endpoint):
+    if not is_listening(endpoint):
         return
     for cell, problem in sorted(asyncio.run(schema_problems(endpoint)).items()):
         if problem:

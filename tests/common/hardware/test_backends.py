@@ -41,7 +41,7 @@ def test_unknown_backend_names_the_choices() -> None:
         find_backend(robot("mok"))
 
 
-@pytest.mark.parametrize("name", ["no.such.module", "common.control.controller"])
+@pytest.mark.parametrize("name", ["no.such.module", "common.control.trajectory_controller"])
 def test_module_that_is_no_backend_is_refused(name: str) -> None:
     with pytest.raises(ConfigError, match=r"robot\.hardware\.backend: "):
         find_backend(robot(name))

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from common.control.checks import Tolerances, checked_trajectory
 from common.control.limiter import Limiter
+from common.control.trajectory import Tolerances, checked_trajectory
 from common.errors import Refused
 from common.hardware.interface import Limits
 from common.planning.pipeline import PlanningPipeline

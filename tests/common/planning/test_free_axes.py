@@ -23,7 +23,7 @@ from common.planning.pipeline import PlanningPipeline
 from common.planning.problem import Region
 from common.robot.model import RobotModel
 from common.robot.transforms import matrix_to_pose, tool_down
-from common.scene.workspace import WorkspaceBounds, reach_reason
+from common.scene.workspace import WorkspaceBounds, unreachable_reason
 from tests.small_arms import nodding, scara
 from tools.robot_setup.proposal import draft
 
@@ -105,11 +105,11 @@ def test_a_place_that_asks_for_more_tilt_is_refused_with_the_least_that_it_takes
     upright = Grasp(approach_clearance=0.04, lift_height=0.06, max_tilt=0.0)
     tilted = upright.model_copy(update={"max_tilt": 1.0})
     place = (0.70, 0.1, 0.03)
-    told = reach_reason(robot, place, upright, ANYWHERE)
+    told = unreachable_reason(robot, place, upright, ANYWHERE)
     assert "with 4 joints the arm cannot choose tilt there: nearest is " in told and "0 deg are allowed" in told
     assert 3 < float(told.partition("nearest is ")[2].split()[0]) < 57
-    assert reach_reason(robot, place, tilted, ANYWHERE) == ""
-    assert "the arm reaches" in reach_reason(robot, (1.5, 0.0, 0.03), tilted, ANYWHERE)
+    assert unreachable_reason(robot, place, tilted, ANYWHERE) == ""
+    assert "the arm reaches" in unreachable_reason(robot, (1.5, 0.0, 0.03), tilted, ANYWHERE)
 
 
 def test_arms_that_can_choose_point_down_unless_something_else_is_set() -> None:

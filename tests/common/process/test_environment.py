@@ -33,8 +33,8 @@ def test_what_the_environment_says_stays():
 
 
 HOLDS = """
-from common.process.environment import give_back, share_memory
-share_memory()
+from common.process.environment import release_free_memory, use_single_memory_arena
+use_single_memory_arena()
 def held():
     return int(open("/proc/self/statm").read().split()[1]) * 4096 / 1e6
 large, small = [], []
@@ -44,7 +44,7 @@ for _ in range(3):  # what is that large comes from among the rest once the firs
         small.append(bytearray(3000))
     large.clear()
 before = held()
-give_back()
+release_free_memory()
 print(before - held())
 """
 

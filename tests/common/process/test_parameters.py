@@ -15,8 +15,8 @@ from common.config import Motion, Parameters, Tunable, load_cell, service_config
 from common.errors import NoResponder, RemoteError
 from common.messages import ParameterReply, ParameterRequest
 from common.process.in_process import running_service
-from common.process.pace import Pace
-from common.process.wiring import wiring
+from common.process.timing import LoopRate
+from common.supervision.wiring import wiring
 from common.topics import parameters_of
 from common.transport.bus import Bus, Client
 from common.transport.local import LocalNetwork
@@ -90,7 +90,7 @@ async def test_a_dry_run_and_what_is_so_already_change_and_log_nothing(rig: Rig)
     assert (await rig.ask(services__toy__rate=20, dry_run=True))["services.toy.rate"] == 10.0
     await rig.ask(services__toy__rate=10)
     await rig.ask(services__toy__size=4)
-    assert await rig.lines(2) == ["services.toy.size: 3 -> 4 (by somebody)", "now at 10 Hz"]
+    assert await rig.lines(2) == ["services.toy.size: 3 -> 4 (by unknown operator)", "now at 10 Hz"]
 
 
 async def test_a_dry_run_is_refused_as_the_change_would_be(rig: Rig) -> None:
@@ -142,7 +142,7 @@ def test_the_request_of_any_service_is_found_by_its_key() -> None:
 async def test_a_pace_that_waits_for_long_goes_on_when_its_rate_is_raised() -> None:
     rate = 1e-6
     bus = LocalNetwork().bus("toy")
-    pace = Pace(bus, lambda: rate)
+    pace = LoopRate(bus, lambda: rate)
     waiting = asyncio.create_task(pace.wait())
     await asyncio.sleep(0)
     bus.parameters_changed()  # of something else
@@ -156,7 +156,7 @@ async def test_a_pace_that_waits_for_long_goes_on_when_its_rate_is_raised() -> N
 
 async def test_turns_of_a_pace_lie_on_a_grid_and_those_that_were_missed_are_left_out() -> None:
     loop = asyncio.get_running_loop()
-    pace = Pace(LocalNetwork().bus("toy"), lambda: 1000.0)
+    pace = LoopRate(LocalNetwork().bus("toy"), lambda: 1000.0)
     await pace.wait()
     first = pace.due
     for _ in range(5):

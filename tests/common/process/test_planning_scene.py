@@ -21,8 +21,8 @@ SEEN = CollisionObject(id="ball", role="target", shape="sphere", dimensions=[0.0
 POLE = SceneEdit(op="add", id="pole", shape="cylinder", dimensions=[0.02, 1.0], pose=Pose(), owner="anna")
 
 
-async def keeper(bus: Bus, config: None) -> None:
-    """Sees a ball, always the same."""
+async def writer(bus: Bus, config: None) -> None:
+    """Publish a scene with one ball."""
     out = SceneWriter(bus)
     await out.begin(PlanningScene(header=Header(stamp=1), objects=[SEEN]))
     await bus.ready()
@@ -35,40 +35,40 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-async def test_added_solid_stands_beside_what_is_perceived_and_is_there_again_after_a_restart(
+async def test_added_solid_is_published_with_the_perceived_scene_also_after_a_restart(
     caplog: pytest.LogCaptureFixture
 ) -> None:
     net = LocalNetwork()
     bus = net.bus("tester", cell="test")
     scenes, edits = bus.reader(topics.PLANNING_SCENE), bus.client(topics.SCENE_EDIT)
-    async with running_service(net, keeper, None, name="keeper"):
-        assert [thing.id for thing in (await scenes.next()).objects] == ["ball"]
+    async with running_service(net, writer, None, name="writer"):
+        assert [each.id for each in (await scenes.next()).objects] == ["ball"]
         assert (await edits.call(POLE, 5.0)).ids == ["added/pole"]
-        assert [thing.id for thing in (await scenes.next()).objects] == ["ball", "added/pole"]
-    with caplog.at_level(logging.WARNING, "keeper"):
-        async with running_service(net, keeper, None, name="keeper"):
-            assert [thing.id for thing in (await scenes.next()).objects] == ["ball", "added/pole"]
+        assert [each.id for each in (await scenes.next()).objects] == ["ball", "added/pole"]
+    with caplog.at_level(logging.WARNING, "writer"):
+        async with running_service(net, writer, None, name="writer"):
+            assert [each.id for each in (await scenes.next()).objects] == ["ball", "added/pole"]
             assert (await edits.call(SceneEdit(op="remove", id="pole"), 5.0)).ids == []
-            assert [thing.id for thing in (await scenes.next()).objects] == ["ball"]
-    assert "added by persons before: added/pole" in caplog.text
+            assert [each.id for each in (await scenes.next()).objects] == ["ball"]
+    assert "solids from an earlier session: added/pole" in caplog.text
 
 
-async def test_solid_that_cannot_be_kept_is_not_added(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_solid_is_not_added_if_it_cannot_be_saved(monkeypatch: pytest.MonkeyPatch) -> None:
     def full(self: object, record: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(KeptFile, "save", full)
     net = LocalNetwork()
     bus = net.bus("tester", cell="test")
-    async with running_service(net, keeper, None, name="keeper"):
-        with pytest.raises(RemoteError, match=r"No space left on device.*nothing was changed") as told:
+    async with running_service(net, writer, None, name="writer"):
+        with pytest.raises(RemoteError, match=r"No space left on device.*was not made") as refused:
             await bus.client(topics.SCENE_EDIT).call(POLE, 5.0)
-        assert told.value.code == "not_kept"
-        assert [thing.id for thing in (await bus.reader(topics.PLANNING_SCENE).next()).objects] == ["ball"]
+        assert refused.value.code == "not_kept"
+        assert [each.id for each in (await bus.reader(topics.PLANNING_SCENE).next()).objects] == ["ball"]
 
 
-async def test_keeper_that_cannot_know_what_was_added_does_not_start(folder: Path) -> None:
-    (folder / "test.keeper.added.json").write_text('{"solids": [{}]}')
-    with pytest.raises(ConfigError, match=r"planning_scene: .*test.keeper.added.json.* cannot be read: it is damaged"):
-        async with running_service(LocalNetwork(), keeper, None, name="keeper"):
-            pytest.fail("it was let in")
+async def test_service_does_not_start_if_its_added_solids_cannot_be_read(folder: Path) -> None:
+    (folder / "test.writer.added.json").write_text('{"solids": [{}]}')
+    with pytest.raises(ConfigError, match=r"planning_scene: .*test.writer.added.json.* cannot be read: it is damaged"):
+        async with running_service(LocalNetwork(), writer, None, name="writer"):
+            pytest.fail("it has started")

@@ -98,7 +98,7 @@ async def tell(net: LocalNetwork, *commands: str) -> str:
 async def test_person_is_told_that_what_they_said_was_kept_by_nobody_yet() -> None:
     net = LocalNetwork()
     async with running(net):
-        assert "does not outlive the task" in await tell(net, "stop")
+        assert "is lost when the task ends" in await tell(net, "stop")
         await (executor := Executor(net)).bus.ready()
         await executor.next()
         assert "outlive" not in await tell(net, "pause")

@@ -1,11 +1,17 @@
+"""Child processes: output, gate, exit codes, and the delay before a restart."""
+
 import asyncio
 import os
 import sys
 
-from common.supervision.child import LONGEST_LINE, TAIL_LINES, Child, describe_exit
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from common.supervision.child import LONGEST_LINE, TAIL_LINES, Backoff, Child, describe_exit
 
 
-async def lines_of(script: str, *, release: bool = False) -> tuple[Child, list[str], int]:
+async def run_child(script: str, *, release: bool = False) -> tuple[Child, list[str], int]:
     lines: list[str] = []
     child = Child("it", [sys.executable, "-c", script], os.environ, lambda name, line: lines.append(line))
     child.start()
@@ -16,40 +22,58 @@ async def lines_of(script: str, *, release: bool = False) -> tuple[Child, list[s
     return child, lines, code
 
 
-async def test_lines_of_both_streams_come_with_the_last_one_unfinished() -> None:
-    _, lines, code = await lines_of("import sys; print('a', flush=True); sys.stderr.write('b\\nc'); sys.exit(3)")
-    assert lines == ["a", "b", "c"]
-    assert code == 3
+async def test_lines_of_stdout_and_stderr_are_read_up_to_an_incomplete_last_line() -> None:
+    _, lines, code = await run_child("import sys; print('a', flush=True); sys.stderr.write('b\\nc'); sys.exit(3)")
+    assert (lines, code) == (["a", "b", "c"], 3)
 
 
-async def test_only_the_last_lines_are_kept() -> None:
-    child, lines, _ = await lines_of("for i in range(200): print(i)")
+async def test_tail_has_the_last_lines() -> None:
+    child, lines, _ = await run_child("for i in range(200): print(i)")
     assert len(lines) == 200
     assert list(child.tail) == [str(i) for i in range(200 - TAIL_LINES, 200)]
 
 
-async def test_endless_lines_and_bytes_that_are_no_text_do_no_harm() -> None:
+async def test_very_long_lines_are_cut_and_undecodable_bytes_are_replaced() -> None:
     script = "import sys; b = sys.stdout.buffer; b.write(b'x' * 1_000_000 + b'\\n\\xff\\xfe\\n'); b.flush()"
-    _, lines, _ = await lines_of(script)
+    _, lines, _ = await run_child(script)
     assert len(lines) == 2
     assert len(lines[0]) == LONGEST_LINE
 
 
-async def test_a_released_process_reads_one_line_and_the_end_of_its_parent_closes_it() -> None:
-    _, lines, code = await lines_of("import sys; print(repr(sys.stdin.readline()))", release=True)
-    assert lines == ["'go\\n'"]
-    assert code == 0
+async def test_release_writes_one_line_to_stdin() -> None:
+    assert (await run_child("import sys; print(repr(sys.stdin.readline()))", release=True))[1:] == (["'go\\n'"], 0)
 
 
-async def test_a_process_that_is_gone_can_be_told_anything() -> None:
-    child, _, _ = await lines_of("")
+async def test_calls_on_an_ended_process_have_no_effect() -> None:
+    child, _, _ = await run_child("")
     child.release()
     child.terminate()
     child.kill()
     assert child.pid is None
 
 
-def test_exit_codes_are_described() -> None:
-    assert describe_exit(1) == "exit code 1"
-    assert describe_exit(-9) == "killed by SIGKILL"
-    assert describe_exit(-250) == "killed by signal 250"
+@pytest.mark.parametrize(("code", "text"), [
+    (1, "exit code 1"), (70, "its event loop was stuck, exit code 70"), (-9, "killed by SIGKILL"),
+    (-250, "killed by signal 250"),
+])
+def test_exit_code_is_described(code: int, text: str) -> None:
+    assert describe_exit(code) == text
+
+
+def test_backoff_doubles_up_to_its_cap() -> None:
+    backoff = Backoff()
+    assert [backoff.after(1.0) for _ in range(8)] == [0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 5.0, 5.0]
+
+
+def test_backoff_starts_over_after_a_long_run() -> None:
+    backoff = Backoff()
+    for _ in range(5):
+        backoff.after(0.0)
+    assert backoff.after(10.0) == 0.1
+    assert backoff.after(9.9) == 0.2
+
+
+@given(st.lists(st.floats(min_value=0, max_value=100)))
+def test_backoff_stays_within_its_bounds(runs: list[float]) -> None:
+    backoff = Backoff()
+    assert all(0.1 <= backoff.after(run) <= 5.0 for run in runs)

@@ -1,3 +1,5 @@
+"""Command lines, environment and location of the router that a cell is launched with."""
+
 import os
 import socket
 import sys
@@ -8,23 +10,24 @@ import pytest
 from common.clock import Clock
 from common.config import ServiceEntry, load_cell
 from common.errors import ConfigError, ZencellError
-from common.supervision.launch import Launch, clock_of, place_of, require_free_port, require_modules
+from common.supervision.launch import Launch, clock_at_speed, require_free_port, require_modules, router_location
 from common.transport.endpoint import small_keys_renamed
 
 ENTRY = ServiceEntry(name="it", module="own.package.it")
 
 
-def test_a_service_is_told_all_that_the_person_asked_for() -> None:
+def test_command_of_a_service_has_all_options_of_the_launch() -> None:
     launch = Launch("my.yaml", ("a.b=1", "c=[2, 3]"), "w2", 5, 77)
-    command = launch.service_command(ENTRY)
-    assert command[1:] == [
+    assert launch.service_command(ENTRY)[1:] == [
         "-P", "-m", "own.package.it", "--cell", "my.yaml", "--set", "a.b=1", "--set", "c=[2, 3]",
         "--world", "w2", "--seed", "5", "--domain", "77", "--gate",
     ]
     assert launch.router_command()[-3:] == ["--domain", "77", "--gate"]
+    connected = Launch("panda", connect="tcp/10.0.0.1:7447", log_json=True).service_command(ENTRY)
+    assert connected[-4:] == ["--connect", "tcp/10.0.0.1:7447", "--gate", "--log-json"]
 
 
-def test_the_router_is_told_small_keys_that_the_cell_has_under_other_names() -> None:
+def test_router_gets_the_small_keys_that_a_cell_renames() -> None:
     cell = load_cell(str(Path(__file__).parents[2] / "data" / "two_cameras.yaml"))
     small = small_keys_renamed(entry.topics for entry in cell.services.values())
     sides = [f"{side}/{key}" for side in ("left", "right") for key in ("camera/camera_info", "detected_objects")]
@@ -33,25 +36,20 @@ def test_the_router_is_told_small_keys_that_the_cell_has_under_other_names() -> 
     assert small_keys_renamed(entry.topics for entry in load_cell("panda").services.values()) == []
 
 
-def test_with_an_endpoint_there_is_no_domain_to_go_to() -> None:
-    command = Launch("panda", connect="tcp/10.0.0.1:7447", log_json=True).service_command(ENTRY)
-    assert command[-4:] == ["--connect", "tcp/10.0.0.1:7447", "--gate", "--log-json"]
-
-
-def test_clock_and_packages_are_handed_down(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_environment_passes_on_clock_and_module_paths(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     clock = Clock(5.0)
     environment = Launch("panda", clock=clock).environment({"PYTHONPATH": "/opt/mine", "HOME": "/"})
     assert environment["HOME"] == "/"
-    handed = Clock.from_environment(environment)
-    assert (handed.speed, handed.epoch_ns) == (5.0, clock.epoch_ns)
+    received = Clock.from_environment(environment)
+    assert (received.speed, received.epoch_ns) == (5.0, clock.epoch_ns)
     project, *rest = environment["PYTHONPATH"].split(os.pathsep)
     assert (Path(project) / "common").is_dir()
     assert rest == ["/opt/mine", str(tmp_path)]
 
 
 @pytest.mark.parametrize(
-    ("domain", "connect", "environ", "place"),
+    ("domain", "connect", "environ", "location"),
     [
         (None, None, {}, (42, None)),
         (None, None, {"ZENCELL_DOMAIN": "7"}, (7, None)),
@@ -60,25 +58,23 @@ def test_clock_and_packages_are_handed_down(tmp_path: Path, monkeypatch: pytest.
         ("9", "tcp/h:2", {}, (42, "tcp/h:2")),
     ],
 )
-def test_options_win_over_the_environment(
-    domain: str | None, connect: str | None, environ: dict[str, str], place: tuple[int, str | None]
-) -> None:
-    assert place_of(domain, connect, environ) == place
+def test_options_take_precedence_over_the_environment(domain, connect, environ, location) -> None:
+    assert router_location(domain, connect, environ) == location
 
 
 @pytest.mark.parametrize(("domain", "connect"), [("233", None), ("-1", None), ("x", None), (None, "nowhere")])
-def test_a_place_that_is_none_is_refused(domain: str | None, connect: str | None) -> None:
+def test_bad_router_location_is_refused(domain: str | None, connect: str | None) -> None:
     with pytest.raises(ConfigError):
-        place_of(domain, connect, {})
+        router_location(domain, connect, {})
 
 
 @pytest.mark.parametrize("speed", [0.0, 0.09, 10.1, -1.0, float("nan")])
 def test_speed_out_of_bounds_is_refused(speed: float) -> None:
     with pytest.raises(ConfigError, match=r"--speed: .* must be 0.1 to 10"):
-        clock_of(speed)
+        clock_at_speed(speed)
 
 
-def test_a_port_in_use_is_named_with_who_holds_it() -> None:
+def test_used_port_is_reported_with_its_process() -> None:
     with socket.socket() as holder:
         holder.bind(("127.0.0.1", 0))
         holder.listen()
@@ -88,10 +84,10 @@ def test_a_port_in_use_is_named_with_who_holds_it() -> None:
     require_free_port(f"tcp/127.0.0.1:{port}")
 
 
-def test_a_module_that_is_not_there_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_module_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "path", list(sys.path))
     cell = load_cell("panda")
     require_modules(cell)
-    wrong = cell.model_copy(update={"services": {"nobodys.it": ServiceEntry(name="it", module="nobodys.it")}})
-    with pytest.raises(ConfigError, match=r"services\.nobodys\.it: 'nobodys\.it' is not a module"):
+    wrong = cell.model_copy(update={"services": {"missing.it": ServiceEntry(name="it", module="missing.it")}})
+    with pytest.raises(ConfigError, match=r"services\.missing\.it: 'missing\.it' is not a module"):
         require_modules(wrong)

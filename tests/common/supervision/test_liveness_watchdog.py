@@ -1,22 +1,29 @@
-"""Who is killed for being silent, with a clock of the test's own."""
+"""Silent processes are killed in time and no others, on a clock of the test; forged messages are no sign of life."""
 
 from __future__ import annotations
 
+import asyncio
+from types import SimpleNamespace
+
 import pytest
 
-from common.config import Watchdogs
-from common.messages import ServiceStatus
+from common import topics
+from common.config import Watchdogs, load_cell
+from common.messages import ServiceCounters, ServiceStatus
+from common.supervision.lifecycle import kill_frozen
 from common.supervision.liveness_watchdog import LEASE, PERIOD, LivenessWatchdog
+from common.transport.codec import encode
+from common.transport.local import LocalNetwork
 
 NAMES = ["router", "camera", "detector", "task"]
 LIMIT, START = Watchdogs().silence, Watchdogs().start
 
 
 class Cell:
-    """Services that speak each second unless they are said to be silent."""
+    """Services that send a sign of life each period, except the silent ones."""
 
     def __init__(self, *names: str, **limits: float) -> None:
-        self.silence = LivenessWatchdog(Watchdogs(**limits))
+        self.watchdog = LivenessWatchdog(Watchdogs(**limits))
         self.states = {name: ServiceStatus(name=name, state="ready", pid=k + 1)
                        for k, name in enumerate(names or NAMES)}
         self.silent: set[str] = set()
@@ -28,18 +35,18 @@ class Cell:
         self.killed: list[tuple[str, str]] = []
 
     def wait(self, seconds: float, period: float = PERIOD) -> list[str]:
-        """Names of those that were killed meanwhile; a killed one is there again at once, and speaks."""
+        """Return the names of killed processes; each is restarted at once and sends again."""
         before, end = len(self.killed), self.now + seconds
         while self.now < end:
             self.now += period
             for name in self.starved:
                 self.waited[name] += 0.9 * period
-            speaks = self.connected and "router" not in self.silent
+            router_works = self.connected and "router" not in self.silent
             for name in set(self.states) - self.silent - {"router"}:
-                if speaks and self.states[name].state == "ready":
-                    self.silence.heard(name)
+                if router_works and self.states[name].state == "ready":
+                    self.watchdog.seen(name)
             states = list(self.states.values())
-            for verdict in self.silence.look(self.now, self.connected, states, self.stopped, dict(self.waited)):
+            for verdict in self.watchdog.check(self.now, self.connected, states, self.stopped, dict(self.waited)):
                 self.killed.append((verdict.name, verdict.reason))
                 self.restart(verdict.name, "ready")
                 self.silent.discard(verdict.name)
@@ -51,42 +58,43 @@ class Cell:
         self.states[name] = self.states[name].model_copy(update={"pid": pid + 100, "state": state})
 
 
-def test_nobody_is_killed_while_all_speak() -> None:
-    assert Cell().wait(60) == []
+@pytest.fixture
+def cell() -> Cell:
+    made = Cell()
+    assert made.wait(5) == []
+    return made
 
 
-def test_a_service_that_falls_silent_is_killed_in_time_and_no_other() -> None:
-    cell = Cell()
-    cell.wait(5)
-    cell.silent = {"detector"}
-    assert cell.wait(LIMIT - 0.5) == []
-    assert cell.wait(1.0) == ["detector"]
-    assert "has not been heard for 7" in cell.killed[0][1]
+def test_no_process_is_killed_while_all_send(cell: Cell) -> None:
     assert cell.wait(60) == []
 
 
-def test_a_service_that_waits_for_a_processor_is_silent_and_not_killed_for_that() -> None:
-    cell = Cell()
-    cell.wait(5)
+def test_silent_service_is_killed_in_time_and_no_other(cell: Cell) -> None:
+    cell.silent = {"detector"}
+    assert cell.wait(LIMIT - 0.5) == []
+    assert cell.wait(1.0) == ["detector"]
+    assert "has sent nothing for 7" in cell.killed[0][1]
+    assert cell.wait(60) == []
+
+
+def test_service_that_waits_for_a_processor_is_not_killed(cell: Cell) -> None:
     cell.silent = cell.starved = {"detector"}
     assert cell.wait(5 * LIMIT) == []
     cell.silent = set()
     assert cell.wait(5) == []
     cell.silent, cell.starved = {"detector"}, set()
     assert cell.wait(LIMIT - 0.5) == []
-    assert cell.wait(1.0) == ["detector"], "what it waited before is no credit"
+    assert cell.wait(1.0) == ["detector"], "earlier waiting is no credit"
 
 
-def test_a_service_that_never_speaks_once_it_is_ready_is_killed_too() -> None:
+def test_service_that_never_sends_after_it_is_ready_is_killed() -> None:
     cell = Cell()
     cell.silent = {"task"}
     assert cell.wait(LIMIT + 1) == ["task"]
 
 
-def test_nobody_but_the_router_is_blamed_while_it_is_not_reached() -> None:
-    cell = Cell()
-    cell.wait(5)
-    cell.silent, cell.connected = {"router"}, False  # found to be lost
+def test_only_the_router_is_blamed_while_it_is_not_reached(cell: Cell) -> None:
+    cell.silent, cell.connected = {"router"}, False  # its loss was noticed
     assert cell.wait(LIMIT - LEASE - 0.5) == []
     assert cell.wait(1.0) == ["router"]
     assert "does not answer" in cell.killed[0][1]
@@ -94,38 +102,33 @@ def test_nobody_but_the_router_is_blamed_while_it_is_not_reached() -> None:
     assert cell.wait(60) == []
 
 
-def test_a_router_that_died_and_comes_back_costs_nobody_else_its_life() -> None:
-    cell = Cell()
-    cell.wait(5)
+def test_restart_of_the_router_kills_no_service(cell: Cell) -> None:
     cell.connected = False
     cell.restart("router", "starting")
     assert cell.wait(20) == []
     cell.restart("router", "ready")
     cell.connected = True
-    cell.silent = {"detector"}  # its connection is not back yet
+    cell.silent = {"detector"}  # it is not reconnected yet
     assert cell.wait(LIMIT - 1) == []
     cell.silent = set()
     assert cell.wait(60) == []
 
 
-def test_a_router_that_lets_nobody_be_heard_is_killed_instead_of_everybody() -> None:
-    cell = Cell()
-    cell.wait(5)
+def test_router_is_killed_if_all_services_are_silent(cell: Cell) -> None:
     cell.silent = set(NAMES)
     assert cell.wait(LIMIT + 1) == ["router"]
     cell.silent = set()
     assert cell.wait(60) == []
 
 
-def test_services_that_stay_silent_with_another_router_are_killed() -> None:
-    cell = Cell()
-    cell.wait(5)
-    cell.silent = {"camera", "detector", "task"}
+def test_services_that_stay_silent_with_a_new_router_are_killed(cell: Cell) -> None:
+    services = {"camera", "detector", "task"}
+    cell.silent = set(services)
     assert cell.wait(LIMIT + 1) == ["router"]
-    assert set(cell.wait(LIMIT + 1)) == {"camera", "detector", "task"}
+    assert set(cell.wait(LIMIT + 1)) == services
 
 
-def test_without_a_router_of_our_own_nobody_is_blamed_when_all_fall_silent() -> None:
+def test_without_a_router_of_our_own_no_process_is_killed_if_all_are_silent() -> None:
     cell = Cell("camera", "detector", "task")
     cell.wait(5)
     cell.silent = {"camera", "detector", "task"}
@@ -133,9 +136,7 @@ def test_without_a_router_of_our_own_nobody_is_blamed_when_all_fall_silent() -> 
 
 
 @pytest.mark.parametrize("stall", [5.0, 60.0, 3600.0])
-def test_nobody_is_killed_for_what_we_have_slept_through(stall: float) -> None:
-    cell = Cell()
-    cell.wait(5)
+def test_time_in_which_the_supervisor_slept_does_not_count(cell: Cell, stall: float) -> None:
     cell.silent = {"detector"}
     cell.wait(LIMIT - 2)
     cell.now += stall
@@ -144,29 +145,52 @@ def test_nobody_is_killed_for_what_we_have_slept_through(stall: float) -> None:
     assert cell.wait(60) == []
 
 
-def test_looks_that_come_late_count_little() -> None:
-    cell = Cell()
-    cell.wait(5)
+def test_late_checks_on_a_slow_machine_count_little(cell: Cell) -> None:
     cell.silent = {"detector"}
-    assert cell.wait(3 * LIMIT, period=2.0) == [], "a machine on which everything takes long"
+    assert cell.wait(3 * LIMIT, period=2.0) == []
 
 
-def test_a_service_that_starts_has_more_time() -> None:
+@pytest.mark.parametrize(("stopped", "limit"), [([], START), (["camera"], LIMIT)])
+def test_starting_service_has_more_time_unless_it_is_stopped(stopped: list[str], limit: float) -> None:
     cell = Cell()
     cell.restart("camera", "starting")
-    assert cell.wait(START - 1) == []
+    cell.stopped = stopped
+    assert cell.wait(limit - 1) == []
     assert cell.wait(2) == ["camera"]
     assert "is not ready" in cell.killed[0][1]
 
 
-def test_a_service_that_is_stopped_while_it_starts_has_not() -> None:
-    cell = Cell()
-    cell.restart("camera", "starting")
-    cell.stopped = ["camera"]
-    assert cell.wait(LIMIT + 1) == ["camera"]
-
-
-def test_with_a_limit_of_0_nobody_is_killed() -> None:
+def test_limit_of_zero_disables_the_watchdog() -> None:
     cell = Cell(silence=0)
     cell.silent, cell.connected = set(NAMES), False
     assert cell.wait(600) == []
+
+
+async def test_counters_under_the_key_of_another_service_are_no_sign_of_life() -> None:
+    spacing = 0.02  # [s]
+    net, cell = LocalNetwork(), load_cell("panda", ["watchdogs.silence=0.5"])
+    killed: asyncio.Queue[str] = asyncio.Queue()
+    names = ("camera_simulator", "vision_detector")
+    supervisor = SimpleNamespace(
+        restartable=[ServiceStatus(name=name, state="ready", pid=number) for number, name in enumerate(names, 1)],
+        stopped=(), waited={}, kill=lambda name, reason: killed.put_nowait(name),
+    )
+    camera = net.bus("camera_simulator", cell=cell.name)
+    own = camera.raw_publisher(f"{cell.name}/counters/camera_simulator", "", reliable=True)
+
+    async def forge() -> None:
+        while True:
+            for name in names:
+                own.put(encode(ServiceCounters(service=name)), b"")
+                await asyncio.sleep(spacing)
+
+    bus = net.bus("supervisor", cell=cell.name)
+    tasks = [asyncio.create_task(each) for each in (kill_frozen(bus, cell, supervisor, spacing), forge())]
+    try:
+        async with asyncio.timeout(20):
+            assert await killed.get() == "vision_detector"
+        assert bus.counters().invalid[topics.COUNTERS.key] > 0
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)

@@ -1,18 +1,17 @@
-"""The supervisor with plain processes and no network: the test says which service is ready."""
+"""The supervisor with plain processes and no network: the test reports which service is ready."""
 
 import asyncio
 import sys
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
 import psutil
 import pytest
 
 from common.config import Cell, ServiceEntry, load_cell
-from common.supervision import operation
-from common.supervision import supervisor as module
 from common.supervision.launch import Launch
+from common.supervision.lifecycle import recover_missed_tokens
 from common.supervision.supervisor import BadConfiguration, StartFailed, Supervisor
 from common.transport.endpoint import endpoint_of
 from common.transport.router import open_router
@@ -43,22 +42,23 @@ def cell_of(**scripts: str) -> Cell:
     return load_cell("panda").model_copy(update={"services": entries})
 
 
-class Watch:
+class Rig:
     """A supervisor and the lines of its processes."""
 
-    def __init__(self, **scripts: str) -> None:
+    def __init__(self, timeouts: dict[str, float], **scripts: str) -> None:
         self.lines: list[tuple[str, str]] = []
         self._came = asyncio.Event()
-        self.supervisor = Supervisor(cell_of(**scripts), Scripts("panda", connect="tcp/127.0.0.1:1"), self._on_line)
-        self.supervisor.begin()
+        launch = Scripts("panda", connect="tcp/127.0.0.1:1")
+        self.supervisor = Supervisor(cell_of(**scripts), launch, self._on_line, **timeouts)
+        self.supervisor.start()
 
     def _on_line(self, name: str, line: str) -> None:
         self.lines.append((name, line))
         self._came.set()
 
-    async def said(self, name: str, start: str, times: int = 1) -> str:
+    async def wrote(self, name: str, start: str, times: int = 1) -> str:
         while True:
-            found = [line for who, line in self.lines if who == name and line.startswith(start)]
+            found = [line for source, line in self.lines if source == name and line.startswith(start)]
             if len(found) >= times:
                 return found[times - 1]
             self._came.clear()
@@ -73,58 +73,54 @@ class Watch:
     async def up(self) -> None:
         admitting = asyncio.create_task(self.supervisor.admit_all())
         for status in self.supervisor.statuses:
-            await self.said(status.name, "in")
+            await self.wrote(status.name, "in")
             self.supervisor.mark_alive(status.name, True)
         await admitting
 
 
-Up = Callable[..., Awaitable[Watch]]
-
-
 @asynccontextmanager
-async def watching(**scripts: str) -> AsyncIterator[Watch]:
-    watch = Watch(**scripts)
+async def supervised(timeouts: dict[str, float] | None = None, **scripts: str) -> AsyncIterator[Rig]:
+    rig = Rig(timeouts or {}, **scripts)
     try:
         async with asyncio.timeout(30):
-            yield watch
+            yield rig
     finally:
-        await watch.supervisor.stop()
+        await rig.supervisor.stop()
 
 
-async def test_a_service_is_let_through_only_when_those_before_it_are_ready() -> None:
-    async with watching(first=WAIT, second=WAIT) as watch:
-        admitting = asyncio.create_task(watch.supervisor.admit_all())
-        await watch.said("first", "in")
-        assert (watch.state("first"), watch.state("second")) == ("starting", "waiting")
-        watch.supervisor.mark_alive("second", True)  # a token of somebody else's: it is not even let through
-        assert watch.state("second") == "waiting"
-        watch.supervisor.mark_alive("first", True)
-        await watch.said("second", "in")
-        assert watch.state("first") == "ready"
+async def test_gate_of_a_service_opens_only_when_those_before_it_are_ready() -> None:
+    async with supervised(first=WAIT, second=WAIT) as rig:
+        admitting = asyncio.create_task(rig.supervisor.admit_all())
+        await rig.wrote("first", "in")
+        assert (rig.state("first"), rig.state("second")) == ("starting", "waiting")
+        rig.supervisor.mark_alive("second", True)  # a foreign token: its gate is closed
+        assert rig.state("second") == "waiting"
+        rig.supervisor.mark_alive("first", True)
+        await rig.wrote("second", "in")
+        assert rig.state("first") == "ready"
         assert not admitting.done()
-        watch.supervisor.mark_alive("second", True)
+        rig.supervisor.mark_alive("second", True)
         await admitting
-        assert [status.ready_seconds is not None for status in watch.supervisor.statuses] == [True, True]
+        assert [status.ready_seconds is not None for status in rig.supervisor.statuses] == [True, True]
 
 
-async def test_all_processes_are_started_at_once_whatever_the_order() -> None:
-    async with watching(first=WAIT, second="print('imports', flush=True); " + WAIT) as watch:
-        await watch.said("second", "imports")
-        assert watch.state("first") == "waiting"
+async def test_all_processes_are_started_at_once_so_that_their_imports_overlap() -> None:
+    async with supervised(first=WAIT, second="print('imports', flush=True); " + WAIT) as rig:
+        await rig.wrote("second", "imports")
+        assert rig.state("first") == "waiting"
 
 
-async def test_time_out_names_the_service_and_its_last_lines(monkeypatch: pytest.MonkeyPatch) -> None:
-    async with watching(first=GATE + "print('waiting for the moon', flush=True); " + WAIT) as watch:
-        admitting = asyncio.create_task(watch.supervisor.reach_router(asyncio.sleep(0)))
-        await admitting
-        monkeypatch.setattr(module, "START_TIMEOUT", 1.5)
+async def test_start_timeout_names_the_service_and_its_last_lines() -> None:
+    script = GATE + "print('waiting for the moon', flush=True); " + WAIT
+    async with supervised({"start_timeout": 1.5}, first=script) as rig:
+        await rig.supervisor.reach_router(asyncio.sleep(0))
         with pytest.raises(StartFailed, match=r"(?s)first was not ready within 1.5 s; its last lines:.*moon"):
-            await watch.supervisor.admit_all()
-        assert watch.state("first") == "failed"
+            await rig.supervisor.admit_all()
+        assert rig.state("first") == "failed"
 
 
 @pytest.mark.parametrize(
-    "said",
+    "printed",
     [
         "services.first.x: 1 is not a parameter",
         "zencell: services.first.x: 1 is not a parameter",
@@ -132,90 +128,88 @@ async def test_time_out_names_the_service_and_its_last_lines(monkeypatch: pytest
         '{"level": "error", "message": "services.first.x: 1 is not a parameter", "service": "first"}',
     ],
 )
-async def test_exit_code_2_is_the_end_with_the_line_that_was_printed(said: str) -> None:
-    async with watching(first=f"import sys; print({said!r}); sys.exit(2)", second=WAIT) as watch:
+async def test_exit_code_2_ends_the_start_with_the_printed_line(printed: str) -> None:
+    async with supervised(first=f"import sys; print({printed!r}); sys.exit(2)", second=WAIT) as rig:
         with pytest.raises(BadConfiguration) as raised:
-            await watch.supervisor.admit_all()
+            await rig.supervisor.admit_all()
         assert str(raised.value) == "services.first.x: 1 is not a parameter"
 
 
-async def test_a_service_that_waits_behind_its_gate_can_fail_too() -> None:
-    async with watching(first=WAIT, second="import sys; print('no'); sys.exit(2)") as watch:
+async def test_service_can_fail_behind_its_closed_gate() -> None:
+    async with supervised(first=WAIT, second="import sys; print('no'); sys.exit(2)") as rig:
         with pytest.raises(BadConfiguration, match=r"^no$"):
-            await watch.supervisor.admit_all()
+            await rig.supervisor.admit_all()
 
 
-async def test_once_up_exit_code_2_is_a_death_like_any_other() -> None:
-    async with watching(first=GATE + "sys.stdin.readline(); sys.exit(2)") as watch:
-        await watch.up()
-        process = psutil.Process(watch.pid("first"))
+async def test_once_the_cell_is_up_a_process_with_exit_code_2_is_restarted() -> None:
+    async with supervised(first=GATE + "sys.stdin.readline(); sys.exit(2)") as rig:
+        await rig.up()
+        process = psutil.Process(rig.pid("first"))
         process.kill()
-        await watch.said("first", "in", times=2)
-        assert watch.supervisor.restarts == {"first": 1}
-        assert watch.state("first") == "starting"
-        watch.supervisor.mark_alive("first", True)
-        assert watch.state("first") == "ready"
+        await rig.wrote("first", "in", times=2)
+        assert rig.supervisor.restarts == {"first": 1}
+        assert rig.state("first") == "starting"
+        rig.supervisor.mark_alive("first", True)
+        assert rig.state("first") == "ready"
 
 
-async def test_a_deaf_process_is_killed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "TERM_TIMEOUT", 0.3)
-    async with watching(first=WAIT, second=DEAF) as watch:
-        await watch.up()
-        await watch.said("second", "deaf")
-        pids = [watch.pid("first"), watch.pid("second")]
-        await watch.supervisor.stop()
+async def test_process_that_ignores_sigterm_is_killed() -> None:
+    async with supervised({"term_timeout": 0.3}, first=WAIT, second=DEAF) as rig:
+        await rig.up()
+        await rig.wrote("second", "deaf")
+        pids = [rig.pid("first"), rig.pid("second")]
+        await rig.supervisor.stop()
         assert not any(psutil.pid_exists(pid) for pid in pids if pid)
-        assert watch.state("second") == "stopped"
+        assert rig.state("second") == "stopped"
 
 
-async def test_many_deaf_processes_are_gone_in_time() -> None:
-    async with watching(**{f"deaf{i}": DEAF for i in range(6)}) as watch:
-        await watch.up()
+async def test_many_processes_that_ignore_sigterm_are_gone_in_time() -> None:
+    async with supervised(**{f"deaf{i}": DEAF for i in range(6)}) as rig:
+        await rig.up()
         for i in range(6):
-            await watch.said(f"deaf{i}", "deaf")
+            await rig.wrote(f"deaf{i}", "deaf")
         hurry = asyncio.Event()
-        stopping = asyncio.create_task(watch.supervisor.stop(hurry))
+        stopping = asyncio.create_task(rig.supervisor.stop(hurry))
         hurry.set()
         await stopping
-        assert {status.state for status in watch.supervisor.statuses} == {"stopped"}
+        assert {status.state for status in rig.supervisor.statuses} == {"stopped"}
 
 
-async def test_what_a_service_started_goes_with_it() -> None:
-    async with watching(first=PARENT) as watch:
-        await watch.up()
-        grandchild = psutil.Process(int((await watch.said("first", "child")).split()[1]))
-        await watch.supervisor.stop()
+async def test_children_of_a_service_are_killed_with_it() -> None:
+    async with supervised(first=PARENT) as rig:
+        await rig.up()
+        grandchild = psutil.Process(int((await rig.wrote("first", "child")).split()[1]))
+        await rig.supervisor.stop()
         deadline = time.monotonic() + 5
         while grandchild.is_running() and grandchild.status() != psutil.STATUS_ZOMBIE:
             assert time.monotonic() < deadline
             await asyncio.sleep(0.02)
 
 
-async def test_stop_does_not_wait_for_a_restart_that_is_due() -> None:
-    async with watching(first="import sys; sys.exit(1)") as watch:
-        while watch.supervisor.restarts["first"] < 2:
-            watch.supervisor.changed.clear()
-            await watch.supervisor.changed.wait()
-    assert watch.state("first") == "stopped"
-    assert watch.pid("first") is None
+async def test_stop_does_not_wait_for_a_pending_restart() -> None:
+    async with supervised(first="import sys; sys.exit(1)") as rig:
+        while rig.supervisor.restarts["first"] < 2:
+            rig.supervisor.changed.clear()
+            await rig.supervisor.changed.wait()
+    assert rig.state("first") == "stopped"
+    assert rig.pid("first") is None
 
 
-async def test_a_token_that_the_network_did_not_tell_of_is_asked_for(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+async def test_readiness_token_that_the_subscription_missed_is_found_by_a_query(
+    caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(operation, "LATE_PERIOD", 0.1)
     endpoint = endpoint_of(free_domain())
     router = await asyncio.to_thread(open_router, [endpoint])
-    async with watching(first=WAIT, second=WAIT) as watch:
+    async with supervised(first=WAIT, second=WAIT) as rig:
         service = await open_zenoh(endpoint)
-        asking = asyncio.create_task(operation.ask_for_the_late("panda", endpoint, watch.supervisor))
-        admitting = asyncio.create_task(watch.supervisor.admit_all())
-        await watch.said("first", "in")
-        service.token("panda/alive/second")  # which is not let through yet
+        recovering = asyncio.create_task(recover_missed_tokens("panda", endpoint, rig.supervisor, period=0.1))
+        admitting = asyncio.create_task(rig.supervisor.admit_all())
+        await rig.wrote("first", "in")
+        service.token("panda/alive/second")  # its gate is closed
         service.token("panda/alive/first")
-        await admitting  # nobody calls `mark_alive` here
-        asking.cancel()
-        assert [status.state for status in watch.supervisor.statuses] == ["ready", "ready"]
-        assert "first is ready, which the network did not tell" in caplog.text
+        await admitting  # the test does not call `mark_alive`
+        recovering.cancel()
+        assert [status.state for status in rig.supervisor.statuses] == ["ready", "ready"]
+        assert "first is ready: the router has its token, which the subscription missed" in caplog.text
         await asyncio.to_thread(service.close)
     await asyncio.to_thread(router.close)

@@ -10,7 +10,7 @@ from common import topics
 from common.errors import NoResponder
 from common.messages import Image, LogLine, TaskCommand, TaskStatus
 from common.process.in_process import running_service
-from common.process.wiring import wiring
+from common.supervision.wiring import wiring
 from common.topics import Request, Topic
 from common.transport.bus import Bus
 from common.transport.local import LocalNetwork

@@ -9,8 +9,8 @@ import pytest
 
 from common import messages as m
 from common import topics
-from common.supervision.liveness_watchdog import Elsewhere
-from common.supervision.plain_keys import keep_plain_keys
+from common.supervision.liveness_watchdog import RemoteServices
+from common.supervision.plain_keys import copy_to_plain_keys
 from common.transport.bus import Bus
 from common.transport.codec import decode
 
@@ -34,7 +34,7 @@ def line(service: str, message: str) -> m.LogLine:
 async def keeping():
     """Starts what keeps the plain keys."""
     tasks = []
-    yield lambda bus, elsewhere: tasks.append(asyncio.create_task(keep_plain_keys(bus, elsewhere)))
+    yield lambda bus, elsewhere: tasks.append(asyncio.create_task(copy_to_plain_keys(bus, elsewhere)))
     for task in tasks:
         task.cancel()
     for ended in await asyncio.gather(*tasks, return_exceptions=True):
@@ -46,7 +46,7 @@ async def test_plain_subscriber_hears_all_and_readers_of_ours_each_line_once(
 ) -> None:
     supervisor, arm, tool = [await new_bus(name) for name in ("supervisor", "arm", "tool")]
     plain, counted = Plain(tool, "log", m.LogLine), Plain(tool, "counters", m.ServiceCounters)
-    keeping(supervisor, Elsewhere("host", ["arm"]))
+    keeping(supervisor, RemoteServices("host", ["arm"]))
     await arm.ready()
     writer, own = arm.writer(topics.LOG), supervisor.writer(topics.LOG)
     await until(lambda: writer.matched and own.matched)
@@ -84,9 +84,9 @@ async def test_who_signs_for_another_is_not_repeated_and_two_supervisors_say_it_
     plain = Plain(tool, "log", m.LogLine)
     kept = {"a": "arm", "b": "eye"}
     for host, bus in hosts.items():
-        elsewhere = Elsewhere(host, [kept[host]])
+        elsewhere = RemoteServices(host, [kept[host]])
         for other, service in kept.items():
-            elsewhere.hear(m.SupervisorStatus(cell="c", host=other, services=[
+            elsewhere.update(m.SupervisorStatus(cell="c", host=other, services=[
                 m.ServiceStatus(name=service, host=other, state="ready")]))
         keeping(bus, elsewhere)
     writers = {bus.service: bus.writer(topics.LOG) for bus in (arm, eye, tool, hosts["b"])}
@@ -110,7 +110,7 @@ async def test_who_signs_for_another_is_not_repeated_and_two_supervisors_say_it_
 async def test_nothing_is_repeated_while_nobody_reads_there(new_bus: NewBus, until, keeping) -> None:
     supervisor, arm, tool = [await new_bus(name) for name in ("supervisor", "arm", "tool")]
     writer = arm.writer(topics.LOG)
-    keeping(supervisor, Elsewhere("host", ["arm"]))
+    keeping(supervisor, RemoteServices("host", ["arm"]))
     plain = Plain(tool, "log", m.LogLine)
     await until(lambda: writer.matched)
     plain.declared.undeclare()

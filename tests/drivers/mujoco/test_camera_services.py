@@ -9,9 +9,9 @@ from common.messages import Header, JointState, WorldObjects
 from common.perception.image import image_to_array
 from common.perception.pinhole import Pinhole
 from common.process.in_process import running_service
-from common.process.wiring import wiring
 from common.robot.model import RobotModel
 from common.sim.interface import load_world
+from common.supervision.wiring import wiring
 from common.transport.local import LocalNetwork
 from services import camera_simulator, depth_camera
 

@@ -11,6 +11,7 @@ from applications.pick_place.topics import (
 )
 from common import topics
 from common.application import find_application
+from common.client.rates import MOST_SERVICES, Rates
 from common.clock import Clock
 from common.messages import (
     Header,
@@ -22,7 +23,6 @@ from common.messages import (
     ServiceCounters,
     Vector3,
 )
-from common.supervision.rates import MOST_SERVICES, Rates
 from common.transport.local import LocalNetwork
 from recording.report.aggregator import Collector, RunAggregator
 
