@@ -123,7 +123,7 @@ def test_shorter_overtime_stops_a_running_trace() -> None:
     cell = OutlineDouble()
     cell.until("trace")
     change(cell.task.p, overtime=1e-3)
-    cell._arrival += 100
+    cell.arrival += 100
     cell.until("ERROR")
     assert "took longer than 1 s" in cell.status.message
 
@@ -165,7 +165,7 @@ async def waits(running: Running, values: list[dict[str, float]], said: list[str
         log = running.bus.reader(topics.LOG)
         for change_, wait in zip(values, said, strict=True):
             await running.tune(**change_)
-            while not (await log.next()).message.endswith(f"opened again in {wait} s"):
+            while not (await log.next()).message.endswith(f"opening it again in {wait} s"):
                 pass
 
 

@@ -175,7 +175,7 @@ async def test_mismatched_depth_is_reported_in_one_line():
         picture = np.zeros((768, 1024, 3), np.uint8)
         picture[300:400, 400:500] = (0, 255, 255)
         nothing = np.full((768, 1024), np.nan, np.float32)
-        for stamp, depth, said in ((5, nothing[::2], "the depth image is 1024x384, but the picture is 1024x768"),
+        for stamp, depth, said in ((5, nothing[::2], "the depth image is 1024x384, but the color image is 1024x768"),
                                    (6, nothing, "the depth image has no valid depth at all")):
             header = Header(stamp=stamp, frame_id=AROUND.camera.frame)
             depths.put(array_to_image(np.ascontiguousarray(depth), "32FC1", header))

@@ -113,7 +113,7 @@ def test_image_without_depth_is_not_an_empty_scene() -> None:
 
 def test_depth_of_another_size_is_dropped() -> None:
     image = array_to_image(cube_depth()[::2, ::2], "32FC1")
-    with pytest.raises(FrameError, match=f"512x384, but the picture is {CAMERA.width}x{CAMERA.height}"):
+    with pytest.raises(FrameError, match=f"512x384, but the color image is {CAMERA.width}x{CAMERA.height}"):
         outline_scene.seen(cube_contours(), image, CAMERA, AROUND)
 
 

@@ -138,7 +138,7 @@ async def test_unusable_image_is_dropped_and_reported_once(bad, problem, caplog)
             rig.images.put(picture(stamp=3))
             while (await rig.next()).header.stamp != 3:
                 pass
-    lines = [record.getMessage() for record in caplog.records if "picture left out" in record.getMessage()]
+    lines = [record.getMessage() for record in caplog.records if "image skipped" in record.getMessage()]
     assert len(lines) == 1 and problem in lines[0]
 
 

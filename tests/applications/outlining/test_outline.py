@@ -424,7 +424,7 @@ def test_failed_task_can_be_restarted() -> None:
 def test_overdue_motion_is_stopped() -> None:
     cell = OutlineDouble(overtime=2.0)
     cell.until("TRACING")
-    cell._arrival = math.inf
+    cell.arrival = math.inf
     cell.until("ERROR")
     assert [type(r) for r in cell.requests].count(m.StopRequest) == 1
     assert "took longer than 3 s" in cell.status.message

@@ -176,13 +176,13 @@ def test_ball_above_the_container_during_release_counts_once() -> None:
     cell = CellDouble([(0.40, -0.30)])
     cell.until("across")
     asked: list[m.GripperCommand] = []
-    cell._grip = asked.append
+    cell._close_or_open = asked.append
     cell.until("release")
     cell.contained = 2  # one above the other, as a picture shows it while the fingers open
     for _ in range(20):
         cell.step()
-    del cell._grip
-    cell._grip(asked[-1])
+    del cell._close_or_open
+    cell._close_or_open(asked[-1])
     cell.contained = 2  # as the picture before still says
     cell.step()
     cell.contained = 1

@@ -146,7 +146,7 @@ def test_separate_moments_without_view_do_not_add_up() -> None:
         cell.is_blind = False
         for _ in range(4):
             cell.step()
-        cell._arrival += 2 * cell.task.p.look_timeout  # the next motion takes its time
+        cell.arrival += 2 * cell.task.p.look_timeout  # the next motion takes its time
     cell.until("DONE")
 
 

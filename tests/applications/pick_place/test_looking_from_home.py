@@ -44,8 +44,8 @@ class HandCell(CellDouble):
             self._homes.add(request.id)
         super().answer(request)
 
-    def _arrive(self, request: m.ExecuteRequest) -> None:
-        super()._arrive(request)
+    def arrive(self, request: m.ExecuteRequest) -> None:
+        super().arrive(request)
         self.q = HOME if request.plan in self._homes else AWAY
 
     def stages(self) -> list[str]:

@@ -74,7 +74,7 @@ def test_time_limit_excludes_holds_and_scales_with_speed(cell: Double) -> None:
     wait(cell, 300)
     cell.command("resume")
     cell.motion = cell.motion.model_copy(update={"speed_scaling": 0.1})
-    cell._arrival += 20.0
+    cell.arrival += 20.0
     goal = cell.motion.id
     while cell.motion.id == goal and cell.motion.state == "active":
         cell.step()
@@ -88,7 +88,7 @@ def test_endless_motion_is_stopped(cell: Double) -> None:
     cell.command("pause")
     wait(cell)
     cell.command("resume")
-    cell._arrival = math.inf
+    cell.arrival = math.inf
     asked = wait(cell, 80)
     assert any(isinstance(r, m.StopRequest) for r in asked)
     assert cell.task.status.failures == 1

@@ -387,7 +387,7 @@ def test_home_only_after_a_failure() -> None:
     cell = CellDouble([(0.40, -0.30)])
     cell.until("pre-grasp")
     cell.motion = cell.motion.model_copy(update={"state": "aborted", "message": "path tolerance"})
-    cell._ends.clear()
+    cell.running.clear()
     cell.until("HOMING")
     cell.until("DONE")
     assert (cell.contained, cell.task.status.failures, cell.stages().count("home")) == (1, 1, 1)
@@ -398,7 +398,7 @@ def test_failures_in_a_row_end_in_error_and_start_tries_again() -> None:
     cell.until("pre-grasp")
     cell.unplannable = lambda r: "no_ik"
     cell.motion = cell.motion.model_copy(update={"state": "aborted", "message": "path tolerance"})
-    cell._ends.clear()
+    cell.running.clear()
     cell.until("DONE")  # the ball is given up, which is no failure of the arm
     assert cell.task.status.failures >= 2
     assert cell.task.status.skipped
@@ -408,7 +408,7 @@ def test_motion_stopped_by_another_client_pauses_picking() -> None:
     cell = CellDouble([(0.40, -0.30)])
     cell.until("pre-grasp")
     cell.motion = cell.motion.model_copy(update={"state": "cancelled", "message": "asked to"})
-    cell._ends.clear()
+    cell.running.clear()
     cell.step()
     assert cell.task.status.paused
     assert cell.step() == []
@@ -473,10 +473,10 @@ def test_every_ball_ends_in_the_container_despite_faults(data: st.DataObject) ->
         elif event == "restart":
             cell.restart()
         elif event == "abort" and cell.motion.state == "active":
-            cell._ends.clear()
+            cell.running.clear()
             cell.motion = cell.motion.model_copy(update={"state": "aborted"})
         elif event == "forget" and cell.motion.state == "active":
-            cell._ends.clear()
+            cell.running.clear()
             cell.motion = m.MotionStatus(header=m.Header(stamp=int((cell.now + 0.01) * 1e9)))
     cell.until("DONE", most=5000)
     assert (cell.contained, cell.balls, cell.held, cell.task.status.placed) == (7, {}, "", 7)
