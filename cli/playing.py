@@ -49,12 +49,12 @@ def play_(
     On a terminal space pauses, right steps one message, down one picture, left goes back 5 s, q quits.
     """
     from common.remapping import is_cell
-    from common.transport.credentials import refuse_to_publish
+    from common.transport.credentials import require_open_cell
     from recording.player import play, played_of, renaming
     from recording.reader import Recording
     from recording.selection import Selection
 
-    refuse_to_publish("play")
+    require_open_cell("play")
     selection = Selection.of([*(keys or ()), *(topics or ())], None, exclude)
     renamed = renaming(remap or [])
     speed, offset = options.number("--rate", rate), options.number("--start-offset", start_offset)

@@ -34,9 +34,9 @@ def pub(
     A state can be asked for while this runs. A key of your own services takes any JSON; {"base64": "..."} is bytes.
     """
     from common.client.publishing import checked, publish, writers_of
-    from common.transport.credentials import refuse_to_publish
+    from common.transport.credentials import require_open_cell
 
-    refuse_to_publish("topic pub")
+    require_open_cell("topic pub")
     period = 1 / options.rate(rate)
     most = 1 if once else options.whole("--count", count, 1)
     topic = _publishable(key)

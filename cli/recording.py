@@ -43,7 +43,7 @@ def record_(
 ) -> None:
     """Record what travels in a cell, all keys if none are given, until Ctrl-C."""
     from common.config import load_cell
-    from common.transport.credentials import identity_of_listener
+    from common.transport.credentials import observer_identity
     from recording.capture import CustomTopics
     from recording.recorder import RecordRequest, record, record_gated, require_published
     from recording.selection import Selection
@@ -67,7 +67,7 @@ def record_(
     if gate:
         asyncio.run(record_gated(asked, cell, at.domain, at.connect, echo, show))
     else:
-        replace(at, cell=cell).visit(lambda bus: record(bus, asked, echo, show), identity=identity_of_listener())
+        replace(at, cell=cell).visit(lambda bus: record(bus, asked, echo, show), identity=observer_identity())
 
 
 def _positive(option: str, text: str | None) -> float | None:

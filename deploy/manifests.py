@@ -6,7 +6,7 @@ from typing import Any
 
 import yaml
 
-from common.kept_file import STATE_VARIABLE
+from common.atomic_file import STATE_VARIABLE
 from deploy.containers import (
     DATA,
     IMAGE,

@@ -74,7 +74,7 @@ class VirtualTimeLoop(base_events.BaseEventLoop):
     """Single-threaded loop on a virtual clock that starts at 0.
 
     A call for another thread runs at once and to its end; its result arrives after a random time drawn from the seed.
-    The loop is also the source of all times and ids: a `common.sources.Sources`.
+    The loop is also the source of all times and ids: a `common.time_source.TimeSource`.
     """
 
     # Of asyncio's own loop:

@@ -17,7 +17,7 @@ from functools import partial
 import numpy as np
 
 from common.transport.local import Lane, LocalNetwork, LocalSession, intersects
-from common.transport.session import Declared, OnSample, RawSample
+from common.transport.session import Declaration, OnSample, RawSample
 from lab.loop import VirtualTimeLoop
 
 Link = tuple["SimulatedSession", "SimulatedSession", Lane, str]
@@ -75,7 +75,7 @@ class SimulatedSession(LocalSession):
         """Call back whenever the link is cut or restored."""
         self._on_change.append(on_change)
 
-    def subscriber(self, key: str, on_sample: OnSample) -> Declared:
+    def subscriber(self, key: str, on_sample: OnSample) -> Declaration:
         """Call back for each value put under a matching key."""
         _simulated_network(self.network).on_subscribe(self, key)
         return super().subscriber(key, on_sample)
@@ -111,7 +111,7 @@ class SimulatedNetwork(LocalNetwork):
         self._sessions.append(session)
         return session
 
-    def notice(self, session: LocalSession, sample: RawSample) -> None:
+    def observe_put(self, session: LocalSession, sample: RawSample) -> None:
         """Pass a put message to the observer."""
         self.on_put(_simulated(session), sample)
 
@@ -185,7 +185,7 @@ class SimulatedNetwork(LocalNetwork):
             if session.connected:
                 session.cut = True
                 session.cuts += 1
-                for asked in list(session.asking):
+                for asked in list(session.pending):
                     self._arrive_at(self._loop.time(), session, session, asked.finish)
                 self._notify_lost(session)
                 for watcher, token in self._tokens_seen_by(session):
@@ -232,7 +232,7 @@ class SimulatedNetwork(LocalNetwork):
             for entry in table:
                 entry.declared = entry.session is not session
             table[:] = [entry for entry in table if entry.declared]
-        self.forget_matches()
+        self.clear_matches()
         self._sessions.remove(session)
         self._arrival = {link: due for link, due in self._arrival.items() if session not in link[:2]}
         self._next_delay = {link: late for link, late in self._next_delay.items() if session not in link[:2]}
@@ -240,7 +240,7 @@ class SimulatedNetwork(LocalNetwork):
     def _notify_lost(self, session: SimulatedSession) -> None:
         """Notify all other sessions that a session's tokens and the requests open to it are lost."""
         for other in [other for other in self._sessions if other is not session and other.connected]:
-            for asked in list(other.asking):
+            for asked in list(other.pending):
                 for query in [query for query in asked.open if query.responder is session]:
                     self._notify((session, other, "query", query.key), partial(asked.finish, query))
         for entry in self.tokens:

@@ -14,7 +14,7 @@ from common.hardware.interface import Gripper, Hardware, Limits, Vector
 from common.hardware.loading import find_backend, load_hardware
 from common.messages import SupervisorStatus
 from common.transport.codec import decode, decode_attachment
-from common.transport.reader import Newness
+from common.transport.reader import SequenceFilter
 from common.transport.session import RawSample
 from recording.capture import CustomTopics
 from recording.sample import Sample, message_of
@@ -115,7 +115,7 @@ class Trace:
         """
         self._writer = RecordingWriter(path, about)
         self._kinds = custom.kinds(custom.topics())
-        self._newness: dict[str, Newness] = {}
+        self._newness: dict[str, SequenceFilter] = {}
         self._run_known = False
         self._flushed = 0
 
@@ -127,7 +127,7 @@ class Trace:
     def add(self, raw: RawSample, now: int) -> None:
         """Write a message put at `now` [ns since the Unix epoch]; skip repetitions."""
         origin = decode_attachment(raw.attachment)
-        if origin is None or not self._newness.setdefault(raw.key, Newness()).is_new(origin):
+        if origin is None or not self._newness.setdefault(raw.key, SequenceFilter()).is_new(origin):
             return
         topic = raw.key.partition("/")[2]
         if topic == topics.SUPERVISOR_STATUS.key and not self._run_known:

@@ -7,7 +7,9 @@ import importlib
 import logging
 from collections import Counter, deque
 from collections.abc import Awaitable, Callable, Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass, field
+from functools import partial
 from types import ModuleType
 from typing import Any, TypeVar
 
@@ -19,7 +21,7 @@ from common.errors import NoResponder, RemoteError, RequestFailed, RequestLost, 
 from common.messages import Message
 from common.process.log import BusLog
 from common.process.service import serve
-from common.sources import monotonic
+from common.time_source import monotonic
 from common.topics import Request, Topic
 from common.transport.bus import Bus, Client, Reader
 from lab.loop import Incarnation, VirtualTimeLoop, context_of
@@ -111,11 +113,16 @@ class _LoggedReader(Reader[M]):
         return super()._decode(arrived)
 
 
+# The OS would keep the file lock of a simulated process that was killed, and threads run outside the virtual clock.
+RUN_ARGUMENTS: dict[str, dict[str, Any]] = {
+    "services.trajectory_executor": {"file_lock": lambda path, name: nullcontext(), "saver_for": lambda file: file},
+}
+
+
 class SimulatedBus(Bus):
     """Bus that logs requests and has a logger of its own."""
 
-    make_reader, make_client = _LoggedReader, _LoggedClient
-    has_threads = has_process = False
+    reader_class, client_class = _LoggedReader, _LoggedClient
 
     def __init__(
         self, session: SimulatedSession, service: str, cell: str, clock: Clock, requests: RequestLog,
@@ -261,7 +268,8 @@ class SimulatedProcess:
         self.bus = bus = SimulatedBus(session, self.name, host.cell.name, clock, host.requests, self._entry.topics)
         bus.log.addHandler(_TailHandler(self._log))
         try:
-            return await serve(module.run, bus, config, self._ending)
+            run = partial(module.run, **RUN_ARGUMENTS.get(self._entry.module, {}))
+            return await serve(run, bus, config, self._ending)
         finally:
             await bus.close()
             session.close()

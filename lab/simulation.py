@@ -21,11 +21,11 @@ from typing import Any
 import numpy as np
 
 from common.application import find_application
+from common.atomic_file import STATE_VARIABLE
 from common.clock import Clock
 from common.config import Cell
-from common.kept_file import STATE_VARIABLE
 from common.messages import TaskStatus
-from common.sources import drawn_from
+from common.time_source import use_time_source
 from common.transport.bus import Bus
 from common.transport.codec import decode
 from common.transport.session import RawSample
@@ -132,7 +132,7 @@ class Simulation:
     def run(self) -> Outcome:
         """Run the cell and return the outcome; an exception of the visit is raised."""
         started_at = time.process_time()
-        with drawn_from(self._loop), observe_set_points(self.invariants.on_set_point), _state_folder(), _quiet():
+        with use_time_source(self._loop), observe_set_points(self.invariants.on_set_point), _state_folder(), _quiet():
             try:
                 self._loop.run_until_complete(self._run())
             finally:

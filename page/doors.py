@@ -12,7 +12,7 @@ from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import Literal
 
-from common.sources import monotonic
+from common.time_source import monotonic
 
 Need = Literal["stop", "look", "operate", "tune", "take"]
 

@@ -16,7 +16,7 @@ from common.client.arm import NO_WAY
 from common.client.operator_motion import OURSELVES
 from common.control.jogging import PAUSE
 from common.messages import UNKNOWN_OPERATOR, MotionOwner, MotionStatus
-from common.sources import monotonic
+from common.time_source import monotonic
 from page.console import Desk
 from page.doors import Doors
 from page.line import Holder

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from websockets.exceptions import ConnectionClosed
 
-from common.sources import monotonic
+from common.time_source import monotonic
 from page.doors import VISITOR
 from page.words import UNDERSTOOD, problem
 

@@ -18,15 +18,15 @@ from common.messages import SupervisorStatus
 from common.remapping import Remapping
 from common.transport.codec import decode, decode_attachment
 from common.transport.credentials import secure_folder
-from common.transport.keys import owns_key
 from common.transport.ownership import Owner
+from common.transport.session import owns_key
 from recording.reader import MOST_SPEED, MOST_TEXT
 from recording.sample import Sample, Sequences, message_of
 from recording.writer import RUN, run_of
 
 if TYPE_CHECKING:
     from common.transport.bus import Bus
-    from common.transport.session import Declared, RawSample
+    from common.transport.session import Declaration, RawSample
     from recording.selection import Selection
     from recording.sink import Sink
 
@@ -56,13 +56,13 @@ class Capture:
         self._known = own.topics()
         self._kinds = own.kinds(self._known)
         self._run_known = False
-        self._declared: list[Declared] = []
+        self._declared: list[Declaration] = []
 
     async def begin(self) -> None:
         """Listen from now on; returns when the values of all states that were there are in the recording."""
         wanted = [f"{self._bus.cell}/{key}" for key in self._selection.expressions]
         # Where no file of the cell was given, tokens tell which services have their keys under other names.
-        self._declared = [self._bus.raw_watch(owns_key(self._bus.cell), self._on_owner)]
+        self._declared = [self._bus.raw_watch_tokens(owns_key(self._bus.cell), self._on_owner)]
         status = f"{self._bus.cell}/{topics.SUPERVISOR_STATUS.key}"
         self._declared += [self._bus.raw_subscriber(key, self.on_sample) for key in wanted]
         if f"{self._bus.cell}/**" not in wanted and status not in wanted:

@@ -16,10 +16,10 @@ from common.errors import ConfigError
 from common.remapping import is_key
 from common.supervision.lifecycle import Interrupts
 from common.transport.bus import Bus
-from common.transport.connect import connect as connect_to
 from common.transport.endpoint import endpoint_of
 from common.transport.router import open_router
-from common.transport.zenoh_session import close_bounded
+from common.transport.zenoh_session import close_within
+from common.transport.zenoh_session import connect as connect_to
 from recording.keyboard import Keys
 from recording.reader import Recording
 from recording.sample import RecordingError, encoding_of, restamp
@@ -282,7 +282,7 @@ async def _router(endpoint: str, *, may_start: bool) -> AsyncIterator[bool]:
     try:
         yield True
     finally:
-        await close_bounded(session, CLOSE)
+        await close_within(session, CLOSE)
 
 
 async def _wait_and_run(player: Player, bus: Bus, wait: list[str]) -> None:

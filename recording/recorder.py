@@ -15,10 +15,10 @@ from common.client.foreign import require_messages
 from common.client.keys import published
 from common.supervision.lifecycle import Interrupts
 from common.transport.bus import Bus
-from common.transport.connect import connect as connect_to
 from common.transport.credentials import RECORDER
 from common.transport.endpoint import endpoint_of
-from common.transport.handoff import call_on_loop
+from common.transport.session import call_on_loop
+from common.transport.zenoh_session import connect as connect_to
 from recording.capture import Capture, CustomTopics
 from recording.selection import Selection
 from recording.sink import Sink
@@ -37,7 +37,7 @@ class RecordRequest:
     Attributes:
         selection: of the messages.
         output: the file; one named after cell and time if None.
-        most_bytes: after which another file is begun.
+        max_bytes: after which another file is begun.
         seconds: after which it ends.
         gate: it is under a supervisor: ready before its services are let through, ended with it.
         own: what there is in the cell beside what comes with the project.
@@ -45,7 +45,7 @@ class RecordRequest:
 
     selection: Selection
     output: Path | None = None
-    most_bytes: int | None = None
+    max_bytes: int | None = None
     seconds: float | None = None
     gate: bool = False
     own: CustomTopics = field(default_factory=CustomTopics)
@@ -93,7 +93,7 @@ async def record(bus: Bus, asked: RecordRequest, tell: Tell, show: Tell | None) 
         if find_topic(key) is None and "*" not in key:
             await require_messages(bus, key)
     path = asked.output or Path(f"{bus.cell}_{time.strftime('%Y%m%d_%H%M%S')}.mcap")
-    writer = SplitWriter(path, about(bus.cell), asked.most_bytes)
+    writer = SplitWriter(path, about(bus.cell), asked.max_bytes)
     sink = Sink(writer, on_failure=lambda: call_on_loop(loop, interrupts.stop.set))
     capture = Capture(bus, asked.selection, sink, asked.own)
     reason = "interrupted"

@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from common.application import message_class
 from common.errors import ZencellError
 from common.messages import Message
-from common.messages.basics import MOST_STAMP
+from common.messages.basics import MAX_STAMP
 
 PREFIX = "application/msgpack;"  # of an encoding; the name of the message class follows
 
@@ -61,7 +61,7 @@ def encoding_of(message: str) -> str:
 
 
 # Whoever is on the network can make up any number of them: known are those heard of last, and counted the first.
-MOST_WRITERS, MOST_KEYS = 10_000, 1000
+MOST_WRITERS, MAX_KEYS = 10_000, 1000
 SEEN_BYTES = 512  # from the front of a payload, where the header is
 
 
@@ -84,7 +84,7 @@ def _first_stamp(unpacker: Any) -> int | None:
         if name == "header":
             header = unpacker.unpack()
             stamp = header.get("stamp") if isinstance(header, dict) else None
-            return stamp if isinstance(stamp, int) and 0 <= stamp <= MOST_STAMP else None
+            return stamp if isinstance(stamp, int) and 0 <= stamp <= MAX_STAMP else None
         if name == "transforms":
             return _first_stamp(unpacker) if unpacker.read_array_header() else None
         unpacker.skip()
@@ -137,7 +137,7 @@ class Sequences:
                 del self._newest[next(iter(self._newest))]
         elif sequence <= before:
             return False
-        elif sequence > before + 1 and (key in self.missed or len(self.missed) < MOST_KEYS):
+        elif sequence > before + 1 and (key in self.missed or len(self.missed) < MAX_KEYS):
             self.missed[key] += sequence - before - 1
         return True
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from common.errors import ConfigError
 
-OF_EACH = ("log", "counters")  # said of those that each service has for itself, they mean all of them
+PER_SERVICE_KEYS = ("log", "counters")  # said of those that each service has for itself, they mean all of them
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Selection:
         """Key expressions, without the cell, that cover what is wanted, and little else."""
         if not self.keys or self.regex is not None:
             return ("**",)
-        return tuple(dict.fromkeys(_expression(f"{key}/**" if key in OF_EACH else key) for key in self.keys))
+        return tuple(dict.fromkeys(_expression(f"{key}/**" if key in PER_SERVICE_KEYS else key) for key in self.keys))
 
     def wants(self, topic: str) -> bool:
         """Whether a topic (key without the cell) is meant."""
@@ -74,7 +74,7 @@ def _compiled(option: str, text: str | None) -> re.Pattern[str] | None:
 
 def covers(key: str, topic: str) -> bool:
     """Whether a topic is one of those that a key stands for."""
-    if key in OF_EACH and topic.startswith(f"{key}/"):
+    if key in PER_SERVICE_KEYS and topic.startswith(f"{key}/"):
         return True
     return topic == key or ("*" in key and _pattern(key).fullmatch(topic) is not None)
 

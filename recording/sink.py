@@ -14,7 +14,7 @@ from recording.writer import SplitWriter
 
 MOST_BYTES = 256 * 1024 * 1024  # that wait while the disk stalls: ten seconds of the most that cameras send
 MOST_SAMPLES = 200_000
-MOST_KEYS, OTHERS = 1000, "others"  # of which it is counted what was dropped, and what all others are called
+MAX_KEYS, OTHERS = 1000, "others"  # of which it is counted what was dropped, and what all others are called
 BATCH_SECONDS = 0.1  # between looks into the queue
 FLUSH_SECONDS = 0.8  # between chunks: with the batch, a kill costs less than a second
 
@@ -36,18 +36,18 @@ class Sink:
     """
 
     def __init__(
-        self, writer: SplitWriter, *, most_bytes: int = MOST_BYTES, on_failure: Callable[[], None] = lambda: None,
+        self, writer: SplitWriter, *, max_bytes: int = MOST_BYTES, on_failure: Callable[[], None] = lambda: None,
     ) -> None:
         """Start writing.
 
         Args:
             writer: is used by this sink alone from now on.
-            most_bytes: payload that may wait [bytes].
+            max_bytes: payload that may wait [bytes].
             on_failure: called once, on the writing thread, when the disk takes no more; `error` says why.
         """
         self.error: RecordingError | None = None
         self._writer = writer
-        self._most = most_bytes
+        self._most = max_bytes
         self._on_failure = on_failure
         self._changed = threading.Condition()
         self._waiting: deque[Sample] = deque()
@@ -72,7 +72,7 @@ class Sink:
             self._bytes += len(sample.payload)
 
     def _drop(self, key: str) -> None:
-        self._dropped[key if key in self._dropped or len(self._dropped) < MOST_KEYS else OTHERS] += 1
+        self._dropped[key if key in self._dropped or len(self._dropped) < MAX_KEYS else OTHERS] += 1
 
     def describe(self, name: str, values: Mapping[str, Any]) -> None:
         """Have a metadata record written; from any thread."""

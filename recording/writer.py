@@ -14,7 +14,7 @@ import msgpack
 from mcap.writer import CompressionType, Writer
 
 from common.messages import SupervisorStatus
-from common.messages.basics import MOST_NAME
+from common.messages.basics import MAX_NAME
 from recording.sample import RecordingError, Sample, schema_of, stamp_of
 
 # Of a file; whoever is on the network can make any number up, and readers take no file of many more. One of another
@@ -177,7 +177,7 @@ class RecordingWriter:
             if about not in self._about:
                 return None
             writer = ""
-        if len(sample.key) > LONGEST_KEY or len(sample.message) > MOST_NAME:
+        if len(sample.key) > LONGEST_KEY or len(sample.message) > MAX_NAME:
             return None
         if (about, writer) not in self._channels:
             self._about.add(about)
@@ -236,20 +236,20 @@ MOST_STATES = 500  # with which a file begins: those that were said last
 
 
 class SplitWriter:
-    """Writes FILE.mcap, or FILE_0.mcap, FILE_1.mcap, ... of about `most_bytes` each.
+    """Writes FILE.mcap, or FILE_0.mcap, FILE_1.mcap, ... of about `max_bytes` each.
 
     A file after the first begins with the last value of every state and with the same descriptions, so that each can
     be used alone.
     """
 
-    def __init__(self, path: Path, about: Mapping[str, Any], most_bytes: int | None = None) -> None:
+    def __init__(self, path: Path, about: Mapping[str, Any], max_bytes: int | None = None) -> None:
         """Create the first file.
 
         Raises:
             RecordingError: it is there already, or cannot be written.
         """
         self._path = path
-        self._most = most_bytes
+        self._most = max_bytes
         self._descriptions: dict[str, Mapping[str, Any]] = {ABOUT: about}
         self._states: dict[tuple[str, str], Sample] = {}
         self._earlier_messages = 0

@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -30,12 +32,13 @@ from common.process.service import main
 from common.robot.model import RobotModel
 from common.scene.workspace import configured_bounds
 from common.sim.interface import GraspTolerances, PhysicalWorld
-from common.sim.simulated_cell import SimulatedCell, create_world, matching_state
-from common.sim.standing import SavedBeside, state_file
+from common.sim.simulated_cell import Saver, SimulatedCell, create_world, matching_state
+from common.sim.standing import SavedBeside, StateFile, state_file
 from common.transport.bus import Bus
 from common.transport.writer import Writer
 
 MAX_CYCLES = 250.0  # per second of wall time
+FileLock = Callable[[Path, str], contextlib.AbstractAsyncContextManager[None]]  # of a path, for a named holder
 
 
 class Config(Parameters):
@@ -99,7 +102,10 @@ class Publishers:
                 self._updates.put(update)
 
 
-def create_executor(bus: Bus, config: Config, store: InterlockStore, simulated: bool, period: float) -> Executor:
+def create_executor(
+    bus: Bus, config: Config, store: InterlockStore, simulated: bool, period: float,
+    saver_for: Callable[[StateFile], Saver] = SavedBeside,
+) -> Executor:
     """Create the executor with its hardware at the home pose and, when simulated, all objects laid out.
 
     Its cycles are `period` of wall time [s] apart. Simulated hardware starts where it was before a restart, if that was
@@ -116,7 +122,7 @@ def create_executor(bus: Bus, config: Config, store: InterlockStore, simulated: 
                              config.grasp_tolerances, config.robot.gripper)
         if file := state_file(bus.cell):
             persisted = matching_state(file.load(), config.world.simulator, world, robot.dof)
-            saver = SavedBeside(file) if bus.has_threads else file
+            saver = saver_for(file)
         if persisted is not None:
             start = np.array(persisted.q)
     world_arm = partial(world.hardware, robot, limits, start) if isinstance(world, PhysicalWorld) else None
@@ -137,10 +143,10 @@ def create_executor(bus: Bus, config: Config, store: InterlockStore, simulated: 
 
 def serve(bus: Bus, config: Config, handlers: RequestHandlers, simulated: bool) -> None:
     """Declare all requests."""
-    bus.keep_parameters = handlers.save_speed
+    bus.save_parameters = handlers.save_speed
     bus.serve(topics.MOTION_EXECUTE, handlers.execute)
     bus.serve(topics.MOTION_FOLLOWED, handlers.followed)
-    bus.serve(topics.MOTION_STOP, handlers.stop, most=MAX_STOPS, crowded=handlers.stop_for_unread)
+    bus.serve(topics.MOTION_STOP, handlers.stop, max_pending=MAX_STOPS, on_overload=handlers.stop_for_unread)
     bus.serve(topics.MOTION_HOLD, handlers.hold)
     bus.serve(topics.MOTION_OWN, handlers.own)
     bus.serve(topics.ROBOT_COMMAND, handlers.order)
@@ -150,20 +156,28 @@ def serve(bus: Bus, config: Config, handlers: RequestHandlers, simulated: bool) 
         bus.serve(topics.WORLD_EDIT, handlers.edit)
 
 
-async def run(bus: Bus, config: Config) -> None:
-    """Control the arm until cancelled."""
+async def run(
+    bus: Bus, config: Config, *, file_lock: FileLock = exclusive_lock,
+    saver_for: Callable[[StateFile], Saver] = SavedBeside,
+) -> None:
+    """Control the arm until cancelled.
+
+    Args:
+        bus: in the cell.
+        config: parameters.
+        file_lock: keeps other executors, also of another cell of that name, from the interlock store.
+        saver_for: creates what saves the state of simulated hardware without blocking the loop.
+    """
     simulated = is_simulated(config.robot)
     publishers = Publishers(bus, config, simulated)
     jog_commands = bus.reader(topics.MOTION_JOG)
     handlers = RequestHandlers(bus.service, config, bus.clock, bus.log, publishers.put)
     serve(bus, config, handlers, simulated)
-    await bus.owned()  # until then another executor may change the file that is read now
+    await bus.acquire_keys()  # before, another executor may still change the file
     async with contextlib.AsyncExitStack() as stack:
         file = interlock_file(bus.cell)
-        if not bus.declares_only:
-            if bus.has_process:  # an executor of another cell of that name may run, too
-                await stack.enter_async_context(exclusive_lock(file.path, f"{bus.service} of {bus.cell}"))
-            file.require_writable()
+        await stack.enter_async_context(file_lock(file.path, f"{bus.service} of {bus.cell}"))
+        file.require_writable()
         began = bus.clock.now_ns()  # an executor before this one may have executed what was decided until now
         store = InterlockStore(file, bus.log)
         configured = config.speed_scaling
@@ -172,7 +186,7 @@ async def run(bus: Bus, config: Config) -> None:
             bus.log.warning("speed is at %.0f %%, as it was set while the cell ran: `zencell param set "
                             "services.trajectory_executor.speed_scaling=1` ends that", 100 * config.speed_scaling)
         period = 1 / bus.clock.wall_rate(config.joint_state_rate, MAX_CYCLES)
-        executor = await asyncio.to_thread(create_executor, bus, config, store, simulated, period)
+        executor = await asyncio.to_thread(create_executor, bus, config, store, simulated, period, saver_for)
         handlers.start(executor, store, began, configured)
         if executor.world is not None and executor.world.restored:
             bus.log.info("the arm and its surroundings are as they were before the restart")

@@ -145,8 +145,8 @@ async def run(bus: Bus, config: Config) -> None:
     depths = DepthBuffer(bus.reader(topics.DEPTH_CAMERA_DEPTH)) if config.depth else None
     detector = Detector(config.world, config)
     left_out = SkippedFrames(bus.log, "image")
-    if not bus.declares_only:
-        warm_up(config.world, config)
+    await bus.acquire_keys()
+    warm_up(config.world, config)
     await bus.ready()
 
     async def look() -> None:

@@ -39,8 +39,8 @@ import psutil
 from cli.main import app
 from common.messages import Message
 from common.transport.bus import Bus, Reader
-from common.transport.connect import connect
 from common.transport.endpoint import BASE_PORT, endpoint_of
+from common.transport.zenoh_session import connect
 
 M = TypeVar("M", bound=Message)
 
@@ -400,8 +400,8 @@ async def wait_router(endpoint: str, timeout: float) -> None:
     Raises:
         TimeoutError: after `timeout` seconds.
     """
-    from common.transport.zenoh_session import close_bounded, open_zenoh
+    from common.transport.zenoh_session import close_within, open_zenoh
 
     async with asyncio.timeout(timeout):
         session = await open_zenoh(endpoint)
-    await close_bounded(session, 0.5)
+    await close_within(session, 0.5)

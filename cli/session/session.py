@@ -227,16 +227,16 @@ class CellSession:
 
         What is simulated stays as it is through restarts, until the end; what persons decided outlives that.
         """
-        from common.kept_file import STANDING_VARIABLE, STATE_VARIABLE, lasting_folder
+        from common.atomic_file import RUNTIME_VARIABLE, STATE_VARIABLE, state_folder
         from common.transport.endpoint import DEFAULT_DOMAIN
 
         if os.environ.get(STATE_VARIABLE):
             return await self._in_cell(work)
-        kept = lasting_folder()
+        kept = state_folder()
         if self._simulated and not self.launch.connect and self.launch.domain != DEFAULT_DOMAIN:
             kept /= f"domain-{self.launch.domain}"  # there may be many of a simulated robot
         with tempfile.TemporaryDirectory(prefix="zencell-") as folder:
-            extra = {**self.launch.extra, STATE_VARIABLE: str(kept), STANDING_VARIABLE: folder}
+            extra = {**self.launch.extra, STATE_VARIABLE: str(kept), RUNTIME_VARIABLE: folder}
             self.launch = replace(self.launch, extra=extra)
             return await self._in_cell(work)
 

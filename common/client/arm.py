@@ -33,7 +33,7 @@ from common.messages import (
     RobotStatus,
     StopRequest,
 )
-from common.sources import new_id
+from common.time_source import new_id
 
 Array = NDArray[np.float64]
 

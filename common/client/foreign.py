@@ -50,16 +50,16 @@ async def samples(bus: Bus, key: str) -> AsyncGenerator[RawSample, None]:
     Raises:
         SilentKey: nothing came in the first moments.
     """
-    from common.transport.reader import Newness
+    from common.transport.reader import SequenceFilter
 
     full = f"{bus.cell}/{key}"
-    newness = Newness()
+    newness = SequenceFilter()
     arriving = bus.raw_reader(full)
     following = asyncio.ensure_future(anext(arriving))
     try:
         latched = await bus.raw_get(full, PATIENCE)
         for sample in latched:
-            if newness.is_news(sample.attachment):
+            if newness.is_new_payload(sample.attachment):
                 yield sample
         if not latched:
             await asyncio.wait({following}, timeout=PATIENCE)
@@ -68,7 +68,7 @@ async def samples(bus: Bus, key: str) -> AsyncGenerator[RawSample, None]:
         while True:
             sample = await following
             following = asyncio.ensure_future(anext(arriving))
-            if newness.is_news(sample.attachment):
+            if newness.is_new_payload(sample.attachment):
                 yield sample
     finally:
         following.cancel()  # which closes what it waits for

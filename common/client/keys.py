@@ -14,8 +14,8 @@ from common.config import load_cell, names_of
 from common.errors import UnknownName
 from common.topics import COUNTERS, LOG, PARAMETERS, SUPERVISOR_STATUS, Topic, general_key
 from common.transport.endpoint import endpoint_of
-from common.transport.keys import owns_key
 from common.transport.ownership import Owner
+from common.transport.session import owns_key
 
 Found = tuple[str, Carried | None, str]  # key, what it carries, service
 EVERYONE, SUPERVISOR = "everyone", "supervisor"

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 SUPERVISOR, ROUTER = "supervisor", "router"
 ASK_TIMEOUT = 1.0  # [s]
-MOST_KEYS = 300  # that are listened to
+MAX_KEYS = 300  # that are listened to
 
 
 @dataclass
@@ -127,7 +127,7 @@ class CellMonitor:
         self._rates.update(counters, now)
         for key in counters.received:
             known = key in self._hearing or key in self._known or key.startswith("param/")
-            if not known and is_key(key) and len(self._hearing) < MOST_KEYS:  # whoever counts may say anything
+            if not known and is_key(key) and len(self._hearing) < MAX_KEYS:  # whoever counts may say anything
                 self._listen(key)
 
     def view(self) -> View:

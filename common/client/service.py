@@ -14,7 +14,7 @@ from common.config.tunables import describe
 from common.errors import RequestFailed, UnknownName
 from common.messages import Parameter, ParameterRequest, ServiceStatus
 from common.supervision.wiring import ServiceWiring
-from common.transport.keys import ROUTER
+from common.transport.session import ROUTER
 
 ASK_TIMEOUT = 2.0  # [s]
 SIDES = ("reads", "writes", "serves", "calls")

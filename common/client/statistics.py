@@ -171,15 +171,15 @@ class TopicStatistics:
         self._clock = clock
         self._arrivals = Arrivals()
         self._delays = Delays()
-        from common.transport.reader import Newness
+        from common.transport.reader import SequenceFilter
 
-        self._newness = Newness()
+        self._newness = SequenceFilter()
         self._lock = threading.Lock()
 
     def know(self, sample: RawSample) -> None:
         """Take note of the value of a state that was said before: its repetitions are no news."""
         with self._lock:
-            self._newness.is_news(sample.attachment)
+            self._newness.is_new_payload(sample.attachment)
 
     def arrive(self, sample: RawSample) -> None:
         """Take a message."""
@@ -188,7 +188,7 @@ class TopicStatistics:
             self._arrivals.add(now, len(sample.payload))
             if stamp is None:
                 self.unstamped += 1
-            elif self._newness.is_news(sample.attachment):  # a state that is put again was made long ago
+            elif self._newness.is_new_payload(sample.attachment):  # a state that is put again was made long ago
                 self._delays.add(now, self._clock.age_ms(stamp))
 
     def arrivals(self) -> Figures:

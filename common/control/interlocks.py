@@ -18,12 +18,12 @@ from typing import Annotated, Literal
 from filelock import FileLock, Timeout
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
+from common.atomic_file import STATE_VARIABLE, AtomicFile, Unreadable, state_folder
 from common.errors import ConfigError, Refused
-from common.kept_file import STATE_VARIABLE, KeptFile, Unreadable, lasting_folder
 from common.messages import UNKNOWN_OPERATOR, HoldRequest, Interlock, StopRequest
 from common.messages.basics import either_name
 from common.messages.execution import NOT_PERSISTED
-from common.sources import monotonic, wall_ns
+from common.time_source import monotonic, wall_ns
 
 OTHERS = "others"  # name of the shared entry when there are too many
 MAX_ENTRIES = 16  # interlocks of operators
@@ -192,7 +192,7 @@ def effective_speed(saved: Speed | None, configured: float) -> float:
 # --- the file ---
 
 
-class InterlockFile(KeptFile[Record]):
+class InterlockFile(AtomicFile[Record]):
     """The file of a cell. One that cannot be read keeps the robot from moving."""
 
     def __init__(self, path: Path) -> None:
@@ -230,7 +230,7 @@ def interlock_file(cell: str, environ: Mapping[str, str] = os.environ) -> Interl
     Raises:
         ConfigError: there is no folder for it.
     """
-    return InterlockFile(lasting_folder(environ) / f"{cell}.inhibits.json")  # the name of earlier versions
+    return InterlockFile(state_folder(environ) / f"{cell}.inhibits.json")  # the name of earlier versions
 
 
 def _not_writable(path: Path, error: OSError) -> ConfigError:

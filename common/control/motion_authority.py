@@ -29,7 +29,7 @@ from common.messages import (
     OwnRequest,
     StopRequest,
 )
-from common.sources import monotonic, wall_ns
+from common.time_source import monotonic, wall_ns
 
 NOT_OWNER = "not_owner"
 STALE, AHEAD = "stale_request", "clock_ahead"

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from common.errors import ConfigError
-from common.sources import monotonic
+from common.time_source import monotonic
 
 Pixels = npt.NDArray[np.uint8]
 

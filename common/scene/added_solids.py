@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from common.errors import Refused
 from common.messages import CollisionObject, SceneEdit
-from common.messages.scene import MOST_ADDED
+from common.messages.scene import MAX_ADDED
 
 PREFIX = "added/"  # of their ids in the planning scene
 
@@ -20,7 +20,7 @@ class AddedSolids(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
     version: Literal[1] = 1
-    solids: list[CollisionObject] = Field([], max_length=MOST_ADDED)
+    solids: list[CollisionObject] = Field([], max_length=MAX_ADDED)
 
     @property
     def ids(self) -> list[str]:
@@ -51,8 +51,8 @@ class AddedSolids(BaseModel):
             return self
         if existing is not None or name in perceived:
             raise Refused("exists", f"another solid is called {name} already: remove it first")
-        if len(others) >= MOST_ADDED:
-            raise Refused("too_many", f"{MOST_ADDED} solids were added already: remove some first")
+        if len(others) >= MAX_ADDED:
+            raise Refused("too_many", f"{MAX_ADDED} solids were added already: remove some first")
         return AddedSolids(solids=[*others, solid])
 
 

@@ -21,8 +21,8 @@ from common.config import Cell, World
 from common.errors import DecodeError, RequestFailed
 from common.hardware.loading import is_simulated
 from common.messages import Message, WorldEdit
-from common.sources import monotonic
 from common.supervision.supervisor import Supervisor
+from common.time_source import monotonic
 from common.topics import AnyTopic
 from common.transport.codec import (
     DEFAULT_LIMIT,
@@ -33,8 +33,8 @@ from common.transport.codec import (
     encode_attachment,
     encoding_of,
 )
-from common.transport.keys import ROUTER
 from common.transport.ownership import Owner
+from common.transport.session import ROUTER
 from lab.chaos.plan import CELL_SECONDS, STATELESS_FORMS, Fault, Form, faults, plan
 from lab.chaos.slip_gate import SlipGate
 from tools.check.cell import seen_from_home

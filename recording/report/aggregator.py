@@ -16,7 +16,7 @@ from common.application import Application, applications
 from common.client.rates import Rates
 from common.config import RobotConfig
 from common.messages import Message, TaskStatus
-from common.sources import monotonic
+from common.time_source import monotonic
 from common.topics import Topic
 from recording.report.application import Figures, Listener, figures_of
 from recording.report.summary import Summary

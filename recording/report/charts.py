@@ -18,7 +18,7 @@ from recording.report.history import SAME_PLACE, RunHistory, Span
 
 Array = npt.NDArray[np.float64]
 
-MOST_POINTS = 1200  # of a line: more than a page has pixels for
+MAX_POINTS = 1200  # of a line: more than a page has pixels for
 STATE_COLORS = {"IDLE": "#c9ced6", "DONE": "#5fb35f", "ERROR": "#d64545"}  # those of every task
 MOTION_COLORS = {"succeeded": "#5d6a7a", "cancelled": "#e6a229", "aborted": "#d64545", "rejected": "#d64545",
                  "not ended": "#c9ced6"}
@@ -177,9 +177,9 @@ def top_view(run: RunHistory, tool: Array, marks: Mapping[str, Mapping[tuple[int
 
 def thinned(times: Array, values: Array) -> npt.NDArray[np.intp]:
     """Indices of at most so many samples as a picture can show, among them the extremes of each column."""
-    if len(times) <= MOST_POINTS:
+    if len(times) <= MAX_POINTS:
         return np.arange(len(times))
-    step = -(-len(times) // MOST_POINTS)
+    step = -(-len(times) // MAX_POINTS)
     kept = set(range(0, len(times), step)) | {len(times) - 1}
     for column in values.T:
         if np.isfinite(column).any():

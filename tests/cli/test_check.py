@@ -137,7 +137,7 @@ def test_parameter_that_nobody_reads_and_key_that_names_nothing_are_told_once_ea
     assert done.returncode == 1 and all(each["severity"] == "error" and each["refused"] for each in found)
     assert [each["what"].partition(";")[0] for each in found] == [
         "services.vision_detector.speling: 3 is not a parameter",
-        "services.scene_manager.topics: 'camra/*' is no key that it reads, writes, serves or asks"]
+        "services.scene_manager.topics: 'camra/*' is no key that it reads, writes, serves or calls"]
 
 
 def test_cell_that_is_well_says_so_and_bad_input_is_one_line(tmp_path):

@@ -240,7 +240,7 @@ async def test_version_is_read_from_what_the_supervisor_says(monkeypatch: pytest
     async def connect(**_: Any) -> Any:
         yield here.bus("tool", cell="_")
 
-    monkeypatch.setattr("common.transport.connect.connect", connect)
+    monkeypatch.setattr("common.transport.zenoh_session.connect", connect)
     good = here.bus("supervisor", cell="good")
     good.writer(topics.SUPERVISOR_STATUS).put(SupervisorStatus(cell="good", services=[]))
     await good.ready()

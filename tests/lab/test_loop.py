@@ -5,13 +5,13 @@ import time
 
 import pytest
 
-from common.sources import drawn_from, monotonic, new_id
+from common.time_source import monotonic, new_id, use_time_source
 from lab.loop import CLOCK_READ_NS, EPOCH_NS, Deadlock, Incarnation, VirtualTimeLoop, context_of
 
 
 def run(main, seed=1, *, shuffled=False):
     loop = VirtualTimeLoop(seed, shuffled=shuffled)
-    with drawn_from(loop):
+    with use_time_source(loop):
         try:
             return loop.run_until_complete(main(loop))
         finally:

@@ -9,7 +9,7 @@ import pytest
 from common.clock import Clock
 from common.errors import NoResponder, RequestLost, RequestTimeout
 from common.messages import HoldRequest, MotionStatus, SceneUpdate
-from common.sources import drawn_from
+from common.time_source import use_time_source
 from common.topics import MOTION_HOLD, MOTION_STATUS, SCENE_OBJECT_UPDATES
 from common.transport.bus import Bus
 from lab.loop import VirtualTimeLoop
@@ -66,7 +66,7 @@ def run(main, links=GOOD_LINKS):
                 task.cancel()
             await asyncio.gather(*rest, return_exceptions=True)
 
-    with drawn_from(loop):
+    with use_time_source(loop):
         try:
             return loop.run_until_complete(run_and_clean_up())
         finally:

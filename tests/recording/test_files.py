@@ -114,7 +114,7 @@ def test_states_before_a_time_are_the_last_of_each_whoever_wrote_it(tmp_path: Pa
 
 
 def test_files_of_a_split_are_complete_alone(tmp_path: Path) -> None:
-    writer = SplitWriter(tmp_path / "a.mcap", {"cell": "panda"}, most_bytes=6000)
+    writer = SplitWriter(tmp_path / "a.mcap", {"cell": "panda"}, max_bytes=6000)
     writer.describe("run", {"seed": 3})
     writer.add(status(0, "GRASPING"))
     for number in range(1, 40):

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from common import topics
+from common.atomic_file import STATE_VARIABLE
 from common.clock import Clock
 from common.config import load_cell, service_config
 from common.errors import RemoteError
-from common.kept_file import STATE_VARIABLE
 from common.messages import ExecuteRequest, GripperCommand, JointState, TFMessage, Vector3, WorldEdit
 from common.process.in_process import running_service
 from common.robot.finger_joints import finger_positions

@@ -11,9 +11,9 @@ from applications.pick_place.task import PickPlace
 from applications.pick_place.topics import PICK_PLACE_STATUS, VALIDATED_TARGETS
 from common import messages as m
 from common import topics
+from common.atomic_file import RUNTIME_VARIABLE
 from common.clock import Clock
 from common.config import load_cell, service_config
-from common.kept_file import STANDING_VARIABLE
 from common.process import task_runner
 from common.process.in_process import running_service
 from common.process.task_runner import run_task
@@ -95,7 +95,7 @@ async def test_late_reader_gets_the_status() -> None:
 
 @pytest.mark.parametrize("damaged", ["{", '{"places": [[0.5, 0.2, NaN]]}', '{"places": 3}', "[]"])
 async def test_release_positions_survive_a_restart(damaged, monkeypatch, tmp_path, caplog) -> None:
-    monkeypatch.setenv(STANDING_VARIABLE, str(tmp_path))
+    monkeypatch.setenv(RUNTIME_VARIABLE, str(tmp_path))
     tasks: list[PickPlace] = []
 
     class Seen(PickPlace):
@@ -125,7 +125,7 @@ async def test_initial_memory_is_used_and_saved_as_soon_as_possible(
 ) -> None:
     blocker = tmp_path / "standing"
     blocker.write_text("no folder")
-    monkeypatch.setenv(STANDING_VARIABLE, str(blocker / "cell"))
+    monkeypatch.setenv(RUNTIME_VARIABLE, str(blocker / "cell"))
     monkeypatch.setattr(task_runner, "SAVE_RETRY", 0.01)
     initial, later = ReleasePositions(places=[(0.5, 0.2, 0.095)]), ReleasePositions(places=[(0.5, 0.3, 0.035)])
     tasks: list[PickPlace] = []

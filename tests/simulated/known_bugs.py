@@ -17,9 +17,9 @@ from common.control.interlocks import InterlockFile, Record
 from common.control.limiter import Limiter
 from common.control.motion_authority import MotionOwnership
 from common.control.trajectory_controller import TrajectoryController
-from common.sources import host_ns, wall_ns
+from common.time_source import host_ns, wall_ns
 from common.transport import requests
-from common.transport.reader import Newness
+from common.transport.reader import SequenceFilter
 from lab import processes
 from lab.doubles import settings_of, with_doubles
 from lab.simulation import Simulation
@@ -107,11 +107,11 @@ def _never_asked_again():
             note(str(error))
             await asyncio.Event().wait()
 
-    return patch("common.process.orders.persist", once)
+    return patch("common.process.task_requests.call_until_answered", once)
 
 
 BUGS = {
-    "what is not newer is read": lambda: patch.object(Newness, "is_new", lambda self, attachment: True),
+    "what is not newer is read": lambda: patch.object(SequenceFilter, "is_new", lambda self, attachment: True),
     "a repeated goal id acts again": lambda: patch.object(GoalMemory, "get", lambda self, goal: None),
     "the task reads the truth": _truth_read,
     "a hold is forgotten": _hold_forgotten,

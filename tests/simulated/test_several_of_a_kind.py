@@ -74,7 +74,7 @@ async def test_keys_and_owners_follow_from_the_cell() -> None:
 
 
 async def test_each_camera_says_its_own_frame_and_tf_has_both(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ownership, "GIVE_UP", 0.0)
+    monkeypatch.setattr(ownership, "CLAIM_SECONDS", 0.0)
     cell, net = load_cell(CELL), LocalNetwork()
     bus = net.bus("tester")
     infos = {side: bus.reader(replace(topics.CAMERA_INFO, key=f"{side}/camera/camera_info"))

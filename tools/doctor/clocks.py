@@ -93,7 +93,7 @@ async def skews_of(bus: Bus, clock: Clock, services: set[str]) -> dict[str, Skew
 async def _all_skews(endpoint: str) -> dict[str, dict[str, Skew]]:
     from common.client.joining import TOOL, alive, cell_clock
     from common.errors import NoRouter
-    from common.transport.connect import connect
+    from common.transport.zenoh_session import connect
 
     services: dict[str, set[str]] = {}
     try:

@@ -19,7 +19,7 @@ TIMEOUT = 1.0  # [s]
 
 def router(endpoint: str) -> Finding:
     """Who listens where the router of the domain would."""
-    from common.transport.router import holder_of
+    from common.transport.router import port_holder
 
     host, _, port = endpoint.partition("/")[2].rpartition(":")
     try:
@@ -29,7 +29,7 @@ def router(endpoint: str) -> Finding:
         return ok(f"{endpoint} is free: no cell is up there")
     except OSError as error:
         return warn(f"{endpoint} cannot be reached ({error})", "check --connect and the network")
-    holder = holder_of(int(port))
+    holder = port_holder(int(port))
     if ROUTER_MODULE in holder:
         return ok(f"{endpoint}: a router of zencell answers there, {holder}")
     return warn(f"{endpoint} is in use by {holder}", "stop it, or give zencell another --domain")
@@ -37,14 +37,14 @@ def router(endpoint: str) -> Finding:
 
 def page() -> Finding:
     """Who listens where the operator's page would."""
-    from common.transport.router import holder_of
+    from common.transport.router import port_holder
 
     where = f"port {PAGE_PORT} of the operator's page"
     with socket.socket() as probe:
         probe.settimeout(TIMEOUT)
         if probe.connect_ex((PAGE_HOST, PAGE_PORT)):
             return ok(f"{where} is free")
-    holder = holder_of(PAGE_PORT)
+    holder = port_holder(PAGE_PORT)
     if VIEWER_MODULE in holder:
         return ok(f"{where}: a page of zencell is served there, {holder}")
     return warn(f"{where} is in use by {holder}", "zencell takes the next free one; --viewer-port N chooses another")
@@ -75,7 +75,7 @@ async def schema_problems(endpoint: str) -> dict[str, str]:
     from common.errors import DecodeError, NoRouter
     from common.messages import SupervisorStatus
     from common.transport.codec import decode, decode_attachment
-    from common.transport.connect import connect
+    from common.transport.zenoh_session import connect
 
     found: dict[str, str] = {}
     try:
@@ -113,20 +113,19 @@ def foreign_interpreters(commands: dict[int, list[str]]) -> dict[int, str]:
 
 def certificates(now: datetime.datetime | None = None) -> Iterator[Finding]:
     """Until when those of `ZENCELL_SECURE` are valid; nothing for an open cell."""
-    from common.transport.credentials import secure_folder
-    from common.transport.expiry import ends_in, warning_of
+    from common.transport.credentials import expiries_in, expiry_warning, secure_folder
 
     folder = secure_folder()
     if folder is None:
         return
     at = now or datetime.datetime.now(datetime.UTC)
-    ends = ends_in(folder)
+    ends = expiries_in(folder)
     if not ends:
         yield fail(f"{folder} has no certificates that can be read", "make them with `zencell secure init`")
-    found = {name: warning_of(name, until, at) for name, until in ends.items()}
+    found = {name: expiry_warning(name, until, at) for name, until in ends.items()}
     for told in found.values():
         if told is not None:
             urgent, line = told
             yield (fail if urgent else warn)(line, f"zencell secure renew {folder}")
     if ends and not any(found.values()):
-        yield ok(f"{len(ends)} certificates in {folder}, the first ends on {min(ends.values()):%Y-%m-%d}")
+        yield ok(f"{len(ends)} certificates in {folder}, the first expires on {min(ends.values()):%Y-%m-%d}")

@@ -15,6 +15,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from common.atomic_file import state_folder
 from common.control.interlocks import (
     MAX_ENTRIES,
     MAX_GOALS,
@@ -27,7 +28,6 @@ from common.control.interlocks import (
     interlock_file,
 )
 from common.errors import ConfigError
-from common.kept_file import lasting_folder
 from common.messages import HoldRequest, MotionStatus, StopRequest
 
 T0 = 1_700_000_000_000_000_000
@@ -349,6 +349,6 @@ def test_folder_that_cannot_be_written_is_refused_in_one_line(tmp_path: Path) ->
 
 
 def test_the_folder_is_the_one_that_was_named_or_one_that_lasts() -> None:
-    assert lasting_folder({"ZENCELL_STATE": "/data", "XDG_STATE_HOME": "/x"}) == Path("/data")
-    assert lasting_folder({"ZENCELL_STATE": "", "XDG_STATE_HOME": "/x"}) == Path("/x/zencell")
-    assert lasting_folder({}) == Path.home() / ".local" / "state" / "zencell"
+    assert state_folder({"ZENCELL_STATE": "/data", "XDG_STATE_HOME": "/x"}) == Path("/data")
+    assert state_folder({"ZENCELL_STATE": "", "XDG_STATE_HOME": "/x"}) == Path("/x/zencell")
+    assert state_folder({}) == Path.home() / ".local" / "state" / "zencell"

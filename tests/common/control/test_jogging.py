@@ -22,7 +22,7 @@ from common.messages import (
     Vector3,
 )
 from common.robot.model import RobotModel
-from common.sources import Machine, drawn_from
+from common.time_source import SystemTimeSource, use_time_source
 
 PERIOD = 0.01
 UR5_WORKS = np.array([0.0, -1.9, 1.9, -1.6, -1.57, 0.0])  # at home it stands upright: a singular place
@@ -45,13 +45,13 @@ class Moved:
             tuple(robot.joint_names), robot.lower, robot.upper, robot.velocity, robot.acceleration,
             np.array(robot.config.deceleration_limits) if robot.config.deceleration_limits else None, robot.jerk)
         self.executor = Executor(MockHardware(home, None), self.limits, home, kinematics=robot)
-        self.sources = Machine()
-        self.sources.monotonic_ns = self.sources.wall_ns = lambda: self.stamp
+        self.source = SystemTimeSource()
+        self.source.monotonic_ns = self.source.wall_ns = lambda: self.stamp
         self.run(0.35)  # after which a stream of commands is none of before
 
     def step(self, seconds=PERIOD):
         self.stamp += int(seconds * 1e9)
-        with drawn_from(self.sources):
+        with use_time_source(self.source):
             self.reports.append(self.executor.cycle(Header(stamp=self.stamp)))
         self.sent.append((self.stamp * 1e-9, self.executor.arm.set_point.copy()))
 
@@ -64,7 +64,7 @@ class Moved:
         for k in range(round(seconds / PERIOD)):
             if k % 2 == 0:
                 try:
-                    with drawn_from(self.sources):
+                    with use_time_source(self.source):
                         self.executor.jog(JogCommand(**{"owner": "ann", **asked}))
                 except Refused as refusal:
                     self.refused.append(refusal.code)
@@ -75,7 +75,7 @@ class Moved:
         self.jog(seconds, **dict(zip(("linear", "angular"), vectors, strict=True)), **asked)
 
     def asked(self, call, *args):
-        with drawn_from(self.sources):
+        with use_time_source(self.source):
             return call(*args)
 
     def own(self, act="take", owner="ann", **more):

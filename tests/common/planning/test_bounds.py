@@ -8,7 +8,7 @@ import pytest
 
 from common.messages import ArcGoal, PathGoal, Pose, PoseGoal, SequenceGoal, SequenceItem, Vector3
 from common.messages.planning import PlanRequest, PlanResponse
-from common.messages.robot import MOST_POINTS
+from common.messages.robot import MAX_POINTS
 from common.planning.path import dense_path
 from common.planning.pipeline import PlanningPipeline
 from common.planning.retiming import parametrise
@@ -87,12 +87,12 @@ def test_a_path_is_timed_within_the_time_and_the_states_that_there_are() -> None
     with pytest.raises(TooLong, match="planning ended while the path was timed") as late:
         parametrise(path, np.ones(3), np.ones(3), deadline=0.0)
     assert late.value.code == "timeout"
-    with pytest.raises(TooLong, match=f"a trajectory has {MOST_POINTS} at most") as long:
+    with pytest.raises(TooLong, match=f"a trajectory has {MAX_POINTS} at most") as long:
         parametrise(path, np.ones(3), np.ones(3), step=1e-6)
     assert long.value.code == "too_long"
 
 
-@pytest.mark.parametrize(("states", "duration"), [(MOST_POINTS + 1, 1.0), (10, 1e7)])
+@pytest.mark.parametrize(("states", "duration"), [(MAX_POINTS + 1, 1.0), (10, 1e7)])
 def test_what_could_not_be_sent_is_no_answer(states: int, duration: float) -> None:
     rest = np.zeros((states, 7))
     with pytest.raises(TooLong, match="states and takes"):

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from common.config import load_cell
 from common.errors import UnknownName
 from common.messages import Header, JointState, Pose, TFMessage, TransformStamped, Vector3
-from common.messages.basics import MOST_STAMP
+from common.messages.basics import MAX_STAMP
 from common.robot.model import RobotModel
 from common.robot.transform_tree import (
     HISTORY_SIZE,
@@ -101,7 +101,7 @@ def test_older_transform_is_ignored_unless_the_child_has_a_new_parent() -> None:
 
 def test_stamp_in_the_future_does_not_block_later_updates_of_the_tree() -> None:
     tree = TransformTree()
-    for stamp, x in ((MOST_STAMP, 1), (20, 2), (10, 3)):
+    for stamp, x in ((MAX_STAMP, 1), (20, 2), (10, 3)):
         tree.set("belt", "part", shifted(x), stamp)
     assert tree.pose("belt", "part")[0, 3] == 2.0 and tree.stamp_of("part") == 20
 
@@ -189,7 +189,7 @@ def test_flood_of_invented_frames_does_not_drop_a_frame_that_is_updated() -> Non
 
 def test_stamp_in_the_future_does_not_block_later_updates_of_the_history() -> None:
     history = history_of([0, 20 * MS])
-    future = [each.model_copy(update={"header": Header(stamp=MOST_STAMP, frame_id=each.header.frame_id)})
+    future = [each.model_copy(update={"header": Header(stamp=MAX_STAMP, frame_id=each.header.frame_id)})
               for each in tf_of(joints_at(40 * MS), 40 * MS).transforms]
     history.add(TFMessage(transforms=future))
     for stamp in (60 * MS, 80 * MS):

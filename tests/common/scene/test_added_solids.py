@@ -3,10 +3,10 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
+from common.atomic_file import ROOM
 from common.errors import Refused
-from common.kept_file import ROOM
 from common.messages import CollisionObject, SceneEdit
-from common.messages.scene import MOST_ADDED
+from common.messages.scene import MAX_ADDED
 from common.scene.added_solids import AddedSolids, added_solids
 
 
@@ -41,12 +41,12 @@ def test_conflicting_edit_is_refused(request_: SceneEdit, perceived: tuple[str, 
 
 def test_maximum_number_of_solids_fits_into_the_file() -> None:
     solids = AddedSolids()
-    for number in range(MOST_ADDED):
+    for number in range(MAX_ADDED):
         at, color = dict.fromkeys("xyz", -1 / 3), dict.fromkeys("rgba", 1 / 3)
         solids = solids.apply(
             edit(name=f"{number:ä>100}", dimensions=[1 / 3] * 3, pose={"position": at}, color=color))
     assert len(solids.model_dump_json(indent=1).encode()) < ROOM / 2
-    with pytest.raises(Refused, match=f"{MOST_ADDED} solids") as refusal:
+    with pytest.raises(Refused, match=f"{MAX_ADDED} solids") as refusal:
         solids.apply(edit())
     assert refusal.value.code == "too_many"
     assert AddedSolids.model_validate_json(solids.model_dump_json()) == solids

@@ -21,10 +21,10 @@ from common.transport.codec import (
     decode_attachment,
     encode,
     encode_attachment,
-    require_whole,
+    require_intact,
 )
 from common.transport.ownership import Owner
-from common.transport.reader import Newness
+from common.transport.reader import SequenceFilter
 from common.transport.session import RawSample
 from lab.chaos.agent import damaged, keys_of, next_damaged, nonsense
 from lab.chaos.plan import CELL_SECONDS, LABELS, Fault, Form, Kind, faults, plan
@@ -101,11 +101,11 @@ def test_remapped_key_has_the_topic_of_its_services_own_key() -> None:
 def test_damaged_message_is_rejected(form: Form) -> None:
     payload = encode(PickPlaceStatus(placed=3))
     attachment = Attachment("smart_pick_place.1", 7, checksum=checksum_of("panda/pick_place_status", payload))
-    require_whole(attachment, "panda/pick_place_status", payload)
+    require_intact(attachment, "panda/pick_place_status", payload)
     for seed in range(50):
         bad = damaged(payload, form, np.random.default_rng(seed))
         with pytest.raises(DecodeError):
-            require_whole(attachment, "panda/pick_place_status", bad)
+            require_intact(attachment, "panda/pick_place_status", bad)
             decode(PickPlaceStatus, bad)
         if form == "huge":
             break
@@ -118,14 +118,14 @@ def test_image_damaged_beyond_its_checksum_costs_one_image() -> None:
     def attachment_of(number: int) -> Attachment:
         return Attachment("depth_camera.1", number, checksum=checksum_of(key, payload))
 
-    newness = Newness()
+    newness = SequenceFilter()
     assert newness.is_new(attachment_of(7))
     real = RawSample(key, payload, "", encode_attachment(attachment_of(7)))
     bad = (next_damaged(real, attachment_of(7), "flipped", rng) for _ in range(100))
     body, encoded = next((body, encoded) for body, encoded in bad if body[:CHECKED_BYTES] == payload[:CHECKED_BYTES])
     attachment = decode_attachment(encoded)
     assert attachment is not None and body != payload
-    require_whole(attachment, key, body)
+    require_intact(attachment, key, body)
     assert newness.is_new(attachment) and not newness.is_new(attachment_of(8)) and newness.is_new(attachment_of(9))
 
 

@@ -9,7 +9,7 @@ import pytest
 import trimesh
 
 from common.errors import ConfigError
-from common.mesh_files import parts_of, triangles_of
+from common.robot.mesh_files import parts_of, triangles_of
 
 BOX = trimesh.creation.box((0.1, 0.2, 0.3))
 DAMAGED = {

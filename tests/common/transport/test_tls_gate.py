@@ -7,7 +7,7 @@ from contextlib import suppress
 
 import pytest
 
-from common.transport.front import MOST_OF_ADDRESS, Front
+from common.transport.tls_gate import MAX_PER_ADDRESS, TlsGate
 
 HELLO = b"\x16\x03\x01\x00\x20\x01"
 PATIENCE = 20.0  # [s] only ever waited for by a test that fails
@@ -45,7 +45,7 @@ def echo() -> Iterator[Echo]:
 def port(echo: Echo) -> Iterator[int]:
     with socket.create_server(("127.0.0.1", 0)) as probe:
         number = int(probe.getsockname()[1])
-    with Front([f"tls/127.0.0.1:{number}"]) as front:
+    with TlsGate([f"tls/127.0.0.1:{number}"]) as front:
         front.open(*echo.listener.getsockname())
         yield number
 
@@ -87,7 +87,7 @@ def test_an_end_is_passed_on_both_ways(port: int, echo: Echo) -> None:
 
 
 def test_silent_ones_do_not_keep_out_who_speaks(port: int, echo: Echo) -> None:
-    silent = [joined(port) for _ in range(4 * MOST_OF_ADDRESS)]
+    silent = [joined(port) for _ in range(4 * MAX_PER_ADDRESS)]
     with joined(port) as connection:
         connection.settimeout(3.0)
         connection.sendall(HELLO)
@@ -101,10 +101,10 @@ def test_silent_ones_do_not_keep_out_who_speaks(port: int, echo: Echo) -> None:
 def test_endpoint_that_somebody_else_has_by_now_is_named(echo: Echo) -> None:
     with socket.create_server(("127.0.0.1", 0)) as probe:
         endpoint = f"tls/127.0.0.1:{probe.getsockname()[1]}"
-    with Front([endpoint]) as first, Front([endpoint]) as second:
+    with TlsGate([endpoint]) as first, TlsGate([endpoint]) as second:
         first.open(*echo.listener.getsockname())
         with pytest.raises(OSError, match="in use") as taken:
             second.open(*echo.listener.getsockname())
         assert taken.value.filename == endpoint
     with echo.listener, pytest.raises(OSError, match="in use") as taken:
-        Front([f"tls/127.0.0.1:{echo.listener.getsockname()[1]}"])
+        TlsGate([f"tls/127.0.0.1:{echo.listener.getsockname()[1]}"])

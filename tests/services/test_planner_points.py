@@ -1,4 +1,4 @@
-"""The planner of a cell with a depth camera avoids what nobody told it of, or says why it cannot."""
+"""A planner with a depth camera avoids obstacles that the planning scene lacks, or reports why it cannot."""
 
 from __future__ import annotations
 
@@ -58,12 +58,12 @@ UNKNOWN = {"unknown": "occupied", "box": {"low": [0.42, -0.1, 1.02], "high": [0.
 POST = ObjectConfig(id="post", shape="box", x=0.5, y=0.0, z=1.0, size=(0.08, 0.08), height=0.25)
 
 
-def sees(**options) -> motion_planner.Config:
+def with_points(**options) -> motion_planner.Config:
     return PLANNER.model_copy(update={"points": PointsOptions(stride=4, max_age=60.0, **options)})
 
 
 class Cell:
-    """What a tester says to a planner and a depth camera."""
+    """A network with clients of a planner and a depth camera."""
 
     def __init__(self) -> None:
         self.net = LocalNetwork()
@@ -74,25 +74,25 @@ class Cell:
         self.depths = self.bus.reader(topics.DEPTH_CAMERA_DEPTH)
         self.clouds = self.bus.reader(topics.DEPTH_CAMERA_POINTS)
 
-    def say(self, q: np.ndarray, *things: ObjectConfig, stamp: int | None = None) -> None:
+    def publish(self, q: np.ndarray, *objects: ObjectConfig, stamp: int | None = None) -> None:
         camera = AROUND.camera
         T = transform(rpy_to_matrix(*camera.rpy), camera.position)
         self.static.put(TFMessage(transforms=[stamped("world", camera.frame, T, 0)]))
         self.scenes.put(SCENE)
-        self.stand(q, stamp)
-        self.truth.put(WorldObjects(objects=[world_object(thing) for thing in things]))
+        self.put_state(q, stamp)
+        self.truth.put(WorldObjects(objects=[world_object(item) for item in objects]))
 
-    def stand(self, q: np.ndarray, stamp: int | None = None) -> None:
+    def put_state(self, q: np.ndarray, stamp: int | None = None) -> None:
         header = self.bus.header() if stamp is None else Header(stamp=stamp)
         self.joints.put(JointState(header=header, name=ROBOT.joint_names, position=list(q)))
 
-    async def picture(self, reader) -> None:
-        """One that was taken from now on has come, and where the robot was then is known."""
+    async def new_image(self, reader) -> None:
+        """Wait for an image taken from now on, and publish a joint state at its time."""
         now = self.bus.clock.now_ns()
         async with asyncio.timeout(60):
-            while (picture := await reader.next()).header.stamp < now:
+            while (image := await reader.next()).header.stamp < now:
                 pass
-        self.stand(START, picture.header.stamp)
+        self.put_state(START, image.header.stamp)
 
     async def refusal(self) -> RemoteError:
         with pytest.raises(RemoteError) as caught:
@@ -102,7 +102,7 @@ class Cell:
 
 
 def joints_at(y: float) -> np.ndarray:
-    """Where the tool points down beside the block's middle, close above it."""
+    """Joint positions with the tool pointing down next to the block's middle, close above it."""
     found = solve_ik(ROBOT, tip_at(0.5, y, 1.15), HOME, rng=np.random.default_rng(1))
     assert found is not None
     return found
@@ -126,90 +126,90 @@ def hits(response) -> bool:
 
 
 @pytest.mark.parametrize("camera", [DEPTH, {"points": topics.DEPTH_CAMERA_POINTS.key}], ids=["depth", "cloud"])
-async def test_what_only_the_camera_sees_is_avoided(camera) -> None:
-    cell, kinds = Cell(), [PLANNER, sees(cameras=[camera], **(UNKNOWN if "depth" in camera else {}))]
+async def test_obstacle_that_only_the_camera_sees_is_avoided(camera) -> None:
+    cell, kinds = Cell(), [PLANNER, with_points(cameras=[camera], **(UNKNOWN if "depth" in camera else {}))]
     outcomes = []
     async with AsyncExitStack() as stack:
         await stack.enter_async_context(running_service(cell.net, depth_camera.run, CAMERA, name="depth_camera"))
         for config in kinds:
             async with running_service(cell.net, motion_planner.run, config, name="motion_planner"):
                 await cell.plan.wait_available(20)
-                cell.say(START, POST)
-                await cell.picture(cell.clouds if "points" in camera else cell.depths)
+                cell.publish(START, POST)
+                await cell.new_image(cell.clouds if "points" in camera else cell.depths)
                 response = await cell.plan.call(ACROSS, timeout=60)
                 assert response.ok, response.message
                 outcomes.append(hits(response))
-    assert outcomes[0]  # so it is in the way
+    assert outcomes[0]  # the post obstructs the path without points
     assert not outcomes[1]
 
 
 @pytest.fixture
 async def planner():
     cell = Cell()
-    async with running_service(cell.net, motion_planner.run, sees(cameras=[DEPTH]), name="motion_planner"):
+    async with running_service(cell.net, motion_planner.run, with_points(cameras=[DEPTH]), name="motion_planner"):
         await cell.plan.wait_available(20)
         yield cell
 
 
-async def test_without_a_picture_nothing_is_planned(planner) -> None:
-    planner.say(START)
+async def test_request_before_the_first_image_is_refused(planner) -> None:
+    planner.publish(START)
     refusal = await planner.refusal()
     assert refusal.code == "no_points" and "depth_camera/depth/image_raw: no image received yet" in refusal.message
 
 
-async def test_picture_of_a_moment_at_which_the_robot_was_anywhere_is_refused(planner) -> None:
+async def test_image_without_a_joint_state_at_its_time_is_refused(planner) -> None:
     async with running_service(planner.net, depth_camera.run, CAMERA, name="depth_camera"):
-        planner.say(START, stamp=1)
+        planner.publish(START, stamp=1)
         async with asyncio.timeout(60):
             await planner.depths.next()
         refusal = await planner.refusal()
         assert refusal.code == "no_state" and "no joint state at the time" in refusal.message
 
 
-async def test_old_picture_is_refused() -> None:
+async def test_old_image_is_refused() -> None:
     cell, config = Cell(), PLANNER.model_copy(update={"points": PointsOptions(cameras=[DEPTH], max_age=1e-6)})
     async with AsyncExitStack() as stack:
         await stack.enter_async_context(running_service(cell.net, motion_planner.run, config, name="motion_planner"))
         await stack.enter_async_context(running_service(cell.net, depth_camera.run, CAMERA, name="depth_camera"))
         await cell.plan.wait_available(20)
-        cell.say(START)
-        await cell.picture(cell.depths)
+        cell.publish(START)
+        await cell.new_image(cell.depths)
         refusal = await cell.refusal()
-        assert refusal.code == "old_points" and "points.max_age is 1e-06 s" in refusal.message
+        assert refusal.code == "old_points" and "limit points.max_age is 1e-06 s" in refusal.message
 
 
-async def test_frame_that_nobody_knows_is_refused(planner) -> None:
+async def test_unknown_camera_frame_is_refused(planner) -> None:
     async with running_service(planner.net, depth_camera.run, CAMERA, name="depth_camera"):
-        planner.say(START)
+        planner.publish(START)
         planner.static.put(TFMessage(transforms=[stamped("world", "elsewhere", np.eye(4), 0)]))
-        await planner.picture(planner.depths)
+        await planner.new_image(planner.depths)
         refusal = await planner.refusal()
     assert refusal.code == "bad_points" and "depth_camera_optical_frame" in refusal.message
 
 
-async def test_who_asks_before_the_first_picture_asks_again() -> None:
-    told: list[str] = []
+async def test_client_retries_a_request_that_came_before_the_first_image() -> None:
+    reports: list[str] = []
 
     class Client:
         async def call(self, request, timeout):
-            if not told:
-                raise RemoteError("motion/plan", "no_points", "nothing came yet")
+            if not reports:
+                raise RemoteError("motion/plan", "no_points", "no image received yet")
             return "a plan"
 
-    assert await call_until_answered(Client(), ACROSS, 1.0, refused=lambda error: error, report=told.append) == "a plan"
-    assert len(told) == 1
+    answer = await call_until_answered(Client(), ACROSS, 1.0, refused=lambda error: error, report=reports.append)
+    assert answer == "a plan" and len(reports) == 1
 
 
-async def test_it_reads_cameras_where_it_is_told_to() -> None:
+async def test_wiring_includes_the_configured_cameras() -> None:
     plain = {topic.key for topic in (await wiring(motion_planner.run, PLANNER)).reads}
     assert plain == {topics.PLANNING_SCENE.key, topics.JOINT_STATES.key, topics.MOTION_STATUS.key}
     other = {"points": "left/points"}
-    found = {topic.key for topic in (await wiring(motion_planner.run, sees(cameras=[DEPTH, other]))).reads}
+    found = {topic.key for topic in (await wiring(motion_planner.run, with_points(cameras=[DEPTH, other]))).reads}
     assert found - plain == {topics.TF_STATIC.key, "left/points", *DEPTH.values()}
 
 
 @pytest.mark.parametrize(
-    ("options", "told"),
+    ("options", "message"),
     [
         ({"cameras": [{}]}, "either points, or depth and info"),
         ({"cameras": [{"depth": "a"}]}, "either points, or depth and info"),
@@ -219,12 +219,12 @@ async def test_it_reads_cameras_where_it_is_told_to() -> None:
         ({"cameras": [DEPTH], "unknown": "occupied", "box": {"low": [0, 0, 0], "high": [9, 9, 9]}}, "million cubes"),
     ],
 )
-def test_options_that_cannot_be_are_told(options, told) -> None:
-    with pytest.raises(ValidationError, match=told):
+def test_invalid_options_are_refused(options, message) -> None:
+    with pytest.raises(ValidationError, match=message):
         PointsOptions(**options)
 
 
-def test_camera_on_the_robot_is_where_its_link_was() -> None:
+def test_mounted_camera_has_the_pose_of_its_link() -> None:
     on_tool = transform(np.eye(3), (0.0, 0.05, 0.1))
     link = ROBOT.link_names[-1]
     poses = TFMessage(transforms=[stamped("mount", "lens", on_tool, 0), stamped(link, "mount", on_tool, 0)])
@@ -232,12 +232,12 @@ def test_camera_on_the_robot_is_where_its_link_was() -> None:
     np.testing.assert_allclose(frame_pose("lens", poses, ROBOT, START), expected, atol=1e-12)
     with pytest.raises(FrameError, match="'nowhere'; its frames: lens, mount"):
         frame_pose("nowhere", poses, ROBOT, START)
-    around = TFMessage(transforms=[stamped("a", "b", on_tool, 0), stamped("b", "a", on_tool, 0)])
+    cycle = TFMessage(transforms=[stamped("a", "b", on_tool, 0), stamped("b", "a", on_tool, 0)])
     with pytest.raises(FrameError, match="frame 'a'; its"):
-        frame_pose("a", around, ROBOT, START)
+        frame_pose("a", cycle, ROBOT, START)
 
 
-def test_where_the_robot_was_is_between_the_states_about_it() -> None:
+def test_joint_history_interpolates_between_close_states() -> None:
     history = JointHistory(ROBOT)
     for stamp, q in ((1.0, START), (1.02, START + 0.02), (1.01, START - 1), (3.0, GOAL)):
         header = Header(stamp=int(stamp * 1e9))
@@ -248,8 +248,8 @@ def test_where_the_robot_was_is_between_the_states_about_it() -> None:
     assert history.at(int(2e9)) is None and history.at(int(0.8e9)) is None
 
 
-def test_clouds_are_read_by_their_fields() -> None:
-    rows = np.zeros((2, 20), np.uint8)  # a row of two points, and four bytes that are nothing
+def test_cloud_points_are_read_by_field_names() -> None:
+    rows = np.zeros((2, 20), np.uint8)  # a row of two points and four bytes of padding
     values = np.array([[[1, 2], [3, 4]], [[5, 6], [np.nan, 8]]], "<f4")
     rows[:, :16] = values.reshape(2, 4).view(np.uint8)
     cloud = PointCloud2(
@@ -262,11 +262,11 @@ def test_clouds_are_read_by_their_fields() -> None:
         cloud_points(flat)
     three = values.repeat(2, axis=2)[..., :3].copy()  # x, x, y
     three = np.ascontiguousarray(three)
-    whole = PointCloud2(
+    complete = PointCloud2(
         header=Header(), height=2, width=2, fields=["z", "x", "y"], point_step=12, row_step=24, data=three.tobytes()
     )
-    np.testing.assert_allclose(cloud_points(whole), [[1, 2, 1], [3, 4, 3], [5, 6, 5]])
+    np.testing.assert_allclose(cloud_points(complete), [[1, 2, 1], [3, 4, 3], [5, 6, 5]])
     with pytest.raises(FrameError, match="too few for 2x2"):
-        cloud_points(whole.model_copy(update={"data": b"0" * 47}))
+        cloud_points(complete.model_copy(update={"data": b"0" * 47}))
     with pytest.raises(FrameError, match="do not fit"):
-        cloud_points(whole.model_copy(update={"row_step": 20}))
+        cloud_points(complete.model_copy(update={"row_step": 20}))
