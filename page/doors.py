@@ -64,7 +64,7 @@ class Doors:
             self._pages[key] = visitor
         return key
 
-    def build_report(self, key: str) -> Visitor | None:
+    def page_of(self, key: str) -> Visitor | None:
         """Who was given that key, as long as the page is open."""
         with self._lock:
             return self._pages.get(key)

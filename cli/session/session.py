@@ -132,9 +132,9 @@ class CellSession:
         Raises:
             ConfigError: there is no page, the port is taken, or host or port cannot be used.
         """
-        from page.serving import build_report
+        from page.serving import page_of
 
-        self._page = page = build_report(self.cell, host, port)
+        self._page = page = page_of(self.cell, host, port)
         if page is not None:
             overrides = (*self.launch.overrides, *page.overrides)
             self.launch = replace(self.launch, overrides=overrides, extra=page.environment)
@@ -150,7 +150,7 @@ class CellSession:
         from common.supervision.launch import module_command
         from common.transport.credentials import RECORDER
         from recording.capture import CustomTopics
-        from recording.summary import require_new
+        from recording.formatting import require_new
         from security.requiring import require_recorder
 
         path = Path(file).absolute()

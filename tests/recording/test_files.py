@@ -137,11 +137,11 @@ def test_files_of_a_split_are_complete_alone(tmp_path: Path) -> None:
 
 def test_nothing_is_written_over(tmp_path: Path) -> None:
     path = write(tmp_path / "a.mcap", [joints(0)])
-    with pytest.raises(RecordingError, match="is there already"):
+    with pytest.raises(RecordingError, match="exists already"):
         RecordingWriter(path, {})
 
 
-@pytest.mark.parametrize(("content", "why"), [(None, "there is no such file"), (b"hello world", "is no MCAP file")])
+@pytest.mark.parametrize(("content", "why"), [(None, "no such file"), (b"hello world", "is no MCAP file")])
 def test_what_is_no_recording_is_said_in_one_line(tmp_path: Path, content: bytes | None, why: str) -> None:
     path = tmp_path / "a.mcap"
     if content is not None:

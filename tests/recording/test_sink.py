@@ -46,7 +46,7 @@ def test_what_does_not_fit_while_the_disk_stalls_is_dropped_and_counted(
     assert written_to.wait(10)  # the first is on its way to the disk and still counts
     for number in range(1, 6):
         sink.offer(joints(number))
-    assert sink.figures.dropped == {"panda/joint_states": 3}
+    assert sink.stats.dropped == {"panda/joint_states": 3}
     disk.set()
     assert sink.close({}).messages == 3
     with Recording(tmp_path / "a.mcap") as recording:
@@ -107,7 +107,7 @@ def test_full_disk_ends_it_with_one_line_and_keeps_whole_chunks(
     assert error.value.exit_code == 1 and "\n" not in str(error.value)
     with Recording(tmp_path / "a.mcap") as recording:
         assert not recording.finished
-        assert recording.layout.whole == recording.layout.size <= 40_000
+        assert recording.layout.complete == recording.layout.size <= 40_000
     sink.offer(joints(0))  # what still comes is let go
 
 
@@ -144,7 +144,7 @@ def test_a_file_that_is_there_where_the_next_one_is_due_is_told_in_one_line(tmp_
     sink = Sink(SplitWriter(tmp_path / "a.mcap", {"cell": "panda"}, max_bytes=1_000_000))
     for number in range(4):
         sink.offer(joints(number, payload=os.urandom(600_000)))
-    with pytest.raises(RecordingError, match=r"a_1.mcap: is there already"):
+    with pytest.raises(RecordingError, match=r"a_1.mcap: exists already"):
         sink.close({})
 
 

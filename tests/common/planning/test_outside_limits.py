@@ -1,4 +1,4 @@
-"""A robot that stands beyond the limit of a joint, as one pushed by hand does: plans lead in, and nothing leads out."""
+"""A robot outside a joint limit, for example pushed by hand: plans lead inside, and no motion leads farther outside."""
 
 import numpy as np
 import pytest
@@ -21,8 +21,8 @@ LIMITS = Limits(ROBOT.joint_names, ROBOT.lower, ROBOT.upper, ROBOT.velocity, ROB
                 ROBOT.jerk)
 
 
-def beyond(by: float) -> np.ndarray:
-    """The elbow stretched and the shoulder leant back farther than they may."""
+def outside(by: float) -> np.ndarray:
+    """The elbow stretched and the shoulder leant back beyond their limits."""
     q = HOME.copy()
     q[ELBOW], q[SHOULDER] = ROBOT.upper[ELBOW] + by, ROBOT.lower[SHOULDER] - by
     return q
@@ -34,9 +34,9 @@ def excess(q: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("planner", [name for name in planner_names() if name not in ("circ", "sequence")])
 @pytest.mark.parametrize("by", [0.0005, 0.04])
-def test_plan_leads_inwards_first_whoever_makes_it(planner, by):
+def test_plan_of_any_planner_leads_inwards_first(planner, by):
     lines = planner in ("cartesian", "lin")
-    start = np.array([*HOME[:-1], ROBOT.upper[-1] + by]) if lines else beyond(by)
+    start = np.array([*HOME[:-1], ROBOT.upper[-1] + by]) if lines else outside(by)
     goal = ROBOT.fk(np.clip(start, ROBOT.lower, ROBOT.upper))
     goal[2, 3] -= 0.05
     request = to_pose(goal, start, planner=planner) if lines else to_joints(HOME, start, planner=planner)
@@ -50,23 +50,23 @@ def test_plan_leads_inwards_first_whoever_makes_it(planner, by):
     limiter, t, q = Limiter(LIMITS, start, 0.01), 0.0, [start]
     while t < trajectory.duration:
         t += 0.01
-        wanted, velocity = accepted.at(t)
-        q.append(limiter.step(wanted, velocity, 0.01)[0])
+        target, velocity = accepted.at(t)
+        q.append(limiter.step(target, velocity, 0.01)[0])
     assert (np.diff(excess(np.array(q)), axis=0) <= 1e-9).all()
     assert np.abs(q[-1] - trajectory.positions[-1]).max() < 1e-3
 
 
-def test_start_farther_beyond_than_the_tolerance_is_refused():
-    response = PIPELINE.plan(to_joints(HOME, beyond(0.06)), TABLE)
+def test_start_outside_the_limits_by_more_than_the_tolerance_is_refused():
+    response = PIPELINE.plan(to_joints(HOME, outside(0.06)), TABLE)
     assert (response.ok, response.error) == (False, "start_out_of_limits")
 
 
-def test_goal_beyond_a_limit_is_refused_however_little():
-    response = PIPELINE.plan(to_joints(beyond(0.001), HOME), TABLE)
+def test_goal_slightly_outside_a_limit_is_refused():
+    response = PIPELINE.plan(to_joints(outside(0.001), HOME), TABLE)
     assert (response.ok, response.error) == (False, "goal_out_of_limits")
 
 
-def test_what_is_in_the_way_back_in_is_named():
+def test_obstacle_on_the_path_back_inside_is_named():
     start = above(0.5, 0.0, 0.15)
     start[ROBOT.dof - 1] = ROBOT.upper[-1] + 0.04
     free = PIPELINE.plan(to_pose(tool_down(0.5, 0, 0.3, 0.0), start), TABLE)
@@ -77,19 +77,19 @@ def test_what_is_in_the_way_back_in_is_named():
     assert response.error == "start_in_collision" and response.colliding
 
 
-def test_arm_that_stands_beyond_a_limit_is_left_alone_until_somebody_asks():
-    start = beyond(0.03)
+def test_limiter_holds_an_arm_outside_its_limits_where_it_is():
+    start = outside(0.03)
     limiter = Limiter(LIMITS, start, 0.01)
     for _ in range(50):
         position, velocity = limiter.step(start, np.zeros(ROBOT.dof), 0.01)
         assert (position == start).all() and not velocity.any()
 
 
-def test_nothing_goes_farther_out_than_the_arm_stands():
-    start = beyond(0.03)
+def test_no_motion_leads_farther_outside_than_the_arm_is():
+    start = outside(0.03)
     limiter = Limiter(LIMITS, start, 0.01)
     for _ in range(300):
-        position, _ = limiter.step(beyond(0.1), np.zeros(ROBOT.dof), 0.01)
+        position, _ = limiter.step(outside(0.1), np.zeros(ROBOT.dof), 0.01)
         assert (excess(position) <= excess(start) + 1e-9).all()
     response = PIPELINE.plan(to_joints(HOME, start), TABLE)
     message = response.trajectory.model_copy(deep=True)

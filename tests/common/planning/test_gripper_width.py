@@ -1,4 +1,4 @@
-"""Motions are planned for the fingers as they stand: what is a gap for closed ones is none for open ones, and back."""
+"""Motions are planned for the gripper's width: closed fingers fit into a gap, open ones around a wall."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ from tests.common.planning.planning_scenes import CELL, HOME, ROBOT, above, scen
 
 UR5 = RobotModel.load(load_cell("ur5").robot)
 OPEN, CLOSED = 0.08, 0.0
-X, LOW = 0.5, 0.02  # where the tool goes, its height there [m]
-# Fingers close along y: between two walls there is room for closed ones alone, about one wall for open ones alone.
+X, LOW = 0.5, 0.02  # target of the tool, and its height there [m]
+# Fingers close along y: only closed ones fit between two walls, only open ones around one wall.
 GAP = scene(box=False).model_copy(update={"objects": [
     solid("left", "fixture", "box", [0.1, 0.02, 0.04], (X, 0.05, 0.02)),
     solid("right", "fixture", "box", [0.1, 0.02, 0.04], (X, -0.05, 0.02))]})
@@ -36,8 +36,8 @@ WALL = scene(box=False).model_copy(update={"objects": [
 START, GOAL = above(X, 0.0, 0.15), above(X, 0.0, LOW)
 
 
-class Judge:
-    """Whether a robot with fingers of a width touches any solid, by coal and the model of all joints alone."""
+class CoalReference:
+    """Collision checks of a robot at a gripper width by coal and the model of all joints."""
 
     def __init__(self, robot: RobotModel, scene_, width: float) -> None:
         self.robot, gripper = robot, robot.config.gripper
@@ -79,28 +79,28 @@ def down(**more) -> PlanRequest:
 CASES = [(GAP, CLOSED, True), (GAP, OPEN, False), (WALL, OPEN, True), (WALL, CLOSED, False)]
 
 
-def test_gap_and_wall_are_what_coal_takes_them_for():
+def test_gap_and_wall_fit_as_intended_according_to_coal():
     for scene_, width, free in CASES:
-        assert Judge(ROBOT, scene_, width).touches(GOAL) is not free
-        assert not Judge(ROBOT, scene_, width).touches(START)
+        assert CoalReference(ROBOT, scene_, width).touches(GOAL) is not free
+        assert not CoalReference(ROBOT, scene_, width).touches(START)
 
 
-def test_motion_is_planned_for_the_fingers_as_they_stand(pipeline):
-    for scene_, width, free in CASES * 2:  # in turn: each plan takes them as they stand for it
+def test_motion_is_planned_for_the_current_gripper_width(pipeline):
+    for scene_, width, free in CASES * 2:  # in turn: each plan uses its own width
         response = pipeline.plan(down(), scene_, width=width)
         assert response.ok is free, response.message
         if not free:
             assert response.error == "goal_in_collision" and "finger" in response.message
             continue
-        judge = Judge(ROBOT, scene_, width)
+        reference = CoalReference(ROBOT, scene_, width)
         path, _ = fine_samples(timed_path(response.trajectory), 0.005)
-        assert len(path) > 50 and not any(judge.touches(q) for q in path)
+        assert len(path) > 50 and not any(reference.touches(q) for q in path)
 
 
-def test_request_says_how_the_fingers_stand_on_the_way(pipeline):
+def test_gripper_width_of_the_request_overrides_the_current_one(pipeline):
     assert pipeline.plan(down(gripper_width=CLOSED), GAP, width=OPEN).ok
     assert not pipeline.plan(down(gripper_width=OPEN), GAP, width=CLOSED).ok
-    assert not pipeline.plan(down(), GAP).ok, "the robot file holds them open"
+    assert not pipeline.plan(down(), GAP).ok, "the robot file locks it open"
     refused = pipeline.plan(down(gripper_width=0.1), GAP)
     assert (refused.error, refused.message) == (
         "bad_request", "request_checks: gripper_width 0.1 m is more than the fingers open (0.08 m)")
@@ -109,18 +109,18 @@ def test_request_says_how_the_fingers_stand_on_the_way(pipeline):
 @pytest.mark.parametrize("robot", [ROBOT, UR5], ids=["panda", "ur5"])
 @settings(max_examples=25, deadline=None)
 @given(share=st.floats(0, 1), seed=st.integers(0, 1000))
-def test_hulls_of_the_fingers_are_where_all_joints_say(robot, share, seed):
+def test_hulls_of_the_fingers_follow_all_joints(robot, share, seed):
     geometry = HULLS[robot.config.name]
     width = share * robot.config.gripper.max_width
     q = np.random.default_rng(seed).uniform(robot.lower, robot.upper)
-    judge = Judge(robot, scene(box=False), width)
-    judge.place(q)
+    reference = CoalReference(robot, scene(box=False), width)
+    reference.place(q)
     placed = dict(geometry.finger_placements(width))
     assert len(placed) == len([link for link in geometry.links if "finger" in link or "knuckle" in link])
     pin.forwardKinematics(robot.model, robot.data, q)
     for index, placement in placed.items():
         found = robot.data.oMi[geometry.joints[index]] * placement
-        assert found.isApprox(judge.shapes.oMg[index], 1e-9)
+        assert found.isApprox(reference.shapes.oMg[index], 1e-9)
     held = {name: value for name, value in robot.config.locked_joints.items() if name == robot.config.gripper.joints[0]}
     usual = measured_width(robot.config.gripper, list(held), list(held.values()))
     for index, placement in geometry.finger_placements(usual):
@@ -130,26 +130,26 @@ def test_hulls_of_the_fingers_are_where_all_joints_say(robot, share, seed):
 HULLS = {robot.config.name: RobotGeometry(robot) for robot in (ROBOT, UR5)}
 
 
-def test_states_and_edges_are_those_of_coal_at_any_opening():
+def test_states_and_edges_agree_with_coal_at_any_width():
     cache, rng = ObstacleCache(HULLS["panda"]), np.random.default_rng(4)
     disagree = checked = 0
     for _ in range(12):
         width = rng.uniform(0, OPEN)
         for scene_ in (GAP, WALL):
-            world, judge = CollisionWorld(ROBOT, scene_, start=START, cache=cache, width=width), Judge(
+            world, reference = CollisionWorld(ROBOT, scene_, start=START, cache=cache, width=width), CoalReference(
                 ROBOT, scene_, width)
             q = GOAL + rng.uniform(-0.05, 0.05, 7)
-            hits = [judge.touches(at) for at in interpolate([START, q], 0.01)]
+            hits = [reference.touches(at) for at in interpolate([START, q], 0.01)]
             checked += 1
             if world.edge_free(START, q):
                 assert not any(hits)
             elif not any(hits):
                 disagree += 1
-            assert world.collides(q) or not judge.touches(q)
+            assert world.collides(q) or not reference.touches(q)
     assert checked == 24 and disagree <= 3  # a grazing edge may not be proved
 
 
-def test_home_is_free_at_any_opening_of_both_robots():
+def test_home_is_free_at_any_gripper_width():
     for robot in (ROBOT, UR5):
         cache = ObstacleCache(HULLS[robot.config.name])
         for width in np.linspace(0, robot.config.gripper.max_width, 5):
@@ -158,17 +158,17 @@ def test_home_is_free_at_any_opening_of_both_robots():
             assert not world.collides(robot.named("home")), width
 
 
-def test_points_on_the_fingers_as_they_stand_are_the_robots_own():
-    known, judge = KnownShapeFilter(HULLS["ur5"]), Judge(UR5, GAP, UR5.config.gripper.max_width)
+def test_points_on_the_fingers_at_their_width_belong_to_the_robot():
+    known, reference = KnownShapeFilter(HULLS["ur5"]), CoalReference(UR5, GAP, UR5.config.gripper.max_width)
     home = UR5.named("home")
-    judge.place(home)
-    links = [judge.model.frames[item.parentFrame].name for item in judge.hulls.geometryObjects]
+    reference.place(home)
+    links = [reference.model.frames[item.parentFrame].name for item in reference.hulls.geometryObjects]
     tips = np.array([
-        np.array(T.translation) for T, link in zip(judge.shapes.oMg, links, strict=True) if "finger" in link])
+        np.array(T.translation) for T, link in zip(reference.shapes.oMg, links, strict=True) if "finger" in link])
     nothing = scene(box=False).model_copy(update={"objects": []})
     given = {"margin": 0.005, "object_margin": 0.0}
     assert known.mask(nothing, home, tips, width=0.085, **given).all()
-    assert not known.mask(nothing, home, tips, **given).any(), "the robot file holds them closed"
+    assert not known.mask(nothing, home, tips, **given).any(), "the robot file locks it closed"
     view = CameraView("camera", tips, home, 0.085)
     assert not len(known.obstacle(view, nothing, margin=0.005, object_margin=0.0).spheres)
     history = JointHistory(UR5)

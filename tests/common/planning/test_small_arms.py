@@ -1,4 +1,4 @@
-"""Arms of fewer than six joints: what they cannot choose of a goal is left free, and what they cannot have is told."""
+"""Arms of fewer than six joints: yaw and tilt that they cannot choose stay free, or the failure is explained."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def arms(tmp_path_factory: pytest.TempPathFactory) -> dict[str, RobotModel]:
 
 @pytest.mark.parametrize("name", TEXTS)
 @pytest.mark.parametrize("bounds", [(0.0, math.pi), (0.3, math.pi), (0.3, 0.5), (0.0, 0.0)])
-def test_where_the_tool_was_it_is_brought_back_to_within_the_bounds(
+def test_region_about_a_reached_pose_is_reached_again(
     arms: dict[str, RobotModel], name: str, bounds: tuple[float, float]
 ) -> None:
     robot, rng = arms[name], np.random.default_rng(3)
@@ -63,7 +63,7 @@ def test_where_the_tool_was_it_is_brought_back_to_within_the_bounds(
     assert found >= 28
 
 
-def test_of_a_box_of_places_the_near_side_is_taken(arms: dict[str, RobotModel]) -> None:
+def test_near_side_of_a_position_box_is_reached(arms: dict[str, RobotModel]) -> None:
     robot = arms["nodding"]
     home = robot.named("home")
     T = robot.fk(home)
@@ -75,7 +75,7 @@ def test_of_a_box_of_places_the_near_side_is_taken(arms: dict[str, RobotModel]) 
     assert away == pytest.approx([-0.02, -0.03, 0.0], abs=1e-3)
 
 
-def test_the_tool_is_tilted_only_where_it_must_be(arms: dict[str, RobotModel]) -> None:
+def test_tool_is_tilted_only_where_necessary(arms: dict[str, RobotModel]) -> None:
     robot = arms["nodding"]
     home = robot.named("home")
     tilts = {}
@@ -87,39 +87,39 @@ def test_the_tool_is_tilted_only_where_it_must_be(arms: dict[str, RobotModel]) -
     assert solve_tool_down_ik(robot, (0.68, 0.0, 0.05), 0.0, home, restarts=5) is None
 
 
-def test_the_yaw_that_a_place_wants_is_told_with_the_one_that_can_be_had(arms: dict[str, RobotModel]) -> None:
+def test_unreachable_yaw_is_reported_with_the_nearest(arms: dict[str, RobotModel]) -> None:
     robot = arms["nodding"]
-    x, y = 0.3, 0.3  # the hand is turned as the arm is: by 45 degrees; at yaw 0 by as much to the other side
+    x, y = 0.3, 0.3  # the gripper is turned with the arm by 45 degrees; at yaw 0 by as much to the other side
     free = solve_region_ik(robot, pose_region(robot, tool_down(x, y, 0.1), 0.0), robot.named("home"), restarts=5)
     assert free is not None
     turned = tool_down(x, y, 0.1)[:3, :3].T @ robot.fk(free)[:3, :3]
     off = abs(math.degrees(math.atan2(turned[1, 0], turned[0, 0])))
-    told = explain_region_unreachable(robot, Region(tool_down(x, y, 0.1), np.zeros(3), 0.0, 0.0), robot.named("home"))
-    said = float(told.partition("nearest is ")[2].split()[0])
-    assert told.startswith("with 4 joints the arm cannot choose yaw there: nearest is ")
-    assert said == pytest.approx(off, abs=5)
+    reason = explain_region_unreachable(robot, Region(tool_down(x, y, 0.1), np.zeros(3), 0.0, 0.0), robot.named("home"))
+    nearest = float(reason.partition("nearest is ")[2].split()[0])
+    assert reason.startswith("with 4 joints the arm cannot choose yaw there: nearest is ")
+    assert nearest == pytest.approx(off, abs=5)
 
 
-def test_a_place_that_asks_for_more_tilt_is_refused_with_the_least_that_it_takes(arms: dict[str, RobotModel]) -> None:
+def test_insufficient_tilt_is_reported_with_the_least_needed(arms: dict[str, RobotModel]) -> None:
     robot = arms["nodding"]
     upright = Grasp(approach_clearance=0.04, lift_height=0.06, max_tilt=0.0)
     tilted = upright.model_copy(update={"max_tilt": 1.0})
     place = (0.70, 0.1, 0.03)
-    told = unreachable_reason(robot, place, upright, ANYWHERE)
-    assert "with 4 joints the arm cannot choose tilt there: nearest is " in told and "0 deg are allowed" in told
-    assert 3 < float(told.partition("nearest is ")[2].split()[0]) < 57
+    reason = unreachable_reason(robot, place, upright, ANYWHERE)
+    assert "with 4 joints the arm cannot choose tilt there: nearest is " in reason and "0 deg are allowed" in reason
+    assert 3 < float(reason.partition("nearest is ")[2].split()[0]) < 57
     assert unreachable_reason(robot, place, tilted, ANYWHERE) == ""
     assert "the arm reaches" in unreachable_reason(robot, (1.5, 0.0, 0.03), tilted, ANYWHERE)
 
 
-def test_arms_that_can_choose_point_down_unless_something_else_is_set() -> None:
+def test_default_tilt_depends_on_the_number_of_joints() -> None:
     assert [Grasp().tilt(joints) for joints in (4, 5, 6, 7)] == [0.35, 0.35, 0.0, 0.0]
     assert [Grasp(max_tilt=0.1).tilt(joints) for joints in (4, 6)] == [0.1, 0.1]
 
 
 @pytest.mark.parametrize("name", TEXTS)
 @pytest.mark.parametrize("straight", [False, True])
-def test_planners_leave_free_what_the_arm_cannot_choose(
+def test_planners_leave_yaw_and_tilt_of_small_arms_free(
     arms: dict[str, RobotModel], name: str, straight: bool
 ) -> None:
     robot = arms[name]
@@ -136,7 +136,7 @@ def test_planners_leave_free_what_the_arm_cannot_choose(
         assert np.abs(places[:, :2] - [0.38, -0.2]).max() < 2e-3
 
 
-def test_a_goal_with_a_yaw_that_cannot_be_had_says_so(arms: dict[str, RobotModel]) -> None:
+def test_goal_with_an_unreachable_yaw_is_refused_with_the_nearest(arms: dict[str, RobotModel]) -> None:
     robot = arms["nodding"]
     pipeline = PlanningPipeline(robot, CELL.motion, CELL.pipeline)
     goal = PoseGoal(pose=matrix_to_pose(tool_down(0.4, 0.0, 0.1, 0.8)))
