@@ -26,7 +26,6 @@ from applications.pick_place.topics import (
 )
 from common.config import Grasp, RobotConfig, Surroundings, Tunable
 from common.messages import Color, Header, Marker, MarkerArray, Pose, PoseArray, Rejections, Vector3
-from common.messages.geometry import MOST_POSES
 from common.process.service import main
 from common.robot.model import RobotModel
 from common.scene.workspace import ReachCache, WorkspaceBounds
@@ -138,7 +137,7 @@ async def run(bus: Bus, config: Config) -> None:
         header = Header(stamp=min(one.frame.header.stamp for one in seen), frame_id=WORLD)
         occluded = remembered.hidden(result.targets, [place for place, _ in result.refused], hiding(seen, radius))
         # Several crowded views may not fit: the rest is offered later.
-        result.targets, occluded = result.targets[:MOST_POSES], occluded[: max(0, MOST_POSES - len(result.targets))]
+        result.targets, occluded = result.targets[:MAX_POSES], occluded[: max(0, MAX_POSES - len(result.targets))]
         unseen, blind = watched.unseen(seen, views, config.may_hide)
         validated.put(targets(
             result.targets, occluded, header=header, remark=result.remark, unseen=unseen, blind=blind))
