@@ -17,17 +17,18 @@ from common.atomic_file import STATE_VARIABLE, Unreadable
 from common.config import World
 from common.messages import Header
 from common.robot.transforms import tool_down
-from common.sim.interface import StandingObject
+from common.sim.interface import ObjectSnapshot
 from common.sim.kinematic import KinematicWorld
-from common.sim.standing import SLOT, Standing, StateFile, state_file
+from common.sim.state_file import SLOT, SimulationState, StateFile, state_file
 
 PLACES = [(0.40, -0.30), (0.52, -0.30), (0.40, -0.17)]
 OPEN, GRIP, R = 0.08, 0.06, 0.03
 
 
-def a_state(number: int) -> Standing:
-    return Standing(layout={"ball_1": (0.4, -0.3, 0.03)}, q=[0.1 * number] * 7, width=0.01 * number, told_width=None,
-                    objects={"ball_1": StandingObject(pose=(0.4, -0.3, 0.01 * number, 0, 0, 0, 1))})
+def a_state(number: int) -> SimulationState:
+    return SimulationState(layout={"ball_1": (0.4, -0.3, 0.03)}, q=[0.1 * number] * 7, width=0.01 * number,
+                           commanded_width=None,
+                           objects={"ball_1": ObjectSnapshot(pose=(0.4, -0.3, 0.01 * number, 0, 0, 0, 1))})
 
 
 def the_world(config: World) -> KinematicWorld:
@@ -69,7 +70,7 @@ def world(world_config) -> KinematicWorld:
 def test_partly_changed_state_is_loaded_completely(tmp_path: Path) -> None:
     file, first, other = StateFile(tmp_path / "state"), a_state(1), a_state(2)
     for objects in (first.objects, first.objects, other.objects):
-        state = Standing.model_construct(**vars(first) | {"q": [0.1 * len(objects)], "objects": objects})
+        state = SimulationState.model_construct(**vars(first) | {"q": [0.1 * len(objects)], "objects": objects})
         file.save(state)
         assert StateFile(tmp_path / "state").load() == state
 
@@ -78,7 +79,7 @@ def test_held_falling_and_contained_balls_are_restored(
     world: KinematicWorld, world_config, tmp_path: Path
 ) -> None:
     file = StateFile(tmp_path / "state")
-    file.save(Standing(layout=world.layout, q=[0.0], objects=world.standing()))
+    file.save(SimulationState(layout=world.layout, q=[0.0], objects=world.snapshot()))
     found = StateFile(tmp_path / "state").load()
     assert found is not None
     again = the_world(world_config)
@@ -115,7 +116,7 @@ def test_link_or_pipe_as_state_file_is_rejected(tmp_path: Path) -> None:
 def test_non_finite_state_falls_back_to_the_previous_one(value: float, tmp_path: Path) -> None:
     file = StateFile(tmp_path / "state")
     file.save(a_state(1))
-    file.save(Standing.model_construct(**vars(a_state(2)) | {"q": [0.0, value]}))
+    file.save(SimulationState.model_construct(**vars(a_state(2)) | {"q": [0.0, value]}))
     assert StateFile(tmp_path / "state").load() == a_state(1)
 
 
@@ -163,7 +164,7 @@ def test_partly_written_state_falls_back_to_the_previous_one(
 
 
 def test_state_of_another_version_is_ignored(tmp_path: Path) -> None:
-    class Later(Standing):
+    class Later(SimulationState):
         wheels: int = 4
 
     file = StateFile(tmp_path / "state")

@@ -1,7 +1,7 @@
-"""What stays as it is while the process that simulates it is gone: an arm with its brakes on, and things that lie.
+"""Persisted state of the simulated hardware: joints, gripper and objects survive a restart of the process.
 
-Real hardware and a real table do not go back to their beginnings when a driver is started again. So that simulated
-ones do not either, their state is kept in a file, which survives the process however it ends.
+Real hardware does not return to its initial state when a driver restarts. The state of simulated hardware is saved to
+a file, which survives the process however it ends.
 """
 
 from __future__ import annotations
@@ -18,41 +18,41 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import msgpack
-from pydantic import BaseModel, ConfigDict
+from pydantic import AliasChoices, BaseModel, ConfigDict, Field
 
 from common.atomic_file import Unreadable, open_regular, runtime_folder
-from common.sim.interface import KINEMATIC, StandingObject
+from common.sim.interface import KINEMATIC, ObjectSnapshot
 
 SLOT = 4 * 1024 * 1024  # [bytes] for each of the two newest states
 CLOSE_SECONDS = 0.3
 _HEAD = struct.Struct("<QII")  # number of the state, its length and checksum
 
 
-class Standing(BaseModel):
-    """Joints (dof,) [rad], fingers [m] and objects at one moment; where objects were at first (x, y, z) [m].
+class SimulationState(BaseModel):
+    """Joints (dof,) [rad], fingers [m] and objects at one moment; initial positions (x, y, z) [m].
 
-    How objects stand is told in the words of the `simulator`, which no other one knows.
+    Details of objects are specific to the `simulator`.
     """
 
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", populate_by_name=True)
 
     simulator: str = KINEMATIC
     layout: dict[str, tuple[float, ...]]
     q: list[float]
     width: float | None = None
-    told_width: float | None = None
-    told_effort: float = 0.0  # [N]
-    objects: dict[str, StandingObject] = {}
+    commanded_width: float | None = Field(None, validation_alias=AliasChoices("commanded_width", "told_width"))
+    commanded_effort: float = Field(0.0, validation_alias=AliasChoices("commanded_effort", "told_effort"))  # [N]
+    objects: dict[str, ObjectSnapshot] = {}
 
 
 class StateFile:
-    """Keeps the newest state in a file: two places are written in turn, so that one of them is always whole."""
+    """Stores the newest state in a file with two alternating slots, of which one is always valid."""
 
     def __init__(self, path: Path) -> None:
-        """Open the file, which need not be there yet.
+        """Open the file, or create it.
 
         Raises:
-            Unreadable: it cannot be opened, or is a link, which may be to something of somebody else's.
+            Unreadable: it cannot be opened, or is a symbolic link, which could point to a foreign file.
         """
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -62,11 +62,11 @@ class StateFile:
                              ) from None
         self._number = 0
         self._packer = msgpack.Packer(default=vars)
-        self._packed: dict[str, tuple[object, bytes]] = {}  # of the maps in the newest state, most of which stay
+        self._packed: dict[str, tuple[object, bytes]] = {}  # packed maps of the newest state, most of which stay equal
 
-    def load(self) -> Standing | None:
-        """The newest state that is whole; None when there is none."""
-        newest: Standing | None = None
+    def load(self) -> SimulationState | None:
+        """Return the newest valid state, or None."""
+        newest: SimulationState | None = None
         for place in (0, SLOT):
             head = os.pread(self._descriptor, _HEAD.size, place)
             if len(head) < _HEAD.size:
@@ -76,19 +76,19 @@ class StateFile:
             if number <= self._number or _checksum(number, body) != checksum:
                 continue
             try:
-                found = Standing.model_validate(msgpack.unpackb(body))
-                if _finite(found.model_dump()):  # else nothing could be put there
+                found = SimulationState.model_validate(msgpack.unpackb(body))
+                if _finite(found.model_dump()):  # else positions would be undefined
                     newest, self._number = found, number
-            except (ValueError, RecursionError):  # of another version, or nobody's
+            except (ValueError, RecursionError):  # another version, or foreign data
                 continue
         return newest
 
-    def save(self, state: Standing) -> None:
-        """Write a state, which outlives this process at once, but not the machine."""
+    def save(self, state: SimulationState) -> None:
+        """Write a state; it survives this process immediately, but not a crash of the machine."""
         fields = vars(state)
         packed = [self._packer.pack(name) + self._pack(name, value) for name, value in fields.items()]
         body = self._packer.pack_map_header(len(fields)) + b"".join(packed)
-        if _HEAD.size + len(body) > SLOT:  # it must not be written over the one before
+        if _HEAD.size + len(body) > SLOT:  # it would overwrite the previous state
             return
         self._number += 1
         place = SLOT * (self._number % 2)
@@ -102,30 +102,30 @@ class StateFile:
         return packed
 
     def close(self) -> None:
-        """Close the file, which stays."""
+        """Close the file."""
         os.close(self._descriptor)
 
 
-class SavedBeside:
-    """Saves the newest state from a thread of its own: a disk that takes its time holds nobody."""
+class BackgroundSaver:
+    """Saves the newest state on a thread: a slow disk blocks no caller."""
 
     def __init__(self, file: StateFile) -> None:
         """Save to this file."""
         self._file = file
-        self._newest: Standing | None = None
+        self._newest: SimulationState | None = None
         self._ends = False
         self._changed = threading.Condition()
         self._thread = threading.Thread(target=self._work, name="standing", daemon=True)
         self._thread.start()
 
-    def save(self, state: Standing) -> None:
-        """Have a state written next, in place of one that still waits for that."""
+    def save(self, state: SimulationState) -> None:
+        """Save a state next; replaces one that is not written yet."""
         with self._changed:
             self._newest = state
             self._changed.notify()
 
     def close(self, seconds: float = CLOSE_SECONDS) -> None:
-        """Close the file when all is written; wait for that at most so long [s]."""
+        """Close the file once everything is written; wait at most this long [s]."""
         with self._changed:
             self._ends = True
             self._changed.notify()
@@ -138,24 +138,24 @@ class SavedBeside:
                 state, self._newest = self._newest, None
             if state is None:
                 return self._file.close()
-            with contextlib.suppress(OSError):  # a full disk stops no arm; what was kept before stays
+            with contextlib.suppress(OSError):  # a full disk must not stop the arm; the previous state stays
                 self._file.save(state)
 
 
-def _finite(kept: object) -> bool:
-    parts = kept.values() if isinstance(kept, dict) else kept if isinstance(kept, list | tuple) else None
-    return all(map(_finite, parts)) if parts is not None else not isinstance(kept, float) or math.isfinite(kept)
+def _finite(value: object) -> bool:
+    parts = value.values() if isinstance(value, dict) else value if isinstance(value, list | tuple) else None
+    return all(map(_finite, parts)) if parts is not None else not isinstance(value, float) or math.isfinite(value)
 
 
 def _checksum(number: int, body: bytes) -> int:
-    """Of the number too: one that was written over an older state must not make it the newest."""
+    """Checksum including the number: a state written over an older one must not become the newest by accident."""
     return zlib.crc32(body, zlib.crc32(number.to_bytes(8, "little")))
 
 
 def state_file(cell: str, environ: Mapping[str, str] = os.environ) -> StateFile | None:
-    """The file of a cell's simulated hardware; None when nobody has said where it is to be kept.
+    """Return the state file of a cell, or None if no folder is configured.
 
-    Its name has that of the host: a container that is started again has the same one, a new one has not.
+    The name includes the host: a restarted container has the same name, a new one has not.
     """
     folder = runtime_folder(environ)
     return StateFile(folder / f"{cell}-{socket.gethostname()}.state") if folder else None
