@@ -7,6 +7,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
+from common.messages.geometry import MAX_POSES
 from pydantic import Field
 
 from applications.pick_place.ball_places import MOST_HIDDEN, VisibleTable

@@ -94,7 +94,7 @@ async def test_selection_releases_an_earlier_stop(cell: Cell) -> None:
 @pytest.mark.parametrize("by", ["the page", "the page, and the arm does not answer", "the command line"])
 async def test_stop_after_the_selection_stays(cell: Cell, by: str) -> None:
     notices: list[str] = []
-    cell.console.tell = lambda line, _kind="bad": notices.append(line)
+    cell.console.notify = lambda line, _kind="bad": notices.append(line)
     cell.executor_answers = by == "the page"
 
     async def stop() -> None:
@@ -113,7 +113,7 @@ async def test_stop_after_the_selection_stays(cell: Cell, by: str) -> None:
 
 async def test_only_the_second_of_two_selections_is_traced_once(cell: Cell) -> None:
     notices: list[str] = []
-    cell.console.tell = lambda line, _kind="bad": notices.append(line)
+    cell.console.notify = lambda line, _kind="bad": notices.append(line)
     cell.labels = ["Object_0", "Object_1"]
     first = asyncio.create_task(choose(cell.console, OutlineSelect()))
     await cell.until(lambda: cell.labels == ["Object_1"])
