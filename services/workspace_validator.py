@@ -7,7 +7,6 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
-from common.messages.geometry import MAX_POSES
 from pydantic import Field
 
 from applications.pick_place.ball_places import MOST_HIDDEN, VisibleTable
@@ -27,6 +26,7 @@ from applications.pick_place.topics import (
 )
 from common.config import Grasp, RobotConfig, Surroundings, Tunable
 from common.messages import Color, Header, Marker, MarkerArray, Pose, PoseArray, Rejections, Vector3
+from common.messages.basics import MAX_POSES
 from common.process.service import main
 from common.robot.model import RobotModel
 from common.scene.workspace import ReachCache, WorkspaceBounds
