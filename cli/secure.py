@@ -36,9 +36,9 @@ def init(
     """Make an authority, a certificate for each process, and the router's rules of who may do what."""
     from common.config import load_cell, names_of
     from common.transport.credentials import ACCESS
-    from page.access import VIEWER
     from security.access import rights_in
     from security.certificates import authority_files, make
+    from security.page_tokens import VIEWER
 
     valid = options.whole("--days", days, 1)
     assert valid is not None

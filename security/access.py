@@ -30,7 +30,7 @@ from common.topics import (
 from common.transport.credentials import OBSERVER, OPERATOR, RECORDER, ROUTER_NAME, SUPERVISOR, common_name
 from common.transport.session import alive_key, owns_key, serves_key
 from common.transport.writer import plain_key
-from page.access import VIEWER
+from security.page_tokens import VIEWER
 
 MESSAGES = [
     "put", "delete", "declare_subscriber", "query", "reply", "declare_queryable", "liveliness_token",

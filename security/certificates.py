@@ -16,8 +16,8 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from common.errors import ConfigError
 from common.transport.credentials import ACCESS, AUTHORITY, OBSERVER, OPERATOR, ROUTER_NAME, common_name
-from page.access import ROLES, make_token, token_file
 from security.access import Rights, access_control
+from security.page_tokens import ROLES, make_token, token_file
 from security.validation import certificate_in, hosts_in
 
 CA_NAME = "zencell certificate authority"
