@@ -9,8 +9,7 @@ from typing import Annotated
 
 import typer
 
-from cli import choices as offers
-from cli import options
+from cli import choices, options
 from common.errors import UnknownName
 from common.terminal import echo
 
@@ -43,11 +42,11 @@ def _first_line(path: Path) -> str:
 def service(
     name: Annotated[
         str, typer.Argument(metavar="NAME", help="of `zencell services`, of the cell, or a module",
-                            autocompletion=offers.services)
+                            autocompletion=choices.services)
     ],
     cell: Annotated[
-        str, typer.Option("--cell", metavar="CELL", help="the cell that it belongs to", autocompletion=offers.cells)
-    ] = offers.default_cell(),
+        str, typer.Option("--cell", metavar="CELL", help="the cell that it belongs to", autocompletion=choices.cells)
+    ] = choices.default_cell(),
     overrides: options.Overrides = None,
     world: options.WorldName = None,
     seed: options.Seed = None,

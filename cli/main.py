@@ -22,6 +22,7 @@ from cli import (
     commands,
     completion,
     doctor,
+    export,
     graph,
     new,
     node,
@@ -38,9 +39,6 @@ from cli import (
     top,
     topic,
     verbs,
-)
-from cli import (
-    export as exporting,
 )
 from cli.target import CommandGroup
 from common.errors import RequestFailed, ZencellError
@@ -138,7 +136,7 @@ app.command()(recording.info)
 app.command("play")(playing.play_)
 app.command()(recording.recover)
 app.command()(report.report)
-app.command()(exporting.export)
+app.command()(export.export)
 app.add_typer(secure.app, name="secure")
 app.add_typer(router.app, name="router")
 app.command()(simulate.simulate)

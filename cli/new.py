@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from cli import choices as offers
+from cli import choices
 from cli.model_sources import ROOT
 from common.errors import ConfigError, UnknownName
 from common.terminal import echo
@@ -22,11 +22,11 @@ DEFAULT = "sort_cubes"
 def new(
     folder: Annotated[str, typer.Argument(metavar="DIR", help="is made; its name is that of cell and task")],
     task: Annotated[
-        str, typer.Option("--task", metavar="KIND", help="what it begins as", autocompletion=offers.tasks)
+        str, typer.Option("--task", metavar="KIND", help="what it begins as", autocompletion=choices.tasks)
     ] = DEFAULT,
 ) -> None:
     """Write a cell, a task in one file and their test into a new folder: they run at once."""
-    kinds = offers.task_kinds()
+    kinds = choices.task_kinds()
     if task not in kinds:
         raise UnknownName("task", task, kinds)
     to = Path(folder).expanduser().absolute()

@@ -13,6 +13,7 @@ import viser
 from pydantic import JsonValue
 
 from common import topics
+from common.client.task import send_task_command, stop_arm_and_task
 from common.config import Members
 from common.errors import RequestFailed
 from common.messages import (
@@ -23,8 +24,6 @@ from common.messages import (
     OwnRequest,
     Parameter,
     ParameterRequest,
-    StopRequest,
-    TaskCommand,
     Vector3,
     WorldEdit,
 )
@@ -223,8 +222,8 @@ class Console(Desk):
         Nothing is let go of that is newer than what was `heard` of as this was decided; left out: that is now.
         """
         acknowledged = self.acknowledged if acknowledged is None else acknowledged
-        said = {"command": command, "by": self.doors.person, "override": override, "acknowledged": acknowledged}
-        await self.ask(topics.TASK_COMMAND, TaskCommand.model_validate(said))
+        await send_task_command(self._clients[topics.TASK_COMMAND.key], command, self.doors.person, override=override,
+                                acknowledged=acknowledged, timeout=_PATIENCE)
 
     async def stop(self) -> str:
         """Bring the arm to rest and end the task, at the same time; returns in a line what was stopped, and by whom.
@@ -233,19 +232,15 @@ class Console(Desk):
             RequestFailed: the arm could not be told; the task was, if it could.
         """
         self.stops += 1
-        arm, task = await asyncio.gather(
-            self.ask(topics.MOTION_STOP, StopRequest(reason="stopped on the page", owner=self.doors.person), _SOON),
-            self.ask(topics.TASK_COMMAND, TaskCommand(command="stop", by=self.doors.person), _SOON),
-            return_exceptions=True,
-        )
-        if isinstance(arm, BaseException):
-            raise arm
-        self._newest = arm.newest
-        if isinstance(task, RequestFailed):
-            return f"Arm stopped by {self.doors.person}; not the task: {problem(task)}"
-        if isinstance(task, BaseException):
-            raise task
-        return f"Stopped by {self.doors.person}"
+        operator = self.doors.person
+        result = await stop_arm_and_task(self._clients[topics.MOTION_STOP.key], self._clients[topics.TASK_COMMAND.key],
+                                         operator, "stopped on the page", _SOON)
+        if isinstance(result.arm, RequestFailed):
+            raise result.arm
+        self._newest = result.arm.newest
+        if isinstance(result.task, RequestFailed):
+            return f"Arm stopped by {operator}; not the task: {problem(result.task)}"
+        return f"Stopped by {operator}"
 
     async def own(self, act: Literal["take", "give"], over: bool = False) -> MotionOwner:
         """Have the motion of the robot for who asks now until it is given back, or give it back."""

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 
 import viser
 
-from common.client.rates import Rates
+from common.client.statistics import Rates
 from common.messages import LogLine, ServiceCounters, SupervisorStatus
 from page import words
 from page.console import Desk

@@ -12,10 +12,9 @@ from typing import Any, Protocol
 
 import viser
 
-from common.client.arm import NO_WAY
-from common.client.operator_motion import OURSELVES
+from common.client.operator_motion import UNREACHABLE
 from common.control.jogging import PAUSE
-from common.messages import UNKNOWN_OPERATOR, MotionOwner, MotionStatus
+from common.messages import SELF_RELEASING, UNKNOWN_OPERATOR, MotionOwner, MotionStatus
 from common.sources import monotonic
 from page.console import Desk
 from page.doors import Doors
@@ -86,7 +85,7 @@ class Jogger(Holder):
             if self._taken and owner.kind == "none" and not owner.jogging:
                 why = "nothing was heard of the button for a moment (a slow link, or a busy machine): press it again"
             else:
-                why = f"{NO_WAY}; the motion is {owner.description}"
+                why = f"{UNREACHABLE}; the motion is {owner.description}"
         if begins:
             self._press, self._began = (who, press), now
             if newest != self._heard:  # the executor wants a pause after a stop: else this press would never count
@@ -102,7 +101,7 @@ class Jogger(Holder):
 
     def _inhibited(self, motion: MotionStatus | None) -> str:
         """Who else stopped the arm, in words."""
-        ours = (self._jogs.doors.person, UNKNOWN_OPERATOR, *OURSELVES)
+        ours = (self._jogs.doors.person, UNKNOWN_OPERATOR, *SELF_RELEASING)
         interlocks = motion.interlocks if motion is not None else []
         return "; ".join(f"it is {one.description}" for one in interlocks if one.by not in ours)
 

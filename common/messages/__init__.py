@@ -8,7 +8,17 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from common.messages.basics import SCHEMA_VERSION, UNKNOWN_OPERATOR, Finite, Fraction, Header, Message, Name, Positive
+from common.messages.basics import (
+    SCHEMA_VERSION,
+    SELF_RELEASING,
+    UNKNOWN_OPERATOR,
+    Finite,
+    Fraction,
+    Header,
+    Message,
+    Name,
+    Positive,
+)
 from common.messages.camera import CameraInfo, Image, Marker, MarkerArray, PointCloud2, Rejection, Rejections
 from common.messages.execution import (
     CLOSED_BEFORE,

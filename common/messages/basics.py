@@ -107,6 +107,7 @@ Remark = Annotated[str, Field(max_length=_MOST_REMARK), BeforeValidator(lambda v
 Plain = Annotated[JsonValue, PlainValidator(_plain)]  # what JSON can say
 # Names of the first releases, which older programs, recordings and record files still hold: read, never written.
 UNKNOWN_OPERATOR = "operator"  # name of an operator who gives none, and `by` of what an operator requests
+SELF_RELEASING = ("watchdog", "controller", "scene_monitor")  # values of `by` whose holds end without an operator
 FORMER_FIELDS: Mapping[str, str] = {"acknowledged": "heard", "interlocks": "inhibits"}
 _FORMER_OPERATOR = "person"
 

@@ -132,7 +132,7 @@ def test_what_became_of_a_run_is_said_although_its_file_cannot_be_written(
 
     folder = tmp_path / "figures"
     folder.mkdir()
-    monkeypatch.setattr(CellSession, "_operate", operate)
+    monkeypatch.setattr(CellSession, "_run", operate)
     assert app.execute(["run", "panda", "--domain", str(domain), "--summary", str(folder / "s.json")]) == 1
     shown = capsys.readouterr()
     assert "panda: IDLE, 0 of 0 placed" in shown.out

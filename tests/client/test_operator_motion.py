@@ -80,10 +80,6 @@ class Cell:
             return request
 
 
-@pytest.fixture(autouse=True)
-def _short_wait(monkeypatch: pytest.MonkeyPatch) -> None:
-    """For the task that most of these cells do not have."""
-    monkeypatch.setattr("common.client.operator_motion.FIRST_WORD", 0.05)
 
 
 @pytest.fixture
@@ -97,7 +93,7 @@ async def cell() -> AsyncIterator[Cell]:
 
 @pytest.fixture
 def person(cell: Cell) -> OperatorMotion:
-    return OperatorMotion(cell.bus)
+    return OperatorMotion(cell.bus, status_timeout=0.05)
 
 
 def kinds(cell: Cell) -> list[str]:
@@ -165,7 +161,7 @@ def said(kind: str, by: str, since: int) -> m.Interlock:
 async def test_robot_that_another_person_holds_or_stopped_is_left_alone(cell: Cell, kind: str) -> None:
     cell.say(held=kind == "held", interlocks=[said(kind, "anna", 7)])
     with pytest.raises(MotionFailed, match=rf"the robot is {kind} since .* by anna"):
-        await OperatorMotion(cell.bus, owner="bert").move(HOME)
+        await OperatorMotion(cell.bus, owner="bert", status_timeout=0.05).move(HOME)
     assert cell.asked == []
 
 
@@ -178,7 +174,7 @@ async def test_what_is_said_while_a_motion_is_planned_is_not_known_to_who_asked_
         return await answer(request)
 
     next(s for s in cell.bus._servers if s.topic is topics.MOTION_PLAN)._handler = stopped
-    await OperatorMotion(cell.bus, owner="anna").move(HOME)
+    await OperatorMotion(cell.bus, owner="anna", status_timeout=0.05).move(HOME)
     _, hold, execute = cell.asked
     assert isinstance(hold, m.HoldRequest) and (hold.owner, hold.into_stop, hold.acknowledged) == ("anna", True, 7)
     assert isinstance(execute, m.ExecuteRequest) and (execute.owner, execute.acknowledged) == ("anna", 7)
@@ -186,7 +182,7 @@ async def test_what_is_said_while_a_motion_is_planned_is_not_known_to_who_asked_
 
 async def test_what_is_said_between_the_motions_of_a_row_is_not_known_to_the_later_ones(cell: Cell) -> None:
     cell.say(interlocks=[said("stopped", "anna", 8)])
-    await OperatorMotion(cell.bus, owner="anna").move(HOME, acknowledged=7)
+    await OperatorMotion(cell.bus, owner="anna", status_timeout=0.05).move(HOME, acknowledged=7)
     assert isinstance(cell.asked[-1], m.ExecuteRequest) and cell.asked[-1].acknowledged == 7
 
 
@@ -332,5 +328,5 @@ async def test_motion_that_ends_otherwise_is_told_in_one_line(
 async def test_cell_without_an_executor_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("common.client.operator_motion.REQUEST_TIMEOUT", 0.05)
     person = OperatorMotion(LocalNetwork().bus(), [])
-    with pytest.raises(MotionFailed, match="does not say how the robot is"):
+    with pytest.raises(MotionFailed, match="publishes no motion status"):
         await person.move(HOME)
