@@ -59,7 +59,7 @@ CASES: dict[str, tuple[list[str], list[str]]] = {
     "no cell": (["run"], ["CELL"]),
     "unknown topic": (["topic", "info", "joint_state"], ["unknown key", "did you mean 'joint_states'?"]),
     "cell file whose name begins no key": (["check", "a cell.yaml"], ["'a cell' is no name of a cell", "letters"]),
-    "cell that stands for several": (["task", "stop", "--cell", "*"], ["cell: '*'", "is no name that a cell can have"]),
+    "cell that stands for several": (["task", "stop", "--cell", "*"], ["cell: '*'", "is not a valid name of a cell"]),
     "cell of two parts": (["play", RECORDING, "--cell", "a/b"], ["--cell: 'a/b'", "is no name"]),
     "key of a part without a name": (["topic", "pub", "my//key", "{}"], ["unknown key 'my//key'", "choices:"]),
     "key that stands for several": (["topic", "pub", "my/*", "{}"], ["unknown key 'my/*'", "choices:"]),
