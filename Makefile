@@ -1,4 +1,4 @@
-# `make run` and `make test` are all that is needed; each sets up .venv first and does nothing when it is up to date.
+# Start with `make run` and `make test`. Each target sets up .venv first if it is outdated.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -8,12 +8,12 @@ STAMP := $(VENV)/.up-to-date
 
 setup: $(STAMP)
 
-# Drivers of real arms and the like, as `make setup EXTRAS=ur,franka`; what was asked for once stays.
+# Optional extras, as in `make setup EXTRAS=ur,franka`; later calls remember them.
 EXTRAS := $(if $(EXTRAS),$(EXTRAS),$(shell cat $(VENV)/.extras 2>/dev/null))
 COMMA := ,
 $(shell mkdir -p $(VENV); [ "$$(cat $(VENV)/.extras 2>/dev/null)" = "$(EXTRAS)" ] || echo "$(EXTRAS)" > $(VENV)/.extras)
 
-# What the compiled planning kernel is made of: it is compiled anew when that changes.
+# Sources of the planning kernel: it is compiled again when they change.
 KERNEL := setup.py common/planning/kernel/build.py $(wildcard common/planning/kernel/src/*)
 
 $(STAMP): pyproject.toml constraints.txt $(KERNEL) $(wildcard $(VENV)/.extras)
@@ -22,7 +22,7 @@ $(STAMP): pyproject.toml constraints.txt $(KERNEL) $(wildcard $(VENV)/.extras)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev$(addprefix $(COMMA),$(EXTRAS))]'
 	@touch $@
 
-# A test host of tests/drivers/test_franka.py and tests/cells/test_real_arms.py; its numpy is not ours. Nothing else needs it.
+# A protocol double for tests/drivers/test_franka.py and tests/cells/test_real_arms.py, with another numpy than ours.
 franka-sim: .venv-franka-sim/.up-to-date
 .venv-franka-sim/.up-to-date:
 	$(PYTHON) -m venv .venv-franka-sim
@@ -32,10 +32,10 @@ franka-sim: .venv-franka-sim/.up-to-date
 run: setup  ## clear the table into the box, print a summary
 	$(BIN)/zencell run panda
 
-up: setup  ## the same, and stay until Ctrl-C
+up: setup  ## start the cell and stay until Ctrl-C
 	$(BIN)/zencell up panda
 
-# Hundreds of processes are started: each compiles the sources again where nothing may keep what was compiled.
+# Tests start hundreds of processes, which would all compile the sources again without a bytecode cache.
 test test-all campaign: export PYTHONDONTWRITEBYTECODE =
 
 test: setup
@@ -43,8 +43,8 @@ test: setup
 
 test-all: setup  ## `make test`, and what takes long
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder -m "not container and not alone and not browser and not campaign"
-	$(BIN)/python -m pytest -q -m "browser and not container and not alone and not campaign"  # cells and Chromium: one after another
-	$(BIN)/python -m pytest -q -m "alone and not campaign" || [ $$? = 5 ]  # none where no driver is installed
+	$(BIN)/python -m pytest -q -m "browser and not container and not alone and not campaign"  # cells with Chromium: one at a time
+	$(BIN)/python -m pytest -q -m "alone and not campaign" || [ $$? = 5 ]  # exit code 5: no driver is installed
 
 campaign: setup  ## tests that repeat over hundreds of seeds, or for minutes
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder -m campaign || [ $$? = 5 ]  # 5: none is marked
@@ -55,38 +55,39 @@ containers: setup  ## build the image and run a cell in containers; needs a cont
 check: setup
 	$(BIN)/ruff check .
 	$(BIN)/mypy
+	$(BIN)/lint-imports
 
-audit: setup  ## known vulnerabilities in the dependencies, where the database can be reached
+audit: setup  ## known vulnerabilities of the dependencies, where the database can be reached
 	.ci/audit $(BIN)
 
 bench: setup  ## every published figure, one module each
 	@for script in $$(grep -l __main__ benchmarks/*.py); do module=benchmarks.$$(basename $$script .py); \
 	  echo "== $$module"; $(BIN)/python -m $$module || exit 1; done
 
-bench-check: setup  ## whether planning lost more than a fifth of its lead; ratios, so that the machine is of no account
+bench-check: setup  ## fail if planning lost more than a fifth of its lead; compares ratios, independent of the machine
 	$(BIN)/python -m benchmarks.ratios
 
-chaos: setup  ## fifty runs, each under a plan of faults of its own: all of them have to end well
+chaos: setup  ## fifty runs with injected faults: all must end DONE
 	$(BIN)/python -m benchmarks.chaos
 
-fuzz: setup  ## a million changed payloads through every message, and thousands under the keys of both cells
+fuzz: setup  ## a million mutated payloads through every message class, and thousands into both cells
 	$(BIN)/python -m benchmarks.fuzz $(ARGS)
 
-soak: setup  ## thirty minutes of work beside a slow and a stuck subscriber: nothing may grow or get lost
+soak: setup  ## thirty minutes with a slow and a stuck subscriber: nothing may grow or get lost
 	$(BIN)/python -m benchmarks.soak
 
-docs: setup  ## write the generated tables and pages again
+docs: setup  ## regenerate tables and pages of docs/
 	$(BIN)/python -m docs.generate
 
-# The site needs an extra that stays, as each of them.
+# The site needs an extra.
 WITH_SITE := $(if $(filter site,$(subst $(COMMA), ,$(EXTRAS))),$(EXTRAS),$(EXTRAS:%=%$(COMMA))site)
 
-docs-site:  ## the pages as a site with search in build/site, to be read without a network; broken links are errors
+docs-site:  ## build docs/ as a site with search in build/site; broken links are errors
 	@$(MAKE) --no-print-directory setup EXTRAS=$(WITH_SITE)
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict  # with --quiet it counts no warnings
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict  # --quiet would hide warnings
 	@echo "to read it: $(PYTHON) -m http.server --bind 127.0.0.1 -d build/site"
 
-deploy: setup  ## write the compose files and Kubernetes manifests again
+deploy: setup  ## regenerate the compose files and Kubernetes manifests
 	$(BIN)/python -m deploy.generate
 
 clean:

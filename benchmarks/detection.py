@@ -21,7 +21,7 @@ from common.messages import Color, Pose, Vector3, WorldObject
 from common.perception.pinhole import Pinhole
 from common.perception.sphere import sphere_in_view
 from common.robot.model import RobotModel
-from common.scene.workspace import reach_reason
+from common.scene.workspace import unreachable_reason
 from common.sim.rendering import draw
 
 Array = npt.NDArray[np.float64]
@@ -147,7 +147,7 @@ def main() -> None:
     within, beyond = [], []
     for x, y in rng.uniform((0.05, -0.45), (0.75, 0.45), (200, 2)):
         start = time.thread_time()
-        reason = reach_reason(robot, (x, y, radius), cell.grasp)
+        reason = unreachable_reason(robot, (x, y, radius), cell.grasp)
         (beyond if reason else within).append((time.thread_time() - start) * 1e3)
     for text, times in (("within reach", within), ("out of reach", beyond)):
         print(f"a new place {text}: median {np.median(times):.2f} ms, most {max(times):.2f} ms, of {len(times)}")

@@ -37,10 +37,9 @@ from common.application import all_topics
 from common.messages import Header, Image
 from common.topics import Topic
 from common.transport.codec import encode
-from common.transport.connect import connect
 from common.transport.endpoint import client_config, endpoint_of
 from common.transport.session import RawSample
-from common.transport.zenoh_session import ZenohSession
+from common.transport.zenoh_session import ZenohSession, connect
 from tests.harness import RunningCell, free_domain
 
 CELL = "panda"

@@ -27,7 +27,7 @@ from common import topics
 from common.application import all_topics
 from common.config import load_cell
 from common.errors import DecodeError
-from common.messages.basics import SMALL, Message
+from common.messages.basics import SMALL_BYTES, Message
 from common.topics import Topic
 from common.transport.bus import Bus
 from common.transport.codec import decode
@@ -68,7 +68,7 @@ def decoded(count: int, seed: int) -> list[str]:
             if len(lines) < TOLD:
                 lines.append(f"{model.__name__}: {type(error).__name__}: {error}: {payload[:200].hex()}")
         took = time.thread_time() - since
-        if model.most_bytes <= SMALL and took > slowest.get(model.__name__, (0.0, 0))[0]:
+        if model.max_bytes <= SMALL_BYTES and took > slowest.get(model.__name__, (0.0, 0))[0]:
             slowest[model.__name__] = min(took, again(model, payload)), len(payload)
     seconds = time.process_time() - began
     name, (most, size) = max(slowest.items(), key=lambda item: item[1])

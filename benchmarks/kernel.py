@@ -20,8 +20,8 @@ from common.config import load_cell
 from common.planning.kernel.oracle import Comparison, compare, random_geometry
 from common.planning.kernel.world import KernelWorld
 from common.planning.robot_geometry import RobotGeometry, convex_hulls
-from common.robot.description import package_folders
 from common.robot.model import RobotModel
+from common.robot.urdf import package_folders
 
 Models = tuple[pin.Model, pin.GeometryModel]
 

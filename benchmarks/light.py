@@ -89,13 +89,13 @@ def main() -> None:
         picture = eye.capture(WorldObjects(objects=objects(places, around)), joints, 0).colour
         q = robot.order(joints.name, joints.position)
         assert q is not None
-        hidden = silhouettes.hidden(eye.pinhole, [q])
+        hidden = silhouettes.occlusion(eye.pinhole, [q])
         began = time.thread_time()
         found = detector.detect(picture, eye.pinhole)
         spent += time.thread_time() - began
         seen = [d for d in found if not hidden.touches([d.position], around.ball_radius)[0]]
         shapes = outlines(eye.pinhole, places, around.ball_radius, 32)
-        whole = np.array([bool(eye.pinhole.in_picture(shape).all())
+        whole = np.array([bool(eye.pinhole.in_image(shape).all())
                           and not any(detector.resting.shows_container(eye.pinhole, pixel) for pixel in shape)
                           for shape in shapes])
         clear = places[whole & ~hidden.touches(places, around.ball_radius)]

@@ -23,8 +23,8 @@ import numpy as np
 from common import messages as m
 from common.topics import Request, Topic
 from common.transport.bus import Bus
-from common.transport.connect import connect
 from common.transport.endpoint import endpoint_of
+from common.transport.zenoh_session import connect
 from tests.harness import ROOT, environment, free_domain
 
 CELL = "transport"

@@ -65,7 +65,7 @@ def intrinsics(
 ) -> None:
     """Find focal lengths, centre and distortion from views of the board all over the picture, tilted to each side."""
     from common.config import check
-    from common.perception.image_sources import pictures
+    from common.perception.image_sources import read_images
     from tools.calibration.intrinsics import CollectingOptions, ViewSelector, calibrate_intrinsics
     from tools.calibration.report import camera_from_intrinsics, format_intrinsics
 
@@ -74,7 +74,7 @@ def intrinsics(
                                          "k_coefficients": options.whole("--k-coefficients", k_coefficients, 0)})
     collector = ViewSelector(board_of(squares, square, marker, dictionary), settings)
     terminal = sys.stderr.isatty()
-    for name, picture in pictures(source, parse_size(size), options.number("--seconds", seconds)):
+    for name, picture in read_images(source, parse_size(size), options.number("--seconds", seconds)):
         reason = collector.add(picture, name)
         if terminal:
             part, unseen = collector.coverage()
@@ -160,7 +160,7 @@ def hand_eye(
     from typing import get_args
 
     from common.perception.camera_file import CameraFile
-    from tools.calibration.hand_eye import LEAST_VIEWS, Mount, calibrate_hand_eye
+    from tools.calibration.hand_eye import MIN_VIEWS, Mount, calibrate_hand_eye
     from tools.calibration.intrinsics import CalibrationFailed
     from tools.calibration.report import format_hand_eye, with_hand_eye
     from tools.calibration.views import load_views
@@ -169,8 +169,8 @@ def hand_eye(
         raise UnknownName("--camera", mount, get_args(Mount))
     camera, board = CameraFile.load(intrinsics_file), board_of(squares, square, marker, dictionary)
     views, why, said = load_views(Path(folder).expanduser(), board, camera)
-    if len(views) < LEAST_VIEWS and why:
-        raise CalibrationFailed(f"{len(views)} views of the board, {LEAST_VIEWS} are needed; {why[0]}")
+    if len(views) < MIN_VIEWS and why:
+        raise CalibrationFailed(f"{len(views)} views of the board, {MIN_VIEWS} are needed; {why[0]}")
     result = calibrate_hand_eye(views, camera, "hand" if mount == "hand" else "beside")
     file = output or intrinsics_file
     with_hand_eye(camera, result, folder, said.robot, mount).save(file)

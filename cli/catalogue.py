@@ -63,7 +63,7 @@ def service(
         require_module,
         router_location,
     )
-    from common.transport.keys import ROUTER
+    from common.transport.session import ROUTER
 
     number, endpoint = router_location(domain, connect)
     launch = Launch(cell, tuple(overrides or ()), world, options.whole("--seed", seed, 0), number, endpoint)

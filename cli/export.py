@@ -10,7 +10,7 @@ import typer
 from cli.recording import Exclude, File
 from common.errors import ConfigError
 from common.terminal import echo, printable
-from recording.summary import in_bytes, require_new
+from recording.formatting import format_bytes, require_new
 
 if TYPE_CHECKING:
     from recording.reader import Recording
@@ -66,7 +66,7 @@ def _foxglove(recording: Recording, target: Path, selection: Selection, decoder:
     from recording.foxglove import export_foxglove
 
     count = export_foxglove(recording, target, selection.wants, decoder)
-    echo(f"{target}: {count:,} messages, {in_bytes(target.stat().st_size)}, for Foxglove")
+    echo(f"{target}: {count:,} messages, {format_bytes(target.stat().st_size)}, for Foxglove")
 
 
 def _tables(recording: Recording, folder: Path, selection: Selection, decoder: Decoder) -> None:

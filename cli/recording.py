@@ -15,7 +15,7 @@ from cli import choices, options
 from cli.target import RUNNING, CellTarget
 from common.errors import ConfigError
 from common.terminal import echo, rewrite
-from recording.summary import contents, in_bytes, require_new
+from recording.formatting import format_bytes, format_contents, require_new
 
 LEAST_FILE = 1.0  # [MB] of a recording that is split
 
@@ -42,7 +42,7 @@ def record_(
 ) -> None:
     """Record what travels in a cell, all keys if none are given, until Ctrl-C."""
     from common.config import load_cell
-    from common.transport.credentials import identity_of_listener
+    from common.transport.credentials import observer_identity
     from recording.capture import CustomTopics
     from recording.recorder import RecordRequest, record, record_gated, require_published
     from recording.selection import Selection
@@ -66,7 +66,7 @@ def record_(
     if gate:
         asyncio.run(record_gated(asked, cell, at.domain, at.connect, echo, show))
     else:
-        replace(at, cell=cell).visit(lambda bus: record(bus, asked, echo, show), identity=identity_of_listener())
+        replace(at, cell=cell).visit(lambda bus: record(bus, asked, echo, show), identity=observer_identity())
 
 
 def _positive(option: str, text: str | None) -> float | None:
@@ -88,7 +88,7 @@ def info(file: File, as_json: options.Json = False) -> None:
     if as_json:
         echo(json.dumps(summary.as_dict()))
         return
-    for line in contents(file, recording.cell, summary):
+    for line in format_contents(file, recording.cell, summary):
         echo(line)
 
 
@@ -105,7 +105,7 @@ def recover(
     target = Path(output) if output else source.with_name(f"{source.stem}_recovered.mcap")
     require_new(target)
     saved = recover_file(source, target)
-    lost = [f"{in_bytes(saved.lost_bytes)} after the cut"] if saved.lost_bytes else []
+    lost = [f"{format_bytes(saved.lost_bytes)} after the cut"] if saved.lost_bytes else []
     lost += [f"{saved.damaged_chunks} damaged chunks"] if saved.damaged_chunks else []
     echo(f"saved {saved.messages:,} messages, {saved.seconds:.1f} s: {target}; "
          f"lost {' and '.join(lost) or 'nothing'}")

@@ -25,7 +25,7 @@ def report(
 ) -> None:
     """Write one page about a recorded run: timeline, plans, latency, joints, what was seen, and what went wrong."""
     from recording.reader import Recording
-    from recording.report.build import build_report, cut
+    from recording.report.build import build_report, truncated_note
     from recording.sample import RecordingError
 
     path = Path(file)
@@ -41,6 +41,6 @@ def report(
         except CANNOT_BE_SHOWN as error:
             raise RecordingError(f"{path}: has values that cannot be shown: {type(error).__name__}: {error}") from error
         if not recording.finished:
-            echo(f"zencell: {cut(recording)}", err=True)
+            echo(f"zencell: {truncated_note(recording)}", err=True)
     options.write_text(str(page_path), text)
     echo(f"{page_path}: {len(text) / 1e6:.1f} MB")

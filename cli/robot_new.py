@@ -40,7 +40,7 @@ def new(
 ) -> None:
     """Write a robot file for an arm from its URDF: what it says, what is measured on it, and guesses marked as such."""
     from common.config import names_of
-    from common.robot.merging import read_urdf
+    from common.robot.urdf import read_urdf
     from tools.robot_setup.files import folders_of_meshes, robot_file, world_layout, write_cell
     from tools.robot_setup.proposal import draft, finish
     from tools.robot_setup.tree import find_wrists, read_tree

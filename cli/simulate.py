@@ -45,7 +45,7 @@ def simulate(
     from common.process.environment import usable_cores
     from lab.campaign import seeds_of
     from lab.doubles import settings_of, with_doubles
-    from lab.observed_arm import with_observed_arm
+    from lab.observers import with_observed_arm
 
     if seeds is not None and seed is not None:
         raise ConfigError("--seed", seed, "does not go with --seeds")
@@ -70,15 +70,16 @@ def simulate(
 def _single(cell: Cell, seed: int, faults: bool, file: str | None, limit: float) -> int:
     """Run one seed and tell of all that happened; the exit code."""
     from lab.campaign import format_outcome
-    from lab.simulation import Simulation, Trace
+    from lab.observers import Trace
+    from lab.simulation import Simulation
     from recording.capture import CustomTopics
-    from recording.summary import about, require_new
+    from recording.formatting import about, require_new
 
     trace = None
     if file is not None:
         require_new(Path(file), "--trace")
         trace = Trace(Path(file), about(cell.name), CustomTopics.of(cell))
-    simulation = Simulation(cell, seed, faults=faults, limit=limit, digest=True, trace=trace, tell=echo)
+    simulation = Simulation(cell, seed, faults=faults, limit=limit, digest=True, trace=trace, log=echo)
     try:
         outcome = simulation.run()
     finally:
@@ -96,7 +97,7 @@ def _campaign(cell: Cell, seeds: Sequence[int], faults: bool, jobs: int, limit: 
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    from lab.campaign import Tally, reason, run_seeds, table
+    from lab.campaign import Tally, failure_reason, run_seeds, table
 
     tally, interrupted = Tally(), False
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
@@ -107,7 +108,7 @@ def _campaign(cell: Cell, seeds: Sequence[int], faults: bool, jobs: int, limit: 
             for outcome in run_seeds(cell, seeds, faults, jobs, limit):
                 tally.add(outcome)
                 if not outcome.ok or outcome.crashes:
-                    line = f"seed {outcome.seed}: {reason(outcome)}"
+                    line = f"seed {outcome.seed}: {failure_reason(outcome)}"
                     console.print(line, markup=False, highlight=False, soft_wrap=True)
                 progress.update(bar, advance=1, description=f"{cell.name} {tally.done} DONE")
         except KeyboardInterrupt:

@@ -152,9 +152,9 @@ def pub(
     from common.client.json_codec import message_from_json
     from common.client.keys import writers_of
     from common.topics import of_service
-    from common.transport.credentials import refuse_to_publish
+    from common.transport.credentials import require_open_cell
 
-    refuse_to_publish("topic pub")
+    require_open_cell("topic pub")
     period = 1 / options.rate(rate)
     most = 1 if once else options.whole("--count", count, 1)
     topic = _publishable(key)

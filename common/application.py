@@ -100,7 +100,7 @@ class ApplicationTopics:
 
 @dataclass(frozen=True, kw_only=True)
 class Checks:
-    """What `zencell check` finds in a cell of the application, each a generator of `tools.check.finding.Finding`."""
+    """What `zencell check` finds in a cell of the application, each a generator of `tools.check.Finding`."""
 
     quick: Callable[..., Iterator[Any]] | None = None
     """`quick(cell)`: what the files tell."""

@@ -1,6 +1,6 @@
-"""Writes the compose files and deploy/kubernetes from the cells of config/cells: `python -m deploy.generate`.
+"""Generate the compose files and deploy/kubernetes from config/cells: `python -m deploy.generate`.
 
-A service is named once, in its cell file; a test holds that what lies there is what this writes.
+A test checks that the committed files are current.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parent.parent
 
 
 def generated() -> dict[Path, str]:
-    """Every file that is made, and its text."""
+    """Return the text of every generated file."""
     kubernetes = ROOT / "deploy" / "kubernetes"
     return {
         ROOT / "compose.yaml": compose(),

@@ -1,4 +1,4 @@
-"""Makes an environment smaller for an image: what only builds other programs goes, and robots that no file names.
+"""Shrink an environment for an image: remove build files, and robots that no robot file uses.
 
 `python deploy/slim.py ENVIRONMENT ROBOTS`, with the folder of a virtual environment and that of the robot files.
 """
@@ -20,13 +20,13 @@ ROBOTS = "cmeel.prefix/share/example-robot-data/robots"
 
 
 def used_robots(folder: Path) -> set[str]:
-    """Descriptions that the robot files name, such as panda_description."""
+    """Return the descriptions that the robot files use, such as panda_description."""
     text = "\n".join(path.read_text(encoding="utf-8") for path in sorted(folder.glob("*.yaml")))
     return set(re.findall(r"package://example-robot-data/robots/(\w+)/", text))
 
 
 def slim(packages: Path, robots: set[str]) -> None:
-    """Remove what is not needed from a site-packages folder."""
+    """Remove unused files from a site-packages folder."""
     for name in BUILD_ONLY:
         shutil.rmtree(packages / name, ignore_errors=True)
     for folder in (packages / ROBOTS).iterdir():
@@ -37,13 +37,13 @@ def slim(packages: Path, robots: set[str]) -> None:
     for pattern in ("*.a", "*.pyi"):
         for path in packages.rglob(pattern):
             path.unlink()
-    for path, same in duplicates(packages):  # wheels carry no links: a library lies there under each of its names
+    for path, same in duplicates(packages):  # wheels contain no links: each name of a library is a copy
         path.unlink()
         path.symlink_to(same.name)
 
 
 def duplicates(packages: Path) -> Iterator[tuple[Path, Path]]:
-    """Shared libraries with the bytes of another one beside them: the copy, and the one that stays."""
+    """Yield duplicate shared libraries of a folder: the copy, and the one to keep."""
     seen: dict[tuple[Path, str], Path] = {}
     for path in sorted(packages.rglob("*.so*")):
         if path.is_file() and not path.is_symlink():

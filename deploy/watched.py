@@ -1,8 +1,7 @@
-"""Which files that change concern the service of this container: the filter of compose.dev.yaml for watchfiles.
+"""Filter of compose.dev.yaml for watchfiles: select the changes that concern the service of this container.
 
-The folder of all services is watched, not the one file: most editors put a new file in the place of the old one, and
-who watches a file then goes on watching the one that is gone. It imports nothing of the project, which may be broken
-just now.
+watchfiles watches the folder of all services, not one file: most editors replace the file, and a watch on the old file
+would miss the new one. This module imports nothing of the project, which may be broken during an edit.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ SERVICES = "/app/services/"
 
 
 def own_file(arguments: Sequence[str]) -> str:
-    """The file of the service that watchfiles was told to start: `... "python -m services.viewer" ...`."""
+    """Return the file of the service in the watchfiles command: `... "python -m services.viewer" ...`."""
     found = re.search(r"-m services\.(\w+)", " ".join(arguments))
     return f"{SERVICES}{found[1]}.py" if found else ""
 
@@ -24,5 +23,5 @@ OWN = own_file(sys.argv)
 
 
 def concerns(_change: object, path: str, own: str = OWN) -> bool:
-    """Whether the service is to be started again: its own file has changed, or one that all share."""
+    """Return whether the change restarts the service: in its own file, or in a shared one."""
     return path.endswith(".py") and (not path.startswith(SERVICES) or path == own)

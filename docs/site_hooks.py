@@ -1,4 +1,4 @@
-"""What `mkdocs build` does beside the pages (mkdocs.yml): GitHub's Markdown and links out of docs/ work in the site, too."""
+"""Hooks of `mkdocs build` (mkdocs.yml): adapt GitHub's Markdown and links to files outside of docs/."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ FOREIGN = re.compile(r"""<(?:script|img|iframe)\b[^>]*\bsrc=["']?(?:https?:)?//[
 
 
 def on_post_build(config: Any) -> None:
-    """Refuse a site of which a page would ask another host for something when it is read.
+    """Fail if a page would load anything from another host.
 
     Raises:
-        Abort: one would.
+        Abort: with the page and the element.
     """
     for page in sorted(Path(config.site_dir).rglob("*.html")):
         if found := FOREIGN.search(page.read_text(encoding="utf-8")):
-            raise Abort(f"{page.name} asks another host: {found[0]}")
+            raise Abort(f"{page.name} loads from another host: {found[0]}")
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
-    """The text of a page as Python-Markdown wants it: what it links to outside of docs/ is part of the site as text."""
+    """Adapt a page to Python-Markdown; linked files outside of docs/ become text files of the site."""
     folder = posixpath.dirname(page.file.src_uri)
     parts, end = [], 0
     for fence in FENCE.finditer(markdown):
@@ -40,15 +40,15 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
 
 
 def _prose(text: str, folder: str, config: Any, files: Any) -> str:
-    text = re.sub(r"^( +)(?=\S)", r"\1\1", text, flags=re.MULTILINE)  # lists within lists: two blanks, where it wants four
+    text = re.sub(r"^( +)(?=\S)", r"\1\1", text, flags=re.MULTILINE)  # nested lists: two blanks here, four in Python-Markdown
     return LINK.sub(lambda link: _shown(link, folder, config, files), text)
 
 
 def _shown(link: re.Match[str], folder: str, config: Any, files: Any) -> str:
-    """A link within docs/ as it is, one to a file beside docs/ to a copy of that in the site, one to a folder as text."""
+    """Keep a link within docs/, point one to another file to its copy in the site, and turn one to a folder into text."""
     target = posixpath.normpath(posixpath.join("docs", folder, link[2]))
     if target.startswith("docs/") or not (ROOT / target).exists():
-        return link[0]  # mkdocs says that it leads nowhere
+        return link[0]  # mkdocs reports a dead link
     if (ROOT / target).is_dir():
         return link[1]
     uri = f"files/{target}.txt"

@@ -1,4 +1,4 @@
-"""A Luxonis OAK-D, with the maker's package `depthai` (version 3): depth is computed on the camera."""
+"""A Luxonis OAK-D, by the maker's package `depthai` (version 3, extra `cameras`): the camera computes depth."""
 
 from __future__ import annotations
 
@@ -12,27 +12,27 @@ from pydantic import Field
 from common.config import Parameters
 from common.perception.depth_drivers import CameraLost, Intrinsics, RgbdFrame, import_sdk
 
-PATIENCE = timedelta(seconds=2)  # without a frame after which the camera is gone
-STEREO_SIZE = (640, 400)  # [px] in which it compares its two lenses
-MILLIMETRE = np.float32(1e-3)  # [m] of one step of its depth
+TIMEOUT = timedelta(seconds=2)  # without a frame, after which the camera is lost
+STEREO_SIZE = (640, 400)  # [px] of the stereo pair
+MILLIMETRE = np.float32(1e-3)  # [m] of one step of depth
 
 
 class Options(Parameters):
-    """Which camera it is, and how often it looks."""
+    """Identity of the camera, and its rate."""
 
-    device: str = Field("", description="id, or address in the network; empty: the first that is found")
-    fps: float = Field(30.0, ge=1, le=60, description="frames per second it makes [Hz]")
-    subpixel: bool = Field(True, description="finer steps of depth, for more work of the camera")
+    device: str = Field("", description="id, or address in the network; empty: the first one found")
+    fps: float = Field(30.0, ge=1, le=60, description="frame rate [Hz]")
+    subpixel: bool = Field(True, description="finer steps of depth, at a higher load of the camera")
 
 
 class Oak:
-    """A camera whose pipeline runs. Colour comes without the distortion of its lens, and depth fits it."""
+    """A camera whose pipeline runs. Colour images are undistorted, and depth is aligned to them."""
 
     def __init__(self, dai: Any, pipeline: Any, queue: Any) -> None:
-        """Wait for the first pictures, which tell of the lens.
+        """Wait for the first frame, which has the intrinsics.
 
         Raises:
-            CameraLost: there are none.
+            CameraLost: none arrives.
         """
         self._dai, self._pipeline, self._queue = dai, pipeline, queue
         try:
@@ -45,34 +45,34 @@ class Oak:
 
     def _next(self) -> Any:
         try:
-            group = self._queue.get(PATIENCE)
+            group = self._queue.get(TIMEOUT)
         except RuntimeError as error:  # unplugged: the queue is closed
             raise CameraLost(str(error)) from None
         if group is None:
-            raise CameraLost(f"no picture within {PATIENCE.total_seconds():g} s")
+            raise CameraLost(f"no frame within {TIMEOUT.total_seconds():g} s")
         return group
 
     def read(self) -> RgbdFrame:
-        """The next shot, depth and colour of the same instant."""
+        """Wait for the next frame, with depth and colour of the same instant."""
         group = self._next()
         color = group["rgb"]
         steps = np.asanyarray(group["depth"].getFrame())
         metres = np.where(steps > 0, steps * MILLIMETRE, np.float32(np.nan)).astype(np.float32)
-        age = (self._dai.Clock.now() - color.getTimestamp()).total_seconds()  # both by the clock of this machine
+        age = (self._dai.Clock.now() - color.getTimestamp()).total_seconds()  # both by the clock of this host
         return RgbdFrame(np.array(color.getCvFrame()), metres, max(0.0, age))
 
     def close(self) -> None:
-        """Stop it."""
-        with contextlib.suppress(RuntimeError):  # it is gone already
+        """Stop the pipeline."""
+        with contextlib.suppress(RuntimeError):  # it is lost already
             self._pipeline.stop()
 
 
 def open_camera(options: Options, size: tuple[int, int], rate: float) -> Oak:
-    """The camera: see `common.perception.depth_drivers`."""
+    """Open the camera: see `common.perception.depth_drivers`."""
     dai = import_sdk("oak", "depthai")
     try:
         device = dai.Device(dai.DeviceInfo(options.device)) if options.device else dai.Device()
-    except RuntimeError as error:  # none is plugged in, or somebody else has it
+    except RuntimeError as error:  # none is plugged in, or another process has it
         raise CameraLost(str(error)) from None
     try:
         pipeline = dai.Pipeline(device)
@@ -85,24 +85,24 @@ def open_camera(options: Options, size: tuple[int, int], rate: float) -> Oak:
 
 
 def _connected(dai: Any, pipeline: Any, device: Any, options: Options, size: tuple[int, int]) -> Any:
-    """The queue of pictures `rgb` and `depth` that belong together."""
+    """Build the pipeline; return its queue of synchronized `rgb` and `depth`."""
     socket, node = dai.CameraBoardSocket, dai.node
     color = pipeline.create(node.Camera).build(socket.CAM_A)
-    picture = color.requestOutput(size, type=dai.ImgFrame.Type.BGR888i, fps=options.fps, enableUndistortion=True)
+    image = color.requestOutput(size, type=dai.ImgFrame.Type.BGR888i, fps=options.fps, enableUndistortion=True)
     sides = [pipeline.create(node.Camera).build(side).requestOutput(STEREO_SIZE, fps=options.fps)
              for side in (socket.CAM_B, socket.CAM_C)]
     stereo = pipeline.create(node.StereoDepth).build(*sides, presetMode=node.StereoDepth.PresetMode.DEFAULT)
     stereo.setLeftRightCheck(True)
     stereo.setSubpixel(options.subpixel)
-    together = pipeline.create(node.Sync)
-    together.setSyncThreshold(timedelta(seconds=0.5 / options.fps))
-    picture.link(together.inputs["rgb"])
-    if device.getPlatform() == dai.Platform.RVC4:  # its stereo does not align by itself
+    synchronized = pipeline.create(node.Sync)
+    synchronized.setSyncThreshold(timedelta(seconds=0.5 / options.fps))
+    image.link(synchronized.inputs["rgb"])
+    if device.getPlatform() == dai.Platform.RVC4:  # its stereo node cannot align
         align = pipeline.create(node.ImageAlign)
         stereo.depth.link(align.input)
-        picture.link(align.inputAlignTo)
-        align.outputAligned.link(together.inputs["depth"])
+        image.link(align.inputAlignTo)
+        align.outputAligned.link(synchronized.inputs["depth"])
     else:
-        picture.link(stereo.inputAlignTo)
-        stereo.depth.link(together.inputs["depth"])
-    return together.out.createOutputQueue(maxSize=1, blocking=False)
+        image.link(stereo.inputAlignTo)
+        stereo.depth.link(synchronized.inputs["depth"])
+    return synchronized.out.createOutputQueue(maxSize=1, blocking=False)

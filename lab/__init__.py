@@ -1,1 +1,1 @@
-"""Whole cells in one process on a virtual clock, where a seed decides the order of everything, faults included."""
+"""Simulation of complete cells on virtual time, with injected faults and checked invariants; chaos in real cells."""

@@ -1,4 +1,8 @@
-"""A cell with doubles in the place of its perception and its planner: what decides and moves is as it is."""
+"""Test doubles for simulated cells: perception and planner are replaced, task and controller run as they are.
+
+This module is also the service that replaces the motion planner: it interpolates between joint positions and ignores
+obstacles.
+"""
 
 from __future__ import annotations
 
@@ -20,24 +24,26 @@ from common.robot.model import RobotModel
 from common.robot.transforms import pose_to_matrix
 from common.transport.bus import Bus
 
+Array = NDArray[np.float64]
+
 PLANNER, PERCEPTION = "motion_planner", "perception"
-PLANNER_DOUBLE = "lab.doubles"
-LEFT_OUT = ("robot_state_publisher", "viewer")  # nobody looks at frames where there are no pictures
-# Control cycles are most of the work of a run; what holds in each of them is looked at all the same.
+LEFT_OUT = ("robot_state_publisher", "viewer")  # nothing reads frames where there are no images
+# Control cycles are most of the work of a run; invariants are still checked in each of them.
 EXECUTOR, FEWER_CYCLES = "trajectory_executor", {"joint_state_rate": 25.0}  # [Hz]
+MOST_POSES = 200  # of a path
 
 
 def settings_of(application: str) -> tuple[str, ...]:
-    """What its application sets in a cell with doubles, as of `--set`, before all that a person sets."""
+    """Return the overrides, as of `--set`, that an application's double makes before the user's."""
     double = find_application(application).double
     return double.settings if double is not None else ()
 
 
 def with_doubles(cell: Cell) -> Cell:
-    """The cell with doubles.
+    """Return the cell with its perception and planner replaced.
 
     Raises:
-        ConfigError: its application brings no double of its perception.
+        ConfigError: its application has no double of its perception.
     """
     double = find_application(cell.application).double
     if double is None:
@@ -45,7 +51,7 @@ def with_doubles(cell: Cell) -> Cell:
     services: dict[str, ServiceEntry] = {}
     for name, entry in cell.services.items():
         if entry.kind == PLANNER:
-            services[name] = ServiceEntry(name=name, module=PLANNER_DOUBLE)
+            services[name] = ServiceEntry(name=name, module=__name__)
         elif entry.kind in double.replaces:
             services.setdefault(PERCEPTION, ServiceEntry(name=PERCEPTION, module=double.module))
         elif entry.kind == EXECUTOR:
@@ -56,27 +62,22 @@ def with_doubles(cell: Cell) -> Cell:
 
 
 def is_double(entry: ServiceEntry) -> bool:
-    """Whether a service stands for others, and may see the truth."""
+    """Return whether a service replaces perception, and may read the ground truth."""
     return entry.name == PERCEPTION
 
 
-Array = NDArray[np.float64]
-
-MOST_POSES = 200  # of a path
-
-
 class Config(Parameters):
-    """How fast it is."""
+    """Robot and speed of the planner's double."""
 
     robot: RobotConfig
     motion: Motion
 
 
 def waypoints(robot: RobotModel, start: Array, goal: object) -> list[Array]:
-    """Joint positions [rad] to come to rest at, one after the other.
+    """Return joint positions [rad] of a goal; the arm stops at each.
 
     Raises:
-        Refused: the goal is out of reach, or none of joints, pose and path.
+        Refused: the goal is out of reach, or of an unknown type.
     """
     if isinstance(goal, m.JointGoal):
         return [robot.named(goal.named) if goal.named else np.array(goal.positions)]
@@ -88,7 +89,7 @@ def waypoints(robot: RobotModel, start: Array, goal: object) -> list[Array]:
             passed += waypoints(robot, passed[-1], item.goal)
         return passed[1:]
     if not isinstance(goal, m.PoseGoal | m.PathGoal):
-        raise Refused("not_applicable", f"the planner's double knows no {type(goal).__name__}")
+        raise Refused("not_applicable", f"the planner's double does not support {type(goal).__name__}")
     poses = [goal.pose] if isinstance(goal, m.PoseGoal) else goal.waypoints[1:MOST_POSES]
     found = [start]
     for pose in poses:
@@ -106,10 +107,10 @@ def waypoints(robot: RobotModel, start: Array, goal: object) -> list[Array]:
 
 
 def plan(robot: RobotModel, motion: Motion, request: m.PlanRequest, current: Array | None) -> m.PlanResponse:
-    """A trajectory that any controller can follow."""
+    """Return a trajectory within all limits that ignores obstacles."""
     start = np.array(request.start) if request.start else current
     if start is None:
-        raise Refused("no_state", f"{request.stage or request.id}: the joint states are not known yet")
+        raise Refused("no_state", f"{request.stage or request.id}: no joint state received yet")
     velocity = robot.velocity * (request.velocity_scaling or motion.velocity_scaling)
     scaling = request.acceleration_scaling or motion.acceleration_scaling
     parts: list[TimedPath] = []
@@ -123,16 +124,16 @@ def plan(robot: RobotModel, motion: Motion, request: m.PlanRequest, current: Arr
 
 
 async def run(bus: Bus, config: Config) -> None:
-    """Serve plan requests as `motion_planner` does, from the newest joint states unless a start is given."""
+    """Serve plan requests as `motion_planner` does; plan from the newest joint state unless a start is given."""
     scenes, states = bus.reader(topics.PLANNING_SCENE), bus.reader(topics.JOINT_STATES)
     display = bus.writer(topics.DISPLAY_TRAJECTORY)
     robot = RobotModel.load(config.robot)
-    one_at_a_time = asyncio.Lock()
+    planning = asyncio.Lock()
 
     async def handle(request: m.PlanRequest) -> m.PlanResponse:
-        async with one_at_a_time:
+        async with planning:
             if scenes.latest is None:
-                raise Refused("no_scene", f"{request.stage or request.id}: there is no planning scene yet")
+                raise Refused("no_scene", f"{request.stage or request.id}: no planning scene received yet")
             state = states.latest
             current = None if state is None else robot.order(state.name, state.position)
             response = await asyncio.to_thread(plan, robot, config.motion, request, current)

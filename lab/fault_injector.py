@@ -1,4 +1,4 @@
-"""Makes the faults of a plan happen to a simulated cell; what persons do between lies beside it."""
+"""Carries out the fault plan of a simulated cell; `operator_model` plays the operators among the faults."""
 
 from __future__ import annotations
 
@@ -15,99 +15,100 @@ from common import topics
 from common.application import find_application
 from common.topics import Topic
 from lab.chaos.agent import Chaos
-from lab.chaos.plan import Fault as Bad
+from lab.chaos.plan import Fault as BadMessages
 from lab.chaos.plan import Form
-from lab.faults import Amid, Fault, FaultPlan
+from lab.faults import Fault, FaultPlan, Party
 from lab.loop import Incarnation, context_of
 from lab.network import SimulatedSession
 from lab.operator_model import OperatorModel
 from lab.processes import SimulatedBus, SimulatedHost, SimulatedProcess
 
-AGAIN = 0.1  # [s] between looks whether something has come about
-LATEST = 0.3  # [s] after which a process crashes that does not get to the turn at which it was to
-NEXT_GOAL = 1.5  # [s] for which the next goal is waited for
-TURN = 0.0005  # [s] that stands for a turn where something is to happen just when a goal is asked for
+POLL = 0.1  # [s] between checks of a condition
+LATEST = 0.3  # [s] after which a process crashes that has not reached the turn of its crash
+NEXT_GOAL = 1.5  # [s] to wait for the next goal
+TURN = 0.0005  # [s] equivalent of a loop turn where a fault waits for a goal
 GOALS = (topics.MOTION_EXECUTE.key, topics.GRIPPER_COMMAND.key)
 PLAN = topics.MOTION_PLAN.key
 STRANGER = "stranger"
 FORMS: tuple[Form, ...] = ("truncated", "flipped", "noise", "wrong type")
-BAD_MESSAGES = 4  # under one key, at most
+BAD_MESSAGES = 4  # most under one key
 
 
 class FaultInjector:
-    """Lets go wrong in one run what its plan says; `made` counts."""
+    """Makes the faults of one plan happen; `injected` counts them by kind."""
 
     def __init__(
-        self, host: SimulatedHost, plan: FaultPlan, seed: int, status: Topic[Any], tell: Callable[[str], None]
+        self, host: SimulatedHost, plan: FaultPlan, seed: int, status: Topic[Any], log: Callable[[str], None]
     ) -> None:
-        """Prepare.
+        """Prepare the faults.
 
         Args:
-            host: of the processes that are hit.
-            plan: what goes wrong, and when.
+            host: runs the processes to hit.
+            plan: which faults happen when.
             seed: decides what the plan leaves open.
-            status: of the cell's task.
-            tell: is called with a line for each fault.
+            status: topic of the cell's task.
+            log: called with a line for each fault.
         """
-        self.made: Counter[str] = Counter()
-        self.lose_supervisor: Callable[[], Awaitable[object]] = asyncio.Event().wait  # and bring the cell up again
-        self._seconds: list[SimulatedProcess] = []
-        self._strange = np.random.default_rng([seed, 10])
-        self._host, self._plan, self._tell = host, plan, tell
+        self.injected: Counter[str] = Counter()
+        self.lose_supervisor: Callable[[], Awaitable[object]] = asyncio.Event().wait  # and start the cell again
+        self._second_instances: list[SimulatedProcess] = []
+        self._random = np.random.default_rng([seed, 10])
+        self._host, self._plan, self._log = host, plan, log
         self._network = host.network
-        self.persons = OperatorModel(host, seed, self._strange, status, tell, self.made)
+        self.operators = OperatorModel(host, seed, self._random, status, log, self.injected)
 
     async def run(self) -> None:
-        """Return when all has happened; cancelled, nothing more does."""
+        """Return when all faults have happened; cancel to inject no more."""
         loop, speed = self._host.loop, self._plan.speed
-        began, persons = loop.time(), list[asyncio.Task[None]]()
-        begins = {"second instance": self._begin_second, "hostile": self._begin_strange,
-                  **dict.fromkeys(self.persons.acts, self.persons.begin)}
+        started_at, running = loop.time(), list[asyncio.Task[None]]()
+        concurrent = {"second instance": self._start_second, "malformed messages": self._start_stranger,
+                      **dict.fromkeys(self.operators.acts, self.operators.start)}
         try:
             for fault in self._plan.faults:
-                await asyncio.sleep(max(0.0, began + fault.at / speed - loop.time()))
-                if fault.kind in begins:
-                    self.made[fault.kind] += 1
-                    persons.append(begins[fault.kind](fault))
+                await asyncio.sleep(max(0.0, started_at + fault.at / speed - loop.time()))
+                if fault.kind in concurrent:
+                    self.injected[fault.kind] += 1
+                    running.append(concurrent[fault.kind](fault))
                 elif fault.kind == "supervisor lost":
-                    persons.append(asyncio.create_task(self._lose_supervisor()))
+                    running.append(asyncio.create_task(self._lose_supervisor()))
                 else:
-                    await self._hit(fault)
-            await asyncio.gather(*persons)
+                    await self._inject(fault)
+            await asyncio.gather(*running)
         finally:
-            for person in persons:
-                person.cancel()
+            for task in running:
+                task.cancel()
 
-    def _note(self, fault: Fault, name: str) -> None:
+    def _record(self, fault: Fault, name: str) -> None:
         by = "by" if fault.kind == "clock step" else "for"
-        lasts = f" {by} {fault.seconds:.1f} s" if fault.seconds else ""
-        self._tell(f"FAULT {fault.kind} {name}{f' amid a goal: {fault.amid}' if fault.amid else ''}{lasts}")
-        self.made[fault.kind] += 1
+        duration = f" {by} {fault.seconds:.1f} s" if fault.seconds else ""
+        during = f" during a goal: {fault.during_goal}" if fault.during_goal else ""
+        self._log(f"FAULT {fault.kind} {name}{during}{duration}")
+        self.injected[fault.kind] += 1
 
-    async def _hit(self, fault: Fault) -> None:
+    async def _inject(self, fault: Fault) -> None:
         loop, network = self._host.loop, self._network
         if fault.kind == "clock step":
-            self._note(fault, "")
+            self._record(fault, "")
             loop.stepped_ns += round(fault.seconds * 1e9)
             return
         if fault.kind == "late goal":
-            if await self._next_goal(fault.amid, fault.seconds) is not None:
-                self._note(fault, "")
+            if await self._next_goal(fault.during_goal, fault.seconds) is not None:
+                self._record(fault, "")
             return
         process, session = await self._victim(fault)
         if fault.kind == "crash":
-            while not await self._crash(process, fault):  # it ended by itself meanwhile
-                process, session = await self._victim(replace(fault, amid=""))
+            while not await self._crash(process, fault):  # the process ended by itself meanwhile
+                process, session = await self._victim(replace(fault, during_goal=""))
             return
-        if fault.amid:
+        if fault.during_goal:
             await asyncio.sleep(fault.turns * TURN)
-        self._note(fault, process.name if fault.target else "")
+        self._record(fault, process.name if fault.target else "")
         if fault.kind in ("router lost", "cut"):
-            # Of one that was let in while the network was split there would be two arms: that is no single cell.
-            self._end_seconds(process.name if fault.kind == "cut" else "")
+            # A second instance admitted while the network was split would drive a second arm: that is no single cell.
+            self._kill_second_instances(process.name if fault.kind == "cut" else "")
         if fault.kind == "router lost":
             network.lose_router()
-            loop.call_later(fault.seconds, network.find_router)
+            loop.call_later(fault.seconds, network.restore_router)
         elif fault.kind == "cut":
             network.cut([session])
             loop.call_later(fault.seconds, self._mend, session)
@@ -117,87 +118,87 @@ class FaultInjector:
             process.terminate()
 
     async def _crash(self, process: SimulatedProcess, fault: Fault) -> bool:
-        """Whether the process crashed, at its turn or somewhat later."""
-        life, pid = process.life, process.pid
+        """Return whether the process crashed, at its turn or at `LATEST`."""
+        incarnation, pid = process.incarnation, process.pid
         process.kill_at_turn(fault.turns)
         deadline = self._host.loop.time() + LATEST
         try:
-            while not life.over and self._host.loop.time() < deadline:  # noqa: ASYNC110 - time is free here
-                await asyncio.sleep(AGAIN)
+            while not incarnation.over and self._host.loop.time() < deadline:  # noqa: ASYNC110 - time is free here
+                await asyncio.sleep(POLL)
         finally:
-            life.at_turn = None
-        if not life.over and process.pid == pid:
+            incarnation.at_turn = None
+        if not incarnation.over and process.pid == pid:
             process.kill()
-        if life.over:
-            self._note(fault, process.name)
-        return life.over
+        if incarnation.over:
+            self._record(fault, process.name)
+        return incarnation.over
 
     async def _victim(self, fault: Fault) -> tuple[SimulatedProcess, SimulatedSession]:
-        """Whom a fault hits: who has to do with the next goal, its target, or another that runs."""
+        """Return the process to hit: client or server of the next goal, the target, or another that runs."""
         processes = self._host.processes
         names = [fault.target, *processes]
-        if fault.amid and (found := await self._next_goal()) is not None:
-            asker, asked = found
-            names = [asker, asked, *names] if fault.amid == "asker" else [asked, asker, *names]
+        if fault.during_goal and (found := await self._next_goal()) is not None:
+            client, server = found
+            names = [client, server, *names] if fault.during_goal == "client" else [server, client, *names]
         while True:
             for process in [processes[name] for name in names if name in processes]:
                 session = process.session
                 if session is not None and not (fault.kind == "cut" and session.cut):
                     return process, session
-            await asyncio.sleep(AGAIN)
+            await asyncio.sleep(POLL)
 
-    async def _next_goal(self, late: Amid = "", seconds: float = 0.0) -> tuple[str, str] | None:
-        """Who asks for the next goal or plan, and who is asked; None when nobody asks for a while.
+    async def _next_goal(self, late: Party = "", seconds: float = 0.0) -> tuple[str, str] | None:
+        """Return client and server of the next goal or plan request; None if there is none within `NEXT_GOAL`.
 
         Args:
-            late: whether what is sent by who asks, or by who is asked, is to be late: of a goal only.
-            seconds: by how much [s].
+            late: party whose message is delayed; goals only.
+            seconds: the delay [s].
         """
         requests = self._host.requests
-        begun: asyncio.Future[tuple[str, str]] = asyncio.get_running_loop().create_future()
+        started: asyncio.Future[tuple[str, str]] = asyncio.get_running_loop().create_future()
 
-        def on_begin(asker: str, asked: str, key: str) -> None:
-            if (key in GOALS or (key == PLAN and not late)) and not begun.done():
-                begun.set_result((asker, asked))
-                found = [self._host.processes.get(name) for name in (asker, asked)]
+        def on_start(client: str, server: str, key: str) -> None:
+            if (key in GOALS or (key == PLAN and not late)) and not started.done():
+                started.set_result((client, server))
+                found = [self._host.processes.get(name) for name in (client, server)]
                 ends = [session for process in found if process and (session := process.session) is not None]
                 if late and len(ends) == 2:
-                    source, target = ends if late == "asker" else reversed(ends)
-                    self._network.hold_up(source, target, f"{self._host.cell.name}/{key}", seconds)
+                    source, target = ends if late == "client" else reversed(ends)
+                    self._network.delay_next_query(source, target, f"{self._host.cell.name}/{key}", seconds)
 
-        requests.on_begin = on_begin
+        requests.on_start = on_start
         try:
             async with asyncio.timeout(NEXT_GOAL):
-                return await begun
+                return await started
         except TimeoutError:
             return None
         finally:
-            requests.on_begin = lambda asker, asked, key: None
+            requests.on_start = lambda client, server, key: None
 
     def _mend(self, session: SimulatedSession) -> None:
         if not session.detached and not self._network.router_lost:
             self._network.mend([session])
 
-    # --- what nobody should do ----------------------------------------------------------------------------------------
+    # --- concurrent faults --------------------------------------------------------------------------------------------
 
     async def _lose_supervisor(self) -> None:
-        self._tell("FAULT supervisor lost: the cell is brought up again")
-        self.made["supervisor lost"] += 1
-        self._end_seconds("")
+        self._log("FAULT supervisor lost: the cell is started again")
+        self.injected["supervisor lost"] += 1
+        self._kill_second_instances("")
         await self.lose_supervisor()
 
-    def _begin_second(self, fault: Fault) -> asyncio.Task[None]:
-        self._tell(f"FAULT second instance {fault.target} for {fault.seconds:.1f} s")
-        return asyncio.create_task(self._be_second(fault))
+    def _start_second(self, fault: Fault) -> asyncio.Task[None]:
+        self._log(f"FAULT second instance {fault.target} for {fault.seconds:.1f} s")
+        return asyncio.create_task(self._run_second(fault))
 
-    async def _be_second(self, fault: Fault) -> None:
-        """Start a service that is up, as somebody might by hand; it is to end by itself, or when it is not needed."""
+    async def _run_second(self, fault: Fault) -> None:
+        """Start a service that is up, as a user might by hand, and terminate it unless it ends by itself."""
         entry = next(entry for entry in self._host.cell.services.values() if entry.name == fault.target)
         while (session := self._host.processes[fault.target].session) is None or session.cut:  # noqa: ASYNC110
-            await asyncio.sleep(AGAIN)
+            await asyncio.sleep(POLL)
         second = SimulatedProcess(
-            self._host, entry, lambda name, line: self._tell(f"second {name}: {line}"), beside=True)
-        self._seconds.append(second)
+            self._host, entry, lambda name, line: self._log(f"second {name}: {line}"), unsupervised=True)
+        self._second_instances.append(second)
         second.start()
         second.release()
         try:
@@ -206,29 +207,29 @@ class FaultInjector:
                     await second.wait()
         finally:
             second.terminate()
-            self._seconds.remove(second)
+            self._second_instances.remove(second)
 
-    def _end_seconds(self, name: str) -> None:
-        """End the second instances of a service, or all of them."""
-        for second in self._seconds:
+    def _kill_second_instances(self, name: str) -> None:
+        """Kill the second instances of a service; of all services if the name is empty."""
+        for second in self._second_instances:
             if name in ("", second.name):
                 second.kill()
 
-    def _begin_strange(self, _fault: Fault) -> asyncio.Task[None]:
-        self._tell("FAULT hostile: messages that nobody can read under all keys")
+    def _start_stranger(self, _fault: Fault) -> asyncio.Task[None]:
+        self._log("FAULT malformed messages: under all keys")
         context = context_of(Incarnation(STRANGER))
-        session = self._network.attach(context, STRANGER, self.made["hostile"])
-        return context.run(lambda: asyncio.create_task(self._be_strange(session)))
+        session = self._network.attach(context, STRANGER, self.injected["malformed messages"])
+        return context.run(lambda: asyncio.create_task(self._run_stranger(session)))
 
-    async def _be_strange(self, session: SimulatedSession) -> None:
-        """Put damaged messages and nonsense under every key, and ask for nonsense."""
-        host, random = self._host, self._strange
+    async def _run_stranger(self, session: SimulatedSession) -> None:
+        """Put damaged messages and nonsense under every key, and send nonsense requests."""
+        host, random = self._host, self._random
         bus = SimulatedBus(session, STRANGER, host.cell.name, host.clock, host.requests)
         known = {**topics.platform_topics(), **find_application(host.cell.application).topics_by_key}
         keys = [key for key in known if topics.SERVICE not in key]
         bad = [
-            Bad(0.0, "corrupt", key, form=FORMS[int(random.integers(len(FORMS)))],
-                count=int(random.integers(1, BAD_MESSAGES + 1)), seed=int(random.integers(2**31)))
+            BadMessages(0.0, "corrupt", key, form=FORMS[int(random.integers(len(FORMS)))],
+                        count=int(random.integers(1, BAD_MESSAGES + 1)), seed=int(random.integers(2**31)))
             for key in [keys[i] for i in random.permutation(len(keys))]
         ]
         try:

@@ -1,4 +1,4 @@
-"""An event loop whose time passes only when everything that could be done by now was done."""
+"""Event loop on virtual time: the clock advances only when no callback is ready."""
 
 from __future__ import annotations
 
@@ -15,47 +15,46 @@ from typing import Any
 
 import numpy as np
 
-EPOCH_NS = 1_767_225_600_000_000_000  # what day it is when a simulation begins: 2026-01-01, UTC
-LOOK_NS = 20_000  # a look at the clock within a call that computes stands for so much work [ns]
-CALL_MEAN, CALL_MOST = 0.01, 0.5  # [s] a call beside the loop takes as long as is drawn, and its looks on top
+EPOCH_NS = 1_767_225_600_000_000_000  # wall time at which a simulation starts: 2026-01-01, UTC
+CLOCK_READ_NS = 20_000  # assumed work between two reads of the clock within a computing call [ns]
+CALL_MEAN, CALL_MOST = 0.01, 0.5  # [s] random duration of a call in a thread, in addition to its clock reads
 
 
 class Deadlock(RuntimeError):
-    """Everybody waits, and nothing will ever happen."""
+    """Everything waits, and nothing is scheduled."""
 
 
 class Incarnation:
-    """What belongs together in a loop, such as one process of a cell; it can be cut off in the middle.
+    """One life of a process in the loop, from its start to its end; it can be cut off anywhere.
 
-    Nothing of it runs then: no `finally`, no callback. `revive` lets it go on, so that it can be cleared away.
+    Nothing of it runs then: no `finally`, no callback. `revive` lets it run again, so that it can be cleaned up.
     """
 
     def __init__(self, name: str) -> None:
-        """Begin to live."""
         self.name = name
         self.over = False
-        self.turns = 0  # taken so far
-        self.at_turn: tuple[int, Callable[[], None]] | None = None  # called in place of that turn
-        self.left: list[tuple[Callable[..., object], tuple[object, ...], Context]] = []  # turns never taken
+        self.turns = 0  # callbacks run so far
+        self.at_turn: tuple[int, Callable[[], None]] | None = None  # called instead of that callback
+        self.skipped: list[tuple[Callable[..., object], tuple[object, ...], Context]] = []  # callbacks never run
 
 
-_life: ContextVar[Incarnation | None] = ContextVar("life", default=None)
+_current: ContextVar[Incarnation | None] = ContextVar("incarnation", default=None)
 
 
 def current_incarnation() -> Incarnation | None:
-    """The life whose turn it is."""
-    return _life.get()
+    """Return the incarnation whose callback runs."""
+    return _current.get()
 
 
-def context_of(life: Incarnation) -> Context:
-    """A context of its own for what belongs to a life; whatever is started in it does too."""
+def context_of(incarnation: Incarnation) -> Context:
+    """Return a new context; whatever is started in it belongs to the incarnation."""
     context = Context()
-    context.run(_life.set, life)
+    context.run(_current.set, incarnation)
     return context
 
 
 class _Numbered:
-    """Has a hash that is the same in every process, so that sets of it are walked in the same order."""
+    """Hashes to the same value in every process, so that sets iterate in the same order."""
 
     _number: int
 
@@ -72,27 +71,32 @@ class _Future(_Numbered, asyncio.Future[Any]):
 
 
 class VirtualTimeLoop(base_events.BaseEventLoop):
-    """A loop of one thread on a virtual clock, which begins at 0; the seed decides how long calls beside it take.
+    """Single-threaded loop on a virtual clock that starts at 0.
 
-    What would run in another thread runs at once and in one go; its result comes after the time that it is said to
-    have taken. The loop is also what everything takes its time and its ids from: a `common.sources.Sources`.
+    A call for another thread runs at once and to its end; its result arrives after a random time drawn from the seed.
+    The loop is also the source of all times and ids: a `common.time_source.TimeSource`.
     """
 
-    # Of asyncio's own loop, whose turns it takes:
+    # Of asyncio's own loop:
     _ready: deque[Any]
-    _scheduled: list[Any]  # when and timer: numbers are compared sooner than timers
+    _scheduled: list[Any]  # time and timer: comparing times is faster than comparing timers
     _timer_cancelled_count: int
     _stopping: bool
 
     def __init__(self, seed: int, *, shuffled: bool = False) -> None:
-        """Begin at 0 s; shuffled, the lives take the turns that are due at once in an order of the seed's."""
+        """Start at 0 s.
+
+        Args:
+            seed: decides ids and the durations of calls in threads.
+            shuffled: whether incarnations run their simultaneous callbacks in an order drawn from the seed.
+        """
         super().__init__()
-        self._shuffle = Random(f"turns of {seed}").shuffle if shuffled else None  # a text: the same in every process
+        self._shuffle = Random(f"turns of {seed}").shuffle if shuffled else None  # text: the same in every process
         self._now = 0.0
-        self.stepped_ns = 0  # by which somebody set the system clock
-        self._work_ns = 0  # done by the call that computes now
+        self.stepped_ns = 0  # by which the system clock was set
+        self._work_ns = 0  # of the computing call
         self._computing = False
-        self._ids = Random(f"ids of {seed}")  # a text: the same in every process
+        self._ids = Random(f"ids of {seed}")  # text: the same in every process
         self._calls = np.random.default_rng([seed, 2])
         self._numbers = count()
         self.set_task_factory(self._make_task)
@@ -100,31 +104,31 @@ class VirtualTimeLoop(base_events.BaseEventLoop):
     # --- time and ids -------------------------------------------------------------------------------------------------
 
     def time(self) -> float:
-        """Virtual time since the loop was made [s]."""
+        """Return the virtual time since the loop was created [s]."""
         return self._now
 
     def monotonic_ns(self) -> int:
-        """Virtual time [ns], which also passes with each look from within a call that computes."""
+        """Return the virtual time [ns]; within a computing call each read advances it."""
         if self._computing:
-            self._work_ns += LOOK_NS
+            self._work_ns += CLOCK_READ_NS
         return round(self._now * 1e9) + self._work_ns
 
     def host_ns(self) -> int:
-        """Virtual time since the host was started [ns]."""
+        """Return the virtual time since the host was started [ns]."""
         return self.monotonic_ns()
 
     def wall_ns(self) -> int:
-        """What the host takes for the time since the Unix epoch [ns]."""
+        """Return the host's system time since the Unix epoch [ns]."""
         return EPOCH_NS + self.stepped_ns + self.monotonic_ns()
 
     def token_hex(self, count: int) -> str:
-        """An id that the seed decides, of so many bytes."""
+        """Return a random id of this many bytes, drawn from the seed."""
         return f"{self._ids.getrandbits(8 * count):0{2 * count}x}"
 
-    # --- turns --------------------------------------------------------------------------------------------------------
+    # --- callbacks ----------------------------------------------------------------------------------------------------
 
     def _run_once(self) -> None:
-        """Take all turns that are due; when there are none, let time pass up to the next one."""
+        """Run all callbacks that are due; if there are none, advance time to the next one."""
         scheduled, ready = self._scheduled, self._ready
         if self._timer_cancelled_count > 100 + len(scheduled) // 2:
             scheduled[:] = [entry for entry in scheduled if not entry[1]._cancelled]
@@ -135,7 +139,7 @@ class VirtualTimeLoop(base_events.BaseEventLoop):
             heapq.heappop(scheduled)
         if not ready and not self._stopping:
             if not scheduled:
-                raise Deadlock(f"nothing will ever happen after {self._now:.3f} s")
+                raise Deadlock(f"nothing is scheduled after {self._now:.3f} s")
             self._now = max(self._now, scheduled[0][0])
         while scheduled and scheduled[0][0] <= self._now:
             _, timer = heapq.heappop(scheduled)
@@ -143,42 +147,42 @@ class VirtualTimeLoop(base_events.BaseEventLoop):
             if not timer._cancelled:
                 ready.append(timer)
         if self._shuffle is not None and len(ready) > 1:
-            self._shuffle_lives(self._shuffle)
+            self._shuffle_ready(self._shuffle)
         for _ in range(len(ready)):
             handle = ready.popleft()
             if not handle._cancelled:
                 handle._run()
 
-    def _shuffle_lives(self, shuffle: Callable[[list[Any]], None]) -> None:
-        """Bring the turns that are ready into another order, in which each life's own keep theirs."""
+    def _shuffle_ready(self, shuffle: Callable[[list[Any]], None]) -> None:
+        """Interleave the ready callbacks of incarnations at random; those of each incarnation keep their order."""
         ready = self._ready
-        lives = [handle._context.get(_life) for handle in ready]
-        if lives.count(lives[0]) == len(lives):
+        owners = [handle._context.get(_current) for handle in ready]
+        if owners.count(owners[0]) == len(owners):
             return
-        turns: dict[Incarnation | None, list[Any]] = {}
-        for life, handle in zip(lives, ready, strict=True):
-            turns.setdefault(life, []).append(handle)
-        for own in turns.values():
+        handles: dict[Incarnation | None, list[Any]] = {}
+        for owner, handle in zip(owners, ready, strict=True):
+            handles.setdefault(owner, []).append(handle)
+        for own in handles.values():
             own.reverse()
-        shuffle(lives)
+        shuffle(owners)
         ready.clear()
-        ready.extend(turns[life].pop() for life in lives)
+        ready.extend(handles[owner].pop() for owner in owners)
 
     def call_soon(
         self, callback: Callable[..., object], *args: object, context: Context | None = None
     ) -> events.Handle:
-        """Take a turn of the life to which the context belongs, unless it is over."""
+        """Schedule a callback, unless the incarnation of its context is over."""
         if context is None:
             context = contextvars.copy_context()
-        life = context.get(_life)
+        incarnation = context.get(_current)
         handle = events.Handle(callback, args, self, context)
-        if life is not None:
-            if life.over:
-                life.left.append((callback, args, context))
+        if incarnation is not None:
+            if incarnation.over:
+                incarnation.skipped.append((callback, args, context))
                 return handle
-            life.turns += 1
-            if life.at_turn is not None and life.turns >= life.at_turn[0]:
-                (_, instead), life.at_turn = life.at_turn, None
+            incarnation.turns += 1
+            if incarnation.at_turn is not None and incarnation.turns >= incarnation.at_turn[0]:
+                (_, instead), incarnation.at_turn = incarnation.at_turn, None
                 self.call_soon(instead, context=Context())
         self._ready.append(handle)
         return handle
@@ -188,38 +192,38 @@ class VirtualTimeLoop(base_events.BaseEventLoop):
     def call_at(
         self, when: float, callback: Callable[..., object], *args: object, context: Context | None = None
     ) -> Any:
-        """Take a turn at a time [s], unless the life is over by then."""
+        """Schedule a callback at a time [s], unless the incarnation of its context is over by then."""
         timer: Any = events.TimerHandle(when, callback, args, self, context)
-        life = timer._context.get(_life)
-        if life is not None and life.over:
+        incarnation = timer._context.get(_current)
+        if incarnation is not None and incarnation.over:
             return timer
         heapq.heappush(self._scheduled, (when, timer))
         timer._scheduled = True
         return timer
 
-    def end(self, life: Incarnation) -> None:
-        """Cut a life off: none of its turns is taken any more."""
-        life.over = True
-        for handle in [handle for handle in self._ready if handle._context.get(_life) is life]:
+    def end(self, incarnation: Incarnation) -> None:
+        """Cut an incarnation off: none of its callbacks runs any more."""
+        incarnation.over = True
+        for handle in [handle for handle in self._ready if handle._context.get(_current) is incarnation]:
             if not handle._cancelled:
-                life.left.append((handle._callback, handle._args, handle._context))
+                incarnation.skipped.append((handle._callback, handle._args, handle._context))
                 handle.cancel()
-        for timer in [timer for _, timer in self._scheduled if timer._context.get(_life) is life]:
+        for timer in [timer for _, timer in self._scheduled if timer._context.get(_current) is incarnation]:
             timer.cancel()
 
-    def revive(self, life: Incarnation) -> None:
-        """Let the turns be taken that were left, so that its tasks can be cancelled; its timers are gone."""
-        life.over = False
-        left, life.left = life.left, []
-        for callback, args, context in left:
+    def revive(self, incarnation: Incarnation) -> None:
+        """Run the skipped callbacks, so that its tasks can be cancelled; its timers are gone."""
+        incarnation.over = False
+        skipped, incarnation.skipped = incarnation.skipped, []
+        for callback, args, context in skipped:
             self.call_soon(callback, *args, context=context)
 
-    # --- calls that would run beside the loop -------------------------------------------------------------------------
+    # --- calls in threads ---------------------------------------------------------------------------------------------
 
     def run_in_executor(  # type: ignore[override]
         self, executor: object, func: Callable[..., Any], *args: Any
     ) -> asyncio.Future[Any]:
-        """Call it now; the result comes after the time that it is said to have taken."""
+        """Call the function now; its result arrives after a random time."""
         future = self.create_future()
         before, self._computing, self._work_ns = self._computing, True, 0
         try:
@@ -235,10 +239,10 @@ class VirtualTimeLoop(base_events.BaseEventLoop):
         self.call_later(took, lambda: None if future.done() else settle(outcome))
         return future
 
-    # --- the rest of what a loop is asked -----------------------------------------------------------------------------
+    # --- the rest of the loop interface -------------------------------------------------------------------------------
 
     def create_future(self) -> asyncio.Future[Any]:
-        """A future that is the same in every process."""
+        """Return a future whose hash is the same in every process."""
         future = _Future(loop=self)
         future._number = next(self._numbers)
         return future

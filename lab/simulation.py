@@ -1,4 +1,4 @@
-"""One whole cell from its start to the end of its task, in this process and on a virtual clock."""
+"""One complete cell from its start to the end of its task, in this process and on virtual time."""
 
 from __future__ import annotations
 
@@ -13,26 +13,21 @@ import shutil
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Coroutine, Iterator, Mapping
+from collections.abc import Callable, Collection, Coroutine, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from common import topics
 from common.application import find_application
+from common.atomic_file import STATE_VARIABLE
 from common.clock import Clock
 from common.config import Cell
-from common.kept_file import STATE_VARIABLE
-from common.messages import SupervisorStatus, TaskStatus
-from common.sources import drawn_from
-from common.supervision.launch import Launch
-from common.supervision.lifecycle import supervise
-from common.supervision.supervisor import Supervisor
+from common.messages import TaskStatus
+from common.time_source import use_time_source
 from common.transport.bus import Bus
-from common.transport.codec import decode, decode_attachment
-from common.transport.reader import Newness
+from common.transport.codec import decode
 from common.transport.session import RawSample
 from lab.doubles import is_double
 from lab.fault_injector import STRANGER, FaultInjector
@@ -40,65 +35,48 @@ from lab.faults import FaultPlan, make_plan
 from lab.invariants import Invariants
 from lab.loop import VirtualTimeLoop
 from lab.network import SimulatedNetwork, SimulatedSession
-from lab.observed_arm import observe_set_points, with_observed_arm
-from lab.processes import RequestLog, SimulatedBus, SimulatedHost, SimulatedProcess
-from recording.capture import CustomTopics
-from recording.sample import Sample, message_of
-from recording.writer import RUN, RecordingWriter, run_of
+from lab.observers import Trace, observe_set_points, with_observed_arm
+from lab.processes import RequestLog, SimulatedBus, SimulatedHost
+from lab.supervisor import SimulatedSupervisor
 
-LIMIT = 300.0  # [s] virtual time in which the task has to end
-LOOK = 0.5  # [s] of virtual time between looks at requests
-SETTLE = 2.0  # [s] of virtual time for what still falls when the task has ended
-CLEARING = 30.0  # [s] of virtual time for what was cut off to come to its end
-SUPERVISOR, VISITOR, HOST = "supervisor", "visitor", "simulated"
-STRANGERS = (VISITOR, STRANGER)  # who may say anything, also what is no message
+LIMIT = 300.0  # [s] of virtual time in which the task must end
+CHECK_PERIOD = 0.5  # [s] of virtual time between checks of open requests
+SETTLE = 2.0  # [s] of virtual time for falling objects after the task has ended
+CLEANUP = 30.0  # [s] of virtual time for killed processes to unwind
+VISITOR = "visitor"
+UNCHECKED = (VISITOR, STRANGER)  # may publish anything, malformed messages included
 ENDED, LEFT = ("DONE", "ERROR"), "LEFT"
-NOTICED = 1.0  # [s] after which a process has noticed that its supervisor is gone
-AGAIN = 0.1  # [s] between looks whether something has come about
-SOONER = 0.5  # faults come in a cell with doubles, whose task takes half as long
-LEFT_OUT = ("viewer",)  # a page in a browser has no place on a virtual clock
+SOONER = 0.5  # factor on the time of faults in a cell with doubles, whose task takes half as long
+LEFT_OUT = ("viewer",)  # a page in a browser cannot run on virtual time
 
 Visit = Callable[[Bus], Coroutine[Any, Any, None]]
-
-log = logging.getLogger(__name__)
 
 
 @dataclass
 class Outcome:
-    """What became of one seed. Times are virtual [s], but for `cpu_seconds`."""
+    """Result of one seed. Times are virtual [s], except `cpu_seconds`."""
 
     seed: int
     state: str = ""
     message: str = ""
     done: int = 0
     total: int = 0
-    left: bool = False  # as a person ended its motion
+    left: bool = False  # an operator stopped the robot and left
     seconds: float = 0.0
     cpu_seconds: float = 0.0
     messages: int = 0
     digest: str = ""  # of the message log: time, key, payload and attachment of every message
     restarts: dict[str, int] = field(default_factory=dict)
-    crashes: list[str] = field(default_factory=list)  # of services by themselves
+    crashes: list[str] = field(default_factory=list)  # of services, not injected
     requests: Counter[str] = field(default_factory=Counter)  # by outcome
-    faults: Counter[str] = field(default_factory=Counter)  # that were made
-    checked: Counter[str] = field(default_factory=Counter)  # how often each invariant was
-    broken: list[str] = field(default_factory=list)  # invariants, with when and how
+    faults: Counter[str] = field(default_factory=Counter)  # injected, by kind
+    checked: Counter[str] = field(default_factory=Counter)  # checks by invariant
+    broken: list[str] = field(default_factory=list)  # violated invariants, with time and detail
 
     @property
     def ok(self) -> bool:
-        """Whether the task ended DONE, or a person ended its motion and nobody started it again."""
+        """Whether the task ended DONE, or an operator stopped the robot and left."""
         return self.state in ("DONE", LEFT)
-
-
-@dataclass
-class _Up:
-    """A supervisor that is there."""
-
-    supervisor: Supervisor
-    bus: SimulatedBus
-    ready: asyncio.Event  # all services are
-    working: asyncio.Task[None]
-    lost: bool = False
 
 
 class Simulation:
@@ -106,7 +84,7 @@ class Simulation:
 
     def __init__(
         self, cell: Cell, seed: int, *, faults: bool = False, limit: float = LIMIT, digest: bool = False,
-        trace: Trace | None = None, tell: Callable[[str], None] = lambda line: None, visit: Visit | None = None,
+        trace: Trace | None = None, log: Callable[[str], None] = lambda line: None, visit: Visit | None = None,
         without: Collection[str] = (),
     ) -> None:
         """Prepare a run.
@@ -114,197 +92,129 @@ class Simulation:
         Args:
             cell: resolved; its viewer is left out.
             seed: decides everything that is left open.
-            faults: whether things go wrong.
-            limit: virtual time in which the task has to end [s].
-            digest: whether a digest of the message log is made.
-            trace: takes all messages.
-            tell: is called with each log line and each fault.
-            visit: what somebody does in the cell, who came to see it; begins when all is ready, and the run ends with
-                the task after it. The invariants do not look at what a visitor says.
-            without: kinds of faults of which there are none.
+            faults: whether faults are injected.
+            limit: virtual time in which the task must end [s].
+            digest: whether to compute a digest of the message log.
+            trace: records all messages.
+            log: called with each log line and each fault.
+            visit: coroutine that runs once the cell is ready; the run ends with the task after it. Its messages are not
+                checked.
+            without: kinds of faults to leave out.
 
         Raises:
-            ConfigError: the cell has a real arm, or is none that can be simulated.
+            ConfigError: the cell has a real arm or cannot be simulated.
         """
-        kept = {key: entry for key, entry in cell.services.items() if entry.name not in LEFT_OUT}
-        self.cell = with_observed_arm(cell.model_copy(update={"services": kept}))
-        names = [entry.name for entry in kept.values()]
-        doubled = any(is_double(entry) for entry in kept.values())
+        services = {key: entry for key, entry in cell.services.items() if entry.name not in LEFT_OUT}
+        self.cell = with_observed_arm(cell.model_copy(update={"services": services}))
+        names = [entry.name for entry in services.values()]
+        doubled = any(is_double(entry) for entry in services.values())
         self.plan = make_plan(seed, names, SOONER if doubled else 1.0, without) if faults else FaultPlan()
         self.outcome = Outcome(seed)
-        self._limit, self._trace, self._tell, self._visit = limit, trace, tell, visit
-        self._failed: Exception | None = None  # of the visit
+        self._limit, self._trace, self._log, self._visit = limit, trace, log, visit
+        self._visit_error: Exception | None = None
         self._hash = hashlib.blake2b(digest_size=16) if digest else None
         self._status = find_application(cell.application).status
         self._status_key = f"{cell.name}/{self._status.key}"
         self._last_status: RawSample | None = None
         self._ended = asyncio.Event()
-        self._restarts: Counter[str] = Counter()  # of supervisors before
-        self._over = False  # what the task says from now on does not count: somebody may have started it again
+        self._over = False  # ignore the task's status from now on: an operator may have started it again
         self._loop = VirtualTimeLoop(seed, shuffled=self.plan.shuffled)
-        self._network = SimulatedNetwork(self._loop, seed, self.plan.weather)
+        self._network = SimulatedNetwork(self._loop, seed, self.plan.links)
         self._network.on_put = self._on_put
-        self._requests = RequestLog()
-        self.invariants = Invariants(self.cell, self._requests, self._loop.time)
-        self._network.on_listen = lambda session, key: self.invariants.on_listen(session.name, key)
+        requests = RequestLog()
+        self.invariants = Invariants(self.cell, requests, self._loop.time)
+        self._network.on_subscribe = lambda session, key: self.invariants.on_subscribe(session.name, key)
+        self._host = SimulatedHost(
+            self._loop, self._network, self.cell, Clock(self.plan.speed), np.random.default_rng([seed, 4]), requests,
+            skews=dict(self.plan.skews),
+        )
 
     def run(self) -> Outcome:
-        """What became of it; what the visit raises is raised."""
-        began = time.process_time()
-        with drawn_from(self._loop), observe_set_points(self.invariants.on_set_point), _state_folder(), _quiet():
+        """Run the cell and return the outcome; an exception of the visit is raised."""
+        started_at = time.process_time()
+        with use_time_source(self._loop), observe_set_points(self.invariants.on_set_point), _state_folder(), _quiet():
             try:
                 self._loop.run_until_complete(self._run())
             finally:
                 self._loop.close()
         if self._hash is not None:
             self.outcome.digest = self._hash.hexdigest()
-        self.outcome.cpu_seconds = time.process_time() - began
-        if self._failed is not None:
-            raise self._failed
+        self.outcome.cpu_seconds = time.process_time() - started_at
+        if self._visit_error is not None:
+            raise self._visit_error
         return self.outcome
 
     def kill(self, name: str) -> None:
-        """End a process of the cell where it is, as SIGKILL does."""
+        """Kill a process of the cell, as SIGKILL does."""
         self._host.processes[name].kill()
 
     def lose_router(self, seconds: float) -> None:
-        """Cut all links for a time [s], as when the router is started again."""
+        """Cut all links for a time [s], as while the router restarts."""
         self._network.lose_router()
-        self._loop.call_later(seconds, self._network.find_router)
+        self._loop.call_later(seconds, self._network.restore_router)
 
     async def _run(self) -> None:
-        outcome, clock = self.outcome, Clock(self.plan.speed)
-        host = SimulatedHost(
-            self._loop, self._network, self.cell, clock, np.random.default_rng([outcome.seed, 4]), self._requests,
-            skews=dict(self.plan.skews),
-        )
-        self._host = host
-        self._misfortune = FaultInjector(host, self.plan, outcome.seed, self._status, self._say)
-        self._misfortune.lose_supervisor, self._misfortune.persons.leave = self._bring_up_again, self._leave
-        self._bring_up()
-        playing = asyncio.create_task(self._play())
-        try:
-            await self._look_on(playing)
-            up = self._up
-            if up.supervisor.failure.done():
-                outcome.state, outcome.message = "NOT STARTED", str(up.supervisor.failure.exception())
-            elif up.working.done() and not up.working.cancelled() and (error := up.working.exception()) is not None:
-                outcome.state, outcome.message = "NOT STARTED", f"{type(error).__name__}: {error}"
-            self._judge()
-        finally:
-            for name, count in self._up.supervisor.restarts.items():
-                self._restarts[name] += count
-            outcome.restarts = {name: count for name, count in self._restarts.items() if count}
-            outcome.crashes, outcome.requests = host.crashes, host.requests.outcomes
-            outcome.faults = self._misfortune.made + self._network.counted
-            outcome.broken, outcome.checked = self.invariants.broken, self.invariants.checked
-            self.invariants.ended = True
-            self._network.on_put = lambda session, sample: None  # what comes now is no part of the run
-            await self._clear(playing, host)
-
-    # --- the supervisor -----------------------------------------------------------------------------------------------
-
-    def _bring_up(self) -> None:
-        """Start a supervisor, which starts all services."""
-        host, clock = self._host, self._host.clock
-        entries = {entry.name: entry for entry in self.cell.services.values()}
-
-        def make_child(name: str, _command: object, _environment: object, on_line: Callable[[str, str], None]) -> Any:
-            return SimulatedProcess(host, entries[name], on_line)
-
-        launch = Launch(cell=self.cell.name, connect="tcp/127.0.0.1:7447", clock=clock)
-        host.started += 1
-        session = self._network.attach(contextvars.copy_context(), SUPERVISOR, host.started)
-        bus = SimulatedBus(session, SUPERVISOR, self.cell.name, clock, host.requests)
-        supervisor = Supervisor(self.cell, launch, lambda name, line: self._say(line), make_child=make_child)
-        # Which is put only while somebody listens.
-        bus.raw_subscriber(f"{self.cell.name}/{topics.LOG.expression}", lambda sample: None)
-        supervisor.start()
-        ready = asyncio.Event()
-
-        async def work(_bus: Bus) -> None:
-            ready.set()
-            await asyncio.Event().wait()
-
-        working = asyncio.create_task(supervise(bus, self.cell, launch, supervisor, work, host=HOST))
-        self._up = _Up(supervisor, bus, ready, working)
-
-    async def _bring_up_again(self) -> None:
-        """End the supervisor as SIGKILL does; return when its services have ended and another one has its own up.
-
-        It asks the system clock anew.
-        """
-        up, host = self._up, self._host
-        up.lost = True
-        self._network.detach(up.bus.session)
-        up.working.cancel()
-        await asyncio.wait({up.working})
-        up.supervisor.abandon()
-        for name, count in up.supervisor.restarts.items():
-            self._restarts[name] += count
-        processes = list(host.processes.values())
-        for process in processes:  # their stdin has ended
-            self._loop.call_later(float(host.random.uniform(0.0, NOTICED)), process.terminate)
-        while any(process.pid is not None for process in processes):  # noqa: ASYNC110 - time is free here
-            await asyncio.sleep(AGAIN)
-        before = host.clock.now()
+        outcome, host = self.outcome, self._host
         host.clock = Clock(self.plan.speed)
-        self.invariants.on_clock(host.clock.now() - before)
-        while True:
-            self._bring_up()
-            up = self._up
-            waiting: asyncio.Future[Any] = asyncio.create_task(up.ready.wait())
-            await asyncio.wait({waiting, up.supervisor.failure}, return_when=asyncio.FIRST_COMPLETED)
-            waiting.cancel()
-            if up.ready.is_set():
-                return
-            self._say(f"not started: {up.supervisor.failure.exception()}")  # somebody tries once more
-            up.lost = True
-            up.working.cancel()
-            await asyncio.wait({up.working})
-            await up.supervisor.stop()
-            self._network.detach(up.bus.session)
+        injector = FaultInjector(host, self.plan, outcome.seed, self._status, self._say)
+        supervisor = SimulatedSupervisor(host, self.plan.speed, self._say, self.invariants.motion.on_clock)
+        injector.lose_supervisor, injector.operators.on_leave = supervisor.restart, self._on_leave
+        playing = asyncio.create_task(self._play(supervisor, injector))
+        try:
+            await self._watch(supervisor, playing)
+            if (failure := supervisor.current.failure) is not None:
+                known = supervisor.current.supervisor.failure.done()
+                outcome.state = "NOT STARTED"
+                outcome.message = str(failure) if known else f"{type(failure).__name__}: {failure}"
+            self._conclude()
+        finally:
+            outcome.restarts = supervisor.restarts
+            outcome.crashes, outcome.requests = host.crashes, host.requests.outcomes
+            outcome.faults = injector.injected + self._network.counted
+            outcome.broken, outcome.checked = self.invariants.broken, self.invariants.checked
+            self.invariants.finished = True
+            self._network.on_put = lambda session, sample: None
+            self._log = lambda line: None
+            await self._clean_up(supervisor, playing)
 
-    async def _look_on(self, playing: asyncio.Task[None]) -> None:
-        """Return when the run is over, or cannot begin, or something broke that must hold."""
+    async def _watch(self, supervisor: SimulatedSupervisor, playing: asyncio.Task[None]) -> None:
+        """Return when the run is over, cannot start, or an invariant is violated."""
         deadline = self._loop.time() + self._limit
         while not playing.done() and self._loop.time() < deadline:
-            up = self._up
-            anything: set[asyncio.Future[Any]] = {playing, up.working, up.supervisor.failure}
-            await asyncio.wait(anything, timeout=LOOK,
-                               return_when=asyncio.FIRST_COMPLETED)
-            self.invariants.look()
-            if self.invariants.broken or (up is self._up and not up.lost and (
-                    up.working.done() or up.supervisor.failure.done())):
+            current = supervisor.current
+            ends: set[asyncio.Future[Any]] = {playing, current.working, current.supervisor.failure}
+            await asyncio.wait(ends, timeout=CHECK_PERIOD, return_when=asyncio.FIRST_COMPLETED)
+            self.invariants.check_requests()
+            if self.invariants.broken or (current is supervisor.current and not current.lost and (
+                    current.working.done() or current.supervisor.failure.done())):
                 return
-            if up.lost:
-                await asyncio.sleep(LOOK)
+            if current.lost:
+                await asyncio.sleep(CHECK_PERIOD)
 
     def _say(self, line: str) -> None:
-        self._tell(f"{self._loop.time():9.3f} s  {line}")
+        self._log(f"{self._loop.time():9.3f} s  {line}")
 
-    async def _play(self) -> None:
-        """Wait for the end of the task, and for what still falls then; or for nobody to start it again."""
-        await self._up.ready.wait()
-        making = asyncio.create_task(self._misfortune.run())
-        await self._visited()
+    async def _play(self, supervisor: SimulatedSupervisor, injector: FaultInjector) -> None:
+        """Wait for the end of the task and for objects to settle, or for an operator to leave."""
+        await supervisor.current.ready.wait()
+        injecting = asyncio.create_task(injector.run())
+        await self._run_visit()
         while not self._ended.is_set() and not self.outcome.left:
             await self._ended.wait()
         self._over = True
         self.outcome.seconds = self._loop.time()
-        making.cancel()
-        await asyncio.wait({making})
-        self._network.find_router()
+        injecting.cancel()
+        await asyncio.wait({injecting})
+        self._network.restore_router()
         await asyncio.sleep(SETTLE)
 
-    def _leave(self) -> None:
-        """Take note that whoever ended motion has gone away: the run is over, unless somebody else started it."""
-        if self.invariants.ended_by_person:
+    def _on_leave(self) -> None:
+        """End the run because an operator stopped the robot and left, unless another one started it again."""
+        if self.invariants.motion.stopped_by_operator:
             self.outcome.left = True
             self._ended.set()
 
-    async def _visited(self) -> None:
-        """Return when the visitor has seen what there was to see."""
+    async def _run_visit(self) -> None:
         if self._visit is None:
             return
         host = self._host
@@ -313,18 +223,18 @@ class Simulation:
         try:
             await self._visit(bus)
         except Exception as error:
-            self._failed = error
+            self._visit_error = error
             raise
         finally:
             await bus.close()
             session.close()
 
-    def _judge(self) -> None:
-        """Take down what the task said last."""
-        outcome, told = self.outcome, self._last_status
-        status = decode(self._status.message, told.payload) if told else TaskStatus()
+    def _conclude(self) -> None:
+        """Fill the outcome from the task's last status and the final checks."""
+        outcome, last = self.outcome, self._last_status
+        status = decode(self._status.message, last.payload) if last else TaskStatus()
         outcome.done, outcome.total = status.done, status.total
-        self.invariants.look()
+        self.invariants.check_requests()
         self.invariants.on_end(status.done, status.state)
         if self.invariants.broken:
             outcome.state, outcome.message = "BROKEN", self.invariants.broken[0]
@@ -332,7 +242,7 @@ class Simulation:
             return
         outcome.state, outcome.message = status.state, status.message
         if outcome.left:
-            outcome.state, outcome.message = LEFT, "as a person left it"
+            outcome.state, outcome.message = LEFT, "an operator stopped the robot and left"
             return
         if status.state not in ENDED:
             outcome.state, outcome.seconds = "NOT ENDED", self._loop.time()
@@ -348,9 +258,9 @@ class Simulation:
             self._hash.update(sample.payload)
         if self._trace is not None:
             self._trace.add(sample, self._loop.wall_ns() - self._loop.stepped_ns)
-        if session.name in STRANGERS:
+        if session.name in UNCHECKED:
             return
-        self.invariants.on_put(session.name, session.life, sample, parted=session.links > 0)
+        self.invariants.on_put(session.name, session.instance, sample, isolated=session.cuts > 0)
         if sample.key == self._status_key and not self._over and sample != self._last_status:
             self._last_status = sample
             if decode(self._status.message, sample.payload).state in ENDED:
@@ -358,19 +268,14 @@ class Simulation:
             else:
                 self._ended.clear()
 
-    async def _clear(self, playing: asyncio.Task[None], host: SimulatedHost) -> None:
-        """Leave nothing behind that runs."""
-        self._tell = lambda line: None
-        up = self._up
-        for task in (playing, up.working):
-            task.cancel()
-        await asyncio.wait({playing, up.working})
-        with contextlib.suppress(Exception):
-            await up.supervisor.stop()
-        await up.bus.close()
-        up.bus.session.close()
-        if left := host.clear_away():
-            await asyncio.wait(left, timeout=CLEARING)
+    async def _clean_up(self, supervisor: SimulatedSupervisor, playing: asyncio.Task[None]) -> None:
+        """End everything that still runs."""
+        playing.cancel()
+        supervisor.current.working.cancel()
+        await asyncio.wait({playing})
+        await supervisor.stop()
+        if killed := self._host.clean_up():
+            await asyncio.wait(killed, timeout=CLEANUP)
         for task in asyncio.all_tasks() - {asyncio.current_task()}:
             task.cancel()
         await asyncio.sleep(1.0)
@@ -378,9 +283,9 @@ class Simulation:
 
 @contextlib.contextmanager
 def _state_folder() -> Iterator[None]:
-    """A folder in memory in which simulated hardware keeps how it stands."""
+    """Let simulated hardware persist its state in a temporary folder, in memory if possible."""
     before = os.environ.get(STATE_VARIABLE)
-    shared = Path("/dev/shm")  # noqa: S108 - where there is one, else on disk
+    shared = Path("/dev/shm")  # noqa: S108 - used where it exists
     folder = tempfile.mkdtemp(prefix="zencell-", dir=shared if os.access(shared, os.W_OK) else None)
     os.environ[STATE_VARIABLE] = folder
     try:
@@ -395,7 +300,7 @@ def _state_folder() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """No log lines of this process, which are those of its processes; and garbage is left for later."""
+    """Silence this process's root logger, to which simulated processes log, and defer garbage collection."""
     root = logging.getLogger()
     handlers, root.handlers[:] = list(root.handlers), [logging.NullHandler()]
     collecting = gc.isenabled()
@@ -407,55 +312,3 @@ def _quiet() -> Iterator[None]:
         if collecting:
             gc.enable()
             gc.collect()
-
-
-FLUSH_NS = 800_000_000  # of virtual time
-
-
-class Trace:
-    """Writes every message once, at its virtual time."""
-
-    def __init__(self, path: Path, about: Mapping[str, Any], own: CustomTopics) -> None:
-        """Create the file.
-
-        Args:
-            path: of the file.
-            about: what is recorded.
-            own: what there is in the cell beside what comes with the project.
-
-        Raises:
-            RecordingError: it is there already, or cannot be written.
-        """
-        self._writer = RecordingWriter(path, about)
-        self._kinds = own.kinds(own.topics())
-        self._newness: dict[str, Newness] = {}
-        self._run_known = False
-        self._flushed = 0
-
-    @property
-    def messages(self) -> int:
-        """How many were written."""
-        return self._writer.messages
-
-    def add(self, raw: RawSample, now: int) -> None:
-        """Write a message that is put now [ns since the Unix epoch], unless it is put again."""
-        origin = decode_attachment(raw.attachment)
-        if origin is None or not self._newness.setdefault(raw.key, Newness()).is_new(origin):
-            return
-        topic = raw.key.partition("/")[2]
-        if topic == topics.SUPERVISOR_STATUS.key and not self._run_known:
-            self._run_known = True
-            status = decode(SupervisorStatus, raw.payload)
-            self._writer.describe(RUN, run_of(status))
-        kind = self._kinds.get(topics.general_key(topic), "stream")
-        self._writer.add(Sample(
-            raw.key, raw.payload, now, message=message_of(raw.encoding), kind=kind,
-            writer=origin.writer, sequence=origin.sequence, trace=origin.trace,
-        ))
-        if now - self._flushed > FLUSH_NS:
-            self._flushed = now
-            self._writer.flush()
-
-    def close(self, reason: str) -> None:
-        """Write how it ended, and the rest."""
-        self._writer.close({"reason": reason, "missed": {}, "dropped": {}})

@@ -262,9 +262,9 @@ def refusal(error: OSError, host: str, port: int, field: str = "") -> ConfigErro
         field: the option that named the port; by default the parameter of the viewer.
     """
     if error.errno == errno.EADDRINUSE:
-        from common.transport.router import holder_of
+        from common.transport.router import port_holder
 
-        return ConfigError(field or "services.viewer.port", port, f"is in use by {holder_of(port)}")
+        return ConfigError(field or "services.viewer.port", port, f"is in use by {port_holder(port)}")
     if error.errno == errno.EACCES:
         return ConfigError(field or "services.viewer.port", port, "may not be used by this user; take 1024 or more")
     reason = error.strerror or str(error)

@@ -12,7 +12,7 @@ from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import Literal
 
-from common.sources import monotonic
+from common.time_source import monotonic
 
 Need = Literal["stop", "look", "operate", "tune", "take"]
 
@@ -64,7 +64,7 @@ class Doors:
             self._pages[key] = visitor
         return key
 
-    def build_report(self, key: str) -> Visitor | None:
+    def page_of(self, key: str) -> Visitor | None:
         """Who was given that key, as long as the page is open."""
         with self._lock:
             return self._pages.get(key)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from common.config import CameraConfig
 from common.messages import TFMessage, TransformStamped
 from common.robot.model import RobotModel
-from common.robot.transform_history import MOST_FRAMES
+from common.robot.transform_tree import MAX_FRAMES
 from common.robot.transforms import pose_to_matrix, rpy_to_matrix, transform
 from common.robot.visual_meshes import Piece, Rgb
 from page.nodes import brightened
@@ -105,7 +105,7 @@ class Transforms:
         for each in m.transforms:
             self.newest.pop(each.child_frame_id, None)
             self.newest[each.child_frame_id] = each
-        for name in [*self.newest][: max(0, len(self.newest) - MOST_FRAMES)]:
+        for name in [*self.newest][: max(0, len(self.newest) - MAX_FRAMES)]:
             del self.newest[name]
 
     def pose(self, frame: str) -> Array:

@@ -27,7 +27,7 @@ from websockets.exceptions import WebSocketException
 from websockets.http11 import Request, Response
 
 from common.errors import ConfigError
-from common.sources import monotonic
+from common.time_source import monotonic
 from page.access import (
     SHORTEST_TOKEN,
     TOKEN,

@@ -10,14 +10,14 @@ from typing import Literal
 
 import numpy as np
 
+from common.atomic_file import state_folder
 from common.config import RobotConfig
 from common.errors import ConfigError
-from common.kept_file import lasting_folder
 from common.messages import CameraInfo, Image, JointState
 from common.perception.camera_file import CameraFile
 from common.robot.model import RobotModel
 from tools.calibration.board import Board
-from tools.calibration.hand_eye import LEAST_VIEWS, calibrate_hand_eye
+from tools.calibration.hand_eye import MIN_VIEWS, calibrate_hand_eye
 from tools.calibration.intrinsics import ViewResidual
 from tools.calibration.report import with_hand_eye
 from tools.calibration.views import AXES, HandEyeCollector, load_views
@@ -37,7 +37,7 @@ def folder_of(name: str) -> Path:
     """
     if not _NAME.fullmatch(name):
         raise ConfigError("Called", name, "must be letters, digits, '_' and '-', at most 40")
-    return lasting_folder() / "hand_eye" / name
+    return state_folder() / "hand_eye" / name
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class HandEye:
     def missing(self) -> str:
         """What is missing, in words; empty when nothing is."""
         few = WANTED - self.count
-        turns = self._collector.turns
+        turns = self._collector.rotation_ranges
         if few <= 0 and turns.min() >= ENOUGH:
             return ""
         views = f"{few} more views" if few > 1 else "one more view" if few == 1 else "some more views"
@@ -81,7 +81,7 @@ class HandEye:
     @property
     def turned(self) -> dict[str, float]:
         """By how many degrees the hand was turned about each of its axes."""
-        return {axis: math.degrees(turn) for axis, turn in zip(AXES, self._collector.turns, strict=True)}
+        return {axis: math.degrees(turn) for axis, turn in zip(AXES, self._collector.rotation_ranges, strict=True)}
 
     def joints(self, state: JointState) -> None:
         """Take note of where the joints are."""
@@ -91,7 +91,7 @@ class HandEye:
 
     def take(self, image: Image) -> str:
         """Keep a picture as a view: empty if it is, else why not."""
-        return self._collector.look(image)
+        return self._collector.add(image)
 
     def calibrate(self, info: CameraInfo) -> Result:
         """Where the camera is by all views; writes the file that a cell takes. Takes seconds.
@@ -120,4 +120,4 @@ class HandEye:
 
 def why_not(views: int) -> str:
     """Why so many views cannot be calibrated; empty if they can."""
-    return "" if views >= LEAST_VIEWS else f"{LEAST_VIEWS} views are needed"
+    return "" if views >= MIN_VIEWS else f"{MIN_VIEWS} views are needed"

@@ -9,7 +9,7 @@ import viser
 from common import topics
 from common.config import check
 from common.messages import GripperCommand, MotionStatus
-from common.sources import new_id
+from common.time_source import new_id
 from page.markup import block, buttons, press, text
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ import viser
 from common.client.operator_motion import UNREACHABLE
 from common.control.jogging import PAUSE
 from common.messages import SELF_RELEASING, UNKNOWN_OPERATOR, MotionOwner, MotionStatus
-from common.sources import monotonic
+from common.time_source import monotonic
 from page.console import Desk
 from page.doors import Doors
 from page.line import Holder

@@ -10,9 +10,9 @@ from typing import Annotated, Literal, get_args
 import yaml
 from pydantic import Field
 
+from common.atomic_file import state_folder
 from common.config import Section, check, config_root, read_yaml
 from common.errors import ConfigError
-from common.kept_file import lasting_folder
 from page.taught import write_whole
 
 FILE = "viewer.yaml"
@@ -57,7 +57,7 @@ class Layout(Section):
 
 def layout_file(given: str) -> Path:
     """The file of the layout: the one that was given, or this user's own."""
-    return Path(given).expanduser() if given else lasting_folder() / FILE
+    return Path(given).expanduser() if given else state_folder() / FILE
 
 
 def _own_layout() -> Path | None:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from websockets.exceptions import ConnectionClosed
 
-from common.sources import monotonic
+from common.time_source import monotonic
 from page.doors import VISITOR
 from page.words import UNDERSTOOD, problem
 
@@ -148,7 +148,7 @@ class Line:
         desk, doors = self._desk, self._desk.doors
         unknown = doors.guarded and not doors.is_in(VISITOR.get())  # which page it is: only STOP is for all
         if said.do == "page":
-            visitor = doors.build_report(said.what)
+            visitor = doors.page_of(said.what)
             if visitor is not None:
                 VISITOR.set(visitor)
             return visitor is not None

@@ -92,7 +92,7 @@ def add_solid(scene: viser.SceneApi, name: str, solid: CollisionObject) -> Solid
     None for a prism whose outline encloses nothing.
     """
     from common.planning.prism import convex_hull  # brings the collision library, which only a scene needs
-    from common.sim.solids import upright
+    from common.sim.solids import extrude
 
     color, opacity = rgb_of(solid.color), solid.color.a if solid.color.a < 1 else None
     place: dict[str, Any] = {"opacity": opacity, "position": position_of(solid.pose), "wxyz": wxyz_of(solid.pose)}
@@ -106,7 +106,7 @@ def add_solid(scene: viser.SceneApi, name: str, solid: CollisionObject) -> Solid
     hull = convex_hull(np.array(solid.outline))
     if len(hull) < 3:
         return None
-    triangles = upright(hull, np.empty((0, 2)), -sizes[0] / 2, sizes[0] / 2)
+    triangles = extrude(hull, np.empty((0, 2)), -sizes[0] / 2, sizes[0] / 2)
     return add_triangles(scene, name, triangles, color, **place, **shade)
 
 

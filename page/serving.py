@@ -36,7 +36,7 @@ class Page:
     port: FreePort | None = None  # kept for it, if none was named
 
 
-def build_report(cell: Cell, host: str | None, port: str | None) -> Page | None:
+def page_of(cell: Cell, host: str | None, port: str | None) -> Page | None:
     """Where the page of a cell is to be served; None for a cell without one.
 
     Args:

@@ -11,9 +11,9 @@ from typing import Annotated
 import yaml
 from pydantic import Field
 
+from common.atomic_file import state_folder
 from common.config import Section, check, read_yaml
 from common.errors import ConfigError
-from common.kept_file import lasting_folder
 
 HEADER = "# Poses that were taught on the page: joint positions [rad, m] by name.\n"
 MOST = 200
@@ -42,7 +42,7 @@ class Taught(Section):
 
 def taught_file(cell: str) -> Path:
     """Where the poses of a cell are kept."""
-    return lasting_folder() / f"{cell}.poses.yaml"
+    return state_folder() / f"{cell}.poses.yaml"
 
 
 def load_taught(path: Path) -> Taught:

@@ -22,9 +22,9 @@ from common.topics import (
     of_service,
     parameters_of,
 )
-from common.transport.copies import plain_key
 from common.transport.credentials import OBSERVER, OPERATOR, RECORDER, ROUTER_NAME, SUPERVISOR, common_name
-from common.transport.keys import alive_key, owns_key, serves_key
+from common.transport.session import alive_key, owns_key, serves_key
+from common.transport.writer import plain_key
 
 MESSAGES = [
     "put", "delete", "declare_subscriber", "query", "reply", "declare_queryable", "liveliness_token",

@@ -69,7 +69,7 @@ async def run(bus: Bus, config: Config) -> None:
     masks = bus.writer(DETECTION_MASK)
     cv2.setNumThreads(1)  # the other cores have other services
     detector = BoxDetector(config)
-    left_out = SkippedFrames(bus.log, "a picture")
+    left_out = SkippedFrames(bus.log, "image")
     kept: deque[Image] = deque(maxlen=KEPT)
     newest, turn = 0, asyncio.Lock()
     await bus.ready()

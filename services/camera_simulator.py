@@ -1,4 +1,4 @@
-"""Draws what a camera would see of the simulated world and sends it as a camera does."""
+"""Render the simulated world and publish images as a camera does."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from common.perception.image import array_to_image
 from common.process.service import main
 from common.process.timing import LoopRate
 from common.sim.camera import CameraParameters, Lens, SimulatedCamera
-from common.sim.rendering import Picture, add_image_noise
+from common.sim.rendering import Pixels, add_image_noise
 from common.transport.bus import Bus
 
 
 class Config(CameraParameters):
-    """Rate and quality of the picture."""
+    """Rate and quality of the images."""
 
     world: Surroundings
     scenery: Scenery = Scenery()
@@ -29,16 +29,16 @@ class Config(CameraParameters):
     max_rate: Tunable[float] = Field(50.0, gt=0, le=250, description="frames per second of wall time at most [Hz]")
     noise_std: Tunable[float] = Field(0.0, ge=0, le=100, description="standard deviation of Gaussian noise [0..255]")
     brightness: Tunable[float] = Field(0.0, ge=-255, le=255, description="added to every channel [0..255]")
-    distorted: bool = Field(False, description="see through the lens of the world's camera, with its distortion d")
-    rectify: bool = Field(True, description="with distorted: take it out again, as camera_opencv does; false sends "
-                                            "pictures as they come, and d in camera_info: the detectors refuse them")
-    draw_robot: bool = Field(False, description="the arm stands before what lies behind it, as in a real picture")
+    distorted: bool = Field(False, description="apply the distortion d of the world's camera")
+    rectify: bool = Field(True, description="with distorted: rectify as camera_opencv does; false publishes distorted "
+                                            "images, and d in camera_info: the detectors reject them")
+    draw_robot: bool = Field(False, description="show the arm, which occludes objects as in a real image")
 
 
 async def run(bus: Bus, config: Config) -> None:
-    """Send a picture at the rate, from the first time on that the world says where everything is.
+    """Publish images at the rate, from the first world state on.
 
-    A camera on the robot is where the joints have it, and its pictures have the time at which they were there.
+    Images of a camera on the robot carry the stamp of the joint state from which its pose was computed.
     """
     truth = bus.reader(topics.SCENE_OBJECTS)
     images, infos = bus.writer(topics.CAMERA_IMAGE), bus.writer(topics.CAMERA_INFO)
@@ -54,22 +54,22 @@ async def run(bus: Bus, config: Config) -> None:
         await joints.next()
     infos.put(camera.info(bus.header(frame)))
     pace = LoopRate(bus, lambda: bus.clock.wall_rate(config.rate, config.max_rate))
-    sent: Image | None = None
-    shown: Picture | None = None
+    message: Image | None = None
+    last_image: Pixels | None = None
     while True:
-        header = bus.header(frame)  # the instant of exposure: what is drawn is where everything is now
+        header = bus.header(frame)  # the instant of exposure: the latest state is rendered
         world = truth.latest or WorldObjects()
         state = joints.latest if joints is not None else None
         if state is not None and camera.is_at(state):
             header = header.model_copy(update={"stamp": state.header.stamp})
         view = (await asyncio.to_thread(camera.capture, world, state, header.stamp) if camera.takes_long(world)
                 else camera.capture(world, state, header.stamp))
-        picture = add_image_noise(view.colour, config.noise_std, config.brightness, rng)
-        if sent is None or picture is not shown:
-            sent, shown = array_to_image(picture, "bgr8", header), picture
+        image = add_image_noise(view.colour, config.noise_std, config.brightness, rng)
+        if message is None or image is not last_image:
+            message, last_image = array_to_image(image, "bgr8", header), image
         else:
-            sent = sent.model_copy(update={"header": header})  # with the pixels as they are
-        images.put(sent)
+            message = message.model_copy(update={"header": header})  # same pixels, new stamp
+        images.put(message)
         await pace.wait()
 
 

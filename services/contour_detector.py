@@ -55,7 +55,7 @@ async def run(bus: Bus, config: Config) -> None:
     following = ContourTracker(initial_choice(config.select))
     last: tuple[Image, Picture, list[Contour]] | None = None
     told = ""
-    left_out = SkippedFrames(bus.log, "a picture")
+    left_out = SkippedFrames(bus.log, "image")
 
     def publish(selected: int, message: str) -> None:
         nonlocal told

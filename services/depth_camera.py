@@ -1,4 +1,4 @@
-"""Looks at the simulated world and the arm in it, and sends what a depth camera sends."""
+"""Render the simulated world with the arm and publish what a depth camera measures."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ class Config(CameraParameters, DepthSensorParameters):
     run: Run
     rate: Tunable[float] = Field(1.0, gt=0, le=30, description="frames per second of cell time [Hz]")
     max_rate: Tunable[float] = Field(5.0, gt=0, le=30, description="frames per second of wall time at most [Hz]")
-    nearest: Tunable[float] = Field(0.10, gt=0, le=100, description="smallest depth that is measured [m]")
-    farthest: Tunable[float] = Field(2.25, gt=0, le=100, description="largest depth that is measured [m]")
+    nearest: Tunable[float] = Field(0.10, gt=0, le=100, description="smallest measured depth [m]")
+    farthest: Tunable[float] = Field(2.25, gt=0, le=100, description="largest measured depth [m]")
     depth_noise_std: Tunable[float] = Field(0.0, ge=0, le=0.1, description="standard deviation of Gaussian noise [m]")
-    depth_dropout: Tunable[float] = Field(0.0, ge=0, le=1, description="part of the pixels that measure no depth")
+    depth_dropout: Tunable[float] = Field(0.0, ge=0, le=1, description="fraction of pixels without depth")
 
 
 async def run(bus: Bus, config: Config) -> None:
-    """Send pictures at the rate, from the first time on that the world says what is in it and the arm where it is.
+    """Publish images at the rate, from the first world and joint state on.
 
-    Those of a camera on the robot have the time at which the joints were where it is then.
+    Images of a camera on the robot carry the stamp of the joint state from which its pose was computed.
     """
     truth, joints = bus.reader(topics.SCENE_OBJECTS), bus.reader(topics.JOINT_STATES)
     images, depths = bus.writer(topics.DEPTH_CAMERA_IMAGE), bus.writer(topics.DEPTH_CAMERA_DEPTH)
@@ -49,10 +49,10 @@ async def run(bus: Bus, config: Config) -> None:
     camera = await asyncio.to_thread(
         lambda: SimulatedCamera(config.world, config.scenery, config.robot, config, rng, plain=False))
 
-    def look(world: WorldObjects, state: JointState | None, now: int) -> View:
-        """What the camera measures."""
-        seen = camera.capture(world, state, now)
-        return View(seen.colour, simulate_depth(seen.depth, camera.pinhole, config, rng))
+    def measure(world: WorldObjects, state: JointState | None, now: int) -> View:
+        """Return color and measured depth."""
+        view = camera.capture(world, state, now)
+        return View(view.colour, simulate_depth(view.depth, camera.pinhole, config, rng))
 
     await bus.ready()
     await truth.next()
@@ -60,18 +60,18 @@ async def run(bus: Bus, config: Config) -> None:
     infos.put(camera.info(bus.header(frame)))
     pace = LoopRate(bus, lambda: bus.clock.wall_rate(config.rate, config.max_rate))
     while True:
-        header = bus.header(frame)  # the instant of exposure: of picture, depth and points alike
+        header = bus.header(frame)  # the instant of exposure of image, depth and points
         world = truth.latest or WorldObjects()
         state = joints.latest
         if state is not None and camera.is_at(state):
             header = header.model_copy(update={"stamp": state.header.stamp})
-        seen = await asyncio.to_thread(look, world, state, header.stamp)
-        depth = seen.depth_within(config.nearest, config.farthest)
+        view = await asyncio.to_thread(measure, world, state, header.stamp)
+        depth = view.depth_within(config.nearest, config.farthest)
         depth = add_depth_noise(depth, rng, config.depth_noise_std, config.depth_dropout)
-        depths.put(array_to_image(depth, "32FC1", header))  # first: who has the picture has its depth
-        images.put(array_to_image(seen.colour, "bgr8", header))
+        depths.put(array_to_image(depth, "32FC1", header))  # first: a client with the image has its depth
+        images.put(array_to_image(view.colour, "bgr8", header))
         if points.matched:
-            points.put(point_cloud(seen.colour, depth, camera.pinhole, header))
+            points.put(point_cloud(view.colour, depth, camera.pinhole, header))
         await pace.wait()
 
 

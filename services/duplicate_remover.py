@@ -13,7 +13,7 @@ from applications.outlining.topics import CONTOUR_PATH, CONTOUR_POINTS, OutlineP
 from common.config import Parameters, Tunable
 from common.errors import ConfigError
 from common.messages import Pose, Vector3
-from common.messages.basics import MOST_NAME
+from common.messages.basics import MAX_NAME
 from common.process.service import main
 from common.terminal import printable
 from common.transport.bus import Bus
@@ -61,7 +61,7 @@ async def run(bus: Bus, config: Config) -> None:
     paths = bus.writer(CONTOUR_PATH)
     file = Path(config.coordinates)
     given = cleared(points_of(file), 0.0) if config.coordinates else []
-    name = printable(f"{file.parent.name}/{file.name}")[-MOST_NAME:]
+    name = printable(f"{file.parent.name}/{file.name}")[-MAX_NAME:]
     await bus.ready()
     async for seen in outlines:
         if given:

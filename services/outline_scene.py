@@ -16,7 +16,7 @@ from common.perception.pinhole import Pinhole
 from common.process.camera_reader import CameraReader
 from common.process.planning_scene import SceneWriter
 from common.process.service import main
-from common.scene.home import HomeWatch
+from common.robot.home import HomeMonitor
 from common.transport.bus import Bus
 
 KEPT = 5  # depth images that wait for their contours
@@ -51,9 +51,9 @@ async def run(bus: Bus, config: Config) -> None:
     cameras = CameraReader(bus, config.world, topics.DEPTH_CAMERA_INFO)
     joints = bus.reader(topics.JOINT_STATES)
     out = SceneWriter(bus)
-    home = HomeWatch(config.robot.named_poses["home"])
+    home = HomeMonitor(config.robot.named_poses["home"])
     kept: deque[Image] = deque(maxlen=KEPT)
-    left_out = SkippedFrames(bus.log, "a picture")
+    left_out = SkippedFrames(bus.log, "image")
     await out.begin(planning_scene(config.world, [], 0))
     await bus.ready()
 
@@ -61,7 +61,7 @@ async def run(bus: Bus, config: Config) -> None:
         async for state in joints:
             found = dict(zip(state.name, state.position, strict=True))
             if all(name in found for name in config.robot.joints):
-                home.note([found[name] for name in config.robot.joints], state.header.stamp)
+                home.add([found[name] for name in config.robot.joints], state.header.stamp)
 
     async def watch_depth() -> None:
         async for image in depths:
@@ -77,7 +77,7 @@ async def run(bus: Bus, config: Config) -> None:
     async def look(found: Contours | None) -> None:
         """Publish what a picture shows once its contours and its depth are both here."""
         nonlocal newest
-        if found is None or found.header.stamp == newest or not home.covers(found.header.stamp):
+        if found is None or found.header.stamp == newest or not home.was_home(found.header.stamp):
             return
         depth = next((image for image in kept if image.header.stamp == found.header.stamp), None)
         if depth is None:

@@ -7,7 +7,7 @@ from collections import OrderedDict
 
 from applications.outlining.contours import is_hole
 from applications.outlining.top_face import TopFace, TopFaceOptions, top_face
-from applications.outlining.topics import CONTOUR_POINTS, CONTOURS, MOST_POINTS, Contours, OutlinePoints
+from applications.outlining.topics import CONTOUR_POINTS, CONTOURS, MAX_POINTS, Contours, OutlinePoints
 from common import topics
 from common.config import Surroundings
 from common.errors import ZencellError
@@ -39,7 +39,7 @@ def outline(contours: Contours, image: Image, camera: Pinhole, config: Config) -
     check_depth(depth, contours.width, contours.height)
     chosen = contours.contours[contours.selected]
     face = top_face(chosen.pixels, depth, camera, config, hole=is_hole(contours.contours, chosen.index))
-    if (count := len(face.outline)) > MOST_POINTS:
+    if (count := len(face.outline)) > MAX_POINTS:
         raise FrameError("crowded", f"its {count} points are more than an outline has room for: is the picture full of "
                                   "noise?")
     require_in_range(face.outline)

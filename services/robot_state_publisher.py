@@ -1,4 +1,4 @@
-"""Publishes what the robot is, and where its links are: tf from the joint states, tf_static for what never moves."""
+"""Publishes the robot's description and the poses of its links: tf from joint states, tf_static for fixed frames."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from common.robot.model import RobotModel
 from common.robot.transforms import pose_fields
 from common.transport.bus import Bus
 
-MOST_MESSAGES = 250.0  # per second of wall time
+MAX_RATE = 250.0  # per second of wall time
 WORLD = "world"
 
 
 class Config(Parameters):
-    """How often."""
+    """Publication rate."""
 
     robot: RobotConfig
     surroundings: Surroundings
-    rate: Tunable[float] = Field(50.0, ge=1, le=250, description="at most so many tf messages, cell time [Hz]")
+    rate: Tunable[float] = Field(50.0, ge=1, le=250, description="largest rate of tf messages, cell time [Hz]")
 
 
 def stamped(parent: str, child: str, T_parent_child: NDArray[np.float64], stamp: int) -> TransformStamped:
-    """The pose of child in parent as a message."""
+    """Return the pose of child in parent as a message."""
     return TransformStamped.model_validate(_fields(parent, child, pose_fields(T_parent_child), stamp))
 
 
@@ -39,10 +39,10 @@ def _fields(parent: str, child: str, pose: dict[str, dict[str, float]], stamp: i
 
 
 class LinkFrames:
-    """The robot's links as a tree of frames, each in the frame of the link that it hangs on."""
+    """The robot's links as a tree of frames, each in the frame of its parent link."""
 
     def __init__(self, robot: RobotModel) -> None:
-        """Find out which links move against their parents and which are fixed to them."""
+        """Determine which links move relative to their parents and which are fixed to them."""
         self._robot = robot
         model = robot.full_model
         joint = {frame.name: frame.parentJoint for frame in model.frames if frame.name in robot.link_names}
@@ -52,14 +52,14 @@ class LinkFrames:
         self._moving = [link for link in robot.link_parents if link not in self._fixed]
 
     def fixed(self, stamp: int) -> list[TransformStamped]:
-        """Links that are fixed to the one they hang on, such as the tool centre point."""
+        """Return the transforms of links that are fixed to their parents, such as the tool centre point."""
         transforms = self._transforms(self._fixed, self._robot.named("home"), None, stamp)
         return TFMessage.model_validate({"transforms": transforms}).transforms
 
     def moving(self, state: JointState) -> TFMessage | None:
-        """Links that a joint moves, at that joint state; None when a joint of the arm is missing in it.
+        """Return the transforms of moving links at a joint state; None if a joint of the arm is missing.
 
-        Only to be sent: its numbers are our own, so that it is not checked, and holds no messages but their fields.
+        For publication only: it is not validated, as its numbers are computed here, and contains plain fields.
         """
         q = self._robot.order(state.name, state.position)
         if q is None:
@@ -82,7 +82,7 @@ class LinkFrames:
 
 
 def description(robot: RobotModel, stamp: int) -> RobotDescription:
-    """What the arm is, for who moves it from outside."""
+    """Return the description of the arm for clients that move it."""
     config, gripper = robot.config, robot.config.gripper
     return RobotDescription.model_validate({
         "header": {"stamp": stamp}, "joints": robot.joint_names, "lower": robot.lower.tolist(),
@@ -96,9 +96,9 @@ async def run(bus: Bus, config: Config) -> None:
     """Publish until cancelled."""
     joints = bus.reader(topics.JOINT_STATES)
     tf, tf_static = bus.writer(topics.TF), bus.writer(topics.TF_STATIC)
-    robot, told_once = RobotModel.load(config.robot), bus.writer(topics.ROBOT_DESCRIPTION)
+    robot, descriptions = RobotModel.load(config.robot), bus.writer(topics.ROBOT_DESCRIPTION)
     frames, stamp = LinkFrames(robot), bus.header().stamp
-    told_once.put(description(robot, stamp))
+    descriptions.put(description(robot, stamp))
     base = stamped(WORLD, frames.root, frames.T_world_root, stamp)
     mounts = mount_links(config.surroundings, robot)
     cameras = [
@@ -108,19 +108,19 @@ async def run(bus: Bus, config: Config) -> None:
     fixed = [base, *cameras, *frames.fixed(stamp)]
     tf_static.put(TFMessage(transforms=fixed))
     await bus.ready()
-    newest, told = 0, False
+    newest, warned = 0, False
     async for state in joints:
-        # A message that comes a little early still counts: otherwise jitter would halve the rate.
-        least_ns = 0.75e9 * bus.clock.speed / bus.clock.wall_rate(config.rate, MOST_MESSAGES)
+        # A message that is a little early still counts: otherwise jitter would halve the rate.
+        least_ns = 0.75e9 * bus.clock.speed / bus.clock.wall_rate(config.rate, MAX_RATE)
         if 0 <= state.header.stamp - newest < least_ns:
             continue
         newest = state.header.stamp
         transforms = frames.moving(state)
         if transforms is not None:
             tf.put(transforms)
-        elif not told:
-            bus.log.warning("joint_states has %s: a joint of the arm is missing", ", ".join(state.name))
-        told = transforms is None
+        elif not warned:
+            bus.log.warning("joint_states has only %s: a joint of the arm is missing", ", ".join(state.name))
+        warned = transforms is None
 
 
 if __name__ == "__main__":

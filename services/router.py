@@ -13,7 +13,7 @@ from common.process.environment import use_single_memory_arena
 from common.process.lifeline import Lifeline, exit_now, exit_with_error
 from common.process.log import log_to_stderr
 from common.process.service import add_process_options
-from common.transport.credentials import secure_folder
+from common.transport.credentials import CertificateMonitor, secure_folder
 from common.transport.endpoint import (
     DEFAULT_DOMAIN,
     DOMAIN_VARIABLE,
@@ -23,8 +23,7 @@ from common.transport.endpoint import (
     endpoints_of,
     is_loopback,
 )
-from common.transport.expiry import EndWatch
-from common.transport.router import Router, log, tend
+from common.transport.router import Router, log, maintain
 
 OPEN = (
     "whoever reaches %s can read and command every cell behind it: `zencell secure init DIR`, then --secure DIR "
@@ -91,8 +90,8 @@ def main() -> NoReturn:
             log.warning(OPEN, endpoint)
     for link in links:
         log.info("to be linked with the router at %s", link)
-    ends = EndWatch()
-    tend(router, stop, lambda: ends.tell(log))
+    ends = CertificateMonitor()
+    maintain(router, stop, lambda: ends.log_new(log))
     log.info("stopped: %s", lifeline.reason)
     closing = threading.Thread(target=router.close, daemon=True)
     closing.start()

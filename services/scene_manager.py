@@ -1,4 +1,4 @@
-"""Keeps the planning scene: fixtures, perceived objects with ids of its own, the one in the hand, those in boxes."""
+"""Maintains the planning scene: fixtures, detected objects with their own ids, attached ones, those in containers."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from common.transport.bus import Bus
 
 
 class Config(ViewsParameters, SceneParameters):
-    """Parameters of the tracking and the sections that it needs."""
+    """Parameters of the tracking, and the sections that it needs."""
 
-    only_at_home: bool = Field(False, description="only pictures count that were taken with the arm at home: for a "
-                                                  "camera before which the arm hides what lies there")
+    only_at_home: bool = Field(False, description="use only images taken with the arm at home: for a camera whose "
+                                                  "view the arm occludes otherwise")
     robot: RobotConfig
     world: Surroundings
 
 
 async def run(bus: Bus, config: Config) -> None:
-    """Publish the planning scene whenever a frame was looked at or the hand closed or opened."""
+    """Publish the planning scene after each detection message and each change of the gripper."""
     views = DetectionViews(bus, config.views, config.world, config.robot, bus.log, only_at_home=config.only_at_home)
     joints = bus.reader(topics.JOINT_STATES)
     gripper = bus.reader(topics.GRIPPER_STATE)
@@ -39,12 +39,12 @@ async def run(bus: Bus, config: Config) -> None:
     if config.robot.gripper is None:
         raise ConfigError("robot.gripper", ..., "is missing: scene_manager needs a robot with one")
     scene = PerceivedScene(config, config.world, config.robot.gripper, config.robot.tcp_link)
-    left_out = SkippedFrames(bus.log, "a planning scene")
+    skipped = SkippedFrames(bus.log, "planning scene")
     await out.begin(scene.scene())
     await bus.ready()
 
-    def hand() -> NDArray[np.float64] | None:
-        """Feel before every look: what the hand does now decides what a frame means. Returns T_world_tcp, if known."""
+    def update_gripper() -> NDArray[np.float64] | None:
+        """Apply the gripper state, which decides how detections are interpreted; return T_world_tcp if known."""
         state, measured = gripper.latest, joints.latest
         q = robot.order(measured.name, measured.position) if measured else None
         T_world_tcp = robot.fk(q) if q is not None else None
@@ -52,24 +52,24 @@ async def run(bus: Bus, config: Config) -> None:
             scene.feel(state, T_world_tcp)
         return T_world_tcp
 
-    async def watch_hand() -> None:
+    async def watch_gripper() -> None:
         held: bool | None = None
         async for state in gripper:
             if state.holding != held:
                 held = state.holding
-                hand()
+                update_gripper()
                 out.put(scene.scene())
 
-    async def look(view: int, seen: CameraDetections) -> None:
-        scene.see(seen.frame, seen.camera, hand(), view, seen.at_times, seen.hidden)
-        if scene.crowded:  # none without some of what stands in the way: who waits for a newer one moves nothing
-            left_out.note(FrameError("crowded", "more is seen than a planning scene has room for"))
+    async def update(view: int, seen: CameraDetections) -> None:
+        scene.see(seen.frame, seen.camera, update_gripper(), view, seen.at_times, seen.hidden)
+        if scene.crowded:  # publish no scene without some obstacles: clients that wait for a newer one do not move
+            skipped.note(FrameError("crowded", "more objects are detected than a planning scene can contain"))
         else:
             out.put(scene.scene())
 
     async with asyncio.TaskGroup() as group:
-        group.create_task(watch_hand())
-        group.create_task(views.watch(look))
+        group.create_task(watch_gripper())
+        group.create_task(views.watch(update))
 
 
 if __name__ == "__main__":

@@ -106,7 +106,8 @@ async def run(bus: Bus, config: Config) -> None:
     line = Line(console)
     status = feeds.reader(read.status) if read.status is not None else None
     motions = OperatorMotion(bus, [status] if status is not None else [], owner=lambda: doors.person)
-    folder = None if bus.declares_only else secure_folder()
+    await bus.acquire_keys()
+    folder = secure_folder()
     server = make_server(
         config.host, config.port, config.token, published=config.published, secured=folder is not None,
         tokens=tokens_in(folder, bus.cell) if folder is not None else None, doors=doors, beside=line.serve,

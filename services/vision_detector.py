@@ -109,9 +109,9 @@ async def run(bus: Bus, config: Config) -> None:
     kept: deque[Image] = deque(maxlen=KEPT)
     news = asyncio.Event()
     detector = Detector(config.world, config)
-    left_out = SkippedFrames(bus.log, "a picture")
-    if not bus.declares_only:
-        warm_up(config.world, config)
+    left_out = SkippedFrames(bus.log, "image")
+    await bus.acquire_keys()
+    warm_up(config.world, config)
     await bus.ready()
 
     async def watch_depths() -> None:

@@ -80,7 +80,7 @@ def hiding(seen: list[CameraDetections], radius: float) -> Callable[[tuple[float
     hidden = [one.hidden for one in seen if one.hidden is not None]
     if len(hidden) < len(seen) or not hidden:
         return None
-    return lambda place: all(bool(one.hides([place], radius)[0]) for one in hidden)
+    return lambda place: all(bool(one.occludes([place], radius)[0]) for one in hidden)
 
 
 def shells(config: Config, header: Header) -> MarkerArray:

@@ -1,6 +1,4 @@
-"""Cells and commands of zencell for tests and benchmarks: as processes of their own, of which none is left behind, and,
-where nothing of a process matters, in this one.
-"""
+"""Start cells and commands of zencell for tests and benchmarks, as processes or within this one; leave none behind."""
 
 from __future__ import annotations
 
@@ -41,27 +39,27 @@ import psutil
 from cli.main import app
 from common.messages import Message
 from common.transport.bus import Bus, Reader
-from common.transport.connect import connect
 from common.transport.endpoint import BASE_PORT, endpoint_of
+from common.transport.zenoh_session import connect
 
 M = TypeVar("M", bound=Message)
 
 ROOT = Path(__file__).resolve().parent.parent
 DOMAINS = range(60, 233)
-PATIENCE = 60.0  # [s] until a test gives up waiting for an event
-logging.getLogger("watcher").addHandler(logging.NullHandler())  # that the router goes at the end is no news
-_given: deque[int] = deque(maxlen=len(DOMAINS) // 4)  # lately, and perhaps not yet listened at
-_locks: dict[int, int] = {}  # descriptors by the domains that this process has
+PATIENCE = 60.0  # [s] timeout of a test that waits for an event
+logging.getLogger("watcher").addHandler(logging.NullHandler())  # the end of the router needs no message
+_given: deque[int] = deque(maxlen=len(DOMAINS) // 4)  # recently returned, perhaps without a listener yet
+_locks: dict[int, int] = {}  # lock descriptors by domain
 SUMMARY, LOG = "summary.json", "cell.log"
 
 
 def free_domain() -> int:
-    """A domain whose port is free, and which no other process that asks here gets while this one lives.
+    """Return a domain with a free port, locked against other test processes until this one ends.
 
-    Tests that run beside each other have shares of their own; a suite and a benchmark, or two suites, have not.
+    Workers of one test run use disjoint ranges; a suite and a benchmark, or two suites, share all.
 
     Raises:
-        RuntimeError: none is.
+        RuntimeError: no domain is free.
     """
     share = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
     domains = DOMAINS[share :: int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))]
@@ -79,7 +77,7 @@ def free_domain() -> int:
 
 
 def _take(domain: int) -> None:
-    """Have the domain for as long as this process lives; an OSError if another one has it."""
+    """Lock a domain until this process ends; raise OSError if another process holds it."""
     if domain in _locks:
         return
     folder = Path(tempfile.gettempdir(), f"zencell-test-domains-{os.getuid()}")
@@ -94,51 +92,50 @@ def _take(domain: int) -> None:
 
 
 def folder_for(parent: Path, label: str) -> Path:
-    """A new folder for the files of one run."""
+    """Create a folder for the files of one run."""
     folder = parent / label.replace(" ", "_")
     folder.mkdir(parents=True)
     return folder
 
 
 def command_line(*arguments: str) -> list[str]:
-    """A command line of zencell with this interpreter."""
+    """Return a command line of zencell with this interpreter."""
     return [sys.executable, "-P", "-m", "cli.main", *arguments]
 
 
 def environment(folder: Path | None = None) -> dict[str, str]:
-    """An environment in which zencell is found and told nothing; what persons decide is kept in the folder."""
-    kept = {name: value for name, value in os.environ.items() if not name.startswith("ZENCELL_")}
-    return {**kept, "PYTHONPATH": str(ROOT)} | ({"XDG_STATE_HOME": str(folder / "state")} if folder else {})
+    """Return an environment that finds zencell, without ZENCELL_ variables, with persistent state in the folder."""
+    inherited = {name: value for name, value in os.environ.items() if not name.startswith("ZENCELL_")}
+    return {**inherited, "PYTHONPATH": str(ROOT)} | ({"XDG_STATE_HOME": str(folder / "state")} if folder else {})
 
 
 def end_in_order() -> None:
-    """Have SIGTERM end this process as Ctrl-C does, through its `with` blocks, so that no cell stays behind."""
+    """Let SIGTERM end this process like Ctrl-C, through its `with` blocks, so that no cell is left behind."""
     if threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGTERM) == signal.SIG_DFL:
         signal.signal(signal.SIGTERM, signal.default_int_handler)
 
 
 def _take_terminal() -> None:
-    """Have Ctrl-C on the terminal that stdout is reach this process."""
+    """Make the terminal on stdout the controlling one, so that its Ctrl-C reaches this process."""
     fcntl.ioctl(1, termios.TIOCSCTTY, 0)
 
 
 class RunningCell:
-    """A `zencell run` or `zencell up` in a domain of its own; its log and its summary are files in a folder."""
+    """A `zencell run` or `zencell up` process in its own domain, with log and summary files in a folder."""
 
     def __init__(
         self, folder: Path, verb: str, cell: str, *arguments: str, secrets: Mapping[str, str] | None = None,
         output: int | None = None,
     ) -> None:
-        """Start it; use it in a `with` block, at the end of which everything it started is gone.
+        """Start the cell; the end of the `with` block ends all of its processes.
 
         Args:
-            folder: where the files go; must be there.
+            folder: existing folder for the files.
             verb: run or up.
             cell: name of the cell.
-            arguments: further options, but for domain and summary; without `--viewer-port` there is no page.
-            secrets: environment variables that no command line may show.
-            output: descriptor of the file that stdout and stderr go to, instead of the log; a terminal is the one
-                whose Ctrl-C it hears.
+            arguments: further options except domain and summary; no page without `--viewer-port`.
+            secrets: environment variables that must not appear on a command line.
+            output: file descriptor for stdout and stderr instead of the log; a terminal becomes the controlling one.
         """
         end_in_order()
         if "--viewer-port" not in arguments:
@@ -165,14 +162,14 @@ class RunningCell:
                 process.kill()
 
     def processes(self) -> dict[str, psutil.Process]:
-        """The processes that the cell's supervisor started, by service, whoever their parent is now."""
+        """Return the processes of the cell by service, whatever their parent is now."""
         return processes_of(self.domain)
 
     async def ended(self, timeout: float) -> int:
-        """Exit code, once the command has ended by itself.
+        """Wait for the end of the command and return its exit code.
 
         Raises:
-            TimeoutError: it has not within `timeout` seconds; the message ends with the last lines of the log.
+            TimeoutError: after `timeout` seconds, with the last log lines.
         """
         try:
             return await asyncio.to_thread(self.process.wait, timeout)
@@ -185,31 +182,31 @@ class RunningCell:
 
     @property
     def text(self) -> str:
-        """Everything that it has written so far."""
+        """The log so far."""
         return (self.folder / LOG).read_text(errors="replace")
 
     def tail(self, lines: int = 30) -> str:
-        """The last lines that it wrote."""
+        """Return the last log lines."""
         return "\n".join(self.text.splitlines()[-lines:])
 
     @property
     def summary(self) -> dict[str, Any]:
-        """The figures of the run, once it has ended."""
+        """The summary file of an ended run."""
         value: dict[str, Any] = json.loads((self.folder / SUMMARY).read_text())
         return value
 
     def listen(self) -> AbstractAsyncContextManager[Bus]:
-        """A bus in the cell for whoever watches, as soon as its router is there."""
+        """Connect a bus to the cell as soon as its router is up."""
         return connect(cell=self.name, service="watcher", endpoint=self.endpoint, timeout=PATIENCE)
 
     def tell(self, *arguments: str) -> subprocess.CompletedProcess[str]:
-        """A zencell command that talks to this cell and ends by itself."""
+        """Run a zencell command against this cell to its end."""
         command = command_line(*arguments, "--domain", str(self.domain))
         return subprocess.run(command, env=environment(), capture_output=True, text=True, timeout=PATIENCE, check=False)
 
 
 class Zencell:
-    """A running zencell command, its lines as they come, and its processes."""
+    """A running zencell command with its output lines and processes."""
 
     def __init__(self, folder: Path, domain: int, *arguments: str) -> None:
         self.domain = domain
@@ -229,7 +226,7 @@ class Zencell:
         self._new.put("")
 
     def until(self, wanted: Callable[[str], bool] | str, *, timeout: float = PATIENCE) -> str:
-        """The first line from now on that is wanted."""
+        """Return the first new line that contains a text or satisfies a condition."""
         deadline = time.monotonic() + timeout
         while True:
             try:
@@ -243,7 +240,7 @@ class Zencell:
                 raise AssertionError(f"{wanted!r} never came:\n" + "\n".join(self.lines))
 
     def end(self, timeout: float = PATIENCE) -> int:
-        """The exit code, once the command has ended; all its lines are there then."""
+        """Wait for the end of the command, collect all lines, and return the exit code."""
         code = self.process.wait(timeout)
         self._reading.join(timeout)
         while not self._new.empty():
@@ -257,11 +254,11 @@ class Zencell:
         self.process.send_signal(signal.SIGINT)
 
     def children(self) -> dict[str, psutil.Process]:
-        """All processes of this cell by name, whoever their parent is now."""
+        """Return the processes of this cell by service, whatever their parent is now."""
         return processes_of(self.domain)
 
     def until_childless(self, timeout: float = PATIENCE) -> None:
-        """Return when no process is left."""
+        """Wait until no process is left."""
         deadline = time.monotonic() + timeout
         while left := self.children():
             assert time.monotonic() < deadline, f"left behind: {sorted(left)}"
@@ -271,27 +268,28 @@ class Zencell:
 def ask(
     folder: Path, *arguments: str, environment: Mapping[str, str] | None = None
 ) -> subprocess.CompletedProcess[str]:
-    """A zencell command that ends by itself, run in this process: its start is most of what it would take.
+    """Run a zencell command to its end within this process, which saves the start of an interpreter.
 
     Args:
-        folder: where the person stands; modules that lie there are forgotten afterwards.
+        folder: working directory; modules in it are unloaded afterwards.
         arguments: of the command.
-        environment: variables beside those of this process, of which zencell is told nothing.
+        environment: variables in addition to those of this process without the ZENCELL_ ones.
     """
     out, err = io.StringIO(), io.StringIO()
-    told = {name: value for name, value in os.environ.items() if not name.startswith("ZENCELL_")} | (environment or {})
-    with (chdir(folder), patch.dict(os.environ, told, clear=True), own_modules(folder), redirect_stdout(out),
+    variables = {name: value for name, value in os.environ.items() if not name.startswith("ZENCELL_")}
+    variables |= environment or {}
+    with (chdir(folder), patch.dict(os.environ, variables, clear=True), own_modules(folder), redirect_stdout(out),
           redirect_stderr(err)):
         try:
             code = app.execute(arguments)
-        except SystemExit as end:  # what a shell asks to complete words ends so
+        except SystemExit as end:  # the completion protocol of shells exits
             code = int(end.code or 0)
     return subprocess.CompletedProcess(arguments, code, out.getvalue(), err.getvalue())
 
 
 @contextmanager
 def own_modules(folder: Path) -> Iterator[None]:
-    """Modules of a folder are found during the block and forgotten at its end, so that another may have the same."""
+    """Make modules of a folder importable during the block, and unload them at its end."""
     with patch.object(sys, "path", [*sys.path]):
         importlib.invalidate_caches()
         try:
@@ -304,7 +302,7 @@ def own_modules(folder: Path) -> Iterator[None]:
 
 
 class Place:
-    """A cell that is up in a folder, and how to ask about it."""
+    """A running cell of a folder, for commands against it."""
 
     def __init__(self, folder: Path, domain: int) -> None:
         self.folder = folder
@@ -312,23 +310,23 @@ class Place:
         self.started: list[Zencell] = []
 
     def start(self, *arguments: str) -> Zencell:
-        """A command as a process of its own."""
+        """Start a command as a process."""
         self.started.append(Zencell(self.folder, self.domain, *arguments))
         return self.started[-1]
 
     def end(self) -> None:
-        """End whatever still runs of what was started."""
+        """End all started commands."""
         for command in self.started:
             if command.process.poll() is None:
                 command.interrupt()
                 command.end()
 
     def ask(self, *arguments: str) -> subprocess.CompletedProcess[str]:
-        """A command that ends by itself."""
+        """Run a command to its end within this process."""
         return ask(self.folder, *arguments, "--domain", str(self.domain))
 
     def say(self, *arguments: str) -> list[str]:
-        """The lines of a command that goes well."""
+        """Run a command that must succeed, and return its lines."""
         done = self.ask(*arguments)
         assert (done.returncode, done.stderr) == (0, "")
         return done.stdout.splitlines()
@@ -336,7 +334,7 @@ class Place:
 
 @contextmanager
 def place_of(folder: Path, file: str, *arguments: str) -> Iterator[Place]:
-    """A cell that is up during the block and ends well."""
+    """Run a cell during the block; it must end with exit code 0."""
     place = Place(folder, free_domain())
     command = place.start("up", file, *arguments)
     try:
@@ -348,29 +346,29 @@ def place_of(folder: Path, file: str, *arguments: str) -> Iterator[Place]:
 
 
 def processes_of(domain: int) -> dict[str, psutil.Process]:
-    """The processes that a supervisor started in a domain, by service, whoever their parent is now."""
+    """Return the processes of a domain by service, whatever their parent is now."""
     found = {}
     for process in psutil.process_iter(["cmdline", "status"]):
         command: list[str] = process.info["cmdline"] or []
         if "--gate" in command and "-m" in command and process.info["status"] != psutil.STATUS_ZOMBIE:
             at = command.index("--domain") + 1 if "--domain" in command else 0
             if command[at] == str(domain):
-                # Helpers of a service look as it does, and began later.
+                # Worker processes have the same command line and are younger.
                 found.setdefault(command[command.index("-m") + 1].rpartition(".")[2], process)
     return found
 
 
 def freeze(child: subprocess.Popen[Any]) -> None:
-    """Stop a child; returns when all of its threads stand, up to 5 ms later: until then it may still answer."""
+    """Stop a child process and wait until all of its threads are stopped, up to 5 ms later."""
     child.send_signal(signal.SIGSTOP)
     os.waitid(os.P_PID, child.pid, os.WSTOPPED | os.WNOWAIT)
 
 
 async def until(reader: Reader[M], wanted: Callable[[M], bool], timeout: float = 60.0) -> M:
-    """The first message from now on, or the newest there is, that is wanted.
+    """Return the latest message, or the first new one, that satisfies a condition.
 
     Raises:
-        TimeoutError: none came within `timeout` seconds.
+        TimeoutError: after `timeout` seconds.
     """
     newest = reader.latest
     if newest is not None and wanted(newest):
@@ -383,7 +381,7 @@ async def until(reader: Reader[M], wanted: Callable[[M], bool], timeout: float =
 
 @asynccontextmanager
 async def beside(*work: Any) -> AsyncIterator[None]:
-    """Coroutines that run during the block and are cancelled at its end; what one raises is raised."""
+    """Run coroutines during the block, cancel them at its end, and raise their exceptions."""
     tasks = [asyncio.create_task(one) for one in work]
     try:
         yield
@@ -397,13 +395,13 @@ async def beside(*work: Any) -> AsyncIterator[None]:
 
 
 async def wait_router(endpoint: str, timeout: float) -> None:
-    """Return as soon as a client can connect to the router.
+    """Wait until a client can connect to the router.
 
     Raises:
-        TimeoutError: none could within `timeout` seconds.
+        TimeoutError: after `timeout` seconds.
     """
-    from common.transport.zenoh_session import close_bounded, open_zenoh
+    from common.transport.zenoh_session import close_within, open_zenoh
 
     async with asyncio.timeout(timeout):
         session = await open_zenoh(endpoint)
-    await close_bounded(session, 0.5)
+    await close_within(session, 0.5)

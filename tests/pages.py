@@ -1,4 +1,4 @@
-"""What pages tell a person to do: their commands, their files, and what they say is printed then."""
+"""Commands, files and expected output in pages of the documentation."""
 
 from __future__ import annotations
 
@@ -14,34 +14,34 @@ STARTS = (".venv/bin/", "make ", "zencell ", "zenoh ", "python ", "PYTHONPATH=",
 
 @dataclass(frozen=True)
 class Step:
-    """A command, and what the page shows below it; `...` stands for anything there."""
+    """A command and its expected output, in which `...` matches anything."""
 
     line: str
     shows: str = ""
 
     def shown_in(self, text: str) -> bool:
-        """Whether a text is what the page says, or has it in it."""
+        """Return whether a text contains the expected output."""
         parts = [re.escape(part.strip()) for part in re.split(r"\.\.\.(?!\.)", self.shows)]
         return re.search(r"[\s\S]*?".join(parts), text) is not None
 
 
 def text_of(page: str) -> str:
-    """The text of a page, by its path in the project."""
+    """Return the text of a page by its path in the project."""
     return (ROOT / page).read_text(encoding="utf-8")
 
 
 def blocks(text: str, language: str = r"\w*") -> list[tuple[str, str]]:
-    """(language, text) of the blocks of code of a page."""
+    """Return (language, text) of the code blocks of a page."""
     return re.findall(rf"^```({language})\n(.*?)^```$", text, re.DOTALL | re.MULTILINE)
 
 
 def files(text: str) -> dict[str, str]:
-    """By name, the files that a page has its reader write."""
+    """Return by name the files that a page asks its reader to write."""
     return dict(re.findall(r"^`([\w./]+)`:\n\n```\w+\n(.*?)^```$", text, re.DOTALL | re.MULTILINE))
 
 
 def steps(text: str, language: str = r"\w*") -> list[Step]:
-    """The commands of a page in their order, without comments; a block `text` below one is what it prints."""
+    """Return the commands of a page in order, without comments; a block `text` below a command is its output."""
     found: list[Step] = []
     for kind, block in blocks(text):
         if kind == "text" and found:
@@ -53,16 +53,16 @@ def steps(text: str, language: str = r"\w*") -> list[Step]:
 
 
 def lines(text: str, language: str = r"\w*") -> list[str]:
-    """The commands of a page."""
+    """Return the command lines of a page."""
     return [step.line for step in steps(text, language)]
 
 
 def prose(text: str) -> str:
-    """A page without its blocks of code."""
+    """Return a page without its code blocks."""
     return re.sub(r"^```.*?^```$", "", text, flags=re.DOTALL | re.MULTILINE)
 
 
 def anchors(text: str) -> set[str]:
-    """The names of the headings of a page, as links call them."""
+    """Return the link anchors of the headings of a page."""
     headings = re.findall(r"^#{1,6} (.*)$", prose(text), re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-") for heading in headings}

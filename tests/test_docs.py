@@ -24,7 +24,7 @@ PAGES = sorted(path.relative_to(ROOT).as_posix() for path in [*ROOT.glob("*.md")
 
 @pytest.mark.parametrize("page", [*generate.PAGES, *generate.TABLES])
 def test_generated_text_is_current(page: str) -> None:
-    assert (generate.DOCS / page).read_text(encoding="utf-8") == generate.made(page), "run `make docs`"
+    assert (generate.DOCS / page).read_text(encoding="utf-8") == generate.generated(page), "run `make docs`"
 
 
 def test_every_controller_parameter_of_the_seed_document_has_a_row() -> None:
@@ -38,7 +38,7 @@ def test_every_controller_parameter_of_the_seed_document_has_a_row() -> None:
 
 
 @pytest.mark.parametrize("page", PAGES)
-def test_links_within_the_project_lead_somewhere(page: str) -> None:
+def test_links_within_the_project_resolve(page: str) -> None:
     path = ROOT / page
     for link in re.findall(r"\]\(([^)\s]+)\)", pages.prose(pages.text_of(page))):
         if "://" not in link:
@@ -48,7 +48,7 @@ def test_links_within_the_project_lead_somewhere(page: str) -> None:
             assert not anchor or anchor in pages.anchors(found.read_text(encoding="utf-8")), link
 
 
-NO_VERBS = {"polish": "one that a reader's own application might bring", "VERB": "stands for any"}
+NOT_COMMANDS = {"polish", "VERB"}  # of a reader's application; a placeholder
 
 
 @pytest.fixture(scope="module")
@@ -57,25 +57,25 @@ def verbs() -> set[str]:
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if page != "CHANGELOG.md"])
-def test_commands_that_a_page_names_are_there(page: str, verbs: set[str]) -> None:
+def test_commands_of_a_page_exist(page: str, verbs: set[str]) -> None:
     text = pages.text_of(page)
     code = "".join(block for _, block in pages.blocks(text))
-    for said in [*re.findall(r"`zencell\s+([^`]+)`", pages.prose(text)),
+    for words in [*re.findall(r"`zencell\s+([^`]+)`", pages.prose(text)),
                  *re.findall(r"^(?:\.venv/bin/)?zencell (.*)$", code, re.MULTILINE)]:
-        verb, *more = said.replace(",", " ").split()
+        verb, *more = words.replace(",", " ").split()
         group = {name.partition(" ")[2] for name in verbs if name.startswith(f"{verb} ")}
         names_one = verb in verbs or (group and (not more or more[0] in group))
-        assert names_one or verb in NO_VERBS or verb.startswith("--"), said
+        assert names_one or verb in NOT_COMMANDS or verb.startswith("--"), words
 
 
 def pages_of(nav: Any) -> list[str]:
-    """The pages of a navigation, in order."""
+    """Return the pages of a navigation in order."""
     if isinstance(nav, str):
         return [nav]
     return [page for part in (nav.values() if isinstance(nav, dict) else nav) for page in pages_of(part)]
 
 
-def test_every_page_is_in_the_navigation_of_the_site_once() -> None:
+def test_navigation_of_the_site_lists_every_page_once() -> None:
     site = yaml.safe_load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"))
     assert sorted(pages_of(site["nav"])) == [page.removeprefix("docs/") for page in PAGES if page.startswith("docs/")]
     tutorials = [page for page in pages_of(site["nav"]) if page.startswith("tutorials/")]
@@ -85,11 +85,11 @@ def test_every_page_is_in_the_navigation_of_the_site_once() -> None:
         assert following is None or f"]({Path(following).name})" in text.rpartition("\nNext: ")[2], page
 
 
-def test_site_is_made_of_nothing_that_another_host_has() -> None:
+def test_site_loads_nothing_from_other_hosts() -> None:
     site = yaml.safe_load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"))
     assert site["theme"]["font"] is False and site["plugins"] == ["search"]
-    assert "repo_url" not in site, "its stars are asked for"
+    assert "repo_url" not in site, "the theme would load its stars"
     assert all((ROOT / "docs" / name).exists() for name in [*site["extra_css"], *site.get("extra_javascript", [])])
     for page in PAGES:
-        assert "```mermaid" not in pages.text_of(page), "drawn by a script of another host"
+        assert "```mermaid" not in pages.text_of(page), "a script of another host would draw it"
         assert not re.search(r"!\[[^]]*\]\(\w+://|<(?:img|script|iframe)\b", pages.prose(pages.text_of(page))), page

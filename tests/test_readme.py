@@ -1,7 +1,6 @@
-"""The commands of the README and of pages that go on where it ends, word for word but for the port, so that tests
-beside each other do not meet.
+"""Run the commands of the README and of two further pages literally, except for the port.
 
-Of each application one run is one of processes; what the others change of it happens on the virtual clock.
+One run per application uses real processes; the others run on the virtual clock.
 """
 
 from __future__ import annotations
@@ -27,9 +26,9 @@ PAGES = ("README.md", "docs/tools.md", "docs/outlining.md")
 README = pages.lines(pages.text_of("README.md"))
 LINES = [*dict.fromkeys(line.removeprefix(".venv/bin/") for page in PAGES for line in pages.lines(pages.text_of(page)))]
 RUNS = [line for line in LINES if line.startswith("zencell run")]
-BESIDE = [line for line in LINES if line.startswith("zen") and line not in RUNS and " up " not in line]
+WITH_CELL = [line for line in LINES if line.startswith("zen") and line not in RUNS and " up " not in line]
 AS_PROCESSES = [next(line for line in RUNS if f" {cell} " in line) for cell in ("panda", "ur5")]
-PATIENCE = 60  # [s]
+TIMEOUT = 60  # [s]
 
 
 def command(line: str, *more: str) -> list[str]:
@@ -39,24 +38,24 @@ def command(line: str, *more: str) -> list[str]:
 
 @pytest.fixture(scope="module")
 def cell() -> Iterator[dict[str, str]]:
-    """What `up` of the README brings up, and the environment in which it is found."""
+    """Start the README's `up` cell, and return the environment of commands that use it."""
     domain = free_domain()
     env = {**os.environ, "ZENCELL_DOMAIN": str(domain)}
     line = next(line for line in LINES if " up " in line)
     with subprocess.Popen(command(line), cwd=ROOT, env=env, text=True, stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
-        while "is up at" not in (said := process.stdout.readline()):
-            assert said, "the cell did not come up"
+        while "is up at" not in (output := process.stdout.readline()):
+            assert output, "the cell did not start"
         env["PASTE"] = process.stdout.readline().strip()
         yield env
         process.send_signal(signal.SIGINT)
         try:
-            process.communicate(timeout=PATIENCE)
+            process.communicate(timeout=TIMEOUT)
         finally:
             process.kill()
 
 
-def test_readme_names_the_two_commands_first() -> None:
+def test_readme_starts_with_the_two_make_commands() -> None:
     assert README[:2] == ["make run", "make test"]
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
     for target in ("run", "test", "setup", "check", "bench"):
@@ -74,31 +73,31 @@ def assert_all_done(line: str, ran: subprocess.CompletedProcess[str]) -> None:
 @pytest.mark.slow
 @pytest.mark.cell
 @pytest.mark.parametrize("line", AS_PROCESSES)
-def test_run_of_the_readme_ends_with_everything_done(line: str) -> None:
+def test_run_of_the_readme_ends_done(line: str) -> None:
     faster = () if "--speed" in line else ("--speed", "10")
     assert_all_done(line, subprocess.run(
         command(line, *faster, "--domain", str(free_domain())), cwd=ROOT, text=True, capture_output=True,
-        timeout=2 * PATIENCE, check=False))
+        timeout=2 * TIMEOUT, check=False))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("line", [line for line in RUNS if line not in AS_PROCESSES])
-def test_run_of_the_readme_would_end_with_everything_done(line: str, tmp_path: Path) -> None:
+def test_simulated_run_of_the_readme_ends_done(line: str, tmp_path: Path) -> None:
     with no_processes():
         assert_all_done(line, ask(tmp_path, *command(line)[1:], "--domain", str(free_domain())))
 
 
 @pytest.mark.slow
 @pytest.mark.cell
-@pytest.mark.parametrize("line", BESIDE)
-def test_command_of_the_readme_answers_beside_a_running_cell(line: str, cell: dict[str, str]) -> None:
+@pytest.mark.parametrize("line", WITH_CELL)
+def test_command_of_the_readme_works_with_a_running_cell(line: str, cell: dict[str, str]) -> None:
     line = line.replace("7489", str(7447 + int(cell["ZENCELL_DOMAIN"])))
     with subprocess.Popen(command(line), cwd=ROOT, env=cell, text=True, stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
         first = process.stdout.readline()
         process.send_signal(signal.SIGINT)
         try:
-            process.communicate(timeout=PATIENCE)
+            process.communicate(timeout=TIMEOUT)
         finally:
             process.kill()
             (ROOT / "mask.png").unlink(missing_ok=True)

@@ -1,6 +1,6 @@
-"""The tutorials, word for word and in the order of each page: what they print is what they say.
+"""Execute the tutorials literally and in order, and compare their output with the pages.
 
-Those that look at a cell share one that is up; what brings one up for itself does so on the virtual clock.
+Tutorials that inspect a cell share a running one; commands that start a cell use the virtual clock.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from tests import pages
 from tests.harness import Place, ask, environment, free_domain, place_of
 from tests.simulated.visited import no_processes
 
-PATIENCE = 100  # [s]
+TIMEOUT = 100  # [s]
 CELL = "zencell up panda --set autostart=false --set world.count=3"
 REAL = "real-arm"
 NAMES = [path.stem for path in pages.TUTORIALS]
 TEXTS = {path.stem: path.read_text(encoding="utf-8") for path in pages.TUTORIALS}
-NOT_RUN = {  # they set up the machine, or need an arm; the double is started by its test
+NOT_RUN = {  # these set up the machine, or need an arm; a test starts the double
     "first-run": {"make setup"},
     REAL: {"make setup EXTRAS=ur", "zencell up my_cell.yaml --set autostart=false", "zencell robot enable",
            "zencell task home",
@@ -34,7 +34,7 @@ NOT_RUN = {  # they set up the machine, or need an arm; the double is started by
 pytestmark = [pytest.mark.slow, pytest.mark.cell, pytest.mark.timeout(600)]  # a page is several runs of a cell
 
 
-def test_what_is_not_run_is_known() -> None:
+def test_unexecuted_commands_are_listed() -> None:
     assert {name: set(lines) for name, text in TEXTS.items() if (lines := pages.lines(text, "console"))} == NOT_RUN
     assert all(line == CELL for name, text in TEXTS.items() if name != REAL
                for line in pages.lines(text, "sh") if line.startswith("zencell up "))
@@ -42,60 +42,60 @@ def test_what_is_not_run_is_known() -> None:
 
 @pytest.fixture(scope="module")
 def up(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Place]:
-    """The cell of most tutorials, as their line brings it up but for its page."""
+    """Start the cell of most tutorials, without its page."""
     folder = tmp_path_factory.mktemp("up")
     with place_of(folder, *shlex.split(CELL)[2:], "--no-viewer") as place:
         yield place
 
 
 def follow(name: str, folder: Path, domain: int) -> list[str]:
-    """Do what a tutorial says but for bringing its cell up; the commands that were run."""
+    """Execute a tutorial except the command that starts its cell; return the executed commands."""
     for file, text in pages.files(TEXTS[name]).items():
         (folder / file).parent.mkdir(parents=True, exist_ok=True)
         (folder / file).write_text(text, encoding="utf-8")
     done = []
     for step in pages.steps(TEXTS[name], "sh"):
         if not step.line.startswith("zencell up "):
-            ran = tell(step.line, folder, domain)
-            deadline = time.monotonic() + PATIENCE
+            ran = execute(step.line, folder, domain)
+            deadline = time.monotonic() + TIMEOUT
             while time.monotonic() < deadline and (
-                ("robot status" in step.line and not step.shown_in(ran.stdout))  # an arm needs its time
-                or ("robot " in step.line and ran.returncode and not step.shows)  # this machine held it up: it rests
+                ("robot status" in step.line and not step.shown_in(ran.stdout))  # an arm needs time
+                or ("robot " in step.line and ran.returncode and not step.shows)  # a delay stopped the arm
             ):
-                ran = tell(step.line, folder, domain)
-            said = ran.stdout + ran.stderr
-            assert step.shown_in(said), (step, said)
-            assert ran.returncode == 0 or step.shows.startswith("zencell:"), (step, said)  # the page shows the error
+                ran = execute(step.line, folder, domain)
+            output = ran.stdout + ran.stderr
+            assert step.shown_in(output), (step, output)
+            assert ran.returncode == 0 or step.shows.startswith("zencell:"), (step, output)  # the page shows the error
             done.append(step.line)
     return done
 
 
-def tell(line: str, folder: Path, domain: int) -> subprocess.CompletedProcess[str]:
-    """Do one line of a tutorial in a folder; a cell of its own runs in no processes and in a domain of its own."""
+def execute(line: str, folder: Path, domain: int) -> subprocess.CompletedProcess[str]:
+    """Execute a command of a tutorial; a cell that it starts runs without processes in its own domain."""
     program, *words = shlex.split(line)
     if program == "python":
-        told = {**environment(folder), "ZENCELL_DOMAIN": str(domain)}
-        return subprocess.run([sys.executable, *words], cwd=folder, env=told, text=True, capture_output=True,
-                              timeout=PATIENCE, check=False)
+        variables = {**environment(folder), "ZENCELL_DOMAIN": str(domain)}
+        return subprocess.run([sys.executable, *words], cwd=folder, env=variables, text=True, capture_output=True,
+                              timeout=TIMEOUT, check=False)
     assert program == "zencell", line
     with no_processes():
         return ask(folder, *words, environment={"ZENCELL_DOMAIN": str(free_domain() if words[0] == "run" else domain)})
 
 
 @pytest.mark.parametrize("name", [
-    pytest.param(name, marks=[pytest.mark.alone] if "robot jog" in TEXTS[name] else [])  # a matter of 0.1 s
+    pytest.param(name, marks=[pytest.mark.alone] if "robot jog" in TEXTS[name] else [])  # timing of 0.1 s
     for name in NAMES if name != REAL and CELL in TEXTS[name]])
-def test_tutorial_beside_a_cell_does_what_it_says(name: str, up: Place, tmp_path: Path) -> None:
+def test_tutorial_with_a_running_cell_prints_what_it_states(name: str, up: Place, tmp_path: Path) -> None:
     assert follow(name, tmp_path, up.domain)
 
 
 @pytest.mark.parametrize("name", [name for name in NAMES if name != REAL and CELL not in TEXTS[name]])
-def test_tutorial_without_a_cell_does_what_it_says(name: str, tmp_path: Path) -> None:
+def test_tutorial_without_a_cell_prints_what_it_states(name: str, tmp_path: Path) -> None:
     assert follow(name, tmp_path, free_domain())
 
 
 @pytest.mark.alone
-def test_tutorial_of_the_real_arm_does_what_it_says_with_a_double(tmp_path: Path) -> None:
+def test_real_arm_tutorial_prints_what_it_states_with_a_double(tmp_path: Path) -> None:
     if os.environ.get("CI") != "true":
         pytest.importorskip("rtde_control", reason="make setup EXTRAS=ur")
     line = next(line for line in pages.lines(TEXTS[REAL], "sh") if line.startswith("zencell up "))

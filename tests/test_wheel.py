@@ -1,4 +1,4 @@
-"""The wheel, built and installed as a person would, and where the modules of every process come from."""
+"""Build and install the wheel, run cells from it, and check where every process loads its modules from."""
 
 from __future__ import annotations
 
@@ -21,36 +21,35 @@ DOMAIN = 110
 
 pytestmark = pytest.mark.timeout(300)
 
-# Python imports this first in every process that finds it on PYTHONPATH: it tells which modules there were at the end.
+# A sitecustomize module on PYTHONPATH: each process writes its loaded modules to a file at its end.
 PROBE = """
 import atexit, json, os, sys
 at_once = os._exit
-def tell():
+def report():
     main = sys.modules.get("__main__")
     loaded = [[name, module.__file__, id(module)] for name, module in list(sys.modules.items())
               if isinstance(getattr(module, "__file__", None), str)]
     path = os.path.join(os.environ["PROBE"], f"{os.getpid()}.json")
-    with open(path + ".part", "w") as file:  # who is killed meanwhile has told nothing
+    with open(path + ".part", "w") as file:  # a process that is killed meanwhile leaves no file
         json.dump({"main": str(getattr(getattr(main, "__spec__", None), "name", None)), "loaded": loaded}, file)
     os.replace(path + ".part", path)
 def leave(code):
-    tell()
+    report()
     at_once(code)
 os._exit = leave
-atexit.register(tell)
+atexit.register(report)
 """
-SERVICE = '''"""A service of one's own, which ends its cell."""
+SERVICE = '''"""A user's service, which ends its cell."""
 import asyncio
-from common import topics
+from applications.pick_place.topics import PICK_PLACE_STATUS, PickPlaceStatus
 from common.config import Parameters
-from common.messages import PickPlaceStatus
 from common.process.service import main
 
 class Config(Parameters):
-    """Nothing."""
+    """No parameters."""
 
 async def run(bus, config):
-    status = bus.writer(topics.PICK_PLACE_STATUS)
+    status = bus.writer(PICK_PLACE_STATUS)
     await bus.ready()
     status.put(PickPlaceStatus(header=bus.header(), state="DONE", started=True))
     await asyncio.Event().wait()
@@ -66,7 +65,7 @@ task: task
 motion: {}
 services: {mine.task: }
 """
-# What the doctor says of the kernel, and who plans around a wall.
+# Which kernel the doctor reports, and which planner plans around a wall.
 PLAN = """
 import zencell
 from tools.doctor.software import kernel
@@ -90,23 +89,23 @@ print(kernel().level, kernel().what, PlanningPipeline(robot, cell.motion, cell.p
 
 @dataclass(frozen=True)
 class Installation:
-    """A `zencell` to run, and the folder in which its modules lie."""
+    """A `zencell` command and the folder of its modules."""
 
     command: list[str]
     modules: Path
-    site: Path | None = None  # the site-packages, of a wheel
-    file: str = ""  # its name
+    site: Path | None = None  # site-packages of a wheel
+    file: str = ""  # name of the wheel
 
     def run(self, folder: Path, *arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
-        """A verb, run in a folder."""
-        kept = {k: v for k, v in os.environ.items() if not k.startswith(("ZENCELL_", "PYTHON", "VIRTUAL_ENV"))}
-        done = subprocess.run([*self.command, *arguments], cwd=folder, env=kept | environment, text=True, timeout=100,
-                              capture_output=True, check=False)
+        """Run a command in a folder."""
+        inherited = {k: v for k, v in os.environ.items() if not k.startswith(("ZENCELL_", "PYTHON", "VIRTUAL_ENV"))}
+        done = subprocess.run([*self.command, *arguments], cwd=folder, env=inherited | environment, text=True,
+                              timeout=100, capture_output=True, check=False)
         assert done.returncode == 0, done.stdout + done.stderr
         return done
 
     def python(self, folder: Path, *arguments: str) -> str:
-        """What its Python prints, run in a folder."""
+        """Return the output of its Python, run in a folder."""
         own = str(Path(self.command[0]).with_name("python"))
         return Installation([own], self.modules).run(folder, *arguments).stdout
 
@@ -115,7 +114,7 @@ CLONE = Installation([sys.executable, "-m", "zencell"], ROOT)
 
 
 def installed(folder: Path, compiler: bool) -> Installation:
-    """The wheel that pip makes of what the clone tracks, with no compiler but the one that the build brings, if any."""
+    """Install the wheel that pip builds from the tracked files, without a compiler except the build's own, if any."""
     listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, check=False)
     if listed.returncode:
         pytest.skip("not a git checkout")
@@ -138,8 +137,7 @@ def installed(folder: Path, compiler: bool) -> Installation:
     subprocess.run([*pip, "install", "--no-deps", made], cwd=folder, env=environment, check=True)
     added = {path.name for path in site.iterdir()} - empty
     assert {name.partition("-")[0] for name in added} == {"zencell"} and len(added) == 2, added
-    # The dependencies as they are installed here: the folders themselves, so that no .pth in them (an editable
-    # installation of the clone) counts.
+    # Use the dependencies installed here, but not their .pth files (an editable installation of the clone).
     here = [path for path in sys.path if Path(path).name == "site-packages"]
     (site / "dependencies.pth").write_text("\n".join(here) + "\n", encoding="utf-8")
     return Installation([str(bare / "bin" / "zencell")], site / "zencell" / "top-level", site, made.name)
@@ -147,48 +145,48 @@ def installed(folder: Path, compiler: bool) -> Installation:
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Installation:
-    """The wheel, installed without the clone in reach."""
+    """The installed wheel, without access to the clone."""
     return installed(tmp_path_factory.mktemp("wheel"), compiler=True)
 
 
 def watched(folder: Path) -> dict[str, str]:
-    """The environment in which every process tells its modules to a folder."""
+    """Return an environment in which every process writes its modules to a folder."""
     (folder / "probe").mkdir()
     (folder / "probe" / "sitecustomize.py").write_text(PROBE, encoding="utf-8")
     return {"PYTHONPATH": str(folder / "probe"), "PROBE": str(folder / "probe")}
 
 
 def mains(folder: Path, installation: Installation) -> set[str]:
-    """The modules that were run as programs; none of the project's may have been loaded twice, nor from elsewhere."""
+    """Return the modules that ran as programs; check that none was loaded twice or from elsewhere."""
     packages = {name: installation.modules / name for name in FOLDERS}
     if installation.site:
         packages["zencell"] = installation.site / "zencell"
     found = set()
     for path in (folder / "probe").glob("*.json"):
-        told = json.loads(path.read_text(encoding="utf-8"))
+        report = json.loads(path.read_text(encoding="utf-8"))
         ours: dict[str, dict[int, str]] = {}
-        for name, file, number in told["loaded"]:
+        for name, file, number in report["loaded"]:
             package = packages.get(name.partition(".")[0])
             assert package is None or Path(file).is_relative_to(package), f"{name} is {file}"
             if any(Path(file).is_relative_to(package) for package in packages.values()):
                 ours.setdefault(os.path.realpath(file), {})[number] = name
-        assert len(ours) > 5, f"{path.name} tells of nothing"
-        assert [list(names.values()) for names in ours.values() if len(names) > 1] == [], told["main"]
-        found.add(told["main"])
+        assert len(ours) > 5, f"{path.name} lists no modules"
+        assert [list(names.values()) for names in ours.values() if len(names) > 1] == [], report["main"]
+        found.add(report["main"])
     return found
 
 
 @pytest.mark.parametrize("arguments", [
     ("-m", "zencell", "cells"), ("-m", "cli.main", "cells"), ("-m", "services.workspace_validator", "--help"),
 ], ids=lambda arguments: arguments[1])
-def test_no_module_of_a_process_of_the_clone_has_two_names(tmp_path: Path, arguments: tuple[str, ...]) -> None:
+def test_processes_of_the_clone_load_no_module_twice(tmp_path: Path, arguments: tuple[str, ...]) -> None:
     Installation([sys.executable], ROOT).run(ROOT, *arguments, **watched(tmp_path))
     assert len(mains(tmp_path, CLONE)) == 1
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["clone", "wheel"])
-def test_cell_runs_from_an_empty_folder_and_no_module_has_two_names(
+def test_cell_runs_from_an_empty_folder_without_loading_a_module_twice(
     kind: str, tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:
     installation = CLONE if kind == "clone" else request.getfixturevalue("wheel")
@@ -203,13 +201,13 @@ def test_cell_runs_from_an_empty_folder_and_no_module_has_two_names(
                             "--domain", str(DOMAIN), "--record", str(tmp_path / "run.mcap"), **environment)
     assert "DONE, 1 of 1 placed" in done.stdout, done.stdout + done.stderr
     assert list(empty.iterdir()) == []
-    told = mains(tmp_path, installation)
-    assert {"services.router", "services.motion_planner", "services.trajectory_executor", "cli.main"} <= told
-    assert len(told) >= 11, told  # the command, which is the supervisor, the recorder, the router and eight services
+    programs = mains(tmp_path, installation)
+    assert {"services.router", "services.motion_planner", "services.trajectory_executor", "cli.main"} <= programs
+    assert len(programs) >= 11, programs  # command (supervisor), recorder, router, eight services
 
 
 @pytest.mark.slow
-def test_modules_of_ones_own_import_the_project_of_a_wheel(wheel: Installation, tmp_path: Path) -> None:
+def test_user_modules_import_the_project_from_a_wheel(wheel: Installation, tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "task.py").write_text(SERVICE, encoding="utf-8")
     (tmp_path / "mine.yaml").write_text(CELL, encoding="utf-8")
@@ -221,7 +219,7 @@ def test_modules_of_ones_own_import_the_project_of_a_wheel(wheel: Installation, 
 
 
 @pytest.mark.slow
-def test_wheel_begins_a_project_that_runs(wheel: Installation, tmp_path: Path) -> None:
+def test_new_project_from_a_wheel_runs(wheel: Installation, tmp_path: Path) -> None:
     wheel.run(tmp_path, "new", "fresh_task", "--task", "stack_cubes")
     assert "DONE" in wheel.run(tmp_path, "simulate", "fresh_task/cell.yaml", "--seed", "1").stdout
 
@@ -238,17 +236,17 @@ for kind in ("decoders", "encoders"):
 
 
 @pytest.mark.slow
-def test_wheel_holds_the_kernel_and_is_for_one_kind_of_machine(wheel: Installation, tmp_path: Path) -> None:
+def test_wheel_contains_the_kernel_and_has_a_platform_tag(wheel: Installation, tmp_path: Path) -> None:
     assert wheel.file.endswith(f"-py3-none-{sysconfig.get_platform().replace('-', '_')}.whl")
     assert list((wheel.modules / KERNEL).glob("*.so"))
-    told = wheel.python(tmp_path, "-c", PLAN)
-    assert told.startswith("ok planning kernel: planning_kernel") and told.endswith(" rrt_connect\n")
+    output = wheel.python(tmp_path, "-c", PLAN)
+    assert output.startswith("ok planning kernel: planning_kernel") and output.endswith(" rrt_connect\n")
 
 
 @pytest.mark.slow
-def test_wheel_that_no_compiler_was_there_for_plans_without_the_kernel_and_says_so(tmp_path: Path) -> None:
+def test_wheel_built_without_a_compiler_plans_without_the_kernel_and_reports_it(tmp_path: Path) -> None:
     wheel = installed(tmp_path, compiler=False)
     assert wheel.file.endswith("-py3-none-any.whl")
     assert list((wheel.modules / KERNEL).glob("*.so")) == []
-    told = wheel.python(tmp_path, "-c", PLAN)
-    assert told.startswith("warn the planning kernel is not compiled") and told.endswith(" ompl\n")
+    output = wheel.python(tmp_path, "-c", PLAN)
+    assert output.startswith("warn the planning kernel is not compiled") and output.endswith(" ompl\n")

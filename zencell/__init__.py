@@ -50,7 +50,7 @@ _FROM = {  # imported at first use: the command line starts without them
 }
 _MODULE = {name: module for module, names in _FROM.items() for name in names}
 # Names of earlier releases, for scripts that use them.
-_FORMER = {"NotJogged": "JogFailed", "NothingHeard": "NothingReceived", "NothingUp": "NoCellRunning"}
+_FORMER = {"JogFailed": "JogFailed", "NothingReceived": "NothingReceived", "NoCellRunning": "NoCellRunning"}
 
 __all__ = [
     "Cell",

@@ -137,7 +137,7 @@ def _sample(channel: npt.NDArray[np.uint8], at: Array) -> Array:
 
 Picture = npt.NDArray[np.uint8]
 Channel = Literal["saturation", "maximum", "grey"]
-MOST, MOST_POINTS, MOST_ALONG_ONE = 1000, 100_000, 65_536  # contours and points that a message has room for
+MOST, MAX_POINTS, MOST_ALONG_ONE = 1000, 100_000, 65_536  # contours and points that a message has room for
 
 
 class ContourOptions(Parameters):
@@ -210,7 +210,7 @@ def _with_room(
     for index in sorted(wanted, key=lambda i: -areas[i]):  # a thin ring is before its hole, which is as large
         size = lengths[index]
         inside = parents[index] in kept or parents[index] < 0
-        if inside and size <= MOST_ALONG_ONE and points + size <= MOST_POINTS and len(kept) < MOST:
+        if inside and size <= MOST_ALONG_ONE and points + size <= MAX_POINTS and len(kept) < MOST:
             kept.add(index)
             points += size
     return sorted(kept)

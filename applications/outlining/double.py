@@ -12,7 +12,7 @@ from common.config import Parameters, RobotConfig, Surroundings, Tunable
 from common.messages import Header, Pose, Vector3, WorldObject
 from common.process.planning_scene import SceneWriter
 from common.process.timing import LoopRate
-from common.scene.home import HomeWatch
+from common.robot.home import HomeMonitor
 from common.transport.bus import Bus
 
 WORLD = "world"
@@ -44,7 +44,7 @@ async def run(bus: Bus, config: Config) -> None:
     """While the arm is at home, tell of all that stands there, and of the first one's outline."""
     truth, joints = bus.reader(topics.SCENE_OBJECTS), bus.reader(topics.JOINT_STATES)
     paths, out = bus.writer(CONTOUR_PATH), SceneWriter(bus)
-    home = HomeWatch(config.robot.named_poses["home"])
+    home = HomeMonitor(config.robot.named_poses["home"])
     await out.begin(planning_scene(config.world, [], 0))
     await bus.ready()
     pace = LoopRate(bus, lambda: bus.clock.wall_rate(config.rate, 30.0))
@@ -53,8 +53,8 @@ async def run(bus: Bus, config: Config) -> None:
         if state is not None:
             at = dict(zip(state.name, state.position, strict=True))
             if all(name in at for name in config.robot.joints):
-                home.note([at[name] for name in config.robot.joints], state.header.stamp)
-        if objects is not None and home.covers(stamp):
+                home.add([at[name] for name in config.robot.joints], state.header.stamp)
+        if objects is not None and home.was_home(stamp):
             solids = [perceived(index, thing) for index, thing in enumerate(objects.objects) if thing.outline]
             out.put(planning_scene(config.world, solids, stamp))
             header = Header(stamp=stamp, frame_id=WORLD)

@@ -35,9 +35,9 @@ class OutlineFigures(application.Figures):
         "RETREATING": "#8d6cc2", "HOMING": "#8d6cc2",
     }
 
-    def __init__(self, robot: RobotConfig | None = None, *, pictured: bool = False) -> None:
+    def __init__(self, robot: RobotConfig | None = None, *, for_report: bool = False) -> None:
         """Start with nothing heard; without a robot only what the task itself tells is known."""
-        super().__init__(robot, pictured=pictured)
+        super().__init__(robot, for_report=for_report)
         self.traced = TraceEvaluation(robot)
 
     def listeners(self) -> dict[Topic[Any], Callable[[float, Any], None]]:

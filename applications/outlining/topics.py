@@ -8,12 +8,12 @@ from pydantic import Field, computed_field, model_validator
 
 from common import messages as m
 from common.application import ApplicationTopics
-from common.messages.basics import SMALL, Count, Finite, Header, Label, Message, Name, Text
+from common.messages.basics import SMALL_BYTES, Count, Finite, Header, Label, Message, Name, Text
 from common.messages.geometry import Color, Pose, PoseArray
 from common.messages.task import TaskStatus
 from common.topics import Request, Topic
 
-MOST_POINTS = 20_000  # of an outline
+MAX_POINTS = 20_000  # of an outline
 
 
 class Contour(Message):
@@ -31,8 +31,8 @@ class Contour(Message):
 class Contours(Message):
     """All contours of one picture, and the one that was chosen."""
 
-    most_bytes: ClassVar[int] = 4 * 1024 * 1024
-    most_parts: ClassVar[int] = 128 * 1024
+    max_bytes: ClassVar[int] = 4 * 1024 * 1024
+    max_parts: ClassVar[int] = 128 * 1024
 
     header: Header
     width: int = Field(ge=1, le=16384)
@@ -63,8 +63,8 @@ class Contours(Message):
 class OutlineSelect(Message):
     """Choose an object: the largest that does not touch the border, one of a colour, or one by its index."""
 
-    most_bytes: ClassVar[int] = SMALL
-    later: ClassVar[tuple[str, ...]] = ("at",)
+    max_bytes: ClassVar[int] = SMALL_BYTES
+    omitted_defaults: ClassVar[tuple[str, ...]] = ("at",)
 
     rule: Literal["auto", "colour", "index"] = "auto"
     index: Count | None = None
@@ -78,7 +78,7 @@ class OutlineSelect(Message):
 class OutlineSelection(Message):
     """What was chosen."""
 
-    most_bytes: ClassVar[int] = SMALL
+    max_bytes: ClassVar[int] = SMALL_BYTES
 
     index: int
     label: Label
@@ -91,12 +91,12 @@ class OutlinePoints(PoseArray):
     and `message` says why.
     """
 
-    most_bytes: ClassVar[int] = 4 * 1024 * 1024
-    most_parts: ClassVar[int] = 128 * 1024
+    max_bytes: ClassVar[int] = 4 * 1024 * 1024
+    max_parts: ClassVar[int] = 128 * 1024
 
-    poses: list[Pose] = Field([], max_length=MOST_POINTS)
-    ids: list[Label] = Field([], max_length=MOST_POINTS)
-    labels: list[Label] = Field([], max_length=MOST_POINTS)
+    poses: list[Pose] = Field([], max_length=MAX_POINTS)
+    ids: list[Label] = Field([], max_length=MAX_POINTS)
+    labels: list[Label] = Field([], max_length=MAX_POINTS)
     object: Label = Field("", description="label of the chosen contour")
     invalid_depth: Count = Field(0, description="pixels whose depth was filled from neighbours")
     given: bool = Field(False, description="by a file: need not be the outline of anything that was seen")

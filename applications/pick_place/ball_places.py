@@ -15,7 +15,7 @@ from common.config import Container, Fixture, Surroundings
 from common.perception.occlusion import Occlusion, RobotSilhouettes
 from common.perception.pinhole import Pinhole
 from common.robot.model import RobotModel
-from common.scene.workspace import WorkspaceBounds, outside_reason
+from common.scene.workspace import WorkspaceBounds, out_of_bounds_reason
 
 Array = npt.NDArray[np.float64]
 
@@ -138,7 +138,7 @@ class VisibleTable:
         ]
         self.places = np.array([
             place for place in dict.fromkeys(found)
-            if not outside_reason(bounds, place)
+            if not out_of_bounds_reason(bounds, place)
             and not any(max(abs(place[0] - box.x), abs(place[1] - box.y)) < box.half_side + self.radius
                         for box in around.containers.values())
         ]).reshape(-1, 3)
@@ -154,10 +154,10 @@ class VisibleTable:
         pixels = camera.project(self.places)
         depth = np.maximum(camera.to_camera(self.places)[:, 2], 1e-3)
         margin = max(camera.fx, camera.fy) * self.radius / depth + 2
-        seen = np.array([camera.in_picture(pixel, float(away)) for pixel, away in zip(pixels, margin, strict=True)])
+        seen = np.array([camera.in_image(pixel, float(away)) for pixel, away in zip(pixels, margin, strict=True)])
         behind = np.array([any(r.shows_container(camera, pixel) for r in self._resting) for pixel in pixels])
-        foot = silhouettes.hidden(camera, [robot.named("home")], [robot.config.base_link])
-        found: Bools = seen & ~behind & ~foot.hides(self.places, self.radius)
+        foot = silhouettes.occlusion(camera, [robot.named("home")], [robot.config.base_link])
+        found: Bools = seen & ~behind & ~foot.occludes(self.places, self.radius)
         self._seen_by[id(camera)] = camera, found
         return found
 
@@ -171,7 +171,7 @@ class VisibleTable:
         shown = np.zeros(len(self.places), bool)
         for within, hidden in views:
             all_of_it |= within
-            shown |= within if hidden is None else within & ~hidden.hides(self.places, self.radius)
+            shown |= within if hidden is None else within & ~hidden.occludes(self.places, self.radius)
         return float(np.mean(~shown[all_of_it])) if all_of_it.any() else 0.0
 
 
@@ -190,7 +190,7 @@ def find_viewing_poses(
         q[0] += turn
         if robot.within_limits(q):
             share = region.hidden(
-                (seen, silhouettes.hidden(camera, [q])) for seen, camera in zip(within, cameras, strict=True))
+                (seen, silhouettes.occlusion(camera, [q])) for seen, camera in zip(within, cameras, strict=True))
             found.append((share, q.tolist()))
     good = [q for share, q in found if share <= most]
     return good or [min(found)[1]] if found else []

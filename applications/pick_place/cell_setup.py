@@ -22,7 +22,7 @@ from common.planning.ik import controls_full_pose, solve_tool_down_ik
 from common.planning.robot_geometry import RobotGeometry
 from common.robot.model import RobotModel
 from common.robot.transforms import tool_down
-from common.scene.workspace import ReachCache, WorkspaceBounds, bounds_told, reach_reason, yaw_candidates
+from common.scene.workspace import ReachCache, WorkspaceBounds, configured_bounds, unreachable_reason, yaw_candidates
 from common.sim.layout import layout
 from common.sim.objects import initial_pose, solid_of
 from common.sim.table import is_inside
@@ -127,18 +127,18 @@ def reach(cell: Cell, arm: Arm) -> Iterator[Finding]:
     Raises:
         ConfigError: inconsistent bounds, or no random layout within reach.
     """
-    bounds = bounds_told(cell.section(Reach).told)  # type: ignore[attr-defined]
+    bounds = configured_bounds(cell.section(Reach).told)  # type: ignore[attr-defined]
     cache = ReachCache(arm.robot, cell.grasp, bounds)
     gripper = cell.robot.gripper
     width = gripper.max_width if gripper is not None and gripper.joints else None
     tilt = cell.grasp.tilt(arm.robot.dof)
-    turned = f"with any of {bounds.yaw_count} hand orientations" if controls_full_pose(arm.robot) else "at any yaw"
+    turned = f"with any of {bounds.yaw_count} gripper orientations" if controls_full_pose(arm.robot) else "at any yaw"
     turns = [yaw + (math.pi / 2 if gripper is not None and gripper.closing_axis == "x" else 0.0)
              for yaw in (yaw_candidates(bounds.yaw_count) if controls_full_pose(arm.robot) else [0.0])]
     things = []
     if is_simulated(cell.robot):
         layout(cell.world, cell.run.seed,
-               lambda x, y, z: not reach_reason(arm.robot, (x, y, z), cell.grasp, bounds, explained=False))
+               lambda x, y, z: not unreachable_reason(arm.robot, (x, y, z), cell.grasp, bounds, explained=False))
         things = [thing for thing in cell.world.objects if thing.placed]
     for thing in things:
         x, y, z = (float(value) for value in initial_pose(thing, solid_of(thing))[:3, 3])
@@ -237,7 +237,7 @@ def _reached(robot: RobotModel, grasp: Grasp, bounds: WorkspaceBounds, radius: f
             place = round(float(x), 3), round(float(y), 3)
             if math.hypot(*place) >= most or abs(y) >= 0.6:
                 continue
-            if not reach_reason(robot, (*place, radius), grasp, bounds, explained=False):
+            if not unreachable_reason(robot, (*place, radius), grasp, bounds, explained=False):
                 found.append(place)
     return found
 

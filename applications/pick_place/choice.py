@@ -17,7 +17,7 @@ from applications.pick_place.grasping import Config, HandShape
 from common import messages as m
 from common.config import Container
 from common.robot.transforms import matrix_to_rpy, pose_to_matrix
-from common.scene.slots import column_at, low_columns
+from common.scene.fixtures import column_at, low_columns
 from common.scene.workspace import yaw_candidates
 from common.tasks.engine import appeared
 from common.tasks.stages import Cycle, Place, View, place_of

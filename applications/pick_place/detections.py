@@ -20,8 +20,8 @@ from common.perception.camera_input import FrameError, SkippedFrames, require_ca
 from common.perception.occlusion import Occlusion, RobotOcclusion, RobotSilhouettes
 from common.perception.pinhole import Pinhole
 from common.process.camera_reader import CameraReader
+from common.robot.home import HomeMonitor
 from common.robot.model import RobotModel
-from common.scene.home import HomeWatch
 from common.scene.workspace import INSIDE_CONTAINER, PARTLY_OUT_OF_VIEW, ReachCache
 from common.transport.bus import Bus
 
@@ -79,10 +79,10 @@ class DetectionViews:
         self._robot: tuple[RobotModel, RobotSilhouettes] | None = None
         self._before: dict[int, RobotOcclusion] = {}
         self._views = list(names)
-        self._names, self._home = robot.joints, HomeWatch(robot.named_poses["home"])
+        self._names, self._home = robot.joints, HomeMonitor(robot.named_poses["home"])
         self._only_at_home = only_at_home
         self._newest: list[CameraDetections | None] = [None for _ in keys]
-        self._left_out = SkippedFrames(log, "a frame of detections")
+        self._left_out = SkippedFrames(log, "frame of detections")
 
     async def watch(self, look: Callable[[int, CameraDetections], Awaitable[None]]) -> None:
         """Call `look` with every frame and the number of its view, one after the other; never returns."""
@@ -92,7 +92,7 @@ class DetectionViews:
             async for frame in self._frames[number]:
                 cameras, stamp = self._cameras[number], frame.header.stamp
                 moves = cameras.moves()
-                if (moves or self._only_at_home) and not self._home.covers(stamp):
+                if (moves or self._only_at_home) and not self._home.was_home(stamp):
                     continue
                 try:
                     require_capacity(len(frame.markers))
@@ -132,7 +132,7 @@ class DetectionViews:
         async for state in self._joints:
             found = dict(zip(state.name, state.position, strict=True))
             if all(name in found for name in self._names):
-                self._home.note([found[name] for name in self._names], state.header.stamp)
+                self._home.add([found[name] for name in self._names], state.header.stamp)
 
     @property
     def robot(self) -> tuple[RobotModel, RobotSilhouettes]:
@@ -152,7 +152,7 @@ class DetectionViews:
         before = self._before.setdefault(number, RobotOcclusion(silhouettes))
         state = self._joints.latest
         q = robot.order(state.name, state.position) if state is not None else None
-        return before.in_picture(camera, frame.header.stamp, q, state.header.stamp if state is not None else 0)
+        return before.in_image(camera, frame.header.stamp, q, state.header.stamp if state is not None else 0)
 
     def _without_cut_off(self, number: int, frame: MarkerArray) -> MarkerArray:
         """Return the frame without detections cut off by its border that another view shows completely."""

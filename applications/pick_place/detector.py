@@ -48,7 +48,7 @@ from applications.pick_place.segmentation import (
 from applications.pick_place.sphere_fit import Fit, fit_each, fit_spheres, separate
 from common.config import CameraConfig, Parameters, Surroundings, Tunable
 from common.perception.depth import Depth
-from common.perception.illumination import BoolMask, blank_image_reason, blue_share, looked_at
+from common.perception.illumination import BoolMask, blank_image_reason, blue_share, sampled_pixels
 from common.perception.pinhole import Pinhole
 from common.perception.sphere import ray_distances, silhouettes
 
@@ -162,7 +162,7 @@ class Detector:
         o = self.options
         windows = (o.hsv_red_lo1, o.hsv_red_hi1), (o.hsv_red_lo2, o.hsv_red_hi2)
         if self._table is None or self._table[0] is not camera:
-            table = shows_table(self._around, camera, looked_at(camera.height, camera.width))
+            table = shows_table(self._around, camera, sampled_pixels(camera.height, camera.width))
             self._table = camera, table if table.mean() >= _LEAST_TABLE else None
         return self._masks.of(picture, Colours(windows, o.morph_kernel_px), self._table[1])
 
@@ -187,7 +187,7 @@ class Detector:
         found = []
         if len(centers):
             pixels, outlines = camera.project(centers), silhouettes(camera, centers, self.resting.radius, 32)
-            inside = np.asarray(camera.in_picture(outlines).all(axis=1))
+            inside = np.asarray(camera.in_image(outlines).all(axis=1))
             area = cv2.countNonZero(fine) / len(centers)
             for center, pixel, outline, whole in zip(centers.tolist(), pixels.tolist(), outlines, inside, strict=True):
                 place, seen = (center[0], center[1], center[2]), (pixel[0], pixel[1])
@@ -399,7 +399,7 @@ class Detector:
         pixels = camera.project(centers)
         places = camera.on_plane(pixels, self.resting.plane)
         outlines = silhouettes(camera, centers, self.resting.radius, 32)
-        inside = np.asarray(camera.in_picture(outlines).all(axis=1))
+        inside = np.asarray(camera.in_image(outlines).all(axis=1))
         return [
             Detection(
                 position=(float(places[k, 0]), float(places[k, 1]), self.resting.plane),

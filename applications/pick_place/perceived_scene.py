@@ -18,8 +18,7 @@ from common.messages import Color, Marker, Quaternion
 from common.perception.occlusion import Occlusion
 from common.perception.pinhole import Pinhole
 from common.robot.transforms import invert, matrix_to_pose, pose_to_matrix
-from common.scene.fixtures import color_of, fixed_objects
-from common.scene.slots import occupied_slots, slot_positions
+from common.scene.fixtures import color_of, fixed_objects, occupied_slots, slot_positions
 
 Place = tuple[float, float, float]
 Shape = Literal["sphere", "box", "cylinder"]
@@ -265,7 +264,7 @@ class PerceivedScene:
                 on_table.append(thing)
         radius = self.around.ball_radius
         self._tracks.update(on_table, stamp * 1e-9, view, at_times, None if hidden is None else (
-            lambda place: bool(hidden.hides([place], radius)[0])))
+            lambda place: bool(hidden.occludes([place], radius)[0])))
         now = Occupied(stamp, *occupied_slots(in_container, camera, self._slots, radius, self._free))
         if hidden is None:
             self._beside_slots[view] = beside_slots
@@ -286,7 +285,7 @@ class PerceivedScene:
         slots = sorted((before.seen | before.beneath) - now.seen - now.beneath) if before else []
         if not before or not slots:
             return
-        behind = hidden.hides(self._slots[slots], self.around.ball_radius)
+        behind = hidden.occludes(self._slots[slots], self.around.ball_radius)
         kept = {slot for slot, away in zip(slots, behind, strict=True) if away}
         now.seen |= kept & before.seen
         now.beneath |= kept - before.seen

@@ -341,7 +341,7 @@ def _is_before(upper: _Candidate, lower: _Candidate, outline: Outline, radius: f
 def _red_at(pixels: Array, mask: Mask, camera: Pinhole) -> tuple[BoolMask, BoolMask]:
     """Return for pixels (..., 2) whether they are in the image, and whether they are red."""
     nearest = np.rint(np.where(np.isfinite(pixels), pixels, -1.0)).astype(int)
-    seen = np.asarray(camera.in_picture(nearest))
+    seen = np.asarray(camera.in_image(nearest))
     u, v = (np.where(seen, nearest[..., axis], 0) for axis in (0, 1))
     return seen, seen & (mask[v, u] > 0)
 

@@ -98,9 +98,9 @@ class CellSession:
         Raises:
             ConfigError: the cell has no page, the port is in use, or host or port are not valid.
         """
-        from page.serving import build_report
+        from page.serving import page_of
 
-        self._page = page = build_report(self.cell, host, port)
+        self._page = page = page_of(self.cell, host, port)
         if page is not None:
             overrides = (*self.launch.overrides, *page.overrides)
             self.launch = replace(self.launch, overrides=overrides, extra=page.environment)
@@ -116,7 +116,7 @@ class CellSession:
         from common.supervision.launch import module_command
         from common.transport.credentials import RECORDER
         from recording.capture import CustomTopics
-        from recording.summary import require_new
+        from recording.formatting import require_new
         from security.requiring import require_recorder
 
         path = Path(file).absolute()
@@ -193,16 +193,16 @@ class CellSession:
 
         The state of simulated hardware lasts as long as the cell; interlocks of operators last longer.
         """
-        from common.kept_file import STANDING_VARIABLE, STATE_VARIABLE, lasting_folder
+        from common.atomic_file import RUNTIME_VARIABLE, STATE_VARIABLE, state_folder
         from common.transport.endpoint import DEFAULT_DOMAIN
 
         if os.environ.get(STATE_VARIABLE):
             return await self._supervised(work)
-        folder = lasting_folder()
+        folder = state_folder()
         if self._simulated and not self.launch.connect and self.launch.domain != DEFAULT_DOMAIN:
             folder /= f"domain-{self.launch.domain}"  # several simulated robots may run on this host
         with tempfile.TemporaryDirectory(prefix="zencell-") as until_end:
-            extra = {**self.launch.extra, STATE_VARIABLE: str(folder), STANDING_VARIABLE: until_end}
+            extra = {**self.launch.extra, STATE_VARIABLE: str(folder), RUNTIME_VARIABLE: until_end}
             self.launch = replace(self.launch, extra=extra)
             return await self._supervised(work)
 

@@ -10,8 +10,7 @@ from typing import Any
 from common import topics
 from common.client.subscriptions import TIMEOUT, NothingReceived
 from common.errors import ZencellError
-from common.robot.transform_history import MOST_FRAMES
-from common.robot.transform_tree import TransformTree
+from common.robot.transform_tree import MAX_FRAMES, TransformTree
 from common.transport.bus import Bus
 
 GATHER_TIME = 0.5  # [s] in which every moving frame is published at least once
@@ -48,7 +47,7 @@ class Frames:
         async for message in self._moving:
             self.tree.update(message)
             self._last_seen |= dict.fromkeys((each.child_frame_id for each in message.transforms), _now())
-            if len(self._last_seen) > 2 * MOST_FRAMES:
+            if len(self._last_seen) > 2 * MAX_FRAMES:
                 self._last_seen = {
                     name: at for name, at in self._last_seen.items() if self.tree.parent_of(name) is not None}
             self._changed.set()

@@ -12,7 +12,7 @@ from common.client.operator_motion import MotionFailed
 from common.client.subscriptions import Part, Subscriptions
 from common.config import check
 from common.messages import GripperCommand, GripperState
-from common.sources import new_id
+from common.time_source import new_id
 
 MOVE_TIMEOUT = 10.0  # [s] wall for a motion of the fingers
 SCENE_TIMEOUT = 0.5  # [s] wall until the planning scene has the held object, if it can know it

@@ -26,7 +26,7 @@ from common.supervision.wiring import ServiceWiring
 from common.topics import Topic
 from common.transport.bus import Bus
 from common.transport.codec import MSGPACK
-from common.transport.keys import ROUTER
+from common.transport.session import ROUTER
 
 TIMEOUT = 2.0  # [s] for the parameters of a service
 SIDES = ("reads", "writes", "serves", "calls")

@@ -15,13 +15,13 @@ from common.clock import Clock
 from common.config import names_of
 from common.errors import ConfigError, DecodeError, NoRouter, RequestFailed, UnknownName
 from common.messages import MotionStatus, SupervisorStatus
-from common.messages.basics import MOST_STAMP
+from common.messages.basics import MAX_STAMP
 from common.remapping import is_cell
 from common.transport.bus import Bus
 from common.transport.codec import decode
-from common.transport.connect import connect as connect_to
 from common.transport.credentials import OPERATOR, SECURE_VARIABLE
 from common.transport.endpoint import endpoint_of
+from common.transport.zenoh_session import connect as connect_to
 
 TOOL = "zencell"
 CONNECT_TIMEOUT = 2.0  # [s] to reach the router
@@ -182,7 +182,7 @@ async def cell_clock(bus: Bus) -> Clock:
     here = status.host == socket.gethostname()  # other hosts have another boot time
     try:
         clock = Clock(status.speed, status.epoch, status.booted if here and status.booted else None)
-        if 0 <= clock.now_ns() <= MOST_STAMP:
+        if 0 <= clock.now_ns() <= MAX_STAMP:
             return clock
         problem = "its time is out of the range of stamps"
     except ValueError as error:

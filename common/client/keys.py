@@ -20,8 +20,8 @@ from common.errors import UnknownName
 from common.remapping import is_key
 from common.topics import COUNTERS, LOG, PARAMETERS, SUPERVISOR_STATUS, Topic, general_key
 from common.transport.endpoint import endpoint_of
-from common.transport.keys import owns_key
 from common.transport.ownership import Owner
+from common.transport.session import owns_key
 
 if TYPE_CHECKING:
     from common.transport.bus import Bus
@@ -144,16 +144,16 @@ async def raw_samples(bus: Bus, key: str) -> AsyncGenerator[RawSample, None]:
     Raises:
         SilentKey: none came within `SILENCE`.
     """
-    from common.transport.reader import Newness
+    from common.transport.reader import SequenceFilter
 
     full = f"{bus.cell}/{key}"
-    newness = Newness()
+    newness = SequenceFilter()
     arriving = bus.raw_reader(full)
     following = asyncio.ensure_future(anext(arriving))
     try:
         latched = await bus.raw_get(full, SILENCE)
         for sample in latched:
-            if newness.is_news(sample.attachment):
+            if newness.is_new_payload(sample.attachment):
                 yield sample
         if not latched:
             await asyncio.wait({following}, timeout=SILENCE)
@@ -162,7 +162,7 @@ async def raw_samples(bus: Bus, key: str) -> AsyncGenerator[RawSample, None]:
         while True:
             sample = await following
             following = asyncio.ensure_future(anext(arriving))
-            if newness.is_news(sample.attachment):
+            if newness.is_new_payload(sample.attachment):
                 yield sample
     finally:
         following.cancel()  # which closes its generator

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 SUPERVISOR, ROUTER = "supervisor", "router"
 QUERY_TIMEOUT = 1.0  # [s]
-MOST_KEYS = 300  # subscriptions
+MAX_KEYS = 300  # subscriptions
 
 
 @dataclass
@@ -125,7 +125,7 @@ class CellMonitor:
         self._rates.update(counters, now)
         for key in counters.received:
             known = key in self._statistics or key in self._known or key.startswith("param/")
-            if not known and is_key(key) and len(self._statistics) < MOST_KEYS:  # counters can name invented keys
+            if not known and is_key(key) and len(self._statistics) < MAX_KEYS:  # counters can name invented keys
                 self._subscribe(key)
 
     def view(self) -> View:

@@ -18,7 +18,7 @@ from common.application import applications
 from common.client.subscriptions import Subscriptions
 from common.config import check
 from common.errors import ConfigError, RequestFailed, RequestLost, ZencellError
-from common.sources import new_id, wall_ns
+from common.time_source import new_id, wall_ns
 from common.transport.bus import Bus
 from common.transport.reader import Reader
 

@@ -16,7 +16,7 @@ from common.config import check
 from common.errors import ConfigError, NoResponder, RemoteError, RequestFailed, UnknownName, ZencellError
 from common.messages import Parameter, ParameterRequest
 from common.transport.bus import Bus
-from common.transport.keys import serves_key
+from common.transport.session import serves_key
 
 TIMEOUT = 5.0  # [s] for a service to answer
 BAD_INPUT = ("unknown_parameter", "bad_value")  # codes of refusals that are the caller's fault

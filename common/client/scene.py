@@ -10,7 +10,7 @@ from common.client.goals import Point, array_of, numbers, pose_of
 from common.client.subscriptions import Part, Subscriptions
 from common.config import check
 from common.messages import CollisionObject, Pose, SceneEdit, SceneEditReply, WorldEdit, WorldObject
-from common.scene.added import added
+from common.scene.added_solids import added_solids
 from common.transport.bus import Bus
 
 TIMEOUT = 5.0  # [s] wall for an answer
@@ -56,7 +56,7 @@ class Scene(Part):
 
     async def objects(self) -> list[CollisionObject]:
         """Return the added solids: ids, shapes, dimensions [m] and poses in world."""
-        return added((await self._subscriptions.query(topics.PLANNING_SCENE)).objects)
+        return added_solids((await self._subscriptions.query(topics.PLANNING_SCENE)).objects)
 
     async def _edit(self, edit: dict[str, object]) -> SceneEditReply:
         client = self._subscriptions.bus.client(topics.SCENE_EDIT)

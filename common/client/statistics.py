@@ -129,18 +129,18 @@ class TopicStatistics:
 
     def __init__(self, clock: Clock) -> None:
         """Start empty, with the clock of the cell, to which stamps refer."""
-        from common.transport.reader import Newness
+        from common.transport.reader import SequenceFilter
 
         self.unstamped = 0
         self._clock = clock
         self._arrivals, self._delays = Arrivals(), Delays()
-        self._newness = Newness()
+        self._newness = SequenceFilter()
         self._lock = threading.Lock()
 
     def mark_known(self, sample: RawSample) -> None:
         """Record the current value of a state, whose repetitions do not count as delays."""
         with self._lock:
-            self._newness.is_news(sample.attachment)
+            self._newness.is_new_payload(sample.attachment)
 
     def add(self, sample: RawSample) -> None:
         """Add a message."""
@@ -149,7 +149,7 @@ class TopicStatistics:
             self._arrivals.add(now, len(sample.payload))
             if stamp is None:
                 self.unstamped += 1
-            elif self._newness.is_news(sample.attachment):  # a repeated state has an old stamp
+            elif self._newness.is_new_payload(sample.attachment):  # a repeated state has an old stamp
                 self._delays.add(now, self._clock.age_ms(stamp))
 
     def arrivals(self) -> Figures:

@@ -25,7 +25,7 @@ from common.config.overrides import expanded, parse_override
 from common.config.robot import RobotConfig
 from common.config.world import CAMERA, Surroundings
 from common.errors import ConfigError, UnknownName
-from common.remapping import SERVICE_NAME, checked_table
+from common.remapping import SERVICE_NAME, validate_table
 
 NOT_A_SERVICE = ("router", "supervisor", "recorder")  # processes beside the services, which have names too
 WHOLE = ("robot", "world", "pipeline", "services")  # overrides of all of these come before those of their parts
@@ -184,7 +184,7 @@ def _service_entry(key: str, given: Any) -> dict[str, Any]:
     module = kind if "." in kind else f"services.{kind}"
     if "." not in kind and importlib.util.find_spec(module) is None:
         raise UnknownName("service", kind, service_names())
-    topics = checked_table(f"services.{name}.topics", parameters.pop("topics", None) or {})
+    topics = validate_table(f"services.{name}.topics", parameters.pop("topics", None) or {})
     return {"name": name, "module": module, "topics": topics, "parameters": parameters}
 
 

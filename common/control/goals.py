@@ -1,9 +1,10 @@
-"""Goals: what one asks of the arm from where it is, and by their ids what became of them, so that none acts twice."""
+"""Goals of the arm: how a trajectory is followed from where the arm is, and the reported state of each goal id."""
 
 from __future__ import annotations
 
 import math
 from collections import OrderedDict
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Generic, NamedTuple, TypeVar
 
@@ -15,15 +16,16 @@ from common.control.trajectory import Trajectory
 from common.errors import Refused
 from common.hardware.interface import Limits, Vector
 from common.hardware.pace import Pace
+from common.messages import GoalState, Holder, Interlock, MotionStatus
 
 S = TypeVar("S", bound=BaseModel)
 V = TypeVar("V", float, Vector)
 
 REMEMBERED = 1000  # goals that were followed, and as many that were refused; older requests are refused for their age
-BLEND_TIME = 0.3  # the difference between the robot's and the trajectory's start fades in this time [s]
+BLEND_TIME = 0.3  # [s] in which the difference between the robot's and the trajectory's start fades
 BLEND_SHARE = 0.5  # of the limits is for that difference at most; else it takes longer
-SLOWEST = 0.01  # of its speed, at which a trajectory is refused instead of being followed so slowly
-MOST_SAMPLES = 20_000  # of a trajectory, when it is looked for how fast it can be followed
+SLOWEST = 0.01  # share of its speed below which a trajectory is refused
+MAX_SAMPLES = 20_000  # of a trajectory, to find how fast it can be followed
 
 
 @dataclass
@@ -31,7 +33,7 @@ class Goal:
     """The goal that moves the robot. `time` is on the trajectory's own time axis [s], which passes at the pace's rate.
 
     The difference `offset` to where the robot was fades in the time `blend` [s]. `share` is the speed at which the
-    limits can be kept, 1 for a trajectory that is as it should be.
+    limits can be kept, 1 for a valid trajectory.
     """
 
     id: str
@@ -42,16 +44,16 @@ class Goal:
     pace: Pace
     share: float = 1.0
     time: float = 0.0
-    behind: float = 0.0  # the newest set-point, of the path [rad]
+    behind: float = 0.0  # distance of the newest set-point from the path [rad]
     stopping: bool = False
     reason: str = ""
-    error: str = ""  # why it is stopped, where nobody asked for it
+    error: str = ""  # of an abort; empty for a requested stop
     source: str = ""
-    plan: str = ""  # id of the plan request that it answers
+    plan: str = ""  # id of the plan request behind it
     scene_stamp: int = 0  # of the planning scene that it was planned on
     ended: float | None = None  # cell time at which the set-points came to rest
-    _told: float = 0.0  # progress so far
-    _newest: tuple[float, tuple[Vector, Vector]] | None = None  # time and answer: most are asked for three times
+    _reported: float = 0.0  # progress so far
+    _newest: tuple[float, tuple[Vector, Vector]] | None = None  # cached time and result: most are read three times
 
     @property
     def duration(self) -> float:
@@ -59,7 +61,7 @@ class Goal:
         return max(self.trajectory.duration, self.blend)
 
     def at(self, time: float) -> tuple[Vector, Vector]:
-        """Positions [rad] and their change per second of the trajectory (dof,), blended from where the robot was."""
+        """Return positions [rad] and their derivative by the trajectory's time (dof,), with the blend."""
         if self._newest is None or self._newest[0] != time:
             self._newest = time, self._blended(time)
         return self._newest[1]
@@ -70,26 +72,26 @@ class Goal:
             return q, dq
         u = time / self.blend
         slope = -30 * u**2 * (1 - u) ** 2 / self.blend
-        return q + _left(u) * self.offset, dq + slope * self.offset
+        return q + _remaining(u) * self.offset, dq + slope * self.offset
 
     def positions_at(self, times: Vector) -> Vector:
-        """Positions (N, dof) at times (N,), blended as well."""
+        """Return positions (N, dof) at times (N,), with the blend."""
         u = np.clip(times / self.blend, 0.0, 1.0) if self.blend > 0 else np.ones_like(times)
-        return self.trajectory.positions_at(times) + _left(u)[:, None] * self.offset
+        return self.trajectory.positions_at(times) + _remaining(u)[:, None] * self.offset
 
     def progress(self, delay: float) -> float:
-        """The share of the trajectory that is behind an arm which is a delay [s] behind its set-points."""
-        behind = self.time - delay * self.pace.rate
-        self._told = max(self._told, min(behind / self.duration, 1.0))  # a delay that is measured grows at times
-        return self._told
+        """Return the progress of an arm that follows its set-points after a delay [s]; it never decreases."""
+        done = self.time - delay * self.pace.rate
+        self._reported = max(self._reported, min(done / self.duration, 1.0))  # a measured delay may grow
+        return self._reported
 
 
-def _left(u: V) -> V:
+def _remaining(u: V) -> V:
     return 1 - u**3 * (10 - 15 * u + 6 * u**2)
 
 
 def blend_time(offset: Vector, duration: float, limits: Limits) -> float:
-    """Time [s] in which an offset (dof,) [rad] from a trajectory of this duration [s] fades; 0 when there is none."""
+    """Return the time [s] in which an offset (dof,) [rad] from a trajectory of this duration [s] fades; 0 for none."""
     off = np.abs(offset)
     if not off.any():
         return 0.0
@@ -102,15 +104,15 @@ def blend_time(offset: Vector, duration: float, limits: Limits) -> float:
 
 
 def possible_share(goal: Goal, limits: Limits, period: float) -> float:
-    """The share of its speed, at most 1, at which set-points of a goal every `period` [s] keep the limits.
+    """Return the share of its speed, at most 1, at which set-points of a goal every `period` [s] keep the limits.
 
     Raises:
-        Refused: there is none that is worth the name.
+        Refused: it is below SLOWEST.
     """
     share, most = 1.0, 1 + SLACK
     while share >= SLOWEST:
-        step = share * period / 2  # of trajectory's time: differences over two, from every second one on
-        count = min(int(goal.duration / step) + 1, MOST_SAMPLES)
+        step = share * period / 2  # of the trajectory's time: differences over two, starting at every second one
+        count = min(int(goal.duration / step) + 1, MAX_SAMPLES)
         q = goal.positions_at(np.arange(-6.0, count + 6) * step)
         v = (q[2:] - q[:-2]) / period
         a = (v[2:] - v[:-2]) / period
@@ -125,31 +127,57 @@ def possible_share(goal: Goal, limits: Limits, period: float) -> float:
                                    f"than {SLOWEST:.0%} of its speed")
 
 
-@dataclass(frozen=True)
-class Judged:
-    """What was found out about a trajectory, for an arm that begins at `begin` (dof,) [rad]: how it can be followed."""
+class Outcome(NamedTuple):
+    """State of a goal, with its error code, message and source."""
 
-    begin: Vector
+    state: GoalState
+    error: str = ""
+    message: str = ""
+    source: str = ""
+
+
+@dataclass(frozen=True)
+class Assessment:
+    """Whether and how a trajectory can be followed by an arm that starts at `start` (dof,) [rad]."""
+
+    start: Vector
     trajectory: Trajectory | None = None
     share: float = 1.0
     refusal: Refused | None = None
 
+    @staticmethod
+    def of(trajectory: Trajectory, start: Vector, limits: Limits, period: float) -> Assessment:
+        """Assess a checked trajectory.
+
+        Raises:
+            Refused: it can only be followed far too slowly.
+        """
+        trial = Assessment(start, trajectory).goal("", start, 0.0, 0.0, limits)
+        return Assessment(start, trajectory, possible_share(trial, limits, period))
+
+    def goal(self, name: str, start: Vector, now: float, rate: float, limits: Limits) -> Goal:
+        """Create the goal that follows the trajectory from `start` (dof,) [rad], at first at a rate, 0 to 1."""
+        assert self.trajectory is not None
+        offset = start - self.trajectory.positions[0]
+        blend = blend_time(offset, self.trajectory.duration, limits)
+        return Goal(name, self.trajectory, offset, blend, now, Pace(rate, 0.0 * start), self.share)
+
 
 class GoalMemory(Generic[S]):
-    """The newest states of the last goals; those that were refused push out none that was followed.
+    """The newest states of the last goals; refused goals do not displace followed ones.
 
-    All but the newest are kept as JSON, a sixth of the memory: that of an arm that works is full for all of its time.
+    All but the newest are stored as JSON, which takes a sixth of the memory.
     """
 
     def __init__(self, most: int = REMEMBERED) -> None:
-        """Remember at most so many goals of either kind; the one heard of longest ago is forgotten first."""
+        """Remember at most so many goals of either kind; the least recently updated is forgotten first."""
         self._most = most
         self._followed: OrderedDict[str, S | _Packed[S]] = OrderedDict()
         self._refused: OrderedDict[str, S | _Packed[S]] = OrderedDict()
         self._newest = "", self._followed
 
     def get(self, goal: str) -> S | None:
-        """The state of a goal, or None for an id that was never heard of."""
+        """Return the state of a goal, or None for an unknown id."""
         state = self._followed.get(goal) or self._refused.get(goal)
         return state.unpacked() if isinstance(state, _Packed) else state
 
@@ -177,3 +205,94 @@ class _Packed(NamedTuple, Generic[S]):
 
     def unpacked(self) -> S:
         return self.kind.model_validate_json(self.text)
+
+
+class GoalReports:
+    """The status of the newest goal and of remembered ones, with the holds in force.
+
+    Attributes:
+        newest: status of the newest goal, without the holds.
+        holds: reasons by holder.
+        interlocks, speed_scaling, fault: reported with every status.
+    """
+
+    def __init__(self, source: str, remember: int) -> None:
+        """Report for a controller of this name."""
+        self._source = source
+        self.memory: GoalMemory[MotionStatus] = GoalMemory(remember)
+        self.newest = MotionStatus()
+        self.holds: dict[Holder, str] = {}
+        self.interlocks: list[Interlock] = []
+        self.speed_scaling = 1.0
+        self.fault = ""
+
+    @property
+    def current(self) -> MotionStatus:
+        """The status of the newest goal."""
+        return self._with_holds(self.newest)
+
+    @property
+    def key(self) -> tuple[object, ...]:
+        """All that `current` consists of except the progress."""
+        return self.newest, *self.holds.items(), self.speed_scaling, self.interlocks, self.fault
+
+    def get(self, goal: str) -> MotionStatus | None:
+        """Return the status of a goal, or None for an unknown id."""
+        known = self.memory.get(goal)
+        return None if known is None else self._with_holds(known)
+
+    def unknown(self, goal: str) -> MotionStatus:
+        """Return the answer about an unknown goal."""
+        return self._with_holds(MotionStatus(
+            id=goal, error="unknown_goal", message=f"no goal {goal!r} is known", source=self._source))
+
+    def reject(self, goal: str, refusal: Refused) -> MotionStatus:
+        """Remember and return that a goal was rejected."""
+        rejected = MotionStatus(
+            id=goal, state="rejected", error=refusal.code, message=str(refusal), source=self._source)
+        return self._with_holds(self.memory.put(goal, rejected, refused=True))
+
+    def report(self, goal: Goal, delay: float, outcome: Outcome) -> MotionStatus:
+        """Set, remember and return the status of the goal, whose arm has a delay [s]."""
+        progress = 1.0 if outcome.state == "succeeded" else goal.progress(delay)
+        self.newest = MotionStatus(
+            id=goal.id, state=outcome.state, progress=progress, error=outcome.error, message=outcome.message,
+            source=outcome.source or self._source, plan=goal.plan, scene_stamp=goal.scene_stamp,
+        )
+        return self._with_holds(self.memory.put(goal.id, self.newest))
+
+    def update_active(self, goal: Goal, delay: float) -> None:
+        """Update progress and message of the goal in progress."""
+        message = self.hold_message(goal)
+        if message == self.newest.message:
+            self.newest.progress = goal.progress(delay)  # the rest of it has not changed
+            self.memory.put(goal.id, self.newest)
+        else:
+            self.report(goal, delay, Outcome("active", message=message))
+
+    def set_message(self, message: str) -> None:
+        """Change the message unless a goal is active."""
+        if self.newest.state != "active":
+            self.newest = self.newest.model_copy(update={"message": message})
+
+    def hold_message(self, goal: Goal) -> str:
+        """Return the message of a held goal; empty without a hold."""
+        if not self.holds:
+            return ""
+        return _with_reasons("held" if goal.pace.rate == 0.0 else "coming to rest", self.holds.values())
+
+    def _with_holds(self, status: MotionStatus) -> MotionStatus:
+        current: dict[str, object] = {  # all of it is part of `key`
+            "held": bool(self.holds), "held_by": sorted(self.holds), "speed_scaling": self.speed_scaling,
+            "interlocks": self.interlocks, "fault": self.fault,
+        }
+        if status.state != "active" and not status.message:
+            if self.fault:
+                current["message"] = f"hardware fault: {self.fault}"
+            elif self.holds:
+                current["message"] = _with_reasons("held", self.holds.values())
+        return status.model_copy(update=current)
+
+
+def _with_reasons(what: str, reasons: Iterable[str]) -> str:
+    return ": ".join([what, *filter(None, ["; ".join(filter(None, reasons))])])

@@ -129,7 +129,7 @@ class DrivenArm:
             q = self._newest.state.q if self._newest else [0.0] * self._dof
             return ArmState(q, [0.0] * self._dof, "disconnected", self._process.problem)
         newest = self._newest.state
-        if self.stopped and newest.mode == "running":  # a person may be near the arm, whoever ended the stop
+        if self.stopped and newest.mode == "running":  # people may be near the arm, whatever ended the stop
             return newest._replace(mode="protective_stop", message=STOPPED)
         return newest
 

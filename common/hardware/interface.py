@@ -139,7 +139,7 @@ class Hardware(Protocol):
 
 @runtime_checkable
 class ControlledArm(Hardware, Protocol):
-    """An arm with a controller of its own, which reports a state and has functions beside motion.
+    """An arm with a controller of its own, which reports a state and has other functions than motion.
 
     The joints follow the set-points after `delay` [s], of which `ahead` [s] because set-points are sent early. `late`
     is the longest delay of a cycle of its driver so far [s]. `stopped` is True from a safety stop until an operator
@@ -184,10 +184,12 @@ class PersistedState(NamedTuple):
 class WorldBackend(Protocol):
     """The simulated world around simulated hardware. A cell with real hardware has none.
 
-    While `suspended`, another thread changes the world; in the control cycle it stands still. `deferred` is a step
-    that takes longer than a cycle: the executor runs it in a thread if it has set `defers_steps`.
+    While `suspended`, another thread changes the world, which does not advance in the control cycle. `deferred` is a
+    step that takes longer than a cycle: the executor runs it in a thread if it has set `defers_steps`. `restored` says
+    whether the world was found as it was before a restart.
     """
 
+    restored: bool
     suspended: bool
     defers_steps: bool
     deferred: Callable[[], None] | None

@@ -27,7 +27,7 @@ class Backend(Protocol):
 
 
 class GripperBackend(Protocol):
-    """A module that moves a gripper, whichever arm carries it."""
+    """A module that moves a gripper, on any arm."""
 
     GripperOptions: type[Parameters]
 

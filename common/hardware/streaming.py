@@ -156,9 +156,9 @@ class SetPointStream:
     def _advance(self, elapsed: float, nominal: float) -> None:
         """Play on for `elapsed` [s]; without delay the set-point time would be `nominal` [s] then."""
         pace, held_up = self._pace, elapsed > self.period + JITTER
-        rests = self._rests_until()
-        if self._time < min(rests, nominal):
-            self._time = min(rests, nominal)
+        still_until = self._at_rest_until()
+        if self._time < min(still_until, nominal):
+            self._time = min(still_until, nominal)
             pace.rate, pace.slope = 1.0, 0.0
             elapsed = nominal - self._time
             held_up = elapsed > self.period + JITTER
@@ -182,7 +182,7 @@ class SetPointStream:
         most = self._limits.braking if self.ceased else self._limits.acceleration
         self._time = pace.advance(self._curve, self._time, target, step, most, RAMP_SHARE * self._limits.jerks)
 
-    def _rests_until(self) -> float:
+    def _at_rest_until(self) -> float:
         """Return the set-point time [s] until which the arm stays at rest; minus infinity while it moves."""
         if self._braking is not None:
             began, motion = self._braking

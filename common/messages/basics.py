@@ -1,4 +1,4 @@
-"""What every message is made of."""
+"""Base class, field types and limits of all messages."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from pydantic import (
 from pydantic_core import CoreSchema
 
 SCHEMA_VERSION = 1
-SMALL = 16 * 1024  # [bytes] for what is read where something moves: checking any such payload takes less than 2 ms
-LARGEST = 32 * 1024 * 1024  # [bytes]; a 4096 x 2560 bgr8 picture still fits
-MOST_STAMP = 2**63 - 1  # [ns since the Unix epoch]; in the year 2262
-MOST_NAME = 120  # characters
-MOST_JOINTS = 64
-_MOST_TEXT = 4000  # characters
-_MOST_REMARK = 500
-_MOST_INT = 2**63 - 1
-_MOST_FLOAT = 1e12  # what is squared or summed up stays far from the ends of a float
-_MOST_ITEMS = 200_000  # of a list or a map that says nothing else
-_MOST_NESTED = 16  # levels of a plain value
+SMALL_BYTES = 16 * 1024  # of messages that are read in control loops: validating one takes less than 2 ms
+MAX_PAYLOAD_BYTES = 32 * 1024 * 1024  # room for a 4096 x 2560 bgr8 image
+MAX_STAMP = 2**63 - 1  # [ns since the Unix epoch]; in the year 2262
+MAX_NAME = 120  # characters
+MAX_JOINTS = 64
+_MAX_TEXT = 4000  # characters
+_MAX_REMARK = 500
+_MAX_INT = 2**63 - 1
+_MAX_FLOAT = 1e12  # squares and sums stay far from the limits of a float
+_MAX_ITEMS = 200_000  # of a list or map without a limit of its own
+_MAX_NESTED = 16  # levels of a plain value
 
-# Control characters, and those that change the direction of the text around them or begin a line.
+# Control characters, and those that change the direction of text or start a line.
 _IN_NAMES = r"^[^\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]*$"
 _ESCAPES = {
     code: ascii(chr(code))[1:-1]
@@ -41,47 +41,47 @@ _ESCAPES = {
 }
 
 
-def clean(text: str, most: int = _MOST_TEXT) -> str:
-    """Free text as it may stand in a message: cut to `most` characters, control characters as escapes.
+def clean(text: str, limit: int = _MAX_TEXT) -> str:
+    """Return free text for a message: cut to `limit` characters, with control characters escaped.
 
-    Line feeds and tabs stay. What a message is about is worth more than how it is said, so text is never refused.
+    Line feeds and tabs stay. Text never makes a message invalid: its other fields matter more.
     """
-    cut = text[: most + 1]
+    cut = text[: limit + 1]
     if not cut.isprintable():
         cut = cut.translate(_ESCAPES)
-    return cut if len(cut) <= most else cut[: most - 3] + "..."
+    return cut if len(cut) <= limit else cut[: limit - 3] + "..."
 
 
-def _cleaned(value: Any, most: int) -> Any:
-    return clean(value, most) if isinstance(value, str) else value
+def _clean_value(value: Any, limit: int) -> Any:
+    return clean(value, limit) if isinstance(value, str) else value
 
 
 def is_name(text: str) -> bool:
-    """Whether text may be a name, or none: not too long, without control characters."""
-    return len(text) <= MOST_NAME and (text.isprintable() or re.search(_IN_NAMES, text) is not None)
+    """Return whether text is empty or a name: not too long, without control characters."""
+    return len(text) <= MAX_NAME and (text.isprintable() or re.search(_IN_NAMES, text) is not None)
 
 
 def _plain(value: Any) -> JsonValue:
-    return _require_plain(value, _MOST_NESTED)
+    return _require_plain(value, _MAX_NESTED)
 
 
 def _require_plain(value: Any, levels: int) -> JsonValue:
-    """The value, when it holds nothing that a number or a name of a message may not be.
+    """Return the value if all numbers and texts in it are allowed in a message.
 
     Raises:
-        ValueError: says what it is.
+        ValueError: names the rule that is broken.
     """
     match value:
-        case bool() | float() | None:  # whoever takes a number knows its bounds, and refuses what is not finite
+        case bool() | float() | None:  # the field's own type checks bounds, and refuses values that are not finite
             pass
         case int():
-            if not -_MOST_INT <= value <= _MOST_INT:
+            if not -_MAX_INT <= value <= _MAX_INT:
                 raise ValueError("must be a number within 64 bits")
         case str():
             if clean(value) != value:
-                raise ValueError(f"must be text of at most {_MOST_TEXT} characters without control characters")
+                raise ValueError(f"must be text of at most {_MAX_TEXT} characters without control characters")
         case _ if not levels:
-            raise ValueError(f"must not be nested more than {_MOST_NESTED} levels deep")
+            raise ValueError(f"must not be nested more than {_MAX_NESTED} levels deep")
         case list():
             for each in value:
                 _require_plain(each, levels - 1)
@@ -90,23 +90,25 @@ def _require_plain(value: Any, levels: int) -> JsonValue:
                 _require_plain(name, levels - 1)
                 _require_plain(each, levels - 1)
         case _:
-            raise ValueError(f"must be what JSON can say, not {type(value).__name__}")
+            raise ValueError(f"must be a JSON value, not {type(value).__name__}")
     return value  # type: ignore[no-any-return]
 
 
-Finite = Annotated[float, Field(ge=-_MOST_FLOAT, le=_MOST_FLOAT)]
-Positive = Annotated[float, Field(gt=0, le=_MOST_FLOAT)]
+Finite = Annotated[float, Field(ge=-_MAX_FLOAT, le=_MAX_FLOAT)]
+Positive = Annotated[float, Field(gt=0, le=_MAX_FLOAT)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
-Metres = Annotated[float, Field(ge=-1e7, le=1e7)]  # a place on earth in a national grid still is one
+Metres = Annotated[float, Field(ge=-1e7, le=1e7)]  # room for a position on earth in a national grid
 Seconds = Annotated[float, Field(ge=0, le=1e9)]
-Count = Annotated[int, Field(ge=0, le=_MOST_INT)]
-Name = Annotated[str, Field(min_length=1, max_length=MOST_NAME, pattern=_IN_NAMES)]
-Label = Annotated[str, Field(max_length=MOST_NAME, pattern=_IN_NAMES)]  # a name, or empty for none
-Text = Annotated[str, Field(max_length=_MOST_TEXT), BeforeValidator(lambda value: _cleaned(value, _MOST_TEXT))]
-Remark = Annotated[str, Field(max_length=_MOST_REMARK), BeforeValidator(lambda value: _cleaned(value, _MOST_REMARK))]
-Plain = Annotated[JsonValue, PlainValidator(_plain)]  # what JSON can say
-# Names of the first releases, which older programs, recordings and record files still hold: read, never written.
-UNKNOWN_OPERATOR = "operator"  # name of an operator who gives none, and `by` of what an operator requests
+Count = Annotated[int, Field(ge=0, le=_MAX_INT)]
+Name = Annotated[str, Field(min_length=1, max_length=MAX_NAME, pattern=_IN_NAMES)]
+Label = Annotated[str, Field(max_length=MAX_NAME, pattern=_IN_NAMES)]  # a name, or empty
+Text = Annotated[str, Field(max_length=_MAX_TEXT), BeforeValidator(lambda value: _clean_value(value, _MAX_TEXT))]
+Remark = Annotated[
+    str, Field(max_length=_MAX_REMARK), BeforeValidator(lambda value: _clean_value(value, _MAX_REMARK))]
+Plain = Annotated[JsonValue, PlainValidator(_plain)]  # any JSON value
+
+# Former names, which older programs, recordings and record files still contain: read, never written.
+UNKNOWN_OPERATOR = "operator"  # name of an operator who gives none, and `by` of an operator's requests
 SELF_RELEASING = ("watchdog", "controller", "scene_monitor")  # values of `by` whose holds end without an operator
 FORMER_FIELDS: Mapping[str, str] = {"acknowledged": "heard", "interlocks": "inhibits"}
 _FORMER_OPERATOR = "person"
@@ -123,73 +125,72 @@ def _rename_operator(value: Any) -> Any:
 
 FormerOperator = BeforeValidator(_rename_operator)  # reads "person" as "operator"
 OperatorName = Annotated[Label, FormerOperator]
-_UNCHANGING = frozenset({str, int, float, bool, bytes, type(None)})
 
-
-_RULES: dict[str, dict[str, Any]] = {  # by kind of value, where a field says nothing else
-    "float": {"strict": True, "allow_inf_nan": False, "ge": -_MOST_FLOAT, "le": _MOST_FLOAT},
-    "int": {"strict": True, "ge": -_MOST_INT, "le": _MOST_INT},
-    "str": {"strict": True, "max_length": LARGEST},
-    "bytes": {"strict": True, "max_length": LARGEST},
+_IMMUTABLE = frozenset({str, int, float, bool, bytes, type(None)})
+_RULES: dict[str, dict[str, Any]] = {  # by type of a value, where a field has no rule of its own
+    "float": {"strict": True, "allow_inf_nan": False, "ge": -_MAX_FLOAT, "le": _MAX_FLOAT},
+    "int": {"strict": True, "ge": -_MAX_INT, "le": _MAX_INT},
+    "str": {"strict": True, "max_length": MAX_PAYLOAD_BYTES},
+    "bytes": {"strict": True, "max_length": MAX_PAYLOAD_BYTES},
     "bool": {"strict": True},
-    "list": {"fail_fast": True, "max_length": _MOST_ITEMS},
+    "list": {"fail_fast": True, "max_length": _MAX_ITEMS},
     "tuple": {"fail_fast": True},
-    "dict": {"max_length": _MOST_ITEMS},
+    "dict": {"max_length": _MAX_ITEMS},
 }
 
 
-def _bound(schema: Any) -> None:
-    """Give all parts of a schema the rules that they have not."""
+def _add_rules(schema: Any) -> None:
+    """Add the general rules to all parts of a schema that lack them."""
     if isinstance(schema, list | tuple):
         for each in schema:
-            _bound(each)
+            _add_rules(each)
     elif isinstance(schema, dict):
         kind = schema.get("type")
-        if not isinstance(kind, str):  # a table of fields, one of which may be called `type`
-            _bound(list(schema.values()))
+        if not isinstance(kind, str):  # a table of fields, one of which may be named `type`
+            _add_rules(list(schema.values()))
             return
         for rule, value in _RULES.get(kind, {}).items():
             if not (rule == "ge" and "gt" in schema) and not (rule == "le" and "lt" in schema):
                 schema.setdefault(rule, value)
-        _bound([value for part, value in schema.items() if part not in ("default", "metadata", "serialization")])
+        _add_rules([value for part, value in schema.items() if part not in ("default", "metadata", "serialization")])
 
 
+class Message(BaseModel):  # noqa: PLW1641 - mutable, so it has no hash
+    """Base of all messages.
 
-class Message(BaseModel):  # noqa: PLW1641 - it can change, and so has no hash
-    """Base of everything that is sent.
-
-    Whatever the fields of a message say of themselves: numbers are numbers and text is text, never one for the other;
-    they are finite and within 64 bits, lists have an end; the first entry of a list that does not fit ends it.
+    Beyond the rules of the fields: numbers and text are never converted into each other, numbers are finite and fit
+    64 bits, lists have a limit, and the first invalid item of a list ends its validation.
     """
 
-    # Each process uses a few of them: to build the rules of all takes as long as importing all else. Who is about to
-    # read or write one builds its rules first (common/transport/bus.py).
+    # A process uses few of the messages, and building all validators takes as long as importing everything else. The
+    # bus builds the validator of a message when it is declared (common/transport/bus.py).
     model_config = ConfigDict(extra="forbid", defer_build=True)
 
-    most_bytes: ClassVar[int] = 1024 * 1024  # of an encoded message; readers and the router take no more
-    most_parts: ClassVar[int] = 32 * 1024  # lists and maps in it, all levels together: they cost most time to read
-    later: ClassVar[tuple[str, ...]] = ()  # fields that are sent only where they say something: others do not know them
+    max_bytes: ClassVar[int] = 1024 * 1024  # of an encoded message; readers and the router refuse larger ones
+    max_parts: ClassVar[int] = 32 * 1024  # lists and maps in it at all levels: they cost most of the time to decode
+    # Fields that are not sent while they hold their default: readers of former versions do not know them.
+    omitted_defaults: ClassVar[tuple[str, ...]] = ()
 
     @classmethod
     def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        """The rules of the fields, each with what holds for all messages."""
+        """Return the rules of the fields with those of all messages."""
         schema = handler(source)
-        _bound(schema)
+        _add_rules(schema)
         return schema
 
     def __eq__(self, other: object) -> bool:
-        """Whether all fields are the same: messages have nothing else, for which pydantic would look."""
+        """Return whether all fields are equal; pydantic would also compare what messages never have."""
         return self.__dict__ == other.__dict__ if type(self) is type(other) else NotImplemented
 
-    def same_but(self, other: Self, *fields: str) -> bool:
-        """Whether all is the same but for these fields."""
+    def equals_except(self, other: Self, *fields: str) -> bool:
+        """Return whether all fields but these are equal."""
         return vars(self) | {name: getattr(other, name) for name in fields} == vars(other)
 
     def __deepcopy__(self, memo: dict[int, Any] | None = None) -> Self:
-        """A copy that shares nothing that can be changed; pydantic makes one of each default that is a message."""
+        """Return a copy that shares no mutable value; pydantic makes one of each default that is a message."""
         fields = self.__dict__.copy()
         for name, value in fields.items():
-            if type(value) not in _UNCHANGING:
+            if type(value) not in _IMMUTABLE:
                 fields[name] = value.__deepcopy__(memo) if isinstance(value, Message) else deepcopy(value, memo)
         copied = self.__class__.__new__(self.__class__)
         object.__setattr__(copied, "__dict__", fields)
@@ -200,8 +201,7 @@ class Message(BaseModel):  # noqa: PLW1641 - it can change, and so has no hash
 
 
 class Header(Message):
-    """When and in which frame."""
+    """Time stamp and frame of a message."""
 
-    stamp: int = Field(0, ge=0, le=MOST_STAMP, description="cell time [ns since the Unix epoch]")
+    stamp: int = Field(0, ge=0, le=MAX_STAMP, description="cell time [ns since the Unix epoch]")
     frame_id: Label = ""
-

@@ -6,30 +6,30 @@ from typing import ClassVar, Literal
 
 from pydantic import Field, model_validator
 
-from common.messages.basics import LARGEST, SMALL, Finite, Header, Label, Message, Text
+from common.messages.basics import MAX_PAYLOAD_BYTES, SMALL_BYTES, Finite, Header, Label, Message, Text
 from common.messages.geometry import Color, Pose, Vector3
 
 
 class Image(Message):
     """Pixels, row by row. `step` is the row stride in bytes; 0 means unpadded. See common/perception/image.py."""
 
-    most_bytes: ClassVar[int] = LARGEST
-    most_parts: ClassVar[int] = 16
+    max_bytes: ClassVar[int] = MAX_PAYLOAD_BYTES
+    max_parts: ClassVar[int] = 16
 
     header: Header
     height: int = Field(ge=1, le=16384)
     width: int = Field(ge=1, le=16384)
     encoding: Label = Field(description="bgr8, rgb8, mono8, 16UC1 or 32FC1")
     is_bigendian: bool = False
-    step: int = Field(0, ge=0, le=LARGEST)
+    step: int = Field(0, ge=0, le=MAX_PAYLOAD_BYTES)
     data: bytes
 
 
 class CameraInfo(Message):
     """Pinhole calibration, as sensor_msgs/CameraInfo: `k` is the 3x3 intrinsic matrix [px], row by row."""
 
-    most_bytes: ClassVar[int] = SMALL
-    later: ClassVar[tuple[str, ...]] = ("without_robot",)
+    max_bytes: ClassVar[int] = SMALL_BYTES
+    omitted_defaults: ClassVar[tuple[str, ...]] = ("without_robot",)
 
     header: Header
     height: int = Field(ge=1, le=16384)
@@ -63,9 +63,9 @@ class Marker(Message):
 class MarkerArray(Message):
     """Markers of one instant; a later message with the same header frame replaces them all."""
 
-    most_bytes: ClassVar[int] = 256 * 1024
-    most_parts: ClassVar[int] = 8 * 1024
-    later: ClassVar[tuple[str, ...]] = ("blind",)
+    max_bytes: ClassVar[int] = 256 * 1024
+    max_parts: ClassVar[int] = 8 * 1024
+    omitted_defaults: ClassVar[tuple[str, ...]] = ("blind",)
 
     header: Header
     markers: list[Marker] = Field(max_length=1000)
@@ -76,15 +76,15 @@ class MarkerArray(Message):
 class PointCloud2(Message):
     """Points as rows of little-endian float32 x, y, z and one packed colour, as sensor_msgs/PointCloud2."""
 
-    most_bytes: ClassVar[int] = LARGEST
-    most_parts: ClassVar[int] = 16
+    max_bytes: ClassVar[int] = MAX_PAYLOAD_BYTES
+    max_parts: ClassVar[int] = 16
 
     header: Header
     height: int = Field(ge=1, le=16384)
     width: int = Field(ge=1, le=16384)
     fields: list[Label] = Field(["x", "y", "z", "rgb"], max_length=64)
     point_step: int = Field(16, ge=4, le=256, description="bytes of one point")
-    row_step: int = Field(ge=4, le=LARGEST, description="bytes of one row")
+    row_step: int = Field(ge=4, le=MAX_PAYLOAD_BYTES, description="bytes of one row")
     data: bytes
 
 
@@ -98,8 +98,8 @@ class Rejection(Message):
 class Rejections(Message):
     """Rejections that are new: one is sent once for each place."""
 
-    most_bytes: ClassVar[int] = 256 * 1024
-    most_parts: ClassVar[int] = 8 * 1024
+    max_bytes: ClassVar[int] = 256 * 1024
+    max_parts: ClassVar[int] = 8 * 1024
 
     header: Header
     rejected: list[Rejection] = Field(max_length=1000)

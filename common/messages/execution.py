@@ -8,9 +8,9 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field
 
 from common.messages.basics import (
-    MOST_JOINTS,
-    MOST_STAMP,
-    SMALL,
+    MAX_JOINTS,
+    MAX_STAMP,
+    SMALL_BYTES,
     UNKNOWN_OPERATOR,
     Finite,
     FormerOperator,
@@ -35,7 +35,7 @@ RobotMode = Literal[
 Holder = Annotated[Literal["operator", "watchdog", "controller", "scene_monitor"], FormerOperator]
 OwnerKind = Literal["none", "task", "operator", "script"]
 JogFrame = Literal["base", "tool", "world"]
-Since = Annotated[int, Field(ge=0, le=MOST_STAMP)]  # [ns since the Unix epoch]
+Since = Annotated[int, Field(ge=0, le=MAX_STAMP)]  # [ns since the Unix epoch]
 Acknowledged = Annotated[Since | None, Field(validation_alias=either_name("acknowledged"))]
 MAX_INTERLOCKS = 32  # in a message
 CLOSED_BEFORE = "closed_before"  # error of a motion that was held up after the fingers began to close for its end
@@ -48,9 +48,9 @@ class ExecuteRequest(Message):
     The stamp of the header is the time of the decision: a request that arrives too late is refused.
     """
 
-    most_bytes: ClassVar[int] = TRAJECTORY_BYTES + SMALL
-    most_parts: ClassVar[int] = 128 * 1024
-    later: ClassVar[tuple[str, ...]] = ("plan", "scene_stamp")
+    max_bytes: ClassVar[int] = TRAJECTORY_BYTES + SMALL_BYTES
+    max_parts: ClassVar[int] = 128 * 1024
+    omitted_defaults: ClassVar[tuple[str, ...]] = ("plan", "scene_stamp")
 
     header: Header = Header()
     id: Name
@@ -66,7 +66,7 @@ class ExecuteRequest(Message):
 class FollowedRequest(Message):
     """Request the trajectory of the goal that is being followed."""
 
-    most_bytes: ClassVar[int] = SMALL
+    max_bytes: ClassVar[int] = SMALL_BYTES
 
     id: Name
 
@@ -78,7 +78,7 @@ class StopRequest(Message):
     persists over restarts. By the requester it ends the named goal only, also a goal that arrives later.
     """
 
-    most_bytes: ClassVar[int] = SMALL
+    max_bytes: ClassVar[int] = SMALL_BYTES
 
     id: Label = ""
     reason: Text = "requested"
@@ -92,8 +92,8 @@ class HoldRequest(Message):
     Holds of operators persist over restarts. A hold without a name belongs to every operator: any of them releases it.
     """
 
-    most_bytes: ClassVar[int] = SMALL
-    later: ClassVar[tuple[str, ...]] = ("goal",)
+    max_bytes: ClassVar[int] = SMALL_BYTES
+    omitted_defaults: ClassVar[tuple[str, ...]] = ("goal",)
 
     hold: bool
     reason: Text = ""
@@ -128,9 +128,9 @@ class Interlock(Message):
 class MotionStatus(Message):
     """State of the newest goal, and the reply to execute, stop and hold."""
 
-    most_bytes: ClassVar[int] = 4 * SMALL  # with all interlocks
-    most_parts: ClassVar[int] = 256
-    later: ClassVar[tuple[str, ...]] = ("fault", "plan", "scene_stamp")
+    max_bytes: ClassVar[int] = 4 * SMALL_BYTES  # with all interlocks
+    max_parts: ClassVar[int] = 256
+    omitted_defaults: ClassVar[tuple[str, ...]] = ("fault", "plan", "scene_stamp")
 
     header: Header = Header()
     id: Label = ""
@@ -180,8 +180,8 @@ class GripperCommand(Message):
     stalled after they began to close, it does not resume: the fingers may have closed on an object.
     """
 
-    most_bytes: ClassVar[int] = SMALL
-    later: ClassVar[tuple[str, ...]] = (
+    max_bytes: ClassVar[int] = SMALL_BYTES
+    omitted_defaults: ClassVar[tuple[str, ...]] = (
         "expected_width", "width_tolerance", "owner", "mass", "acknowledged", "after", "lead", "within")
 
     header: Header = Header()
@@ -208,8 +208,8 @@ class GripperState(Message):
     slipping when an object was held and then, without a command, the fingers closed further or lost it.
     """
 
-    most_bytes: ClassVar[int] = SMALL
-    later: ClassVar[tuple[str, ...]] = ("outcome",)
+    max_bytes: ClassVar[int] = SMALL_BYTES
+    omitted_defaults: ClassVar[tuple[str, ...]] = ("outcome",)
 
     header: Header = Header()
     width: Finite = 0.0
@@ -228,7 +228,7 @@ class GripperState(Message):
 class RobotStatus(Message):
     """State of the arm's own controller: its mode, speed slider, timing and digital inputs and outputs."""
 
-    later: ClassVar[tuple[str, ...]] = ("controller",)
+    omitted_defaults: ClassVar[tuple[str, ...]] = ("controller",)
 
     header: Header = Header()
     mode: RobotMode
@@ -247,9 +247,9 @@ class RobotCommand(Message):
     stamp never is.
     """
 
-    most_bytes: ClassVar[int] = SMALL
+    max_bytes: ClassVar[int] = SMALL_BYTES
 
-    later: ClassVar[tuple[str, ...]] = ("header", "output", "com")
+    omitted_defaults: ClassVar[tuple[str, ...]] = ("header", "output", "com")
 
     header: Header = Header()
     act: Literal["enable", "recover", "freedrive", "payload", "output"] = Field(
@@ -274,13 +274,13 @@ class JogCommand(Message):
     The arm brakes 0.1 s after the newest command, and is at rest 0.2 s after it. Without velocities it stops at once.
     """
 
-    most_bytes: ClassVar[int] = SMALL
+    max_bytes: ClassVar[int] = SMALL_BYTES
 
     header: Header = Header()
     owner: OperatorName = Field(UNKNOWN_OPERATOR, min_length=1, description="name of the operator who jogs")
     acknowledged: Acknowledged = Field(
         None, description="`since` of the newest interlock that the operator has seen: later ones block the motion")
-    joints: Annotated[dict[Name, Finite], Field(max_length=MOST_JOINTS)] = Field(
+    joints: Annotated[dict[Name, Finite], Field(max_length=MAX_JOINTS)] = Field(
         {}, description="velocities of joints by name [rad/s, m/s]; other joints stay")
     linear: Vector3 = Field(Vector3(), description="velocity of the TCP [m/s]; not together with joints")
     angular: Vector3 = Field(Vector3(), description="rotation about the TCP [rad/s]; not together with joints")
@@ -290,7 +290,7 @@ class JogCommand(Message):
 class OwnRequest(Message):
     """Take or give back the ownership of motion. It has one owner at a time; motions of others are refused."""
 
-    most_bytes: ClassVar[int] = SMALL
+    max_bytes: ClassVar[int] = SMALL_BYTES
 
     act: Literal["take", "give"]
     owner: Annotated[Name, FormerOperator] = Field(description="name of an operator, a script or a task")
@@ -303,7 +303,7 @@ class OwnRequest(Message):
 class MotionOwner(Message):
     """Current owner of motion: motions of others are refused. Stop and hold are open to everyone."""
 
-    most_bytes: ClassVar[int] = SMALL
+    max_bytes: ClassVar[int] = SMALL_BYTES
 
     header: Header = Header()
     owner: OperatorName = ""

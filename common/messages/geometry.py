@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar
 
 from pydantic import Field, model_validator
 
-from common.messages.basics import SMALL, Fraction, Header, Label, Message, Metres, Name, Text
+from common.messages.basics import SMALL_BYTES, Fraction, Header, Label, Message, Metres, Name, Text
 
 Unit = Annotated[float, Field(ge=-1.001, le=1.001)]  # part of a quaternion
 MOST_POSES = 256
@@ -50,9 +50,9 @@ class Pose(Message):
 class PoseArray(Message):
     """Poses of several things; `ids[i]` and `labels[i]`, where given, belong to `poses[i]`."""
 
-    most_bytes: ClassVar[int] = 2 * SMALL
-    most_parts: ClassVar[int] = 1024
-    later: ClassVar[tuple[str, ...]] = ("unseen", "blind")
+    max_bytes: ClassVar[int] = 2 * SMALL_BYTES
+    max_parts: ClassVar[int] = 1024
+    omitted_defaults: ClassVar[tuple[str, ...]] = ("unseen", "blind")
 
     header: Header = Header()
     poses: list[Pose] = Field([], max_length=MOST_POSES)
@@ -83,8 +83,8 @@ class TransformStamped(Message):
 class TFMessage(Message):
     """Transforms of one instant."""
 
-    most_bytes: ClassVar[int] = 256 * 1024
-    most_parts: ClassVar[int] = 8 * 1024
+    max_bytes: ClassVar[int] = 256 * 1024
+    max_parts: ClassVar[int] = 8 * 1024
 
     transforms: list[TransformStamped] = Field(max_length=1000)
 

@@ -7,7 +7,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
-from common.messages.basics import MOST_STAMP, SMALL, Count, Finite, Fraction, Header, Label, Message, Name, Text
+from common.messages.basics import MAX_STAMP, SMALL_BYTES, Count, Finite, Fraction, Header, Label, Message, Name, Text
 from common.messages.geometry import Pose, Vector3
 from common.messages.robot import TRAJECTORY_BYTES, Joints, JointTrajectory
 from common.messages.scene import Pairs
@@ -157,8 +157,8 @@ class PlanRequest(Message):
     the tool has moved `contact_distance`.
     """
 
-    most_bytes: ClassVar[int] = 4 * 1024 * 1024  # a path of 20000 poses
-    most_parts: ClassVar[int] = 128 * 1024
+    max_bytes: ClassVar[int] = 4 * 1024 * 1024  # a path of 20000 poses
+    max_parts: ClassVar[int] = 128 * 1024
 
     header: Header = Header()
     id: Name
@@ -207,9 +207,9 @@ class PlanAttempt(Message):
 class PlanResponse(Message):
     """A trajectory, or the error of the planner that got furthest. All attempts are listed."""
 
-    most_bytes: ClassVar[int] = TRAJECTORY_BYTES + 64 * SMALL  # with all that was tried
-    most_parts: ClassVar[int] = 128 * 1024
-    later: ClassVar[tuple[str, ...]] = ("scene_stamp",)
+    max_bytes: ClassVar[int] = TRAJECTORY_BYTES + 64 * SMALL_BYTES  # with all that was tried
+    max_parts: ClassVar[int] = 128 * 1024
+    omitted_defaults: ClassVar[tuple[str, ...]] = ("scene_stamp",)
 
     header: Header = Header()
     id: Name
@@ -218,7 +218,7 @@ class PlanResponse(Message):
     planner: Label = ""
     goal_index: Count = Field(0, description="which goal of a set is reached, from 0; of a sequence, of its last")
     seconds: Finite = Field(0.0, description="wall time [s] of the whole request")
-    scene_stamp: Annotated[int, Field(ge=0, le=MOST_STAMP)] = Field(
+    scene_stamp: Annotated[int, Field(ge=0, le=MAX_STAMP)] = Field(
         0, description="of the planning scene that it was planned on; 0: not known")
     fraction: Finite = 0.0
     error: Label = Field("", description="code: start_in_collision, no_ik, collision, incomplete, timeout, ...")

@@ -6,10 +6,22 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from common.messages.basics import MOST_STAMP, SMALL, Count, Finite, Header, Label, Message, Name, Plain, Positive, Text
+from common.messages.basics import (
+    MAX_STAMP,
+    SMALL_BYTES,
+    Count,
+    Finite,
+    Header,
+    Label,
+    Message,
+    Name,
+    Plain,
+    Positive,
+    Text,
+)
 
-MOST_KEYS = 256
-Counts = Annotated[dict[Label, Count], Field(max_length=MOST_KEYS)]
+MAX_KEYS = 256
+Counts = Annotated[dict[Label, Count], Field(max_length=MAX_KEYS)]
 
 
 class ServiceStatus(Message):
@@ -35,8 +47,8 @@ class Notice(Message):
 class SupervisorStatus(Message):
     """All processes of the cell."""
 
-    most_bytes: ClassVar[int] = 256 * 1024
-    most_parts: ClassVar[int] = 8 * 1024
+    max_bytes: ClassVar[int] = 256 * 1024
+    max_parts: ClassVar[int] = 8 * 1024
 
     header: Header = Header()
     cell: Label
@@ -44,10 +56,10 @@ class SupervisorStatus(Message):
     host: Label = Field("", description="name of the computer of this supervisor; each tells of the whole cell")
     speed: Positive = Field(1.0, description="cell time per wall time")
     epoch: int = Field(
-        0, ge=0, le=MOST_STAMP, description="when cell time and wall time were equal [ns since the Unix epoch]"
+        0, ge=0, le=MAX_STAMP, description="when cell time and wall time were equal [ns since the Unix epoch]"
     )
     booted: int = Field(
-        0, ge=-MOST_STAMP, le=MOST_STAMP, description="when the clock of that host was at 0 [ns since the Unix epoch]"
+        0, ge=-MAX_STAMP, le=MAX_STAMP, description="when the clock of that host was at 0 [ns since the Unix epoch]"
     )
     seed: int = 0
     world: Text = Field("", description="that replaces the cell's, as it was asked for")
@@ -60,7 +72,7 @@ class SupervisorStatus(Message):
 class LogLine(Message):
     """A line of a service's log."""
 
-    most_bytes: ClassVar[int] = SMALL
+    max_bytes: ClassVar[int] = SMALL_BYTES
 
     header: Header = Header()
     service: Label
@@ -71,11 +83,11 @@ class LogLine(Message):
 class ServiceCounters(Message):
     """What a service's transport counted: dropped, refused and handled messages by key."""
 
-    most_bytes: ClassVar[int] = SMALL
+    max_bytes: ClassVar[int] = SMALL_BYTES
 
     header: Header = Header()
     service: Label
-    writes: list[Label] = Field([], max_length=MOST_KEYS, description="keys that it writes")
+    writes: list[Label] = Field([], max_length=MAX_KEYS, description="keys that it writes")
     received: Counts = {}
     dropped: Counts = Field({}, description="newer message came before this one was read")
     invalid: Counts = Field({}, description="payloads that did not parse or validate")
@@ -101,8 +113,8 @@ class Parameter(Message):
 class ParameterRequest(Message):
     """Change parameters of a service, all of them or none; with nothing to set, ask what there is."""
 
-    most_bytes: ClassVar[int] = 4 * SMALL
-    most_parts: ClassVar[int] = 1024
+    max_bytes: ClassVar[int] = 4 * SMALL_BYTES
+    max_parts: ClassVar[int] = 1024
 
     set: dict[Name, Plain] = Field({}, max_length=256, description="by path")
     dry_run: bool = Field(False, description="only say whether it could be done")

@@ -6,22 +6,22 @@ from typing import Annotated, ClassVar
 
 from pydantic import Field, model_validator
 
-from common.messages.basics import MOST_JOINTS, SMALL, Finite, Header, Message, Name
+from common.messages.basics import MAX_JOINTS, SMALL_BYTES, Finite, Header, Message, Name
 
-MOST_SECONDS = 1e6  # of a trajectory
-MOST_POINTS = 25_000  # of a trajectory
+MAX_SECONDS = 1e6  # of a trajectory
+MAX_POINTS = 25_000  # of a trajectory
 TRAJECTORY_BYTES = 7 * 1024 * 1024  # so many points of seven joints
 
-Joints = Annotated[list[Finite], Field(max_length=MOST_JOINTS)]
+Joints = Annotated[list[Finite], Field(max_length=MAX_JOINTS)]
 
 
 class JointState(Message):
     """Positions [rad or m], velocities [rad/s or m/s] and efforts of named joints."""
 
-    most_bytes: ClassVar[int] = SMALL
+    max_bytes: ClassVar[int] = SMALL_BYTES
 
     header: Header
-    name: list[Name] = Field(max_length=MOST_JOINTS)
+    name: list[Name] = Field(max_length=MAX_JOINTS)
     position: Joints
     velocity: Joints = []
     effort: Joints = []
@@ -38,10 +38,10 @@ class JointState(Message):
 class RobotDescription(Message):
     """What an arm is, for who moves it from outside: `joints` are those of goals and plans, in their order."""
 
-    most_bytes: ClassVar[int] = 4 * SMALL
+    max_bytes: ClassVar[int] = 4 * SMALL_BYTES
 
     header: Header = Header()
-    joints: list[Name] = Field(max_length=MOST_JOINTS)
+    joints: list[Name] = Field(max_length=MAX_JOINTS)
     lower: Joints = Field(description="least positions [rad or m]")
     upper: Joints = Field(description="greatest positions [rad or m]")
     velocity: Joints = Field(description="speed limits [rad/s or m/s]")
@@ -62,7 +62,7 @@ class RobotDescription(Message):
 class JointTrajectoryPoint(Message):
     """State of all joints at a time [s] after the start."""
 
-    time_from_start: Annotated[float, Field(ge=0, le=MOST_SECONDS)]
+    time_from_start: Annotated[float, Field(ge=0, le=MAX_SECONDS)]
     positions: Joints
     velocities: Joints
     accelerations: Joints
@@ -77,12 +77,12 @@ class JointTrajectoryPoint(Message):
 class JointTrajectory(Message):
     """A timed path of the named joints; the first point is where the robot starts, at time 0."""
 
-    most_bytes: ClassVar[int] = TRAJECTORY_BYTES
-    most_parts: ClassVar[int] = 128 * 1024
+    max_bytes: ClassVar[int] = TRAJECTORY_BYTES
+    max_parts: ClassVar[int] = 128 * 1024
 
     header: Header = Header()
-    joint_names: list[Name] = Field(min_length=1, max_length=MOST_JOINTS)
-    points: list[JointTrajectoryPoint] = Field(max_length=MOST_POINTS)
+    joint_names: list[Name] = Field(min_length=1, max_length=MAX_JOINTS)
+    points: list[JointTrajectoryPoint] = Field(max_length=MAX_POINTS)
 
     @model_validator(mode="after")
     def _dof_fits(self) -> JointTrajectory:

@@ -6,7 +6,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
-from common.messages.basics import SMALL, Header, Label, Message, Name, Positive
+from common.messages.basics import SMALL_BYTES, Header, Label, Message, Name, Positive
 from common.messages.geometry import Color, Corners, Pose
 
 Pairs = Annotated[list[tuple[Label, Label]], Field(max_length=2000)]
@@ -14,7 +14,7 @@ Pairs = Annotated[list[tuple[Label, Label]], Field(max_length=2000)]
 
 Side = Annotated[float, Field(ge=0.001, le=10)]  # [m] of what a person says is there
 FARTHEST = 10.0  # [m] along each axis from the origin of world, of what a person says is there
-MOST_ADDED = 50
+MAX_ADDED = 50
 _DIMENSIONS = {"box": 3, "sphere": 1, "cylinder": 2, "prism": 1}
 
 
@@ -30,7 +30,7 @@ class CollisionObject(Message):
     prism has the convex hull of `outline` [m] as its cross-section and, as all shapes, its pose at half its length.
     """
 
-    later: ClassVar[tuple[str, ...]] = ("grip_effort", "mass", "kind", "unseen")
+    omitted_defaults: ClassVar[tuple[str, ...]] = ("grip_effort", "mass", "kind", "unseen")
 
     id: Name
     role: Literal["fixture", "container", "target", "contained", "attached"]
@@ -64,8 +64,8 @@ class AttachedObject(Message):
 class PlanningScene(Message):
     """What the planner avoids, all of it perceived or fixed; poses of `objects` are in `header.frame_id`."""
 
-    most_bytes: ClassVar[int] = 256 * 1024
-    most_parts: ClassVar[int] = 8 * 1024
+    max_bytes: ClassVar[int] = 256 * 1024
+    max_parts: ClassVar[int] = 8 * 1024
 
     header: Header
     objects: list[CollisionObject] = Field([], max_length=500)
@@ -79,7 +79,7 @@ class SceneEdit(Message):
     `id` is a name of one's own: in the scene it stands as `added/NAME`, which nothing else is called.
     """
 
-    most_bytes: ClassVar[int] = SMALL
+    max_bytes: ClassVar[int] = SMALL_BYTES
 
     op: Literal["add", "remove"]
     id: Annotated[Name, Field(max_length=100)]
@@ -108,7 +108,7 @@ class SceneEdit(Message):
 class SceneEditReply(Message):
     """The id of the solid in the planning scene, and those of all that were added."""
 
-    most_bytes: ClassVar[int] = SMALL
+    max_bytes: ClassVar[int] = SMALL_BYTES
 
     id: Name
-    ids: list[Name] = Field(max_length=MOST_ADDED)
+    ids: list[Name] = Field(max_length=MAX_ADDED)

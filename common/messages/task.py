@@ -6,7 +6,7 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from common.messages.basics import SMALL, Count, Finite, Header, Label, Message, Name, OperatorName, Text
+from common.messages.basics import SMALL_BYTES, Count, Finite, Header, Label, Message, Name, OperatorName, Text
 from common.messages.camera import Rejection
 from common.messages.execution import Acknowledged
 
@@ -14,7 +14,7 @@ from common.messages.execution import Acknowledged
 class TaskCommand(Message):
     """What a person may tell the task. Who gives no name has none of their own holds."""
 
-    most_bytes: ClassVar[int] = SMALL
+    max_bytes: ClassVar[int] = SMALL_BYTES
 
     command: Literal["start", "pause", "resume", "stop"]
     by: OperatorName = Field("", description="name of the person")
@@ -38,8 +38,8 @@ class TaskStatus(Message):
     `figures` are the task's own, by name; they stand in the summary of a run as they are.
     """
 
-    most_bytes: ClassVar[int] = 256 * 1024
-    most_parts: ClassVar[int] = 8 * 1024
+    max_bytes: ClassVar[int] = 256 * 1024
+    max_parts: ClassVar[int] = 8 * 1024
 
     header: Header = Header()
     state: Label = Field("IDLE", description="DONE and ERROR end a run; IDLE is at rest; all else is the task's own")

@@ -7,7 +7,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
-from common.messages.basics import SMALL, Finite, Header, Label, Message, Metres, Name, Positive
+from common.messages.basics import SMALL_BYTES, Finite, Header, Label, Message, Metres, Name, Positive
 from common.messages.geometry import Color, Corners, Pose, Vector3
 
 Shape = Literal["sphere", "box", "cylinder", "prism", "ring", "mesh"]
@@ -16,7 +16,7 @@ Shape = Literal["sphere", "box", "cylinder", "prism", "ring", "mesh"]
 class SceneUpdate(Message):
     """What happened to an object of the simulated world, as in the seed: "remove:ID", "add:ID"."""
 
-    most_bytes: ClassVar[int] = SMALL
+    max_bytes: ClassVar[int] = SMALL_BYTES
 
     header: Header = Header()
     data: Label
@@ -30,8 +30,8 @@ class WorldEdit(Message):
     world, but for what is said here.
     """
 
-    most_bytes: ClassVar[int] = 4 * SMALL
-    most_parts: ClassVar[int] = 2048 + 8
+    max_bytes: ClassVar[int] = 4 * SMALL_BYTES
+    max_parts: ClassVar[int] = 2048 + 8
 
     op: Literal["add", "move", "remove", "reset", "drop"]
     id: Label = ""
@@ -49,8 +49,8 @@ class WorldEdit(Message):
 class WorldEditReply(Message):
     """The object that was changed and what is in the world now."""
 
-    most_bytes: ClassVar[int] = 4 * SMALL
-    most_parts: ClassVar[int] = 512
+    max_bytes: ClassVar[int] = 4 * SMALL_BYTES
+    max_parts: ClassVar[int] = 512
 
     id: Label
     ids: list[Label] = Field(max_length=1000)
@@ -111,8 +111,8 @@ class WorldObject(Message):
 class WorldObjects(Message):
     """All solids of the simulated world: the truth."""
 
-    most_bytes: ClassVar[int] = 4 * 1024 * 1024  # meshes
-    most_parts: ClassVar[int] = 128 * 1024
+    max_bytes: ClassVar[int] = 4 * 1024 * 1024  # meshes
+    max_parts: ClassVar[int] = 128 * 1024
 
     header: Header = Header()
     objects: list[WorldObject] = Field([], max_length=1000)

@@ -1,4 +1,4 @@
-"""The file of a calibrated camera: what `zencell calibrate` writes, and a cell and `camera_opencv` read."""
+"""The YAML file of a calibrated camera: written by `zencell calibrate`, read by cells and by `camera_opencv`."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from common.errors import ConfigError
 Array = npt.NDArray[np.float64]
 
 _HEADER = """\
-# A camera as `zencell calibrate` found it. A cell takes it with its pose as `--set world.camera={name}`,
-# or as `camera: {name}` in a world file; then all services compute with it. Lengths in [m], angles in [rad].
+# A camera calibrated by `zencell calibrate`. A cell uses it with its pose by `--set world.camera={name}`,
+# or by `camera: {name}` in a world file; all services then use it. Lengths in [m], angles in [rad].
 """
 
 
 class CameraFile(Parameters):
-    """A calibrated camera. What is not needed to compute with it stands under `calibration`, for people."""
+    """A calibrated camera. `calibration` holds records for people; no computation reads them."""
 
     width: int = Field(ge=16, le=16384, description="[px]")
     height: int = Field(ge=16, le=16384, description="[px]")
@@ -34,40 +34,40 @@ class CameraFile(Parameters):
     cy: float = Field(ge=0, le=16384, description="principal point [px]")
     d: list[Number] = Field([], max_length=8, description="distortion k1, k2, p1, p2, k3, ... as OpenCV's plumb bob; "
                                                           "eight are the rational model")
-    frame: str | None = Field(None, description="name of the optical frame; none: that of the world's camera")
-    mount: str | None = Field(None, description="link of the robot that it sits on, or tcp; none: fixed in world")
+    frame: str | None = Field(None, description="name of the optical frame; none: the frame of the world's camera")
+    mount: str | None = Field(None, description="robot link that carries it, or tcp; none: fixed in world")
     position: Point | None = Field(None, description="optical centre in world, or in its mount [m]")
     rpy: tuple[Number, Number, Number] | None = Field(
         None, description="of the optical frame in world, or in its mount [rad], R = Rz Ry Rx"
     )
-    calibration: dict[str, Any] = Field({}, description="how it came about: residuals, date, source")
+    calibration: dict[str, Any] = Field({}, description="record of the calibration: residuals, date, source")
 
     @classmethod
     def load(cls, path: str) -> CameraFile:
-        """The camera of a YAML file.
+        """Load the camera from a YAML file.
 
         Raises:
-            ConfigError: the file cannot be read, or names the field that does not fit.
+            ConfigError: the file cannot be read; or names the invalid field.
         """
         return check(cls, read_yaml(Path(path).expanduser()), path)
 
     @classmethod
     def of(cls, camera: CameraConfig) -> CameraFile:
-        """The camera of a world."""
+        """Convert the camera of a world."""
         return cls(**camera.model_dump())
 
     def save(self, path: str) -> None:
-        """Write it as a YAML file that `load` and a cell read.
+        """Write the YAML file that `load` and a cell read.
 
         Raises:
-            ConfigError: it cannot be written.
+            ConfigError: the file cannot be written.
         """
         values = {field: value for field, value in self.model_dump().items() if value is not None}
         values |= {field: [float(x) for x in values[field]] for field in ("position", "rpy") if field in values}
-        place = Path(path).expanduser()
+        output = Path(path).expanduser()
         text = yaml.safe_dump(_rounded(values), sort_keys=False, default_flow_style=None, width=110)
         try:
-            place.write_text(_HEADER.format(name=place.name) + text, encoding="utf-8")
+            output.write_text(_HEADER.format(name=output.name) + text, encoding="utf-8")
         except OSError as error:
             raise ConfigError("--output", path, f"cannot be written: {error.strerror}") from None
 
@@ -78,17 +78,17 @@ class CameraFile(Parameters):
 
     @property
     def distortion(self) -> Array:
-        """Coefficients, filled up with zeros to a number that OpenCV takes: 4, 5 or 8."""
+        """Distortion coefficients, zero-padded to a length that OpenCV accepts: 4, 5 or 8."""
         length = next(n for n in (4, 5, 8) if len(self.d) <= n)
         return np.array([*self.d, *[0.0] * (length - len(self.d))])
 
     @property
     def distortion_model(self) -> str:
-        """Name of the model as in sensor_msgs/CameraInfo."""
+        """Name of the distortion model as in sensor_msgs/CameraInfo."""
         return "rational_polynomial" if len(self.d) > 5 else "plumb_bob"
 
     def undistorted(self, pixels: npt.ArrayLike) -> Array:
-        """(n, 2) where a pinhole camera with the same matrix would see what the lens shows at pixels (n, 2) [px]."""
+        """(n, 2) pixels at which a pinhole with the same matrix sees the rays of distorted pixels (n, 2) [px]."""
         points = np.asarray(pixels, dtype=float).reshape(-1, 1, 2)
         criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-10)
         ideal = cv2.undistortPoints(points, self.matrix, self.distortion, P=self.matrix, criteria=criteria)
@@ -96,22 +96,22 @@ class CameraFile(Parameters):
 
 
 def _rounded(value: Any) -> Any:
-    """Nine digits are more than a camera has, and can be read."""
+    """Round to nine digits: more precise than a camera, and still readable."""
     if isinstance(value, float):
         return round(value, 9)
     if isinstance(value, dict):
-        return {key: _rounded(one) for key, one in value.items()}
-    return [_rounded(one) for one in value] if isinstance(value, list | tuple) else value
+        return {key: _rounded(item) for key, item in value.items()}
+    return [_rounded(item) for item in value] if isinstance(value, list | tuple) else value
 
 
-Picture = npt.NDArray[np.uint8]
+Pixels = npt.NDArray[np.uint8]
 
 
 class Rectifier:
-    """Makes pictures of a lens those of a pinhole with the same matrix, so that everybody can compute with that."""
+    """Removes lens distortion: its images are those of a pinhole with the same matrix."""
 
     def __init__(self, camera: CameraFile) -> None:
-        """Compute the maps once."""
+        """Compute the remapping once."""
         self._camera = camera
         self._maps: tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]] | None = None
         if any(camera.d):
@@ -121,25 +121,25 @@ class Rectifier:
             )
             self._maps = np.asarray(first, np.float32), np.asarray(second, np.float32)
 
-    def __call__(self, picture: Picture, source: str) -> Picture:
-        """The bgr8 picture without distortion.
+    def __call__(self, image: Pixels, source: str) -> Pixels:
+        """Rectify a bgr8 image.
 
         Raises:
-            ConfigError: it has another size than the intrinsics are for.
+            ConfigError: the size differs from that of the intrinsics.
         """
-        require_size(picture, self._camera, source)
+        require_size(image, self._camera, source)
         if self._maps is None:
-            return picture
-        return np.asarray(cv2.remap(picture, *self._maps, cv2.INTER_LINEAR), np.uint8)
+            return image
+        return np.asarray(cv2.remap(image, *self._maps, cv2.INTER_LINEAR), np.uint8)
 
 
-def require_size(picture: Picture, camera: CameraFile, source: str) -> None:
-    """Return when the picture is as large as the camera's.
+def require_size(image: Pixels, camera: CameraFile, source: str) -> None:
+    """Check that the image has the size of the camera's intrinsics.
 
     Raises:
-        ConfigError: it is not.
+        ConfigError: it has another size.
     """
-    height, width = picture.shape[:2]
+    height, width = image.shape[:2]
     if (width, height) != (camera.width, camera.height):
-        expected = f"do not fit {source}, whose pictures are {width}x{height}"
+        expected = f"do not fit {source}, whose images are {width}x{height}"
         raise ConfigError("intrinsics", f"{camera.width}x{camera.height}", expected)

@@ -1,4 +1,4 @@
-"""From messages to a picture and the camera that took it, or the reason why that cannot be."""
+"""Decode camera messages: image, intrinsics and pose, or the reason why a frame is unusable."""
 
 from __future__ import annotations
 
@@ -12,93 +12,93 @@ from common.errors import ZencellError
 from common.messages import CameraInfo, Image, TFMessage
 from common.perception.image import ImageError, image_to_array
 from common.perception.pinhole import CameraError, Pinhole
-from common.robot.transform_history import NoTransform, TransformHistory
+from common.robot.transform_tree import TransformHistory, TransformUnavailable
 
-Picture = npt.NDArray[np.uint8]
+Pixels = npt.NDArray[np.uint8]
 
 UNKNOWN_CAMERA = "unknown_camera"
-FARTHEST = 1e7  # [m] along each axis that a message has room for
-MAX_DETECTIONS = 250  # found in a picture: neither a list of targets nor a planning scene has room for many more
+RANGE = 1e7  # [m] along each axis that a message can hold
+MAX_DETECTIONS = 250  # in an image: limit of target lists and planning scenes
 
 
 class FrameError(ZencellError):
-    """A picture that cannot be looked at. `kind` tells causes apart: unknown_camera, camera, size, encoding, ..."""
+    """An unusable frame. `kind` names the cause for programs: unknown_camera, camera, size, encoding, ..."""
 
     def __init__(self, kind: str, message: str) -> None:
         super().__init__(message)
         self.kind = kind
 
 
-def require_capacity(things: int) -> None:
-    """Return when so many things that were found in a picture can be told of; some of them are never left out.
+def require_capacity(count: int) -> None:
+    """Check that a planning scene can hold all objects detected in an image; none is dropped silently.
 
     Raises:
-        FrameError: they are too many.
+        FrameError: there are more than `MAX_DETECTIONS`.
     """
-    if things > MAX_DETECTIONS:
-        raise FrameError("crowded", f"{things} objects in it are more than a planning scene has room for: is the "
+    if count > MAX_DETECTIONS:
+        raise FrameError("crowded", f"{count} objects in it are more than a planning scene has room for: is the "
                                     "image full of noise?")
 
 
-def require_in_range(places: npt.ArrayLike) -> None:
-    """Return when places in world [m] that were told by a camera are so near that a message can say where they are.
+def require_in_range(positions: npt.ArrayLike) -> None:
+    """Check that positions in world [m], computed from a camera, are finite and fit into a message.
 
     Raises:
-        FrameError: one of them is farther, or not finite: the camera looks along the search plane, or is invalid.
+        FrameError: one is farther than `RANGE`, or not finite: the camera looks along the search plane, or is invalid.
     """
-    if not (np.abs(np.asarray(places, dtype=float)) <= FARTHEST).all():
-        raise FrameError("far", f"something in it would be more than {FARTHEST:g} m away: is the camera's pose right?")
+    if not (np.abs(np.asarray(positions, dtype=float)) <= RANGE).all():
+        raise FrameError("far", f"an object would be more than {RANGE:g} m away: check the camera's pose")
 
 
 class SkippedFrames:
-    """Frames that could not be used: told once for each cause, counted after that."""
+    """Counts unusable frames by cause and logs the first of each cause."""
 
     def __init__(self, log: logging.Logger, what: str) -> None:
-        """Tell of frames that are called `what` in the log of a service."""
+        """Log to the service's logger; `what` names the frames in the log."""
         self._log, self._what = log, what
         self.counts: Counter[str] = Counter()
 
     def note(self, error: FrameError | ImageError) -> None:
-        """Take note of a frame that was left out; that no camera is known yet is usual in the first moments."""
+        """Count a skipped frame; log its cause the first time, except for a camera that is not known yet at start."""
         self.counts[error.kind] += 1
         if self.counts[error.kind] == 1 and error.kind != UNKNOWN_CAMERA:
-            self._log.warning("%s left out: %s (told once; further ones are counted)", self._what, error)
+            self._log.warning("%s skipped: %s (logged once; further ones are counted)", self._what, error)
 
 
 def resolve_camera(
     info: CameraInfo | None, fixed: TFMessage | None, frame_id: str = "", *, moving: TransformHistory | None = None,
     stamp: int = 0,
 ) -> Pinhole:
-    """The camera that camera_info and tf describe, where it was when a picture was taken.
+    """Return the camera described by camera_info and tf, at its pose when an image was taken.
 
     Args:
         info: intrinsics.
         fixed: tf_static.
-        frame_id: of the picture; that of `info` when empty.
-        moving: tf, for a camera that hangs on what moves.
-        stamp: of the picture [ns].
+        frame_id: of the image; empty: that of `info`.
+        moving: tf history, for a camera on a moving link.
+        stamp: of the image [ns].
 
     Raises:
-        FrameError: one of them is missing or says something that no pinhole camera does. Of kind `early` it may help to
-            wait: the next message of tf may say where the camera was.
+        FrameError: a message is missing, or describes no pinhole camera. After kind `early` retry with the next tf
+            message: it may hold the pose at that time.
     """
     if info is None or fixed is None:
         missing = "camera_info" if info is None else "tf_static"
-        raise FrameError(UNKNOWN_CAMERA, f"no {missing} came yet")
+        raise FrameError(UNKNOWN_CAMERA, f"no {missing} received yet")
     history = moving if moving is not None else TransformHistory()
     try:
         return Pinhole.from_info(info, history.pose(frame_id or info.header.frame_id, fixed, stamp))
-    except NoTransform as error:
+    except TransformUnavailable as error:
         raise FrameError(error.kind, str(error)) from None
     except CameraError as error:
         raise FrameError("camera", str(error)) from None
 
 
 class CameraCache:
-    """`resolve_camera` that gives the same camera for the same messages, and for one that has not moved meanwhile."""
+    """Caches `resolve_camera`: returns the same object while the messages and the pose are unchanged."""
 
     def __init__(self) -> None:
-        """Nothing is known yet."""
+        """Start without a camera."""
         self.moving = TransformHistory()
         self._last: tuple[CameraInfo, TFMessage, str, Pinhole] | None = None
 
@@ -106,7 +106,7 @@ class CameraCache:
         self, info: CameraInfo | None, fixed: TFMessage | None, frame_id: str = "", stamp: int = 0, *,
         moves: bool = False,
     ) -> Pinhole:
-        """The camera of a picture; one that `moves` is looked for in `moving` as well, at the time of the picture."""
+        """Return the camera of an image; for a camera that `moves`, at its pose in `moving` at `stamp` [ns]."""
         last = self._last
         same = last is not None and last[0] is info and last[1] is fixed and last[2] == frame_id
         if last is not None and same and not moves:
@@ -119,11 +119,11 @@ class CameraCache:
         return camera
 
 
-def decode_image(image: Image, camera: Pinhole) -> Picture:
-    """The bgr8 picture (height, width, 3) of an image message.
+def decode_image(image: Image, camera: Pinhole) -> Pixels:
+    """Return the bgr8 pixels (height, width, 3) of an image message of this camera.
 
     Raises:
-        FrameError: another size than the camera has, not a colour picture, or bytes that do not add up.
+        FrameError: the size differs from camera_info, the encoding is no color, or the data are inconsistent.
     """
     if (image.width, image.height) != (camera.width, camera.height):
         raise FrameError(
@@ -132,20 +132,20 @@ def decode_image(image: Image, camera: Pinhole) -> Picture:
     return decode_color_image(image)
 
 
-def decode_color_image(image: Image) -> Picture:
-    """The bgr8 picture (height, width, 3) of an image message, whatever camera took it.
+def decode_color_image(image: Image) -> Pixels:
+    """Return the bgr8 pixels (height, width, 3) of an image message of any camera.
 
     Raises:
-        FrameError: not a colour picture, or bytes that do not add up.
+        FrameError: the encoding is no color, or the data are inconsistent.
     """
     if image.encoding not in ("bgr8", "rgb8"):
-        raise FrameError("encoding", f"encoding {image.encoding!r} is no colour picture; choices: bgr8, rgb8")
+        raise FrameError("encoding", f"encoding {image.encoding!r} is no color image; choices: bgr8, rgb8")
     try:
-        pixels: Picture = image_to_array(image)
+        pixels: Pixels = image_to_array(image)
     except ImageError as error:
         raise FrameError(error.kind, str(error)) from None
     if image.encoding == "bgr8":
         return pixels
-    import cv2  # many read clouds by this module, and no picture
+    import cv2  # readers of point clouds import this module without decoding images
 
     return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR), np.uint8)

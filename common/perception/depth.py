@@ -1,4 +1,4 @@
-"""Depth images: from messages to metres, from pixels and their depth to points in world, and to a cloud of points."""
+"""Depth images: decode messages to [m], convert pixels with depth to world points and point clouds."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from common.perception.pinhole import Pinhole
 Array = npt.NDArray[np.float64]
 Depth = npt.NDArray[np.float32]
 
-FARTHEST = 1e4  # [m] that a camera measures: some say the largest number there is where they measure nothing
+MAX_DEPTH = 1e4  # [m]; some cameras report the largest float where they measure nothing
 
 
 class DepthError(ZencellError):
-    """A depth image that does not tell where an object is. `kind` is for programs: size, nothing, invalid or far."""
+    """A depth image that cannot locate an object. `kind` names the cause: size, nothing, invalid or far."""
 
     def __init__(self, kind: str, message: str) -> None:
         super().__init__(message)
@@ -28,33 +28,33 @@ class DepthError(ZencellError):
 
 
 def check_depth(depth: npt.NDArray[np.float32], width: int, height: int) -> None:
-    """Return when the depth image fits a picture of that size and has any depth.
+    """Check that the depth image has the size of the color image and any valid depth.
 
     Raises:
-        DepthError: one line that says what does not fit.
+        DepthError: it does not.
     """
     if depth.ndim != 2 or depth.shape != (height, width):
         shape = "x".join(str(n) for n in depth.shape[::-1])
-        raise DepthError("size", f"the depth image is {shape}, but the picture is {width}x{height}")
+        raise DepthError("size", f"the depth image is {shape}, but the color image is {width}x{height}")
     if not is_valid(depth).any():
         raise DepthError("nothing", "the depth image has no valid depth at all: nothing is within the camera's range")
 
 
 def is_valid(depth: npt.NDArray[np.float32]) -> npt.NDArray[np.bool_]:
-    """Where a depth is a distance: in front of the camera, and no farther than one measures."""
-    return np.asarray((depth > 0) & (depth < FARTHEST))
+    """Mask of pixels with a usable depth: positive and below `MAX_DEPTH`."""
+    return np.asarray((depth > 0) & (depth < MAX_DEPTH))
 
 
 @dataclass(frozen=True, eq=False)
 class Rays:
-    """Rays through pixels in world, one metre of depth long: a point at depth d is `origin + d * directions`."""
+    """World rays through pixels, scaled to 1 m of depth: the point at depth d is `origin + d * directions`."""
 
     origin: Array
     directions: Array
 
     @classmethod
     def through(cls, camera: Pinhole, pixels: npt.ArrayLike) -> Rays:
-        """Rays (..., 3) through pixels (..., 2)."""
+        """Return rays (..., 3) through pixels (..., 2)."""
         p = np.asarray(pixels, dtype=float)
         x, y = (p[..., 0] - camera.cx) / camera.fx, (p[..., 1] - camera.cy) / camera.fy
         optical = np.stack([x, y, np.ones_like(x)], axis=-1)
@@ -70,27 +70,27 @@ class Rays:
 
 
 def point_cloud(
-    picture: npt.NDArray[np.uint8], depth: npt.NDArray[np.float32], camera: Pinhole, header: Header
+    colors: npt.NDArray[np.uint8], depth: npt.NDArray[np.float32], camera: Pinhole, header: Header
 ) -> PointCloud2:
-    """Points of all pixels in the optical frame, row by row, NaN where there is no depth.
+    """Organized point cloud of all pixels in the optical frame, row by row; NaN without depth.
 
-    `rgb` is 0x00rrggbb in the bits of a float32, as point clouds have it in ROS.
+    `rgb` is 0x00rrggbb in the bits of a float32, as in ROS point clouds.
     """
     height, width = depth.shape
     cloud = np.empty((height, width, 4), "<f4")
     cloud[..., 0] = depth * ((np.arange(width) - camera.cx) / camera.fx).astype(np.float32)[None, :]
     cloud[..., 1] = depth * ((np.arange(height) - camera.cy) / camera.fy).astype(np.float32)[:, None]
     cloud[..., 2] = depth
-    blue, green, red = (picture[..., i].astype(np.uint32) for i in range(3))
+    blue, green, red = (colors[..., i].astype(np.uint32) for i in range(3))
     cloud[..., 3] = (red << 16 | green << 8 | blue).astype("<u4").view("<f4")
     return PointCloud2(header=header, height=height, width=width, row_step=16 * width, data=cloud.tobytes())
 
 
 def depth_of(image: Image) -> Depth:
-    """The depth image (height, width) [m] of a message; 16UC1 is in millimetres with 0 for none, as in ROS.
+    """Return the depth image (height, width) [m] of a message; 16UC1 is in millimeters with 0 for none, as in ROS.
 
     Raises:
-        FrameError: it is no depth image, or its bytes do not add up.
+        FrameError: the encoding is no depth, or the data are inconsistent.
     """
     if image.encoding not in ("32FC1", "16UC1"):
         raise FrameError("encoding", f"encoding {image.encoding!r} is no depth image; choices: 32FC1, 16UC1")

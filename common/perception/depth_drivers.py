@@ -1,4 +1,4 @@
-"""Where the pictures of a real depth camera come from: a driver, which may be one's own. All calls may block."""
+"""Interface to drivers of real depth cameras, built-in or from a user's module. All calls may block."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from common.plugins import find_plugin, plugin_names
 
 GROUP = "zencell.cameras"
 
-Picture = npt.NDArray[np.uint8]
+Pixels = npt.NDArray[np.uint8]
 Depth = npt.NDArray[np.float32]
 
 
 class CameraLost(ZencellError):
-    """The camera is not there, or gives nothing any more: the message says why. It is opened again after a while."""
+    """The camera is missing or stopped delivering; the message says why. The service reopens it later."""
 
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """The pinhole that took colour and depth, without distortion: size, focal lengths and principal point [px]."""
+    """Pinhole model shared by color and depth, without distortion: size, focal lengths and principal point [px]."""
 
     width: int
     height: int
@@ -37,33 +37,33 @@ class Intrinsics:
 
 @dataclass(frozen=True)
 class RgbdFrame:
-    """What a depth camera sees at one instant, colour and depth pixel by pixel through the same lens.
+    """One frame of a depth camera; color and depth are registered pixel by pixel.
 
     Attributes:
-        colour: (height, width, 3) blue green red, 0 to 255.
-        depth: (height, width) along the optical axis [m], NaN where nothing was measured.
-        age: how long ago it was exposed [s].
+        colour: (height, width, 3) blue, green, red, 0 to 255.
+        depth: (height, width) along the optical axis [m]; NaN without a measurement.
+        age: time since exposure [s].
     """
 
-    colour: Picture
+    colour: Pixels
     depth: Depth
     age: float = 0.0
 
 
 class DepthSource(Protocol):
-    """A depth camera that is open."""
+    """An open depth camera."""
 
     lens: Intrinsics
 
     def read(self) -> RgbdFrame:
-        """The next shot.
+        """Return the next frame.
 
         Raises:
             CameraLost: there is none.
         """
 
     def close(self) -> None:
-        """Let go of it, also when it is gone."""
+        """Release the camera, also after it was lost."""
 
 
 class Driver(Protocol):
@@ -72,40 +72,40 @@ class Driver(Protocol):
     Options: type[Parameters]
 
     def open_camera(self, options: Any, size: tuple[int, int], rate: float, /) -> DepthSource:
-        """The camera, asked for pictures of that width and height [px], so many a second [Hz].
+        """Open the camera; request frames of width and height [px] at a rate [Hz].
 
         Raises:
-            CameraLost: it is not there.
-            ConfigError: it is no such camera.
+            CameraLost: no camera is connected.
+            ConfigError: the device is not supported.
         """
 
 
-def find_camera_driver(name: str, given: dict[str, Any], field: str) -> tuple[Driver, Parameters]:
-    """A driver by its name, or by the dotted name of its module, and its options.
+def find_camera_driver(name: str, options: dict[str, Any], field: str) -> tuple[Driver, Parameters]:
+    """Find a driver by plain name or dotted module name and validate its options.
 
     Args:
         name: of the driver.
-        given: options as they stand in the cell.
-        field: of the cell in which the driver is named: for what is told.
+        options: as written in the cell.
+        field: of the cell that names the driver, for errors.
 
     Raises:
-        ConfigError: no such module, or not one that opens cameras; or an option that does not fit.
+        ConfigError: the module does not exist or is no camera driver, or an option is invalid.
     """
     if "." not in name and name not in (choices := plugin_names(GROUP, "open_camera")):
-        raise ConfigError(field, name, f"must be one of {', '.join(choices)}, or the dotted name of a module of yours")
+        raise ConfigError(field, name, f"must be one of {', '.join(choices)}, or the dotted name of a module")
     module = find_plugin(GROUP, name, field=field, noun="camera driver", marker="open_camera")
     missing = [part for part in ("Options", "open_camera") if not hasattr(module, part)]
     if missing:
-        raise ConfigError(field, name, f"opens no cameras: it has no {', '.join(missing)}")
+        raise ConfigError(field, name, f"is no camera driver: it lacks {', '.join(missing)}")
     driver = cast(Driver, module)
-    return driver, check(driver.Options, given, f"{field.rpartition('.')[0]}.options")
+    return driver, check(driver.Options, options, f"{field.rpartition('.')[0]}.options")
 
 
 def import_sdk(driver: str, package: str) -> Any:
-    """The package of a camera's maker, which is imported only now.
+    """Import the vendor's package when the driver is used.
 
     Raises:
-        ConfigError: it is not installed, or a library that it needs is not there.
+        ConfigError: it is not installed, or a library that it needs is missing.
     """
     try:
         return importlib.import_module(package)
@@ -114,16 +114,16 @@ def import_sdk(driver: str, package: str) -> Any:
                           ) from None
 
 
-def require_frame_shape(shot: RgbdFrame, lens: Intrinsics, field: str, name: str) -> None:
-    """Return when the pictures are as the lens says.
+def require_frame_shape(frame: RgbdFrame, lens: Intrinsics, field: str, name: str) -> None:
+    """Check that the frame has the shape and type that the intrinsics declare.
 
     Raises:
-        ConfigError: they are not; names the driver, as it stands in a field of the cell.
+        ConfigError: it does not; names the driver and its field in the cell.
     """
     for what, array, shape, dtype in (
-        ("colour", shot.colour, (lens.height, lens.width, 3), np.uint8),
-        ("depth", shot.depth, (lens.height, lens.width), np.float32),
+        ("colour", frame.colour, (lens.height, lens.width, 3), np.uint8),
+        ("depth", frame.depth, (lens.height, lens.width), np.float32),
     ):
         if array.shape != shape or array.dtype != dtype:
-            raise ConfigError(field, name, f"gives {what} of shape {array.shape} and type {array.dtype}; its lens is "
-                                           f"for {shape} and {np.dtype(dtype)}")
+            raise ConfigError(field, name, f"gives {what} of shape {array.shape} and type {array.dtype}; the lens "
+                                           f"needs {shape} and {np.dtype(dtype)}")

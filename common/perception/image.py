@@ -1,7 +1,7 @@
-"""Pixels as arrays, and arrays as `Image` messages.
+"""Convert `Image` messages to arrays, arrays to messages, and messages to PNG files.
 
-The contract is that of sensor_msgs/Image: `step` is the length of a row in bytes and may be longer than the pixels
-need; 0 means that rows follow each other without padding. Anything that does not add up is refused with one line.
+Follows sensor_msgs/Image: `step` is the length of a row in bytes and may exceed the pixels; 0 means no padding.
+Inconsistent fields are rejected with an error.
 """
 
 from __future__ import annotations
@@ -19,10 +19,7 @@ from common.messages import Header, Image
 
 
 class ImageError(ZencellError):
-    """An image whose fields contradict each other or that has an encoding nobody here knows.
-
-    `kind` is for programs: encoding, step, truncated, shape or dtype.
-    """
+    """An image with inconsistent fields or an unknown encoding. `kind`: encoding, step, truncated, shape or dtype."""
 
     def __init__(self, kind: str, message: str) -> None:
         super().__init__(message)
@@ -31,7 +28,7 @@ class ImageError(ZencellError):
 
 @dataclass(frozen=True)
 class Encoding:
-    """How one pixel is stored."""
+    """Storage of one pixel."""
 
     dtype: np.dtype[Any]
     channels: int
@@ -58,13 +55,13 @@ def _encoding(name: str) -> Encoding:
 
 
 def image_to_array(image: Image) -> npt.NDArray[Any]:
-    """A writable, contiguous copy of the pixels in native byte order.
+    """Writable, contiguous copy of the pixels in native byte order.
 
     Returns:
-        (height, width, 3) for bgr8 and rgb8, in that order of channels; (height, width) for the others.
+        (height, width, 3) for bgr8 and rgb8, in that channel order; (height, width) for the others.
 
     Raises:
-        ImageError: unknown encoding; a step that is shorter than a row or not whole pixels; too few bytes.
+        ImageError: unknown encoding; a step shorter than a row or not a whole number of pixels; too few or many bytes.
     """
     encoding = _encoding(image.encoding)
     row = image.width * encoding.pixel_bytes
@@ -75,7 +72,7 @@ def image_to_array(image: Image) -> npt.NDArray[Any]:
         raise ImageError(
             "step", f"step {step} is not a whole number of {image.encoding} pixels of {encoding.pixel_bytes} bytes"
         )
-    needed = step * (image.height - 1) + row  # the last row may come without its padding
+    needed = step * (image.height - 1) + row  # the last row may lack its padding
     if len(image.data) < needed:
         raise ImageError(
             "truncated",
@@ -96,24 +93,24 @@ def image_to_array(image: Image) -> npt.NDArray[Any]:
 
 
 def array_to_image(array: npt.NDArray[Any], encoding: str, header: Header | None = None) -> Image:
-    """An unpadded little-endian image message of the pixels.
+    """Unpadded little-endian image message of the pixels.
 
     Args:
-        array: (height, width, 3) or (height, width), of the encoding's type exactly; any memory layout.
+        array: (height, width, 3) or (height, width), exactly of the encoding's type; any memory layout.
         encoding: bgr8, rgb8, mono8, 16UC1 or 32FC1.
         header: stamp and frame.
 
     Raises:
-        ImageError: unknown encoding, wrong shape or type: nothing is converted silently.
+        ImageError: unknown encoding, wrong shape or type: nothing is converted implicitly.
     """
-    wanted = _encoding(encoding)
-    dimensions = 3 if wanted.channels == 3 else 2
+    expected = _encoding(encoding)
+    dimensions = 3 if expected.channels == 3 else 2
     if array.ndim != dimensions or (dimensions == 3 and array.shape[2] != 3) or 0 in array.shape:
         form = "(height, width, 3)" if dimensions == 3 else "(height, width)"
         raise ImageError("shape", f"{encoding} needs an array of shape {form}, not {array.shape}")
-    if array.dtype.newbyteorder("=") != wanted.dtype:
-        raise ImageError("dtype", f"{encoding} needs {wanted.dtype} values, not {array.dtype}")
-    little = np.ascontiguousarray(array, wanted.dtype.newbyteorder("<"))
+    if array.dtype.newbyteorder("=") != expected.dtype:
+        raise ImageError("dtype", f"{encoding} needs {expected.dtype} values, not {array.dtype}")
+    little = np.ascontiguousarray(array, expected.dtype.newbyteorder("<"))
     height, width = array.shape[:2]
     return Image(
         header=header or Header(),
@@ -121,22 +118,22 @@ def array_to_image(array: npt.NDArray[Any], encoding: str, header: Header | None
         width=width,
         encoding=encoding,
         is_bigendian=False,
-        step=width * wanted.pixel_bytes,
+        step=width * expected.pixel_bytes,
         data=little.tobytes(),
     )
 
 
-# Image messages as PNG files."""
+# PNG files
 
 MILLIMETRES = 1000.0
 
 
 class ImageFileError(ZencellError):
-    """An image message cannot be shown, or its file cannot be written."""
+    """An image message cannot be displayed, or its file cannot be written."""
 
 
 def save_image(message: Any, path: Path) -> None:
-    """Write an image message to a PNG file, atomically; depth as uint16 [mm].
+    """Write an image message to a PNG file atomically; depth as uint16 [mm].
 
     Raises:
         ImageFileError: the message holds no displayable image, or the file cannot be written.
@@ -144,7 +141,7 @@ def save_image(message: Any, path: Path) -> None:
     pixels = displayable(message)
     written, data = cv2.imencode(".png", pixels) if pixels is not None else (False, None)
     if not written or data is None:
-        raise ImageFileError(f"{path}: the message holds no image that can be written")
+        raise ImageFileError(f"{path}: the message holds no displayable image")
     part = path.with_name(f".{path.name}.part")
     try:
         part.write_bytes(data.tobytes())
@@ -154,7 +151,7 @@ def save_image(message: Any, path: Path) -> None:
 
 
 def displayable(message: Any) -> npt.NDArray[Any] | None:
-    """Return what OpenCV can write: BGR, grey, or depth as uint16 [mm]; None for anything else."""
+    """Pixels that OpenCV can write: BGR, grey, or depth as uint16 [mm]; None for anything else."""
     if not isinstance(message, Image):
         return None
     try:

@@ -1,4 +1,4 @@
-"""Where real pictures come from: a camera device, a video file or a folder of images. All calls may block."""
+"""Read images from a camera device, a video file or an image folder. All calls may block."""
 
 from __future__ import annotations
 
@@ -12,46 +12,46 @@ import numpy as np
 import numpy.typing as npt
 
 from common.errors import ConfigError
-from common.sources import monotonic
+from common.time_source import monotonic
 
-Picture = npt.NDArray[np.uint8]
+Pixels = npt.NDArray[np.uint8]
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 
 
 class Source(Protocol):
-    """Something that pictures are read from."""
+    """A source of images."""
 
-    live: bool  # a device has its own pace and may vanish; files are read at the pace of the reader
-    name: str  # of the picture that was read last
+    live: bool  # a device sets the rate and may vanish; files are read on demand
+    name: str  # of the last image
 
-    def read(self) -> Picture | None:
-        """The next bgr8 picture (height, width, 3); None when there is none: the end, or the device is gone."""
+    def read(self) -> Pixels | None:
+        """Return the next bgr8 image (height, width, 3); None at the end or when the device is gone."""
 
     def close(self) -> None:
-        """Let go of it."""
+        """Release the device or file."""
 
 
 class Video:
     """A camera device or a video file."""
 
     def __init__(self, capture: cv2.VideoCapture, *, live: bool, loop: bool) -> None:
-        """Take over an open capture; `loop` begins a file again at its end."""
+        """Take over an open capture; `loop` restarts a file at its end."""
         self.live = live
         self.name = ""
         self._count = 0
         self._capture = capture
         self._loop = loop
 
-    def read(self) -> Picture | None:
-        """The next picture; None at the end."""
-        good, picture = self._capture.read()
+    def read(self) -> Pixels | None:
+        """Return the next image; None at the end."""
+        good, image = self._capture.read()
         if not good and self._loop and self._capture.set(cv2.CAP_PROP_POS_FRAMES, 0):
-            good, picture = self._capture.read()
+            good, image = self._capture.read()
             self._count = 0
         self._count += 1
         self.name = f"frame {self._count}"
-        return _as_bgr8(picture) if good and picture is not None else None
+        return _as_bgr8(image) if good and image is not None else None
 
     def close(self) -> None:
         """Release the device or file."""
@@ -59,19 +59,19 @@ class Video:
 
 
 class Folder:
-    """The images of a folder in the order of their names, numbers within them counted as such."""
+    """Images of a folder in natural order of their names (numbers compare as numbers)."""
 
     live = False
 
     def __init__(self, paths: list[Path], *, loop: bool) -> None:
-        """Read these, once or over and over."""
+        """Read these paths once, or repeatedly with `loop`."""
         self.name = ""
         self._paths = paths
         self._loop = loop
         self._next = 0
 
-    def read(self) -> Picture | None:
-        """The next picture; None at the end.
+    def read(self) -> Pixels | None:
+        """Return the next image; None at the end.
 
         Raises:
             ConfigError: a file is no image.
@@ -84,28 +84,28 @@ class Folder:
         self._next += 1
         self.name = path.name
         data = np.frombuffer(path.read_bytes(), np.uint8)
-        picture = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None  # of nothing OpenCV makes an error
-        if picture is None:
-            raise ConfigError("source", str(path), "is no image that can be read")
-        return _as_bgr8(picture)
+        image = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None  # OpenCV raises on empty data
+        if image is None:
+            raise ConfigError("source", str(path), "is not a readable image")
+        return _as_bgr8(image)
 
     def close(self) -> None:
-        """Nothing is open between reads."""
+        """Do nothing: no file stays open between reads."""
 
 
 def open_source(
     source: str | int, size: tuple[int, int] | None, rate: float | None, *, loop: bool
 ) -> Source | None:
-    """The source that a device number or path, a video file or an image folder stands for; None: device not there.
+    """Open the source that a device number or path, a video file or an image folder names; None if no device is there.
 
     Args:
         source: number or path.
-        size: width and height that a device is asked for [px]; None: what it gives by itself.
-        rate: pictures per second that a device is asked for [Hz]; None: what it gives by itself.
-        loop: begin a file or folder again at its end.
+        size: requested width and height of a device [px]; None: the device's default.
+        rate: requested images per second of a device [Hz]; None: the device's default.
+        loop: restart a file or folder at its end.
 
     Raises:
-        ConfigError: a path that is nothing of these.
+        ConfigError: the path is none of these.
     """
     number = int(source) if str(source).isdigit() else None
     device = number is not None or str(source).startswith("/dev/")
@@ -126,14 +126,14 @@ def open_source(
     if path.is_dir():
         images = sorted((p for p in path.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES), key=_natural)
         if not images:
-            raise ConfigError("source", str(source), f"holds no image; looked for {', '.join(IMAGE_SUFFIXES)}")
+            raise ConfigError("source", str(source), f"contains no image; supported: {', '.join(IMAGE_SUFFIXES)}")
         return Folder(images, loop=loop)
     if not path.is_file():
-        raise ConfigError("source", str(source), "is no device number, /dev path, video file or image folder")
+        raise ConfigError("source", str(source), "is not a device number, /dev path, video file or image folder")
     capture = cv2.VideoCapture(str(path))
     if not capture.isOpened():
         capture.release()
-        raise ConfigError("source", str(source), "is no video that can be read")
+        raise ConfigError("source", str(source), "is not a readable video")
     return Video(capture, live=False, loop=loop)
 
 
@@ -141,24 +141,24 @@ def _natural(path: Path) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.name)]
 
 
-def _as_bgr8(picture: npt.NDArray[Any]) -> Picture:
-    if picture.ndim == 2 or picture.shape[2] == 1:
-        return np.asarray(cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR), np.uint8)
-    return np.ascontiguousarray(picture[..., :3], np.uint8)
+def _as_bgr8(image: npt.NDArray[Any]) -> Pixels:
+    if image.ndim == 2 or image.shape[2] == 1:
+        return np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), np.uint8)
+    return np.ascontiguousarray(image[..., :3], np.uint8)
 
 
-def pictures(source: str, size: tuple[int, int] | None, seconds: float) -> Iterator[tuple[str, Picture]]:
-    """Pictures of a source with their names: all of a file or folder, those of so many seconds of a device.
+def read_images(source: str, size: tuple[int, int] | None, seconds: float) -> Iterator[tuple[str, Pixels]]:
+    """Yield images of a source with their names: all of a file or folder, or those within some seconds of a device.
 
     Raises:
-        ConfigError: it is nothing that pictures can be read from.
+        ConfigError: the source cannot be read.
     """
     opened = open_source(source, size, None, loop=False)
     if opened is None:
-        raise ConfigError("SOURCE", source, "is a device that cannot be opened")
+        raise ConfigError("SOURCE", source, "cannot be opened: no such device")
     until = monotonic() + seconds
     try:
-        while (picture := opened.read()) is not None and (not opened.live or monotonic() < until):
-            yield opened.name, picture
+        while (image := opened.read()) is not None and (not opened.live or monotonic() < until):
+            yield opened.name, image
     finally:
         opened.close()

@@ -1,7 +1,7 @@
-"""One rigid camera pose and its pinhole model: the only way from pixels to the world and back.
+"""Pinhole cameras with a rigid pose: the only conversion between pixels and world, and cameras mounted on the robot.
 
-The optical frame is OpenCV's: +X to the right in the picture, +Y down, +Z forward. Pixel (0, 0) is the centre of the
-pixel in the upper left corner. There is no other mapping anywhere: a mirrored one would not be a rotation.
+The optical frame is OpenCV's: +X right in the image, +Y down, +Z forward. Pixel (0, 0) is the center of the upper left
+pixel. A mirrored image cannot be represented, since the pose must be a rotation.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ Array = npt.NDArray[np.float64]
 
 
 class CameraError(ZencellError):
-    """A camera that cannot be: a pose that is not rigid, a distortion that is not handled here."""
+    """An invalid camera: the pose is not rigid, or the distortion is not supported."""
 
 
 @dataclass(frozen=True, eq=False)
 class Pinhole:
-    """Intrinsics [px], picture size [px] and the (4, 4) pose of the optical frame in world."""
+    """Intrinsics [px], image size [px] and the (4, 4) pose of the optical frame in world."""
 
     fx: float
     fy: float
@@ -51,25 +51,25 @@ class Pinhole:
 
     @classmethod
     def from_config(cls, camera: CameraConfig) -> Pinhole:
-        """A camera of the surroundings that is fixed in world.
+        """Return a camera that is fixed in world.
 
         Raises:
-            CameraError: it is mounted on the robot; `common/perception/pinhole.py` says where it is then.
+            CameraError: it is mounted on the robot: use `MountedCamera`.
         """
         if camera.mount:
-            raise CameraError(f"{camera.frame} sits on {camera.mount}: where the camera is follows from the joints")
+            raise CameraError(f"{camera.frame} is mounted on {camera.mount}: its pose follows from the joints")
         T = transform(rpy_to_matrix(*camera.rpy), camera.position)
         return cls(camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, T)
 
     @classmethod
     def from_info(cls, info: CameraInfo, T_world_optical: Array) -> Pinhole:
-        """The camera that a camera_info message and a (4, 4) pose of its optical frame describe.
+        """Return the camera of a camera_info message, at a (4, 4) pose of its optical frame.
 
         Raises:
-            CameraError: the picture is distorted (rectify it first) or skewed.
+            CameraError: the image is distorted (rectify it first) or skewed.
         """
         if any(abs(value) > 1e-12 for value in info.d):
-            raise CameraError(f"distortion {list(info.d)} is not handled: rectify the picture first")
+            raise CameraError(f"distortion {list(info.d)} is not supported: rectify the image first")
         fx, skew, cx, s10, fy, cy, s20, s21, s22 = info.k
         if skew or s10 or s20 or s21 or s22 != 1:
             raise CameraError(f"intrinsic matrix {list(info.k)} is not of the form [fx 0 cx; 0 fy cy; 0 0 1]")
@@ -77,21 +77,21 @@ class Pinhole:
 
     @property
     def position(self) -> Array:
-        """Optical centre in world, (3,) [m]."""
+        """Optical center in world, (3,) [m]."""
         return self._position
 
     def info(self, header: Header, *, without_robot: bool = False) -> CameraInfo:
-        """The camera_info message of this camera; one that leaves the robot out of its pictures says so."""
+        """Return the camera_info message; `without_robot` declares that its images omit the robot."""
         k = [self.fx, 0.0, self.cx, 0.0, self.fy, self.cy, 0.0, 0.0, 1.0]
         return CameraInfo(header=header, height=self.height, width=self.width, d=[0.0] * 5, k=k,
                           without_robot=without_robot)
 
     def to_camera(self, points: npt.ArrayLike) -> Array:
-        """Points of world in the optical frame: (..., 3) [m]."""
+        """Transform points from world to the optical frame: (..., 3) [m]."""
         return (np.asarray(points, dtype=float) - self._position) @ self._rotation
 
     def project(self, points: npt.ArrayLike) -> Array:
-        """Pixels (u, v) of points in world: (..., 2) [px]; nan where a point is not in front of the camera."""
+        """Pixels (u, v) of points in world: (..., 2) [px]; nan for points that are not in front of the camera."""
         p = self.to_camera(points)
         z = np.where(p[..., 2] > 1e-9, p[..., 2], np.nan)
         return np.stack([self.fx * p[..., 0] / z + self.cx, self.fy * p[..., 1] / z + self.cy], axis=-1)
@@ -111,15 +111,15 @@ class Pinhole:
         return self._position, self._rotation @ (x / length, y / length, 1 / length)
 
     def on_plane(self, pixels: npt.ArrayLike, z: float) -> Array:
-        """Where the rays through pixels meet the horizontal plane at z [m]: (..., 2) [m]; nan where they do not."""
+        """Intersections of pixel rays with the horizontal plane at z [m]: (..., 2) [m]; nan without one."""
         d = self.directions(pixels)
         with np.errstate(divide="ignore", invalid="ignore"):
             t = (z - self._position[2]) / d[..., 2]
         t = np.where(np.isfinite(t) & (t > 0), t, np.nan)
         return self._position[:2] + t[..., None] * d[..., :2]
 
-    def in_picture(self, pixels: npt.ArrayLike, margin: float = 0.0) -> npt.NDArray[np.bool_]:
-        """Which pixels lie in the picture, at least `margin` [px] inside its border: (...)."""
+    def in_image(self, pixels: npt.ArrayLike, margin: float = 0.0) -> npt.NDArray[np.bool_]:
+        """Mask of pixels inside the image, at least `margin` [px] from its border: (...)."""
         p = np.asarray(pixels, dtype=float)
         u, v = p[..., 0], p[..., 1]
         low, right, bottom = margin - 0.5, self.width - 0.5 - margin, self.height - 0.5 - margin
@@ -127,24 +127,24 @@ class Pinhole:
         return inside
 
 
-# CameraCache that sit on the robot: where they are follows from its joints. They look from home."""
+# Cameras mounted on the robot: their pose follows from the joints
 
-if TYPE_CHECKING:  # a fixed camera needs none
+if TYPE_CHECKING:  # fixed cameras need no robot model
     from common.robot.model import RobotModel
 
 S = TypeVar("S", bound=Surroundings)
 
 
 def camera_in_mount(camera: CameraConfig) -> Array:
-    """(4, 4) pose of the optical frame in the link that it sits on, or in world where it has no mount."""
+    """(4, 4) pose of the optical frame in its mount link, or in world without a mount."""
     return transform(rpy_to_matrix(*camera.rpy), camera.position)
 
 
 def mount_link(camera: CameraConfig, robot: RobotModel, field: str = "world.camera") -> str:
-    """The link that a camera, which stands in a field of the cell, sits on.
+    """Return the link that carries a camera, which a field of the cell configures.
 
     Raises:
-        ConfigError: the robot has no such link; with the choices.
+        ConfigError: the robot has no such link; lists the choices.
     """
     link = robot.config.tcp_link if camera.mount == TCP else camera.mount
     if link not in robot.link_names:
@@ -154,10 +154,10 @@ def mount_link(camera: CameraConfig, robot: RobotModel, field: str = "world.came
 
 
 def mount_links(around: Surroundings, robot: RobotModel) -> dict[str, str]:
-    """By name of the camera, the link that it sits on; only those that do.
+    """Return the mount link of each mounted camera, by camera name.
 
     Raises:
-        ConfigError: the robot has no such link; with the choices.
+        ConfigError: the robot has no such link; lists the choices.
     """
     single = len(around.cameras) == 1
     return {name: mount_link(camera, robot, "world.camera" if single else f"world.cameras.{name}")
@@ -165,10 +165,10 @@ def mount_links(around: Surroundings, robot: RobotModel) -> dict[str, str]:
 
 
 class MountedCamera:
-    """One camera, fixed in world or on the robot."""
+    """A camera that is fixed in world or mounted on the robot."""
 
     def __init__(self, camera: CameraConfig, robot: RobotModel | None = None) -> None:
-        """Take the camera, and the robot where it has a mount.
+        """Take the camera, and the robot if the camera is mounted.
 
         Raises:
             ConfigError: the robot has no such link.
@@ -178,10 +178,10 @@ class MountedCamera:
         self._link = mount_link(camera, robot) if self.moves and robot is not None else ""
 
     def at(self, q: npt.ArrayLike | None = None) -> Pinhole:
-        """The camera at joint positions (dof,) [rad]; without them where the robot is at home.
+        """Return the camera at joint positions (dof,) [rad]; by default at the home pose.
 
         Raises:
-            CameraError: it has a mount, and no robot was given.
+            CameraError: it is mounted, but no robot was passed.
         """
         c = self._camera
         if self._robot is None or not self._link:
@@ -191,7 +191,7 @@ class MountedCamera:
 
 
 def cameras_at_home(world: S, robot: RobotModel) -> S:
-    """The world with cameras on the robot fixed where they are while it is at home.
+    """World with every mounted camera fixed at its pose for the robot's home pose.
 
     Raises:
         ConfigError: the robot has no link of that name.

@@ -1,8 +1,8 @@
-"""How a sphere looks: the cone of rays that touch it.
+"""Outline of a sphere in an image: the cone of tangent rays.
 
-A ray with unit direction d from the optical centre touches the sphere with centre c (relative to the optical centre)
-and radius r exactly where its distance from c, |c - (c . d) d|, is r. In the picture that is a conic, not a circle
-about the image of the centre, which is why centroids are a little off and outlines are not.
+A ray with unit direction d from the optical center touches a sphere with center c (relative to the optical center) and
+radius r exactly if its distance from c, |c - (c . d) d|, is r. The image is a conic, not a circle about the projected
+center; hence centroids are slightly biased and outlines are not.
 """
 
 from __future__ import annotations
@@ -18,24 +18,24 @@ Array = npt.NDArray[np.float64]
 
 
 def silhouettes(camera: Pinhole, centers: npt.ArrayLike, radius: float, count: int = 64) -> Array:
-    """Pixels (k, count, 2) on the outlines of spheres, all the way round [px].
+    """Return pixels (k, count, 2) around the outlines of spheres [px].
 
     Args:
         camera: the camera.
         centers: (k, 3) in world [m].
         radius: [m].
-        count: number of points of each.
+        count: points per outline.
 
     Returns:
-        nan for spheres that are not wholly in front of the optical centre.
+        nan for spheres that are not completely in front of the optical center.
     """
-    places = np.asarray(centers, dtype=float).reshape(-1, 3)
-    c = places - camera.position
+    positions = np.asarray(centers, dtype=float).reshape(-1, 3)
+    c = positions - camera.position
     distance = np.sqrt(np.einsum("ij,ij->i", c, c))[:, None]
     sine = np.clip(radius / np.maximum(distance, 1e-12), 0, 1)
     axis = c / np.maximum(distance, 1e-12)
-    # All tangent points lie on a circle in front of the centre.
-    middle = axis * distance * (1 - sine**2)
+    # All tangent points lie on a circle in front of the center.
+    ring_center = axis * distance * (1 - sine**2)
     around = radius * np.sqrt(1 - sine**2)
     x, y, z = axis.T
     o = np.zeros_like(x)
@@ -44,28 +44,28 @@ def silhouettes(camera: Pinhole, centers: npt.ArrayLike, radius: float, count: i
     fx, fy, fz = first.T
     second = np.column_stack([y * fz - z * fy, z * fx - x * fz, x * fy - y * fx])
     angle = np.linspace(0.0, 2 * math.pi, count, endpoint=False)[None, :, None]
-    ring = middle[:, None] + around[:, None] * (np.cos(angle) * first[:, None] + np.sin(angle) * second[:, None])
+    ring = ring_center[:, None] + around[:, None] * (np.cos(angle) * first[:, None] + np.sin(angle) * second[:, None])
     pixels = camera.project(camera.position + ring)
-    pixels[camera.to_camera(places)[:, 2] <= radius] = np.nan
+    pixels[camera.to_camera(positions)[:, 2] <= radius] = np.nan
     return pixels
 
 
 def silhouette(camera: Pinhole, center: npt.ArrayLike, radius: float, count: int = 64) -> Array:
-    """Pixels (count, 2) on the outline of one sphere; empty (0, 2) when it is not wholly in front of the camera."""
+    """Pixels (count, 2) on the outline of one sphere; empty (0, 2) unless it is completely in front of the camera."""
     pixels: Array = silhouettes(camera, center, radius, count)[0]
     return np.empty((0, 2)) if np.isnan(pixels).any() else pixels
 
 
 def ray_distances(directions: Array, centers: Array) -> tuple[Array, Array]:
-    """Distances of rays from the optical centre to points.
+    """Compute distances between rays from the optical center and points.
 
     Args:
         directions: (n, 3) unit vectors.
-        centers: (k, 3) relative to the optical centre [m].
+        centers: (k, 3) relative to the optical center [m].
 
     Returns:
-        (n, k) distances [m], and (n, k) how far along each ray it passes each point [m]. The gradient of a distance
-        in its centre is the unit vector (center - along * direction) / distance.
+        (n, k) distances [m], and (n, k) lengths along each ray to the closest approach [m]. The gradient of a distance
+        with respect to its center is the unit vector (center - along * direction) / distance.
     """
     along: Array = directions @ centers.T
     square = np.einsum("ij,ij->i", centers, centers) - along**2
@@ -74,6 +74,6 @@ def ray_distances(directions: Array, centers: Array) -> tuple[Array, Array]:
 
 
 def sphere_in_view(camera: Pinhole, center: npt.ArrayLike, radius: float, margin: float = 0.0) -> bool:
-    """Whether the whole silhouette of a sphere lies in the picture, at least `margin` [px] inside its border."""
+    """Whether the outline of a sphere lies in the image, at least `margin` [px] inside its border."""
     outline = silhouette(camera, center, radius, 32)
-    return len(outline) > 0 and bool(camera.in_picture(outline, margin).all())
+    return len(outline) > 0 and bool(camera.in_image(outline, margin).all())

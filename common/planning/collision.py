@@ -26,7 +26,7 @@ from common.robot.transforms import invert, pose_to_matrix
 Array = NDArray[np.float64]
 Pair = tuple[str, str]
 
-PERCEIVED = ("target", "contained", "attached")  # roles of objects that are kept `padding` away
+PERCEIVED = ("target", "contained", "attached")  # roles of objects with padding
 _CONTACT_SLACK = 1  # margin level [1 mm] within which an attached object counts as touching at the start
 _FARTHEST_HELD = 100.0  # [m] from a joint that an attached object may reach
 _DEEPER = 2e-4  # [m] more penetration than at the start: rounding, and how far a followed line may be off
@@ -60,7 +60,7 @@ class CollisionWorld:
       link reaches at the start: until the TCP is `contact_distance` away from where it was at the start. For points,
       only their padding is ignored, for attached objects, too.
     Planners and validation use the same world, so they apply the same rule. With tool constraints, positions that
-    violate them are not free either (`collides`, `edge_free`, `blends_free`); messages tell them apart.
+    violate them are not free either (`collides`, `edge_free`, `blends_free`); messages distinguish them.
     """
 
     def __init__(

@@ -29,7 +29,7 @@ from common.planning.retiming import RetimingFailed, parametrise
 from common.planning.trajectory import TooLong
 from common.robot.model import RobotModel
 from common.robot.transforms import transform
-from common.sources import monotonic
+from common.time_source import monotonic
 
 Array = NDArray[np.float64]
 Choices = tuple[Array | Region, ...]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from common.messages import PlanAttempt
 from common.planning.path import dense_path, distinct
 from common.planning.problem import Cancel, Problem, Result
-from common.sources import monotonic
+from common.time_source import monotonic
 
 Array = NDArray[np.float64]
 

@@ -43,7 +43,7 @@ from common.planning.trajectory import TimedPath, TooLong, cubics, join, require
 from common.planning.validation import Fault, validate
 from common.planning.waypoint_timing import BLENDS, limit_tool_speed, retime
 from common.robot.model import RobotModel
-from common.sources import monotonic
+from common.time_source import monotonic
 
 Array = NDArray[np.float64]
 Planners = dict[str, tuple[Plan, Parameters]]

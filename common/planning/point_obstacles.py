@@ -53,7 +53,7 @@ def downsampled(points: Array, side: float, skip: Mask | None = None) -> Array:
     """Return spheres (M, 4), centre and radius [m]: one for each cube of a grid that contains any of points (N, 3).
 
     A sphere is centred at the mean of its points and contains all of them, so no point is lost. Its radius is at least
-    half a side, because a point stands for a piece of a surface.
+    half a side, because a point represents a piece of a surface.
 
     Args:
         side: of the cubes [m].

@@ -14,7 +14,7 @@ from common.planning.collision import CollisionWorld, Pair
 from common.planning.retiming import RetimingFailed
 from common.planning.trajectory import TimedPath, TooLong
 from common.robot.model import RobotModel
-from common.sources import monotonic
+from common.time_source import monotonic
 
 Array = NDArray[np.float64]
 

@@ -1,7 +1,7 @@
 """Distances with gradients between the robot and its surroundings: at positions, and of swept links along edges.
 
 Swept hulls follow Schulman et al., "Motion planning with sequential convex optimization and convex collision checking"
-(IJRR 2014): the hull of a link at both ends of an edge stands for all that it sweeps, and a step is expected to move
+(IJRR 2014): the hull of a link at both ends of an edge approximates all that it sweeps, and a step is expected to move
 the hull's nearest point with the end whose link reaches as far. A link that turns much bulges out of the hull: the
 final check proves what is free.
 """
@@ -22,7 +22,7 @@ Indices = NDArray[np.int64]
 
 _EQUAL = 1e-3  # [m] reaches of both ends that differ by less share the gradient
 _SIDES = 16  # of the prism about a cylinder
-_POINT = 1e-5  # [m] size of the body that stands for a point: coal makes hulls of bodies only
+_POINT = 1e-5  # [m] size of the body that replaces a point: coal makes hulls of bodies only
 _HALF = 0.55  # of the distance between the ends: the path of a turning point is longer than the straight one
 _STILL = coal.Transform3s()
 

@@ -16,11 +16,11 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from common.messages.robot import MOST_POINTS
+from common.messages.robot import MAX_POINTS
 from common.planning.kernel.solvers import fastest_speeds
 from common.planning.path import SmoothPath
 from common.planning.trajectory import TimedPath, TooLong, cubics, end_accelerations, join
-from common.sources import monotonic
+from common.time_source import monotonic
 
 Array = NDArray[np.float64]
 
@@ -72,8 +72,8 @@ def parametrise(
     for _ in range(_REFINEMENTS):
         if monotonic() > deadline:
             raise TooLong("timeout", "planning ended while the path was timed")
-        if (states := len(path.lengths) + move / step) > MOST_POINTS:
-            raise TooLong("too_long", f"the path takes {states:.3g} states; a trajectory has {MOST_POINTS} at most")
+        if (states := len(path.lengths) + move / step) > MAX_POINTS:
+            raise TooLong("too_long", f"the path takes {states:.3g} states; a trajectory has {MAX_POINTS} at most")
         trajectory = _timed(path.divided(step), limit_v, limit_a, limit_b, speed)
         if _overshoot(trajectory, np.maximum(limit_a, limit_b)) <= _OVERSHOOT:
             return trajectory

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from common.messages import JointTrajectory, JointTrajectoryPoint
-from common.messages.robot import MOST_POINTS, MOST_SECONDS
+from common.messages.robot import MAX_POINTS, MAX_SECONDS
 from common.robot.model import RobotModel
 
 Array = NDArray[np.float64]
@@ -45,9 +45,9 @@ def require_sendable(trajectory: TimedPath) -> None:
     Raises:
         TooLong: too_long: it has too many states, or takes longer than any motion does.
     """
-    if (states := len(trajectory.times)) > MOST_POINTS or trajectory.duration > MOST_SECONDS:
+    if (states := len(trajectory.times)) > MAX_POINTS or trajectory.duration > MAX_SECONDS:
         size = f"the trajectory has {states} states and takes {trajectory.duration:.3g} s"
-        raise TooLong("too_long", f"{size}; the limits are {MOST_POINTS} states and {MOST_SECONDS:g} s")
+        raise TooLong("too_long", f"{size}; the limits are {MAX_POINTS} states and {MAX_SECONDS:g} s")
 
 
 def at_rest(q: Array) -> TimedPath:

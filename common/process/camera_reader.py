@@ -31,7 +31,7 @@ class CameraReader:
         if self._tf is None:
             return
         async for message in self._tf:
-            self._cameras.moving.note(message)
+            self._cameras.moving.add(message)
             self._tf_changed.set()
 
     def moves(self, frame_id: str = "") -> bool:

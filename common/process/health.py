@@ -18,8 +18,8 @@ from pathlib import Path
 
 from common.transport.credentials import ROUTER_NAME, common_name, credentials_of, secure_folder
 from common.transport.endpoint import endpoint_of
-from common.transport.keys import ROUTER, alive_key
 from common.transport.router import is_reached
+from common.transport.session import ROUTER, alive_key
 
 TIMEOUT = 1.0  # [s]
 PROC = Path("/proc")

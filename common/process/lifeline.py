@@ -22,8 +22,8 @@ import time
 from collections.abc import Callable
 from typing import NoReturn
 
-from common.transport.handoff import Doorbell
-from common.waking import Waking
+from common.time_source import WatchdogClock
+from common.transport.session import LoopNotifier
 
 log = logging.getLogger(__name__)
 
@@ -157,7 +157,7 @@ class StallTimer:
 
     def __init__(self) -> None:
         """Start as if the loop had just turned."""
-        self._awake = Waking(2 * PERIOD)
+        self._awake = WatchdogClock(2 * PERIOD)
         self._turned = True
         self._since = 0.0
 
@@ -167,7 +167,7 @@ class StallTimer:
 
     def still_for(self, now: float) -> float:
         """Return for how long the loop has not turned [s]; call it each period with the monotonic time `now` [s]."""
-        awake = self._awake.look(now)
+        awake = self._awake.advance(now)
         if self._turned:
             self._turned, self._since = False, awake
         return awake - self._since
@@ -180,7 +180,7 @@ class LoopWatchdog:
         """Start to watch; `limit()` is the longest stall that is allowed now [s], 0 for no limit."""
         self._limit = limit
         self._timer = StallTimer()
-        self._doorbell = Doorbell(loop, self._timer.turned)
+        self._doorbell = LoopNotifier(loop, self._timer.turned)
         self._stopped = threading.Event()
         threading.Thread(target=self._watch, name="loop watchdog", daemon=True).start()
 
@@ -193,7 +193,7 @@ class LoopWatchdog:
         armed = 0.0
         while not self._stopped.wait(PERIOD):
             now, limit = time.monotonic(), self._limit()
-            self._doorbell.ring()
+            self._doorbell.notify()
             still = self._timer.still_for(now)
             if limit and now - armed > 1.0 and not self._stopped.is_set():
                 armed = now

@@ -14,7 +14,7 @@ from common.messages import LogLine
 from common.process.dropping_writer import DroppingWriter, lost_lines_text
 from common.terminal import printable
 from common.transport.bus import Bus
-from common.transport.handoff import call_on_loop
+from common.transport.session import call_on_loop
 
 FLUSH_SECONDS = 0.3  # for the last lines when a process ends
 

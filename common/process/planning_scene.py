@@ -5,10 +5,10 @@ from __future__ import annotations
 import asyncio
 
 from common import topics
+from common.atomic_file import AtomicFile, Unreadable, state_folder
 from common.errors import ConfigError, Refused
-from common.kept_file import KeptFile, Unreadable, lasting_folder
 from common.messages import PlanningScene, SceneEdit, SceneEditReply
-from common.scene.added import AddedSolids, id_of
+from common.scene.added_solids import AddedSolids, added_id
 from common.transport.bus import Bus
 
 
@@ -20,7 +20,7 @@ class SceneWriter:
         self._bus, self._out = bus, bus.writer(topics.PLANNING_SCENE)
         self._perceived: PlanningScene | None = None
         self._added, self._editing = AddedSolids(), asyncio.Lock()
-        self._file: KeptFile[AddedSolids] | None = None
+        self._file: AtomicFile[AddedSolids] | None = None
         bus.serve(topics.SCENE_EDIT, self._edit)
 
     async def begin(self, perceived: PlanningScene) -> None:
@@ -29,18 +29,17 @@ class SceneWriter:
         Raises:
             ConfigError: the file cannot be read; without its solids motions could be planned through them.
         """
-        await self._bus.owned()  # until then another process of this name may still write the file
-        if not self._bus.declares_only:
-            path = lasting_folder() / f"{self._bus.cell}.{self._bus.service}.added.json"
-            self._file = KeptFile(path, AddedSolids)
-            try:
-                self._added = self._file.read()
-            except Unreadable as error:
-                raise ConfigError("planning_scene", str(path), f"cannot be read: {error.why}. It holds the solids that "
-                                  "operators added; move it away to start without them") from None
-            if self._added.ids:
-                self._bus.log.warning("solids from an earlier session: %s; `zencell scene remove` removes them",
-                                      ", ".join(self._added.ids))
+        await self._bus.acquire_keys()  # before, another process of this name may still write the file
+        path = state_folder() / f"{self._bus.cell}.{self._bus.service}.added.json"
+        self._file = AtomicFile(path, AddedSolids)
+        try:
+            self._added = self._file.read()
+        except Unreadable as error:
+            raise ConfigError("planning_scene", str(path), f"cannot be read: {error.why}. It holds the solids that "
+                              "operators added; move it away to start without them") from None
+        if self._added.ids:
+            self._bus.log.warning("solids from an earlier session: %s; `zencell scene remove` removes them",
+                                  ", ".join(self._added.ids))
         self.put(perceived)
 
     def put(self, perceived: PlanningScene) -> None:
@@ -52,7 +51,7 @@ class SceneWriter:
         async with self._editing:
             assert self._file is not None and self._perceived is not None
             perceived = [each.id for each in self._perceived.objects]
-            changed = self._added.edited(edit, perceived)
+            changed = self._added.apply(edit, perceived)
             if changed is not self._added:
                 try:
                     await asyncio.to_thread(self._file.save, changed)
@@ -61,6 +60,6 @@ class SceneWriter:
                                               "change would be lost at a restart and was not made") from None
                 self._added = changed
                 self.put(self._perceived)
-                self._bus.log.info("%s %s%s", "added" if edit.op == "add" else "removed", id_of(edit.id),
+                self._bus.log.info("%s %s%s", "added" if edit.op == "add" else "removed", added_id(edit.id),
                                    edit.owner and f", by {edit.owner}")
-            return SceneEditReply(id=id_of(edit.id), ids=self._added.ids)
+            return SceneEditReply(id=added_id(edit.id), ids=self._added.ids)

@@ -1,4 +1,4 @@
-"""Planning workers: processes that plan requests that arrive while the first planner is busy.
+"""Planning workers: processes that plan requests that arrive while the first planner is busy; and the pool of both.
 
 A worker is forked with all modules loaded, before its parent has started anything else. Until it is used it costs no
 time and 30 MB. Threads would not help: two thirds of an easy plan are Python code.
@@ -15,14 +15,17 @@ import pickle
 import signal
 import socket
 import sys
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
 from typing import cast
 
 from common.config import Motion, Pipeline, RobotConfig
 from common.errors import ZencellError
 from common.messages import PlanningScene, PlanRequest, PlanResponse
 from common.planning.pipeline import PlanningPipeline
+from common.planning.point_obstacles import PointObstacle
 from common.planning.problem import Cancel
-from common.process.environment import usable_cores
+from common.process.environment import lower_thread_priority, usable_cores
 from common.process.lifeline import die_when_orphaned
 from common.robot.model import RobotModel
 
@@ -110,6 +113,72 @@ def fork_workers(niceness: int) -> list[PlanningWorker]:
     if sys.platform != "linux":
         return []
     return [PlanningWorker(niceness) for _ in range(min(MOST, max(1, int(usable_cores()) // 2 - 1)))]
+
+
+# Plans a request on a scene, from joints [rad], with a gripper width [m] and, in a thread, obstacles of cameras.
+PlanCall = Callable[
+    [PlanRequest, PlanningScene, list[float] | None, float | None, Callable[[], list[PointObstacle]] | None],
+    Awaitable[PlanResponse],
+]
+
+
+class PlannerPool:
+    """Planners that take one request at a time; the one added last is used first."""
+
+    def __init__(self) -> None:
+        self._free: list[PlanCall] = []
+        self._available = asyncio.Semaphore(0)
+
+    def add(self, planner: PlanCall) -> None:
+        """Add a planner that is free."""
+        self._free.append(planner)
+        self._available.release()
+
+    @asynccontextmanager
+    async def planner(self) -> AsyncIterator[PlanCall]:
+        """Yield the first free planner, in the order of the requests; a worker that died is removed from the pool."""
+        await self._available.acquire()
+        planner = self._free.pop()
+        died = False
+        try:
+            yield planner
+        except WorkerDied:
+            died = True
+            raise
+        finally:
+            if not died:
+                self.add(planner)
+
+
+async def plan_in_worker(
+    worker: PlanningWorker, request: PlanRequest, scene: PlanningScene, current: list[float] | None,
+    width: float | None, obstacles: Callable[[], list[PointObstacle]] | None,
+) -> PlanResponse:
+    """Plan in a worker, which has no obstacles of cameras."""
+    assert obstacles is None
+    return await worker.plan(request, scene, current, width)
+
+
+async def plan_in_thread(
+    pipeline: PlanningPipeline, request: PlanRequest, scene: PlanningScene, current: list[float] | None,
+    width: float | None, obstacles: Callable[[], list[PointObstacle]] | None,
+) -> PlanResponse:
+    """Plan in a thread; a cancellation is passed to the pipeline and waits until it is free again."""
+    cancel = Cancel()
+
+    def plan() -> PlanResponse:
+        lower_thread_priority()
+        points = [] if obstacles is None else obstacles()
+        return pipeline.plan(request, scene, current, cancel, points, width)
+
+    planning = asyncio.create_task(asyncio.to_thread(plan))
+    try:
+        return await asyncio.shield(planning)
+    except asyncio.CancelledError:
+        cancel.set()
+        await asyncio.wait({planning})
+        planning.exception()  # retrieved, or asyncio would report it
+        raise
 
 
 def _serve(ours: socket.socket, of_parent: socket.socket, cancel: Cancel, niceness: int) -> None:

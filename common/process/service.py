@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Generic, NoReturn, Protocol, TypeVar
 
 from common import topics
-from common.clock import BOOTED_VARIABLE, EPOCH_VARIABLE, KEPT_VARIABLE, SPEED_VARIABLE, Clock
+from common.clock import BOOTED_VARIABLE, CLOCK_FOLDER_VARIABLE, EPOCH_VARIABLE, SPEED_VARIABLE, Clock
 from common.config import Cell, Parameters, Watchdogs, load_cell, service_config
 from common.config.tunables import apply, checked, describe, values_of
 from common.errors import ConfigError, UnknownName, ZencellError
@@ -23,11 +23,17 @@ from common.process.environment import release_free_memory, use_single_memory_ar
 from common.process.lifeline import Lifeline, LoopWatchdog, exit_now, exit_with_error
 from common.process.log import BusLog, log_to_stderr
 from common.transport.bus import Bus
-from common.transport.credentials import Credentials, common_name, credentials_of, secure_folder
+from common.transport.credentials import (
+    PERIOD,
+    CertificateMonitor,
+    Credentials,
+    common_name,
+    credentials_of,
+    secure_folder,
+)
 from common.transport.endpoint import endpoint_of
-from common.transport.expiry import PERIOD, EndWatch
-from common.transport.handoff import call_on_loop
-from common.transport.zenoh_session import ZenohSession, close_bounded, open_zenoh
+from common.transport.session import call_on_loop
+from common.transport.zenoh_session import ZenohSession, close_within, open_zenoh
 
 log = logging.getLogger(__name__)
 
@@ -95,7 +101,7 @@ def clock_from(speed: float | None, environ: Mapping[str, str] = os.environ) -> 
     try:
         return Clock.from_environment(variables)
     except ValueError as error:
-        names = (SPEED_VARIABLE, EPOCH_VARIABLE, BOOTED_VARIABLE, KEPT_VARIABLE)
+        names = (SPEED_VARIABLE, EPOCH_VARIABLE, BOOTED_VARIABLE, CLOCK_FOLDER_VARIABLE)
         given = {name: variables[name] for name in names if name in variables}
         raise ConfigError("speed", given, f"is not valid: {error}") from None
 
@@ -213,17 +219,17 @@ async def _live(run: Run[P], start: Start[P], lifeline: Lifeline) -> int:
             root.removeHandler(to_topic)
             await bus.close()
     finally:
-        await close_bounded(session, _CLOSE_SECONDS)
+        await close_within(session, _CLOSE_SECONDS)
 
 
 async def _watch_certificate(bus: Bus, credentials: Credentials | None) -> None:
     """Log when the certificate of the process is about to expire, in the same words as the page."""
     if credentials is None:
         return
-    watch = EndWatch(credentials.certificate.parent, frozenset([credentials.certificate.stem]))
+    watch = CertificateMonitor(credentials.certificate.parent, frozenset([credentials.certificate.stem]))
     await bus.ready_event.wait()
     while True:
-        watch.tell(bus.log)
+        watch.log_new(bus.log)
         await asyncio.sleep(PERIOD)
 
 
@@ -279,7 +285,7 @@ class StopState(Protocol):
 async def serve(run: Run[P], bus: Bus, config: P, lifeline: StopState) -> int:
     """Run the service on a bus and return the exit code of its process."""
     try:
-        bus.hold_back()
+        bus.defer_writes()
         serve_parameters(bus, config)
         await bus.run(run(bus, config))
     except (ConfigError, UnknownName) as error:  # bad input that shows only in use, such as a missing URDF
@@ -308,7 +314,7 @@ def serve_parameters(bus: Bus, config: Parameters) -> None:
             for line in lines:
                 bus.log.info("%s (by %s)", line, request.by or "unknown operator")
             bus.parameters_changed()
-            await bus.keep_parameters()
+            await bus.save_parameters()
         parameters = describe(config, bus.service, started)
         return ParameterReply(header=bus.header(), service=bus.service, parameters=parameters)
 

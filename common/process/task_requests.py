@@ -9,8 +9,8 @@ from typing import Generic, Protocol, TypeVar
 from common import messages as m
 from common import topics
 from common.process.timing import RETRY_CODES, call_until_answered
-from common.sources import wall_ns
 from common.tasks.stages import Command, View
+from common.time_source import wall_ns
 from common.transport.bus import Bus
 from common.transport.requests import Client
 

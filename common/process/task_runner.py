@@ -9,16 +9,16 @@ from typing import Any, Generic, Protocol, TypeVar
 
 from common import messages as m
 from common import topics
+from common.atomic_file import AtomicFile, Unreadable, runtime_folder
 from common.errors import Refused, RequestFailed
-from common.kept_file import KeptFile, Unreadable, standing_folder
 from common.process.task_requests import GOAL_TIMEOUT, SELF_RELEASING, AnswerHandler, TaskRequests
 from common.robot.model import RobotModel
 from common.robot.transforms import matrix_to_pose
-from common.sources import monotonic, new_id
 from common.tasks.decisions import TaskConfig
 from common.tasks.engine import Task
 from common.tasks.stages import Command, View, within_range
 from common.tasks.watchdogs import LOOK_PERIOD, LivenessWatchdog
+from common.time_source import monotonic, new_id
 from common.topics import Topic
 from common.transport.bus import Bus
 from common.transport.reader import Reader
@@ -203,7 +203,7 @@ class TaskRunner(Generic[V]):
             now.message = f"{WAITS}{trouble}"
         elif now.message.startswith(WAITS):
             now.message = ""
-        if before and before.same_but(now, "task_seconds", "header"):
+        if before and before.equals_except(now, "task_seconds", "header"):
             return
         if now.state == "ERROR" and (before is None or before.state != "ERROR"):
             self._bus.log.error("%s", now.message)
@@ -249,18 +249,16 @@ class TaskMemory:
         """Start with the memory of a new task; nothing is written yet."""
         self._bus, self._task = bus, task
         self._saved = task.memory
-        self._file: KeptFile[Any] | None = None
+        self._file: AtomicFile[Any] | None = None
         self._saving: asyncio.Task[None] | None = None
 
     async def load(self) -> None:
         """Restore the saved memory of the task, if it has one."""
-        folder = standing_folder()
+        folder = runtime_folder()
         if self._saved is None or folder is None:
             return
-        await self._bus.owned()  # until then another process of this name may still write the file
-        if self._bus.declares_only:
-            return
-        self._file = KeptFile(folder / f"{self._bus.cell}.{self._bus.service}.json", type(self._saved))
+        await self._bus.acquire_keys()  # before, another process of this name may still write the file
+        self._file = AtomicFile(folder / f"{self._bus.cell}.{self._bus.service}.json", type(self._saved))
         try:
             saved = self._file.find()
         except Unreadable as error:  # the next save replaces it
@@ -277,7 +275,7 @@ class TaskMemory:
             return
         self._saving = group.create_task(self._write(self._file), name="memory")
 
-    async def _write(self, file: KeptFile[Any]) -> None:
+    async def _write(self, file: AtomicFile[Any]) -> None:
         """Write the newest memory, retrying until it succeeds."""
         warned = False
         while True:

@@ -1,1 +1,1 @@
-"""The robot: model, kinematics, transforms."""
+"""The robot: description, kinematics, gripper, frames and meshes."""

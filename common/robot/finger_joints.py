@@ -1,4 +1,4 @@
-"""Where the joints of a gripper are when its fingers are some width apart."""
+"""Positions of a gripper's joints by its width."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from common.config import GripperConfig
 
 
 def driven_position(gripper: GripperConfig, width: float) -> float:
-    """Position of the driven joint [rad or m] at a width [m]: half of it beyond `closed`, or an angle.
+    """Return the position of the driven joint [rad or m] at a width [m]: half of it beyond `closed`, or an angle.
 
-    The pads move as the ends of the linkage's bars do, sideways by length * sin(open_angle - a).
+    The pads move with the ends of the linkage's bars, sideways by length * sin(open_angle - a).
     """
     if (jaw := gripper.jaw) is not None:
         sine = math.sin(jaw.angle) + width / jaw.radius
@@ -27,7 +27,7 @@ def driven_position(gripper: GripperConfig, width: float) -> float:
 
 
 def width_at(gripper: GripperConfig, position: float) -> float:
-    """Width [m] at a position of the driven joint [rad or m]: the inverse of `driven_position`."""
+    """Return the width [m] at a position of the driven joint [rad or m]: the inverse of `driven_position`."""
     if (jaw := gripper.jaw) is not None:
         turned = jaw.opens * (position - jaw.closed)
         return jaw.radius * (math.sin(jaw.angle + turned) - math.sin(jaw.angle))
@@ -38,7 +38,7 @@ def width_at(gripper: GripperConfig, position: float) -> float:
 
 
 def measured_width(gripper: GripperConfig | None, names: Sequence[str], positions: Sequence[float]) -> float | None:
-    """Width [m] that positions of named joints say; None where there are no fingers, or nothing is said of them."""
+    """Return the width [m] by positions of named joints; None without a gripper, or if its joints are missing."""
     if gripper is None or not gripper.joints or gripper.joints[0] not in names:
         return None
     width = width_at(gripper, positions[list(names).index(gripper.joints[0])])
@@ -46,13 +46,13 @@ def measured_width(gripper: GripperConfig | None, names: Sequence[str], position
 
 
 def finger_positions(gripper: GripperConfig, width: float) -> list[float]:
-    """Positions [rad or m] of the gripper's joints, in their order, at a width [m]."""
+    """Return positions [rad or m] of the gripper's joints, in their order, at a width [m]."""
     driven = driven_position(gripper, width)
     return [factor * driven for factor in finger_factors(gripper)]
 
 
 def finger_velocities(gripper: GripperConfig, width: float, rate: float) -> list[float]:
-    """Velocities [rad/s or m/s] of the gripper's joints at a width [m] that changes at a rate [m/s]."""
+    """Return velocities [rad/s or m/s] of the gripper's joints at a width [m] that changes at a rate [m/s]."""
     driven = rate / 2
     if gripper.linkage is not None:
         bars = gripper.linkage
@@ -64,7 +64,7 @@ def finger_velocities(gripper: GripperConfig, width: float, rate: float) -> list
 
 
 def closing_frame(gripper: GripperConfig) -> NDArray[np.float64]:
-    """(4, 4) pose in the frame of the tool centre point of one whose y axis is that along which the fingers close."""
+    """Return the (4, 4) pose, in the TCP frame, of a frame whose y axis is the closing direction of the gripper."""
     T_tcp_closing = np.eye(4)
     if gripper.closing_axis == "x":
         T_tcp_closing[:2, :2] = [[0.0, 1.0], [-1.0, 0.0]]
@@ -72,5 +72,5 @@ def closing_frame(gripper: GripperConfig) -> NDArray[np.float64]:
 
 
 def finger_factors(gripper: GripperConfig) -> list[float]:
-    """What each joint does per driven joint, which is the first of them."""
+    """Return the factor of each joint relative to the driven joint, which is the first."""
     return list(gripper.mimic) or [1.0] * len(gripper.joints)

@@ -1,4 +1,4 @@
-"""The robot as everybody computes with it: the planning group's joints, limits, forward kinematics."""
+"""The robot model: joints of the planning group, limits, forward kinematics."""
 
 from __future__ import annotations
 
@@ -11,27 +11,26 @@ from numpy.typing import ArrayLike, NDArray
 
 from common.config import RobotConfig
 from common.errors import ConfigError, UnknownName
-from common.robot.description import find_description, package_folders
-from common.robot.merging import WORLD, merged_urdf
 from common.robot.transforms import rpy_to_matrix
+from common.robot.urdf import WORLD, find_description, merged_urdf, package_folders
 
 Array = NDArray[np.float64]
 
 
 class RobotModel:
-    """Kinematics of the planning group; joints outside it are held where the robot file says.
+    """Kinematics of the planning group; joints outside it are locked at positions of the robot file.
 
-    Poses are in `world`, where the robot file puts the base. Not thread-safe: pinocchio's working data belong to the
+    Poses are in `world`; the robot file defines the base pose. Not thread-safe: pinocchio's working data belong to the
     model, so each thread loads its own.
 
     Attributes:
         config: the robot file.
-        urdf: text of the URDF with everything that is attached, rooted in a link `world`; srdf: path, or None.
+        urdf: text of the URDF with all attachments, rooted in a link `world`; srdf: path, or None.
         joint_names: joints of the group, in the order of every (dof,) array.
         lower, upper: position limits (dof,) [rad], from the robot file, else the URDF.
         velocity: limits (dof,) [rad/s], from the robot file, else the URDF.
         acceleration, jerk: limits (dof,) [rad/s^2], [rad/s^3], from the robot file.
-        link_parents: link -> the link it hangs on, for every link but the root.
+        link_parents: link -> parent link, for every link but the root.
         full_model, model: pinocchio models with all joints and with those of the group.
         tcp_frame: index of the TCP's frame in `model`.
     """
@@ -50,7 +49,7 @@ class RobotModel:
         if self.joint_names != config.joints:
             raise ConfigError("robot.joints", config.joints, f"must be in the URDF's order: {self.joint_names}")
         if self.model.nq != len(self.joint_names):
-            raise ConfigError("robot.joints", config.joints, "must have one position each, which planar ones do not")
+            raise ConfigError("robot.joints", config.joints, "must have one position each, unlike planar ones")
         self.dof: int = self.model.nq
         if config.position_limits:
             lowest, highest = np.array(config.position_limits, dtype=float).T
@@ -62,8 +61,8 @@ class RobotModel:
         self.jerk: Array = np.array(config.jerk_limits, dtype=float)
         for name, low, high, speed in zip(self.joint_names, self.lower, self.upper, self.velocity, strict=True):
             if not (np.isfinite(low) and np.isfinite(high) and low < high and 0 < speed < np.inf):
-                said = ("position_limits", [low, high]) if config.position_limits else ("urdf", config.urdf)
-                raise ConfigError(f"robot.{said[0]}", said[1], f"has no usable limits for joint {name}")
+                source = ("position_limits", [low, high]) if config.position_limits else ("urdf", config.urdf)
+                raise ConfigError(f"robot.{source[0]}", source[1], f"has no usable limits for joint {name}")
         self._links = _link_frames(self.model)
         self._full_links = _link_frames(full_model)
         names = list(full_model.names)[1:]
@@ -81,10 +80,10 @@ class RobotModel:
 
     @classmethod
     def load(cls, config: RobotConfig) -> RobotModel:
-        """The model of a robot file.
+        """Return the model of a robot file.
 
         Raises:
-            ConfigError: a description is not there or does not fit the robot file: names the field and what would do.
+            ConfigError: a description is missing or does not fit the robot file; names the field and the choices.
         """
         urdf = merged_urdf(config)
         srdf = find_description("robot.srdf", config.srdf, config.package_dirs) if config.srdf else None
@@ -96,44 +95,44 @@ class RobotModel:
 
     @property
     def reach(self) -> float:
-        """Farther [m] from the first joint than the TCP can ever be: all links stretched out, all slides drawn out."""
+        """Upper bound [m] of the TCP's distance from the first joint: all links stretched, all slides extended."""
         placements = [placement.translation for placement in self.model.jointPlacements[2:]]
         tcp = self.model.frames[self.tcp_frame].placement.translation
         slides = [max(abs(low), abs(high)) for joint, low, high in zip(
             self.model.joints[1:], self.lower, self.upper, strict=True) if joint.shortname().startswith("JointModelP")]
-        return float(sum(np.linalg.norm(way) for way in (*placements, tcp)) + sum(slides))
+        return float(sum(np.linalg.norm(offset) for offset in (*placements, tcp)) + sum(slides))
 
     @property
     def foot(self) -> Array:
-        """(3,) where the first joint is [m], world."""
+        """Position (3,) of the first joint [m], world."""
         return np.asarray(self.model.jointPlacements[1].translation)
 
     @property
     def package_folders(self) -> list[Path]:
-        """Folders in which the URDF's package:// meshes are looked up."""
+        """Folders that are searched for the URDF's package:// meshes."""
         return package_folders(self.config.package_dirs)
 
     def full_geometry(self, kind: pin.GeometryType) -> pin.GeometryModel:
-        """Collision or visual shapes of all links, placed on the joints of `full_model`.
+        """Return collision or visual shapes of all links, placed on the joints of `full_model`.
 
         Raises:
-            ConfigError: a mesh is not there or cannot be read.
+            ConfigError: a mesh is missing or cannot be read.
         """
         folders = [str(folder) for folder in self.package_folders]
         try:
             return pin.buildGeomFromUrdfString(self.full_model, self.urdf, kind, package_dirs=folders)
         except ValueError as error:
-            said = " ".join(str(error).split())
-            raise ConfigError("robot.urdf", self.config.urdf, f"has a mesh that cannot be loaded: {said}") from None
+            reason = " ".join(str(error).split())
+            raise ConfigError("robot.urdf", self.config.urdf, f"has a mesh that cannot be loaded: {reason}") from None
 
     @property
     def groups(self) -> list[str]:
-        """Names under which the planning group is known."""
+        """Names of the planning group."""
         return [self.config.group, *self.config.group_aliases]
 
     @property
     def world_frames(self) -> list[str]:
-        """Names of frames whose coordinates are those of world: the base link too, when it stands at the origin."""
+        """Names of frames that equal world: also the base link, if it is at the origin."""
         at_origin = not any(self.config.base_position) and not any(self.config.base_rpy)
         return ["", WORLD, *([self.config.base_link] if at_origin else [])]
 
@@ -143,32 +142,32 @@ class RobotModel:
         return list(self._links)
 
     def fk(self, q: ArrayLike) -> Array:
-        """(4, 4) T_world_tcp at joint positions q (dof,) [rad]."""
+        """Return (4, 4) T_world_tcp at joint positions q (dof,) [rad]."""
         pin.forwardKinematics(self.model, self.data, self._checked(q))
         return np.array(pin.updateFramePlacement(self.model, self.data, self.tcp_frame).homogeneous)
 
     def tool_speed(self, q: ArrayLike, dq: ArrayLike) -> float:
-        """[m/s] of the TCP at q (dof,) [rad] and dq (dof,) [rad/s]."""
+        """Return the speed [m/s] of the TCP at q (dof,) [rad] and dq (dof,) [rad/s]."""
         pin.forwardKinematics(self.model, self.data, self._checked(q), self._checked(dq))
         twist = pin.getFrameVelocity(self.model, self.data, self.tcp_frame, pin.ReferenceFrame.LOCAL)
         return float(np.linalg.norm(twist.linear))
 
     def jacobian(self, q: ArrayLike) -> Array:
-        """(6, dof): what joint velocities move the TCP by, linear [m/s] then angular [rad/s], along world's axes."""
+        """Return the Jacobian (6, dof) of the TCP: linear [m/s], then angular [rad/s], along world's axes."""
         axes = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
         return np.array(pin.computeFrameJacobian(self.model, self.data, self._checked(q), self.tcp_frame, axes))
 
     @property
     def base_axes(self) -> Array:
-        """(3, 3) axes of the base in world."""
+        """Axes (3, 3) of the base in world."""
         return rpy_to_matrix(*self.config.base_rpy)
 
     def link_poses(self, q: ArrayLike, others: Mapping[str, float] | None = None) -> dict[str, Array]:
-        """(4, 4) T_world_link of every link at q (dof,) [rad].
+        """Return (4, 4) T_world_link of every link at q (dof,) [rad].
 
         Args:
             q: positions of the group.
-            others: positions [rad or m] of joints outside the group, such as the fingers; else where they are locked.
+            others: positions [rad or m] of joints outside the group, such as the gripper's; default: locked.
         """
         placed, links = self._placed(q, others), self._full_links if others else self._links
         return {name: np.array(placed[i].homogeneous) for name, i in links.items()}
@@ -176,10 +175,10 @@ class RobotModel:
     def poses_in_parents(
         self, links: Sequence[str], q: ArrayLike, others: Mapping[str, float] | None = None
     ) -> list[list[float]]:
-        """For each link its pose in that of the link which it hangs on: x, y, z [m], then a quaternion x, y, z, w >= 0.
+        """Return each link's pose in its parent link: x, y, z [m], then a quaternion x, y, z, w >= 0.
 
         Args:
-            links: have parents.
+            links: not the root.
             q: positions of the group, (dof,) [rad].
             others: as in `link_poses`.
         """
@@ -192,7 +191,7 @@ class RobotModel:
         return found
 
     def _placed(self, q: ArrayLike, others: Mapping[str, float] | None) -> pin.StdVec_SE3:
-        """Where all frames are: of the group's model, or with `others` of the full one."""
+        """Return the placements of all frames: of the group's model, or with `others` of the full one."""
         checked = self._checked(q)
         if not others:
             pin.framesForwardKinematics(self.model, self.data, checked)
@@ -206,7 +205,7 @@ class RobotModel:
         return self._full_data.oMf
 
     def named(self, name: str) -> Array:
-        """Joint positions (dof,) [rad] of a named pose of the robot file.
+        """Return joint positions (dof,) [rad] of a named pose of the robot file.
 
         Raises:
             UnknownName: with the choices.
@@ -216,12 +215,12 @@ class RobotModel:
         return np.array(self.config.named_poses[name], dtype=float)
 
     def within_limits(self, q: ArrayLike, tolerance: float = 1e-6) -> bool:
-        """Whether all positions are within the joints' limits, give or take the tolerance [rad]."""
+        """Return whether all positions are within the joints' limits, up to the tolerance [rad]."""
         checked = self._checked(q)
         return bool(np.all(checked >= self.lower - tolerance) and np.all(checked <= self.upper + tolerance))
 
     def order(self, names: Sequence[str], values: Sequence[float]) -> Array | None:
-        """Values of the group's joints (dof,) picked from named ones; None when one is missing."""
+        """Return values of the group's joints (dof,) from named ones; None if one is missing."""
         found = dict(zip(names, values, strict=True))
         try:
             return np.array([found[name] for name in self.joint_names], dtype=float)
@@ -236,7 +235,7 @@ class RobotModel:
 
 
 def _locked(config: RobotConfig, model: pin.Model) -> tuple[list[int], Array]:
-    """Indices of the joints outside the group, and a full configuration that holds them where the file says."""
+    """Return indices of the joints outside the group, and a full configuration that locks them as in the file."""
     names = list(model.names)[1:]
     for name in [*config.joints, *config.locked_joints]:
         if name not in names:
@@ -247,7 +246,7 @@ def _locked(config: RobotConfig, model: pin.Model) -> tuple[list[int], Array]:
         if name in config.joints:
             continue
         if name not in config.locked_joints:
-            raise ConfigError("robot.locked_joints", name, "must be given: it is in the URDF but not in the group")
+            raise ConfigError("robot.locked_joints", name, "is missing: the joint is in the URDF but not in the group")
         index = model.getJointId(name)
         reference[model.joints[index].idx_q] = config.locked_joints[name]
         locked.append(index)
@@ -255,7 +254,7 @@ def _locked(config: RobotConfig, model: pin.Model) -> tuple[list[int], Array]:
 
 
 def _link_frames(model: pin.Model) -> dict[str, int]:
-    """Index of the frame of each link; `world` is none of the robot's."""
+    """Return the frame index of each link of the robot, without `world`."""
     return {f.name: i for i, f in enumerate(model.frames) if f.type == pin.FrameType.BODY and f.name != WORLD}
 
 

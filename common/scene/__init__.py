@@ -1,1 +1,1 @@
-"""The planning scene: what is fixed, and where an arm can take things from."""
+"""The planning scene: fixed and added solids, and the workspace in which an arm can grasp."""

@@ -1,25 +1,33 @@
-"""Solids that are known beforehand: fixtures, and containers as a floor and four walls each."""
+"""Solids of the configuration, fixtures and containers; and the slots of equal spheres in a container."""
 
 from __future__ import annotations
 
+from collections.abc import Collection, Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+
 from common import messages as m
 from common.config import Container, Rgb, Surroundings
+from common.perception.pinhole import Pinhole
 from common.robot.transforms import matrix_to_pose, rpy_to_matrix, transform
+
+Array = NDArray[np.float64]
 
 
 def color_of(rgb: Rgb) -> m.Color:
-    """An opaque colour."""
+    """Return an opaque colour."""
     return m.Color(r=rgb[0], g=rgb[1], b=rgb[2])
 
 
 def fixed_objects(around: Surroundings) -> list[m.CollisionObject]:
-    """All solids that never move, poses in world."""
+    """Return all solids that never move, poses in world."""
     panels = [panel for box in around.containers.values() for panel in container_panels(box, around.table_height)]
     return fixture_objects(around) + panels
 
 
 def fixture_objects(around: Surroundings) -> list[m.CollisionObject]:
-    """The fixtures, without containers: a cell that fills none has none."""
+    """Return the fixtures without containers, for cells that fill none."""
     return [
         m.CollisionObject(
             id=f.id, role="fixture", shape=f.shape, dimensions=list(f.dimensions), color=color_of(f.color),
@@ -30,7 +38,7 @@ def fixture_objects(around: Surroundings) -> list[m.CollisionObject]:
 
 
 def container_panels(box: Container, table_height: float) -> list[m.CollisionObject]:
-    """Floor and four walls of the container, standing on the table at `table_height` [m]."""
+    """Return floor and four walls of a container on the table at `table_height` [m]."""
     inner = box.half_side - box.wall_thickness / 2
     side = 2 * box.half_side
     wall_z, floor_z = table_height + box.wall_height / 2, table_height + box.floor_thickness / 2
@@ -48,3 +56,73 @@ def container_panels(box: Container, table_height: float) -> list[m.CollisionObj
         )
         for name, (at, size) in panels.items()
     ]
+
+
+def slot_positions(box: Container, radius: float, table_height: float) -> Array:
+    """Return centres (layers, 4, 3) [m], world, of the spheres that fill the container: 2 x 2 in each layer.
+
+    Each layer is straight above the one below it.
+    """
+    d = box.slot_offset
+    corners = [(-d, -d), (-d, d), (d, -d), (d, d)]
+    lowest = table_height + box.floor_thickness + radius
+    return np.array([
+        [(box.x + dx, box.y + dy, lowest + 2 * radius * layer) for dx, dy in corners] for layer in range(box.layers)
+    ])
+
+
+def column_at(box: Container, place: tuple[float, float]) -> tuple[float, float]:
+    """Return (x, y) of the column of slots nearest to a position [m], world."""
+    d = box.slot_offset
+    return box.x + (d if place[0] > box.x else -d), box.y + (d if place[1] > box.y else -d)
+
+
+def low_columns(box: Container, places: Iterable[tuple[float, float, float]], same: float) -> list[tuple[float, float]]:
+    """Return (x, y) of the lowest columns of slots, which may be all of them [m], world.
+
+    Args:
+        box: the container.
+        places: centres of what lies in it or will soon [m], world; each belongs to the nearest column.
+        same: columns whose highest centres differ by less count as equally high [m].
+    """
+    d = box.slot_offset
+    heights = {(box.x + dx, box.y + dy): -np.inf for dx in (-d, d) for dy in (-d, d)}
+    for x, y, z in places:
+        if max(abs(x - box.x), abs(y - box.y)) <= box.half_side:
+            column = column_at(box, (x, y))
+            heights[column] = max(heights[column], z)
+    least = min(heights.values())
+    return [column for column, height in heights.items() if height == least or height - least < same]
+
+
+def occupied_slots(
+    pixels: Iterable[tuple[float, float]], camera: Pinhole, slots: Array, radius: float, free: Collection[int] = ()
+) -> tuple[set[int], set[int]]:
+    """Return the indices of slots with a sphere that is seen, and of slots with an occluded one.
+
+    Each seen sphere belongs to the slot whose centre is imaged nearest to it, the nearest pairs first, one to one.
+    Below a seen sphere there are those that carry it, though they are occluded; but none in a slot that is known to be
+    free: a sphere above it hangs or falls.
+
+    Args:
+        pixels: (u, v) of the spheres that are seen inside the container.
+        camera: with its pose in world.
+        slots: (n, 3) [m], world, in the order of `slot_positions`.
+        radius: of a sphere [m].
+        free: slots that contain a sphere only if it is seen.
+    """
+    images = camera.project(slots)
+    seen = np.array(list(pixels)).reshape(-1, 2)
+    reach = camera.fx * radius / float(np.min(camera.to_camera(slots)[:, 2]))
+    away = images[:, None] - seen
+    distances = np.hypot(away[..., 0], away[..., 1])
+    near = np.argwhere(distances <= reach).tolist()
+    taken: set[int] = set()
+    matched: set[int] = set()
+    for slot, number in sorted(near, key=lambda pair: distances[pair[0], pair[1]]):
+        if slot in taken or number in matched:
+            continue
+        taken.add(slot)
+        matched.add(number)
+    carriers = {slot - 4 * below for slot in taken for below in range(1, slot // 4 + 1)}
+    return taken, carriers - taken - set(free)

@@ -1,11 +1,11 @@
-"""Where the arm can take things from: bounds of the workspace, the container, and the chain of poses of a grasp."""
+"""Where the arm can grasp objects: bounds of the workspace, and the chain of poses of a grasp."""
 
 from __future__ import annotations
 
 import math
 import threading
 from collections import OrderedDict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -22,13 +22,13 @@ Array = npt.NDArray[np.float64]
 INSIDE_CONTAINER = "inside the container"
 PARTLY_OUT_OF_VIEW = "partly out of view"
 
-# Where there is a solution it is found within 12 steps from home, and within 4 from two centimetres away.
+# IK iterations: solutions are found within 12 from home, and within 4 from two centimetres away.
 _FROM_HOME = 16
 _FROM_NEAR = 8
 
 
 class WorkspaceBounds(Parameters):
-    """A cylindrical shell about the robot's base axis, and the effort to find a chain of poses within it."""
+    """A cylindrical shell about the robot's base axis, and the resolution of the reach test within it."""
 
     min_height: Tunable[float] = Field(-0.05, ge=-5, le=5, description="lowest z of an object [m]")
     max_height: Tunable[float] = Field(0.98, ge=-5, le=5, description="highest z of an object [m]")
@@ -39,10 +39,10 @@ class WorkspaceBounds(Parameters):
     singularity_radius: Tunable[float] = Field(
         0.08, ge=0, le=5, description="column about the base axis in which the wrist axes line up [m]"
     )
-    yaw_count: Tunable[int] = Field(8, ge=1, le=36, description="hand orientations tried, spread over half a turn")
-    line_step: Tunable[float] = Field(0.02, gt=0, le=0.2, description="between poses checked along straight lines [m]")
+    yaw_count: Tunable[int] = Field(8, ge=1, le=36, description="gripper orientations tried, spread over half a turn")
+    line_step: Tunable[float] = Field(0.02, gt=0, le=0.2, description="step of checks along straight lines [m]")
     max_joint_step: Tunable[float] = Field(
-        0.5, gt=0, le=3.2, description="a joint that moves further from one pose to the next has changed branch [rad]"
+        0.5, gt=0, le=3.2, description="a joint that moves farther between two poses has changed branch [rad]"
     )
 
     @model_validator(mode="after")
@@ -53,23 +53,23 @@ class WorkspaceBounds(Parameters):
         return self
 
 
-def bounds_told(told: Mapping[str, Mapping[str, Any]]) -> WorkspaceBounds:
-    """The bounds that the services of a cell are told, whichever of them judges by such.
+def configured_bounds(services: Mapping[str, Mapping[str, Any]]) -> WorkspaceBounds:
+    """Return the workspace bounds of a cell: those of the first service that has such parameters.
 
     Args:
-        told: parameters by service.
+        services: parameters by service.
 
     Raises:
-        ConfigError: names the parameter that does not fit.
+        ConfigError: names the invalid parameter.
     """
-    for service, parameters in told.items():
-        if given := {name: value for name, value in parameters.items() if name in WorkspaceBounds.model_fields}:
-            return check(WorkspaceBounds, given, f"services.{service}")
+    for service, parameters in services.items():
+        if values := {name: value for name, value in parameters.items() if name in WorkspaceBounds.model_fields}:
+            return check(WorkspaceBounds, values, f"services.{service}")
     return WorkspaceBounds()
 
 
-def outside_reason(bounds: WorkspaceBounds, position: Sequence[float]) -> str:
-    """Why a place (x, y, z) [m] in world is out of bounds, with the value and the bound; empty when it is within.
+def out_of_bounds_reason(bounds: WorkspaceBounds, position: Sequence[float]) -> str:
+    """Return why a position (x, y, z) [m], world, is out of bounds, with value and bound; empty if it is within.
 
     The singularity column comes first: the least radius would hide it.
     """
@@ -88,13 +88,13 @@ def outside_reason(bounds: WorkspaceBounds, position: Sequence[float]) -> str:
     return ""
 
 
-def chain_reason(
+def grasp_chain_failure(
     robot: RobotModel, position: Sequence[float], grasp: Grasp, bounds: WorkspaceBounds, *, explained: bool = True
 ) -> str:
-    """Which stage of a grasp has no solution at a place (x, y, z) [m], for any yaw; empty when one yaw has them all.
+    """Return the stage of a grasp at (x, y, z) [m] that has no solution for any yaw; empty if one yaw has them all.
 
     The stages: pre-grasp above it, the straight line down, the grasp, the straight lift; tool down, from home. For an
-    arm that cannot choose yaw and tilt it is looked at length for what it misses them by, unless it is not `explained`.
+    arm that cannot choose yaw and tilt, `explained` adds what it misses them by, after a long search.
     """
     furthest, worst = -1, ""
     for yaw in yaw_candidates(bounds.yaw_count) if controls_full_pose(robot) else (0.0,):
@@ -112,7 +112,7 @@ def chain_reason(
     return f"{worst}: {explain_region_unreachable(robot, region, robot.named('home'))}"
 
 
-def reach_reason(
+def unreachable_reason(
     robot: RobotModel,
     position: Sequence[float],
     grasp: Grasp | None = None,
@@ -120,14 +120,14 @@ def reach_reason(
     *,
     explained: bool = True,
 ) -> str:
-    """Why the arm cannot take an object whose centre is at (x, y, z) [m] in world; empty when it can."""
+    """Return why the arm cannot grasp an object centred at (x, y, z) [m], world; empty if it can."""
     limits = bounds or WorkspaceBounds()
-    outside = outside_reason(limits, position)
-    return outside or chain_reason(robot, position, grasp or Grasp(), limits, explained=explained)
+    outside = out_of_bounds_reason(limits, position)
+    return outside or grasp_chain_failure(robot, position, grasp or Grasp(), limits, explained=explained)
 
 
 class ReachCache:
-    """Answers of `reach_reason` by place: inverse kinematics only where nothing was asked before."""
+    """Caches `unreachable_reason` by position: computes inverse kinematics only once for each cell of a grid."""
 
     def __init__(
         self,
@@ -137,47 +137,50 @@ class ReachCache:
         *,
         cell: float = 0.005,
         size: int = 20_000,
+        compute: Callable[[RobotModel, Sequence[float], Grasp, WorkspaceBounds], str] = grasp_chain_failure,
     ) -> None:
         """Start empty.
 
         Args:
-            robot: not to be used by another thread while `reason` runs; `known` may be called from any.
+            robot: must not be used by another thread while `reason` runs; `known` may be called from any.
             grasp: heights of the stages.
-            bounds: of the workspace; they may change meanwhile.
-            cell: places in the same cube of this side share their answer [m].
-            size: places that are remembered; the longest unused go first.
+            bounds: of the workspace; they may change later.
+            cell: positions in the same cube of this side share their answer [m].
+            size: cached positions; the least recently used are dropped first.
+            compute: the reason of a position within bounds.
         """
         self._robot = robot
         self._grasp = grasp or Grasp()
         self._bounds = bounds or WorkspaceBounds()
         self._cell = cell
         self._size = size
+        self._compute = compute
         self._lock = threading.Lock()
         self._known: OrderedDict[tuple[int, int, int], str] = OrderedDict()
-        self._effort = _effort(self._bounds)  # with which they were found
+        self._resolution = _resolution(self._bounds)  # of the cached answers
 
     def known(self, position: Sequence[float]) -> str | None:
-        """The reason at a place without any inverse kinematics; None when that would be needed."""
-        reason = outside_reason(self._bounds, position)
+        """Return the reason at a position if no inverse kinematics is needed, else None."""
+        reason = out_of_bounds_reason(self._bounds, position)
         if reason:
             return reason
         key = self._key(position)
         with self._lock:
-            if self._effort != _effort(self._bounds):
+            if self._resolution != _resolution(self._bounds):
                 self._known.clear()
-                self._effort = _effort(self._bounds)
+                self._resolution = _resolution(self._bounds)
             if key in self._known:
                 self._known.move_to_end(key)
             return self._known.get(key)
 
     def reason(self, position: Sequence[float]) -> str:
-        """As `reach_reason`; the chain is computed for the place itself, the first that is asked for in its cell."""
-        bounds = self._bounds.model_copy()  # on the loop they may change while this thread computes
+        """Return `unreachable_reason`; of each cell the first requested position is computed."""
+        bounds = self._bounds.model_copy()  # the event loop may change them while this thread computes
         known = self.known(position)
         if known is None:
-            known = chain_reason(self._robot, position, self._grasp, bounds)
+            known = self._compute(self._robot, position, self._grasp, bounds)
             with self._lock:
-                if self._effort == _effort(bounds):
+                if self._resolution == _resolution(bounds):
                     self._known[self._key(position)] = known
                 if len(self._known) > self._size:
                     self._known.popitem(last=False)
@@ -188,29 +191,29 @@ class ReachCache:
         return x, y, z
 
 
-def _effort(bounds: WorkspaceBounds) -> tuple[float, ...]:
-    """What the answer of `chain_reason` depends on, besides the place."""
+def _resolution(bounds: WorkspaceBounds) -> tuple[float, ...]:
+    """Return what the answer of `grasp_chain_failure` depends on, besides the position."""
     return bounds.yaw_count, bounds.line_step, bounds.max_joint_step
 
 
 def yaw_candidates(count: int) -> list[float]:
-    """Yaws [rad] in (-pi/2, pi/2], from the smallest turn to the largest; a parallel gripper repeats after pi."""
+    """Return yaws [rad] in (-pi/2, pi/2], the smallest turn first; a parallel gripper repeats after pi."""
     return [k * math.pi / count for k in sorted(range(-((count - 1) // 2), count // 2 + 1), key=lambda k: (abs(k), -k))]
 
 
 def _chain(
     robot: RobotModel, position: Sequence[float], yaw: float, grasp: Grasp, bounds: WorkspaceBounds
 ) -> tuple[int, str]:
-    """How far the chain goes with one yaw, and why it ends there; an empty reason for a whole chain.
+    """Return how far the chain goes with one yaw, and why it ends there; an empty reason for a complete chain.
 
-    The arm has a joint more than the pose needs, and a planner may come to the pre-grasp in another posture than the
-    one found from home. So the line must be there twice: downwards from the pre-grasp, upwards from the grasp.
+    The arm has one joint more than the pose needs, and a planner may reach the pre-grasp in another posture than the
+    one found from home. So the line must exist twice: downwards from the pre-grasp, upwards from the grasp.
     """
     x, y, z = position
     low = grasp.height(z)
     above, top = low + grasp.approach_clearance, low + grasp.lift_height
     tilt = grasp.tilt(robot.dof)
-    turned = f"with any of {bounds.yaw_count} hand orientations" if controls_full_pose(robot) else "at any yaw"
+    turned = f"with any of {bounds.yaw_count} gripper orientations" if controls_full_pose(robot) else "at any yaw"
     home = robot.named("home")
     q = solve_tool_down_ik(robot, (x, y, above), yaw, home, tilt=tilt, iterations=_FROM_HOME)
     if q is None:
@@ -232,7 +235,7 @@ def _chain(
 
 
 def _line(start: float, end: float, step: float) -> list[float]:
-    """Heights from start, which is left out, to end [m], evenly spaced, no further apart than step."""
+    """Return heights from start (excluded) to end [m], evenly spaced, at most one step apart."""
     count = max(1, math.ceil(abs(end - start) / step - 1e-9))
     return [start + (end - start) * k / count for k in range(1, count + 1)]
 
@@ -240,7 +243,7 @@ def _line(start: float, end: float, step: float) -> list[float]:
 def _next(
     robot: RobotModel, place: tuple[float, float, float], yaw: float, tilt: float, q: Array, bounds: WorkspaceBounds
 ) -> Array | None:
-    """Joint positions of the next pose of a line, near the last ones; None when there are none."""
+    """Return joint positions of the next pose of a line near the last ones, or None."""
     found = solve_tool_down_ik(robot, place, yaw, q, tilt=tilt, iterations=_FROM_NEAR, upright=False)
     if found is None or float(np.abs(found - q).max()) > bounds.max_joint_step:
         return None

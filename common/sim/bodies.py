@@ -1,4 +1,4 @@
-"""What there is in the kinematic world, and what is to be said about each body and kept of it over a restart."""
+"""Bodies of the kinematic world: state, message and snapshot of each."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from common.messages import WorldObject
 from common.robot.transforms import matrix_to_quaternion, quaternion_to_matrix, transform
-from common.sim.footprints import apart, convex_parts, parts_meet
+from common.sim.footprints import boxes_disjoint, convex_parts, parts_meet
 from common.sim.interface import StandingObject
 from common.sim.objects import Solid, object_message
 from common.sim.table import Slot
@@ -23,7 +23,7 @@ State = Literal["table", "held", "falling", "contained", "elsewhere"]
 
 @dataclass(frozen=True)
 class Rest:
-    """Where a body lies: its pose (4, 4) in world, and the container and slot if it lies in one."""
+    """Rest pose of a body (4, 4) in world, and the container and slot that hold it."""
 
     T: Array
     state: State = "table"
@@ -33,7 +33,7 @@ class Rest:
 
 @dataclass(eq=False)
 class Body:
-    """A solid and what is done to it. Held: `grip` is its pose in the TCP frame. Falling: it is to lie at `rest`."""
+    """A solid and its state. Held: `grip` is its pose in the TCP frame. Falling: it comes to rest at `rest`."""
 
     name: str
     solid: Solid
@@ -43,103 +43,103 @@ class Body:
     container: str = ""
     slot: Slot | None = None
     grip: Array | None = None
-    width: float = 0.0  # between the fingers that hold it [m]
-    dropped: float = 0.0  # height at which it began to fall [m]
-    since: float = 0.0  # when [s]
+    width: float = 0.0  # of the fingers that hold it [m]
+    drop_height: float = 0.0  # where the fall started [m]
+    drop_time: float = 0.0  # when the fall started [s]
     rest: Rest | None = None
-    added: bool = False  # by a person
-    like: str = ""  # the object of the first layout whose shape it has
-    told: WorldObject | None = None  # the message about it, while it is as it was
-    kept: StandingObject | None = None  # the same of how it stands
+    added: bool = False  # by an operator
+    like: str = ""  # id of the object of the initial layout whose shape it shares
+    _message: WorldObject | None = None  # cached until the body changes
+    _snapshot: StandingObject | None = None  # cached until the body changes
 
-    def lie(self, rest: Rest) -> None:
-        """Be at rest there."""
+    def rest_at(self, rest: Rest) -> None:
+        """Put the body at rest."""
         self.T, self.state, self.container, self.slot = rest.T, rest.state, rest.container, rest.slot
         self.rest, self.grip = None, None
         self.changed()
 
     def changed(self) -> None:
-        """Forget what was said about it: it is not as it was."""
-        self.told = self.kept = None
+        """Invalidate the cached message and snapshot."""
+        self._message = self._snapshot = None
 
     @property
-    def lying(self) -> Array:
-        """Its pose (4, 4), or that to which it falls."""
+    def rest_pose(self) -> Array:
+        """Its pose (4, 4), or its future rest pose while it falls."""
         return self.T if self.rest is None else self.rest.T
 
     @property
     def slot_taken(self) -> tuple[str, Slot] | None:
-        """The container and slot in which it lies or will lie."""
+        """Container and slot that it occupies or will occupy."""
         return None if self.slot_in is None else (self.container_taken, self.slot_in)
 
     @property
     def bottom(self) -> float:
-        """Height of its lowest point where it lies or will lie [m]."""
-        return float(self.lying[2, 3]) + self.solid.lowest(self.lying[:3, :3])
+        """Height of its lowest point at rest [m]."""
+        return float(self.rest_pose[2, 3]) + self.solid.lowest(self.rest_pose[:3, :3])
 
     def message(self) -> WorldObject:
-        """What there is to say about it."""
-        if self.told is None:
-            self.told = object_message(self.name, self.solid, self.T, self.color, state=self.state,
+        """Message that describes the body."""
+        if self._message is None:
+            self._message = object_message(self.name, self.solid, self.T, self.color, state=self.state,
                                    container=self.container)
-        return self.told
+        return self._message
 
     @property
     def container_taken(self) -> str:
-        """The container in which it lies or will lie, or an empty string."""
+        """Container that holds it or will hold it, or an empty string."""
         return self.container if self.rest is None else self.rest.container
 
     @property
     def slot_in(self) -> Slot | None:
-        """The slot in which it lies or will lie."""
+        """Slot that it occupies or will occupy."""
         return self.slot if self.rest is None else self.rest.slot
 
     def block(self) -> Block:
-        """What others can lie on."""
-        T = self.lying
+        """Vertical extrusion that obstructs and supports other bodies."""
+        T = self.rest_pose
         low, high = (float(T[2, 3]) + end for end in (self.solid.lowest(T[:3, :3]), self.solid.highest(T[:3, :3])))
         outline = self.solid.footprint(T[:3, :3]) + T[:2, 3]
         return Block(self.name, outline, low, high, flat=self.solid.shape != "sphere")
 
     def standing(self) -> StandingObject:
-        """All of it, for `restored`."""
-        if self.kept is None:
+        """Complete state, for `restored`."""
+        if self._snapshot is None:
             rest = self.rest
-            self.kept = StandingObject(
+            self._snapshot = StandingObject(
                 pose=_numbers(self.T), like=self.like, made=self.message() if self.added and not self.like else None,
                 details={
-                    "state": self.state, "container": self.container, "slot": self.slot, "dropped": self.dropped,
-                    "since": self.since, "width": self.width, "added": self.added,
+                    "state": self.state, "container": self.container, "slot": self.slot, "dropped": self.drop_height,
+                    "since": self.drop_time, "width": self.width, "added": self.added,
                     "grip": None if self.grip is None else _numbers(self.grip),
                     "rest": None if rest is None else [_numbers(rest.T), rest.state, rest.container, rest.slot],
                 },
             )
-        return self.kept
+        return self._snapshot
 
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """Something that is in the way or carries: its outline (N, 2) [m] and between which heights [m] it is."""
+    """Vertical extrusion of an outline (N, 2) [m] between two heights [m]; obstructs and may support bodies."""
 
     id: str
     outline: Array
     low: float
     high: float
-    flat: bool  # its top carries things
+    flat: bool  # its top supports bodies
 
     @cached_property
     def parts(self) -> Array:
-        """Its outline in convex parts (n, K, 2) [m]."""
+        """Convex parts of the outline (n, K, 2) [m]."""
         return convex_parts(self.outline)
 
     def reaches(self, outline: Array, parts: Array | None = None) -> bool:
-        """Whether it covers some of an area seen from above, of which convex parts (m, N, 2) [m] may be given."""
-        return not apart(outline, self.outline) and parts_meet(
+        """Whether it overlaps an area seen from above; `parts` are convex parts (m, N, 2) [m] of the area, if known."""
+        return not boxes_disjoint(outline, self.outline) and parts_meet(
             convex_parts(outline) if parts is None else parts, self.parts)
 
 
 def restored(name: str, kept: StandingObject, solid: Solid, color: tuple[float, float, float]) -> Body:
-    """A body as it stood."""
+    """Restore a body from its snapshot."""
     d: dict[str, Any] = kept.details
     body = Body(
         name, solid, color, _matrix(kept.pose), d["state"], d["container"], _slot(d["slot"]),

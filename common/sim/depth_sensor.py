@@ -1,16 +1,16 @@
-"""What a structured light or stereo camera measures of depth, with what it cannot see and how wrong it is.
+"""Error model of structured light and stereo depth cameras.
 
-Both find how far a pattern is shifted between two places a baseline b apart, the disparity d = f b / z [px]:
+Both measure the shift of a pattern between two viewpoints a baseline b apart, the disparity d = f b / z [px]:
 
-- what they measure comes in steps of disparity, and so in steps of z^2 / (f b) in depth. With the Kinect's f = 580 px,
-  b = 75 mm and steps of an eighth of a pixel that is 2.9 mm at 1 m and grows with z^2, as measured by Khoshelham and
-  Elberink, "Accuracy and Resolution of Kinect Depth Data for Indoor Mapping Applications", Sensors 12(2), 2012, who
-  also derive the random error from that of the disparity: sigma_z = z^2 / (f b) sigma_d;
-- edges are not where they are seen: by Nguyen, Izadi and Lovell, "Modeling Kinect Sensor Noise for Improved 3D
-  Reconstruction and Tracking", 3DIMPVT 2012, a pixel's depth is that of one some 0.8 px aside, and surfaces seen at a
-  small angle are more noisy, 60 degrees off and beyond ever more, until nothing is measured;
-- what the projector (or the second camera) does not see has no depth: a shadow beside whatever stands before something
-  else, on the side away from the projector.
+- Disparity is quantized, so depth is quantized in steps of z^2 / (f b). With the Kinect's f = 580 px, b = 75 mm and
+  steps of 1/8 px that is 2.9 mm at 1 m and grows with z^2, as measured by Khoshelham and Elberink, "Accuracy and
+  Resolution of Kinect Depth Data for Indoor Mapping Applications", Sensors 12(2), 2012. They also derive the random
+  error from that of the disparity: sigma_z = z^2 / (f b) sigma_d.
+- Edges jitter: a pixel reports the depth of another about 0.8 px away. Noise grows with the angle of the surface from
+  60 degrees on, until nothing is measured. Nguyen, Izadi and Lovell, "Modeling Kinect Sensor Noise for Improved 3D
+  Reconstruction and Tracking", 3DIMPVT 2012.
+- Points that the projector (or second camera) does not see have no depth: foreground objects cast a shadow on the side
+  away from the projector.
 """
 
 from __future__ import annotations
@@ -25,37 +25,37 @@ from common.perception.pinhole import Pinhole
 Array = npt.NDArray[np.float64]
 Depth = npt.NDArray[np.float32]
 
-HIDDEN = 1.0  # [px] of disparity by which something must be nearer to keep the light from what lies behind it
-STEEP = 60.0  # [deg] from which on noise grows with the angle, after Nguyen et al.
+SHADOW_STEP = 1.0  # [px] of disparity between a surface and the foreground that shadows it
+STEEP = 60.0  # [deg] above which noise grows with the angle, after Nguyen et al.
 
 
 class DepthSensorParameters(Parameters):
-    """How depth is measured. With a baseline of 0 it is measured as it is."""
+    """Depth error model; a baseline of 0 disables it."""
 
     baseline: Tunable[float] = Field(
-        0.0, ge=-1, le=1, description="from the camera to its projector or second lens, along the picture's x: to the "
-                                      "right, or to the left where negative, such as 0.075; 0: depth as it is [m]"
+        0.0, ge=-1, le=1, description="offset of the projector or second lens along the image x axis, such as 0.075; "
+                                      "negative: to the left; 0: exact depth [m]"
     )
-    disparity_step: Tunable[float] = Field(0.125, ge=0, le=1, description="with a baseline: what it resolves [px]")
+    disparity_step: Tunable[float] = Field(0.125, ge=0, le=1, description="with a baseline: resolution [px]")
     disparity_noise: Tunable[float] = Field(0.1, ge=0, le=2, description="with a baseline: standard deviation [px]")
     edge_noise: Tunable[float] = Field(
-        0.8, ge=0, le=5, description="with a baseline: standard deviation sideways [px]"
+        0.8, ge=0, le=5, description="with a baseline: standard deviation of edge positions [px]"
     )
     steepest: Tunable[float] = Field(
-        82.0, ge=10, le=90, description="with a baseline: angle of surfaces that have a depth [deg]"
+        82.0, ge=10, le=90, description="with a baseline: largest angle of incidence that is measured [deg]"
     )
 
 
 def simulate_depth(
     depth: Depth, camera: Pinhole, config: DepthSensorParameters, rng: np.random.Generator
 ) -> Depth:
-    """The depth image (height, width) [m] that such a camera gives of a true one; NaN where it measures nothing.
+    """Return the measured depth image (height, width) [m] of a true one; NaN where nothing is measured.
 
     Args:
-        depth: along the optical axis [m]; NaN or inf where there is nothing.
-        camera: its intrinsics.
-        config: what kind of camera it is.
-        rng: where noise comes from.
+        depth: true depth along the optical axis [m]; NaN or inf for background.
+        camera: intrinsics.
+        config: error model.
+        rng: noise source.
     """
     baseline, step, noise, edge_noise, steepest = (
         config.baseline, config.disparity_step, config.disparity_noise, config.edge_noise, config.steepest)
@@ -64,24 +64,24 @@ def simulate_depth(
     reach = camera.fx * abs(baseline)  # [px m]: disparity is that by depth
     with np.errstate(divide="ignore", invalid="ignore"):
         disparity = np.where(np.isfinite(depth) & (depth > 0), reach / depth, np.nan).astype(np.float32)
-    lost = _in_shadow(disparity, right=baseline > 0)
+    unmeasured = _in_shadow(disparity, right=baseline > 0)
     angle = _angles(depth, camera)
-    lost |= angle > steepest
+    unmeasured |= angle > steepest
     deviation = noise * _growth(angle)
-    seen = _shaken(np.where(lost, np.float32(np.nan), disparity), edge_noise, rng)
+    noisy = _edge_jitter(np.where(unmeasured, np.float32(np.nan), disparity), edge_noise, rng)
     normal = rng.standard_normal(depth.shape, dtype=np.float32)
-    seen = seen + np.where(np.isfinite(deviation), deviation, 0).astype(np.float32) * normal
+    noisy = noisy + np.where(np.isfinite(deviation), deviation, 0).astype(np.float32) * normal
     if step > 0:
-        seen = np.round(seen / step) * np.float32(step)
+        noisy = np.round(noisy / step) * np.float32(step)
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(seen > 0, np.float32(reach) / seen, np.float32(np.nan)).astype(np.float32)
+        return np.where(noisy > 0, np.float32(reach) / noisy, np.float32(np.nan)).astype(np.float32)
 
 
 def _in_shadow(disparity: Depth, *, right: bool) -> npt.NDArray[np.bool_]:
-    """Pixels (height, width) that the projector does not see.
+    """Mask (height, width) of pixels that the projector does not illuminate.
 
-    What is at column u with disparity d stands at column u - d of the picture of a projector on the right: of all that
-    stands there it sees what has the largest disparity.
+    A pixel at column u with disparity d appears at column u - d in the view of a projector on the right. There, the
+    point with the largest disparity is illuminated.
     """
     known = np.isfinite(disparity)
     d = np.where(known, disparity, 0)
@@ -91,13 +91,13 @@ def _in_shadow(disparity: Depth, *, right: bool) -> npt.NDArray[np.bool_]:
     at = (np.arange(height)[:, None] * (high - low + 1) + column - low).ravel()
     nearest = np.zeros(height * (high - low + 1), np.float32)
     np.maximum.at(nearest, at, np.where(known, d, 0).ravel().astype(np.float32))
-    return np.asarray(known & (nearest[at].reshape(d.shape) > d + HIDDEN))
+    return np.asarray(known & (nearest[at].reshape(d.shape) > d + SHADOW_STEP))
 
 
 def _angles(depth: Depth, camera: Pinhole) -> Depth:
-    """Between line of sight and normal of the surface at each pixel (height, width) [deg]; NaN without neighbours.
+    """Angle of incidence at each pixel (height, width) [deg]; NaN without neighbors.
 
-    Of the two neighbours on either side the nearer one in depth is on the same surface.
+    Of the two neighbors along an axis, the one nearer in depth is on the same surface.
     """
     z = np.where(np.isfinite(depth), depth, np.nan).astype(np.float32)
     slopes = []
@@ -122,19 +122,19 @@ def _angles(depth: Depth, camera: Pinhole) -> Depth:
 
 
 def _growth(angle: Depth) -> Depth:
-    """How many times as noisy surfaces at an angle [deg] are: 1 up to `STEEP`, then as the square of Nguyen's term."""
+    """Noise factor at an angle [deg]: 1 up to `STEEP`, then the square of Nguyen's term."""
     radians = np.radians(np.minimum(angle, 89.0))
     term = (radians / (np.pi / 2 - radians)) ** 2
     start = (np.radians(STEEP) / (np.pi / 2 - np.radians(STEEP))) ** 2
     return np.asarray(np.maximum(1.0, term / start), np.float32)
 
 
-def _shaken(disparity: Depth, deviation: float, rng: np.random.Generator) -> Depth:
-    """Each pixel with the value of one that lies some pixels aside, as at edges."""
+def _edge_jitter(disparity: Depth, deviation: float, rng: np.random.Generator) -> Depth:
+    """Replace each pixel by one displaced by a random offset, as at edges."""
     if deviation <= 0:
         return disparity
     height, width = disparity.shape
-    aside = np.rint(rng.standard_normal((2, height, width), dtype=np.float32) * np.float32(deviation)).astype(np.int32)
-    v = np.clip(np.arange(height)[:, None] + aside[0], 0, height - 1)
-    u = np.clip(np.arange(width)[None, :] + aside[1], 0, width - 1)
+    offset = np.rint(rng.standard_normal((2, height, width), dtype=np.float32) * np.float32(deviation)).astype(np.int32)
+    v = np.clip(np.arange(height)[:, None] + offset[0], 0, height - 1)
+    u = np.clip(np.arange(width)[None, :] + offset[1], 0, width - 1)
     return np.asarray(disparity[v, u])

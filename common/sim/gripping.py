@@ -1,4 +1,4 @@
-"""What a hand of the kinematic world has between its fingers, or its cup lies on."""
+"""What the gripper of the kinematic world holds: between its fingers, or on its suction cup."""
 
 from __future__ import annotations
 

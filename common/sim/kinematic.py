@@ -1,12 +1,11 @@
-"""The truth beside simulated hardware: where everything really is. Read by cameras, by nothing that decides.
+"""Kinematic world: the ground truth of a simulated cell, read by cameras and never by decision logic.
 
-Grasping, carrying, falling and coming to rest are simulated; pushing a thing aside, and rolling, are not: what cannot
-stay where it falls appears at the nearest place where it can.
+Simulates grasping, carrying, falling and coming to rest, but no pushing and no rolling: a body that cannot stay where
+it falls is moved to the nearest position where it can.
 """
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -17,15 +16,14 @@ from numpy.typing import NDArray
 from common.config import GripperConfig, ObjectConfig, Scenery, Surroundings, World
 from common.errors import ConfigError, Refused, UnknownName
 from common.messages import Header, WorldEdit, WorldObject, WorldObjects
-from common.planning.prism import convex_hull
 from common.robot.finger_joints import closing_frame
 from common.robot.transforms import invert, transform
 from common.sim.bodies import Body, Rest, restored
-from common.sim.footprints import is_convex
+from common.sim.edits import new_body, requested_position, require_room
 from common.sim.gripping import felt
 from common.sim.interface import GraspTolerances, StandingObject
 from common.sim.news import News
-from common.sim.objects import Solid, initial_pose, make_solid, solid_of, solid_of_message
+from common.sim.objects import initial_pose, solid_of, solid_of_message
 from common.sim.resting import Ground
 
 if TYPE_CHECKING:
@@ -36,17 +34,13 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 GRAVITY = 9.81  # [m/s^2]
-MOST_OBJECTS = 500  # in the world: each is told of while something moves, and looked at in every cycle
-MOST_CORNERS = 50_000  # of all of them
-FARTHEST = 1000.0  # [m] along each axis from the origin of world, and from a thing's own: all has to be told of
-MOST_BENT = 200  # corners of a cross-section that is not convex: how it meets another takes time by their product
-FEW = 32  # spheres among which a place is found at once
+FEW = 32  # spheres for which a search is fast
 
 
 def create(
     world: World, objects: Sequence[ObjectConfig], tolerances: GraspTolerances, gripper: GripperConfig | None
 ) -> KinematicWorld:
-    """The world with its objects, each of which has a place."""
+    """Create the world with objects that all have a position."""
     return KinematicWorld(world, objects, tolerances, gripper)
 
 
@@ -54,28 +48,28 @@ def renderer(
     around: Surroundings, scenery: Scenery, robot: Callable[[], RobotModel], *, plain: bool, camera: Pinhole,
     arm: bool = False,
 ) -> Renderer:
-    """What draws this world for a camera: see `common.sim.interface`."""
-    from common.sim.rendering import Renderer  # of no use to who moves the world
+    """Create the renderer of this world for one camera: see `common.sim.interface`."""
+    from common.sim.rendering import Renderer  # only cameras need it
 
     seen = robot() if arm or not plain else None
     return Renderer(around, seen, plain=plain, camera=camera, scenery=scenery)
 
 
 class KinematicWorld(News):
-    """The objects, and what becomes of them while a hand moves among them.
+    """The objects, and their motion as the gripper moves among them.
 
     Attributes:
-        version: grows whenever something has changed.
+        version: increases with every change.
     """
 
     def __init__(
         self, world: World, objects: Sequence[ObjectConfig] | None = None, tolerances: GraspTolerances | None = None,
         gripper: GripperConfig | None = None,
     ) -> None:
-        """Put every object where it lies at first; a sphere above a container lies in it.
+        """Put every object at its initial position; a sphere above a container lies in it.
 
         Raises:
-            ConfigError: an object cannot lie where it is to.
+            ConfigError: an object cannot lie there.
         """
         super().__init__()
         self._config = world
@@ -83,49 +77,49 @@ class KinematicWorld(News):
         self._gripper = gripper
         self._T_tcp_closing = closing_frame(gripper) if gripper else np.eye(4)
         self._ground = Ground(world)
-        self._first = {thing.id: thing for thing in (world.objects if objects is None else objects)}
-        self._solids = {name: solid_of(thing) for name, thing in self._first.items()}
+        self._first = {obj.id: obj for obj in (world.objects if objects is None else objects)}
+        self._solids = {name: solid_of(obj) for name, obj in self._first.items()}
         self._bodies: dict[str, Body] = {}
-        self._between: dict[str, tuple[float, float]] = {}  # what the fingers would press on: its ends along tool y [m]
+        self._between: dict[str, tuple[float, float]] = {}  # bodies between the fingers: ends along tool y [m]
         try:
             self._lay_out()
         except Refused as refusal:
-            raise ConfigError("world.objects", ..., f"cannot be laid out: {refusal}") from None
+            raise ConfigError("world.objects", ..., f"cannot be placed: {refusal}") from None
         self._events.clear()
 
-    # --- over a restart ---
+    # --- snapshot ---
 
     @cached_property
     def layout(self) -> dict[str, tuple[float, ...]]:
-        """Where everything was at first, (x, y, z) [m] by id."""
-        return {name: tuple(initial_pose(thing, self._solids[name])[:3, 3].tolist())
-                for name, thing in self._first.items()}
+        """Initial positions (x, y, z) [m] by id."""
+        return {name: tuple(initial_pose(obj, self._solids[name])[:3, 3].tolist())
+                for name, obj in self._first.items()}
 
     def standing(self) -> dict[str, StandingObject]:
-        """Everything as it is, for `restore`."""
+        """Complete state, for `restore`."""
         return {name: body.standing() for name, body in self._bodies.items()}
 
     def restore(self, objects: Mapping[str, StandingObject]) -> None:
-        """Put everything where it was; what is of a shape that there is not is passed over."""
-        self._bodies = {name: body for name, kept in objects.items() if (body := self._restored(name, kept))}
+        """Restore a state; objects of unknown shape are skipped."""
+        self._bodies = {name: body for name, snapshot in objects.items() if (body := self._restored(name, snapshot))}
         self._between = {}
         self.version += 1
 
-    def _restored(self, name: str, kept: StandingObject) -> Body | None:
-        first = self._first.get(kept.like or name)
-        if kept.made is not None:
-            solid, c = solid_of_message(kept.made), kept.made.color
+    def _restored(self, name: str, snapshot: StandingObject) -> Body | None:
+        first = self._first.get(snapshot.like or name)
+        if snapshot.made is not None:
+            solid, c = solid_of_message(snapshot.made), snapshot.made.color
             color = (c.r, c.g, c.b)
         elif first is not None:
             solid, color = self._solids[first.id], first.color
         else:
             return None
-        return restored(name, kept, solid, color)
+        return restored(name, snapshot, solid, color)
 
-    # --- the hand ---
+    # --- gripper ---
 
     def obstruction(self, T_world_tcp: Array, width: float) -> float:
-        """The width [m] that the fingers cannot close below: see `common.sim.interface`."""
+        """Width [m] below which the fingers cannot close: see `common.sim.interface`."""
         if held := self.held:
             return self._bodies[held].width
         found: dict[str, tuple[float, float]] = {}
@@ -139,19 +133,19 @@ class KinematicWorld(News):
         return max((high - low for low, high in found.values()), default=0.0)
 
     def takes_long(self, width: float, gripping: bool) -> bool:
-        """Whether places have to be looked for in the next tick, which may take longer than a cycle: as of `tick`."""
-        if self._is_plain:
+        """Whether the next `tick` may take longer than a control cycle, since it searches for a rest position."""
+        if self._is_simple:
             return False
         if held := self.held:
             return width > self._bodies[held].width + self._tolerances.release
         return gripping and bool(self._between)
 
     @property
-    def _is_plain(self) -> bool:
+    def _is_simple(self) -> bool:
         return len(self._bodies) <= FEW and all(body.solid.shape == "sphere" for body in self._bodies.values())
 
     def tick(self, now: float, T_world_tcp: Array, width: float, gripping: bool) -> None:
-        """Move on to a time: see `common.sim.interface`."""
+        """Advance to a time: see `common.sim.interface`."""
         held = self.held
         if not held and gripping and self._between:
             held = min(self._between,
@@ -169,16 +163,16 @@ class KinematicWorld(News):
     def _grasp(self, body: Body, T_world_tcp: Array, now: float) -> None:
         low, high = self._between[body.name]
         body.grip = invert(T_world_tcp) @ body.T
-        body.grip[1, 3] -= (low + high) / 2  # the fingers centre it
-        is_cupped = self._gripper is not None and self._gripper.cup is not None
-        body.width = 2 * body.solid.radius if body.solid.shape == "sphere" and not is_cupped else high - low
+        body.grip[1, 3] -= (low + high) / 2  # the fingers center it
+        has_cup = self._gripper is not None and self._gripper.cup is not None
+        body.width = 2 * body.solid.radius if body.solid.shape == "sphere" and not has_cup else high - low
         slot, block = body.slot_taken, body.block()
         body.state, body.container, body.slot = "held", "", None
         body.changed()
         self._between = {}
         self._say("remove", body)
-        self._sink(slot, now)
-        self._lose(block, now)
+        self._lower_layers(slot, now)
+        self._drop_supported(block, now)
 
     def _carry(self, body: Body, T_world_tcp: Array) -> None:
         assert body.grip is not None
@@ -195,7 +189,7 @@ class KinematicWorld(News):
         self._drop(body, now)
 
     def _drop(self, body: Body, now: float) -> None:
-        body.state, body.grip, body.dropped, body.since = "falling", None, float(body.T[2, 3]), now
+        body.state, body.grip, body.drop_height, body.drop_time = "falling", None, float(body.T[2, 3]), now
         body.container, body.slot = "", None
         body.changed()
         self.version += 1
@@ -203,16 +197,16 @@ class KinematicWorld(News):
     def _fall(self, body: Body, now: float) -> None:
         assert body.rest is not None
         self.version += 1
-        z = body.dropped - GRAVITY * (now - body.since) ** 2 / 2
+        z = body.drop_height - GRAVITY * (now - body.drop_time) ** 2 / 2
         if z > body.rest.T[2, 3]:
             body.T = transform(body.T[:3, :3], (float(body.T[0, 3]), float(body.T[1, 3]), z))
             body.changed()
             return
-        body.lie(body.rest)
+        body.rest_at(body.rest)
         if body.state != "elsewhere":
             self._say("add", body)
 
-    def _sink(self, taken: tuple[str, tuple[int, int]] | None, now: float) -> None:
+    def _lower_layers(self, taken: tuple[str, tuple[int, int]] | None, now: float) -> None:
         """Let the spheres above a slot that was vacated fall by one layer."""
         if taken is None:
             return
@@ -222,30 +216,30 @@ class KinematicWorld(News):
             if mine is not None and mine[0] == container and mine[1][1] == index and mine[1][0] > layer:
                 slot = (mine[1][0] - 1, index)
                 position = self._ground.slot_position(container, body.solid.radius, slot)
-                lies = body.state == "contained"
+                settled = body.state == "contained"
                 body.rest = Rest(transform(body.T[:3, :3], position), "contained", container, slot)
                 body.changed()
-                if lies:
+                if settled:
                     self._say("remove", body)
                     self._drop(body, now)
 
-    def _lose(self, gone: Any, now: float) -> None:
+    def _drop_supported(self, gone: Any, now: float) -> None:
         """Let what lay on something fall, which is no longer there."""
-        for body in self._ground.carries_nothing_any_more(gone, self._bodies):
+        for body in self._ground.unsupported_by(gone, self._bodies):
             block = body.block()
             self._say("remove", body)
             self._release(body, now)
-            self._lose(block, now)
+            self._drop_supported(block, now)
 
     # --- edits ---
 
     def edit_takes_long(self, request: WorldEdit) -> bool:
-        """Whether an edit may take longer than a cycle."""
-        return not self._is_plain or request.shape not in (None, "sphere") or any(
+        """Whether an edit may take longer than a control cycle."""
+        return not self._is_simple or request.shape not in (None, "sphere") or any(
             solid.shape != "sphere" for solid in self._solids.values())
 
     def edit(self, request: WorldEdit, now: float) -> str:
-        """Change the world as a person asks: see `common.sim.interface`."""
+        """Change the world as an operator requests: see `common.sim.interface`."""
         if request.op == "reset":
             return self._reset()
         name = request.id
@@ -253,70 +247,36 @@ class KinematicWorld(News):
             return self._slip(name, now)
         old = self._bodies.get(name)
         if request.op == "add":
-            body = self._made(request)
-            self._require_room(body)
+            body = new_body(request, self._first, self._solids, self._config.spare, self._bodies)
+            require_room((each.solid for each in (*self._bodies.values(), body)), len(self._bodies))
         elif old is None:
             raise Refused("unknown_id", str(UnknownName("object", name, list(self._bodies))))
         else:
             body = old
         rest = None
         if request.op != "remove":
-            if request.position is None:
-                raise Refused("no_position", f"position: {request.op} needs one, for example {{x: 0.5, y: 0.0}}")
-            at = request.position
-            if max(abs(at.x), abs(at.y), abs(at.z)) > FARTHEST:
-                raise Refused("too_far", f"position: is more than {FARTHEST:g} m away from the origin of world")
-            rest = self._ground.put(body, request.position.x, request.position.y, request.yaw, self._bodies)
-        lay, slot = old is not None and old.state in ("table", "contained"), body.slot_taken
-        block = body.block() if lay else None
-        if lay:
+            at = requested_position(request)
+            rest = self._ground.put(body, at.x, at.y, request.yaw, self._bodies)
+        rested, slot = old is not None and old.state in ("table", "contained"), body.slot_taken
+        block = body.block() if rested else None
+        if rested:
             self._say("remove", body)
         if rest is not None:
-            body.lie(rest)
+            body.rest_at(rest)
             self._bodies[body.name] = body
             self._say("add", body)
         else:
             del self._bodies[name]
         self._between.pop(body.name, None)
         if body.slot_taken != slot or rest is None:
-            self._sink(slot, now)
+            self._lower_layers(slot, now)
         if block is not None:
-            self._lose(block, now)
+            self._drop_supported(block, now)
         self.version += 1
         return body.name
 
-    def _made(self, request: WorldEdit) -> Body:
-        """What a request adds, nowhere yet."""
-        model = self._first.get(request.like) if request.like else self._config.spare
-        if model is None:
-            raise Refused("unknown_id", str(UnknownName("object of the first layout", request.like, self._first)))
-        name = request.id or self._free_name(request.shape or re.sub(r"_\d+$", "", model.id))
-        if name in self._bodies:
-            raise Refused("id_exists", f"id: {name!r} exists already; leave it empty for a new one")
-        if not re.fullmatch(r"[A-Za-z0-9_.-]{1,60}", name):
-            raise Refused("bad_id", f"id: {name[:60]!r} must be letters, digits, '_', '.' and '-', at most 60")
-        c = request.color
-        color = model.color if c is None else (c.r, c.g, c.b)
-        if request.shape is None:
-            solid = self._solids.get(model.id) or solid_of(model)
-            like = model.id if model.id in self._first and c is None else ""
-        else:
-            solid, like = _requested(request), ""
-        return Body(name, solid, color, np.eye(4), "elsewhere", added=True, like=like)
-
-    def _require_room(self, body: Body) -> None:
-        if len(self._bodies) >= MOST_OBJECTS:
-            raise Refused("world_full", f"there are {len(self._bodies)} objects, and room for {MOST_OBJECTS}")
-        corners = sum(_corners(each.solid) for each in (*self._bodies.values(), body))
-        if corners > MOST_CORNERS:
-            raise Refused("world_full", f"all objects together would have {corners} corners; at most {MOST_CORNERS} "
-                                        "can be told of")
-
-    def _free_name(self, kind: str) -> str:
-        return next(n for i in range(1, len(self._bodies) + 2) if (n := f"{kind}_{i}") not in self._bodies)
-
     def _slip(self, name: str, now: float) -> str:
-        """Let what is held slip out of the fingers, which close on without it; its id. Raises Refused without one."""
+        """Let the held body slip out of the fingers, which close; return its id. Raises Refused if nothing is held."""
         held = self.held
         if not held or name not in ("", held):
             raise Refused("not_held", f"{name or 'nothing'} is {'not ' if name else ''}between the fingers")
@@ -332,66 +292,38 @@ class KinematicWorld(News):
         return ""
 
     def _lay_out(self) -> None:
-        for name, thing in self._first.items():
+        for name, obj in self._first.items():
             solid = self._solids[name]
-            body = Body(name, solid, thing.color, initial_pose(thing, solid))
-            if solid.shape == "sphere" and thing.x is not None and thing.y is not None and (
-                thing.z == self._config.table_height
+            body = Body(name, solid, obj.color, initial_pose(obj, solid))
+            if solid.shape == "sphere" and obj.x is not None and obj.y is not None and (
+                obj.z == self._config.table_height
             ):
-                body.lie(self._ground.put(body, thing.x, thing.y, None, self._bodies))
+                body.rest_at(self._ground.put(body, obj.x, obj.y, None, self._bodies))
             elif container := self._ground.container_of(body):
-                body.lie(Rest(body.T, "contained", container))
+                body.rest_at(Rest(body.T, "contained", container))
             self._bodies[name] = body
             self._say("add", body)
 
-    # --- what there is ---
+    # --- queries ---
 
     @property
     def ids(self) -> list[str]:
-        """What is in it."""
+        """Ids of all objects."""
         return list(self._bodies)
 
     @property
     def bodies(self) -> dict[str, Body]:
-        """Everything by id, for a world that moves it by other laws."""
+        """All bodies by id, for a world with other dynamics."""
         return self._bodies
 
     @property
     def held(self) -> str:
-        """The id of what is between the fingers, or an empty string."""
+        """Id of the held object, or an empty string."""
         return next((name for name, body in self._bodies.items() if body.state == "held"), "")
 
     def objects(self, header: Header) -> WorldObjects:
-        """Where everything is; what is "elsewhere" is off the table, out of sight."""
+        """State of all objects; those in state "elsewhere" are off the table and invisible."""
         return WorldObjects(header=header, objects=[body.message() for body in self._bodies.values()])
-
-
-
-def _requested(request: WorldEdit) -> Solid:
-    """The shape that a request describes. Raises Refused when something of it is missing."""
-    size = request.size
-    if request.shape is None or size is None or size.x <= 0 or (request.shape != "sphere" and size.z <= 0):
-        raise Refused("no_size", f"size: a {request.shape} needs one, for example {{x: 0.04, y: 0.04, z: 0.04}}")
-    inner = (request.inner_radius or 0.0) if request.shape == "ring" else 0.0
-    if request.shape == "ring" and not 0 < inner < size.x / 2:
-        raise Refused("no_size", f"inner_radius: a ring needs one below {size.x / 2:g} m")
-    if request.shape == "box" and size.y <= 0:
-        raise Refused("no_size", "size: a box needs x, y and z")
-    if request.shape == "prism" and len(request.polygon) < 3:
-        raise Refused("no_size", "polygon: a prism needs at least 3 corners")
-    if len(request.polygon) > MOST_BENT and not is_convex(np.array(request.polygon)):
-        raise Refused("too_many_corners", f"polygon: has {len(request.polygon)} corners and is not convex; at most "
-                                          f"{MOST_BENT} can be")
-    if request.shape == "prism" and len(convex_hull(np.array(request.polygon))) < 3:
-        raise Refused("no_size", "polygon: encloses nothing")
-    solid = make_solid(request.shape, size, inner, request.polygon)
-    if solid.reach > FARTHEST:
-        raise Refused("no_size", f"size: it would reach {solid.reach:g} m from its middle; {FARTHEST:g} m can be")
-    return solid
-
-
-def _corners(solid: Solid) -> int:
-    return len(solid.section) + len(solid.hole) + 3 * len(solid.mesh)
 
 
 __all__ = ["GraspTolerances", "KinematicWorld", "WorldObject", "create"]

@@ -1,4 +1,4 @@
-"""How bright light is and of which colour: from a temperature and lux to what red, green and blue pixels get of it."""
+"""Brightness and color of light: from color temperature and illuminance to blue, green and red pixel values."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from common.config import Light, Scenery
 
 Array = NDArray[np.float64]
 
-REFERENCE = 500.0  # [lx] of a well lit table: in this light a surface looks as its colour says
-DAYLIGHT = 6500.0  # [K] white
-CUTOFF = 45.0  # [deg] off its axis to which a lamp shines
-OVERHEAD = Light()  # of a world that names no light, with its ambient light
+REFERENCE = 500.0  # [lx] of a well lit table: renders surfaces in their configured color
+DAYLIGHT = 6500.0  # [K] white point
+CUTOFF = 45.0  # [deg] half angle of a lamp's cone
+OVERHEAD = Light()  # default of a world without lights
 XYZ_TO_BGR = np.array(  # of linear sRGB, IEC 61966-2-1
     [[0.0557, -0.2040, 1.0570], [-0.9689, 1.8758, 0.0415], [3.2406, -1.5372, -0.4986]]
 )
 
 
 def tint(temperature: float) -> Array:
-    """(3,) blue, green and red of light of a temperature [K], of the same luminance as daylight, which is all ones.
+    """(3,) blue, green and red of light at a color temperature [K], at the luminance of daylight, which is all ones.
 
-    A black body: its place in the CIE diagram by Kim et al., US patent 7024034 (2006), 1667 to 25000 K.
+    Chromaticity of a black body by Kim et al., US patent 7024034 (2006), valid from 1667 to 25000 K.
     """
     return _black_body(temperature) / _black_body(DAYLIGHT)
 
@@ -42,21 +42,21 @@ def _black_body(temperature: float) -> Array:
 
 
 def lamps(scenery: Scenery) -> list[Light]:
-    """The lights of a scenery; where it names none, one above the table."""
+    """Return the lights of a scenery; by default one above the table."""
     return list(scenery.lights.values()) or [OVERHEAD]
 
 
 def ambient(scenery: Scenery) -> Array:
-    """(3,) [lx] of blue, green and red light that comes from everywhere, of the mean colour of the lights."""
+    """(3,) [lx] of blue, green and red ambient light, of the mean color of the lights."""
     lights = lamps(scenery)
-    whole = sum(light.illuminance for light in lights)
-    if whole <= 0:
+    total = sum(light.illuminance for light in lights)
+    if total <= 0:
         return np.full(3, scenery.ambient)
-    mean = sum((light.illuminance / whole * tint(light.temperature) for light in lights), np.zeros(3))
+    mean = sum((light.illuminance / total * tint(light.temperature) for light in lights), np.zeros(3))
     return np.asarray(scenery.ambient * mean)
 
 
 def white_level(scenery: Scenery) -> Array:
-    """(3,) [lx] of blue, green and red light of all lamps together, as if all shone straight at everything."""
+    """(3,) [lx] of blue, green and red light of all lamps together, each at normal incidence."""
     each = (light.illuminance * tint(light.temperature) for light in lamps(scenery))
     return np.asarray(sum(each, ambient(scenery)))

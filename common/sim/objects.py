@@ -1,4 +1,4 @@
-"""The shapes of what can be taken and moved, whatever made them: a world's file, a request, or a message."""
+"""Shapes of movable objects, created from a world file, an edit request or a message."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from numpy.typing import NDArray
 from common.config import ObjectConfig
 from common.config.objects import Shape
 from common.errors import ConfigError
-from common.mesh_files import triangles_of
 from common.messages import Color, Pose, Vector3, WorldObject
 from common.planning.prism import convex_hull
+from common.robot.mesh_files import triangles_of
 from common.robot.transforms import matrix_to_pose, pose_to_matrix, rpy_to_matrix, transform
 from common.sim.ray_caster import Mesh
-from common.sim.solids import circle, placed, primitive, upright
+from common.sim.solids import circle, extrude, primitive, transformed
 
 Array = NDArray[np.float64]
 
-MOST_TRIANGLES = 2000  # of a mesh: it travels in every message about it
-LEVEL = 1 - 1e-9  # cosine of the tilt from which on something does not stand upright
-NEAR = 1e-6  # [m] beyond the box about it something may still be said to meet a solid
-_OFF = np.array([1.234e-7, 2.345e-7])  # [m] lines are shifted by it: they meet no edge of a shape in round numbers
+MAX_TRIANGLES = 2000  # of a mesh: every message about it carries them
+UPRIGHT = 1 - 1e-9  # cosine of the largest tilt of an extrude object
+SLACK = 1e-6  # [m] tolerance of the bounding box test
+_OFF = np.array([1.234e-7, 2.345e-7])  # [m] shifts lines off edges at round coordinates
 _NONE = np.empty((0, 2))
 
 
@@ -35,9 +35,9 @@ class Solid:
     """A shape in its own frame (see ObjectConfig).
 
     Attributes:
-        low, high: (3,) corners of the box about it [m].
+        low, high: (3,) corners of the bounding box [m].
         radius: of a sphere [m].
-        section, hole: (N, 2) outer and inner edge of the cross-section of what is a prism along z [m], anticlockwise.
+        section, hole: (N, 2) outer and inner edge of the cross-section of a prism along z [m], counterclockwise.
         mesh: (n, 3, 3) triangles of a mesh [m].
     """
 
@@ -52,16 +52,16 @@ class Solid:
 
     @cached_property
     def triangles(self) -> Array:
-        """Its surface (n, 3, 3) [m]."""
+        """Surface (n, 3, 3) [m]."""
         if self.shape == "sphere":
             return primitive("sphere", [self.radius])
         if self.shape == "mesh":
             return self.mesh
-        return upright(self.section, self.hole, float(self.low[2]), float(self.high[2]))
+        return extrude(self.section, self.hole, float(self.low[2]), float(self.high[2]))
 
     @cached_property
     def corners(self) -> Array:
-        """Points (n, 3) [m] of which it is the convex hull, or more; those of a sphere are not exact."""
+        """Points (n, 3) [m] whose convex hull contains the solid; approximate for a sphere."""
         if self.shape in ("sphere", "mesh"):
             return np.unique(self.triangles.reshape(-1, 3), axis=0)
         return np.concatenate([np.column_stack([self.section, np.full(len(self.section), z)])
@@ -69,69 +69,69 @@ class Solid:
 
     @cached_property
     def reach(self) -> float:
-        """Distance of its farthest point from the origin of its frame [m]."""
+        """Distance of the farthest point from the origin [m]."""
         return self.radius if self.shape == "sphere" else float(np.linalg.norm(self.corners, axis=1).max())
 
     @property
     def size(self) -> Array:
-        """(3,) of the box about it [m]."""
+        """(3,) of the bounding box [m]."""
         return self.high - self.low
 
     def lowest(self, rotation: Array) -> float:
-        """Height of its lowest point above its origin, negative below it [m], when turned by (3, 3)."""
+        """Height of the lowest point relative to the origin [m] under a rotation (3, 3)."""
         return -self.radius if self.shape == "sphere" else float((self.corners @ rotation[2]).min())
 
     def highest(self, rotation: Array) -> float:
-        """Height of its highest point above its origin [m], when turned by (3, 3)."""
+        """Height of the highest point relative to the origin [m] under a rotation (3, 3)."""
         return self.radius if self.shape == "sphere" else float((self.corners @ rotation[2]).max())
 
     def footprint(self, rotation: Array) -> Array:
-        """Outline (N, 2) [m] seen from above, anticlockwise about its origin, when turned by (3, 3)."""
+        """Counterclockwise outline (N, 2) [m] seen from above, about the origin, under a rotation (3, 3)."""
         if self.shape == "sphere":
             return circle(self.radius)[::10]
-        if len(self.section) and abs(rotation[2, 2]) > LEVEL:
+        if len(self.section) and abs(rotation[2, 2]) > UPRIGHT:
             outline = self.section @ rotation[:2, :2].T
             return outline if rotation[2, 2] > 0 else outline[::-1]
         return convex_hull((self.corners @ rotation.T)[:, :2])
 
     def settled(self, rotation: Array) -> Array:
-        """How it lies when it was let go in that (3, 3) rotation: on the nearest of its sides."""
+        """Rotation (3, 3) after it tips from a rotation onto its nearest side."""
         if self.shape == "sphere":
             return rotation
         axis = int(np.argmax(np.abs(rotation[2])))
         side = np.zeros(3)
         side[axis] = math.copysign(1.0, rotation[2, axis])
-        up = rotation @ side  # the axis of its own that points up most is made upright, on the shortest way
+        up = rotation @ side  # turn the body axis nearest to vertical upright by the smallest rotation
         turn = np.cross(up, (0.0, 0.0, 1.0))
         cross = np.array([[0, -turn[2], turn[1]], [turn[2], 0, -turn[0]], [-turn[1], turn[0], 0]])
-        upright_one = rotation + (cross + cross @ cross / (1.0 + up[2])) @ rotation
-        upright_one[2], upright_one[:, axis] = side, (0.0, 0.0, side[axis])
-        return np.asarray(upright_one)
+        result = rotation + (cross + cross @ cross / (1.0 + up[2])) @ rotation
+        result[2], result[:, axis] = side, (0.0, 0.0, side[axis])
+        return np.asarray(result)
 
     def may_meet(self, T_tool_object: Array) -> bool:
-        """Whether the tool's y axis meets the box about it, by the slab method; else it meets nothing of the solid."""
-        way, origin = T_tool_object[1, :3], -T_tool_object[:3, 3] @ T_tool_object[:3, :3]
-        way = np.where(np.abs(way) < 1e-12, 1e-12, way)
-        first, second = (self.low - NEAR - origin) / way, (self.high + NEAR - origin) / way
+        """Whether the tool's y axis meets the bounding box (slab method); necessary for contact."""
+        direction, origin = T_tool_object[1, :3], -T_tool_object[:3, 3] @ T_tool_object[:3, :3]
+        direction = np.where(np.abs(direction) < 1e-12, 1e-12, direction)
+        first, second = (self.low - SLACK - origin) / direction, (self.high + SLACK - origin) / direction
         return bool(np.minimum(first, second).max() <= np.maximum(first, second).min())
 
     def spans(self, T_tool_object: Array, lines: Array) -> list[Array]:
-        """Where lines along the tool's y axis, through (k, 2) places x, z [m], run within it: (n, 2) y [m] of each.
+        """Intervals (n, 2) y [m] inside the solid of lines along the tool's y axis through (k, 2) positions x, z [m].
 
-        Of a mesh, which need not be closed, from the first to the last point. What is last in the list are the ends
-        of what of its edges lies among the lines.
+        A mesh may be open: its interval runs from the first to the last intersection. The last list entry holds the end
+        points of the edges, clipped to the region of the lines.
         """
-        surface = placed(self.triangles, T_tool_object)
+        surface = transformed(self.triangles, T_tool_object)
         corners, flat = surface, surface[..., [0, 2]]
-        wanted = lines + _OFF
-        near = ((flat.max(axis=1) >= wanted.min(axis=0)) & (flat.min(axis=1) <= wanted.max(axis=0))).all(axis=1)
+        targets = lines + _OFF
+        near = ((flat.max(axis=1) >= targets.min(axis=0)) & (flat.min(axis=1) <= targets.max(axis=0))).all(axis=1)
         corners, flat = corners[near], flat[near]
         a, first, second = flat[:, 0], flat[:, 1] - flat[:, 0], flat[:, 2] - flat[:, 0]
         area = _cross(first, second)
-        good = np.abs(area) > 1e-15
-        corners, a, first, second, area = corners[good], a[good], first[good], second[good], area[good]
-        way = wanted[:, None] - a
-        u, v = _cross(way, second) / area, _cross(first, way) / area
+        valid = np.abs(area) > 1e-15
+        corners, a, first, second, area = corners[valid], a[valid], first[valid], second[valid], area[valid]
+        direction = targets[:, None] - a
+        u, v = _cross(direction, second) / area, _cross(first, direction) / area
         met = (u >= 0) & (v >= 0) & (u + v <= 1)
         y = corners[:, 0, 1] + u * (corners[:, 1, 1] - corners[:, 0, 1]) + v * (corners[:, 2, 1] - corners[:, 0, 1])
         found = []
@@ -146,54 +146,54 @@ class Solid:
 
 
 def _clipped(start: Array, end: Array, low: Array, high: Array) -> Array:
-    """y (n,) [m] of the ends of what of the edges between points (m, 3) lies between two corners (x, z) [m].
+    """y (n,) [m] of both ends of the edges between points (m, 3), clipped between two corners (x, z) [m].
 
     Liang and Barsky, "A new concept and method for line clipping" (1984).
     """
-    way = end - start
+    direction = end - start
     enter, leave = np.zeros(len(start)), np.ones(len(start))
     for axis, bottom, top in ((0, low[0], high[0]), (2, low[1], high[1])):
-        flat = np.abs(way[:, axis]) < 1e-12
-        slope = np.where(flat, 1.0, way[:, axis])
+        flat = np.abs(direction[:, axis]) < 1e-12
+        slope = np.where(flat, 1.0, direction[:, axis])
         s, t = (bottom - start[:, axis]) / slope, (top - start[:, axis]) / slope
         within = (start[:, axis] >= bottom) & (start[:, axis] <= top)
         enter = np.maximum(enter, np.where(flat, np.where(within, 0.0, 2.0), np.minimum(s, t)))
         leave = np.minimum(leave, np.where(flat, 1.0, np.maximum(s, t)))
-    some = enter <= leave
-    return np.concatenate([(start[:, 1] + share * way[:, 1])[some] for share in (enter, leave)])
+    entering = enter <= leave
+    return np.concatenate([(start[:, 1] + fraction * direction[:, 1])[entering] for fraction in (enter, leave)])
 
 
 def _cross(a: Array, b: Array) -> Array:
     return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
 
 
-def solid_of(thing: ObjectConfig) -> Solid:
-    """The shape that the configuration describes.
+def solid_of(obj: ObjectConfig) -> Solid:
+    """Return the shape of a configured object.
 
     Raises:
-        ConfigError: the file of a mesh cannot be read.
+        ConfigError: a mesh file cannot be read.
     """
-    if thing.shape == "mesh":
-        return mesh(load_mesh(thing.id, Path(thing.mesh), thing.scale))
-    across = 2 * (thing.radius or 0.0)
-    x, y = (thing.size or (across, across))[:2]
-    return make_solid(thing.shape, Vector3(x=x, y=y, z=thing.height or 0.0), thing.inner_radius or 0.0, thing.polygon)
+    if obj.shape == "mesh":
+        return mesh(load_mesh(obj.id, Path(obj.mesh), obj.scale))
+    across = 2 * (obj.radius or 0.0)
+    x, y = (obj.size or (across, across))[:2]
+    return make_solid(obj.shape, Vector3(x=x, y=y, z=obj.height or 0.0), obj.inner_radius or 0.0, obj.polygon)
 
 
 def sphere(radius: float) -> Solid:
-    """A sphere about its origin."""
+    """Return a sphere about the origin."""
     return Solid("sphere", np.full(3, -radius), np.full(3, radius), radius=radius)
 
 
 def cylinder_or_ring(shape: Shape, radius: float, inner_radius: float, height: float) -> Solid:
-    """A cylinder, or a ring with an inner radius, along z [m]."""
+    """Return a cylinder, or a ring with an inner radius, along z [m]."""
     hole = circle(inner_radius) if shape == "ring" else _NONE
     size = np.array([radius, radius, height / 2])
     return Solid(shape, -size, size, inner_radius=inner_radius, section=circle(radius), hole=hole)
 
 
 def prism(shape: Shape, polygon: Array, height: float) -> Solid:
-    """A prism along z with this cross-section (N, 2) [m], either way round; a box is one."""
+    """Return a prism along z with a cross-section (N, 2) [m] of either orientation; boxes too."""
     x, y = polygon.T
     section = polygon if float(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y)) > 0 else polygon[::-1]
     low, high = section.min(axis=0), section.max(axis=0)
@@ -201,43 +201,43 @@ def prism(shape: Shape, polygon: Array, height: float) -> Solid:
 
 
 def mesh(triangles: Array) -> Solid:
-    """A mesh of triangles (n, 3, 3) [m]."""
+    """Return a solid of triangles (n, 3, 3) [m]."""
     points = triangles.reshape(-1, 3)
     return Solid("mesh", points.min(axis=0), points.max(axis=0), mesh=triangles)
 
 
 def load_mesh(name: str, path: Path, scale: float) -> Array:
-    """Triangles (n, 3, 3) [m] of a file, scaled.
+    """Load scaled triangles (n, 3, 3) [m] from a file.
 
     Raises:
-        ConfigError: it cannot be read, or has too many triangles.
+        ConfigError: the file cannot be read, or has too many triangles.
     """
     triangles = scale * triangles_of(f"world.objects.{name}.mesh", path)
-    if len(triangles) > MOST_TRIANGLES:
+    if len(triangles) > MAX_TRIANGLES:
         raise ConfigError(f"world.objects.{name}.mesh", str(path),
-                          f"has {len(triangles)} triangles; at most {MOST_TRIANGLES} can be simulated: simplify it")
+                          f"has {len(triangles)} triangles; at most {MAX_TRIANGLES} can be simulated: simplify it")
     return triangles
 
 
-def initial_pose(thing: ObjectConfig, solid: Solid) -> Array:
+def initial_pose(obj: ObjectConfig, solid: Solid) -> Array:
     """(4, 4) T_world_object at the start."""
-    if thing.position is not None:
-        return transform(rpy_to_matrix(*thing.rpy), thing.position)
-    height = thing.z - float(solid.low[2])
-    return transform(rpy_to_matrix(0.0, 0.0, thing.yaw), (thing.x or 0.0, thing.y or 0.0, height))
+    if obj.position is not None:
+        return transform(rpy_to_matrix(*obj.rpy), obj.position)
+    height = obj.z - float(solid.low[2])
+    return transform(rpy_to_matrix(0.0, 0.0, obj.yaw), (obj.x or 0.0, obj.y or 0.0, height))
 
 
 def object_message(
     name: str, solid: Solid, T: Array, color: Sequence[float], *, state: str = "table", container: str = ""
 ) -> WorldObject:
-    """The solid at a (4, 4) pose as a message."""
+    """Return the message of a solid at a (4, 4) pose."""
     vertices: list[tuple[float, float, float]] = []
     triangles: list[tuple[int, int, int]] = []
     if solid.shape == "mesh":
         points, index = np.unique(solid.mesh.reshape(-1, 3), axis=0, return_inverse=True)
         vertices = [(x, y, z) for x, y, z in points.tolist()]
         triangles = [(a, b, c) for a, b, c in index.reshape(-1, 3).tolist()]
-    stands = len(solid.section) > 0 and T[2, 2] > LEVEL and state not in ("held", "falling")
+    is_upright = len(solid.section) > 0 and T[2, 2] > UPRIGHT and state not in ("held", "falling")
     at, turn = T[:2, 3], T[:2, :2].T
     size = solid.size
     return WorldObject.model_validate({
@@ -247,27 +247,27 @@ def object_message(
         "polygon": solid.section.tolist() if solid.shape == "prism" else [],
         "vertices": vertices, "triangles": triangles,
         "color": Color(r=color[0], g=color[1], b=color[2]), "state": state, "container": container,
-        "outline": (solid.section @ turn + at).tolist() if stands else [],
-        "hole": (solid.hole @ turn + at).tolist() if stands else [],
-        "base": float(T[2, 3] + solid.low[2]) if stands else 0.0, "height": float(size[2]) if stands else 0.0,
+        "outline": (solid.section @ turn + at).tolist() if is_upright else [],
+        "hole": (solid.hole @ turn + at).tolist() if is_upright else [],
+        "base": float(T[2, 3] + solid.low[2]) if is_upright else 0.0, "height": float(size[2]) if is_upright else 0.0,
     })
 
 
-def world_object(thing: ObjectConfig) -> WorldObject:
-    """The object of a world's file as it lies at the start."""
-    solid = solid_of(thing)
-    return object_message(thing.id, solid, initial_pose(thing, solid), thing.color)
+def world_object(obj: ObjectConfig) -> WorldObject:
+    """Return the message of a configured object at its initial pose."""
+    solid = solid_of(obj)
+    return object_message(obj.id, solid, initial_pose(obj, solid), obj.color)
 
 
-def solid_of_message(thing: WorldObject) -> Solid:
-    """The shape that a message describes."""
-    if thing.shape == "mesh":
-        return mesh(np.array(thing.vertices, float)[np.array(thing.triangles, int)].reshape(-1, 3, 3))
-    return make_solid(thing.shape, thing.size, thing.inner_radius, thing.polygon)
+def solid_of_message(obj: WorldObject) -> Solid:
+    """Return the shape that a message describes."""
+    if obj.shape == "mesh":
+        return mesh(np.array(obj.vertices, float)[np.array(obj.triangles, int)].reshape(-1, 3, 3))
+    return make_solid(obj.shape, obj.size, obj.inner_radius, obj.polygon)
 
 
 def make_solid(shape: Shape, size: Vector3, inner_radius: float, polygon: Sequence[tuple[float, float]]) -> Solid:
-    """A solid that is no mesh, by the size of the box about it, and what else its shape needs."""
+    """Return a solid that is no mesh, from its bounding box and shape-specific values."""
     if shape == "sphere":
         return sphere(size.x / 2)
     if shape in ("cylinder", "ring"):
@@ -276,27 +276,27 @@ def make_solid(shape: Shape, size: Vector3, inner_radius: float, polygon: Sequen
     return prism(shape, np.array([(-x, -y), (x, -y), (x, y), (-x, y)] if shape == "box" else polygon), size.z)
 
 
-def appearance_of(thing: WorldObject) -> tuple[object, ...]:
-    """What tells its shape and colour from others, wherever it is."""
-    size, color = thing.size, thing.color
-    sizes = tuple(round(value, 7) for value in (size.x, size.y, size.z, thing.inner_radius))
-    polygon = tuple((round(x, 7), round(y, 7)) for x, y in thing.polygon)
-    return (thing.shape, sizes, polygon, tuple(thing.vertices), tuple(thing.triangles), color.r, color.g, color.b)
+def appearance_of(obj: WorldObject) -> tuple[object, ...]:
+    """Return a hashable key of shape and color, independent of the pose."""
+    size, color = obj.size, obj.color
+    sizes = tuple(round(value, 7) for value in (size.x, size.y, size.z, obj.inner_radius))
+    polygon = tuple((round(x, 7), round(y, 7)) for x, y in obj.polygon)
+    return (obj.shape, sizes, polygon, tuple(obj.vertices), tuple(obj.triangles), color.r, color.g, color.b)
 
 
-def object_mesh(thing: WorldObject) -> Mesh:
-    """Its surface in world, in its colour."""
-    T = pose_to_matrix(thing.pose)
-    return Mesh(placed(solid_of_message(thing).triangles, T), (thing.color.r, thing.color.g, thing.color.b))
+def object_mesh(obj: WorldObject) -> Mesh:
+    """Return its colored surface in world."""
+    T = pose_to_matrix(obj.pose)
+    return Mesh(transformed(solid_of_message(obj).triangles, T), (obj.color.r, obj.color.g, obj.color.b))
 
 
-def centre_of(thing: WorldObject) -> tuple[float, float, float]:
-    """Middle [m] of the box about an object: of its outline when it stands upright, else of its own box."""
-    if thing.outline:
-        outline = np.array(thing.outline)
+def centre_of(obj: WorldObject) -> tuple[float, float, float]:
+    """Center [m] of the bounding box: of the outline if upright, else the origin of its frame."""
+    if obj.outline:
+        outline = np.array(obj.outline)
         x, y = (outline.min(axis=0) + outline.max(axis=0)) / 2
-        return float(x), float(y), thing.base + thing.height / 2
-    p = thing.pose.position
+        return float(x), float(y), obj.base + obj.height / 2
+    p = obj.pose.position
     return p.x, p.y, p.z
 
 

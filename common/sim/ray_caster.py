@@ -1,11 +1,11 @@
-"""What the ray through each pixel meets first: colour and depth of triangles, as a pinhole camera sees them.
+"""Ray caster: color and depth of the nearest triangle at each pixel of a pinhole camera.
 
-All rays start at one point, so a triangle's rays are the pixels within its projection: going through the triangles
-and testing the rays of a whole row at once needs no search tree. With the few thousand triangles of a work cell numpy
-is faster so than embree is ray by ray (benchmarks/outline_perception.py compares time and depth), and it is the same
-on every platform, without a dependency that has no wheel for some.
+All rays share an origin, so the rays of a triangle are the pixels within its projection: looping over triangles and
+testing rays row by row needs no search tree. For the few thousand triangles of a work cell, numpy is faster than
+embree ray by ray (benchmarks/outline_perception.py compares time and depth). It gives the same result on every
+platform and adds no binary dependency.
 
-A ray that passes within rounding of the edge of two triangles meets one of them: there are no gaps between them.
+A ray that passes within rounding of a shared edge meets one of the two triangles: there are no gaps.
 """
 
 from __future__ import annotations
@@ -21,21 +21,21 @@ from common.perception.pinhole import Pinhole
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
-Picture = npt.NDArray[np.uint8]
+Pixels = npt.NDArray[np.uint8]
 Depth = npt.NDArray[np.float32]
 
 log = logging.getLogger(__name__)
 
-NEAREST = 0.01  # triangles are cut off this far before the optical centre [m]
-SLACK = 1e-7  # [px] by which spans are widened, so that rounding leaves no gaps
-MOST_LAYERS = 100  # of triangles that fill the picture: what comes after them is not drawn
-MOST_AT_ONCE = 2_000_000  # pixels of triangles that are worked on together
-SAMPLES = 16  # rays through a pixel at the edge of something
+NEAREST = 0.01  # near clipping plane [m]
+SLACK = 1e-7  # [px] widens spans, so that rounding leaves no gaps
+MAX_LAYERS = 100  # of image-filling triangles; the rest is not drawn
+BATCH_PIXELS = 2_000_000  # triangle pixels processed together
+SAMPLES = 16  # rays per edge pixel
 
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """Triangles of one colour: `corners` (n, 3, 3) [m] in world, `color` red, green and blue, 0 to 1."""
+    """Triangles of one color: `corners` (n, 3, 3) [m] in world, `color` red, green and blue, 0 to 1."""
 
     corners: Array
     color: tuple[float, float, float]
@@ -43,32 +43,32 @@ class Mesh:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """What a camera sees: bgr `colour` (height, width, 3), and `depth` along the optical axis [m], inf for nothing."""
+    """Rendered image: bgr `colour` (height, width, 3), and `depth` along the optical axis [m], inf for background."""
 
-    colour: Picture
+    colour: Pixels
     depth: Depth
 
     def depth_within(self, nearest: float, farthest: float) -> Depth:
-        """The depth (height, width) [m] that a camera with this range measures: NaN outside of it."""
+        """Depth (height, width) [m] within a measuring range; NaN outside."""
         return np.where((self.depth >= nearest) & (self.depth <= farthest), self.depth, np.float32(np.nan))
 
 
 def empty_view(camera: Pinhole, color: tuple[float, float, float]) -> View:
-    """A view of nothing but a colour that is infinitely far away."""
+    """Return a view of a uniform color at infinite depth."""
     shape = (camera.height, camera.width)
     return View(np.full((*shape, 3), _bgr(color), np.uint8), np.full(shape, np.inf, np.float32))
 
 
 def cast(meshes: Sequence[Mesh], camera: Pinhole, behind: View) -> View:
-    """The view of the meshes in front of, or behind, what was seen already.
+    """Return the view of the meshes in front of, or behind, an existing view.
 
-    Depth is that of the ray through the centre of each pixel. The colour of pixels in which something ends is the
-    mean of `SAMPLES` rays spread over the pixel, as light on a real pixel mixes: that is what carries sub-pixel edges.
+    Depth is sampled at pixel centers. The color of an edge pixel is the mean of `SAMPLES` rays spread over the pixel,
+    as in a real camera: it carries sub-pixel edge positions.
 
     Args:
         meshes: in world; no shading.
         camera: intrinsics and pose.
-        behind: of the same size; is not changed.
+        behind: of the same size; not modified.
     """
     colour, depth = behind.colour.copy(), behind.depth.copy()
     corners, owner = _in_front(meshes, camera)
@@ -78,35 +78,35 @@ def cast(meshes: Sequence[Mesh], camera: Pinhole, behind: View) -> View:
     pixels, plane = _project(corners, camera)
     order = np.argsort(owner, kind="stable")
     order = order[: _drawable(pixels[order], camera)]
-    nearness, winner = _centres(pixels[order], plane[order], camera, depth)
+    nearness, winner = _cast_centers(pixels[order], plane[order], camera, depth)
     hit = np.flatnonzero(winner >= 0)
     mesh_of = np.full(winner.shape, -1, np.int64)
     mesh_of[hit] = owner[order][winner[hit]]
     depth.ravel()[hit] = 1.0 / nearness[hit]
     colour.reshape(-1, 3)[hit] = palette[mesh_of[hit]]
     grid = mesh_of.reshape(camera.height, camera.width)
-    _soften(pixels[order], plane[order], palette[owner[order]], grid, colour, behind)
+    _antialias(pixels[order], plane[order], palette[owner[order]], grid, colour, behind)
     return View(colour, depth)
 
 
 def _in_front(meshes: Sequence[Mesh], camera: Pinhole) -> tuple[Array, Ints]:
-    """Triangles (n, 3, 3) [m] in the optical frame, cut at `NEAREST`, and which mesh each belongs to (n,)."""
+    """Triangles (n, 3, 3) [m] in the optical frame, clipped at `NEAREST`, and the mesh index of each (n,)."""
     parts: list[Array] = []
     owners: list[Ints] = []
     for index, mesh in enumerate(meshes):
         corners = camera.to_camera(mesh.corners)
         before = corners[..., 2] > NEAREST
-        whole, cut = before.all(axis=1), before.any(axis=1) & ~before.all(axis=1)
-        mine = [corners[whole], *(_cut(triangle) for triangle in corners[cut])]
-        parts += mine
-        owners.append(np.full(sum(len(part) for part in mine), index))
+        complete, cut = before.all(axis=1), before.any(axis=1) & ~before.all(axis=1)
+        clipped = [corners[complete], *(_clip(triangle) for triangle in corners[cut])]
+        parts += clipped
+        owners.append(np.full(sum(len(part) for part in clipped), index))
     if not parts:
         return np.empty((0, 3, 3)), np.empty(0, np.int64)
     return np.concatenate(parts), np.concatenate(owners)
 
 
-def _cut(triangle: Array) -> Array:
-    """The one or two triangles (k, 3, 3) that are left in front of the plane z = `NEAREST`."""
+def _clip(triangle: Array) -> Array:
+    """Clip a triangle at z = `NEAREST` to one or two triangles (k, 3, 3)."""
     kept: list[Array] = []
     for a, b in zip(triangle, np.roll(triangle, -1, axis=0), strict=True):
         if a[2] > NEAREST:
@@ -117,9 +117,9 @@ def _cut(triangle: Array) -> Array:
 
 
 def _project(corners: Array, camera: Pinhole) -> tuple[Array, Array]:
-    """Corners (n, 3, 2) [px] of the triangles that are in the picture, and 1/depth as a plane (n, 3) over pixels.
+    """Corners (n, 3, 2) [px] of the triangles, and 1/depth as a plane (n, 3) over pixels.
 
-    1/depth of a plane is affine in the pixel: a u + b v + c. Triangles that are seen edge-on have a plane of zeros.
+    1/depth of a plane is affine in the pixel: a u + b v + c. Triangles seen edge-on get a plane of zeros.
     """
     z = corners[..., 2]
     pixels = np.stack([camera.fx * corners[..., 0] / z + camera.cx, camera.fy * corners[..., 1] / z + camera.cy], -1)
@@ -134,7 +134,7 @@ def _project(corners: Array, camera: Pinhole) -> tuple[Array, Array]:
 def _spans(pixels: Array, width: int, height: int, reach: float) -> tuple[Ints, Ints, Ints, Ints]:
     """For each triangle and row that it meets: index, row, first and last column.
 
-    With `reach` 0 those are the pixels whose centres lie in the triangle, with 0.5 all that it touches (and some more).
+    With `reach` 0: pixels whose centers are inside; with 0.5: a superset of the pixels that it touches.
     """
     low, high = pixels[..., 1].min(axis=1), pixels[..., 1].max(axis=1)
     first = np.maximum(np.ceil(low - reach - SLACK), 0).astype(np.int64)
@@ -163,60 +163,60 @@ def _spans(pixels: Array, width: int, height: int, reach: float) -> tuple[Ints, 
 
 
 def _areas(pixels: Array, width: int, height: int) -> Array:
-    """About how many pixels (n,) of the picture each triangle meets: never fewer."""
+    """Upper estimate of the number of pixels (n,) that each triangle meets."""
     size = np.array([width, height])
     low, high = np.clip(pixels.min(axis=1) - 1, 0, size), np.clip(pixels.max(axis=1) + 1, 0, size)
     sides = np.roll(pixels, -1, axis=1) - pixels
-    own = np.abs(_cross(sides[:, 0], sides[:, 1])) / 2 + 2 * np.abs(sides).sum(axis=(1, 2)) + 4
-    return np.asarray(np.minimum(np.prod(high - low, axis=1), own) + 1)
+    estimate = np.abs(_cross(sides[:, 0], sides[:, 1])) / 2 + 2 * np.abs(sides).sum(axis=(1, 2)) + 4
+    return np.asarray(np.minimum(np.prod(high - low, axis=1), estimate) + 1)
 
 
 def _drawable(pixels: Array, camera: Pinhole) -> int:
-    """How many of the triangles, from the first on, can be drawn before so many layers of them fill the picture."""
+    """Number of triangles, from the first, within the limit of image-filling layers."""
     areas = np.cumsum(_areas(pixels, camera.width, camera.height))
-    most = MOST_LAYERS * camera.width * camera.height
+    most = MAX_LAYERS * camera.width * camera.height
     count = int(np.searchsorted(areas, most, side="right"))
     if count < len(pixels):
-        log.warning("%d of %d triangles are not drawn: all together would fill the picture %.0f times",
+        log.warning("%d of %d triangles are not drawn: together they fill the image %.0f times",
                     len(pixels) - count, len(pixels), areas[-1] / (camera.width * camera.height))
     return count
 
 
 def _batches(pixels: Array, width: int, height: int) -> list[slice]:
-    """The triangles in order, so many at once that what is worked out for each pixel of them has room."""
-    batch = np.cumsum(_areas(pixels, width, height)) // MOST_AT_ONCE
+    """Slices of the triangles that limit memory per batch."""
+    batch = np.cumsum(_areas(pixels, width, height)) // BATCH_PIXELS
     ends = [*(np.flatnonzero(np.diff(batch)) + 1), len(pixels)]
     return [slice(begin, end) for begin, end in zip([0, *ends[:-1]], ends, strict=True)]
 
 
 def _ramps(values: Ints, counts: Ints) -> tuple[Ints, Ints]:
-    """Each value repeated as often as its count says, and beside it 0, 1, 2, ... up to that."""
+    """Repeat each value by its count, and count 0, 1, 2, ... within each repetition."""
     offsets = np.cumsum(counts) - counts
     return np.repeat(values, counts), np.arange(int(counts.sum())) - np.repeat(offsets, counts)
 
 
-def _centres(pixels: Array, plane: Array, camera: Pinhole, depth: Depth) -> tuple[Array, Ints]:
-    """1/depth (height * width,) at the centre of each pixel and the triangle met there; -1 where none is nearer."""
+def _cast_centers(pixels: Array, plane: Array, camera: Pinhole, depth: Depth) -> tuple[Array, Ints]:
+    """1/depth (height * width,) at each pixel center, and the triangle hit; -1 where none is nearer."""
     with np.errstate(divide="ignore"):
         best = (1.0 / depth.astype(np.float64)).ravel()
     winner = np.full(best.shape, -1, np.int64)
-    for some in _batches(pixels, camera.width, camera.height):
-        triangle, row, start, end = _spans(pixels[some], camera.width, camera.height, 0.0)
+    for batch in _batches(pixels, camera.width, camera.height):
+        triangle, row, start, end = _spans(pixels[batch], camera.width, camera.height, 0.0)
         span, step = _ramps(np.arange(len(triangle)), end - start + 1)
-        of, column = triangle[span] + some.start, start[span] + step
+        of, column = triangle[span] + batch.start, start[span] + step
         near = plane[of, 0] * column + plane[of, 1] * row[span] + plane[of, 2]
         flat = row[span] * camera.width + column
         inside = near > best[flat]
         of, near, flat = of[inside], near[inside], flat[inside]
         np.maximum.at(best, flat, near)
         won = near == best[flat]
-        winner[flat[won][::-1]] = of[won][::-1]  # of two at the same depth the mesh that was named first
+        winner[flat[won][::-1]] = of[won][::-1]  # at equal depth the first mesh wins
     return best, winner
 
 
-def _soften(pixels: Array, plane: Array, colors: Picture, meshes: Ints, colour: Picture, behind: View) -> None:
-    """Mix the colours of what is seen within pixels in which one mesh ends or another begins."""
-    import cv2  # the supervisor knows what there is by this module, and draws nothing
+def _antialias(pixels: Array, plane: Array, colors: Pixels, meshes: Ints, colour: Pixels, behind: View) -> None:
+    """Mix the colors of edge pixels from `SAMPLES` rays each."""
+    import cv2  # the supervisor imports this module without drawing
 
     levels = (meshes + 1).astype(np.float32)
     square = np.ones((3, 3), np.uint8)
@@ -232,15 +232,15 @@ def _soften(pixels: Array, plane: Array, colors: Picture, meshes: Ints, colour: 
     with np.errstate(divide="ignore"):
         best = np.repeat((1.0 / behind.depth.ravel()[flat_edges].astype(np.float64))[:, None], SAMPLES, axis=1)
     mixed = np.repeat(behind.colour.reshape(-1, 3)[flat_edges][:, None], SAMPLES, axis=1)
-    for some in _batches(pixels, width, height):
-        triangle, row, start, end = _spans(pixels[some], width, height, 0.5)
+    for batch in _batches(pixels, width, height):
+        triangle, row, start, end = _spans(pixels[batch], width, height, 0.5)
         near_edge = some_edge[row, end + 1] > some_edge[row, start]
-        triangle, row, start, end = triangle[near_edge] + some.start, row[near_edge], start[near_edge], end[near_edge]
+        triangle, row, start, end = triangle[near_edge] + batch.start, row[near_edge], start[near_edge], end[near_edge]
         span, step = _ramps(np.arange(len(triangle)), end - start + 1)
         of, u, v = triangle[span], start[span] + step, row[span]
         at = place[v * width + u]
-        wanted = at >= 0
-        of, u, v, at = of[wanted], u[wanted], v[wanted], at[wanted]
+        at_edge = at >= 0
+        of, u, v, at = of[at_edge], u[at_edge], v[at_edge], at[at_edge]
         a, b, c = (pixels[of, k] - np.stack([u, v], axis=1) for k in range(3))
         turn = np.sign(_cross(b - a, c - a))
         inside = np.ones((len(of), SAMPLES), bool)
@@ -263,7 +263,7 @@ def _cross(a: Array, b: Array) -> Array:
 
 
 def _spread(count: int) -> Array:
-    """Places (count, 2) within a pixel, -0.5 to 0.5, each in a row and a column of its own (Hammersley's points)."""
+    """Sample positions (count, 2) within a pixel, -0.5 to 0.5, each in its own row and column (Hammersley points)."""
     bits = max(1, (count - 1).bit_length())
     mirrored = [int(f"{i:0{bits}b}"[::-1], 2) / 2**bits for i in range(count)]
     return np.column_stack([(np.arange(count) + 0.5) / count, np.array(mirrored) + 0.5 / 2**bits]) - 0.5

@@ -1,4 +1,4 @@
-"""Solids as triangles, for a camera to see: prisms, primitives, fixtures."""
+"""Triangle meshes of solids for rendering: prisms, primitives, fixtures, robot links."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ CIRCLE_POINTS = 360  # a circle of 0.06 m is then at most 2.3 um off
 
 
 def circle(radius: float) -> Array:
-    """Points (N, 2) [m] on a circle about the origin, anticlockwise."""
+    """Points (N, 2) [m] on a circle about the origin, counterclockwise."""
     angles = np.linspace(0, 2 * math.pi, CIRCLE_POINTS, endpoint=False)
     return radius * np.column_stack([np.cos(angles), np.sin(angles)])
 
 
-def upright(outline: Array, hole: Array, low: float, high: float) -> Array:
-    """Triangles (n, 3, 3) of the solid between two heights [m] with this outline (k, 2) and this hole, if any."""
-    face = between(outline, hole) if len(hole) else triangulate(outline)
+def extrude(outline: Array, hole: Array, low: float, high: float) -> Array:
+    """Triangles (n, 3, 3) of a vertical prism between two heights [m] with an outline (k, 2) and an optional hole."""
+    face = band_triangles(outline, hole) if len(hole) else triangulate(outline)
     parts = [_lift(face, low), _lift(face, high), _walls(outline, low, high)]
     if len(hole):
         parts.append(_walls(hole, low, high))
@@ -51,8 +51,8 @@ def _walls(outline: Array, low: float, high: float) -> Array:
     return np.concatenate([np.stack([corners[0], corners[i], corners[i + 1]], axis=1) for i in (1, 2)])
 
 
-def between(outline: Array, hole: Array) -> Array:
-    """Triangles (n, 3, 2) of the band between two closed curves of the same sense that begin at the same angle."""
+def band_triangles(outline: Array, hole: Array) -> Array:
+    """Triangles (n, 3, 2) of the band between two closed curves of the same orientation and start angle."""
     count = max(len(outline), len(hole))
     steps = np.arange(count + 1)
     a, b = outline[steps * len(outline) // count % len(outline)], hole[steps * len(hole) // count % len(hole)]
@@ -61,10 +61,10 @@ def between(outline: Array, hole: Array) -> Array:
 
 
 def triangulate(outline: Array) -> Array:
-    """Triangles (n, 3, 2) of a simple polygon (k, 2), either way round: ears are cut off until three corners are left.
+    """Triangulate a simple polygon (k, 2) of either orientation by ear clipping: triangles (n, 3, 2).
 
-    Meisters, "Polygons have ears" (1975): there is always an ear. A convex polygon gets a fan about its middle, whose
-    triangles are less thin. What is left without an ear, since the polygon crosses itself, gets a fan about a corner.
+    Meisters, "Polygons have ears" (1975). A convex polygon gets a fan about its center, whose triangles are less thin.
+    If a polygon crosses itself, the rest without ears gets a fan about a corner.
     """
     following = np.roll(outline, -1, axis=0)
     twice_area = float(np.sum(_cross(outline, following)))
@@ -89,7 +89,7 @@ def _is_ear(corners: Array, left: Sequence[int], i: int) -> bool:
     if _cross(b - a, c - b) <= 0:
         return False
     others = corners[[k for k in left if k not in (left[i - 1], left[i], left[(i + 1) % len(left)])]]
-    least = -1e-9 * _cross(b - a, c - b)  # what lies on a side is within, also when rounding puts it beside it
+    least = -1e-9 * _cross(b - a, c - b)  # points on a side count as inside, despite rounding
     sides = [_cross(q - p, others - p) >= least for p, q in ((a, b), (b, c), (c, a))]
     within = sides[0] & sides[1] & sides[2]
     return not bool(within.any())
@@ -100,19 +100,19 @@ def _cross(a: Array, b: Array) -> Array:
 
 
 def fixture_mesh(fixture: Fixture) -> Mesh:
-    """A box, cylinder or sphere in its place."""
+    """Mesh of a fixture at its pose."""
     size = fixture.dimensions
     T = transform(rpy_to_matrix(*fixture.rpy), fixture.position)
-    return Mesh(placed(primitive(fixture.shape, size), T), fixture.color)
+    return Mesh(transformed(primitive(fixture.shape, size), T), fixture.color)
 
 
 def primitive(shape: str, dimensions: Sequence[float]) -> Array:
     """Triangles (n, 3, 3) [m] about the origin: box (x, y, z), cylinder (radius, length along z), sphere (radius,)."""
     if shape == "box":
         x, y, z = (value / 2 for value in dimensions)
-        return upright(np.array([(-x, -y), (x, -y), (x, y), (-x, y)]), np.empty((0, 2)), -z, z)
+        return extrude(np.array([(-x, -y), (x, -y), (x, y), (-x, y)]), np.empty((0, 2)), -z, z)
     if shape == "cylinder":
-        return upright(circle(dimensions[0])[::4], np.empty((0, 2)), -dimensions[1] / 2, dimensions[1] / 2)
+        return extrude(circle(dimensions[0])[::4], np.empty((0, 2)), -dimensions[1] / 2, dimensions[1] / 2)
     if shape == "sphere":
         around, along = np.meshgrid(np.linspace(0, 2 * math.pi, 2 * RINGS + 1), np.linspace(0, math.pi, RINGS + 1))
         grid = dimensions[0] * np.stack(
@@ -123,18 +123,18 @@ def primitive(shape: str, dimensions: Sequence[float]) -> Array:
     raise ValueError(f"no triangles for a {shape}; choices: box, cylinder, sphere")
 
 
-def placed(corners: Array, T: Array) -> Array:
-    """Triangles (n, 3, 3) after a rigid (4, 4) transform."""
+def transformed(corners: Array, T: Array) -> Array:
+    """Transform triangles (n, 3, 3) by a rigid (4, 4) transform."""
     return np.asarray(corners @ T[:3, :3].T + T[:3, 3])
 
 
-# The links of a robot as triangles, from its collision geometry."""
+# Robot links, from collision geometry
 
 def robot_shapes(robot: RobotModel) -> dict[str, Array]:
-    """Triangles (n, 3, 3) [m] of every link that has a shape, in the frame of the link.
+    """Triangles (n, 3, 3) [m] of each link with a collision shape, in the frame of the link.
 
     Raises:
-        ConfigError: a mesh is not there.
+        ConfigError: a mesh is missing.
     """
     import pinocchio as pin
 
@@ -142,7 +142,7 @@ def robot_shapes(robot: RobotModel) -> dict[str, Array]:
     for item in robot.full_geometry(pin.GeometryType.COLLISION).geometryObjects:
         frame = robot.full_model.frames[item.parentFrame]
         T_link_shape = invert(np.array(frame.placement.homogeneous)) @ np.array(item.placement.homogeneous)
-        parts.setdefault(frame.name, []).append(placed(triangles(item.geometry), T_link_shape))
+        parts.setdefault(frame.name, []).append(transformed(triangles(item.geometry), T_link_shape))
     return {link: np.concatenate(shapes) for link, shapes in parts.items()}
 
 
@@ -150,11 +150,11 @@ def triangles(shape: coal.CollisionGeometry) -> Array:
     """Triangles (n, 3, 3) [m] of one shape, about its own origin.
 
     Raises:
-        ValueError: a shape that is neither mesh, box, cylinder, capsule nor sphere.
+        ValueError: the shape is no mesh, box, cylinder, capsule or sphere.
     """
     import coal
 
-    if isinstance(shape, coal.BVHModelBase):  # its points are scaled already
+    if isinstance(shape, coal.BVHModelBase):  # vertices are scaled already
         corners = [[shape.tri_indices(i)[k] for k in range(3)] for i in range(shape.num_tris)]
         return np.asarray(np.array(shape.vertices())[np.array(corners)], dtype=float)
     if isinstance(shape, coal.Box):

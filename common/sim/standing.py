@@ -20,7 +20,7 @@ from pathlib import Path
 import msgpack
 from pydantic import BaseModel, ConfigDict
 
-from common.kept_file import Unreadable, open_regular, standing_folder
+from common.atomic_file import Unreadable, open_regular, runtime_folder
 from common.sim.interface import KINEMATIC, StandingObject
 
 SLOT = 4 * 1024 * 1024  # [bytes] for each of the two newest states
@@ -157,5 +157,5 @@ def state_file(cell: str, environ: Mapping[str, str] = os.environ) -> StateFile 
 
     Its name has that of the host: a container that is started again has the same one, a new one has not.
     """
-    folder = standing_folder(environ)
+    folder = runtime_folder(environ)
     return StateFile(folder / f"{cell}-{socket.gethostname()}.state") if folder else None

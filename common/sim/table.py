@@ -1,4 +1,4 @@
-"""Where a sphere can lie: on the table, clear of everything that stands there, or in a slot of a container."""
+"""Rest positions of spheres: free positions on the table, and the slots of containers."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from common.config import Container, Fixture, Surroundings, World
-from common.scene.slots import slot_positions
+from common.scene.fixtures import slot_positions
 from common.sim.footprints import distances, heights
 
 Array = NDArray[np.float64]
 Slot = tuple[int, int]  # layer, index within the layer
 
-GAP = 1e-3  # room that is left to what a sphere rolls up to [m]
-RING = 2e-3  # step of the search for a free place [m]
+GAP = 1e-3  # clearance around a sphere after rolling [m]
+RING = 2e-3  # step of the search for a free position [m]
 
 
 class Table:
-    """The surface on which spheres of one size rest, and what stands on it."""
+    """Surface that carries spheres of one radius, with its obstacles."""
 
     def __init__(self, world: World, radius: float) -> None:
-        """Find the tables among the fixtures: boxes whose top is at `table_height`. None: it has no end."""
+        """Find the tables: box fixtures with their top at `table_height`. Without any, the surface is unbounded."""
         self.height = world.table_height
         self.radius = radius
         self._containers = list(world.containers.values())
@@ -31,11 +31,11 @@ class Table:
         self._obstacles = [f for f in world.fixtures if f not in self._tables and _rises_through(f, world, radius)]
 
     def carries(self, x: float, y: float) -> bool:
-        """Whether a centre at (x, y) [m] is above a table."""
+        """Whether a center at (x, y) [m] is above a table."""
         return bool(self._carries(np.array([[x, y]]))[0])
 
     def extent(self) -> str:
-        """The tables, for people."""
+        """Describe the tables, for messages."""
         return " or ".join(
             f"x {f.position[0] - f.dimensions[0] / 2:g} to {f.position[0] + f.dimensions[0] / 2:g}, "
             f"y {f.position[1] - f.dimensions[1] / 2:g} to {f.position[1] + f.dimensions[1] / 2:g}"
@@ -43,7 +43,7 @@ class Table:
         )
 
     def blocked(self, x: float, y: float) -> str:
-        """The thing into which a sphere resting at (x, y) [m] would reach, or an empty string."""
+        """Id of the container or fixture that a sphere at (x, y) [m] would overlap, or an empty string."""
         point = np.array([[x, y]])
         reach = self.radius - 1e-9
         for c in self._containers:
@@ -55,38 +55,38 @@ class Table:
         self, points: Array, others: Array, gap: float = 0.0, *, apart: Sequence[float] = (),
         outlines: Sequence[Array] = (),
     ) -> NDArray[np.bool_]:
-        """Which of the points (N, 2) are on the table and clear of all that stands there.
+        """Mask of points (N, 2) on the table that are clear of all obstacles.
 
         Args:
-            points: centres [m].
-            others: (M, 2) centres of other spheres [m].
-            gap: that is left to everything [m].
-            apart: how far centres are at least from each of the others [m]; without, they are of the same size.
-            outlines: (K, 2) each, of what else lies there [m].
+            points: centers [m].
+            others: (M, 2) centers of other spheres [m].
+            gap: clearance to everything [m].
+            apart: smallest distance from the center of each other sphere [m]; default: for equal radii.
+            outlines: (K, 2) of other objects on the table [m].
         """
-        good = self._carries(points)
+        free = self._carries(points)
         for c in self._containers:
-            good &= _distance_to_box(points, c.x, c.y, c.half_side) >= self.radius + gap
+            free &= _distance_to_box(points, c.x, c.y, c.half_side) >= self.radius + gap
         for fixture in self._obstacles:
-            good &= _distance(points, fixture) >= self.radius + gap
+            free &= _distance(points, fixture) >= self.radius + gap
         for other, least in zip(others, apart or [2 * self.radius] * len(others), strict=True):
-            good &= np.hypot(*(points - other).T) >= least + gap
+            free &= np.hypot(*(points - other).T) >= least + gap
         for outline in outlines:
-            good &= distances(points, outline) >= self.radius + gap
-        return good
+            free &= distances(points, outline) >= self.radius + gap
+        return free
 
     def nearest_free(
         self, x: float, y: float, others: Array, *, apart: Sequence[float] = (), outlines: Sequence[Array] = ()
     ) -> tuple[float, float] | None:
-        """The free place nearest to (x, y) [m], to within the search step; None when the table is full."""
+        """Free position nearest to (x, y) [m], within the search step; None if the table is full."""
         if self.free(np.array([[x, y]]), others, apart=apart, outlines=outlines)[0]:
             return x, y
         for ring in range(1, int(2.5 / RING)):
             angles = np.linspace(0.0, 2 * math.pi, max(8, 2 * ring), endpoint=False)
             points = np.column_stack([x + ring * RING * np.cos(angles), y + ring * RING * np.sin(angles)])
-            good = self.free(points, others, GAP, apart=apart, outlines=outlines)
-            if good.any():
-                found = points[int(np.argmax(good))]
+            free = self.free(points, others, GAP, apart=apart, outlines=outlines)
+            if free.any():
+                found = points[int(np.argmax(free))]
                 return float(found[0]), float(found[1])
         return None
 
@@ -100,10 +100,10 @@ class Table:
 
 
 class Slots:
-    """The places of equal spheres in a container: 2 x 2 in each layer, one of a layer lies on the one below."""
+    """Slots of equal spheres in a container: layers of 2 x 2, each on top of the one below."""
 
     def __init__(self, container: Container, radius: float, table_height: float) -> None:
-        """Lay out the slots for spheres of that radius [m]."""
+        """Lay out the slots for spheres of a radius [m]."""
         self._container = container
         self._positions = slot_positions(container, radius, table_height)
         self.centres = [(float(x), float(y)) for x, y, _ in self._positions[0]]
@@ -111,12 +111,12 @@ class Slots:
         self.count = 4 * self.layers
 
     def position(self, slot: Slot) -> Array:
-        """Centre of a sphere in the slot (3,) [m]."""
+        """Center of a sphere in the slot (3,) [m]."""
         position: Array = self._positions[slot].copy()
         return position
 
     def choose(self, x: float, y: float, taken: Iterable[Slot]) -> Slot | None:
-        """The free slot nearest to (x, y) in the lowest layer that is not full; None when the container is."""
+        """Free slot nearest to (x, y) in the lowest layer with room; None if the container is full."""
         occupied = set(taken)
         for layer in range(self.layers):
             free = [i for i in range(4) if (layer, i) not in occupied]
@@ -126,13 +126,13 @@ class Slots:
 
 
 def tables(world: Surroundings) -> list[Fixture]:
-    """Fixtures whose flat top is at the table's height."""
+    """Fixtures whose flat top is at the height of the table."""
     flat = [f for f in world.fixtures if f.shape == "box" and f.rpy[0] == 0.0 and f.rpy[1] == 0.0]
     return [f for f in flat if abs(f.position[2] + f.dimensions[2] / 2 - world.table_height) < 1e-3]
 
 
 def is_over(container: Container, x: float, y: float) -> bool:
-    """Whether (x, y) [m] is above a container, its walls included."""
+    """Whether (x, y) [m] is above a container, including its walls."""
     return max(abs(x - container.x), abs(y - container.y)) <= container.half_side
 
 
@@ -143,13 +143,13 @@ def is_inside(container: Container, x: float, y: float) -> bool:
 
 
 def _rises_through(fixture: Fixture, world: World, radius: float) -> bool:
-    """Whether a fixture is anywhere as high as a sphere on the table."""
+    """Whether a fixture reaches into the height range of a sphere on the table."""
     bottom, top = heights(fixture)
     return bottom < world.table_height + 2 * radius - 1e-6 and top > world.table_height + 1e-6
 
 
 def _distance(points: Array, fixture: Fixture) -> Array:
-    """Horizontal distance [m] of points (N, 2) to a fixture seen from above; 0 inside. A tilted one counts as round."""
+    """Horizontal distance [m] of points (N, 2) to a fixture; 0 inside. A tilted one counts as its bounding circle."""
     x, y, _ = fixture.position
     if fixture.shape == "box" and not any(fixture.rpy[:2]):
         cos, sin = math.cos(fixture.rpy[2]), math.sin(fixture.rpy[2])

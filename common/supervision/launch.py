@@ -171,9 +171,9 @@ def require_free_port(endpoint: str) -> None:
         try:
             probe.bind((host, int(port)))
         except OSError:
-            from common.transport.router import PortInUse, holder_of
+            from common.transport.router import PortInUse, port_holder
 
-            raise PortInUse(endpoint, holder_of(int(port))) from None
+            raise PortInUse(endpoint, port_holder(int(port))) from None
 
 
 def process_start_time() -> float:

@@ -18,13 +18,12 @@ from common import topics
 from common.config import Cell
 from common.errors import ConfigError, DecodeError, NoRouter, ZencellError
 from common.messages import Notice, ServiceStatus, SupervisorStatus
-from common.sources import monotonic
 from common.supervision.launch import Launch
 from common.supervision.liveness_watchdog import PERIOD, LivenessWatchdog, RemoteServices
 from common.supervision.supervisor import Supervisor
-from common.transport.credentials import SUPERVISOR
-from common.transport.expiry import EndWatch
-from common.transport.keys import alive_key
+from common.time_source import monotonic
+from common.transport.credentials import SUPERVISOR, CertificateMonitor
+from common.transport.session import alive_key
 
 if TYPE_CHECKING:
     from common.transport.bus import Bus
@@ -136,7 +135,7 @@ async def _connect_and_work(
 ) -> T:
     from common.process.log import BusLog
     from common.supervision.plain_keys import copy_to_plain_keys
-    from common.transport.connect import connect
+    from common.transport.zenoh_session import connect
 
     timeout = CONNECT_TIMEOUT if launch.connect else None  # our own router is watched by the supervisor
     connecting = connect(cell=cell.name, service=NAME, endpoint=endpoint, clock=launch.clock, timeout=timeout,
@@ -201,7 +200,7 @@ async def recover_missed_tokens(
         near: endpoints of the same router to try first.
         period: [s] between two checks; a service that is starting in two of them is looked up.
     """
-    from common.transport.connect import connect
+    from common.transport.zenoh_session import connect
 
     late: set[str] = set()
     while True:
@@ -256,12 +255,12 @@ async def publish_status(
     """
     out = bus.writer(topics.SUPERVISOR_STATUS)
     published: tuple[list[ServiceStatus], list[Notice]] = [], []
-    expiry, notices, checked = EndWatch(), list[Notice](), -notice_period
+    expiry, notices, checked = CertificateMonitor(), list[Notice](), -notice_period
     while True:
         supervisor.mark_connected(bus.connected)
         if monotonic() - checked >= notice_period:
             checked = monotonic()
-            notices = [Notice(urgent=urgent, message=line, host=remote.host) for urgent, line in expiry.ending()]
+            notices = [Notice(urgent=urgent, message=line, host=remote.host) for urgent, line in expiry.warnings()]
         now = remote.statuses(bus.alive.names), [*notices, *remote.notices]
         if supervisor.changed.is_set() or now != published:
             supervisor.changed.clear()

@@ -9,8 +9,8 @@ from types import MappingProxyType
 from common.config import Watchdogs
 from common.messages import Notice, ServiceStatus, SupervisorStatus
 from common.messages.basics import clean
-from common.transport.keys import ROUTER
-from common.waking import Waking
+from common.time_source import WatchdogClock
+from common.transport.session import ROUTER
 
 PERIOD = 0.25  # [s] between two checks
 LEASE = 2.0  # [s] after which a connection without traffic counts as lost
@@ -48,7 +48,7 @@ class LivenessWatchdog:
     def __init__(self, watchdogs: Watchdogs) -> None:
         """Start without any process."""
         self._limits = watchdogs
-        self._awake = Waking(2 * PERIOD)
+        self._awake = WatchdogClock(2 * PERIOD)
         self._signs: dict[str, _LastSign] = {}
         self._waited: Mapping[str, float] = {}
         self._router_blamed = False
@@ -72,7 +72,7 @@ class LivenessWatchdog:
             stopped: names of stopped processes (SIGSTOP).
             waited: total time that each process has waited for a processor [s]; 0 if unknown.
         """
-        awake, self._waited = self._awake.look(now), waited
+        awake, self._waited = self._awake.advance(now), waited
         if not self._limits.silence:
             return []
         verdicts = []

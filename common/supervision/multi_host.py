@@ -30,7 +30,7 @@ class HostOptions:
         Raises:
             ConfigError: an endpoint is not valid, or no router of our own is started.
         """
-        from common.transport.endpoint import LINK_VARIABLE, LISTEN_VARIABLE, endpoints_of, listening
+        from common.transport.endpoint import LINK_VARIABLE, LISTEN_VARIABLE, endpoints_of, listen_endpoints
 
         if launch.connect:
             for option, given in (("--listen", self.listen), ("--link", self.link)):
@@ -39,7 +39,7 @@ class HostOptions:
             return launch
         wider = endpoints_of("--listen", self.listen or (), LISTEN_VARIABLE)
         links = endpoints_of("--link", self.link or (), LINK_VARIABLE)
-        return replace(launch, listen=tuple(listening(launch.domain, wider)) if wider else (), link=tuple(links))
+        return replace(launch, listen=tuple(listen_endpoints(launch.domain, wider)) if wider else (), link=tuple(links))
 
     def part_of(self, cell: Cell) -> Cell:
         """Return the cell with only the services that run on this host.

@@ -15,7 +15,7 @@ from common.supervision.liveness_watchdog import RemoteServices
 from common.topics import Topic
 from common.transport.bus import Bus
 from common.transport.codec import encode, encoding_of
-from common.transport.copies import COPY, plain_key
+from common.transport.writer import COPY, plain_key
 
 MATCH_PERIOD = 1.0  # [s] between checks for subscribers of a plain key
 

@@ -14,11 +14,11 @@ from typing import Any, Protocol, TypeVar
 from common.config import Cell
 from common.errors import ZencellError
 from common.messages import ServiceStatus
-from common.sources import monotonic
 from common.supervision.child import Backoff, Child, describe_exit
 from common.supervision.launch import Launch
-from common.transport.endpoint import small_keys_renamed
-from common.transport.keys import ROUTER
+from common.time_source import monotonic
+from common.transport.endpoint import remapped_small_keys
+from common.transport.session import ROUTER
 
 T = TypeVar("T")
 
@@ -130,7 +130,7 @@ class Supervisor:
         ]
         self._router = None
         if not launch.connect:
-            small = small_keys_renamed(entry.topics for entry in cell.services.values())
+            small = remapped_small_keys(entry.topics for entry in cell.services.values())
             self._router = SupervisedProcess(make_child(ROUTER, launch.router_command(small), environment, on_line))
         self._all = [self._router, *self._services] if self._router else list(self._services)
         self._by_name = {watched.child.name: watched for watched in self._all}

@@ -73,9 +73,7 @@ def require_one_owner(wirings: Mapping[str, Wiring]) -> None:
 
 
 class Recorder(Bus):
-    """A bus on a network of its own that records declarations and never gets past `ready`."""
-
-    declares_only = True
+    """A bus on a network of its own that records declarations and never gets past `acquire_keys`."""
 
     def __init__(self, service: str = "recorded", topics: Mapping[str, str] | None = None) -> None:
         super().__init__(LocalNetwork().session(), service=service, cell="recorded", clock=Clock(), topics=topics)
@@ -101,11 +99,8 @@ class Recorder(Bus):
         self.wiring.calls.add(self._in_cell(topic))
         return super().client(topic)
 
-    async def owned(self) -> None:
-        """Return at once: this network has no other service."""
-
-    async def ready(self) -> None:
-        """Signal that all is declared, then wait to be cancelled."""
+    async def acquire_keys(self) -> None:
+        """Signal that all is declared, then wait to be cancelled; `ready` waits here too."""
         self._remapping.require_used(self.service)
         self.ready_event.set()
         await asyncio.get_running_loop().create_future()

@@ -18,8 +18,8 @@ from pydantic import Field
 
 from common import messages as m
 from common.config import Grasp, Surroundings, Tunable
+from common.robot.home import HOME_TOLERANCE
 from common.robot.transforms import invert, matrix_to_pose, matrix_to_rpy, pose_to_matrix, rpy_to_matrix, tool_down
-from common.scene.home import AT_HOME
 from common.tasks.decisions import TaskConfig
 from common.tasks.engine import Task
 from common.tasks.stages import MISSES, AwaitImage, Cycle, Grip, Move, Place, Stage, View, place_of
@@ -133,7 +133,7 @@ class Handling(Task[View]):
     def decide(self, view: View) -> None:
         """Continue with a held object; with an empty gripper go home, look and choose."""
         assert view.gripper is not None and view.q is not None and view.scene is not None
-        away = max(abs(a - b) for a, b in zip(view.q, self._home, strict=True)) > AT_HOME
+        away = max(abs(a - b) for a, b in zip(view.q, self._home, strict=True)) > HOME_TOLERANCE
         if self.status.state == "DONE":  # no operator asked for more
             return
         if view.holding and view.gripper.outcome in MISSES:  # another object than intended

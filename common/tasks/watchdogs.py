@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from common import messages as m
-from common.waking import Waking
+from common.time_source import WatchdogClock
 
 LOOK_PERIOD = 0.05  # [s] longest period between two updates of a task that runs on time
 USUAL_GAPS = 4  # joint states are missing after this many of their usual periods
@@ -32,7 +32,7 @@ class LivenessWatchdog:
         """
         self.trouble = ""  # why the arm must not move now
         self._received, self._timeout = received, timeout
-        self._awake = Waking(2 * LOOK_PERIOD)
+        self._awake = WatchdogClock(2 * LOOK_PERIOD)
         self._count: int | None = None
         self._heard = 0.0  # process uptime
         self._gap = 0.0  # usual period of joint states
@@ -50,7 +50,7 @@ class LivenessWatchdog:
         """
         self._seen |= {name for name, there in serving.items() if there}
         gone = [name for name, there in serving.items() if not there and name in self._seen]
-        silent = self._joints_are_missing(self._awake.look(now))
+        silent = self._joints_are_missing(self._awake.advance(now))
         self.trouble = f"{' and '.join(gone)} {'is' if len(gone) == 1 else 'are'} gone" if gone else silent
         if motion is None:
             return []

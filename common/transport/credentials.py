@@ -1,10 +1,14 @@
-"""A folder of certificates, as `zencell secure init` makes it, and what one process takes from it."""
+"""The folder of certificates of `zencell secure init`: credentials of one process, and when certificates expire."""
 
 from __future__ import annotations
 
+import datetime
 import json
+import logging
 import os
+import re
 import ssl
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,23 +16,30 @@ from typing import Any
 
 from common.errors import ConfigError
 
-SECURE_VARIABLE = "ZENCELL_SECURE"  # folder of certificates, as `zencell secure init` makes it
+SECURE_VARIABLE = "ZENCELL_SECURE"  # folder of certificates
 AUTHORITY, ROUTER_NAME, ACCESS = "ca", "router", "access.json5"
-SUPERVISOR, RECORDER = "supervisor", "recorder"  # beside the services of each cell
-OPERATOR, OBSERVER = "operator", "observer"  # people's tools, for all cells
+SUPERVISOR, RECORDER = "supervisor", "recorder"  # in each cell, besides its services
+OPERATOR, OBSERVER = "operator", "observer"  # tools of people, for all cells
 REMEDY = "make it with `zencell secure init`"
+
+WARNING_TIME, URGENT_TIME = datetime.timedelta(days=30), datetime.timedelta(days=1)  # before a certificate expires
+PERIOD = 3600.0  # [s] between two checks of the files
+# Validity in a certificate: two UTC times, the second of which is its end. A library for it would stay in the memory
+# of every process.
+_TIMES = re.compile(rb"\x30.(?:\x17\x0d\d{12}Z|\x18\x0f\d{14}Z)(?:\x17\x0d(\d{12})Z|\x18\x0f(\d{14})Z)", re.DOTALL)
+_END = "-----END CERTIFICATE-----"
 
 
 @dataclass(frozen=True)
 class Credentials:
-    """Files with which one process proves who it is."""
+    """Files with which one process authenticates itself."""
 
     authority: Path
     certificate: Path
     key: Path
 
     def tls(self, *, listens: bool = False) -> dict[str, Any]:
-        """The `transport/link/tls` section of a Zenoh configuration: both ends show a certificate."""
+        """Return the `transport/link/tls` section of a Zenoh configuration; both ends show a certificate."""
         section: dict[str, Any] = {
             "root_ca_certificate": str(self.authority), "enable_mtls": True, "verify_name_on_connect": True,
             "connect_certificate": str(self.certificate), "connect_private_key": str(self.key),
@@ -39,37 +50,37 @@ class Credentials:
 
 
 def common_name(cell: str, process: str) -> str:
-    """The name in the certificate of a process, by which access is controlled; a tool's is that of no one cell."""
+    """Return the name in the certificate of a process, which access rules refer to; that of a tool names no cell."""
     return process if process in (OPERATOR, OBSERVER) else f"{cell}.{process}"
 
 
 def secure_folder(environ: Mapping[str, str] = os.environ) -> Path | None:
-    """The folder of certificates that is to be used; None for an open cell."""
+    """Return the folder of certificates to use; None for an open cell."""
     given = environ.get(SECURE_VARIABLE)
     return Path(given) if given else None
 
 
-def identity_of_listener(environ: Mapping[str, str] = os.environ) -> str:
-    """Whose certificate a tool shows that only listens: the observer's, where there is one."""
+def observer_identity(environ: Mapping[str, str] = os.environ) -> str:
+    """Return the identity of a tool that only reads: the observer if the folder has one, else the operator."""
     folder = secure_folder(environ)
     return OBSERVER if folder is not None and (folder / f"{OBSERVER}.key").is_file() else OPERATOR
 
 
-def refuse_to_publish(what: str, environ: Mapping[str, str] = os.environ) -> None:
+def require_open_cell(what: str, environ: Mapping[str, str] = os.environ) -> None:
     """Return in an open cell.
 
     Raises:
-        ConfigError: the cell is secured, where the router would take nothing that a tool publishes.
+        ConfigError: the cell is secured: its router drops what a tool publishes.
     """
     if secure_folder(environ) is not None:
         raise ConfigError(what, ..., "is not possible with certificates: only a cell's own services publish")
 
 
 def credentials_of(name: str, folder: Path) -> Credentials:
-    """The credentials of a common name.
+    """Return the credentials of a common name.
 
     Raises:
-        ConfigError: the folder has none for it, or its key can be read by others.
+        ConfigError: a file is missing or unreadable, or other users can read the key.
     """
     found = Credentials(folder / f"{AUTHORITY}.pem", folder / f"{name}.pem", folder / f"{name}.key")
     for file in (found.authority, found.certificate, found.key):
@@ -83,10 +94,10 @@ def credentials_of(name: str, folder: Path) -> Credentials:
 
 
 def require_pair(found: Credentials) -> None:
-    """Return when key and certificate belong together, and the authority's can be read.
+    """Return if the key fits the certificate and the authority's certificate is readable.
 
     Raises:
-        ConfigError: they do not.
+        ConfigError: they do not fit, or one is malformed.
     """
     try:
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
@@ -97,10 +108,10 @@ def require_pair(found: Credentials) -> None:
 
 
 def read_access(folder: Path) -> dict[str, Any]:
-    """The router's rules of who may do what.
+    """Return the access rules of the router.
 
     Raises:
-        ConfigError: there are none, or they cannot be read.
+        ConfigError: the file is missing, malformed, or does not enable access control.
     """
     path = folder / ACCESS
     try:
@@ -114,3 +125,79 @@ def read_access(folder: Path) -> dict[str, Any]:
     if not isinstance(rules, dict) or not rules.get("enabled"):
         raise ConfigError("--secure", str(path), "does not control access")
     return rules
+
+
+def expiry_of(path: Path) -> datetime.datetime | None:
+    """Return the end of validity of the first certificate in a file; None if it is unreadable or has none."""
+    try:
+        text = path.read_text(encoding="ascii")
+        first = text[: text.index(_END) + len(_END)]
+        found = _TIMES.search(ssl.PEM_cert_to_DER_cert(first[first.index("-----BEGIN"):]))
+    except (OSError, ValueError):
+        return None
+    if found is None:
+        return None
+    digits = (found[2] or b"20" + found[1]).decode()
+    return datetime.datetime.strptime(digits, "%Y%m%d%H%M%S").replace(tzinfo=datetime.UTC)
+
+
+def expiries_in(folder: Path) -> dict[str, datetime.datetime]:
+    """Return the end of validity of each certificate in a folder by its common name; the authority's is `ca`."""
+    found = ((path.stem, expiry_of(path)) for path in sorted(folder.glob("*.pem")))
+    return {name: until for name, until in found if until is not None}
+
+
+def expiry_warning(name: str, until: datetime.datetime, now: datetime.datetime) -> tuple[bool, str] | None:
+    """Return whether renewing a certificate is urgent, and a warning; None more than 30 days before it expires."""
+    left = until - now
+    if left > WARNING_TIME:
+        return None
+    what = "the authority's certificate" if name == AUTHORITY else f"the certificate of {name}"
+    if left <= datetime.timedelta(0):
+        return True, f"{what} expired on {until:%Y-%m-%d %H:%M} UTC: new connections with it fail"
+    hours = left / datetime.timedelta(hours=1)
+    return left <= URGENT_TIME, f"{what} expires on {until:%Y-%m-%d %H:%M} UTC, in " + (
+        f"{hours / 24:.0f} days" if left > 2 * URGENT_TIME else f"{hours:.0f} hours")
+
+
+class CertificateMonitor:
+    """Warns once for each certificate that expires soon, again when that is urgent, and again when it has expired."""
+
+    def __init__(self, folder: Path | None = None, names: frozenset[str] | None = None) -> None:
+        """Monitor a folder.
+
+        Args:
+            folder: of certificates; by default that of `ZENCELL_SECURE`.
+            names: common names to monitor; by default all in the folder.
+        """
+        self._folder = folder or secure_folder()
+        self._names = names
+        self._next = 0.0
+        self._reported: dict[str, tuple[bool, bool]] = {}  # urgent and expired, by name
+
+    def log_new(self, log: logging.Logger) -> None:
+        """Log new warnings; checks the files at most once an hour."""
+        if time.monotonic() >= self._next:
+            self._next = time.monotonic() + PERIOD
+            for urgent, line in self.new_warnings():
+                log.log(logging.ERROR if urgent else logging.WARNING, "%s", line)
+
+    def warnings(self, now: datetime.datetime | None = None) -> list[tuple[bool, str]]:
+        """Return all current warnings: whether it is urgent, and a line."""
+        return [(urgent, line) for urgent, line, _, _ in self._expiring(now or datetime.datetime.now(datetime.UTC))]
+
+    def new_warnings(self, now: datetime.datetime | None = None) -> list[tuple[bool, str]]:
+        """Return the warnings that were not returned before: whether it is urgent, and a line."""
+        found = self._expiring(now or datetime.datetime.now(datetime.UTC))
+        new = [(urgent, line) for urgent, line, name, expired in found if self._reported.get(name) != (urgent, expired)]
+        self._reported = {name: (urgent, expired) for urgent, _, name, expired in found}
+        return new
+
+    def _expiring(self, at: datetime.datetime) -> list[tuple[bool, str, str, bool]]:
+        """Return urgency, line, name and whether it has expired for each certificate that expires soon."""
+        found = []
+        for name, until in (expiries_in(self._folder) if self._folder else {}).items():
+            if (self._names is None or name in self._names) and (warning := expiry_warning(name, until, at)):
+                line = f"{warning[1]}: `zencell secure renew {self._folder}` (docs/security.md)"
+                found.append((warning[0], line, name, until <= at))
+        return found

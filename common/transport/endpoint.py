@@ -1,4 +1,4 @@
-"""Where the router of a domain is, and the one configuration of Zenoh that all processes share."""
+"""Endpoints of the routers of domains, and the Zenoh configuration that all processes share."""
 
 from __future__ import annotations
 
@@ -20,38 +20,38 @@ DOMAIN_VARIABLE = "ZENCELL_DOMAIN"
 CONNECT_VARIABLE = "ZENCELL_CONNECT"
 LISTEN_VARIABLE = "ZENCELL_LISTEN"
 LINK_VARIABLE = "ZENCELL_LINK"
-NEAR_VARIABLE = "ZENCELL_NEAR"  # ENDPOINT=OTHER,OTHER, set by a supervisor for what it starts
-NEAR_MS = 2000  # in which a try to connect ends where there is another way: a loaded machine takes 1 s
-LEASE_MS = 2000  # a frozen process or cut link is noticed after this
-STUCK_MS = 1000  # so is a link that takes nothing
-# The same in the router, where all that comes from the writer waits meanwhile, several times over: with 300 ms for up
-# to 2 s, after which it is taken for lost. With 30 ms readers were dropped that waited for a processor.
+NEAR_VARIABLE = "ZENCELL_NEAR"  # ENDPOINT=OTHER,OTHER, set by a supervisor for its processes
+NEAR_MS = 2000  # of one attempt to connect if there are further endpoints; a loaded machine takes 1 s
+LEASE_MS = 2000  # after which a frozen process or cut link is detected
+STUCK_MS = 1000  # after which a link that takes nothing is cut
+# The same in the router, where all messages of a writer wait meanwhile, several times over: with 300 ms for up to 2 s,
+# after which the writer counts as lost. With 30 ms readers were dropped that waited for a processor.
 ROUTER_STUCK_MS = 100
-LINK_RETRY_MS = (100, 1000)  # between two tries to reach the router of another host: at first, and at most
-LARGE_BYTES = 32 * 1024  # a stream with a larger message travels apart from then on: pictures and clouds
-LINKS = ("0-5", "6-7")  # priorities of each link between two: what is large has one of its own
-STREAM_BATCHES = 16  # of 64 kB that may wait in a link: a whole picture, so that what follows it is not dropped
-MOST_BYTES = 40 * 1024 * 1024  # of one message; the largest picture that is read has 32 MB
-MOST_BYTES_BESIDES = 8 * 1024 * 1024 + 4096  # of one that holds no picture: minutes of a trajectory have 1 MB
-BESIDE_BYTES = 4096  # that a message may have beside its payload
-MOST_SESSIONS = 512  # at one router: 50 cells of ten services
-MOST_PENDING = 32  # of these that have not shown who they are yet
+LINK_RETRY_MS = (100, 1000)  # first and longest pause between two attempts to reach the router of another host
+LARGE_BYTES = 32 * 1024  # from its first larger message on a stream uses the second link: images and clouds
+LINKS = ("0-5", "6-7")  # priorities of each link between two sessions: large messages have one of their own
+STREAM_BATCHES = 16  # of 64 kB that may wait in a link: an entire image, so that the next message is not dropped
+MAX_BYTES = 40 * 1024 * 1024  # of one message; the largest image that is read has 32 MB
+MAX_OTHER_BYTES = 8 * 1024 * 1024 + 4096  # of a message without an image: minutes of a trajectory have 1 MB
+OVERHEAD_BYTES = 4096  # of a message besides its payload
+MAX_SESSIONS = 512  # at one router: 50 cells of ten services
+MAX_PENDING = 32  # of these that have not authenticated themselves yet
 ACCEPT_MS = 3000  # in which they must; a loaded machine takes 1 s
-STATE_BATCHES = 16  # of states and events, the most there can be: seconds of them for a reader that is held up
-# Those of what a router sends that is small; with two batches each, as it comes, they are full wherever the thread that
-# empties them waits for a processor.
+STATE_BATCHES = 16  # of states and events, the maximum: seconds of them for a reader that is delayed
+# Priorities of the small messages of a router. With Zenoh's default of two batches each they are full whenever the
+# thread that empties them waits for a processor.
 SMALL_PRIORITIES = ("control", "real_time", "interactive_high", "interactive_low", "data_high", "data")
 STREAM_WAIT_US = 20_000  # that a stream's message waits for room before it is dropped, once until there is room again
-PARTS_WAIT_US = 300_000  # that one of several batches does, in all: a point cloud of 12 MB has 192 of them
-# The same in the router, where other readers of that writer's pictures wait meanwhile: less than makes a picture old.
+PARTS_WAIT_US = 300_000  # in all, that one of several batches does: a point cloud of 12 MB has 192 of them
+# The same in the router, where other readers of these images wait meanwhile: less than the age that makes one stale.
 ROUTER_PARTS_WAIT_US = 500_000
 
 
 def parse_domain(value: object, field: str = "--domain") -> int:
-    """The domain as a number.
+    """Return the domain as a number.
 
     Raises:
-        ConfigError: it is not a whole number from 0 to 232.
+        ConfigError: it is not an integer from 0 to 232.
     """
     try:
         domain = int(str(value))
@@ -63,21 +63,21 @@ def parse_domain(value: object, field: str = "--domain") -> int:
 
 
 def port_of(domain: int) -> int:
-    """The TCP port of a domain's router."""
+    """Return the TCP port of a domain's router."""
     return BASE_PORT + domain
 
 
 def endpoint_of(domain: int | str | None = None, connect: str | None = None,
                 environ: Mapping[str, str] = os.environ) -> str:
-    """The endpoint to connect to, such as tcp/127.0.0.1:7489.
+    """Return the endpoint to connect to, such as tcp/127.0.0.1:7489.
 
     Args:
-        domain: 0 to 232; when not given `ZENCELL_DOMAIN`, else 42.
-        connect: an endpoint of someone else's router, which wins over the domain; when not given `ZENCELL_CONNECT`.
-        environ: where the variables are looked up.
+        domain: 0 to 232; by default `ZENCELL_DOMAIN`, else 42.
+        connect: endpoint of another router, which overrides the domain; by default `ZENCELL_CONNECT`.
+        environ: environment variables.
 
     Raises:
-        ConfigError: the domain is out of bounds or the endpoint is not one.
+        ConfigError: the domain is out of bounds or the endpoint is malformed.
     """
     field = "--connect" if connect else CONNECT_VARIABLE
     given = connect or ("" if domain is not None else environ.get(CONNECT_VARIABLE, ""))
@@ -101,69 +101,76 @@ def _checked_endpoint(field: str, endpoint: str) -> str:
 
 
 def endpoints_of(field: str, given: Sequence[str], variable: str, environ: Mapping[str, str] = os.environ) -> list[str]:
-    """The endpoints that were given to an option, else those of a variable, which stand there with commas between.
+    """Return the endpoints of an option, else those of a variable, separated by commas.
 
     Raises:
-        ConfigError: one of them is not an endpoint, or goes without TLS in a secured cell.
+        ConfigError: one of them is malformed, or is not encrypted in a secured cell.
     """
     if not given:
         field = variable
         given = [text.strip() for text in environ.get(variable, "").split(",") if text.strip()]
     for endpoint in given:
         _checked_endpoint(field, endpoint)
-        if environ.get(SECURE_VARIABLE) and not endpoint.startswith(("tls/", "quic/")):
+        if environ.get(SECURE_VARIABLE) and not is_encrypted(endpoint):
             raise ConfigError(field, endpoint, "is an open endpoint: with certificates it must be tls/HOST:PORT")
     return list(dict.fromkeys(given))
 
 
-def listening(domain: int, wider: Sequence[str]) -> list[str]:
-    """Where the router of a domain listens: at its own port for the services of its host, and wherever else it must."""
+def listen_endpoints(domain: int, more: Sequence[str]) -> list[str]:
+    """Return where the router of a domain listens: at its port for services of its host, and at `more` endpoints."""
     own = endpoint_of(domain)
     port = own.rpartition(":")[2]
-    every = [endpoint for endpoint in wider if endpoint.rpartition(":")[2] == port and is_any(endpoint)]
-    return [*every, *(e for e in wider if e not in every)] if every else list(dict.fromkeys([own, *wider]))
+    wildcards = [endpoint for endpoint in more if endpoint.rpartition(":")[2] == port and _is_wildcard(endpoint)]
+    return [*wildcards, *(e for e in more if e not in wildcards)] if wildcards else list(dict.fromkeys([own, *more]))
 
 
 def address_of(endpoint: str) -> tuple[str, int]:
-    """Host and port of an endpoint."""
+    """Return host and port of an endpoint."""
     host, _, port = endpoint.partition("/")[2].split("?")[0].split("#")[0].rpartition(":")
     return host.strip("[]"), int(port)
 
 
-def is_any(endpoint: str) -> bool:
-    """Whether it stands for all addresses of a host."""
-    return endpoint.partition("/")[2].rpartition(":")[0].strip("[]") in {"0.0.0.0", "::"}
+def _host_of(endpoint: str) -> str:
+    return endpoint.partition("/")[2].rpartition(":")[0].strip("[]")
+
+
+def _is_wildcard(endpoint: str) -> bool:
+    return _host_of(endpoint) in {"0.0.0.0", "::"}
 
 
 def is_loopback(endpoint: str) -> bool:
-    """Whether an endpoint is reached from its own host only."""
-    host = endpoint.partition("/")[2].rpartition(":")[0].strip("[]")
+    """Return whether only its own host reaches an endpoint."""
+    host = _host_of(endpoint)
     return host in {"localhost", "::1"} or host.startswith("127.")
 
 
 def is_encrypted(endpoint: str) -> bool:
-    """Whether both ends of a connection prove who they are there, and nobody between them can read."""
+    """Return whether connections to an endpoint are authenticated and encrypted."""
     return endpoint.startswith(("tls/", "quic/"))
 
 
-def near_of(endpoint: str, environ: Mapping[str, str] = os.environ) -> list[str]:
-    """Where the router of an endpoint listens for the services of its own host besides, as their supervisor says."""
+def nearby_endpoints(endpoint: str, environ: Mapping[str, str] = os.environ) -> list[str]:
+    """Return the further endpoints of a router for services of its own host, which their supervisor handed down."""
     known, _, near = environ.get(NEAR_VARIABLE, "").partition("=")
     return near.split(",") if near and known == endpoint else []
 
 
 def client_config(
-    endpoint: str, *, connect_ms: int, credentials: Credentials | None = None, apart: bool = False,
+    endpoint: str, *, connect_ms: int, credentials: Credentials | None = None, two_links: bool = False,
     near: Sequence[str] = (),
 ) -> zenoh.Config:
-    """Configuration of a client of the router at an endpoint, which tries for `connect_ms` to reach it at first.
+    """Return the configuration of a client.
 
-    With `apart` it has a link of its own for what is large; the router must admit that, as ours does. With other
-    endpoints of that router, that are `near`, each is tried once, these first.
+    Args:
+        endpoint: of the router.
+        connect_ms: for the first connection.
+        credentials: of a client of a secured router.
+        two_links: open a second link for large messages; the router must admit it, as ours does.
+        near: further endpoints of that router; each is tried once, before `endpoint`.
     """
     links: dict[str, Any] = {"connect__endpoints": [*near, endpoint]}
-    if apart:
-        links["connect__endpoints"] = [{"strategy": "allOf", "locators": _apart(each)} for each in (*near, endpoint)]
+    if two_links:
+        links["connect__endpoints"] = [{"strategy": "allOf", "locators": _locators(e)} for e in (*near, endpoint)]
         links["transport__unicast__max_links"] = len(LINKS)
     if near:
         links["transport__unicast__open_timeout"] = NEAR_MS
@@ -177,8 +184,8 @@ def client_config(
     ))
 
 
-def _apart(endpoint: str) -> list[str]:
-    """The endpoint once for each link, unless it says itself what travels there."""
+def _locators(endpoint: str) -> list[str]:
+    """Return the endpoint once for each link, unless it declares priorities itself."""
     place, mark, config = endpoint.partition("#")
     if "prio=" in place:
         return [endpoint]
@@ -189,7 +196,7 @@ def router_config(
     endpoints: Sequence[str], credentials: Credentials | None = None, access: dict[str, Any] | None = None,
     links: Sequence[str] = (), small: Sequence[str] = (),
 ) -> zenoh.Config:
-    """Configuration of a router that listens at these endpoints only: that of `router_settings`."""
+    """Return the configuration of a router: `router_settings`."""
     return _config(router_settings(endpoints, credentials, access, links, small))
 
 
@@ -197,56 +204,56 @@ def router_settings(
     endpoints: Sequence[str], credentials: Credentials | None = None, access: dict[str, Any] | None = None,
     links: Sequence[str] = (), small: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """What a router is told, as the tree of a Zenoh configuration file; all else is as Zenoh has it.
+    """Return the settings of a router that differ from Zenoh's defaults, as the tree of a configuration file.
 
     Args:
-        endpoints: where.
-        credentials: with which it proves itself; without them everybody is let in.
-        access: who may do what.
-        links: endpoints of routers of other hosts, which it tries to reach for as long as it runs.
-        small: more keys under which nothing large travels, without the cell: `small_keys` under other names.
+        endpoints: the only ones at which it listens.
+        credentials: with which it authenticates itself; without them it admits every client.
+        access: rules of access control.
+        links: endpoints of routers of other hosts, to which it connects again and again.
+        small: further keys of small messages, without the cell: remapped keys of topics.
     """
-    first, most = LINK_RETRY_MS
+    first_ms, longest_ms = LINK_RETRY_MS
     secure = {"transport__link__tls": credentials.tls(listens=True)} if credentials else {}
     controlled = {"access_control": access} if access else {}
-    # Small messages share a batch where they have to wait. What must arrive does wait (`block`): `block_first`, which
-    # keeps a reader that takes nothing from holding up the router, drops each message whose predecessor's thread was
-    # not scheduled within the time that a stream waits, on an idle machine one of some 20,000.
+    # Small messages share a batch if they have to wait. Reliable ones wait (`block`): `block_first`, with which a stuck
+    # reader does not delay the router, drops each message whose predecessor's thread was not scheduled within the wait
+    # of a stream, on an idle machine one of some 20,000.
     shared = {"messages": ["put"], "flows": ["egress"], "overwrite": {"express": False}}
-    # Pictures of those who know nothing of a link for what is large.
-    apart = {
+    # Images of clients without a second link.
+    large = {
         "messages": ["put"], "flows": ["egress"], "qos": {"congestion_control": "drop"},
         "payload_size": f"{LARGE_BYTES}..", "overwrite": {"express": False, "priority": "data_low"},
     }
     return _settings(
-        qos__network=[apart, shared],
+        qos__network=[large, shared],
         transport__link__tx__queue__congestion_control__block__wait_before_close=ROUTER_STUCK_MS * 1000,
         transport__link__tx__queue__congestion_control__drop__max_wait_before_drop_fragments=ROUTER_PARTS_WAIT_US,
         **{f"transport__link__tx__queue__size__{name}": STATE_BATCHES for name in SMALL_PRIORITIES},
         mode="router", listen__endpoints=list(endpoints),
-        # One link each: where two were opened at once, nothing travelled over either in one start of four.
+        # One link each: when two were opened at once, neither carried messages in one start of four.
         connect__endpoints=list(links),
         connect__timeout_ms=-1, connect__exit_on_failure=False,
-        connect__retry={"period_init_ms": first, "period_max_ms": most, "period_increase_factor": 1.5},
+        connect__retry={"period_init_ms": first_ms, "period_max_ms": longest_ms, "period_increase_factor": 1.5},
         low_pass_filter=size_limits(small),
         transport__unicast__max_links=len(LINKS),
-        transport__unicast__max_sessions=MOST_SESSIONS,
-        transport__unicast__accept_pending=MOST_PENDING,
+        transport__unicast__max_sessions=MAX_SESSIONS,
+        transport__unicast__accept_pending=MAX_PENDING,
         transport__unicast__accept_timeout=ACCEPT_MS,
         **secure, **controlled,
     )
 
 
 def size_limits(more: Sequence[str] = ()) -> list[dict[str, Any]]:
-    """What the router drops, because it is larger than any message of its topic ever is; `more` keys beside our own."""
+    """Return the router's filters, which drop messages larger than any of their topic; `more`: further keys."""
     from common.application import all_topics
 
     by_size: dict[int, list[str]] = {}
     for topic in all_topics().values():
-        most = max(topic.message.most_bytes, getattr(topic, "answer", topic.message).most_bytes)
-        if (allowed := most + BESIDE_BYTES) <= MOST_BYTES_BESIDES:
+        largest = max(topic.message.max_bytes, getattr(topic, "answer", topic.message).max_bytes)
+        if (allowed := largest + OVERHEAD_BYTES) <= MAX_OTHER_BYTES:
             by_size.setdefault(allowed, []).append(topic.expression)
-    by_size.setdefault(MOST_BYTES_BESIDES, []).extend(more)
+    by_size.setdefault(MAX_OTHER_BYTES, []).extend(more)
     return [
         {
             "id": f"at most {size} bytes", "flows": ["ingress"], "messages": ["put", "query", "reply"],
@@ -256,44 +263,38 @@ def size_limits(more: Sequence[str] = ()) -> list[dict[str, Any]]:
     ]
 
 
-def small_keys() -> list[str]:
-    """Keys of all topics whose messages are neither pictures nor clouds."""
+def remapped_small_keys(tables: Iterable[Mapping[str, str]]) -> list[str]:
+    """Return the keys that services of a cell remap topics without images and clouds to, as in common/remapping.py."""
     from common.application import all_topics
     from common.messages import Image, PointCloud2
-
-    return [topic.expression for topic in all_topics().values() if topic.message not in (Image, PointCloud2)]
-
-
-def small_keys_renamed(tables: Iterable[Mapping[str, str]]) -> list[str]:
-    """The same under the other names that services give them, as common/remapping.py has it."""
     from common.remapping import Remapping
 
-    if not (given := [Remapping(table) for table in tables if table]):
+    if not (remappings := [Remapping(table) for table in tables if table]):
         return []
-    own = small_keys()
-    return sorted({names.key(key) for names in given for key in own}.difference(own))
+    own = [topic.expression for topic in all_topics().values() if topic.message not in (Image, PointCloud2)]
+    return sorted({remapping.key(key) for remapping in remappings for key in own}.difference(own))
 
 
 def _settings(**values: Any) -> dict[str, Any]:
-    """A tree of settings, those that all processes share among them; `__` in a name goes down one level."""
+    """Return a tree of settings, with those that all processes share; `__` in a name goes down one level."""
     common = {
         "scouting__multicast__enabled": False,
         "scouting__gossip__enabled": False,
         "timestamping__enabled": True,
         "transport__link__tx__lease": LEASE_MS,
-        # A message that must arrive and that a link does not take for so long ends the link. By default it is 5 s, and
-        # Zenoh does not see meanwhile that the lease of a frozen router has run out, nor that it is back.
+        # A reliable message that a link does not take for this long ends the link. By default it is 5 s, in which Zenoh
+        # does not notice that the lease of a frozen router has expired, nor that it is back.
         "transport__link__tx__queue__congestion_control__block__wait_before_close": STUCK_MS * 1000,
-        # By default two batches and 1 ms: a busy machine does not take a picture then.
+        # By default two batches and 1 ms: a busy machine does not take an image then.
         "transport__link__tx__queue__size__data": STREAM_BATCHES,
         "transport__link__tx__queue__size__data_low": STREAM_BATCHES,
         "transport__link__tx__queue__congestion_control__drop__wait_before_drop": STREAM_WAIT_US,
         # By default 50 ms: on a busy machine every second point cloud was dropped.
         "transport__link__tx__queue__congestion_control__drop__max_wait_before_drop_fragments": PARTS_WAIT_US,
-        # Shared memory goes round the size limits of a link, and queries over it were lost when a receiver stalled.
+        # Shared memory bypasses the size limits of a link, and queries over it were lost when a receiver stalled.
         "transport__shared_memory__enabled": False,
-        # What is longer ends the link that it comes from; by default a message may have 1 GB.
-        "transport__link__rx__max_message_size": MOST_BYTES,
+        # A longer message ends its link; by default a message may have 1 GB.
+        "transport__link__rx__max_message_size": MAX_BYTES,
     }
     tree: dict[str, Any] = {}
     for path, value in {**common, **values}.items():
@@ -306,6 +307,6 @@ def _settings(**values: Any) -> dict[str, Any]:
 
 
 def _config(settings: dict[str, Any]) -> zenoh.Config:
-    import zenoh  # here: the command line asks for endpoints before it has started anything
+    import zenoh  # slow to import: the command line needs endpoints only
 
     return zenoh.Config.from_json5(json.dumps(settings))

@@ -14,44 +14,45 @@ from common.topics import Request
 from common.transport.codec import (
     Attachment,
     checksum_of,
+    current_trace,
     decode_attachment,
-    decode_beside,
     decode_error,
+    decode_in_thread,
     encode,
     encode_attachment,
     encode_error,
     encoding_of,
-    require_whole,
+    require_intact,
+    set_trace,
 )
-from common.transport.handoff import call_on_loop
 from common.transport.reader import NO_SENDER, Refusals
-from common.transport.session import Declared, Query, RawReply, Session
+from common.transport.session import Declaration, Query, RawReply, Session, call_on_loop
 from common.transport.tokens import TokenWatch
-from common.transport.trace import current_trace, follow
 
 Q = TypeVar("Q", bound=Message)
 A = TypeVar("A", bound=Message)
+T = TypeVar("T")
 
-_MOST_WAITING = 1000  # requests that are not begun yet
-_LOOK_SECONDS = 1.0  # how long a new client looks for servers before a request is given up unsent
-_VANISH_SECONDS = 0.25  # the token of a server that has just answered may be gone before its answer is here
+_MAX_PENDING = 1000  # requests that are not started yet
+_DISCOVERY_SECONDS = 1.0  # in which a new client finds servers; then a request fails unsent
+_VANISH_SECONDS = 0.25  # the token of a server that has just answered may vanish before its answer arrives
 
 
 class Server(Generic[Q, A]):
     """Answers requests with a handler, each in a task of its own.
 
-    Of many that come at once one is begun in each turn of the loop, so that all else has its turns between them.
+    Of a burst of requests one starts in each turn of the loop, so that other tasks run in between.
     """
 
     def __init__(
         self, session: Session, cell: str, service: str, topic: Request[Q, A], handler: Callable[[Q], Awaitable[A]],
         *, loop: asyncio.AbstractEventLoop, log: logging.Logger, ready: asyncio.Event,
-        crash: Callable[[BaseException], None], limit: int, most: int | None = None,
-        crowded: Callable[[], str] | None = None,
+        crash: Callable[[BaseException], None], limit: int, max_pending: int | None = None,
+        on_overload: Callable[[], str] | None = None,
     ) -> None:
         self.topic = topic
         self.received = 0
-        self._most, self._crowded = most, crowded
+        self._max_pending, self._on_overload = max_pending or _MAX_PENDING, on_overload
         self._key = f"{cell}/{topic.key}"
         self._service = service
         self._sequence = 0
@@ -62,51 +63,50 @@ class Server(Generic[Q, A]):
         self._limit = limit
         self._refusals = Refusals(topic.key, loop, log)
         self._tasks: set[asyncio.Task[None]] = set()
-        self._waiting: deque[Query] = deque()
-        self._beginning = False  # one has not had its turn yet
+        self._pending: deque[Query] = deque()
+        self._starting = False  # whether a started request did not run yet
         self._in_order = asyncio.Lock()
         self._session, self._loop = session, loop
-        self._queryable: Declared | None = None
+        self._queryable: Declaration | None = None
 
     def open(self) -> None:
-        """Be asked from now on: not before it is sure that nobody else serves the key, who would miss requests."""
+        """Accept requests from now on. Call it when no other server has the key, which would miss requests."""
         self._queryable = self._session.queryable(
-            self._key, lambda query: call_on_loop(self._loop, lambda: self._start(query)), complete=True)
+            self._key, lambda query: call_on_loop(self._loop, lambda: self._accept(query)), complete=True)
 
     @property
     def invalid(self) -> int:
-        """Requests that were refused because they are not valid requests."""
+        """Payloads that are not valid requests."""
         return self._refusals.count
 
-    def _start(self, query: Query) -> None:
+    def _accept(self, query: Query) -> None:
         if self._closed:
             query.finish()
             return
         self.received += 1
-        most = self._most or _MOST_WAITING
-        if len(self._waiting) >= most:
-            told = f"{most} requests wait already"
+        if len(self._pending) >= self._max_pending:
+            reason = f"{self._max_pending} requests wait already"
             try:
-                told += f": {self._crowded()}" if self._crowded is not None else ""
+                reason += f": {self._on_overload()}" if self._on_overload is not None else ""
             finally:
-                query.refuse(encode_error("busy", told))
+                query.refuse(encode_error("busy", reason))
                 query.finish()
             return
-        if self._beginning:
-            self._waiting.append(query)
+        if self._starting:
+            self._pending.append(query)
         else:
-            self._begin(query)
+            self._start(query)
 
-    def _begin(self, query: Query) -> None:
-        self._beginning = True
+    def _start(self, query: Query) -> None:
+        self._starting = True
         task = asyncio.create_task(self._serve(query), name=f"{self.topic.key} request")
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
     async def _serve(self, query: Query) -> None:
-        self._beginning = False
-        if self._waiting:
-            self._begin(self._waiting.popleft())
+        self._starting = False
+        if self._pending:
+            self._start(self._pending.popleft())
         try:
             payload = self._check(query)
             if payload is None:
@@ -116,19 +116,19 @@ class Server(Generic[Q, A]):
             try:
                 attachment = decode_attachment(query.attachment)
                 sender = attachment.writer if attachment else NO_SENDER
-                require_whole(attachment, self._key, payload)
-                async with self._in_order:  # what came first is answered first, however large it is
-                    request = await decode_beside(self.topic.message, payload, self._limit)
+                require_intact(attachment, self._key, payload)
+                async with self._in_order:  # a large request does not let later ones pass
+                    request = await decode_in_thread(self.topic.message, payload, self._limit)
             except DecodeError as error:
                 self._refuse(query, "invalid", error, sender)
                 return
-            follow(attachment.trace if attachment else "")
+            set_trace(attachment.trace if attachment else "")
             await self._answer(query, request)
         finally:
             query.finish()
 
     def _check(self, query: Query) -> bytes | None:
-        """The payload, or None when the query is refused: it may have come from someone who just looks around."""
+        """Return the payload; refuse a query without one or with a wildcard, such as of a tool, and return None."""
         if query.key != self._key or query.parameters:
             asked = f"{query.key}?{query.parameters}" if query.parameters else query.key
             self._refuse(query, "bad_request", ValueError(f"{self._key} is a request: ask exactly for it, not {asked}"))
@@ -151,7 +151,7 @@ class Server(Generic[Q, A]):
             payload = encode(answer)
         except Refused as refused:
             query.refuse(encode_error(refused.code, str(refused)))
-        except RequestFailed as failed:  # of a request that the handler made itself
+        except RequestFailed as failed:  # a request of the handler itself
             query.refuse(encode_error("upstream", str(failed)))
         except Exception as error:
             query.refuse(encode_error("internal", f"{type(error).__name__}: {error}"))
@@ -163,12 +163,12 @@ class Server(Generic[Q, A]):
             query.reply(self._key, payload, encoding_of(self.topic.answer), attachment)
 
     async def close(self) -> None:
-        """Be asked no more, and cancel what is being worked on: its requesters learn that it was lost."""
+        """Accept no more requests and cancel running ones: their clients get `RequestLost`."""
         self._closed = True
         if self._queryable is not None:
             self._queryable.undeclare()
-        while self._waiting:
-            self._waiting.pop().finish()
+        while self._pending:
+            self._pending.pop().finish()
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
@@ -189,25 +189,25 @@ class Client(Generic[Q, A]):
         self._limit = limit
         self._key = f"{cell}/{topic.key}"
         self._servers = servers
-        self._waiting: dict[asyncio.Future[RawReply | None], None] = {}  # in their order
+        self._waiting: dict[asyncio.Future[RawReply | None], None] = {}  # in order
         self._server = min(servers.names, default=topic.key)
         servers.on_change(self._on_servers)
 
     @property
     def available(self) -> bool:
-        """Whether the router is reached and somebody serves the key."""
+        """Whether the router is connected and a service serves the key."""
         return self._session.connected and bool(self._servers.names)
 
     @property
     def server(self) -> str:
-        """The service that serves the key, or did last; the key itself before any was known."""
+        """The service that serves the key, or served it last; the key itself if none was seen."""
         return self._server
 
     async def wait_available(self, timeout: float | None = None) -> None:
-        """Return as soon as somebody serves the key.
+        """Return as soon as a service serves the key.
 
         Raises:
-            NoResponder: nobody did within `timeout` seconds.
+            NoResponder: none did within `timeout` seconds.
         """
         try:
             await self._servers.wait(bool, timeout)
@@ -221,42 +221,42 @@ class Client(Generic[Q, A]):
                 self._loop.call_later(_VANISH_SECONDS, _settle, future, None)
 
     async def call(self, request: Q, timeout: float = 5.0) -> A:
-        """The answer to a request.
+        """Send a request and return its answer.
 
         Args:
-            request: what is asked.
-            timeout: for all of it [s], wall time.
+            request: to send.
+            timeout: of the entire call [s], wall time.
 
         Raises:
-            NoResponder: nobody serves the key, or the router is not reached: nothing was sent.
+            NoResponder: no service serves the key, or the router is not connected: nothing was sent.
             RemoteError: the responder refused, or its answer cannot be read.
-            RequestLost: the responder or the router went away: it may have been done.
-            RequestTimeout: no answer in time: it may still be done.
+            RequestLost: the responder or the router went away: the request may have been carried out.
+            RequestTimeout: no answer in time: it may still be carried out.
         """
         if not isinstance(request, self.topic.message):
             raise TypeError(f"{self.topic.key} takes {self.topic.message.__name__}, not {type(request).__name__}")
         payload = encode(request)
         deadline = self._loop.time() + timeout
         if not self.available:
-            if self._session.connected:  # a client that was just made may not know its servers yet
-                await self._servers.known(min(timeout, _LOOK_SECONDS))
+            if self._session.connected:  # a new client may not know its servers yet
+                await self._servers.known(min(timeout, _DISCOVERY_SECONDS))
             if not self.available:
                 raise NoResponder(self.topic.key)
-        reply = await self._ask(payload, max(0.0, deadline - self._loop.time()), timeout)
+        reply = await self._send(payload, max(0.0, deadline - self._loop.time()), timeout)
         if reply is None:
             raise RequestLost(self.topic.key)
         if reply.sample is None:
             refusal = decode_error(reply.error)
-            if refusal is None:  # what Zenoh says when its own time-out, a little later than ours, is up
+            if refusal is None:  # Zenoh's own time-out, a little later than ours
                 raise RequestTimeout(self.topic.key, timeout)
             raise RemoteError(self.topic.key, *refusal)
         try:
-            require_whole(decode_attachment(reply.sample.attachment), self._key, reply.sample.payload)
-            return await decode_beside(self.topic.answer, reply.sample.payload, self._limit)
+            require_intact(decode_attachment(reply.sample.attachment), self._key, reply.sample.payload)
+            return await decode_in_thread(self.topic.answer, reply.sample.payload, self._limit)
         except DecodeError as error:
             raise RemoteError(self.topic.key, "bad_answer", f"the answer cannot be read: {error}") from None
 
-    async def _ask(self, payload: bytes, seconds: float, timeout: float) -> RawReply | None:
+    async def _send(self, payload: bytes, seconds: float, timeout: float) -> RawReply | None:
         future: asyncio.Future[RawReply | None] = self._loop.create_future()
         self._sequence += 1
         attachment = encode_attachment(Attachment(
@@ -278,9 +278,6 @@ class Client(Generic[Q, A]):
         finally:
             del self._waiting[future]
             cancel()
-
-
-T = TypeVar("T")
 
 
 def _settle(future: asyncio.Future[T], value: T) -> None:

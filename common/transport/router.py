@@ -1,4 +1,4 @@
-"""The router of a domain: the one session that every service of the host is a client of."""
+"""The router of a domain: the session that all services of a host are clients of."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ from common.transport.credentials import (
     require_pair,
 )
 from common.transport.endpoint import address_of, client_config, is_encrypted, port_of, router_config
-from common.transport.front import Front
+from common.transport.tls_gate import TlsGate
 
 log = logging.getLogger("router")
 
-_LOOK_SECONDS = 0.5  # between looks at the links with other routers
+_CHECK_SECONDS = 0.5  # between two checks of the links with other routers
 
 
 class PortInUse(ZencellError):
-    """Somebody else listens where the router should."""
+    """Another process listens at the router's endpoint."""
 
     def __init__(self, endpoint: str, holder: str) -> None:
         port = int(endpoint.rpartition(":")[2])
@@ -43,9 +43,9 @@ class PortInUse(ZencellError):
         self.holder = holder
 
 
-def holder_of(port: int) -> str:
-    """Who listens on a TCP port of this host, as well as the system lets us know."""
-    import psutil  # here: a health check has to start fast
+def port_holder(port: int) -> str:
+    """Return the process that listens on a TCP port of this host, as far as the system shows it."""
+    import psutil  # slow to import: health checks start often
 
     try:
         found = [c.pid for c in psutil.net_connections("tcp")
@@ -59,36 +59,33 @@ def holder_of(port: int) -> str:
 
 
 class Router:
-    """A router as `open_router` opens it; a secured one stands behind a front, and can show new certificates.
-
-    A `with` block.
-    """
+    """A router as of `open_router`; a secured one is behind a TLS gate and can reload certificates. A `with` block."""
 
     def __init__(
         self, endpoints: Sequence[str], secured: Path | None = None, links: Sequence[str] = (),
         small: Sequence[str] = (), near: Sequence[str] = (),
     ) -> None:
-        """Listen; a secured one also at one of the `near` endpoints, without a front: another after each renewal.
+        """Listen at the endpoints; a secured router also at a `near` one without gate, the next one after a reload.
 
         Raises:
             PortInUse, ConfigError: as `open_router`.
         """
-        self._front: Front | None = None
+        self._gate: TlsGate | None = None
         self._secured, self._links, self._small = secured, links, small
         self._near = deque(near if secured is not None else ())
-        self._besides = [*endpoints]
+        self._ungated = [*endpoints]
         if secured is not None:
             _require_encrypted(endpoints, links)
-            shown = [endpoint for endpoint in endpoints if endpoint.startswith("tls/")]
-            self._besides = [endpoint for endpoint in endpoints if endpoint not in shown]
-            with _named():
-                self._front = Front(shown)
+            gated = [endpoint for endpoint in endpoints if endpoint.startswith("tls/")]
+            self._ungated = [endpoint for endpoint in endpoints if endpoint not in gated]
+            with _explain_listen_errors():
+                self._gate = TlsGate(gated)
         try:
-            self._files = self._seen = self._files_now()
+            self._files = self._seen = self._read_files()
             self.session = self._open()
         except BaseException:
-            if self._front is not None:
-                self._front.close()
+            if self._gate is not None:
+                self._gate.close()
             raise
 
     def __enter__(self) -> Router:
@@ -98,47 +95,47 @@ class Router:
         self.close()
 
     def close(self) -> None:
-        """Route no more."""
+        """Close the session and the gate."""
         self.session.close()  # type: ignore[no-untyped-call]
-        if self._front is not None:
-            self._front.close()
+        if self._gate is not None:
+            self._gate.close()
 
     def _open(self) -> zenoh.Session:
-        if self._front is None:
-            return open_router(self._besides, self._secured, self._links, self._small)
+        if self._gate is None:
+            return open_router(self._ungated, self._secured, self._links, self._small)
         host, port = "127.0.0.1", _free_port()
-        behind = [f"tls/{host}:{port}", *self._besides]
-        self._near.rotate(1)  # the one of before is still listened at
+        behind = [f"tls/{host}:{port}", *self._ungated]
+        self._near.rotate(1)  # the previous session still listens at the previous one
         try:
             session = open_router([*behind, *[*self._near][:1]], self._secured, self._links, self._small)
         except PortInUse:
             if not self._near:
                 raise
-            log.warning("%s is in use by %s: services of this host come in with all others", self._near[0],
-                        holder_of(address_of(self._near[0])[1]))
+            log.warning("%s is in use by %s: services of this host connect through the gate", self._near[0],
+                        port_holder(address_of(self._near[0])[1]))
             session = open_router(behind, self._secured, self._links, self._small)
-        with _named():
-            self._front.open(host, port)
+        with _explain_listen_errors():
+            self._gate.open(host, port)
         return session
 
-    def _files_now(self) -> dict[str, bytes]:
+    def _read_files(self) -> dict[str, bytes]:
         names = (f"{AUTHORITY}.pem", f"{ROUTER_NAME}.pem", f"{ROUTER_NAME}.key", ACCESS)
         return {name: (self._secured / name).read_bytes() for name in names} if self._secured is not None else {}
 
     def renew(self) -> bool:
-        """Whether certificates or rules are others than before, and are in force from now on; everybody connects anew.
+        """Reload changed certificates and rules; return whether they are in force now. All clients reconnect then.
 
-        To be called again and again: they count when they were the same at two calls.
+        Call it periodically: a change counts once two calls in a row read the same files.
 
         Raises:
-            ConfigError: they cannot be used; those of before stay in force, and this is said once.
+            ConfigError: the new files are unusable; the previous ones stay in force. Raised once per change.
         """
-        if self._front is None or self._besides:
+        if self._gate is None or self._ungated:
             return False
         try:
-            now = self._files_now()
+            now = self._read_files()
         except OSError:
-            return False  # are just being replaced
+            return False  # being replaced
         before, self._seen = self._seen, now
         if now in (self._files, {}) or now != before:
             return False
@@ -152,13 +149,13 @@ class Router:
 
 
 @contextmanager
-def _named() -> Iterator[None]:
-    """Say of an endpoint of the front that cannot be had who has it, or why."""
+def _explain_listen_errors() -> Iterator[None]:
+    """Replace an OSError of the gate by one that names the endpoint and its holder, or the reason."""
     try:
         yield
     except OSError as error:
         if error.errno == errno.EADDRINUSE:
-            raise PortInUse(error.filename, holder_of(address_of(error.filename)[1])) from None
+            raise PortInUse(error.filename, port_holder(address_of(error.filename)[1])) from None
         raise ConfigError("endpoint", error.filename, f"cannot be listened at: {error.strerror}") from None
 
 
@@ -177,13 +174,13 @@ def _require_encrypted(endpoints: Sequence[str], links: Sequence[str]) -> None:
 def open_router(
     endpoints: Sequence[str], secured: Path | None = None, links: Sequence[str] = (), small: Sequence[str] = ()
 ) -> zenoh.Session:
-    """A session that routes for everybody who connects to the endpoints, and listens nowhere else.
+    """Open a session that routes for all clients at the endpoints, and listens nowhere else.
 
     Args:
-        endpoints: where.
-        secured: folder of certificates and rules; without one everybody may do everything.
-        links: endpoints of routers of other hosts; it is no error when nobody is there yet.
-        small: more keys, without the cell, under which nothing large travels.
+        endpoints: where it listens.
+        secured: folder of certificates and rules; without it every client may do everything.
+        links: endpoints of routers of other hosts, which need not be up yet.
+        small: further keys of small messages, without the cell.
 
     Raises:
         PortInUse: names the port, the domain and the process that holds it.
@@ -200,27 +197,27 @@ def open_router(
         text = str(error)
         endpoint = next((each for each in endpoints if each in text), endpoints[0])
         if "os error 98" in text or "in use" in text:
-            raise PortInUse(endpoint, holder_of(int(endpoint.rpartition(":")[2]))) from None
-        reason = text.split(" at /", maxsplit=1)[0]  # without the place in Zenoh's own source
+            raise PortInUse(endpoint, port_holder(int(endpoint.rpartition(":")[2]))) from None
+        reason = text.split(" at /", maxsplit=1)[0]  # without the position in Zenoh's source
         raise ConfigError("endpoint", endpoint, f"cannot be listened at: {reason}") from None
 
 
-def tend(router: Router, stop: threading.Event, look: Callable[[], None] = lambda: None) -> None:
-    """Show new certificates, and log which routers of other hosts are reached and lost, until told to stop.
+def maintain(router: Router, stop: threading.Event, check: Callable[[], None] = lambda: None) -> None:
+    """Reload certificates and log which routers of other hosts are connected and lost, until stopped.
 
     Args:
-        router: that is tended.
+        router: to maintain.
         stop: ends it.
-        look: called now and then.
+        check: called periodically.
     """
     linked: set[str] = set()
-    while not stop.wait(_LOOK_SECONDS):
+    while not stop.wait(_CHECK_SECONDS):
         try:
             if router.renew():
-                log.warning("certificates or rules are new: everybody connects anew, with their own that are new")
+                log.warning("new certificates or rules are in force: all clients reconnect, with their new ones")
         except ZencellError as error:
-            log.error("%s; those of before stay in force", error)
-        look()
+            log.error("%s; the previous ones stay in force", error)
+        check()
         now = {str(zid) for zid in router.session.info.routers_zid()}
         for zid in now - linked:
             log.info("linked with router %s", zid)
@@ -230,7 +227,7 @@ def tend(router: Router, stop: threading.Event, look: Callable[[], None] = lambd
 
 
 def is_reached(endpoint: str, token: str, timeout: float, credentials: Credentials | None = None) -> bool:
-    """Whether a router answers at the endpoint within a time-out [s] and, unless empty, has a liveliness token."""
+    """Return whether a router answers at the endpoint within `timeout` [s] and, unless empty, has the token."""
     try:
         session = zenoh.open(client_config(endpoint, connect_ms=int(timeout * 1000), credentials=credentials))
     except zenoh.ZError:

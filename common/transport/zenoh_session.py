@@ -1,32 +1,46 @@
-"""A `Session` over Zenoh: a client of one router."""
+"""A `Session` over Zenoh, client of one router, and buses for tools."""
 
 from __future__ import annotations
 
 import asyncio
 import logging
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import zenoh
 
-from common.transport.credentials import Credentials
-from common.transport.endpoint import LARGE_BYTES, client_config, near_of
-from common.transport.outbox import Outbox
-from common.transport.session import Declared, OnQuery, OnReply, OnSample, OnToken, RawReply, RawSample
-from common.transport.tokens import MOST_NAMES
+from common.clock import Clock
+from common.errors import NoRouter
+from common.transport.bus import Bus
+from common.transport.credentials import OPERATOR, Credentials, common_name, credentials_of, secure_folder
+from common.transport.endpoint import LARGE_BYTES, client_config, nearby_endpoints
+from common.transport.session import (
+    Declaration,
+    OnQuery,
+    OnReply,
+    OnSample,
+    OnToken,
+    RawReply,
+    RawSample,
+    SendQueue,
+)
+from common.transport.tokens import MAX_NAMES
 
 log = logging.getLogger(__name__)
 
-_CONNECT_MS = 1000  # one try, where there is one way
-_MOST_PAUSE_SECONDS = 0.2  # between two tries: each takes 7 ms of a processor
+_CONNECT_MS = 1000  # one attempt, where there is one endpoint
+_MAX_PAUSE_SECONDS = 0.2  # between two attempts: each takes 7 ms of a processor
 _FLUSH_SECONDS = 0.2
 _LIVELINESS_SECONDS = 2.0
+_CLOSE_SECONDS = 0.5
 
 
 def _direct(on_item: Callable[[Any], None], on_drop: Callable[[], None] | None = None) -> Any:
-    # The default, an indirect callback, makes a thread that keeps the interpreter from ending.
+    # The default, an indirect callback, starts a thread that keeps the interpreter from exiting.
     return zenoh.handlers.Callback(on_item, on_drop, indirect=False)
 
 
@@ -41,13 +55,13 @@ def _sample(sample: zenoh.Sample) -> RawSample:
 
 
 class _Publisher:
-    def __init__(self, declare: Callable[[zenoh.Priority], zenoh.Publisher], outbox: Outbox | None) -> None:
-        """Declare it, with an outbox for what must arrive, without one for a stream."""
-        # Apart from each other, so that nothing small queues behind a picture, nor what must arrive behind a stream.
-        self._publisher = declare(zenoh.Priority.DATA if outbox is None else zenoh.Priority.DATA_HIGH)
+    def __init__(self, declare: Callable[[zenoh.Priority], zenoh.Publisher], queue: SendQueue | None) -> None:
+        """Declare a reliable publisher with a send queue, or a stream without one."""
+        # Each on its own priority: small messages do not queue behind images, reliable ones not behind a stream.
+        self._publisher = declare(zenoh.Priority.DATA if queue is None else zenoh.Priority.DATA_HIGH)
         self._declare = declare
         self._large: zenoh.Publisher | None = None  # of a stream, from its first large message on
-        self._outbox = outbox
+        self._queue = queue
         self._undeclared = False
 
     @property
@@ -57,45 +71,45 @@ class _Publisher:
     def put(self, payload: bytes, attachment: bytes) -> None:
         if self._undeclared:
             return
-        if self._outbox is None:
+        if self._queue is None:
             if self._large is None and len(payload) > LARGE_BYTES:
                 self._large = self._declare(zenoh.Priority.DATA_LOW)
             (self._large or self._publisher).put(payload, attachment=attachment or None)
         else:
-            self._outbox.post(lambda: self._publisher.put(payload, attachment=attachment or None))
+            self._queue.post(lambda: self._publisher.put(payload, attachment=attachment or None))
 
     def undeclare(self) -> None:
         if self._undeclared:
             return
         self._undeclared = True
-        if self._outbox is None:
+        if self._queue is None:
             for publisher in filter(None, (self._large, self._publisher)):
                 publisher.undeclare()  # type: ignore[no-untyped-call]
-        else:  # which may be in the middle of a put; Zenoh refuses both at once
-            self._outbox.post(self._publisher.undeclare)
+        else:  # a put may be running in the queue's thread; Zenoh refuses both at once
+            self._queue.post(self._publisher.undeclare)
 
 
 class _Query:
-    def __init__(self, query: zenoh.Query, outbox: Outbox) -> None:
+    def __init__(self, query: zenoh.Query, queue: SendQueue) -> None:
         self._query = query
-        self._outbox = outbox
+        self._queue = queue
         self.key = str(query.key_expr)
         self.parameters = str(query.parameters)
         self.payload = query.payload.to_bytes() if query.payload is not None else None
         self.attachment = query.attachment.to_bytes() if query.attachment is not None else None
 
     def reply(self, key: str, payload: bytes, encoding: str, attachment: bytes) -> None:
-        self._outbox.post(lambda: self._query.reply(key, payload, encoding=encoding, attachment=attachment))
+        self._queue.post(lambda: self._query.reply(key, payload, encoding=encoding, attachment=attachment))
 
     def refuse(self, payload: bytes) -> None:
-        self._outbox.post(lambda: self._query.reply_err(payload, encoding="application/msgpack"))
+        self._queue.post(lambda: self._query.reply_err(payload, encoding="application/msgpack"))
 
     def finish(self) -> None:
-        self._outbox.post(self._query.drop)
+        self._queue.post(self._query.drop)
 
 
 class _Undeclare:
-    """Runs a zenoh undeclaration once."""
+    """Runs a Zenoh undeclaration once."""
 
     def __init__(self, undeclare: Callable[[], Any]) -> None:
         self._undeclare: Callable[[], Any] | None = undeclare
@@ -110,7 +124,7 @@ class _Undeclare:
 class _TokenWatcher:
     pattern: zenoh.KeyExpr
     on_token: OnToken
-    told: set[str] = field(default_factory=set)  # tokens that are there, as Zenoh said
+    reported: set[str] = field(default_factory=set)  # existing tokens, as Zenoh reported them
 
 
 class ZenohSession:
@@ -119,30 +133,30 @@ class ZenohSession:
     def __init__(self, session: zenoh.Session) -> None:
         self._session = session
         self._closed = False
-        self._outbox = Outbox()
-        self._declared: list[Declared] = []
+        self._queue = SendQueue(zenoh.ZError)
+        self._declared: list[Declaration] = []
         self._lock = threading.Lock()
         self._own_tokens: set[str] = set()
         self._token_watchers: list[_TokenWatcher] = []
 
     @property
     def connected(self) -> bool:
-        """Whether the link to the router stands."""
-        # Not session.is_closed(): it keeps the interpreter's lock while it waits for one that a callback may hold.
+        """Whether there is a link to the router."""
+        # Not session.is_closed(): it holds the GIL while it waits for a lock that a callback may hold.
         return not self._closed and bool(self._session.info.routers_zid())
 
     def watch_connection(self, on_change: Callable[[], None]) -> None:
         """Call back when the router may have been lost or reached."""
-        # The events themselves do not add up: after a frozen router some come twice and some out of order.
+        # The events are not a reliable count: after a frozen router some come twice and some out of order.
         listener = self._session.info.declare_transport_events_listener(_direct(lambda _event: on_change()))
-        self._keep(_Undeclare(listener.undeclare))  # else it calls into an interpreter that ends
+        self._keep(_Undeclare(listener.undeclare))  # else it calls into an interpreter that is exiting
 
-    def _keep(self, declared: Declared) -> Declared:
+    def _keep(self, declared: Declaration) -> Declaration:
         self._declared.append(declared)
         return declared
 
     def publisher(self, key: str, encoding: str, *, reliable: bool) -> _Publisher:
-        """Declare a publisher; a stream is dropped by a network that cannot take it, the rest waits in the outbox."""
+        """Declare a publisher; a congested network drops a stream's values, reliable ones wait in the send queue."""
         control = zenoh.CongestionControl.BLOCK if reliable else zenoh.CongestionControl.DROP
 
         def declare(priority: zenoh.Priority) -> zenoh.Publisher:
@@ -151,12 +165,12 @@ class ZenohSession:
                 reliability=zenoh.Reliability.RELIABLE,
             )
 
-        made = _Publisher(declare, self._outbox if reliable else None)
-        self._keep(made)
-        return made
+        publisher = _Publisher(declare, self._queue if reliable else None)
+        self._keep(publisher)
+        return publisher
 
-    def subscriber(self, key: str, on_sample: OnSample) -> Declared:
-        """Call back for each value put under a matching key."""
+    def subscriber(self, key: str, on_sample: OnSample) -> Declaration:
+        """Call back for each value published under a matching key."""
 
         def on_zenoh(sample: zenoh.Sample) -> None:
             if sample.kind == zenoh.SampleKind.PUT:
@@ -164,12 +178,12 @@ class ZenohSession:
 
         return self._keep(_Undeclare(self._session.declare_subscriber(key, _direct(on_zenoh)).undeclare))
 
-    def queryable(self, key: str, on_query: OnQuery, *, complete: bool) -> Declared:
+    def queryable(self, key: str, on_query: OnQuery, *, complete: bool) -> Declaration:
         """Call back for each `get` that covers the key."""
-        made = self._session.declare_queryable(
-            key, _direct(lambda query: on_query(_Query(query, self._outbox))), complete=complete
+        declared = self._session.declare_queryable(
+            key, _direct(lambda query: on_query(_Query(query, self._queue))), complete=complete
         )
-        return self._keep(_Undeclare(made.undeclare))
+        return self._keep(_Undeclare(declared.undeclare))
 
     def get(
         self,
@@ -182,7 +196,7 @@ class ZenohSession:
         attachment: bytes | None = None,
         timeout: float = 10.0,
     ) -> Callable[[], None]:
-        """Ask everybody who serves the key; returns what cancels the question."""
+        """Query all matching queryables; return a cancel function."""
         token = zenoh.CancellationToken()
 
         def on_zenoh(reply: zenoh.Reply) -> None:
@@ -191,7 +205,7 @@ class ZenohSession:
             elif reply.err is not None:
                 on_reply(RawReply(None, reply.err.payload.to_bytes()))
 
-        def ask() -> None:
+        def send() -> None:
             try:
                 self._session.get(
                     key, _direct(on_zenoh, on_done), payload=payload, encoding=encoding or None,
@@ -202,21 +216,21 @@ class ZenohSession:
                 on_done()
                 raise
 
-        self._outbox.post(ask)
-        return lambda: self._outbox.post(token.cancel)
+        self._queue.post(send)
+        return lambda: self._queue.post(token.cancel)
 
-    def token(self, key: str) -> Declared:
+    def token(self, key: str) -> Declaration:
         """Declare a liveliness token."""
-        made = self._session.liveliness().declare_token(key)
-        self._own_token(key, there=True)
+        declared = self._session.liveliness().declare_token(key)
+        self._report_own_token(key, there=True)
 
         def undeclare() -> None:
-            made.undeclare()  # type: ignore[no-untyped-call]
-            self._own_token(key, there=False)
+            declared.undeclare()  # type: ignore[no-untyped-call]
+            self._report_own_token(key, there=False)
 
         return self._keep(_Undeclare(undeclare))
 
-    def _own_token(self, key: str, *, there: bool) -> None:
+    def _report_own_token(self, key: str, *, there: bool) -> None:
         # Zenoh does not report a session's own tokens to it.
         with self._lock:
             (self._own_tokens.add if there else self._own_tokens.discard)(key)
@@ -226,17 +240,17 @@ class ZenohSession:
 
     def watch_tokens(
         self, key: str, on_token: OnToken, on_first: Callable[[str], None], on_known: Callable[[], None]
-    ) -> Declared:
-        """Call back for each matching token that is there, appears or vanishes, after a first question for them."""
+    ) -> Declaration:
+        """Call back for each matching token that exists, appears or vanishes, after a first query for them."""
         watcher = _TokenWatcher(zenoh.KeyExpr(key), on_token)
 
-        def tell(sample: zenoh.Sample) -> None:
+        def report(sample: zenoh.Sample) -> None:
             token, there = str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT
             with self._lock:
                 if not there:
-                    watcher.told.discard(token)
-                elif len(watcher.told) < MOST_NAMES:  # however many somebody declares, a question looks at few
-                    watcher.told.add(token)
+                    watcher.reported.discard(token)
+                elif len(watcher.reported) < MAX_NAMES:  # bounds the cost of `get_tokens` in a flood
+                    watcher.reported.add(token)
             on_token(token, there)
 
         with self._lock:
@@ -244,22 +258,22 @@ class ZenohSession:
             own = [token for token in self._own_tokens if watcher.pattern.intersects(token)]
         for token in own:
             on_token(token, True)
-        # Before the watch: afterwards Zenoh would answer it from what the watch has seen so far, which may be nothing.
+        # Before the watch: afterwards Zenoh would answer from what the watch has seen so far, which may be nothing.
         self.get_tokens(key, on_first, on_known, timeout=_LIVELINESS_SECONDS)
-        made = self._session.liveliness().declare_subscriber(key, _direct(tell), history=True)
+        declared = self._session.liveliness().declare_subscriber(key, _direct(report), history=True)
 
         def undeclare() -> None:
             with self._lock:
                 self._token_watchers.remove(watcher)
-            made.undeclare()  # type: ignore[no-untyped-call]
+            declared.undeclare()  # type: ignore[no-untyped-call]
 
         return self._keep(_Undeclare(undeclare))
 
     def get_tokens(
         self, key: str, on_token: Callable[[str], None], on_done: Callable[[], None], *, timeout: float
     ) -> None:
-        """Call back for each matching token that is there now, then once `on_done`."""
-        asked = zenoh.KeyExpr(key)
+        """Call back for each existing matching token, then once `on_done`."""
+        pattern = zenoh.KeyExpr(key)
         found: set[str] = set()
 
         def on_found(reply: zenoh.Reply) -> None:
@@ -268,20 +282,20 @@ class ZenohSession:
                 on_token(token)
 
         def done() -> None:
-            # Of what watches of this session were told, Zenoh 1.10 leaves some out: of one answer in ten.
+            # Zenoh 1.10 omits, from one reply in ten, tokens that it has reported to a watch of this session.
             with self._lock:
-                told = set[str]().union(*(watcher.told for watcher in self._token_watchers))
-            for token in told - found:
-                if asked.intersects(token):
+                reported = set[str]().union(*(watcher.reported for watcher in self._token_watchers))
+            for token in reported - found:
+                if pattern.intersects(token):
                     on_token(token)
             on_done()
 
         self._session.liveliness().get(key, _direct(on_found, done), timeout=timeout)
 
     def close(self) -> None:
-        """Take back everything in reverse order and leave; may block."""
+        """Undeclare all in reverse order and close; may block."""
         self._closed = True
-        self._outbox.close(_FLUSH_SECONDS)
+        self._queue.close(_FLUSH_SECONDS)
         while self._declared:
             try:
                 self._declared.pop().undeclare()
@@ -291,37 +305,37 @@ class ZenohSession:
 
 
 def _open(endpoint: str, credentials: Credentials | None, near: Sequence[str] = ()) -> zenoh.Session:
-    """A session with a link of its own for what is large, where the router admits that.
+    """Open a session with a second link for large messages, if the router admits one.
 
     Raises:
-        zenoh.ZError: nobody is there yet.
+        zenoh.ZError: there is no router yet.
     """
 
-    def opened(*, apart: bool, connect_ms: int = _CONNECT_MS) -> zenoh.Session:
+    def attempt(*, two_links: bool, connect_ms: int = _CONNECT_MS) -> zenoh.Session:
         return zenoh.open(
-            client_config(endpoint, connect_ms=connect_ms, credentials=credentials, apart=apart, near=near))
+            client_config(endpoint, connect_ms=connect_ms, credentials=credentials, two_links=two_links, near=near))
 
-    if near:  # of our own router, which admits it
-        return opened(apart=True)
+    if near:  # endpoints of our own router, which admits two links
+        return attempt(two_links=True)
     try:
-        return opened(apart=True)
+        return attempt(two_links=True)
     except zenoh.ZError:
-        opened(apart=False, connect_ms=0).close()  # type: ignore[no-untyped-call]
+        attempt(two_links=False, connect_ms=0).close()  # type: ignore[no-untyped-call]
     try:
-        return opened(apart=True)  # the router came meanwhile
+        return attempt(two_links=True)  # the router started meanwhile
     except zenoh.ZError:
-        log.info("%s admits one link of each client: what is small shares it with pictures", endpoint)
-        return opened(apart=False)
+        log.info("%s admits one link per client: small messages share it with images", endpoint)
+        return attempt(two_links=False)
 
 
 async def open_zenoh(
     endpoint: str, credentials: Credentials | None = None, near: Sequence[str] | None = None
 ) -> ZenohSession:
-    """A session with the router at the endpoint, for which it waits as long as it takes; may be cancelled at once.
+    """Return a session with the router at the endpoint; waits for the router without limit, may be cancelled at once.
 
-    It is reached at its `near` endpoints where that is possible: those that a supervisor has handed down by default.
+    The `near` endpoints of the same router are tried first; by default those that a supervisor handed down.
     """
-    near = near_of(endpoint) if near is None else near
+    near = nearby_endpoints(endpoint) if near is None else near
     loop = asyncio.get_running_loop()
     opened: asyncio.Future[ZenohSession] = loop.create_future()
     stop = threading.Event()
@@ -336,21 +350,20 @@ async def open_zenoh(
         pause = 0.02
         while not stop.is_set():
             try:
-                session = _open(endpoint, credentials, near)
+                session = ZenohSession(_open(endpoint, credentials, near))
             except zenoh.ZError as error:
                 log.debug("no router yet: %s", error)
                 stop.wait(pause)
-                pause = min(1.5 * pause, _MOST_PAUSE_SECONDS)
+                pause = min(1.5 * pause, _MAX_PAUSE_SECONDS)
                 continue
-            made = ZenohSession(session)
             try:
-                loop.call_soon_threadsafe(deliver, made)
+                loop.call_soon_threadsafe(deliver, session)
             except RuntimeError:  # the loop was closed meanwhile
-                made.close()
+                session.close()
             return
 
-    # A thread of our own: asyncio would wait at its end for one of its executor's.
-    # No daemon: cut off inside Zenoh at the end of a program it would bring that down.
+    # Not in asyncio's executor: the loop would wait for it when it ends.
+    # Not a daemon thread: killed inside Zenoh at exit it would crash the program.
     threading.Thread(target=work, name="connect", daemon=False).start()
     try:
         return await opened
@@ -358,8 +371,8 @@ async def open_zenoh(
         stop.set()
 
 
-async def close_bounded(session: Any, seconds: float) -> bool:
-    """Close in a thread, and say whether that ended within the time: a dead network can hold it for many seconds."""
+async def close_within(session: Any, seconds: float) -> bool:
+    """Close in a thread and return whether that ended in time: a dead network can block it for many seconds."""
     loop = asyncio.get_running_loop()
     closed = asyncio.Event()
 
@@ -377,3 +390,40 @@ async def close_bounded(session: Any, seconds: float) -> bool:
     except TimeoutError:
         return False
     return True
+
+
+@asynccontextmanager
+async def connect(
+    *, cell: str, service: str, endpoint: str, clock: Clock | None = None, timeout: float | None = 3.0,
+    identity: str = OPERATOR, near: Sequence[str] | None = None, remapped: Mapping[str, str] | None = None,
+    secure: str | None = None,
+) -> AsyncIterator[Bus]:
+    """Yield a bus for a tool: without a readiness token, closed at the end of the block.
+
+    Args:
+        cell: name of the cell.
+        service: name of the tool, for its log lines.
+        endpoint: of the router, from `endpoint_of`.
+        clock: the cell's clock; one at speed 1 by default.
+        timeout: for the connection [s]; None waits without limit.
+        identity: common name of the certificate to show in a secured cell.
+        near: endpoints of the same router to try first; by default those that a supervisor handed down.
+        remapped: keys of the cell by the keys in the tool's code, as in common/remapping.py.
+        secure: folder of certificates; that of the environment by default.
+
+    Raises:
+        NoRouter: no router was reached in time.
+    """
+    folder = Path(secure) if secure else secure_folder()
+    credentials = credentials_of(common_name(cell, identity), folder) if folder else None
+    try:
+        async with asyncio.timeout(timeout):
+            session = await open_zenoh(endpoint, credentials, near)
+    except TimeoutError:
+        raise NoRouter(endpoint) from None
+    bus = Bus(session, service=service, cell=cell, clock=clock or Clock(), topics=remapped)
+    try:
+        yield bus
+    finally:
+        await bus.close()
+        await close_within(session, _CLOSE_SECONDS)

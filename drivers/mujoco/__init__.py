@@ -1,6 +1,6 @@
-"""A world with physics, by MuJoCo (extra `physics`): gravity, friction, contact, an arm that is driven by servos.
+"""World with physics by MuJoCo (extra `physics`): gravity, friction, contact, and a servo-driven arm.
 
-Only what `world.simulator: mujoco` names imports it.
+Imported only for `world.simulator: mujoco`.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ if TYPE_CHECKING:
 def create(
     world: World, objects: Sequence[ObjectConfig], tolerances: GraspTolerances, gripper: GripperConfig | None
 ) -> PhysicsWorld:
-    """The world with its objects, each of which has a place; `hardware` puts the arm into it.
+    """Create the world with objects that all have a position; `hardware` adds the arm.
 
     Raises:
-        ConfigError: MuJoCo is not installed, an object cannot lie where it is to, or the gripper is a suction cup.
+        ConfigError: MuJoCo is not installed, an object cannot lie at its position, or the gripper is a suction cup.
     """
     require()
     from drivers.mujoco.world import PhysicsWorld
@@ -38,7 +38,7 @@ def renderer(
     around: Surroundings, scenery: Scenery, robot: Callable[[], RobotModel], *, plain: bool, camera: Pinhole,
     arm: bool = False,
 ) -> Renderer:
-    """What draws this world for a camera, always with the arm. A plain picture has no depth."""
+    """Create the renderer of this world for one camera, always with the arm. A plain image has no depth."""
     require()
     from drivers.mujoco.gl import select_gl
     from drivers.mujoco.rendering import PhysicsRenderer

@@ -1,7 +1,7 @@
-"""A MuJoCo model to look at: what is fixed, the robot's visual meshes and the objects in their true shapes.
+"""MuJoCo model for rendering: fixtures, visual meshes of the robot, and objects in their exact shapes.
 
-Nothing in it has mass or contact: links and objects are put where they are told to be. It is not the model that moves
-things, whose shapes are coarser.
+Nothing in it has mass or contact; links and objects are set to published poses. The dynamics model in `model.py` has
+coarser shapes.
 """
 
 from __future__ import annotations
@@ -25,38 +25,38 @@ from drivers.mujoco.scene import add_surroundings
 Array = NDArray[np.float64]
 
 TRIANGLES = 25_000  # of the robot
-AWAY = (0.0, 0.0, -100.0)  # [m] where the links are before anybody has told where
-SHADOW_MAP = 1024  # [px] a side: MuJoCo's own 4096 take three times as long as the picture
-SHADOW_REACH = 1.2  # [m] half the side of the square about the aim of parallel light in which there are shadows
-EXTENT = 1.0  # [m] to which MuJoCo's lengths of a view refer
-SIDES = 48  # of what is round
+AWAY = (0.0, 0.0, -100.0)  # [m] of links before the first joint state
+SHADOW_MAP = 1024  # [px] side; MuJoCo's default 4096 takes three times as long as the image
+SHADOW_REACH = 1.2  # [m] half side of the shadowed square around the aim of parallel light
+EXTENT = 1.0  # [m] unit of MuJoCo's view lengths
+SIDES = 48  # of round shapes
 
 
 class DrawnModel:
-    """A compiled model of fixtures, robot and some objects, and where the bodies in it are put.
+    """Compiled model of fixtures, robot and objects, whose bodies can be moved.
 
     Attributes:
-        model, data: of MuJoCo; after `put` all is where it is to be.
+        model, data: MuJoCo's; current after `put`.
     """
 
     def __init__(
         self, around: Surroundings, robot: RobotModel | None, objects: Sequence[WorldObject], camera: Pinhole
     ) -> None:
-        """Build it for pictures of the camera's size.
+        """Build the model for images of the camera's size.
 
         Raises:
-            ConfigError: a mesh of the robot is not there.
+            ConfigError: a mesh of the robot is missing.
         """
         spec = mujoco.MjSpec()
-        _looks(spec, camera)
+        _set_quality(spec, camera)
         add_surroundings(spec, around)
         _cast_no_shadow(spec, around)
         self._links: list[str] = []
         if robot is not None:
             self._add_robot(spec, robot)
-        self.looks = tuple(appearance_of(thing) for thing in objects)
-        for number, thing in enumerate(objects):
-            _add_object(spec, number, thing)
+        self.appearances = tuple(appearance_of(obj) for obj in objects)
+        for number, obj in enumerate(objects):
+            _add_object(spec, number, obj)
         for geom in spec.geoms:
             geom.contype = geom.conaffinity = 0
         self.model = spec.compile()
@@ -66,14 +66,14 @@ class DrawnModel:
         mujoco.mj_forward(self.model, self.data)
 
     def put(self, objects: Sequence[WorldObject], links: Mapping[str, Array] | None) -> None:
-        """Put the objects, in the order in which they were given first, and the links where they are.
+        """Move the objects, in the order of construction, and the links.
 
         Args:
-            objects: of the same looks.
-            links: (4, 4) poses in world by name; None leaves the arm where it was.
+            objects: of the same appearance.
+            links: (4, 4) poses in world by name; None leaves the arm unchanged.
         """
-        for number, thing in enumerate(objects):
-            self._set(f"object:{number}", pose_to_matrix(thing.pose))
+        for number, obj in enumerate(objects):
+            self._set(f"object:{number}", pose_to_matrix(obj.pose))
         if links is not None:
             for name in self._links:
                 self._set(f"link:{name}", links[name])
@@ -97,8 +97,8 @@ class DrawnModel:
                           rgba=[*(part / 255 for part in piece.color), 1.0])
 
 
-def _looks(spec: mujoco.MjSpec, camera: Pinhole) -> None:
-    """How fine everything is drawn."""
+def _set_quality(spec: mujoco.MjSpec, camera: Pinhole) -> None:
+    """Set rendering quality."""
     spec.compiler.boundmass = spec.compiler.boundinertia = 1e-6
     spec.stat.extent = EXTENT
     quality = spec.visual.quality
@@ -111,16 +111,16 @@ def _looks(spec: mujoco.MjSpec, camera: Pinhole) -> None:
 
 
 def _cast_no_shadow(spec: mujoco.MjSpec, around: Surroundings) -> None:
-    """Keep floor and tables out of the map of shadows, where they would stain themselves with its rounding."""
+    """Exclude floor and tables from the shadow map, whose rounding would stain them."""
     spec.geom("floor").castshadow = False
     for table in tables(around):
         spec.geom(f"fixture:{table.id}").castshadow = False
 
 
-def _add_object(spec: mujoco.MjSpec, number: int, thing: WorldObject) -> None:
+def _add_object(spec: mujoco.MjSpec, number: int, obj: WorldObject) -> None:
     body, kinds, solid = spec.worldbody.add_body(name=f"object:{number}", mocap=True), mujoco.mjtGeom, \
-        solid_of_message(thing)
-    rgba = [thing.color.r, thing.color.g, thing.color.b, 1.0]
+        solid_of_message(obj)
+    rgba = [obj.color.r, obj.color.g, obj.color.b, 1.0]
     if solid.shape == "sphere":
         body.add_geom(type=kinds.mjGEOM_SPHERE, size=[solid.radius, 0.0, 0.0], rgba=rgba)
     elif solid.shape == "box":
@@ -135,19 +135,19 @@ def _add_object(spec: mujoco.MjSpec, number: int, thing: WorldObject) -> None:
 
 
 def _indexed(solid: Solid) -> tuple[Array, NDArray[np.int32]]:
-    """Vertices (n, 3) [m] and outward faces (m, 3) of a solid, a vertex for each place and direction of a face.
+    """Vertices (n, 3) [m] and outward faces (m, 3) of a solid, one vertex per position and face normal.
 
-    MuJoCo takes the mean direction of the faces at a vertex for how it is lit, which would round off edges.
+    MuJoCo averages the normals of the faces at a vertex, which would smooth edges.
     """
     triangles = np.array(solid.triangles, float)
-    if solid.shape != "mesh":  # a file says which side is out; of a prism the lower face and the hole look inwards
+    if solid.shape != "mesh":  # mesh files define orientation; flip the lower face and hole of a prism
         low = len(triangles) // 2 - len(solid.section) - len(solid.hole)
         for inward in (slice(0, low), slice(len(triangles) - 2 * len(solid.hole), None)):
             triangles[inward] = triangles[inward, ::-1]
     normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     length = np.linalg.norm(normals, axis=1)
-    whole = length > 1e-12  # [m^2]
-    triangles, normals = triangles[whole], normals[whole] / length[whole, None]
+    nonzero = length > 1e-12  # [m^2]
+    triangles, normals = triangles[nonzero], normals[nonzero] / length[nonzero, None]
     keyed = np.concatenate([triangles.reshape(-1, 3), np.repeat(np.round(normals, 2) + 0.0, 3, axis=0)], axis=1)
     unique, index = np.unique(keyed, axis=0, return_inverse=True)
     return unique[:, :3], index.reshape(-1, 3).astype(np.int32)

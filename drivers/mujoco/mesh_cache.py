@@ -1,4 +1,4 @@
-"""Meshes of a robot as MuJoCo takes them. They are read once and cached, by their content, in the folder of caches."""
+"""Meshes of a robot for MuJoCo, cached in files by content hash."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from common.mesh_files import triangles_of
+from common.robot.mesh_files import triangles_of
 from common.robot.model import RobotModel
 
-CACHE_VARIABLE = "ZENCELL_CACHE"  # folder for what can be made again; else zencell in that of the user
-_FORMAT = b"1"  # of what is cached_arrays: another number is made anew
+CACHE_VARIABLE = "ZENCELL_CACHE"  # cache folder; default: zencell in the user's cache
+_FORMAT = b"1"  # version of the cached format
 if TYPE_CHECKING:
     from common.robot.visual_meshes import Piece
 
@@ -26,17 +26,17 @@ Arrays = dict[str, NDArray[Any]]
 
 
 def cache_folder() -> Path:
-    """Where what can be made again is cached_arrays: it need not be there."""
+    """Return the cache folder, which need not exist."""
     if named := os.environ.get(CACHE_VARIABLE):
         return Path(named)
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "zencell"
 
 
 def hull_points(path: Path) -> NDArray[np.float64]:
-    """(n, 3) points of a mesh file, each once, in its own units: its convex hull is what collides.
+    """(n, 3) distinct vertices of a mesh file in its units; their convex hull is the collision shape.
 
     Raises:
-        ConfigError: it cannot be read.
+        ConfigError: the file cannot be read.
     """
     def read() -> Arrays:
         return {"points": np.unique(triangles_of("robot.urdf", path).reshape(-1, 3), axis=0)}
@@ -45,18 +45,18 @@ def hull_points(path: Path) -> NDArray[np.float64]:
 
 
 def cached_visual_meshes(robot: RobotModel, triangles: int) -> list[Piece]:
-    """What is seen of all links with about so many triangles: see `common.robot.visual_meshes`."""
-    from common.robot.visual_meshes import Piece, seen_shapes, visual_pieces  # brings trimesh
+    """Visual meshes of all links, simplified to about this many triangles: see `common.robot.visual_meshes`."""
+    from common.robot.visual_meshes import Piece, visible_shapes, visual_pieces  # imports trimesh
 
-    files = [shape.path.read_bytes() for shape in seen_shapes(robot) if shape.path is not None]
+    files = [shape.path.read_bytes() for shape in visible_shapes(robot) if shape.path is not None]
 
     def make() -> Arrays:
-        made: Arrays = {}
+        arrays: Arrays = {}
         for number, piece in enumerate(visual_pieces(robot, triangles)):
             red, green, blue = piece.color
             name = f"{number}|{piece.link}|{red}|{green}|{blue}"
-            made[f"{name}|vertices"], made[f"{name}|faces"] = piece.vertices, piece.faces
-        return made
+            arrays[f"{name}|vertices"], arrays[f"{name}|faces"] = piece.vertices, piece.faces
+        return arrays
 
     found = cached_arrays("visual", [robot.urdf.encode(), str(triangles).encode(), *files], make)
     pieces = {}
@@ -69,18 +69,18 @@ def cached_visual_meshes(robot: RobotModel, triangles: int) -> list[Piece]:
 
 
 def cached_arrays(kind: str, content: list[bytes], make: Callable[[], Arrays]) -> Arrays:
-    """What was made of the content before, or is made now and cached_arrays where that can be done."""
+    """Return the cached arrays for the content, or compute them and cache them if possible."""
     digest = hashlib.sha256(_FORMAT)
     for part in content:
         digest.update(len(part).to_bytes(8, "little") + part)
     path = cache_folder() / "meshes" / f"{kind}-{digest.hexdigest()[:32]}.npz"
     with contextlib.suppress(OSError, ValueError, EOFError, zipfile.BadZipFile), path.open("rb") as file:
         return dict(np.load(file, allow_pickle=False))
-    made = make()
-    with contextlib.suppress(OSError):  # a folder that cannot be written to: made anew next time
+    arrays = make()
+    with contextlib.suppress(OSError):  # read-only folder: computed again next time
         path.parent.mkdir(parents=True, exist_ok=True)
         descriptor, name = tempfile.mkstemp(dir=path.parent, suffix=".npz")
         with os.fdopen(descriptor, "wb") as file:
-            np.savez(file, **made)  # type: ignore[arg-type]
+            np.savez(file, **arrays)  # type: ignore[arg-type]
         os.replace(name, path)
-    return made
+    return arrays

@@ -1,14 +1,14 @@
-"""A MuJoCo model of a cell from its configuration, for who moves it and for who draws it.
+"""MuJoCo model of a cell from its configuration, for dynamics and for rendering.
 
-    cell = build_model(RobotModel.load(config.robot), config.world, things)
+    cell = build_model(RobotModel.load(config.robot), config.world, objects)
     data = mujoco.MjData(cell.model)
     cell.set_joints(data, joint_names, positions)
     cell.set_object(data, "cup", T_world_cup)
     mujoco.mj_forward(cell.model, data)
 
-All frames are the project's: bodies of links are called and placed as in the URDF, world is world. Geoms of group
-`contact.SEEN` are only seen, those of `contact.COLLIDES` only collide, all others are both. Shapes of objects, the
-floor, fixtures and containers have their configured colour; lights are not in the model.
+Frames are the project's: link bodies have their URDF names and frames, world is world. Geoms of group `scene.SEEN` are
+only visual, those of `scene.COLLIDES` only collide, all others are both. Objects, floor, fixtures and containers have
+their configured colors; the model has no lights.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ from drivers.mujoco.scene import (
 
 Array = NDArray[np.float64]
 
-AWAY = 10.0  # [m]
+AWAY = 10.0  # [m] between objects without a pose
 
 
-class Place(NamedTuple):
-    """Where an object is in a model: its body, and the first of its 7 positions and 6 velocities."""
+class Address(NamedTuple):
+    """Addresses of an object: its body, and the first of its 7 positions and 6 velocities."""
 
     body: int
     qpos: int
@@ -52,14 +52,14 @@ class Place(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class CellModel:
-    """A compiled model, and where in it everything is.
+    """A compiled model and the addresses in it.
 
     Attributes:
-        spec: what it was made of; can be changed (lights, materials) and compiled anew with `compiled`.
+        spec: source; may be modified (lights, materials) and recompiled with `compiled`.
         joints, dofs: index into qpos and qvel of each joint of the robot, by name.
-        actuators: index of the servo of each joint that has one, by the name of the joint.
-        things: by id.
-        start: qpos with the arm at home and fingers open; objects are far away, and from each other.
+        actuators: index of the servo of each driven joint, by joint name.
+        things: addresses of objects by id.
+        start: qpos with the arm at home and open fingers; objects are far away and apart.
     """
 
     spec: mujoco.MjSpec
@@ -67,40 +67,40 @@ class CellModel:
     joints: dict[str, int]
     dofs: dict[str, int]
     actuators: dict[str, int]
-    things: dict[str, Place]
+    objects: dict[str, Address]
     start: Array
 
     def set_joints(self, data: mujoco.MjData, names: Sequence[str], positions: Iterable[float]) -> None:
-        """Write positions [rad or m] of joints; names that the robot does not have raise KeyError."""
+        """Write joint positions [rad or m]; KeyError for an unknown name."""
         for name, position in zip(names, positions, strict=True):
             data.qpos[self.joints[name]] = position
 
     def set_object(self, data: mujoco.MjData, name: str, T: Array) -> None:
         """Write the pose (4, 4) of an object in world."""
-        place = self.things[name]
+        address = self.objects[name]
         x, y, z, w = matrix_to_quaternion(T[:3, :3])
-        data.qpos[place.qpos: place.qpos + 7] = [*T[:3, 3], w, x, y, z]
+        data.qpos[address.qpos: address.qpos + 7] = [*T[:3, 3], w, x, y, z]
 
     def pose_of(self, data: mujoco.MjData, name: str) -> Array:
         """(4, 4) pose of an object in world."""
-        at = self.things[name].qpos
+        at = self.objects[name].qpos
         x, y, z, qw, qx, qy, qz = data.qpos[at: at + 7].tolist()
         return transform(quaternion_to_matrix(qx, qy, qz, qw), (x, y, z))
 
 
 def build_model(
-    robot: RobotModel, world: Surroundings, things: Sequence[SceneObject], *, visuals: bool = False
+    robot: RobotModel, world: Surroundings, objects: Sequence[SceneObject], *, visuals: bool = False
 ) -> CellModel:
-    """The cell: robot, what is fixed, objects and cameras.
+    """Build the cell: robot, surroundings, objects and cameras.
 
     Args:
-        robot: any that the planner takes.
-        world: what is fixed, and the cameras.
+        robot: any that the planner supports.
+        world: surroundings and cameras.
         things: each becomes a free body.
-        visuals: with the visual meshes of the robot, which only who draws needs.
+        visuals: include visual meshes, needed only for rendering.
 
     Raises:
-        ConfigError: what of it cannot be simulated.
+        ConfigError: a part cannot be simulated.
     """
     spec = mujoco.MjSpec()
     spec.modelname = robot.config.name
@@ -112,25 +112,25 @@ def build_model(
     add_surroundings(spec, world)
     add_robot(spec, robot, visuals)
     add_cameras(spec, world, robot)
-    for thing in things:
-        add_object(spec, thing)
+    for obj in objects:
+        add_object(spec, obj)
     gripper = robot.config.gripper
     for name in [*robot.joint_names, *(gripper.joints[:1] if gripper else [])]:
         actuator = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
-        actuator.set_to_position(kp=1.0, kv=1.0)  # servo.tune says how stiff
-    cell = compiled(spec, robot, [thing.id for thing in things])
-    if touching := _fixed_to(cell):
-        for pair in touching:
+        actuator.set_to_position(kp=1.0, kv=1.0)  # gains: `arm.tune`
+    cell = compiled(spec, robot, [obj.id for obj in objects])
+    if excluded := _contacts_at_home(cell):
+        for pair in excluded:
             spec.add_exclude(bodyname1=pair[0], bodyname2=pair[1])
-        cell = compiled(spec, robot, [thing.id for thing in things])
+        cell = compiled(spec, robot, [obj.id for obj in objects])
     return cell
 
 
-def compiled(spec: mujoco.MjSpec, robot: RobotModel, things: Iterable[str]) -> CellModel:
-    """The model of a spec that `build_model` made.
+def compiled(spec: mujoco.MjSpec, robot: RobotModel, objects: Iterable[str]) -> CellModel:
+    """Compile a spec of `build_model`.
 
     Raises:
-        ConfigError: MuJoCo does not take it.
+        ConfigError: MuJoCo rejects it.
     """
     try:
         model = spec.compile()
@@ -142,18 +142,20 @@ def compiled(spec: mujoco.MjSpec, robot: RobotModel, things: Iterable[str]) -> C
         name = model.joint(number).name
         if model.jnt_type[number] != mujoco.mjtJoint.mjJNT_FREE:
             joints[name], dofs[name] = int(model.jnt_qposadr[number]), int(model.jnt_dofadr[number])
-    places = {}
-    for thing in things:
-        joint, body = model.joint(f"thing:{thing}"), model.body(f"thing:{thing}")
-        places[thing] = Place(int(body.id), int(joint.qposadr[0]), int(joint.dofadr[0]))
+    addresses = {}
+    for obj in objects:
+        joint, body = model.joint(f"object:{obj}"), model.body(f"object:{obj}")
+        addresses[obj] = Address(int(body.id), int(joint.qposadr[0]), int(joint.dofadr[0]))
     actuators = {model.actuator(number).name: number for number in range(model.nu)}
-    return CellModel(spec, model, joints, dofs, actuators, places, _start(model, robot, joints, places))
+    return CellModel(spec, model, joints, dofs, actuators, addresses, _start(model, robot, joints, addresses))
 
 
-def _start(model: mujoco.MjModel, robot: RobotModel, joints: Mapping[str, int], places: Mapping[str, Place]) -> Array:
+def _start(
+    model: mujoco.MjModel, robot: RobotModel, joints: Mapping[str, int], addresses: Mapping[str, Address]
+) -> Array:
     start = np.array(model.qpos0)
-    for number, place in enumerate(places.values()):  # else all would touch all
-        start[place.qpos: place.qpos + 3] = 0.0, 0.0, (1 + number) * AWAY
+    for number, address in enumerate(addresses.values()):  # else they would overlap
+        start[address.qpos: address.qpos + 3] = 0.0, 0.0, (1 + number) * AWAY
     for name, position in robot.config.locked_joints.items():
         if name in joints:
             start[joints[name]] = position
@@ -162,8 +164,8 @@ def _start(model: mujoco.MjModel, robot: RobotModel, joints: Mapping[str, int], 
     return start
 
 
-def _fixed_to(cell: CellModel) -> list[tuple[str, str]]:
-    """Links and fixtures that touch at home: one that stands in its table must not push itself out of it."""
+def _contacts_at_home(cell: CellModel) -> list[tuple[str, str]]:
+    """Links and fixtures in contact at home: a robot standing in its table must not be pushed out."""
     model, data = cell.model, mujoco.MjData(cell.model)
     data.qpos[:] = cell.start
     mujoco.mj_forward(model, data)

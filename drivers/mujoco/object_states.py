@@ -1,4 +1,4 @@
-"""What is to be said of objects that physics moves: where each lies, who holds it, what has changed."""
+"""Object states from physics: contacts, support, grasp, and significant pose changes."""
 
 from __future__ import annotations
 
@@ -18,45 +18,45 @@ from drivers.mujoco.model import CellModel
 
 Array = NDArray[np.float64]
 
-MOVED = 1e-4  # [m] less is not told of
-TURNED = 1e-3  # [rad] nor is that
-UPRIGHT = 1 - 1e-6  # cosine of the tilt up to which something is said to stand upright
-LETS_GO = 0.05  # [s] what fingers have not touched for so long is not between them any more
-RESTS = 0.02  # [m/s] what is slower has come to lie
+MOVED = 1e-4  # [m] smallest published motion
+TURNED = 1e-3  # [rad] smallest published rotation
+UPRIGHT = 1 - 1e-6  # cosine of the tilt up to which an object counts as upright
+RELEASE_TIME = 0.05  # [s] without finger contact after which an object is released
+REST_SPEED = 0.02  # [m/s] of an object at rest
 
 
 class Contacts:
-    """Who set_contact whom in a model: objects by fingers, by the floor, and by anything at all."""
+    """Contacts of objects: with fingers, with the floor, and any."""
 
     def __init__(self, cell: CellModel, robot: RobotModel) -> None:
-        """Find out which geom is of what."""
+        """Start without contacts."""
         model = cell.model
-        self._names = list(cell.things)
-        number = {cell.things[name].body: index for index, name in enumerate(self._names)}
-        self._thing = np.array([number.get(int(body), -1) for body in model.geom_bodyid])
+        self._names = list(cell.objects)
+        number = {cell.objects[name].body: index for index, name in enumerate(self._names)}
+        self._object = np.array([number.get(int(body), -1) for body in model.geom_bodyid])
         config = robot.config.gripper
         fingers = [model.body(link).id for link in (config.links if config is not None else [])]
         side = {body: index for index, body in enumerate(fingers)}
         self._side = np.array([side.get(int(body), -1) for body in model.geom_bodyid])
         self._floor = model.geom("floor").id
 
-    def look(self, data: mujoco.MjData) -> tuple[set[str], set[str], set[str]]:
-        """Names of objects that two links of the gripper touch, that lie on the floor, and that touch anything."""
+    def update(self, data: mujoco.MjData) -> tuple[set[str], set[str], set[str]]:
+        """Names of objects touched by two gripper links, on the floor, and touching anything."""
         pairs = data.contact.geom
         if not len(pairs):
             return set(), set(), set()
         pairs = np.concatenate([pairs, pairs[:, ::-1]])
-        pairs = pairs[self._thing[pairs[:, 0]] >= 0]
-        things, others = self._thing[pairs[:, 0]], pairs[:, 1]
+        pairs = pairs[self._object[pairs[:, 0]] >= 0]
+        objects, others = self._object[pairs[:, 0]], pairs[:, 1]
         sides = self._side[others]
-        fingers = np.unique(np.stack([things[sides >= 0], sides[sides >= 0]]), axis=1)
+        fingers = np.unique(np.stack([objects[sides >= 0], sides[sides >= 0]]), axis=1)
         names = self._names
         held = {names[index] for index in range(len(names)) if (fingers[0] == index).sum() >= 2}
-        return held, {names[index] for index in things[others == self._floor]}, {names[index] for index in things}
+        return held, {names[index] for index in objects[others == self._floor]}, {names[index] for index in objects}
 
 
-class Watch:
-    """Where objects are, in the words that the kinematic world has for it too."""
+class ObjectStates:
+    """State of each object, in the terms of the kinematic world."""
 
     def __init__(self, world: World) -> None:
         """Nothing is known yet."""
@@ -65,24 +65,24 @@ class Watch:
         self._on_floor: set[str] = set()
 
     def on_floor(self, name: str) -> None:
-        """An object that lay on the floor before."""
+        """Mark an object as lying on the floor."""
         self._on_floor.add(name)
 
     def forget(self, name: str) -> None:
-        """An object that was put somewhere else by a person."""
+        """Reset an object that an operator moved."""
         self._touched.pop(name, None)
         self._on_floor.discard(name)
 
-    def look(self, now: float, contacts: tuple[set[str], set[str], set[str]], bodies: Mapping[str, Body]) -> None:
-        """Take note of contacts at a time [s]."""
+    def update(self, now: float, contacts: tuple[set[str], set[str], set[str]], bodies: Mapping[str, Body]) -> None:
+        """Update with the contacts at a time [s]."""
         held, floor, _ = contacts
         self._on_floor = (self._on_floor | floor) & bodies.keys()
         for name in held:
             self._touched[name] = now
-        self._touched = {name: at for name, at in self._touched.items() if now - at < LETS_GO and name in bodies}
+        self._touched = {name: at for name, at in self._touched.items() if now - at < RELEASE_TIME and name in bodies}
 
     def state_of(self, body: Body, T: Array, supported: bool) -> tuple[State, str]:
-        """The state of a body at (4, 4), and the container in which it lies."""
+        """State of a body at (4, 4), and the container that holds it."""
         if body.name in self._on_floor:
             return "elsewhere", ""
         if body.name in self._touched:
@@ -98,7 +98,7 @@ class Watch:
 
 
 def pose_changed(T: Array, other: Array) -> bool:
-    """Whether two poses (4, 4) differ by so much that it is told."""
+    """Whether two poses (4, 4) differ enough to be published."""
     if float(np.abs(T[:3, 3] - other[:3, 3]).max()) > MOVED:
         return True
     cosine = (float(np.sum(T[:3, :3] * other[:3, :3])) - 1) / 2
@@ -106,7 +106,7 @@ def pose_changed(T: Array, other: Array) -> bool:
 
 
 def snap_upright(T: Array) -> Array:
-    """The pose, upright where it is so nearly: physics tilts what stands by microns."""
+    """Make a nearly upright pose exactly upright: physics tilts standing objects by microns."""
     if not UPRIGHT < T[2, 2] < 1:
         return T
     yaw = math.atan2(T[1, 0], T[0, 0])

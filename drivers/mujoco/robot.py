@@ -1,4 +1,4 @@
-"""The robot in a model: the bodies, joints, masses and shapes of its URDF, and couplings of its fingers."""
+"""Add a robot to a MuJoCo spec: bodies, joints, masses and shapes of its URDF, and finger couplings."""
 
 from __future__ import annotations
 
@@ -11,11 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from common.errors import ConfigError
-from common.robot.description import find_description
 from common.robot.finger_joints import finger_factors
-from common.robot.merging import WORLD
 from common.robot.model import RobotModel
 from common.robot.transforms import rpy_to_matrix, transform
+from common.robot.urdf import WORLD, find_description
 from drivers.mujoco.mesh_cache import cached_visual_meshes, hull_points
 from drivers.mujoco.scene import COLLIDES, ROBOT, SOLIMP, SOLREF, set_contact, set_finger_contact, visual_only, wxyz
 
@@ -24,19 +23,19 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-DENSITY = 1500.0  # [kg/m^3] of a link that says no mass: a case of metal with air in it
-ARMATURE = 0.1  # [kg m^2 or kg] of motor and gear at an arm's joint
-FINGER_ARMATURE = 0.05  # [kg] at the width of the fingers
+DENSITY = 1500.0  # [kg/m^3] of a link without mass: a hollow metal housing
+ARMATURE = 0.1  # [kg m^2 or kg] of motor and gear at an arm joint
+FINGER_ARMATURE = 0.05  # [kg] with respect to the width
 _HINGE, _SLIDE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
 _JOINTS = {"revolute": _HINGE, "continuous": _HINGE, "prismatic": _SLIDE}
-_TRIANGLES = 25_000  # of all that is seen of a robot
+_TRIANGLES = 25_000  # of all visual meshes of a robot
 
 
 def add_robot(spec: mujoco.MjSpec, robot: RobotModel, visuals: bool) -> None:
-    """Put the robot into a model, its base where the robot file says; a body for each link, of its name.
+    """Add the robot with its base at the configured pose; one body per link, of its name.
 
     Raises:
-        ConfigError: a joint or shape of the URDF that cannot be simulated, or a mesh that cannot be read.
+        ConfigError: a URDF joint or shape is not supported, or a mesh cannot be read.
     """
     root = ET.fromstring(robot.urdf)
     links = {str(link.get("name")): link for link in root.findall("link")}
@@ -50,7 +49,7 @@ def add_robot(spec: mujoco.MjSpec, robot: RobotModel, visuals: bool) -> None:
 
     def add(parent: Any, joint: ET.Element) -> None:
         name = _link(joint, "child")
-        body = parent.add_body(name=name, gravcomp=1.0)  # arms hold themselves
+        body = parent.add_body(name=name, gravcomp=1.0)  # arms compensate gravity
         _place(body, joint.find("origin"))
         _add_joint(body, joint, robot)
         _add_inertia(body, links[name])
@@ -78,19 +77,19 @@ def _link(joint: ET.Element, which: str) -> str:
     return "" if found is None else str(found.get("link"))
 
 
-def _numbers(element: ET.Element | None, name: str, usual: str) -> list[float]:
-    return [float(value) for value in (element.get(name, usual) if element is not None else usual).split()]
+def _numbers(element: ET.Element | None, name: str, default: str) -> list[float]:
+    return [float(value) for value in (element.get(name, default) if element is not None else default).split()]
 
 
 def pose_of_origin(origin: ET.Element | None) -> Array:
-    """(4, 4) that an <origin> describes."""
+    """(4, 4) pose of an <origin> element."""
     x, y, z = _numbers(origin, "xyz", "0 0 0")
     return transform(rpy_to_matrix(*_numbers(origin, "rpy", "0 0 0")), (x, y, z))
 
 
-def _place(what: Any, origin: ET.Element | None) -> None:
+def _place(element_: Any, origin: ET.Element | None) -> None:
     T = pose_of_origin(origin)
-    what.pos, what.quat = T[:3, 3], wxyz(T[:3, :3])
+    element_.pos, element_.quat = T[:3, 3], wxyz(T[:3, :3])
 
 
 def _add_joint(body: Any, joint: ET.Element, robot: RobotModel) -> None:
@@ -98,16 +97,16 @@ def _add_joint(body: Any, joint: ET.Element, robot: RobotModel) -> None:
     if kind == "fixed":
         return
     if kind not in _JOINTS:
-        raise ConfigError("robot.urdf", name, f"is a {kind} joint, which is not simulated; choices: fixed, "
+        raise ConfigError("robot.urdf", name, f"is a {kind} joint, which is not supported; choices: fixed, "
                                               f"{', '.join(_JOINTS)}")
     limit, dynamics = joint.find("limit"), joint.find("dynamics")
-    made = body.add_joint(name=name, type=_JOINTS[kind], axis=_numbers(joint.find("axis"), "xyz", "1 0 0"))
+    mj_joint = body.add_joint(name=name, type=_JOINTS[kind], axis=_numbers(joint.find("axis"), "xyz", "1 0 0"))
     low, high = (float(limit.get(end, 0.0)) if limit is not None else 0.0 for end in ("lower", "upper"))
-    if low < high and kind != "continuous":  # one without any room is no joint of the arm, and held where it is
-        made.range, made.limited = [low, high], True
-    made.damping = [float(dynamics.get("damping", 0.0)) if dynamics is not None else 0.0, 0.0, 0.0]
-    made.frictionloss = float(dynamics.get("friction", 0.0)) if dynamics is not None else 0.0
-    made.armature = ARMATURE if name in robot.joint_names else 1e-4  # of fingers it depends on their linkage
+    if low < high and kind != "continuous":  # a joint without range is locked
+        mj_joint.range, mj_joint.limited = [low, high], True
+    mj_joint.damping = [float(dynamics.get("damping", 0.0)) if dynamics is not None else 0.0, 0.0, 0.0]
+    mj_joint.frictionloss = float(dynamics.get("friction", 0.0)) if dynamics is not None else 0.0
+    mj_joint.armature = ARMATURE if name in robot.joint_names else 1e-4  # for fingers it depends on their linkage
 
 
 def _add_inertia(body: Any, link: ET.Element) -> None:
@@ -117,12 +116,12 @@ def _add_inertia(body: Any, link: ET.Element) -> None:
         return
     T = pose_of_origin(inertial.find("origin"))
     xx, yy, zz, xy, xz, yz = (float(inertia.get(f"i{axes}", 0)) for axes in ("xx", "yy", "zz", "xy", "xz", "yz"))
-    about = T[:3, :3] @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ T[:3, :3].T
-    smallest = np.linalg.eigvalsh(about)[0]
-    if smallest < 1e-7:  # descriptions have inertias that no body has
-        about = about + (1e-7 - smallest) * np.eye(3)
+    tensor = T[:3, :3] @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ T[:3, :3].T
+    smallest = np.linalg.eigvalsh(tensor)[0]
+    if smallest < 1e-7:  # some URDFs have unphysical inertias
+        tensor = tensor + (1e-7 - smallest) * np.eye(3)
     body.explicitinertial, body.mass, body.ipos = True, float(mass.get("value", 0)), T[:3, 3]
-    body.fullinertia = [about[0, 0], about[1, 1], about[2, 2], about[0, 1], about[0, 2], about[1, 2]]
+    body.fullinertia = [tensor[0, 0], tensor[1, 1], tensor[2, 2], tensor[0, 1], tensor[0, 2], tensor[1, 2]]
 
 
 def _shape(spec: mujoco.MjSpec, body: Any, shape: ET.Element, name: str, robot: RobotModel) -> Any:
@@ -132,7 +131,8 @@ def _shape(spec: mujoco.MjSpec, body: Any, shape: ET.Element, name: str, robot: 
     _place(geom, shape.find("origin"))
     kinds = mujoco.mjtGeom
     if geometry is None or tag not in ("box", "cylinder", "capsule", "sphere", "mesh"):
-        raise ConfigError("robot.urdf", tag, "is no collision shape; choices: box, capsule, cylinder, mesh, sphere")
+        raise ConfigError("robot.urdf", tag,
+                          "is no supported collision shape; choices: box, capsule, cylinder, mesh, sphere")
     if tag == "mesh":
         path = find_description("robot.urdf", str(geometry.get("filename")), robot.config.package_dirs)
         points = hull_points(path) * _numbers(geometry, "scale", "1 1 1")
@@ -150,7 +150,7 @@ def _shape(spec: mujoco.MjSpec, body: Any, shape: ET.Element, name: str, robot: 
 
 
 def _couple(spec: mujoco.MjSpec, root: ET.Element, robot: RobotModel) -> None:
-    """Have fingers follow the driven one, what is a mimic its joint, and hold what nothing drives."""
+    """Couple fingers to the driven one and mimic joints to theirs; lock undriven joints."""
     gripper = robot.config.gripper
     follows: dict[str, tuple[str, float, float]] = {}
     if gripper is not None and gripper.joints:

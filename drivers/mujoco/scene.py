@@ -1,4 +1,4 @@
-"""Objects in a model: free bodies with the mass and the shape that they have."""
+"""Add objects, fixtures, containers, floor and cameras to a MuJoCo spec, with their contact parameters."""
 
 from __future__ import annotations
 
@@ -22,55 +22,54 @@ from common.sim.resting import FLOOR_BELOW_TABLE
 Array = NDArray[np.float64]
 
 RING_PIECES = 16  # convex pieces of a ring
-USUAL_MASS = 0.1  # [kg] where nobody says
+DEFAULT_MASS = 0.1  # [kg]
 
 
 @dataclass(frozen=True, eq=False)
 class SceneObject:
-    """An object: its shape in its own frame, its colour and its mass [kg]."""
+    """An object: shape in its own frame, color and mass [kg]."""
 
     id: str
     solid: Solid
     color: tuple[float, float, float]
-    mass: float = USUAL_MASS
+    mass: float = DEFAULT_MASS
 
 
-def add_object(spec: mujoco.MjSpec, thing: SceneObject) -> None:
-    """Put an object into a model: a free body `thing:ID` at the origin."""
-    body = spec.worldbody.add_body(name=f"thing:{thing.id}")
-    body.add_freejoint(name=f"thing:{thing.id}")
-    geoms = _geoms(spec, body, thing)
+def add_object(spec: mujoco.MjSpec, obj: SceneObject) -> None:
+    """Add an object: a free body `object:ID` at the origin."""
+    body = spec.worldbody.add_body(name=f"object:{obj.id}")
+    body.add_freejoint(name=f"object:{obj.id}")
+    geoms = _geoms(spec, body, obj)
     volume = sum(volume for _, volume in geoms)
     for geom, part in geoms:
-        geom.mass = thing.mass * part / volume
-        geom.rgba = [*thing.color, 1.0]
+        geom.mass = obj.mass * part / volume
+        geom.rgba = [*obj.color, 1.0]
         set_contact(geom, OBJECT)
 
 
-def _geoms(spec: mujoco.MjSpec, body: Any, thing: SceneObject) -> list[tuple[Any, float]]:
+def _geoms(spec: mujoco.MjSpec, body: Any, obj: SceneObject) -> list[tuple[Any, float]]:
     """Convex geoms, each with its volume [m^3]."""
-    solid, kinds = thing.solid, mujoco.mjtGeom
+    solid, kinds = obj.solid, mujoco.mjtGeom
     if solid.shape == "sphere":
         return [(body.add_geom(type=kinds.mjGEOM_SPHERE, size=[solid.radius, 0.0, 0.0]), 1.0)]
     if solid.shape in ("box", "cylinder"):
-        size, middle = solid.size / 2, (solid.low + solid.high) / 2
+        size, center = solid.size / 2, (solid.low + solid.high) / 2
         if solid.shape == "box":
-            return [(body.add_geom(type=kinds.mjGEOM_BOX, size=size, pos=middle), 1.0)]
-        return [(body.add_geom(type=kinds.mjGEOM_CYLINDER, size=[size[0], size[2], 0.0], pos=middle), 1.0)]
-    made = []
+            return [(body.add_geom(type=kinds.mjGEOM_BOX, size=size, pos=center), 1.0)]
+        return [(body.add_geom(type=kinds.mjGEOM_CYLINDER, size=[size[0], size[2], 0.0], pos=center), 1.0)]
+    pieces = []
     for number, points in enumerate(convex_pieces(solid)):
-        mesh = spec.add_mesh(name=f"thing:{thing.id}.{number}")
+        mesh = spec.add_mesh(name=f"object:{obj.id}.{number}")
         mesh.uservert = points.ravel()
         mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
-        made.append((body.add_geom(type=kinds.mjGEOM_MESH, meshname=mesh.name), _volume(points)))
-    return made
+        pieces.append((body.add_geom(type=kinds.mjGEOM_MESH, meshname=mesh.name), _volume(points)))
+    return pieces
 
 
 def convex_pieces(solid: Solid) -> list[Array]:
     """Points (n, 3) [m] of convex pieces of a solid.
 
-    A prism is cut into triangles where it is not convex, a ring into wedges; of a mesh each connected part is taken for
-    its convex hull.
+    Concave prisms are split into triangles, rings into wedges; each connected part of a mesh becomes its convex hull.
     """
     if solid.shape == "mesh":
         return _connected(solid.mesh)
@@ -80,8 +79,8 @@ def convex_pieces(solid: Solid) -> list[Array]:
         angles = np.linspace(0.0, 2 * math.pi, RING_PIECES + 1)
         sections = []
         for a, b in pairwise(angles):
-            way = np.array([[math.cos(t), math.sin(t)] for t in (a, (a + b) / 2, b)])
-            sections.append(np.concatenate([outer * way, inner * way[::-2]]))
+            directions = np.array([[math.cos(t), math.sin(t)] for t in (a, (a + b) / 2, b)])
+            sections.append(np.concatenate([outer * directions, inner * directions[::-2]]))
     else:
         sections = [np.asarray(part) for part in convex_parts(solid.section)]
     return [np.concatenate([np.column_stack([section, np.full(len(section), z)]) for z in heights])
@@ -104,64 +103,64 @@ def _connected(triangles: Array) -> list[Array]:
 
 
 def _volume(points: Array) -> float:
-    """About that of what is convex [m^3]: a share of the box about it is enough to part a mass."""
+    """Approximate volume of a convex piece [m^3]: that of its bounding box suffices to distribute mass."""
     return float(np.prod(np.maximum(np.ptp(points, axis=0), 1e-6)))
 
 
-# How things touch: the numbers of MuJoCo's solver, and who meets whom. docs/physics.md says where they come from."""
+# Contact parameters and collision filtering; docs/physics.md explains the values
 
 TIMESTEP = 0.002  # [s]
-IMPRATIO = 10.0  # friction is stiffer than contact: what is held does not creep
-SOLREF = (0.004, 1.0)  # time constant [s], damping: MuJoCo's own 0.02 squeezes fingers 11 mm into what they hold
+IMPRATIO = 10.0  # friction stiffer than contact: held objects do not creep
+SOLREF = (0.004, 1.0)  # time constant [s], damping; with MuJoCo's default 0.02 fingers sink 11 mm into objects
 SOLIMP = (0.95, 0.99, 0.001, 0.5, 2.0)
-SLIDING, TORSION, ROLLING = 1.0, 0.01, 0.001  # coefficient, [m], [m]: without rolling friction nothing round stops
+SLIDING, TORSION, ROLLING = 1.0, 0.01, 0.001  # coefficient, [m], [m]; without rolling friction round objects never stop
 FINGER_SLIDING = 1.5  # rubber pads
 CONDIM = 6  # sliding, torsion and rolling
 
-ROBOT, FIXED, OBJECT, HIDDEN = 1, 2, 4, 0  # what meets what; a robot meets itself only in its planner's mind
-_MEETS = {ROBOT: 0, FIXED: ROBOT, OBJECT: ROBOT | FIXED | OBJECT, HIDDEN: 0}
+ROBOT, FIXED, OBJECT, HIDDEN = 1, 2, 4, 0  # collision categories; only the planner checks self-collision
+_COLLIDES_WITH = {ROBOT: 0, FIXED: ROBOT, OBJECT: ROBOT | FIXED | OBJECT, HIDDEN: 0}
 
-# Groups of shapes, for who draws them: what is only seen, and what only collides.
+# Geom groups for rendering: visual only, and collision only
 SEEN, COLLIDES = 2, 3
 
 
 def wxyz(rotation: Array) -> list[float]:
-    """Quaternion w, x, y, z, as MuJoCo has it, of a (3, 3) rotation."""
+    """Quaternion w, x, y, z, as in MuJoCo, of a (3, 3) rotation."""
     x, y, z, w = matrix_to_quaternion(rotation)
     return [w, x, y, z]
 
 
 def set_contact(geom: Any, kind: int, *, group: int = 0) -> Any:
-    """The geom (of an MjSpec) with the contact of its kind."""
-    geom.contype, geom.conaffinity, geom.group = kind, _MEETS[kind], group
+    """Set the contact parameters of a category on a geom (of an MjSpec); return the geom."""
+    geom.contype, geom.conaffinity, geom.group = kind, _COLLIDES_WITH[kind], group
     geom.condim = CONDIM if kind == OBJECT else 3
     geom.friction, geom.solref, geom.solimp = (SLIDING, TORSION, ROLLING), SOLREF, SOLIMP
     return geom
 
 
 def set_finger_contact(geom: Any) -> Any:
-    """The geom of a finger with the contact of its pads, which counts more than that of what it holds."""
+    """Set the contact parameters of a finger pad, which override those of the object; return the geom."""
     geom.friction = (FINGER_SLIDING, TORSION, ROLLING)
     geom.condim, geom.priority = CONDIM, 1
     return geom
 
 
 def visual_only(geom: Any) -> Any:
-    """The geom without contact and mass."""
+    """Remove contact and mass from a geom; return it."""
     geom.contype = geom.conaffinity = HIDDEN
     geom.group, geom.mass, geom.density = SEEN, 0.0, 0.0
     return geom
 
 
-# What never moves in a model: fixtures, containers, the floor; and the cameras."""
+# Surroundings and cameras
 
-STANDS = 0.3  # [m] a fixture whose bottom is so far below the highest top stands on the floor
+MIN_HEIGHT = 0.3  # [m] smallest height of fixtures that reach the floor
 FLOOR_COLOR = (0.62, 0.62, 0.60, 1.0)
-_OPTICAL_TO_GL = np.diag([1.0, -1.0, -1.0])  # an optical frame looks along z with y down, MuJoCo's along -z with y up
+_OPTICAL_TO_GL = np.diag([1.0, -1.0, -1.0])  # optical frame: z forward, y down; MuJoCo camera: -z forward, y up
 
 
 def add_surroundings(spec: mujoco.MjSpec, world: Surroundings) -> None:
-    """Put what is fixed into a model: a body `fixture:ID` or `container:ID` for each, and the floor."""
+    """Add fixtures and containers, as bodies `fixture:ID` and `container:ID`, and the floor."""
     kinds = {"box": mujoco.mjtGeom.mjGEOM_BOX, "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
              "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER}
     for fixture in world.fixtures:
@@ -181,14 +180,14 @@ def add_surroundings(spec: mujoco.MjSpec, world: Surroundings) -> None:
 
 
 def floor_height(world: Surroundings) -> float:
-    """z of the floor [m]: where fixtures stand, or below the table."""
+    """z of the floor [m]: bottom of the fixtures, or below the table."""
     extents = [_extent(fixture) for fixture in world.fixtures]
     top, bottom = max((high for _, high in extents), default=0.0), min((low for low, _ in extents), default=0.0)
-    return bottom if top - bottom > STANDS else min(bottom, world.table_height) - FLOOR_BELOW_TABLE
+    return bottom if top - bottom > MIN_HEIGHT else min(bottom, world.table_height) - FLOOR_BELOW_TABLE
 
 
 def _extent(fixture: Fixture) -> tuple[float, float]:
-    """Heights [m] between which it certainly lies."""
+    """Conservative height range [m] of a fixture."""
     d, up = fixture.dimensions, np.abs(rpy_to_matrix(*fixture.rpy)[2])
     half = {"box": float(up @ np.resize(d, 3)) / 2, "sphere": d[0],
             "cylinder": float(up[2] * d[-1] / 2 + math.hypot(up[0], up[1]) * d[0])}[fixture.shape]
@@ -196,13 +195,13 @@ def _extent(fixture: Fixture) -> tuple[float, float]:
 
 
 def _add_container(spec: mujoco.MjSpec, c: Container, table: float) -> None:
-    """Five panels: a floor, and walls from the table up."""
+    """Add five panels: a floor and walls on the table."""
     body = spec.worldbody.add_body(name=f"container:{c.id}", pos=[c.x, c.y, table])
-    half, thick, middle = c.half_side, c.wall_thickness / 2, c.wall_height / 2
+    half, thick, center = c.half_side, c.wall_thickness / 2, c.wall_height / 2
     off = half - thick
     panels = [((0.0, 0.0, c.floor_thickness / 2), (half, half, c.floor_thickness / 2))]
-    panels += [((sign * off, 0.0, middle), (thick, half, middle)) for sign in (-1, 1)]
-    panels += [((0.0, sign * off, middle), (half - 2 * thick, thick, middle)) for sign in (-1, 1)]
+    panels += [((sign * off, 0.0, center), (thick, half, center)) for sign in (-1, 1)]
+    panels += [((0.0, sign * off, center), (half - 2 * thick, thick, center)) for sign in (-1, 1)]
     for number, (at, size) in enumerate(panels):
         geom = body.add_geom(name=f"container:{c.id}.{number}", type=mujoco.mjtGeom.mjGEOM_BOX, pos=at, size=size,
                              rgba=[*c.color, 1.0])
@@ -210,7 +209,7 @@ def _add_container(spec: mujoco.MjSpec, c: Container, table: float) -> None:
 
 
 def add_cameras(spec: mujoco.MjSpec, world: Surroundings, robot: RobotModel | None) -> None:
-    """Put the cameras of the world into a model, by their names, on their mounts."""
+    """Add the cameras of the world by name, on their mounts."""
     for name, camera in world.cameras.items():
         body: Any = spec.worldbody
         if camera.mount and robot is not None:
@@ -225,5 +224,5 @@ def camera_quaternion(rotation: NDArray[np.float64]) -> list[float]:
 
 
 def field_of_view(camera: CameraConfig) -> float:
-    """Vertical [deg]; whose principal point is off the middle, or whose pixels are not square, is not in it."""
+    """Vertical field of view [deg]; ignores the principal point and non-square pixels."""
     return math.degrees(2 * math.atan(camera.height / (2 * camera.fy)))

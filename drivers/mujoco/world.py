@@ -1,7 +1,6 @@
-"""The truth as physics has it: objects fall, roll, are pushed, held by friction, and slip.
+"""Ground truth with physics: objects fall, roll, are pushed, are held by friction, and slip.
 
-Where a person may put something, what objects are called and look like is as in the kinematic world, whose bodies are
-used for that: what is asked of it is where an edit puts them.
+Edits, names and appearance follow the kinematic world: its bodies are reused, and it decides where an edit puts them.
 """
 
 from __future__ import annotations
@@ -24,46 +23,46 @@ from common.sim.kinematic import KinematicWorld
 from common.sim.news import News
 from drivers.mujoco.arm import PhysicsArm, tune
 from drivers.mujoco.model import CellModel, build_model
-from drivers.mujoco.object_states import RESTS, Contacts, Watch, pose_changed, snap_upright
-from drivers.mujoco.scene import ROBOT, TIMESTEP, USUAL_MASS, SceneObject
+from drivers.mujoco.object_states import REST_SPEED, Contacts, ObjectStates, pose_changed, snap_upright
+from drivers.mujoco.scene import DEFAULT_MASS, ROBOT, TIMESTEP, SceneObject
 
 Array = NDArray[np.float64]
 
-MOST_CAUGHT_UP = 2.0  # [s] of a hold-up; what is longer, the world has stood still
-TOLD = 0.05  # [s] between changes that are told of while something moves
-SLIPPERY = 0.5  # [s] fingers do not touch what a person lets slip, and not before they are clear of it
-QUIET = 1e-6  # [m] or of a quaternion: nothing has moved since the last look
-ASLEEP = 1e-3  # [m/s] or [rad/s]: velocities below are not saved over a restart
+MAX_CATCH_UP = 2.0  # [s] of delay; time of a longer one is skipped
+PUBLISH_INTERVAL = 0.05  # [s] between published changes while objects move
+SLIP_TIME = 0.5  # [s] without finger contact after a drop; extended until they are clear
+QUIET = 1e-6  # [m] or quaternion entries: no motion since the last update
+ASLEEP = 1e-3  # [m/s] or [rad/s]: smaller velocities are restored as zero
 
 
 class PhysicsWorld(News):
-    """The objects and the arm among them.
+    """The objects and the arm.
 
     Attributes:
-        version: grows whenever something has changed that is worth telling.
+        version: increases with every published change.
     """
 
     def __init__(
         self, world: World, objects: Sequence[ObjectConfig], tolerances: GraspTolerances,
         gripper: GripperConfig | None,
     ) -> None:
-        """Lay everything out; it begins to move with `hardware`.
+        """Place all objects; motion starts with `hardware`.
 
         Raises:
-            ConfigError: an object cannot lie where it is to, or the gripper is a suction cup.
+            ConfigError: an object cannot lie at its position, or the gripper is a suction cup.
         """
         if gripper is not None and gripper.cup is not None:
-            raise ConfigError("world.simulator", "mujoco", "has fingers only: with a suction cup use kinematic")
+            raise ConfigError("world.simulator", "mujoco", "supports fingers only; use kinematic with a suction cup")
         super().__init__()
         self._config = world
-        self._paper = KinematicWorld(world, objects, tolerances, gripper)
-        self._first_masses = {thing.id: thing.mass for thing in objects}
+        self._kinematic = KinematicWorld(world, objects, tolerances, gripper)
+        self._first_masses = {obj.id: obj.mass for obj in objects}
         self._masses = dict(self._first_masses)
-        self._watch = Watch(world)
-        self._taken: set[str] = set()  # what "remove" was said of
-        self._slippery: dict[str, float] = {}  # until when
+        self._states = ObjectStates(world)
+        self._removed: set[str] = set()  # objects reported as removed
+        self._slippery: dict[str, float] = {}  # end of the slip time [s]
         self._time: float | None = None
-        self._told_at = -math.inf
+        self._published_at = -math.inf
         self._cell: CellModel | None = None
         self._data: mujoco.MjData
         self._touching: tuple[set[str], set[str], set[str]] | None = None
@@ -71,7 +70,7 @@ class PhysicsWorld(News):
     # --- the arm ---
 
     def hardware(self, robot: RobotModel, limits: Limits, start: Vector) -> Hardware:
-        """The arm in this world, at rest at `start` (dof,) [rad], with open fingers.
+        """Return the arm in this world, at rest at `start` (dof,) [rad], with open fingers.
 
         Raises:
             ConfigError: the robot cannot be simulated.
@@ -89,16 +88,16 @@ class PhysicsWorld(News):
     @property
     def _built(self) -> tuple[CellModel, mujoco.MjData]:
         if self._cell is None:
-            raise RuntimeError("the world stands still without the arm: call `hardware` first")
+            raise RuntimeError("the world has no arm yet: call `hardware` first")
         return self._cell, self._data
 
     def _build(self) -> None:
-        """Make the model of what there is; joints and objects that were there are where they were, as fast."""
+        """Build the model; joints and objects of the previous model keep position and velocity."""
         before = None if self._cell is None else (self._cell, self._data)
-        bodies = self._paper.bodies
-        things = [SceneObject(name, body.solid, body.color, self._masses.get(name, USUAL_MASS))
+        bodies = self._kinematic.bodies
+        objects = [SceneObject(name, body.solid, body.color, self._masses.get(name, DEFAULT_MASS))
                   for name, body in bodies.items()]
-        cell = build_model(self._robot, self._config, things)
+        cell = build_model(self._robot, self._config, objects)
         tune(cell, self._robot)
         data = mujoco.MjData(cell.model)
         data.qpos[:] = cell.start
@@ -109,17 +108,17 @@ class PhysicsWorld(News):
         mujoco.mj_forward(cell.model, data)
         self._cell, self._data, self._contacts = cell, data, Contacts(cell, self._robot)
         for name in self._slippery:
-            self._touchable(name, False)
-        self._qpos = np.array([at for place in cell.things.values() for at in range(place.qpos, place.qpos + 7)], int)
-        self._touching, self._looked_at = None, np.full(len(self._qpos), np.inf)
+            self._set_robot_contact(name, False)
+        self._qpos = np.array([i for at in cell.objects.values() for i in range(at.qpos, at.qpos + 7)], int)
+        self._touching, self._last_qpos = None, np.full(len(self._qpos), np.inf)
         self._arm.attach(cell, data)
 
     # --- time ---
 
     def advance(self, now: float) -> None:
-        """Let the world go on to a time [s]."""
+        """Advance to a time [s]."""
         cell, data = self._built
-        if self._time is None or now - self._time > MOST_CAUGHT_UP:
+        if self._time is None or now - self._time > MAX_CATCH_UP:
             self._time = now
         steps = math.floor((now - self._time) / TIMESTEP + 1e-6)
         for _ in range(steps):
@@ -128,181 +127,183 @@ class PhysicsWorld(News):
             self._time += TIMESTEP
         if steps > 0:
             self._arm.sense(self._time)
-            self._look(self._time)
+            self._update(self._time)
 
-    def _look(self, now: float) -> None:
-        """Take note of what has moved."""
+    def _update(self, now: float) -> None:
+        """Update bodies and events from physics."""
         cell, data = self._built
         for name in [name for name, until in self._slippery.items() if now >= until and not self._within_robot(name)]:
             del self._slippery[name]
-            self._touchable(name, True)
-        contacts = self._contacts.look(data)
-        bodies = self._paper.bodies
-        self._watch.look(now, contacts, bodies)
-        places = data.qpos[self._qpos]
-        if contacts == self._touching and not self._taken and np.abs(places - self._looked_at).max(initial=0.0) < QUIET:
+            self._set_robot_contact(name, True)
+        contacts = self._contacts.update(data)
+        bodies = self._kinematic.bodies
+        self._states.update(now, contacts, bodies)
+        qpos = data.qpos[self._qpos]
+        is_quiet = np.abs(qpos - self._last_qpos).max(initial=0.0) < QUIET
+        if contacts == self._touching and not self._removed and is_quiet:
             return
-        self._touching, due = contacts, now - self._told_at >= TOLD
-        if due:  # else the next look tells of it
-            self._looked_at = places
+        self._touching, publish = contacts, now - self._published_at >= PUBLISH_INTERVAL
+        if publish:  # else the next update publishes it
+            self._last_qpos = qpos
         for name, body in bodies.items():
             T = snap_upright(cell.pose_of(data, name))
-            state, container = self._watch.state_of(body, T, name in contacts[2])
-            same = (state, container) == (body.state, body.container)
-            if same and not (due and pose_changed(T, body.T)):
-                self._news_of(body)
+            state, container = self._states.state_of(body, T, name in contacts[2])
+            unchanged = (state, container) == (body.state, body.container)
+            if unchanged and not (publish and pose_changed(T, body.T)):
+                self._publish_events(body)
                 continue
             body.T, body.state, body.container = T, state, container
             body.slot = body.rest = body.grip = None
             body.changed()
             self.version += 1
-            self._told_at = now
-            self._news_of(body)
+            self._published_at = now
+            self._publish_events(body)
 
-    def _news_of(self, body: Body) -> None:
-        if body.state == "held" and body.name not in self._taken:
-            self._taken.add(body.name)
+    def _publish_events(self, body: Body) -> None:
+        if body.state == "held" and body.name not in self._removed:
+            self._removed.add(body.name)
             self._say("remove", body)
-        elif body.state in ("table", "contained") and body.name in self._taken and self._speed(body.name) < RESTS:
-            self._taken.discard(body.name)
+        elif body.state in ("table", "contained") and body.name in self._removed and (
+                self._speed(body.name) < REST_SPEED):
+            self._removed.discard(body.name)
             self._say("add", body)
 
     def _speed(self, name: str) -> float:
         cell, data = self._built
-        at = cell.things[name].dof
+        at = cell.objects[name].dof
         return float(np.linalg.norm(data.qvel[at: at + 3]))
 
-    # --- what there is ---
+    # --- queries ---
 
     @property
     def ids(self) -> list[str]:
-        """What is in it."""
-        return self._paper.ids
+        """Ids of all objects."""
+        return self._kinematic.ids
 
     @property
     def layout(self) -> dict[str, Numbers]:
-        """Where everything was at first, (x, y, z) [m] by id."""
-        return self._paper.layout
+        """Initial positions (x, y, z) [m] by id."""
+        return self._kinematic.layout
 
     @property
     def held(self) -> str:
-        """The id of what is between the fingers, or an empty string."""
-        return self._paper.held
+        """Id of the held object, or an empty string."""
+        return self._kinematic.held
 
     def objects(self, header: Header) -> WorldObjects:
-        """Where everything is; what is "elsewhere" lies on the floor."""
-        return self._paper.objects(header)
+        """State of all objects; those in state "elsewhere" lie on the floor."""
+        return self._kinematic.objects(header)
 
-
-    # --- over a restart ---
+    # --- snapshot ---
 
     def standing(self) -> dict[str, StandingObject]:
-        """Everything as it is and moves at this moment, for `restore`."""
+        """Complete state with velocities, for `restore`."""
         cell, data = self._built
         found = {}
-        for name, body in self._paper.bodies.items():
-            saved, at = body.standing(), cell.things[name]
+        for name, body in self._kinematic.bodies.items():
+            snapshot, at = body.standing(), cell.objects[name]
             speeds = data.qvel[at.dof: at.dof + 6]
-            details = {**saved.details, "mass": self._masses.get(name, USUAL_MASS), "slippery": name in self._slippery,
+            details = {**snapshot.details, "mass": self._masses.get(name, DEFAULT_MASS),
+                       "slippery": name in self._slippery,
                        "qpos": data.qpos[at.qpos: at.qpos + 7].tolist(),
                        "qvel": speeds.tolist() if np.abs(speeds).max() > ASLEEP else [0.0] * 6}
-            found[name] = saved.model_copy(update={"details": details})
+            found[name] = snapshot.model_copy(update={"details": details})
         return found
 
     def restore(self, objects: Mapping[str, StandingObject]) -> None:
-        """Put everything where it was, as fast as it was; what is held stands still, as the arm does that begins."""
-        self._paper.restore(objects)
-        self._masses = {name: float(saved.details.get("mass", USUAL_MASS)) for name, saved in objects.items()}
-        self._taken = {name for name, body in self._paper.bodies.items() if body.state in ("held", "falling")}
-        self._slippery = {name: -math.inf for name, saved in objects.items() if saved.details.get("slippery")}
+        """Restore a state with velocities; a held object is at rest, like the restarted arm."""
+        self._kinematic.restore(objects)
+        self._masses = {name: float(snapshot.details.get("mass", DEFAULT_MASS)) for name, snapshot in objects.items()}
+        self._removed = {name for name, body in self._kinematic.bodies.items() if body.state in ("held", "falling")}
+        self._slippery = {name: -math.inf for name, snapshot in objects.items() if snapshot.details.get("slippery")}
         self._build()
         cell, data = self._built
-        for name, saved in objects.items():
-            if name in cell.things and "qpos" in saved.details:
-                place = cell.things[name]
-                data.qpos[place.qpos: place.qpos + 7] = saved.details["qpos"]
-                held = saved.details.get("state") == "held"
-                data.qvel[place.dof: place.dof + 6] = [0.0] * 6 if held else saved.details["qvel"]
-            if name in cell.things and saved.details.get("state") == "elsewhere":
-                self._watch.on_floor(name)
+        for name, snapshot in objects.items():
+            if name in cell.objects and "qpos" in snapshot.details:
+                address = cell.objects[name]
+                data.qpos[address.qpos: address.qpos + 7] = snapshot.details["qpos"]
+                held = snapshot.details.get("state") == "held"
+                data.qvel[address.dof: address.dof + 6] = [0.0] * 6 if held else snapshot.details["qvel"]
+            if name in cell.objects and snapshot.details.get("state") == "elsewhere":
+                self._states.on_floor(name)
         mujoco.mj_forward(cell.model, data)
         self.version += 1
 
     # --- edits ---
 
     def edit(self, request: WorldEdit, now: float) -> str:
-        """Change the world as a person asks: see `common.sim.interface`."""
+        """Change the world as an operator requests: see `common.sim.interface`."""
         if request.op == "drop":
             return self._slip(request.id)
-        before = set(self._paper.ids)
-        name = self._paper.edit(request, now)
-        updates = self._paper.take_events()
-        changed = self._paper.ids if request.op == "reset" else [name] if name in self._paper.bodies else []
+        before = set(self._kinematic.ids)
+        name = self._kinematic.edit(request, now)
+        updates = self._kinematic.take_events()
+        changed = self._kinematic.ids if request.op == "reset" else [name] if name in self._kinematic.bodies else []
         if request.op == "reset":
             self._masses = dict(self._first_masses)
         elif request.op == "add":
-            self._masses[name] = request.mass or self._first_masses.get(request.like or self._usual, USUAL_MASS)
-        if request.op == "reset" or before != set(self._paper.ids):
+            template = request.like or self._default_template
+            self._masses[name] = request.mass or self._first_masses.get(template, DEFAULT_MASS)
+        if request.op == "reset" or before != set(self._kinematic.ids):
             try:
                 self._build()
-            except ConfigError as error:  # of what was added: all else was built before
-                self._paper.edit(WorldEdit(op="remove", id=name), now)
-                self._paper.take_events()
+            except ConfigError as error:  # caused by the added object: the rest was built before
+                self._kinematic.edit(WorldEdit(op="remove", id=name), now)
+                self._kinematic.take_events()
                 self._masses.pop(name, None)
                 raise Refused("no_size", f"{name}: {error}") from None
         self._events += [each for each in updates if request.op == "reset" or each.data.partition(":")[2] == name]
         cell, data = self._built
         for each in changed:
-            place, body = cell.things[each], self._paper.bodies[each]
+            address, body = cell.objects[each], self._kinematic.bodies[each]
             body.rest = None
             cell.set_object(data, each, body.T)
-            data.qvel[place.dof: place.dof + 6] = 0.0
-            self._watch.forget(each)
-            self._taken.discard(each)
+            data.qvel[address.dof: address.dof + 6] = 0.0
+            self._states.forget(each)
+            self._removed.discard(each)
         mujoco.mj_forward(cell.model, data)
         self.version += 1
         return name
 
     @property
-    def _usual(self) -> str:
+    def _default_template(self) -> str:
         return next(iter(self._first_masses), "")
 
     def _slip(self, name: str) -> str:
         held = self.held
         if not held or name not in ("", held):
             raise Refused("not_held", f"{name or 'nothing'} is {'not ' if name else ''}between the fingers")
-        self._touchable(held, False)
-        self._slippery[held] = (self._time or 0.0) + SLIPPERY
-        self._watch.forget(held)
+        self._set_robot_contact(held, False)
+        self._slippery[held] = (self._time or 0.0) + SLIP_TIME
+        self._states.forget(held)
         return held
 
-    def _touchable(self, name: str, by_robot: bool) -> None:
+    def _set_robot_contact(self, name: str, by_robot: bool) -> None:
         cell, _ = self._built
-        if name in cell.things:
-            geoms = cell.model.geom_bodyid == cell.things[name].body
+        if name in cell.objects:
+            geoms = cell.model.geom_bodyid == cell.objects[name].body
             affinity = cell.model.geom_conaffinity[geoms]
             cell.model.geom_conaffinity[geoms] = affinity | ROBOT if by_robot else affinity & ~ROBOT
 
-
     def _within_robot(self, name: str) -> bool:
-        """Whether part of the robot is where a thing is: they would be flung apart if they touched from now on."""
+        """Whether the robot overlaps an object: restoring contact would fling them apart."""
         cell, data = self._built
-        if name not in cell.things:
+        if name not in cell.objects:
             return False
-        of_thing = np.flatnonzero(cell.model.geom_bodyid == cell.things[name].body)
+        of_object = np.flatnonzero(cell.model.geom_bodyid == cell.objects[name].body)
         of_robot = np.flatnonzero(cell.model.geom_contype & ROBOT)
         return any(mujoco.mj_geomDistance(cell.model, data, int(one), int(other), 0.0, None) < 0.0
-                   for one in of_thing for other in of_robot)
+                   for one in of_object for other in of_robot)
 
 
 def _copy(old: CellModel, source: mujoco.MjData, new: CellModel, data: mujoco.MjData) -> None:
-    """Bring positions and velocities of what is in both models from one to the other."""
+    """Copy positions and velocities of joints and objects from one model to another."""
     for name, qpos in old.joints.items():
         data.qpos[new.joints[name]] = source.qpos[qpos]
         data.qvel[new.dofs[name]] = source.qvel[old.dofs[name]]
-    for name, was in old.things.items():
-        if name in new.things:
-            now = new.things[name]
+    for name, was in old.objects.items():
+        if name in new.objects:
+            now = new.objects[name]
             data.qpos[now.qpos: now.qpos + 7] = source.qpos[was.qpos: was.qpos + 7]
             data.qvel[now.dof: now.dof + 6] = source.qvel[was.dof: was.dof + 6]
     for name, actuator in old.actuators.items():

@@ -1,1 +1,1 @@
-"""Faults on purpose: a seeded plan of them, and what carries it out in a running cell."""
+"""Faults in cells of real processes: a seeded plan, and an agent that carries it out."""

@@ -13,8 +13,8 @@ import pytest
 from common import topics
 from common.messages import JointState
 from common.transport.bus import Reader
-from common.transport.connect import connect
 from common.transport.endpoint import endpoint_of
+from common.transport.zenoh_session import connect
 from tests.harness import PATIENCE, Place, Zencell, free_domain, until
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]

@@ -13,8 +13,8 @@ import msgpack
 import pytest
 
 from applications.pick_place.topics import DETECTED_OBJECTS
-from common.transport.connect import connect
 from common.transport.endpoint import endpoint_of
+from common.transport.zenoh_session import connect
 from tests.harness import RunningCell, command_line, environment, free_domain, until
 from tests.simulated.test_replay import found_in
 

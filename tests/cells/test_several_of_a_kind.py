@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from common.transport.connect import connect
+from common.transport.zenoh_session import connect
 from tests.harness import Place, RunningCell
 
 pytestmark = [pytest.mark.cell, pytest.mark.slow]

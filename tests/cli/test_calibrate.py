@@ -65,10 +65,10 @@ def test_a_camera_is_calibrated_from_pictures_to_the_file_of_a_cell(calibrated):
 def test_it_tells_residuals_uncertainty_and_what_comes_next(calibrated, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(calibrated.parent)
     told = Path("told.txt").read_text()
-    assert re.search(r"^10 views, \d+ corners, \d+ % of the picture covered$", told, re.MULTILINE)
+    assert re.search(r"^10 views, \d+ corners, \d+ % of the image covered$", told, re.MULTILINE)
     assert re.search(r"^residual 0\.\d+ px rms; p0\.png 0\.\d+, p1\.png", told, re.MULTILINE)
     assert re.search(r"^fx\s+53\d\.\d\d \+- 0\.\d\d px$", told, re.MULTILINE) and "calibrate pose" in told
-    assert re.search(r"^4 pictures, residual 0\.\d+ px rms, 0\.\d+ mm on the board", told, re.MULTILINE)
+    assert re.search(r"^4 images, residual 0\.\d+ px rms, 0\.\d+ mm on the board", told, re.MULTILINE)
     assert re.search(r"^position 0\.4\d+, -0\.0\d+, 0\.\d+ m \+- 0\.\d+ mm$", told, re.MULTILINE)
     assert f"--set world.camera={calibrated}" in told
     path = shutil.copy(calibrated, tmp_path / "camera.yaml")
@@ -110,12 +110,12 @@ def test_a_board_is_written_with_its_true_size(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "code", "wanted"),
     [
-        (["intrinsics", "few"], 1, ["3 of 3 pictures are usable", "8 are needed, 5 more"]),
-        (["intrinsics", "empty"], 1, ["0 of 2 pictures", "2 show no marker"]),
-        (["intrinsics", "blurred"], 1, ["0 of 3 pictures", "3 are blurred"]),
+        (["intrinsics", "few"], 1, ["3 of 3 images are usable", "8 are needed, 5 more"]),
+        (["intrinsics", "empty"], 1, ["0 of 2 images", "2 show no marker"]),
+        (["intrinsics", "blurred"], 1, ["0 of 3 images", "3 are blurred"]),
         (["intrinsics", "views", "--squares", "6x5"], 1, ["another board", "6x5"]),
-        (["intrinsics", "nowhere"], 2, ["nowhere", "is no device number"]),
-        (["intrinsics", "broken"], 2, ["p0.png", "is no image"]),
+        (["intrinsics", "nowhere"], 2, ["nowhere", "is not a device number"]),
+        (["intrinsics", "broken"], 2, ["p0.png", "is not a readable image"]),
         (["intrinsics", "/dev/zencell-none"], 2, ["/dev/zencell-none", "cannot be opened"]),
         (["intrinsics", "views", "-o", "no/where.yaml"], 2, ["--output", "no/where.yaml", "cannot be written"]),
         (["intrinsics", "views", "--views", "x"], 2, ["--views", "'x'", "3 or more"]),
@@ -129,8 +129,8 @@ def test_a_board_is_written_with_its_true_size(tmp_path, capsys):
         (["pose", "a", "--intrinsics", "FILE", "--board-position", "0,0"], 2, ["--board-position", "'0,0'", "three"]),
         (["pose", "a", "b", "--intrinsics", "FILE", "--board-position", "0,0,0"], 2, ["1 times for 2 places"]),
         (["pose", "empty", "--intrinsics", "FILE", "--board-position", "0,0,0"], 1, ["none of 2", "no marker"]),
-        (["pose", "blurred", "--intrinsics", "FILE", "--board-position", "0,0,0"], 1, ["none of 3", "smeared"]),
-        (["pose", "views", "--intrinsics", "FILE", "--board-position", "0,0,0"], 1, ["do not fit together"]),
+        (["pose", "blurred", "--intrinsics", "FILE", "--board-position", "0,0,0"], 1, ["none of 3", "blurred"]),
+        (["pose", "views", "--intrinsics", "FILE", "--board-position", "0,0,0"], 1, ["are inconsistent"]),
     ],
 )
 def test_what_can_not_be_calibrated_is_one_line(arguments, code, wanted, calibrated, monkeypatch, capsys, tmp_path):

@@ -19,8 +19,8 @@ from common.application import message_class
 from common.messages import TaskStatus
 from common.topics import Topic
 from common.transport.codec import decode
-from common.transport.connect import connect
 from common.transport.endpoint import endpoint_of
+from common.transport.zenoh_session import connect
 from recording.reader import Recording
 from tests.harness import command_line, environment
 

@@ -56,14 +56,14 @@ def rest_at(collector: HandEyeCollector, q: np.ndarray, begin: float) -> None:
 def test_pictures_of_a_resting_arm_in_new_poses_count_and_the_folder_can_be_gone_on_with(tmp_path: Path) -> None:
     first, second = poses(2)
     collector = HandEyeCollector(tmp_path / "views", ROBOT, "panda", BOARD)
-    assert collector.picture(1.0, picture(first)) == "nobody says where the joints were"
+    assert collector.add_image(1.0, picture(first)) == "no joint state at the time of the image"
     rest_at(collector, first, 1.0)
-    assert collector.picture(1.59, picture(first)) == "" and collector.count == 1
-    assert collector.picture(1.59, picture(first)) == "the hand was in this pose before"
+    assert collector.add_image(1.59, picture(first)) == "" and collector.count == 1
+    assert collector.add_image(1.59, picture(first)) == "the gripper was in this pose before"
     rest_at(collector, second, 1.6)
-    assert collector.picture(1.8, picture(second)) == "the arm moves"
-    assert collector.picture(2.19, np.full((480, 640, 3), 90, np.uint8)) == "no marker is seen"
-    assert collector.picture(2.19, picture(second)) == "" and "turn the hand further" in collector.hint
+    assert collector.add_image(1.8, picture(second)) == "the arm moves"
+    assert collector.add_image(2.19, np.full((480, 640, 3), 90, np.uint8)) == "no marker is visible"
+    assert collector.add_image(2.19, picture(second)) == "" and "rotate the gripper further" in collector.hint
     again = HandEyeCollector(tmp_path / "views", ROBOT, "panda", BOARD)
     assert again.count == 2
     kept = yaml.safe_load((tmp_path / "views" / "joints.yaml").read_text())
@@ -76,12 +76,12 @@ def test_camera_on_the_hand_is_found_from_a_folder_and_written(
     collector = HandEyeCollector(tmp_path / "views", ROBOT, "panda", BOARD)
     for n, q in enumerate(poses(10)):
         rest_at(collector, q, float(n))
-        assert collector.picture(n + 0.59, picture(q, n)) == ""
+        assert collector.add_image(n + 0.59, picture(q, n)) == ""
     file = intrinsics(tmp_path)
     asked = ["calibrate", "hand-eye", str(tmp_path / "views"), "--intrinsics", file]
     code, (told, problem) = app.execute([*asked, "--camera", "hand"]), capsys.readouterr()
     assert (code, problem) == (0, "")
-    assert "10 views, residual 0.0" in told and told.splitlines()[-1].startswith("good: places are right to about")
+    assert "10 views, residual 0.0" in told and told.splitlines()[-1].startswith("good: accurate to about")
     found = yaml.safe_load(Path(file).read_text())
     assert found["mount"] == "tcp" and f"a cell takes both with --set world.camera={file}" in told
     on_hand = f"world.camera={file}"
@@ -92,7 +92,7 @@ def test_camera_on_the_hand_is_found_from_a_folder_and_written(
     assert np.allclose(rpy_to_matrix(*found["rpy"]), T_TCP_CAMERA[:3, :3], atol=1e-3)
     for more, wanted in (
         (["--camera", "foot"], "unknown --camera 'foot'; choices: beside, hand"),
-        (["--camera", "beside"], "the views do not fit together"),
+        (["--camera", "beside"], "the views are inconsistent"),
     ):
         assert app.execute([*asked, *more]) != 0
         assert wanted in capsys.readouterr().err
@@ -146,5 +146,5 @@ def test_views_are_collected_from_a_cell_that_is_up(tmp_path: Path) -> None:
         assert [line for line in told if line.startswith("view ")][-1].startswith("view 3 of 3; ")
         assert told[-1].startswith("views holds 3 views; next: zencell calibrate hand-eye views")
         done = place.ask("calibrate", "collect", "more", "--robot", "panda", "--key", "camera/nothing")
-        assert done.returncode == 1 and "no picture came for 5 s" in done.stderr
+        assert done.returncode == 1 and "no image received for 5 s" in done.stderr
     assert len(yaml.safe_load((folder / "views" / "joints.yaml").read_text())["pictures"]) == 3

@@ -13,7 +13,7 @@ import pytest
 
 from cli.main import app
 from common.errors import ConfigError
-from lab.campaign import listed, seeds_of
+from lab.campaign import format_counts, seeds_of
 from recording.reader import Recording
 
 pytestmark = pytest.mark.timeout(600)  # some seconds of work, on a machine that may be busy
@@ -27,7 +27,7 @@ def test_campaign_with_faults_tells_what_was_made_and_checked(capfd):
     assert "2 of 2 (100.0%)" in told
     crashes = re.search(r"fault: crash +│ (\d+) ", told)
     assert crashes and int(crashes[1]) >= 6
-    for what in ("fault: lost", "fault: doubled", "invariant: never two goals", "invariant: a goal id acts once"):
+    for what in ("fault: lost", "fault: duplicated", "invariant: one goal at a time", "invariant: a goal id acts once"):
         assert what in told
 
 
@@ -112,4 +112,4 @@ def test_seeds_are_a_range_or_one():
 
 
 def test_counts_are_listed_with_the_largest_first():
-    assert listed({"a": 1, "b": 2000}) == "b 2,000, a 1"
+    assert format_counts({"a": 1, "b": 2000}) == "b 2,000, a 1"

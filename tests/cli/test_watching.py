@@ -9,7 +9,7 @@ from cli.top import render
 from common import topics
 from common.application import all_topics
 from common.client.joining import cell_clock
-from common.client.monitor import MOST_KEYS, CellMonitor, Processes, ServiceRow, TopicRow, View, on_demand, statuses
+from common.client.monitor import MAX_KEYS, CellMonitor, Processes, ServiceRow, TopicRow, View, on_demand, statuses
 from common.clock import Clock
 from common.messages import (
     GripperState,
@@ -156,7 +156,7 @@ async def test_keys_that_somebody_makes_up_are_listened_to_up_to_a_number() -> N
     async with CellMonitor(network.bus("top"), CLOCK) as watch:
         for number in range(10):
             watch.count(counted(f"liar_{number}", {f"mine/{number}/{i}": 1 for i in range(200)}), 1.0)
-        assert len(watch._hearing) == MOST_KEYS
+        assert len(watch._hearing) == MAX_KEYS
         assert len(watch.view().topics) == 0
 
 

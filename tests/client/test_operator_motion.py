@@ -15,7 +15,7 @@ from common.client.arm import Arm
 from common.client.operator_motion import MotionFailed, OperatorMotion
 from common.client.subscriptions import Subscriptions
 from common.errors import ConfigError
-from common.sources import wall_ns
+from common.time_source import wall_ns
 from common.transport.local import LocalNetwork
 
 HOME = m.JointGoal(named="home")

@@ -41,7 +41,7 @@ def test_added_solid_is_avoided_also_after_a_restart_until_it_is_removed() -> No
                 await cell.arm.plan(RIGHT, straight=True)
             with pytest.raises(MotionFailed, match="added/wall"):
                 await cell.arm.plan(pose(0.45, 0.0, 0.35))
-            with pytest.raises(RemoteError, match="is another solid"):
+            with pytest.raises(RemoteError, match="another solid is called"):
                 await cell.scene.add("wall", *WALL, at=(0.5, 0.0, 0.35))
 
             await again(simulated, bus, "scene_manager")
@@ -56,7 +56,7 @@ def test_added_solid_is_avoided_also_after_a_restart_until_it_is_removed() -> No
             await cell.arm.move("home")
             await cell.arm.move(LEFT)
             await cell.arm.move(RIGHT, straight=True)
-            with pytest.raises(RemoteError, match="nothing was added as added/wall; there are: none"):
+            with pytest.raises(RemoteError, match="no added solid is called added/wall; there are: none"):
                 await cell.scene.remove("wall")
         raise Over
 

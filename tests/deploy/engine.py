@@ -1,4 +1,4 @@
-"""Containers of a compose project under a name of its own, as a test brings them up, asks about them and ends them."""
+"""Start, inspect and remove the containers of a compose project in a test."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ HEALTH = ("python", "-m", "common.process.health")
 
 
 def require_engine() -> None:
-    """Skip the test where no container engine answers."""
+    """Skip the test without a container engine."""
     answers = shutil.which("docker") and subprocess.run(["docker", "info"], capture_output=True, check=False)
     if not answers or answers.returncode:
         pytest.skip("no container engine answers `docker info`")
@@ -40,7 +40,7 @@ def run(
 
 @dataclass
 class Containers:
-    """A compose project; a `with` block leaves nothing of it behind."""
+    """A compose project, removed completely at the end of a `with` block."""
 
     project: str
     files: Sequence[str] = ("compose.yaml",)
@@ -52,7 +52,7 @@ class Containers:
 
     def __exit__(self, *_: object) -> None:
         of_ours = ("--filter", f"label=com.docker.compose.project={self.project}", "-q")
-        for _ in range(2):  # old engines can hold the network of a container that was started again for a while
+        for _ in range(2):  # old engines keep the network of a restarted container for a while
             self.compose("down", "-v", "-t", "10", timeout=180, check=False)
             if not run("docker", "network", "ls", *of_ours):
                 break
@@ -63,7 +63,7 @@ class Containers:
                    environment=self.environment)
 
     def refused(self, *arguments: str, timeout: float = 60) -> str:
-        """What a command that has to fail says on stderr."""
+        """Run a command that must fail, and return its stderr."""
         done = subprocess.run(
             self._command(*arguments), cwd=self.folder, env={**os.environ, **self.environment}, capture_output=True,
             text=True, timeout=timeout, check=False,
@@ -77,30 +77,30 @@ class Containers:
         return found[0]
 
     def health(self, service: str) -> str:
-        """What the engine thinks of it: starting, healthy or unhealthy."""
+        """Return the engine's health status: starting, healthy or unhealthy."""
         return str(self.inspect(service)["State"]["Health"]["Status"])
 
     def is_ready(self, service: str) -> bool:
-        """What its own health check says now, which the engine asks every few seconds only."""
+        """Run the health check now; the engine runs it only every few seconds."""
         container = self.compose("ps", "-q", service).strip()
         return bool(container) and subprocess.run(
             ["docker", "exec", container, *HEALTH], capture_output=True, timeout=60, check=False,
         ).returncode == 0
 
     def process(self, service: str) -> int:
-        """The process id, on the host, of the service itself; 0 if there is none."""
+        """Return the host process id of the service, or 0."""
         container = self.compose("ps", "-q", service).strip()
         listed = run("docker", "top", container, "-eo", "pid,args", check=False).splitlines()[1:] if container else []
         found = [int(line.split()[0]) for line in listed if line.split()[1:4] == ["python", "-m", _module(service)]]
         return found[0] if found else 0
 
     def address(self, service: str) -> str:
-        """Its address in the cell's network, which the host reaches too."""
+        """Return the address in the cell's network, which the host reaches, too."""
         networks = self.inspect(service)["NetworkSettings"]["Networks"]
         return str(networks[f"{self.project}_cell"]["IPAddress"])
 
     def wait_for(self, what: str, seen: Callable[[], bool], seconds: float) -> None:
-        """Return when it is so. An engine tells no events of what is inside a container: it is asked twice a second."""
+        """Poll a condition twice a second, because an engine reports no events from inside a container."""
         deadline = time.monotonic() + seconds
         while not seen():
             assert time.monotonic() < deadline, (

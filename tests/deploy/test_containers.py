@@ -1,4 +1,4 @@
-"""The Panda in containers, for real: built, brought up, seen from the host, hurt, and taken down."""
+"""Build the image, run the Panda cell in containers, observe it from the host, kill services, and take it down."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def cell() -> Iterator[Containers]:
 
 
 def status_on_host(cell: Containers) -> dict[str, Any]:
-    """The task's status, as zenoh-cli on the host reads it."""
+    """Read the task's status with zenoh-cli on the host."""
     line = run(
         str(Path(sys.executable).with_name("zenoh")), "--mode", "client",
         "--connect", f"tcp/{cell.address('router')}:7447", "get",
@@ -41,13 +41,13 @@ def status_on_host(cell: Containers) -> dict[str, Any]:
     return json.loads(line) if line else {}
 
 
-def test_plain_up_clears_the_table_as_the_host_sees_it(cell: Containers) -> None:
+def test_compose_up_clears_the_table(cell: Containers) -> None:
     cell.wait_for("task is DONE", lambda: status_on_host(cell).get("state") == "DONE", 240)
     assert status_on_host(cell)["placed"] == 7
 
 
 @pytest.mark.parametrize("service", SERVICES)
-def test_every_container_is_healthy_and_has_no_rights(cell: Containers, service: str) -> None:
+def test_every_container_is_healthy_and_unprivileged(cell: Containers, service: str) -> None:
     cell.wait_for(f"{service} is healthy", lambda: cell.health(service) == "healthy", 60)
     found = cell.inspect(service)
     assert found["HostConfig"]["ReadonlyRootfs"]
@@ -63,7 +63,7 @@ def test_only_the_page_is_published_and_only_to_this_machine(cell: Containers) -
     assert published == {("panda-viewer", "127.0.0.1", PAGE_PORT)}
 
 
-def test_image_is_small_and_has_no_tools_to_build_with(cell: Containers) -> None:
+def test_image_is_small_and_contains_no_build_tools(cell: Containers) -> None:
     size = int(run("docker", "image", "inspect", "-f", "{{.Size}}", "zencell"))
     assert size < MOST_MEGABYTES * 1e6
     missing = cell.compose("exec", "-T", "router", "sh", "-c", "command -v gcc cc make pip zig; true").strip()
@@ -75,18 +75,18 @@ def test_image_is_small_and_has_no_tools_to_build_with(cell: Containers) -> None
     assert sorted(robots) == ["panda_description", "ur_description"]
 
 
-def test_planning_kernel_is_in_the_image_and_what_compiled_it_is_not(cell: Containers) -> None:
+def test_image_contains_the_planning_kernel_but_no_compiler(cell: Containers) -> None:
     assert "ok    planning kernel: planning_kernel" in cell.compose("exec", "-T", "router", "zencell", "doctor")
     packages = cell.compose("exec", "-T", "router", "sh", "-c", "ls /opt/zencell/lib/python3*/site-packages")
     assert "pydantic" in packages and "ziglang" not in packages
 
 
-def test_configuration_can_not_be_changed_from_inside(cell: Containers) -> None:
-    said = cell.compose("exec", "-T", "router", "sh", "-c", "(echo x >> /app/config/cells/panda.yaml) 2>&1; true")
-    assert "Read-only" in said or "denied" in said
+def test_configuration_is_read_only_in_containers(cell: Containers) -> None:
+    output = cell.compose("exec", "-T", "router", "sh", "-c", "(echo x >> /app/config/cells/panda.yaml) 2>&1; true")
+    assert "Read-only" in output or "denied" in output
 
 
-def test_service_that_is_killed_is_started_again(cell: Containers) -> None:
+def test_killed_service_is_restarted(cell: Containers) -> None:
     before = cell.inspect("panda-vision_detector")
     os.kill(before["State"]["Pid"], signal.SIGKILL)
     cell.wait_for(
@@ -96,36 +96,36 @@ def test_service_that_is_killed_is_started_again(cell: Containers) -> None:
     )
 
 
-def said(cell: Containers, *arguments: str) -> str:
-    """What a zencell command says that is run in the router's container."""
+def zencell(cell: Containers, *arguments: str) -> str:
+    """Run a zencell command in the router's container and return its output."""
     return cell.compose("exec", "-T", "router", "zencell", *arguments, "--cell", "panda", timeout=120)
 
 
-def heard(cell: Containers, key: str) -> dict[str, Any]:
-    """The next message of a topic."""
-    message: dict[str, Any] = json.loads(said(cell, "topic", "echo", key, "--count", "1", "--json"))
+def message_of(cell: Containers, key: str) -> dict[str, Any]:
+    """Return the next message of a topic."""
+    message: dict[str, Any] = json.loads(zencell(cell, "topic", "echo", key, "--count", "1", "--json"))
     return message
 
 
-def test_what_a_person_stopped_stays_so_when_containers_are_started_again_or_made_anew(cell: Containers) -> None:
+def test_operator_stop_survives_restarted_and_recreated_containers(cell: Containers) -> None:
     executor, task = "panda-trajectory_executor", "panda-smart_pick_place"
-    patience = 240.0  # [s] only ever waited for by a test that fails
+    timeout = 240.0  # [s]
 
-    def rests() -> tuple[list[float], dict[str, Any]]:
-        """Where the arm is, and who stopped it, once the task that was started again has said that it waits."""
-        cell.wait_for("the task waits", lambda: heard(cell, "pick_place_status")["message"].startswith("stopped since"),
-                      patience)
-        (stop,) = heard(cell, "motion/status")["interlocks"]
-        return heard(cell, "joint_states")["position"], stop
+    def stopped_state() -> tuple[list[float], dict[str, Any]]:
+        """Wait until the task reports the stop; return the joint positions and the interlock."""
+        cell.wait_for("the task waits", lambda: message_of(cell, "pick_place_status")["message"]
+                      .startswith("stopped since"), timeout)
+        (stop,) = message_of(cell, "motion/status")["interlocks"]
+        return message_of(cell, "joint_states")["position"], stop
 
-    cell.wait_for("the task is ready", lambda: cell.is_ready(task), patience)
-    if heard(cell, "pick_place_status")["state"] == "DONE":
-        said(cell, "world", "reset")
-    said(cell, "task", "start")
-    cell.wait_for("the arm moves", lambda: heard(cell, "motion/status")["state"] == "active", patience)
-    said(cell, "task", "stop")
-    cell.wait_for("the arm is at rest", lambda: heard(cell, "motion/status")["state"] != "active", patience)
-    where, stop = rests()
+    cell.wait_for("the task is ready", lambda: cell.is_ready(task), timeout)
+    if message_of(cell, "pick_place_status")["state"] == "DONE":
+        zencell(cell, "world", "reset")
+    zencell(cell, "task", "start")
+    cell.wait_for("the arm moves", lambda: message_of(cell, "motion/status")["state"] == "active", timeout)
+    zencell(cell, "task", "stop")
+    cell.wait_for("the arm is at rest", lambda: message_of(cell, "motion/status")["state"] != "active", timeout)
+    position, stop = stopped_state()
     assert stop["kind"] == "stopped" and "@" in stop["by"]
 
     before = {service: cell.inspect(service)["State"]["Pid"] for service in (executor, task)}
@@ -133,16 +133,16 @@ def test_what_a_person_stopped_stays_so_when_containers_are_started_again_or_mad
         os.kill(pid, signal.SIGKILL)
     for service, pid in before.items():
         cell.wait_for(f"{service} is back", lambda service=service, pid=pid: (  # type: ignore[misc]
-            cell.inspect(service)["State"]["Pid"] not in (0, pid) and cell.is_ready(service)), patience)
-    assert rests() == (where, stop)
+            cell.inspect(service)["State"]["Pid"] not in (0, pid) and cell.is_ready(service)), timeout)
+    assert stopped_state() == (position, stop)
 
-    cell.compose("down", "-t", "10", timeout=180)  # the volume stays
+    cell.compose("down", "-t", "10", timeout=180)  # keeps the volume
     cell.compose("up", "-d", "--no-build", timeout=180)
-    for service in (executor, task):  # what is simulated begins anew with new containers
-        cell.wait_for(f"{service} is ready", lambda service=service: cell.is_ready(service), patience)  # type: ignore[misc]
-        where = heard(cell, "joint_states")["position"] if service == executor else where
-    assert rests() == (where, stop)
+    for service in (executor, task):  # new containers reset the simulated world
+        cell.wait_for(f"{service} is ready", lambda service=service: cell.is_ready(service), timeout)  # type: ignore[misc]
+        position = message_of(cell, "joint_states")["position"] if service == executor else position
+    assert stopped_state() == (position, stop)
 
-    said(cell, "task", "start")
-    cell.wait_for("the arm moves", lambda: heard(cell, "joint_states")["position"] != where, patience)
-    assert heard(cell, "motion/status")["interlocks"] == []
+    zencell(cell, "task", "start")
+    cell.wait_for("the arm moves", lambda: message_of(cell, "joint_states")["position"] != position, timeout)
+    assert message_of(cell, "motion/status")["interlocks"] == []

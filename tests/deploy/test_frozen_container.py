@@ -37,4 +37,4 @@ def test_frozen_service_is_killed_and_started_again(cell: Containers, service: s
     cell.wait_for("the engine finds it healthy", lambda: cell.health(service) == "healthy", PATIENCE)
     assert cell.inspect(service)["RestartCount"] == started + 1
     cell.wait_for(f"{other} is ready", lambda: cell.is_ready(other), PATIENCE)
-    assert cell.process(other) == others, "nobody else is started again"
+    assert cell.process(other) == others, "no other service restarts"

@@ -51,7 +51,7 @@ def test_containers_get_ready_behind_their_certificates(cell: Containers) -> Non
 
 def test_tool_with_the_operators_certificate_reads_the_status(cell: Containers) -> None:
     line = cell.compose("run", "--rm", "-T", "tool", *READ, timeout=200)
-    assert json.loads(line)["state"] == "none", "nobody has given the executor a goal"
+    assert json.loads(line)["state"] == "none", "no client has sent a goal"
 
 
 def test_tool_without_a_certificate_finds_no_router(cell: Containers) -> None:

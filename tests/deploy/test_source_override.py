@@ -62,7 +62,7 @@ def test_service_follows_its_source(cell: Containers) -> None:
 
     replace(own, good + "# edited\n")
     second = started_again(SERVICE, first)
-    assert (cell.process("router"), cell.process(OTHER)) == (router, other), "nobody else is started again"
+    assert (cell.process("router"), cell.process(OTHER)) == (router, other), "no other service restarts"
 
     replace(own, good + "def (\n")
     cell.wait_for("the service has ended", lambda: cell.process(SERVICE) == 0, PATIENCE)

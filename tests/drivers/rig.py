@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from common.control.checks import Tolerances
-from common.control.controller import TrajectoryController
+from common.control.trajectory import Tolerances
+from common.control.trajectory_controller import TrajectoryController
 from common.hardware.mock import MockHardware
 
 START = np.zeros(2)

@@ -129,7 +129,7 @@ async def test_stamps_of_a_recording_are_of_now(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("options", "told"), [
     ({"file": "/nowhere/table.db3"}, "options.file: '/nowhere/table.db3' is no file"),
-    ({"file": __file__, "serial": "0123"}, "options.serial: '0123' is of a camera; there is a recording too"),
+    ({"file": __file__, "serial": "0123"}, "options.serial: '0123' selects a camera, but options.file "),
 ])
 async def test_recording_that_cannot_be_meant_ends_the_start_with_one_line(options: dict[str, str], told: str) -> None:
     with pytest.raises(ConfigError) as refused:

@@ -1,4 +1,4 @@
-"""A cell on two hosts whose link can be cut, and what became of it."""
+"""Run a cell on two hosts, cut the link between them, and collect the effects."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Cut:
     seconds: float
     noticed: float | None  # from the cut until the services of the other host were known to be gone; None: never
     data: float | None  # from the repair until targets flowed again
-    begun: int  # motions that began while it was cut
+    started: int  # motions that started during the cut
 
 
 @dataclass
@@ -48,7 +48,7 @@ class CutCell:
     _read: int = 0
 
     def __enter__(self) -> CutCell:
-        """Start both parts, and who listens beside the arm."""
+        """Start both parts, and the observer on the host of the arm."""
         first, second = self.two.hosts
         part = ",".join(SPLITS[self.split])
         environment = {"ZENCELL_EPOCH": str(time.time_ns())}

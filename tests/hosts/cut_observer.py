@@ -1,4 +1,4 @@
-"""Says on stdout what is heard on a host: motion, targets, and who of the perception is there, with the time."""
+"""Print motion states, target counts and liveliness changes that a host receives, with their times."""
 
 from __future__ import annotations
 
@@ -11,33 +11,33 @@ from typing import Any
 from applications.pick_place.topics import VALIDATED_TARGETS
 from common import topics
 from common.transport.bus import Bus
-from common.transport.connect import connect
 from common.transport.endpoint import endpoint_of
+from common.transport.zenoh_session import connect
 
 
-def say(what: str, **values: Any) -> None:
+def write(what: str, **values: Any) -> None:
     """Write an event; the clock is the same in all network namespaces."""
     sys.stdout.write(json.dumps({"what": what, "at": time.monotonic(), **values}) + "\n")
     sys.stdout.flush()
 
 
 async def motions(bus: Bus) -> None:
-    """Say each state of the motion."""
+    """Write each motion status."""
     async for status in bus.reader(topics.MOTION_STATUS):
-        say("motion", id=status.id, state=status.state, progress=status.progress, held=status.held_by,
+        write("motion", id=status.id, state=status.state, progress=status.progress, held=status.held_by,
             error=status.error)
 
 
 async def targets(bus: Bus) -> None:
-    """Say each time that targets came."""
+    """Write each message of targets."""
     async for seen in bus.reader(VALIDATED_TARGETS):
-        say("targets", count=len(seen.poses))
+        write("targets", count=len(seen.poses))
 
 
 async def main(domain: str) -> None:
-    """Listen until ended."""
+    """Observe until interrupted."""
     async with connect(cell="panda", service="observer", endpoint=endpoint_of(domain), timeout=60) as bus:
-        bus.alive.on_change(lambda name, there: say("there" if there else "gone", service=name))
+        bus.alive.on_change(lambda name, there: write("there" if there else "gone", service=name))
         await asyncio.gather(motions(bus), targets(bus))
 
 

@@ -1,4 +1,4 @@
-"""What the invariants make of goals that are asked for again, and of motion after a person's stop."""
+"""Invariants of a simulated cell: goals, motion after an operator's stop, objects of the ground truth."""
 
 import numpy as np
 import pytest
@@ -14,44 +14,64 @@ from common.messages import (
     JointTrajectory,
     MotionStatus,
     PlanRequest,
+    Pose,
     StopRequest,
+    Vector3,
+    WorldEdit,
+    WorldEditReply,
     WorldObject,
     WorldObjects,
 )
-from common.transport.codec import encode
+from common.transport.codec import encode, encoding_of
 from common.transport.session import RawSample
-from lab.invariants import ASKED, JUDGED, NEVER, Invariants, _Goals
+from lab.invariants import ACCEPTED, OBJECTS, Invariants
 from lab.loop import Incarnation, context_of
+from lab.motion_invariants import NEVER, UNREQUESTED
 from lab.processes import RequestLog
 
 MOTION = ExecuteRequest(id="a-1", trajectory=JointTrajectory(joint_names=["j"], points=[]))
 FINGERS = GripperCommand(id="a-1", width=0.04)
+EDIT = WorldEdit(op="move", id="ball_1", position=Vector3(x=0.5))
 
 
 @pytest.fixture
-def seen():
-    """What looks, and what it looks at."""
-    requests = RequestLog()
-    return Invariants(load_cell("panda"), requests, lambda: 1.0), requests
+def requests():
+    return RequestLog()
 
 
-@pytest.mark.parametrize(("first", "again", "holds"), [
-    ("active", "active", True), ("active", "succeeded", True), ("rejected", "rejected", True),
-    ("active", "rejected", False), ("rejected", "active", False),
+@pytest.fixture
+def invariants(requests):
+    return Invariants(load_cell("panda"), requests, lambda: 1.0)
+
+
+def put(invariants, topic, message):
+    sample = RawSample(f"panda/{topic}", encode(message), encoding_of(type(message)))
+    invariants.on_put("executor", "executor 1", sample)
+
+
+def put_objects(invariants, **positions):
+    """Publish objects at x [m]; return the violations so far."""
+    objects = [WorldObject(id=name, shape="sphere", pose=Pose(position=Vector3(x=x)), state="table")
+               for name, x in positions.items()]
+    put(invariants, "scene_objects", WorldObjects(objects=objects))
+    return invariants.broken
+
+
+# --- goals ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("instance", "first", "again", "holds"), [
+    ("executor 1", "active", "active", True), ("executor 1", "active", "succeeded", True),
+    ("executor 1", "rejected", "rejected", True), ("executor 1", "active", "rejected", False),
+    ("executor 1", "rejected", "active", False),
+    ("executor 2", "active", "rejected", True),  # a restarted executor does not know earlier goals
 ])
-def test_who_asks_for_a_goal_again_hears_what_became_of_it(seen, first, again, holds):
-    invariants, requests = seen
-    for state in (first, again):
-        requests.on_serve("executor 1", MOTION, MotionStatus(id="a-1", state=state))
-        requests.on_serve("executor 1", FINGERS.model_copy(update={"id": "b-1"}), GripperState(id="b-1", state=state))
+def test_repeated_goal_request_gets_the_same_decision(invariants, requests, instance, first, again, holds):
+    fingers = FINGERS.model_copy(update={"id": "b-1"})
+    for process, state in (("executor 1", first), (instance, again)):
+        requests.on_serve(process, MOTION, MotionStatus(id="a-1", state=state))
+        requests.on_serve(process, fingers, GripperState(id="b-1", state=state))
     assert (invariants.broken == []) == holds
-
-
-def test_executor_that_was_started_again_knows_no_goals(seen):
-    invariants, requests = seen
-    requests.on_serve("executor 1", MOTION, MotionStatus(id="a-1", state="active"))
-    requests.on_serve("executor 2", MOTION, MotionStatus(id="a-1", state="rejected"))
-    assert invariants.broken == []
 
 
 @pytest.mark.parametrize(("other", "holds"), [
@@ -59,74 +79,87 @@ def test_executor_that_was_started_again_knows_no_goals(seen):
     (MOTION.model_copy(update={"trajectory": JointTrajectory(joint_names=["k"], points=[])}), False),
     (PlanRequest(id="a-1", goal=JointGoal(named="home")), False),
 ])
-def test_an_id_stands_for_one_thing(seen, other, holds):
-    invariants, requests = seen
-    requests.on_ask("task", MOTION)
-    requests.on_ask("task", other)
+def test_id_belongs_to_one_request(invariants, requests, other, holds):
+    requests.on_request("task", MOTION)
+    requests.on_request("task", other)
     assert (invariants.broken == []) == holds
 
 
 @pytest.mark.parametrize("known", [False, True])
-def test_goal_that_was_stopped_before_it_was_heard_of_never_moves(seen, known):
-    invariants, requests = seen
-    known_of = MotionStatus(id="a-1", state="active") if known else MotionStatus(id="a-1", error="unknown_goal")
-    requests.on_serve("executor 1", StopRequest(id="a-1", by="requester"), known_of)
-    moving = encode(MotionStatus(id="a-1", state="active"))
-    invariants.on_put("executor", "executor 1", RawSample("panda/motion/status", moving, "application/msgpack", b""))
+def test_goal_stopped_before_it_arrived_never_moves(invariants, requests, known):
+    answer = MotionStatus(id="a-1", state="active") if known else MotionStatus(id="a-1", error="unknown_goal")
+    requests.on_serve("executor 1", StopRequest(id="a-1", by="requester"), answer)
+    put(invariants, "motion/status", MotionStatus(id="a-1", state="active"))
     assert invariants.broken == ([] if known else [f"1.000 s: {NEVER}: a-1"])
 
 
 @pytest.mark.parametrize(("goal", "held", "holds"), [
     ("", True, True), ("", False, False), ("a-1", False, False), ("a-0", False, True),
 ])
-def test_arm_is_held_for_whoever_asks_but_not_for_a_goal_that_is_over(seen, goal, held, holds):
-    invariants, requests = seen
-    request = HoldRequest(hold=True, reason="a mug is in the way", by="scene_monitor", goal=goal)
+def test_requested_hold_takes_effect_unless_its_goal_is_over(invariants, requests, goal, held, holds):
+    request = HoldRequest(hold=True, reason="a mug blocks the path", by="scene_monitor", goal=goal)
     requests.on_answer("motion_planner", request, MotionStatus(id="a-1", state="active", held=held))
     assert (invariants.broken == []) == holds
 
 
-@pytest.mark.parametrize(("begun_later", "seconds", "holds"), [
+# --- motion after a stop ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("restarted", "seconds", "holds"), [
     (False, 1.0, True), (False, 3.0, False), (True, 1.0, False),
 ])
-def test_arm_that_a_person_stopped_brakes_and_rests_and_does_not_move_when_its_process_is_another(
-    seen, begun_later, seconds, holds
-):
-    invariants, requests = seen
+def test_after_a_stop_only_the_process_that_served_it_may_brake(invariants, requests, restarted, seconds, holds):
     limits = Limits(("j",), np.array([-3.0]), np.array([3.0]), np.array([1.0]), np.array([1.0]))
     stop = StopRequest(owner="anna")
     first = context_of(Incarnation("executor"))
-    then = context_of(Incarnation("executor")) if begun_later else first
+    then = context_of(Incarnation("executor")) if restarted else first
 
-    def move(begin, count):
-        q = np.array([0.5])
-        for cycle in range(count):
-            q = q + 1e-4
-            invariants.on_set_point(limits, q, q, np.array([0.01]), begin + 0.01 * cycle)
+    def move(start, cycles, position):
+        for cycle in range(cycles):
+            q = np.array([position + 1e-4 * cycle])
+            invariants.on_set_point(limits, q, q, np.array([0.01]), start + 0.01 * cycle)
 
-    requests.on_ask("person", stop)
+    requests.on_request("operator", stop)
     first.run(requests.on_serve, "executor 1", stop, MotionStatus(id="a-1", state="active"))
-    invariants._goals["panda/motion/status"] = _Goals("a-1", "executor 1")
-    first.run(move, 0.0, 10)
-    invariants._last = None
-    then.run(move, seconds, 20)
-    assert any(ASKED in line for line in invariants.broken) != holds
+    put(invariants, "motion/status", MotionStatus(id="a-1", state="active"))
+    first.run(move, 0.0, 10, 0.5)
+    then.run(move, seconds, 20, 0.501)
+    assert any(UNREQUESTED in line for line in invariants.broken) != holds
 
 
-def test_application_judges_the_truth_when_its_task_says_done_and_not_before(tmp_path, monkeypatch):
-    (tmp_path / "judging").mkdir()
-    (tmp_path / "judging" / "task.py").write_text(
+# --- objects ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("later", [{}, {"ball_1": 0.4}, {"ball_1": 0.3, "ball_2": 0.5}])
+def test_object_that_vanishes_moves_or_appears_by_itself_is_reported(invariants, later):
+    assert put_objects(invariants, ball_1=0.3) == []
+    assert any(OBJECTS in line for line in put_objects(invariants, **later))
+
+
+@pytest.mark.parametrize("answered", [True, False])
+def test_edit_of_the_world_may_be_published_before_or_after_its_answer(invariants, requests, answered):
+    put_objects(invariants, ball_1=0.3)
+    requests.on_request("visitor", EDIT)
+    if answered:
+        requests.on_answer("visitor", EDIT, WorldEditReply(id="ball_1", ids=["ball_1"]))
+    assert put_objects(invariants, ball_1=0.5) == []
+    if answered:
+        assert any(OBJECTS in line for line in put_objects(invariants, ball_1=0.3)), "the edit allows one change"
+
+
+def test_application_checks_the_ground_truth_once_its_task_is_done(tmp_path, monkeypatch):
+    (tmp_path / "checking").mkdir()
+    (tmp_path / "checking" / "task.py").write_text(
         "from common.messages import TaskStatus\nfrom common.topics import Topic\n"
         "from common.application import Application, ApplicationTopics\n"
-        "STATUS = Topic('judging_status', TaskStatus, 'state', '')\n"
-        "def misplaced(truth):\n    return ', '.join(thing.id for thing in truth.objects)\n"
+        "STATUS = Topic('checking_status', TaskStatus, 'state', '')\n"
+        "def misplaced(truth):\n    return ', '.join(each.id for each in truth.objects)\n"
         "APPLICATION = Application(topics=ApplicationTopics(status=STATUS), truth_check=misplaced)\n")
     monkeypatch.syspath_prepend(tmp_path)
-    cell = load_cell("panda").model_copy(update={"application": "judging.task"})
+    cell = load_cell("panda").model_copy(update={"application": "checking.task"})
     for state, broken in (("ERROR", False), ("DONE", True)):
         invariants = Invariants(cell, RequestLog(), lambda: 1.0)
-        key, world = "panda/scene_objects", WorldObjects(objects=[WorldObject(id="thing", shape="box")])
-        invariants.on_put("executor", "executor 1", RawSample(key, encode(world), "", None))
+        put(invariants, "scene_objects", WorldObjects(objects=[WorldObject(id="cube", shape="box")]))
         invariants.on_end(0, state)
-        assert [line.endswith(f"{JUDGED}: thing") for line in invariants.broken] == [True] * broken
-    assert JUDGED not in Invariants(load_cell("panda"), RequestLog(), lambda: 1.0).checked
+        assert [line.endswith(f"{ACCEPTED}: cube") for line in invariants.broken] == [True] * broken
+    assert ACCEPTED not in Invariants(load_cell("panda"), RequestLog(), lambda: 1.0).checked

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from common.sources import drawn_from
+from common.time_source import use_time_source
 from page.access import EVERYTHING
 from page.doors import IDLE, QUIET, Doors, Need, Visitor
 
@@ -40,7 +40,7 @@ class Rig:
 @pytest.fixture
 def rig() -> Iterator[Rig]:
     clock = Clock()
-    with drawn_from(clock):
+    with use_time_source(clock):
         yield Rig(clock)
 
 

@@ -13,7 +13,7 @@ from common import messages as m
 from common import topics
 from common.config import CameraConfig
 from common.perception.pinhole import Pinhole
-from common.robot.transform_history import MOST_FRAMES
+from common.robot.transform_tree import MAX_FRAMES
 from common.robot.transforms import matrix_to_pose, pose_to_matrix, rpy_to_matrix, transform
 from page.figure import Transforms
 from tests.page.scene_cell import Stage, around_of, at, in_world
@@ -92,7 +92,7 @@ def test_any_number_of_frames_is_told_of_and_the_newest_are_shown(stage: Stage) 
         stage.say(topics.TF, hang([f"{number}/{i}" for i in range(1000)]))
     stage.say(topics.TF, tf("world", "base", TURNED))
     frames = stage.layer("frames")
-    assert len(stage.view.stage.transforms.newest) == MOST_FRAMES and len(frames._nodes) <= 500
+    assert len(stage.view.stage.transforms.newest) == MAX_FRAMES and len(frames._nodes) <= 500
     assert frames.node("base") is not None and frames.node("0/1") is None and frames.node("3/1") is not None
 
 

@@ -59,11 +59,11 @@ def poses(count: int) -> list[np.ndarray]:
 def test_camera_is_found_from_views_that_the_page_kept() -> None:
     views = HandEye("wrist", CONFIG, BOARD, "hand")
     arm, said = Arm(views), []
-    assert views.missing == "15 more views: tilt the hand to another side"
+    assert views.missing == "15 more views: tilt the gripper in another direction"
     for q in poses(9):
         said.append(views.take(arm.rest(q)))
     assert said.count("") == views.count >= 7, said
-    assert f"{15 - views.count} more views: turn the hand further about its" in views.missing
+    assert f"{15 - views.count} more views: rotate the gripper further about its" in views.missing
     assert all(turn > 10 for turn in views.turned.values())
     result = views.calibrate(INFO)
     camera = CameraFile.load(str(views.folder / "camera.yaml"))
@@ -78,9 +78,9 @@ def test_picture_that_is_no_view_says_why_and_views_are_there_the_next_time() ->
     views = HandEye("wrist", CONFIG, BOARD, "hand")
     arm, q = Arm(views), poses(1)[0]
     image = arm.rest(q)
-    assert views.take(image) == "" and views.take(image) == "the hand was in this pose before"
+    assert views.take(image) == "" and views.take(image) == "the gripper was in this pose before"
     long_ago = image.model_copy(update={"header": Header(stamp=1)})
-    assert views.take(long_ago) == "nobody says where the joints were"
+    assert views.take(long_ago) == "no joint state at the time of the image"
     with pytest.raises(CalibrationFailed, match="views of the board"):
         views.calibrate(INFO)
     assert HandEye("wrist", CONFIG, BOARD, "hand").count == 1
@@ -99,8 +99,8 @@ def resting() -> Arm:
 
 
 @pytest.mark.parametrize(("encoding", "kind", "why"), [
-    ("mono8", np.uint8, "no marker is seen"), ("32FC1", np.float32, "'32FC1' is no colour picture"),
-    ("16UC1", np.uint16, "'16UC1' is no colour picture"), ("bgr8", None, "too few for 64x48")])
+    ("mono8", np.uint8, "no marker is visible"), ("32FC1", np.float32, "'32FC1' is no color image"),
+    ("16UC1", np.uint16, "'16UC1' is no color image"), ("bgr8", None, "too few for 64x48")])
 def test_picture_of_another_kind_is_no_view_and_says_why(encoding: str, kind: type | None, why: str) -> None:
     arm = resting()
     image = (array_to_image(np.zeros((48, 64), kind), encoding) if kind
@@ -124,7 +124,7 @@ def test_views_of_another_robot_with_joints_of_the_same_names_are_refused(robot:
     if fits:
         assert HandEye("wrist", CONFIG, BOARD, "hand").count == 0
         return
-    with pytest.raises(ConfigError, match="has views of another robot: panda_long"):
+    with pytest.raises(ConfigError, match="contains views of another robot: panda_long"):
         HandEye("wrist", CONFIG, BOARD, "hand")
 
 

@@ -5,9 +5,9 @@ from pathlib import Path
 import pytest
 
 from common.application import find_application
+from common.atomic_file import state_folder
 from common.config import config_root
 from common.errors import ConfigError
-from common.kept_file import lasting_folder
 from page.layers import find_layers, layers_shown
 from page.layout import TABS, Layout, Viewpoint, load_layout, save_layout
 
@@ -22,7 +22,7 @@ def test_layout_of_the_project_can_be_read_and_has_every_panel() -> None:
 def test_layout_that_is_saved_is_the_users_own_and_the_projects_stays_as_it_is(tmp_path: Path) -> None:
     before = (config_root() / "viewer.yaml").read_text()
     path = save_layout("", Layout(dark=False))
-    assert path.is_relative_to(lasting_folder()) and not load_layout("", print).dark
+    assert path.is_relative_to(state_folder()) and not load_layout("", print).dark
     assert (config_root() / "viewer.yaml").read_text() == before
 
 

@@ -229,7 +229,7 @@ def test_video_that_does_not_fit_on_the_disk_is_not_there(tmp_path: Path, monkey
 
 def test_video_of_depth_alone_is_refused_in_one_line(tmp_path: Path) -> None:
     source = write(tmp_path / "a.mcap", [image(0, DEPTH, "32FC1")])
-    with Recording(source) as recording, pytest.raises(RecordingError, match="has no colour picture"):
+    with Recording(source) as recording, pytest.raises(RecordingError, match="has no color image"):
         export.export_video(recording, tmp_path / "v.mp4", "camera/image_raw", Decoder())
 
 

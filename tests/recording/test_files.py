@@ -114,7 +114,7 @@ def test_states_before_a_time_are_the_last_of_each_whoever_wrote_it(tmp_path: Pa
 
 
 def test_files_of_a_split_are_complete_alone(tmp_path: Path) -> None:
-    writer = SplitWriter(tmp_path / "a.mcap", {"cell": "panda"}, most_bytes=6000)
+    writer = SplitWriter(tmp_path / "a.mcap", {"cell": "panda"}, max_bytes=6000)
     writer.describe("run", {"seed": 3})
     writer.add(status(0, "GRASPING"))
     for number in range(1, 40):
@@ -137,11 +137,11 @@ def test_files_of_a_split_are_complete_alone(tmp_path: Path) -> None:
 
 def test_nothing_is_written_over(tmp_path: Path) -> None:
     path = write(tmp_path / "a.mcap", [joints(0)])
-    with pytest.raises(RecordingError, match="is there already"):
+    with pytest.raises(RecordingError, match="exists already"):
         RecordingWriter(path, {})
 
 
-@pytest.mark.parametrize(("content", "why"), [(None, "there is no such file"), (b"hello world", "is no MCAP file")])
+@pytest.mark.parametrize(("content", "why"), [(None, "no such file"), (b"hello world", "is no MCAP file")])
 def test_what_is_no_recording_is_said_in_one_line(tmp_path: Path, content: bytes | None, why: str) -> None:
     path = tmp_path / "a.mcap"
     if content is not None:

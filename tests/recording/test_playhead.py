@@ -1,7 +1,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recording.selection import Playhead
+from recording.player import Playhead
 
 SECOND = 1_000_000_000
 

@@ -10,7 +10,7 @@ import pytest
 
 from recording.reader import Recording
 from recording.sample import MOST_WRITERS, RecordingError, Sequences
-from recording.sink import MOST_KEYS, Sink
+from recording.sink import MAX_KEYS, Sink
 from recording.writer import SplitWriter, WriteFailed
 from tests.recording.samples import fill_disk, joints, status
 
@@ -41,12 +41,12 @@ def test_what_does_not_fit_while_the_disk_stalls_is_dropped_and_counted(
             return super().add(sample)
 
     size = len(joints(0).payload)
-    sink = Sink(Stalled(tmp_path / "a.mcap", {}), most_bytes=3 * size + 1)
+    sink = Sink(Stalled(tmp_path / "a.mcap", {}), max_bytes=3 * size + 1)
     sink.offer(joints(0))
     assert written_to.wait(10)  # the first is on its way to the disk and still counts
     for number in range(1, 6):
         sink.offer(joints(number))
-    assert sink.figures.dropped == {"panda/joint_states": 3}
+    assert sink.stats.dropped == {"panda/joint_states": 3}
     disk.set()
     assert sink.close({}).messages == 3
     with Recording(tmp_path / "a.mcap") as recording:
@@ -62,7 +62,7 @@ def test_whatever_keys_and_writers_somebody_makes_up_the_recording_goes_on_and_c
     sink.offer(joints(200_000))
     sink.offer(joints(200_001, writer="executor.2"))  # was started again
     figures = sink.close({"reason": "test"})
-    assert figures.messages + sum(figures.dropped.values()) == 66_003 and len(figures.dropped) == MOST_KEYS + 1
+    assert figures.messages + sum(figures.dropped.values()) == 66_003 and len(figures.dropped) == MAX_KEYS + 1
     with Recording(tmp_path / "a.mcap") as recording:
         states = [sample for sample in recording.samples() if sample.key == "panda/joint_states"]
     assert len(states) == 33_003
@@ -107,7 +107,7 @@ def test_full_disk_ends_it_with_one_line_and_keeps_whole_chunks(
     assert error.value.exit_code == 1 and "\n" not in str(error.value)
     with Recording(tmp_path / "a.mcap") as recording:
         assert not recording.finished
-        assert recording.layout.whole == recording.layout.size <= 40_000
+        assert recording.layout.complete == recording.layout.size <= 40_000
     sink.offer(joints(0))  # what still comes is let go
 
 
@@ -128,7 +128,7 @@ def test_disk_that_is_full_as_the_next_file_is_due_is_told_in_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, missing: int
 ) -> None:
     def recorded(name: str) -> None:
-        sink = Sink(SplitWriter(tmp_path / name, {"cell": "panda"}, most_bytes=1_000_000))
+        sink = Sink(SplitWriter(tmp_path / name, {"cell": "panda"}, max_bytes=1_000_000))
         for number in range(4):
             sink.offer(joints(number, payload=Random(number).randbytes(600_000)))
         sink.close({})
@@ -141,10 +141,10 @@ def test_disk_that_is_full_as_the_next_file_is_due_is_told_in_one_line(
 
 def test_a_file_that_is_there_where_the_next_one_is_due_is_told_in_one_line(tmp_path: Path) -> None:
     (tmp_path / "a_1.mcap").touch()
-    sink = Sink(SplitWriter(tmp_path / "a.mcap", {"cell": "panda"}, most_bytes=1_000_000))
+    sink = Sink(SplitWriter(tmp_path / "a.mcap", {"cell": "panda"}, max_bytes=1_000_000))
     for number in range(4):
         sink.offer(joints(number, payload=os.urandom(600_000)))
-    with pytest.raises(RecordingError, match=r"a_1.mcap: is there already"):
+    with pytest.raises(RecordingError, match=r"a_1.mcap: exists already"):
         sink.close({})
 
 

@@ -27,10 +27,10 @@ from common import topics
 from common.errors import NoRouter
 from common.topics import of_service
 from common.transport.codec import DEFAULT_LIMIT, decode, decode_attachment, encode
-from common.transport.connect import connect
 from common.transport.credentials import ROUTER_NAME, Credentials, credentials_of
-from common.transport.endpoint import MOST_BYTES, MOST_BYTES_BESIDES, client_config, router_config
+from common.transport.endpoint import MAX_BYTES, MAX_OTHER_BYTES, client_config, router_config
 from common.transport.session import RawSample
+from common.transport.zenoh_session import connect
 from page.access import ROLES, tokens_in
 from recording.reader import Recording
 from security.certificates import Authority
@@ -411,12 +411,12 @@ def test_what_is_larger_than_anything_of_its_topic_goes_no_farther_than_the_rout
           secured.holder("panda.scene_manager") as other):
         heard = detector.hear("panda/camera/camera_info", "panda/camera/image_raw")
         own = other.hear("panda/camera/camera_info")
-        camera.put("panda/camera/camera_info", bytes(MOST_BYTES_BESIDES + 1))
+        camera.put("panda/camera/camera_info", bytes(MAX_OTHER_BYTES + 1))
         camera.put("panda/camera/camera_info", MARK)
         heard.wait_for("panda/camera/camera_info", MARK)
-        camera.put("panda/camera/image_raw", bytes(MOST_BYTES + 1))  # ends its own link
+        camera.put("panda/camera/image_raw", bytes(MAX_BYTES + 1))  # ends its own link
         _again(camera, heard)
-        assert max(len(payload) for _, payload in heard.samples) < MOST_BYTES_BESIDES
+        assert max(len(payload) for _, payload in heard.samples) < MAX_OTHER_BYTES
         assert other.connected
         assert own.keys
 

@@ -12,9 +12,8 @@ import pytest
 import zenoh
 
 from cli.main import app
-from common.transport.credentials import Credentials, credentials_of
-from common.transport.expiry import EndWatch, end_of, warning_of
-from common.transport.router import Router, tend
+from common.transport.credentials import CertificateMonitor, Credentials, credentials_of, expiry_of, expiry_warning
+from common.transport.router import Router, maintain
 from security.access import Rights, access_control
 from security.certificates import Authority
 from security.checking import certificate_in, require_valid
@@ -44,7 +43,7 @@ def endpoint(folder: Path) -> Iterator[str]:
     """A router that is tended, as its process does it."""
     found, stop = f"tls/127.0.0.1:{free_port()}", threading.Event()
     with Router([found], folder) as router:
-        tending = threading.Thread(target=tend, args=[router, stop])
+        tending = threading.Thread(target=maintain, args=[router, stop])
         tending.start()
         yield found
         stop.set()
@@ -67,23 +66,23 @@ def now_in(days: float) -> datetime.datetime:
 
 def test_the_end_is_that_of_the_certificate(folder: Path) -> None:
     for name in ("ca", *NAMES):
-        assert end_of(folder / f"{name}.pem") == certificate_in(folder / f"{name}.pem").not_valid_after_utc
+        assert expiry_of(folder / f"{name}.pem") == certificate_in(folder / f"{name}.pem").not_valid_after_utc
     Authority.new(365 * 40).write(folder / "late.pem", folder / "late.key")  # told in another form from 2050 on
-    assert end_of(folder / "late.pem") == certificate_in(folder / "late.pem").not_valid_after_utc
-    assert end_of(folder / "ca.key") is None
-    assert end_of(folder / "none.pem") is None
+    assert expiry_of(folder / "late.pem") == certificate_in(folder / "late.pem").not_valid_after_utc
+    assert expiry_of(folder / "ca.key") is None
+    assert expiry_of(folder / "none.pem") is None
 
 
 @pytest.mark.parametrize(("days", "urgent", "said"), [
     (9, None, ""), (11, False, "in 29 days"), (38, False, "in 2 days"), (39.5, True, "in 12 hours"),
-    (41, True, "has ended"),
+    (41, True, "expired on"),
 ])
 def test_it_is_said_30_days_and_one_day_before(
     folder: Path, monkeypatch: pytest.MonkeyPatch, days: float, urgent: bool | None, said: str
 ) -> None:
     monkeypatch.setenv("ZENCELL_SECURE", str(folder))
     at = now_in(days) + datetime.timedelta(minutes=-1)
-    found = warning_of("router", certificate_in(folder / "router.pem").not_valid_after_utc, at)
+    found = expiry_warning("router", certificate_in(folder / "router.pem").not_valid_after_utc, at)
     assert (found[0] if found else None) is urgent
     told = [*findings(at)]
     assert {finding.level for finding in told} == {{None: "ok", False: "warn", True: "fail"}[urgent]}
@@ -92,16 +91,16 @@ def test_it_is_said_30_days_and_one_day_before(
 
 
 def test_each_end_is_logged_once_and_once_more_when_it_is_urgent(folder: Path) -> None:
-    watch = EndWatch(folder)
+    watch = CertificateMonitor(folder)
     assert watch.look() == []
     assert len(watch.look(now_in(11))) == len(NAMES)
     assert watch.look(now_in(12)) == []
     assert len(watch.look(now_in(39.5))) == len(NAMES)
     assert [urgent for urgent, _ in watch.look(now_in(41))] == [True] * len(NAMES)
     assert watch.look(now_in(42)) == []
-    own = EndWatch(folder, frozenset(["panda.camera"]))
+    own = CertificateMonitor(folder, frozenset(["panda.camera"]))
     ((_, line),) = own.look(now_in(11))
-    assert "the certificate of panda.camera ends on" in line
+    assert "the certificate of panda.camera expires on" in line
     assert f"`zencell secure renew {folder}`" in line
 
 
@@ -164,7 +163,7 @@ def test_what_cannot_be_used_leaves_in_force_what_was_there(
     with caplog.at_level(logging.ERROR, "router"):
         (folder / "router.key").write_bytes((folder / "operator.key").read_bytes())
         until("nothing was said", lambda: caplog.records)
-    assert "those of before stay in force" in caplog.text
+    assert "the previous ones stay in force" in caplog.text
     assert is_let_in(endpoint, credentials_of("operator", folder))
 
 

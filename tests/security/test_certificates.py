@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from common.errors import ConfigError
-from common.transport.credentials import credentials_of, identity_of_listener, refuse_to_publish
+from common.transport.credentials import credentials_of, observer_identity, require_open_cell
 from security.certificates import Authority, write_secret
 from security.checking import require_valid
 
@@ -110,12 +110,12 @@ def test_credentials_tell_nothing_of_the_key(folder: Path) -> None:
 
 def test_a_listener_shows_the_certificate_of_the_observer_if_there_is_one(folder: Path) -> None:
     secured = {"ZENCELL_SECURE": str(folder)}
-    assert identity_of_listener({}) == identity_of_listener(secured) == "operator"
+    assert observer_identity({}) == observer_identity(secured) == "operator"
     (folder / "observer.key").touch()
-    assert identity_of_listener(secured) == "observer"
+    assert observer_identity(secured) == "observer"
 
 
 def test_tools_publish_only_in_an_open_cell(folder: Path) -> None:
-    refuse_to_publish("play", {})
+    require_open_cell("play", {})
     with pytest.raises(ConfigError, match=r"^play: is not possible"):
-        refuse_to_publish("play", {"ZENCELL_SECURE": str(folder)})
+        require_open_cell("play", {"ZENCELL_SECURE": str(folder)})

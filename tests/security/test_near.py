@@ -14,7 +14,7 @@ import pytest
 
 from common.supervision.launch import Launch, free_endpoints
 from common.transport.credentials import credentials_of
-from common.transport.endpoint import LINKS, NEAR_MS, near_of
+from common.transport.endpoint import LINKS, NEAR_MS, nearby_endpoints
 from common.transport.router import Router
 from common.transport.zenoh_session import ZenohSession, open_zenoh
 from security.certificates import Authority
@@ -35,8 +35,8 @@ class Door:
         self.router = Router([self.endpoint], certificates, near=self.near)
 
     @property
-    def through_the_front(self) -> int:
-        return len(self.router._front._sockets)
+    def through_the_gate(self) -> int:
+        return len(self.router._gate._sockets)
 
     async def enter(self, *, near: bool) -> tuple[ZenohSession, float]:
         began = time.monotonic()
@@ -60,9 +60,9 @@ def connections(ports: list[str]) -> list[socket.socket]:
 
 async def test_who_is_near_passes_no_front_and_has_the_rights_of_his_certificate(door: Door) -> None:
     session, _ = await door.enter(near=True)
-    assert session.connected and not door.through_the_front and len(session._session.info.links()) == len(LINKS)
+    assert session.connected and not door.through_the_gate and len(session._session.info.links()) == len(LINKS)
     far, _ = await door.enter(near=False)
-    assert far.connected and door.through_the_front
+    assert far.connected and door.through_the_gate
     with Holder(door.endpoint, credentials_of("operator", door.certificates)) as operator:
         heard = operator.hear("panda/**")
         for _ in range(100):
@@ -146,7 +146,7 @@ async def test_after_a_renewal_who_is_near_comes_in_near_again(door: Door) -> No
     assert renewed == [False, True]
     before = door.near[1]
     await until(lambda: not _listens(before) and _listens(door.near[0]))
-    await until(lambda: session.connected and not door.through_the_front)
+    await until(lambda: session.connected and not door.through_the_gate)
     session.close()
 
 
@@ -158,7 +158,7 @@ def test_router_goes_without_where_somebody_else_has_the_port(
         stack.enter_context(socket.create_server(("127.0.0.1", int(near[0].rpartition(":")[2]))))
         with caplog.at_level(logging.WARNING):
             stack.enter_context(Router([endpoint], certificates, near=near))
-        assert "services of this host come in with all others" in caplog.text
+        assert "services of this host connect through the gate" in caplog.text
         assert stack.enter_context(Holder(endpoint, credentials_of("operator", certificates))).connected
 
 
@@ -166,6 +166,6 @@ def test_supervisor_hands_down_where_the_router_of_its_domain_is_near(monkeypatc
     monkeypatch.setenv("ZENCELL_SECURE", "somewhere")
     launch = Launch("panda", domain=3, near=("tls/127.0.0.1:1", "tls/127.0.0.1:2"))
     environment = launch.environment({})
-    assert near_of("tls/127.0.0.1:7450", environment) == ["tls/127.0.0.1:1", "tls/127.0.0.1:2"]
-    assert near_of("tls/192.168.1.10:7450", environment) == [] == near_of("tls/127.0.0.1:7450", {})
+    assert nearby_endpoints("tls/127.0.0.1:7450", environment) == ["tls/127.0.0.1:1", "tls/127.0.0.1:2"]
+    assert nearby_endpoints("tls/192.168.1.10:7450", environment) == [] == nearby_endpoints("tls/127.0.0.1:7450", {})
     assert launch.router_command()[-5:] == ["--near", "tls/127.0.0.1:1", "--near", "tls/127.0.0.1:2", "--gate"]

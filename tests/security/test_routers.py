@@ -15,7 +15,7 @@ import zenoh
 from cli.main import app
 from common.errors import ConfigError
 from common.transport.credentials import ACCESS, ROUTER_NAME, credentials_of, read_access
-from common.transport.endpoint import MOST_BYTES_BESIDES, port_of, router_config
+from common.transport.endpoint import MAX_OTHER_BYTES, port_of, router_config
 from common.transport.router import open_router
 from security.access import Rights, access_control
 from security.certificates import Authority
@@ -49,7 +49,7 @@ def test_what_is_too_large_for_a_key_under_another_name_goes_no_farther_than_the
         writer, reader = (stack.enter_context(Holder(here, None)) for _ in range(2))
         heard = reader.hear(key)
         for _ in range(100):
-            writer.put(key, bytes(MOST_BYTES_BESIDES + 1))
+            writer.put(key, bytes(MAX_OTHER_BYTES + 1))
             writer.put(key, b"small")
             if heard.samples:
                 break

@@ -141,15 +141,15 @@ async def test_a_device_that_vanishes_is_told_and_opened_again(monkeypatch, intr
             while device.opened < 5 or len(seen) < 3:
                 seen.add(value_of(await asyncio.wait_for(images.next(), 10)))
     lines = [record.getMessage() for record in caplog.records]
-    assert lines[0] == "camera 0 gives no picture; opening it again in 0.01 s"
+    assert lines[0] == "camera 0 delivers no image; opening it again in 0.01 s"
     assert lines[1].endswith("in 0.02 s")
 
 
 @pytest.mark.parametrize(
     ("make", "told"),
     [
-        (lambda p: p / "nothing.mp4", "is no device number, /dev path, video file or image folder"),
-        (lambda p: p, "holds no image"),
+        (lambda p: p / "nothing.mp4", "is not a device number, /dev path, video file or image folder"),
+        (lambda p: p, "contains no image"),
     ],
 )
 def test_a_source_that_is_nothing_is_named_with_the_choices(tmp_path, make, told):
@@ -161,7 +161,7 @@ def test_a_source_that_is_nothing_is_named_with_the_choices(tmp_path, make, told
 def test_a_file_in_the_folder_that_is_no_image_is_named(tmp_path, content):
     (tmp_path / "a.png").write_bytes(content)
     source = open_source(str(tmp_path), (64, 48), 10, loop=True)
-    with pytest.raises(ConfigError, match=r"a\.png' is no image"):
+    with pytest.raises(ConfigError, match=r"a\.png' is not a readable image"):
         source.read()
 
 
@@ -194,7 +194,7 @@ def test_without_a_file_the_intrinsics_are_those_of_the_worlds_camera():
 def test_intrinsics_whose_pose_is_not_that_of_the_world_are_refused(tmp_path):
     path = tmp_path / "camera.yaml"
     path.write_text(yaml.safe_dump(SMALL | {"position": [0.1, 0.2, 0.9], "rpy": [3.1, 0.0, 0.0]}))
-    with pytest.raises(ConfigError, match=r"another pose than the world's camera has: .*--set world\.camera="):
+    with pytest.raises(ConfigError, match=r"another pose than the world's camera: .*--set world\.camera="):
         calibrated(config(source=0, intrinsics=str(path)))
     camera = around.camera
     path.write_text(yaml.safe_dump(SMALL | {"position": list(camera.position), "rpy": list(camera.rpy)}))

@@ -240,9 +240,9 @@ async def test_mode_that_the_camera_does_not_have_is_told_with_what_was_asked(ca
 
 
 @pytest.mark.parametrize(("given", "told"), [
-    ({"driver": ""}, "services.camera.driver: '' must be one of oak, realsense, or the dotted name of a module of"),
+    ({"driver": ""}, "services.camera.driver: '' must be one of oak, realsense, or the dotted name of a module"),
     ({"driver": "my_pkg.nothing"}, "services.camera.driver: 'my_pkg.nothing' cannot be imported: No module named"),
-    ({"driver": "common.errors"}, "'common.errors' opens no cameras: it has no Options, open_camera"),
+    ({"driver": "common.errors"}, "'common.errors' is no camera driver: it lacks Options, open_camera"),
     ({"options": {"fps": 900}}, "services.camera.options.fps: 900 must be less than or equal to 90"),
     ({"options": {"speed": 3}}, "services.camera.options.speed: "),
 ])

@@ -103,7 +103,7 @@ async def test_picture_waits_for_the_transform_of_its_time_and_is_left_out_where
         found = await waiting
         expected = MountedCamera(AROUND.camera, ROBOT).at(HOME + 0.01)
         np.testing.assert_allclose(found.T_world_optical, expected.T_world_optical, atol=1e-4)
-        with pytest.raises(FrameError, match="tf does not say yet where 'panda_link7' is") as refused:
+        with pytest.raises(FrameError, match="tf has no pose of 'panda_link7' at the time of the image yet") as refused:
             await camera.of(picture.model_copy(update={"stamp": 9000 * MS}))
         assert refused.value.kind == "early"
 

@@ -11,6 +11,7 @@ from common.config import load_cell, service_config
 from common.perception.pinhole import Pinhole
 from common.process.in_process import running_service
 from common.robot.transforms import matrix_to_pose
+from common.transport.bus import Bus
 from common.transport.local import LocalNetwork
 from services import scene_manager
 
@@ -27,21 +28,26 @@ def frame(bus_stamp: int, *balls: tuple[float, float]) -> m.MarkerArray:
     return m.MarkerArray(header=m.Header(stamp=bus_stamp, frame_id="world"), markers=markers)
 
 
+def network_with_camera() -> tuple[LocalNetwork, Bus]:
+    net = LocalNetwork()
+    bus = net.bus("tester", cell="test", clock=Clock())
+    bus.writer(topics.CAMERA_INFO).put(CAMERA.info(bus.header("camera_optical_frame")))
+    bus.writer(topics.TF_STATIC).put(m.TFMessage(transforms=[m.TransformStamped(
+        header=bus.header("world"), child_frame_id="camera_optical_frame",
+        transform=matrix_to_pose(CAMERA.T_world_optical))]))
+    return net, bus
+
+
 async def film(expose: Callable[[], None]) -> None:
-    """Frames that go on, as those of a camera do: the first may come before the camera is known."""
+    """Publish frames repeatedly as a camera does: the first may arrive before the camera is known."""
     while True:
         expose()
         await asyncio.sleep(0.02)
 
 
-async def test_seen_ball_becomes_an_object_with_an_id_and_moves_into_the_hand_that_takes_it() -> None:
-    net = LocalNetwork()
-    bus = net.bus("tester", cell="test", clock=Clock())
+async def test_detected_ball_becomes_an_object_and_is_attached_when_grasped() -> None:
+    net, bus = network_with_camera()
     detected, scene = bus.writer(DETECTED_OBJECTS), bus.reader(topics.PLANNING_SCENE)
-    bus.writer(topics.CAMERA_INFO).put(CAMERA.info(bus.header("camera_optical_frame")))
-    bus.writer(topics.TF_STATIC).put(m.TFMessage(transforms=[m.TransformStamped(
-        header=bus.header("world"), child_frame_id="camera_optical_frame",
-        transform=matrix_to_pose(CAMERA.T_world_optical))]))
     home = CELL.robot.named_poses["home"]
     joints = bus.writer(topics.JOINT_STATES)
     grip = bus.writer(topics.GRIPPER_STATE)
@@ -50,7 +56,7 @@ async def test_seen_ball_becomes_an_object_with_an_id_and_moves_into_the_hand_th
     async with running_service(net, scene_manager.run, config, name="scene_manager"):
         first = await scene.next()
         assert {o.role for o in first.objects} == {"fixture", "container"}
-        ball = (0.307, 0.0)  # below the hand at home, as far as the match radius is concerned not in it
+        ball = (0.307, 0.0)  # below the gripper at home, outside the match radius
 
         def expose() -> None:
             joints.put(m.JointState(header=bus.header(), name=CELL.robot.joints, position=home))
@@ -69,14 +75,9 @@ async def test_seen_ball_becomes_an_object_with_an_id_and_moves_into_the_hand_th
         assert ("panda_hand", held.attached[0].object.id) in held.allowed_collisions
 
 
-async def test_pictures_that_the_arm_may_hide_something_in_do_not_count_where_the_cell_says_so() -> None:
-    net = LocalNetwork()
-    bus = net.bus("tester", cell="test", clock=Clock())
+async def test_only_at_home_ignores_images_taken_with_the_arm_away() -> None:
+    net, bus = network_with_camera()
     detected, scene = bus.writer(DETECTED_OBJECTS), bus.reader(topics.PLANNING_SCENE)
-    bus.writer(topics.CAMERA_INFO).put(CAMERA.info(bus.header("camera_optical_frame")))
-    bus.writer(topics.TF_STATIC).put(m.TFMessage(transforms=[m.TransformStamped(
-        header=bus.header("world"), child_frame_id="camera_optical_frame",
-        transform=matrix_to_pose(CAMERA.T_world_optical))]))
     joints, home = bus.writer(topics.JOINT_STATES), CELL.robot.named_poses["home"]
     config = service_config(CELL, "scene_manager", scene_manager.Config)
     config = config.model_copy(update={"only_at_home": True, "confirm_frames": 1})

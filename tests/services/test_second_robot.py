@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from common import topics
+from common.atomic_file import STATE_VARIABLE
 from common.clock import Clock
 from common.config import load_cell, service_config
 from common.errors import RemoteError
-from common.kept_file import STATE_VARIABLE
 from common.messages import ExecuteRequest, GripperCommand, JointState, TFMessage, Vector3, WorldEdit
 from common.process.in_process import running_service
 from common.robot.finger_joints import finger_positions
@@ -100,7 +100,7 @@ async def test_it_follows_a_trajectory_and_signs_with_its_name(robot: RobotModel
 async def test_what_is_added_without_a_shape_is_like_the_first_object_of_the_world() -> None:
     async with executor() as bus:
         edit = bus.client(topics.WORLD_EDIT)
-        with pytest.raises(RemoteError, match="would reach into cube"):
+        with pytest.raises(RemoteError, match="would overlap cube"):
             await edit.call(WorldEdit(op="add", position=Vector3(x=0.5, y=0.0)))
         reply = await edit.call(WorldEdit(op="add", position=Vector3(x=0.5, y=0.2)))
         assert reply.ids == ["cube", "cube_1"]

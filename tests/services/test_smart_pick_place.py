@@ -11,9 +11,9 @@ from applications.pick_place.task import PickPlace
 from applications.pick_place.topics import PICK_PLACE_STATUS, VALIDATED_TARGETS
 from common import messages as m
 from common import topics
+from common.atomic_file import RUNTIME_VARIABLE
 from common.clock import Clock
 from common.config import load_cell, service_config
-from common.kept_file import STANDING_VARIABLE
 from common.process import task_runner
 from common.process.in_process import running_service
 from common.process.task_runner import run_task
@@ -95,7 +95,7 @@ async def test_status_is_a_state_that_a_late_reader_gets() -> None:
 
 @pytest.mark.parametrize("damaged", ["{", '{"places": [[0.5, 0.2, NaN]]}', '{"places": 3}', "[]"])
 async def test_what_a_task_knows_of_what_it_let_go_outlives_it(damaged, monkeypatch, tmp_path, caplog) -> None:
-    monkeypatch.setenv(STANDING_VARIABLE, str(tmp_path))
+    monkeypatch.setenv(RUNTIME_VARIABLE, str(tmp_path))
     tasks: list[PickPlace] = []
 
     class Seen(PickPlace):
@@ -125,7 +125,7 @@ async def test_memory_that_a_task_begins_with_stays_where_none_was_kept_and_is_w
 ) -> None:
     in_the_way = tmp_path / "standing"
     in_the_way.write_text("no folder")
-    monkeypatch.setenv(STANDING_VARIABLE, str(in_the_way / "cell"))
+    monkeypatch.setenv(RUNTIME_VARIABLE, str(in_the_way / "cell"))
     monkeypatch.setattr(task_runner, "SAVE_RETRY", 0.01)
     begun, later = ReleasePositions(places=[(0.5, 0.2, 0.095)]), ReleasePositions(places=[(0.5, 0.3, 0.035)])
     tasks: list[PickPlace] = []

@@ -194,5 +194,5 @@ async def test_frame_with_more_in_it_than_there_is_room_for_is_left_out_and_told
         rig.found.put(seen(*crowd, stamp=2_000))
         line = await asyncio.wait_for(told.get(), 10)
         log.removeHandler(listening)
-        assert line.startswith("a frame of detections left out: 300 objects in it are more than")
+        assert line.startswith("frame of detections skipped: 300 objects in it are more than")
         await rig.answer(seen((0.45, -0.2, 0.03), stamp=3_000), 1)

@@ -11,15 +11,15 @@ from unittest.mock import patch
 from applications.pick_place.perceived_scene import PerceivedScene
 from common import topics
 from common.config import load_cell
-from common.control.controller import TrajectoryController
+from common.control import request_handlers
 from common.control.goals import GoalMemory
-from common.control.interlocks import Record
+from common.control.interlocks import InterlockFile, Record
 from common.control.limiter import Limiter
-from common.control.ownership import Ownership
-from common.control.record_file import RecordFile
-from common.sources import host_ns, wall_ns
+from common.control.motion_authority import MotionOwnership
+from common.control.trajectory_controller import TrajectoryController
+from common.time_source import host_ns, wall_ns
 from common.transport import requests
-from common.transport.reader import Newness
+from common.transport.reader import SequenceFilter
 from lab import processes
 from lab.doubles import settings_of, with_doubles
 from lab.simulation import Simulation
@@ -44,7 +44,7 @@ def _hold_forgotten():
 
     def hold(self, *arguments, **named):
         honest(self, *arguments, **named)
-        self._holds.clear()
+        self.reports.holds.clear()
         return self.status
 
     return patch.object(TrajectoryController, "hold", hold)
@@ -68,11 +68,11 @@ def _two_goals():
     honest = TrajectoryController.accept
 
     def accept(self, goal, *arguments, **named):
-        if self._memory.get(goal) is None:
+        if self.reports.memory.get(goal) is None:
             self._goal = None
         return honest(self, goal, *arguments, **named)
 
-    with patch.object(TrajectoryController, "accept", accept), patch.object(Ownership, "objection", lambda *_: None):
+    with patch.object(TrajectoryController, "accept", accept), patch.object(MotionOwnership, "check", lambda *_: None):
         yield
 
 
@@ -107,27 +107,27 @@ def _never_asked_again():
             note(str(error))
             await asyncio.Event().wait()
 
-    return patch("common.processes.orders.persist", once)
+    return patch("common.process.task_requests.call_until_answered", once)
 
 
 BUGS = {
-    "what is not newer is read": lambda: patch.object(Newness, "is_new", lambda self, attachment: True),
+    "what is not newer is read": lambda: patch.object(SequenceFilter, "is_new", lambda self, attachment: True),
     "a repeated goal id acts again": lambda: patch.object(GoalMemory, "get", lambda self, goal: None),
     "the task reads the truth": _truth_read,
     "a hold is forgotten": _hold_forgotten,
     "a hold without brakes": _hold_without_brakes,
     "a motion that was decided long ago begins": lambda: patch.object(
-        trajectory_executor, "objection", lambda *_: None),
+        request_handlers, "check_age", lambda *_: None),
     "objects and arm forgotten at a restart": lambda: patch.object(
         trajectory_executor, "state_file", lambda cell: None),
-    "a stop dies with the executor": lambda: patch.object(RecordFile, "load", lambda self: (Record(), "")),
+    "a stop dies with the executor": lambda: patch.object(InterlockFile, "load", lambda self: (Record(), "")),
     "a new goal while another runs": _two_goals,
     "a request that waits without end": _waits_without_end,
     "a request that is not asked again": _never_asked_again,
     "what is in the hand is forgotten": lambda: patch.object(
         PerceivedScene, "feel", lambda self, state, T_world_tcp: None),
     "what day it is asked for at each start": _clock_of_its_own,
-    "goal ids that repeat after a restart": lambda: patch("common.processes.task_runner.new_id", lambda: "0000"),
+    "goal ids that repeat after a restart": lambda: patch("common.process.task_runner.new_id", lambda: "0000"),
 }
 
 

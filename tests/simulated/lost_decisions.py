@@ -8,8 +8,7 @@ import sys
 from unittest.mock import patch
 
 from common.config import load_cell
-from common.control.interlocks import Interlocks, Record
-from common.control.record_file import RecordFile
+from common.control.interlocks import InterlockFile, Interlocks, Record
 from common.transport.ownership import Ownership
 from lab.doubles import settings_of, with_doubles
 from lab.simulation import Simulation
@@ -17,14 +16,14 @@ from services import trajectory_executor
 
 
 def _without(**left_out):
-    honest = RecordFile.load
+    honest = InterlockFile.load
 
     def load(self):
         record, problem = honest(self)
         stops = {"interlocks": [i for i in record.interlocks if i.kind != "held"]} if "interlocks" in left_out else {}
         return record.model_copy(update=left_out | stops), problem
 
-    return patch.object(RecordFile, "load", load)
+    return patch.object(InterlockFile, "load", load)
 
 
 def _let_in():
@@ -35,17 +34,17 @@ def _let_in():
 
 
 def _late_start_counts():
-    return patch("common.control.interlocks._lets_go", lambda request, interlock: (
+    return patch("common.control.interlocks._releases", lambda request, interlock: (
         request.override or (request.stops if interlock.kind == "stopped" else True)))
 
 
 DECISIONS = {
-    "a restart forgets the stop": lambda: patch.object(RecordFile, "load", lambda self: (Record(), "")),
+    "a restart forgets the stop": lambda: patch.object(InterlockFile, "load", lambda self: (Record(), "")),
     "the hold's record is not read": lambda: _without(interlocks=[]),
     "a remembered stop of an unknown goal is forgotten": lambda: patch.object(
-        Interlocks, "never", lambda self, goals: None),
+        Interlocks, "block_goals", lambda self, goals: None),
     "the speed is forgotten": lambda: patch.object(
-        trajectory_executor, "speed_of", lambda kept, configured: configured),
+        trajectory_executor, "effective_speed", lambda kept, configured: configured),
     "a second instance is let in": _let_in,
     "a start undoes a later stop": _late_start_counts,
 }

@@ -12,7 +12,8 @@ from common.config import Cell, load_cell
 from common.messages import GripperState, WorldObjects
 from common.transport.codec import decode
 from common.transport.session import RawSample
-from lab.simulation import Simulation, Trace
+from lab.observers import Trace
+from lab.simulation import Simulation
 
 CELL = """
 cell: boxes

@@ -40,15 +40,15 @@ def outcome_of(name: str, seed: int, faults: bool = True) -> Outcome:
 def test_cell_with_doubles_ends_well_whatever_goes_wrong(name, seed):
     outcome = outcome_of(name, seed)
     assert outcome.ok and not outcome.broken and not outcome.crashes, outcome
-    assert outcome.faults["crash"] >= 2 and outcome.faults["hostile"] >= 1
+    assert outcome.faults["crash"] >= 2 and outcome.faults["malformed messages"] >= 1
     assert all(count > 0 for count in outcome.checked.values()) and len(outcome.checked) >= (9 if outcome.left else 10)
 
 
 def test_every_plan_has_hostile_payloads_and_some_have_each_other_fault():
     plans = [make_plan(seed, ["one", "two"], 0.5) for seed in range(100)]
     kinds = [{fault.kind for fault in plan.faults} for plan in plans]
-    assert all("hostile" in each for each in kinds)
-    assert all(5 < sum(kind in each for each in kinds) < 90 for kind in LAST if kind != "hostile")
+    assert all("malformed messages" in each for each in kinds)
+    assert all(5 < sum(kind in each for each in kinds) < 90 for kind in LAST if kind != "malformed messages")
     assert make_plan(1, ["one"], without=LAST).faults == tuple(
         fault for fault in make_plan(1, ["one"]).faults if fault.kind not in LAST)
 
@@ -57,7 +57,7 @@ def test_every_plan_has_hostile_payloads_and_some_have_each_other_fault():
 def test_run_that_a_person_stops_for_good_ends_with_the_robot_at_rest():
     outcomes = (outcome_of("panda", seed) for seed in range(1, 101))  # about every tenth
     left = []
-    for outcome in (outcome for outcome in outcomes if outcome.faults["left so"]):
+    for outcome in (outcome for outcome in outcomes if outcome.faults["left stopped"]):
         assert outcome.ok
         left.append(outcome.state)
         if left[-1] == "LEFT":
@@ -98,7 +98,7 @@ def test_bug_about_what_persons_decided_is_found_within_some_tens_of_seeds(bug):
 
 def test_only_the_double_may_see_the_truth():
     with BUGS["the task reads the truth"]():
-        assert "nothing that decides saw the truth" in outcome_of("panda", 1).broken[0]
+        assert "no deciding service reads the ground truth" in outcome_of("panda", 1).broken[0]
 
 
 def test_application_without_a_double_is_told_in_one_line():

@@ -8,7 +8,7 @@ from common.config import load_cell
 from common.errors import ConfigError
 from lab.campaign import run_seeds
 from lab.faults import SKEW, SPEEDS, make_plan
-from lab.observed_arm import with_observed_arm
+from lab.observers import with_observed_arm
 from lab.simulation import LIMIT, Outcome, Simulation
 from tests.simulated.known_bugs import BUGS, RARE, found_within
 
@@ -34,7 +34,7 @@ def outcome_of(name: str, seed: int) -> Outcome:
 def test_cell_ends_well_whatever_goes_wrong(cell, seed):
     outcome = outcome_of(cell, seed)
     assert outcome.ok and not outcome.broken and not outcome.crashes, outcome
-    assert outcome.faults["crash"] >= 3 and outcome.faults["cut"] >= 1 and outcome.faults["changed places"] > 100
+    assert outcome.faults["crash"] >= 3 and outcome.faults["cut"] >= 1 and outcome.faults["reordered"] > 100
     assert sum(outcome.restarts.values()) >= 3
     assert all(count > 0 for count in outcome.checked.values()) and len(outcome.checked) >= 9
 
@@ -78,7 +78,7 @@ def test_every_plan_has_three_crashes_a_cut_and_wrong_clocks():
         kinds = [fault.kind for fault in plan.faults]
         assert kinds.count("crash") >= 3 and kinds.count("cut") >= 1 and kinds.count("late goal") >= 2
         assert [fault.at for fault in plan.faults] == sorted(fault.at for fault in plan.faults)
-        assert plan.weather.loss > 0 and plan.weather.hiccup > 0 and plan.weather.doubled > 0 and plan.weather.late > 0
+        assert plan.links.loss > 0 and plan.links.hiccup > 0 and plan.links.duplicated > 0 and plan.links.late > 0
         assert plan.shuffled and plan.speed in (1.0, *SPEEDS)
         assert all(abs(skew) <= SKEW for _, skew in plan.skews) and len(plan.skews) == 3
 

@@ -15,7 +15,8 @@ from common.process.in_process import running_service
 from common.supervision.wiring import owned_in, require_one_owner, wiring_of
 from common.transport import ownership
 from common.transport.local import LocalNetwork
-from lab.simulation import Simulation, Trace
+from lab.observers import Trace
+from lab.simulation import Simulation
 from recording.capture import CustomTopics
 from recording.reader import Recording
 from services import camera_simulator
@@ -73,7 +74,7 @@ async def test_keys_and_owners_follow_from_the_cell() -> None:
 
 
 async def test_each_camera_says_its_own_frame_and_tf_has_both(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ownership, "GIVE_UP", 0.0)
+    monkeypatch.setattr(ownership, "CLAIM_SECONDS", 0.0)
     cell, net = load_cell(CELL), LocalNetwork()
     bus = net.bus("tester")
     infos = {side: bus.reader(replace(topics.CAMERA_INFO, key=f"{side}/camera/camera_info"))

@@ -1,4 +1,4 @@
-"""What a simulation runs asks nobody for time and ids but common/sources.py."""
+"""What a simulation runs asks nobody for time and ids but common/time_source.py."""
 
 import ast
 from pathlib import Path
@@ -13,7 +13,7 @@ SINGLE = (
     "common/supervision/supervisor.py", "common/supervision/lifecycle.py",
 )
 REAL = tuple(f"common/{name}.py" for name in (  # of real arms and cameras, which no simulation has
-    "hardware/driver", "hardware/driver_process", "hardware/driven_gripper"))
+    "hardware/driven_arm", "hardware/driver_process", "hardware/driven_gripper"))
 OF_THE_MACHINE = {"time", "uuid", "secrets", "random", "datetime"}
 
 

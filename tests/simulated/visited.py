@@ -20,7 +20,8 @@ from common.application import find_application
 from common.config import Cell, load_cell
 from common.messages import TaskCommand
 from common.transport.bus import Bus
-from lab.simulation import Outcome, Simulation, Trace
+from lab.observers import Trace
+from lab.simulation import Outcome, Simulation
 from recording.capture import CustomTopics
 from recording.report.aggregator import Collector, RunAggregator
 from recording.report.summary import describe
@@ -56,7 +57,7 @@ class SimulatedCell:
             loaded.name, find_application(loaded.application), robot=loaded.robot, seed=loaded.run.seed,
             containers=list(loaded.world.containers))
         trace = None if record is None else Trace(record, {"cell": loaded.name}, CustomTopics.of(loaded))
-        self._simulation = Simulation(loaded, seed, limit=limit, trace=trace, tell=self.lines.append, visit=self._look)
+        self._simulation = Simulation(loaded, seed, limit=limit, trace=trace, log=self.lines.append, visit=self._look)
         self.outcome: Outcome = self._simulation.run()
         if trace is not None:
             trace.close("simulated")

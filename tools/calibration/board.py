@@ -1,7 +1,7 @@
-"""The ChArUco board that cameras are calibrated with: what is printed, and where it is in a picture.
+"""The ChArUco calibration board: print it and detect it.
 
-The frame of a board has its origin at the lower left corner of the squares as printed, x to the right, y up and z out
-of the paper, towards the reader: a board that lies on a table face up has its z axis up.
+The frame of a board has its origin at the lower left corner of the printed squares, x right, y up, z out of the paper:
+on a board lying face up, z points up.
 """
 
 from __future__ import annotations
@@ -16,32 +16,32 @@ import numpy.typing as npt
 from pydantic import Field, model_validator
 
 from common.config import Parameters
-from tools.calibration.corners import SMEARED, Print, homography, mapped, refine
+from tools.calibration.corners import PAGE_BLUR, PrintedBoard, homography, mapped, refine
 
 Array = npt.NDArray[np.float64]
-Picture = npt.NDArray[np.uint8]
+Pixels = npt.NDArray[np.uint8]
 
 Dictionary = Literal["4x4_50", "4x4_250", "5x5_50", "5x5_250", "6x6_50", "6x6_250", "apriltag_36h11"]
 
-_MARGIN = 0.012  # [m] white around the squares; what tells how it is printed is in the lower one
+_MARGIN = 0.012  # [m] white border; the lower one holds the print instructions
 _PRINT_DENSITY = 300 / 0.0254  # [px/m], about
-_LEAST_CORNERS = 6
-_LEAST_FITTING = 0.7  # part of the markers that must lie where the board has them
-_MARKER_TOLERANCE = 0.1, 1.5  # of the length of markers: relative, or [px] by which blur makes them smaller
-_LOOKED_AT = (24, 48, 96, 192)  # [px] of a square in the pages that pictures are compared with
-_WINDOW = 15  # [px] in which an edge is looked at
-_LEAST_CONTRAST = 30  # grey levels without which nobody can tell
-_SMEARED = 1.3  # [px] from which on blur is why nothing is found
+_MIN_CORNERS = 6
+_MIN_FITTING = 0.7  # fraction of markers that must match the board
+_MARKER_TOLERANCE = 0.1, 1.5  # of marker length: relative, or shrinkage by blur [px]
+_PAGE_SIDES = (24, 48, 96, 192)  # [px] of a square in the reference pages
+_WINDOW = 15  # [px] of edge analysis
+_MIN_CONTRAST = 30  # grey levels needed to judge blur
+_BLURRED = 1.3  # [px] blur that explains a failed detection
 
 
 class BoardOptions(Parameters):
-    """A board as it is printed. The default fits on A4 paper."""
+    """A printed board. The default fits on A4 paper."""
 
     columns: int = Field(7, ge=3, le=50, description="squares along x")
     rows: int = Field(5, ge=3, le=50, description="squares along y")
     square: float = Field(0.036, gt=0, le=1, description="length of a square [m]")
     marker: float = Field(0.027, gt=0, le=1, description="length of a marker [m]")
-    dictionary: Dictionary = Field("4x4_50", description="which markers")
+    dictionary: Dictionary = Field("4x4_50", description="dictionary of the markers")
 
     @model_validator(mode="after")
     def _fits_together(self) -> BoardOptions:
@@ -59,15 +59,15 @@ class BoardOptions(Parameters):
 
 @dataclass(frozen=True, eq=False)
 class BoardDetection:
-    """Where the inner corners of a board are seen in a picture.
+    """Inner corners of a board detected in an image.
 
     Attributes:
-        name: of the picture.
-        size: width and height of the picture [px].
-        points: (n, 3) corners in the frame of the board [m].
-        pixels: (n, 2) the same corners in the picture, (0, 0) the centre of the upper left pixel [px].
-        blur: standard deviation of how far edges are smeared [px].
-        outline: (4, 2) where the board's outer corners are or would be [px].
+        name: of the image.
+        size: width and height of the image [px].
+        points: (n, 3) corners in the board's frame [m].
+        pixels: (n, 2) the same corners in the image; (0, 0) is the center of the upper left pixel [px].
+        blur: standard deviation of edge blur [px].
+        outline: (4, 2) outer corners of the board, inside the image or not [px].
     """
 
     name: str
@@ -80,14 +80,14 @@ class BoardDetection:
 
 @dataclass(frozen=True)
 class NoBoard:
-    """Why a picture shows no board: `kind` is for counting, the reason for people."""
+    """Why an image shows no board: `kind` for counting, `reason` for people."""
 
     kind: Literal["nothing", "blurred", "few corners", "other board"]
     reason: str
 
 
 class Board:
-    """A ChArUco board: draws itself and finds itself."""
+    """A ChArUco board: draws and detects itself."""
 
     def __init__(self, options: BoardOptions | None = None) -> None:
         """Prepare the detector."""
@@ -97,31 +97,30 @@ class Board:
         )
         self._detector = cv2.aruco.CharucoDetector(self._board)
         self._markers = {
-            int(number): self._upright(corners)[:, :2]
+            int(number): self._to_board_frame(corners)[:, :2]
             for number, corners in zip(self._board.getIds(), self._board.getObjPoints(), strict=True)
         }
-        self.corners = self._upright(self._board.getChessboardCorners())
+        self.corners = self._to_board_frame(self._board.getChessboardCorners())
         """(n, 3) inner corners in the frame of the board [m], z = 0."""
 
         pages = []
-        for side in _LOOKED_AT:
-            page = np.pad(self._drawn(side), side, constant_values=255)
-            pages.append(np.asarray(cv2.GaussianBlur(page, (0, 0), SMEARED), np.float32))
-        self._print = Print(pages, list(_LOOKED_AT), o.rows, o.square)
+        for side in _PAGE_SIDES:
+            page = np.pad(self._draw(side), side, constant_values=255)
+            pages.append(np.asarray(cv2.GaussianBlur(page, (0, 0), PAGE_BLUR), np.float32))
+        self._print = PrintedBoard(pages, list(_PAGE_SIDES), o.rows, o.square)
 
     @property
     def size(self) -> tuple[float, float]:
         """Width and height of all squares [m]."""
         return self.options.columns * self.options.square, self.options.rows * self.options.square
 
-    def _upright(self, points: npt.ArrayLike) -> Array:
-        """From OpenCV's frame, whose origin is the upper left corner and whose y points down, to the board's."""
+    def _to_board_frame(self, points: npt.ArrayLike) -> Array:
+        """Convert from OpenCV's frame (origin upper left, y down) to the board's."""
         p = np.array(points, dtype=float).reshape(-1, 3)
         return p * (1, -1, 1) + (0, self.size[1], 0)
 
-    def _drawn(self, side: int) -> npt.NDArray[np.float32]:
-        """The squares, each of so many pixels, grey where an edge of a marker cuts a pixel: OpenCV's own picture has
-        markers moved to whole pixels, which is as much as half of one."""
+    def _draw(self, side: int) -> npt.NDArray[np.float32]:
+        """Draw squares of `side` pixels, antialiased; OpenCV rounds markers to whole pixels."""
         o, dictionary = self.options, self._board.getDictionary()
         dark = np.indices((o.rows, o.columns)).sum(axis=0) % 2 == 0
         page = np.where(np.kron(dark, np.ones((side, side), bool)), np.float32(0), np.float32(255))
@@ -136,19 +135,18 @@ class Board:
             page[first[1] : first[1] + count, first[0] : first[0] + count] += down @ (marker - 255) @ across.T
         return np.asarray(page, np.float32)
 
-    def page(self) -> tuple[Picture, float]:
-        """The grey picture to print, with a margin that says what it is, and its density [px/m].
+    def page(self) -> tuple[Pixels, float]:
+        """Return the grey image to print, with instructions in its border, and its density [px/m].
 
-        The density is a little below 300 dpi and such that squares and, if possible, the cells of markers are a whole
-        number of pixels.
+        The density is slightly below 300 dpi: squares and, if possible, marker cells are whole numbers of pixels.
         """
         o = self.options
         bits = self._board.getDictionary().markerSize + 2
         near = round(_PRINT_DENSITY * o.square)
-        side = min(range(max(16, int(0.95 * near)), max(16, near) + 1), key=lambda side: _off(side, o, bits))
+        side = min(range(max(16, int(0.95 * near)), max(16, near) + 1), key=lambda side: _rounding_error(side, o, bits))
         density = side / o.square
         margin = round(_MARGIN * density)
-        page = np.pad(np.asarray(np.rint(self._drawn(side)), np.uint8), margin, constant_values=255)
+        page = np.pad(np.asarray(np.rint(self._draw(side)), np.uint8), margin, constant_values=255)
         bottom, mm = page.shape[0] - margin, density / 1000
         length = min(100, int(1e3 * o.columns * o.square) // 10 * 10)  # [mm]
         right, y = margin + round(length * mm), round(bottom + 3 * mm)
@@ -162,34 +160,34 @@ class Board:
             cv2.putText(page, text, place, cv2.FONT_HERSHEY_SIMPLEX, scale, 0, max(1, round(0.15 * mm)), cv2.LINE_AA)
         return page, density
 
-    def find(self, picture: Picture, name: str) -> BoardDetection | NoBoard:
-        """Where the board is in a bgr8 or grey picture, or why it is not seen."""
-        grey = np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY), np.uint8) if picture.ndim == 3 else picture
+    def find(self, image: Pixels, name: str) -> BoardDetection | NoBoard:
+        """Detect the board in a bgr8 or grey image; otherwise return the reason."""
+        grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8) if image.ndim == 3 else image
         pixels, ids, marker_pixels, marker_ids = self._detector.detectBoard(grey)
         if marker_ids is None or not len(marker_ids):
-            return _blurred(grey) or NoBoard("nothing", "no marker is seen")
+            return _blurred(grey) or NoBoard("nothing", "no marker is visible")
         markers = {int(number): np.asarray(corners, float).reshape(4, 2)
                    for number, corners in zip(np.ravel(marker_ids), marker_pixels, strict=True)}
-        other = self._other_board(markers)
-        if other:
-            return NoBoard("other board", other)
-        if ids is None or len(ids) < _LEAST_CORNERS or self._board.checkCharucoCornersCollinear(ids):
-            return _blurred(grey) or NoBoard("few corners", f"{0 if ids is None else len(ids)} corners are seen, "
-                                                            f"{_LEAST_CORNERS} not on one line are needed")
+        mismatch = self._other_board(markers)
+        if mismatch:
+            return NoBoard("other board", mismatch)
+        if ids is None or len(ids) < _MIN_CORNERS or self._board.checkCharucoCornersCollinear(ids):
+            return _blurred(grey) or NoBoard("few corners", f"{0 if ids is None else len(ids)} corners are visible; "
+                                                            f"{_MIN_CORNERS} not on one line are needed")
         points, found = self.corners[np.ravel(ids)], np.asarray(pixels, float).reshape(-1, 2)
-        other = self._other_length(homography(points[:, :2], found), markers)
-        if other:
-            return _blurred(grey) or NoBoard("other board", other)
+        mismatch = self._other_length(homography(points[:, :2], found), markers)
+        if mismatch:
+            return _blurred(grey) or NoBoard("other board", mismatch)
         low, high = np.maximum(found.min(axis=0) - _WINDOW, 0).astype(int), found.max(axis=0).astype(int) + _WINDOW
         blur = _blur(grey[low[1] : high[1], low[0] : high[0]])
-        found, good = refine(grey, self._print, points[:, :2], found, blur)
-        if good.sum() < _LEAST_CORNERS or np.linalg.matrix_rank(points[good] - points[good][0], 1e-6) < 2:
-            return _blurred(grey) or NoBoard("few corners", f"{good.sum()} of {len(good)} corners look as they are "
-                                                            f"printed, {_LEAST_CORNERS} not on one line are needed")
-        points, found = points[good], found[good]
+        found, matching = refine(grey, self._print, points[:, :2], found, blur)
+        if matching.sum() < _MIN_CORNERS or np.linalg.matrix_rank(points[matching] - points[matching][0], 1e-6) < 2:
+            return _blurred(grey) or NoBoard("few corners", f"{matching.sum()} of {len(matching)} corners match the "
+                                                            f"print; {_MIN_CORNERS} not on one line are needed")
+        points, found = points[matching], found[matching]
         H = homography(points[:, :2], found)
         if H is None:
-            return NoBoard("few corners", "the corners that are seen do not say where the board is")
+            return NoBoard("few corners", "the visible corners do not determine the pose of the board")
         width, height = self.size
         outer = np.array([[0, 0], [width, 0], [width, height], [0, height]])
         outline = mapped(H, outer)
@@ -197,7 +195,7 @@ class Board:
         return BoardDetection(name, size, points, found, blur, outline)
 
     def _other_board(self, markers: dict[int, Array]) -> str:
-        """Why the markers that are seen are those of another board; empty when they fit."""
+        """Why the visible markers belong to another board; empty if they match."""
         foreign = [number for number in markers if number not in self._markers]
         if len(foreign) > 0.3 * len(markers):
             return (f"marker {max(foreign)} is not on a board of {self.options.columns}x{self.options.rows} squares, "
@@ -205,16 +203,16 @@ class Board:
         known = [number for number in markers if number in self._markers]
         if len(known) < 4:
             return ""
-        there = np.array([self._markers[number].mean(axis=0) for number in known])
+        expected = np.array([self._markers[number].mean(axis=0) for number in known])
         seen = np.array([markers[number].mean(axis=0) for number in known])
         side = float(np.median([_side(markers[number]) for number in known]))
-        _, fitting = cv2.findHomography(there, seen, cv2.RANSAC, max(2.0, 0.25 * side))
-        if fitting is None or fitting.mean() >= _LEAST_FITTING:
+        _, fitting = cv2.findHomography(expected, seen, cv2.RANSAC, max(2.0, 0.25 * side))
+        if fitting is None or fitting.mean() >= _MIN_FITTING:
             return ""
-        return f"the markers do not lie as on a board of {self.options.columns}x{self.options.rows} squares"
+        return f"the layout of the markers differs from a board of {self.options.columns}x{self.options.rows} squares"
 
     def _other_length(self, H: Array | None, markers: dict[int, Array]) -> str:
-        """Why the markers have another length than the board's; empty when they have it or nobody can tell."""
+        """Why the marker length differs from the board's; empty if it matches or is unknown."""
         if H is None or not (set(markers) & set(self._markers)):
             return ""
         back = np.asarray(np.linalg.inv(H), float)
@@ -233,39 +231,39 @@ def _dictionary(name: str) -> cv2.aruco.Dictionary:
 
 
 def _overlap(edges: Array, count: int) -> Array:
-    """(count, n) which part of each of `count` pixels lies in each of the n intervals between edges [px]."""
+    """(count, n) fraction of each of `count` pixels covered by each of the n intervals between edges [px]."""
     low = np.arange(count)[:, None]
     return np.asarray(np.clip(np.minimum(low + 1, edges[1:]) - np.maximum(low, edges[:-1]), 0, 1), float)
 
 
 def _side(corners: Array) -> float:
-    """Mean length of the sides of a (4, 2) polygon."""
+    """Mean side length of a (4, 2) polygon."""
     return float(np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1).mean())
 
 
-def _off(side: int, options: BoardOptions, bits: int) -> float:
-    """How far from whole numbers of pixels markers are in squares of that side [px]."""
+def _rounding_error(side: int, options: BoardOptions, bits: int) -> float:
+    """Deviation of marker edges from whole pixels at a square side [px]."""
     edge = side * (options.square - options.marker) / options.square / 2
     cell = side * options.marker / options.square / bits
     return round(abs(edge - round(edge)) + bits * abs(cell - round(cell)), 6)
 
 
-def _blurred(grey: Picture) -> NoBoard | None:
-    if np.ptp(np.percentile(grey, (1, 99))) < _LEAST_CONTRAST:
+def _blurred(grey: Pixels) -> NoBoard | None:
+    if np.ptp(np.percentile(grey, (1, 99))) < _MIN_CONTRAST:
         return None
     blur = _blur(grey)
-    return NoBoard("blurred", f"edges are smeared over {blur:.1f} px") if blur > _SMEARED else None
+    return NoBoard("blurred", f"edges are blurred over {blur:.1f} px") if blur > _BLURRED else None
 
 
-def _blur(grey: Picture) -> float:
-    """Standard deviation of how far the strongest edges of a picture are smeared [px], 0.4 or so when it is sharp.
+def _blur(grey: Pixels) -> float:
+    """Standard deviation of the blur of the strongest edges in an image [px]; about 0.4 if sharp.
 
-    A step of height h that is smeared by a Gaussian of deviation s rises by h (2 Phi(1 / s) - 1) over two pixels.
+    A step of height h, blurred by a Gaussian of deviation s, rises by h (2 Phi(1 / s) - 1) over two pixels.
     """
     around = np.ones((_WINDOW, _WINDOW), np.uint8)
     height = np.asarray(cv2.morphologyEx(grey, cv2.MORPH_GRADIENT, around), float)
     across, down = cv2.Sobel(grey, cv2.CV_64F, 1, 0, scale=1 / 8), cv2.Sobel(grey, cv2.CV_64F, 0, 1, scale=1 / 8)
-    steep = np.asarray(cv2.dilate(np.hypot(across, down), around), float)
+    slope = np.asarray(cv2.dilate(np.hypot(across, down), around), float)
     edges = height >= 0.7 * float(np.percentile(height, 99))
-    rise = float(np.median(steep[edges] / np.maximum(height[edges], 1.0)))  # per pixel, of the whole step
+    rise = float(np.median(slope[edges] / np.maximum(height[edges], 1.0)))  # per pixel, of the whole step
     return 1 / NormalDist().inv_cdf(0.5 + min(max(rise, 1e-3), 0.499))

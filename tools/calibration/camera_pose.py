@@ -1,4 +1,4 @@
-"""Pose of a camera in world from pictures of a board that lies where a person measured."""
+"""Pose of a fixed camera in world, from images of a board at measured poses."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ import numpy as np
 import numpy.typing as npt
 
 from common.perception.camera_file import CameraFile
-from common.perception.image_sources import pictures
+from common.perception.image_sources import read_images
 from common.robot.transforms import invert, matrix_to_rpy, transform
 from tools.calibration.board import Board, BoardDetection, NoBoard
 from tools.calibration.intrinsics import CalibrationFailed, ViewResidual
 
 Array = npt.NDArray[np.float64]
 
-_OUTLIER = 3.0, 0.2  # a picture is dropped when its residual is above so many medians, and above so many [px]
-_WORST_FIT = 2.0  # [px] rms above which the board cannot have lain still where it is said to have been
-_GRID = 5  # places along each side of the picture at which the uncertainty is looked at
+_OUTLIER = 3.0, 0.2  # residual of a dropped image: times the median, and [px]
+_MAX_RMS = 2.0  # [px] above which board or camera moved, or the given board pose is wrong
+_GRID = 5  # points along each image side at which uncertainty is evaluated
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,13 +29,13 @@ class PoseCalibration:
 
     Attributes:
         T_world_camera: (4, 4) pose of the optical frame in world.
-        position_std: standard deviation of the optical centre, along x, y, z of world [m].
-        rotation_std: standard deviation of the rotation, over all axes [rad].
-        place_std: standard deviation of a place on the board's plane, at the worst place of the picture [m].
-        rms: residual of all corners in the picture [px].
+        position_std: standard deviation of the optical center along x, y, z of world [m].
+        rotation_std: standard deviation of the rotation over all axes [rad].
+        place_std: standard deviation of a point on the board's plane, at the worst point of the image [m].
+        rms: residual of all corners in the image [px].
         rms_on_board: residual of all corners on the board [m].
-        pictures: those that were fitted.
-        dropped: those that did not fit.
+        pictures: fitted images.
+        dropped: outlier images.
     """
 
     T_world_camera: Array
@@ -49,7 +49,7 @@ class PoseCalibration:
 
     @property
     def position(self) -> tuple[float, float, float]:
-        """Optical centre in world [m]."""
+        """Optical center in world [m]."""
         x, y, z = self.T_world_camera[:3, 3]
         return float(x), float(y), float(z)
 
@@ -60,87 +60,88 @@ class PoseCalibration:
 
 
 @dataclass(frozen=True, eq=False)
-class _Seen:
-    """A sighting with the place of its board: corners in world (n, 3) [m], and in the picture without distortion."""
+class _PlacedDetection:
+    """A detection with its board's pose: corners in world (n, 3) [m], and undistorted pixels."""
 
-    sighting: BoardDetection
+    detection: BoardDetection
     T_world_board: Array
     points: Array
-    ideal: Array  # (n, 1, 2) [px], as a pinhole with the same k would see them
+    ideal: Array  # (n, 1, 2) [px], undistorted
 
 
 def calibrate_pose(
     places: Sequence[tuple[Array, Sequence[BoardDetection]]], camera: CameraFile
 ) -> PoseCalibration:
-    """The pose that fits the corners of all pictures best; pictures that do not fit the others are dropped.
+    """Fit the camera pose to the corners of all images; outlier images are dropped.
 
     Args:
-        places: pose of the board in world (4, 4), and what was seen of it there; the camera is always where it is.
+        places: pose of the board in world (4, 4), and its detections there; the camera does not move.
         camera: its intrinsics.
 
     Raises:
-        CalibrationFailed: no picture shows the board, it has another size, or the pictures contradict each other.
+        CalibrationFailed: no image shows the board, it has another size, or the images are inconsistent.
     """
-    seen = [_straightened(sighting, T, camera) for T, sightings in places for sighting in sightings]
-    if not seen:
-        raise CalibrationFailed("no picture shows the board")
+    detected = [_undistorted(detection, T, camera) for T, detections in places for detection in detections]
+    if not detected:
+        raise CalibrationFailed("no image shows the board")
     K, dropped = camera.matrix, []
     while True:
-        T_camera_world = _fit(seen, K)
-        errors = [_errors(one, T_camera_world, K) for one in seen]
+        T_camera_world = _fit(detected, K)
+        errors = [_errors(view, T_camera_world, K) for view in detected]
         residuals = [_rms(e) for e in errors]
         limit = max(_OUTLIER[0] * float(np.median(residuals)), _OUTLIER[1])
         worst = int(np.argmax(residuals))
-        if residuals[worst] <= limit or len(seen) == 1:
+        if residuals[worst] <= limit or len(detected) == 1:
             break
-        dropped.append(ViewResidual(seen[worst].sighting.name, len(errors[worst]), residuals[worst]))
-        seen = [one for k, one in enumerate(seen) if k != worst]
+        dropped.append(ViewResidual(detected[worst].detection.name, len(errors[worst]), residuals[worst]))
+        detected = [view for k, view in enumerate(detected) if k != worst]
     rms = _rms(np.concatenate(errors))
-    if rms > _WORST_FIT or len(dropped) > len(seen):
+    if rms > _MAX_RMS or len(dropped) > len(detected):
         raise CalibrationFailed(
-            f"the pictures do not fit together: residual {rms:.1f} px, {len(dropped)} of {len(dropped) + len(seen)} "
-            "dropped; did the camera or the board move, is the board where it is said to be, are its squares as long?"
+            f"the images are inconsistent: residual {rms:.1f} px, {len(dropped)} of {len(dropped) + len(detected)} "
+            "dropped; check that camera and board did not move, and the given pose and square size of the board"
         )
     T_world_camera = invert(T_camera_world)
-    position, rotation, place = _uncertainty(seen, T_camera_world, K, rms, camera)
-    on_board = np.concatenate([_on_board(one, T_world_camera, K) for one in seen])
-    pictures = [ViewResidual(one.sighting.name, len(one.points), r) for one, r in zip(seen, residuals, strict=True)]
+    position, rotation, place = _uncertainty(detected, T_camera_world, K, rms, camera)
+    on_board = np.concatenate([_on_board(view, T_world_camera, K) for view in detected])
+    pictures = [ViewResidual(view.detection.name, len(view.points), r)
+                for view, r in zip(detected, residuals, strict=True)]
     return PoseCalibration(T_world_camera, position, rotation, place, rms, _rms(on_board), pictures, dropped)
 
 
 def detect_boards_in(source: str, board: Board, camera: CameraFile, most: int, seconds: float) -> list[BoardDetection]:
-    """What is seen of the board in pictures of a source, in so many of them at most.
+    """Detect the board in the images of a source, in at most `most` of them.
 
     Args:
         source: device, file or folder.
-        board: that is looked for.
+        board: to detect.
         camera: its intrinsics.
-        most: pictures with the board.
-        seconds: how long a device is looked at.
+        most: images with the board.
+        seconds: duration for a device.
 
     Raises:
-        CalibrationFailed: the board is in none; why it is not in most of them.
-        ConfigError: the source is nothing that pictures can be read from.
+        CalibrationFailed: no image shows it; reports the most frequent reason.
+        ConfigError: the source cannot be read.
     """
-    seen: list[BoardDetection] = []
-    why: list[str] = []
-    for name, picture in pictures(source, (camera.width, camera.height), seconds):
+    detected: list[BoardDetection] = []
+    reasons_: list[str] = []
+    for name, picture in read_images(source, (camera.width, camera.height), seconds):
         found, reasons = detect_boards(board, [(f"{source}: {name}", picture)], camera)
-        seen, why = seen + found, why + reasons
-        if len(seen) >= most:
+        detected, reasons_ = detected + found, reasons_ + reasons
+        if len(detected) >= most:
             break
-    if not seen:
-        raise CalibrationFailed(f"{source}: the board ({board.options}) is in none of {len(why)} pictures: "
-                                f"{max(set(why), key=why.count)}")
-    return seen
+    if not detected:
+        raise CalibrationFailed(f"{source}: the board ({board.options}) is in none of {len(reasons_)} images: "
+                                f"{max(set(reasons_), key=reasons_.count)}")
+    return detected
 
 
 def detect_boards(board: Board, pictures: Sequence[tuple[str, npt.NDArray[np.uint8]]], camera: CameraFile,
                  max_blur: float = 2.5) -> tuple[list[BoardDetection], list[str]]:
-    """Where the board is seen, and for each picture without it the reason.
+    """Return the detections, and the reason for each image without the board.
 
     Raises:
-        CalibrationFailed: a picture has another size than the intrinsics are for.
+        CalibrationFailed: an image size differs from the intrinsics.
     """
     found: list[BoardDetection] = []
     reasons: list[str] = []
@@ -149,33 +150,34 @@ def detect_boards(board: Board, pictures: Sequence[tuple[str, npt.NDArray[np.uin
         if (width, height) != (camera.width, camera.height):
             raise CalibrationFailed(f"{name} is {width}x{height}, but the intrinsics are for "
                                     f"{camera.width}x{camera.height}")
-        sighting = board.find(picture, name)
-        if isinstance(sighting, NoBoard):
-            reasons.append(sighting.reason)
-        elif sighting.blur > max_blur:
-            reasons.append(f"edges are smeared over {sighting.blur:.1f} px")
+        detection = board.find(picture, name)
+        if isinstance(detection, NoBoard):
+            reasons.append(detection.reason)
+        elif detection.blur > max_blur:
+            reasons.append(f"edges are blurred over {detection.blur:.1f} px")
         else:
-            found.append(sighting)
+            found.append(detection)
     return found, reasons
 
 
-def _straightened(sighting: BoardDetection, T_world_board: Array, camera: CameraFile) -> _Seen:
-    ideal = camera.undistorted(sighting.pixels)
-    points = sighting.points @ T_world_board[:3, :3].T + T_world_board[:3, 3]
-    return _Seen(sighting, T_world_board, points, ideal[:, None])
+def _undistorted(detection: BoardDetection, T_world_board: Array, camera: CameraFile) -> _PlacedDetection:
+    ideal = camera.undistorted(detection.pixels)
+    points = detection.points @ T_world_board[:3, :3].T + T_world_board[:3, 3]
+    return _PlacedDetection(detection, T_world_board, points, ideal[:, None])
 
 
-def _fit(seen: Sequence[_Seen], K: Array) -> Array:
+def _fit(detected: Sequence[_PlacedDetection], K: Array) -> Array:
     """T_camera_world (4, 4) with the least residual over all corners.
 
-    A plane that is seen from afar has two poses that look much alike (T. Collins, A. Bartoli, Infinitesimal
-    plane-based pose estimation, IJCV 109 (2014), 252-286): both are refined, the better one is taken.
+    A distant plane has two similar poses (T. Collins, A. Bartoli, Infinitesimal plane-based pose estimation, IJCV 109
+    (2014), 252-286): both are refined and the better one is returned.
     """
-    most = max(seen, key=lambda one: len(one.points))
+    most = max(detected, key=lambda view: len(view.points))
     _, rotations, translations, _ = cv2.solvePnPGeneric(
-        most.sighting.points, most.ideal, K, None, flags=cv2.SOLVEPNP_IPPE
+        most.detection.points, most.ideal, K, None, flags=cv2.SOLVEPNP_IPPE
     )
-    points, ideal = np.concatenate([one.points for one in seen]), np.concatenate([one.ideal for one in seen])
+    points = np.concatenate([view.points for view in detected])
+    ideal = np.concatenate([view.ideal for view in detected])
     best, least = np.eye(4), math.inf
     for rotation, translation in zip(rotations, translations, strict=True):
         start = _pose(rotation, translation) @ invert(most.T_world_board)
@@ -190,53 +192,53 @@ def _fit(seen: Sequence[_Seen], K: Array) -> Array:
 
 
 def _uncertainty(
-    seen: Sequence[_Seen], T_camera_world: Array, K: Array, rms: float, camera: CameraFile
+    detected: Sequence[_PlacedDetection], T_camera_world: Array, K: Array, rms: float, camera: CameraFile
 ) -> tuple[tuple[float, float, float], float, float]:
-    """Standard deviations of position [m], rotation [rad] and of a place on the board's plane [m], to first order."""
-    points = np.concatenate([one.points for one in seen])
+    """First order standard deviations of position [m], rotation [rad] and a point on the board's plane [m]."""
+    points = np.concatenate([view.points for view in detected])
     nudges = [_nudge(T_camera_world, axis, 1e-6) for axis in range(6)]
     here = _project(points, T_camera_world, K)
     J = np.stack([(_project(points, T, K) - here).ravel() / 1e-6 for T in nudges], axis=1)
-    # The rms is that of a corner, of u and v together. Pictures of one place err alike: they count as one.
-    repeated = len(seen) / len({one.T_world_board.tobytes() for one in seen})
+    # The rms is that of a corner, of u and v together. Images of one board pose are correlated: they count as one.
+    repeated = len(detected) / len({view.T_world_board.tobytes() for view in detected})
     covariance = repeated * rms**2 / 2 * np.linalg.inv(J.T @ J)
     centre = invert(T_camera_world)[:3, 3]
     D = np.stack([(invert(T)[:3, 3] - centre) / 1e-6 for T in nudges], axis=1)
     x, y, z = np.sqrt(np.diag(D @ covariance @ D.T))
     u, v = np.meshgrid(np.linspace(0, camera.width - 1, _GRID), np.linspace(0, camera.height - 1, _GRID))
     grid = np.stack([u.ravel(), v.ravel()], axis=1)
-    board = seen[0].T_world_board
-    there = _on_plane(grid, invert(T_camera_world), K, board)
-    G = np.stack([(_on_plane(grid, invert(T), K, board) - there) / 1e-6 for T in nudges], axis=-1)  # (n, 2, 6)
+    board = detected[0].T_world_board
+    intersection = _on_plane(grid, invert(T_camera_world), K, board)
+    G = np.stack([(_on_plane(grid, invert(T), K, board) - intersection) / 1e-6 for T in nudges], axis=-1)  # (n, 2, 6)
     spread = np.sqrt(np.einsum("nik,kl,nil->n", G, covariance, G))
     return (float(x), float(y), float(z)), float(np.sqrt(np.trace(covariance[:3, :3]))), float(np.nanmax(spread))
 
 
 def _nudge(T: Array, axis: int, by: float) -> Array:
-    """T turned about (axes 0 to 2) or moved along (3 to 5) an axis of the camera."""
+    """Rotate T about (axes 0 to 2), or translate it along (3 to 5), an axis of the camera."""
     step = np.zeros(6)
     step[axis] = by
     return transform(np.asarray(cv2.Rodrigues(step[:3])[0], float), step[3:]) @ T
 
 
-def _errors(one: _Seen, T_camera_world: Array, K: Array) -> Array:
+def _errors(view: _PlacedDetection, T_camera_world: Array, K: Array) -> Array:
     """(n, 2) [px]."""
-    return _project(one.points, T_camera_world, K) - one.ideal[:, 0]
+    return _project(view.points, T_camera_world, K) - view.ideal[:, 0]
 
 
-def _on_board(one: _Seen, T_world_camera: Array, K: Array) -> Array:
-    """(n, 2) how far from its corners the rays of their pixels meet the board [m]."""
-    return _on_plane(one.ideal[:, 0], T_world_camera, K, one.T_world_board) - one.sighting.points[:, :2]
+def _on_board(view: _PlacedDetection, T_world_camera: Array, K: Array) -> Array:
+    """(n, 2) offsets [m] of the pixel rays from their corners on the board."""
+    return _on_plane(view.ideal[:, 0], T_world_camera, K, view.T_world_board) - view.detection.points[:, :2]
 
 
 def _on_plane(pixels: Array, T_world_camera: Array, K: Array, T_world_board: Array) -> Array:
-    """(n, 2) where rays through pixels meet the plane of a board, in its frame [m]; nan where they do not."""
+    """(n, 2) intersections of pixel rays with the plane of a board, in its frame [m]; nan without one."""
     T = invert(T_world_board) @ T_world_camera
     rays = np.concatenate([(pixels - K[:2, 2]) / np.diag(K)[:2], np.ones((len(pixels), 1))], axis=1) @ T[:3, :3].T
     with np.errstate(divide="ignore", invalid="ignore"):
         along = np.where(rays[:, 2] * T[2, 3] < 0, -T[2, 3] / rays[:, 2], np.nan)
-    there: Array = T[:2, 3] + along[:, None] * rays[:, :2]
-    return there
+    intersection: Array = T[:2, 3] + along[:, None] * rays[:, :2]
+    return intersection
 
 
 def _project(points: Array, T_camera_world: Array, K: Array) -> Array:
@@ -250,5 +252,5 @@ def _pose(rotation: npt.ArrayLike, translation: npt.ArrayLike) -> Array:
 
 
 def _rms(errors: Array) -> float:
-    """Root of the mean squared length of (n, 2) errors."""
+    """Root mean square length of (n, 2) errors."""
     return float(np.sqrt((errors**2).sum(axis=1).mean()))

@@ -1,10 +1,10 @@
-"""Places the corners of a board to a hundredth of a pixel, by comparing the picture with what was printed.
+"""Refine board corners to a hundredth of a pixel by registering the image with the printed board.
 
-Around each corner the printed board is drawn as the camera would see it there, and a motion, a gain and a ramp of
-brightness are fitted to all pixels: B. D. Lucas, T. Kanade, An iterative image registration technique, IJCAI 1981;
-S. Baker, I. Matthews, Lucas-Kanade 20 years on, IJCV 56 (2004), 221-255. The motion is quadratic in place, because the
-lens bends what is drawn straight. Saddle points alone give a tenth of a pixel, because between the squares and the
-markers there are only a few pixels to look at.
+The board is rendered around each corner as the camera sees it; a displacement, a gain and a brightness ramp are fitted
+to all pixels: B. D. Lucas, T. Kanade, An iterative image registration technique, IJCAI 1981; S. Baker, I. Matthews,
+Lucas-Kanade 20 years on, IJCV 56 (2004), 221-255. The displacement is quadratic in position, because the lens bends
+straight lines. Saddle point refinement alone reaches a tenth of a pixel, because squares and markers are only a few
+pixels apart.
 """
 
 from __future__ import annotations
@@ -16,28 +16,28 @@ import numpy as np
 import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
-Picture = npt.NDArray[np.uint8]
+Pixels = npt.NDArray[np.uint8]
 
-SMEARED = 1.0  # [px] of a page
-_PIXEL = 1 / 12  # [px^2] variance of a pixel, which sees all of its square
+PAGE_BLUR = 1.0  # [px] of a page
+_PIXEL = 1 / 12  # [px^2] variance of a square pixel's aperture
 _STEPS = 3
-_FINER = 3  # rays along each side of a pixel when the board is drawn
-_REACH = 0.8  # half side of what is compared, in squares
-_LEAST_REACH, _MOST_REACH = 6, 40  # [px]
-_NEIGHBOURS = 9  # corners that say how the board lies around one of them
-_MOST_SHIFT = 2.0  # [px]; a corner that goes further was none
-_LEAST_FIT = 0.8  # part of the variation of brightness that the printed board must explain
+_OVERSAMPLING = 3  # samples along each pixel side when rendering
+_REACH = 0.8  # half side of the compared window, in squares
+_MIN_REACH, _MAX_REACH = 6, 40  # [px]
+_NEIGHBORS = 9  # corners that define the local homography
+_MAX_SHIFT = 2.0  # [px] of a valid corner
+_MIN_FIT = 0.8  # fraction of brightness variance that the print must explain
 
 
 @dataclass(frozen=True, eq=False)
-class Print:
-    """What is printed, as coarse as a camera may see it.
+class PrintedBoard:
+    """The printed board at several resolutions.
 
     Attributes:
-        pages: grey pictures, each smeared by one of its pixels so that it can be sampled, one square of white around.
-        sides: pixels of a square in each of them, increasing.
+        pages: grey images with a border of one white square, blurred by one pixel so that they can be sampled.
+        sides: pixels of a square in each page, increasing.
         rows: of squares.
-        square: length of one [m].
+        square: side length [m].
     """
 
     pages: list[npt.NDArray[np.float32]]
@@ -46,119 +46,126 @@ class Print:
     square: float
 
     def at(self, side: float) -> tuple[npt.NDArray[np.float32], Array, float]:
-        """For a picture in which squares have that side [px]: page, (3, 3) from the board's frame [m] to its pixels,
-        and the deviation by which it is smeared, in pixels of the picture."""
+        """Select the page for squares of `side` pixels in the image.
+
+        Returns:
+            The page, (3, 3) from the board's frame [m] to its pixels, and its blur in pixels of the image.
+        """
         level = next((k for k, fine in enumerate(self.sides) if fine >= 1.5 * side), len(self.sides) - 1)
         fine = self.sides[level]
         scale = fine / self.square
         to_pixels = np.array([[scale, 0, fine - 0.5], [0, -scale, (self.rows + 1) * fine - 0.5], [0, 0, 1]])
-        return self.pages[level], to_pixels, SMEARED * side / fine
+        return self.pages[level], to_pixels, PAGE_BLUR * side / fine
 
 
 def refine(
-    grey: Picture, sheet: Print, points: Array, pixels: Array, blur: float
+    grey: Pixels, sheet: PrintedBoard, points: Array, pixels: Array, blur: float
 ) -> tuple[Array, npt.NDArray[np.bool_]]:
-    """Places of corners in the picture (n, 2) [px], and which of them look as they should (n,).
+    """Refine corner positions.
 
     Args:
-        grey: the picture.
-        sheet: what is printed.
-        points: (n, 2) the corners in the board's frame [m], at least four.
-        pixels: (n, 2) about where they are seen [px].
-        blur: standard deviation of smeared edges [px].
+        grey: the image.
+        sheet: the printed board.
+        points: (n, 2) corners in the board's frame [m], at least four.
+        pixels: (n, 2) approximate positions [px].
+        blur: standard deviation of edge blur [px].
+
+    Returns:
+        (n, 2) refined positions [px], and (n,) which corners match the print.
     """
-    start, here = pixels, pixels.copy()
-    good = np.ones(len(points), bool)
-    near = np.argsort(np.linalg.norm(points[:, None] - points[None], axis=2), axis=1)[:, :_NEIGHBOURS]
+    start, current = pixels, pixels.copy()
+    valid = np.ones(len(points), bool)
+    near = np.argsort(np.linalg.norm(points[:, None] - points[None], axis=2), axis=1)[:, :_NEIGHBORS]
     for _ in range(_STEPS):
-        there = here.copy()
-        for k in np.flatnonzero(good):
-            H = _local(points, here, near[k], good)
+        refined = current.copy()
+        for k in np.flatnonzero(valid):
+            H = _local(points, current, near[k], valid)
             moved = None if H is None else _step(grey, sheet, H, points[k], blur)
-            if moved is None or np.linalg.norm(moved - start[k]) > _MOST_SHIFT:
-                good[k] = False
+            if moved is None or np.linalg.norm(moved - start[k]) > _MAX_SHIFT:
+                valid[k] = False
             else:
-                there[k] = moved
-        here = there
-    return here, good
+                refined[k] = moved
+        current = refined
+    return current, valid
 
 
-def _local(points: Array, pixels: Array, near: npt.NDArray[np.intp], good: npt.NDArray[np.bool_]) -> Array | None:
-    """(3, 3) from the board's frame to the picture, as the corners near one of them say; it passes through that one."""
-    chosen = [k for k in near if good[k]]
-    middle = points[near[0]]
-    if len(chosen) < 5 or np.linalg.matrix_rank(points[chosen] - middle, 1e-6) < 2:
-        chosen = list(np.flatnonzero(good))
-    if len(chosen) < 4:
+def _local(points: Array, pixels: Array, near: npt.NDArray[np.intp], valid: npt.NDArray[np.bool_]) -> Array | None:
+    """(3, 3) homography from the board to the image by the corners near one of them, passing through that one."""
+    selected = [k for k in near if valid[k]]
+    center = points[near[0]]
+    if len(selected) < 5 or np.linalg.matrix_rank(points[selected] - center, 1e-6) < 2:
+        selected = list(np.flatnonzero(valid))
+    if len(selected) < 4:
         return None
-    H = homography(points[chosen], pixels[chosen])
+    H = homography(points[selected], pixels[selected])
     if H is None:
         return None
-    off = pixels[near[0]] - mapped(H, middle[None])[0]
+    off = pixels[near[0]] - mapped(H, center[None])[0]
     through: Array = np.array([[1, 0, off[0]], [0, 1, off[1]], [0, 0, 1.0]]) @ H
     return through
 
 
-def _step(grey: Picture, sheet: Print, H: Array, point: Array, blur: float) -> Array | None:
-    """Where the corner is, one step nearer; None when the picture does not look like the board there."""
-    middle = mapped(H, point[None])[0]
+def _step(grey: Pixels, sheet: PrintedBoard, H: Array, point: Array, blur: float) -> Array | None:
+    """One refinement step of a corner; None if the image does not match the print there."""
+    center = mapped(H, point[None])[0]
     ends = mapped(H, point + sheet.square * np.array([[1, 0], [0, 1.0]]))
-    side = float(np.linalg.norm(ends - middle, axis=1).min())
-    reach = int(np.clip(_REACH * side, _LEAST_REACH, _MOST_REACH))
-    low = np.round(middle).astype(int) - reach
+    side = float(np.linalg.norm(ends - center, axis=1).min())
+    reach = int(np.clip(_REACH * side, _MIN_REACH, _MAX_REACH))
+    low = np.round(center).astype(int) - reach
     high = low + 2 * reach + 1
     if (low < 0).any() or high[0] > grey.shape[1] or high[1] > grey.shape[0]:
         cut = np.maximum(np.maximum(-low, high - (grey.shape[1], grey.shape[0])), 0).max()
-        if reach - cut < _LEAST_REACH:
+        if reach - cut < _MIN_REACH:
             return None
         reach -= int(cut)
         low, high = low + cut, high - cut
     seen = grey[low[1] : high[1], low[0] : high[0]].astype(float)
-    drawn = _drawn(sheet, H, low, reach, side, blur)
+    drawn = _render(sheet, H, low, reach, side, blur)
     across, down = np.gradient(drawn, axis=1), np.gradient(drawn, axis=0)
-    x = np.broadcast_to((low[0] - middle[0] + np.arange(2 * reach + 1)) / reach, drawn.shape)
-    y = np.broadcast_to(((low[1] - middle[1]) + np.arange(2 * reach + 1))[:, None] / reach, drawn.shape)
-    one = np.ones_like(drawn)
-    # seen(p) = gain drawn(p - motion(p)) + ramp: linear in gain, gain times motion, and the ramp.
-    motion = (one, x, y, x * x, x * y, y * y)
-    terms = (drawn, *(across * part for part in motion), *(down * part for part in motion), one, x, y)
+    x = np.broadcast_to((low[0] - center[0] + np.arange(2 * reach + 1)) / reach, drawn.shape)
+    y = np.broadcast_to(((low[1] - center[1]) + np.arange(2 * reach + 1))[:, None] / reach, drawn.shape)
+    ones = np.ones_like(drawn)
+    # seen(p) = gain drawn(p - motion(p)) + ramp is linear in gain, gain times motion, and the ramp.
+    motion = (ones, x, y, x * x, x * y, y * y)
+    terms = (drawn, *(across * part for part in motion), *(down * part for part in motion), ones, x, y)
     A = np.stack([term.ravel() for term in terms], axis=1)
     try:
         found = np.linalg.solve(A.T @ A, A.T @ seen.ravel())
-    except np.linalg.LinAlgError:  # one colour only
+    except np.linalg.LinAlgError:  # uniform image
         return None
-    gain, left = found[0], seen.ravel() - A @ found
-    if gain <= 0.05 or left.var() > (1 - _LEAST_FIT) * seen.var():
+    gain, residual = found[0], seen.ravel() - A @ found
+    if gain <= 0.05 or residual.var() > (1 - _MIN_FIT) * seen.var():
         return None
-    moved: Array = middle - np.array([found[1], found[7]]) / gain
+    moved: Array = center - np.array([found[1], found[7]]) / gain
     return moved
 
 
-def _drawn(sheet: Print, H: Array, low: npt.NDArray[np.intp], reach: int, side: float, blur: float) -> Array:
-    """The board around a corner as the camera would see it: (2 reach + 1, 2 reach + 1)."""
-    margin = 3  # [px], so that smearing knows what comes from outside
-    whole = 2 * (reach + margin) + 1
-    page, to_pixels, smeared = sheet.at(side)
-    # From parts of pixels of the window to pixels of the page.
-    shift = (1 / _FINER - 1) / 2 - margin
-    to_picture = np.array([[1 / _FINER, 0, low[0] + shift], [0, 1 / _FINER, low[1] + shift], [0, 0, 1.0]])
+def _render(sheet: PrintedBoard, H: Array, low: npt.NDArray[np.intp], reach: int, side: float, blur: float) -> Array:
+    """Render the board around a corner as the camera sees it: (2 reach + 1, 2 reach + 1)."""
+    margin = 3  # [px] for the blur kernel
+    size = 2 * (reach + margin) + 1
+    page, to_pixels, page_blur = sheet.at(side)
+    # From oversampled window pixels to page pixels.
+    shift = (1 / _OVERSAMPLING - 1) / 2 - margin
+    to_picture = np.array([[1 / _OVERSAMPLING, 0, low[0] + shift], [0, 1 / _OVERSAMPLING, low[1] + shift], [0, 0, 1.0]])
     to_page = to_pixels @ np.linalg.inv(H) @ to_picture
     fine = cv2.warpPerspective(
-        page, to_page, (whole * _FINER, whole * _FINER), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, borderValue=255
+        page, to_page, (size * _OVERSAMPLING, size * _OVERSAMPLING),
+        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, borderValue=255,
     )
-    drawn = np.asarray(cv2.resize(fine, (whole, whole), interpolation=cv2.INTER_AREA), float)
-    more = float(np.sqrt(max(blur**2 - smeared**2 - _PIXEL, 0.0)))
-    if more > 0.2:
-        drawn = np.asarray(cv2.GaussianBlur(drawn, (0, 0), more), float)
+    drawn = np.asarray(cv2.resize(fine, (size, size), interpolation=cv2.INTER_AREA), float)
+    extra_blur = float(np.sqrt(max(blur**2 - page_blur**2 - _PIXEL, 0.0)))
+    if extra_blur > 0.2:
+        drawn = np.asarray(cv2.GaussianBlur(drawn, (0, 0), extra_blur), float)
     return drawn[margin:-margin, margin:-margin]
 
 
 def homography(points: Array, pixels: Array) -> Array | None:
-    """(3, 3) from points (n, 2) to pixels (n, 2) with the least squares of errors; None when they do not tell."""
-    found: object = cv2.findHomography(points, pixels)[0]  # None sometimes, which OpenCV's types do not say
+    """(3, 3) least squares homography from points (n, 2) to pixels (n, 2); None if undetermined."""
+    found: object = cv2.findHomography(points, pixels)[0]  # may be None, despite OpenCV's types
     return None if found is None else np.array(found, float)
 
 
 def mapped(H: Array, points: Array) -> Array:
-    """Points (n, 2) through a homography (3, 3)."""
+    """Map points (n, 2) by a homography (3, 3)."""
     return np.asarray(cv2.perspectiveTransform(points[:, None].astype(float), H), float)[:, 0]

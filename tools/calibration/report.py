@@ -1,4 +1,4 @@
-"""What a calibration found, in lines for people."""
+"""Report calibration results: text for people, and records in the camera file."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from tools.calibration.camera_pose import PoseCalibration
 from tools.calibration.hand_eye import HandEyeCalibration
 from tools.calibration.intrinsics import IntrinsicCalibration, ViewResidual
 
-_MOST_LISTED = 12  # views of which the residuals are shown
+_MAX_LISTED = 12  # views with listed residuals
 
 
 def format_intrinsics(found: IntrinsicCalibration) -> str:
-    """Focal lengths, centre and distortion, how well they are known, and where nothing was seen."""
+    """Text: intrinsics and distortion with uncertainties, and regions without corners."""
     lines = [
-        f"{len(found.views)} views, {found.corners} corners, {100 * found.coverage:.0f} % of the picture covered",
+        f"{len(found.views)} views, {found.corners} corners, {100 * found.coverage:.0f} % of the image covered",
         f"residual {found.rms:.3f} px rms; {_per_view(found.views)}",
         *(f"{name} {value:8.2f} +- {std:.2f} px" for name, value, std in
           zip(("fx", "fy", "cx", "cy"), found.k, found.k_std, strict=True)),
@@ -27,33 +27,33 @@ def format_intrinsics(found: IntrinsicCalibration) -> str:
         *_dropped(found.dropped),
     ]
     if found.unseen:
-        lines.append(f"no corner was seen in these parts of the picture: {', '.join(found.unseen)}; "
-                     "views with the board there make the distortion better")
+        lines.append(f"no corners in these parts of the image: {', '.join(found.unseen)}; "
+                     "add views with the board there to improve the distortion")
     return "\n".join(lines)
 
 
 def format_pose(result: PoseCalibration) -> str:
-    """Where a camera is in world, and how well that is known."""
+    """Text: pose of a camera in world with uncertainties."""
     return "\n".join([
-        f"{len(result.pictures)} pictures, residual {result.rms:.3f} px rms, "
+        f"{len(result.pictures)} images, residual {result.rms:.3f} px rms, "
         f"{1e3 * result.rms_on_board:.3f} mm on the board; {_per_view(result.pictures)}",
-        *_placed(result, ""),
-        f"places on the board's plane +- {1e3 * result.place_std:.2f} mm where it is worst in the picture",
+        *_pose_lines(result, ""),
+        f"points on the board's plane +- {1e3 * result.place_std:.2f} mm at the worst point of the image",
         *_dropped(result.dropped),
     ])
 
 
 def format_hand_eye(result: HandEyeCalibration) -> str:
-    """Where a camera is on the hand, or beside an arm that holds the board."""
+    """Text: pose of a camera on the gripper, or beside an arm that holds the board."""
     return "\n".join([
         f"{len(result.pictures)} views, residual {result.rms:.3f} px rms, {1e3 * result.rms_at_board:.2f} mm at the "
         f"board; {_per_view(result.pictures)}",
-        *_placed(result, f" in {'the tool centre point' if result.mount == 'hand' else 'world'}"),
+        *_pose_lines(result, f" in {'the tool center point' if result.mount == 'hand' else 'world'}"),
         *_dropped(result.dropped),
     ])
 
 
-def _placed(result: PoseCalibration | HandEyeCalibration, frame: str) -> list[str]:
+def _pose_lines(result: PoseCalibration | HandEyeCalibration, frame: str) -> list[str]:
     x, y, z = result.position
     roll, pitch, yaw = result.rpy
     return [f"position {x:.5f}, {y:.5f}, {z:.5f} m{frame} +- {1e3 * max(result.position_std):.2f} mm",
@@ -61,21 +61,21 @@ def _placed(result: PoseCalibration | HandEyeCalibration, frame: str) -> list[st
 
 
 def _dropped(views: list[ViewResidual]) -> list[str]:
-    return [f"dropped, since they do not fit: {_per_view(views)}"] if views else []
+    return [f"dropped outliers: {_per_view(views)}"] if views else []
 
 
 def _per_view(views: list[ViewResidual]) -> str:
-    """Residuals of views [px], in their order; of many only the worst."""
-    if len(views) <= _MOST_LISTED:
+    """Residuals of views [px] in order; if there are many, only the worst."""
+    if len(views) <= _MAX_LISTED:
         return ", ".join(f"{view.name} {view.rms:.3f}" for view in views)
-    worst = sorted(views, key=lambda view: -view.rms)[:_MOST_LISTED]
+    worst = sorted(views, key=lambda view: -view.rms)[:_MAX_LISTED]
     return "worst: " + ", ".join(f"{view.name} {view.rms:.3f}" for view in worst)
 
 
-# A camera file with what was found, and with how: so that it can be judged later."""
+# Records in the camera file
 
 def camera_from_intrinsics(found: IntrinsicCalibration, source: str, board: str) -> CameraFile:
-    """A camera whose intrinsics were found with pictures of a source, of a board that words describe."""
+    """Return a camera with calibrated intrinsics; `source` and `board` describe the images."""
     names = ("fx", "fy", "cx", "cy")
     camera = CameraFile(width=found.size[0], height=found.size[1], d=found.d, **dict(zip(names, found.k, strict=True)))
     record = {"date": _today(), "source": source, "board": board, "distortion_model": camera.distortion_model,
@@ -88,7 +88,7 @@ def with_pose(
     camera: CameraFile, found: PoseCalibration, sources: Sequence[str], positions: Sequence[Sequence[float]],
     angles: Sequence[Sequence[float]],
 ) -> CameraFile:
-    """The camera with its pose in world, from pictures of boards that lay at positions [m], turned by rpy [rad]."""
+    """Return the camera with its pose in world, from boards at positions [m] with rpy [rad]."""
     places = [{"source": source, "board_position": list(position), "board_rpy": list(rpy)}
               for source, position, rpy in zip(sources, positions, angles, strict=True)]
     record = {"date": _today(), "places": places, "pictures": len(found.pictures), "rms_px": found.rms,
@@ -98,7 +98,7 @@ def with_pose(
 
 
 def with_hand_eye(camera: CameraFile, found: HandEyeCalibration, source: str, robot: str, mount: str) -> CameraFile:
-    """The camera with where it sits on the hand, or with its pose in world, beside the arm."""
+    """Return the camera with its pose on the gripper, or in world beside the arm."""
     record: dict[str, Any] = {
         "date": _today(), "source": source, "robot": robot, "camera": mount, "views": len(found.pictures),
         "rms_px": found.rms, "rms_mm": 1e3 * found.rms_at_board, "verdict": found.verdict, **_deviations(found)}

@@ -1,4 +1,4 @@
-"""Ports, and the versions of what answers at them."""
+"""Checks ports, message versions of running cells, and certificates."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ TIMEOUT = 1.0  # [s]
 
 
 def router(endpoint: str) -> Finding:
-    """Who listens where the router of the domain would."""
-    from common.transport.router import holder_of
+    """Check the port of the domain's router."""
+    from common.transport.router import port_holder
 
     host, _, port = endpoint.partition("/")[2].rpartition(":")
     try:
@@ -29,29 +29,29 @@ def router(endpoint: str) -> Finding:
         return ok(f"{endpoint} is free: no cell is up there")
     except OSError as error:
         return warn(f"{endpoint} cannot be reached ({error})", "check --connect and the network")
-    holder = holder_of(int(port))
+    holder = port_holder(int(port))
     if ROUTER_MODULE in holder:
         return ok(f"{endpoint}: a router of zencell answers there, {holder}")
     return warn(f"{endpoint} is in use by {holder}", "stop it, or give zencell another --domain")
 
 
 def page() -> Finding:
-    """Who listens where the operator's page would."""
-    from common.transport.router import holder_of
+    """Check the port of the operator's page."""
+    from common.transport.router import port_holder
 
     where = f"port {PAGE_PORT} of the operator's page"
     with socket.socket() as probe:
         probe.settimeout(TIMEOUT)
         if probe.connect_ex((PAGE_HOST, PAGE_PORT)):
             return ok(f"{where} is free")
-    holder = holder_of(PAGE_PORT)
+    holder = port_holder(PAGE_PORT)
     if VIEWER_MODULE in holder:
         return ok(f"{where}: a page of zencell is served there, {holder}")
     return warn(f"{where} is in use by {holder}", "zencell takes the next free one; --viewer-port N chooses another")
 
 
 def versions(endpoint: str) -> Iterator[Finding]:
-    """Whether the cells that are up speak the same version of the messages, and are run by this Python."""
+    """Check that running cells use the same message version and the same Python."""
     from common.client.joining import is_listening
 
     if not is_listening(endpoint):
@@ -60,7 +60,7 @@ def versions(endpoint: str) -> Iterator[Finding]:
         if problem:
             yield fail(f"cell {cell} at {endpoint}: {problem}", "run the cell and this tool from the same version")
         else:
-            yield ok(f"cell {cell} at {endpoint} speaks the version of this tool")
+            yield ok(f"cell {cell} at {endpoint} has the message version of this tool")
     foreign = foreign_interpreters(service_commands())
     if foreign:
         listed = ", ".join(f"{pid} ({python})" for pid, python in foreign.items())
@@ -69,13 +69,13 @@ def versions(endpoint: str) -> Iterator[Finding]:
 
 
 async def schema_problems(endpoint: str) -> dict[str, str]:
-    """By cell that is up: what is wrong with the version of its messages; empty when nothing is."""
+    """Return the problem with the message version by running cell; empty if there is none."""
     from common import topics
     from common.client.joining import TOOL, ready_services
     from common.errors import DecodeError, NoRouter
     from common.messages import SupervisorStatus
     from common.transport.codec import decode, decode_attachment
-    from common.transport.connect import connect
+    from common.transport.zenoh_session import connect
 
     found: dict[str, str] = {}
     try:
@@ -89,12 +89,12 @@ async def schema_problems(endpoint: str) -> dict[str, str]:
                     except DecodeError as error:
                         found[cell] = str(error)
     except NoRouter:
-        return {}  # what listens there is no router: the line on the port says so
+        return {}  # no router listens there: `router` reports it
     return found
 
 
 def service_commands() -> dict[int, list[str]]:
-    """Command lines of all services on this host, by process."""
+    """Return the command lines of all services on this host by process id."""
     import psutil
 
     found = {}
@@ -106,27 +106,26 @@ def service_commands() -> dict[int, list[str]]:
 
 
 def foreign_interpreters(commands: dict[int, list[str]]) -> dict[int, str]:
-    """By process: the Python that runs it, where that is not this one."""
+    """Return the Python executable by process id, for processes that another Python runs."""
     here = Path(sys.executable).parent
     return {pid: command[0] for pid, command in commands.items() if Path(command[0]).parent != here}
 
 
 def certificates(now: datetime.datetime | None = None) -> Iterator[Finding]:
-    """Until when those of `ZENCELL_SECURE` are valid; nothing for an open cell."""
-    from common.transport.credentials import secure_folder
-    from common.transport.expiry import ends_in, warning_of
+    """Check how long the certificates of `ZENCELL_SECURE` are valid; without access control there are none."""
+    from common.transport.credentials import expiries_in, expiry_warning, secure_folder
 
     folder = secure_folder()
     if folder is None:
         return
     at = now or datetime.datetime.now(datetime.UTC)
-    ends = ends_in(folder)
+    ends = expiries_in(folder)
     if not ends:
-        yield fail(f"{folder} has no certificates that can be read", "make them with `zencell secure init`")
-    found = {name: warning_of(name, until, at) for name, until in ends.items()}
-    for told in found.values():
-        if told is not None:
-            urgent, line = told
+        yield fail(f"{folder} has no readable certificates", "create them with `zencell secure init`")
+    found = {name: expiry_warning(name, until, at) for name, until in ends.items()}
+    for problem in found.values():
+        if problem is not None:
+            urgent, line = problem
             yield (fail if urgent else warn)(line, f"zencell secure renew {folder}")
     if ends and not any(found.values()):
-        yield ok(f"{len(ends)} certificates in {folder}, the first ends on {min(ends.values()):%Y-%m-%d}")
+        yield ok(f"{len(ends)} certificates in {folder}, the first expires on {min(ends.values()):%Y-%m-%d}")

@@ -14,9 +14,8 @@ import yaml
 from common.application import find_application
 from common.config import config_root, find_file, load_cell, load_robot, read_yaml
 from common.errors import ConfigError
-from common.robot.description import SCHEME, find_description, installed_share, package_folders
-from common.robot.merging import read_urdf
 from common.robot.model import RobotModel
+from common.robot.urdf import SCHEME, find_description, installed_share, package_folders, read_urdf
 from tools.robot_setup.proposal import Proposal
 
 

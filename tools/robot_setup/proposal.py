@@ -17,9 +17,9 @@ from common.errors import ConfigError
 from common.planning.disabled_collisions import disabled_pairs, srdf
 from common.planning.robot_geometry import RobotGeometry
 from common.robot.finger_joints import finger_positions
-from common.robot.merging import read_urdf
 from common.robot.model import RobotModel
 from common.robot.transforms import invert, matrix_to_rpy, transform
+from common.robot.urdf import read_urdf
 from tools.robot_setup.end_effector import (
     GripperProposal,
     complaints,

@@ -21,7 +21,7 @@ from common.planning.joint_goals import joint_goals
 from common.planning.joint_paths import straight_edge
 from common.planning.problem import Cancel, Problem, Result
 from common.robot.model import RobotModel
-from common.sources import monotonic
+from common.time_source import monotonic
 
 Array = NDArray[np.float64]
 

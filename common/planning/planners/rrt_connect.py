@@ -16,7 +16,7 @@ from common.planning.joint_paths import straight_edge
 from common.planning.kernel.solvers import SearchResult, find_path
 from common.planning.kernel.world import KernelWorld
 from common.planning.problem import NOT_APPLICABLE, Cancel, Problem, Result
-from common.sources import monotonic
+from common.time_source import monotonic
 
 Array = NDArray[np.float64]
 

@@ -10,7 +10,7 @@ from applications.outlining.solids import PerceivedSolid, collision_object, plan
 from common.config import Surroundings, load_cell
 from common.messages import Color, PlanningScene
 from common.perception.camera_input import FrameError
-from common.scene.home import HomeWatch
+from common.robot.home import HomeMonitor
 from common.transport.codec import decode, encode
 
 CELL = load_cell("ur5")
@@ -54,33 +54,33 @@ def test_scene_that_is_as_full_as_it_may_be_can_be_read_and_a_fuller_one_is_not_
 
 
 def test_arm_that_never_left_home_was_always_there() -> None:
-    watch = HomeWatch(HOME)
-    assert not watch.covers(5)
-    watch.note(HOME, 10)
-    assert watch.covers(5) and watch.covers(20)
+    watch = HomeMonitor(HOME)
+    assert not watch.was_home(5)
+    watch.add(HOME, 10)
+    assert watch.was_home(5) and watch.was_home(20)
 
 
 def test_pictures_count_from_the_return_home_until_the_arm_leaves_again() -> None:
-    watch = HomeWatch(HOME)
-    watch.note(HOME, 10)
-    watch.note(AWAY, 20)
-    watch.note(AWAY, 30)
-    assert watch.covers(15) and not watch.covers(20) and not watch.covers(35)
-    watch.note(HOME, 40)
-    assert not watch.covers(15) and not watch.covers(39)
-    assert watch.covers(40) and watch.covers(100)
+    watch = HomeMonitor(HOME)
+    watch.add(HOME, 10)
+    watch.add(AWAY, 20)
+    watch.add(AWAY, 30)
+    assert watch.was_home(15) and not watch.was_home(20) and not watch.was_home(35)
+    watch.add(HOME, 40)
+    assert not watch.was_home(15) and not watch.was_home(39)
+    assert watch.was_home(40) and watch.was_home(100)
 
 
 def test_return_home_at_a_time_to_come_counts_until_the_next_word_of_the_arm() -> None:
-    watch = HomeWatch(HOME)
+    watch = HomeMonitor(HOME)
     for q, stamp in ((AWAY, 10), (HOME, 2**63 - 1), (HOME, 40)):
-        watch.note(q, stamp)
-    assert not watch.covers(39) and watch.covers(40) and watch.covers(100)
+        watch.add(q, stamp)
+    assert not watch.was_home(39) and watch.was_home(40) and watch.was_home(100)
 
 
 def test_arm_that_was_elsewhere_at_first_has_to_come_home() -> None:
-    watch = HomeWatch(HOME)
-    watch.note(AWAY, 10)
-    assert not watch.covers(5) and not watch.covers(15)
-    watch.note(HOME, 20)
-    assert watch.covers(25) and not watch.covers(5)
+    watch = HomeMonitor(HOME)
+    watch.add(AWAY, 10)
+    assert not watch.was_home(5) and not watch.was_home(15)
+    watch.add(HOME, 20)
+    assert watch.was_home(25) and not watch.was_home(5)

@@ -77,7 +77,7 @@ def test_arm_is_turned_out_of_the_way_as_little_as_need_be() -> None:
     within = region.within(CAMERA, silhouettes, robot)
 
     def share(q: object) -> float:
-        return region.hidden([(within, silhouettes.hidden(CAMERA, [np.asarray(q)]))])
+        return region.hidden([(within, silhouettes.occlusion(CAMERA, [np.asarray(q)]))])
 
     poses = find_viewing_poses(robot, [CAMERA], region, MOST_HIDDEN, 0.03)
     assert share(robot.named("home")) > 0.1 >= MOST_HIDDEN >= share(poses[0])

@@ -9,7 +9,7 @@ import yaml
 
 from common.config import Surroundings, load_cell, service_config
 from common.errors import ConfigError, UnknownName
-from common.remapping import Remapping, checked_table
+from common.remapping import Remapping, validate_table
 from services import camera_opencv, vision_detector
 
 TWO = ["services={motion_planner: {}, "
@@ -97,14 +97,14 @@ def test_task_under_a_name_of_its_own_is_still_that_of_its_application() -> None
 
 def test_longest_beginning_that_fits_renames_a_key_and_shared_keys_stay() -> None:
     table = {"*": "x/*", "camera/*": "left/*", "tf": "t", "tf_static": "tf_static"}
-    remapping = Remapping(checked_table("topics", table))
+    remapping = Remapping(validate_table("topics", table))
     asked = ["camera/image_raw", "camera/depth/a", "tf", "tf_static", "motion/plan", "log", "counters", "param/viewer"]
     assert [remapping.key(key) for key in asked] == [
         "left/image_raw", "left/depth/a", "t", "tf_static", "x/motion/plan", "log", "counters", "param/viewer"]
 
 
 def test_what_lies_under_a_key_goes_where_that_goes() -> None:
-    remapping = Remapping(checked_table("topics", {"seen": "left/seen", "other": "left/other"}))
+    remapping = Remapping(validate_table("topics", {"seen": "left/seen", "other": "left/other"}))
     assert [remapping.key(key) for key in ("seen/mask", "seen", "other/a/b")] == [
         "left/seen/mask", "left/seen", "other/a/b"]
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import ruckig
 
-from common.control.controller import PERIOD, TrajectoryController
 from common.control.limiter import SLACK
+from common.control.trajectory_controller import PERIOD, TrajectoryController
 from common.hardware.interface import Limits
 from common.hardware.streaming import SetPointStream
 from common.messages import JointTrajectory, JointTrajectoryPoint
@@ -51,7 +51,7 @@ def executed(event: str, seed: int) -> list[tuple[float, np.ndarray, np.ndarray]
         elif cycle == at + 50 and event == "held":
             controller.hold(False, "go on")
         elif cycle in (at, at + 50) and event == "speed":
-            controller.speed_scaling = 0.3 if cycle == at else 1.0
+            controller.reports.speed_scaling = 0.3 if cycle == at else 1.0
         set_point = controller.update(now, q, dq)
         assert set_point is not None
         q, dq = set_point

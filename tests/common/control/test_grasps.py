@@ -131,11 +131,11 @@ def test_what_is_held_and_slips_is_told_until_the_next_command(expected):
     slipping = rig.run(0.5)
     assert (slipping.id, slipping.state, slipping.outcome, slipping.holding) == (
         goal.id, "succeeded", "slipping", True)
-    assert slipping.message == "what is held slips: it was 0.0600 m wide, the fingers are 0.0550 m apart now"
+    assert slipping.message == "the held object slips: it was 0.0600 m wide, the fingers are 0.0550 m apart"
     rig.between(0.0)
     lost = rig.run(0.5)
     assert (lost.state, lost.outcome, lost.holding) == ("succeeded", "slipping", False)
-    assert lost.message == "what was held slipped out: it was 0.0600 m wide, nothing is between the fingers now"
+    assert lost.message == "the held object slipped out: it was 0.0600 m wide, nothing is between the fingers now"
     assert rig.told(0.08).outcome == ""
 
 

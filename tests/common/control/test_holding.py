@@ -84,9 +84,9 @@ def test_whatever_is_held_and_scaled_the_arm_stays_on_its_path_and_within_limits
         if deed == "hold":
             assert rig.controller.hold(value, "tested").held == value
         else:
-            rig.controller.speed_scaling = value
+            rig.controller.reports.speed_scaling = value
     rig.controller.hold(False, "")
-    rig.controller.speed_scaling = 1.0
+    rig.controller.reports.speed_scaling = 1.0
     status = rig.until_over()
     assert status.state == "succeeded" and np.allclose(rig.q, [1, 0.3 * np.sin(np.pi * swings)], atol=2e-3)
     assert_on_path(rig, swings)
@@ -242,7 +242,7 @@ def test_times_stretch_with_the_speed(limits, rest_to_rest):
     took = []
     for scaling in (1.0, 0.5, 0.05):
         rig = Timed(limits)
-        rig.controller.speed_scaling = scaling
+        rig.controller.reports.speed_scaling = scaling
         rig.accept("a", rest_to_rest([0, 0], [1, 1]))
         status = rig.until_over(30)
         assert status.state == "succeeded" and status.speed_scaling == scaling

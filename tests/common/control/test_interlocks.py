@@ -15,10 +15,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from common.control.interlocks import MOST, MOST_GOALS, SLOWEST, Interlocks, Record, Speed, speed_of
-from common.control.record_file import RecordFile, record_file
+from common.atomic_file import state_folder
+from common.control.interlocks import (
+    MAX_ENTRIES,
+    MAX_GOALS,
+    SLOWEST,
+    InterlockFile,
+    Interlocks,
+    Record,
+    Speed,
+    effective_speed,
+    interlock_file,
+)
 from common.errors import ConfigError
-from common.kept_file import lasting_folder
 from common.messages import HoldRequest, MotionStatus, StopRequest
 
 T0 = 1_700_000_000_000_000_000
@@ -54,24 +63,24 @@ def test_a_stop_is_let_go_by_a_start_of_anybody_and_not_by_a_resume_of_its_owner
     interlocks = made()
     interlocks.stop(StopRequest(owner="anna", reason="fire"))
     interlocks.hold(HoldRequest(hold=False, owner="anna"))
-    refused = interlocks.objection("a")
+    refused = interlocks.check("a")
     assert refused is not None and refused.code == "stopped"
     assert str(refused) == "stopped since 2023-11-14 22:13:20 UTC by anna (fire)"
     interlocks.hold(HoldRequest(hold=False, owner="bert", stops=True))
-    assert interlocks.objection("a") is None
+    assert interlocks.check("a") is None
 
 
 def test_what_was_decided_before_a_stop_neither_lets_go_of_it_nor_moves() -> None:
     interlocks = made()
     interlocks.stop(StopRequest(owner="anna"))
     acknowledged = interlocks.stops[0].since
-    assert interlocks.objection("go there", "anna", acknowledged) is None, "who stopped it moves it, knowing that"
-    assert interlocks.objection("go there", "bert", acknowledged) and interlocks.objection("go there", "", acknowledged)
+    assert interlocks.check("go there", "anna", acknowledged) is None, "who stopped it moves it, knowing that"
+    assert interlocks.check("go there", "bert", acknowledged) and interlocks.check("go there", "", acknowledged)
     interlocks.stop(StopRequest(owner="anna"))
     interlocks.hold(HoldRequest(hold=False, stops=True, override=True, acknowledged=acknowledged))
-    assert interlocks.objection("go there", "anna", acknowledged) and interlocks.objection("go there", "anna")
+    assert interlocks.check("go there", "anna", acknowledged) and interlocks.check("go there", "anna")
     interlocks.hold(HoldRequest(hold=False, stops=True, acknowledged=interlocks.stops[0].since))
-    assert interlocks.objection("task") is None
+    assert interlocks.check("task") is None
 
 
 def test_hold_that_its_owner_turns_into_a_stop_still_keeps_everybody_else() -> None:
@@ -79,8 +88,8 @@ def test_hold_that_its_owner_turns_into_a_stop_still_keeps_everybody_else() -> N
     interlocks.hold(HoldRequest(hold=True, owner="anna"))
     since = interlocks.holds[0].since
     interlocks.hold(HoldRequest(hold=False, owner="anna", into_stop=True, acknowledged=since))
-    assert not interlocks.holds and interlocks.objection("task")
-    assert interlocks.objection("go there", "anna", since) is None
+    assert not interlocks.holds and interlocks.check("task")
+    assert interlocks.check("go there", "anna", since) is None
 
 
 @given(times=st.lists(st.integers(0, 2 * T0), min_size=2, max_size=8))
@@ -97,7 +106,7 @@ def test_a_later_word_has_a_later_time_whatever_the_clock_does_also_after_a_rest
 def test_holds_of_watchdog_and_controller_are_no_part_of_the_record() -> None:
     interlocks = made()
     interlocks.hold(HoldRequest(hold=True, by="watchdog", reason="no joint states"))
-    interlocks.hold_ourselves("controller", True, "the task is gone")
+    interlocks.set_internal_hold("controller", True, "the task is gone")
     interlocks.hold(HoldRequest(hold=True, owner="watchdog"))
     assert [one.by for one in interlocks.all] == ["watchdog", "watchdog", "controller"]
     assert [one.by for one in made(interlocks.record).all] == ["watchdog"]
@@ -107,17 +116,17 @@ def test_holds_of_watchdog_and_controller_are_no_part_of_the_record() -> None:
 
 def test_goals_that_were_stopped_never_move_and_are_not_remembered_without_end() -> None:
     interlocks = made()
-    interlocks.never(str(number) for number in range(MOST_GOALS + 5))
+    interlocks.block_goals(str(number) for number in range(MAX_GOALS + 5))
     again = made(interlocks.record)
-    assert again.objection("5") and again.objection(str(MOST_GOALS + 4)) and not again.objection("4")
+    assert again.check("5") and again.check(str(MAX_GOALS + 4)) and not again.check("4")
 
 
 def test_so_many_persons_that_they_share_an_entry_still_hold_the_robot() -> None:
     interlocks = made()
-    for number in range(MOST + 9):
+    for number in range(MAX_ENTRIES + 9):
         interlocks.hold(HoldRequest(hold=True, owner=f"{number}", reason="x" * 1000))
-    assert len(interlocks.all) == MOST + 1
-    for number in range(MOST + 9):
+    assert len(interlocks.all) == MAX_ENTRIES + 1
+    for number in range(MAX_ENTRIES + 9):
         interlocks.hold(HoldRequest(hold=False, owner=f"{number}"))
     assert held(interlocks) == ["others"]
     assert interlocks.hold(HoldRequest(hold=False, override=True)) and not interlocks.all
@@ -130,7 +139,7 @@ def test_so_many_persons_that_they_share_an_entry_still_hold_the_robot() -> None
 def test_speed_that_was_set_is_kept_and_the_slower_when_another_was_configured_since(
     kept: Speed | None, configured: float, now: float
 ) -> None:
-    assert speed_of(kept, configured) == now
+    assert effective_speed(kept, configured) == now
 
 
 # --- the file ---
@@ -139,9 +148,9 @@ def test_speed_that_was_set_is_kept_and_the_slower_when_another_was_configured_s
 def test_what_was_saved_is_found_again(tmp_path: Path) -> None:
     interlocks = made()
     interlocks.stop(StopRequest(owner="anna", reason="fire"))
-    interlocks.never(["a"])
+    interlocks.block_goals(["a"])
     interlocks.speed, interlocks.arm_stopped = Speed(scaling=0.05, configured=1.0), True
-    file = record_file("panda", {"ZENCELL_STATE": str(tmp_path / "new" / "folder")})
+    file = interlock_file("panda", {"ZENCELL_STATE": str(tmp_path / "new" / "folder")})
     file.require_writable()
     assert file.load() == (Record(), "")
     file.save(interlocks.record)
@@ -149,7 +158,7 @@ def test_what_was_saved_is_found_again(tmp_path: Path) -> None:
 
 
 def test_save_that_is_cut_off_anywhere_leaves_the_record_before_it(tmp_path: Path) -> None:
-    file, interlocks = RecordFile(tmp_path / "r"), made()
+    file, interlocks = InterlockFile(tmp_path / "r"), made()
     interlocks.stop(StopRequest(owner="anna"))
     file.save(interlocks.record)
     for size in (0, 10, 200):
@@ -171,7 +180,7 @@ def step_or_cut(steps: Iterator[int], step: Callable[..., Any], *args: Any, **na
 def test_save_that_is_cut_off_between_any_two_steps_leaves_one_of_both_records_and_room_for_the_next(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, full_disk: Callable[[], None], step: int
 ) -> None:
-    file, interlocks = RecordFile(tmp_path / "r"), made()
+    file, interlocks = InterlockFile(tmp_path / "r"), made()
     file.require_writable()
     interlocks.stop(StopRequest(owner="anna"))
     file.save(interlocks.record)
@@ -185,7 +194,7 @@ def test_save_that_is_cut_off_between_any_two_steps_leaves_one_of_both_records_a
             file.save(interlocks.record)
     assert file.load() in ((before, ""), (interlocks.record, ""))
     full_disk()
-    again = RecordFile(tmp_path / "r")
+    again = InterlockFile(tmp_path / "r")
     again.require_writable()
     again.save(interlocks.record)
     assert again.load() == (interlocks.record, "")
@@ -206,9 +215,9 @@ def full_disk(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
 
 def largest() -> Interlocks:
     interlocks = made()
-    for number in range(MOST + 1):
+    for number in range(MAX_ENTRIES + 1):
         interlocks.stop(StopRequest(owner=f"{number}".rjust(120, "\U0001f916"), reason="\U0001f916" * 300))
-    interlocks.never(f"{number}".rjust(120, "\U0001f916") for number in range(MOST_GOALS))
+    interlocks.block_goals(f"{number}".rjust(120, "\U0001f916") for number in range(MAX_GOALS))
     interlocks.speed = Speed(scaling=1 / 3, configured=2 / 3)
     return interlocks
 
@@ -216,7 +225,7 @@ def largest() -> Interlocks:
 def test_disk_that_becomes_full_takes_any_record_again_and_again(
     tmp_path: Path, full_disk: Callable[[], None]
 ) -> None:
-    file, interlocks = RecordFile(tmp_path / "r"), made()
+    file, interlocks = InterlockFile(tmp_path / "r"), made()
     file.require_writable()
     full_disk()
     for state in (largest(), interlocks, largest()):
@@ -234,7 +243,7 @@ def test_record_that_was_written_without_room_is_read_and_has_it_from_then_on(
     interlocks.stop(StopRequest(owner="anna"))
     path.write_text(interlocks.record.model_dump_json(indent=1))
     (tmp_path / "r.new").write_bytes(b"")
-    file = RecordFile(path)
+    file = InterlockFile(path)
     file.require_writable()
     assert file.load() == (interlocks.record, "")
     full_disk()
@@ -251,13 +260,13 @@ def test_disk_that_is_full_from_the_start_is_refused_in_one_line(
         (tmp_path / name).write_text(Record().model_dump_json())
     full_disk()
     with pytest.raises(ConfigError, match=r"cannot be written \(No space left on device\): stops") as caught:
-        RecordFile(tmp_path / "r").require_writable()
+        InterlockFile(tmp_path / "r").require_writable()
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("kind", ["second name of the record", "link to another file", "pipe"])
 def test_what_else_lies_in_the_place_of_the_next_record_is_never_written_over(tmp_path: Path, kind: str) -> None:
-    file, other = RecordFile(tmp_path / "r"), tmp_path / "other"
+    file, other = InterlockFile(tmp_path / "r"), tmp_path / "other"
     file.save(largest().record)
     other.write_text("mine")
     new = tmp_path / "r.new"
@@ -270,7 +279,7 @@ def test_what_else_lies_in_the_place_of_the_next_record_is_never_written_over(tm
 def test_record_that_cannot_be_read_stays_to_be_looked_at_until_something_is_decided(tmp_path: Path) -> None:
     path = tmp_path / "r"
     path.write_bytes(b"{")
-    RecordFile(path).require_writable()
+    InterlockFile(path).require_writable()
     assert path.read_bytes() == b"{"
 
 
@@ -280,13 +289,13 @@ def test_what_is_not_kept_is_told_so_and_what_was_before_is_not() -> None:
     kept = interlocks.record
     interlocks.stop(StopRequest(owner="bert", reason="fire"))
     interlocks.hold(HoldRequest(hold=True, by="watchdog", reason="no joint states"))
-    interlocks.note_kept(kept, "No space left on device")
+    interlocks.note_saved(kept, "No space left on device")
     status = MotionStatus(interlocks=interlocks.all)
     lost = "not saved on disk (No space left on device), lost if the executor ends"
     assert [one.reason for one in status.interlocks] == ["smoke", f"{lost}; fire", "no joint states"]
     assert status.unsaved.endswith(f"by bert ({lost}; fire)")
     assert interlocks.record.interlocks[1].reason == "fire"
-    interlocks.note_kept(interlocks.record)
+    interlocks.note_saved(interlocks.record)
     assert not MotionStatus(interlocks=interlocks.all).unsaved
 
 
@@ -301,14 +310,14 @@ MANY = json.dumps({"interlocks": [{"kind": "held", "by": f"p{number}", "since": 
 def test_record_that_cannot_be_read_counts_as_stopped_and_slow(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "r"
     path.write_bytes(content)
-    record, problem = RecordFile(path).load()
+    record, problem = InterlockFile(path).load()
     assert problem.startswith(f"{path} cannot be read: ")
     interlocks = Interlocks(record)
-    refused = interlocks.objection("a")
-    assert refused is not None and str(path) in str(refused) and speed_of(interlocks.speed, 1.0) == SLOWEST
+    refused = interlocks.check("a")
+    assert refused is not None and str(path) in str(refused) and effective_speed(interlocks.speed, 1.0) == SLOWEST
     assert interlocks.arm_stopped, "nobody knows that it was not"
     interlocks.hold(HoldRequest(hold=False, stops=True))
-    assert interlocks.objection("a") is None
+    assert interlocks.check("a") is None
 
 
 @pytest.mark.parametrize("kind", ["link to nothing", "pipe", "folder", "link in a circle"])
@@ -318,28 +327,28 @@ def test_what_is_no_file_in_the_place_of_the_record_counts_as_stopped_and_keeps_
     path = tmp_path / "r"
     {"link to nothing": lambda: path.symlink_to(tmp_path / "gone"), "pipe": lambda: os.mkfifo(path),
      "folder": path.mkdir, "link in a circle": lambda: path.symlink_to(path)}[kind]()
-    record, problem = RecordFile(path).load()
+    record, problem = InterlockFile(path).load()
     assert problem.startswith(f"{path} cannot be read: ") and "\n" not in problem
-    assert Interlocks(record).objection("a")
+    assert Interlocks(record).check("a")
 
 
 def test_link_to_a_record_is_read(tmp_path: Path) -> None:
     interlocks = made()
     interlocks.stop(StopRequest(owner="anna"))
-    RecordFile(tmp_path / "there").save(interlocks.record)
+    InterlockFile(tmp_path / "there").save(interlocks.record)
     (tmp_path / "r").symlink_to(tmp_path / "there")
-    assert RecordFile(tmp_path / "r").load() == (interlocks.record, "")
+    assert InterlockFile(tmp_path / "r").load() == (interlocks.record, "")
 
 
 def test_folder_that_cannot_be_written_is_refused_in_one_line(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     for folder in (tmp_path / "file", tmp_path / "file" / "below"):
         with pytest.raises(ConfigError, match=r"^ZENCELL_STATE: '.*' cannot be written \(.*\): stops") as caught:
-            RecordFile(folder / "r").require_writable()
+            InterlockFile(folder / "r").require_writable()
         assert "\n" not in str(caught.value)
 
 
 def test_the_folder_is_the_one_that_was_named_or_one_that_lasts() -> None:
-    assert lasting_folder({"ZENCELL_STATE": "/data", "XDG_STATE_HOME": "/x"}) == Path("/data")
-    assert lasting_folder({"ZENCELL_STATE": "", "XDG_STATE_HOME": "/x"}) == Path("/x/zencell")
-    assert lasting_folder({}) == Path.home() / ".local" / "state" / "zencell"
+    assert state_folder({"ZENCELL_STATE": "/data", "XDG_STATE_HOME": "/x"}) == Path("/data")
+    assert state_folder({"ZENCELL_STATE": "", "XDG_STATE_HOME": "/x"}) == Path("/x/zencell")
+    assert state_folder({}) == Path.home() / ".local" / "state" / "zencell"

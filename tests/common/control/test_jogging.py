@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from common.config import load_cell
-from common.control.cycle import ControlCycle
+from common.control.executor import Executor
 from common.errors import Refused
 from common.hardware.interface import Limits
 from common.hardware.mock import MockHardware
@@ -22,7 +22,7 @@ from common.messages import (
     Vector3,
 )
 from common.robot.model import RobotModel
-from common.sources import Machine, drawn_from
+from common.time_source import SystemTimeSource, use_time_source
 
 PERIOD = 0.01
 UR5_WORKS = np.array([0.0, -1.9, 1.9, -1.6, -1.57, 0.0])  # at home it stands upright: a singular place
@@ -44,16 +44,16 @@ class Moved:
         self.limits = Limits(
             tuple(robot.joint_names), robot.lower, robot.upper, robot.velocity, robot.acceleration,
             np.array(robot.config.deceleration_limits) if robot.config.deceleration_limits else None, robot.jerk)
-        self.cycle = ControlCycle(MockHardware(home, None), self.limits, home, kinematics=robot)
-        self.sources = Machine()
-        self.sources.monotonic_ns = self.sources.wall_ns = lambda: self.stamp
+        self.executor = Executor(MockHardware(home, None), self.limits, home, kinematics=robot)
+        self.source = SystemTimeSource()
+        self.source.monotonic_ns = self.source.wall_ns = lambda: self.stamp
         self.run(0.35)  # after which a stream of commands is none of before
 
     def step(self, seconds=PERIOD):
         self.stamp += int(seconds * 1e9)
-        with drawn_from(self.sources):
-            self.reports.append(self.cycle.step(Header(stamp=self.stamp)))
-        self.sent.append((self.stamp * 1e-9, self.cycle._arm.set_point.copy()))
+        with use_time_source(self.source):
+            self.reports.append(self.executor.cycle(Header(stamp=self.stamp)))
+        self.sent.append((self.stamp * 1e-9, self.executor.arm.set_point.copy()))
 
     def run(self, seconds):
         for _ in range(round(seconds / PERIOD)):
@@ -64,8 +64,8 @@ class Moved:
         for k in range(round(seconds / PERIOD)):
             if k % 2 == 0:
                 try:
-                    with drawn_from(self.sources):
-                        self.cycle.jog(JogCommand(**{"owner": "ann", **asked}))
+                    with use_time_source(self.source):
+                        self.executor.jog(JogCommand(**{"owner": "ann", **asked}))
                 except Refused as refusal:
                     self.refused.append(refusal.code)
             self.step()
@@ -75,11 +75,11 @@ class Moved:
         self.jog(seconds, **dict(zip(("linear", "angular"), vectors, strict=True)), **asked)
 
     def asked(self, call, *args):
-        with drawn_from(self.sources):
+        with use_time_source(self.source):
             return call(*args)
 
     def own(self, act="take", owner="ann", **more):
-        return self.asked(self.cycle.authority.own, OwnRequest(act=act, owner=owner, **more), self.stamp * 1e-9)
+        return self.asked(self.executor.authority.own, OwnRequest(act=act, owner=owner, **more), self.stamp * 1e-9)
 
     def execute(self, goal, owner="", **more):
         begin = self.q
@@ -87,7 +87,7 @@ class Moved:
                                        accelerations=[0.0] * len(begin)) for t, way in ((0.0, 0.0), (2.0, 0.2))]
         request = ExecuteRequest(id=goal, owner=owner, trajectory=JointTrajectory(
             joint_names=self.robot.joint_names, points=points), **more)
-        return self.asked(self.cycle.execute, request, self.stamp * 1e-9)
+        return self.asked(self.executor.execute, request, self.stamp * 1e-9)
 
     @property
     def q(self):
@@ -95,7 +95,7 @@ class Moved:
 
     @property
     def owner(self):
-        return self.cycle.authority.owner.owner, self.cycle.authority.owner.kind
+        return self.executor.authority.owner.owner, self.executor.authority.owner.kind
 
     def rests(self, seconds=0.3):
         before = self.q
@@ -162,11 +162,11 @@ def test_whatever_is_asked_for_set_points_keep_the_limits(arm):
 def test_each_joint_comes_to_rest_before_its_end(arm, sign):
     for k, joint in enumerate(arm.robot.joint_names):
         arm.jog(0.2, joints={joint: sign * 9.0})
-        arm.cycle.authority._jogging._kinematics = None  # without the tool's own limit, faster
+        arm.executor.authority._jogging._kinematics = None  # without the tool's own limit, faster
         arm.jog(12.0, joints={joint: sign * 9.0})
         end = arm.robot.upper[k] if sign > 0 else arm.robot.lower[k]
         assert 0 <= sign * (end - arm.q[k]) < 0.01
-        arm.cycle.authority._jogging._kinematics = arm.robot
+        arm.executor.authority._jogging._kinematics = arm.robot
     assert max(arm.judge()) <= 1.001
 
 
@@ -223,16 +223,16 @@ def test_a_command_for_nothing_brings_it_to_rest_at_once(arm):
 ])
 def test_what_cannot_be_jogged_is_refused_with_the_choices(arm, asked, code, told):
     if code is None:
-        arm.asked(arm.cycle.jog, JogCommand(**asked))
+        arm.asked(arm.executor.jog, JogCommand(**asked))
         return
     with pytest.raises(Refused, match=told) as refusal:
-        arm.asked(arm.cycle.jog, JogCommand(**asked))
+        arm.asked(arm.executor.jog, JogCommand(**asked))
     assert refusal.value.code == code
 
 
 def test_joints_and_tool_together_are_a_contradiction(arm):
-    with pytest.raises(Refused, match="do not go together"):
-        arm.asked(arm.cycle.jog, JogCommand(joints={arm.robot.joint_names[0]: 1.0}, linear=Vector3(x=1.0)))
+    with pytest.raises(Refused, match="exclude each other"):
+        arm.asked(arm.executor.jog, JogCommand(joints={arm.robot.joint_names[0]: 1.0}, linear=Vector3(x=1.0)))
 
 
 def test_no_goal_begins_while_the_arm_is_jogged_and_none_is_disturbed(arm):
@@ -250,13 +250,13 @@ def test_after_a_stop_or_a_hold_who_keeps_asking_moves_nothing_until_they_let_go
     joint = {arm.robot.joint_names[0]: 0.2}
     arm.jog(0.3, joints=joint)
     if end == "stop":
-        arm.asked(arm.cycle.authority.stop, StopRequest(owner="bob"), arm.stamp * 1e-9)
+        arm.asked(arm.executor.authority.stop, StopRequest(owner="bob"), arm.stamp * 1e-9)
     else:
-        arm.asked(arm.cycle.authority.hold, HoldRequest(hold=True, owner="bob"))
+        arm.asked(arm.executor.authority.hold, HoldRequest(hold=True, owner="bob"))
     arm.jog(0.2, joints=joint)
     before = arm.q
     arm.jog(1.0, joints=joint)
-    arm.asked(arm.cycle.authority.hold, HoldRequest(hold=False, owner="bob", stops=True))
+    arm.asked(arm.executor.authority.hold, HoldRequest(hold=False, owner="bob", stops=True))
     arm.jog(1.0, joints=joint)
     assert np.array_equal(arm.q, before)
     arm.run(0.35)
@@ -266,7 +266,7 @@ def test_after_a_stop_or_a_hold_who_keeps_asking_moves_nothing_until_they_let_go
 
 def test_who_stopped_the_arm_jogs_it_and_nobody_else(arm):
     joint = {arm.robot.joint_names[0]: 0.2}
-    acknowledged = arm.asked(arm.cycle.authority.stop, StopRequest(owner="ann"), arm.stamp * 1e-9).newest
+    acknowledged = arm.asked(arm.executor.authority.stop, StopRequest(owner="ann"), arm.stamp * 1e-9).newest
     arm.jog(0.3, joints=joint, owner="bob", acknowledged=acknowledged)
     arm.jog(0.3, joints=joint)
     assert arm.rests() and set(arm.refused) == {"stopped", "let_go"}
@@ -278,7 +278,7 @@ def test_who_stopped_the_arm_jogs_it_and_nobody_else(arm):
 def test_of_two_that_jog_the_first_does(arm):
     arm.jog(0.2, joints={arm.robot.joint_names[0]: 0.2})
     with pytest.raises(Refused, match=r"the motion is owned by ann \(operator\)"):
-        arm.asked(arm.cycle.jog, JogCommand(owner="bob", joints={arm.robot.joint_names[0]: -0.2}))
+        arm.asked(arm.executor.jog, JogCommand(owner="bob", joints={arm.robot.joint_names[0]: -0.2}))
 
 
 def test_a_stall_of_the_executor_while_it_jogs_makes_no_step(arm):
@@ -317,7 +317,7 @@ def test_what_is_given_back_in_a_motion_is_nobody_elses_before_that_has_ended(ar
     arm.run(0.3)
     arm.own("give")
     arm.step()
-    assert arm.cycle.goal == "one" and arm.owner == ("ann", "operator")
+    assert arm.executor.arm.goal == "one" and arm.owner == ("ann", "operator")
     with pytest.raises(Refused, match=r"the motion is owned by ann \(operator\)"):
         arm.own(owner="bob")
     arm.run(3.0)
@@ -357,21 +357,21 @@ def test_who_takes_over_from_a_task_stops_it_for_good(arm):
     arm.run(0.5)
     arm.own(over=True)
     arm.run(0.5)
-    assert arm.rests() and arm.cycle.goal == ""
+    assert arm.rests() and arm.executor.arm.goal == ""
     assert arm.execute("two").error == "stopped"  # latched: it outlives the executor
-    assert arm.cycle._interlocks.record.interlocks[0].by == "ann"
+    assert arm.executor._interlocks.record.interlocks[0].by == "ann"
     assert arm.execute("three", "ann", acknowledged=arm.stamp + 1).state == "active"
     arm.run(3.0)
-    arm.asked(arm.cycle.authority.hold, HoldRequest(hold=False, owner="ann", stops=True))  # she starts the task
+    arm.asked(arm.executor.authority.hold, HoldRequest(hold=False, owner="ann", stops=True))  # she starts the task
     assert arm.owner == ("", "none") and arm.own(owner="sorting", kind="task").owner == "sorting"
     assert arm.execute("four").state == "active"
 
 
 def test_a_start_by_another_does_not_take_it_from_who_has_it(arm):
     arm.own()
-    arm.asked(arm.cycle.authority.hold, HoldRequest(hold=False, owner="bob", stops=True))
+    arm.asked(arm.executor.authority.hold, HoldRequest(hold=False, owner="bob", stops=True))
     assert arm.owner == ("ann", "operator") and arm.execute("one").error == "not_owner"
-    arm.asked(arm.cycle.authority.hold, HoldRequest(hold=False, owner="bob", stops=True, override=True))
+    arm.asked(arm.executor.authority.hold, HoldRequest(hold=False, owner="bob", stops=True, override=True))
     assert arm.owner == ("", "none")
 
 
@@ -379,15 +379,15 @@ def test_motion_of_whom_a_start_takes_it_from_comes_to_rest_for_good(arm):
     arm.own()
     arm.execute("one", "ann")
     arm.run(0.5)
-    arm.asked(arm.cycle.authority.hold, HoldRequest(hold=False, owner="bob", stops=True, override=True))
+    arm.asked(arm.executor.authority.hold, HoldRequest(hold=False, owner="bob", stops=True, override=True))
     assert arm.own(owner="sorting", kind="task").owner == "sorting"
     arm.run(0.5)
-    assert arm.rests() and arm.cycle.goal == "" and arm.reports[-1].owner is None
-    assert arm.execute("one", "ann").state == "cancelled" and "one" in arm.cycle._interlocks.record.goals
+    assert arm.rests() and arm.executor.arm.goal == "" and arm.reports[-1].owner is None
+    assert arm.execute("one", "ann").state == "cancelled" and "one" in arm.executor._interlocks.record.goals
     assert arm.execute("two").state == "active"
-    arm.asked(arm.cycle.authority.hold, HoldRequest(hold=False, owner="bob", stops=True, override=True))
+    arm.asked(arm.executor.authority.hold, HoldRequest(hold=False, owner="bob", stops=True, override=True))
     arm.run(0.5)
-    assert arm.cycle.goal == "two", "a task that is started once more goes on"
+    assert arm.executor.arm.goal == "two", "a task that is started once more goes on"
 
 
 def test_a_start_that_comes_after_a_later_stop_takes_it_from_nobody(arm):
@@ -397,20 +397,20 @@ def test_a_start_that_comes_after_a_later_stop_takes_it_from_nobody(arm):
     arm.execute("one", "ann", acknowledged=arm.stamp + 1)
     arm.run(0.5)
     late = HoldRequest(hold=False, owner="bob", stops=True, override=True, acknowledged=said)
-    arm.asked(arm.cycle.authority.hold, late, arm.stamp * 1e-9)
+    arm.asked(arm.executor.authority.hold, late, arm.stamp * 1e-9)
     arm.run(0.5)
-    assert arm.owner == ("ann", "operator") and arm.cycle.goal == "one" and not arm.rests()
+    assert arm.owner == ("ann", "operator") and arm.executor.arm.goal == "one" and not arm.rests()
     assert arm.execute("two").error == "stopped"
 
 
 def test_everybodys_start_takes_it_from_who_took_it_without_a_name(arm):
     arm.own(owner="operator")
-    arm.asked(arm.cycle.authority.hold, HoldRequest(hold=False, owner="bob", stops=True))
+    arm.asked(arm.executor.authority.hold, HoldRequest(hold=False, owner="bob", stops=True))
     assert arm.owner == ("", "none") and arm.execute("one").state == "active"
 
 
 def test_who_holds_the_arm_and_then_moves_it_does_not_take_it_from_who_has_it(arm):
-    hold = arm.cycle.authority.hold
+    hold = arm.executor.authority.hold
     arm.own()
     arm.asked(hold, HoldRequest(hold=True, owner="bob"))
     arm.asked(hold, HoldRequest(hold=False, owner="bob", into_stop=True, acknowledged=arm.stamp + 1))
@@ -425,34 +425,34 @@ def test_who_holds_the_arm_and_then_moves_it_does_not_take_it_from_who_has_it(ar
 def test_goal_that_was_refused_of_an_operator_and_is_asked_for_again_does_not_stop_the_task_that_was_started(arm):
     arm.own()
     assert arm.execute("one").error == "not_owner"
-    arm.asked(arm.cycle.authority.hold, HoldRequest(hold=False, owner="ann", stops=True))  # she starts the task
+    arm.asked(arm.executor.authority.hold, HoldRequest(hold=False, owner="ann", stops=True))  # she starts the task
     assert arm.own(owner="sorting", kind="task").owner == "sorting"
     assert arm.execute("one").error == "not_owner"  # as before: an id stands for one answer
     assert arm.execute("two").state == "active"
     arm.run(3.0)
     arm.own("give", "sorting")
     arm.own(owner="bob")
-    assert arm.execute("one").error == "not_owner" and not arm.cycle.authority.interlocks.all
+    assert arm.execute("one").error == "not_owner" and not arm.executor.authority.interlocks.all
 
 
 def test_a_stop_and_a_hold_need_no_ownership_and_a_stop_ends_it(arm):
     arm.own()
     arm.execute("one", "ann")
     arm.run(0.5)
-    assert arm.asked(arm.cycle.authority.hold, HoldRequest(hold=True, owner="bob"))[0].held
+    assert arm.asked(arm.executor.authority.hold, HoldRequest(hold=True, owner="bob"))[0].held
     arm.run(0.5)
     assert arm.rests()
-    arm.asked(arm.cycle.authority.stop, StopRequest(owner="bob"), arm.stamp * 1e-9)
+    arm.asked(arm.executor.authority.stop, StopRequest(owner="bob"), arm.stamp * 1e-9)
     assert arm.owner == ("", "none")
 
 
 def test_a_task_that_is_gone_has_the_motion_no_more(arm):
     arm.own(owner="sorting", kind="task")
-    arm.cycle.authority.disown()
+    arm.executor.authority.disown_task()
     arm.step()
     assert arm.owner == ("", "none")
     arm.own()
-    arm.cycle.authority.disown()
+    arm.executor.authority.disown_task()
     assert arm.owner == ("ann", "operator")
 
 
@@ -503,7 +503,7 @@ def test_where_the_tool_was_led_to_the_end_of_its_reach_it_comes_back(arm):
 
 def test_a_stream_of_before_moves_nothing_when_the_executor_is_started_again(arm):
     again = Moved(arm.robot)
-    again.cycle = ControlCycle(MockHardware(again.q.copy(), None), again.limits, again.q, kinematics=arm.robot)
+    again.executor = Executor(MockHardware(again.q.copy(), None), again.limits, again.q, kinematics=arm.robot)
     before = again.q
     again.jog(2.0, joints={arm.robot.joint_names[0]: 0.5})
     assert np.array_equal(again.q, before) and set(again.refused) == {"let_go"}
@@ -516,13 +516,13 @@ def test_a_stream_of_before_moves_nothing_when_the_executor_is_started_again(arm
 def test_however_many_ask_in_vain_who_kept_asking_over_a_stop_moves_nothing(arm, others):
     joint = {arm.robot.joint_names[0]: 0.2}
     arm.jog(0.3, joints=joint)
-    arm.asked(arm.cycle.authority.stop, StopRequest(owner="bob"), arm.stamp * 1e-9)
+    arm.asked(arm.executor.authority.stop, StopRequest(owner="bob"), arm.stamp * 1e-9)
     for _ in range(10):
         for k in range(others):
             with pytest.raises(Refused):
-                arm.asked(arm.cycle.jog, JogCommand(owner=f"other {k}", joints=joint))
+                arm.asked(arm.executor.jog, JogCommand(owner=f"other {k}", joints=joint))
         arm.jog(0.02, joints=joint)
-    arm.asked(arm.cycle.authority.hold, HoldRequest(hold=False, owner="bob", stops=True))
+    arm.asked(arm.executor.authority.hold, HoldRequest(hold=False, owner="bob", stops=True))
     before = arm.q
     arm.jog(0.5, joints=joint)
     assert np.array_equal(arm.q, before)
@@ -535,12 +535,12 @@ def test_what_a_dead_task_left_running_is_taken_over_too(arm):
     arm.own(owner="sorting", kind="task")
     assert arm.execute("one").state == "active"
     arm.run(0.3)
-    arm.cycle.authority.disown()
+    arm.executor.authority.disown_task()
     with pytest.raises(Refused):
         arm.own(owner="bob")
     arm.own(over=True)
     arm.run(0.5)
-    assert arm.rests() and arm.cycle.goal == ""
+    assert arm.rests() and arm.executor.arm.goal == ""
     arm.own("give")
     assert arm.execute("two").error == "stopped"
 
@@ -557,5 +557,5 @@ def test_a_task_that_was_kept_from_going_on_does_not_when_the_motion_is_given_ba
     arm.own("give")
     assert arm.execute("two").error == "stopped"
     assert arm.execute("three", "bob").error == "stopped"
-    arm.asked(arm.cycle.authority.hold, HoldRequest(hold=False, owner="bob", stops=True))
+    arm.asked(arm.executor.authority.hold, HoldRequest(hold=False, owner="bob", stops=True))
     assert arm.execute("four").state == "active"

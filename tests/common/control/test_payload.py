@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from common.config import GripperConfig
-from common.control.cycle import ControlCycle
+from common.control.executor import Executor
 from common.hardware.interface import Limits
 from common.hardware.mock import SimulatedFingers
 from common.messages import ExecuteRequest, GripperCommand, Header, JointTrajectory
@@ -20,7 +20,7 @@ class Rig:
         config = GripperConfig.model_validate({"joints": ["left", "right"], "links": [], **gripper})
         self.fingers = SimulatedFingers(config, 0.08)
         self.arm = StoppingArm(0 * TWO, self.fingers)
-        self.cycle, self.now, self.notes = ControlCycle(self.arm, LIMITS, 0 * TWO, gripper=config), 10.0, []
+        self.cycle, self.now, self.notes = Executor(self.arm, LIMITS, 0 * TWO, gripper=config), 10.0, []
         self.run()
 
     def run(self, seconds: float = 0.5) -> list[tuple[object, ...]]:
@@ -28,7 +28,7 @@ class Rig:
         before = len(self.arm.orders)
         for _ in range(round(seconds / 0.01)):
             self.now += 0.01
-            self.notes += self.cycle.step(Header(stamp=round(self.now * 1e9))).notes
+            self.notes += self.cycle.cycle(Header(stamp=round(self.now * 1e9))).notes
         return self.arm.orders[before:]
 
     def move(self, trajectory: JointTrajectory) -> None:
@@ -36,7 +36,7 @@ class Rig:
         assert answer.state == "active", answer
 
     def told(self, width: float, **more: float) -> list[tuple[object, ...]]:
-        self.cycle.command(GripperCommand(id=f"{self.now:.2f}", width=width, **more), self.now)
+        self.cycle.command_gripper(GripperCommand(id=f"{self.now:.2f}", width=width, **more), self.now)
         return self.run(1.5)
 
 
@@ -74,7 +74,7 @@ def test_nothing_is_told_where_the_robot_file_says_nothing_and_a_refusal_is_said
     rig.run()
     rig.arm.stopped = False
     rig.run(3.0)
-    assert [note for note in rig.notes if "carries" in note] == ["the arm was not told what it carries: too heavy"]
+    assert [note for note in rig.notes if "payload" in note] == ["the arm did not accept its payload: too heavy"]
 
 
 def test_what_came_to_nothing_is_told_again_after_a_motion(rest_to_rest):
@@ -95,5 +95,5 @@ def test_what_changes_while_the_arm_moves_is_told_when_it_rests(rest_to_rest):
     rig.told(0.0, expected_width=0.05, mass=0.3)
     rig.move(rest_to_rest([0, 0], [0, 0.2]))
     rig.run(0.1)
-    rig.cycle.command(GripperCommand(id="let go", width=0.08), rig.now)
+    rig.cycle.command_gripper(GripperCommand(id="let go", width=0.08), rig.now)
     assert rig.run(0.1) == [] and rig.run(3.0) == [("payload", 0.9, 0.0, 0.0, 0.06)]

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common.control.controller import LATE
+from common.control.trajectory_controller import LATE
 from common.hardware.interface import HardwareFault
 from common.hardware.mock import MockHardware
 from common.messages import JointTrajectory, JointTrajectoryPoint
@@ -68,7 +68,7 @@ def goal_at(place, seconds, names=LIMITS.names):
 @pytest.mark.parametrize("share", [1.0, 0.05])
 def test_goals_of_a_microsecond_that_are_off_by_their_tolerance_move_within_limits_and_at_the_speed_asked(share):
     rig = Sampled(LIMITS)
-    rig.controller.speed_scaling = share
+    rig.controller.reports.speed_scaling = share
     place, begin = START, rig.now
     for number in range(20):
         place = place + 0.0099
@@ -162,7 +162,7 @@ def test_whatever_happens_set_points_stay_within_limits(events):
         if event == "hold":
             controller.hold(value, "tested")
         elif event == "speed":
-            controller.speed_scaling = value
+            controller.reports.speed_scaling = value
         elif event == "stall":
             rig.step(value)
         elif event == "stop":
@@ -197,7 +197,7 @@ def test_arm_that_is_moved_from_outside_is_held_where_it_is_found_and_says_so(by
     rig.pieces.append([there - moving * STEP * k for k in (3, 2, 1, 0)])
     rig.step()
     assert np.allclose(rig.positions[-1] - there, moving * STEP, atol=STEP**2 * LIMITS.acceleration.max())
-    assert "was moved from outside" in rig.controller.news() and not rig.controller.news()
+    assert "was moved from outside" in rig.controller.pop_log_line() and not rig.controller.pop_log_line()
     assert "moved from outside" in rig.controller.status.message
     for _ in range(100):
         rig.step()
@@ -244,7 +244,7 @@ def test_arm_that_is_found_in_motion_is_braked_from_where_it_is():
     rig.pieces = [[speed * STEP * k for k in (-2, -1, 0, 1)]]
     for _ in range(100):
         rig.step()
-    assert not rig.velocities[-1].any() and np.all(np.abs(rig.q) < 0.3) and not rig.controller.news()
+    assert not rig.velocities[-1].any() and np.all(np.abs(rig.q) < 0.3) and not rig.controller.pop_log_line()
     rig.assert_within(HARD)
 
 

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from common.control.checks import Tolerances, checked_trajectory
+from common.control.trajectory import Tolerances, checked_trajectory
 from common.errors import Refused
 from common.hardware.interface import Limits
 from common.messages import JointTrajectory, JointTrajectoryPoint

@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from common.control.controller import LATE
 from common.control.goals import REMEMBERED, GoalMemory
 from common.control.trajectory import Trajectory
+from common.control.trajectory_controller import LATE
 from common.hardware.lag import LagHardware
 from common.hardware.mock import MockHardware
 from common.messages import Header, Interlock, MotionStatus
@@ -97,7 +97,7 @@ def test_goals_that_were_followed_are_remembered_however_many_are_refused(rig, r
 
 
 def test_as_many_goals_are_remembered_as_the_docs_say():
-    said = re.search(r"newest goals by id \((\d+) of", (ROOT / "docs" / "security.md").read_text())
+    said = re.search(r"newest goals by id \((\d+) accepted", (ROOT / "docs" / "security.md").read_text())
     assert said is not None and int(said[1]) == REMEMBERED
     memory = GoalMemory()
     for number in range(REMEMBERED + 1):
@@ -257,7 +257,7 @@ def test_arm_that_is_behind_its_set_points_is_judged_by_those_of_then_and_by_non
     limits, rest_to_rest
 ):
     rig = Rig(limits, Behind(10), path=0.02)
-    rig.controller.delay = 0.1
+    rig.controller.history.delay = 0.1
     rig.accept("a", rest_to_rest([0, 0], [1, 1]))
     for _ in range(60):
         assert rig.step().state == "active", "0.1 s at 1.9 rad/s is ten times the tolerance"
@@ -270,10 +270,10 @@ def test_arm_that_is_behind_its_set_points_is_judged_by_those_of_then_and_by_non
 
 def test_progress_is_that_of_the_arm_where_it_is_behind_its_set_points_and_never_falls(limits, rest_to_rest):
     rig, seen = Rig(limits, Behind(10)), []
-    rig.controller.delay = 0.1
+    rig.controller.history.delay = 0.1
     rig.accept("a", rest_to_rest([0, 0], [1, 1]))
     for k in range(105):
-        rig.controller.delay = 0.1 + 0.02 * (k % 2)
+        rig.controller.history.delay = 0.1 + 0.02 * (k % 2)
         seen.append(rig.step().progress)
     assert seen == sorted(seen) and seen[49] == pytest.approx(0.4, abs=0.011)
     assert seen[99] == pytest.approx(0.9, abs=0.011), "the set-points are there, the arm is not"
@@ -282,26 +282,26 @@ def test_progress_is_that_of_the_arm_where_it_is_behind_its_set_points_and_never
 
 def test_arm_whose_readings_are_held_up_is_judged_by_where_it_was_to_be_when_they_were_made(limits, rest_to_rest):
     rig = Rig(limits, Behind(10), path=0.02)
-    rig.controller.delay = 0.1
+    rig.controller.history.delay = 0.1
     rig.accept("a", rest_to_rest([0, 0], [1, 1]))
     for _ in range(60):
         rig.step()
     honest, old = rig.hardware.read, rig.hardware.read(rig.now)
     rig.hardware.read = lambda now: old
     for _ in range(10):
-        rig.controller.delay += STEP
+        rig.controller.history.delay += STEP
         assert rig.step().state == "active" and not rig.controller.status.message
-    rig.hardware.read, rig.controller.delay = honest, 0.1
+    rig.hardware.read, rig.controller.history.delay = honest, 0.1
     assert rig.until_over().state == "succeeded"
 
 
 def test_arm_that_is_later_than_usual_is_on_its_path_and_one_that_stays_behind_is_not(limits, rest_to_rest):
     rig = Rig(limits, Behind(18), path=0.02)
-    rig.controller.delay = 0.1
+    rig.controller.history.delay = 0.1
     rig.accept("a", rest_to_rest([0, 0], [1, 1]))
     assert rig.until_over().state == "succeeded"
     rig = Rig(limits, Behind(25), path=0.02)
-    rig.controller.delay = 0.1
+    rig.controller.history.delay = 0.1
     rig.accept("a", rest_to_rest([0, 0], [1, 1]))
     assert rig.until_over().error == "path_tolerance"
 

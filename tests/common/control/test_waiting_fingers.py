@@ -14,7 +14,7 @@ from common import messages as m
 from common.hardware.interface import HardwareFault, Limits, Vector
 from common.hardware.mock import MockHardware, SimulatedFingers
 from common.messages import GripperCommand, HoldRequest, StopRequest
-from tests.common.control.test_control_cycle import GRIPPER, START, Rig
+from tests.common.control.rig import GRIPPER, START, ExecutorRig
 from tests.common.hardware.conftest import Make
 
 DOWN, AWAY = 0.4, 0.3  # [m] that the arm goes
@@ -40,12 +40,12 @@ class LateArm(MockHardware):
         self._sent.append((now, positions.copy(), velocities.copy()))
 
 
-class Hand(Rig):
+class Hand(ExecutorRig):
     """The hand above a ball, or with the ball in it and on its way somewhere else."""
 
     def __init__(self, limits: Limits, trajectory: Make, holding: bool, delay: float = 0.0) -> None:
-        super().__init__(limits, LateArm(START, delay, SimulatedFingers(GRIPPER, 0.08)))
-        self.cycle._arm.delay = delay
+        super().__init__(limits, LateArm(START, delay, SimulatedFingers(GRIPPER)))
+        self.executor.arm.history.delay = delay
         self.step()
         if holding:
             self.grip("close", 0.0)
@@ -60,19 +60,19 @@ class Hand(Rig):
             self.begin = self.command("close", width=0.0, expected_width=0.06, lead=CLOSE, within=0.05)
 
     def command(self, goal: str, after: str = "go", **more: float) -> m.GripperState:
-        return self.cycle.command(GripperCommand(id=goal, after=after, **more), self.now)
+        return self.executor.command_gripper(GripperCommand(id=goal, after=after, **more), self.now)
 
     @property
     def width(self) -> float:
-        return self.cycle._gripper.state.width
+        return self.executor.gripper.state.width
 
     @property
     def gripper(self) -> m.GripperState:
-        return self.cycle._gripper.state
+        return self.executor.gripper.state
 
     @property
     def motion(self) -> m.MotionStatus:
-        return self.cycle._arm.status
+        return self.executor.arm.status
 
     def until(self, told, most: float = 10.0) -> float:
         """Step until that is so; how long it took [s]."""
@@ -84,7 +84,7 @@ class Hand(Rig):
 
     @property
     def height(self) -> float:
-        return float(self.cycle._q[1])
+        return float(self.executor._q[1])
 
 
 def broken(*_given: object) -> None:
@@ -126,7 +126,7 @@ def test_fingers_touch_nothing_before_an_arm_behind_its_set_points_stands(
 def test_fingers_that_let_go_do_so_where_the_arm_comes_to_rest(carrying: Callable[[], Hand]) -> None:
     hand = carrying()
     hand.until(lambda: not hand.gripper.holding)
-    assert hand.motion.state == "active" and abs(hand.cycle._q[0] + AWAY) <= WITHIN
+    assert hand.motion.state == "active" and abs(hand.executor._q[0] + AWAY) <= WITHIN
     hand.run(1.0)
     assert hand.motion.state == "succeeded" and hand.balls[-1].poses[0].position.x == pytest.approx(0.2, abs=WITHIN)
 
@@ -135,13 +135,13 @@ def test_fingers_begin_no_farther_from_the_end_than_they_may(carrying: Callable[
     hand = carrying()
     hand.command("wide", width=0.08, lead=10.0, within=0.002)
     hand.until(lambda: hand.gripper.id == "wide")
-    assert 0 < abs(hand.cycle._q[0] + AWAY) <= 0.002
+    assert 0 < abs(hand.executor._q[0] + AWAY) <= 0.002
 
 
 @pytest.mark.parametrize("share", [0.3, 1.0])
 def test_arm_that_is_slower_has_the_fingers_begin_later(taking: Callable[[], Hand], share: float) -> None:
     hand = taking()
-    hand.cycle.speed_scaling = share
+    hand.executor.speed_scaling = share
     hand.until(lambda: hand.gripper.id == "close")
     left = hand.until(lambda: hand.motion.state == "succeeded")
     assert left == pytest.approx(CLOSE, abs=0.03)
@@ -150,10 +150,10 @@ def test_arm_that_is_slower_has_the_fingers_begin_later(taking: Callable[[], Han
 def test_held_arm_has_no_fingers_begin_and_goes_on_to_where_they_do(taking: Callable[[], Hand]) -> None:
     hand = taking()
     hand.until(lambda: hand.motion.progress > 0.5)
-    hand.cycle.authority.hold(HoldRequest(hold=True, by="operator"), hand.now)
+    hand.executor.authority.hold(HoldRequest(hold=True, by="operator"), hand.now)
     hand.run(5.0)
     assert hand.width == 0.08 and hand.gripper.id != "close"
-    hand.cycle.authority.hold(HoldRequest(hold=False, by="operator"), hand.now)
+    hand.executor.authority.hold(HoldRequest(hold=False, by="operator"), hand.now)
     hand.until(lambda: hand.gripper.state == "succeeded" and hand.gripper.id == "close")
     assert hand.gripper.outcome == "grasped" and hand.motion.state == "succeeded"
 
@@ -162,7 +162,7 @@ def test_held_arm_has_no_fingers_begin_and_goes_on_to_where_they_do(taking: Call
 def test_stop_calls_off_fingers_that_wait(taking: Callable[[], Hand], by: str) -> None:
     hand = taking()
     hand.until(lambda: hand.motion.progress > 0.3)
-    hand.cycle.authority.stop(StopRequest(id="" if by == "operator" else "go", by=by), hand.now)
+    hand.executor.authority.stop(StopRequest(id="" if by == "operator" else "go", by=by), hand.now)
     hand.run(5.0)
     assert hand.width == 0.08 and hand.motion.state == "cancelled"
     assert (hand.grippers[-1].id, hand.grippers[-1].state) == ("close", "cancelled")
@@ -173,7 +173,7 @@ def test_stop_calls_off_fingers_that_wait(taking: Callable[[], Hand], by: str) -
 
 def test_stop_of_what_waits_lets_the_arm_arrive_without_it(taking: Callable[[], Hand]) -> None:
     hand = taking()
-    hand.cycle.authority.stop(StopRequest(id="close", by="requester"), hand.now)
+    hand.executor.authority.stop(StopRequest(id="close", by="requester"), hand.now)
     hand.until(lambda: hand.motion.state == "succeeded")
     hand.run(1.0)
     assert hand.width == 0.08 and (hand.gripper.id, hand.gripper.state) == ("close", "cancelled")
@@ -183,7 +183,7 @@ def test_stop_of_what_waits_lets_the_arm_arrive_without_it(taking: Callable[[], 
 def test_stop_as_the_fingers_close_is_told_of_as_a_stop(taking: Callable[[], Hand], by: str) -> None:
     hand = taking()
     hand.until(lambda: hand.gripper.id == "close")
-    hand.cycle.authority.stop(StopRequest(id="" if by == "operator" else "go", by=by, reason="enough"), hand.now)
+    hand.executor.authority.stop(StopRequest(id="" if by == "operator" else "go", by=by, reason="enough"), hand.now)
     hand.until(lambda: hand.motion.state != "active")
     assert (hand.motion.state, hand.motion.error, hand.motion.message) == ("cancelled", "cancelled", "enough")
 
@@ -249,16 +249,16 @@ def test_arm_does_not_go_on_down_with_fingers_that_closed_ahead_of_it(taking: Ca
     hand = taking()
     hand.until(lambda: hand.gripper.id == "close")
     if how == "held":
-        hand.cycle.authority.hold(HoldRequest(hold=True, by="operator"), hand.now)
+        hand.executor.authority.hold(HoldRequest(hold=True, by="operator"), hand.now)
     elif how == "slowed":
-        hand.cycle.speed_scaling = 0.1
+        hand.executor.speed_scaling = 0.1
     else:
         hand.step(0.3)
     hand.until(lambda: hand.motion.state != "active")
     before = hand.height
     assert (hand.motion.state, hand.motion.error) == ("aborted", m.CLOSED_BEFORE)
-    hand.cycle.speed_scaling = 1.0
-    hand.cycle.authority.hold(HoldRequest(hold=False, by="operator"), hand.now)
+    hand.executor.speed_scaling = 1.0
+    hand.executor.authority.hold(HoldRequest(hold=False, by="operator"), hand.now)
     hand.run(3.0)
     assert hand.height == pytest.approx(before, abs=1e-3) and hand.gripper.state != "active"
 
@@ -269,10 +269,10 @@ def test_arm_does_not_go_on_down_with_fingers_that_were_to_close_on_whatever_is_
     hand = taking()
     hand.command("whatever", width=0.0, lead=CLOSE, within=0.05)
     hand.until(lambda: hand.gripper.id == "whatever")
-    hand.cycle.authority.hold(HoldRequest(hold=True, by="operator"), hand.now)
+    hand.executor.authority.hold(HoldRequest(hold=True, by="operator"), hand.now)
     hand.run(1.0)
     before = hand.height
-    hand.cycle.authority.hold(HoldRequest(hold=False, by="operator"), hand.now)
+    hand.executor.authority.hold(HoldRequest(hold=False, by="operator"), hand.now)
     hand.run(1.0)
     assert hand.motion.error == m.CLOSED_BEFORE and hand.height == pytest.approx(before, abs=1e-3)
 
@@ -280,9 +280,9 @@ def test_arm_does_not_go_on_down_with_fingers_that_were_to_close_on_whatever_is_
 def test_arm_that_is_held_as_it_lets_go_still_arrives(carrying: Callable[[], Hand]) -> None:
     hand = carrying()
     hand.until(lambda: hand.gripper.id == "open")
-    hand.cycle.authority.hold(HoldRequest(hold=True, by="operator"), hand.now)
+    hand.executor.authority.hold(HoldRequest(hold=True, by="operator"), hand.now)
     hand.run(1.0)
-    hand.cycle.authority.hold(HoldRequest(hold=False, by="operator"), hand.now)
+    hand.executor.authority.hold(HoldRequest(hold=False, by="operator"), hand.now)
     hand.until(lambda: hand.motion.state == "succeeded")
 
 
@@ -294,7 +294,7 @@ def test_wherever_there_is_no_processor_what_is_let_go_falls_where_it_was_to(
 ) -> None:
     hand = carrying()
     hand.command("sooner", width=0.08, lead=lead, within=WITHIN)
-    hand.cycle.speed_scaling = speed
+    hand.executor.speed_scaling = speed
     began, left = hand.now, sorted(stalls)
     while hand.gripper.holding:
         due = bool(left) and (hand.now - began) * speed >= left[0][0]
@@ -310,7 +310,7 @@ def test_whenever_there_is_no_processor_the_arm_does_not_go_on_with_fingers_that
     taking: Callable[[], Hand], at: float, stall: float, speed: float,
 ) -> None:
     hand = taking()
-    hand.cycle.speed_scaling = speed
+    hand.executor.speed_scaling = speed
     hand.until(lambda: hand.gripper.id == "close")
     hand.run(at)
     hand.step(stall)

@@ -10,7 +10,7 @@ from pydantic import Field
 from common import messages as m
 from common.application import all_topics
 from common.errors import DecodeError
-from common.messages.basics import LARGEST, SMALL, Message, Text, clean
+from common.messages.basics import MAX_PAYLOAD_BYTES, SMALL_BYTES, Message, Text, clean
 from common.transport.codec import decode, encode
 
 MESSAGES = sorted(
@@ -56,7 +56,7 @@ def test_every_number_is_bounded_and_every_list_ends_at_its_first_error(model: t
             case "int" | "float":
                 assert node["strict"] and ({"ge", "gt"} & node.keys()) and ({"le", "lt"} & node.keys())
             case "str" | "bytes":
-                assert node["strict"] and node["max_length"] <= LARGEST
+                assert node["strict"] and node["max_length"] <= MAX_PAYLOAD_BYTES
             case "bool":
                 assert node["strict"]
             case "list":
@@ -65,14 +65,14 @@ def test_every_number_is_bounded_and_every_list_ends_at_its_first_error(model: t
 
 @pytest.mark.parametrize("model", MESSAGES)
 def test_a_message_says_how_large_it_may_be(model: type[Message]) -> None:
-    assert SMALL <= model.most_bytes <= LARGEST
-    with pytest.raises(DecodeError, match=f"the limit is {model.most_bytes}"):
-        decode(model, bytes(model.most_bytes + 1))
+    assert SMALL_BYTES <= model.max_bytes <= MAX_PAYLOAD_BYTES
+    with pytest.raises(DecodeError, match=f"the limit is {model.max_bytes}"):
+        decode(model, bytes(model.max_bytes + 1))
 
 
 @pytest.mark.parametrize("model", CONTROL)
 def test_what_is_read_where_something_moves_is_small(model: type[Message]) -> None:
-    assert model.most_bytes == SMALL
+    assert model.max_bytes == SMALL_BYTES
 
 
 @pytest.mark.parametrize(
@@ -168,4 +168,4 @@ def test_plain_values_are_not_nested_deeply() -> None:
 def test_messages_are_the_same_when_their_fields_are() -> None:
     here, there = (m.Vector3(x=x) for x in (1.0, 2.0))
     assert here == m.Vector3(x=1.0, y=0.0) and here != there and here != m.Pose() and here != vars(here)
-    assert here.same_but(there, "x") and not here.same_but(there, "y")
+    assert here.equals_except(there, "x") and not here.equals_except(there, "y")

@@ -41,10 +41,10 @@ def test_camera_is_worked_out_again_for_other_messages_only():
 @pytest.mark.parametrize(
     ("arguments", "kind", "told"),
     [
-        ((None, tf), "unknown_camera", "no camera_info came yet"),
-        ((info, None), "unknown_camera", "no tf_static came yet"),
-        ((info, tf, "elsewhere"), "unknown_frame", "no frame 'elsewhere'; it has: optical"),
-        ((info, TFMessage(transforms=[])), "unknown_frame", "it has: none"),
+        ((None, tf), "unknown_camera", "no camera_info received yet"),
+        ((info, None), "unknown_camera", "no tf_static received yet"),
+        ((info, tf, "elsewhere"), "unknown_frame", "no frame 'elsewhere'; its frames: optical"),
+        ((info, TFMessage(transforms=[])), "unknown_frame", "its frames: none"),
         ((info.model_copy(update={"d": [0.1]}), tf), "camera", "distortion"),
     ],
 )

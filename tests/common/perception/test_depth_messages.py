@@ -24,12 +24,12 @@ def test_what_is_no_depth_image_is_refused():
     depth = array_to_image(np.zeros((2, 2), np.float32), "32FC1", HEADER)
     with pytest.raises(FrameError, match="too few"):
         depth_of(depth.model_copy(update={"data": b"abc"}))
-    with pytest.raises(FrameError, match="is no colour picture"):
+    with pytest.raises(FrameError, match="is no color image"):
         decode_color_image(depth)
 
 
 def test_sizes_and_a_depth_image_without_depth_are_told():
-    with pytest.raises(DepthError, match="the depth image is 5x4, but the picture is 5x3"):
+    with pytest.raises(DepthError, match="the depth image is 5x4, but the color image is 5x3"):
         check_depth(np.ones((4, 5), np.float32), 5, 3)
     for value in (np.nan, np.inf, 0.0, -1.0):
         with pytest.raises(DepthError, match="no valid depth at all"):

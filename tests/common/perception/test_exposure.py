@@ -23,7 +23,7 @@ def test_an_empty_table_shows_something_also_in_little_light_and_noise(plain: bo
         assert blank_image_reason(shown) == ""
 
 
-@pytest.mark.parametrize(("level", "why"), [(0, "dark"), (4, "dark"), (255, "white"), (90, "one colour")])
+@pytest.mark.parametrize(("level", "why"), [(0, "dark"), (4, "dark"), (255, "white"), (90, "single color")])
 @pytest.mark.parametrize("noise", [0.0, 6.0])
 def test_a_covered_or_blinded_camera_shows_nothing(level: int, why: str, noise: float) -> None:
     covered = np.full((480, 640, 3), level, np.uint8)

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from common.perception.illumination import amplify_green, green_gain, looked_at
+from common.perception.illumination import amplify_green, green_gain, sampled_pixels
 from common.sim.lighting import tint
 
 TABLE, RED = (0.10, 0.35, 0.55), (0.10, 0.15, 1.0)  # blue, green, red
@@ -46,7 +46,7 @@ def test_grey_and_dark_pictures_stay_as_they_are() -> None:
 def test_light_is_that_of_the_part_of_a_picture_that_shows_the_table() -> None:
     picture = table(2700)
     picture[:120] = np.clip(128 * tint(2700), 0, 255)  # a grey floor
-    pixels = looked_at(240, 320)
+    pixels = sampled_pixels(240, 320)
     shown = pixels[..., 1] >= 120
     assert green_gain(picture, shown) == green_gain(picture[120:]) > green_gain(picture)
     assert green_gain(picture, np.ones(pixels.shape[:2], bool)) == green_gain(picture)

@@ -33,17 +33,18 @@ def test_whatever_is_drawn_of_the_arm_is_hidden_and_little_more(robot: RobotMode
         q = robot.named("home") + rng.uniform(-0.6, 0.6, 7)
         state = JointState(header=Header(), name=list(robot.joint_names), position=q.tolist(), velocity=[], effort=[])
         arm = (renderer.render([], state).colour != empty.render([]).colour).any(axis=2)
-        hidden = silhouettes.hidden(camera, [q])
-        assert hidden.away is not None
-        mask = cv2.resize((hidden.away <= MARGIN).astype(np.uint8), (camera.width, camera.height), interpolation=0) > 0
+        hidden = silhouettes.occlusion(camera, [q])
+        assert hidden.distance is not None
+        occluded, size = (hidden.distance <= MARGIN).astype(np.uint8), (camera.width, camera.height)
+        mask = cv2.resize(occluded, size, interpolation=0) > 0
         assert not (arm & ~mask).any()
         assert mask.sum() < 2.0 * arm.sum() + 8000
 
 
 def test_places_below_the_hand_or_out_of_the_picture_are_hidden_and_others_are_not(robot: RobotModel) -> None:
-    hidden = RobotSilhouettes(robot).hidden(ABOVE, [robot.named("home")])
+    hidden = RobotSilhouettes(robot).occlusion(ABOVE, [robot.named("home")])
     below, clear, outside = (0.15, 0.0, 0.03), (0.6, 0.1, 0.03), (0.4, 0.6, 0.03)
-    assert hidden.hides([below, clear, outside], 0.03).tolist() == [True, False, True]
+    assert hidden.occludes([below, clear, outside], 0.03).tolist() == [True, False, True]
     assert hidden.touches([below, clear, outside], 0.03).tolist() == [True, False, False]
 
 
@@ -53,25 +54,25 @@ def test_a_camera_that_looks_away_from_the_arm_sees_none_of_it(robot: RobotModel
     away = Pinhole(ABOVE.fx, ABOVE.fy, ABOVE.cx, ABOVE.cy, 640, 480, ABOVE.T_world_optical + np.array(
         [[0, 0, 0, 0.3], [0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0]]))
     places = [(0.7, y, 0.03) for y in np.linspace(-0.3, 0.3, 9)]
-    assert not RobotSilhouettes(robot).hidden(away, [q]).hides(places, 0.03).any()
+    assert not RobotSilhouettes(robot).occlusion(away, [q]).occludes(places, 0.03).any()
 
 
 def test_a_picture_of_which_nothing_can_be_judged_hides_everything() -> None:
     blind = Occlusion(ABOVE, "the lens is covered")
-    assert blind.everything and blind.hides([(0.4, 0.0, 0.03)])[0] and blind.touches([(0.4, 0.0, 0.03)])[0]
+    assert blind.everything and blind.occludes([(0.4, 0.0, 0.03)])[0] and blind.touches([(0.4, 0.0, 0.03)])[0]
 
 
 def test_what_the_arm_swept_since_the_picture_is_hidden_until_one_is_taken_after_it_stands(robot: RobotModel) -> None:
     before, home = RobotOcclusion(RobotSilhouettes(robot)), robot.named("home")
     turned = home + np.array([1.2, 0, 0, 0, 0, 0, 0])
     below = [(0.15, 0.0, 0.03)]
-    first = before.in_picture(ABOVE, 100, home, 100)
-    moving = before.in_picture(ABOVE, 150, turned, 200)
-    stands = before.in_picture(ABOVE, 250, turned, 300)
+    first = before.in_image(ABOVE, 100, home, 100)
+    moving = before.in_image(ABOVE, 150, turned, 200)
+    stands = before.in_image(ABOVE, 250, turned, 300)
     assert first is not None and moving is not None and stands is not None
-    assert [bool(one.hides(below, 0.03)[0]) for one in (first, moving, stands)] == [True, True, False]
-    assert before.in_picture(ABOVE, 350, turned, 400) is stands and stands.by == BY_ROBOT
+    assert [bool(one.occludes(below, 0.03)[0]) for one in (first, moving, stands)] == [True, True, False]
+    assert before.in_image(ABOVE, 350, turned, 400) is stands and stands.by == BY_ROBOT
 
 
 def test_nothing_is_said_as_long_as_nobody_knows_where_the_arm_is(robot: RobotModel) -> None:
-    assert RobotOcclusion(RobotSilhouettes(robot)).in_picture(ABOVE, 1, None, 0) is None
+    assert RobotOcclusion(RobotSilhouettes(robot)).in_image(ABOVE, 1, None, 0) is None

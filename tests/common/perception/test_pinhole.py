@@ -85,6 +85,6 @@ def test_distortion_and_skew_are_refused():
 
 
 def test_the_picture_ends_half_a_pixel_beyond_the_centres_of_its_outer_pixels():
-    inside = default.in_picture([(-0.4, 10), (-0.6, 10), (639.4, 479.4), (100, 479.6)])
+    inside = default.in_image([(-0.4, 10), (-0.6, 10), (639.4, 479.4), (100, 479.6)])
     assert inside.tolist() == [True, False, True, False]
-    assert not default.in_picture((3.0, 100.0), margin=5)
+    assert not default.in_image((3.0, 100.0), margin=5)

@@ -24,7 +24,7 @@ def to_arc(T, **circle) -> PlanRequest:
 
 
 @given(start=points, via=points, goal=points)
-def test_circle_passes_its_three_points_in_their_order(start, via, goal):
+def test_circle_passes_its_three_points_in_order(start, via, goal):
     try:
         circle = circle_through(start, via, goal)
     except NoArc:
@@ -38,7 +38,7 @@ def test_circle_passes_its_three_points_in_their_order(start, via, goal):
 
 
 @given(centre=points, one=points, other=points)
-def test_circle_about_a_centre_takes_the_shorter_way(centre, one, other):
+def test_circle_about_a_centre_takes_the_shorter_arc(centre, one, other):
     assume(min(np.linalg.norm(one), np.linalg.norm(other)) > 0.05)
     one, other = 0.3 * one / np.linalg.norm(one), 0.3 * other / np.linalg.norm(other)
     try:
@@ -58,7 +58,7 @@ def test_circle_about_a_centre_takes_the_shorter_way(centre, one, other):
         (lambda: circle_about(START, START + DY, START + 2 * DX), "0.1000 m from the start and 0.2236"),
     ],
 )
-def test_points_that_tell_no_circle_are_refused(make, text):
+def test_points_that_define_no_circle_are_refused(make, text):
     with pytest.raises(NoArc, match=text):
         make()
 
@@ -84,7 +84,7 @@ def test_tool_follows_the_arc_at_its_speed(how):
     assert timed.duration < circle.length / 0.1 + 1
 
 
-def test_arc_that_collides_says_where_and_between_what():
+def test_colliding_arc_is_reported_with_waypoint_and_pair():
     beam = solid("beam", "fixture", "box", [0.1, 0.02, 0.1], (0.5, 0.0, 0.5))
     blocked = EMPTY.model_copy(update={"objects": [*EMPTY.objects, beam]})
     response = with_planner("circ").plan(to_arc(tool_down(0.5, 0.3, 0.2), via=(0.5, 0.0, 0.5)), blocked)
@@ -94,7 +94,7 @@ def test_arc_that_collides_says_where_and_between_what():
     assert 0.1 < response.fraction < 0.5
 
 
-def test_arc_beyond_the_reach_says_how_far_it_goes():
+def test_arc_beyond_the_reach_is_reported_with_its_fraction():
     response = with_planner("circ").plan(to_arc(tool_down(0.5, 0.3, 0.2), via=(1.0, 0.0, 0.2)), EMPTY)
     assert response.error == "no_ik"
     assert 0 < response.fraction < 0.5
@@ -114,6 +114,6 @@ def test_arc_needs_one_circle():
 
 
 @pytest.mark.parametrize("planner", ["cartesian", "joint_move", "lerp", "lin", "ompl", "ptp"])
-def test_other_planners_leave_arcs_alone(planner):
+def test_other_planners_do_not_accept_arcs(planner):
     response = with_planner(planner).plan(to_arc(tool_down(0.5, 0.3, 0.2), via=(0.5, 0.0, 0.5)), EMPTY)
     assert response.error == "no_planner"

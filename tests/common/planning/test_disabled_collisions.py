@@ -17,7 +17,7 @@ def named(pairs, *reasons):
     return {frozenset((p.one, p.other)) for p in pairs if not reasons or p.reason in reasons}
 
 
-def test_srdf_of_the_ur5_is_what_the_command_computes():
+def test_srdf_of_the_ur5_is_up_to_date():
     assert ROBOT.srdf is not None
     written = {
         (item.get("link1"), item.get("link2"), item.get("reason"))
@@ -33,7 +33,7 @@ def test_same_seed_gives_the_same_pairs():
 
 @pytest.mark.parametrize("robot", [ROBOT, PANDA], ids=["ur5", "panda"])
 @pytest.mark.slow
-def test_pairs_called_never_do_not_collide_at_other_samples(robot):
+def test_never_colliding_pairs_do_not_collide_at_other_samples(robot):
     never = named(disabled_pairs(robot), "Never")
     assert never
     geometry = convex_hulls(robot.full_geometry(pin.GeometryType.COLLISION))
@@ -47,7 +47,7 @@ def test_pairs_called_never_do_not_collide_at_other_samples(robot):
         assert not pin.computeCollisions(robot.full_model, data, geometry, shapes, q, True)
 
 
-def test_links_that_the_group_can_bring_together_stay_checked():
+def test_links_that_can_collide_stay_checked():
     checked = RobotGeometry(ROBOT)
     pairs = {
         frozenset((checked.links[p.first], checked.links[p.second])) for p in checked.geometry.collisionPairs
@@ -59,18 +59,18 @@ def test_links_that_the_group_can_bring_together_stay_checked():
     assert not any(pair <= set(fingers) for pair in pairs)
 
 
-def test_it_finds_for_the_panda_nearly_what_its_makers_list_says():
+def test_panda_pairs_are_almost_those_of_its_manufacturer():
     assert PANDA.srdf is not None
-    theirs = {
+    manufacturer = {
         frozenset((item.get("link1"), item.get("link2"))) for item in ET.parse(PANDA.srdf).iter("disable_collisions")
     }
     with_shapes = {link for pair in named(disabled_pairs(PANDA, samples=1)) for link in pair}
-    missed = {pair for pair in theirs if pair <= with_shapes} - named(disabled_pairs(PANDA))
-    # Their list leaves out two pairs whose shapes meet at about one sample in twelve.
+    missed = {pair for pair in manufacturer if pair <= with_shapes} - named(disabled_pairs(PANDA))
+    # The manufacturer disables two pairs whose shapes collide at about one sample in twelve.
     assert missed == {frozenset(("panda_link5", "panda_link7")), frozenset(("panda_link5", "panda_hand"))}
 
 
-def test_folded_links_that_always_touch_are_told_from_those_that_may(tmp_path):
+def test_links_that_always_touch_are_reported_as_always(tmp_path):
     shapes = {"base": ("0.2 0.2 0.2", "0 0 0"), "arm": ("0.02 0.02 0.02", "0 0 0"), "tip": ("0.3 0.3 0.3", "0 0 0")}
     links = "".join(
         f'<link name="{name}"><collision><origin xyz="{at}"/><geometry><box size="{size}"/></geometry></collision>'
@@ -91,7 +91,7 @@ def test_folded_links_that_always_touch_are_told_from_those_that_may(tmp_path):
     assert found == {("base", "arm"): "Adjacent", ("arm", "tip"): "Adjacent", ("base", "tip"): "Always"}
 
 
-def test_srdf_names_groups_and_poses_and_is_taken_by_the_planner(tmp_path):
+def test_srdf_contains_groups_and_poses_and_is_loaded_by_the_planner(tmp_path):
     text = srdf(ROBOT, disabled_pairs(ROBOT, samples=100))
     root = ET.fromstring(text)
     assert [group.get("name") for group in root.findall("group")] == ["ur_manipulator", "ur_gripper"]
@@ -110,7 +110,7 @@ def test_srdf_names_groups_and_poses_and_is_taken_by_the_planner(tmp_path):
 
 
 def _wrist(gap: float) -> str:
-    """A box before a joint and a wall behind it, `gap` [m] apart where it is at 0: they meet when it turns."""
+    """A box before a joint and a wall behind it, a gap [m] apart at position 0: they touch when the joint turns."""
     def link(name: str, at: str, size: str) -> str:
         shape = f'<origin xyz="{at}"/><geometry><box size="{size}"/></geometry>'
         return f'<link name="{name}"><collision>{shape}</collision></link>'
@@ -126,7 +126,7 @@ def _wrist(gap: float) -> str:
 
 
 @pytest.mark.parametrize(("gap", "reason"), [(0.0002, "Always"), (0.02, None)])
-def test_neighbours_that_touch_nearly_everywhere_are_left_out_and_others_stay_checked(gap, reason, tmp_path):
+def test_neighbours_that_almost_always_touch_are_disabled(gap, reason, tmp_path):
     (tmp_path / "r.urdf").write_text(_wrist(gap))
     robot = RobotModel.load(RobotConfig.model_validate({
         "name": "r", "urdf": str(tmp_path / "r.urdf"), "joints": ["a", "b"], "base_link": "base", "tcp_link": "hand",

@@ -1,4 +1,4 @@
-"""Sequences of regions: passed without a stop, where that takes the least time, whoever plans the legs."""
+"""Sequences of regions: passed without a stop, in the least time, with segments of any planner."""
 
 import math
 
@@ -45,14 +45,14 @@ def region(goal: PoseGoal) -> Region:
 
 
 def passes_by(timed, goal: PoseGoal) -> float:
-    """How near the tool comes to a region [m]."""
+    """Least distance of the tool from a region [m]."""
     path, _ = fine_samples(timed, 0.003)
     place, side = goal.pose.position, goal.position_tolerance.x / 2
     away = np.abs([ROBOT.fk(q)[:3, 3] - (place.x, place.y, place.z) for q in path]) - side
     return float(np.linalg.norm(np.maximum(away, 0.0), axis=1).min())
 
 
-def test_region_on_the_way_is_passed_within_the_radius_without_a_stop():
+def test_intermediate_region_is_passed_within_the_radius_without_a_stop():
     response = PIPELINE.plan(through(VIA, GRASP), TABLE)
     timed = assert_sound(PIPELINE, through(VIA, GRASP), TABLE, response)
     assert np.abs(timed.velocities[1:-1]).max(axis=1).min() > 1e-3
@@ -61,16 +61,16 @@ def test_region_on_the_way_is_passed_within_the_radius_without_a_stop():
     path, _ = fine_samples(timed, 0.003)
     tool = np.array([ROBOT.fk(q)[:3, 3] for q in path])
     low = tool[tool[:, 2] < BALL[2] + 0.04]
-    assert np.linalg.norm(low[:, :2] - BALL[:2], axis=1).max() < 0.02, "it comes from above"
+    assert np.linalg.norm(low[:, :2] - BALL[:2], axis=1).max() < 0.02, "the tool comes from above"
 
 
-def test_one_motion_takes_less_time_than_one_for_each_goal():
+def test_one_motion_takes_less_time_than_separate_motions():
     first = PIPELINE.plan(PlanRequest(id="1", start=HOME.tolist(), goal=VIA, gripper_width=0.08), TABLE)
     second = PIPELINE.plan(PlanRequest(
         id="2", start=last(first).tolist(), goal=GRASP, straight=True, gripper_width=0.08), TABLE)
     apart = sum(response.trajectory.points[-1].time_from_start for response in (first, second))
-    whole = PIPELINE.plan(through(VIA, GRASP), TABLE).trajectory.points[-1].time_from_start
-    assert whole < 0.85 * apart
+    together = PIPELINE.plan(through(VIA, GRASP), TABLE).trajectory.points[-1].time_from_start
+    assert together < 0.85 * apart
 
 
 @pytest.mark.parametrize("name", ["cartesian_ompl", "chomp", "lerp", "trajopt", "pilz"])
@@ -83,7 +83,7 @@ def test_every_pipeline_passes_regions(name):
     assert passes_by(timed, VIA) < RADIUS
 
 
-def test_leg_whose_straight_edge_is_blocked_is_planned_by_the_planners():
+def test_blocked_segment_is_planned_by_the_planners():
     across = wall(0.35)
     request = through(about(0.5, -0.1, 0.3), about(0.5, 0.3, 0.15))
     response = PIPELINE.plan(request, across)
@@ -93,7 +93,7 @@ def test_leg_whose_straight_edge_is_blocked_is_planned_by_the_planners():
     assert lone.message.startswith("legs: item ")
 
 
-def test_goal_of_the_set_at_the_end_is_told():
+def test_reached_goal_of_a_final_set_is_reported():
     far = about(0.3, -0.5, 0.3, side=0.0, tilt=0.0, yaw=0.0)
     request = through(VIA, GoalSet(goals=[far, GRASP, JointGoal(named="home")]))
     response = PIPELINE.plan(request, TABLE)
@@ -104,7 +104,7 @@ def test_goal_of_the_set_at_the_end_is_told():
     assert (response.ok, response.goal_index) == (True, 1)
 
 
-def test_item_that_cannot_be_reached_is_named():
+def test_unreachable_item_is_reported_with_its_number():
     response = PIPELINE.plan(through(VIA, about(0.9, 0.0, 0.9, side=0.0, yaw=0.0)), TABLE)
     assert response.error == "no_ik"
     assert response.message.startswith("legs: item 2 of 2: ")
@@ -113,7 +113,7 @@ def test_item_that_cannot_be_reached_is_named():
     assert response.message.startswith("legs: item 1 of 2: ")
 
 
-def test_joint_goals_between_are_passed_and_where_the_arm_is_needs_no_motion():
+def test_intermediate_joint_goal_is_passed_and_the_start_needs_no_motion():
     between = JointGoal(positions=(HOME + 0.2).tolist())
     response = PIPELINE.plan(through(between, JointGoal(named="home"), radius=0.0), TABLE)
     timed = assert_sound(PIPELINE, through(between, JointGoal(named="home")), TABLE, response)
@@ -122,7 +122,7 @@ def test_joint_goals_between_are_passed_and_where_the_arm_is_needs_no_motion():
     assert np.allclose(assert_sound(PIPELINE, through(VIA), TABLE, still).positions, HOME, atol=1e-6)
 
 
-def test_arcs_and_lines_are_left_to_planners_that_know_them():
+def test_arcs_are_left_to_other_planners():
     arc = ArcGoal(pose=matrix_to_pose(tool_down(0.5, 0.2, 0.3)), via=Vector3(x=0.55, y=0.1, z=0.35))
     assert PIPELINE.plan(through(VIA, arc), TABLE).error == "no_planner"
 
@@ -133,13 +133,13 @@ def test_search_ends_when_it_is_cancelled():
     assert PIPELINE.plan(through(VIA, GRASP), TABLE, cancel=cancel).error == "cancelled"
 
 
-def test_the_same_request_has_the_same_answer():
+def test_same_sequence_request_gives_the_same_answer():
     one, other = (PIPELINE.plan(through(VIA, GRASP), TABLE).trajectory for _ in range(2))
     assert one.points == other.points
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_nearest_pose_of_a_region_lies_in_it_and_those_inside_stay(seed):
+def test_nearest_pose_is_inside_the_region_and_inner_poses_are_unchanged(seed):
     rng = np.random.default_rng(seed)
     T = tool_down(0.5, 0.1, 0.3, 0.7)
     small = Region(T, np.array([0.02, 0.01, 0.03]), 0.2, 0.4)

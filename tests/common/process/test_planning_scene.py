@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from common import topics
+from common.atomic_file import STATE_VARIABLE, AtomicFile
 from common.errors import ConfigError, RemoteError
-from common.kept_file import STATE_VARIABLE, KeptFile
 from common.messages import CollisionObject, Header, PlanningScene, Pose, SceneEdit
 from common.process.in_process import running_service
 from common.process.planning_scene import SceneWriter
@@ -57,7 +57,7 @@ async def test_solid_is_not_added_if_it_cannot_be_saved(monkeypatch: pytest.Monk
     def full(self: object, record: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(KeptFile, "save", full)
+    monkeypatch.setattr(AtomicFile, "save", full)
     net = LocalNetwork()
     bus = net.bus("tester", cell="test")
     async with running_service(net, writer, None, name="writer"):

@@ -20,8 +20,8 @@ from common.errors import NoResponder, NoRouter, RemoteError, RequestLost, Reque
 from common.messages import TaskCommand
 from common.process.service import add_options, prepare
 from common.transport.bus import Bus, Client
-from common.transport.connect import connect
 from common.transport.endpoint import endpoint_of, port_of
+from common.transport.zenoh_session import connect
 from tests.common.process.toy import Config
 from tests.harness import freeze, wait_router
 

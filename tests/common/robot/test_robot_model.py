@@ -25,7 +25,7 @@ def test_panda_has_seven_joints_and_the_limits_of_its_description(robot):
     assert robot.jerk[6] == 10000
 
 
-def test_both_names_of_the_group_are_known(robot):
+def test_group_has_both_names(robot):
     assert robot.groups == ["arm", "panda_arm"]
 
 
@@ -39,7 +39,7 @@ def test_tcp_lies_between_the_finger_tips(robot):
     assert np.isclose(np.linalg.norm(robot.fk(q)[:3, 3] - links["panda_link8"][:3, 3]), 0.1034, atol=1e-4)
 
 
-def test_fingers_follow_the_positions_given_for_them(robot):
+def test_link_poses_of_the_fingers_follow_their_positions(robot):
     q = robot.named("home")
     closed = robot.link_poses(q, {"panda_finger_joint1": 0.0, "panda_finger_joint2": 0.0})
     assert np.allclose(closed["panda_leftfinger"][:3, 3], closed["panda_rightfinger"][:3, 3])
@@ -47,13 +47,13 @@ def test_fingers_follow_the_positions_given_for_them(robot):
     assert np.isclose(np.linalg.norm(opened["panda_leftfinger"][:3, 3] - opened["panda_rightfinger"][:3, 3]), 0.08)
 
 
-def test_every_link_hangs_on_one_that_is_known(robot):
+def test_every_link_has_a_known_parent(robot):
     links = set(robot.link_poses(robot.named("home")))
     assert set(robot.link_parents) == links - {"panda_link0"}
     assert set(robot.link_parents.values()) <= links
 
 
-def test_joint_state_is_put_into_the_order_of_the_group(robot):
+def test_joint_state_is_ordered_as_the_group(robot):
     names = [*reversed(robot.joint_names), "panda_finger_joint1"]
     assert np.array_equal(robot.order(names, list(range(8))), [6, 5, 4, 3, 2, 1, 0])
     assert robot.order(names[1:], list(range(7))) is None
@@ -79,13 +79,13 @@ def test_unknown_names_are_refused_with_the_choices(robot):
         ({"named_poses": {"home": [9.0, 0, 0, -1, 0, 1, 0]}}, "robot.named_poses.home.*panda_joint1"),
     ],
 )
-def test_robot_files_that_do_not_fit_are_refused_with_field_and_choice(config, change, message):
+def test_invalid_robot_file_is_refused_with_field_and_choices(config, change, message):
     changed = RobotConfig.model_validate(config.model_dump() | change)
     with pytest.raises(ConfigError, match=message):
         RobotModel.load(changed)
 
 
-def test_joints_must_be_given_in_the_order_of_the_description(config):
+def test_joints_in_another_order_than_the_description_are_refused(config):
     swapped = config.model_dump()
     swapped["joints"] = [swapped["joints"][1], swapped["joints"][0], *swapped["joints"][2:]]
     with pytest.raises(ConfigError, match=r"robot\.joints"):

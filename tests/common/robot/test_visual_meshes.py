@@ -1,4 +1,4 @@
-"""The robot's shapes: where they belong, in their colours, with few triangles and none lost."""
+"""Meshes of the robot for viewers: positions, colours, and number of triangles."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ COARSE = """<robot name="post">
     [("", ["arm", "arm_coarse", "foot"]),
      ('<visual><geometry><box size="0.1 0.1 0.1"/></geometry></visual>', ["arm", "foot"])],
 )
-def test_links_with_collision_shapes_alone_are_seen_as_these(tmp_path: Path, visual: str, links: list[str]) -> None:
+def test_links_with_collision_shapes_only_are_drawn_as_these(tmp_path: Path, visual: str, links: list[str]) -> None:
     with patch(f"{__name__}.URDF", COARSE.replace("{visual}", visual)):
         robot = post(tmp_path)
     assert sorted({piece.link for piece in visual_pieces(robot)}) == links
@@ -79,7 +79,7 @@ def test_links_with_collision_shapes_alone_are_seen_as_these(tmp_path: Path, vis
 
 @pytest.mark.parametrize("cell", ["panda", "ur5"])
 @pytest.mark.slow
-def test_every_visual_of_the_description_is_where_its_link_is(cell: str) -> None:
+def test_every_visual_of_the_description_moves_with_its_link(cell: str) -> None:
     robot = robot_of(cell)
     model, data = robot.full_model, robot.full_model.createData()
     q = np.clip(robot.full_reference + 0.3, model.lowerPositionLimit, model.upperPositionLimit)
@@ -98,13 +98,13 @@ def test_every_visual_of_the_description_is_where_its_link_is(cell: str) -> None
         shown.setdefault(piece.link, []).append(piece.vertices @ T[:3, :3].T + T[:3, 3])
     assert set(shown) == set(described)
     for link, parts in described.items():
-        if not link.startswith("robotiq"):  # the corners of a box that is turned are none of a cylinder's
-            wanted, found = np.concatenate(parts), np.concatenate(shown[link])
-            np.testing.assert_allclose(found.min(axis=0), wanted.min(axis=0), atol=0.004)
-            np.testing.assert_allclose(found.max(axis=0), wanted.max(axis=0), atol=0.004)
+        if not link.startswith("robotiq"):  # a cylinder has other extreme points than its bounding box
+            expected, found = np.concatenate(parts), np.concatenate(shown[link])
+            np.testing.assert_allclose(found.min(axis=0), expected.min(axis=0), atol=0.004)
+            np.testing.assert_allclose(found.max(axis=0), expected.max(axis=0), atol=0.004)
 
 
-def test_colours_are_those_of_the_files() -> None:
+def test_colours_are_those_of_the_files_and_the_urdf() -> None:
     colors = {piece.color for piece in pieces_of("ur5")}
     assert (64, 89, 104) in colors  # the caps of the joints
     assert (38, 38, 41) in colors  # the gripper, by its URDF
@@ -113,12 +113,12 @@ def test_colours_are_those_of_the_files() -> None:
 
 @pytest.mark.parametrize("cell", ["panda", "ur5"])
 @pytest.mark.slow
-def test_few_triangles_are_left_and_no_part_is_lost(cell: str) -> None:
+def test_simplification_leaves_few_triangles_and_loses_no_part(cell: str) -> None:
     robot = robot_of(cell)
-    whole = visual_pieces(robot, 10**9)
+    full_pieces = visual_pieces(robot, 10**9)
     few = pieces_of(cell)
-    assert sum(len(piece.faces) for piece in few) < 50_000 < sum(len(piece.faces) for piece in whole)
-    for full, simple in zip(whole, few, strict=True):
+    assert sum(len(piece.faces) for piece in few) < 50_000 < sum(len(piece.faces) for piece in full_pieces)
+    for full, simple in zip(full_pieces, few, strict=True):
         assert (simple.link, simple.color) == (full.link, full.color)
         assert simple.faces.max() < len(simple.vertices)
         np.testing.assert_allclose(simple.vertices.min(axis=0), full.vertices.min(axis=0), atol=0.003)
@@ -126,7 +126,7 @@ def test_few_triangles_are_left_and_no_part_is_lost(cell: str) -> None:
 
 
 @given(st.integers(1, 30), st.data())
-def test_parts_are_those_that_edges_connect(count: int, data: st.DataObject) -> None:
+def test_parts_are_connected_by_edges(count: int, data: st.DataObject) -> None:
     node = st.integers(0, count - 1)
     edges = data.draw(st.lists(st.tuples(node, node), max_size=40))
     lowest = list(range(count))
@@ -144,21 +144,21 @@ def test_parts_are_those_that_edges_connect(count: int, data: st.DataObject) -> 
     trimesh.creation.capsule(), trimesh.creation.cone(1, 3), trimesh.creation.cylinder(1, 2, sections=6),
     trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], process=False),
 ])
-def test_surfaces_are_parted_at_edges_as_trimesh_does(mesh: trimesh.Trimesh) -> None:
-    wanted = trimesh.graph.smooth_shade(mesh, angle=0.6)
+def test_surfaces_are_split_at_sharp_edges_as_in_trimesh(mesh: trimesh.Trimesh) -> None:
+    expected = trimesh.graph.smooth_shade(mesh, angle=0.6)
     piece = _piece("link", (0, 0, 0), mesh)
-    assert len(piece.vertices) == len(wanted.vertices)
+    assert len(piece.vertices) == len(expected.vertices)
     np.testing.assert_allclose(piece.vertices[piece.faces], mesh.triangles, atol=1e-6)
 
 
-def test_ghost_has_fewer_triangles_of_the_same_links() -> None:
+def test_coarse_pieces_have_fewer_triangles_of_the_same_links() -> None:
     pieces = pieces_of("panda")
-    ghost = coarse(pieces, 0.3)
-    assert [piece.link for piece in ghost] == list(dict.fromkeys(piece.link for piece in pieces))
-    assert sum(len(piece.faces) for piece in ghost) < 0.6 * sum(len(piece.faces) for piece in pieces)
+    simple = coarse(pieces, 0.3)
+    assert [piece.link for piece in simple] == list(dict.fromkeys(piece.link for piece in pieces))
+    assert sum(len(piece.faces) for piece in simple) < 0.6 * sum(len(piece.faces) for piece in pieces)
 
 
-def test_shapes_without_files_are_made_from_their_dimensions(tmp_path: Path) -> None:
+def test_primitive_shapes_are_created_from_their_dimensions(tmp_path: Path) -> None:
     pieces = visual_pieces(post(tmp_path))
     box = next(piece for piece in pieces if piece.color == (0, 0, 255))
     np.testing.assert_allclose([box.vertices.min(axis=0), box.vertices.max(axis=0)], [[-0.1, -0.2, 0], [0.1, 0.2, 1]])
@@ -168,7 +168,7 @@ def test_shapes_without_files_are_made_from_their_dimensions(tmp_path: Path) -> 
     np.testing.assert_allclose(arm.max(axis=0)[0], 1.25, atol=1e-6)
 
 
-def test_file_without_colours_takes_those_of_the_urdf_and_its_scale(tmp_path: Path) -> None:
+def test_file_without_colours_gets_colour_and_scale_of_the_urdf(tmp_path: Path) -> None:
     trimesh.creation.box(extents=(1, 2, 3)).export(tmp_path / "box.stl")
     visual = """<visual><geometry><mesh filename="box.stl" scale="0.1 0.1 0.1"/></geometry>
       <material name="red"><color rgba="1 0 0 1"/></material></visual>"""
@@ -177,7 +177,7 @@ def test_file_without_colours_takes_those_of_the_urdf_and_its_scale(tmp_path: Pa
     np.testing.assert_allclose(red.vertices.max(axis=0), [0.05, 0.1, 0.15])
 
 
-def test_mesh_that_can_not_be_read_is_named(tmp_path: Path) -> None:
+def test_unreadable_mesh_is_named(tmp_path: Path) -> None:
     trimesh.creation.box().export(tmp_path / "box.stl")
     robot = post(tmp_path, '<visual><geometry><mesh filename="box.stl"/></geometry></visual>')
     robot.urdf = robot.urdf.replace("box.stl", "box.unknown")
@@ -186,12 +186,12 @@ def test_mesh_that_can_not_be_read_is_named(tmp_path: Path) -> None:
         visual_pieces(robot)
 
 
-def test_mesh_that_is_not_there_and_shape_that_is_not_known_are_named(tmp_path: Path) -> None:
+def test_missing_mesh_and_unknown_shape_are_named(tmp_path: Path) -> None:
     robot = post(tmp_path)
     good = robot.urdf
     robot.urdf = good.replace('<box size="0.2 0.4 1.0" />', '<mesh filename="/nowhere/box.stl"/>')
     with pytest.raises(ConfigError, match=r"nowhere/box\.stl"):
         visual_pieces(robot)
     robot.urdf = good.replace('<box size="0.2 0.4 1.0" />', "<torus/>")
-    with pytest.raises(ConfigError, match="'torus' is no visual shape; choices: box, capsule"):
+    with pytest.raises(ConfigError, match="'torus' is an unknown shape; choices: box, capsule"):
         visual_pieces(robot)

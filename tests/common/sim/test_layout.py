@@ -80,7 +80,7 @@ def test_ball_in_the_picture_is_seen_with_every_point_of_its_surface(world_confi
 @pytest.mark.parametrize("accepts", [lambda *at: False, lambda x, y, z: math.dist((x, y), (0.4, -0.2)) < 0.05])
 def test_layout_that_is_not_found_is_a_configuration_error(world_config: World, accepts: object) -> None:
     config = changed(world_config, layout="random")
-    with pytest.raises(ConfigError, match=r"world\.objects: 7 objects find no random layout"):
+    with pytest.raises(ConfigError, match=r"world\.objects: 7 objects fit no random layout"):
         layout(config, 1, accepts)  # type: ignore[arg-type]
 
 

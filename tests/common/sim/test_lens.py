@@ -6,7 +6,7 @@ from common.config import CameraConfig, Scenery, load_cell
 from common.errors import ConfigError
 from common.messages import Header, JointState, Pose, Vector3, WorldObject, WorldObjects
 from common.perception.pinhole import Pinhole
-from common.sim.camera import CameraParameters, Lens, ObjectMotion, SimulatedCamera, joints_ago, times
+from common.sim.camera import CameraParameters, Lens, ObjectMotion, SimulatedCamera, joints_ago, sample_times
 
 BARREL = [-0.25, 0.08, 0.001, -0.0005, 0.0]
 BENT = CameraConfig(d=BARREL)
@@ -34,7 +34,7 @@ PLACES = [(0.4, 0.0, 0.0), (0.68, 0.38, 0.0), (0.15, -0.4, 0.0)]
 def test_lens_shows_things_where_opencv_says(place):
     lens = Lens(BENT, distorted=True, rectify=False)
     plain = Pinhole.from_config(BENT)
-    seen = middle(lens.bend(spot(Pinhole.from_config(lens.drawn), place)))
+    seen = middle(lens.distort(spot(Pinhole.from_config(lens.rendered), place)))
     k = np.array([[520, 0, 320], [0, 520, 240], [0, 0, 1.0]])
     expected, _ = cv2.projectPoints(plain.to_camera(place)[None], np.zeros(3), np.zeros(3), k, np.array(BARREL))
     np.testing.assert_allclose(seen, expected.ravel(), atol=0.1)
@@ -45,21 +45,22 @@ def test_lens_shows_things_where_opencv_says(place):
 @pytest.mark.parametrize("place", PLACES)
 def test_what_is_rectified_is_where_a_pinhole_sees_it(place):
     lens = Lens(BENT, distorted=True)
-    picture = lens.come_out(lens.bend(spot(Pinhole.from_config(lens.drawn), place)))
+    picture = lens.rectify(lens.distort(spot(Pinhole.from_config(lens.rendered), place)))
     np.testing.assert_allclose(middle(picture), Pinhole.from_config(BENT).project(place), atol=0.1)
     assert lens.d == [0.0] * 5
 
 
 def test_pictures_are_drawn_as_wide_as_the_lens_sees_and_no_wider():
     lens = Lens(BENT, distorted=True)
-    assert 640 < lens.drawn.width < 1000 and 480 < lens.drawn.height < 800 and not lens.drawn.d
-    assert lens.bend(np.full((lens.drawn.height, lens.drawn.width, 3), 200, np.uint8)).min() == 200, "no black corners"
+    assert 640 < lens.rendered.width < 1000 and 480 < lens.rendered.height < 800 and not lens.rendered.d
+    white = np.full((lens.rendered.height, lens.rendered.width, 3), 200, np.uint8)
+    assert lens.distort(white).min() == 200, "no black corners"
 
 
 def test_without_distortion_nothing_is_done():
     picture = np.zeros((480, 640, 3), np.uint8)
     for lens in (Lens(BENT), Lens(CameraConfig(), distorted=True)):
-        assert lens.bend(picture) is picture and lens.come_out(picture) is picture
+        assert lens.distort(picture) is picture and lens.rectify(picture) is picture
 
 
 def test_a_lens_that_bends_everything_is_refused():
@@ -76,7 +77,7 @@ def sphere(x, stamp):
 def test_what_moves_was_elsewhere_within_the_exposure():
     movement = ObjectMotion()
     for number in range(3):
-        movement.take(sphere(0.4 + 0.01 * number, 100_000_000 * number))  # 0.1 m/s, at ten pictures a second
+        movement.update(sphere(0.4 + 0.01 * number, 100_000_000 * number))  # 0.1 m/s, at ten pictures a second
     now = 200_000_000
     assert movement.objects(0.02, now)[0].pose.position.x == pytest.approx(0.418)
     assert movement.objects(0.0, now)[0].pose.position.x == pytest.approx(0.42)
@@ -85,8 +86,8 @@ def test_what_moves_was_elsewhere_within_the_exposure():
 
 def test_what_was_put_elsewhere_did_not_fly_there():
     movement = ObjectMotion()
-    movement.take(sphere(0.0, 0))
-    movement.take(sphere(0.6, 50_000_000))
+    movement.update(sphere(0.0, 0))
+    movement.update(sphere(0.6, 50_000_000))
     assert movement.objects(0.02, 50_000_000)[0].pose.position.x == pytest.approx(0.6)
 
 
@@ -97,8 +98,8 @@ def test_joints_were_where_their_velocities_say():
 
 
 def test_times_of_an_exposure_are_even_and_end_with_it():
-    assert list(times(0.02, 1)) == [0.0]
-    assert list(times(0.02, 3)) == pytest.approx([0.02, 0.01, 0.0])
+    assert list(sample_times(0.02, 1)) == [0.0]
+    assert list(sample_times(0.02, 3)) == pytest.approx([0.02, 0.01, 0.0])
 
 
 def camera(**parameters):

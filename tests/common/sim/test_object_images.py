@@ -113,8 +113,8 @@ def test_spheres_that_lie_as_before_are_drawn_as_before_and_not_worked_out_again
         worked_out.append(1)
         return seen_sphere(*arguments)
 
-    seen_sphere = rendering._seen_sphere
-    monkeypatch.setattr(rendering, "_seen_sphere", seen)
+    seen_sphere = rendering._sphere_coverage
+    monkeypatch.setattr(rendering, "_sphere_coverage", seen)
     renderer, places = Renderer(AROUND, plain=True), [(0.4, 0.1, 0.03), (0.45, 0.15, 0.03), (0.6, -0.2, 0.03)]
     renderer.render(spheres(places, AROUND).objects)
     for moved in ((0.43, 0.14, 0.03), (0.43, 0.14, 0.05)):
@@ -149,7 +149,7 @@ def test_objects_without_a_place_are_laid_out_apart_by_the_seed() -> None:
     truth = KinematicWorld(world, found)
     for one in truth.objects(Header()).objects:
         assert one.state == "table" and math.hypot(one.pose.position.x, one.pose.position.y) < 0.75
-    with pytest.raises(ConfigError, match=r"world\.objects: 8 objects find no random layout"):
+    with pytest.raises(ConfigError, match=r"world\.objects: 8 objects fit no random layout"):
         layout(world, 3, lambda x, y, z: False)
 
 

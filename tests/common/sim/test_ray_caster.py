@@ -142,7 +142,7 @@ def test_view_is_the_same_however_many_triangles_are_worked_on_at_once(monkeypat
     meshes = [Mesh(triangles(seed, 20), tuple(rng.integers(0, 256, 3) / 255)) for seed in range(5)]
     meshes.append(meshes[0])  # of what is as near as something else, the first is seen
     whole = cast(meshes, CAMERA, empty_view(CAMERA, GREY))
-    monkeypatch.setattr(ray_caster, "MOST_AT_ONCE", 100)
+    monkeypatch.setattr(ray_caster, "BATCH_PIXELS", 100)
     parts = cast(meshes, CAMERA, empty_view(CAMERA, GREY))
     assert np.array_equal(whole.colour, parts.colour) and np.array_equal(whole.depth, parts.depth)
 
@@ -159,8 +159,8 @@ def test_work_for_a_view_is_bounded_whatever_there_is(monkeypatch, caplog):
         return found
 
     monkeypatch.setattr(ray_caster, "_spans", counted)
-    monkeypatch.setattr(ray_caster, "MOST_AT_ONCE", 20_000)
+    monkeypatch.setattr(ray_caster, "BATCH_PIXELS", 20_000)
     view = cast(meshes, CAMERA, empty_view(CAMERA, GREY))
     assert view.depth[24, 32] == pytest.approx(1.0, rel=1e-6), "the first of them are seen"
-    assert sum(pixels) <= 2 * ray_caster.MOST_LAYERS * 64 * 48 and max(pixels) < 20_000 + 2 * 64 * 48
+    assert sum(pixels) <= 2 * ray_caster.MAX_LAYERS * 64 * 48 and max(pixels) < 20_000 + 2 * 64 * 48
     assert "901 of 1000 triangles are not drawn" in caplog.text

@@ -12,7 +12,7 @@ from common.config import Fixture, World
 from common.errors import ConfigError, Refused
 from common.messages import Header, Vector3, WorldEdit
 from common.robot.transforms import tool_down
-from common.sim import kinematic
+from common.sim import edits
 from common.sim.kinematic import KinematicWorld
 
 R = 0.03
@@ -32,7 +32,7 @@ class Rig:
         self.width = OPEN
 
     def tick(self, hand=None, width=None, gripping=False):
-        """What ControlCycle does with simulated fingers."""
+        """What Executor does with simulated fingers."""
         self.now += 0.01
         self.hand = self.hand if hand is None else hand
         obstruction = self.world.obstruction(self.hand, self.width)
@@ -440,18 +440,18 @@ def test_nothing_slips_out_of_an_empty_hand(name):
 
 
 def test_world_takes_no_more_objects_than_can_be_told_of(monkeypatch) -> None:
-    assert kinematic.MOST_OBJECTS <= 1000, "of messages"
-    monkeypatch.setattr(kinematic, "MOST_OBJECTS", 3)
+    assert edits.MAX_OBJECTS <= 1000, "of messages"
+    monkeypatch.setattr(edits, "MAX_OBJECTS", 3)
     world = Rig().world
     small = {"op": "add", "shape": "sphere", "size": Vector3(x=0.01)}
     for i in range(2):
         world.edit(WorldEdit(**small, position=Vector3(x=0.3 + 0.1 * i)), 0.0)
-    with pytest.raises(Refused, match="room for 3"):
+    with pytest.raises(Refused, match="at most 3"):
         world.edit(WorldEdit(**small, position=Vector3(x=0.7)), 0.0)
     world.edit(WorldEdit(op="remove", id="sphere_1"), 0.0)
     world.edit(WorldEdit(**small, position=Vector3(x=0.7)), 0.0)
-    monkeypatch.setattr(kinematic, "MOST_OBJECTS", 100)
-    monkeypatch.setattr(kinematic, "MOST_CORNERS", 500)
+    monkeypatch.setattr(edits, "MAX_OBJECTS", 100)
+    monkeypatch.setattr(edits, "MAX_CORNERS", 500)
     cylinder_or_ring = {"op": "add", "shape": "cylinder", "size": Vector3(x=0.01, y=0.01, z=0.01)}
     world.edit(WorldEdit(**cylinder_or_ring, position=Vector3(x=0.3, y=0.2)), 0.0)
     with pytest.raises(Refused, match="at most 500"):

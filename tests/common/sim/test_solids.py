@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from common.config import Fixture, ObjectConfig
 from common.sim import solids
 from common.sim.objects import object_mesh, world_object
-from common.sim.solids import between, circle, fixture_mesh, primitive, triangulate, upright
+from common.sim.solids import band_triangles, circle, extrude, fixture_mesh, primitive, triangulate
 
 is_ear = solids._is_ear
 
@@ -63,7 +63,7 @@ def test_polygon_that_crosses_itself_takes_no_longer_than_others():
 
 def test_band_between_two_circles_has_their_difference():
     outer, inner = circle(0.06), circle(0.04)[::3]
-    assert area(between(outer, inner)) == pytest.approx(shoelace(outer) - shoelace(inner), rel=2e-3)
+    assert area(band_triangles(outer, inner)) == pytest.approx(shoelace(outer) - shoelace(inner), rel=2e-3)
 
 
 @pytest.mark.parametrize("shape, size, expected", [
@@ -93,4 +93,4 @@ def test_an_object_goes_from_what_it_stands_on_to_its_top():
     assert (corners[..., 2].min(), corners[..., 2].max()) == pytest.approx((1.0, 1.03))
     radii = np.linalg.norm(corners[..., :2] - (0.5, 0), axis=-1)
     assert radii.min() == pytest.approx(0.04) and radii.max() == pytest.approx(0.06)
-    assert len(upright(circle(1.0)[::90], np.empty((0, 2)), 0, 1)) == 4 + 4 + 8
+    assert len(extrude(circle(1.0)[::90], np.empty((0, 2)), 0, 1)) == 4 + 4 + 8

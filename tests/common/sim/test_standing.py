@@ -13,8 +13,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from common.atomic_file import STATE_VARIABLE, Unreadable
 from common.config import World
-from common.kept_file import STATE_VARIABLE, Unreadable
 from common.messages import Header
 from common.robot.transforms import tool_down
 from common.sim.interface import StandingObject

@@ -74,10 +74,10 @@ def test_move_is_news_and_what_is_refused_is_none() -> None:
         ("move", "ball_1", (0.5, 0.0), "unknown_id", "choices: blue_prism, green_box, red_cylinder"),
         ("move", "green_box", (0.9, 0.0), "off_table", "target_base is x 0.375 to 0.625, y -0.375 to 0.375"),
         ("move", "green_box", (0.4, -0.12), "off_table", "for green_box, which takes 0.06 x 0.09 m"),
-        ("move", "green_box", (0.52, -0.01), "occupied", "would reach into red_cylinder"),
+        ("move", "green_box", (0.52, -0.01), "occupied", "would overlap red_cylinder"),
         ("move", "green_box", None, "no_position", "position"),
         ("remove", "green_bx", None, "unknown_id", "did you mean 'green_box'"),
-        ("add", "", (0.52, 0.02), "occupied", "would reach into red_cylinder"),
+        ("add", "", (0.52, 0.02), "occupied", "would overlap red_cylinder"),
         ("add", "green_box", (0.5, 0.3), "id_exists", "green_box"),
     ],
 )
@@ -97,7 +97,7 @@ def test_object_on_the_ground_may_stand_anywhere_but_not_in_a_fixture() -> None:
     post = ObjectConfig(id="post", shape="cylinder", x=1.5, y=1.5, radius=0.05, height=0.3)
     world = KinematicWorld(config_of("w2").model_copy(update={"objects": [post]}))
     move(world, "post", -3.0, 2.0)
-    with pytest.raises(Refused, match="would reach into target_base"):
+    with pytest.raises(Refused, match="would overlap target_base"):
         move(world, "post", 0.5, 0.0)
     assert centre_of(solids(world)["post"])[:2] == pytest.approx((-3.0, 2.0))
 

@@ -11,7 +11,7 @@ from common.clock import Clock
 from common.config import ServiceEntry, load_cell
 from common.errors import ConfigError, ZencellError
 from common.supervision.launch import Launch, clock_at_speed, require_free_port, require_modules, router_location
-from common.transport.endpoint import small_keys_renamed
+from common.transport.endpoint import remapped_small_keys
 
 ENTRY = ServiceEntry(name="it", module="own.package.it")
 
@@ -29,11 +29,11 @@ def test_command_of_a_service_has_all_options_of_the_launch() -> None:
 
 def test_router_gets_the_small_keys_that_a_cell_renames() -> None:
     cell = load_cell(str(Path(__file__).parents[2] / "data" / "two_cameras.yaml"))
-    small = small_keys_renamed(entry.topics for entry in cell.services.values())
+    small = remapped_small_keys(entry.topics for entry in cell.services.values())
     sides = [f"{side}/{key}" for side in ("left", "right") for key in ("camera/camera_info", "detected_objects")]
     assert set(sides) <= set(small) and not any("image" in key for key in small)
     assert Launch("my.yaml").router_command(small[:1])[-3:] == ["--small", small[0], "--gate"]
-    assert small_keys_renamed(entry.topics for entry in load_cell("panda").services.values()) == []
+    assert remapped_small_keys(entry.topics for entry in load_cell("panda").services.values()) == []
 
 
 def test_environment_passes_on_clock_and_module_paths(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,9 +14,9 @@ import pytest
 
 from common.clock import Clock
 from common.transport.bus import Bus
-from common.transport.connect import connect
 from common.transport.endpoint import endpoint_of
 from common.transport.local import LocalNetwork
+from common.transport.zenoh_session import connect
 from tests.harness import ROOT, environment, free_domain, wait_router
 
 PATIENCE = 20.0  # only ever waited for by a test that fails

@@ -6,8 +6,8 @@ import zenoh
 
 from common.application import all_topics
 from common.errors import ConfigError
-from common.messages.basics import LARGEST
-from common.transport.endpoint import BESIDE_BYTES, endpoint_of, size_limits
+from common.messages.basics import MAX_PAYLOAD_BYTES
+from common.transport.endpoint import OVERHEAD_BYTES, endpoint_of, size_limits
 
 
 @pytest.mark.parametrize(
@@ -58,7 +58,7 @@ def test_client_file_points_at_the_default_router_and_searches_for_nothing() -> 
 def test_the_router_takes_nothing_larger_than_readers_do() -> None:
     limits = {key: entry["size_limit"] for entry in size_limits() for key in entry["key_exprs"]}
     for topic in all_topics().values():
-        most = max(topic.message.most_bytes, getattr(topic, "answer", topic.message).most_bytes)
-        if most < LARGEST:
-            assert limits[f"*/{topic.expression}"] == most + BESIDE_BYTES
+        most = max(topic.message.max_bytes, getattr(topic, "answer", topic.message).max_bytes)
+        if most < MAX_PAYLOAD_BYTES:
+            assert limits[f"*/{topic.expression}"] == most + OVERHEAD_BYTES
     assert limits["*/joint_states"] < 32 * 1024 < limits["*/planning_scene"] < limits["*/motion/execute"]

@@ -13,8 +13,8 @@ import pytest
 from common import messages as m
 from common.application import all_topics
 from common.errors import DecodeError
-from common.messages.basics import SMALL, Message
-from common.messages.robot import MOST_POINTS
+from common.messages.basics import SMALL_BYTES, Message
+from common.messages.robot import MAX_POINTS
 from common.topics import MOTION_EXECUTE
 from common.transport.codec import decode, encode
 from common.transport.local import LocalNetwork
@@ -46,13 +46,13 @@ def seconds_to_decode(model: type[Message], payload: bytes) -> float:
     return min(times)
 
 
-@pytest.mark.parametrize("model", [model for model in MESSAGES if model.most_bytes <= 4 * SMALL])
+@pytest.mark.parametrize("model", [model for model in MESSAGES if model.max_bytes <= 4 * SMALL_BYTES])
 @pytest.mark.slow
 def test_nothing_that_is_small_takes_long_to_refuse(model: type[Message]) -> None:
     worst = 0.0
     for field in model.model_fields:
         for value in VALUES:
-            count = (model.most_bytes - 64) // len(msgpack.packb(value))
+            count = (model.max_bytes - 64) // len(msgpack.packb(value))
             worst = max(worst, seconds_to_decode(model, msgpack.packb({field: [value] * count})))
     worst = max(worst, seconds_to_decode(model, msgpack.packb({f"{i:x}": 0 for i in range(1500)})))
     assert worst < 0.02  # measured: 1.5 ms; a machine that is busy counts the work of others' caches too
@@ -72,9 +72,9 @@ def test_what_cost_seconds_costs_milliseconds(model: type[Message], payload: byt
 
 
 def test_the_longest_trajectory_fits_and_reads_the_same_in_pieces() -> None:
-    request = execute(MOST_POINTS)
+    request = execute(MAX_POINTS)
     payload = encode(request)
-    assert len(payload) <= m.ExecuteRequest.most_bytes
+    assert len(payload) <= m.ExecuteRequest.max_bytes
     assert decode(m.ExecuteRequest, payload, in_pieces=True) == decode(m.ExecuteRequest, payload)
 
 
@@ -82,11 +82,11 @@ def test_the_longest_trajectory_fits_and_reads_the_same_in_pieces() -> None:
 @pytest.mark.parametrize(("payload", "reason"), [
     (encode(execute(200)) + b"\x00", "1 bytes after the end"),
     (encode(execute(200))[:-1], "not msgpack"),
-    (msgpack.packb({1: 1, "id": "a" * SMALL}), "not allowed for map key"),
+    (msgpack.packb({1: 1, "id": "a" * SMALL_BYTES}), "not allowed for map key"),
     (msgpack.packb({"id": [[]] * 400_000}), "more than 131072 lists and maps"),
     (msgpack.packb({"id": [0] * 600_000}), "exceeds max_array_len|more than 131072 lists"),
-    (msgpack.packb({"id": msgpack.ExtType(5, b"0" * SMALL)}), "exceeds max_ext_len"),
-    (msgpack.packb({"id": b"a" * SMALL})[:-9] + b"\xc1" * 9, r"id: must be a valid string"),
+    (msgpack.packb({"id": msgpack.ExtType(5, b"0" * SMALL_BYTES)}), "exceeds max_ext_len"),
+    (msgpack.packb({"id": b"a" * SMALL_BYTES})[:-9] + b"\xc1" * 9, r"id: must be a valid string"),
 ], ids=["more", "less", "key", "lists", "list", "extension", "bytes"])
 def test_large_payloads_are_refused_alike(payload: bytes, reason: str, in_pieces: bool) -> None:
     with pytest.raises(DecodeError, match=reason):

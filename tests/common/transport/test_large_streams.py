@@ -13,7 +13,7 @@ import zenoh
 
 from common.transport.endpoint import LINKS, client_config, endpoint_of
 from common.transport.session import RawSample
-from common.transport.zenoh_session import ZenohSession, close_bounded, open_zenoh
+from common.transport.zenoh_session import ZenohSession, close_within, open_zenoh
 
 PATIENCE = 20.0  # only ever waited for by a test that fails
 PICTURE = bytes(4_000_000)
@@ -94,7 +94,7 @@ async def test_what_is_small_does_not_wait_behind_pictures(shared_router: str, b
     finally:
         behind.may.set()
         for session in (reader, writer):
-            await close_bounded(session, 1.0)
+            await close_within(session, 1.0)
 
 
 @pytest.mark.parametrize("open_camera", [open_zenoh, one_link, foreign])
@@ -112,7 +112,7 @@ async def test_over_one_link_no_small_message_is_lost_with_pictures(
     finally:
         behind.may.set()
         for session in sessions:
-            await close_bounded(session, 1.0)
+            await close_within(session, 1.0)
 
 
 @pytest.mark.slow
@@ -137,7 +137,7 @@ async def test_while_pictures_wait_for_a_reader_all_else_goes_on(domain: int, pr
     finally:
         behind.may.set()
         for session in sessions:
-            await close_bounded(session, 1.0)
+            await close_within(session, 1.0)
 
 
 async def test_pictures_have_a_link_of_their_own(shared_router: str) -> None:
@@ -146,4 +146,4 @@ async def test_pictures_have_a_link_of_their_own(shared_router: str) -> None:
         links = session._session.info.links()  # type: ignore[attr-defined]
         assert sorted(link.priorities for link in links) == [tuple(map(int, one.split("-"))) for one in LINKS]
     finally:
-        await close_bounded(session, 1.0)
+        await close_within(session, 1.0)

@@ -16,10 +16,9 @@ from common.messages import Header, PlanningScene, TaskCommand, TaskStatus
 from common.transport import ownership
 from common.transport.bus import Bus
 from common.transport.codec import decode
-from common.transport.keys import owns_key
 from common.transport.local import LocalNetwork
-from common.transport.ownership import Owner, Ownership, process_name, who_owns
-from common.transport.session import Declared
+from common.transport.ownership import Owner, Ownership, process_name, unique_owners
+from common.transport.session import Declaration, owns_key
 
 NewBus = Callable[..., Awaitable[Bus]]
 
@@ -30,7 +29,7 @@ async def obey(_: TaskCommand) -> TaskStatus:
 
 @pytest.fixture(autouse=True)
 def _hurry(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ownership, "GIVE_UP", 0.0)
+    monkeypatch.setattr(ownership, "CLAIM_SECONDS", 0.0)
 
 
 async def test_second_writer_is_refused_with_both_names_and_a_remedy(new_bus: NewBus) -> None:
@@ -63,7 +62,7 @@ async def test_what_is_put_before_a_key_is_ours_reaches_nobody_who_listens_or_as
     await listener.ready()
     key = f"{first.cell}/{topics.PLANNING_SCENE.key}"
     for number, bus in enumerate((first, second), 1):
-        bus.hold_back()
+        bus.defer_writes()
         writer = bus.writer(topics.PLANNING_SCENE)
         for stamp in (1, 10 * number):  # of a state the newest counts
             writer.put(PlanningScene(header=Header(stamp=stamp)))
@@ -74,9 +73,9 @@ async def test_what_is_put_before_a_key_is_ours_reaches_nobody_who_listens_or_as
     asked = [decode(PlanningScene, sample.payload) for sample in await listener.raw_get(key, 1.0)]
     assert [scene.header.stamp for scene in asked] == [10]
     assert heard.latest is not None and heard.latest.header.stamp == 10
-    monkeypatch.setattr(ownership, "GIVE_UP", 10.0)  # the tokens of who ends take their time
+    monkeypatch.setattr(ownership, "CLAIM_SECONDS", 10.0)  # the tokens of who ends take their time
     await first.close()
-    await second.owned()
+    await second.acquire_keys()
     assert (await heard.next()).header.stamp == 20
 
 
@@ -110,12 +109,12 @@ def test_who_just_became_ready_owns_a_key_once_while_both_its_tokens_are_seen() 
     ready = replace(asks, process=process_name("abc", since=7))
     other = replace(asks, process=process_name("def"))
     for seen in itertools.permutations((asks, ready, other)):
-        assert sorted(who_owns(seen), key=lambda owner: owner.life)[:1] == [ready]
-        assert {owner.life for owner in who_owns(seen)} == {"abc", "def"}
+        assert sorted(unique_owners(seen), key=lambda owner: owner.instance)[:1] == [ready]
+        assert {owner.instance for owner in unique_owners(seen)} == {"abc", "def"}
 
 
 async def test_second_writer_waits_for_the_first_to_go(new_bus: NewBus, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ownership, "GIVE_UP", 20.0)
+    monkeypatch.setattr(ownership, "CLAIM_SECONDS", 20.0)
     before, after = await new_bus("camera"), await new_bus("camera")
     for bus in (before, after):
         bus.writer(topics.CAMERA_IMAGE)
@@ -157,14 +156,14 @@ async def test_keys_are_told_under_the_name_in_the_cell_with_the_own_word() -> N
 def test_token_says_who_holds_it() -> None:
     owner = Owner("left/image_raw", "camera/image_raw", "left", process_name("a1", 7))
     assert Owner.of(f"panda{owner.token}") == owner
-    assert owner.life == "a1" and not owner.asks and replace(owner, process=process_name("a2")).asks
+    assert owner.instance == "a1" and not owner.claiming and replace(owner, process=process_name("a2")).claiming
 
 
 def test_who_was_ready_first_stays_and_who_asks_never_displaces_anybody() -> None:
     names = [process_name(*each) for each in (("b", 5), ("a", 6), ("c", 6), ("a0", None))]
     owners = [Owner("tf", "tf", "camera", name) for name in names]
     for earlier, later in itertools.combinations(owners, 2):
-        assert earlier.was_before(later) and not later.was_before(earlier)
+        assert earlier.precedes(later) and not later.precedes(earlier)
 
 
 class Split:
@@ -188,10 +187,10 @@ class Split:
         self.stood.append(asyncio.create_task(bus.run(run())))
         await bus.ready_event.wait()
 
-    def join(self) -> list[Declared]:
+    def join(self) -> list[Declaration]:
         """Show to each side the tokens of the other; returns what the first side is shown."""
         tokens = [list(net.tokens) for net in self.nets]
-        shown: list[list[Declared]] = []
+        shown: list[list[Declaration]] = []
         for net, theirs in zip(self.nets, reversed(tokens), strict=True):
             session = net.session()
             shown.append([session.token(entry.key) for entry in theirs])
@@ -202,7 +201,7 @@ class Split:
 async def test_split_network_that_is_whole_again_leaves_the_one_that_was_there_first(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, first: int
 ) -> None:
-    monkeypatch.setattr("common.transport.ownership.MEET", 0.0)
+    monkeypatch.setattr("common.transport.ownership.CONFLICT_SECONDS", 0.0)
     split = Split()
     for side in (first, 1 - first):
         await split.start(side)
@@ -243,8 +242,8 @@ async def test_who_asks_and_goes_soon_is_told_of_by_nobody(caplog: pytest.LogCap
 async def test_second_service_that_is_started_while_one_is_up_is_told_of_by_both(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr("common.transport.ownership.MEET", 0.0)
-    monkeypatch.setattr(ownership, "GIVE_UP", 0.3)
+    monkeypatch.setattr("common.transport.ownership.CONFLICT_SECONDS", 0.0)
+    monkeypatch.setattr(ownership, "CLAIM_SECONDS", 0.3)
     split = Split()
     await split.start(0)
     second = split.nets[0].bus("arm")
@@ -256,7 +255,7 @@ async def test_second_service_that_is_started_while_one_is_up_is_told_of_by_both
 
 
 async def test_who_asks_for_a_key_that_is_alive_takes_no_request_away(new_bus: NewBus, monkeypatch) -> None:
-    monkeypatch.setattr(ownership, "GIVE_UP", 20.0)
+    monkeypatch.setattr(ownership, "CLAIM_SECONDS", 20.0)
     first, second, tool = await new_bus("task"), await new_bus("task"), await new_bus("tool")
 
     async def steal(_: TaskCommand) -> TaskStatus:

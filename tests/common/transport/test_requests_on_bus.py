@@ -12,10 +12,9 @@ from common.topics import Request
 from common.transport import requests
 from common.transport.bus import Bus
 from common.transport.codec import decode_error, encode
-from common.transport.connect import connect
-from common.transport.keys import serves_key
 from common.transport.local import LocalNetwork
-from common.transport.session import RawReply
+from common.transport.session import RawReply, serves_key
+from common.transport.zenoh_session import connect
 
 PATIENCE = 20.0
 START = TaskCommand(command="start")
@@ -295,7 +294,7 @@ async def test_of_many_requests_at_once_one_is_begun_in_each_turn() -> None:
 
 
 async def test_requests_that_nobody_can_begin_with_are_refused_in_the_end(monkeypatch) -> None:
-    monkeypatch.setattr(requests, "_MOST_WAITING", 10)
+    monkeypatch.setattr(requests, "_MAX_PENDING", 10)
     net = LocalNetwork()
     server, client = net.bus("server"), net.bus("client")
     await served(server)

@@ -12,10 +12,10 @@ from common.errors import ConfigError
 from common.messages import TaskCommand, TaskStatus
 from common.transport import ownership
 from common.transport.bus import Bus
-from common.transport.keys import alive_key, owns_key
 from common.transport.local import LocalNetwork, LocalSession
-from common.transport.ownership import MOST_OTHERS, MOST_TOLD, Owner, Ownership
-from common.transport.tokens import MOST_AT_ONCE, MOST_NAMES, TokenWatch
+from common.transport.ownership import MAX_OTHERS, MAX_WARNINGS, Owner, Ownership
+from common.transport.session import alive_key, owns_key
+from common.transport.tokens import MAX_NAMES, MAX_PER_TURN, TokenWatch
 
 NewBus = Callable[..., Awaitable[Bus]]
 FLOOD = 3000  # counts, not seconds: as many more would be the same
@@ -53,7 +53,7 @@ class Watched:
 
     async def settled(self) -> None:
         """Return when all that came before was told."""
-        for _ in range(2 + MOST_NAMES // MOST_AT_ONCE):
+        for _ in range(2 + MAX_NAMES // MAX_PER_TURN):
             await asyncio.sleep(0)
 
 
@@ -63,9 +63,9 @@ async def test_watch_tells_of_a_few_names_in_a_turn_and_of_some_in_all(caplog: p
     for number in range(FLOOD):
         flooder.token(alive_key("test", f"n{number}"))
     await watched.settled()
-    assert 0 < watched.most_at_once <= MOST_AT_ONCE
-    assert len(watched.changes) == len(watched.watch.names) == MOST_NAMES
-    assert watched.watch.left_out == FLOOD - MOST_NAMES and caplog.text.count("further ones are left out") == 1
+    assert 0 < watched.most_at_once <= MAX_PER_TURN
+    assert len(watched.changes) == len(watched.watch.names) == MAX_NAMES
+    assert watched.watch.left_out == FLOOD - MAX_NAMES and caplog.text.count("further ones are left out") == 1
     flooder.close()
     await watched.settled()
     token = net.session().token(alive_key("test", "camera"))
@@ -98,19 +98,19 @@ async def test_tokens_of_a_key_never_come_to_who_has_other_keys(
     new_bus: NewBus, monkeypatch: pytest.MonkeyPatch, until
 ) -> None:
     heard: list[str] = []
-    hear = Ownership._hear
+    hear = Ownership._receive
 
     def note(self: Ownership, token: str, there: bool) -> None:
         heard.append(token)
         hear(self, token, there)
 
-    monkeypatch.setattr(Ownership, "_hear", note)
+    monkeypatch.setattr(Ownership, "_receive", note)
     executor, flooder = await new_bus("executor"), await new_bus("camera")
     executor.serve(topics.TASK_COMMAND, obey)
     executor.writer(topics.JOINT_STATES)
     await executor.ready()
     seen: set[str] = set()
-    (await new_bus("tool")).raw_watch(owns_key(executor.cell), seen.add)
+    (await new_bus("tool")).raw_watch_tokens(owns_key(executor.cell), seen.add)
     for number in range(FLOOD):
         flooder._declare_token(forged(number, cell=executor.cell))
     # Comes after all of these to who hears it.
@@ -126,13 +126,13 @@ class Flooded:
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.net = LocalNetwork()
         self.judged: list[Owner] = []
-        judge = Ownership._judge
+        judge = Ownership._resolve
 
         def note(owners: Ownership, other: Owner, now: float) -> None:
             self.judged.append(other)
             judge(owners, other, now)
 
-        monkeypatch.setattr(Ownership, "_judge", note)
+        monkeypatch.setattr(Ownership, "_resolve", note)
         self.bus = self.net.bus("camera")
         self.bus.writer(topics.CAMERA_IMAGE)
         self.ran = asyncio.create_task(self.bus.run(self._run()))
@@ -161,16 +161,16 @@ class Flooded:
 async def test_few_of_those_who_claim_a_key_are_looked_at_and_told_of(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(ownership, "MEET", 0.0)
+    monkeypatch.setattr(ownership, "CONFLICT_SECONDS", 0.0)
     flooded = Flooded(monkeypatch)
     await flooded.flood()
-    assert len(flooded.judged) <= 2 * MOST_OTHERS
-    assert 0 < caplog.text.count("gives way") <= MOST_TOLD and not flooded.ran.done()
+    assert len(flooded.judged) <= 2 * MAX_OTHERS
+    assert 0 < caplog.text.count("gives way") <= MAX_WARNINGS and not flooded.ran.done()
     flooded.ran.cancel()
 
 
 async def test_other_that_was_there_first_is_met_amid_a_flood(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ownership, "MEET", 0.0)
+    monkeypatch.setattr(ownership, "CONFLICT_SECONDS", 0.0)
     flooded = Flooded(monkeypatch)
     await flooded.flood()
     flooded.net.session().token(owns_key("test", "camera/image_raw", "camera/image_raw", "camera", f"{7:016x}-first"))
@@ -184,9 +184,9 @@ async def test_lines_about_who_claims_a_key_go_on_after_a_while_and_say_how_many
     owners = Ownership(net.session(), "test", "camera", loop=loop, warn=lines.append, lose=pytest.fail)
     owners.claim("camera/image_raw", "camera/image_raw")
     await owners.settle()
-    others = [Owner.of(forged(number)) for number in range(2 * MOST_TOLD + 1)]
+    others = [Owner.of(forged(number)) for number in range(2 * MAX_WARNINGS + 1)]
     for other in others[:-1]:
-        owners._judge(other, now=0.0)
-    assert len(lines) == MOST_TOLD
-    owners._judge(others[-1], now=ownership.TELL_SECONDS)
-    assert lines[-1].endswith(f"; so did {MOST_TOLD} before") and len({*lines}) == MOST_TOLD + 1
+        owners._resolve(other, now=0.0)
+    assert len(lines) == MAX_WARNINGS
+    owners._resolve(others[-1], now=ownership.WARNING_SECONDS)
+    assert lines[-1].endswith(f"; so did {MAX_WARNINGS} before") and len({*lines}) == MAX_WARNINGS + 1

@@ -74,13 +74,13 @@ async def test_loop_is_woken_for_who_waits_and_not_for_who_looks_at_the_newest_a
     sender, receiver = await new_bus("sender"), await new_bus("receiver")
     reader, writer = receiver.reader(topics.CAMERA_IMAGE), sender.writer(topics.CAMERA_IMAGE)
     await matched(writer, until)
-    rings, ring = [], reader._doorbell.ring
+    rings, ring = [], reader._notifier.notify
 
     def rung() -> None:
         rings.append(1)
         ring()
 
-    reader._doorbell.ring = rung  # type: ignore[method-assign]
+    reader._notifier.notify = rung  # type: ignore[method-assign]
     for number in (1, 2, 3):
         writer.put(image(number))
     await until(lambda: reader.received == 3)

@@ -37,7 +37,7 @@ def test_which_is_used_is_told_once(monkeypatch, caplog):
     caplog.set_level("INFO")
     for _ in range(3):
         chosen(monkeypatch, egl=True)
-    assert [record.message for record in caplog.records] == ["pictures are drawn by OpenGL (egl, found here)"]
+    assert [record.message for record in caplog.records] == ["images are rendered by OpenGL (egl, detected)"]
 
 
 def test_a_machine_without_the_library_has_no_egl(monkeypatch):

@@ -10,7 +10,7 @@ from common.messages import Color, Header, JointState, Pose, Vector3, WorldObjec
 from common.perception.pinhole import Pinhole
 from common.robot.model import RobotModel
 from common.sim.interface import load_renderer
-from drivers.mujoco import rendering
+from drivers.mujoco import gl
 from drivers.mujoco.gl import select_gl
 from drivers.mujoco.rendering import PhysicsRenderer
 
@@ -195,10 +195,10 @@ def test_pictures_are_drawn_by_rays_where_opengl_is_there_and_does_not_work(monk
     def broken(kind, width, height):
         raise error("no glGetError")
 
-    monkeypatch.setattr(rendering, "gl_context", broken)
+    monkeypatch.setattr(gl, "gl_context", broken)
     renderer = PhysicsRenderer(CELL.world, Scenery(), ROBOT, SMALL, depth=False, gl="egl")
     assert red(renderer.render(balls(), AWAY).colour).any()
-    assert "drawn by rays, without shadows: OpenGL (egl) does not work: no glGetError" in caplog.text
+    assert "ray-cast, without shadows: OpenGL (egl) fails: no glGetError" in caplog.text
 
 
 def test_simulator_of_the_cell_says_who_draws(monkeypatch):

@@ -89,7 +89,7 @@ def test_nothing_touches_at_home_but_what_stands_on_something(cell: str) -> None
     _, made = model_of(cell)
     data = mujoco.MjData(made.model)
     data.qpos[:] = made.start
-    for number, name in enumerate(made.things):
+    for number, name in enumerate(made.objects):
         made.set_object(data, name, transform(np.eye(3), (5.0 + number, 0.0, 1.0)))
     mujoco.mj_forward(made.model, data)
     assert data.ncon == 0
@@ -103,7 +103,7 @@ def test_visual_shapes_are_made_once_and_change_nothing_that_moves(
     monkeypatch.setattr("common.robot.visual_meshes.visual_pieces", None)  # not asked again
     _, again = model_of("panda", visuals=True)
     assert first.model.nmeshvert == again.model.nmeshvert > bare.model.nmeshvert
-    assert first.joints == bare.joints and first.things == bare.things
+    assert first.joints == bare.joints and first.objects == bare.objects
     assert first.model.body_mass == pytest.approx(bare.model.body_mass)
 
 
@@ -137,7 +137,7 @@ def test_every_shape_rests_as_it_was_put(shape: dict[str, object]) -> None:
     after = made.pose_of(data, told.id)
     assert after[:3, 3] == pytest.approx(before[:3, 3], abs=1e-3)
     assert after[:3, :3] == pytest.approx(before[:3, :3], abs=0.01)
-    assert made.model.body_mass[made.things[told.id].body] == pytest.approx(0.1)
+    assert made.model.body_mass[made.objects[told.id].body] == pytest.approx(0.1)
 
 
 def test_camera_looks_where_its_optical_frame_does() -> None:

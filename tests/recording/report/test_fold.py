@@ -27,7 +27,7 @@ from recording.report.summary import describe
 )
 def test_progress_in_one_line(values: dict[str, object], line: str) -> None:
     fold = RunAggregator("panda", find_application("pick_place"))
-    assert fold.progress == "the task has not spoken yet"
+    assert fold.progress == "no task status received yet"
     fold.on("pick_place_status", PickPlaceStatus.model_validate(values), 0.0, 0)
     assert fold.progress == line
 
@@ -42,10 +42,10 @@ def test_every_application_is_heard_on_its_status_and_on_what_it_decides_by() ->
 
 
 def test_a_frame_is_as_old_as_its_stamp_on_the_cells_clock() -> None:
-    gathering = RunHistory()
-    fold = RunAggregator("panda", find_application("pick_place"), speed=5.0, gathering=gathering)
+    history = RunHistory()
+    fold = RunAggregator("panda", find_application("pick_place"), speed=5.0, history=history)
     fold.on("validated_targets", PoseArray(header=Header(stamp=1_000_000_000)), 1.0, 1_100_000_000)
-    assert gathering.latencies == [20.0]
+    assert history.latencies == [20.0]
     assert fold.summary.as_dict()["frame_to_target_ms"] == {"p50": 20.0, "p99": 20.0}
 
 

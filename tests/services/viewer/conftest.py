@@ -129,7 +129,7 @@ def config_of(cell: Cell, **changes: object) -> viewer.Config:
 
 
 @asynccontextmanager
-async def build_report(cell: str, serve: bool = True, **changes: object) -> AsyncIterator[Played]:
+async def page_of(cell: str, serve: bool = True, **changes: object) -> AsyncIterator[Played]:
     """A viewer among played services."""
     net = LocalNetwork()
     played = Played(net, net.bus("played", cell="test", clock=Clock()))
@@ -147,7 +147,7 @@ async def build_report(cell: str, serve: bool = True, **changes: object) -> Asyn
 
 @pytest.fixture
 async def panda() -> AsyncIterator[Played]:
-    async with build_report("panda") as played:
+    async with page_of("panda") as played:
         yield played
 
 

@@ -13,7 +13,7 @@ from common import topics
 from common.errors import Refused
 from common.transport.reader import Reader
 from tests.page.browser_double import PATIENCE, BrowserDouble, opened
-from tests.services.viewer.conftest import TOKEN, Played, SceneDouble, build_report, until
+from tests.services.viewer.conftest import TOKEN, Played, SceneDouble, page_of, until
 
 
 async def aim(page: BrowserDouble, goal: str) -> None:
@@ -31,7 +31,7 @@ async def test_stop_stops_the_arm_and_the_task(panda: Played, page: BrowserDoubl
 
 
 async def test_arm_is_stopped_though_no_task_answers_and_that_is_told(panda: Played) -> None:
-    async with build_report("panda", serve=False) as alone:
+    async with page_of("panda", serve=False) as alone:
         alone.bus.serve(topics.MOTION_STOP, alone.stop)
         async with opened(alone.port) as page:
             await page.speak(do="stop", n=1)
@@ -41,7 +41,7 @@ async def test_arm_is_stopped_though_no_task_answers_and_that_is_told(panda: Pla
 
 
 async def test_stop_that_reaches_nobody_says_so() -> None:
-    async with build_report("panda", serve=False) as played, opened(played.port) as page:
+    async with page_of("panda", serve=False) as played, opened(played.port) as page:
         await page.speak(do="stop", n=7)
         line = "NOT stopped: nobody answers motion/stop now"
         await page.until(lambda: line in page.text and page.said == [(7, line, "bad")])
@@ -274,7 +274,7 @@ async def test_arm_that_a_task_has_is_not_jogged_and_the_buttons_say_why(panda: 
 
 async def test_of_two_operators_one_operates_and_the_other_sees_whom_and_takes_over() -> None:
     async with (
-        build_report("panda", token=TOKEN) as played,
+        page_of("panda", token=TOKEN) as played,
         opened(played.port, TOKEN) as first, opened(played.port, TOKEN) as second,
     ):
         reader = await ready_to_jog(played, first)
@@ -335,7 +335,7 @@ async def test_taught_pose_is_a_goal_and_is_kept_for_the_next_page(panda: Played
     await page.press("Plan")
     await until(lambda: asked)
     assert asked[0].goal == m.JointGoal(positions=q)
-    async with build_report("panda") as again, opened(again.port) as later:
+    async with page_of("panda") as again, opened(again.port) as later:
         await later.until(lambda: "bin" in later.parts[later.label("Goal")]["options"])
 
 

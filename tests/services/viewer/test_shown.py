@@ -39,7 +39,7 @@ from common.config import Members, load_cell
 from page.layout import Layout
 from services import viewer
 from tests.page.browser_double import PATIENCE, BrowserDouble, opened
-from tests.services.viewer.conftest import MIN_AREA, TOKEN, Played, SceneDouble, build_report, until
+from tests.services.viewer.conftest import MIN_AREA, TOKEN, Played, SceneDouble, page_of, until
 
 
 async def test_state_and_counters_are_shown_in_words(panda: Played, page: BrowserDouble) -> None:
@@ -140,7 +140,7 @@ async def test_odd_messages_leave_the_page_and_the_service_as_they_are(
 
 async def test_light_comes_before_what_it_falls_on() -> None:
     """Else a browser makes the shaders of everything twice, which takes it seconds without a graphics card."""
-    async with build_report("panda") as played, opened(played.port) as page:
+    async with page_of("panda") as played, opened(played.port) as page:
         await page.until(lambda: page.label("Speed [%]"))
         first = next(number for number, kind in enumerate(page.kinds) if kind in ("GuiSliderMessage", "MeshMessage"))
         lights = ("EnableLightsMessage", "EnvironmentMapMessage", "HemisphereLightMessage")
@@ -150,7 +150,7 @@ async def test_light_comes_before_what_it_falls_on() -> None:
 async def test_saved_layout_opens_with_what_was_on(tmp_path: Path) -> None:
     file = tmp_path / "layout.yaml"
     file.write_text("tabs: [Log, View]\n")
-    async with build_report("panda", layout=str(file)) as played, opened(played.port) as page:
+    async with page_of("panda", layout=str(file)) as played, opened(played.port) as page:
         await page.set("Frames", True)
         await page.set("Show", "error")
         await page.click("Save layout")
@@ -165,7 +165,7 @@ async def test_saved_layout_opens_with_what_was_on(tmp_path: Path) -> None:
 
 
 async def test_chosen_object_is_traced_once_its_path_is_known() -> None:
-    async with build_report("ur5") as played, opened(played.port) as page:
+    async with page_of("ur5") as played, opened(played.port) as page:
         played.bus.writer(OUTLINE_STATUS).put(OutlineStatus(state="DONE", started=True))
         contours = [Contour(index=i, label=f"Object_{i}", pixels=[(1.0, 1.0), (2.0, 1.0), (2.0, 2.0)])
                     for i in range(2)]
@@ -182,7 +182,7 @@ async def test_chosen_object_is_traced_once_its_path_is_known() -> None:
 
 
 async def test_contour_that_is_clicked_in_the_scene_is_chosen(scenes: list[SceneDouble]) -> None:
-    async with build_report("ur5") as played:
+    async with page_of("ur5") as played:
         await until(lambda: scenes and scenes[0].begun)
         console, wanted = scenes[0].console, OutlineSelect(rule="index", index=1)
         await asyncio.to_thread(lambda: console.put(lambda: choose(console, wanted)))  # as viser does
@@ -218,7 +218,7 @@ async def test_rejection_that_came_before_the_scene_is_shown_in_it(
         return SceneDouble(*arguments, **options)
 
     monkeypatch.setattr("page.scene.Scene", slow)
-    async with build_report("panda") as played, opened(played.port) as page:
+    async with page_of("panda") as played, opened(played.port) as page:
         rejected = m.Rejections(header=m.Header(), rejected=[m.Rejection(position=m.Vector3(x=1.0), reason="too far")])
         played.bus.writer(REJECTED_TARGETS).put(rejected)
         await page.speak(do="press", what="pause")  # the page is there before the scene is
@@ -232,13 +232,13 @@ async def test_meshes_are_read_when_the_cell_is_up_or_somebody_looks(
 ) -> None:
     monkeypatch.setattr(viewer, "START_PATIENCE", 1e6)
     cell = load_cell("panda")
-    async with build_report("panda") as played:
+    async with page_of("panda") as played:
         await played.bus.alive.wait("viewer")
         assert not scenes
         async with opened(played.port):
             await until(lambda: scenes)
     scenes.clear()
-    async with build_report("panda") as played:
+    async with page_of("panda") as played:
         for name in cell.services.keys() - {"viewer"}:  # which is there already
             assert not scenes
             await played.net.bus(name, cell="test").ready()
@@ -246,7 +246,7 @@ async def test_meshes_are_read_when_the_cell_is_up_or_somebody_looks(
 
 
 async def test_line_is_closed_to_other_pages_and_to_who_has_no_token() -> None:
-    async with build_report("panda", token=TOKEN) as played:
+    async with page_of("panda", token=TOKEN) as played:
         address = f"ws://127.0.0.1:{played.port}/line"
         for status, headers in ((401, {}), (403, {"Cookie": f"zencell-{played.port}={TOKEN}", "Origin": "http://a.b"})):
             with pytest.raises(InvalidStatus) as refused:
@@ -265,7 +265,7 @@ LABEL, ON, TOPICS = "My noise", False, (topics.DEPTH_CAMERA_DEPTH,)
 def show(layer, topic, message): ...
 """)
     monkeypatch.syspath_prepend(tmp_path)
-    async with build_report("ur5", layers=["viewer_pkg.noise"]) as played, opened(played.port) as page:
+    async with page_of("ur5", layers=["viewer_pkg.noise"]) as played, opened(played.port) as page:
         depth = played.bus.writer(topics.DEPTH_CAMERA_DEPTH)
         await page.until(lambda: page.values[page.label("My noise")] is False)
         assert not depth.matched
@@ -276,7 +276,7 @@ def show(layer, topic, message): ...
 async def test_pictures_of_two_cameras_are_shown_beside_each_other() -> None:
     members = Members(services=["left_camera", "right_camera"], task="", application="pick_place",
                       keys=[{"camera/*": "left_camera/*"}, {"camera/*": "right_camera/*"}])
-    async with build_report("panda", members=members) as played, opened(played.port) as page:
+    async with page_of("panda", members=members) as played, opened(played.port) as page:
         keys = [f"{side}_camera/image_raw" for side in ("left", "right")]
         writers = [played.bus.writer(replace(topics.CAMERA_IMAGE, key=key)) for key in keys]
         await until(lambda: all(writer.matched for writer in writers))
@@ -300,7 +300,7 @@ APPLICATION = Application(topics=ApplicationTopics(status=STATUS))
 """)
     monkeypatch.syspath_prepend(tmp_path)
     members = Members(services=["trajectory_executor", "viewer", "mover"], task="mover", application="apps.moving")
-    async with build_report("panda", members=members) as played, opened(played.port) as page:
+    async with page_of("panda", members=members) as played, opened(played.port) as page:
         application = find_application("apps.moving")
         status = application.status.message(state="CARRYING", started=True, subject="cube", done=1, total=2)
         played.bus.writer(application.status).put(status)

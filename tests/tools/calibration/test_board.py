@@ -53,10 +53,10 @@ def test_page_has_the_size_that_it_says_and_shows_the_board():
 @pytest.mark.parametrize(
     ("printed", "kind", "told"),
     [
-        (BoardOptions(columns=6, rows=5), "other board", "do not lie as on a board of 7x5 squares"),
+        (BoardOptions(columns=6, rows=5), "other board", "differs from a board of 7x5 squares"),
         (BoardOptions(columns=10, rows=7, square=0.025, marker=0.019), "other board", "is not on a board of 7x5"),
         (BoardOptions(marker=0.02), "other board", "of a square long, not 0.75 as 27 mm would be"),
-        (BoardOptions(dictionary="5x5_50"), "nothing", "no marker is seen"),
+        (BoardOptions(dictionary="5x5_50"), "nothing", "no marker is visible"),
     ],
 )
 def test_another_board_is_told_apart(printed, kind, told):

@@ -77,14 +77,14 @@ def test_a_picture_in_which_the_board_was_elsewhere_is_dropped_and_named(places)
 
 def test_places_that_contradict_each_other_are_refused(places):
     wrong = [(lying(0.35, -0.05, 0.1), places[0][1]), *places[1:]]
-    with pytest.raises(CalibrationFailed, match="do not fit together"):
+    with pytest.raises(CalibrationFailed, match="are inconsistent"):
         calibrate_pose(wrong, CAMERA)
 
 
 def test_no_board_and_another_size_are_one_line():
-    with pytest.raises(CalibrationFailed, match="no picture shows the board"):
+    with pytest.raises(CalibrationFailed, match="no image shows the board"):
         calibrate_pose([(np.eye(4), [])], CAMERA)
     with pytest.raises(CalibrationFailed, match="a is 320x240, but the intrinsics are for 640x480"):
         detect_boards(BOARD, [("a", np.zeros((240, 320, 3), np.uint8))], CAMERA)
     found, reasons = detect_boards(BOARD, [("a", np.zeros((480, 640, 3), np.uint8))], CAMERA)
-    assert not found and reasons == ["no marker is seen"]
+    assert not found and reasons == ["no marker is visible"]

@@ -85,7 +85,7 @@ def test_arm_that_is_not_where_its_joints_say_makes_the_verdict_worse(mount):
     for n, T in enumerate(hands(mount, 14)):
         view = seen(mount, T, n)
         wrong = transform(rpy_to_matrix(*rng.normal(0, 4e-3, 3)), rng.normal(0, 2e-3, 3))
-        views.append(View(view.sighting, view.T_world_tcp @ wrong))
+        views.append(View(view.detection, view.T_world_tcp @ wrong))
     result = calibrate_hand_eye(views, CAMERA, mount)
     assert not result.verdict.startswith("good") and result.rms > 1.0
 
@@ -94,7 +94,7 @@ def test_arm_that_is_not_where_its_joints_say_makes_the_verdict_worse(mount):
 def test_view_with_the_joints_of_another_is_dropped_by_name(mount):
     poses = hands(mount, 10)
     views = [seen(mount, T, n) for n, T in enumerate(poses)]
-    views[3] = View(views[3].sighting, poses[7])
+    views[3] = View(views[3].detection, poses[7])
     result = calibrate_hand_eye(views, CAMERA, mount)
     assert [view.name for view in result.dropped] == ["p3"]
     assert off(result.T_mount_camera, TRUTH[mount][0])[0] < 1e-3
@@ -104,11 +104,11 @@ def test_what_cannot_be_told_is_said():
     views = [seen("hand", T, n) for n, T in enumerate(hands("hand", 8))]
     with pytest.raises(CalibrationFailed, match="5 views of the board, 6 are needed"):
         calibrate_hand_eye(views[:5], CAMERA, "hand")
-    still = [View(view.sighting, views[0].T_world_tcp @ transform(rpy_to_matrix(0, 0, 0.3 * n), (0, 0, 0)))
+    still = [View(view.detection, views[0].T_world_tcp @ transform(rpy_to_matrix(0, 0, 0.3 * n), (0, 0, 0)))
              for n, view in enumerate(views)]
     with pytest.raises(CalibrationFailed, match="degrees about a second axis, 5 are needed"):
         calibrate_hand_eye(still, CAMERA, "hand")
-    with pytest.raises(CalibrationFailed, match=r"do not fit together.* is the camera beside the arm"):
+    with pytest.raises(CalibrationFailed, match=r"are inconsistent.* the camera is beside the arm"):
         calibrate_hand_eye(views, CAMERA, "beside")
 
 

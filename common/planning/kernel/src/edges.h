@@ -1,7 +1,7 @@
-/* Whether a piece of a joint-space curve is free all along, proved and not sampled.
+/* Proves that a complete joint-space curve is free, without sampling.
 
-   Of a pair at time t0 a plane with normal n holds the shapes apart by s0. Later the plane, moved along, still holds them
-   apart by at least
+   At time t0 a plane with normal n separates the shapes of a pair by s0. Later the moved plane still separates them by at
+   least
 
        s(t) = s0 - v (t - t0) - K (t - t0)^2 / 2,
 
@@ -9,36 +9,36 @@
    last joint that moves both) and K bounds the acceleration of any of their points on the whole curve: with the axes a_j
    of the joints up to a shape, p'' = sum over j, k of q'_j q'_k a_min(j,k) x (a_max(j,k) x (p - o)) + sum of
    q''_k a_k x (p - o), so K = sum over j, k of |q'_j| |q'_k| L_max(j,k) + sum of |q''_k| L_k with the levers L. The same
-   holds without the direction: s(t) = s0 - M |t - t0| with M = sum of |q'_k| L_k. So each look at a pair proves an
-   interval about t0. What is left is looked at again in the middle, the likeliest collisions first. */
+   holds without the direction: s(t) = s0 - M |t - t0| with M = sum of |q'_k| L_k. So each check of a pair proves an
+   interval about t0. The remaining intervals are checked in their middles, the most likely collisions first. */
 #ifndef ZK_EDGES_H
 #define ZK_EDGES_H
 
 #include "world.h"
 
-#define FARTHEST 1e4           /* [rad], [m] a curve that leads farther away, or nowhere, is not free */
-#define SHORTEST_MOTION 1e-6 /* [m] no piece is cut in which no point moves farther: what is not proved then is not free */
+#define FARTHEST 1e4           /* [rad], [m] a curve that leads farther away, or is not finite, is not free */
+#define SHORTEST_MOTION 1e-6 /* [m] pieces in which no point moves farther are not divided: unproved ones are not free */
 
 /* Tuned by processor time on the benchmarks' edges; correctness does not depend on them. */
-#define KEEP 0.05      /* a group's sphere that proves less of a span than this share gives way to its pairs */
-#define KEEP_PAIR 0.3  /* and a pair's sphere to its shapes */
-#define SHARE 0.7      /* of the distance that a plane shows; GJK need not look for a better one */
-#define ACCEPT 0.7     /* of what the nearest spheres leave of a span: a node that proves as much is not looked into */
-#define PROBES 7       /* places of an edge at which the collisions that were found last are looked for first */
+#define GROUP_SHARE 0.05      /* a group's sphere that proves less of a span is replaced by its pairs */
+#define PAIR_SHARE 0.3  /* and a pair's sphere by its shapes */
+#define SHARE 0.7      /* of the distance that is enough: GJK stops there */
+#define ACCEPT 0.7     /* of what the nearest spheres leave of a span: a node that proves as much is not descended */
+#define PROBES 7       /* positions on an edge at which the last collisions are checked first */
 
 /* q(t) = c[0] + c[1] t + c[2] t^2 + c[3] t^3, 0 <= t <= 1 */
 typedef struct {
-    double c[4][MOST_JOINTS];
-    double speed[MOST_JOINTS], bend[MOST_JOINTS]; /* largest |q'| and |q''| */
-    double beyond; /* [m] at most by which joints slide out of their limits, where levers are longer */
+    double c[4][MAX_JOINTS];
+    double speed[MAX_JOINTS], bend[MAX_JOINTS]; /* largest |q'| and |q''| */
+    double beyond; /* [m] bound of how far joints slide out of their limits, which lengthens levers */
 } curve;
 
 typedef struct span {
     double from, to;
-    int first, count; /* pairs that are not proved in it, in the list */
+    int first, count; /* unproved pairs, in the list */
 } span;
 
-/* By how much [m] positions as large as |q| are out of the strokes. */
+/* How far [m] positions as large as |q| exceed the stroke of a sliding joint. */
 static inline double beyond_stroke(const world *w, int j, double q) {
     return w->joint[j + 1].kind == PRISMATIC ? fmax(fabs(q) - w->stroke[j + 1], 0.0) : 0.0;
 }
@@ -62,7 +62,7 @@ static void cubic_curve(const world *w, const double *c, curve *out) {
         out->speed[j] = fmax(fabs(c1), fabs(c1 + 2 * c2 + 3 * c3));
         double most = fabs(c[j]) + fabs(c1) + fabs(c2) + fabs(c3);
         out->beyond += beyond_stroke(w, j, most);
-        double turn = c3 != 0.0 ? -c2 / (3 * c3) : -1.0; /* where the velocity of a cubic has its extreme */
+        double turn = c3 != 0.0 ? -c2 / (3 * c3) : -1.0; /* where the velocity of a cubic is extreme */
         if (turn > 0 && turn < 1) out->speed[j] = fmax(out->speed[j], fabs(c1 + turn * (2 * c2 + 3 * c3 * turn)));
     }
 }
@@ -81,8 +81,8 @@ static inline void bounds(const world *w, const curve *e, int tip, int above, co
     *M = first, *K = second;
 }
 
-/* How long s0 - v t - K t^2 / 2 or s0 - M t stays positive. */
-static inline double lasts(double s0, double v, double K, double M) {
+/* How long s0 - v t - K t^2 / 2 or s0 - M t stays positive, the longer of both. */
+static inline double time_to_zero(double s0, double v, double K, double M) {
     double root = sqrt(v * v + 2 * K * s0), curved;
     if (v > 0)
         curved = 2 * s0 / (v + root);
@@ -119,30 +119,30 @@ static inline void relative_twist(const scratch *c, int tip, int above, double *
     sub3(c->slide[tip], c->slide[above], slide);
 }
 
-/* What moves towards a set of points: a sphere, and the shape within it where that is asked, too. */
+/* A body that moves towards a set of points: a sphere, and the shape in it if required. */
 typedef struct {
     int shape; /* -1: the sphere alone */
     const double *middle, *spin, *slide, *bound; /* M and K of the sphere's middle, then of the shape */
     double sphere;
 } mover;
 
-/* The interval about t0, within `from` to `to`, in which all spheres of a set stay farther than `need` from a mover; 0
-   where one does not at t0. Each node's sphere is a convex shape, so its plane holds apart all that is within. */
+/* Sets the interval about t0, within `from` to `to`, in which all spheres of a set stay farther than `need` from a mover;
+   0 if one does not at t0. Each node's sphere is convex, so a plane separates everything inside it. */
 static int points_proved(scratch *c, const struct points *set, const mover *m, double *axis, double need, double t0,
                          double from, double to, double *since, double *until, int *hit) {
     const shape *A = m->shape < 0 ? NULL : &c->w->shape[m->shape];
     const pose *T = A ? shape_pose(c, m->shape) : NULL;
-    double lo = from, hi = to, least_lo = from, least_hi = to; /* what spheres themselves leave, and nodes for all below */
+    double lo = from, hi = to, least_lo = from, least_hi = to; /* limits by spheres themselves, and by nodes for all below */
     visit stack[DEEPEST] = {{0, {axis[0], axis[1], axis[2]}}};
     int top = set && set->count ? 1 : 0;
     while (top) {
         visit v = stack[--top];
-        const globe *b = &set->node[v.node];
+        const sphere_node *b = &set->node[v.node];
         double n[3], a = t0, z = t0, s0 = spheres_apart(m->middle, m->sphere, b->c, b->r, n) - need;
         if (s0 > 0) {
             double speed = speed_at(m->spin, m->slide, m->middle, n);
-            z = t0 + lasts(s0, speed, m->bound[1], m->bound[0]);
-            a = t0 - lasts(s0, -speed, m->bound[1], m->bound[0]);
+            z = t0 + time_to_zero(s0, speed, m->bound[1], m->bound[0]);
+            a = t0 - time_to_zero(s0, -speed, m->bound[1], m->bound[0]);
             if (a <= lo && z >= hi) continue;
         }
         if (A && (!b->right || b->r < A->sphere)) {
@@ -151,13 +151,13 @@ static int points_proved(scratch *c, const struct points *set, const mover *m, d
             double wanted = fmax(ahead * (speed + 0.5 * K * ahead), back * (0.5 * K * back - speed));
             wanted = fmax(fmin(wanted, fmax(ahead, back) * M), 0.0);
             gjk_answer found;
-            globe_distance(A, T, b, v.n, need + 1.01 * wanted, need, SHARE, &found);
+            node_distance(A, T, b, v.n, need + 1.01 * wanted, need, SHARE, &found);
             c->searches++, c->iterations += found.iterations;
             if (found.below > -1e9) memcpy(v.n, found.n, sizeof v.n), memcpy(axis, found.n, sizeof v.n);
             s0 = found.below - need;
             if (s0 > 0) {
-                z = fmax(z, t0 + lasts(s0, shape_speed(c, m->shape, m->spin, m->slide, v.n, 1.0), K, M));
-                a = fmin(a, t0 - lasts(s0, shape_speed(c, m->shape, m->spin, m->slide, v.n, -1.0), K, M));
+                z = fmax(z, t0 + time_to_zero(s0, shape_speed(c, m->shape, m->spin, m->slide, v.n, 1.0), K, M));
+                a = fmin(a, t0 - time_to_zero(s0, shape_speed(c, m->shape, m->spin, m->slide, v.n, -1.0), K, M));
                 if (a <= lo && z >= hi) continue;
             }
         }
@@ -177,8 +177,8 @@ static int points_proved(scratch *c, const struct points *set, const mover *m, d
     return 1;
 }
 
-/* The interval about t0 in which a group's spheres keep its margin; 0 where they do not at t0. After forward, twists,
-   middles. */
+/* Sets the interval about t0 in which a group's spheres keep its margin; 0 if they do not at t0. Call after forward,
+   twists, middles. */
 static int group_proved(scratch *c, const curve *e, const group *g, double margin, double t0, double from, double to,
                         double *since, double *until) {
     const world *w = c->w;
@@ -204,8 +204,8 @@ static int group_proved(scratch *c, const curve *e, const group *g, double margi
         v -= speed_at(spin, slide, c->body_middle[p->b], n);
         bounds(w, e, p->b, p->common, w->body[p->b].reach, &Mb, &Kb);
     }
-    *until = t0 + lasts(s0, v, K + Kb, M + Mb);
-    *since = t0 - lasts(s0, -v, K + Kb, M + Mb);
+    *until = t0 + time_to_zero(s0, v, K + Kb, M + Mb);
+    *since = t0 - time_to_zero(s0, -v, K + Kb, M + Mb);
     return 1;
 }
 
@@ -245,14 +245,14 @@ static int proved(scratch *c, int i, double margin, double t0, double from, doub
     if (s0 > 0) {
         double v = speed_at(spin, slide, c->middle[p->a], n);
         if (!p->fixed) v -= speed_at(spin_b, slide_b, c->middle[p->b], n);
-        *until = t0 + lasts(s0, v, bound[1], bound[0]);
-        *since = t0 - lasts(s0, -v, bound[1], bound[0]);
-        int small = (to - from) * bound[2] < 100 * SHORTEST_MOTION; /* near the end of cutting the shapes decide */
+        *until = t0 + time_to_zero(s0, v, bound[1], bound[0]);
+        *since = t0 - time_to_zero(s0, -v, bound[1], bound[0]);
+        int small = (to - from) * bound[2] < 100 * SHORTEST_MOTION; /* near the end of the division the shapes decide */
         if (*since <= from && *until >= to) return 1;
-        if (!small && fmin(*until, to) - fmax(*since, from) > KEEP_PAIR * (to - from)) return 1;
+        if (!small && fmin(*until, to) - fmax(*since, from) > PAIR_SHARE * (to - from)) return 1;
     }
     double M = bound[2], K = bound[3], v, wanted = 0, ahead = to - t0, back = t0 - from;
-    rotate(shape_pose(c, p->b)->R, c->axis[i], n); /* about how far apart they have to be */
+    rotate(shape_pose(c, p->b)->R, c->axis[i], n); /* estimate of the required distance */
     v = speed_at(spin, slide, c->middle[p->a], n);
     if (!p->fixed) v -= speed_at(spin_b, slide_b, c->middle[p->b], n);
     wanted = fmax(ahead * (v + 0.5 * K * ahead), back * (0.5 * K * back - v));
@@ -267,7 +267,7 @@ static int proved(scratch *c, int i, double margin, double t0, double from, doub
         if (side ? *since <= from : *until >= to) continue;
         v = shape_speed(c, p->a, spin, slide, n, sign);
         if (!p->fixed) v += shape_speed(c, p->b, spin_b, slide_b, n, -sign);
-        double t = lasts(s0, v, K, M);
+        double t = time_to_zero(s0, v, K, M);
         if (side)
             *since = fmin(*since, t0 - t);
         else
@@ -276,9 +276,9 @@ static int proved(scratch *c, int i, double margin, double t0, double from, doub
     return 1;
 }
 
-/* The same of a pair whose margin changes with the distance of the tool from its start: by the larger margin, and by the
-   smaller one as long as that one counts. inside: how much of its leash the tool has left [m]; tip: M of its point. */
-static int proved_leashed(scratch *c, int i, double inside, double tip, double t0, double from, double to, double *since,
+/* The same for a pair whose margin changes with the distance of the tool from its start: by the larger margin, and by the
+   smaller one while it applies. inside: what the tool has left of contact_distance [m]; tip: M of the tool point. */
+static int proved_near_start(scratch *c, int i, double inside, double tip, double t0, double from, double to, double *since,
                           double *until) {
     const world *w = c->w;
     double large = fmax(w->near[i], w->far[i]), small = fmin(w->near[i], w->far[i]);
@@ -290,11 +290,11 @@ static int proved_leashed(scratch *c, int i, double inside, double tip, double t
     return 1;
 }
 
-#define MOST_ENTRIES (1 << 26)
-#define MOST_SPANS (1 << 24)
+#define MAX_ENTRIES (1 << 26)
+#define MAX_SPANS (1 << 24)
 
 static int grow(scratch *c, int list, int spans) {
-    if (list > MOST_ENTRIES || spans > MOST_SPANS) return 0;
+    if (list > MAX_ENTRIES || spans > MAX_SPANS) return 0;
     if (list > c->list_room) {
         int *more = realloc(c->list, sizeof(int) * 2 * list);
         if (!more) return 0;
@@ -316,7 +316,7 @@ static void at_time(const world *w, const curve *e, double t, double *q, double 
     }
 }
 
-/* What one span leaves to its two halves. */
+/* Unproved entries of a span for its two halves. */
 typedef struct {
     int *list, lefts, rights;
     double from, to, until_left, since_right;
@@ -333,17 +333,17 @@ static inline void leave(halves *h, int right, int entry, double since, double u
     }
 }
 
-/* Whether a few states of a curve are free of the collisions that were found last. */
+/* Whether a few states of a curve are free of the collisions found last. */
 static int probes_free(scratch *c, const curve *e) {
     static const double times[PROBES] = {0.5, 0.25, 0.75, 0.875, 0.125, 0.625, 0.375};
     const world *w = c->w;
-    double q[MOST_JOINTS], dq[MOST_JOINTS];
+    double q[MAX_JOINTS], dq[MAX_JOINTS];
     if (c->hot[0] < 0) return 1;
     for (int k = 0; k < PROBES; k++) {
         at_time(w, e, times[k], q, dq);
         forward(c, q);
         middles(c);
-        const double *margin = w->excuses && tool_travel(c) < w->leash ? w->near : w->far;
+        const double *margin = w->near_differs && tool_travel(c) < w->contact_distance ? w->near : w->far;
         if (hot_free(c, margin)) continue;
         c->hit_at = times[k];
         return 0;
@@ -351,10 +351,10 @@ static int probes_free(scratch *c, const curve *e) {
     return 1;
 }
 
-/* Whether the whole curve is free. Else `hit_pair` and `hit_at` say what touches or cannot be proved, and where. */
+/* Whether the complete curve is free. Else `hit_pair` and `hit_at` are the pair that touches or is unproved, and where. */
 static int curve_free(scratch *c, const curve *e) {
     const world *w = c->w;
-    double q[MOST_JOINTS], dq[MOST_JOINTS], most = 0; /* how fast any point moves */
+    double q[MAX_JOINTS], dq[MAX_JOINTS], most = 0; /* how fast any point moves */
     double far = 0;
     c->edges++;
     for (int j = 0; j < w->dof; j++)
@@ -369,7 +369,7 @@ static int curve_free(scratch *c, const curve *e) {
             most = fmax(most, M);
         }
     double M_tip = 0, K_tip = 0;
-    if (w->excuses) bounds(w, e, w->tool, 0, w->tip_lever, &M_tip, &K_tip);
+    if (w->near_differs) bounds(w, e, w->tool, 0, w->tip_lever, &M_tip, &K_tip);
     int used = 0, head = 0, tail = 1;
     if (!grow(c, w->groups, 64)) return 0;
     for (int g = 0; g < w->groups; g++) /* entries below zero are groups */
@@ -382,9 +382,9 @@ static int curve_free(scratch *c, const curve *e) {
         forward(c, q);
         twists(c, dq);
         middles(c);
-        double inside = 0; /* how much of its leash the tool has left */
-        if (w->excuses) inside = w->leash - tool_travel(c);
-        int most_pairs = s.count + w->pairs; /* that can be left */
+        double inside = 0; /* what the tool has left of contact_distance */
+        if (w->near_differs) inside = w->contact_distance - tool_travel(c);
+        int most_pairs = s.count + w->pairs; /* that can remain */
         if (!grow(c, used + 2 * most_pairs, tail + 2)) return 0;
         int right = most_pairs;
         halves h = {c->list + used, 0, 0, s.from, s.to, s.from, s.to};
@@ -396,7 +396,7 @@ static int curve_free(scratch *c, const curve *e) {
                 if (group_proved(c, e, g, fmax(g->far, g->near), t0, s.from, s.to, &since, &until)) {
                     if (since <= s.from && until >= s.to) continue;
                     int small = (s.to - s.from) * most < 100 * SHORTEST_MOTION;
-                    if (!small && fmin(until, s.to) - fmax(since, s.from) > KEEP * (s.to - s.from)) {
+                    if (!small && fmin(until, s.to) - fmax(since, s.from) > GROUP_SHARE * (s.to - s.from)) {
                         leave(&h, right, entry, since, until, t0);
                         continue;
                     }
@@ -409,8 +409,8 @@ static int curve_free(scratch *c, const curve *e) {
                     if (w->far[i] <= CONTACT_ALLOWED && w->near[i] <= CONTACT_ALLOWED) continue;
                     pair_bounds(c, e, i);
                 }
-                if (w->excuses && w->near[i] != w->far[i])
-                    ok = proved_leashed(c, i, inside, M_tip, t0, s.from, s.to, &since, &until);
+                if (w->near_differs && w->near[i] != w->far[i])
+                    ok = proved_near_start(c, i, inside, M_tip, t0, s.from, s.to, &since, &until);
                 else
                     ok = proved(c, i, w->far[i], t0, s.from, s.to, &since, &until);
                 if (!ok) {
@@ -434,7 +434,7 @@ static int curve_free(scratch *c, const curve *e) {
     return 1;
 }
 
-/* Whether all positions are free that differ from q by at most `away` (dof,): spheres and planes hold the pairs apart by
+/* Whether all positions that differ from q by at most `away` (dof,) are free: spheres and planes separate the pairs by
    more than any of their points moves. */
 static int around_free(scratch *c, const double *q, const double *away) {
     const world *w = c->w;
@@ -447,9 +447,9 @@ static int around_free(scratch *c, const double *q, const double *away) {
     }
     forward(c, q);
     middles(c);
-    if (w->excuses) {
+    if (w->near_differs) {
         bounds(w, &e, w->tool, 0, w->tip_lever, &M, &K);
-        double left = w->leash - tool_travel(c);
+        double left = w->contact_distance - tool_travel(c);
         inside = left > M ? 1 : left + M <= 0 ? -1 : 0; /* near for sure, far for sure */
     }
     for (int g = 0; g < w->groups; g++) {
@@ -482,7 +482,7 @@ static int around_free(scratch *c, const double *q, const double *away) {
     return 1;
 }
 
-/* The first of positions (count, dof) that is not free, or -1; stretches about their middles are proved in one go. */
+/* The first of positions (count, dof) that is not free, or -1; ranges about their middles are proved at once. */
 static int first_hit(scratch *c, int count, const double *path) {
     int dof = c->w->dof, top = 0, stack[128][2];
     if (count < 1) return -1;
@@ -494,8 +494,8 @@ static int first_hit(scratch *c, int count, const double *path) {
             if (!state_free(c, q)) return i;
             continue;
         }
-        double away[MOST_JOINTS] = {0};
-        int known = 1; /* all are numbers */
+        double away[MAX_JOINTS] = {0};
+        int known = 1; /* all are finite */
         for (int k = i; k <= j; k++)
             for (int d = 0; d < dof; d++) {
                 double way = fabs(path[(size_t)dof * k + d] - q[d]);

@@ -1,10 +1,10 @@
 /* Distance of two convex shapes: Gilbert, Johnson, Keerthi, "A fast procedure for computing the distance between complex
    objects in three-dimensional space" (1988).
 
-   Two numbers are kept that hold whatever rounding does: `above`, the distance of two points of the shapes, and
-   `below`, how far a plane holds the shapes apart. "Free" rests on `below` alone. The closest point of a simplex is
-   found region by region (as in the signed volumes of Montanari, Petrinic, Barbieri 2017: signs of sub-areas and
-   volumes), and where a simplex is flat by comparing all its faces. */
+   Two bounds hold in spite of rounding: `above`, the distance of two points of the shapes, and `below`, the distance by
+   which a plane separates the shapes. "Free" depends on `below` alone. The closest point of a simplex is found region by
+   region (as in the signed volumes of Montanari, Petrinic, Barbieri 2017: signs of sub-areas and volumes); for a flat
+   simplex all its faces are compared. */
 #ifndef ZK_GJK_H
 #define ZK_GJK_H
 
@@ -17,7 +17,7 @@ typedef struct {
 } vertex; /* w = a - b, in the frame of the second shape; a and b on the cores */
 
 typedef struct {
-    double above, below; /* [m], of the rounded shapes; below is negative where no plane was found */
+    double above, below; /* [m], of the rounded shapes; below is negative if no plane was found */
     double n[3];         /* unit, from the first to the second, of the plane that gave `below`; frame of the second */
     double a[3], b[3];   /* nearest points of the cores, frame of the second */
     int iterations;
@@ -87,7 +87,7 @@ static inline void on_triangle(const vertex *s, int i, int j, int k, closest *c)
 }
 
 static inline void on_tetrahedron(const vertex *s, closest *c) {
-    static const int faces[4][4] = {{3, 0, 1, 2}, {3, 1, 2, 0}, {3, 2, 0, 1}, {0, 1, 2, 3}}; /* face, then the opposite */
+    static const int faces[4][4] = {{3, 0, 1, 2}, {3, 1, 2, 0}, {3, 2, 0, 1}, {0, 1, 2, 3}}; /* face, opposite vertex */
     closest e;
     int outside = 0;
     c->square = INFINITY;
@@ -109,9 +109,9 @@ static inline void on_tetrahedron(const vertex *s, closest *c) {
 
 /* The distance of A from B, whose frame is that of `T_b_a`.
 
-   n: unit direction (frame of B) to begin with, from A to B.
+   begin: unit direction (frame of B) to start with, from A to B.
    enough: stop when `below` is more than this [m]; near: stop when `above` is at most this [m].
-   share: stop when `below` is this share of the way from `near` to `above`; 1: go on to the end. */
+   share: stop when `below` is this share of the distance from `near` to `above`; 1: converge completely. */
 static inline void gjk(const shape *A, const shape *B, const pose *T_b_a, const double *begin, double enough, double near,
                        double share, gjk_answer *out) {
     vertex s[4];
@@ -162,15 +162,15 @@ static inline void gjk(const shape *A, const shape *B, const pose *T_b_a, const 
         }
         if (c.count == 4) {
             out->above = -radii;
-            if (out->below > 0) out->below = 0; /* rounding alone said so */
+            if (out->below > 0) out->below = 0; /* by rounding only */
             break;
         }
         double now = sqrt(c.square);
         if (!(now < length)) break; /* rounding ended the progress */
         length = now;
-        vertex kept[4];
-        for (int i = 0; i < c.count; i++) kept[i] = s[c.index[i]];
-        memcpy(s, kept, sizeof(vertex) * c.count);
+        vertex used[4];
+        for (int i = 0; i < c.count; i++) used[i] = s[c.index[i]];
+        memcpy(s, used, sizeof(vertex) * c.count);
         count = c.count;
         out->above = length - radii;
         for (int k = 0; k < 3; k++) {
@@ -181,7 +181,7 @@ static inline void gjk(const shape *A, const shape *B, const pose *T_b_a, const 
         if (out->above <= near || length < 1e-11) break;
         for (int k = 0; k < 3; k++) n[k] = -c.v[k] / length;
     }
-    /* A shape within its rounding alone: the cores are apart, so the distance is known below zero, too. */
+    /* If only the roundings overlap, the cores are apart, so the negative distance is known, too. */
 }
 
 #endif

@@ -6,7 +6,7 @@
 
 #define LARGEST_STEP 1.0 /* [rad], [m] in one joint and iteration: beyond it the linearisation means nothing */
 #define FULL_TURN 6.283185307179586 /* [rad] */
-#define MOST_STEPS 50 /* from a random start */
+#define MAX_STEPS 50 /* from a random start */
 
 typedef struct {
     const world *w;
@@ -33,11 +33,11 @@ static void rotation_vector(const double *R, double *out) {
     for (int k = 0; k < 3; k++) out[k] = scale * v[k];
 }
 
-/* The twist (6,), linear at the tool's point first, world, that leads from q to the target, and what one unit of each
-   joint of the chain adds to it. Returns whether q is within the tolerances. */
+/* Returns whether q is within the tolerances, and sets the twist (6,) from q to the target, linear at the tool point
+   first, world, and the Jacobian of the chain's joints. */
 static int tool_error(const arm *a, const double *q, const pose *target, double *error, double (*J)[6]) {
     pose T = {{1, 0, 0, 0, 1, 0, 0, 0, 1}, {0, 0, 0}};
-    double at[MOST_JOINTS][3];
+    double at[MAX_JOINTS][3];
     for (int i = 0; i < a->joints; i++) {
         const joint *joint = &a->w->joint[a->chain[i]];
         double value = q[a->chain[i] - 1];
@@ -72,8 +72,8 @@ static int tool_error(const arm *a, const double *q, const pose *target, double 
     return dot3(error, error) < a->position * a->position && dot3(error + 3, error + 3) < a->rotation * a->rotation;
 }
 
-/* step = J' (J J' + damping)^-1 error of the joints that are not left out, by Cholesky's factors; none is longer than
-   LARGEST_STEP. */
+/* step = J' (J J' + damping)^-1 error of the joints that are not left out, by a Cholesky decomposition; no joint moves
+   more than LARGEST_STEP. */
 static void damped_step(const arm *a, double (*J)[6], const int *left_out, const double *error, double damping,
                         double *step) {
     double A[6][6], x[6], most = 0;
@@ -91,7 +91,7 @@ static void damped_step(const arm *a, double (*J)[6], const int *left_out, const
             A[r][r] -= A[r][c] * A[r][c];
             x[r] -= A[r][c] * x[c];
         }
-        A[r][r] = 1 / sqrt(fmax(A[r][r], 1e-12)); /* its inverse is kept */
+        A[r][r] = 1 / sqrt(fmax(A[r][r], 1e-12)); /* stores its inverse */
         x[r] *= A[r][r];
     }
     for (int r = 5; r >= 0; r--) {
@@ -108,17 +108,17 @@ static void damped_step(const arm *a, double (*J)[6], const int *left_out, const
         for (int i = 0; i < a->joints; i++) step[i] *= LARGEST_STEP / most;
 }
 
-/* Whether a joint can be turned back by a full turn at either limit, which descriptions give in few digits. */
+/* Whether a joint can be turned back by a full turn at either limit; descriptions round limits to few digits. */
 static int turns_round(const world *w, int j) {
     return w->joint[j].kind == REVOLUTE && w->upper[j - 1] - w->lower[j - 1] >= FULL_TURN - 1e-3;
 }
 
-/* Moves q, within the limits, to where the tool is at the target; 0 where it gets stuck. The damping follows the error
-   (Sugihara 2011). A joint that stands at a limit and would go on is left out of the step. With `anywhere` it is turned
-   back by a full turn where it can be, and the search ends where five steps do not halve the square of the error. */
+/* Moves q, within the limits, to where the tool is at the target; 0 if it gets stuck. The damping follows the error
+   (Sugihara 2011). A joint that presses against a limit is left out of the step. With `anywhere` it is turned back by a
+   full turn if possible, and the search ends when five steps do not halve the square of the error. */
 static int converge(const arm *a, const pose *target, int steps, int anywhere, double *q) {
     const world *w = a->w;
-    double J[MOST_JOINTS][6], error[6], step[MOST_JOINTS], last = INFINITY;
+    double J[MAX_JOINTS][6], error[6], step[MAX_JOINTS], last = INFINITY;
     for (int n = 0; n < steps; n++) {
         if (tool_error(a, q, target, error, J)) return 1;
         double size = dot3(error, error) + dot3(error + 3, error + 3);
@@ -126,7 +126,7 @@ static int converge(const arm *a, const pose *target, int steps, int anywhere, d
             if (!(size < 0.5 * last)) return 0;
             last = size;
         }
-        int left_out[MOST_JOINTS] = {0};
+        int left_out[MAX_JOINTS] = {0};
         for (int tries = 0, blocked = 1; blocked && tries < 3; tries++) {
             blocked = 0;
             damped_step(a, J, left_out, error, 0.05 * fmin(1.0, size) + 1e-7, step);
@@ -150,8 +150,8 @@ static int converge(const arm *a, const pose *target, int steps, int anywhere, d
     return 0;
 }
 
-/* Joint positions that put the tool at the target, in q: from the seed that is in it, then from random starts. Returns
-   how many of those it took, -1 when none served. */
+/* Finds joint positions q with the tool at the target: from the seed in q, then from random starts. Returns the number of
+   random starts used, -1 if none led there. */
 static int reach(const arm *a, const pose *target, int restarts, int steps, rng *random, double *q) {
     const world *w = a->w;
     for (int j = 0; j < w->dof; j++) q[j] = fmin(fmax(q[j], w->lower[j]), w->upper[j]);
@@ -161,7 +161,7 @@ static int reach(const arm *a, const pose *target, int restarts, int steps, rng 
             int j = a->chain[i] - 1;
             q[j] = w->lower[j] + uniform(random) * (w->upper[j] - w->lower[j]);
         }
-        if (converge(a, target, MOST_STEPS, 1, q)) return n;
+        if (converge(a, target, MAX_STEPS, 1, q)) return n;
     }
     return -1;
 }

@@ -1,5 +1,5 @@
-/* What Python calls. No function keeps a pointer of the caller; a world may be read by several threads at once when each
-   has a scratch of its own, and changed by one while no other uses it. */
+/* The functions that Python calls. None stores a pointer of the caller. Several threads may read a world at once if each
+   has its own scratch; a thread may change it while no other uses it. */
 #include "ik.h"
 #include "speeds.h"
 
@@ -13,7 +13,7 @@
 
 API int zk_version(void) { return VERSION; }
 
-/* 1 where the processor and its system have AVX2 and FMA, for which a second library is built. */
+/* 1 if processor and operating system support AVX2 and FMA, for which a second library is built. */
 API int zk_has_avx2(void) {
 #if defined(__x86_64__)
     unsigned a, b, c, d;
@@ -52,7 +52,7 @@ static void aligned_free(void *at) {
     if (at) free(((void **)at)[-1]);
 }
 
-/* A rotation that takes z to a unit axis. */
+/* A rotation that turns z to a unit axis. */
 static void turn_z(const double *axis, double *R) {
     double x[3] = {fabs(axis[0]) < 0.9 ? 1.0 : 0.0, fabs(axis[0]) < 0.9 ? 0.0 : 1.0, 0.0}, y[3];
     double along = dot3(x, axis);
@@ -64,10 +64,10 @@ static void turn_z(const double *axis, double *R) {
 }
 
 /* A robot of `dof` joints: parents (0 the world, joints count from 1), kinds (1 turns, 2 slides), placements (dof, 3, 4)
-   in the parents' frames, unit axes (dof, 3), limits. NULL when it does not fit. */
+   in the parents' frames, unit axes (dof, 3), limits. NULL if it is invalid. */
 API world *zk_world(int dof, const int *parents, const int *kinds, const double *placements, const double *axes,
                     const double *lower, const double *upper) {
-    if (dof < 1 || dof >= MOST_JOINTS) return NULL;
+    if (dof < 1 || dof >= MAX_JOINTS) return NULL;
     world *w = calloc(1, sizeof *w);
     if (!w) return NULL;
     w->dof = dof, w->joints = dof + 1;
@@ -92,7 +92,7 @@ API world *zk_world(int dof, const int *parents, const int *kinds, const double 
         memcpy(J->chain, up->chain, sizeof J->chain);
         J->chain[J->depth - 1] = j;
         w->lower[j - 1] = lower[j - 1], w->upper[j - 1] = upper[j - 1];
-        double stroke = fmax(fabs(lower[j - 1]), fabs(upper[j - 1])); /* without limits all of the way is beyond them */
+        double stroke = fmax(fabs(lower[j - 1]), fabs(upper[j - 1])); /* without limits every position is beyond the stroke */
         w->stroke[j] = J->kind == PRISMATIC && stroke < 1e6 ? stroke : 0.0;
     }
     return w;
@@ -146,7 +146,7 @@ API int zk_add(world *w, int kind, int jointed, const double *size, const double
         s->size[0] = s->radius = size[0], s->size[1] = 0.5 * size[1];
         s->sphere = s->size[0] + s->size[1];
         break;
-    case POINTS: /* none as yet: see zk_points */
+    case POINTS: /* empty until zk_points */
         break;
     default:
         s->blocks = (count + 3) / 4;
@@ -164,7 +164,7 @@ API int zk_add(world *w, int kind, int jointed, const double *size, const double
     return w->shapes++;
 }
 
-/* A sphere about all shapes of each joint's body. */
+/* Computes a sphere about all shapes of each joint's body. */
 static void enclose(world *w) {
     for (int j = 0; j < w->joints; j++) {
         body *B = &w->body[j];
@@ -195,7 +195,7 @@ static void enclose(world *w) {
     }
 }
 
-/* Puts a shape at a placement (3, 4) in its joint's frame. */
+/* Sets the placement (3, 4) of a shape in its joint's frame. */
 API void zk_place(world *w, int i, const double *placement) {
     place(w, i, placement);
     if (w->shape[i].joint) enclose(w);
@@ -210,7 +210,7 @@ static pair related(const world *w, int a, int b, int joint_a, int joint_b) {
     return (pair){a, b, last, joint_b == last};
 }
 
-/* Which shapes may not touch: (count,) first and second. Returns 0 when there is no memory. */
+/* Sets the pairs to check: (count,) first and second shapes. Returns 0 if out of memory. */
 API int zk_pairs(world *w, int count, const int *first, const int *second) {
     free(w->pair), free(w->far), free(w->near), free(w->group), free(w->member);
     w->pair = malloc(sizeof(pair) * (count + 1));
@@ -226,7 +226,7 @@ API int zk_pairs(world *w, int count, const int *first, const int *second) {
     for (int i = 0; i < count; i++) {
         w->pair[i] = related(w, first[i], second[i], w->shape[first[i]].joint, w->shape[second[i]].joint);
         int a = w->shape[w->pair[i].a].joint, b = w->shape[w->pair[i].b].joint, obstacle = w->pair[i].b;
-        int g = 0, found = 0; /* what does not move has an obstacle's group, unless it is the robot's base */
+        int g = 0, found = 0; /* fixed shapes are grouped as obstacles, except the robot's base */
         for (; g < w->groups && !found; g++)
             found = w->group[g].spheres.a == a && (b ? w->group[g].moving && w->group[g].spheres.b == b
                                                    : !w->group[g].moving && w->group[g].spheres.b == obstacle);
@@ -252,10 +252,10 @@ API int zk_pairs(world *w, int count, const int *first, const int *second) {
     return 1;
 }
 
-/* Margins [m] of the pairs, CONTACT_ALLOWED or less for none, far from the start and near it: within `leash` [m] of `origin` by
-   the tool point at `tip` (3,) in the frame of joint `tool`. near may be NULL. */
+/* Sets the margins [m] of the pairs, CONTACT_ALLOWED or less for none: `near` while the tool point, at `tip` (3,) in the
+   frame of joint `tool`, is within `contact_distance` [m] of `origin`, else `far`. near may be NULL. */
 API void zk_rules(world *w, const double *far, const double *near, int tool, const double *tip, const double *origin,
-                  double leash) {
+                  double contact_distance) {
     memcpy(w->far, far, sizeof(double) * w->pairs);
     memcpy(w->near, near ? near : far, sizeof(double) * w->pairs);
     for (int g = 0; g < w->groups; g++) {
@@ -266,31 +266,31 @@ API void zk_rules(world *w, const double *far, const double *near, int tool, con
             G->near = fmax(G->near, w->near[w->member[G->first + k]]);
         }
     }
-    w->excuses = near && memcmp(far, near, sizeof(double) * w->pairs) != 0;
-    if (!w->excuses) return;
-    w->tool = tool, w->leash = leash;
+    w->near_differs = near && memcmp(far, near, sizeof(double) * w->pairs) != 0;
+    if (!w->near_differs) return;
+    w->tool = tool, w->contact_distance = contact_distance;
     unrotate(w->joint[tool].turned, tip, w->tip);
     memcpy(w->origin, origin, sizeof w->origin);
     levers_of(w, tool, w->tip, 0.0, w->tip_lever);
 }
 
-/* What the tool keeps to: `count` numbers n x - least that must not be negative, of directions `at` (count, 3) in the frame
-   of joint `tool` or, where `direction` is 0, of the point `tip` in it. See `kept`. Returns 0 where there are too many. */
+/* Sets the tool constraints: `count` numbers n x - least that must not be negative, of directions `at` (count, 3) in the
+   frame of joint `tool` or, where `direction` is 0, of the point `tip` in it. Returns 0 if there are too many. */
 API int zk_keep(world *w, int count, int tool, const double *tip, const int *direction, const double *at, const double *n,
                 const double *least, const double *slack, const double *inside) {
-    w->keeps = 0;
-    if (count < 0 || count > MOST_KEPT || tool < 0 || tool >= w->joints) return 0;
-    w->keep_tool = tool;
-    unrotate(w->joint[tool].turned, tip, w->keep_tip);
-    levers_of(w, tool, w->keep_tip, 0.0, w->keep_lever);
+    w->constraints = 0;
+    if (count < 0 || count > MAX_CONSTRAINTS || tool < 0 || tool >= w->joints) return 0;
+    w->constrained_joint = tool;
+    unrotate(w->joint[tool].turned, tip, w->constrained_tip);
+    levers_of(w, tool, w->constrained_tip, 0.0, w->constrained_lever);
     for (int j = 0; j < w->joints; j++) w->turn_lever[j] = w->joint[j].kind == REVOLUTE;
     for (int i = 0; i < count; i++) {
-        kept *k = &w->keep[i];
+        constraint *k = &w->constraint[i];
         k->direction = direction[i] != 0, k->least = least[i], k->slack = slack[i], k->inside = inside[i];
         unrotate(w->joint[tool].turned, at + 3 * i, k->at);
         memcpy(k->n, n + 3 * i, sizeof k->n);
     }
-    w->keeps = count;
+    w->constraints = count;
     return 1;
 }
 
@@ -307,7 +307,7 @@ API void zk_scratch_free(scratch *c) {
     free(c->body_middle), free(c->bound), free(c->touched), free(c);
 }
 
-/* Working memory for one thread; to be made anew when shapes or pairs were added. */
+/* Working memory for one thread; create it again after adding shapes or pairs. */
 API scratch *zk_scratch(const world *w) {
     scratch *c = calloc(1, sizeof *c);
     if (!c) return NULL;
@@ -329,7 +329,7 @@ API scratch *zk_scratch(const world *w) {
     return c;
 }
 
-/* Takes over where obstacles stand now: after zk_place, before the next question. */
+/* Applies the current placements of obstacles: after zk_place, before the next query. */
 API void zk_refresh(scratch *c) {
     const world *w = c->w;
     for (int i = 0; i < w->shapes; i++)
@@ -340,8 +340,8 @@ API void zk_refresh(scratch *c) {
     c->now++;
 }
 
-/* Spheres (count, 4), middle and radius [m] in the world, in place of those that were in a shape of kind POINTS; then
-   zk_refresh. Returns 0 when there is no memory. */
+/* Replaces the spheres (count, 4), centre and radius [m], world, of a shape of kind POINTS; call zk_refresh afterwards.
+   Returns 0 if out of memory. */
 API int zk_points(world *w, int i, int count, const double *spheres) {
     shape *s = &w->shape[i];
     struct points *set = points_of(count, spheres);
@@ -354,16 +354,16 @@ API int zk_points(world *w, int i, int count, const double *spheres) {
     return 1;
 }
 
-/* See thin_points. */
+/* See downsample_points. */
 API int zk_thin(int count, const double *points, const uint8_t *skip, double side, double *out) {
-    return thin_points(count, points, skip, side, (double(*)[4])out);
+    return downsample_points(count, points, skip, side, (double(*)[4])out);
 }
 
-/* Sets a 1 in `out` (count,) for each of points (count, 3), world, that is no farther than a margin [m] from any shape
-   where the robot is at q. margins: of each shape, CONTACT_ALLOWED for those that do not count. */
+/* Sets a 1 in `out` (count,) for each of points (count, 3), world, within a margin [m] of any shape with the robot at q.
+   margins: of each shape, CONTACT_ALLOWED for those to ignore. */
 API void zk_near(scratch *c, const double *q, const double *margins, int count, const double *points, uint8_t *out) {
     const world *w = c->w;
-    double reach[MOST_JOINTS], axis[3] = {0, 0, 1}; /* squares of how far from their middles bodies count */
+    double reach[MAX_JOINTS], axis[3] = {0, 0, 1}; /* squares of the distances within which bodies are checked */
     forward(c, q);
     middles(c);
     for (int j = 0; j < w->joints; j++) reach[j] = -1;
@@ -375,7 +375,7 @@ API void zk_near(scratch *c, const double *q, const double *margins, int count, 
     for (int k = 0; k < count; k++) {
         const double *at = points + 3 * (size_t)k;
         double d[3], n[3];
-        unsigned near = 1; /* joints whose bodies are; obstacles are looked at one by one */
+        unsigned near = 1; /* joints whose bodies are near; obstacles are checked one by one */
         for (int j = 1; j < w->joints; j++) {
             sub3(at, c->body_middle[j], d);
             if (dot3(d, d) <= reach[j]) near |= 1u << j;
@@ -388,9 +388,9 @@ API void zk_near(scratch *c, const double *q, const double *margins, int count, 
             if (dot3(d, d) > far * far) continue;
             const pose *T = shape_pose(c, i);
             if (B->kind == HULL) {
-                globe point = {{at[0], at[1], at[2]}, 0.0, 0};
+                sphere_node point = {{at[0], at[1], at[2]}, 0.0, 0};
                 gjk_answer found;
-                globe_distance(B, T, &point, axis, margin, margin, 1.0, &found);
+                node_distance(B, T, &point, axis, margin, margin, 1.0, &found);
                 if (found.below > -1e9) memcpy(axis, found.n, sizeof axis);
                 out[k] = !(found.below > margin);
             } else {
@@ -402,10 +402,10 @@ API void zk_near(scratch *c, const double *q, const double *margins, int count, 
     }
 }
 
-/* -1 when the robot is free at q, else a pair that is too close. */
+/* -1 if the robot is free at q, else a pair that is too close. */
 API int zk_state(scratch *c, const double *q) { return state_free(c, q) ? -1 : c->hit_pair; }
 
-/* -1 when the straight line in joint space is free, proved all along; else a pair, and where on it (0 to 1). */
+/* -1 if the complete straight line in joint space is proved free; else a pair, and where on it (0 to 1). */
 API int zk_edge(scratch *c, const double *a, const double *b, double *at) {
     curve e;
     line_curve(c->w, a, b, &e);
@@ -427,13 +427,13 @@ API int zk_cubics(scratch *c, int count, const double *coefficients, double *at)
     return -1;
 }
 
-/* The first of cubics (count, 4, dof), as in zk_cubics, that breaks what is kept to, -1 when none does, and where on it.
-   States may use a share `accepted` of the slack; `proved` is what is proved between them. */
+/* The first of cubics (count, 4, dof), as in zk_cubics, that violates a tool constraint, -1 if none, and where on it.
+   States may use the share `accepted` of the slack; the share `proved` is proved between them. */
 API int zk_kept(scratch *c, int count, const double *coefficients, double accepted, double proved, double *at) {
     curve e;
     for (int i = 0; i < count; i++) {
         cubic_curve(c->w, coefficients + 4 * c->w->dof * i, &e);
-        if (!keeps_curve(c, &e, accepted, proved)) {
+        if (!curve_satisfies(c, &e, accepted, proved)) {
             *at = c->hit_at;
             return i;
         }
@@ -441,14 +441,14 @@ API int zk_kept(scratch *c, int count, const double *coefficients, double accept
     return -1;
 }
 
-/* The first of positions (count, dof) that is not free, -1 when all are; `hit` is a pair that is too close there. */
+/* The first of positions (count, dof) that is not free, -1 if all are; `hit` is a pair that is too close there. */
 API int zk_first(scratch *c, int count, const double *path, int *hit) {
     int found = first_hit(c, count, path);
     *hit = c->hit_pair;
     return found;
 }
 
-/* Bounds (pairs,) [m] on the distances at q: points that are this far apart, planes that hold this far apart. */
+/* Bounds (pairs,) [m] on the distances at q: of two points, and of a separating plane. */
 API void zk_distances(scratch *c, const double *q, double *above, double *below) {
     forward(c, q);
     middles(c);
@@ -465,7 +465,7 @@ API void zk_distances(scratch *c, const double *q, double *above, double *below)
     }
 }
 
-/* Poses (joints, 3, 4) of the joints' frames as they were given. */
+/* Poses (joints, 3, 4) of the joints' original frames. */
 API void zk_forward(scratch *c, const double *q, double *out) {
     forward(c, q);
     for (int j = 1; j < c->w->joints; j++) {
@@ -481,14 +481,14 @@ API void zk_forward(scratch *c, const double *q, double *out) {
     }
 }
 
-/* How much was done: states, looks at pairs, searches of GJK, their iterations. */
+/* Counters: states, checks of pairs, GJK searches, their iterations, edges. */
 API void zk_counters(const scratch *c, long long *out) {
     out[0] = c->states, out[1] = c->checks, out[2] = c->searches, out[3] = c->iterations;
     out[4] = c->edges;
 }
 
-/* Waypoints (room, dof) of a path from the start to one of goals (goals, dof), all of them free: their number, or -1 when
-   there are too many nodes, -2 out of time, -3 cancelled, -4 no room. `cancel` may be NULL, or set by another thread. */
+/* Waypoints (room, dof) of a free path from the start to one of goals (goals, dof), all free: their number, or -1 for too
+   many nodes, -2 out of time, -3 cancelled, -4 no room. `cancel` may be NULL, or set by another thread. */
 API int zk_plan(scratch *c, const double *start, int goals, const double *goal, const plan_options *options,
                 const volatile int *cancel, int room, double *path, plan_report *report) {
     memset(report, 0, sizeof *report);
@@ -502,9 +502,9 @@ API int zk_speeds(int count, int rows, const double *lengths, const double *up, 
     return speeds(count, rows, lengths, up, down, slope, highest, x, u);
 }
 
-/* Joint positions that put a tool, at `tip` (3, 4) in the frame of joint `tool`, at a target (3, 4): q (dof,) holds the
-   seed and then what was found. Returns how many random starts it took, -1 where nothing was found. tolerance: [m],
-   [rad]. Of a world it reads joints and limits alone. */
+/* Finds joint positions with a tool, at `tip` (3, 4) in the frame of joint `tool`, at a target (3, 4). q (dof,) is the seed
+   and the result. Returns the number of random starts, -1 if nothing was found. tolerance: [m], [rad]. Reads only joints
+   and limits of the world. */
 API int zk_ik(const world *w, int tool, const double *tip, const double *tolerance, const double *target, int restarts,
               int steps, uint64_t seed, double *q) {
     arm a = {w, w->joint[tool].depth, w->joint[tool].chain, {{0}, {0}}, tolerance[0], tolerance[1]};

@@ -1,12 +1,12 @@
 /* A path among obstacles: RRT-Connect (Kuffner, LaValle 2000), then shortcuts. All edges are proved free. The seed decides
-   the path. Where the tool keeps to something, new states are projected onto it (Berenson et al. 2009, see keep.h). */
+   the path. With tool constraints, new states are projected onto them (Berenson et al. 2009, see constraints.h). */
 #ifndef ZK_PLANNER_H
 #define ZK_PLANNER_H
 
 #include <stdint.h>
 #include <time.h>
 
-#include "keep.h"
+#include "constraints.h"
 
 typedef struct {
     uint64_t s[4];
@@ -78,7 +78,7 @@ static int nearest(const tree *t, const double *q, double *square) {
 
 static int line_free(scratch *c, const double *a, const double *b) {
     curve e;
-    if (!keeps_line(c, a, b)) return 0;
+    if (!line_satisfies(c, a, b)) return 0;
     line_curve(c->w, a, b, &e);
     return curve_free(c, &e);
 }
@@ -86,14 +86,14 @@ static int line_free(scratch *c, const double *a, const double *b) {
 typedef struct {
     double range;        /* [rad] longest edge of the trees */
     double seconds;      /* wall time for the search and the shortcuts together */
-    long long nodes;     /* most of both trees */
-    long long shortcuts; /* tries */
-    long long patience;  /* shortcuts that fail in a row before the shortening ends */
+    long long nodes;     /* limit of both trees */
+    long long shortcuts; /* limit of attempts */
+    long long patience;  /* failed shortcuts in a row that end the shortening */
     uint64_t seed;
 } plan_options;
 
 typedef struct {
-    long long samples, nodes, from_start, shortcuts, shortened; /* from_start: nodes of the tree that begins there */
+    long long samples, nodes, from_start, shortcuts, shortened; /* from_start: nodes of the start's tree */
     double search_seconds, shorten_seconds;
 } plan_report;
 
@@ -111,33 +111,33 @@ static int stopped(const run *r) {
     return now() >= r->end ? NO_TIME : 0;
 }
 
-#define SHORTEST_STEP 0.02 /* [rad] of the trees, where the tool keeps to something */
-#define LEAST_PROGRESS 0.1 /* share of a step by which it has to come nearer */
+#define SHORTEST_STEP 0.02 /* [rad] of the trees, with tool constraints */
+#define LEAST_PROGRESS 0.1 /* share of a step that must reduce the distance */
 
-/* A state `to` towards q, kept to and with a free line from a; 0 when there is none. Steps are as long as they may be. */
+/* Sets a state `to` towards q that satisfies the constraints, with a free line from a; 0 if none. Longest step first. */
 static int step_towards(run *r, const double *a, const double *q, double far, double *to, int *reached) {
     scratch *c = r->c;
     int dof = c->w->dof;
     for (double step = fmin(r->o->range, far); step >= fmin(SHORTEST_STEP, far) && step > 0; step *= 0.5) {
         *reached = step >= far;
         for (int j = 0; j < dof; j++) to[j] = *reached ? q[j] : a[j] + step / far * (q[j] - a[j]);
-        if (!keeps_state(c, to)) {
+        if (!state_satisfies(c, to)) {
             *reached = 0;
             if (!project(c, to)) continue;
         }
         if (!*reached && sqrt(distance2(dof, to, q)) > far - LEAST_PROGRESS * step) continue;
-        if (!keeps_line(c, a, to)) continue;
+        if (!line_satisfies(c, a, to)) continue;
         return state_free(c, to) && line_free(c, a, to);
     }
     return 0;
 }
 
-/* A new node towards q, from the nearest one: its index, or -1. */
+/* Adds a node towards q from the nearest one; returns its index, or -1. */
 static int extend(run *r, tree *t, int from, const double *q, double square, int *reached) {
     int dof = t->dof;
-    double far = sqrt(square), to[MOST_JOINTS];
+    double far = sqrt(square), to[MAX_JOINTS];
     const double *a = t->q + (size_t)dof * from;
-    if (r->c->w->keeps) return step_towards(r, a, q, far, to, reached) ? add_node(t, to, from) : -1;
+    if (r->c->w->constraints) return step_towards(r, a, q, far, to, reached) ? add_node(t, to, from) : -1;
     *reached = far <= r->o->range;
     double share = *reached ? 1.0 : r->o->range / far;
     for (int j = 0; j < dof; j++) to[j] = *reached ? q[j] : a[j] + share * (q[j] - a[j]);
@@ -145,18 +145,18 @@ static int extend(run *r, tree *t, int from, const double *q, double square, int
     return add_node(t, to, from);
 }
 
-/* Both trees meet at these nodes, or an error. */
+/* Sets the nodes at which both trees meet; returns 0 or an error. */
 static int search(run *r, tree trees[2], int meet[2], rng *random, plan_report *report) {
     const world *w = r->c->w;
     int dof = w->dof, grows = 0;
-    double q[MOST_JOINTS], square;
+    double q[MAX_JOINTS], square;
     while (trees[0].count + trees[1].count < r->o->nodes) {
         int stop = stopped(r);
         if (stop) return stop;
         tree *one = &trees[grows], *other = &trees[1 - grows];
         report->samples++;
         for (int j = 0; j < dof; j++) q[j] = w->lower[j] + uniform(random) * (w->upper[j] - w->lower[j]);
-        if (w->keeps) project(r->c, q);
+        if (w->constraints) project(r->c, q);
         int from = nearest(one, q, &square);
         int reached, node = extend(r, one, from, q, square, &reached);
         if (node < 0) continue;
@@ -175,7 +175,7 @@ static int search(run *r, tree trees[2], int meet[2], rng *random, plan_report *
             }
             square = distance2(dof, other->q + (size_t)dof * at, q);
         }
-        if (trees[grows].count > trees[1 - grows].count) grows = 1 - grows; /* the smaller one grows */
+        if (trees[grows].count > trees[1 - grows].count) grows = 1 - grows; /* the smaller tree grows */
     }
     return NO_PATH;
 }
@@ -186,7 +186,7 @@ static double path_length(int dof, int count, const double *path) {
     return sum;
 }
 
-/* Drops waypoints that can be passed by: from the first on, the farthest that is seen. */
+/* Drops waypoints by free lines from each waypoint to the farthest reachable one. */
 static int skip_waypoints(run *r, int count, double *path) {
     int dof = r->c->w->dof;
     for (int i = 0; i + 2 < count; i++)
@@ -200,9 +200,9 @@ static int skip_waypoints(run *r, int count, double *path) {
     return count;
 }
 
-#define MOST_FOLLOWED 64
+#define MAX_FOLLOWED 64
 
-/* Waypoints from a to b, both included: a straight line, or steps that keep to what is kept to. 0 when it is not free. */
+/* Waypoints from a to b, both included: a straight line, or steps that satisfy the constraints; 0 if not free. */
 static int follow(run *r, const double *a, const double *b, double *out) {
     int dof = r->c->w->dof, count = 1, reached = 0;
     memcpy(out, a, sizeof(double) * dof);
@@ -210,15 +210,15 @@ static int follow(run *r, const double *a, const double *b, double *out) {
         memcpy(out + dof, b, sizeof(double) * dof);
         return 2;
     }
-    if (!r->c->w->keeps) return 0;
-    for (; count < MOST_FOLLOWED && !reached; count++) {
+    if (!r->c->w->constraints) return 0;
+    for (; count < MAX_FOLLOWED && !reached; count++) {
         double *at = out + (size_t)dof * (count - 1), far = sqrt(distance2(dof, at, b));
         if (stopped(r) || !step_towards(r, at, b, far, at + dof, &reached)) return 0;
     }
     return reached ? count : 0;
 }
 
-/* Replaces pieces between two points of the path by straight lines, or what comes near to them, where these are free. */
+/* Replaces pieces between two points of the path by free straight lines, or by steps close to them. */
 static int shorten(run *r, int count, int room, double *path, rng *random, plan_report *report) {
     int dof = r->c->w->dof;
     long long failed = 0;
@@ -231,7 +231,7 @@ static int shorten(run *r, int count, int room, double *path, rng *random, plan_
             double swap = s;
             s = t, t = swap;
         }
-        double ends[2][MOST_JOINTS], at[2] = {s, t}, sum = 0;
+        double ends[2][MAX_JOINTS], at[2] = {s, t}, sum = 0;
         int piece[2] = {-1, -1};
         for (int i = 0; i + 1 < count; i++) {
             const double *a = path + (size_t)dof * i, *b = a + dof;
@@ -249,7 +249,7 @@ static int shorten(run *r, int count, int room, double *path, rng *random, plan_
         double before = 0, *first = path + (size_t)dof * (piece[0] + 1);
         before += sqrt(distance2(dof, ends[0], first)) + sqrt(distance2(dof, ends[1], path + (size_t)dof * piece[1]));
         before += path_length(dof, dropped, first);
-        double after = sqrt(distance2(dof, ends[0], ends[1])), new[MOST_FOLLOWED * MOST_JOINTS];
+        double after = sqrt(distance2(dof, ends[0], ends[1])), new[MAX_FOLLOWED * MAX_JOINTS];
         int added = after > before - 1e-3 * total ? 0 : follow(r, ends[0], ends[1], new);
         if (!added || count - dropped + added > room || path_length(dof, added, new) > before - 1e-3 * total) {
             failed++;

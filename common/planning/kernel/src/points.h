@@ -1,7 +1,7 @@
-/* Obstacles as they are seen: spheres, each about some points that were measured, in a tree of spheres about spheres.
+/* Obstacles from cameras: spheres, each about some measured points, in a tree of bounding spheres.
 
-   A question goes down the tree only where a node's sphere does not settle it, so what is far away costs nothing and the
-   answer is that of all spheres one by one. */
+   A query descends only where a node's sphere does not decide, so distant spheres cost nothing, and the answer is the
+   same as for all spheres one by one. */
 #ifndef ZK_POINTS_H
 #define ZK_POINTS_H
 
@@ -11,23 +11,24 @@
 
 typedef struct {
     double c[3], r; /* [m], world: about all spheres below */
-    int right;      /* the second child; the first one follows its parent. 0: this is one of the spheres themselves */
-} globe;
+    int right;      /* the second child; the first one follows its parent. 0: a leaf, one of the spheres */
+} sphere_node;
 
 struct points {
     int count, nodes; /* spheres of the set; all of the tree, the root first */
-    globe *node;
+    sphere_node *node;
 };
 
-/* What is left to look at: a node, and the direction in which its parent lay. */
+/* A node to check, and the direction to its parent. */
 typedef struct {
     int node;
     double n[3];
 } visit;
 
-#define DEEPEST 80 /* nodes that can wait at once: one for each level, and halves make 31 levels of 2^31 spheres */
+#define DEEPEST 80 /* limit of nodes on the stack: one for each level; 2^31 spheres have 31 levels */
 
-static void choose_middle(double (*p)[4], int count, int k, int axis) { /* Hoare's: the k-th along an axis in its place */
+/* Puts the k-th point along an axis in its place: Hoare's quickselect. */
+static void choose_middle(double (*p)[4], int count, int k, int axis) {
     int low = 0, high = count - 1;
     while (low < high) {
         double pivot = p[low + (high - low) / 2][axis];
@@ -49,8 +50,8 @@ static void choose_middle(double (*p)[4], int count, int k, int axis) { /* Hoare
     }
 }
 
-static void build_globes(globe *node, int at, double (*p)[4], int count) {
-    globe *b = &node[at];
+static void build_nodes(sphere_node *node, int at, double (*p)[4], int count) {
+    sphere_node *b = &node[at];
     if (count == 1) {
         memcpy(b->c, p[0], sizeof b->c);
         b->r = p[0][3], b->right = 0;
@@ -78,8 +79,8 @@ static void build_globes(globe *node, int at, double (*p)[4], int count) {
     int half = count / 2;
     choose_middle(p, count, half, axis);
     b->right = at + 2 * half;
-    build_globes(node, at + 1, p, half);
-    build_globes(node, b->right, p + half, count - half);
+    build_nodes(node, at + 1, p, half);
+    build_nodes(node, b->right, p + half, count - half);
 }
 
 static void points_free(struct points *set) {
@@ -87,31 +88,31 @@ static void points_free(struct points *set) {
     free(set);
 }
 
-/* A set of spheres (count, 4): middle and radius. NULL when there is no memory. */
+/* A set of spheres (count, 4): centre and radius. NULL if out of memory. */
 static struct points *points_of(int count, const double *spheres) {
     struct points *set = calloc(1, sizeof *set);
     double(*copy)[4] = malloc(sizeof(double) * 4 * ((size_t)count + 1));
-    globe *node = malloc(sizeof(globe) * (2 * (size_t)count + 1));
+    sphere_node *node = malloc(sizeof(sphere_node) * (2 * (size_t)count + 1));
     if (!set || !copy || !node) {
         free(set), free(copy), free(node);
         return NULL;
     }
     memcpy(copy, spheres, sizeof(double) * 4 * (size_t)count);
-    if (count) build_globes(node, 0, copy, count);
+    if (count) build_nodes(node, 0, copy, count);
     free(copy);
     *set = (struct points){count, count ? 2 * count - 1 : 0, node};
     return set;
 }
 
-/* Distance [m] of two spheres, at most the true one. */
-static inline double globe_apart(const double *a, double ra, const globe *b) {
+/* Lower bound [m] of the distance of a sphere and a node. */
+static inline double node_apart(const double *a, double ra, const sphere_node *b) {
     double d[3];
     sub3(b->c, a, d);
     return norm3(d) - ra - b->r;
 }
 
-/* Bounds on the distance of a shape at a pose (world) from a node's sphere: see gjk; directions are of the world. */
-static inline void globe_distance(const shape *A, const pose *T, const globe *b, const double *begin, double enough,
+/* Bounds on the distance of a shape at a pose (world) from a node's sphere, as in gjk; directions in world. */
+static inline void node_distance(const shape *A, const pose *T, const sphere_node *b, const double *begin, double enough,
                                  double near, double share, gjk_answer *out) {
     shape B = {0};
     pose to = *T;
@@ -120,11 +121,11 @@ static inline void globe_distance(const shape *A, const pose *T, const globe *b,
     gjk(A, &B, &to, begin, enough, near, share, out);
 }
 
-/* Puts those of a node's children on the stack whose spheres are at most `far` from a sphere, the nearer one on top. */
-static inline int push_children(const globe *node, const visit *v, const double *middle, double sphere, double far,
+/* Pushes the children of a node whose spheres are at most `far` from a sphere, the nearer one on top. */
+static inline int push_children(const sphere_node *node, const visit *v, const double *middle, double sphere, double far,
                                 visit *stack, int top) {
     int one = v->node + 1, other = node[v->node].right;
-    double d1 = globe_apart(middle, sphere, &node[one]), d2 = globe_apart(middle, sphere, &node[other]);
+    double d1 = node_apart(middle, sphere, &node[one]), d2 = node_apart(middle, sphere, &node[other]);
     if (d1 < d2) {
         int swap = one;
         double way = d1;
@@ -135,19 +136,19 @@ static inline int push_children(const globe *node, const visit *v, const double 
     return top;
 }
 
-/* -1 where all spheres of the set are farther than `far` from a sphere, or farther than `need` from the shape A within it,
-   which may be NULL; else a sphere that is not. axis: direction to begin with, and the one that served. */
+/* -1 if all spheres of the set are farther than `far` from a sphere, or farther than `need` from the shape A in it, which
+   may be NULL; else the node of a sphere that is not. axis: direction to start with, and the last successful one. */
 static int points_touch(const struct points *set, const shape *A, const pose *T, const double *middle, double sphere,
                         double far, double need, double *axis, long long *searches) {
-    if (!set || !set->count || globe_apart(middle, sphere, &set->node[0]) > far) return -1;
+    if (!set || !set->count || node_apart(middle, sphere, &set->node[0]) > far) return -1;
     visit stack[DEEPEST] = {{0, {axis[0], axis[1], axis[2]}}};
     int top = 1;
     while (top) {
         visit v = stack[--top];
-        const globe *b = &set->node[v.node];
+        const sphere_node *b = &set->node[v.node];
         if (A && (!b->right || b->r < A->sphere)) {
             gjk_answer found;
-            globe_distance(A, T, b, v.n, need, need, 1.0, &found);
+            node_distance(A, T, b, v.n, need, need, 1.0, &found);
             ++*searches;
             if (found.below > -1e9) memcpy(v.n, found.n, sizeof v.n), memcpy(axis, found.n, sizeof v.n);
             if (found.below > need) continue;
@@ -167,12 +168,12 @@ static void points_distance(const struct points *set, const shape *A, const pose
     int top = 1;
     while (top) {
         visit v = stack[--top];
-        const globe *b = &set->node[v.node];
-        if (globe_apart(middle, A->sphere, b) > *above) continue;
+        const sphere_node *b = &set->node[v.node];
+        if (node_apart(middle, A->sphere, b) > *above) continue;
         if (!b->right || b->r < A->sphere) {
             gjk_answer found;
             int leaf = !b->right;
-            globe_distance(A, T, b, v.n, leaf ? INFINITY : *above, leaf ? -INFINITY : *above, 1.0, &found);
+            node_distance(A, T, b, v.n, leaf ? INFINITY : *above, leaf ? -INFINITY : *above, 1.0, &found);
             if (found.below > -1e9) memcpy(v.n, found.n, sizeof v.n);
             if (leaf) {
                 if (found.above < *above) *above = found.above, memcpy(axis, v.n, sizeof v.n);
@@ -185,10 +186,10 @@ static void points_distance(const struct points *set, const shape *A, const pose
     }
 }
 
-/* Spheres about points (count, 3) of the world: one for each cube of the grid in which there are any, about their mean and
-   all of them, of at least half a side. `out` has room for `count`; what is no number, or farther than 1e4 m, is left
-   out, and points with a 1 in `skip` (which may be NULL). Their number, or -1 when there is no memory. */
-static int thin_points(int count, const double *p, const uint8_t *skip, double side, double (*out)[4]) {
+/* Spheres about points (count, 3), world: one for each cube of a grid that contains any, centred at their mean, about all
+   of them and at least half a side large. `out` has room for `count`. Ignores points that are not finite or farther than
+   1e4 m, and those with a 1 in `skip` (may be NULL). Returns the number of spheres, or -1 if out of memory. */
+static int downsample_points(int count, const double *p, const uint8_t *skip, double side, double (*out)[4]) {
     int bits = 4, used = 0;
     while ((1 << bits) < 2 * (long long)count && bits < 30) bits++;
     size_t room = (size_t)1 << bits;

@@ -1,7 +1,7 @@
-/* Convex shapes as a core and a rounding radius: what GJK needs is the core's farthest point in a direction.
+/* Convex shapes as a core and a rounding radius. GJK needs the core's farthest point in a direction.
 
-   A sphere is a point, a capsule a segment, each with a radius; boxes, cylinders and hulls have none. Dimensions are
-   coal's: box full sides; cylinder and capsule radius and length along z; sphere radius. */
+   A sphere is a point, a capsule a segment, each with a radius; boxes, cylinders and hulls have none. Dimensions as in
+   coal: box full sides; cylinder and capsule radius and length along z; sphere radius. */
 #ifndef ZK_SHAPES_H
 #define ZK_SHAPES_H
 
@@ -83,8 +83,8 @@ static inline void support(const shape *s, const double *d, double *out) {
     }
 }
 
-/* Distance [m] of a point p outside the shape from it, and the unit direction to it, both in the shape's own frame;
-   0 within. Of a hull, of the sphere about it. */
+/* Distance [m] of a point p outside the shape, and the unit direction to the shape, both in the shape's frame; 0 inside.
+   For a hull, the distance of the sphere about it. */
 static inline double point_distance(const shape *s, const double *p, double *n) {
     double to[3] = {0, 0, 0}, less = s->radius;
     switch (s->kind) {

@@ -4,8 +4,8 @@
 
 #include <math.h>
 
-/* count intervals of `rows` limits: -down - slope x <= u <= up - slope x. highest (count + 1): most x at the grid points,
-   lowered in place; x (count + 1), u (count). Returns -1, or a grid point i that cannot be passed: i backwards,
+/* count intervals of `rows` limits: -down - slope x <= u <= up - slope x. highest (count + 1): limit of x at the grid
+   points, lowered in place; x (count + 1), u (count). Returns -1, or a grid point i that cannot be passed: i backwards,
    count + i forwards. */
 static int speeds(int count, int rows, const double *lengths, const double *up, const double *down, const double *slope,
                   double *highest, double *x, double *u) {

@@ -1,32 +1,32 @@
-/* A robot among obstacles: joints, shapes, pairs that may not touch, and the working memory of one thread. */
+/* A robot among obstacles: joints, shapes, pairs to check, and the working memory of one thread. */
 #ifndef ZK_WORLD_H
 #define ZK_WORLD_H
 
 #include "points.h"
 
-#define MOST_JOINTS 32 /* the first stands for the world */
-#define CONTACT_ALLOWED (-1e9) /* [m] a margin that every distance keeps */
+#define MAX_JOINTS 32 /* the first is the world */
+#define CONTACT_ALLOWED (-1e9) /* [m] a margin that every distance satisfies */
 #define HOT 8
-#define TOUCHING 1e-9  /* [m] shapes this close touch: what cannot be told apart from contact is contact */
+#define TOUCHING 1e-9  /* [m] shapes this close count as touching */
 
 enum { FIXED, REVOLUTE, PRISMATIC };
 
 typedef struct {
     int parent, kind;
     pose place;       /* in the frame of the parent; frames are turned so that z is the axis */
-    double turned[9]; /* from the turned frame to the frame that was given */
-    int depth;        /* joints from the world to this one, itself included */
-    int chain[MOST_JOINTS];
+    double turned[9]; /* from the turned frame to the original frame */
+    int depth;        /* number of joints from the world to this one, itself included */
+    int chain[MAX_JOINTS];
 } joint;
 
 typedef struct {
     int a, b;   /* shapes; the joints of a beyond `common` are at least as many as those of b */
     int common; /* the last joint that moves both */
-    int fixed;  /* whether b rests in the frame of `common` */
+    int fixed;  /* whether b is fixed in the frame of `common` */
 } pair;
 
 /* Pairs of the shapes of one joint's body with one obstacle, or with the shapes of another body: a sphere about the body
-   settles most of them at once. */
+   decides most of them at once. */
 typedef struct {
     pair spheres;        /* a: the body; b: the obstacle's shape, or a body where `moving` */
     int moving;
@@ -36,10 +36,10 @@ typedef struct {
 
 typedef struct {
     double middle[3], sphere;        /* in the frame of the joint */
-    double reach[MOST_JOINTS];     /* levers of the middle */
+    double reach[MAX_JOINTS];     /* levers of the middle */
 } body;
 
-#define MOST_KEPT 8
+#define MAX_CONSTRAINTS 8
 
 /* A number n x - least that must not be negative: of a direction of the tool, or of the tool point. */
 typedef struct {
@@ -47,40 +47,40 @@ typedef struct {
     double at[3];  /* the direction, in the frame of the joint that carries the tool */
     double n[3], least, slack; /* slack: of n x, at the tolerance */
     double inside; /* where states are projected to: an angle [rad], or a distance from the bound [m] */
-} kept;
+} constraint;
 
 typedef struct {
     int dof, joints, shapes, pairs, room;
-    joint joint[MOST_JOINTS]; /* joint i > 0 is moved by q[i - 1] */
-    double lower[MOST_JOINTS], upper[MOST_JOINTS];
-    double stroke[MOST_JOINTS]; /* [m] how far each joint slides within its limits */
+    joint joint[MAX_JOINTS]; /* joint i > 0 is moved by q[i - 1] */
+    double lower[MAX_JOINTS], upper[MAX_JOINTS];
+    double stroke[MAX_JOINTS]; /* [m] how far each joint slides within its limits */
     shape *shape;
-    double (*lever)[MOST_JOINTS]; /* of each shape about each joint [m]: as far from the axis as it ever gets */
-    double (*reach)[MOST_JOINTS]; /* the same of the middle of its sphere */
+    double (*lever)[MAX_JOINTS]; /* of each shape about each joint [m]: as far from the axis as it ever gets */
+    double (*reach)[MAX_JOINTS]; /* the same for the centre of its sphere */
     pair *pair;
     group *group;
     int groups, *member;
-    body body[MOST_JOINTS];
-    double *far, *near; /* margins [m] of the pairs; near holds while the tool is near its start */
-    int excuses;        /* whether near and far differ */
+    body body[MAX_JOINTS];
+    double *far, *near; /* margins [m] of the pairs; near applies while the tool is near its start */
+    int near_differs;        /* whether near and far differ */
     int tool;           /* joint that carries the tool point */
-    double tip[3], origin[3], leash;
-    double tip_lever[MOST_JOINTS];
-    int keeps, keep_tool; /* what the tool keeps to, and the joint that carries it */
-    kept keep[MOST_KEPT];
-    double keep_tip[3], keep_lever[MOST_JOINTS], turn_lever[MOST_JOINTS];
+    double tip[3], origin[3], contact_distance;
+    double tip_lever[MAX_JOINTS];
+    int constraints, constrained_joint; /* number of tool constraints, and the joint that carries the tool */
+    constraint constraint[MAX_CONSTRAINTS];
+    double constrained_tip[3], constrained_lever[MAX_JOINTS], turn_lever[MAX_JOINTS];
 } world;
 
-/* What one thread needs to answer questions. */
+/* Working memory of one thread. */
 typedef struct {
     const world *w;
-    pose T[MOST_JOINTS];
-    double spin[MOST_JOINTS][3], slide[MOST_JOINTS][3]; /* twist of each joint's body: angular, linear at the origin */
+    pose T[MAX_JOINTS];
+    double spin[MAX_JOINTS][3], slide[MAX_JOINTS][3]; /* twist of each joint's body: angular, linear at the origin */
     double (*middle)[3];
     pose *T_shape;
     unsigned *stamp, now;
-    double (*axis)[3]; /* direction that held a pair apart the last time, frame of b */
-    int *touched;      /* sphere of a set of points that a pair touched last */
+    double (*axis)[3]; /* direction that separated a pair last, frame of b */
+    int *touched;      /* node of a set of points that a pair touched last */
     int hot[HOT];      /* pairs that touched last, the last one first */
     double (*body_middle)[3];
     double (*bound)[4]; /* of each pair on a curve: M and K of the sphere, M and K of the shape */
@@ -88,7 +88,7 @@ typedef struct {
     int *list, list_room;
     struct span *span;
     int span_room;
-    /* what happened */
+    /* counters and the last hit */
     long long states, checks, searches, iterations, edges;
     int hit_pair;
     double hit_at;
@@ -96,10 +96,10 @@ typedef struct {
 
 static double axis_distance(const double *p) { return sqrt(p[0] * p[0] + p[1] * p[1]); }
 
-/* Levers of a sphere of radius r about a point of a joint's frame: for every joint above, the farthest that any of its
-   points can be from the axis, whatever the positions within limits of the joints between. */
+/* Levers of a sphere of radius r about a point of a joint's frame: for every joint above, the largest distance of any of
+   its points from the axis, over all positions within limits of the joints between. */
 static void levers_of(const world *w, int j, const double *at, double r, double *lever) {
-    memset(lever, 0, sizeof(double) * MOST_JOINTS);
+    memset(lever, 0, sizeof(double) * MAX_JOINTS);
     if (!j) return;
     double beyond = norm3(at) + r;
     lever[j] = w->joint[j].kind == PRISMATIC ? 1.0 : axis_distance(at) + r;
@@ -113,7 +113,7 @@ static void levers_of(const world *w, int j, const double *at, double r, double 
     }
 }
 
-/* The hull's own farthest point from the axis of the joint that carries it; for other shapes that of their sphere. */
+/* Levers of a shape: by the farthest point of a hull from the axis of its joint, for other shapes by their sphere. */
 static void measure(world *w, int i) {
     shape *s = &w->shape[i];
     double at[3];
@@ -128,10 +128,10 @@ static void measure(world *w, int i) {
                 act(&s->placed, p, out);
                 beyond = fmax(beyond, norm3(out)), most = fmax(most, axis_distance(out));
             }
-        double origin[3] = {0, 0, 0}, own[MOST_JOINTS];
+        double origin[3] = {0, 0, 0}, own[MAX_JOINTS];
         levers_of(w, s->joint, origin, beyond, own);
         if (w->joint[s->joint].kind != PRISMATIC) own[s->joint] = most;
-        for (int k = 0; k < MOST_JOINTS; k++) w->lever[i][k] = fmin(w->lever[i][k], own[k]);
+        for (int k = 0; k < MAX_JOINTS; k++) w->lever[i][k] = fmin(w->lever[i][k], own[k]);
     }
 }
 
@@ -198,7 +198,7 @@ static inline void middles(scratch *c) {
         }
 }
 
-/* Distance [m] of a sphere from a sphere; n: unit, from the first to the second. */
+/* Distance [m] of two spheres; n: unit, from the first to the second. */
 static inline double spheres_apart(const double *a, double ra, const double *b, double rb, double *n) {
     sub3(b, a, n);
     double far = norm3(n);
@@ -210,7 +210,7 @@ static inline double spheres_apart(const double *a, double ra, const double *b, 
     return far - ra - rb;
 }
 
-/* Distance [m] of a sphere (world) from a shape, at most the true one; n: unit, world, from the sphere to the shape. */
+/* Lower bound [m] of the distance of a sphere (world) and a shape; n: unit, world, from the sphere to the shape. */
 static inline double sphere_apart(scratch *c, const double *middle, double sphere, int b, double *n) {
     const shape *B = &c->w->shape[b];
     if (B->kind == HULL || B->kind == SPHERE) return spheres_apart(middle, sphere, c->middle[b], B->sphere, n);
@@ -223,8 +223,8 @@ static inline double sphere_apart(scratch *c, const double *middle, double spher
     return far - sphere;
 }
 
-/* The same of the sphere about the first shape of a pair. What moves itself counts with its sphere, too, so that its turning
-   is of no account. */
+/* The same for the sphere about the first shape of a pair. A second shape that moves is replaced by its sphere, too, so
+   that its rotation does not matter. */
 static inline double pair_apart(scratch *c, const pair *p, double *n) {
     const world *w = c->w;
     if (!p->fixed) return spheres_apart(c->middle[p->a], w->shape[p->a].sphere, c->middle[p->b], w->shape[p->b].sphere, n);
@@ -239,7 +239,7 @@ static inline double group_apart(scratch *c, const group *g, double *n) {
     return spheres_apart(middle, A->sphere, c->body_middle[g->spheres.b], c->w->body[g->spheres.b].sphere, n);
 }
 
-/* Bounds on the distance of a pair, stopping as `gjk` does; begins with the direction that served last. */
+/* Bounds on the distance of a pair, stopping as `gjk` does; starts with the last successful direction. */
 static inline void pair_distance(scratch *c, int i, double enough, double near, double share, gjk_answer *out) {
     const pair *p = &c->w->pair[i];
     pose T;
@@ -263,17 +263,17 @@ static inline double tool_travel(scratch *c) {
     return norm3(at);
 }
 
-/* Whether the sphere about the first shape of a pair keeps `far` [m] from all points of the second, or the shape `need`. */
+/* Whether the sphere about the first shape of a pair is `far` [m] from all points of the second, or the shape `need`. */
 static inline int pair_clear(scratch *c, int i, double far, double need) {
     const pair *p = &c->w->pair[i];
     const shape *A = &c->w->shape[p->a];
     const struct points *set = c->w->shape[p->b].set;
     const pose *T = shape_pose(c, p->a);
-    if (set && c->touched[i] >= 0 && c->touched[i] < set->nodes) { /* likely still so */
-        const globe *b = &set->node[c->touched[i]];
+    if (set && c->touched[i] >= 0 && c->touched[i] < set->nodes) { /* likely still touching */
+        const sphere_node *b = &set->node[c->touched[i]];
         gjk_answer found;
-        if (globe_apart(c->middle[p->a], A->sphere, b) <= far) {
-            globe_distance(A, T, b, c->axis[i], need, need, 1.0, &found);
+        if (node_apart(c->middle[p->a], A->sphere, b) <= far) {
+            node_distance(A, T, b, c->axis[i], need, need, 1.0, &found);
             if (!(found.below > need)) return 0;
         }
     }
@@ -281,7 +281,7 @@ static inline int pair_clear(scratch *c, int i, double far, double need) {
     return c->touched[i] < 0;
 }
 
-/* Whether the sphere about a body keeps a distance from an obstacle. */
+/* Whether the sphere about a body is farther than a distance from an obstacle. */
 static inline int group_clear(scratch *c, const group *g, double need) {
     double n[3] = {0, 0, 1};
     const body *A = &c->w->body[g->spheres.a];
@@ -290,7 +290,7 @@ static inline int group_clear(scratch *c, const group *g, double need) {
     return points_touch(c->w->shape[g->spheres.b].set, NULL, NULL, middle, A->sphere, need, need, n, &c->searches) < 0;
 }
 
-/* Whether a pair keeps its margin where the robot is now. */
+/* Whether a pair keeps its margin at the current position. */
 static inline int pair_free(scratch *c, int i, double margin) {
     double n[3], need = margin + TOUCHING;
     c->checks++;
@@ -301,7 +301,7 @@ static inline int pair_free(scratch *c, int i, double margin) {
     return found.below > need;
 }
 
-/* Whether the pairs that touched last keep their margins where the robot is now. */
+/* Whether the pairs that touched last keep their margins at the current position. */
 static inline int hot_free(scratch *c, const double *margin) {
     for (int k = 0; k < HOT && c->hot[k] >= 0; k++)
         if (margin[c->hot[k]] > CONTACT_ALLOWED && !pair_free(c, c->hot[k], margin[c->hot[k]])) {
@@ -316,7 +316,7 @@ static int state_free(scratch *c, const double *q) {
     const world *w = c->w;
     forward(c, q);
     middles(c);
-    int starting = w->excuses && tool_travel(c) < w->leash;
+    int starting = w->near_differs && tool_travel(c) < w->contact_distance;
     const double *margin = starting ? w->near : w->far;
     if (!hot_free(c, margin)) return 0;
     for (int g = 0; g < w->groups; g++) {

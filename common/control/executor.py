@@ -1,0 +1,344 @@
+"""The executor: requests in, one control cycle at a time, status out. It has no clock, no network and no files.
+
+A cycle reads arm and gripper, advances the simulated world where there is one, sends set-points and reports what has
+changed. Requests are checked by the motion authority, which knows interlocks and the owner of the motion.
+"""
+
+from __future__ import annotations
+
+from common.config import GripperConfig
+from common.control.devices import DeviceFault, PayloadReporter, call_device, read_gripper, read_joints
+from common.control.goals import Assessment
+from common.control.gripper_controller import DeferredCommand, GripperController
+from common.control.interlocks import Interlocks
+from common.control.jogging import Jogging, ToolKinematics
+from common.control.motion_authority import MotionAuthority
+from common.control.status import ChangeDetector, Report, joint_state, robot_fields
+from common.control.trajectory import Tolerances
+from common.control.trajectory_controller import PERIOD, TrajectoryController
+from common.errors import ConfigError, Refused
+from common.hardware.interface import (
+    ControlledArm,
+    Hardware,
+    HardwareFault,
+    Limits,
+    PersistedState,
+    Vector,
+    WorldBackend,
+)
+from common.messages import (
+    CLOSED_BEFORE,
+    ExecuteRequest,
+    GripperCommand,
+    GripperState,
+    Header,
+    JogCommand,
+    JointState,
+    MotionStatus,
+    RobotCommand,
+    RobotStatus,
+)
+
+
+class Executor:
+    """Controls an arm, its gripper and, with simulated hardware, the world around them.
+
+    Attributes:
+        arm: follows trajectories.
+        gripper: commands the fingers; None without a gripper.
+        authority: decides which motions may start.
+        world: the simulated world; None with real hardware.
+    """
+
+    def __init__(
+        self,
+        hardware: Hardware,
+        limits: Limits,
+        start: Vector,
+        *,
+        tolerances: Tolerances | None = None,
+        gripper: GripperConfig | None = None,
+        controller: str = "controller",
+        kinematics: ToolKinematics | None = None,
+        world: WorldBackend | None = None,
+        interlocks: Interlocks | None = None,
+        period: float = PERIOD,
+    ) -> None:
+        """Control this hardware every `period` [s], subject to `interlocks`; jog the tool if there are kinematics.
+
+        Raises:
+            ConfigError: the robot has a gripper, but the hardware has none.
+        """
+        if gripper is not None and hardware.gripper is None:
+            raise ConfigError("robot.hardware.backend", type(hardware).__name__,
+                              "has no gripper, but the robot has one: name its backend in robot.gripper.hardware")
+        self._hardware, self._limits, self._gripper_config = hardware, limits, gripper
+        self.world = world
+        self.arm = TrajectoryController(limits, start, tolerances, name=controller, period=period)
+        self.gripper = None
+        if gripper is not None and hardware.gripper is not None:
+            self.gripper = GripperController(hardware.gripper, gripper)
+        self._deferred = DeferredCommand(self.arm, kinematics)
+        self._q = start.copy()
+        self._was_read = False  # whether the position of the arm is known
+        self._width_rate = 0.0
+        self._speed_scaling = 1.0  # as operators and programs set it
+        self._followed: ExecuteRequest | None = None  # newest accepted goal
+        self._controlled = hardware if isinstance(hardware, ControlledArm) else None
+        self._payload = PayloadReporter(self._controlled, gripper)
+        self._arm_fault, self._gripper_fault = DeviceFault("the arm"), DeviceFault("the gripper")
+        self._changes = ChangeDetector(self.arm)
+        self._interlocks = interlocks or Interlocks()
+        if self._controlled is not None:
+            self.arm.history.delay, self.arm.bridges = self._controlled.delay, self._controlled.ahead
+            self._controlled.stopped = self._controlled.stopped or self._interlocks.arm_stopped
+        self.authority = MotionAuthority(self.arm, Jogging(limits, kinematics), self._interlocks)
+
+    # --- the cycle ------------------------------------------------------------------------------------------------
+
+    def cycle(self, header: Header) -> Report:
+        """Do one cycle at the header's time; return what has changed."""
+        now = header.stamp * 1e-9
+        report = Report()
+        if not self._arm_fault.is_paused(now):
+            try:
+                report.joints = self._control_devices(header, now)
+            except HardwareFault as fault:
+                self._arm_fault.set(str(fault), now)
+                self.arm.fault(str(fault))
+                self.authority.interrupt_jogging()
+        if self.gripper is not None:
+            self._update_deferred(self.gripper, now)
+        if self._controlled is not None:
+            self._interlocks.arm_stopped = self._controlled.stopped
+        moving = self.gripper is not None and self.gripper.state.moving
+        self.authority.update(bool(self.arm.goal) or not self.arm.at_rest or moving)
+        self._report_changes(report, header)
+        return report
+
+    def _control_devices(self, header: Header, now: float) -> JointState:
+        """Read the devices and send set-points; return the joint state.
+
+        Raises:
+            HardwareFault: the arm does not work.
+        """
+        self._q, dq = read_joints(self._hardware, len(self._q), now)
+        self._was_read = True
+        try:
+            self._update_gripper(now)
+        except HardwareFault as fault:
+            self._fail_gripper(fault, now)
+            if self.gripper is not None:
+                self.gripper.fault(str(fault))
+        if self._controlled is None or self._update_controlled_arm(self._controlled):
+            self.arm.jog(self.authority.jog_velocity(self.arm.reports.speed_scaling))
+            set_points = self.arm.update(now, self._q, dq)
+            if set_points is not None:
+                call_device("sending set-points", self._hardware.write, *set_points, now)
+                self._arm_fault.clear(now)
+        width = self.gripper.state.width if self.gripper is not None else 0.0
+        return joint_state(header, self._limits.names, self._q, dq, self._gripper_config, width, self._width_rate)
+
+    def _update_controlled_arm(self, arm: ControlledArm) -> bool:
+        """Return whether the arm's own controller accepts set-points."""
+        state, self.arm.history.delay = arm.state, arm.delay
+        self.arm.reports.speed_scaling = self._speed_scaling * state.speed
+        held = self.gripper.held_mass if self.gripper is not None else 0.0
+        self._payload.update(held, state.mode == "running", self.arm.at_rest)
+        if state.mode == "running":
+            return True
+        self.arm.fault(state.message or state.mode)  # no pause: its state says when it is over
+        self.authority.interrupt_jogging()
+        return False
+
+    def _update_gripper(self, now: float) -> None:
+        gripper = self._hardware.gripper
+        if self.gripper is None or gripper is None or self._gripper_fault.is_paused(now):
+            return
+        if self.world is not None:
+            self.world.obstruct(self._q)
+        reading = read_gripper(gripper, now)
+        if self.world is not None:
+            self.world.step(now, self._q, reading)
+        self._width_rate = reading.velocity
+        self.gripper.update(reading, now)
+        self._gripper_fault.clear(now)
+
+    def _fail_gripper(self, fault: HardwareFault, now: float) -> None:
+        """Brake the arm along its path: the gripper does not work."""
+        self._gripper_fault.set(str(fault), now)
+        self.arm.abort("hardware_fault", str(fault), "hardware")
+
+    def _update_deferred(self, gripper: GripperController, now: float) -> None:
+        """Start or cancel a deferred gripper command; stop an arm that arrives late for closing fingers."""
+        waiting = self._deferred.command
+        blocked = waiting and self.authority.check_interlocks(waiting, waiting.id)
+        if waiting is not None and blocked:
+            self._deferred.take()
+            gripper.cancel_deferred(waiting, str(blocked))
+        elif waiting is not None and self._deferred.is_due(now, self._q, gripper.state.width):
+            try:
+                gripper.start(waiting, now)
+            except HardwareFault as fault:
+                self._fail_gripper(fault, now)
+                gripper.cancel_deferred(waiting, str(fault), "hardware_fault")
+        if self._deferred.closed_early(now):
+            self.arm.abort(CLOSED_BEFORE, "held up or slowed as the fingers began to close")
+        if failed := self._deferred.take_failed():
+            gripper.cancel_deferred(*failed)
+
+    def _report_changes(self, report: Report, header: Header) -> None:
+        report.robot = self._changes.robot(header, robot_fields(self._controlled, self._arm_fault.reason), self._late)
+        report.notes = [*filter(None, (self._arm_fault.pop_log_line(), self._gripper_fault.pop_log_line(),
+                                       self.arm.pop_log_line(), self._payload.pop_log_line()))]
+        report.owner = self.authority.changed_owner(header)
+        report.motion = self.changed_motion(header)
+        if self.gripper is not None:
+            report.gripper = self._changes.gripper(header, self.gripper.state)
+        if self.world is not None:
+            report.updates, report.objects = self.world.updates(header)
+            self.world.save(PersistedState(self._q, *(
+                (self.gripper.state.width, self.gripper.commanded_width, self.gripper.commanded_effort)
+                if self.gripper is not None else ())))
+
+    def changed_motion(self, header: Header) -> MotionStatus | None:
+        """Return the status of the motion if it has changed since it was last returned."""
+        return self._changes.motion(header)
+
+    # --- requests -------------------------------------------------------------------------------------------------
+
+    def takes_long(self, request: ExecuteRequest) -> bool:
+        """Return whether assessing the request takes longer than there is time between two cycles."""
+        return self.arm.takes_long(request.id, request.trajectory)
+
+    def assess(self, request: ExecuteRequest) -> Assessment:
+        """Return whether and how the arm can follow the trajectory; any thread may call it."""
+        return self.arm.assess(request.trajectory, self._q)
+
+    def execute(
+        self, request: ExecuteRequest, now: float, refusal: Refused | None = None, assessment: Assessment | None = None
+    ) -> MotionStatus:
+        """Return the state of the goal: active, or rejected with the reason; of a known id its present state."""
+        authority, known = self.authority, self.arm.knows(request.id)
+        refusal = (authority.check_interlocks(request, request.id) or refusal or authority.check_owner(request.owner)
+                   or self._check_devices())
+        status = self.arm.accept(
+            request.id, request.trajectory, now, self._q, refusal, assessment, request.plan, request.scene_stamp,
+        )
+        if not known:
+            authority.note_refusal(request, status)
+        if request.id == self.arm.goal and (self._followed is None or self._followed.id != request.id):
+            self._followed = request
+            authority.use(request.owner)
+        return status
+
+    def _check_devices(self) -> Refused | None:
+        if self._gripper_fault.check() is None and not self._was_read and not self._arm_fault.reason:
+            return Refused("hardware_fault", "no joint reading received yet")
+        return self._gripper_fault.check()
+
+    def jog(self, request: JogCommand, refusal: Refused | None = None) -> None:
+        """Jog the arm until the next command is overdue, unless there is a `refusal` already.
+
+        Raises:
+            Refused: with the reason. Commands count again after a pause.
+        """
+        self.authority.jog(request, refusal or self._check_devices())
+
+    def followed(self, goal: str) -> ExecuteRequest:
+        """Return the request of the goal that is followed.
+
+        Raises:
+            Refused: another goal, or none, is followed.
+        """
+        if self._followed is None or not goal == self._followed.id == self.arm.goal:
+            raise Refused("unknown_goal", f"goal {goal!r} is not followed now")
+        return self._followed
+
+    def command_gripper(self, request: GripperCommand, now: float, refusal: Refused | None = None) -> GripperState:
+        """Return the state of the gripper's goal, which is rejected if there is a `refusal` already.
+
+        Raises:
+            Refused: this robot has no gripper.
+        """
+        if self.gripper is None:
+            raise Refused("no_gripper", "this robot has no gripper")
+        refusal = (self.authority.check_interlocks(request, request.id) or refusal
+                   or self.authority.check_owner(request.owner) or self._gripper_fault.check())
+        deferred = bool(request.after) and request.after == self.arm.goal
+        if request.after and not deferred and self.arm.fails(request.after):
+            refusal = refusal or Refused("unknown_goal", f"goal {request.after!r} is not followed now")
+        try:
+            known = self.gripper.knows(request.id)
+            state = self.gripper.command(request, now, refusal, deferred)
+            if not known:
+                self.authority.note_refusal(request, state)
+            if not known and state.state == "active":
+                self._replace_deferred(self.gripper, request)
+                if deferred:
+                    self._deferred.wait(request)
+            if refusal is None:
+                self.authority.use(request.owner)
+            return state
+        except HardwareFault as fault:
+            self._gripper_fault.set(str(fault), now)
+            self.gripper.fault(str(fault))
+            self._replace_deferred(self.gripper, request)
+            return self.gripper.command(request, now, self._gripper_fault.check())
+
+    def _replace_deferred(self, gripper: GripperController, request: GripperCommand) -> None:
+        if (replaced := self._deferred.take()) is not None:
+            gripper.cancel_deferred(replaced, f"replaced by {request.id!r}")
+
+    def order(self, request: RobotCommand) -> int:
+        """Start a function of the arm's own controller; return a number for `outcome`.
+
+        Raises:
+            Refused: it has no controller, or a goal is being followed.
+        """
+        if self._controlled is None:
+            raise Refused("no_controller", "this arm has no controller of its own that could do that")
+        if request.act == "freedrive" and request.value and self.arm.goal:
+            raise Refused("busy", f"goal {self.arm.goal!r} is still being followed: stop it first")
+        return self._controlled.order(request.act, *request.values)
+
+    def outcome(self, number: int) -> str | None:
+        """Return None while an order runs, then once "" for success or the reason of its failure."""
+        assert self._controlled is not None
+        return self._controlled.outcome(number)
+
+    @property
+    def robot(self) -> RobotStatus:
+        """State of the arm."""
+        return RobotStatus(**robot_fields(self._controlled, self._arm_fault.reason), late=self._late)
+
+    @property
+    def _late(self) -> float:
+        return self._controlled.late if self._controlled is not None else 0.0
+
+    @property
+    def speed_scaling(self) -> float:
+        """Share of their speed at which trajectories are followed, 0 to 1; the arm's slider reduces it further."""
+        return self._speed_scaling
+
+    @speed_scaling.setter
+    def speed_scaling(self, share: float) -> None:
+        self._speed_scaling = share
+        slider = self._controlled.state.speed if self._controlled is not None else 1.0
+        self.arm.reports.speed_scaling = share * slider
+
+    def restore(self, now: float) -> None:
+        """Continue what simulated hardware did before a restart, at a time [s]."""
+        state = self.world.restore(stopped=bool(self._interlocks.stops)) if self.world is not None else None
+        gripper = self._hardware.gripper
+        if state is None or self.gripper is None or gripper is None:
+            return
+        if state.commanded_width is not None:
+            self.gripper.resume(state.commanded_width, now, state.commanded_effort)
+        self.gripper.update(gripper.read(now), now)
+
+    def close(self) -> None:
+        """Release the hardware, and close the world."""
+        self._hardware.close()
+        if self.world is not None:
+            self.world.close()
