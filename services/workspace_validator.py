@@ -24,7 +24,7 @@ from applications.pick_place.topics import (
 )
 from common.config import Grasp, RobotConfig, Surroundings, Tunable
 from common.messages import Color, Header, Marker, MarkerArray, Pose, PoseArray, Rejections, Vector3
-from common.messages.geometry import MOST_POSES
+from common.messages.basics import MAX_POSES
 from common.process.service import main
 from common.robot.model import RobotModel
 from common.scene.workspace import ReachCache, WorkspaceBounds
@@ -129,7 +129,7 @@ async def run(bus: Bus, config: Config) -> None:
         header = Header(stamp=min(one.frame.header.stamp for one in seen), frame_id=WORLD)
         kept = remembered.hidden(verdict.targets, [place for place, _ in verdict.refused], hiding(seen, radius))
         # Of several crowded views not all can be told of: what is left out is nobody's target for now.
-        verdict.targets, kept = verdict.targets[:MOST_POSES], kept[: max(0, MOST_POSES - len(verdict.targets))]
+        verdict.targets, kept = verdict.targets[:MAX_POSES], kept[: max(0, MAX_POSES - len(verdict.targets))]
         poses = [Pose(position=Vector3(x=x, y=y, z=z)) for x, y, z in [*verdict.targets, *kept]]
         labels = [*("" for _ in verdict.targets), *(HIDDEN for _ in kept)] if kept else []
         unseen, blind = watched.unseen(seen, views, config.may_hide)

@@ -8,9 +8,20 @@ from pydantic import Field, computed_field, model_validator
 
 from common import messages as m
 from common.application import ApplicationTopics
-from common.messages.basics import SMALL_BYTES, Count, Finite, Header, Label, Message, Name, Text
-from common.messages.geometry import Color, Pose, PoseArray
-from common.messages.task import TaskStatus
+from common.messages.basics import (
+    SMALL_BYTES,
+    Color,
+    Count,
+    Finite,
+    Header,
+    Label,
+    Message,
+    Name,
+    Pose,
+    PoseArray,
+    Text,
+)
+from common.messages.execution import TaskStatus
 from common.topics import Request, Topic
 
 MAX_POINTS = 20_000  # of an outline

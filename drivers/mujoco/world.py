@@ -78,7 +78,7 @@ class PhysicsWorld(News):
         self._robot = robot
         self._arm = PhysicsArm(robot, start, self.advance)
         self._build()
-        cell, data = self._built
+        cell, data = self.simulation
         cell.set_joints(data, robot.joint_names, start)
         if self._arm.fingers is not None and robot.config.gripper is not None:
             self._arm.fingers.place(robot.config.gripper.max_width)
@@ -86,7 +86,8 @@ class PhysicsWorld(News):
         return self._arm
 
     @property
-    def _built(self) -> tuple[CellModel, mujoco.MjData]:
+    def simulation(self) -> tuple[CellModel, mujoco.MjData]:
+        """The compiled model and its state."""
         if self._cell is None:
             raise RuntimeError("the world has no arm yet: call `hardware` first")
         return self._cell, self._data
@@ -117,7 +118,7 @@ class PhysicsWorld(News):
 
     def advance(self, now: float) -> None:
         """Advance to a time [s]."""
-        cell, data = self._built
+        cell, data = self.simulation
         if self._time is None or now - self._time > MAX_CATCH_UP:
             self._time = now
         steps = math.floor((now - self._time) / TIMESTEP + 1e-6)
@@ -131,7 +132,7 @@ class PhysicsWorld(News):
 
     def _update(self, now: float) -> None:
         """Update bodies and events from physics."""
-        cell, data = self._built
+        cell, data = self.simulation
         for name in [name for name, until in self._slippery.items() if now >= until and not self._within_robot(name)]:
             del self._slippery[name]
             self._set_robot_contact(name, True)
@@ -169,7 +170,7 @@ class PhysicsWorld(News):
             self._say("add", body)
 
     def _speed(self, name: str) -> float:
-        cell, data = self._built
+        cell, data = self.simulation
         at = cell.objects[name].dof
         return float(np.linalg.norm(data.qvel[at: at + 3]))
 
@@ -198,7 +199,7 @@ class PhysicsWorld(News):
 
     def standing(self) -> dict[str, StandingObject]:
         """Complete state with velocities, for `restore`."""
-        cell, data = self._built
+        cell, data = self.simulation
         found = {}
         for name, body in self._kinematic.bodies.items():
             snapshot, at = body.standing(), cell.objects[name]
@@ -217,7 +218,7 @@ class PhysicsWorld(News):
         self._removed = {name for name, body in self._kinematic.bodies.items() if body.state in ("held", "falling")}
         self._slippery = {name: -math.inf for name, snapshot in objects.items() if snapshot.details.get("slippery")}
         self._build()
-        cell, data = self._built
+        cell, data = self.simulation
         for name, snapshot in objects.items():
             if name in cell.objects and "qpos" in snapshot.details:
                 address = cell.objects[name]
@@ -253,7 +254,7 @@ class PhysicsWorld(News):
                 self._masses.pop(name, None)
                 raise Refused("no_size", f"{name}: {error}") from None
         self._events += [each for each in updates if request.op == "reset" or each.data.partition(":")[2] == name]
-        cell, data = self._built
+        cell, data = self.simulation
         for each in changed:
             address, body = cell.objects[each], self._kinematic.bodies[each]
             body.rest = None
@@ -279,7 +280,7 @@ class PhysicsWorld(News):
         return held
 
     def _set_robot_contact(self, name: str, by_robot: bool) -> None:
-        cell, _ = self._built
+        cell, _ = self.simulation
         if name in cell.objects:
             geoms = cell.model.geom_bodyid == cell.objects[name].body
             affinity = cell.model.geom_conaffinity[geoms]
@@ -287,7 +288,7 @@ class PhysicsWorld(News):
 
     def _within_robot(self, name: str) -> bool:
         """Whether the robot overlaps an object: restoring contact would fling them apart."""
-        cell, data = self._built
+        cell, data = self.simulation
         if name not in cell.objects:
             return False
         of_object = np.flatnonzero(cell.model.geom_bodyid == cell.objects[name].body)

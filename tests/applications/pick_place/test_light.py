@@ -16,7 +16,7 @@ from common.perception.pinhole import Pinhole
 from common.perception.sphere import silhouettes
 from common.robot.model import RobotModel
 from common.sim.camera import CameraParameters, SimulatedCamera
-from common.sim.lighting import tint
+from common.sim.photometry import tint
 from common.sim.rendering import Renderer
 
 CELL = load_cell("panda")

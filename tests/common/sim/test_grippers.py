@@ -52,7 +52,7 @@ class Rig:
 
 
 @pytest.mark.parametrize(("thing", "top"), [(BALL, 0.06), (BAR, 0.04)])
-def test_cup_takes_what_its_lip_touches_carries_it_and_lets_it_fall(thing: ObjectConfig, top: float) -> None:
+def test_cup_picks_carries_and_releases_an_object(thing: ObjectConfig, top: float) -> None:
     rig = Rig(CUP, thing)
     before = rig.place(thing.id)
     rig.be_at(0.5, 0.0, top)
@@ -66,13 +66,13 @@ def test_cup_takes_what_its_lip_touches_carries_it_and_lets_it_fall(thing: Objec
 
 
 @pytest.mark.parametrize(("x", "z"), [(0.5, 0.08), (0.53, 0.06), (0.5, 0.03)])
-def test_cup_draws_nothing_above_beside_or_within_a_ball(x: float, z: float) -> None:
+def test_cup_picks_nothing_without_full_contact(x: float, z: float) -> None:
     rig = Rig(CUP, BALL)
     rig.be_at(x, 0.0, z, width=0.0)
     assert not rig.holding and rig.fingers.read(rig.now).width == pytest.approx(0.0, abs=1e-6)
 
 
-def test_cup_that_draws_takes_what_it_comes_to() -> None:
+def test_active_cup_picks_on_contact() -> None:
     rig = Rig(CUP, BALL)
     rig.be_at(0.5, 0.0, 0.2, width=0.0)
     assert not rig.holding
@@ -80,7 +80,7 @@ def test_cup_that_draws_takes_what_it_comes_to() -> None:
     assert rig.holding
 
 
-def test_lip_must_lie_on_the_object_all_round() -> None:
+def test_complete_lip_must_touch_the_object() -> None:
     solid = solid_of(BAR)
     cup = SuctionCup(lip_radius=0.012, give=0.002)
     below = np.diag([1.0, -1.0, -1.0, 1.0])  # the tool looks down; the top of the bar is at its tip
@@ -99,7 +99,7 @@ def test_lip_must_lie_on_the_object_all_round() -> None:
 
 @pytest.mark.parametrize(("axis", "yaw", "takes"), [
     ("y", 0.0, False), ("y", math.pi / 2, True), ("x", 0.0, True), ("x", math.pi / 2, False)])
-def test_fingers_close_along_the_axis_that_the_robot_file_names(axis: str, yaw: float, takes: bool) -> None:
+def test_fingers_close_along_the_configured_axis(axis: str, yaw: float, takes: bool) -> None:
     rig = Rig(GripperConfig.model_validate({**FINGERS, "closing_axis": axis}), BAR)  # 50 mm along x, 200 along y
     rig.be_at(0.5, 0.0, 0.02, yaw, width=0.0)
     assert rig.holding is takes

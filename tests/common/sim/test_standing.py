@@ -66,7 +66,7 @@ def world(world_config) -> KinematicWorld:
     return world
 
 
-def test_a_state_with_some_of_the_one_before_is_found_whole(tmp_path: Path) -> None:
+def test_partly_changed_state_is_loaded_completely(tmp_path: Path) -> None:
     file, first, other = StateFile(tmp_path / "state"), a_state(1), a_state(2)
     for objects in (first.objects, first.objects, other.objects):
         state = Standing.model_construct(**vars(first) | {"q": [0.1 * len(objects)], "objects": objects})
@@ -74,7 +74,7 @@ def test_a_state_with_some_of_the_one_before_is_found_whole(tmp_path: Path) -> N
         assert StateFile(tmp_path / "state").load() == state
 
 
-def test_balls_that_are_held_that_fall_and_that_lie_in_the_box_go_on_where_they_were(
+def test_held_falling_and_contained_balls_are_restored(
     world: KinematicWorld, world_config, tmp_path: Path
 ) -> None:
     file = StateFile(tmp_path / "state")
@@ -98,11 +98,11 @@ def test_balls_that_are_held_that_fall_and_that_lie_in_the_box_go_on_where_they_
     assert again.objects(Header()) == world.objects(Header())
 
 
-def test_without_a_file_there_is_nothing(tmp_path: Path) -> None:
+def test_missing_state_file_loads_nothing(tmp_path: Path) -> None:
     assert StateFile(tmp_path / "new" / "state").load() is None
 
 
-def test_a_link_and_a_pipe_in_its_place_are_named_and_left_alone(tmp_path: Path) -> None:
+def test_link_or_pipe_as_state_file_is_rejected(tmp_path: Path) -> None:
     (tmp_path / "state").symlink_to(tmp_path / "other")
     os.mkfifo(tmp_path / "pipe")
     for name, why in (("state", "it is a link"), ("pipe", "it is not a regular file")):
@@ -112,14 +112,14 @@ def test_a_link_and_a_pipe_in_its_place_are_named_and_left_alone(tmp_path: Path)
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf])
-def test_numbers_that_are_none_are_passed_over_for_the_state_before(value: float, tmp_path: Path) -> None:
+def test_non_finite_state_falls_back_to_the_previous_one(value: float, tmp_path: Path) -> None:
     file = StateFile(tmp_path / "state")
     file.save(a_state(1))
     file.save(Standing.model_construct(**vars(a_state(2)) | {"q": [0.0, value]}))
     assert StateFile(tmp_path / "state").load() == a_state(1)
 
 
-def test_the_newest_of_many_is_found_and_what_is_written_after_it_is_newer(tmp_path: Path) -> None:
+def test_newest_state_is_loaded_and_numbering_continues(tmp_path: Path) -> None:
     file = StateFile(tmp_path / "state")
     for number in range(7):
         file.save(a_state(number))
@@ -137,7 +137,7 @@ def padded(path: Path) -> bytes:
 
 @settings(max_examples=60, deadline=None)
 @given(before=st.integers(1, 4), cut=st.integers(0, 400), rubbish=st.booleans())
-def test_a_state_that_was_half_written_leaves_the_one_before_it(
+def test_partly_written_state_falls_back_to_the_previous_one(
     tmp_path_factory: pytest.TempPathFactory, before: int, cut: int, rubbish: bool
 ) -> None:
     path = tmp_path_factory.mktemp("torn") / "state"
@@ -162,7 +162,7 @@ def test_a_state_that_was_half_written_leaves_the_one_before_it(
     assert StateFile(path).load() == a_state(9), "and the next one is written over what was torn"
 
 
-def test_a_state_of_another_version_is_no_state(tmp_path: Path) -> None:
+def test_state_of_another_version_is_ignored(tmp_path: Path) -> None:
     class Later(Standing):
         wheels: int = 4
 
@@ -174,14 +174,14 @@ def test_a_state_of_another_version_is_no_state(tmp_path: Path) -> None:
     assert StateFile(tmp_path / "state").load() == a_state(2)
 
 
-def test_the_file_is_that_of_a_cell_on_a_host_and_only_where_a_folder_is_named(tmp_path: Path) -> None:
+def test_state_file_is_named_by_cell_and_host(tmp_path: Path) -> None:
     assert state_file("panda", {}) is None
     file = state_file("panda", {STATE_VARIABLE: str(tmp_path)})
     assert file is not None
     assert [path.name for path in tmp_path.iterdir()] == [f"panda-{socket.gethostname()}.state"]
 
 
-def test_state_that_has_no_room_leaves_the_one_before(tmp_path) -> None:
+def test_oversized_state_leaves_the_previous_one(tmp_path) -> None:
     file = StateFile(tmp_path / "state")
     file.save(a_state(1))
     file.save(a_state(2).model_copy(update={"q": [0.0] * (SLOT // 9)}))

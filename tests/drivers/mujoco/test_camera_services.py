@@ -48,7 +48,7 @@ async def first_pictures(service, config, cell, images, objects):
         return picture, depths.latest
 
 
-async def test_plain_camera_sees_arm_and_objects_of_the_world_with_physics() -> None:
+async def test_plain_camera_shows_arm_and_objects_of_the_physics_world() -> None:
     cell = load_cell("panda")
     config = camera_simulator.Config(world=small(cell), scenery=PHYSICS, robot=cell.robot, run=Run(cell="test"))
     assert (await wiring(camera_simulator.run, config)).reads == {topics.SCENE_OBJECTS, topics.JOINT_STATES}
@@ -65,7 +65,7 @@ async def test_plain_camera_sees_arm_and_objects_of_the_world_with_physics() -> 
     assert max(b, g, r) - min(b, g, r) < 20, "the arm, which has no colour, before a brown table"
 
 
-async def test_depth_camera_measures_an_object_where_it_is() -> None:
+async def test_depth_camera_measures_an_object_at_its_position() -> None:
     cell = load_cell("ur5")
     config = depth_camera.Config(world=small(cell), scenery=PHYSICS, robot=cell.robot, run=Run(cell="test"),
                                  farthest=5.0)
@@ -82,7 +82,7 @@ async def test_depth_camera_measures_an_object_where_it_is() -> None:
     assert side == pytest.approx(0.1, abs=0.002), "the cube"
 
 
-async def test_nothing_is_sent_before_the_arm_says_where_it_is() -> None:
+async def test_no_image_before_the_first_joint_state() -> None:
     cell = load_cell("panda")
     config = camera_simulator.Config(world=small(cell), scenery=PHYSICS, robot=cell.robot, run=Run(cell="test"))
     net = LocalNetwork()

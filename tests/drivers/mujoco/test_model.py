@@ -42,7 +42,7 @@ def model_of(cell: str, visuals: bool = False) -> tuple[RobotModel, CellModel]:
 
 
 @pytest.mark.parametrize("cell", ["panda", "ur5"])
-def test_every_link_is_where_the_planner_has_it(cell: str) -> None:
+def test_link_poses_match_the_planner(cell: str) -> None:
     robot, made = model_of(cell)
     data = mujoco.MjData(made.model)
     rng, fingers = np.random.default_rng(1), robot.config.gripper
@@ -57,7 +57,7 @@ def test_every_link_is_where_the_planner_has_it(cell: str) -> None:
             assert data.body(link).xmat == pytest.approx(T[:3, :3].ravel(), abs=1e-9), link
 
 
-def test_many_objects_do_not_touch_each_other_before_they_are_put_anywhere() -> None:
+def test_unplaced_objects_do_not_touch() -> None:
     config = load_cell("panda")
     box = solid_of(ObjectConfig.model_validate({"id": "box", "shape": "box", "size": [0.02, 0.02], "height": 0.02,
                                                 "x": 0.0, "y": 0.0}))
@@ -69,7 +69,7 @@ def test_many_objects_do_not_touch_each_other_before_they_are_put_anywhere() -> 
     assert data.ncon == 0
 
 
-def test_a_joint_without_any_room_between_its_limits_is_held() -> None:
+def test_joint_without_range_is_locked() -> None:
     config = load_cell("panda")
     robot = RobotModel.load(config.robot)
     robot.urdf = robot.urdf.replace("</robot>", '<link name="lid"><inertial><mass value="1"/><inertia ixx="0.01" '
@@ -85,7 +85,7 @@ def test_a_joint_without_any_room_between_its_limits_is_held() -> None:
 
 
 @pytest.mark.parametrize("cell", ["panda", "ur5"])
-def test_nothing_touches_at_home_but_what_stands_on_something(cell: str) -> None:
+def test_home_pose_has_no_contacts(cell: str) -> None:
     _, made = model_of(cell)
     data = mujoco.MjData(made.model)
     data.qpos[:] = made.start
@@ -95,7 +95,7 @@ def test_nothing_touches_at_home_but_what_stands_on_something(cell: str) -> None
     assert data.ncon == 0
 
 
-def test_visual_shapes_are_made_once_and_change_nothing_that_moves(
+def test_visual_meshes_are_cached_and_do_not_affect_dynamics(
     monkeypatch: pytest.MonkeyPatch, kept_meshes: Path
 ) -> None:
     _, bare = model_of("panda")
@@ -107,14 +107,14 @@ def test_visual_shapes_are_made_once_and_change_nothing_that_moves(
     assert first.model.body_mass == pytest.approx(bare.model.body_mass)
 
 
-def test_what_can_not_be_kept_is_made_anew(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_arrays_are_computed_when_the_cache_is_not_writable(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("not a folder")
     monkeypatch.setenv("ZENCELL_CACHE", str(tmp_path / "file"))
     for _ in range(2):
         assert cached_arrays("hull", [b"some"], lambda: {"points": np.ones(3)})["points"].sum() == 3
 
 
-def test_cut_short_file_of_a_mesh_is_made_anew(kept_meshes: Path) -> None:
+def test_truncated_cache_file_is_recomputed(kept_meshes: Path) -> None:
     made = cached_arrays("hull", [b"cut"], lambda: {"points": np.ones(3)})
     newest = max(kept_meshes.rglob("hull-*.npz"), key=lambda path: path.stat().st_mtime_ns)
     newest.write_bytes(newest.read_bytes()[:40])
@@ -122,7 +122,7 @@ def test_cut_short_file_of_a_mesh_is_made_anew(kept_meshes: Path) -> None:
 
 
 @pytest.mark.parametrize("shape", SHAPES, ids=lambda shape: shape["id"])
-def test_every_shape_rests_as_it_was_put(shape: dict[str, object]) -> None:
+def test_every_shape_rests_as_placed(shape: dict[str, object]) -> None:
     config = load_cell("panda", ["world.count=0"])
     world = World.model_validate({"fixtures": config.world.fixtures, "objects": [shape]})
     robot = RobotModel.load(config.robot)
@@ -140,7 +140,7 @@ def test_every_shape_rests_as_it_was_put(shape: dict[str, object]) -> None:
     assert made.model.body_mass[made.objects[told.id].body] == pytest.approx(0.1)
 
 
-def test_camera_looks_where_its_optical_frame_does() -> None:
+def test_camera_follows_its_optical_frame() -> None:
     config = load_cell("panda")
     _, made = model_of("panda")
     data = mujoco.MjData(made.model)

@@ -87,12 +87,12 @@ class Rig:
         return p.x, p.y, p.z
 
     def push(self, name: str, *velocity: float) -> None:
-        cell, data = self.world._built
+        cell, data = self.world.simulation
         at = cell.objects[name].dof
         data.qvel[at: at + len(velocity)] = velocity
 
 
-def test_ball_rests_where_it_was_put_and_nothing_is_told_of_it() -> None:
+def test_resting_ball_stays_and_publishes_nothing() -> None:
     rig = Rig(BALL)
     rig.wait(0.1)
     version = rig.world.version
@@ -101,7 +101,7 @@ def test_ball_rests_where_it_was_put_and_nothing_is_told_of_it() -> None:
     assert rig.thing().state == "table" and rig.world.version == version and rig.world.take_events() == []
 
 
-def test_pushed_ball_rolls_and_comes_to_a_stop() -> None:
+def test_pushed_ball_rolls_and_stops() -> None:
     rig = Rig(BALL)
     rig.push("thing_1", 0.3)
     rig.wait(0.5)
@@ -122,14 +122,14 @@ def test_ball_that_leaves_the_table_is_elsewhere() -> None:
     assert rig.thing().state == "elsewhere" and rig.place()[2] < -0.5
 
 
-def test_still_arm_stays_where_it_is_against_gravity() -> None:
+def test_arm_holds_its_pose_against_gravity() -> None:
     rig = Rig()
     rig.wait(1.0)
     q, dq = rig.arm.read(rig.now)
     assert q == pytest.approx(rig.robot.named("home"), abs=1e-3) and np.abs(dq).max() < 1e-3
 
 
-def test_at_rest_nothing_that_is_measured_changes() -> None:
+def test_readings_at_rest_are_constant() -> None:
     rig = Rig(BALL)
     rig.wait(0.5)
     readings = set()
@@ -140,7 +140,7 @@ def test_at_rest_nothing_that_is_measured_changes() -> None:
     assert len(readings) == 1
 
 
-def test_grasp_lifts_by_friction_and_drops_what_is_let_go() -> None:
+def test_grasped_ball_is_lifted_by_friction_and_released() -> None:
     rig = Rig(BALL)
     rig.move(rig.above(0.45, 0.0, 0.1))
     rig.move(rig.above(0.45, 0.0, 0.03))
@@ -159,7 +159,7 @@ def test_grasp_lifts_by_friction_and_drops_what_is_let_go() -> None:
     assert [update.data for update in rig.world.take_events()] == ["remove:thing_1", "add:thing_1"]
 
 
-def test_heavy_thing_slips_out_of_weak_fingers() -> None:
+def test_heavy_object_slips_out_of_weak_fingers() -> None:
     rig = Rig({**CUBE, "mass": 3.0})
     rig.move(rig.above(0.45, 0.0, 0.1))
     rig.move(rig.above(0.45, 0.0, 0.025))
@@ -168,7 +168,7 @@ def test_heavy_thing_slips_out_of_weak_fingers() -> None:
     assert rig.place()[2] < 0.05
 
 
-def test_fingers_close_as_fast_as_they_are_told_to_from_the_first_time_on() -> None:
+def test_fingers_respect_their_speed_limit() -> None:
     rig = Rig()
     for _ in range(2):
         rig.wait(0.1)
@@ -181,7 +181,7 @@ def test_fingers_close_as_fast_as_they_are_told_to_from_the_first_time_on() -> N
         rig.grip(0.08)
 
 
-def test_fingers_close_on_nothing_and_say_so() -> None:
+def test_fingers_that_close_on_nothing_hold_nothing() -> None:
     rig = Rig()
     rig.grip(0.0)
     reading = rig.fingers.read(rig.now)
@@ -190,7 +190,7 @@ def test_fingers_close_on_nothing_and_say_so() -> None:
     assert rig.fingers.read(rig.now).width == pytest.approx(0.08, abs=1e-3)
 
 
-def test_fingers_that_open_against_something_do_not_push_the_arm_away() -> None:
+def test_fingers_opening_against_an_obstacle_do_not_push_the_arm() -> None:
     rig = Rig({**CUBE, "size": [0.1, 0.1, 0.07], "y": 0.085, "mass": 80.0})  # beside the closed fingers
     rig.grip(0.0)
     rig.move(rig.above(0.45, 0.0, 0.1))
@@ -201,11 +201,11 @@ def test_fingers_that_open_against_something_do_not_push_the_arm_away() -> None:
 
 
 @pytest.mark.parametrize("cell", ["panda", "ur5"])
-def test_all_joints_of_the_gripper_follow_the_driven_one(cell: str) -> None:
+def test_gripper_joints_follow_the_driven_one(cell: str) -> None:
     rig = Rig(cell=cell)
     gripper = rig.robot.config.gripper
     assert gripper is not None
-    model, data = rig.world._built
+    model, data = rig.world.simulation
     for share in (0.2, 0.7):
         rig.grip(share * gripper.max_width, gripper.max_effort, 3.0)
         wanted = finger_positions(gripper, share * gripper.max_width)
@@ -213,7 +213,7 @@ def test_all_joints_of_the_gripper_follow_the_driven_one(cell: str) -> None:
         assert found == pytest.approx(wanted, abs=0.01 if gripper.linkage else 1e-3)
 
 
-def test_stack_falls_when_it_is_touched() -> None:
+def test_stack_falls_when_touched() -> None:
     rig = Rig(CUBE, {**CUBE, "position": [0.45, 0.0, 0.075], "x": None, "y": None})
     rig.wait(1.0)
     assert rig.place("thing_2")[2] == pytest.approx(0.075, abs=1e-3)
@@ -224,7 +224,7 @@ def test_stack_falls_when_it_is_touched() -> None:
     assert rig.place("thing_2")[2] < 0.06 and rig.place("thing_2")[1] > 0.03
 
 
-def test_what_is_found_again_moves_on_as_it_did() -> None:
+def test_restored_motion_continues() -> None:
     rig = Rig({**BALL, "x": 0.3}, CUBE)
     rig.push("thing_1", 0.3, 0.1)
     rig.wait(0.3)
@@ -241,7 +241,7 @@ def test_what_is_found_again_moves_on_as_it_did() -> None:
     assert rig.place() == pytest.approx(after, abs=5e-3)
 
 
-def test_what_was_held_over_a_restart_is_still_held() -> None:
+def test_held_object_is_still_held_after_a_restart() -> None:
     rig = Rig(BALL)
     rig.move(rig.above(0.45, 0.0, 0.03))
     rig.grip(0.0)
@@ -262,7 +262,7 @@ def test_edits_add_move_remove_and_reset() -> None:
     rig.wait(0.1)
     added = rig.world.edit(WorldEdit(op="add", shape="ring", size=Vector3(x=0.06, y=0.06, z=0.03), inner_radius=0.02,
                                      position=Vector3(x=0.6, y=-0.2), mass=0.25), rig.now)
-    cell, _ = rig.world._built
+    cell, _ = rig.world.simulation
     assert cell.model.body_mass[cell.objects[added].body] == pytest.approx(0.25)
     rig.wait(0.5)
     assert rig.place(added) == pytest.approx((0.6, -0.2, 0.015), abs=1e-3) and rig.place()[0] == pytest.approx(0.45)
@@ -279,7 +279,7 @@ def test_edits_add_move_remove_and_reset() -> None:
     assert rig.world.ids == ["thing_1", "thing_2"] and rig.place() == pytest.approx((0.45, 0.0, 0.03), abs=1e-3)
 
 
-def test_what_the_simulator_does_not_take_is_refused_and_changes_nothing() -> None:
+def test_object_that_mujoco_rejects_is_refused_without_effect() -> None:
     rig = Rig(BALL)
     rig.wait(0.1)
     thin = WorldEdit(op="add", shape="prism", size=Vector3(x=0.1, y=0.1, z=1e-30), position=Vector3(x=0.6, y=-0.2),
@@ -294,7 +294,7 @@ def test_what_the_simulator_does_not_take_is_refused_and_changes_nothing() -> No
 
 
 @pytest.mark.parametrize("meanwhile", [None, WorldEdit(op="add", position=Vector3(x=0.3, y=-0.3, z=0.0))])
-def test_what_a_person_lets_slip_falls_out_of_the_fingers(meanwhile: WorldEdit | None) -> None:
+def test_dropped_object_falls_out_of_the_fingers(meanwhile: WorldEdit | None) -> None:
     rig = Rig(BALL)
     with pytest.raises(Refused, match="between the fingers"):
         rig.world.edit(WorldEdit(op="drop"), rig.now)
@@ -318,7 +318,7 @@ def lies_there_and_can_be_taken_again(rig: Rig) -> None:
     assert rig.fingers.read(rig.now).holding, "and it can be taken again"
 
 
-def test_what_a_person_lets_slip_on_the_table_is_not_flung_away_by_the_fingers_that_close_through_it() -> None:
+def test_object_dropped_on_the_table_is_not_flung_away_by_closing_fingers() -> None:
     rig = Rig(BALL)
     rig.move(rig.above(0.45, 0.0, 0.03))
     rig.grip(0.0)
@@ -327,7 +327,7 @@ def test_what_a_person_lets_slip_on_the_table_is_not_flung_away_by_the_fingers_t
     lies_there_and_can_be_taken_again(rig)
 
 
-def test_what_slips_over_a_restart_is_not_flung_away_by_the_fingers_that_are_within_it() -> None:
+def test_slipping_object_is_not_flung_away_after_a_restart() -> None:
     rig = Rig(BALL)
     rig.move(rig.above(0.45, 0.0, 0.03))
     rig.grip(0.0)
@@ -343,7 +343,7 @@ def test_what_slips_over_a_restart_is_not_flung_away_by_the_fingers_that_are_wit
     lies_there_and_can_be_taken_again(rig)
 
 
-def test_what_is_kept_of_a_world_is_of_the_moment() -> None:
+def test_snapshot_has_the_current_pose() -> None:
     rig = Rig(BALL)
     rig.wait(0.5)
     rig.push("thing_1", 0.2)
@@ -353,7 +353,7 @@ def test_what_is_kept_of_a_world_is_of_the_moment() -> None:
         assert rig.world.standing()["thing_1"].details["qpos"][0] - before > 0.1 * PERIOD
 
 
-def test_what_was_carried_over_a_restart_stands_still_with_the_arm() -> None:
+def test_held_object_is_restored_at_rest() -> None:
     rig = Rig(BALL)
     rig.move(rig.above(0.45, 0.0, 0.03))
     rig.grip(0.0)
@@ -363,11 +363,11 @@ def test_what_was_carried_over_a_restart_stands_still_with_the_arm() -> None:
     assert saved["thing_1"].details["qvel"][1] == 1.0
     rig.begin(rig.set_point)
     rig.world.restore(saved)
-    cell, data = rig.world._built
+    cell, data = rig.world.simulation
     assert not data.qvel[cell.objects["thing_1"].dof:][:6].any()
 
 
-def test_hold_up_of_the_process_is_no_leap_in_the_world() -> None:
+def test_delay_of_the_process_does_not_advance_the_world() -> None:
     rig = Rig(BALL)
     rig.push("thing_1", 0.2)
     rig.wait(0.1)
@@ -377,30 +377,30 @@ def test_hold_up_of_the_process_is_no_leap_in_the_world() -> None:
     assert rig.place() == pytest.approx(before, abs=5e-3)
 
 
-def test_kinds_of_worlds_are_told_apart() -> None:
+def test_kinematic_and_physics_worlds_satisfy_different_protocols() -> None:
     rig = Rig()
     kinematic = load_world(rig.config.model_copy(update={"simulator": "kinematic"}), [])
     assert isinstance(rig.world, PhysicalWorld) and not isinstance(rig.world, FeltWorld)
     assert isinstance(kinematic, FeltWorld) and not isinstance(kinematic, PhysicalWorld)
 
 
-def test_suction_cup_is_refused_and_says_what_does() -> None:
+def test_suction_cup_is_rejected_with_an_alternative() -> None:
     rig = Rig()
     cup = rig.robot.config.gripper.model_copy(update={"cup": object()})  # type: ignore[union-attr]
     with pytest.raises(ConfigError, match="kinematic"):
         load_world(rig.config, [], None, cup)
 
 
-def test_without_mujoco_one_line_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_mujoco_is_an_error_that_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     rig = Rig()
     monkeypatch.setattr("drivers.mujoco.find_spec", lambda name: None)
     with pytest.raises(ConfigError, match="zencell\\[physics\\]"):
         load_world(rig.config, [])
 
 
-def test_arm_pushes_with_no_more_than_its_motors_have() -> None:
+def test_joint_forces_respect_effort_limits() -> None:
     rig = Rig()
-    model, data = rig.world._built
+    model, data = rig.world.simulation
     limits = rig.robot.model.effortLimit
     rig.arm.write(rig.set_point + 0.5, 0 * rig.set_point, rig.now)
     rig.wait(0.05)

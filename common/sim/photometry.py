@@ -1,8 +1,8 @@
-"""Camera sensor model: exposure, gain, noise and white balance.
+"""Photometry: light sources, and the sensor that turns light into pixel values.
 
-Grey levels are proportional to light (gamma 1), as in machine vision cameras: at `REFERENCE` light, `EXPOSURE` and
-gain 1 a surface shows its configured color. Noise is shot noise (Poisson) plus read noise: variance = signal +
-read noise^2, in electrons (EMVA Standard 1288, release 3.1, section 2).
+Light is described by color temperature and illuminance. Grey levels are proportional to light (gamma 1), as in machine
+vision cameras: at `REFERENCE` light, `EXPOSURE` and gain 1 a surface shows its configured color. Noise is shot noise
+(Poisson) plus read noise: variance = signal + read noise^2, in electrons (EMVA Standard 1288, release 3.1, section 2).
 """
 
 from __future__ import annotations
@@ -15,13 +15,19 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
-from common.config import Parameters, Tunable
-from common.sim.lighting import REFERENCE, tint
+from common.config import Light, Parameters, Scenery, Tunable
 
 Array = npt.NDArray[np.float64]
 Values = npt.NDArray[np.float32]
 Pixels = npt.NDArray[np.uint8]
 
+REFERENCE = 500.0  # [lx] of a well lit table: renders surfaces in their configured color
+DAYLIGHT = 6500.0  # [K] white point
+CUTOFF = 45.0  # [deg] half angle of a lamp's cone
+OVERHEAD = Light()  # default of a world without lights
+XYZ_TO_BGR = np.array(  # of linear sRGB, IEC 61966-2-1
+    [[0.0557, -0.2040, 1.0570], [-0.9689, 1.8758, 0.0415], [3.2406, -1.5372, -0.4986]]
+)
 EXPOSURE = 0.01  # [s] at which a white surface in reference light just saturates
 TARGET = 110.0  # mean grey level of automatic exposure
 BRIGHTEST = 245.0  # 99th percentile limit of automatic exposure
@@ -30,6 +36,51 @@ STRIDE = 8  # [px] between metered pixels
 TEMPERATURES = 1e6 / np.linspace(1e6 / 2000, 1e6 / 12_000, 30)  # [K] in even steps of 1/K, as perceived
 GREY = 0.08  # log tolerance between channels of a grey surface
 FEWEST = 0.02  # fraction of grey pixels needed to estimate the light
+
+
+def tint(temperature: float) -> Array:
+    """(3,) blue, green and red of light at a color temperature [K], at the luminance of daylight, which is all ones.
+
+    Chromaticity of a black body by Kim et al., US patent 7024034 (2006), valid from 1667 to 25000 K.
+    """
+    return _black_body(temperature) / _black_body(DAYLIGHT)
+
+
+def _black_body(temperature: float) -> Array:
+    t = 1000.0 / temperature
+    if temperature < 4000:
+        x = ((-0.2661239 * t - 0.2343589) * t + 0.8776956) * t + 0.179910
+    else:
+        x = ((-3.0258469 * t + 2.1070379) * t + 0.2226347) * t + 0.240390
+    if temperature < 2222:
+        y = ((-1.1063814 * x - 1.34811020) * x + 2.18555832) * x - 0.20219683
+    elif temperature < 4000:
+        y = ((-0.9549476 * x - 1.37418593) * x + 2.09137015) * x - 0.16748867
+    else:
+        y = ((3.0817580 * x - 5.87338670) * x + 3.75112997) * x - 0.37001483
+    return np.asarray(np.maximum(XYZ_TO_BGR @ np.array([x / y, 1.0, (1 - x - y) / y]), 0.0))
+
+
+def lamps(scenery: Scenery) -> list[Light]:
+    """Return the lights of a scenery; by default one above the table."""
+    return list(scenery.lights.values()) or [OVERHEAD]
+
+
+def ambient(scenery: Scenery) -> Array:
+    """(3,) [lx] of blue, green and red ambient light, of the mean color of the lights."""
+    lights = lamps(scenery)
+    total = sum(light.illuminance for light in lights)
+    if total <= 0:
+        return np.full(3, scenery.ambient)
+    mean = sum((light.illuminance / total * tint(light.temperature) for light in lights), np.zeros(3))
+    return np.asarray(scenery.ambient * mean)
+
+
+def white_level(scenery: Scenery) -> Array:
+    """(3,) [lx] of blue, green and red light of all lamps together, each at normal incidence."""
+    each = (light.illuminance * tint(light.temperature) for light in lamps(scenery))
+    return np.asarray(sum(each, ambient(scenery)))
+
 
 
 class SensorParameters(Parameters):
