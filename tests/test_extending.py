@@ -34,7 +34,7 @@ from common.tasks.stages import View
 from common.topics import CAMERA_IMAGE, CAMERA_INFO, GRIPPER_STATE, SCENE_OBJECTS
 from common.transport.codec import decode
 from common.transport.local import LocalNetwork
-from page.guard import close_server, make_server
+from page.server import close_server, make_server
 from recording.reader import Recording
 from tests import pages
 from tests.harness import ask, free_domain

@@ -73,9 +73,9 @@ async def choose(console: Console, choice: OutlineSelect) -> None:
 
     Whoever stops or holds the arm until then has the last word, and of several choices the last one counts.
     """
-    console.tell("")
-    acknowledged, stops = console.acknowledged, console.stops
-    chosen = _newest[console] = await console.ask(OUTLINE_SELECT, choice)
+    console.notify("")
+    acknowledged, stops = console.acknowledged, console.stop_count
+    chosen = _newest[console] = await console.call(OUTLINE_SELECT, choice)
     status = console.latest(OUTLINE_STATUS)
     if status is not None and (not status.started or status.state in _ENDED):  # else it traces what is chosen by itself
         try:
@@ -86,11 +86,11 @@ async def choose(console: Console, choice: OutlineSelect) -> None:
             pass  # the task tells what is wrong with the object
         if _newest[console] is not chosen:  # that one starts the task, if anything
             return
-        if console.stops > stops or (console.acknowledged or 0) > (acknowledged or 0):
-            console.tell(f"{chosen.label} is chosen, but not traced: the arm was stopped or held meanwhile", "busy")
+        if console.stop_count > stops or (console.acknowledged or 0) > (acknowledged or 0):
+            console.notify(f"{chosen.label} is chosen, but not traced: the arm was stopped or held meanwhile", "busy")
             return
         await console.command("start", acknowledged=acknowledged)
-    console.tell(f"{chosen.label} is chosen", "good")
+    console.notify(f"{chosen.label} is chosen", "good")
 
 
 class Controls:
@@ -243,5 +243,5 @@ PAGE = ApplicationPage(
     layers=(Outline, ContourChoice), controls=Controls, requests=(OUTLINE_SELECT,),
     states={"SELECTING": "Waiting for a choice", "PLANNING": "Planning", "APPROACHING": "Approaching",
             "TRACING": "Tracing", "RETREATING": "Retreating"},
-    latency="Picture to path", counters=counters, progress=progress,
+    latency="Image to path", counters=counters, progress=progress,
 )

@@ -39,8 +39,8 @@ def resolve(
     from common.config import expanded, load_cell
     from common.supervision.launch import Launch, clock_at_speed, require_free_port, require_modules, router_location
     from common.transport.endpoint import endpoint_of
-    from page.access import VIEWER
     from recording.report.aggregator import RunAggregator
+    from security.page_tokens import VIEWER
     from security.requiring import require_secured, with_near
     from tools.check.cell import require_safe
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from common.supervision.supervisor import Supervisor
     from common.transport.bus import Bus
     from lab.chaos.agent import Chaos
-    from page.serving import Page
+    from page.address import PageAddress
     from recording.report.aggregator import Collector
 
 T = TypeVar("T")
@@ -86,7 +86,7 @@ class CellSession:
         self._supervisor: Supervisor | None = None
         self._collector: Collector | None = None
         self._screen: Screen | None = None
-        self._page: Page | None = None
+        self._page: PageAddress | None = None
         self._watchers: dict[str, list[str]] = {}  # commands of observing processes by name
         self._faults: Faults | None = None
         self._chaos: Chaos | None = None
@@ -98,9 +98,9 @@ class CellSession:
         Raises:
             ConfigError: the cell has no page, the port is in use, or host or port are not valid.
         """
-        from page.serving import page_of
+        from page.address import plan_page
 
-        self._page = page = page_of(self.cell, host, port)
+        self._page = page = plan_page(self.cell, host, port)
         if page is not None:
             overrides = (*self.launch.overrides, *page.overrides)
             self.launch = replace(self.launch, overrides=overrides, extra=page.environment)
@@ -361,7 +361,7 @@ class CellSession:
         assert self._collector is not None
         self.summary.ready = time.monotonic() - self.began
         if self._page:
-            self._note(f"Open {self._page.address}")
+            self._note(f"Open {self._page.url}")
         self._checking = asyncio.create_task(self._check_cell(), name="check")
         if self._faults is not None:
             from lab.chaos.agent import create_chaos, keys_of

@@ -107,13 +107,13 @@ def _in_front(meshes: Sequence[Mesh], camera: Pinhole) -> tuple[Array, Ints]:
 
 def _clip(triangle: Array) -> Array:
     """Clip a triangle at z = `NEAREST` to one or two triangles (k, 3, 3)."""
-    kept: list[Array] = []
+    clipped: list[Array] = []
     for a, b in zip(triangle, np.roll(triangle, -1, axis=0), strict=True):
         if a[2] > NEAREST:
-            kept.append(a)
+            clipped.append(a)
         if (a[2] > NEAREST) != (b[2] > NEAREST):
-            kept.append(a + (NEAREST - a[2]) / (b[2] - a[2]) * (b - a))
-    return np.array([[kept[0], kept[i], kept[i + 1]] for i in range(1, len(kept) - 1)])
+            clipped.append(a + (NEAREST - a[2]) / (b[2] - a[2]) * (b - a))
+    return np.array([[clipped[0], clipped[i], clipped[i + 1]] for i in range(1, len(clipped) - 1)])
 
 
 def _project(corners: Array, camera: Pinhole) -> tuple[Array, Array]:

@@ -17,10 +17,9 @@ from common.errors import ConfigError, Refused
 from common.hardware.interface import Hardware, Limits, Vector
 from common.messages import Header, WorldEdit, WorldObjects
 from common.robot.model import RobotModel
-from common.sim.bodies import Body
-from common.sim.interface import GraspTolerances, Numbers, StandingObject
+from common.sim.bodies import Body, WorldEvents
+from common.sim.interface import GraspTolerances, Numbers, ObjectSnapshot
 from common.sim.kinematic import KinematicWorld
-from common.sim.news import News
 from drivers.mujoco.arm import PhysicsArm, tune
 from drivers.mujoco.model import CellModel, build_model
 from drivers.mujoco.object_states import REST_SPEED, Contacts, ObjectStates, pose_changed, snap_upright
@@ -35,7 +34,7 @@ QUIET = 1e-6  # [m] or quaternion entries: no motion since the last update
 ASLEEP = 1e-3  # [m/s] or [rad/s]: smaller velocities are restored as zero
 
 
-class PhysicsWorld(News):
+class PhysicsWorld(WorldEvents):
     """The objects and the arm.
 
     Attributes:
@@ -163,11 +162,11 @@ class PhysicsWorld(News):
     def _publish_events(self, body: Body) -> None:
         if body.state == "held" and body.name not in self._removed:
             self._removed.add(body.name)
-            self._say("remove", body)
+            self._add_event("remove", body)
         elif body.state in ("table", "contained") and body.name in self._removed and (
                 self._speed(body.name) < REST_SPEED):
             self._removed.discard(body.name)
-            self._say("add", body)
+            self._add_event("add", body)
 
     def _speed(self, name: str) -> float:
         cell, data = self.simulation
@@ -197,12 +196,12 @@ class PhysicsWorld(News):
 
     # --- snapshot ---
 
-    def standing(self) -> dict[str, StandingObject]:
+    def snapshot(self) -> dict[str, ObjectSnapshot]:
         """Complete state with velocities, for `restore`."""
         cell, data = self.simulation
         found = {}
         for name, body in self._kinematic.bodies.items():
-            snapshot, at = body.standing(), cell.objects[name]
+            snapshot, at = body.snapshot(), cell.objects[name]
             speeds = data.qvel[at.dof: at.dof + 6]
             details = {**snapshot.details, "mass": self._masses.get(name, DEFAULT_MASS),
                        "slippery": name in self._slippery,
@@ -211,7 +210,7 @@ class PhysicsWorld(News):
             found[name] = snapshot.model_copy(update={"details": details})
         return found
 
-    def restore(self, objects: Mapping[str, StandingObject]) -> None:
+    def restore(self, objects: Mapping[str, ObjectSnapshot]) -> None:
         """Restore a state with velocities; a held object is at rest, like the restarted arm."""
         self._kinematic.restore(objects)
         self._masses = {name: float(snapshot.details.get("mass", DEFAULT_MASS)) for name, snapshot in objects.items()}

@@ -29,9 +29,9 @@ from common.process.in_process import running_service
 from common.robot.model import RobotModel
 from common.robot.transforms import tool_down
 from common.scene.workspace import unreachable_reason
-from common.sim.interface import StandingObject
+from common.sim.interface import ObjectSnapshot
 from common.sim.kinematic import KinematicWorld
-from common.sim.standing import Standing, StateFile, state_file
+from common.sim.state_file import SimulationState, StateFile, state_file
 from common.supervision.wiring import wiring
 from common.transport.bus import Bus
 from common.transport.local import LocalNetwork
@@ -404,12 +404,12 @@ async def test_saved_state_of_another_layout_is_not_used(
 async def test_saved_state_of_another_simulator_is_not_used(robot: RobotModel, persistent: None) -> None:
     home, world = robot.named("home"), load_cell("panda").world
     layout = KinematicWorld(world).layout
-    falling = {name: StandingObject(pose=(*position, 0, 0, 0, 1), details={
+    falling = {name: ObjectSnapshot(pose=(*position, 0, 0, 0, 1), details={
         "state": "falling", "container": "", "slot": None, "grip": None, "width": 0.0, "dropped": 0.0, "since": 0.0,
         "added": False, "rest": None}) for name, position in layout.items()}
     file = state_file(CELL)
     assert file is not None
-    file.save(Standing(simulator="mujoco", layout=layout, q=(home + 0.2).tolist(), objects=falling))
+    file.save(SimulationState(simulator="mujoco", layout=layout, q=(home + 0.2).tolist(), objects=falling))
     async with executor() as client:
         assert set((await client.wait_for(client.balls)).labels) == {"table"}
         assert (await client.wait_for(client.joints)).position[: robot.dof] == pytest.approx(home)

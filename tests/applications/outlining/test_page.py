@@ -94,7 +94,7 @@ async def test_choice_lets_go_of_the_stop_that_was_there_as_it_was_made(cell: Ce
 @pytest.mark.parametrize("by", ["the page", "the page, and the arm does not answer", "the command line"])
 async def test_stop_between_choice_and_path_stays_a_stop(cell: Cell, by: str) -> None:
     told: list[str] = []
-    cell.console.tell = lambda line, _kind="bad": told.append(line)
+    cell.console.notify = lambda line, _kind="bad": told.append(line)
     cell.executor_answers = by == "the page"
 
     async def stop() -> None:
@@ -113,7 +113,7 @@ async def test_stop_between_choice_and_path_stays_a_stop(cell: Cell, by: str) ->
 
 async def test_of_two_objects_chosen_one_after_the_other_only_the_second_is_traced_and_once(cell: Cell) -> None:
     told: list[str] = []
-    cell.console.tell = lambda line, _kind="bad": told.append(line)
+    cell.console.notify = lambda line, _kind="bad": told.append(line)
     cell.labels = ["Object_0", "Object_1"]
     first = asyncio.create_task(choose(cell.console, OutlineSelect()))
     await cell.until(lambda: cell.labels == ["Object_1"])

@@ -20,7 +20,7 @@ from common.messages import (
     WorldEdit,
     WorldObjects,
 )
-from common.sim.interface import StandingObject
+from common.sim.interface import ObjectSnapshot
 from common.sim.kinematic import KinematicWorld
 from common.transport.codec import decode, encode
 from tests.common.control.rig import GRIPPER, START, ExecutorRig, mock
@@ -156,7 +156,7 @@ def test_backend_with_an_unsuitable_gripper_is_a_configuration_error(limits, fin
 
 def test_long_step_of_the_world_is_deferred_and_the_arm_continues(rig, monkeypatch):
     rig.cell.defers_steps = True
-    monkeypatch.setattr(KinematicWorld, "_is_plain", False)
+    monkeypatch.setattr(KinematicWorld, "is_simple", False)
     rig.grip("close", 0.0)
     while rig.cell.deferred is None:
         rig.step()
@@ -194,8 +194,8 @@ def test_objects_of_physics_are_saved_as_of_the_same_moment_as_the_arm(limits, r
     class Physics:
         version, ids, layout, held = 1, [], {}, "ball"  # it reports moving objects only now and then
 
-        def standing(self):
-            return {"ball": StandingObject(pose=tuple(hardware.last[0]))}
+        def snapshot(self):
+            return {"ball": ObjectSnapshot(pose=tuple(hardware.last[0]))}
 
         def objects(self, header):
             return WorldObjects(header=header)

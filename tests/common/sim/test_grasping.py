@@ -178,7 +178,7 @@ def test_added_mesh_is_restored(wedge: Path) -> None:
     world = KinematicWorld(config)
     world.edit(WorldEdit(op="add", like="wedge", position=Vector3(x=0.3, y=0.2)), 0.0)
     again = KinematicWorld(config)
-    again.restore(world.standing())
+    again.restore(world.snapshot())
     assert again.objects(Header()) == world.objects(Header()) and again.ids == ["wedge", "wedge_1"]
 
 

@@ -208,7 +208,7 @@ def test_added_and_falling_objects_are_restored() -> None:
     rig.release(0.6, 0.3, 0.3, 0.4)
     rig.tick()
     again = KinematicWorld(rig.config)
-    again.restore(rig.world.standing())
+    again.restore(rig.world.snapshot())
     for _ in range(60):
         rig.now += 0.01
         for world in (rig.world, again):

@@ -13,7 +13,7 @@ from common.errors import ConfigError, Refused
 from common.messages import Color, Header, Vector3, WorldObject
 from common.robot.transforms import matrix_to_rpy, tool_down
 from common.sim import edits
-from common.sim.interface import StandingObject
+from common.sim.interface import ObjectSnapshot
 from common.sim.objects import centre_of
 from tests.common.sim.rig import BOX, CUBE, R, Rig
 
@@ -143,8 +143,8 @@ def test_reset_and_restore_recover_positions() -> None:
     rig, again = rig_of("w5"), rig_of("w5")
     first = centers(rig)
     rig.edit("move", "red_cylinder", (0.5, 0.05))
-    stranger = StandingObject(pose=(0, 0, 0, 0, 0, 0, 1))
-    again.world.restore(rig.world.standing() | {"stranger": stranger})
+    stranger = ObjectSnapshot(pose=(0, 0, 0, 0, 0, 0, 1))
+    again.world.restore(rig.world.snapshot() | {"stranger": stranger})
     assert centers(again) == centers(rig) and centers(again)["red_cylinder"][:2] == pytest.approx((0.5, 0.05))
     assert rig.world.layout == rig_of("w5").world.layout
     assert rig.edit("reset") == ""

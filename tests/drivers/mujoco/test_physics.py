@@ -17,7 +17,7 @@ from common.planning.ik import solve_ik
 from common.robot.finger_joints import finger_positions
 from common.robot.model import RobotModel
 from common.robot.transforms import tool_down
-from common.sim.interface import FeltWorld, PhysicalWorld, load_world
+from common.sim.interface import GripperDrivenWorld, PhysicalWorld, load_world
 from drivers.mujoco.world import PhysicsWorld
 
 BALL = {"shape": "sphere", "radius": 0.03, "mass": 0.1}
@@ -228,7 +228,7 @@ def test_restored_motion_continues() -> None:
     rig = Rig({**BALL, "x": 0.3}, CUBE)
     rig.push("thing_1", 0.3, 0.1)
     rig.wait(0.3)
-    saved, before = rig.world.standing(), rig.place()
+    saved, before = rig.world.snapshot(), rig.place()
     saved = {name: type(each).model_validate(each.model_dump()) for name, each in saved.items()}
     rig.wait(0.3)
     after = rig.place()
@@ -246,7 +246,7 @@ def test_held_object_is_still_held_after_a_restart() -> None:
     rig.move(rig.above(0.45, 0.0, 0.03))
     rig.grip(0.0)
     rig.move(rig.above(0.45, 0.0, 0.2))
-    saved, width = rig.world.standing(), rig.fingers.read(rig.now).width
+    saved, width = rig.world.snapshot(), rig.fingers.read(rig.now).width
     rig.begin(rig.set_point)
     rig.world.restore(saved)
     assert isinstance(rig.fingers, PlaceableGripper)
@@ -333,7 +333,7 @@ def test_slipping_object_is_not_flung_away_after_a_restart() -> None:
     rig.grip(0.0)
     rig.world.edit(WorldEdit(op="drop"), rig.now)
     rig.wait(0.15)
-    saved, width = rig.world.standing(), rig.fingers.read(rig.now).width
+    saved, width = rig.world.snapshot(), rig.fingers.read(rig.now).width
     assert width < 0.04, "the fingers are within the ball"
     rig.begin(rig.set_point)
     rig.world.restore({name: type(each).model_validate(each.model_dump()) for name, each in saved.items()})
@@ -348,9 +348,9 @@ def test_snapshot_has_the_current_pose() -> None:
     rig.wait(0.5)
     rig.push("thing_1", 0.2)
     for _ in range(10):  # more often than is told of anything that moves
-        before = rig.world.standing()["thing_1"].details["qpos"][0]
+        before = rig.world.snapshot()["thing_1"].details["qpos"][0]
         rig.wait(PERIOD)
-        assert rig.world.standing()["thing_1"].details["qpos"][0] - before > 0.1 * PERIOD
+        assert rig.world.snapshot()["thing_1"].details["qpos"][0] - before > 0.1 * PERIOD
 
 
 def test_held_object_is_restored_at_rest() -> None:
@@ -359,7 +359,7 @@ def test_held_object_is_restored_at_rest() -> None:
     rig.grip(0.0)
     rig.move(rig.above(0.45, 0.0, 0.2))
     rig.push("thing_1", 0.0, 1.0)
-    saved = rig.world.standing()
+    saved = rig.world.snapshot()
     assert saved["thing_1"].details["qvel"][1] == 1.0
     rig.begin(rig.set_point)
     rig.world.restore(saved)
@@ -380,8 +380,8 @@ def test_delay_of_the_process_does_not_advance_the_world() -> None:
 def test_kinematic_and_physics_worlds_satisfy_different_protocols() -> None:
     rig = Rig()
     kinematic = load_world(rig.config.model_copy(update={"simulator": "kinematic"}), [])
-    assert isinstance(rig.world, PhysicalWorld) and not isinstance(rig.world, FeltWorld)
-    assert isinstance(kinematic, FeltWorld) and not isinstance(kinematic, PhysicalWorld)
+    assert isinstance(rig.world, PhysicalWorld) and not isinstance(rig.world, GripperDrivenWorld)
+    assert isinstance(kinematic, GripperDrivenWorld) and not isinstance(kinematic, PhysicalWorld)
 
 
 def test_suction_cup_is_rejected_with_an_alternative() -> None:

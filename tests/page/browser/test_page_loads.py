@@ -15,7 +15,7 @@ from websockets.asyncio.client import connect as connect_socket
 from applications.pick_place.topics import PICK_PLACE_STATUS
 from common import topics
 from common.messages import TaskCommand
-from page.guard import close_server, make_server
+from page.server import close_server, make_server
 from tests.harness import until
 from tests.page.browser.conftest import IN_BROWSER, PATIENCE, Bring, Opened, Viewed, Watched
 

@@ -9,7 +9,7 @@ import pytest
 
 from common import topics
 from common.messages import WorldObjects
-from page.world_edits import free_places, middle_of
+from page.world_editing import center_of, free_positions
 from tests.harness import until
 from tests.page.browser.conftest import IN_BROWSER, PATIENCE, Bring, Watched
 from tests.page.browser.test_bar import PANDA, look
@@ -31,7 +31,7 @@ NAMELESS = """() => [...document.querySelectorAll("#zc-bar button, .zc button, #
 
 def places(told: WorldObjects) -> dict[str, tuple[float, float]]:
     """Where each object lies [m], to a tenth of a millimetre."""
-    return {thing.id: (round((at := middle_of(thing)).x, 4), round(at.y, 4)) for thing in told.objects}
+    return {thing.id: (round((at := center_of(thing)).x, 4), round(at.y, 4)) for thing in told.objects}
 
 
 async def tab(page: Page, name: str) -> None:
@@ -88,7 +88,7 @@ async def test_object_is_moved_on_the_page_and_that_is_undone(bring: Bring, watc
         await page.wait_for_function(CHOSEN)
         fields = page.get_by_label("At [mm]", exact=True)
         x, y = [1e-3 * float(await field.input_value()) for field in (fields.nth(0), fields.nth(1))]
-        there = min(free_places(x, y, 0.06, before), key=lambda at: math.dist(at, MIDDLE))
+        there = min(free_positions(x, y, 0.06, before), key=lambda at: math.dist(at, MIDDLE))
         for field, value in zip((fields.nth(0), fields.nth(1)), there, strict=True):
             await field.fill(f"{1e3 * value:.0f}")
             await field.press("Enter")

@@ -25,7 +25,7 @@ from common.process.in_process import running_service
 from common.transport.bus import Bus
 from common.transport.local import LocalNetwork
 from services import viewer
-from tests.page.browser_double import PATIENCE, BrowserDouble, opened
+from tests.page.fake_browser import PATIENCE, FakeBrowser, opened
 
 TOKEN = "a-token-that-is-long-enough"
 MIN_AREA = "services.vision_detector.min_area"
@@ -37,10 +37,10 @@ async def until(condition: Callable[[], object]) -> None:
             await asyncio.sleep(0.005)
 
 
-class SceneDouble:
+class FakeScene:
     """Stands for the 3D scene, whose meshes take seconds to read."""
 
-    made: ClassVar[list[SceneDouble]] = []
+    made: ClassVar[list[FakeScene]] = []
 
     def __init__(self, *arguments: Any, shown: Mapping[str, bool]) -> None:
         self.layers, self.console, self.latest = arguments[3:6]
@@ -48,7 +48,7 @@ class SceneDouble:
         self.calls: list[tuple[str, tuple[Any, ...]]] = []
         self.visible = dict(shown)
         self.started = False  # is fed, and heard
-        SceneDouble.made.append(self)
+        FakeScene.made.append(self)
 
     def __getattr__(self, name: str) -> Callable[..., None]:
         return lambda *arguments: self.calls.append((name, arguments))
@@ -62,11 +62,11 @@ class SceneDouble:
 
 
 @pytest.fixture(autouse=True)
-def scenes(monkeypatch: pytest.MonkeyPatch) -> list[SceneDouble]:
-    monkeypatch.setattr("page.scene.Scene", SceneDouble)
-    monkeypatch.setattr(viewer, "START_PATIENCE", 0.0)
-    monkeypatch.setattr(SceneDouble, "made", [])
-    return SceneDouble.made
+def scenes(monkeypatch: pytest.MonkeyPatch) -> list[FakeScene]:
+    monkeypatch.setattr("page.scene.Scene", FakeScene)
+    monkeypatch.setattr(viewer, "STARTUP_TIMEOUT", 0.0)
+    monkeypatch.setattr(FakeScene, "made", [])
+    return FakeScene.made
 
 
 @dataclass
@@ -129,7 +129,7 @@ def config_of(cell: Cell, **changes: object) -> viewer.Config:
 
 
 @asynccontextmanager
-async def page_of(cell: str, serve: bool = True, **changes: object) -> AsyncIterator[Played]:
+async def serve_page(cell: str, serve: bool = True, **changes: object) -> AsyncIterator[Played]:
     """A viewer among played services."""
     net = LocalNetwork()
     played = Played(net, net.bus("played", cell="test", clock=Clock()))
@@ -147,11 +147,11 @@ async def page_of(cell: str, serve: bool = True, **changes: object) -> AsyncIter
 
 @pytest.fixture
 async def panda() -> AsyncIterator[Played]:
-    async with page_of("panda") as played:
+    async with serve_page("panda") as played:
         yield played
 
 
 @pytest.fixture
-async def page(panda: Played) -> AsyncIterator[BrowserDouble]:
+async def page(panda: Played) -> AsyncIterator[FakeBrowser]:
     async with opened(panda.port) as browser:
         yield browser
