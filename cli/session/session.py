@@ -12,6 +12,7 @@ import tempfile
 import time
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
@@ -213,6 +214,10 @@ class CellSession:
         return is_simulated(self.cell.robot)
 
     async def _supervised(self, work: Callable[[Bus], Awaitable[int]]) -> int:
+        from common.supervision.preloaded import Preloaded
+
+        preloaded = Preloaded(self.launch.environment())  # its imports overlap with ours
+        from common.supervision.child import Child
         from common.supervision.lifecycle import Interrupted, Interrupts, run_cell
         from common.supervision.supervisor import Supervisor
 
@@ -226,7 +231,8 @@ class CellSession:
             else:
                 self._screen.line(name, text)
 
-        self._supervisor = Supervisor(self.cell, self.launch, show, self._watchers)
+        await asyncio.to_thread(preloaded.wait_ready)
+        self._supervisor = Supervisor(self.cell, self.launch, show, self._watchers, partial(Child, preloaded=preloaded))
         self._supervisor.start()  # before the rest of our imports, which take as long as those of the services
         try:
             self._open_screen(early)
@@ -240,6 +246,7 @@ class CellSession:
                 self._collector.read_truth()
             self.summary.restarts = self._supervisor.restarts
             self.summary.chaos = self._chaos.as_dicts() if self._chaos else None
+            preloaded.close()
             if self._screen:
                 self._screen.close()
 

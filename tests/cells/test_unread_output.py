@@ -1,4 +1,4 @@
-"""Nobody reads what a cell says, on a pipe or a terminal: it works, and ends when it is told to."""
+"""Cells whose output is not read, on a pipe or a terminal: they work, and stop on request."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from tests.harness import ROOT, RunningCell, until
 
 pytestmark = [pytest.mark.cell, pytest.mark.slow]
 
-SECONDS = 15.0  # for which nobody reads
-HELD_UP = 0.05  # most of that time in gaps that come of it; a process that waits to write stands for all of it
+SECONDS = 15.0  # without reading
+HELD_UP = 0.05  # largest share of that time in gaps caused by it; a blocked write would take all of it
 CTRL_C, CTRL_Q, CTRL_S = b"\x03", b"\x11", b"\x13"
 
 
@@ -42,7 +42,7 @@ def full_pipe() -> tuple[int, int]:
 
 @pytest.mark.parametrize("kind", ["full", "dead"])
 @pytest.mark.parametrize("options", [(), ("--log-json",)])
-async def test_cell_whose_lines_nobody_reads_works_and_can_be_ended(
+async def test_cell_with_unread_output_works_and_can_be_stopped(
     tmp_path: Path, kind: str, options: tuple[str, ...]
 ) -> None:
     read, write = full_pipe()
@@ -64,7 +64,7 @@ async def test_cell_whose_lines_nobody_reads_works_and_can_be_ended(
 
 
 class Terminal:
-    """A terminal with somebody in front of it, who may look away."""
+    """A terminal whose output may stay unread."""
 
     def __init__(self) -> None:
         self._keys, self.device = pty.openpty()
@@ -91,7 +91,7 @@ class Terminal:
         os.write(self._keys, key)
 
     def until(self, text: str, timeout: float = 60.0) -> None:
-        """Return when the text stands there, of all that came since a key was pressed."""
+        """Return once the output since the last key press contains the text."""
         with self._changed:
             assert self._changed.wait_for(lambda: text.encode() in self._text, timeout), self._text[-2000:]
 
@@ -102,7 +102,7 @@ class Terminal:
                 continue
             try:
                 chunk = os.read(self._keys, 65536)
-            except OSError:  # nobody has it open any more
+            except OSError:  # no process has it open any more
                 return
             with self._changed:
                 self._text += chunk
@@ -110,7 +110,7 @@ class Terminal:
 
 
 @pytest.mark.parametrize(("verb", "how"), [("up", "Ctrl-S"), ("run", "looks away")])
-async def test_terminal_that_takes_nothing_holds_nothing_up(tmp_path: Path, verb: str, how: str) -> None:
+async def test_blocked_terminal_does_not_block_the_cell(tmp_path: Path, verb: str, how: str) -> None:
     file = tmp_path / "with_chatty.yaml"
     cell_file = yaml.safe_load((ROOT / "config" / "cells" / "panda.yaml").read_text())
     file.write_text(yaml.safe_dump({**cell_file, "services": {**cell_file["services"], "tests.cells.chatty": {}}},
@@ -132,9 +132,9 @@ async def test_terminal_that_takes_nothing_holds_nothing_up(tmp_path: Path, verb
                 gaps = Gaps(bus, cell.name, executor)
                 await asyncio.sleep(SECONDS)
                 gaps.add_to(side)
-            told = "\n".join(map(str, [*sides, *read.own, *unread.own]))
-            assert unread.states > 0.5 * read.states, told
-            assert unread.held_up < read.held_up + HELD_UP * SECONDS, told
+            report = "\n".join(map(str, [*sides, *read.own, *unread.own]))
+            assert unread.states > 0.5 * read.states, report
+            assert unread.held_up < read.held_up + HELD_UP * SECONDS, report
         if how == "Ctrl-S":
             terminal.press(CTRL_Q)
             terminal.until(" lines were lost: nobody read them")

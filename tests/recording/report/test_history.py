@@ -11,7 +11,7 @@ def status(state, target="", **values):
     return PickPlaceStatus(state=state, target=target, **values)
 
 
-def test_states_of_the_task_follow_each_other_without_gaps():
+def test_task_states_follow_each_other_without_gaps():
     run = RunHistory()
     for time, state, target in ((1, "IDLE", ""), (2, "IDLE", ""), (3, "GRASPING", "ball_1"), (5, "GRASPING", "ball_2"),
                                 (6, "DONE", "")):
@@ -22,7 +22,7 @@ def test_states_of_the_task_follow_each_other_without_gaps():
     ]
 
 
-def test_failures_are_events_but_for_those_from_before_the_recording_or_another_life_of_the_task():
+def test_failures_before_the_recording_or_a_task_restart_are_no_events():
     run = RunHistory()
     for time, failures, retries in ((1, 4, 1), (2, 4, 1), (3, 4, 2), (4, 5, 2), (5, 0, 0), (6, 1, 0), (7, 1, 0)):
         run.on_task(time, status("GRASPING", "ball_1", failures=failures, retries=retries, message=f"at {time}"))
@@ -30,7 +30,7 @@ def test_failures_are_events_but_for_those_from_before_the_recording_or_another_
         (3, "GRASPING ball_1", "at 3"), (4, "GRASPING ball_1", "at 4"), (6, "GRASPING ball_1", "at 6")]
 
 
-def test_a_motion_lasts_from_its_first_status_to_the_one_that_ends_it():
+def test_motion_spans_from_its_first_to_its_last_status():
     run = RunHistory()
     for time, goal, state in ((0, "", "none"), (1, "a", "active"), (2, "a", "active"), (3, "a", "succeeded"),
                               (4, "a", "succeeded"), (5, "b", "active"), (6, "b", "aborted")):
@@ -44,7 +44,7 @@ def test_a_motion_lasts_from_its_first_status_to_the_one_that_ends_it():
     assert run.motions[1].error == "limit" and run.motions[1].source == "c"
 
 
-def test_a_pick_is_where_the_target_was_seen_last():
+def test_pick_is_at_the_last_position_of_the_target():
     run = RunHistory()
     place = m.CollisionObject(id="ball_1", role="target", shape="sphere", dimensions=[0.03],
                               pose=m.Pose(position=m.Vector3(x=0.4, y=-0.1, z=0.03)))
@@ -68,7 +68,7 @@ def test_holding_and_pausing_are_spans():
     assert [(s.since, s.until) for s in run.paused] == [(1, 8)]
 
 
-def test_a_service_that_was_started_again_is_an_event():
+def test_restart_of_a_service_is_an_event():
     run = RunHistory()
     for time, restarts in ((1, 0), (2, 0), (3, 1), (4, 1)):
         one = m.ServiceStatus(name="vision_detector", state="ready", restarts=restarts, message="died: SIGKILL")
@@ -76,7 +76,7 @@ def test_a_service_that_was_started_again_is_an_event():
     assert [(e.time, e.what, e.note) for e in run.restarts] == [(3, "vision_detector", "died: SIGKILL")]
 
 
-def test_only_warnings_and_errors_are_kept_and_not_too_many():
+def test_log_contains_a_limited_number_of_warnings_and_errors():
     run = RunHistory()
     for k in range(MOST_LINES + 5):
         run.on_log(k, m.LogLine(service="a", level="info", message="fine"))
@@ -84,7 +84,7 @@ def test_only_warnings_and_errors_are_kept_and_not_too_many():
     assert len(run.log) == MOST_LINES and run.lines_left_out == 5 and {e.level for e in run.log} == {"error"}
 
 
-def test_joints_are_taken_by_name_and_states_without_them_left_out():
+def test_joint_states_without_the_named_joints_are_left_out():
     run = RunHistory()
     header = m.Header()
     run.on_joints(1, m.JointState(header=header, name=["f", "b", "a"], position=[9, 2, 1], velocity=[0, 4, 3]))
@@ -95,13 +95,13 @@ def test_joints_are_taken_by_name_and_states_without_them_left_out():
     assert np.isnan(v[1]).all()
 
 
-def test_what_slides_is_not_told_in_radians():
+def test_prismatic_joints_are_not_labelled_in_radians():
     text = charts.joints(np.arange(2.0), np.zeros((2, 1)), np.zeros((2, 1)), ["lift"], None)
     assert "position [rad or m]" in text and "speed [rad/s or m/s]" in text
 
 
 @pytest.mark.parametrize(("shape", "dimensions"), [("box", [0.4, 0.2, 0.1]), ("cylinder", [0.1, 0.3])])
-def test_a_footprint_is_the_solid_from_above(shape, dimensions):
+def test_footprint_is_the_solid_from_above(shape, dimensions):
     turned = m.Pose(position=m.Vector3(x=1, y=2), orientation=m.Quaternion(z=np.sqrt(0.5), w=np.sqrt(0.5)))
     thing = m.CollisionObject(id="t", role="fixture", shape=shape, dimensions=dimensions, pose=turned)
     run = RunHistory()
@@ -111,10 +111,10 @@ def test_a_footprint_is_the_solid_from_above(shape, dimensions):
     assert run.footprints["t"].corners.mean(axis=0) == pytest.approx([1, 2])
 
 
-def test_long_curves_are_thinned_but_keep_their_extremes():
+def test_long_curves_are_thinned_and_keep_their_extremes():
     times = np.linspace(0, 60, 6001)
     values = np.sin(times)[:, None] * 0.1
     values[1234], values[4321] = 3.0, -2.0
-    kept = charts.thinned(times, values)
-    assert len(kept) <= charts.MAX_POINTS + 4 and {1234, 4321, 6000} <= set(kept.tolist())
+    indices = charts.thinned(times, values)
+    assert len(indices) <= charts.MAX_POINTS + 4 and {1234, 4321, 6000} <= set(indices.tolist())
     assert charts.thinned(times[:50], values[:50]).tolist() == list(range(50))

@@ -1,4 +1,4 @@
-"""The quick check at a cell that a process of its own takes."""
+"""Quick checks of a cell in a subprocess."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tools.check.cell import quick_warnings, warnings_in_subprocess
 ROOT = str(Path(__file__).resolve().parents[3])
 
 
-async def test_what_modules_of_a_person_print_is_no_part_of_what_was_found(tmp_path: Path) -> None:
+async def test_prints_of_user_modules_do_not_mix_with_the_findings(tmp_path: Path) -> None:
     (tmp_path / "loud.py").write_text("""
 import os
 from tools.check import warning
@@ -34,6 +34,6 @@ APPLICATION = Application(topics=ApplicationTopics(status=STATUS), checks=Checks
     assert any("the cell is loud" in each.line for each in found)
 
 
-async def test_quick_look_finds_beside_what_it_finds_here() -> None:
+async def test_findings_are_those_of_a_check_in_this_process() -> None:
     cell = load_cell("panda")
     assert await warnings_in_subprocess(cell, {**os.environ, "PYTHONPATH": ROOT}) == quick_warnings(cell)

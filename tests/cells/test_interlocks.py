@@ -1,4 +1,4 @@
-"""A stop that outlives every process of a cell, killed all at once, and a `run` that lets go of it."""
+"""A stop that survives the death of all processes of a cell, and a `run` that releases it."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def place(tmp_path: Path) -> Iterator[Place]:
     made.end()
 
 
-async def test_stop_outlives_supervisor_and_executor_that_are_killed_and_up_says_so(place: Place) -> None:
+async def test_stop_survives_killed_supervisor_and_executor(place: Place) -> None:
     command = place.start("up", *PANDA)
     async with connect(cell="panda", service="watcher", endpoint=endpoint_of(place.domain), timeout=PATIENCE) as bus:
         motion = bus.reader(topics.MOTION_STATUS)
@@ -57,8 +57,8 @@ async def test_stop_outlives_supervisor_and_executor_that_are_killed_and_up_says
     kill_all(command)
     command = place.start("up", *PANDA)
     command.until("Motions run at 5 % of their speed")
-    told = command.until("panda is stopped since")
-    assert "`zencell task start` lets it continue" in told and "@" in told
+    line = command.until("panda is stopped since")
+    assert "`zencell task start` lets it continue" in line and "@" in line
     async with connect(cell="panda", service="watcher", endpoint=endpoint_of(place.domain), timeout=PATIENCE) as bus:
         joints, motion = bus.reader(topics.JOINT_STATES), bus.reader(topics.MOTION_STATUS)
         await assert_still(joints)
