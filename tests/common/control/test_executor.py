@@ -162,7 +162,7 @@ def test_long_step_of_the_world_is_deferred_and_the_arm_continues(rig, monkeypat
         rig.step()
     before, saved = len(rig.joints), len(rig.saver.states)
     with monkeypatch.context() as patched:
-        for name in ("tick", "obstruction", "objects", "take_events", "standing"):
+        for name in ("tick", "obstruction", "objects", "take_events", "snapshot"):
             owner = next(cls for cls in KinematicWorld.__mro__ if name in vars(cls))
             patched.delattr(owner, name)  # any call would fail
         rig.run(0.2)
