@@ -27,7 +27,7 @@ from benchmarks.first_picture import chromium, openings
 from common import topics
 from common.messages import SupervisorStatus
 from tests.harness import RunningCell, until
-from tests.page.browser_double import BrowserDouble, opened
+from tests.page.fake_browser import FakeBrowser, opened
 
 SETTLE = 5.0  # [s] after the cell is up, for meshes to be read
 MEASURE = 15.0  # [s]
@@ -43,7 +43,7 @@ async def share(process: psutil.Process) -> float:
     return 100 * (after.user + after.system - before.user - before.system) / (time.monotonic() - began)
 
 
-async def time_stops(cell: RunningCell, page: BrowserDouble, count: int) -> list[tuple[float, float]]:
+async def time_stops(cell: RunningCell, page: FakeBrowser, count: int) -> list[tuple[float, float]]:
     """Seconds from a click on STOP to the word of it and to rest, each time while the arm moves for the task."""
     times = []
     async with cell.listen() as bus:

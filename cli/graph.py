@@ -38,7 +38,7 @@ def graph(
 ) -> None:
     """Draw services and topics of a cell, up or not; while it is up, what is not alive is dashed."""
     from common.config import load_cell
-    from page.access import VIEWER
+    from security.page_tokens import VIEWER
     from tools.graph import graph_of, names
 
     path = Path(output).expanduser() if output else None

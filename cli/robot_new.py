@@ -100,11 +100,11 @@ def check(
     from common.config import load_robot
     from common.planning.robot_geometry import RobotGeometry
     from common.robot.model import RobotModel
-    from tools.robot_setup.end_effector import complaints
+    from tools.robot_setup.end_effector import check_gripper
     from tools.robot_setup.home import hits
 
     robot = RobotModel.load(load_robot(name))
-    wrong = complaints(robot)
+    wrong = check_gripper(robot)
     touching = hits(robot, RobotGeometry(robot), robot.named("home"))
     wrong += [f"named_poses.home: {pair} touch" for pair in touching]
     for line in wrong:

@@ -36,8 +36,8 @@ def init(
     """Make an authority, a certificate for each process, and the router's rules of who may do what."""
     from common.config import load_cell, names_of
     from common.transport.credentials import ACCESS
-    from page.access import VIEWER
     from security.folder import authority_files, make
+    from security.page_tokens import VIEWER
     from security.rights import rights_in
 
     valid = options.whole("--days", days, 1)

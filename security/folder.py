@@ -11,10 +11,10 @@ from cryptography import x509
 
 from common.errors import ConfigError
 from common.transport.credentials import ACCESS, AUTHORITY, OBSERVER, OPERATOR, ROUTER_NAME, common_name
-from page.access import ROLES, make_token, token_file
 from security.access import Rights, access_control
 from security.certificates import Authority, write_secret
 from security.checking import certificate_in, hosts_in
+from security.page_tokens import ROLES, make_token, token_file
 
 LOCAL = ("localhost", "127.0.0.1", "::1")
 ACCESS_HEAD = "// Who may do what, as the services declare it; all else is denied. Made by `zencell secure init`.\n"

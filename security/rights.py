@@ -10,8 +10,8 @@ from common.errors import ZencellError
 from common.supervision.launch import require_modules
 from common.supervision.wiring import Wiring, WiringFailed, require_one_owner, wiring_of
 from common.transport.credentials import RECORDER, SUPERVISOR
-from page.access import VIEWER
 from security.access import Rights, rights_of, rights_of_recorder, rights_of_supervisor
+from security.page_tokens import VIEWER
 
 
 def rights_in(cell: Cell, names: Collection[str] | None = None) -> dict[str, Rights]:

@@ -11,6 +11,7 @@ import tempfile
 import time
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
     from common.supervision.supervisor import Supervisor
     from common.transport.bus import Bus
     from lab.chaos.agent import Chaos
-    from page.serving import Page
+    from page.address import PageAddress
     from recording.report.aggregator import Collector
 
 T = TypeVar("T")
@@ -83,8 +84,8 @@ class CellSession:
             router_location,
         )
         from common.transport.endpoint import endpoint_of
-        from page.access import VIEWER
         from recording.report.aggregator import RunAggregator
+        from security.page_tokens import VIEWER
         from security.requiring import require_secured, with_near
         from tools.check.cell import require_safe
 
@@ -119,7 +120,7 @@ class CellSession:
         self._supervisor: Supervisor | None = None
         self._collector: Collector | None = None
         self._screen: Screen | None = None
-        self._page: Page | None = None
+        self._page: PageAddress | None = None
         self._watchers: dict[str, list[str]] = {}  # commands by name
         self._disturbance: Disturbance | None = None
         self._chaos: Chaos | None = None
@@ -132,9 +133,9 @@ class CellSession:
         Raises:
             ConfigError: there is no page, the port is taken, or host or port cannot be used.
         """
-        from page.serving import page_of
+        from page.address import plan_page
 
-        self._page = page = page_of(self.cell, host, port)
+        self._page = page = plan_page(self.cell, host, port)
         if page is not None:
             overrides = (*self.launch.overrides, *page.overrides)
             self.launch = replace(self.launch, overrides=overrides, extra=page.environment)
@@ -247,6 +248,10 @@ class CellSession:
         return is_simulated(self.cell.robot)
 
     async def _in_cell(self, work: Callable[[Bus], Awaitable[int]]) -> int:
+        from common.supervision.preloaded import Preloaded
+
+        preloaded = Preloaded(self.launch.environment())  # its imports overlap with ours
+        from common.supervision.child import Child
         from common.supervision.lifecycle import Interrupted, Interrupts, run_cell
         from common.supervision.supervisor import Supervisor
 
@@ -260,7 +265,8 @@ class CellSession:
             else:
                 self._screen.line(name, text)
 
-        self._supervisor = Supervisor(self.cell, self.launch, show, self._watchers)
+        await asyncio.to_thread(preloaded.wait_ready)
+        self._supervisor = Supervisor(self.cell, self.launch, show, self._watchers, partial(Child, preloaded=preloaded))
         self._supervisor.start()  # before the rest of our own imports, which take as long as theirs
         try:
             self._open_screen(early)
@@ -274,6 +280,7 @@ class CellSession:
                 self._collector.read_truth()
             self.summary.restarts = self._supervisor.restarts
             self.summary.chaos = self._chaos.as_dicts() if self._chaos else None
+            preloaded.close()
             if self._screen:
                 self._screen.close()
 
@@ -371,7 +378,7 @@ class CellSession:
         assert self._collector is not None
         self.summary.ready = time.monotonic() - self.began
         if self._page and self._screen:
-            self._screen.note(f"Open {self._page.address}")
+            self._screen.note(f"Open {self._page.url}")
         self._doubts = asyncio.create_task(self._tell_doubts(), name="doubts")
         if self._disturbance is not None:
             from lab.chaos.agent import create_chaos, keys_of
