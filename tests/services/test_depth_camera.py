@@ -221,7 +221,7 @@ async def test_unplugged_realsense_is_reported_and_reopened(camera: FakeCamera) 
 
 async def test_distorted_lens_is_rejected_and_depth_lens_is_selectable(camera: FakeCamera) -> None:
     camera.coeffs = [0.1, 0.0, 0.0, 0.0, 0.0]
-    with pytest.raises(ConfigError, match=r"options\.align: 'color' has distortion .* cannot be corrected: choose depth"):
+    with pytest.raises(ConfigError, match=r"options\.align: 'color' has distortion .* corrected: choose depth"):
         async with running_service(LocalNetwork(), real_depth_camera.run, config_of(), name="camera"):
             await asyncio.sleep(10)
     net = LocalNetwork()
