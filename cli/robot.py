@@ -34,8 +34,8 @@ def collisions(
     import numpy as np
 
     from common.config import load_robot
-    from common.planning.disabled_collisions import disabled_pairs, srdf
     from common.robot.model import RobotModel
+    from tools.robot_setup.disabled_collisions import disabled_pairs, srdf
 
     count, number = options.whole("--samples", samples, 1), options.whole("--seed", seed, 0)
     distance = options.number("--margin", margin)

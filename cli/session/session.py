@@ -11,6 +11,7 @@ import tempfile
 import time
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
@@ -247,6 +248,10 @@ class CellSession:
         return is_simulated(self.cell.robot)
 
     async def _in_cell(self, work: Callable[[Bus], Awaitable[int]]) -> int:
+        from common.supervision.preloaded import Preloaded
+
+        preloaded = Preloaded(self.launch.environment())  # its imports overlap with ours
+        from common.supervision.child import Child
         from common.supervision.lifecycle import Interrupted, Interrupts, run_cell
         from common.supervision.supervisor import Supervisor
 
@@ -260,7 +265,8 @@ class CellSession:
             else:
                 self._screen.line(name, text)
 
-        self._supervisor = Supervisor(self.cell, self.launch, show, self._watchers)
+        await asyncio.to_thread(preloaded.wait_ready)
+        self._supervisor = Supervisor(self.cell, self.launch, show, self._watchers, partial(Child, preloaded=preloaded))
         self._supervisor.start()  # before the rest of our own imports, which take as long as theirs
         try:
             self._open_screen(early)
@@ -274,6 +280,7 @@ class CellSession:
                 self._collector.read_truth()
             self.summary.restarts = self._supervisor.restarts
             self.summary.chaos = self._chaos.as_dicts() if self._chaos else None
+            preloaded.close()
             if self._screen:
                 self._screen.close()
 

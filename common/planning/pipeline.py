@@ -18,6 +18,7 @@ from common.planning.goal_sampling import distance_outside
 from common.planning.obstacles import InvalidShape, ObstacleCache
 from common.planning.planners import Plan, load_planner, planner_names
 from common.planning.planners.joint_move import straight_profile
+from common.planning.planners.sequence import SEGMENTS, NoOptions, join_segments
 from common.planning.point_obstacles import PointObstacle
 from common.planning.problem import (
     NOT_APPLICABLE,
@@ -38,7 +39,6 @@ from common.planning.request_checks import (
 )
 from common.planning.retiming import RetimingFailed, limited_jerk
 from common.planning.robot_geometry import RobotGeometry
-from common.planning.segments import SEGMENTS, NoOptions, join_segments
 from common.planning.trajectory import TimedPath, TooLong, cubics, join, require_sendable, stretch, trajectory_message
 from common.planning.validation import Fault, validate
 from common.planning.waypoint_timing import BLENDS, limit_tool_speed, retime

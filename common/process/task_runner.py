@@ -16,8 +16,8 @@ from common.robot.model import RobotModel
 from common.robot.transforms import matrix_to_pose
 from common.tasks.decisions import TaskConfig
 from common.tasks.engine import Task
+from common.tasks.monitoring import LOOK_PERIOD, LivenessWatchdog
 from common.tasks.stages import Command, View, within_range
-from common.tasks.watchdogs import LOOK_PERIOD, LivenessWatchdog
 from common.time_source import monotonic, new_id
 from common.topics import Topic
 from common.transport.bus import Bus
@@ -172,7 +172,7 @@ class TaskRunner(Generic[V]):
         """Return holds to request or release because of missing messages or services; the view gets the reason."""
         if self._watchdog is None:
             return []
-        holds = self._watchdog.look(monotonic(), self._requests.serving, view.motion)
+        holds = self._watchdog.update(monotonic(), self._requests.serving, view.motion)
         view.trouble = self._watchdog.trouble
         return holds
 

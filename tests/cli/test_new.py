@@ -20,7 +20,7 @@ KINDS = offers.task_kinds()
 def test_kinds_are_the_examples_with_a_cell_and_are_completed() -> None:
     assert KINDS == ["sort_cubes", "stack_cubes"]
     found = dict(offers.tasks("st"))
-    assert list(found) == ["stack_cubes"] and found["stack_cubes"].startswith("Stacks cubes")
+    assert list(found) == ["stack_cubes"] and found["stack_cubes"].startswith("Stack cubes")
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 
 from common.config import RobotConfig, check
 from common.errors import ConfigError
-from common.planning.disabled_collisions import disabled_pairs, srdf
 from common.planning.robot_geometry import RobotGeometry
 from common.robot.finger_joints import finger_positions
 from common.robot.model import RobotModel
 from common.robot.transforms import invert, matrix_to_rpy, transform
 from common.robot.urdf import read_urdf
+from tools.robot_setup.disabled_collisions import disabled_pairs, srdf
 from tools.robot_setup.end_effector import (
     GripperProposal,
     check_gripper,

@@ -36,6 +36,7 @@ from tests.common.planning.planning_scenes import CELL, HOME, ROBOT, scene, to_j
 
 PIPELINE = PlanningPipeline(ROBOT, CELL.motion, CELL.pipeline)
 EMPTY = scene(box=False)
+OTHERS = ("joint_move", "lerp", "ptp", "ompl", "chomp", "trajopt", "lin")
 CORRIDOR = Box(pose=Pose(position=Vector3(x=0.5, z=0.25)), size=Vector3(x=0.2, y=0.7, z=0.2))
 LEANING = transform(rpy_to_matrix(np.pi - 0.5, 0.0, 0.0), (0.5, 0.3, 0.3))
 
@@ -112,8 +113,7 @@ def test_goal_region_is_reached_with_an_upright_tool():
     assert PIPELINE.plan(request.model_copy(update={"planner": "rrt_connect"}), EMPTY).ok
 
 
-@pytest.mark.parametrize("planner", ["joint_move", "lerp", "ptp", "rrt_connect", "ompl", "chomp", "trajopt", "lin"])
-@pytest.mark.slow
+@pytest.mark.parametrize("planner", ["rrt_connect", *(pytest.param(name, marks=pytest.mark.slow) for name in OTHERS)])
 def test_no_planner_returns_a_violating_trajectory(planner):
     satisfied = refused = 0
     pipeline = with_planner(planner)
@@ -244,14 +244,13 @@ def test_tool_speed_is_limited_and_used_fully(planner, goal, speed):
         assert len(way.speeds) * 1e-3 < 1.1 * length / speed + 0.5
 
 
-@pytest.mark.parametrize(
-    "what", ["tilt 0.3", "tilt 0.1", pytest.param("tilt 0.1, corridor", marks=pytest.mark.slow)])
-@pytest.mark.parametrize("name", ["panda", "ur5"])
-@pytest.mark.slow
-def test_glass_is_carried_upright_over_a_wall(name, what):
+@pytest.mark.parametrize(("name", "what", "count"), [("panda", "tilt 0.1", 2), *(
+    pytest.param(name, what, 20, marks=pytest.mark.campaign)
+    for name in ("panda", "ur5") for what in ("tilt 0.3", "tilt 0.1", "tilt 0.1, corridor"))])
+def test_glass_is_carried_upright_over_a_wall(name, what, count):
     robot, pipeline = arms()[name == "ur5"]
     constraints, around = constraints_of(what, name), walled(name)
-    for number, carry in enumerate(carries(robot, name, 20, 0.5 * constraints.tilt)):
+    for number, carry in enumerate(carries(robot, name, count, 0.5 * constraints.tilt)):
         request = to_pose(carry.T_world_goal, carry.start, constraints=constraints, planning_time=20.0, seed=number)
         response = pipeline.plan(request, around)
         assert response.ok, (number, response.message)

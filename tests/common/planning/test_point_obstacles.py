@@ -81,8 +81,8 @@ def worlds(model, hulls: pin.GeometryModel, spheres: np.ndarray, held: bool) -> 
 
 
 @needs_kernel
-@pytest.mark.parametrize(("robot", "seed"), [("panda", 0), ("panda", 1), ("ur5", 0), ("ur5", 1)])
-@pytest.mark.slow
+@pytest.mark.parametrize(("robot", "seed"), [("panda", 1), *(
+    pytest.param(*case, marks=pytest.mark.campaign) for case in (("panda", 0), ("ur5", 0), ("ur5", 1)))])
 def test_kernel_agrees_with_coal_on_spheres(robot, seed):
     rng = np.random.default_rng(seed)
     one = ROBOT if robot == "panda" else UR5

@@ -10,7 +10,6 @@ import pytest
 
 from common.config import Grasp, RobotConfig, check, load_cell
 from common.messages import Header, PlanningScene, PlanRequest, PoseGoal
-from common.planning.disabled_collisions import disabled_pairs, srdf
 from common.planning.goal_sampling import distance_outside
 from common.planning.ik import (
     converge_to_region,
@@ -25,6 +24,7 @@ from common.robot.model import RobotModel
 from common.robot.transforms import matrix_to_pose, tool_down
 from common.scene.workspace import WorkspaceBounds, unreachable_reason
 from tests.small_arms import nodding, scara
+from tools.robot_setup.disabled_collisions import disabled_pairs, srdf
 from tools.robot_setup.proposal import draft
 
 CELL = load_cell("panda")

@@ -5,10 +5,10 @@ import pinocchio as pin
 import pytest
 
 from common.config import RobotConfig, load_cell
-from common.planning.disabled_collisions import disabled_pairs, sample_configurations, srdf
 from common.planning.robot_geometry import RobotGeometry, convex_hulls
 from common.robot.model import RobotModel
 from tests.common.planning.ur5_scene import ROBOT
+from tools.robot_setup.disabled_collisions import disabled_pairs, sample_configurations, srdf
 
 PANDA = RobotModel.load(load_cell("panda").robot)
 
