@@ -224,7 +224,7 @@ class JogPanel:
             rows = [self._row(axis.upper(), f"move:{frame}:{axis}", f"tool along {axis}", f"p:{axis}") for axis in AXES]
             rows += [self._row(f"R{axis.upper()}", f"turn:{frame}:{axis}", f"rotate tool about {axis}",
                                f"r:{axis}") for axis in AXES]
-        note = self._disabled or "Hold a button to move. No collision checking."
+        note = self._disabled or "hold a button to move; no collision checking"
         return block(f'<div class="dim small">{text(note)}</div><div class="pad">{"".join(rows)}</div>', "jog")
 
     def _row(self, label: str, name: str, spoken: str, number: str) -> str:
