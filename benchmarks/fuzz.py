@@ -190,10 +190,10 @@ async def live(options: argparse.Namespace, folder: Path) -> list[str]:
     wrong = [f"{name} ended: {folder}" for name, process in before.items()
              if name not in after or after[name].pid != process.pid]
     at = [0, rounds // 4, rounds // 2, rounds]
-    sizes_mb = {name: [memory[number].get(name, 0.0) for number in at] for name in before}
+    grown = {name: [memory[number].get(name, 0.0) for number in at] for name in before}
     print("memory of what was attacked, at the begin, after a quarter, a half, and at the end [MB]: " + ", ".join(
-        f"{name} {' '.join(f'{size:.1f}' for size in sizes)}" for name, sizes in sizes_mb.items()), flush=True)
-    wrong += [f"{name} grew from {sizes[1]:.1f} MB after a quarter to {sizes[3]:.1f}" for name, sizes in sizes_mb.items()
+        f"{name} {' '.join(f'{size:.1f}' for size in sizes)}" for name, sizes in grown.items()), flush=True)
+    wrong += [f"{name} grew from {sizes[1]:.1f} MB after a quarter to {sizes[3]:.1f}" for name, sizes in grown.items()
               if rounds >= LEAST and sizes[3] - sizes[1] > max(MOST_GROWTH * sizes[1], MOST_MEGABYTES)]
     own, own_before = len(attacked.own) + attacked.lost, len(calm.own) + calm.lost
     if own > own_before:
