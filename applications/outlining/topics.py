@@ -28,7 +28,7 @@ MAX_POINTS = 20_000  # of an outline
 
 
 class Contour(Message):
-    """One closed contour in a picture. `pixels` are (u, v) [px], every one along the edge."""
+    """One closed contour in an image. `pixels` are (u, v) [px], every one along the edge."""
 
     index: Count
     label: Name
@@ -40,7 +40,7 @@ class Contour(Message):
 
 
 class Contours(Message):
-    """All contours of one picture, and the one that was chosen."""
+    """All contours of one image, and the selected one."""
 
     max_bytes: ClassVar[int] = 4 * 1024 * 1024
     max_parts: ClassVar[int] = 128 * 1024
@@ -59,7 +59,7 @@ class Contours(Message):
             raise ValueError("the indices of contours must be 0, 1, ... in their order")
         if self.selected != -1 and self.selected not in places:
             raise ValueError(f"contour {self.selected} is selected, of {len(places)}")
-        within = {-1}  # what is known to lie in no circle
+        within = {-1}  # contours known to be in no cycle
         for contour in self.contours:
             way, at = set[int](), contour.index
             while at not in within:
@@ -87,7 +87,7 @@ class OutlineSelect(Message):
 
 
 class OutlineSelection(Message):
-    """What was chosen."""
+    """The selected contour."""
 
     max_bytes: ClassVar[int] = SMALL_BYTES
 
@@ -96,10 +96,10 @@ class OutlineSelection(Message):
 
 
 class OutlinePoints(PoseArray):
-    """The outline of the top face of the chosen object, closed: the last point is followed by the first.
+    """Outline of the selected object's top face, closed: the last point is followed by the first.
 
-    The stamp is that of the picture. Without a chosen object, or when its outline cannot be told, there are no poses
-    and `message` says why.
+    The stamp is that of the image. Without a selected object, or without a known outline, there are no poses, and
+    `message` has the reason.
     """
 
     max_bytes: ClassVar[int] = 4 * 1024 * 1024
@@ -120,7 +120,7 @@ OutlineState = Literal[
 
 
 class OutlineStatus(TaskStatus):
-    """State and figures of the outline task. `subject` is the label of the object that is outlined."""
+    """State and figures of the outlining task. `subject` is the label of the outlined object."""
 
     state: OutlineState = "IDLE"
     points: Count = 0
@@ -140,7 +140,7 @@ class OutlineStatus(TaskStatus):
     @computed_field  # type: ignore[prop-decorator]
     @property
     def object(self) -> str:
-        """Label of the object that is outlined."""
+        """Label of the outlined object."""
         return self.subject
 
 
