@@ -22,6 +22,7 @@ STYLE = """<style>
 .zc th { font-weight: 500; opacity: 0.6; white-space: nowrap; }
 .zc tr + tr td { border-top: 1px solid rgba(128, 128, 128, 0.18); }
 .zc td.number, .zc th.number { text-align: right; white-space: nowrap; }
+.zc td:has(button) { width: 1%; white-space: nowrap; }
 .zc .dim { opacity: 0.6; }
 .zc .big { font-size: 1.3em; font-weight: 600; }
 .zc .good { color: #2fb344; } .zc .busy { color: #f59f00; } .zc .bad { color: #fa5252; } .zc .off { color: #868e96; }

@@ -6,7 +6,7 @@ An application extends it by an `ApplicationPage` (application.py).
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Coroutine, Mapping
+from collections.abc import Callable, Coroutine, Iterable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -88,75 +88,52 @@ class Page:
         self._layout, self._schedule, self._recordings = layout, schedule, recordings
         self._topics, self._text = Topics(application, layers.values(), members.keys), TaskText.of(application)
         self._shown, self._editing = shown_layers(layout.layers, layers), layout.edit_world
-        self._rejected, self._losses = RejectedPositions(), LossDetector()
+        self._losses = LossDetector()
         self._recorder = HistoryRecorder(feeds, self._text.states)
         self.timeline = Timeline(feeds.latest, self._recorder.recent)
-        self._pending_events: list[tuple[Topic[Any], Any]] = []  # until there is a scene
         self._scene: Scene | None = None
         self._plots: PlotPanel | None = None
         self._move: MovePanel | None = None
         self.pages = 0
         self.visited = asyncio.Event()
         _prepare_scene(server, layout, cell)
-        self._add_main_panel(application)
-        self._tabs = self._add_tabs()
+        self._panels = Panels(server, console, layout, cell, self._text, go_home=self._go_home)
+        create = page_of(application).controls
+        self._controls = create(server.gui, console) if create is not None else None
+        self._controls_updater = Updater(self._controls, feeds.latest) if self._controls is not None else None
+        self._panels.add_tabs()
+        self._subscriptions = Subscriptions(feeds, self._topics, layers, self._panels, self._recorder)
         self._fill_tabs(members, robot, layout_file)
         self._connect()
 
     # --- layout ---
 
-    def _add_main_panel(self, application: Application | None) -> None:
-        gui, console, layout = self._server.gui, self.console, self._layout
-        gui.configure_theme(dark_mode=layout.dark, show_logo=False, show_share_button=False)
-        gui.set_panel_label(f"zencell · {self._cell}")
-        gui.main_panel.dock_right()
-        gui.main_panel.set_width(layout.panel_width)
-        self._task = TaskPanel(gui, console, self._text, self._go_home)
-        self._controller = ControllerPanel(gui, console)
-        create = page_of(application).controls
-        self._controls = create(gui, console) if create is not None else None
-        self._controls_updater = (
-            Updater(self._controls, self._feeds.latest) if self._controls is not None else None)
-
-    def _add_tabs(self) -> dict[Tab, viser.GuiTabHandle | viser.GuiFolderHandle]:
-        """Return the container of each tab; one that the layout leaves out is invisible."""
-        gui = self._server.gui
-        panel = gui.add_panel()
-        tabs = {name: panel.add_tab(name) for name in self._layout.tabs}
-        panel.dock_below(gui.main_panel)
-        hidden = gui.add_folder(None, visible=False)
-        return {tab: tabs.get(tab, hidden) for tab in TABS}
-
     def _fill_tabs(self, members: Members, robot: RobotConfig, layout_file: str) -> None:
-        gui, console, layout, tabs = self._server.gui, self.console, self._layout, self._tabs
-        with tabs["Cameras"]:
+        gui, console, layout, panels = self._server.gui, self.console, self._layout, self._panels
+        with panels.tabs["Cameras"]:
             self._cameras = CameraPanel(
                 gui, console, {LIVE: layout.live_image, ANNOTATED: layout.annotated_image, MASK: layout.mask_image,
                                DEPTH: layout.depth_image}, self._select_topics)
-        with tabs["Cameras"], gui.add_folder("Hand-eye calibration", expand_by_default=False):
+        with panels.tabs["Cameras"], gui.add_folder("Hand-eye calibration", expand_by_default=False):
             self._hand_eye = HandEyePanel(gui, console, self._feeds.latest, self._topics.images[LIVE], robot,
                                           on_topics=self._select_topics)
-        with tabs["Time"]:
+        with panels.tabs["Time"]:
             self._time = TimePanel(gui, console, self.timeline, names=partial(recordings_in, self._recordings),
                                    open_recording=self._open_recording)
-        with tabs["Health"]:
-            self._health = HealthPanel(gui, members.services)
-        with tabs["Log"]:
-            self._log = LogPanel(gui, console, layout.log_level)
-        self._tuning = TuningPanel(gui, tabs["Tuning"], console)
-        with tabs["View"]:
+        panels.add_diagnostics(members.services)
+        with panels.tabs["View"]:
             self._view = ViewPanel(
                 gui, console, self._kinds, self._shown, shadows=layout.shadows, on_layer=self._set_layer,
                 on_shadows=lambda on: self._server.scene.configure_default_lights(cast_shadow=on))
             gui.add_divider()
             self._world = WorldPanel(gui, console, editing=self._editing, on_editing=self._set_editing,
-                                     on_reset=self._forget_rejected)
+                                     on_reset=self._subscriptions.clear_rejected)
             LayoutSaver(gui, console, self._kinds, layout, layout_file, self._cell, self._layout_values)
 
     def _connect(self) -> None:
         """Connect console, control socket, timeline and browsers."""
         console, control = self.console, self._control
-        console.notify, control.stop = self._task.notify, self._task.stop
+        console.notify, control.stop = self._panels.task.notify, self._panels.task.stop
         console.before_operation = self.timeline.return_to_present
         console.permissions.require(STOP, "stop", "STOP")
         console.permissions.require(HOLD, "operate", "jogs")
@@ -183,21 +160,19 @@ class Page:
             planners: available planners.
         """
         gui = self._server.gui
-        with self._tabs["Plots"]:
+        with self._panels.tabs["Plots"]:
             limits = Limits(robot.joint_names, robot.lower, robot.upper, robot.velocity)
             self._plots = PlotPanel(gui, limits, self._text.latency)
-        with self._tabs["Move"]:
+        with self._panels.tabs["Move"]:
             self._move = MovePanel(
                 gui, self.console, self._motions, scene, robot, planners, cell=self._cell,
-                planner=self._layout.planner, marker=self._layout.goal_marker, notify=self._task.notify)
+                planner=self._layout.planner, marker=self._layout.goal_marker, notify=self._panels.task.notify)
             self._control.hold_handler = self._move.jogger
         for name, on in self._shown.items():
             scene.set_shown(name, on)
         if self._editing:
             scene.set_editing(True)
-        for topic, event in self._pending_events:
-            scene.handle_event(topic, event)
-        self._pending_events.clear()
+        self._subscriptions.connect(scene, self._plots)
         self._scene = scene
         self.timeline.resend_images()
 
@@ -212,7 +187,7 @@ class Page:
         motion = {"goal_marker": self._move.marker, "planner": self._move.planner} if self._move else {}
         return {"layers": self._shown, "live_image": images[LIVE], "annotated_image": images[ANNOTATED],
                 "mask_image": images[MASK], "depth_image": images[DEPTH], "shadows": self._view.shadows,
-                "log_level": self._log.level, "edit_world": self._editing, **motion}
+                "log_level": self._panels.log.level, "edit_world": self._editing, **motion}
 
     # --- updates ---
 
@@ -238,7 +213,7 @@ class Page:
             self._show_panels(now)
         self._hand_eye.update(now)
         if self._schedule.is_due("diagnostics", now):
-            self._health.show(self._feeds.latest(topics.SUPERVISOR_STATUS), alive)
+            self._panels.health.show(self._feeds.latest(topics.SUPERVISOR_STATUS), alive)
         if self._plots is not None and self._schedule.is_due("plots", now):
             self._show_plots(self._plots, now)
         if self._schedule.is_due("images", now):
@@ -254,12 +229,12 @@ class Page:
 
     def _show_panels(self, now: float) -> None:
         latest = self._feeds.latest
-        self._task.show(self._status, latest(topics.MOTION_STATUS), latest(topics.MOTION_OWNER),
-                        gripper_text(latest(topics.GRIPPER_STATE)), len(self._rejected.positions))
+        self._panels.task.show(self._status, latest(topics.MOTION_STATUS), latest(topics.MOTION_OWNER),
+                        gripper_text(latest(topics.GRIPPER_STATE)), len(self._subscriptions.rejected.positions))
         if self._move is not None:
             self._move.show(self._status, now)
-        self._controller.show(latest(topics.ROBOT_STATUS))
-        self._log.show()
+        self._panels.controller.show(latest(topics.ROBOT_STATUS))
+        self._panels.log.show()
         self._world.show()
         self._time.show(now)
         self._hand_eye.show()
@@ -273,8 +248,8 @@ class Page:
         self._control.publish(PageStatus(
             summary=summarize(self._cell, self._text, self._status, motion, owner,
                               permissions.operating_page if permissions.enforced else None),
-            lost=tuple(self._losses.update(connected, alive, responders, now)), note=self._task.note, owner=owner,
-            live=self._move.readout.live() if self._move is not None else {}, past=self._time.position))
+            lost=tuple(self._losses.update(connected, alive, responders, now)), note=self._panels.task.note,
+            owner=owner, live=self._move.readout.live() if self._move is not None else {}, past=self._time.position))
 
     def _show_images(self, now: float) -> None:
         timeline = self.timeline
@@ -312,42 +287,8 @@ class Page:
         Args:
             age_ms: returns the wall time [ms] since a stamp.
         """
-        now = asyncio.get_running_loop().time
-
-        def add_latency(message: Any) -> None:
-            if self._plots is not None:
-                self._plots.add_latency(age_ms(message.header.stamp), now())
-
-        def reject(rejections: Rejections) -> None:
-            left = [each for each in rejections.rejected if NOT_LEFT_BEHIND not in each.reason]
-            self._rejected.update(rejections.model_copy(update={"rejected": left}))
-            self._recorder.record_events(rejections, now())
-
-        handlers: dict[Topic[Any], list[Callable[[Any], None]]] = {
-            topics.LOG: [self._log.add], topics.COUNTERS: [lambda counters: self._health.count(counters, now())],
-        }
-        for topic in self._topics.decided_by:
-            handlers.setdefault(topic, []).extend((add_latency, self._rejected.update))
-        for topic in self._topics.rejected:
-            handlers.setdefault(topic, []).append(reject)
-        for topic in self._topics.detected:
-            handlers.setdefault(topic, []).append(self._rejected.update)
-        for topic in {topic for kind in self._kinds.values() for topic in kind.TOPICS if topic.kind == "event"}:
-            handlers.setdefault(topic, []).append(partial(self._handle_event, topic))
-        readers = (self._read(*each) for each in handlers.items())
-        return [self.console.run(), self._poll_parameters(), self._poll_published(), *readers]
-
-    async def _read(self, topic: Topic[Any], handlers: list[Callable[[Any], None]]) -> None:
-        if (reader := self._feeds.reader(topic)) is not None:
-            async for message in reader:
-                for handle in handlers:
-                    handle(message)
-
-    def _handle_event(self, topic: Topic[Any], event: Any) -> None:
-        if self._scene is not None:
-            self._scene.handle_event(topic, event)
-        else:
-            self._pending_events.append((topic, event))
+        return [self.console.run(), self._poll_parameters(), self._poll_published(),
+                *self._subscriptions.tasks(age_ms)]
 
     async def _poll_published(self) -> None:
         """Offer layers and images once their topics are published; a restart of the publisher changes nothing."""
@@ -363,7 +304,7 @@ class Page:
     async def _poll_parameters(self) -> None:
         while True:
             if self.pages:
-                self._tuning.show(await self.console.parameters())
+                self._panels.tuning.show(await self.console.parameters())
             await asyncio.sleep(1.0)
 
     # --- callbacks ---
@@ -390,7 +331,7 @@ class Page:
 
     async def _go_home(self) -> None:
         if self._move is None:
-            self._task.notify("The page is still loading: try again in a moment.", "busy")
+            self._panels.task.notify("The page is still loading: try again in a moment.", "busy")
         else:
             await self._move.go_home()
 
@@ -400,16 +341,130 @@ class Page:
             self._scene.set_shown(name, on)
         self._select_topics()
 
-    def _forget_rejected(self) -> None:
-        """Forget rejected positions after a reset of the world, if no detections will clear them."""
-        if not self._topics.detected:
-            self._rejected.positions.clear()
-
     def _set_editing(self, on: bool) -> None:
         self._editing = on
         if self._scene is not None:
             self._scene.set_editing(on)
         self._select_topics()
+
+
+class Panels:
+    """The panels that need neither the scene nor topics on demand: main panel, Health, Log, Tuning; and all tabs.
+
+    Attributes:
+        task, controller, health, log, tuning: the panels.
+        tabs: container of each tab; one that the layout leaves out is invisible.
+    """
+
+    def __init__(
+        self, server: viser.ViserServer, console: Console, layout: Layout, cell: str, text: TaskText, *,
+        go_home: Callable[[], Coroutine[Any, Any, None]],
+    ) -> None:
+        """Build the main panel and empty tabs.
+
+        Args:
+            server: that serves the page.
+            console: sends requests to the cell.
+            layout: initial layout.
+            cell: its name.
+            text: texts for the task.
+            go_home: moves the arm to its home pose.
+        """
+        self._gui, self._console, self._layout = server.gui, console, layout
+        gui = server.gui
+        gui.configure_theme(dark_mode=layout.dark, show_logo=False, show_share_button=False)
+        gui.set_panel_label(f"zencell · {cell}")
+        gui.main_panel.dock_right()
+        gui.main_panel.set_width(layout.panel_width)
+        self.task = TaskPanel(gui, console, text, go_home)
+        self.controller = ControllerPanel(gui, console)
+        self.tabs: dict[Tab, viser.GuiTabHandle | viser.GuiFolderHandle] = {}
+
+    def add_tabs(self) -> None:
+        """Add the tabs below the main panel."""
+        panel = self._gui.add_panel()
+        tabs = {name: panel.add_tab(name) for name in self._layout.tabs}
+        panel.dock_below(self._gui.main_panel)
+        hidden = self._gui.add_folder(None, visible=False)
+        self.tabs = {tab: tabs.get(tab, hidden) for tab in TABS}
+
+    def add_diagnostics(self, services: Iterable[str]) -> None:
+        """Fill the tabs Health, Log and Tuning."""
+        with self.tabs["Health"]:
+            self.health = HealthPanel(self._gui, services)
+        with self.tabs["Log"]:
+            self.log = LogPanel(self._gui, self._console, self._layout.log_level)
+        self.tuning = TuningPanel(self._gui, self.tabs["Tuning"], self._console)
+
+
+class Subscriptions:
+    """Handles messages of which every one counts: events, log lines, counters, rejections, latencies.
+
+    Attributes:
+        rejected: positions of rejected targets.
+    """
+
+    def __init__(
+        self, feeds: Feeds, topics_: Topics, layers: Layers, panels: Panels, recorder: HistoryRecorder
+    ) -> None:
+        """Pass messages to the panels and the recorder."""
+        self._feeds, self._topics, self._layers = feeds, topics_, layers
+        self._panels, self._recorder = panels, recorder
+        self.rejected = RejectedPositions()
+        self._scene: Scene | None = None
+        self._plots: PlotPanel | None = None
+        self._pending_events: list[tuple[Topic[Any], Any]] = []  # until there is a scene
+
+    def connect(self, scene: Scene, plots: PlotPanel) -> None:
+        """Pass messages to scene and plots too, and former events to the scene."""
+        self._scene, self._plots = scene, plots
+        for topic, event in self._pending_events:
+            scene.handle_event(topic, event)
+        self._pending_events.clear()
+
+    def clear_rejected(self) -> None:
+        """Forget rejected positions after a reset of the world, if no detections will clear them."""
+        if not self._topics.detected:
+            self.rejected.positions.clear()
+
+    def tasks(self, age_ms: Callable[[int], float]) -> list[Coroutine[Any, Any, None]]:
+        """Return a coroutine for each topic; `age_ms` returns the wall time [ms] since a stamp."""
+        now = asyncio.get_running_loop().time
+
+        def add_latency(message: Any) -> None:
+            if self._plots is not None:
+                self._plots.add_latency(age_ms(message.header.stamp), now())
+
+        def reject(rejections: Rejections) -> None:
+            left = [each for each in rejections.rejected if NOT_LEFT_BEHIND not in each.reason]
+            self.rejected.update(rejections.model_copy(update={"rejected": left}))
+            self._recorder.record_events(rejections, now())
+
+        health, log = self._panels.health, self._panels.log
+        handlers: dict[Topic[Any], list[Callable[[Any], None]]] = {
+            topics.LOG: [log.add], topics.COUNTERS: [lambda counters: health.count(counters, now())],
+        }
+        for topic in self._topics.decided_by:
+            handlers.setdefault(topic, []).extend((add_latency, self.rejected.update))
+        for topic in self._topics.rejected:
+            handlers.setdefault(topic, []).append(reject)
+        for topic in self._topics.detected:
+            handlers.setdefault(topic, []).append(self.rejected.update)
+        for topic in {topic for kind in self._layers.values() for topic in kind.TOPICS if topic.kind == "event"}:
+            handlers.setdefault(topic, []).append(partial(self._handle_event, topic))
+        return [self._read(*each) for each in handlers.items()]
+
+    async def _read(self, topic: Topic[Any], handlers: list[Callable[[Any], None]]) -> None:
+        if (reader := self._feeds.reader(topic)) is not None:
+            async for message in reader:
+                for handle in handlers:
+                    handle(message)
+
+    def _handle_event(self, topic: Topic[Any], event: Any) -> None:
+        if self._scene is not None:
+            self._scene.handle_event(topic, event)
+        else:
+            self._pending_events.append((topic, event))
 
 
 def _prepare_scene(server: viser.ViserServer, layout: Layout, cell: str) -> None:
