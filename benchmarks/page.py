@@ -54,10 +54,10 @@ async def time_stops(cell: RunningCell, page: FakeBrowser, count: int) -> list[t
             began = time.monotonic()
             await page.speak(do="stop", n=1)
             await until(motion, lambda status: status.state == "cancelled")
-            told = time.monotonic() - began
+            confirmed = time.monotonic() - began
             await until(joints, lambda state: max(map(abs, state.velocity)) < REST)
-            times.append((told, time.monotonic() - began))
-            await asyncio.sleep(0.5)  # the task has heard of it too
+            times.append((confirmed, time.monotonic() - began))
+            await asyncio.sleep(0.5)  # the task has received it too
     return times
 
 
@@ -94,7 +94,7 @@ async def measure(name: str, stops: int, opened_times: int) -> None:
                     await pages[0].speak(do="stop", n=1)
         async with opened(port) as page:
             times = await time_stops(cell, page, stops)
-        for what, values in zip(("stop is told", "arm is at rest"), zip(*times, strict=True), strict=True):
+        for what, values in zip(("stop is confirmed", "arm is at rest"), zip(*times, strict=True), strict=True):
             say(f"{what}: median {1e3 * statistics.median(values):.0f} ms, most {1e3 * max(values):.0f} ms")
 
 

@@ -2,7 +2,7 @@
 
     python benchmarks/pictures.py [--pictures 10]
 
-Processor time is told: beside other work it is worth more than how long one waits.
+Reports processor time: with other work on the machine it is more meaningful than wall time.
 """
 
 from __future__ import annotations

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from cli import choices as offers
-from cli import options
+from cli import choices, options
 from cli.target import RUNNING, CellTarget, CommandGroup
 from common.errors import ConfigError, UnknownName
 from common.terminal import echo
@@ -32,7 +31,7 @@ NEGATIVE_NUMBERS = {"ignore_unknown_options": True}  # -0.2 is a coordinate, not
 def call(
     key: Annotated[
         str, typer.Argument(metavar="KEY", help="of a request, as in `zencell topic list`",
-                            autocompletion=offers.requests)
+                            autocompletion=choices.requests)
     ],
     body: Annotated[str, typer.Argument(metavar="JSON", help="its fields; `zencell topic info KEY` has an example")],
     at: CellTarget = RUNNING,
@@ -40,14 +39,14 @@ def call(
 ) -> None:
     """Send a request and print the answer as JSON; exit 1 with one line if there is none."""
     from common.application import all_topics, find_topic
-    from common.client.publishing import checked
+    from common.client.json_codec import message_from_json
     from common.topics import Request
 
     request = find_topic(key)
     if not isinstance(request, Request):
         requests = [name for name, topic in all_topics().items() if isinstance(topic, Request)]
         raise UnknownName("request", key, requests)
-    message = checked(request, key, body)
+    message = message_from_json(request, key, body)
     seconds = options.number("--timeout", timeout)
     if seconds <= 0:
         raise ConfigError("--timeout", timeout, "must be more than 0")
@@ -109,7 +108,7 @@ def stop(at: CellTarget = RUNNING) -> None:
 @task.command()
 def home(
     planner: Annotated[
-        str, typer.Option("--planner", metavar="NAME", help="use only this one", autocompletion=offers.planners)
+        str, typer.Option("--planner", metavar="NAME", help="use only this one", autocompletion=choices.planners)
     ] = "",
     at: CellTarget = RUNNING,
 ) -> None:

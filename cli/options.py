@@ -8,18 +8,18 @@ from typing import Annotated
 
 import typer
 
-from cli import choices as offers
+from cli import choices
 from common.errors import ConfigError
 
 MOST_PER_SECOND = 1000.0  # messages or lines
 
 CellArgument = Annotated[
     str, typer.Argument(metavar="CELL", help="a name of `zencell cells`, or the path of a YAML file",
-                        autocompletion=offers.cells)
+                        autocompletion=choices.cells)
 ]
 CellName = Annotated[
     str | None, typer.Option("--cell", metavar="NAME", help="which cell; not needed while only one is up",
-                              autocompletion=offers.cells)
+                              autocompletion=choices.cells)
 ]
 Domain = Annotated[
     str | None,
@@ -53,7 +53,7 @@ Secure = Annotated[
 ]
 PublishedKey = Annotated[
     str, typer.Argument(metavar="KEY", help="as in `zencell topic list`, without the cell",
-                        autocompletion=offers.published)
+                        autocompletion=choices.published)
 ]
 Json = Annotated[bool, typer.Option("--json", help="one JSON object a line")]
 Count = Annotated[str | None, typer.Option("--count", "-n", metavar="N", help="stop after N")]
@@ -64,11 +64,11 @@ Overrides = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="PATH=VALUE",
                  help="any value of the cell, as world.count=5, or those of a YAML file, as @FILE; repeatable",
-                 autocompletion=offers.overrides),
+                 autocompletion=choices.overrides),
 ]
 WorldName = Annotated[
     str | None, typer.Option("--world", metavar="NAME", help="another world, by name or path",
-                             autocompletion=offers.worlds)
+                             autocompletion=choices.worlds)
 ]
 Seed = Annotated[str | None, typer.Option("--seed", metavar="N", help="of everything random")]
 

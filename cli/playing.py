@@ -80,7 +80,7 @@ def play_(
         if not name:
             raise ConfigError("--cell", ..., f"{file} does not say of which cell it is: name one")
         if not is_cell(name):
-            raise ConfigError("--cell", name, "is no name that a cell can have")
+            raise ConfigError("--cell", name, "is not a valid name of a cell")
         show = rewrite if on_terminal else None
         code = asyncio.run(play(create, recording, played, name, wait or [], domain, connect, echo, show))
     raise typer.Exit(code)

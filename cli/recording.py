@@ -11,8 +11,7 @@ from typing import Annotated
 
 import typer
 
-from cli import choices as offers
-from cli import options
+from cli import choices, options
 from cli.target import RUNNING, CellTarget
 from common.errors import ConfigError
 from common.terminal import echo, rewrite
@@ -23,7 +22,7 @@ LEAST_FILE = 1.0  # [MB] of a recording that is split
 File = Annotated[str, typer.Argument(metavar="FILE.mcap", help="a recording")]
 Keys = Annotated[
     list[str] | None, typer.Argument(metavar="KEY", help="without the cell; * and ** as wildcards",
-                                     autocompletion=offers.published)
+                                     autocompletion=choices.published)
 ]
 Exclude = Annotated[str | None, typer.Option("--exclude", metavar="RE", help="leave out keys in which RE is found")]
 

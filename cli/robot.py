@@ -7,8 +7,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from cli import choices as offers
-from cli import options, robot_new
+from cli import choices, options, robot_new
 from cli.target import RUNNING, CellTarget, CommandGroup
 from common.errors import ConfigError
 from common.terminal import echo
@@ -22,7 +21,7 @@ app.command()(robot_new.check)
 def collisions(
     name: Annotated[
         str, typer.Argument(metavar="ROBOT", help="a name of config/robots, or the path of a YAML file",
-                            autocompletion=offers.robots)
+                            autocompletion=choices.robots)
     ],
     samples: Annotated[str, typer.Option("--samples", metavar="N", help="random configurations")] = "10000",
     margin: Annotated[str, typer.Option("--margin", metavar="M", help="pairs that come this close are checked [m]")]
@@ -168,7 +167,7 @@ def jog(
     at: CellTarget = RUNNING,
 ) -> None:
     """Move the arm by hand for a while: at most 0.25 m/s, and it stands 0.2 s after Ctrl-C or the end of this."""
-    from common.client.arm import check_seconds
+    from common.client.operator_motion import check_seconds
 
     duration = options.number("--seconds", seconds)
     check_seconds(duration, "--seconds")

@@ -13,6 +13,7 @@ import viser
 from pydantic import JsonValue
 
 from common import topics
+from common.client.task import send_task_command, stop_arm_and_task
 from common.config import Members
 from common.errors import RequestFailed
 from common.messages import (
@@ -23,8 +24,6 @@ from common.messages import (
     OwnRequest,
     Parameter,
     ParameterRequest,
-    StopRequest,
-    TaskCommand,
 )
 from common.topics import Request, Topic
 from page.feeds import Feeds
@@ -253,9 +252,8 @@ class Console(ActionQueue):
             acknowledged: newest stop or hold known when this was decided; newer ones stay in force. Default: now.
         """
         acknowledged = self.acknowledged if acknowledged is None else acknowledged
-        fields = {"command": command, "by": self.permissions.client_name, "override": override,
-                  "acknowledged": acknowledged}
-        await self.call(topics.TASK_COMMAND, TaskCommand.model_validate(fields))
+        await send_task_command(self._clients[topics.TASK_COMMAND.key], command, self.permissions.client_name,
+                                override=override, acknowledged=acknowledged, timeout=_TIMEOUT)
 
     async def stop(self) -> str:
         """Stop the arm and end the task, concurrently; return a line with what was stopped.
@@ -265,18 +263,13 @@ class Console(ActionQueue):
         """
         self.stop_count += 1
         client = self.permissions.client_name
-        arm, task = await asyncio.gather(
-            self.call(topics.MOTION_STOP, StopRequest(reason="stopped on the page", owner=client), _FAST_TIMEOUT),
-            self.call(topics.TASK_COMMAND, TaskCommand(command="stop", by=client), _FAST_TIMEOUT),
-            return_exceptions=True,
-        )
-        if isinstance(arm, BaseException):
-            raise arm
-        self._own_stop = arm.newest
-        if isinstance(task, RequestFailed):
-            return f"Arm stopped by {client}; task NOT stopped: {error_text(task)}"
-        if isinstance(task, BaseException):
-            raise task
+        result = await stop_arm_and_task(self._clients[topics.MOTION_STOP.key], self._clients[topics.TASK_COMMAND.key],
+                                         client, "stopped on the page", _FAST_TIMEOUT)
+        if isinstance(result.arm, RequestFailed):
+            raise result.arm
+        self._own_stop = result.arm.newest
+        if isinstance(result.task, RequestFailed):
+            return f"Arm stopped by {client}; task NOT stopped: {error_text(result.task)}"
         return f"Stopped by {client}"
 
     async def own(self, act: Literal["take", "give"], over: bool = False) -> MotionOwner:

@@ -13,7 +13,7 @@ import viser
 from numpy.typing import ArrayLike, NDArray
 from viser import uplot
 
-from common.client.rates import Rates
+from common.client.statistics import Rates
 from common.messages import JointState, LogLine, ServiceCounters, SupervisorStatus
 from page.markup import Html, block, fields, line, row, span, table, text
 from page.status_text import service_state

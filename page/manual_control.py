@@ -16,11 +16,10 @@ import viser
 from numpy.typing import NDArray
 
 from common import topics
-from common.client.arm import NO_WAY
-from common.client.operator_motion import OURSELVES
+from common.client.operator_motion import UNREACHABLE
 from common.config import check
 from common.control.jogging import PAUSE
-from common.messages import UNKNOWN_OPERATOR, GripperCommand, MotionOwner, MotionStatus
+from common.messages import SELF_RELEASING, UNKNOWN_OPERATOR, GripperCommand, MotionOwner, MotionStatus
 from common.robot.transforms import matrix_to_rpy
 from common.time_source import monotonic, new_id
 from page.control_socket import HoldHandler
@@ -157,7 +156,7 @@ class Jogger(HoldHandler):
 
     def _interlocked(self, motion: MotionStatus | None) -> str:
         """Return the stops and holds of other operators."""
-        ours = (self._sender.permissions.client_name, UNKNOWN_OPERATOR, *OURSELVES)
+        ours = (self._sender.permissions.client_name, UNKNOWN_OPERATOR, *SELF_RELEASING)
         interlocks = motion.interlocks if motion is not None else []
         return "; ".join(f"the arm is {one.description}" for one in interlocks if one.by not in ours)
 
@@ -169,7 +168,7 @@ class Jogger(HoldHandler):
             return ""
         if self._moved and owner.kind == "none" and not owner.jogging:
             return "the connection was interrupted (slow network or busy machine): press the button again"
-        return f"{NO_WAY}; the motion is {owner.description}"
+        return f"{UNREACHABLE}; the motion is {owner.description}"
 
 
 class JogPanel:

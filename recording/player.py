@@ -10,7 +10,7 @@ from collections.abc import AsyncIterator, Callable
 from typing import TYPE_CHECKING, Protocol
 
 from common.client.joining import is_listening
-from common.client.publishing import writers_of
+from common.client.keys import writers_of
 from common.clock import Clock
 from common.errors import ConfigError
 from common.remapping import is_key

@@ -11,8 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from common.application import find_topic
-from common.client.foreign import require_messages
-from common.client.keys import published
+from common.client.keys import published_topic, require_messages
 from common.supervision.lifecycle import Interrupts
 from common.transport.bus import Bus
 from common.transport.credentials import RECORDER
@@ -59,7 +58,7 @@ def require_published(selection: Selection) -> None:
     """
     for key in selection.keys:
         if find_topic(key) is not None:
-            published(key)
+            published_topic(key)
 
 
 async def record_gated(

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from common.messages.basics import (
     SCHEMA_VERSION,
+    SELF_RELEASING,
     UNKNOWN_OPERATOR,
     Color,
     Finite,

@@ -111,6 +111,7 @@ Plain = Annotated[JsonValue, PlainValidator(_plain)]  # any JSON value
 
 # Former names, which older programs, recordings and record files still contain: read, never written.
 UNKNOWN_OPERATOR = "operator"  # name of an operator who gives none, and `by` of an operator's requests
+SELF_RELEASING = ("watchdog", "controller", "scene_monitor")  # values of `by` whose holds end without an operator
 FORMER_FIELDS: Mapping[str, str] = {"acknowledged": "heard", "interlocks": "inhibits"}
 _FORMER_OPERATOR = "person"
 

@@ -115,7 +115,7 @@ class BackgroundSaver:
         self._newest: SimulationState | None = None
         self._ends = False
         self._changed = threading.Condition()
-        self._thread = threading.Thread(target=self._work, name="standing", daemon=True)
+        self._thread = threading.Thread(target=self._work, name="state-file", daemon=True)
         self._thread.start()
 
     def save(self, state: SimulationState) -> None:

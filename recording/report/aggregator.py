@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from common import topics as t
 from common.application import Application, applications
-from common.client.rates import Rates
+from common.client.statistics import Rates
 from common.config import RobotConfig
 from common.messages import Message, TaskStatus
 from common.time_source import monotonic

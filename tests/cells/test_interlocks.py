@@ -56,9 +56,9 @@ async def test_stop_survives_killed_supervisor_and_executor(place: Place) -> Non
         await asyncio.to_thread(place.say, "task", "stop")
     kill_all(command)
     command = place.start("up", *PANDA)
-    command.until("Motions go at 5 % of their speed")
+    command.until("Motions run at 5 % of their speed")
     line = command.until("panda is stopped since")
-    assert "`zencell task start` lets it go on" in line and "@" in line
+    assert "`zencell task start` lets it continue" in line and "@" in line
     async with connect(cell="panda", service="watcher", endpoint=endpoint_of(place.domain), timeout=PATIENCE) as bus:
         joints, motion = bus.reader(topics.JOINT_STATES), bus.reader(topics.MOTION_STATUS)
         await assert_still(joints)
@@ -71,5 +71,5 @@ async def test_stop_survives_killed_supervisor_and_executor(place: Place) -> Non
     command.interrupt()
     assert command.end() == 0
     run = place.start("run", *PANDA)
-    run.until("Let go: panda was stopped since")
+    run.until("Released: panda was stopped since")
     assert run.end() == 0

@@ -1,4 +1,4 @@
-"""From a calibration to places in the world: a camera whose lens and pose nobody told the cell but the board."""
+"""From a calibration to positions in the world: the cell uses the lens and pose found with the board."""
 
 import asyncio
 from contextlib import AsyncExitStack

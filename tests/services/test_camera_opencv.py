@@ -146,14 +146,14 @@ async def test_vanished_device_is_reported_and_reopened(monkeypatch, intrinsics,
 
 
 @pytest.mark.parametrize(
-    ("make", "told"),
+    ("make", "message"),
     [
         (lambda p: p / "nothing.mp4", "is not a device number, /dev path, video file or image folder"),
         (lambda p: p, "contains no image"),
     ],
 )
-def test_unknown_source_is_named_with_the_choices(tmp_path, make, told):
-    with pytest.raises(ConfigError, match=told):
+def test_unknown_source_is_named_with_the_choices(tmp_path, make, message):
+    with pytest.raises(ConfigError, match=message):
         open_source(str(make(tmp_path)), (64, 48), 10, loop=True)
 
 
@@ -170,7 +170,7 @@ def test_missing_device_is_none():
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("content", "message"),
     [
         ("width: 64", "height"),
         ("{width: 64, height: 48, fx: -1, fy: 50, cx: 32, cy: 24}", "fx"),
@@ -179,10 +179,10 @@ def test_missing_device_is_none():
         ("width: [", "does not parse"),
     ],
 )
-def test_invalid_intrinsics_are_named(tmp_path, text, told):
+def test_invalid_intrinsics_are_named(tmp_path, content, message):
     path = tmp_path / "camera.yaml"
-    path.write_text(text)
-    with pytest.raises(ConfigError, match=told):
+    path.write_text(content)
+    with pytest.raises(ConfigError, match=message):
         CameraFile.load(str(path))
 
 

@@ -194,7 +194,7 @@ async def test_color_depth_points_and_intrinsics_are_published(camera: FakeCamer
     assert age >= 0.2  # it was exposed before it came
 
 
-async def told(log: Reader[LogLine], line: str) -> None:
+async def wait_for_line(log: Reader[LogLine], line: str) -> None:
     """Return when a line of the log begins so."""
     async for message in log:
         if message.message.startswith(line):
@@ -207,11 +207,11 @@ async def test_unplugged_realsense_is_reported_and_reopened(camera: FakeCamera) 
     images, log = bus.reader(topics.DEPTH_CAMERA_IMAGE), bus.reader(topics.LOG)
     camera.plugged = False
     async with running_service(net, real_depth_camera.run, config_of(), name="camera"), asyncio.timeout(30):
-        await told(log, f"camera {DRIVER}: no RealSense is plugged in; opening it again in 0.01 s")
+        await wait_for_line(log, f"camera {DRIVER}: no RealSense is plugged in; opening it again in 0.01 s")
         camera.plugged = True
         first = await images.next()
         camera.plugged = False
-        await told(log, f"camera {DRIVER}: Frame didn't arrive within 1000; opening it again in 0.01 s")
+        await wait_for_line(log, f"camera {DRIVER}: Frame didn't arrive within 1000; opening it again in 0.01 s")
         camera.plugged = True
         again = await images.next()
         while camera.opened < 2:  # the newest picture from before may not have been read yet
@@ -221,7 +221,7 @@ async def test_unplugged_realsense_is_reported_and_reopened(camera: FakeCamera) 
 
 async def test_distorted_lens_is_rejected_and_depth_lens_is_selectable(camera: FakeCamera) -> None:
     camera.coeffs = [0.1, 0.0, 0.0, 0.0, 0.0]
-    with pytest.raises(ConfigError, match=r"options\.align: 'color' has distortion .* cannot have: depth"):
+    with pytest.raises(ConfigError, match=r"options\.align: 'color' has distortion .* corrected: choose depth"):
         async with running_service(LocalNetwork(), real_depth_camera.run, config_of(), name="camera"):
             await asyncio.sleep(10)
     net = LocalNetwork()
@@ -236,10 +236,10 @@ async def test_unsupported_mode_is_reported_with_the_request(camera: FakeCamera)
     log = net.bus().reader(topics.LOG)
     asked = config_of((128, 96))
     async with running_service(net, real_depth_camera.run, asked, name="camera"), asyncio.timeout(30):
-        await told(log, f"camera {DRIVER}: 128x96 at 30 Hz: Couldn't resolve requests; opening it again in")
+        await wait_for_line(log, f"camera {DRIVER}: 128x96 at 30 Hz: Couldn't resolve requests; opening it again in")
 
 
-@pytest.mark.parametrize(("given", "told"), [
+@pytest.mark.parametrize(("options", "message"), [
     ({"driver": ""}, "services.camera.driver: '' must be one of oak, realsense, or the dotted name of a module"),
     ({"driver": "my_pkg.nothing"}, "services.camera.driver: 'my_pkg.nothing' cannot be imported: No module named"),
     ({"driver": "common.errors"}, "'common.errors' is no camera driver: it lacks Options, open_camera"),
@@ -247,12 +247,12 @@ async def test_unsupported_mode_is_reported_with_the_request(camera: FakeCamera)
     ({"options": {"speed": 3}}, "services.camera.options.speed: "),
 ])
 async def test_unknown_driver_or_option_is_a_one_line_error(
-    camera: FakeCamera, given: dict[str, Any], told: str,
+    camera: FakeCamera, options: dict[str, Any], message: str,
 ) -> None:
     with pytest.raises(ConfigError) as refused:
-        async with running_service(LocalNetwork(), real_depth_camera.run, config_of(**given), name="camera"):
+        async with running_service(LocalNetwork(), real_depth_camera.run, config_of(**options), name="camera"):
             await asyncio.sleep(10)
-    assert told in str(refused.value) and "\n" not in str(refused.value)
+    assert message in str(refused.value) and "\n" not in str(refused.value)
 
 
 async def test_frame_of_unexpected_shape_is_a_one_line_error(
@@ -287,7 +287,7 @@ def drawn() -> RgbdFrame:
     view = Renderer(cell.world, camera=camera).render(objects)
     depth = view.depth_within(0.1, 10.0)
     depth[:, 3] = np.nan
-    assert len(np.unique(depth[np.isfinite(depth)])) > 1, "something stands there"
+    assert len(np.unique(depth[np.isfinite(depth)])) > 1, "an object is visible"
     return RgbdFrame(view.colour, depth)
 
 
@@ -412,11 +412,11 @@ async def test_unplugged_oak_is_reported_and_reopened(monkeypatch: pytest.Monkey
     fake.plugged = False
     async with running_service(net, real_depth_camera.run, config_of(driver="oak", options={}), name="camera"):
         async with asyncio.timeout(30):
-            await told(log, "camera oak: No available devices; opening it again in")
+            await wait_for_line(log, "camera oak: No available devices; opening it again in")
             fake.plugged = True
             await images.next()
             fake.plugged = False
-            await told(log, "camera oak: queue was closed; opening it again in")
+            await wait_for_line(log, "camera oak: queue was closed; opening it again in")
             fake.plugged = True
             while not fake.closed:
                 await images.next()

@@ -53,7 +53,7 @@ def test_every_plan_has_malformed_messages_and_some_have_each_other_fault():
         fault for fault in make_plan(1, ["one"]).faults if fault.kind not in LAST)
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_run_that_an_operator_leaves_stopped_ends_at_standstill():
     outcomes = (outcome_of("panda", seed) for seed in range(1, 101))  # about every tenth
     left = []
@@ -89,7 +89,7 @@ def test_same_seed_is_the_same_run_with_doubles():
     assert outcome_of("panda", 2).digest == outcome_of("panda", 2).digest
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 @pytest.mark.parametrize("bug", DECISIONS)
 def test_interlock_bug_is_found_within_tens_of_seeds(bug):
     [seed], report = found_in("panda", bug, range(1, 401), enough=1)  # the rarest is seen in one of thirty

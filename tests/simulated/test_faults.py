@@ -63,7 +63,8 @@ def test_campaign_replaces_worker_processes(monkeypatch):
 AT_ONCE = ["what is not newer is read", "the task reads the truth", "a request that waits without end"]
 
 
-@pytest.mark.parametrize("bug", [bug if bug in AT_ONCE else pytest.param(bug, marks=pytest.mark.slow) for bug in BUGS])
+@pytest.mark.parametrize(
+    "bug", [bug if bug in AT_ONCE else pytest.param(bug, marks=pytest.mark.campaign) for bug in BUGS])
 def test_known_bug_is_found_within_tens_of_seeds(bug):
     assert found_within(bug, 400 if bug in RARE else 30) is not None
 

@@ -102,7 +102,7 @@ def no_processes() -> Iterator[None]:
 
 def _run_to_end(operation: CellSession) -> int:
     async def work(bus: Bus) -> None:
-        collector = Collector(bus, operation.fold, 0.0, lambda line: None)
+        collector = Collector(bus, operation.aggregator, 0.0, lambda line: None)
         async with beside(collector.run()):
             if not operation.cell.run.autostart:
                 await bus.client(topics.TASK_COMMAND).call(TaskCommand(command="start"))
@@ -113,6 +113,6 @@ def _run_to_end(operation: CellSession) -> int:
     assert not outcome.broken and not outcome.crashes, outcome
     operation.summary.restarts = outcome.restarts
     operation.write_summary()
-    for line in describe(operation.summary.as_dict(), operation.fold.figures):
+    for line in describe(operation.summary.as_dict(), operation.aggregator.figures):
         typer.echo(line)
     return 0 if operation.summary.state == "DONE" else 1

@@ -91,14 +91,14 @@ async def skews_of(bus: Bus, clock: Clock, services: set[str]) -> dict[str, Skew
 
 
 async def _all_skews(endpoint: str) -> dict[str, dict[str, Skew]]:
-    from common.client.joining import TOOL, alive, cell_clock
+    from common.client.joining import TOOL, cell_clock, ready_services
     from common.errors import NoRouter
     from common.transport.zenoh_session import connect
 
     services: dict[str, set[str]] = {}
     try:
         async with connect(cell="_", service=TOOL, endpoint=endpoint, timeout=TIMEOUT) as bus:
-            for cell, service in await alive(bus):
+            for cell, service in await ready_services(bus):
                 services.setdefault(cell, set()).add(service)
         found = {}
         for cell, names in services.items():

@@ -71,7 +71,7 @@ def versions(endpoint: str) -> Iterator[Finding]:
 async def schema_problems(endpoint: str) -> dict[str, str]:
     """Return the problem with the message version by running cell; empty if there is none."""
     from common import topics
-    from common.client.joining import TOOL, alive
+    from common.client.joining import TOOL, ready_services
     from common.errors import DecodeError, NoRouter
     from common.messages import SupervisorStatus
     from common.transport.codec import decode, decode_attachment
@@ -80,7 +80,7 @@ async def schema_problems(endpoint: str) -> dict[str, str]:
     found: dict[str, str] = {}
     try:
         async with connect(cell="_", service=TOOL, endpoint=endpoint, timeout=TIMEOUT) as bus:
-            for cell in {name for name, _ in await alive(bus)}:
+            for cell in {name for name, _ in await ready_services(bus)}:
                 found[cell] = ""
                 for sample in await bus.raw_get(f"{cell}/{topics.SUPERVISOR_STATUS.key}", TIMEOUT):
                     try:

@@ -68,10 +68,10 @@ def test_swept_region_is_occluded_until_an_image_is_taken_at_standstill(robot: R
     below = [(0.15, 0.0, 0.03)]
     first = before.in_image(ABOVE, 100, home, 100)
     moving = before.in_image(ABOVE, 150, turned, 200)
-    stands = before.in_image(ABOVE, 250, turned, 300)
-    assert first is not None and moving is not None and stands is not None
-    assert [bool(one.occludes(below, 0.03)[0]) for one in (first, moving, stands)] == [True, True, False]
-    assert before.in_image(ABOVE, 350, turned, 400) is stands and stands.by == BY_ROBOT
+    at_rest = before.in_image(ABOVE, 250, turned, 300)
+    assert first is not None and moving is not None and at_rest is not None
+    assert [bool(one.occludes(below, 0.03)[0]) for one in (first, moving, at_rest)] == [True, True, False]
+    assert before.in_image(ABOVE, 350, turned, 400) is at_rest and at_rest.by == BY_ROBOT
 
 
 def test_occlusion_is_unknown_without_joint_readings(robot: RobotModel) -> None:

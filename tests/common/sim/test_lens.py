@@ -81,7 +81,7 @@ def test_moving_object_is_extrapolated_back_within_the_exposure():
     now = 200_000_000
     assert movement.objects(0.02, now)[0].pose.position.x == pytest.approx(0.418)
     assert movement.objects(0.0, now)[0].pose.position.x == pytest.approx(0.42)
-    assert movement.objects(0.02, now + 500_000_000)[0].pose.position.x == pytest.approx(0.42), "it stands by now"
+    assert movement.objects(0.02, now + 500_000_000)[0].pose.position.x == pytest.approx(0.42), "too old"
 
 
 def test_repositioned_object_has_no_velocity():

@@ -11,7 +11,7 @@ from applications.pick_place.topics import (
 )
 from common import topics
 from common.application import find_application
-from common.client.rates import MOST_SERVICES, Rates
+from common.client.statistics import MOST_SERVICES, Rates
 from common.clock import Clock
 from common.messages import (
     Header,

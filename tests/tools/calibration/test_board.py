@@ -51,7 +51,7 @@ def test_page_has_the_stated_size_and_shows_the_board():
 
 
 @pytest.mark.parametrize(
-    ("printed", "kind", "told"),
+    ("printed", "kind", "reason"),
     [
         (BoardOptions(columns=6, rows=5), "other board", "differs from a board of 7x5 squares"),
         (BoardOptions(columns=10, rows=7, square=0.025, marker=0.019), "other board", "is not on a board of 7x5"),
@@ -59,10 +59,10 @@ def test_page_has_the_stated_size_and_shows_the_board():
         (BoardOptions(dictionary="5x5_50"), "nothing", "no marker is visible"),
     ],
 )
-def test_other_boards_are_recognized(printed, kind, told):
+def test_other_boards_are_recognized(printed, kind, reason):
     board = Board(printed)
     found = BOARD.find(render(board, LENS, facing(board, 0, 0, 0.4, 0.2, 0.2)), "a picture")
-    assert isinstance(found, NoBoard) and found.kind == kind and told in found.reason
+    assert isinstance(found, NoBoard) and found.kind == kind and reason in found.reason
 
 
 def test_missing_board_and_blur_are_distinguished():
@@ -97,7 +97,7 @@ def test_uneven_light_moves_no_corner():
 
 
 @pytest.mark.parametrize(
-    ("values", "told"),
+    ("values", "reason"),
     [
         ({"marker": 0.036}, "must be 0.4 to 0.95 of square"),
         ({"columns": 20, "rows": 20}, "squares need 200 markers; dictionary has 50"),
@@ -105,6 +105,6 @@ def test_uneven_light_moves_no_corner():
         ({"square": float("nan")}, "square"),
     ],
 )
-def test_impossible_board_is_a_one_line_error(values, told):
-    with pytest.raises(ConfigError, match=told):
+def test_impossible_board_is_a_one_line_error(values, reason):
+    with pytest.raises(ConfigError, match=reason):
         check(BoardOptions, values)

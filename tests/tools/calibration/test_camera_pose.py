@@ -60,9 +60,9 @@ def test_several_board_poses_reduce_error_and_uncertainty(places):
 
 def test_upright_rotated_board_is_supported():
     looks_ahead = transform(rpy_to_matrix(-np.pi / 2, 0, -np.pi / 2), (0.0, 0.0, 0.5))  # along +x, upright
-    stands = transform(rpy_to_matrix(np.pi / 2, 0, -np.pi / 2 + 0.3), (0.7, 0.12, 0.4))
-    pictures = [("a", render(BOARD, LENS, invert(looks_ahead) @ stands))]
-    found = calibrate_pose([(stands, detect_boards(BOARD, pictures, CAMERA)[0])], CAMERA)
+    upright = transform(rpy_to_matrix(np.pi / 2, 0, -np.pi / 2 + 0.3), (0.7, 0.12, 0.4))
+    pictures = [("a", render(BOARD, LENS, invert(looks_ahead) @ upright))]
+    found = calibrate_pose([(upright, detect_boards(BOARD, pictures, CAMERA)[0])], CAMERA)
     distance, angle = errors(found, looks_ahead)
     assert distance < 2e-3 and angle < 0.1
 

@@ -2,37 +2,38 @@ import pytest
 
 from cli.main import app
 from common import topics
-from common.client.keys import published_or_foreign
-from common.client.publishing import checked, stamped
+from common.client.json_codec import message_from_json, stamped
+from common.client.keys import published_topic
 from common.clock import Clock
 from common.errors import ConfigError, UnknownName
 
 CLOCK = Clock(2.0, 1_000)
 
 
-def test_header_that_is_left_out_gets_the_time_of_the_cell() -> None:
-    message = checked(topics.GRIPPER_STATE, "gripper/state", '{"width": 0.04}')
+def test_missing_header_gets_the_cell_time() -> None:
+    message = message_from_json(topics.GRIPPER_STATE, "gripper/state", '{"width": 0.04}')
     before = CLOCK.now_ns()
     first, second = stamped(message, CLOCK), stamped(message, CLOCK)
     assert before <= first.header.stamp < second.header.stamp <= CLOCK.now_ns()
     assert message.header.stamp == 0
 
 
-def test_header_that_must_be_there_may_be_left_out_too() -> None:
-    message = checked(topics.JOINT_STATES, "joint_states", '{"name": ["a"], "position": [1]}')
+def test_required_header_may_be_omitted() -> None:
+    message = message_from_json(topics.JOINT_STATES, "joint_states", '{"name": ["a"], "position": [1]}')
     assert stamped(message, CLOCK).header.stamp > 0
 
 
-def test_stamp_and_frame_that_are_given_are_kept() -> None:
-    message = checked(topics.GRIPPER_STATE, "gripper/state", '{"header": {"stamp": 7, "frame_id": "x"}, "width": 0}')
+def test_given_stamp_and_frame_are_preserved() -> None:
+    message = message_from_json(topics.GRIPPER_STATE, "gripper/state",
+                                '{"header": {"stamp": 7, "frame_id": "x"}, "width": 0}')
     assert stamped(message, CLOCK).header == message.header
-    message = checked(topics.GRIPPER_STATE, "gripper/state", '{"header": {"frame_id": "x"}, "width": 0}')
+    message = message_from_json(topics.GRIPPER_STATE, "gripper/state", '{"header": {"frame_id": "x"}, "width": 0}')
     assert stamped(message, CLOCK).header.frame_id == "x"
     assert stamped(message, CLOCK).header.stamp > 7
 
 
-def test_headers_within_a_message_are_stamped_as_well() -> None:
-    message = checked(topics.TF, "tf", '{"transforms": [{"header": {"frame_id": "a"}, "child_frame_id": "b",'
+def test_nested_headers_are_stamped() -> None:
+    message = message_from_json(topics.TF, "tf", '{"transforms": [{"header": {"frame_id": "a"}, "child_frame_id": "b",'
                                        ' "transform": {"position": {"x": 1}}}]}')
     (transform,) = stamped(message, CLOCK).transforms
     assert transform.header.stamp > 0
@@ -40,8 +41,9 @@ def test_headers_within_a_message_are_stamped_as_well() -> None:
     assert transform.transform.position.x == 1
 
 
-def test_key_of_ones_own_takes_any_json() -> None:
-    assert checked(None, "my/key", "[1, null, {\"a\": {\"base64\": \"AAE=\"}}]") == [1, None, {"a": b"\x00\x01"}]
+def test_unknown_key_takes_any_json() -> None:
+    assert message_from_json(
+        None, "my/key", "[1, null, {\"a\": {\"base64\": \"AAE=\"}}]") == [1, None, {"a": b"\x00\x01"}]
 
 
 @pytest.mark.parametrize(("body", "wanted"), [
@@ -51,24 +53,24 @@ def test_key_of_ones_own_takes_any_json() -> None:
     ('{"width": "wide"}', r"gripper/state.width: 'wide' must be a valid number"),
     ('{"header": 3, "width": 1}', r"gripper/state.header: 3"),
 ])
-def test_what_is_no_message_names_the_field_and_what_would_do(body: str, wanted: str) -> None:
+def test_invalid_message_names_the_field_and_the_choices(body: str, wanted: str) -> None:
     with pytest.raises(ConfigError, match=wanted):
-        checked(topics.GRIPPER_STATE, "gripper/state", body)
+        message_from_json(topics.GRIPPER_STATE, "gripper/state", body)
 
 
 @pytest.mark.parametrize("key", ["/joint_states", "joint_states/", "joint//states", "joint_states?", "joint states"])
-def test_what_can_be_no_key_is_told_before_anything_is_listened_to(key: str) -> None:
+def test_invalid_key_is_refused_with_a_suggestion(key: str) -> None:
     with pytest.raises(UnknownName, match=r"did you mean 'joint_states'\?"):
-        published_or_foreign(key)
-    assert published_or_foreign("my/**") is published_or_foreign("my/*/key") is None
+        published_topic(key)
+    assert published_topic("my/**") is published_topic("my/*/key") is None
 
 
 @pytest.mark.parametrize(("body", "wanted"), [
     ("[" * 100_000, "is not JSON"), ('{"a": 1' + 30 * "0" + "}", "cannot be sent"),
 ])
-def test_json_that_no_message_can_hold_is_told_in_one_line(body: str, wanted: str) -> None:
+def test_json_that_cannot_be_sent_is_refused(body: str, wanted: str) -> None:
     with pytest.raises(ConfigError, match=wanted):
-        checked(None, "my/key", body)
+        message_from_json(None, "my/key", body)
 
 
 @pytest.mark.parametrize(("arguments", "wanted"), [
@@ -79,7 +81,7 @@ def test_json_that_no_message_can_hold_is_told_in_one_line(body: str, wanted: st
     (["pub", "tf", "{}", "--count", "0"], "--count: '0'"),
     (["delay", "motion/stop"], "unknown published key 'motion/stop'"),
 ])
-def test_what_can_not_be_asked_for_is_one_line(
+def test_bad_input_is_one_line(
     arguments: list[str], wanted: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert app.execute(["topic", *arguments]) == 2

@@ -1,24 +1,21 @@
-"""Says what will not work in a cell, before anything moves."""
+"""`check` and `doctor`: what will not work in a cell, and what is wrong with this machine."""
 
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING
+from dataclasses import asdict
 
 import typer
 
 from cli import options
 from common.terminal import echo
 
-if TYPE_CHECKING:
-    pass
-
 
 def check(
     cell: options.CellArgument, overrides: options.Overrides = None, world: options.WorldName = None,
     seed: options.Seed = None, as_json: options.Json = False,
 ) -> None:
-    """Say what will not work in a cell: places out of reach, cameras that see nothing, keys of nobody; exit 1 if so.
+    """Report what will not work in a cell: unreachable positions, blind cameras, keys without writer; exit 1 if any.
 
     Nothing is started and nothing moves. Exit 0 without errors, also with warnings.
     """
@@ -42,3 +39,21 @@ def check(
 
 def _counted(count: int, what: str) -> str:
     return f"{count or 'no'} {what}{'' if count == 1 else 's'}"
+
+
+def doctor(
+    domain: options.Domain = None, connect: options.Connect = None, as_json: options.Json = False
+) -> None:
+    """Check this machine and say how to fix each problem; exit 1 if a check fails."""
+    from common.transport.endpoint import endpoint_of
+    from tools.doctor.examination import examine
+
+    failed = False
+    for finding in examine(endpoint_of(domain, connect)):
+        if as_json:
+            echo(json.dumps(asdict(finding)))
+        else:
+            echo(f"{finding.level:<4}  {finding.what}{f': {finding.remedy}' if finding.remedy else ''}")
+        failed |= finding.level == "fail"
+    if failed:
+        raise typer.Exit(1)
