@@ -121,7 +121,7 @@ async def test_terminal_jogs_the_arm_and_releases_it_when_killed(up: RunningCell
     (["take"], "the motion is .* \\(operator\\) since .* UTC\n"), (["give"], "the motion is free\n"),
     (["give"], "the motion is free\n"),
     (["jog"], "zencell: jog: needs --joint NAME=V, --linear X,Y,Z or --angular X,Y,Z\n"),
-    (["jog", "--linear", "1,2"], "zencell: --linear: '1,2' must be three numbers apart by commas, as 0.3,-0.1,0\n"),
+    (["jog", "--linear", "1,2"], "zencell: --linear: '1,2' must be three numbers separated by commas, such as 0.3,-0.1,0\n"),
     (["jog", "--joint", "nose=1"], "zencell: unknown joint 'nose'; choices: panda_finger_joint1, .*\n"),
     (["jog", "--linear", "0,0,1", "--frame", "moon"], "zencell: jog.frame: 'moon' must be .*\n"),
     (["jog", "--linear", "0,0,1", "--seconds", "99"],
