@@ -342,7 +342,7 @@ def start(line: str, folder: Path, env: dict[str, str]) -> subprocess.Popen[str]
 def test_custom_layer_is_drawn_on_the_page(folder: Path) -> None:
     server = make_server("127.0.0.1", 0)
     try:
-        stage = Stage(server, "panda", own=["my_pkg.hand_width"])
+        stage = Stage(server, "panda", custom=["my_pkg.hand_width"])
         stage.say(GRIPPER_STATE, m.GripperState(width=0.04))
         label = server.scene.get_handle_by_name("/my_pkg.hand_width/words")
         assert isinstance(label, viser.LabelHandle) and label.text == "40 mm"

@@ -125,10 +125,7 @@ class CollisionWorld:
         if held and not self._lever.max() <= _FARTHEST_HELD:  # pieces of 1 mm of its path would be too many
             raise InvalidShape(f"{held[0][0].id}: the attached object reaches {self._lever.max():.3g} m from a joint; "
                                f"the limit is {_FARTHEST_HELD:g} m")
-        # The TCP may lie outside the hulls, so it has a lever of its own.
-        tcp = robot.model.frames[robot.tcp_frame]
-        point = pin.GeometryObject("tcp", tcp.parentJoint, robot.tcp_frame, tcp.placement, coal.Sphere(1e-6))
-        self._tcp_lever = self.cache.robot.lever(point)
+        self._tcp_lever = _tcp_lever(self.cache.robot)
 
     def _load(
         self, environment: list[CollisionObject], held: list[tuple[CollisionObject, int, Array]],
@@ -356,6 +353,13 @@ class CollisionWorld:
                 return Obstruction("constraint", violation, None)
         pair = hit.pair if hit else ("robot", "scene")
         return Obstruction("collision", f"{pair[0]} collides with {pair[1]}", pair)
+
+
+def _tcp_lever(geometry: RobotGeometry) -> Array:
+    """Return (dof,) [m] how far the TCP moves per radian: it may lie outside the hulls, which have levers too."""
+    frame = geometry.robot.tcp_frame
+    tcp = geometry.robot.model.frames[frame]
+    return geometry.lever(pin.GeometryObject("tcp", tcp.parentJoint, frame, tcp.placement, coal.Sphere(1e-6)))
 
 
 def _split_scene(

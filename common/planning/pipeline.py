@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -56,8 +56,11 @@ FINISHING_SHARE = 0.1  # of the planning time, added to it for timing and checki
 class PlanningPipeline:
     """Answers plan requests one after the other. Not thread-safe."""
 
-    def __init__(self, robot: RobotModel, motion: Motion, pipeline: Pipeline, *, seed: int = 0) -> None:
-        """Load the robot's collision geometry and the planners.
+    def __init__(
+        self, robot: RobotModel, motion: Motion, pipeline: Pipeline, *, seed: int = 0,
+        validator: Callable[..., Fault | None] = validate,
+    ) -> None:
+        """Load the robot's collision geometry and the planners; `validator` checks every timed path.
 
         Raises:
             ConfigError, UnknownName: a planner, an option or a mesh that cannot be used.
@@ -66,6 +69,7 @@ class PlanningPipeline:
         self._motion = motion
         self._pipeline = pipeline
         self._seed = seed
+        self._validate = validator
         self._planners: Planners = {}
         for entry in pipeline.planners:
             self._planners[entry.name.rpartition(".")[2]] = load_planner(entry.name, entry.options)
@@ -291,7 +295,7 @@ class PlanningPipeline:
             yield limit_tool_speed(robot, trajectory, limit)
 
     def _fault(self, problem: Problem, trajectory: TimedPath) -> Fault | None:
-        fault = validate(
+        fault = self._validate(
             trajectory,
             problem.robot,
             problem.world,

@@ -174,7 +174,7 @@ class ExecutionMonitor(TaskDecisions[V]):
             why = "the fingers have not opened yet"
         else:
             self._opening, why = None, f"the fingers did not open: {view.gripper.message}"
-        if state in ("succeeded", "cancelled"):  # whoever commanded the gripper since then handles the result
+        if state in ("succeeded", "cancelled"):  # handled by the later command
             return []
         stop = self.stop(view, why)
         self._opening = None
@@ -194,7 +194,7 @@ class ExecutionMonitor(TaskDecisions[V]):
         if not held or not ours or view.trouble or view.motion.paused or self.status.paused:
             self._obstructed.reset()
             return ""
-        return held[0] if self._obstructed.elapsed("in the way", view.now) >= self.p.obstacle_patience else ""
+        return held[0] if self._obstructed.elapsed("blocked", view.now) >= self.p.obstacle_patience else ""
 
     def _decide_again(self, message: str, view: V) -> None:
         self.clear()

@@ -84,7 +84,7 @@ async def test_outline_survives_a_protective_stop_and_a_pulled_cable(tmp_path: P
             await until(robot, lambda status: status.mode == "running", SOON)
             assert await cell.ended(WHOLE) == 0, cell.tail()
         check_traced(cell, host, stops=1)
-    assert "tester asks the arm: recover" in cell.text
+    assert "tester orders the arm: recover" in cell.text
 
 
 @on_ur
@@ -170,4 +170,4 @@ async def test_balls_are_placed_despite_a_reflex_silences_and_a_controller_resta
     summary = cell.summary
     assert summary["state"] == "DONE" and summary["failures"] == 0, cell.text
     assert summary["placed"] == summary["truth"]["in_box"] == 7, summary
-    assert "tester asks the arm: recover" in cell.text
+    assert "tester orders the arm: recover" in cell.text

@@ -111,7 +111,7 @@ def test_operators_hold_and_speed_survive_restarts_and_only_the_operator_release
         await bus.client(topics.parameters_of(EXECUTOR)).call(ParameterRequest(set={path: 1.0}, by="anna"))
         await command(bus, "resume", "bert", override=True)
         await until(motion, lambda m: not m.held)
-        assert any("bert let go of what another said: held since" in line for line in cell.lines)
+        assert any("bert released an interlock of another operator: held since" in line for line in cell.lines)
 
     summary = SimulatedCell("panda", ["world.count=1"], visit=visit).summary
     assert summary["state"] == "DONE"

@@ -139,8 +139,10 @@ def test_arm_is_created_without_its_own_gripper_if_another_one_is_named(
 def test_unsuitable_gripper_backend_is_refused_with_the_choices(
     limits: Limits, gripper: dict[str, object], error: str
 ) -> None:
-    with pytest.raises((ConfigError, UnknownName), match=error):
-        load_hardware(robot("mock", gripper), limits, START)
+    config = robot("mock", gripper)
+    for refuse in (is_simulated, lambda config: load_hardware(config, limits, START)):
+        with pytest.raises((ConfigError, UnknownName), match=error):
+            refuse(config)
 
 
 def test_gripper_backend_of_the_user_is_a_dotted_module(monkeypatch: pytest.MonkeyPatch) -> None:

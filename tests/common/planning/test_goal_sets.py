@@ -5,7 +5,7 @@ import pytest
 from pydantic import ValidationError
 
 from common.messages import GoalSet, JointGoal, PlanningScene, PlanRequest, PoseGoal, Vector3
-from common.planning import joint_goals, pipeline
+from common.planning import joint_goals
 from common.planning.pipeline import PlanningPipeline
 from common.planning.problem import Cancel
 from common.planning.validation import Fault, validate
@@ -76,7 +76,7 @@ def test_failure_of_each_line_is_reported():
 
 
 @pytest.mark.parametrize("planner", LINES)
-def test_line_that_fails_validation_is_replaced_by_the_next(planner, monkeypatch):
+def test_line_that_fails_validation_is_replaced_by_the_next(planner):
     lower, lowest = pose(0.31, 0.0, 0.42), pose(0.31, 0.0, 0.37)
     requests = [to_any(goals, straight=True, planner=planner) for goals in ([lowest, lower], [lower])]
     reached = last(PIPELINE.plan(requests[0], TABLE))
@@ -86,11 +86,11 @@ def test_line_that_fails_validation_is_replaced_by_the_next(planner, monkeypatch
         bad = np.allclose(trajectory.positions[-1], reached, atol=1e-6)
         return Fault("collision", "found late") if bad else validate(trajectory, *arguments, **options)
 
-    monkeypatch.setattr(pipeline, "validate", not_to_the_nearest)
-    response = PIPELINE.plan(requests[0], TABLE)
+    pipeline = PlanningPipeline(ROBOT, CELL.motion, CELL.pipeline, validator=not_to_the_nearest)
+    response = pipeline.plan(requests[0], TABLE)
     assert response.ok and response.goal_index == 0, response.message
     assert [attempt.error for attempt in response.attempts] == ["collision", ""]
-    response = PIPELINE.plan(requests[1], TABLE)
+    response = pipeline.plan(requests[1], TABLE)
     assert not response.ok and response.error == "collision"
     assert "none of 1 goals; goal 1: validation: found late" in response.message
 

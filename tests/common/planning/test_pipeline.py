@@ -203,20 +203,20 @@ def test_validation_applies_the_contact_rule_of_planning():
     assert free_again(request, close, response)
 
 
-def test_colliding_blend_is_replaced_by_a_stop(monkeypatch):
+def test_colliding_blend_is_replaced_by_a_stop():
     wall = [*scene(box=False).objects, solid("wall", "fixture", "box", [0.5, 0.02, 0.4], (0.55, 0.0, 0.2))]
     blocked = scene().model_copy(update={"objects": wall})
     left, right = above(0.5, 0.3, 0.2), above(0.5, -0.3, 0.2)
 
-    def strict(trajectory, robot, world, **given):
+    def strict(trajectory, *_, **__):
         resting = np.abs(trajectory.velocities[1:-1]).max(axis=1) < 1e-9
         return None if resting.any() else Fault("collision", "waypoint 5 of 9: a collides with b", 5, ("a", "b"))
 
-    monkeypatch.setattr("common.planning.pipeline.validate", strict)
-    response = PIPELINE.plan(to_joints(left, right, planner="ompl"), blocked)
+    pipeline = PlanningPipeline(ROBOT, CELL.motion, CELL.pipeline, validator=strict)
+    response = pipeline.plan(to_joints(left, right, planner="ompl"), blocked)
     assert response.ok
     assert free_again(to_joints(left, right), blocked, response)
-    direct = PIPELINE.plan(to_joints(HOME, right, planner="ompl"), blocked)
+    direct = pipeline.plan(to_joints(HOME, right, planner="ompl"), blocked)
     assert direct.error == "collision"
     assert direct.message == "ompl: validation: waypoint 5 of 9: a collides with b"
     assert [a.error for a in direct.attempts] == ["", "collision"]

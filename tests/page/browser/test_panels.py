@@ -92,7 +92,7 @@ async def test_object_is_moved_on_the_page_and_the_move_is_undone(bring: Bring, 
         for field, value in zip((fields.nth(0), fields.nth(1)), there, strict=True):
             await field.fill(f"{1e3 * value:.0f}")
             await field.press("Enter")
-        await page.get_by_role("button", name="Move object").click()
+        await page.get_by_role("button", name="Move object", exact=True).click()
         moved = await until(world, lambda truth: positions(truth) != positions(before), PATIENCE)
         (name,) = [name for name, at in positions(before).items() if positions(moved)[name] != at]
         assert positions(before)[name] == pytest.approx((x, y), abs=1e-3)

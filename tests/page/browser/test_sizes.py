@@ -39,7 +39,7 @@ async def controls(page: Page, expected: list[str] | None = None) -> list[str]:
         from playwright.async_api import TimeoutError as NotInTime
 
         with suppress(NotInTime):  # the comparison of the caller shows the difference
-            await page.wait_for_function(f"wanted => ({CONTROLS})().words.join() === wanted", arg=",".join(expected))
+            await page.wait_for_function(f"wanted => ({CONTROLS})().labels.join() === wanted", arg=",".join(expected))
     seen = await page.evaluate(CONTROLS)
     assert not seen["out"], seen["out"]
     await page.wait_for_function(f"() => ({NAMELESS})().length === 0")
@@ -63,7 +63,7 @@ async def test_every_tab_has_the_same_elements_at_every_size_without_overflow(br
                 await page.get_by_text("Color mask", exact=True).wait_for()
                 await page.get_by_text("Depth image", exact=True).wait_for(state="hidden")  # not in this cell
             await check_stop(page)
-            words = await controls(page, offered.get(name))
-            assert words, (size, name)
-            assert set(words) ^ set(offered.setdefault(name, words)) == set(), (size, name)
+            labels = await controls(page, offered.get(name))
+            assert labels, (size, name)
+            assert set(labels) ^ set(offered.setdefault(name, labels)) == set(), (size, name)
     assert not watched.errors

@@ -1,4 +1,4 @@
-"""Fingers that wait for the arm begin by the arm's own time, and nowhere else than near the end of its motion."""
+"""Gripper commands deferred to the end of a motion: they start by the time of the arm, near its end only."""
 
 from __future__ import annotations
 
@@ -74,10 +74,10 @@ class Hand(ExecutorRig):
     def motion(self) -> m.MotionStatus:
         return self.executor.arm.status
 
-    def until(self, told, most: float = 10.0) -> float:
-        """Step until that is so; how long it took [s]."""
+    def until(self, condition, most: float = 10.0) -> float:
+        """Step until the condition holds; return how long that took [s]."""
         began = self.now
-        while not told():
+        while not condition():
             self.step()
             assert self.now - began < most, (self.motion, self.gripper)
         return self.now - began
@@ -101,19 +101,19 @@ def carrying(limits: Limits, rest_to_rest: Make) -> Callable[[], Hand]:
     return lambda: Hand(limits, rest_to_rest, holding=True)
 
 
-def test_fingers_touch_what_they_take_just_after_the_arm_stands(taking: Callable[[], Hand]) -> None:
+def test_closing_fingers_touch_the_object_just_after_the_arm_has_arrived(taking: Callable[[], Hand]) -> None:
     hand = taking()
     assert (hand.begin.state, hand.begin.id) == ("active", "close") and "go" in hand.begin.message
     hand.until(lambda: hand.width < 0.079)
     assert hand.motion.state == "active" and hand.gripper.id == "close"
     hand.until(lambda: hand.motion.state == "succeeded")
-    assert not hand.gripper.holding, "before it stands they touch nothing"
+    assert not hand.gripper.holding, "they touch nothing before it has arrived"
     waited = hand.until(lambda: hand.gripper.state == "succeeded")
     assert waited <= 0.05 and hand.gripper.outcome == "grasped"
 
 
 @pytest.mark.parametrize("delay", [0.05, 0.15, 0.3, 0.5])
-def test_fingers_touch_nothing_before_an_arm_behind_its_set_points_stands(
+def test_fingers_touch_nothing_before_an_arm_with_a_delay_has_arrived(
     limits: Limits, rest_to_rest: Make, delay: float,
 ) -> None:
     hand = Hand(limits, rest_to_rest, holding=False, delay=delay)
@@ -123,7 +123,7 @@ def test_fingers_touch_nothing_before_an_arm_behind_its_set_points_stands(
     assert hand.until(lambda: hand.gripper.state == "succeeded") <= 0.05
 
 
-def test_fingers_that_let_go_do_so_where_the_arm_comes_to_rest(carrying: Callable[[], Hand]) -> None:
+def test_opening_fingers_release_the_object_where_the_arm_comes_to_rest(carrying: Callable[[], Hand]) -> None:
     hand = carrying()
     hand.until(lambda: not hand.gripper.holding)
     assert hand.motion.state == "active" and abs(hand.executor._q[0] + AWAY) <= WITHIN
@@ -131,7 +131,7 @@ def test_fingers_that_let_go_do_so_where_the_arm_comes_to_rest(carrying: Callabl
     assert hand.motion.state == "succeeded" and hand.balls[-1].poses[0].position.x == pytest.approx(0.2, abs=WITHIN)
 
 
-def test_fingers_begin_no_farther_from_the_end_than_they_may(carrying: Callable[[], Hand]) -> None:
+def test_fingers_start_within_the_allowed_distance_of_the_end(carrying: Callable[[], Hand]) -> None:
     hand = carrying()
     hand.command("wide", width=0.08, lead=10.0, within=0.002)
     hand.until(lambda: hand.gripper.id == "wide")
@@ -139,7 +139,7 @@ def test_fingers_begin_no_farther_from_the_end_than_they_may(carrying: Callable[
 
 
 @pytest.mark.parametrize("share", [0.3, 1.0])
-def test_arm_that_is_slower_has_the_fingers_begin_later(taking: Callable[[], Hand], share: float) -> None:
+def test_slower_arm_starts_the_fingers_later(taking: Callable[[], Hand], share: float) -> None:
     hand = taking()
     hand.executor.speed_scaling = share
     hand.until(lambda: hand.gripper.id == "close")
@@ -147,7 +147,7 @@ def test_arm_that_is_slower_has_the_fingers_begin_later(taking: Callable[[], Han
     assert left == pytest.approx(CLOSE, abs=0.03)
 
 
-def test_held_arm_has_no_fingers_begin_and_goes_on_to_where_they_do(taking: Callable[[], Hand]) -> None:
+def test_held_arm_starts_no_fingers_before_it_continues(taking: Callable[[], Hand]) -> None:
     hand = taking()
     hand.until(lambda: hand.motion.progress > 0.5)
     hand.executor.authority.hold(HoldRequest(hold=True, by="operator"), hand.now)
@@ -159,7 +159,7 @@ def test_held_arm_has_no_fingers_begin_and_goes_on_to_where_they_do(taking: Call
 
 
 @pytest.mark.parametrize("by", ["operator", "requester"])
-def test_stop_calls_off_fingers_that_wait(taking: Callable[[], Hand], by: str) -> None:
+def test_stop_cancels_a_deferred_command(taking: Callable[[], Hand], by: str) -> None:
     hand = taking()
     hand.until(lambda: hand.motion.progress > 0.3)
     hand.executor.authority.stop(StopRequest(id="" if by == "operator" else "go", by=by), hand.now)
@@ -171,7 +171,7 @@ def test_stop_calls_off_fingers_that_wait(taking: Callable[[], Hand], by: str) -
     assert hand.width == 0.08
 
 
-def test_stop_of_what_waits_lets_the_arm_arrive_without_it(taking: Callable[[], Hand]) -> None:
+def test_stop_of_a_deferred_command_lets_the_arm_arrive_without_it(taking: Callable[[], Hand]) -> None:
     hand = taking()
     hand.executor.authority.stop(StopRequest(id="close", by="requester"), hand.now)
     hand.until(lambda: hand.motion.state == "succeeded")
@@ -180,7 +180,7 @@ def test_stop_of_what_waits_lets_the_arm_arrive_without_it(taking: Callable[[], 
 
 
 @pytest.mark.parametrize("by", ["operator", "requester"])
-def test_stop_as_the_fingers_close_is_told_of_as_a_stop(taking: Callable[[], Hand], by: str) -> None:
+def test_stop_while_the_fingers_close_is_reported_as_a_stop(taking: Callable[[], Hand], by: str) -> None:
     hand = taking()
     hand.until(lambda: hand.gripper.id == "close")
     hand.executor.authority.stop(StopRequest(id="" if by == "operator" else "go", by=by, reason="enough"), hand.now)
@@ -188,14 +188,14 @@ def test_stop_as_the_fingers_close_is_told_of_as_a_stop(taking: Callable[[], Han
     assert (hand.motion.state, hand.motion.error, hand.motion.message) == ("cancelled", "cancelled", "enough")
 
 
-def test_fingers_that_wait_for_a_goal_that_is_not_followed_are_refused(taking: Callable[[], Hand]) -> None:
+def test_command_deferred_to_an_unknown_goal_is_refused(taking: Callable[[], Hand]) -> None:
     hand = taking()
-    refused = hand.command("other", after="nobody's", width=0.0)
-    assert (refused.state, refused.error) == ("rejected", "unknown_goal") and "nobody's" in refused.message
+    refused = hand.command("other", after="unknown", width=0.0)
+    assert (refused.state, refused.error) == ("rejected", "unknown_goal") and "unknown" in refused.message
     hand.until(lambda: hand.gripper.state == "succeeded" and hand.gripper.id == "close")
 
 
-def test_fingers_that_wait_for_an_arm_that_is_there_begin_at_once(taking: Callable[[], Hand]) -> None:
+def test_command_deferred_to_a_reached_goal_starts_at_once(taking: Callable[[], Hand]) -> None:
     hand = taking()
     hand.until(lambda: hand.motion.state == "succeeded" and hand.gripper.state == "succeeded")
     assert hand.command("open", width=0.08).state == "active"
@@ -203,7 +203,7 @@ def test_fingers_that_wait_for_an_arm_that_is_there_begin_at_once(taking: Callab
     assert hand.gripper.id == "open" and hand.gripper.state == "succeeded"
 
 
-def test_newer_command_takes_the_place_of_one_that_waits(taking: Callable[[], Hand]) -> None:
+def test_newer_command_replaces_a_deferred_one(taking: Callable[[], Hand]) -> None:
     hand = taking()
     hand.command("half", after="", width=0.07)
     hand.run(5.0)
@@ -211,7 +211,7 @@ def test_newer_command_takes_the_place_of_one_that_waits(taking: Callable[[], Ha
     assert hand.command("close", width=0.0).state == "cancelled"
 
 
-def test_newer_command_that_the_fingers_cannot_do_takes_the_place_of_one_that_waits_too(
+def test_newer_command_that_fails_replaces_a_deferred_one_too(
     carrying: Callable[[], Hand], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     hand = carrying()
@@ -221,10 +221,10 @@ def test_newer_command_that_the_fingers_cannot_do_takes_the_place_of_one_that_wa
     assert hand.command("open", width=0.08).state == "cancelled"
     hand.until(lambda: hand.motion.state != "active")
     hand.run(1.0)
-    assert hand.gripper.holding, "nothing was let go"
+    assert hand.gripper.holding, "the object is still held"
 
 
-def test_what_the_fingers_do_is_judged_while_others_wait(carrying: Callable[[], Hand]) -> None:
+def test_running_command_is_checked_while_another_is_deferred(carrying: Callable[[], Hand]) -> None:
     hand = carrying()
     assert hand.gripper.outcome == "grasped" and hand.gripper.id == "close"
     hand.world.edit(m.WorldEdit(op="remove", id="ball_1"), hand.now)
@@ -233,19 +233,19 @@ def test_what_the_fingers_do_is_judged_while_others_wait(carrying: Callable[[], 
     assert hand.gripper.outcome == "slipping" and hand.gripper.id == "close"
 
 
-def test_fingers_that_do_not_work_when_they_are_to_begin_stop_the_arm(
+def test_fingers_that_fail_to_start_stop_the_arm(
     taking: Callable[[], Hand], monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     hand = taking()
     monkeypatch.setattr(hand.hardware.gripper, "command", broken)
     hand.until(lambda: hand.motion.state == "aborted")
     assert hand.motion.error == "hardware_fault" and "no answer" in hand.motion.message
-    told = hand.command("close", width=0.0)
-    assert (told.state, told.error) == ("aborted", "hardware_fault")
+    state = hand.command("close", width=0.0)
+    assert (state.state, state.error) == ("aborted", "hardware_fault")
 
 
 @pytest.mark.parametrize("how", ["held", "slowed", "no processor"])
-def test_arm_does_not_go_on_down_with_fingers_that_closed_ahead_of_it(taking: Callable[[], Hand], how: str) -> None:
+def test_arm_does_not_continue_with_fingers_that_closed_early(taking: Callable[[], Hand], how: str) -> None:
     hand = taking()
     hand.until(lambda: hand.gripper.id == "close")
     if how == "held":
@@ -263,7 +263,7 @@ def test_arm_does_not_go_on_down_with_fingers_that_closed_ahead_of_it(taking: Ca
     assert hand.height == pytest.approx(before, abs=1e-3) and hand.gripper.state != "active"
 
 
-def test_arm_does_not_go_on_down_with_fingers_that_were_to_close_on_whatever_is_there(
+def test_arm_does_not_continue_with_fingers_that_closed_early_on_any_width(
     taking: Callable[[], Hand],
 ) -> None:
     hand = taking()
@@ -277,7 +277,7 @@ def test_arm_does_not_go_on_down_with_fingers_that_were_to_close_on_whatever_is_
     assert hand.motion.error == m.CLOSED_BEFORE and hand.height == pytest.approx(before, abs=1e-3)
 
 
-def test_arm_that_is_held_as_it_lets_go_still_arrives(carrying: Callable[[], Hand]) -> None:
+def test_arm_held_while_the_fingers_open_still_arrives(carrying: Callable[[], Hand]) -> None:
     hand = carrying()
     hand.until(lambda: hand.gripper.id == "open")
     hand.executor.authority.hold(HoldRequest(hold=True, by="operator"), hand.now)
@@ -289,7 +289,7 @@ def test_arm_that_is_held_as_it_lets_go_still_arrives(carrying: Callable[[], Han
 @settings(deadline=None, max_examples=25)
 @given(stalls=st.lists(st.tuples(st.floats(0.0, 1.5), st.floats(0.03, 0.6)), max_size=5), speed=st.floats(0.2, 1.0),
        lead=st.floats(0.0, 1.0))
-def test_wherever_there_is_no_processor_what_is_let_go_falls_where_it_was_to(
+def test_stall_at_any_time_does_not_displace_a_released_object(
     carrying: Callable[[], Hand], stalls: list[tuple[float, float]], speed: float, lead: float,
 ) -> None:
     hand = carrying()
@@ -306,7 +306,7 @@ def test_wherever_there_is_no_processor_what_is_let_go_falls_where_it_was_to(
 
 @settings(deadline=None, max_examples=25)
 @given(at=st.floats(0.0, 0.15), stall=st.floats(0.03, 0.6), speed=st.floats(0.2, 1.0))
-def test_whenever_there_is_no_processor_the_arm_does_not_go_on_with_fingers_that_are_closed(
+def test_stall_at_any_time_does_not_let_the_arm_continue_with_closed_fingers(
     taking: Callable[[], Hand], at: float, stall: float, speed: float,
 ) -> None:
     hand = taking()

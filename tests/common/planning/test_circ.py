@@ -14,16 +14,16 @@ from tests.common.planning.planning_scenes import ROBOT, last, scene, solid
 EMPTY = scene(box=False)
 DX, DY = np.array([0.1, 0, 0]), np.array([0, 0.1, 0])
 START = ROBOT.fk(RIGHT)[:3, 3]
-points = st.tuples(*[st.floats(-1, 1)] * 3).map(np.array)
+POINTS = st.tuples(*[st.floats(-1, 1)] * 3).map(np.array)
 SHARES = np.linspace(0, 1, 101)
 
 
 def to_arc(T, **circle) -> PlanRequest:
-    given = {name: Vector3(x=p[0], y=p[1], z=p[2]) for name, p in circle.items()}
-    return PlanRequest(id="1", start=list(RIGHT), goal=ArcGoal(pose=matrix_to_pose(T), **given))
+    points = {name: Vector3(x=p[0], y=p[1], z=p[2]) for name, p in circle.items()}
+    return PlanRequest(id="1", start=list(RIGHT), goal=ArcGoal(pose=matrix_to_pose(T), **points))
 
 
-@given(start=points, via=points, goal=points)
+@given(start=POINTS, via=POINTS, goal=POINTS)
 def test_circle_passes_its_three_points_in_order(start, via, goal):
     try:
         circle = circle_through(start, via, goal)
@@ -37,7 +37,7 @@ def test_circle_passes_its_three_points_in_order(start, via, goal):
     assert np.allclose(np.linalg.norm(arc - circle.centre, axis=1), circle.radius, atol=1e-6)
 
 
-@given(centre=points, one=points, other=points)
+@given(centre=POINTS, one=POINTS, other=POINTS)
 def test_circle_about_a_centre_takes_the_shorter_arc(centre, one, other):
     assume(min(np.linalg.norm(one), np.linalg.norm(other)) > 0.05)
     one, other = 0.3 * one / np.linalg.norm(one), 0.3 * other / np.linalg.norm(other)
@@ -72,9 +72,7 @@ def test_tool_follows_the_arc_at_its_speed(how):
     response = pipeline.plan(request, EMPTY)
     timed = assert_sound(pipeline, request, EMPTY, response)
     assert np.allclose(ROBOT.fk(last(response)), T, atol=2e-4)
-    circle = circle_about(START, np.array(point), T[:3, 3]) if how == "center" else circle_through(
-        START, np.array(point), T[:3, 3]
-    )
+    circle = (circle_about if how == "center" else circle_through)(START, np.array(point), T[:3, 3])
     path, _ = fine_samples(timed, 0.01)
     way = np.array([ROBOT.fk(q)[:3, 3] for q in path])
     normal = np.cross(circle.x, circle.y)
@@ -94,26 +92,20 @@ def test_colliding_arc_is_reported_with_waypoint_and_pair():
     assert 0.1 < response.fraction < 0.5
 
 
-def test_arc_beyond_the_reach_is_reported_with_its_fraction():
-    response = with_planner("circ").plan(to_arc(tool_down(0.5, 0.3, 0.2), via=(1.0, 0.0, 0.2)), EMPTY)
-    assert response.error == "no_ik"
-    assert 0 < response.fraction < 0.5
+@pytest.mark.parametrize(("planner", "via", "error", "text"), [
+    ("circ", (1.0, 0.0, 0.2), "no_ik", ""),
+    ("circ", (0.5, 0.0, 0.2), "bad_goal", "straight line"),
+    *((name, (0.5, 0.0, 0.5), "no_planner", "") for name in ("cartesian", "joint_move", "lerp", "lin", "ompl", "ptp")),
+])
+def test_impossible_arc_is_refused(planner, via, error, text):
+    response = with_planner(planner).plan(to_arc(tool_down(0.5, 0.3, 0.2), via=via), EMPTY)
+    assert response.error == error
+    assert text in response.message
+    if error == "no_ik":
+        assert 0 < response.fraction < 0.5
 
 
-def test_arc_through_points_on_a_line_is_a_bad_goal():
-    response = with_planner("circ").plan(to_arc(tool_down(0.5, 0.3, 0.2), via=(0.5, 0.0, 0.2)), EMPTY)
-    assert response.error == "bad_goal"
-    assert "straight line" in response.message
-
-
-def test_arc_needs_one_circle():
+@pytest.mark.parametrize("points", [{}, {"via": Vector3(), "center": Vector3()}])
+def test_arc_needs_one_circle(points):
     with pytest.raises(ValidationError, match="either via or center"):
-        ArcGoal(pose=Pose())
-    with pytest.raises(ValidationError, match="either via or center"):
-        ArcGoal(pose=Pose(), via=Vector3(), center=Vector3())
-
-
-@pytest.mark.parametrize("planner", ["cartesian", "joint_move", "lerp", "lin", "ompl", "ptp"])
-def test_other_planners_do_not_accept_arcs(planner):
-    response = with_planner(planner).plan(to_arc(tool_down(0.5, 0.3, 0.2), via=(0.5, 0.0, 0.5)), EMPTY)
-    assert response.error == "no_planner"
+        ArcGoal(pose=Pose(), **points)
