@@ -14,7 +14,7 @@ from cli.target import CommandGroup
 from common.supervision.multi_host import HostOptions
 from common.terminal import echo
 
-app = CommandGroup("Certificates for a cell's processes, and who may do what.")
+app = CommandGroup("Certificates and access rules of a cell's processes.")
 
 DAYS = 365
 SHOWN = ("writes", "reads", "answers", "asks", "passes on")
