@@ -33,7 +33,7 @@ STEP = 0.005  # [rad]
 
 def spans(recording: Path) -> dict[str, list[tuple[float, float]]]:
     """When each goal that was executed began and ended [s], by who executed it."""
-    begun: dict[tuple[str, str], float] = {}
+    started: dict[tuple[str, str], float] = {}
     found: dict[str, list[tuple[float, float]]] = {kind: [] for kind in KINDS.values()}
     with recording.open("rb") as file:
         for _, channel, message in make_reader(file).iter_messages():
@@ -43,13 +43,13 @@ def spans(recording: Path) -> dict[str, list[tuple[float, float]]]:
             said: dict[str, Any] = msgpack.unpackb(message.data)
             goal, stamp = (kind, said["id"]), said["header"]["stamp"] * 1e-9
             if said["id"] and said["state"] == "active":
-                begun.setdefault(goal, stamp)
-            elif said["state"] in ENDS and goal in begun:
-                found[kind].append((begun.pop(goal), stamp))
+                started.setdefault(goal, stamp)
+            elif said["state"] in ENDS and goal in started:
+                found[kind].append((started.pop(goal), stamp))
     return found
 
 
-def told(recording: Path) -> str:
+def report(recording: Path) -> str:
     """A line about a recording."""
     found = spans(recording)
     arm, fingers = (sum(end - begin for begin, end in found[kind]) for kind in ("arm", "fingers"))
@@ -61,16 +61,16 @@ def told(recording: Path) -> str:
 
 def checked(recording: Path) -> str:
     """What the arm touched, in words."""
-    cell, heard = load_cell(CELL), RecordedMotion()
-    fold = RunAggregator(CELL, find_application(cell.application), listeners=heard.listeners())
-    topics = {topic.key: topic for topic in heard.listeners()}
+    cell, motion = load_cell(CELL), RecordedMotion()
+    aggregator = RunAggregator(CELL, find_application(cell.application), listeners=motion.listeners())
+    topics = {topic.key: topic for topic in motion.listeners()}
     with recording.open("rb") as file:
         for _, channel, message in make_reader(file).iter_messages():
             key = channel.topic.partition("/")[2]
             if key in topics:
-                fold.on(key, decode(topics[key].message, message.data), 0.0, 0)
+                aggregator.on(key, decode(topics[key].message, message.data), 0.0, 0)
     recheck = ContactCheck(cell, STEP)
-    contacts = recheck.contacts(heard)
+    contacts = recheck.contacts(motion)
     return "; ".join([f"{len(contacts)} contacts in {recheck.checked:,} positions", *map(str, contacts)])
 
 
@@ -81,7 +81,7 @@ def main() -> None:
     parser.add_argument("--seed", default="1")
     given = parser.parse_args()
     if given.recording is not None:
-        print(told(given.recording))
+        print(report(given.recording))
         return
     with tempfile.TemporaryDirectory() as folder:
         for scaling in SCALINGS:
@@ -90,7 +90,7 @@ def main() -> None:
             subprocess.run(
                 [sys.executable, "-m", "cli.main", "simulate", CELL, "--seed", given.seed, "--trace", str(file),
                  "--set", scalings[0], "--set", scalings[1]], check=True, stdout=subprocess.DEVNULL)
-            print(f"scaling {scaling}: {told(file)}; {checked(file)}")
+            print(f"scaling {scaling}: {report(file)}; {checked(file)}")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Arms that nobody set up: `zencell robot new --yes` for each, then seven balls in a world of its own reach.
+"""Arms without a prepared robot file: `zencell robot new --yes` for each, then seven balls in a world of its own reach.
 
     python -m benchmarks.arms [--only NAME] [--seeds A-B] [--folder DIR]
     python -m benchmarks.arms --urdf FILE [--gripper FILE] [--package-dir DIR]
@@ -93,7 +93,7 @@ def written(case: Case, folder: Path) -> str:
     return "no cell: " + "; ".join(lost) if lost else done.stderr.strip().splitlines()[-1].removeprefix("zencell: ")
 
 
-def told(cell: str, seed: int) -> str:
+def outcome_of(cell: str, seed: int) -> str:
     """How a cell ended under one seed, which also says where everything lies, in a few words."""
     outcome = Simulation(load_cell(cell, seed=seed), seed).run()
     wrong = [*outcome.broken, *outcome.crashes]
@@ -114,8 +114,8 @@ def main() -> None:
     given = parser.parse_args()
     cases = (Case(Path(given.urdf).stem, given.urdf, given.gripper, given.package_dir),) if given.urdf else CASES
     print("| arm | gripper | edits | `robot new` | in the box |\n|---|---|---|---|---|", flush=True)
-    with tempfile.TemporaryDirectory() as kept:
-        folder = Path(given.folder or kept)
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(given.folder or temporary)
         for case in cases:
             if given.only and case.name not in given.only:
                 continue
@@ -123,7 +123,7 @@ def main() -> None:
             refused = written(case, folder)
             took = time.monotonic() - began
             result = refused or "; ".join(
-                f"seed {seed}: {told(str(folder / f'{case.name}_cell.yaml'), seed)}"
+                f"seed {seed}: {outcome_of(str(folder / f'{case.name}_cell.yaml'), seed)}"
                 for seed in seeds_of(given.seeds))
             gripper = Path(case.gripper).stem if case.gripper else "its own"
             print(f"| {case.name} | {gripper} | 0 | {took:.0f} s | {result} |", flush=True)

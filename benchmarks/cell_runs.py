@@ -59,9 +59,9 @@ class Result:
 async def record(bus: Bus, stop: asyncio.Event) -> RecordedMotion:
     """What is said about arm, hand and truth until `stop` is set; it is decoded when there is time for that."""
     recording = RecordedMotion()
-    fold = RunAggregator(bus.cell, find_application(load_cell(CELL).application), listeners=recording.listeners())
+    aggregator = RunAggregator(bus.cell, find_application(load_cell(CELL).application), listeners=recording.listeners())
     raw: list[tuple[str, bytes]] = []
-    heard = {topic.key: topic for topic in fold.topics}
+    topics_by_key = {topic.key: topic for topic in aggregator.topics}
 
     async def keep(key: str) -> None:
         async for sample in bus.raw_reader(f"{bus.cell}/{key}"):
@@ -70,7 +70,7 @@ async def record(bus: Bus, stop: asyncio.Event) -> RecordedMotion:
     async with beside(*(keep(topic.key) for topic in recording.listeners())):
         await stop.wait()
     for key, payload in raw:
-        fold.on(key, decode(heard[key].message, payload), 0.0, 0)
+        aggregator.on(key, decode(topics_by_key[key].message, payload), 0.0, 0)
     return recording
 
 

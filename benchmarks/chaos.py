@@ -23,7 +23,7 @@ from tests.harness import LOG, SUMMARY, RunningCell, folder_for
 USUAL = "panda"
 WORLD = {USUAL: [], "ur5": ["--world", "w2"]}
 ASKED = ("cell", "speed", "balls", "rate", "set")  # what makes a run with a seed the same as another
-BEFORE: dict[str, Any] = {"cell": USUAL, "set": []}  # of runs told of in a file that does not say
+BEFORE: dict[str, Any] = {"cell": USUAL, "set": []}  # of runs in a file without these fields
 MOST_OFF = 1.0  # [mm] from the true outline
 TIMEOUT = 300.0  # [s] for one run
 RECORDING = "run.mcap"
@@ -164,7 +164,7 @@ def main() -> int:
     options = parser.parse_args()
     folder = Path(tempfile.mkdtemp(prefix="zencell-chaos-"))
     file = Path(options.file) if options.file else folder / "chaos.jsonl"
-    print(f"runs are told in {file}, logs of bad ones are in {folder}", flush=True)
+    print(f"runs are listed in {file}, logs of bad ones are in {folder}", flush=True)
     return asyncio.run(run_all(options, file, folder))
 
 

@@ -2,7 +2,7 @@
 
     python -m benchmarks.constraints [--robot panda|ur5 ...] [--count N] [--planner NAME ...] [--time S]
 
-Problems: the tool stands upright on one side of a wall, turned about its axis and leaning at random, and shall stand so
+Problems: the tool is upright on one side of a wall, turned about its axis and leaning at random, and must be so
 on the other side, in a corridor or not. Both ends have a solution near to the home pose: from one posture of the arm to
 another there may be no way that keeps the tool upright. Printed for each: how many are solved within --time of wall
 time, and processor time of the whole pipeline. Trajectories are judged again by pinocchio at every millisecond; ends

@@ -41,7 +41,7 @@ class Outcome:
     seconds_lost: list[float] = field(default_factory=list)  # wall time
 
     def add(self, summary: dict[str, Any], lost: float) -> None:
-        """Take note of a run and of the wall time [s] that it took longer."""
+        """Add a run and its additional wall time [s]."""
         self.states.append(summary["state"])
         self.in_box.append((summary["truth"] or {}).get("in_box", 0))
         self.restarts += summary["restarts"].get(self.victim, 0)
@@ -63,7 +63,7 @@ class Assassin:
     notes: list[str] = field(default_factory=list)  # when that was
 
     async def run(self, bus: Bus) -> None:
-        """Kill it at any moment, and once more with a ball in the hand."""
+        """Kill the process at a random moment, and again while a ball is held."""
         gripper, task = bus.reader(topics.GRIPPER_STATE), bus.reader(PICK_PLACE_STATUS)
         processes = bus.reader(topics.SUPERVISOR_STATUS)
         await until(bus.reader(topics.MOTION_STATUS), lambda status: status.state == "active")

@@ -97,9 +97,9 @@ async def openings(program: str, address: str, count: int) -> list[Opening]:
         for _ in range(count):
             page = await context.new_page()
             panels, picture = asyncio.Future[float](), asyncio.Future[tuple[float, float]]()
-            await page.expose_function("tellPanels", lambda at, told=panels: told.set_result(at))
+            await page.expose_function("tellPanels", lambda at, future=panels: future.set_result(at))
             await page.expose_function(
-                "tellPicture", lambda at, told=picture: told.set_result((at, processor_seconds(process))))
+                "tellPicture", lambda at, future=picture: future.set_result((at, processor_seconds(process))))
             await page.add_init_script(watch)
             before = processor_seconds(process)
             async with asyncio.timeout(PATIENCE):

@@ -105,18 +105,18 @@ def picture(rate: float) -> Spoken:
 
 
 def _sessions(endpoint: str, names: list[str]) -> dict[str, ZenohSession]:
-    # To be kept: a session that nobody holds is closed.
+    # Referenced, because an unreferenced session is closed.
     return {name: ZenohSession(zenoh.open(client_config(endpoint, connect_ms=CONNECT_MS))) for name in names}
 
 
-def write(endpoint: str, names: list[str], spoken: list[Spoken], parent: Connection) -> None:
-    """Be a process that speaks for some cells until it is told to stop."""
+def write(endpoint: str, names: list[str], planned: list[Spoken], parent: Connection) -> None:
+    """Publish for some cells until the pipe requests the end."""
     sys.setswitchinterval(0.0005)
     due: list[tuple[float, int, float, Any, bytes]] = []
     offsets = random.Random(1)
     sessions = _sessions(endpoint, names)
     for name, session in sessions.items():
-        for one in spoken:
+        for one in planned:
             publisher = session.publisher(f"{name}/{one.key}", "application/msgpack", reliable=one.reliable)
             due.append((offsets.random() / one.rate, len(due), 1 / one.rate, publisher, one.payload))
     heapq.heapify(due)
@@ -142,7 +142,7 @@ def write(endpoint: str, names: list[str], spoken: list[Spoken], parent: Connect
 
 
 class Subscriptions:
-    """Times and gaps of what comes in."""
+    """Times and gaps of received messages."""
 
     def __init__(self) -> None:
         self.on = False
@@ -152,7 +152,7 @@ class Subscriptions:
         self._newest: dict[str, int] = {}
 
     def hear(self, sample: RawSample) -> None:
-        """Take note of a message."""
+        """Count a message."""
         now = time.monotonic_ns()
         assert sample.attachment is not None
         put, number = NOTE.unpack(sample.attachment)
@@ -166,7 +166,7 @@ class Subscriptions:
 
 
 def read(endpoint: str, names: list[str], parent: Connection) -> None:
-    """Be a process that hears some cells: told to begin, it counts; told to stop, it sends what it found."""
+    """Subscribe to some cells: count from the start request to the stop request, then send the result."""
     sys.setswitchinterval(0.0005)
     ear = Subscriptions()
     sessions = _sessions(endpoint, names)
@@ -181,7 +181,7 @@ def read(endpoint: str, names: list[str], parent: Connection) -> None:
     os._exit(0)
 
 
-def fleet(cells: int, spoken: list[Spoken]) -> str:
+def fleet(cells: int, planned: list[Spoken]) -> str:
     """A line of the table: so many cells through a new router."""
     domain = free_domain()
     endpoint = endpoint_of(domain)
@@ -199,7 +199,7 @@ def fleet(cells: int, spoken: list[Spoken]) -> str:
             return ours
 
         readers = [start(read, share) for share in shares]
-        writers = [start(write, share, spoken) for share in shares]
+        writers = [start(write, share, planned) for share in shares]
         for one in (*readers, *writers):
             one.recv()
         for writer in writers:
@@ -214,14 +214,14 @@ def fleet(cells: int, spoken: list[Spoken]) -> str:
             reader.send("stop")
         took = time.monotonic() - began
         share, memory = (sum(process.cpu_times()[:2]) - before) / took, process.memory_full_info().pss / 1e6
-        heard = [reader.recv() for reader in readers]
+        received = [reader.recv() for reader in readers]
         for writer in writers:
             writer.send("stop")
-        told = [writer.recv() for writer in writers]
-    times = np.concatenate([one[0] for one in heard])
-    lost, size = sum(one[1] for one in heard), sum(one[2] for one in heard)
+        sent_by = [writer.recv() for writer in writers]
+    times = np.concatenate([one[0] for one in received])
+    lost, size = sum(one[1] for one in received), sum(one[2] for one in received)
     p50, p99 = np.percentile(times, [50, 99])
-    wanted, sent = cells * sum(one.rate for one in spoken), sum(one[0] for one in told)
+    wanted, sent = cells * sum(one.rate for one in planned), sum(one[0] for one in sent_by)
     return (f"| {cells} | {sent:.0f} of {wanted:.0f} | {len(times) / took:.0f} | {size / took / 1e6:.1f} | {p50:.2f} | "
             f"{p99:.1f} | {lost} ({lost / (lost + len(times)):.2%}) | {share:.0%} | {memory:.0f} | "
             f"{os.getloadavg()[0]:.0f} |")
@@ -233,18 +233,18 @@ def main() -> int:
     parser.add_argument("--cells", type=int, nargs="+", default=CELLS)
     parser.add_argument("--pictures", type=float, default=0.0, metavar="HZ", help="of each cell [0]")
     options = parser.parse_args()
-    spoken = asyncio.run(gather(Path(tempfile.mkdtemp(prefix="zencell-fleet-"))))
+    planned = asyncio.run(gather(Path(tempfile.mkdtemp(prefix="zencell-fleet-"))))
     if options.pictures:
-        spoken.append(picture(options.pictures))
+        planned.append(picture(options.pictures))
     print("| topic | bytes | Hz |\n|---|---|---|")
-    for one in spoken:
+    for one in planned:
         print(f"| {one.key} | {len(one.payload):,} | {one.rate:g} |")
-    print(f"| together | {sum(len(one.payload) * one.rate for one in spoken):,.0f} a second | "
-          f"{sum(one.rate for one in spoken):g} |\n")
-    print("| cells | sent each second | heard each second | MB/s | p50 [ms] | p99 [ms] | lost | router, of one core | "
+    print(f"| together | {sum(len(one.payload) * one.rate for one in planned):,.0f} a second | "
+          f"{sum(one.rate for one in planned):g} |\n")
+    print("| cells | sent per second | received per second | MB/s | p50 [ms] | p99 [ms] | lost | router, of one core | "
           "router, PSS [MB] | load |\n|---|---|---|---|---|---|---|---|---|---|")
     for cells in options.cells:
-        print(fleet(cells, spoken), flush=True)
+        print(fleet(cells, planned), flush=True)
     return 0
 
 

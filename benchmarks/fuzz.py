@@ -2,8 +2,8 @@
 
 `python -m benchmarks.fuzz` changes payloads of all messages by a seed and decodes them; then it puts and asks what it
 made under every key of both cells, on the virtual clock. With `--live SECONDS` it does so to a cell of real processes
-as well, and compares the gaps in its joint states with those of a cell beside it that is left alone. Of each gap it
-tells whether the executor computed, waited for a processor, which is the machine's load, or was held up by something.
+as well, and compares the gaps in its joint states with those of an undisturbed cell next to it. For each gap it
+reports whether the executor computed, waited for a processor (the load of the machine), or was blocked.
 Exit code 1 if anything but DecodeError was raised, a process ended, memory grew, or there were more gaps, without those
 in which the executor waited for a processor.
 """
@@ -41,7 +41,7 @@ ROUND = 60.0  # [s] for which gaps are gathered before they are counted
 AFTER = 1.0  # [s]
 LEAST = 20  # rounds after which memory must have come to rest
 MOST_GROWTH, MOST_MEGABYTES = 0.05, 3.0  # of it in the last three quarters
-TOLD = 10  # findings that are printed in full
+SHOWN = 10  # findings that are printed in full
 PAUSE = 0.002  # [s] of virtual time between two payloads
 SECONDS = 60.0  # of virtual time
 SHY = ("supervisor/status",)  # what the visit itself lives by
@@ -65,7 +65,7 @@ def decoded(count: int, seed: int) -> list[str]:
             pass
         except BaseException as error:  # which is what this looks for
             found[f"{model.__name__}: {type(error).__name__}"] += 1
-            if len(lines) < TOLD:
+            if len(lines) < SHOWN:
                 lines.append(f"{model.__name__}: {type(error).__name__}: {error}: {payload[:200].hex()}")
         took = time.thread_time() - since
         if model.max_bytes <= SMALL_BYTES and took > slowest.get(model.__name__, (0.0, 0))[0]:
@@ -115,7 +115,7 @@ async def attack(bus: Bus, mutations: Mutations, cell: str, pause: float, *, act
             await asyncio.sleep(pause)
 
 
-class _Unheard(list[str]):
+class _Ignored(list[str]):
     """A list that stays empty."""
 
     def append(self, item: str) -> None:
@@ -139,7 +139,7 @@ def simulated(name: str, seed: int) -> list[str]:
         await attack(bus, mutations, name, PAUSE, acts=True)
 
     simulation = Simulation(load_cell(name, ["services.viewer.port=0"]), seed, limit=SECONDS, visit=visit)
-    simulation.invariants.broken = _Unheard()  # some payloads are valid: a ball more, a goal that nobody decided
+    simulation.invariants.checks.broken = _Ignored()  # some payloads are valid: another ball, an unplanned goal
     outcome = simulation.run()
     print(f"{name}, seed {seed}: {sent} payloads under its keys in {outcome.seconds:.0f} s of its time: "
           f"{outcome.state or 'no end'}, {len(outcome.crashes)} crashes, restarts {outcome.restarts}", flush=True)
@@ -169,7 +169,7 @@ def private(processes: dict[str, psutil.Process]) -> dict[str, float]:
 
 
 async def live(options: argparse.Namespace, folder: Path) -> list[str]:
-    """Compare a cell that is attacked with one that is left alone beside it; a line for each thing that is worse."""
+    """Compare an attacked cell with an undisturbed one next to it; return a line for each figure that is worse."""
     rounds = max(1, round(options.live / ROUND))
     calm, attacked = Side("left alone"), Side("attacked")
     async with working(folder, "alone") as (alone, quiet), working(folder, "attacked") as (cell, bus):
@@ -190,10 +190,10 @@ async def live(options: argparse.Namespace, folder: Path) -> list[str]:
     wrong = [f"{name} ended: {folder}" for name, process in before.items()
              if name not in after or after[name].pid != process.pid]
     at = [0, rounds // 4, rounds // 2, rounds]
-    told = {name: [memory[number].get(name, 0.0) for number in at] for name in before}
+    grown = {name: [memory[number].get(name, 0.0) for number in at] for name in before}
     print("memory of what was attacked, at the begin, after a quarter, a half, and at the end [MB]: " + ", ".join(
-        f"{name} {' '.join(f'{size:.1f}' for size in sizes)}" for name, sizes in told.items()), flush=True)
-    wrong += [f"{name} grew from {sizes[1]:.1f} MB after a quarter to {sizes[3]:.1f}" for name, sizes in told.items()
+        f"{name} {' '.join(f'{size:.1f}' for size in sizes)}" for name, sizes in grown.items()), flush=True)
+    wrong += [f"{name} grew from {sizes[1]:.1f} MB after a quarter to {sizes[3]:.1f}" for name, sizes in grown.items()
               if rounds >= LEAST and sizes[3] - sizes[1] > max(MOST_GROWTH * sizes[1], MOST_MEGABYTES)]
     own, own_before = len(attacked.own) + attacked.lost, len(calm.own) + calm.lost
     if own > own_before:

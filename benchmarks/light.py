@@ -4,7 +4,7 @@
 
 Each scene has one to seven balls, a lamp of 100 to 10000 lx and 2700 to 10000 K from one side, in whose shadow the
 other side lies, a camera that exposes by itself, a lens with distortion that is taken out again, and the arm about
-home. The camera is above the table, or where docs/detection.md has one that stands at the side. Balls that reach into
+home. The camera is above the table, or where docs/detection.md has one at the side. Balls that reach into
 what the arm or the container hides, or out of the picture, count neither as found nor as missed.
 """
 
@@ -101,17 +101,17 @@ def main() -> None:
         clear = places[whole & ~hidden.touches(places, around.ball_radius)]
         odd = [one for one in detector.outliers if not hidden.touches([one.position], around.ball_radius)[0]]
         lamp = light.lights["lamp"]
-        told = f"{lamp.illuminance:.0f} lx, {lamp.temperature:.0f} K"
+        label = f"{lamp.illuminance:.0f} lx, {lamp.temperature:.0f} K"
         wrong = []
         for place in clear:
-            # Of all that was found: a ball beside what the arm hides may be taken for one that just reaches into it.
+            # Of all detections: a ball next to an occluded one may be detected as a partly occluded one.
             near = min((math.dist(place[:2], d.position[:2]) * 1e3 for d in found), default=1e3)
             if near > FAR:
                 missed += 1
                 refused += any(math.dist(place[:2], one.position[:2]) * 1e3 < 2 * FAR for one in odd)
                 wrong.append(f"missed {place[:2].round(3)}")
             else:
-                errors.append((near, told))
+                errors.append((near, label))
                 if near > 3:
                     wrong.append(f"{near:.1f} mm at {place[:2].round(3)}")
         extra = [d for d in seen if all(math.dist(place[:2], d.position[:2]) * 1e3 > FAR for place in places)]
@@ -121,7 +121,7 @@ def main() -> None:
         wrong += [f"surplus at ({d.position[0]:.3f}, {d.position[1]:.3f})" for d in extra]
         shown += len(clear)
         if wrong:
-            print(f"scene {number}: {told}, {'; '.join(wrong)}")
+            print(f"scene {number}: {label}, {'; '.join(wrong)}")
             if options.save:
                 options.save.mkdir(parents=True, exist_ok=True)
                 cv2.imwrite(str(options.save / f"{number}.png"), picture)

@@ -20,7 +20,7 @@ from tests.hosts.two_hosts import two_hosts, why_not
 COUNT = 3  # balls
 SECONDS = (1.0, 10.0, 60.0)
 CASES = [(split, alone, when) for split in SPLITS for alone in ("finish", "hold") for when in ("motion", "between")
-         if split == "robot" or alone == "finish"]  # beside the arm the task is never gone
+         if split == "robot" or alone == "finish"]  # a task next to the arm is never cut off
 MIDDLE = (0.2, 0.8)  # of a motion
 
 

@@ -159,7 +159,7 @@ class Referee:
     """Collision of the hulls with each other and with the solids by coal alone, pair by pair."""
 
     def __init__(self, hulls: RobotGeometry, scene: PlanningScene) -> None:
-        """Put the solids of a scene beside the hulls: everything but the base has to keep off them."""
+        """Add the solids of a scene to the hulls; everything but the base must stay clear of them."""
         self._model = hulls.robot.model
         self._geometry = hulls.geometry.copy()
         for item in scene.objects:
@@ -204,7 +204,7 @@ def run(
 
 
 def arguments(about: str | None, every: int) -> argparse.ArgumentParser:
-    """A parser that knows where the problems are and which of them are taken: every n-th unless told."""
+    """A parser that knows where the problems are and which of them are used: every n-th by default."""
     parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", nargs="?", type=Path, help="holds panda.tar.bz2 and ur5.tar.bz2")
     parser.add_argument("--robot", choices=list(CHANGES), default="panda")

@@ -92,7 +92,7 @@ def outlines(view: View, camera: Pinhole, objects: Sequence[WorldObject], repeat
 
 
 def arm(repeat: int) -> None:
-    """Print how long the arm takes, which is all that is cast anew while it moves."""
+    """Print how long the arm takes, which is all that is rendered again while it moves."""
     world, objects, meshes = load("w5")
     robot = RobotModel.load(load_robot("ur5"))
     around = Surroundings.model_validate({f: getattr(world, f) for f in Surroundings.model_fields})

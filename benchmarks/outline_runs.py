@@ -65,7 +65,7 @@ class Watched:
 
 
 async def watch(bus: Bus, seen: Watched) -> None:
-    """Take note until cancelled."""
+    """Collect until cancelled."""
     ages: dict[str, dict[int, float]] = {}
 
     async def stamped(name: str, reader: Reader[Any]) -> None:

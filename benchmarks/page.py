@@ -27,7 +27,7 @@ from benchmarks.first_picture import chromium, openings
 from common import topics
 from common.messages import SupervisorStatus
 from tests.harness import RunningCell, until
-from tests.page.browser_double import BrowserDouble, opened
+from tests.page.fake_browser import FakeBrowser, opened
 
 SETTLE = 5.0  # [s] after the cell is up, for meshes to be read
 MEASURE = 15.0  # [s]
@@ -43,7 +43,7 @@ async def share(process: psutil.Process) -> float:
     return 100 * (after.user + after.system - before.user - before.system) / (time.monotonic() - began)
 
 
-async def time_stops(cell: RunningCell, page: BrowserDouble, count: int) -> list[tuple[float, float]]:
+async def time_stops(cell: RunningCell, page: FakeBrowser, count: int) -> list[tuple[float, float]]:
     """Seconds from a click on STOP to the word of it and to rest, each time while the arm moves for the task."""
     times = []
     async with cell.listen() as bus:
@@ -54,10 +54,10 @@ async def time_stops(cell: RunningCell, page: BrowserDouble, count: int) -> list
             began = time.monotonic()
             await page.speak(do="stop", n=1)
             await until(motion, lambda status: status.state == "cancelled")
-            told = time.monotonic() - began
+            confirmed = time.monotonic() - began
             await until(joints, lambda state: max(map(abs, state.velocity)) < REST)
-            times.append((told, time.monotonic() - began))
-            await asyncio.sleep(0.5)  # the task has heard of it too
+            times.append((confirmed, time.monotonic() - began))
+            await asyncio.sleep(0.5)  # the task has received it too
     return times
 
 
@@ -94,7 +94,7 @@ async def measure(name: str, stops: int, opened_times: int) -> None:
                     await pages[0].speak(do="stop", n=1)
         async with opened(port) as page:
             times = await time_stops(cell, page, stops)
-        for what, values in zip(("stop is told", "arm is at rest"), zip(*times, strict=True), strict=True):
+        for what, values in zip(("stop is confirmed", "arm is at rest"), zip(*times, strict=True), strict=True):
             say(f"{what}: median {1e3 * statistics.median(values):.0f} ms, most {1e3 * max(values):.0f} ms")
 
 

@@ -23,27 +23,27 @@ BUDGET = 60.0  # [s]
 class Robot:
     """Hulls and disabled pairs; solids come and go."""
 
-    def __init__(self, told: dict[str, Any]) -> None:
+    def __init__(self, problem: dict[str, Any]) -> None:
         """Of the URDF, its locked joints being fixed."""
-        self.model = pin.buildModelFromXML(told["urdf"])
+        self.model = pin.buildModelFromXML(problem["urdf"])
         self.hulls = pin.buildGeomFromUrdfString(
-            self.model, told["urdf"], pin.GeometryType.COLLISION, package_dirs=told["packages"])
+            self.model, problem["urdf"], pin.GeometryType.COLLISION, package_dirs=problem["packages"])
         for one in self.hulls.geometryObjects:
             if isinstance(one.geometry, coal.BVHModelBase):
                 one.geometry.buildConvexRepresentation(True)
                 one.geometry = one.geometry.convex
         links = [self.model.frames[one.parentFrame].name for one in self.hulls.geometryObjects]
-        disabled = {frozenset(pair) for pair in told["disabled"]}
+        disabled = {frozenset(pair) for pair in problem["disabled"]}
         for i, a in enumerate(links):
             for j, b in enumerate(links[:i]):
                 if a != b and frozenset((a, b)) not in disabled:
                     self.hulls.addCollisionPair(pin.CollisionPair(j, i))
-        self.moving = [i for i, link in enumerate(links) if link not in told["base"]]
-        joints = [self.model.getJointId(name) for name in told["joints"]]
+        self.moving = [i for i, link in enumerate(links) if link not in problem["base"]]
+        joints = [self.model.getJointId(name) for name in problem["joints"]]
         self.order = [self.model.joints[joint].idx_q for joint in joints]
         self.lower = self.model.lowerPositionLimit[self.order]
         self.upper = self.model.upperPositionLimit[self.order]
-        self.step = told["step"]
+        self.step = problem["step"]
 
     def among(self, solids: list[dict[str, Any]]) -> Callable[[Any], bool]:
         """Whether a state is free among the solids, as a function."""

@@ -1,4 +1,4 @@
-"""Planning beside roboplan and OMPL on MotionBenchMaker's problems, in turn within one run.
+"""Planning compared with roboplan and OMPL on MotionBenchMaker's problems, in turn within one run.
 
     python -m benchmarks.peers FOLDER [--robot panda|ur5] [--set NAME] [--every N] [--step RAD] [--peers DIR]
                                       [--only roboplan|ompl]
@@ -48,7 +48,7 @@ class Peer:
     """Another planner in its own process."""
 
     def __init__(self, name: str, python: Path, hulls: RobotGeometry, step: float) -> None:
-        """Start it and tell it the robot."""
+        """Start the process and send it the robot."""
         self.name = name
         script = Path(__file__).with_name(f"peer_{name}.py")
         self._process = subprocess.Popen(

@@ -2,7 +2,7 @@
 
     python benchmarks/pictures.py [--pictures 10]
 
-Processor time is told: beside other work it is worth more than how long one waits.
+Reports processor time: with other work on the machine it is more meaningful than wall time.
 """
 
 from __future__ import annotations
@@ -21,8 +21,7 @@ from common.perception.sphere import silhouette
 from common.robot.model import RobotModel
 from common.sim.depth_sensor import DepthSensorParameters, simulate_depth
 from common.sim.interface import load_world
-from common.sim.lighting import REFERENCE
-from common.sim.sensor import Sensor, SensorParameters
+from common.sim.photometry import REFERENCE, Sensor, SensorParameters
 from drivers.mujoco.gl import select_gl
 from drivers.mujoco.rendering import PhysicsRenderer
 

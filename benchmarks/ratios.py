@@ -1,4 +1,4 @@
-"""Whether planning is as quick as it was: the kernel beside what takes its place, as ratios, which no machine changes.
+"""Whether planning is as fast as before: kernel versus Python fallback, as ratios that do not depend on the machine.
 
     python -m benchmarks.ratios [--rounds N] [--write]
 

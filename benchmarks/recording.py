@@ -77,8 +77,8 @@ def _lines(summary: Summary) -> list[str]:
 
 def _where(summary: Summary) -> str:
     lost = {name: (topic.missed, topic.dropped) for name, topic in summary.topics.items()}
-    told = [f"{name} {m} on the way, {d} at the disk" for name, (m, d) in lost.items() if m or d]
-    return f" ({'; '.join(told)})" if told else ""
+    losses = [f"{name} {m} on the way, {d} at the disk" for name, (m, d) in lost.items() if m or d]
+    return f" ({'; '.join(losses)})" if losses else ""
 
 
 async def main() -> None:

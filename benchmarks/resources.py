@@ -84,7 +84,7 @@ def environment() -> list[str]:
 
 
 def needed(name: str) -> set[str]:
-    """Names of the distributions that one needs, and those that they need, without extras that nobody asks for."""
+    """Return the distributions that one requires, recursively, without unrequested extras."""
     found: set[str] = set()
     open_ends: list[tuple[str, frozenset[str]]] = [(name, frozenset())]
     seen = set()

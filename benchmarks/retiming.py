@@ -1,8 +1,8 @@
-"""How long trajectories take beside toppra's on the same paths: `python -m benchmarks.retiming [--pairs N]`.
+"""Duration of trajectories compared with toppra's on the same paths: `python -m benchmarks.retiming [--pairs N]`.
 
 Paths between random positions of the Panda through one in between, corners rounded off, as `common/planning` does it,
 with jerk limits raised 1000-fold: toppra has none. It exits with 1 where one takes more than 5 % longer. toppra is no
-dependency: install it beside (`pip install toppra`).
+dependency: install it (`pip install toppra`).
 """
 
 from __future__ import annotations

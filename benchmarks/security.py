@@ -43,14 +43,14 @@ def latencies(endpoint: str, folder: Path | None, size: int) -> list[float]:
         taken.append((time.monotonic_ns() - int(sample.payload.to_bytes()[:20])) / 1e6)
 
     with open_session(endpoint, who[0]) as writer, open_session(endpoint, who[1]) as reader:
-        kept = reader.declare_subscriber(KEY, zenoh.handlers.Callback(on_sample, indirect=False))
+        subscriber = reader.declare_subscriber(KEY, zenoh.handlers.Callback(on_sample, indirect=False))
         publisher = writer.declare_publisher(KEY, express=True)
         last.wait(1.0)
         for _ in range(MESSAGES):
             publisher.put(f"{time.monotonic_ns():020d}".encode() + bytes(size - 20))
             last.wait(PERIOD)
         last.wait(0.5)
-        kept.undeclare()
+        subscriber.undeclare()
     return sorted(taken)
 
 

@@ -1,8 +1,8 @@
-"""A Panda cell that works for a long time beside a slow and a stuck subscriber: does anything grow or get lost?
+"""A Panda cell that works for a long time next to a slow and a stuck subscriber: does anything grow or get lost?
 
 `python -m benchmarks.soak` takes 30 minutes at speed 1 with the camera at 30 Hz. Exit code 1 unless, after the first
 5 minutes, memory grows by less than 2 % and descriptors not at all, nothing of a state or event topic is lost, nor a
-joint state or transform, joint states keep their rate and the task goes on placing. The machine must have room: at a
+joint state or transform, joint states keep their rate and the task continues placing. The machine must have room: at a
 load of 20 on two cores nothing is lost, but joint states are written at 89 Hz.
 
 Memory is what a process has for itself (anonymous and shared pages, also those swapped out): pages of files, such as
@@ -115,7 +115,7 @@ async def keep_busy(bus: Bus, seen: Seen) -> None:
         if not seen.placed or seen.placed[-1][1] != message.placed:
             seen.placed.append((time.monotonic(), message.placed))
         if message.state == "DONE" and time.monotonic() > again:
-            # A cell that does not answer now may do so in a while; that nothing is placed meanwhile is told at the end.
+            # A cell that does not answer now may answer later; missing placements are reported at the end.
             with suppress(RequestFailed):
                 await edit.call(WorldEdit(op="reset"), 5.0)
                 seen.resets += 1
@@ -125,9 +125,9 @@ async def keep_busy(bus: Bus, seen: Seen) -> None:
 async def count(bus: Bus, seen: Seen) -> None:
     """Note what the services have dropped, lost and refused so far."""
     async for counters in bus.reader(topics.COUNTERS):
-        for into, told in ((seen.dropped, counters.dropped), (seen.overflow, counters.overflow),
+        for into, counted in ((seen.dropped, counters.dropped), (seen.overflow, counters.overflow),
                            (seen.invalid, counters.invalid)):
-            for key, number in told.items():
+            for key, number in counted.items():
                 into[counters.service, key] = number
 
 
@@ -224,7 +224,7 @@ def descriptors_of_router(cell: RunningCell) -> int:
 
 
 async def descriptors_left(cell: RunningCell, before: int) -> int:
-    """How many the router has once it has noticed that somebody is gone, or does not."""
+    """Return the number of sessions of the router, after it had time to notice closed ones."""
     for _ in range(round(GONE)):
         if descriptors_of_router(cell) <= before:
             break
@@ -233,7 +233,7 @@ async def descriptors_left(cell: RunningCell, before: int) -> int:
 
 
 async def until_over(cell: RunningCell, seen: Seen, end: float) -> None:
-    """Wait for the end [s, monotonic] or for that of the cell, and tell each minute how it goes."""
+    """Wait for the end [s, monotonic] or for that of the cell, and print the state each minute."""
     while (left := end - time.monotonic()) > 0 and cell.process.poll() is None:
         await asyncio.sleep(min(60.0, left))
         memory = sum(looks[-1].private for looks in seen.looks.values())
@@ -251,9 +251,9 @@ async def soak(options: argparse.Namespace, folder: Path) -> int:
             losses = Losses(bus)
             end = time.monotonic() + options.minutes * 60
             watching = (watch_processes(cell, seen, options.period), keep_busy(bus, seen), count(bus, seen))
-            beside_it = nullcontext() if options.alone else disturbed(cell.endpoint)
+            disturbance = nullcontext() if options.alone else disturbed(cell.endpoint)
             before = descriptors_of_router(cell)
-            async with beside_it, beside(*watching):
+            async with disturbance, beside(*watching):
                 await until_over(cell, seen, end)
                 losses.stop()
             left = await descriptors_left(cell, before)

@@ -1,6 +1,6 @@
-"""How soon the arm stands still after `task pause` and `task stop`, in whole cells at speed 1.
+"""How soon the arm stops after `task pause` and `task stop`, in whole cells at speed 1.
 
-`python -m benchmarks.stop_times` waits for the arm to move fast, tells the task to pause or stop and looks at the joint
+`python -m benchmarks.stop_times` waits for the arm to move fast, pauses or stops the task and observes the joint
 states: the time from just before the request to the stamp of the first state in which no joint moves. It does so again
 and again over the motions of a run, and says for each robot how fast the fastest joint was and how long it took.
 """
@@ -32,9 +32,9 @@ CELLS = ("panda", "ur5")
 
 @dataclass(frozen=True)
 class Stop:
-    """One stop: what was told, speed of the fastest joint before [rad/s], time to rest [ms]."""
+    """One stop: command, speed of the fastest joint before [rad/s], time to rest [ms]."""
 
-    told: str
+    command: str
     speed: float
     milliseconds: float
 
@@ -43,7 +43,7 @@ class Watch:
     """A cell that is stopped again and again."""
 
     def __init__(self, bus: Bus, cell: str) -> None:
-        """Watch and tell."""
+        """Observes the arm and sends commands."""
         self._bus, self._joints = bus, bus.reader(topics.JOINT_STATES)
         self._task: Client[TaskCommand, TaskStatus] = bus.client(topics.TASK_COMMAND)
         self._edit, self._cell = bus.client(topics.WORLD_EDIT), cell
@@ -56,7 +56,7 @@ class Watch:
     def _speed(self, state: JointState) -> float:
         return max(abs(v) for name, v in zip(state.name, state.velocity, strict=True) if name in self._names)
 
-    async def _tell(self, command: str) -> None:
+    async def _send(self, command: str) -> None:
         await self._task.call(TaskCommand.model_validate({"command": command}), 10.0)
 
     async def start_again(self) -> None:
@@ -65,9 +65,9 @@ class Watch:
             if status.state == "DONE":
                 if self._cell == "panda":
                     await self._edit.call(WorldEdit(op="reset"))
-                await self._tell("start")
+                await self._send("start")
 
-    async def stop(self, told: str, again: str, rng: np.random.Generator) -> Stop:
+    async def stop(self, command: str, again: str, rng: np.random.Generator) -> Stop:
         """Stop the arm in a fast motion, and let it go on."""
         await until(self._joints, lambda s: self._speed(s) > self._fast, 120)
         await asyncio.sleep(float(rng.uniform(0.0, 0.2)))
@@ -75,13 +75,13 @@ class Watch:
         while (speed := self._speed(state)) < self._fast:
             state = await self._joints.next()
         begin = self._bus.clock.now_ns()
-        asking = asyncio.create_task(self._tell(told))
+        asking = asyncio.create_task(self._send(command))
         still = await until(self._joints, lambda s: s.header.stamp > begin and self._speed(s) == 0)
         await asking
         await asyncio.sleep(SETTLE)
-        await self._tell(again)
+        await self._send(again)
         await asyncio.sleep(SETTLE)
-        return Stop(told, speed, (still.header.stamp - begin) * 1e-6)
+        return Stop(command, speed, (still.header.stamp - begin) * 1e-6)
 
 
 async def stops(cell: RunningCell, count: int, seed: int) -> list[Stop]:
@@ -91,8 +91,8 @@ async def stops(cell: RunningCell, count: int, seed: int) -> list[Stop]:
     async with cell.listen() as bus:
         watch = Watch(bus, cell.name)
         async with beside(watch.start_again()):
-            for told in [("pause", "resume")] * count + [("stop", "start")] * count:
-                found.append(await watch.stop(*told, rng))
+            for command in [("pause", "resume")] * count + [("stop", "start")] * count:
+                found.append(await watch.stop(*command, rng))
     return found
 
 
@@ -102,16 +102,16 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=10, help="pauses and stops of each cell")
     parser.add_argument("--cells", nargs="+", default=CELLS, choices=CELLS)
     arguments = parser.parse_args()
-    print("| cell | told | speed before, least to most [rad/s] | to rest, median [ms] | longest [ms] |")
+    print("| cell | command | speed before, least to most [rad/s] | to rest, median [ms] | longest [ms] |")
     print("|---|---|---|---|---|")
     with tempfile.TemporaryDirectory() as parent:
         for name in arguments.cells:
             with RunningCell(folder_for(Path(parent), name), "up", name, "--no-viewer") as cell:
                 done = asyncio.run(stops(cell, arguments.count, 0))
-            for told in ("pause", "stop"):
-                speeds = [stop.speed for stop in done if stop.told == told]
-                times = [stop.milliseconds for stop in done if stop.told == told]
-                print(f"| {name} | {told} | {min(speeds):.2f} to {max(speeds):.2f} | {np.median(times):.0f} | "
+            for command in ("pause", "stop"):
+                speeds = [stop.speed for stop in done if stop.command == command]
+                times = [stop.milliseconds for stop in done if stop.command == command]
+                print(f"| {name} | {command} | {min(speeds):.2f} to {max(speeds):.2f} | {np.median(times):.0f} | "
                       f"{max(times):.0f} |")
 
 

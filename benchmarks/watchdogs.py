@@ -1,4 +1,4 @@
-"""How long it takes until somebody notices: frozen processes, a dead planner, a supervisor that is killed.
+"""How long it takes until a failure is noticed: frozen processes, a dead planner, a supervisor that is killed.
 
 Run as `python -m benchmarks.watchdogs`; it brings up the Panda cell once and takes about a minute and a half.
 """
@@ -28,7 +28,7 @@ def waits(status: PickPlaceStatus) -> bool:
     return status.message.startswith("the arm waits")
 
 
-def begun(status: MotionStatus) -> bool:
+def started(status: MotionStatus) -> bool:
     """Whether a motion is under way, with most of it to come."""
     return status.state == "active" and not status.held and status.progress < 0.3
 
@@ -43,30 +43,30 @@ async def freeze(cell: RunningCell, bus: Bus, name: str) -> str:
     """Stop a process; a row of what followed."""
     supervisor, status = bus.reader(topics.SUPERVISOR_STATUS), bus.reader(PICK_PLACE_STATUS)
     before = of(await supervisor.next(), name).restarts
-    await until(bus.reader(topics.MOTION_STATUS), begun)
+    await until(bus.reader(topics.MOTION_STATUS), started)
     process, began = cell.processes()[name], time.monotonic()
     process.send_signal(signal.SIGSTOP)
-    told = ""
+    noticed = ""
     if name == "trajectory_executor":
         await until(status, waits)
-        told = f"{time.monotonic() - began:.2f} s"
+        noticed = f"{time.monotonic() - began:.2f} s"
     await asyncio.to_thread(psutil.wait_procs, [process])
     killed = time.monotonic() - began
     await until(supervisor, lambda s: of(s, name).restarts > before and of(s, name).state == "ready")
-    return f"| {name} frozen | {told} | {killed:.1f} s | {time.monotonic() - began:.1f} s |"
+    return f"| {name} frozen | {noticed} | {killed:.1f} s | {time.monotonic() - began:.1f} s |"
 
 
 async def kill_planner(cell: RunningCell, bus: Bus) -> str:
     """Kill the planner in the middle of a motion; a row of what followed."""
     status, motion = bus.reader(PICK_PLACE_STATUS), bus.reader(topics.MOTION_STATUS)
-    await until(motion, begun)
+    await until(motion, started)
     began = time.monotonic()
     cell.processes()["motion_planner"].kill()
     await until(status, waits)
-    told = time.monotonic() - began
+    noticed = time.monotonic() - began
     await until(motion, lambda m: m.held)
     await until(motion, lambda m: not m.held)
-    return f"| motion_planner killed | {told:.2f} s | | {time.monotonic() - began:.1f} s |"
+    return f"| motion_planner killed | {noticed:.2f} s | | {time.monotonic() - began:.1f} s |"
 
 
 async def measure(cell: RunningCell) -> list[str]:

@@ -1,4 +1,4 @@
-"""Bring a cell up: `run` to the end of its task, `up` until Ctrl-C."""
+"""`run` and `up`: bring a cell up until its task has ended, or until Ctrl-C."""
 
 from __future__ import annotations
 
@@ -14,26 +14,28 @@ from common.supervision.multi_host import HostOptions
 Speed = Annotated[str, typer.Option("--speed", metavar="X", help="cell time per wall time, 0.1 to 10")]
 NoViewer = Annotated[bool, typer.Option("--no-viewer", help="without the operator's page")]
 ViewerPort = Annotated[
-    str | None, typer.Option("--viewer-port", metavar="N", help="of the operator's page [8080, or the next free]")
+    str | None, typer.Option("--viewer-port", metavar="N", help="port of the operator's page [8080, or the next free]")
 ]
 ViewerHost = Annotated[
-    str | None, typer.Option("--viewer-host", metavar="HOST", help="that it listens at; a token beyond [127.0.0.1]")
+    str | None, typer.Option("--viewer-host", metavar="HOST", help="address on which the page listens; other hosts "
+                                                                   "need a token [127.0.0.1]")
 ]
-SummaryFile = Annotated[str | None, typer.Option("--summary", metavar="FILE.json", help="write the figures there")]
-LogJson = Annotated[bool, typer.Option("--log-json", help="log lines as JSON objects")]
-Record = Annotated[str | None, typer.Option("--record", metavar="FILE.mcap", help="record all of it there")]
+SummaryFile = Annotated[str | None, typer.Option("--summary", metavar="FILE.json", help="write the figures of the run")]
+LogJson = Annotated[bool, typer.Option("--log-json", help="write log lines as JSON objects")]
+Record = Annotated[str | None, typer.Option("--record", metavar="FILE.mcap", help="record all messages")]
 ChaosSeed = Annotated[
-    str | None, typer.Option("--chaos", metavar="SEED", help="faults on purpose: the same seed plans the same ones")
+    str | None, typer.Option("--chaos", metavar="SEED", help="inject faults; the same seed plans the same faults")
 ]
 ChaosRate = Annotated[
-    str | None, typer.Option("--chaos-rate", metavar="N", help="faults per minute of wall time, on average [30]")
+    str | None, typer.Option("--chaos-rate", metavar="N", help="average number of faults per minute of wall time [30]")
 ]
 UntilStdinEnds = Annotated[
-    bool, typer.Option("--until-stdin-ends", help="end when standard input does: with the program that started this")
+    bool, typer.Option("--until-stdin-ends", help="shut down at the end of standard input, with the program that "
+                                                  "started this")
 ]
 
 
-def _operation(
+def _session(
     cell: options.CellArgument,
     overrides: options.Overrides = None,
     world: options.WorldName = None,
@@ -58,32 +60,32 @@ def _operation(
     *,
     until_ended: bool,
 ) -> CellSession:
-    """What is asked for with the options of `run` and `up`, which are these."""
+    """Return the session that the options of `run` and `up` describe; these are its parameters."""
     from common.supervision.lifecycle import interrupt_at_stdin_end
-    from security.requiring import choose
+    from security.preflight import choose
 
     choose(secure)
-    operation = CellSession(
+    session = CellSession(
         cell, overrides, world=world, seed=options.whole("--seed", seed, 0), speed=options.number("--speed", speed),
         domain=domain, connect=connect, no_viewer=no_viewer, summary=summary, log_json=log_json,
-        share=HostOptions(listen, link, only, without),
+        host=HostOptions(listen, link, only, without),
     )
     if until_stdin_ends:
         interrupt_at_stdin_end()
-    operation.serve_page(viewer_host, viewer_port)
-    operation.record_to(record)
-    disturbance = options.whole("--chaos", chaos, 0)
+    session.serve_page(viewer_host, viewer_port)
+    session.record_to(record)
+    chaos_seed = options.whole("--chaos", chaos, 0)
     per_minute = _per_minute(chaos, chaos_rate)
-    if disturbance is not None:
-        operation.disturb(disturbance, per_minute, until_ended=until_ended)
-    return operation
+    if chaos_seed is not None:
+        session.inject_faults(chaos_seed, per_minute, until_ended=until_ended)
+    return session
 
 
 def _per_minute(seed: str | None, rate: str | None) -> float:
-    """How often faults are made on purpose.
+    """Return the rate of injected faults [1/min].
 
     Raises:
-        ConfigError: the rate cannot be used.
+        ConfigError: the rate is not valid.
     """
     from common.errors import ConfigError
     from lab.chaos.plan import MOST_PER_MINUTE, PER_MINUTE
@@ -99,22 +101,22 @@ def _per_minute(seed: str | None, rate: str | None) -> float:
 def run(**given: Any) -> None:
     """Bring a cell up, run its task to the end, print a summary and shut down; exit 0 only if the task is DONE.
 
-    Exit 3 if it is DONE, but the simulated world knows of something that was left and that the summary does not name.
+    Exit 3 if it is DONE but the simulated world has objects left that the summary does not explain.
     """
     of_applications = {name: given.pop(name) for name in given.keys() - _OPTIONS}
     before = verbs.before_run(given["cell"], given["overrides"], given["world"], of_applications)
-    operation = _operation(**{**given, "overrides": before.overrides}, until_ended=True)
-    operation.first = before.first
-    raise typer.Exit(operation.run_to_end())
+    session = _session(**{**given, "overrides": before.overrides}, until_ended=True)
+    session.first = before.first
+    raise typer.Exit(session.run_to_end())
 
 
 def up(**given: Any) -> None:
-    """Bring a cell up and stay until Ctrl-C; the task starts by itself unless the cell says `autostart: false`."""
-    raise typer.Exit(_operation(**given, until_ended=False).stay())
+    """Bring a cell up and stay until Ctrl-C. Its task starts unless the cell file says `autostart: false`."""
+    raise typer.Exit(_session(**given, until_ended=False).stay())
 
 
-_ASKED = inspect.signature(_operation, eval_str=True)
-_OPTIONS = _ASKED.parameters.keys() - {"until_ended"}
-for verb in (run, up):
-    verb.__signature__ = _ASKED.replace(  # type: ignore[attr-defined]
-        parameters=[p for p in _ASKED.parameters.values() if p.name in _OPTIONS], return_annotation=None)
+_SIGNATURE = inspect.signature(_session, eval_str=True)
+_OPTIONS = _SIGNATURE.parameters.keys() - {"until_ended"}
+for command in (run, up):
+    command.__signature__ = _SIGNATURE.replace(  # type: ignore[attr-defined]
+        parameters=[p for p in _SIGNATURE.parameters.values() if p.name in _OPTIONS], return_annotation=None)

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cli import choices as offers
-from cli import options
+from cli import choices, options
 from cli.target import CellTarget
 from common.errors import ConfigError
 from common.terminal import echo
@@ -24,8 +23,8 @@ FORMATS = (".svg", ".dot", ".mmd")
 
 def graph(
     cell: Annotated[
-        str, typer.Argument(metavar="[CELL]", help="name or path of the cell file", autocompletion=offers.cells)
-    ] = offers.default_cell(),
+        str, typer.Argument(metavar="[CELL]", help="name or path of the cell file", autocompletion=choices.cells)
+    ] = choices.default_cell(),
     output: Annotated[
         str, typer.Option("-o", "--output", metavar="FILE", help="*.svg, *.dot or *.mmd; without it Mermaid on stdout")
     ] = "",
@@ -38,13 +37,13 @@ def graph(
 ) -> None:
     """Draw services and topics of a cell, up or not; while it is up, what is not alive is dashed."""
     from common.config import load_cell
-    from page.access import VIEWER
+    from security.page_tokens import VIEWER
     from tools.graph import graph_of, names
 
     path = Path(output).expanduser() if output else None
     write = _writer_of(path)
     loaded = load_cell(cell, overrides or ())
-    presence = CellTarget(domain=domain, connect=connect).look().get(loaded.name)
+    presence = CellTarget(domain=domain, connect=connect).running_cells().get(loaded.name)
     services = [each for each in _wired_services(loaded) if not (no_viewer and each.name == VIEWER)]
     made = graph_of(loaded.name, services, presence.ready if presence else None)
     text = write(made)

@@ -18,19 +18,16 @@ from cli import (
     bringup,
     calibrate,
     catalogue,
-    check,
+    checks,
     commands,
     completion,
-    doctor,
+    export,
     graph,
-    new,
     node,
     param,
     playing,
     recording,
-    report,
     robot,
-    router,
     scene,
     secure,
     simulate,
@@ -38,9 +35,6 @@ from cli import (
     top,
     topic,
     verbs,
-)
-from cli import (
-    export as exporting,
 )
 from cli.target import CommandGroup
 from common.errors import RequestFailed, ZencellError
@@ -116,7 +110,7 @@ app.callback()(completion.root)
 of_applications = verbs.ApplicationVerbs(app, {"task": commands.task}, bringup.run, last="chaos")
 app.command()(bringup.run)
 app.command()(bringup.up)
-app.command()(new.new)
+app.command()(catalogue.new)
 app.command()(catalogue.cells)
 app.command()(catalogue.services)
 app.command()(catalogue.service)
@@ -137,13 +131,13 @@ app.command("record")(recording.record_)
 app.command()(recording.info)
 app.command("play")(playing.play_)
 app.command()(recording.recover)
-app.command()(report.report)
-app.command()(exporting.export)
+app.command()(export.report)
+app.command()(export.export)
 app.add_typer(secure.app, name="secure")
-app.add_typer(router.app, name="router")
+app.add_typer(secure.router, name="router")
 app.command()(simulate.simulate)
-app.command()(check.check)
-app.command()(doctor.doctor)
+app.command()(checks.check)
+app.command()(checks.doctor)
 
 
 if __name__ == "__main__":

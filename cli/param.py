@@ -6,22 +6,21 @@ from typing import Annotated
 
 import typer
 
-from cli import choices as offers
-from cli import options
+from cli import choices, options
 from cli.target import RUNNING, CellTarget, CommandGroup
 from common.terminal import echo
 
-app = CommandGroup("Parameters of running services: what there is, and changing it.")
+app = CommandGroup("List, read, change and save parameters of running services.")
 
 LONGEST_VALUE = 28  # characters of a value in a table
 
 PathArgument = Annotated[
     str, typer.Argument(metavar="PATH", help="as in `zencell param list`; services. may be left out",
-                        autocompletion=offers.parameters)
+                        autocompletion=choices.parameters)
 ]
 Assignments = Annotated[
     list[str], typer.Argument(metavar="PATH=VALUE...", help="values as YAML; @FILE: all of a file of `param dump`",
-                              autocompletion=offers.overrides)
+                              autocompletion=choices.overrides)
 ]
 
 
@@ -29,13 +28,13 @@ Assignments = Annotated[
 def list_(
     service: Annotated[
         str | None, typer.Argument(metavar="SERVICE", help="of one; of all if not given",
-                                   autocompletion=offers.services)
+                                   autocompletion=choices.services)
     ] = None,
     at: CellTarget = RUNNING,
     as_json: options.Json = False,
 ) -> None:
     """List parameters: path, value, whether a change needs a restart, range, and what it is."""
-    from common.client.parameters import listing, range_of
+    from common.client.parameters import listing, range_text
     from common.config import yaml_line
     from common.messages.schema import to_json
 
@@ -49,7 +48,8 @@ def list_(
         value = yaml_line(parameter.value)
         value = value if len(value) <= LONGEST_VALUE else f"{value[: LONGEST_VALUE - 3]}..."
         how = "live" if parameter.runtime else "restart"
-        meaning = "; ".join(text for text in (range_of(parameter), parameter.description) if text)
+        bounds = range_text(parameter.choices, parameter.minimum, parameter.maximum)
+        meaning = "; ".join(text for text in (bounds, parameter.description) if text)
         echo(f"{parameter.path:<{width}}  {value:<{LONGEST_VALUE}}  {how:<7}  {meaning}".rstrip())
     found.raise_first()
 
@@ -84,7 +84,7 @@ def set_(assignments: Assignments, at: CellTarget = RUNNING) -> None:
 def dump(
     services: Annotated[
         list[str] | None, typer.Argument(metavar="SERVICE...", help="all if none is given",
-                                         autocompletion=offers.services)
+                                         autocompletion=choices.services)
     ] = None,
     everything: Annotated[bool, typer.Option("--all", help="what is as by default, too")] = False,
     output: Annotated[str, typer.Option("-o", "--output", metavar="FILE", help="write there, not here")] = "",

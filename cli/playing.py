@@ -50,7 +50,7 @@ def play_(
     """
     from common.remapping import is_cell
     from common.transport.credentials import require_open_cell
-    from recording.player import play, played_of, renaming
+    from recording.player import play, played_topics, renaming
     from recording.reader import Recording
     from recording.selection import Selection
 
@@ -66,11 +66,11 @@ def play_(
     with Recording(Path(file)) as recording:
         if not 0 <= offset <= recording.seconds:
             raise ConfigError("--start-offset", start_offset, f"must be 0 to {recording.seconds:.1f}, its length [s]")
-        played = played_of(recording, selection)
+        played = played_topics(recording, selection)
         if loop and recording.seconds == 0:
             raise ConfigError("--loop", ..., f"needs a recording with a length, which {file} has not")
 
-        def make() -> Player:
+        def create() -> Player:
             from recording.player import Player
 
             return Player(recording, selection.wants, renamed, rate=speed, offset=offset, loop=loop,
@@ -80,7 +80,7 @@ def play_(
         if not name:
             raise ConfigError("--cell", ..., f"{file} does not say of which cell it is: name one")
         if not is_cell(name):
-            raise ConfigError("--cell", name, "is no name that a cell can have")
+            raise ConfigError("--cell", name, "is not a valid name of a cell")
         show = rewrite if on_terminal else None
-        code = asyncio.run(play(make, recording, played, name, wait or [], domain, connect, echo, show))
+        code = asyncio.run(play(create, recording, played, name, wait or [], domain, connect, echo, show))
     raise typer.Exit(code)

@@ -11,19 +11,18 @@ from typing import Annotated
 
 import typer
 
-from cli import choices as offers
-from cli import options
+from cli import choices, options
 from cli.target import RUNNING, CellTarget
 from common.errors import ConfigError
 from common.terminal import echo, rewrite
-from recording.summary import contents, in_bytes, require_new
+from recording.formatting import format_bytes, format_contents, require_new
 
 LEAST_FILE = 1.0  # [MB] of a recording that is split
 
 File = Annotated[str, typer.Argument(metavar="FILE.mcap", help="a recording")]
 Keys = Annotated[
     list[str] | None, typer.Argument(metavar="KEY", help="without the cell; * and ** as wildcards",
-                                     autocompletion=offers.published)
+                                     autocompletion=choices.published)
 ]
 Exclude = Annotated[str | None, typer.Option("--exclude", metavar="RE", help="leave out keys in which RE is found")]
 
@@ -89,7 +88,7 @@ def info(file: File, as_json: options.Json = False) -> None:
     if as_json:
         echo(json.dumps(summary.as_dict()))
         return
-    for line in contents(file, recording.cell, summary):
+    for line in format_contents(file, recording.cell, summary):
         echo(line)
 
 
@@ -106,7 +105,7 @@ def recover(
     target = Path(output) if output else source.with_name(f"{source.stem}_recovered.mcap")
     require_new(target)
     saved = recover_file(source, target)
-    lost = [f"{in_bytes(saved.lost_bytes)} after the cut"] if saved.lost_bytes else []
+    lost = [f"{format_bytes(saved.lost_bytes)} after the cut"] if saved.lost_bytes else []
     lost += [f"{saved.damaged_chunks} damaged chunks"] if saved.damaged_chunks else []
     echo(f"saved {saved.messages:,} messages, {saved.seconds:.1f} s: {target}; "
          f"lost {' and '.join(lost) or 'nothing'}")

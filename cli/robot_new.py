@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cli import choices as offers
+from cli import choices
 from common.errors import ConfigError
 from common.terminal import echo
 
@@ -34,7 +34,7 @@ def new(
     cell: Annotated[str, typer.Option("--cell", metavar="FILE.yaml", help="write a cell too, whose world lies in "
                                                                           "reach of this arm")] = "",
     like: Annotated[str, typer.Option("--like", metavar="CELL", help="which that cell is like",
-                                      autocompletion=offers.cells)] = "",
+                                      autocompletion=choices.cells)] = "",
     yes: Annotated[bool, typer.Option("--yes", "-y", help="ask nothing: take the best guess")] = False,
     force: Annotated[bool, typer.Option("--force", help="overwrite what is there")] = False,
 ) -> None:
@@ -93,18 +93,18 @@ def new(
 def check(
     name: Annotated[
         str, typer.Argument(metavar="ROBOT", help="a name of config/robots, or the path of a YAML file",
-                            autocompletion=offers.robots)
+                            autocompletion=choices.robots)
     ],
 ) -> None:
     """Check what a robot file says of the tool on the robot's model; exit code 1 with a line for all that is not so."""
     from common.config import load_robot
     from common.planning.robot_geometry import RobotGeometry
     from common.robot.model import RobotModel
-    from tools.robot_setup.end_effector import complaints
+    from tools.robot_setup.end_effector import check_gripper
     from tools.robot_setup.home import hits
 
     robot = RobotModel.load(load_robot(name))
-    wrong = complaints(robot)
+    wrong = check_gripper(robot)
     touching = hits(robot, RobotGeometry(robot), robot.named("home"))
     wrong += [f"named_poses.home: {pair} touch" for pair in touching]
     for line in wrong:

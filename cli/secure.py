@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 from typing import Annotated
 
@@ -13,7 +14,7 @@ from cli.target import CommandGroup
 from common.supervision.multi_host import HostOptions
 from common.terminal import echo
 
-app = CommandGroup("Certificates for a cell's processes, and who may do what.")
+app = CommandGroup("Certificates and access rules of a cell's processes.")
 
 DAYS = 365
 SHOWN = ("writes", "reads", "answers", "asks", "passes on")
@@ -36,9 +37,9 @@ def init(
     """Make an authority, a certificate for each process, and the router's rules of who may do what."""
     from common.config import load_cell, names_of
     from common.transport.credentials import ACCESS
-    from page.access import VIEWER
-    from security.folder import authority_files, make
-    from security.rights import rights_in
+    from security.access import rights_in
+    from security.certificates import authority_files, make
+    from security.page_tokens import VIEWER
 
     valid = options.whole("--days", days, 1)
     assert valid is not None
@@ -64,8 +65,8 @@ def renew_(
     The router takes what is new within seconds and has everybody connect anew, each with what is new of his own.
     """
     from common.errors import ConfigError
-    from security.folder import authority_files, renew
-    from security.folder import forget as forget_others
+    from security.certificates import authority_files, renew
+    from security.certificates import forget as forget_others
 
     valid, place = options.whole("--days", days, 1), Path(folder)
     assert valid is not None
@@ -88,7 +89,7 @@ def show(folder: Folder, as_json: options.Json = False) -> None:
     """Show who may do what, as the router enforces it, and until when each certificate is valid."""
     from common.errors import ConfigError
     from common.transport.credentials import ROUTER_NAME, read_access
-    from security.checking import allowances, certificate_in
+    from security.validation import allowances, certificate_in
 
     place = Path(folder)
     allowed = allowances(read_access(place))
@@ -123,9 +124,9 @@ def check(
     from common.config import load_cell, names_of
     from common.errors import ConfigError
     from common.transport.credentials import OPERATOR, RECORDER, ROUTER_NAME, common_name, read_access
-    from security.checking import require_current, require_valid
-    from security.requiring import renewal
-    from security.rights import rights_in
+    from security.access import rights_in
+    from security.preflight import renewal
+    from security.validation import require_current, require_valid
 
     if only and len(cells or ()) != 1:
         raise ConfigError("--only", ",".join(only), "needs the one cell that they are services of: --cell CELL")
@@ -140,3 +141,41 @@ def check(
             require_valid(place, names, again)
         require_current(place, read_access(place), cell.name, rights, again)
         echo(f"{cell.name}: {len(rights)} processes, certificates and rules are as they need them")
+
+
+router = CommandGroup("Configuration of a cell's router.")
+HEAD = "// A router for work cells, as `zencell up` would start it: zenohd --config THIS_FILE\n"
+
+
+@router.command()
+def config(
+    domain: options.Domain = None,
+    listen: options.Listen = None,
+    link: options.Link = None,
+    secure: options.Secure = None,
+) -> None:
+    """Print the router's configuration as JSON5, for zenohd or the image eclipse/zenoh."""
+    from common.supervision.launch import Launch
+    from common.transport.credentials import ROUTER_NAME, credentials_of, read_access, secure_folder
+    from common.transport.endpoint import (
+        DEFAULT_DOMAIN,
+        DOMAIN_VARIABLE,
+        endpoint_of,
+        parse_domain,
+        router_settings,
+    )
+    from security.preflight import choose
+    from security.validation import require_valid
+
+    choose(secure)
+    given = os.environ.get(DOMAIN_VARIABLE, DEFAULT_DOMAIN) if domain is None else domain
+    number = parse_domain(given, DOMAIN_VARIABLE if domain is None else "--domain")
+    launch = HostOptions(listen, link).linked(Launch(cell="", domain=number))
+    endpoints = launch.listen or (endpoint_of(number),)
+    folder = secure_folder()
+    if folder is None:
+        settings = router_settings(endpoints, links=launch.link)
+    else:
+        require_valid(folder, [ROUTER_NAME], f"zencell secure init {folder} --renew")
+        settings = router_settings(endpoints, credentials_of(ROUTER_NAME, folder), read_access(folder), launch.link)
+    echo(HEAD + json.dumps(settings, indent=1))

@@ -73,7 +73,7 @@ def _single(cell: Cell, seed: int, faults: bool, file: str | None, limit: float)
     from lab.observers import Trace
     from lab.simulation import Simulation
     from recording.capture import CustomTopics
-    from recording.summary import about, require_new
+    from recording.formatting import about, require_new
 
     trace = None
     if file is not None:

@@ -1,4 +1,4 @@
-"""Where a verb is done: a cell that is up, or what its options name, and short visits to it."""
+"""The running cell that a command works on, from its options --cell, --domain and --connect."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ if TYPE_CHECKING:
     from common.transport.bus import Bus
 
 T = TypeVar("T")
-Verb = TypeVar("Verb", bound=Callable[..., Any])
+Command = TypeVar("Command", bound=Callable[..., Any])
 
 
 @dataclass(frozen=True)
 class CellTarget:
-    """A cell that is up, by the options --cell, --domain and --connect.
+    """A running cell, by the options --cell, --domain and --connect.
 
-    Its methods raise NoCellRunning without a router or a cell, and UnknownName if several cells are up and none was
-    named, or if another one was.
+    Its methods raise NoCellRunning without a router or a cell, and UnknownName if several cells are running and none
+    was named.
     """
 
     cell: str | None = None
@@ -40,12 +40,12 @@ class CellTarget:
     def visit(
         self, visit: Callable[[Bus], Awaitable[T]], *, any_cell: bool = False, identity: str | None = None
     ) -> T:
-        """What a visit to the cell's network returns.
+        """Join the cell's network and return the result of `visit`.
 
         Args:
-            visit: is called with a bus in the cell.
-            any_cell: the visit is to the network, no cell needs to be up.
-            identity: whose certificate is shown in a secured cell; the operator's if not given.
+            visit: called with a bus in the cell.
+            any_cell: join the network; no cell needs to be running.
+            identity: certificate to use in a secured cell; default: the operator's.
         """
         from common.client.joining import joined
         from common.transport.credentials import OPERATOR
@@ -59,7 +59,7 @@ class CellTarget:
         return asyncio.run(visited())
 
     def join(self, visit: Callable[[Cell], Awaitable[T]]) -> T:
-        """What is done in the cell, as a program with the client does it."""
+        """Join the cell with the Python client and return the result of `visit`."""
         from common.client.cell import Cell
 
         async def joined() -> T:
@@ -69,13 +69,13 @@ class CellTarget:
         return asyncio.run(joined())
 
     def answer(self, visit: Callable[[Cell], Awaitable[Message]]) -> None:
-        """Print what a program with the client gets for an answer, as JSON."""
+        """Join the cell with the Python client and print the result of `visit` as JSON."""
         from common.messages.schema import to_json
 
         echo(to_json(self.join(visit).model_dump()))
 
     def show(self, lines: Callable[[Bus], AsyncGenerator[str, None]], most: int | None) -> None:
-        """Write lines as they come in the cell, until there are so many."""
+        """Write lines as they come from the cell, at most that many."""
 
         async def visit(bus: Bus) -> None:
             shown = 0
@@ -88,47 +88,47 @@ class CellTarget:
 
         self.visit(visit)
 
-    def look(self) -> dict[str, RunningCell]:
-        """The cells that are up, by name; none when nothing is up there."""
-        from common.client.joining import look
+    def running_cells(self) -> dict[str, RunningCell]:
+        """Return the running cells by name."""
+        from common.client.joining import running_cells
 
-        return asyncio.run(look(self.domain, self.connect))
+        return asyncio.run(running_cells(self.domain, self.connect))
 
 
-RUNNING = CellTarget()  # the one cell that is up, where ZENCELL_DOMAIN or ZENCELL_CONNECT say
+RUNNING = CellTarget()  # the only running cell, at ZENCELL_DOMAIN or ZENCELL_CONNECT
 _OPTIONS = {"cell": options.CellName, "domain": options.Domain, "connect": options.Connect}
 
 
 class CommandGroup(typer.Typer):
-    """A group of verbs; the parameter `at: CellTarget` of one is what --cell, --domain and --connect say."""
+    """A group of commands; a parameter `at: CellTarget` becomes the options --cell, --domain and --connect."""
 
     def __init__(self, about: str = "", **settings: Any) -> None:
-        """A group with a line about it."""
+        """Create a group with a line of help."""
         super().__init__(**{"help": about, "no_args_is_help": True, **settings})
 
-    def command(self, *name: Any, **settings: Any) -> Callable[[Verb], Verb]:
-        """What adds a verb, as typer's does."""
+    def command(self, *name: Any, **settings: Any) -> Callable[[Command], Command]:
+        """Return a decorator that adds a command, like typer's."""
         add = super().command(*name, **settings)
 
-        def added(verb: Verb) -> Verb:
-            add(_with_options(verb))
-            return verb
+        def added(command: Command) -> Command:
+            add(_with_options(command))
+            return command
 
         return added
 
 
-def _with_options(verb: Callable[..., T]) -> Callable[..., T]:
-    """The verb with the options of its place: --cell where `at` stands, the others last, as in all verbs."""
-    signature = inspect.signature(verb, eval_str=True)
+def _with_options(command: Callable[..., T]) -> Callable[..., T]:
+    """Replace `at` by its options: --cell in its position, the others last, as in all commands."""
+    signature = inspect.signature(command, eval_str=True)
     if not isinstance(getattr(signature.parameters.get("at"), "default", None), CellTarget):
-        return verb
+        return command
 
-    @functools.wraps(verb)
-    def placed(cell: str | None, domain: str | None, connect: str | None, **given: Any) -> T:
-        return verb(**given, at=CellTarget(cell, domain, connect))
+    @functools.wraps(command)
+    def targeted(cell: str | None, domain: str | None, connect: str | None, **given: Any) -> T:
+        return command(**given, at=CellTarget(cell, domain, connect))
 
-    made = {name: inspect.Parameter(name, inspect.Parameter.POSITIONAL_OR_KEYWORD, default=None, annotation=annotation)
-            for name, annotation in _OPTIONS.items()}
-    shown = [made.pop("cell") if name == "at" else each for name, each in signature.parameters.items()]
-    placed.__signature__ = signature.replace(parameters=[*shown, *made.values()])  # type: ignore[attr-defined]
-    return placed
+    added = {name: inspect.Parameter(name, inspect.Parameter.POSITIONAL_OR_KEYWORD, default=None, annotation=annotation)
+             for name, annotation in _OPTIONS.items()}
+    shown = [added.pop("cell") if name == "at" else each for name, each in signature.parameters.items()]
+    targeted.__signature__ = signature.replace(parameters=[*shown, *added.values()])  # type: ignore[attr-defined]
+    return targeted

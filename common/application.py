@@ -100,10 +100,10 @@ class ApplicationTopics:
 
 @dataclass(frozen=True, kw_only=True)
 class Checks:
-    """What `zencell check` finds in a cell of the application, each a generator of `tools.check.finding.Finding`."""
+    """What `zencell check` finds in a cell of the application, each a generator of `tools.check.Finding`."""
 
     quick: Callable[..., Iterator[Any]] | None = None
-    """`quick(cell)`: what the files tell."""
+    """`quick(cell)`: from the files alone."""
     reach: Callable[..., Iterator[Any]] | None = None
     """`reach(cell, arm)`: what needs the robot model, with a `tools.check.arm.Arm`."""
 

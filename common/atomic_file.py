@@ -1,4 +1,4 @@
-"""A file that is always whole, in which what persons decided outlives the service that keeps it, and the machine."""
+"""Files that are always complete, in which state outlives its service and a power failure."""
 
 from __future__ import annotations
 
@@ -16,35 +16,35 @@ from common.errors import ConfigError, ZencellError
 
 R = TypeVar("R", bound=BaseModel)
 
-STATE_VARIABLE = "ZENCELL_STATE"  # folder for what is kept: what persons decided, how the simulated world stands
-RUNTIME_VARIABLE = "ZENCELL_STANDING"  # folder for what is kept until the cell's end alone, as how the world stands
-LARGEST = 1_000_000  # [bytes]
-ROOM = 128 * 1024  # [bytes] that each file takes: more than the largest record there can be
+STATE_VARIABLE = "ZENCELL_STATE"  # folder of persistent state: interlocks, added solids, the simulated world
+RUNTIME_VARIABLE = "ZENCELL_STANDING"  # folder of state that lasts until the cell ends, such as the simulated world
+MAX_BYTES = 1_000_000  # that are read of a file
+ROOM = 128 * 1024  # [bytes] reserved for each file: more than the largest record
 
 
 def state_folder(environ: Mapping[str, str] = os.environ) -> Path:
-    """The folder for what is kept: ZENCELL_STATE, else one in the person's home.
+    """Return the folder of persistent state: ZENCELL_STATE, else one in the user's home.
 
     Raises:
-        ConfigError: there is no home.
+        ConfigError: the user has no home.
     """
-    if told := environ.get(STATE_VARIABLE):
-        return Path(told)
+    if given := environ.get(STATE_VARIABLE):
+        return Path(given)
     try:
         return Path(environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "zencell"
     except RuntimeError:
-        told = "must name a folder to keep what persons decide in: this user has no home"
-        raise ConfigError(STATE_VARIABLE, ..., told) from None
+        expected = "must name a folder for persistent state, such as interlocks: this user has no home"
+        raise ConfigError(STATE_VARIABLE, ..., expected) from None
 
 
 def runtime_folder(environ: Mapping[str, str] = os.environ) -> Path | None:
-    """The folder for what outlives a service, but not the cell; None where nobody has said one: then it is not kept."""
+    """Return the folder of state that outlives a service but not the cell; None: it is not saved."""
     folder = environ.get(RUNTIME_VARIABLE) or environ.get(STATE_VARIABLE)
     return Path(folder) if folder else None
 
 
 class Unreadable(ZencellError):
-    """A file that does not say what was kept."""
+    """A file that holds no valid record."""
 
     def __init__(self, path: Path, why: str) -> None:
         super().__init__(f"{path} cannot be read: {why}")
@@ -52,12 +52,12 @@ class Unreadable(ZencellError):
 
 
 def open_regular(path: Path, flags: int) -> int:
-    """A descriptor of a file; one that is made is for us alone.
+    """Open a file and return its descriptor; a new file is private to this user.
 
     Raises:
-        OSError: it cannot be opened, or is something else than a file.
+        OSError: it cannot be opened, or is no regular file.
     """
-    descriptor = os.open(path, flags | os.O_NONBLOCK, 0o600)  # a pipe would have us wait for its other end
+    descriptor = os.open(path, flags | os.O_NONBLOCK, 0o600)  # opening a pipe would block without
     if stat.S_ISREG(os.fstat(descriptor).st_mode):
         return descriptor
     os.close(descriptor)
@@ -65,31 +65,31 @@ def open_regular(path: Path, flags: int) -> int:
 
 
 class AtomicFile(Generic[R]):
-    """A record that is always whole: a new file takes the place of the old one, which is the next new one.
+    """A record in a file that is always complete: a new file replaces the old one, which becomes the next new one.
 
-    Both have room for any record from the start: a disk that becomes full later still takes what is decided.
+    Both reserve room for any record from the start: a disk that gets full later still takes new records.
     """
 
     def __init__(self, path: Path, model: type[R]) -> None:
-        """Use this file for records of a kind; neither it nor its folder need be there yet."""
+        """Use this file for records of a model; neither it nor its folder need exist yet."""
         self.path, self._model = path, model
         self._new = path.with_name(f"{path.name}.new")
         self._last = path.with_name(f"{path.name}.last")  # second name of the old file while it is replaced
 
     def read(self) -> R:
-        """The record; an empty one when nothing was kept yet.
+        """Return the record; a default one if none was saved yet.
 
         Raises:
-            Unreadable: there is something else.
+            Unreadable: the file holds no valid record.
         """
-        kept = self.find()
-        return self._model() if kept is None else kept
+        record = self.find()
+        return self._model() if record is None else record
 
     def find(self) -> R | None:
-        """The record; None when nothing was kept yet.
+        """Return the record; None if none was saved yet.
 
         Raises:
-            Unreadable: there is something else.
+            Unreadable: the file holds no valid record.
         """
         try:
             return self._model.model_validate_json(self._text())
@@ -105,17 +105,17 @@ class AtomicFile(Generic[R]):
 
     def _text(self) -> bytes:
         with open(open_regular(self.path, os.O_RDONLY), "rb") as file:
-            return file.read(LARGEST)
+            return file.read(MAX_BYTES)
 
     def save(self, record: R) -> None:
-        """Write a record so that it is there, or the one before it, whatever happens to the machine.
+        """Save a record; a power failure at any time leaves this or the previous one.
 
         Raises:
             OSError: it could not be written.
         """
         self.make_room(record)
         self._last.unlink(missing_ok=True)
-        with contextlib.suppress(OSError):  # there is none yet, or no second names: then the next one needs new room
+        with contextlib.suppress(OSError):  # no file yet, or no hard links: then the next save needs new room
             os.link(self.path, self._last, follow_symlinks=False)
         self._new.replace(self.path)
         with contextlib.suppress(FileNotFoundError):
@@ -127,7 +127,7 @@ class AtomicFile(Generic[R]):
             os.close(folder)
 
     def make_room(self, record: R) -> None:
-        """Write the new file, over what it holds: a file that is made shorter gives its room away.
+        """Write the new file over its previous contents: truncating a file would release its room.
 
         Raises:
             OSError: it could not be written.
@@ -135,10 +135,10 @@ class AtomicFile(Generic[R]):
         self.path.parent.mkdir(parents=True, exist_ok=True)
         with contextlib.suppress(FileNotFoundError):
             if not os.path.lexists(self._new):
-                self._last.replace(self._new)  # we were ended between the two
+                self._last.replace(self._new)  # a process was killed between the two renames
             found = self._new.lstat()
             if not stat.S_ISREG(found.st_mode) or found.st_nlink > 1:
-                self._new.unlink()  # writing over it would change something else
+                self._new.unlink()  # writing to it would change another file
         left = record.model_dump_json(indent=1).encode().ljust(ROOM - 1) + b"\n"
         descriptor = os.open(self._new, os.O_WRONLY | os.O_CREAT | os.O_NOFOLLOW, 0o600)
         try:
@@ -148,5 +148,3 @@ class AtomicFile(Generic[R]):
             os.fsync(descriptor)
         finally:
             os.close(descriptor)
-
-

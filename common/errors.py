@@ -1,27 +1,27 @@
-"""Errors that carry their data, so that a message can name the thing, the value and the choices."""
+"""Errors that carry their data, so that a message names the object, the value and the choices."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from difflib import get_close_matches
 
-LONGEST_SHOWN = 120  # characters of a value
+MAX_SHOWN = 120  # characters of a value
 
 
 class ZencellError(Exception):
-    """An error that is shown to the person as one line, without a traceback."""
+    """An error that users see as one line, without a traceback."""
 
 
 class ConfigError(ZencellError):
-    """A value of the configuration that cannot be used: names the field, the value and what would do.
+    """An unusable value of the configuration: names the field, the value and what is expected.
 
-    The value `...` stands for none, where one is missing or several do not fit together.
+    The value `...` means that it is missing, or that several values do not fit together.
     """
 
     def __init__(self, field: str, value: object, expected: str) -> None:
-        shown = " ".join(repr(value).split())  # one line, also of a matrix
-        if len(shown) > LONGEST_SHOWN:
-            shown = shown[: LONGEST_SHOWN - 3] + "..."
+        shown = " ".join(repr(value).split())  # one line, also for a matrix
+        if len(shown) > MAX_SHOWN:
+            shown = shown[: MAX_SHOWN - 3] + "..."
         super().__init__(f"{field}: {expected}" if value is ... else f"{field}: {shown} {expected}")
         self.field = field
         self.value = value
@@ -54,7 +54,7 @@ class RequestFailed(ZencellError):
 
 
 class RemoteError(RequestFailed):
-    """The responder refused the request or failed at it: `code` is for programs, the message for people."""
+    """The responder refused the request or failed: `code` is for programs, `message` for users."""
 
     def __init__(self, key: str, code: str, message: str) -> None:
         super().__init__(f"{key}: {message} [{code}]")
@@ -64,7 +64,7 @@ class RemoteError(RequestFailed):
 
 
 class NoResponder(RequestFailed):
-    """Nobody serves the key, known before anything was sent: the request was certainly not carried out."""
+    """No service serves the key. Known before sending: the request was certainly not carried out."""
 
     def __init__(self, key: str) -> None:
         super().__init__(f"{key}: no service answers this key")
@@ -80,7 +80,7 @@ class RequestLost(RequestFailed):
 
 
 class RequestTimeout(RequestFailed):
-    """No answer within the time given: the request may still be carried out."""
+    """No answer in time: the request may still be carried out."""
 
     def __init__(self, key: str, seconds: float) -> None:
         super().__init__(f"{key}: no answer within {seconds:g} s")
@@ -89,7 +89,7 @@ class RequestTimeout(RequestFailed):
 
 
 class Refused(ZencellError):
-    """Raised by the handler of a request to refuse it: becomes a `RemoteError` at the requester."""
+    """Raised by the handler of a request to refuse it; the client gets a `RemoteError`."""
 
     def __init__(self, code: str, message: str) -> None:
         super().__init__(message)
@@ -97,4 +97,4 @@ class Refused(ZencellError):
 
 
 class DecodeError(ZencellError):
-    """A payload that is not a valid message: too large, not msgpack, or not of the expected shape."""
+    """A payload that is no valid message: too large, not msgpack, or of another shape."""

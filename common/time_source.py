@@ -1,6 +1,6 @@
-"""Where time and ids come from: this machine, or a simulation that runs in this process.
+"""Source of time and ids: this machine, or a simulation that runs in this process.
 
-Whatever a cell does asks here and not the machine itself, so that a simulation decides both.
+All code of a cell takes them from here, so that a simulation controls both.
 """
 
 from __future__ import annotations
@@ -11,24 +11,24 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Protocol
 
-# Where there is no such clock (macOS), the monotonic one is shared by all processes as well.
+# Without such a clock (macOS) the monotonic one is the same in all processes as well.
 _HOST_CLOCK = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)
 
 
 class TimeSource(Protocol):
-    """A clock that never goes back, one that says what day it is, and ids."""
+    """A monotonic clock, a boot clock, a wall clock, and ids."""
 
     def monotonic_ns(self) -> int:
-        """Time since some moment [ns]."""
+        """Return the time since an arbitrary moment [ns]."""
 
     def host_ns(self) -> int:
-        """Time since this host was started, also while it slept [ns]: the same in all its processes."""
+        """Return the time since this host was booted, sleep included [ns]: the same in all its processes."""
 
     def wall_ns(self) -> int:
-        """Time since the Unix epoch [ns]."""
+        """Return the time since the Unix epoch [ns]."""
 
     def token_hex(self, count: int) -> str:
-        """So many bytes that nobody else has, in hexadecimal digits."""
+        """Return `count` unique bytes in hexadecimal digits."""
 
 
 def _host_ns() -> int:
@@ -36,7 +36,7 @@ def _host_ns() -> int:
 
 
 class SystemTimeSource:
-    """The clocks of this machine, and ids that nobody can guess."""
+    """The clocks of this machine, and random ids."""
 
     monotonic_ns = staticmethod(time.monotonic_ns)
     host_ns = staticmethod(_host_ns)
@@ -44,43 +44,43 @@ class SystemTimeSource:
     token_hex = staticmethod(secrets.token_hex)
 
 
-class _Chosen:
-    sources: TimeSource = SystemTimeSource()
+class _Current:
+    source: TimeSource = SystemTimeSource()
 
 
 def monotonic() -> float:
-    """Time since some moment [s], for durations."""
-    return _Chosen.sources.monotonic_ns() * 1e-9
+    """Return the time since an arbitrary moment [s], for durations."""
+    return _Current.source.monotonic_ns() * 1e-9
 
 
 def monotonic_ns() -> int:
-    """Time since some moment [ns], for durations."""
-    return _Chosen.sources.monotonic_ns()
+    """Return the time since an arbitrary moment [ns], for durations."""
+    return _Current.source.monotonic_ns()
 
 
 def host_ns() -> int:
-    """Time since this host was started, also while it slept [ns]: the same in all its processes."""
-    return _Chosen.sources.host_ns()
+    """Return the time since this host was booted, sleep included [ns]: the same in all its processes."""
+    return _Current.source.host_ns()
 
 
 def wall_ns() -> int:
-    """Time since the Unix epoch [ns]; may be set back."""
-    return _Chosen.sources.wall_ns()
+    """Return the time since the Unix epoch [ns]; it may be set back."""
+    return _Current.source.wall_ns()
 
 
 def new_id(count: int = 4) -> str:
-    """An id of `count` bytes in hexadecimal digits."""
-    return _Chosen.sources.token_hex(count)
+    """Return an id of `count` bytes in hexadecimal digits."""
+    return _Current.source.token_hex(count)
 
 
 @contextmanager
-def use_time_source(sources: TimeSource) -> Iterator[None]:
-    """Inside, everything in this process takes time and ids from there."""
-    before, _Chosen.sources = _Chosen.sources, sources
+def use_time_source(source: TimeSource) -> Iterator[None]:
+    """Use another source for the whole process inside the block."""
+    before, _Current.source = _Current.source, source
     try:
         yield
     finally:
-        _Chosen.sources = before
+        _Current.source = before
 
 
 class WatchdogClock:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from common.atomic_file import STATE_VARIABLE
-from common.clock import KEPT_VARIABLE
+from common.clock import CLOCK_FOLDER_VARIABLE
 from common.config import Cell, load_cell, names_of
 
 IMAGE = "zencell"
@@ -49,7 +49,7 @@ def router() -> Container:
 
 def containers_of(file: str, cell: Cell) -> list[Container]:
     """Return the services of a cell in start order."""
-    environment = {"ZENCELL_CONNECT": f"tcp/{ROUTER}:{ROUTER_PORT}", "ZENCELL_CELL": file, KEPT_VARIABLE: DATA}
+    environment = {"ZENCELL_CONNECT": f"tcp/{ROUTER}:{ROUTER_PORT}", "ZENCELL_CELL": file, CLOCK_FOLDER_VARIABLE: DATA}
     state = {kind: {STATE_VARIABLE: DATA} for kind in PERSISTENT}
     return [
         Container(

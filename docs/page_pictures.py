@@ -1,6 +1,6 @@
-"""Writes the pictures of the page in docs, each from the middle of a real run: `python -m docs.page_pictures`.
+"""Write the screenshots of the page for docs, each during a real run: `python -m docs.page_pictures [CELL ...]`.
 
-It needs Chromium (apt install chromium). With the name of a cell only that one's is written.
+Needs Chromium (apt install chromium).
 """
 
 from __future__ import annotations
@@ -16,41 +16,40 @@ from playwright.sync_api import Page, sync_playwright
 
 HERE = Path(__file__).resolve().parent
 ARGUMENTS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-PATIENCE = 240_000  # [ms]
-SPEED = "0.3"  # of the cell: a browser without a graphics card draws slowly
-# Of each cell, what the page says at a moment that is worth a picture.
-MOMENTS = {"panda": "Placing", "ur5": "Tracing"}
-PLACED = 3  # balls in the box, for the Panda
+TIMEOUT = 240_000  # [ms]
+SPEED = "0.3"  # of the cell: a browser without a GPU draws slowly
+STATES = {"panda": "Placing", "ur5": "Tracing"}  # state of the task in which the screenshot of each cell is taken
+PLACED = 3  # balls in the box of the Panda cell
 
 
 def take(cell: str, page: Page) -> None:
-    """Wait for the moment and write the picture."""
+    """Start the task, wait for its state and write the screenshot."""
     page.locator("canvas").first.wait_for()
     page.get_by_text("STOP", exact=True).wait_for()
     page.get_by_role("button", name="Start", exact=True).click()
     if cell == "panda":
         page.wait_for_function(f"[...document.querySelectorAll('*')].some(e => e.textContent.trim() === '{PLACED}')")
-    page.get_by_text(MOMENTS[cell]).first.wait_for()
+    page.get_by_text(STATES[cell]).first.wait_for()
     page.wait_for_timeout(4000)
     page.screenshot(path=HERE / f"page_{cell}.jpg", type="jpeg", quality=80)
 
 
 def main() -> None:
-    """Bring each cell up and look at it."""
+    """Start each cell and take its screenshot."""
     program = shutil.which("chromium")
     if program is None:
         sys.exit("Chromium is not installed: apt install chromium")
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=program, args=ARGUMENTS)
-        for number, cell in enumerate(sys.argv[1:] or MOMENTS):
+        for number, cell in enumerate(sys.argv[1:] or STATES):
             command = [sys.executable, "-m", "cli.main", "up", cell, "--speed", SPEED, "--domain", str(200 + number),
                        "--set", "autostart=false"]
             with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
                 assert process.stdout is not None
                 address = next(found[1] for line in process.stdout if (found := re.match(r"Open (http\S+)", line)))
-                threading.Thread(target=process.stdout.read, daemon=True).start()  # a full pipe would hold the cell up
+                threading.Thread(target=process.stdout.read, daemon=True).start()  # a full pipe would block the cell
                 page = browser.new_page(viewport={"width": 1600, "height": 900})
-                page.set_default_timeout(PATIENCE)
+                page.set_default_timeout(TIMEOUT)
                 page.goto(address)
                 take(cell, page)
                 page.close()

@@ -13,10 +13,11 @@ from pydantic import BaseModel
 import zencell
 from cli.main import app
 from common.application import all_topics
-from common.client.arm import Arm, Gripper
-from common.client.cell import Cell, World
+from common.client.arm import Arm
+from common.client.cell import Cell
+from common.client.gripper import Gripper
 from common.client.parameters import Parameters
-from common.client.scene import Scene
+from common.client.scene import Scene, World
 from common.client.subscriptions import Camera
 from common.client.task import TaskControl
 from common.config.tunables import bounds_of

@@ -81,7 +81,8 @@ class Robotiq:
         """
         if fault := self._get("FLT"):
             raise RuntimeError(f"the gripper has fault {fault}: see its manual")
-        position, status = self._get("POS"), self._get("OBJ")
+        status = self._get("OBJ")  # first: once the fingers have stopped, the position read next is final
+        position = self._get("POS")
         model = self._model
         share = (model.closed - position) / (model.closed - model.open)
         holding = status in (HOLDING_OPENING, HOLDING_CLOSING)

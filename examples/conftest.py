@@ -1,4 +1,4 @@
-"""The tests of the examples are whole cells: with the others that take long."""
+"""Tests of the examples run complete cells: marked slow."""
 
 from pathlib import Path
 

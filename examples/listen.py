@@ -1,4 +1,4 @@
-"""Joint states to a CSV file; and any key by its name."""
+"""Write joint states to a CSV file; read any other key."""
 
 import csv
 import sys

@@ -1,4 +1,4 @@
-"""Named poses, poses, straight lines, arcs and paths; and a plan that is looked at before it is executed."""
+"""Named poses, poses, straight lines, arcs and paths; a plan inspected before execution."""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""A ball that the camera saw is picked up."""
+"""Pick a ball that the camera detected."""
 
 import sys
 

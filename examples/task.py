@@ -1,4 +1,4 @@
-"""With `async`: a task is started, heard of, paused, and gone on with."""
+"""With `async`: start, monitor, pause and resume a task."""
 
 import asyncio
 import sys
@@ -19,7 +19,7 @@ async def main() -> None:
         try:
             await cell.arm.move("home")
         except MotionFailed as error:
-            print(error)  # while a task has the robot, nobody else moves it
+            print(error)  # rejected: the task has the motion authority
         await cell.task.pause()
         print("paused at", (await cell.arm.joints()).round(2))
         await cell.task.resume()

@@ -1,4 +1,4 @@
-"""Parameters while the cell runs: at which least area the detector loses the balls."""
+"""Parameters at runtime: from which minimum area the detector loses the balls."""
 
 import sys
 

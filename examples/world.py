@@ -1,4 +1,4 @@
-"""Objects of the simulated world: added, moved and taken away; and how far off they are seen."""
+"""Add, move and remove objects of the simulated world, and measure the error of their detection."""
 
 import sys
 

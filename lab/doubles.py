@@ -30,7 +30,7 @@ PLANNER, PERCEPTION = "motion_planner", "perception"
 LEFT_OUT = ("robot_state_publisher", "viewer")  # nothing reads frames where there are no images
 # Control cycles are most of the work of a run; invariants are still checked in each of them.
 EXECUTOR, FEWER_CYCLES = "trajectory_executor", {"joint_state_rate": 25.0}  # [Hz]
-MOST_POSES = 200  # of a path
+MAX_POSES = 200  # of a path
 
 
 def settings_of(application: str) -> tuple[str, ...]:
@@ -90,7 +90,7 @@ def waypoints(robot: RobotModel, start: Array, goal: object) -> list[Array]:
         return passed[1:]
     if not isinstance(goal, m.PoseGoal | m.PathGoal):
         raise Refused("not_applicable", f"the planner's double does not support {type(goal).__name__}")
-    poses = [goal.pose] if isinstance(goal, m.PoseGoal) else goal.waypoints[1:MOST_POSES]
+    poses = [goal.pose] if isinstance(goal, m.PoseGoal) else goal.waypoints[1:MAX_POSES]
     found = [start]
     for pose in poses:
         T = pose_to_matrix(pose)

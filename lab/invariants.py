@@ -123,7 +123,7 @@ class Invariants:
 
     def __init__(self, cell: Cell, requests: RequestLog, now: Callable[[], float]) -> None:
         """Observe the requests of a cell; `now` returns the virtual time [s]."""
-        self._checks = checks = Checks(now)
+        self.checks = checks = Checks(now)
         self.finished = False  # ignore set-points from now on
         self.truth_readers: set[str] = set()  # processes that subscribe to what only cameras may read
         self.motion = MotionInvariants(checks, cell)
@@ -150,12 +150,12 @@ class Invariants:
     @property
     def broken(self) -> list[str]:
         """Violations: virtual time, invariant and detail."""
-        return self._checks.broken
+        return self.checks.broken
 
     @property
     def checked(self) -> Counter[str]:
         """Number of checks by invariant."""
-        return self._checks.checked
+        return self.checks.checked
 
     # --- messages -----------------------------------------------------------------------------------------------------
 
@@ -173,7 +173,7 @@ class Invariants:
             sample: as it travels.
             isolated: whether its link was cut before, so that another process may have replaced it meanwhile.
         """
-        checks = self._checks
+        checks = self.checks
         self._isolated |= {instance} if isolated else set()
         if self._log_part not in sample.key:  # a refused second instance may log
             last = self._publishing.setdefault(service, instance)
@@ -205,8 +205,8 @@ class Invariants:
     def _on_request(self, service: str, request: Message) -> None:
         if isinstance(request, WITH_ID):
             known = self._by_id.setdefault(request.id, request)
-            if self._checks.fails(known is request or known == request, ONCE):
-                self._checks.report(ONCE, f"{request.id} is the id of two different requests: "
+            if self.checks.fails(known is request or known == request, ONCE):
+                self.checks.report(ONCE, f"{request.id} is the id of two different requests: "
                                           f"{type(known).__name__} and {type(request).__name__}")
         self.motion.on_request(service, request)
         if isinstance(request, WorldEdit):
@@ -219,7 +219,7 @@ class Invariants:
 
     def check_requests(self) -> None:
         """Check open requests for their deadlines, and report what the request log found."""
-        checks, requests, now = self._checks, self._requests, self._checks.now()
+        checks, requests, now = self.checks, self._requests, self.checks.now()
         for service, key, end in requests.open.values():
             if checks.fails(now <= end + LATE, OUTCOMES):
                 checks.report(OUTCOMES, f"{key} of {service} should have ended by {end:.1f} s")

@@ -1,4 +1,4 @@
-"""What an application adds to the operator's page."""
+"""The part of an application that extends the operator's page."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ class ApplicationPage:
     controls: Callable[..., Any] | None = None
     """Class of the controls below the task's buttons, created with `(gui, console)`; has TOPICS, PERIOD and `show`."""
     requests: Sequence[Request[Any, Any]] = ()
-    """Requests that the controls send."""
+    """Requests that controls and layers send by `Console.call`."""
     states: Mapping[str, str] = field(default_factory=dict)
-    """Labels of its task states, besides IDLE, HOMING, DONE and ERROR."""
-    latency: str = "Picture to decision"
+    """Labels of its task states, in addition to IDLE, HOMING, DONE and ERROR."""
+    latency: str = "Image to decision"
     """Label of the age of `ApplicationTopics.decided_by`."""
     counters: Callable[[TaskStatus, int], Mapping[str, object]] | None = None
     """Figures shown below the state, from the status and the number of rejections."""

@@ -1,4 +1,4 @@
-"""From a person to the cell: what is done on the page is brought from viser's threads to the loop, and asked there."""
+"""Operations of the page: callbacks of viser's threads are moved to the service's loop, and become requests there."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import viser
 from pydantic import JsonValue
 
 from common import topics
+from common.client.task import send_task_command, stop_arm_and_task
 from common.config import Members
 from common.errors import RequestFailed
 from common.messages import (
@@ -23,22 +24,18 @@ from common.messages import (
     OwnRequest,
     Parameter,
     ParameterRequest,
-    StopRequest,
-    TaskCommand,
-    Vector3,
-    WorldEdit,
 )
 from common.topics import Request, Topic
-from page.doors import VISITOR, Doors, Need
 from page.feeds import Feeds
-from page.words import UNDERSTOOD, problem
-from page.world_edits import WorldEdits
+from page.permissions import CURRENT_SESSION, Permission, Permissions
+from page.status_text import USER_ERRORS, error_text
+from page.viser_inside import element_id
 
 if TYPE_CHECKING:
     from common.transport.bus import Bus
     from common.transport.requests import Client
 
-Act = Callable[[], Coroutine[Any, Any, None] | None]
+Action = Callable[[], Coroutine[Any, Any, None] | None]
 M = TypeVar("M", bound=Message)
 Q = TypeVar("Q", bound=Message)
 A = TypeVar("A", bound=Message)
@@ -47,248 +44,263 @@ V_co = TypeVar("V_co", covariant=True)
 
 EXECUTOR = "trajectory_executor"
 SPEED = f"services.{EXECUTOR}.speed_scaling"
-SLIDING = 0.15  # [s] after a slider came to rest, what it says is sent
-_SOON = 2.0  # [s] wall: for what every service has at hand, and for stopping
-_PATIENCE = 5.0  # [s] wall: for anything else
+SLIDER_DEBOUNCE = 0.15  # [s] without a change, after which the value of a slider is sent
+_FAST_TIMEOUT = 2.0  # [s] wall: for stopping, and for replies that need no work
+_TIMEOUT = 5.0  # [s] wall: for all other requests
 
 
 class Field(Protocol[V_co]):
-    """Something on the page that has a value, as mypy sees it."""
+    """A field of the page, in a form that mypy understands."""
 
     @property
     def value(self) -> V_co:
-        """What it shows."""
+        """Its current value."""
 
 
 def assign(handle: Field[V], value: V) -> None:
-    """Show a value in a field of the page, in every browser."""
+    """Set the value of a field in every browser."""
     handle.value = value  # type: ignore[misc]  # it has a setter, behind a decorator
 
 
-def can_be_given(handle: object, value: object) -> bool:
-    """Whether a browser can give that value: whoever has the page open may send what no field of it takes."""
+def is_valid_input(handle: object, value: object) -> bool:
+    """Return whether a browser could have entered this value: a modified client can send anything."""
     if isinstance(value, float) and not math.isfinite(value):
         return False
-    if isinstance(value, list | tuple) and not all(can_be_given(None, each) for each in value):
+    if isinstance(value, list | tuple) and not all(is_valid_input(None, each) for each in value):
         return False
     return not isinstance(handle, viser.GuiDropdownHandle) or value in handle.options
 
 
-class Tell(Protocol):
-    """Shows a person a line about what they asked for."""
+class Notify(Protocol):
+    """Shows the operator the result of an operation."""
 
     def __call__(self, line: str, kind: str = "bad", /) -> None:
-        """Show a line that is good, busy or bad; an empty one takes it away. On the loop of the service."""
+        """Show a line of kind good, busy or bad; an empty line clears it. Runs on the loop of the service."""
 
 
-class Desk:
-    """Takes orders on any thread and carries them out on the loop: plain calls in order, coroutines side by side.
+class ActionQueue:
+    """Accepts actions from any thread and runs them on the loop: plain functions in order, coroutines concurrently.
 
-    What goes wrong in a way that a person can understand is told; anything else is a bug and ends `run`.
+    Errors that an operator can understand are shown; any other exception is a bug and ends `run`.
+
+    Attributes:
+        notify: shows a line to the operator; set by the panel that displays it.
+        permissions: of the pages.
+        before_operation: runs before each operation of a button of `markup`.
     """
 
-    def __init__(self, doors: Doors | None = None) -> None:
-        """Make a desk, on the running loop. `tell` is to be replaced by whoever can show a line to the person."""
-        self.tell: Tell = lambda _line, _kind="bad": None
-        self.doors = doors or Doors()
-        self.doors.refused = lambda line: self.put(lambda: self.tell(line))
+    def __init__(self, permissions: Permissions | None = None) -> None:
+        """Bind to the running loop."""
+        self.notify: Notify = lambda _line, _kind="bad": None
+        self.permissions = permissions or Permissions()
+        self.permissions.on_denied = lambda line: self.put(lambda: self.notify(line))
+        self.before_operation: Action = lambda: None
         self._loop = asyncio.get_running_loop()
-        self._orders: asyncio.Queue[tuple[Act, Context]] = asyncio.Queue()
-        self._pressed: dict[str, tuple[Act, Need]] = {}
-        self.operated: Act = lambda: None  # is done first when somebody operates by a button of our own
+        self._queue: asyncio.Queue[tuple[Action, Context]] = asyncio.Queue()
+        self._buttons: dict[str, tuple[Action, Permission]] = {}
 
-    def put(self, act: Act) -> None:
-        """Have something done for who asks now; from any thread. A loop that has ended does nothing more."""
+    def put(self, action: Action) -> None:
+        """Queue an action for the current session; thread-safe, ignored once the loop is closed."""
         with contextlib.suppress(RuntimeError):
-            self._loop.call_soon_threadsafe(self._orders.put_nowait, (act, copy_context()))
+            self._loop.call_soon_threadsafe(self._queue.put_nowait, (action, copy_context()))
 
     async def run(self) -> None:
-        """Carry out orders until cancelled."""
+        """Run actions until cancelled."""
         async with asyncio.TaskGroup() as group:
             while True:
-                act, context = await self._orders.get()
+                action, context = await self._queue.get()
                 try:
-                    doing = context.run(act)
-                except UNDERSTOOD as error:
-                    self.tell(problem(error))
+                    coroutine = context.run(action)
+                except USER_ERRORS as error:
+                    self.notify(error_text(error))
                     continue
-                if doing is not None:
-                    group.create_task(self._see_through(doing), context=context)
+                if coroutine is not None:
+                    group.create_task(self._await(coroutine), context=context)
 
-    async def _see_through(self, doing: Coroutine[Any, Any, None]) -> None:
+    async def _await(self, coroutine: Coroutine[Any, Any, None]) -> None:
         try:
-            await doing
-        except UNDERSTOOD as error:
-            self.tell(problem(error))
+            await coroutine
+        except USER_ERRORS as error:
+            self.notify(error_text(error))
 
-    def on_press(self, name: str, act: Act, what: str, need: Need = "operate") -> None:
-        """Do something whenever a button of `markup.press` is clicked by somebody who may; `what` is for the log."""
-        self.doors.need(f"press:{name}", need, what)
-        self._pressed[name] = act, need
+    # --- buttons of `markup`, which report over the control socket ---
+
+    def on_press(self, name: str, action: Action, label: str, permission: Permission = "operate") -> None:
+        """Run an action when a permitted page clicks a button of `markup.press`; the log shows `label`."""
+        self.permissions.require(f"press:{name}", permission, label)
+        self._buttons[name] = action, permission
 
     def press(self, name: str) -> None:
-        """A button was clicked by who asks now; one that there is not does nothing. From any thread."""
-        act, need = self._pressed.get(name, (None, "look"))
-        if act is not None and self.doors.admit(VISITOR.get(), f"press:{name}"):
-            if need == "operate":
-                self.put(self.operated)
-            self.put(act)
+        """Handle a click on a button; an unknown name is ignored. Thread-safe."""
+        action, permission = self._buttons.get(name, (None, "look"))
+        if action is not None and self.permissions.allow(CURRENT_SESSION.get(), f"press:{name}"):
+            if permission == "operate":
+                self.put(self.before_operation)
+            self.put(action)
 
-    # Callbacks of viser that are coroutines run on its loop at once; others would wait for a thread.
+    # --- elements of viser; it runs coroutine callbacks on its loop at once, others wait for a thread ---
 
-    def on_click(self, button: viser.GuiButtonHandle, act: Act, need: Need = "operate") -> None:
-        """Do something whenever a button is clicked by somebody who may."""
-        self.doors.need(button._impl.uuid, need, button.label)
+    def on_click(self, button: viser.GuiButtonHandle, action: Action, permission: Permission = "operate") -> None:
+        """Run an action when a permitted page clicks a button."""
+        self.permissions.require(element_id(button), permission, button.label)
 
         async def clicked(_event: object) -> None:
-            self.put(act)
+            self.put(action)
 
         button.on_click(clicked)
 
     def on_choice(
-        self, buttons: viser.GuiButtonGroupHandle, act: Callable[[str], Coroutine[Any, Any, None] | None]
+        self, buttons: viser.GuiButtonGroupHandle, action: Callable[[str], Coroutine[Any, Any, None] | None]
     ) -> None:
-        """Do something with the text of the button that was clicked in a group."""
-        self.doors.need(buttons._impl.uuid, "operate", buttons.label)
+        """Run an action with the text of the clicked button of a group."""
+        self.permissions.require(element_id(buttons), "operate", buttons.label)
 
         async def clicked(event: viser.GuiEvent[viser.GuiButtonGroupHandle]) -> None:
             chosen = event.target.value
             if chosen in event.target.options:
-                self.put(lambda: act(chosen))
+                self.put(lambda: action(chosen))
 
         buttons.on_click(clicked)
 
     def on_change(
-        self, handle: viser.GuiInputHandle[V], act: Callable[[V], Coroutine[Any, Any, None] | None],
-        need: Need = "operate",
+        self, handle: viser.GuiInputHandle[V], action: Callable[[V], Coroutine[Any, Any, None] | None],
+        permission: Permission = "operate",
     ) -> None:
-        """Do something with the value that a person gave; not with one that the service sets itself."""
-        self.doors.need(handle._impl.uuid, need, handle.label)
+        """Run an action with the value that a page entered; not for values that the service sets itself."""
+        self.permissions.require(element_id(handle), permission, handle.label)
 
         async def changed(event: viser.GuiEvent[viser.GuiInputHandle[V]]) -> None:
             value = event.target.value
-            if event.client_id is not None and can_be_given(event.target, value):
-                self.put(lambda: act(value))
+            if event.client_id is not None and is_valid_input(event.target, value):
+                self.put(lambda: action(value))
 
         handle.on_update(changed)
 
 
-class Console(Desk):
-    """A desk that knows whom to ask. Each request ends in an answer or raises a `RequestFailed`."""
+class Console(ActionQueue):
+    """Sends the operator's requests to the cell. Each ends with an answer or raises a `RequestFailed`.
+
+    Attributes:
+        on_object_selected: called with the id of an object of the simulated world that was clicked in the scene.
+        on_object_moved: called with the id and the new center x, y [m] of one that was dragged in the scene.
+        stop_count: number of STOPs on this page, successful or not.
+    """
 
     def __init__(
-        self, bus: Bus, members: Members, feeds: Feeds, more: Iterable[Request[Any, Any]] = (),
-        doors: Doors | None = None,
+        self, bus: Bus, members: Members, feeds: Feeds, requests: Iterable[Request[Any, Any]] = (),
+        permissions: Permissions | None = None,
     ) -> None:
         """Declare the clients.
 
         Args:
             bus: of the service.
-            members: who is in the cell.
-            feeds: what the cell says.
-            more: what else may be asked.
-            doors: know who may do what on the page.
+            members: services of the cell.
+            feeds: topics that the page reads.
+            requests: further requests, of the application.
+            permissions: of the pages.
         """
-        super().__init__(doors)
-        self._feeds, self._bus, self._jog = feeds, bus, bus.writer(topics.MOTION_JOG)
-        self.world = WorldEdits(
-            lambda edit: self.ask(topics.WORLD_EDIT, edit), lambda: self.latest(topics.SCENE_OBJECTS))
-        self.picked: Callable[[str], None] = lambda _name: None  # an object of the simulated world, in the scene
-        self._newest = 0  # `since` of the stop that was said here
-        self.stops = 0  # how often STOP was said here, heard or not
-        asked: list[Request[Any, Any]] = [
+        super().__init__(permissions)
+        self._feeds, self._bus, self._jog_writer = feeds, bus, bus.writer(topics.MOTION_JOG)
+        self.on_object_selected: Callable[[str], None] = lambda _name: None
+        self.on_object_moved: Callable[[str, float, float], Coroutine[Any, Any, None] | None] = lambda *_moved: None
+        self.stop_count = 0
+        self._own_stop = 0  # `since` of the newest stop of this page
+        used: list[Request[Any, Any]] = [
             topics.TASK_COMMAND, topics.MOTION_STOP, topics.MOTION_OWN, topics.GRIPPER_COMMAND,
             topics.ROBOT_COMMAND, topics.WORLD_EDIT]
-        self._clients: dict[str, Client[Any, Any]] = {request.key: bus.client(request) for request in [*asked, *more]}
+        self._clients: dict[str, Client[Any, Any]] = {
+            request.key: bus.client(request) for request in [*used, *requests]}
         self._parameters = {name: bus.client(topics.parameters_of(name)) for name in members.services}
 
-    def latest(self, topic: Topic[M]) -> M | None:
-        """The newest message of a topic that the page reads, or None."""
-        return self._feeds.latest(topic)
+    # --- state of the cell ---
 
-    async def ask(self, request: Request[Q, A], message: Q, timeout: float = _PATIENCE) -> A:
-        """The answer to a request of the page, or of those that an application named as its `REQUESTS`."""
-        client: Client[Q, A] = self._clients[request.key]
-        return await client.call(message, timeout)
+    def latest(self, topic: Topic[M]) -> M | None:
+        """Return the newest message of a topic that the page reads, or None."""
+        return self._feeds.latest(topic)
 
     @property
     def acknowledged(self) -> int | None:
-        """`since` of the newest stop or hold that the page knows of; None where nobody tells of them."""
+        """`since` of the newest stop or hold known to the page; None without a motion status."""
         motion = self.latest(topics.MOTION_STATUS)
-        return max(motion.newest, self._newest) if motion else None
-
-    async def command(self, command: str, override: bool = False, acknowledged: int | None = None) -> None:
-        """Tell the task to start, pause, resume or stop; to start or resume although another person holds the arm.
-
-        Nothing is let go of that is newer than what was `heard` of as this was decided; left out: that is now.
-        """
-        acknowledged = self.acknowledged if acknowledged is None else acknowledged
-        said = {"command": command, "by": self.doors.person, "override": override, "acknowledged": acknowledged}
-        await self.ask(topics.TASK_COMMAND, TaskCommand.model_validate(said))
-
-    async def stop(self) -> str:
-        """Bring the arm to rest and end the task, at the same time; returns in a line what was stopped, and by whom.
-
-        Raises:
-            RequestFailed: the arm could not be told; the task was, if it could.
-        """
-        self.stops += 1
-        arm, task = await asyncio.gather(
-            self.ask(topics.MOTION_STOP, StopRequest(reason="stopped on the page", owner=self.doors.person), _SOON),
-            self.ask(topics.TASK_COMMAND, TaskCommand(command="stop", by=self.doors.person), _SOON),
-            return_exceptions=True,
-        )
-        if isinstance(arm, BaseException):
-            raise arm
-        self._newest = arm.newest
-        if isinstance(task, RequestFailed):
-            return f"Arm stopped by {self.doors.person}; not the task: {problem(task)}"
-        if isinstance(task, BaseException):
-            raise task
-        return f"Stopped by {self.doors.person}"
-
-    async def own(self, act: Literal["take", "give"], over: bool = False) -> MotionOwner:
-        """Have the motion of the robot for who asks now until it is given back, or give it back."""
-        return await self.ask(topics.MOTION_OWN, OwnRequest(act=act, owner=self.doors.person, over=over), _SOON)
-
-    def jog(self, acknowledged: int, **velocities: Any) -> None:
-        """Move with velocities for the next 0.1 s, as a `JogCommand` has them; without any come to rest."""
-        fields = {"header": self._bus.header(), "owner": self.doors.person, "acknowledged": acknowledged, **velocities}
-        self._jog.put(JogCommand.model_validate(fields))
+        return max(motion.newest, self._own_stop) if motion else None
 
     def header(self) -> Header:
-        """Of what is decided now: what comes late, or again after a restart, is refused by it."""
+        """Return a header for a request that is decided now: receivers reject it if it arrives too late."""
         return self._bus.header()
 
-    def answers(self, request: Request[Any, Any]) -> bool:
-        """Whether somebody serves a request now."""
+    def is_available(self, request: Request[Any, Any]) -> bool:
+        """Return whether a service serves this request now."""
         return self._clients[request.key].available
 
-    async def written(self) -> frozenset[str]:
-        """The keys that are written or served in the cell now."""
+    async def published_keys(self) -> frozenset[str]:
+        """Return the keys that are published or served in the cell now."""
         return frozenset(owner.key for owner in await self._bus.owners())
 
-    async def move(self, object_id: str, x: float, y: float) -> None:
-        """Put an object of the simulated world somewhere [m]."""
-        await self.world.do(WorldEdit(op="move", id=object_id, position=Vector3(x=x, y=y)))
+    # --- requests ---
+
+    async def call(self, request: Request[Q, A], message: Q, timeout: float = _TIMEOUT) -> A:
+        """Return the answer to a request of the page, or to one that an application lists in its `REQUESTS`."""
+        client: Client[Q, A] = self._clients[request.key]
+        return await client.call(message, timeout)
+
+    async def command(self, command: str, override: bool = False, acknowledged: int | None = None) -> None:
+        """Send the task a command: start, pause, resume or stop.
+
+        Args:
+            command: name of the command.
+            override: start or resume although another operator holds the arm.
+            acknowledged: newest stop or hold known when this was decided; newer ones stay in force. Default: now.
+        """
+        acknowledged = self.acknowledged if acknowledged is None else acknowledged
+        await send_task_command(self._clients[topics.TASK_COMMAND.key], command, self.permissions.client_name,
+                                override=override, acknowledged=acknowledged, timeout=_TIMEOUT)
+
+    async def stop(self) -> str:
+        """Stop the arm and end the task, concurrently; return a line with what was stopped.
+
+        Raises:
+            RequestFailed: the arm did not confirm the stop; the task was stopped if it could be reached.
+        """
+        self.stop_count += 1
+        client = self.permissions.client_name
+        result = await stop_arm_and_task(self._clients[topics.MOTION_STOP.key], self._clients[topics.TASK_COMMAND.key],
+                                         client, "stopped on the page", _FAST_TIMEOUT)
+        if isinstance(result.arm, RequestFailed):
+            raise result.arm
+        self._own_stop = result.arm.newest
+        if isinstance(result.task, RequestFailed):
+            return f"Arm stopped by {client}; task NOT stopped: {error_text(result.task)}"
+        return f"Stopped by {client}"
+
+    async def own(self, act: Literal["take", "give"], over: bool = False) -> MotionOwner:
+        """Take motion ownership for the current session until it is released, or release it."""
+        request = OwnRequest(act=act, owner=self.permissions.client_name, over=over)
+        return await self.call(topics.MOTION_OWN, request, _FAST_TIMEOUT)
+
+    def jog(self, acknowledged: int, **velocities: Any) -> None:
+        """Move with velocities, as fields of a `JogCommand`, for the next 0.1 s; without any come to a stop."""
+        fields = {"header": self._bus.header(), "owner": self.permissions.client_name, "acknowledged": acknowledged}
+        self._jog_writer.put(JogCommand.model_validate(fields | velocities))
+
+    # --- parameters ---
 
     async def parameters(self) -> dict[str, list[Parameter]]:
-        """The parameters of each service that answers."""
+        """Return the parameters of each service that answers."""
         names = [name for name, client in self._parameters.items() if client.available]
         replies = await asyncio.gather(*map(self._parameters_of, names))
         return {name: reply for name, reply in zip(names, replies, strict=True) if reply is not None}
 
     async def _parameters_of(self, service: str) -> list[Parameter] | None:
         try:
-            return (await self._parameters[service].call(ParameterRequest(), _SOON)).parameters
+            return (await self._parameters[service].call(ParameterRequest(), _FAST_TIMEOUT)).parameters
         except RequestFailed:
-            return None  # it is shown as gone, or asked again soon
+            return None  # shown as lost elsewhere, or requested again soon
 
     async def set_parameter(self, services: list[str], path: str, value: JsonValue) -> None:
-        """Change a parameter in every service that has it."""
-        request = ParameterRequest(set={path: value}, by=self.doors.person)
-        await asyncio.gather(*(self._parameters[name].call(request, _SOON) for name in services))
+        """Set a parameter in every service that has it."""
+        request = ParameterRequest(set={path: value}, by=self.permissions.client_name)
+        await asyncio.gather(*(self._parameters[name].call(request, _FAST_TIMEOUT) for name in services))
 
     async def set_speed(self, scaling: float) -> None:
-        """Have trajectories followed at a share of their speed."""
+        """Set the speed at which trajectories are executed, 0 to 1."""
         await self.set_parameter([EXECUTOR], SPEED, scaling)

@@ -1,4 +1,4 @@
-"""What the page reads, and when: what its panels are made of always, anything else only while somebody looks at it."""
+"""Topics that the page reads: those of its panels always, all others only while a page displays them."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ M = TypeVar("M", bound=Message)
 ALWAYS: tuple[Topic[Any], ...] = (
     topics.JOINT_STATES, topics.MOTION_STATUS, topics.MOTION_OWNER, topics.ROBOT_STATUS, topics.GRIPPER_STATE,
     topics.SUPERVISOR_STATUS, topics.COUNTERS, topics.LOG,
-    topics.PLANNING_SCENE, topics.DISPLAY_TRAJECTORY,  # seldom new; who opens the page may look back at them
+    topics.PLANNING_SCENE, topics.DISPLAY_TRAJECTORY,  # published rarely; the history needs them
 )
-LIVE, ANNOTATED, MASK, DEPTH = "live", "annotated", "mask", "depth"  # pictures
-_LOG_SIZE = 2000  # lines that may wait
+LIVE, ANNOTATED, MASK, DEPTH = "live", "annotated", "mask", "depth"  # kinds of images
+_LOG_QUEUE = 2000  # log lines
 
 
 class Feeds:
-    """A reader for each topic that the page has to do with."""
+    """A reader for each topic of the page."""
 
     def __init__(
         self, bus: Bus, always: Iterable[Topic[Any]], on_demand: Iterable[Topic[Any]] = ()
@@ -38,17 +38,17 @@ class Feeds:
 
         Args:
             bus: of the service.
-            always: what is read all the time.
-            on_demand: what is read while `listen` says so; events are read all the time, since each counts.
+            always: topics that are always read.
+            on_demand: topics that are read while `select` selects them; of these, events are always read.
         """
         self._bus = bus
         self._readers: dict[str, Reader[Any]] = {}
         self._topics: dict[str, Topic[Any]] = {}
-        self._seen: dict[str, Message] = {}
+        self._taken: dict[str, Message] = {}
         self._on_demand: set[str] = set()
         for topic, listening in [*((t, True) for t in always), *((t, t.kind == "event") for t in on_demand)]:
             if topic.key not in self._readers:
-                self._readers[topic.key] = bus.reader(topic, size=_LOG_SIZE, listening=listening)
+                self._readers[topic.key] = bus.reader(topic, size=_LOG_QUEUE, listening=listening)
                 self._topics[topic.key] = topic
                 if not listening:
                     self._on_demand.add(topic.key)
@@ -58,39 +58,39 @@ class Feeds:
 
     @property
     def topics(self) -> list[Topic[Any]]:
-        """All that is read, always or on demand."""
+        """All topics, always read or on demand."""
         return list(self._topics.values())
 
     def reader(self, topic: Topic[M]) -> Reader[M] | None:
-        """The reader of a topic, or None when the page does not read it."""
+        """Return the reader of a topic, or None if the page does not read it."""
         return self._readers.get(topic.key)
 
     def latest(self, topic: Topic[M]) -> M | None:
-        """The newest message of a topic, or None."""
+        """Return the newest message of a topic, or None."""
         reader = self._readers.get(topic.key)
         return reader.latest if reader is not None else None
 
-    def fresh(self, topic: Topic[M]) -> M | None:
-        """The newest message of a topic, when it was not returned yet."""
+    def take(self, topic: Topic[M]) -> M | None:
+        """Return the newest message of a topic if this method has not returned it yet."""
         message = self.latest(topic)
-        if message is None or message is self._seen.get(topic.key):
+        if message is None or message is self._taken.get(topic.key):
             return None
-        self._seen[topic.key] = message
+        self._taken[topic.key] = message
         return message
 
-    def listen(self, wanted: Iterable[Topic[Any]]) -> None:
-        """Listen to these of the topics that are read on demand, and to no other of them."""
-        keys = {topic.key for topic in wanted}
+    def select(self, selected: Iterable[Topic[Any]]) -> None:
+        """Read these on-demand topics and no others."""
+        keys = {topic.key for topic in selected}
         for key in self._on_demand:
             self._bus.listen(self._readers[key], key in keys)
 
 
-def under_all_keys(topic: Topic[M], tables: Iterable[Mapping[str, str]]) -> list[Topic[M]]:
-    """A topic under each key that it has in a cell: two cameras say the same under different ones.
+def remapped_topics(topic: Topic[M], tables: Iterable[Mapping[str, str]]) -> list[Topic[M]]:
+    """Return a topic under each key that it has in a cell, such as one per camera.
 
     Args:
-        topic: in the words of the services.
-        tables: the cell's keys by a service's own, of each service that has some.
+        topic: as the services name it.
+        tables: remappings of the services: the cell's keys by the service's own.
     """
     keys = dict.fromkeys([topic.key, *(Remapping(table).key(topic.key) for table in tables)])
     return [replace(topic, key=key) for key in keys]
@@ -101,117 +101,113 @@ class HasTopics(Protocol):
 
     @property
     def TOPICS(self) -> Sequence[Topic[Any]]:
-        """What it is shown."""
+        """Topics that it displays."""
 
 
 class Topics:
-    """What the page has to do with: what every cell has, what the application names, and what layers show.
+    """Topics and requests of a page: those of every cell, of the application, and of the layers.
 
     Attributes:
         status, rejected, detected, decided_by: of the application, if it has them.
-        images: pictures as the cameras send them, with what was found in them, what was looked at, and depth.
-        requests: what the application asks.
-        on_demand: what is read while somebody looks at it.
+        images: topics of each kind of image.
+        requests: of the application.
+        on_demand: topics that are read while a page displays them.
     """
 
     def __init__(
         self, application: Application | None, parts: Iterable[HasTopics], keys: Sequence[Mapping[str, str]] = ()
     ) -> None:
-        """Look at what an application and parts of the page say, and what services call otherwise by their `keys`."""
+        """Collect the topics of an application and of parts of the page, under the remapped `keys` of the services."""
         found, page = application.topics if application is not None else None, page_of(application)
-        self.status: Topic[Any] | None = found.status if found is not None else None
 
-        def everywhere(*wanted: Topic[Any] | None) -> list[Topic[Any]]:
-            return [each for topic in wanted if topic is not None for each in under_all_keys(topic, keys)]
+        def remapped(*some: Topic[Any] | None) -> list[Topic[Any]]:
+            return [each for topic in some if topic is not None for each in remapped_topics(topic, keys)]
 
-        self.rejected: list[Topic[Rejections]] = everywhere(found.rejected if found else None)
-        self.detected: list[Topic[Any]] = everywhere(found.detected if found else None)
-        self.decided_by: list[Topic[Any]] = everywhere(found.decided_by if found else None)
+        self.status: Topic[Any] | None = found.status if found else None
+        self.rejected: list[Topic[Rejections]] = remapped(found.rejected if found else None)
+        self.detected: list[Topic[Any]] = remapped(found.detected if found else None)
+        self.decided_by: list[Topic[Any]] = remapped(found.decided_by if found else None)
         self.images: dict[str, list[Topic[Image]]] = {
-            LIVE: everywhere(topics.CAMERA_IMAGE, topics.DEPTH_CAMERA_IMAGE),
-            ANNOTATED: everywhere(found.annotated if found else None),
-            MASK: everywhere(found.mask if found else None),
-            DEPTH: everywhere(topics.DEPTH_CAMERA_DEPTH),
+            LIVE: remapped(topics.CAMERA_IMAGE, topics.DEPTH_CAMERA_IMAGE),
+            ANNOTATED: remapped(found.annotated if found else None),
+            MASK: remapped(found.mask if found else None),
+            DEPTH: remapped(topics.DEPTH_CAMERA_DEPTH),
         }
         self.requests: Sequence[Request[Any, Any]] = page.requests
         controls = getattr(page.controls, "TOPICS", ())
-        shown = [topic for part in parts for topic in part.TOPICS]
-        pictures = [topic for each in self.images.values() for topic in each]
-        self.on_demand: list[Topic[Any]] = [*pictures, *controls, *shown]
+        displayed = [topic for part in parts for topic in part.TOPICS]
+        images = [topic for each in self.images.values() for topic in each]
+        self.on_demand: list[Topic[Any]] = [*images, *controls, *displayed]
 
     @property
     def always(self) -> list[Topic[Any]]:
-        """What is read all the time: small or seldom."""
+        """Topics that are always read: small or rarely published."""
         return [*ALWAYS, *([self.status] if self.status is not None else []), *self.rejected,
                 *self.detected, *self.decided_by]
 
 
 class Latest(Protocol):
-    """Where the newest message of a topic comes from: `Feeds.latest`."""
+    """Source of the newest message of a topic, such as `Feeds.latest`."""
 
     def __call__(self, topic: Topic[M], /) -> M | None:
-        """The newest message, or None."""
+        """Return the newest message, or None."""
 
 
-class Shows(HasTopics, Protocol):
-    """A part of the page that shows messages."""
+class MessageView(HasTopics, Protocol):
+    """A part of the page that displays messages."""
 
     @property
     def PERIOD(self) -> float:
-        """Least time between two looks at what is new [s]."""
+        """Minimum time between two updates [s]."""
 
     def show(self, topic: Topic[Any], message: Any, /) -> None:
-        """Show a message."""
+        """Display a message."""
 
 
-class News:
-    """Has a part of the page show the newest message of each of its topics, once, and no more often than it wants.
+class Updater:
+    """Passes the newest message of each topic to a part of the page, once, at most every `PERIOD`.
 
-    Events are not among them: each counts, and is shown when it comes.
+    Events are excluded: all of them are displayed, as they arrive.
     """
 
-    def __init__(self, part: Shows, latest: Latest) -> None:
-        """Tell a part what is new."""
+    def __init__(self, part: MessageView, latest: Latest) -> None:
+        """Update a part of the page."""
         self._part, self._latest = part, latest
-        self._seen: dict[str, Message] = {}
-        self._due = 0.0
+        self._shown: dict[str, Message] = {}
+        self._next = 0.0
 
-    def tell(self, now: float) -> None:
-        """Show what is new at a wall time [s], if it is time."""
-        if now < self._due:
+    def update(self, now: float) -> None:
+        """Display new messages at a wall time [s], if the period is over."""
+        if now < self._next:
             return
         for topic in self._part.TOPICS:
             message = None if topic.kind == "event" else self._latest(topic)
-            if message is not None and message is not self._seen.get(topic.key):
-                self._seen[topic.key] = message
-                self._due = now + self._part.PERIOD
+            if message is not None and message is not self._shown.get(topic.key):
+                self._shown[topic.key] = message
+                self._next = now + self._part.PERIOD
                 self._part.show(topic, message)
 
 
 @dataclass
-class Periods:
-    """Wall time between two looks at a part of the page [s]."""
+class Schedule:
+    """Wall time between two updates of each part of the page [s]."""
 
-    picture: float = 0.1
+    images: float = 0.1
     task: float = 0.2
-    health: float = 0.25
-    line: float = 0.25
+    diagnostics: float = 0.25
+    status_bar: float = 0.25
     plots: float = 0.5
-    memory: float = 0.1
-    _due: dict[str, float] = field(default_factory=dict)
+    history: float = 0.1
+    _next: dict[str, float] = field(default_factory=dict)
 
-    def due(self, part: str, now: float) -> bool:
-        """Whether it is time for a part at a wall time [s]; it is done then."""
-        if now < self._due.get(part, 0.0):
+    def is_due(self, part: str, now: float) -> bool:
+        """Return whether a part is to be updated at a wall time [s], and schedule its next update."""
+        if now < self._next.get(part, 0.0):
             return False
-        self._due[part] = now + float(getattr(self, part))
+        self._next[part] = now + float(getattr(self, part))
         return True
 
-    def hurry_to(self, *parts: str) -> None:
-        """Have it be time for some parts."""
-        for part in parts:
-            self._due.pop(part, None)
-
-    def hurry(self) -> None:
-        """Have it be time for everything: somebody has come who has seen nothing yet."""
-        self._due.clear()
+    def hasten(self, *parts: str) -> None:
+        """Make parts due now; without a name all of them."""
+        for part in parts or list(self._next):
+            self._next.pop(part, None)

@@ -1,15 +1,19 @@
-"""Text of the page: pieces of HTML whose every value is escaped, and the one style sheet."""
+"""HTML of the panels: every value is escaped; one style sheet."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from html import escape
+from typing import TYPE_CHECKING
 
 from common.terminal import printable
 
-GOOD, BUSY, BAD, OFF = "good", "busy", "bad", "off"  # how something is, as a colour beside the word
+if TYPE_CHECKING:
+    import viser
 
-ARM = ' data-needs="arm"'
+GOOD, BUSY, BAD, OFF = "good", "busy", "bad", "off"  # kinds of a state; each has a color
+
+_MOVES_ARM = ' data-needs="arm"'  # overlay.js disables these buttons on pages that must not move the arm
 
 STYLE = """<style>
 .zc { padding: 0 0.75em 0.4em; font-size: 0.8125em; line-height: 1.5; overflow-wrap: anywhere; }
@@ -18,6 +22,7 @@ STYLE = """<style>
 .zc th { font-weight: 500; opacity: 0.6; white-space: nowrap; }
 .zc tr + tr td { border-top: 1px solid rgba(128, 128, 128, 0.18); }
 .zc td.number, .zc th.number { text-align: right; white-space: nowrap; }
+.zc td:has(button) { width: 1%; white-space: nowrap; }
 .zc .dim { opacity: 0.6; }
 .zc .big { font-size: 1.3em; font-weight: 600; }
 .zc .good { color: #2fb344; } .zc .busy { color: #f59f00; } .zc .bad { color: #fa5252; } .zc .off { color: #868e96; }
@@ -45,42 +50,46 @@ STYLE = """<style>
 .zc .pad > div { display: flex; gap: 0.35em; align-items: center; }
 .zc .pad .name { flex: 1; min-width: 2em; } .zc .live { min-width: 4.6em; text-align: right;
   font-variant-numeric: tabular-nums; }
-/* A tick stands before its words, which then need not wrap. */
+/* A checkbox is placed before its label, which then fits on one line. */
 .mantine-Flex-root:has(> div input[type="checkbox"]) { flex-direction: row-reverse; justify-content: flex-end; }
 .mantine-Flex-root:has(> div input[type="checkbox"]) > div { flex-grow: 0 !important; }
 .mantine-Flex-root:has(> div input[type="checkbox"]) > div:first-child { width: auto !important; padding-left: 0.6em; }
 </style>"""
 
-
 def text(value: object) -> str:
-    """The value as text that HTML cannot mistake for anything else, without control characters."""
+    """Return a value as escaped text without control characters."""
     return escape(printable(value, keep="\n"), quote=True)
 
 
 def span(value: object, kind: str) -> str:
-    """Text of a kind: dim, big, good, busy, bad or off."""
+    """Return text of a kind: dim, big, good, busy, bad or off."""
     return f'<span class="{text(kind)}">{text(value)}</span>'
 
 
+def line(value: object, kind: str) -> str:
+    """Return a line of text of a kind."""
+    return f"<div>{span(value, kind)}</div>"
+
+
 def swatch(color: tuple[int, int, int]) -> str:
-    """A small square of a colour, red, green and blue from 0 to 255."""
+    """Return a small square of a color, RGB from 0 to 255."""
     return f'<span class="swatch" style="background: rgb{color}"></span>'
 
 
 def block(inner: str, name: str, **data: object) -> str:
-    """A part of a panel, found by its name; `data` become attributes that say in one word how it is.
+    """Return a named part of a panel.
 
     Args:
         inner: HTML, already escaped.
         name: of the part.
-        data: attributes.
+        data: its state, as data attributes.
     """
     attributes = "".join(f' data-{key.replace("_", "-")}="{text(value)}"' for key, value in data.items())
     return f'<div class="zc" data-part="{text(name)}"{attributes}>{inner}</div>'
 
 
 def fields(values: Mapping[str, object]) -> str:
-    """Numbers with their names below them, side by side."""
+    """Return numbers next to each other, each with its name below."""
     cells = (
         f'<div data-field="{text(name)}"><b>{text(value)}</b><span class="dim">{text(name)}</span></div>'
         for name, value in values.items()
@@ -88,40 +97,40 @@ def fields(values: Mapping[str, object]) -> str:
     return f'<div class="fields">{"".join(cells)}</div>'
 
 
-def press(label: str, name: str, why_not: str = "", *, arm: bool = False) -> str:
-    """A button that is clicked, which the desk knows by a name.
+def press(label: str, name: str, disabled: str = "", *, arm: bool = False) -> str:
+    """Return a button to click.
 
     Args:
-        label: on it.
-        name: that the desk knows.
-        why_not: why it does nothing now.
-        arm: it moves the arm: it is off, too, on the pages of those who may not do that.
+        label: on the button.
+        name: under which `ActionQueue.on_press` has its action.
+        disabled: why the button is disabled; empty: it is enabled.
+        arm: it moves the arm, so it is also disabled on pages that must not do that.
     """
-    return _button(label, f'data-press="{text(name)}"' + arm * ARM, why_not, "")
+    return _button(label, f'data-press="{text(name)}"' + arm * _MOVES_ARM, disabled, "")
 
 
-def hold(label: str, name: str, told: str, why_not: str = "") -> str:
-    """A button that does something while it is held down; `told` is what a screen reader says."""
-    return _button(label, f'data-hold="{text(name)}"{ARM} aria-label="{text(told)}"', why_not, "hold")
+def hold(label: str, name: str, spoken: str, disabled: str = "") -> str:
+    """Return a button that moves the arm while it is held down; `spoken` is its name for screen readers."""
+    return _button(label, f'data-hold="{text(name)}"{_MOVES_ARM} aria-label="{text(spoken)}"', disabled, "hold")
 
 
-def _button(label: str, data: str, why_not: str, kind: str) -> str:
-    off = f' aria-disabled="true" title="{text(why_not)}"' if why_not else ""
+def _button(label: str, data: str, disabled: str, kind: str) -> str:
+    off = f' aria-disabled="true" title="{text(disabled)}"' if disabled else ""
     return f'<button type="button" class="{text(kind)}" {data}{off}>{text(label)}</button>'
 
 
 def live(name: str) -> str:
-    """A number that the page brings up to date four times a second, by its name."""
+    """Return a number that the status of the control socket updates four times a second."""
     return f'<span class="live" data-live="{text(name)}">–</span>'
 
 
-def buttons(*made: str, label: str = "") -> str:
-    """Buttons side by side, with what they are for before them."""
-    return f'<div class="buttons">{span(label, "dim what") if label else ""}{"".join(made)}</div>'
+def buttons(*items: str, label: str = "") -> str:
+    """Return buttons next to each other, after an optional label."""
+    return f'<div class="buttons">{span(label, "dim what") if label else ""}{"".join(items)}</div>'
 
 
 def table(head: Iterable[str], rows: Iterable[str], kind: str = "") -> str:
-    """A table of rows made by `row`; head names that end in a space belong to columns of numbers."""
+    """Return a table of rows of `row`; a head that ends in a space belongs to a column of numbers."""
     heads = "".join(
         f'<th class="number">{text(name.strip())}</th>' if name.endswith(" ") else f"<th>{text(name)}</th>"
         for name in head
@@ -131,10 +140,28 @@ def table(head: Iterable[str], rows: Iterable[str], kind: str = "") -> str:
 
 
 def row(*cells: str, **data: object) -> str:
-    """A row of HTML cells; those that begin with a digit or a dash are numbers."""
+    """Return a row of HTML cells; cells that start with a digit or a dash are numbers."""
     attributes = "".join(f' data-{key}="{text(value)}"' for key, value in data.items())
-    made = "".join(
+    content = "".join(
         f'<td class="number">{cell}</td>' if cell[:1].isdigit() or cell[:1] == "–" else f"<td>{cell}</td>"
         for cell in cells
     )
-    return f"<tr{attributes}>{made}</tr>"
+    return f"<tr{attributes}>{content}</tr>"
+
+
+class Html:
+    """An HTML element that is sent to browsers only when its content changes."""
+
+    def __init__(self, gui: viser.GuiApi, content: str = "") -> None:
+        """Add the element at the current position of the GUI."""
+        self._handle = gui.add_html(content)
+
+    @property
+    def content(self) -> str:
+        """Current content."""
+        return self._handle.content
+
+    def set(self, content: str) -> None:
+        """Replace the content."""
+        if content != self._handle.content:
+            self._handle.content = content

@@ -1,4 +1,4 @@
-"""The panel on which parameters of running services are changed; made from what the services say of themselves."""
+"""The Tuning tab: parameters of running services, built from their descriptions."""
 
 from __future__ import annotations
 
@@ -14,34 +14,34 @@ from pydantic import JsonValue, TypeAdapter
 from common.config import parse_yaml
 from common.errors import ConfigError
 from common.messages import Parameter
-from page.console import SLIDING, Console, assign
-from page.markup import block, span
-from page.words import UNDERSTOOD, problem
+from page.console import SLIDER_DEBOUNCE, Console, assign
+from page.markup import Html, block, span
+from page.status_text import USER_ERRORS, error_text
 
-SLIDER_STEPS = 200  # at least; a slider that moves coarser than a quarter of the value is of no use
-COARSE = 10  # a slider's step about a value of 0
-TYPING = 0.8  # [s] after the last letter a text or number is sent
+MIN_SLIDER_STEPS = 200
+MAX_STEP_AT_ZERO = 10  # step of a slider around a value of 0
+TYPING_DEBOUNCE = 0.8  # [s] without a key press, after which a text or number is sent
 
 _JSON: TypeAdapter[JsonValue] = TypeAdapter(JsonValue)
-HINT = "What may change while the cell runs. ● is no longer what the cell was started with."
+HINT = "Parameters that may change while the cell runs. ● marks values that differ from the start of the cell."
 
 
 class TuningPanel:
-    """A folder of knobs for each service and each section of the cell that has parameters that may change."""
+    """A folder of fields for each service and each section of the cell that has runtime parameters."""
 
     def __init__(
         self, gui: viser.GuiApi, tab: viser.GuiTabHandle | viser.GuiFolderHandle, console: Console
     ) -> None:
-        """Lay the panel out in a tab; the console takes the changes and carries them out."""
+        """Build the panel in a tab; the console sends the changes."""
         self._gui, self._tab, self._console = gui, tab, console
-        self._knobs: dict[str, Knob] = {}
+        self._fields: dict[str, ParameterField] = {}
         self._folders: dict[str, viser.GuiFolderHandle] = {}
         with tab:
-            self._note = gui.add_html("")
-        self._tell(HINT, "dim")
+            self._note = Html(gui)
+        self._report(HINT, "dim")
 
     def show(self, found: Mapping[str, list[Parameter]]) -> None:
-        """Show the parameters that the services have now, by service; those of a service that is silent stay."""
+        """Update from the parameters of each service; those of a service that does not respond remain."""
         services: dict[str, list[str]] = {}
         parameters: dict[str, Parameter] = {}
         for service, listed in found.items():
@@ -50,115 +50,117 @@ class TuningPanel:
                     services.setdefault(parameter.path, []).append(service)
                     parameters.setdefault(parameter.path, parameter)
         for path, parameter in parameters.items():
-            knob = self._knobs.get(path)
-            if knob is not None and knob.fits(parameter):
-                knob.services = services[path]
-                knob.show(parameter)
+            field = self._fields.get(path)
+            if field is not None and field.fits(parameter):
+                field.services = services[path]
+                field.show(parameter)
                 continue
-            if knob is not None:
-                knob.handle.remove()
-            self._knobs[path] = self._new(parameter, services[path])
+            if field is not None:
+                field.handle.remove()
+            self._fields[path] = self._add(parameter, services[path])
 
-    def _new(self, parameter: Parameter, services: list[str]) -> Knob:
+    def _add(self, parameter: Parameter, services: list[str]) -> ParameterField:
         group = group_of(parameter)
         if group not in self._folders:
             with self._tab:
                 self._folders[group] = self._gui.add_folder(group.replace("_", " "), expand_by_default=False)
         with self._folders[group]:
-            knob = Knob(self._gui, parameter, services)
-        self._console.on_change(knob.handle, lambda value: self._turn(knob, value), "tune")
-        return knob
+            field = ParameterField(self._gui, parameter, services)
+        self._console.on_change(field.handle, lambda value: self._set(field, value), "tune")
+        return field
 
-    async def _turn(self, knob: Knob, value: Any) -> None:
-        """Send a value once the person has let go of it."""
-        knob.turned += 1
-        turned, knob.pending = knob.turned, True
-        await asyncio.sleep(knob.patience)
-        if turned != knob.turned:
+    async def _set(self, field: ParameterField, value: Any) -> None:
+        """Send a value once the operator has finished changing it."""
+        field.changes += 1
+        change, field.pending = field.changes, True
+        await asyncio.sleep(field.debounce)
+        if change != field.changes:
             return
-        path = knob.parameter.path
+        path = field.parameter.path
         try:
-            given = knob.read(value)
-            await self._console.set_parameter(knob.services, path, given)
-        except UNDERSTOOD as error:
-            self._tell(problem(error), "bad")
-            if turned == knob.turned:
-                knob.pending = False
-                knob.show(knob.parameter)
+            parsed = field.parse(value)
+            await self._console.set_parameter(field.services, path, parsed)
+        except USER_ERRORS as error:
+            self._report(error_text(error), "bad")
+            if change == field.changes:
+                field.pending = False
+                field.show(field.parameter)
             return
-        self._tell(f"{path} is {given} now", "good")
-        if turned == knob.turned:
-            knob.pending = False
-            knob.parameter = knob.parameter.model_copy(update={"value": given})
+        self._report(f"{path} set to {parsed}", "good")
+        if change == field.changes:
+            field.pending = False
+            field.parameter = field.parameter.model_copy(update={"value": parsed})
 
-    def _tell(self, line: str, kind: str) -> None:
-        self._note.content = block(span(line, kind), "tuning", kind=kind)
+    def _report(self, message: str, kind: str) -> None:
+        self._note.set(block(span(message, kind), "tuning", kind=kind))
 
 
-class Knob:
-    """What one parameter is turned with: a slider, tick, list, number or text, made from its description.
+class ParameterField:
+    """The field of a parameter: a slider, checkbox, dropdown, number or text, according to its description.
 
     Attributes:
-        parameter: as it was heard of last.
+        parameter: newest known state.
         services: that have it.
-        turned: how often the person changed it.
-        pending: whether what the person gave is still on its way.
+        changes: number of changes by the operator.
+        pending: whether a change was not sent yet.
     """
 
     def __init__(self, gui: viser.GuiApi, parameter: Parameter, services: list[str]) -> None:
-        """Put it where the GUI stands."""
+        """Add the field at the current position of the GUI."""
         self.parameter = parameter
         self.services = services
-        self.turned = 0
+        self.changes = 0
         self.pending = False
-        self.as_text = False
+        self.as_yaml = False
         self._label = label_of(parameter)
-        self.handle = self._make(gui, f"{parameter.description or self._label} ({parameter.path})")
+        self.handle = self._add(gui, f"{parameter.description or self._label} ({parameter.path})")
         immediate = isinstance(self.handle, viser.GuiCheckboxHandle | viser.GuiDropdownHandle)
-        self.patience = 0.0 if immediate else SLIDING if isinstance(self.handle, viser.GuiSliderHandle) else TYPING
+        is_slider = isinstance(self.handle, viser.GuiSliderHandle)
+        self.debounce = 0.0 if immediate else SLIDER_DEBOUNCE if is_slider else TYPING_DEBOUNCE
         self._mark()
 
-    def _make(self, gui: viser.GuiApi, hint: str) -> viser.GuiInputHandle[Any]:
+    def _add(self, gui: viser.GuiApi, hint: str) -> viser.GuiInputHandle[Any]:
         p, value = self.parameter, self.parameter.value
         if p.type == "boolean" and isinstance(value, bool):
             return gui.add_checkbox(self._label, value, hint=hint)
         if p.choices and value in p.choices:
             return gui.add_dropdown(self._label, p.choices, initial_value=str(value), hint=hint)
         if p.type in ("number", "integer") and isinstance(value, int | float):
-            whole = p.type == "integer"
-            number: Any = int if whole else float
+            is_integer = p.type == "integer"
+            number: Any = int if is_integer else float
             low, high = (None if bound is None else number(bound) for bound in (p.minimum, p.maximum))
             step = step_of(p)
             if (low is not None and value < low) or (high is not None and value > high):
-                low = high = step = None  # its service must know
+                low = high = step = None  # the service accepted this value
             if low is not None and high is not None and step is not None:
                 return gui.add_slider(self._label, low, high, number(step), number(value), hint=hint)
-            return gui.add_number(self._label, number(value), min=low, max=high, step=1 if whole else None, hint=hint)
-        self.as_text = p.type != "string" or not isinstance(value, str)
+            return gui.add_number(
+                self._label, number(value), min=low, max=high, step=1 if is_integer else None, hint=hint)
+        self.as_yaml = p.type != "string" or not isinstance(value, str)
         return gui.add_text(self._label, self._text(value), hint=hint)
 
     def _text(self, value: JsonValue) -> str:
-        if not self.as_text:
+        if not self.as_yaml:
             return str(value)
         text = str(yaml.safe_dump(value, default_flow_style=True, width=10_000))
         return text.removesuffix("\n").removesuffix("\n...")
 
-    def read(self, given: Any) -> JsonValue:
-        """The value that was given with it.
+    def parse(self, entered: Any) -> JsonValue:
+        """Return the value that was entered.
 
         Raises:
-            ConfigError: a text that cannot be read.
+            ConfigError: a text is not valid YAML.
         """
-        if not self.as_text:
-            return given  # type: ignore[no-any-return]
+        if not self.as_yaml:
+            return entered  # type: ignore[no-any-return]
         try:
-            value: JsonValue = _JSON.validate_python(parse_yaml(given))
-        except (yaml.YAMLError, ValueError):  # a date there never was is a ValueError
-            raise ConfigError(self.parameter.path, given, "is not a YAML value") from None
+            value: JsonValue = _JSON.validate_python(parse_yaml(entered))
+        except (yaml.YAMLError, ValueError):  # an impossible date is a ValueError
+            raise ConfigError(self.parameter.path, entered, "is not a YAML value") from None
         return value
 
     def show(self, parameter: Parameter) -> None:
-        """Show the value that a parameter has now, unless the person is just changing it."""
+        """Show the current value, unless the operator is changing it."""
         self.parameter = parameter
         if self.pending:
             return
@@ -173,37 +175,37 @@ class Knob:
             self.handle.label = label
 
     def fits(self, parameter: Parameter) -> bool:
-        """Whether it can show that parameter; else another has to be made."""
+        """Return whether this field can show a parameter; otherwise it has to be replaced."""
         return _form(self.parameter) == _form(parameter)
 
 
 def _form(p: Parameter) -> tuple[object, ...]:
-    """What of a parameter decides what it is turned with."""
+    """Return the properties of a parameter that determine its field."""
     kind = "number" if isinstance(p.value, int | float) and not isinstance(p.value, bool) else type(p.value).__name__
     return p.path, p.type, p.minimum, p.maximum, p.choices, kind, p.choices and p.value in p.choices
 
 
 def label_of(parameter: Parameter) -> str:
-    """What a parameter is called on the page: the end of its path in words, and the unit."""
+    """Return the label of a parameter: the end of its path, and the unit."""
     parts = parameter.path.split(".")
     name = " ".join(parts[2:] if parts[0] == "services" else parts[1:]).replace("_", " ")
     return f"{name} [{parameter.unit}]" if parameter.unit else name
 
 
 def group_of(parameter: Parameter) -> str:
-    """Under which heading a parameter stands: its service, or its section of the cell."""
+    """Return the folder of a parameter: its service, or its section of the cell."""
     parts = parameter.path.split(".")
     return parts[1] if parts[0] == "services" else parts[0]
 
 
 def step_of(parameter: Parameter) -> float | None:
-    """A round step for a slider between the bounds; None when a slider would be too coarse or there are no bounds."""
+    """Return a round step for a slider; None without bounds, or if it would exceed a quarter of the value."""
     if parameter.minimum is None or parameter.maximum is None or parameter.maximum <= parameter.minimum:
         return None
-    step = 10 ** math.floor(math.log10((parameter.maximum - parameter.minimum) / SLIDER_STEPS))
+    step = 10 ** math.floor(math.log10((parameter.maximum - parameter.minimum) / MIN_SLIDER_STEPS))
     if parameter.type == "integer":
         step = max(1, step)
     sizes = [abs(v) for v in (parameter.value, parameter.default)
              if isinstance(v, int | float) and not isinstance(v, bool) and v]
-    fine = step <= min(sizes) / 4 if sizes else step <= COARSE
+    fine = step <= min(sizes) / 4 if sizes else step <= MAX_STEP_AT_ZERO
     return step if fine or parameter.type == "integer" else None

@@ -1,30 +1,27 @@
-"""Everything of the page that reaches inside viser, and what viser would have to offer in its place.
+"""All code that depends on the internals of viser, with the API that viser would have to offer instead.
 
-Five things have no public call in viser 1.1; whoever updates viser reads this file, and nothing else of the page.
+Nothing else needs checking when viser is updated.
 
-- **Who may open the page, and at which socket.** viser has no authentication, takes a WebSocket from any web page, and
-  tries the next port when one is taken. Its server is one call of `websockets`' `serve`, which can ask a function about
-  each request before anything else reads it: `made_server` puts ours in front of viser's while the server is made.
-  Upstream request: `ViserServer(..., sock=, process_request=, websocket_options=)`, handed on to `serve`.
-- **No tunnel to a public server.** Whoever has the page open may ask for a share URL. The handlers are taken away.
+- **Access checks and the listening socket.** viser has no authentication, accepts a WebSocket from any web page, and
+  tries the next port if one is in use. It makes one call of `websockets.serve`; `create_server` replaces that function
+  during the call. Upstream request: `ViserServer(..., sock=, process_request=, websocket_options=)`.
+- **No tunnel to a public server.** Any page may request a share URL; `create_server` removes these handlers.
   Upstream request: `ViserServer(..., allow_share_url=False)`.
-- **A client that starts soon.** viser's client is one packed file that a browser unpacks and compiles at each opening,
-  before anything else. Sent as a script, a style sheet and the decoder of messages, each under a name that has its
-  contents in it, it compiles while it loads, and a browser keeps what it has compiled for the next opening.
-  Upstream requests: a client build in separate files; `configure_environment_map(hdri=None)` and the antialiasing of
-  edges as options that are known before the client begins.
-- **A bar above everything, and buttons that are held down.** viser's panels can be collapsed, scrolled and covered by
-  dialogs; its buttons tell a click, or at a rate that they are held, over the connection in which pictures wait too.
-  overlay.js and overlay.css put a bar above the element that viser fills, which they make smaller, and speak over a
-  WebSocket of their own at `LINE` (line.py), which `made_server` hands to us. `introduce` tells the script which of
-  viser's connections is of the same page.
-  Upstream requests: a panel that is always in view; a WebSocket path for the application; a button event for release.
-- **Messages from any thread.** viser wakes its loop by an `asyncio.Event` that it sets from the thread that asks, which
-  may fail or wake nobody; it sets it a second time on its loop, which is enough (`_Event`).
-  Upstream request: leave the first one out.
+- **Messages of a browser.** `filter_messages` drops what the page may not do.
+  Upstream request: a hook that accepts or rejects a client's message.
+- **A client that starts fast.** viser's client is one packed file, which a browser unpacks and compiles at each start.
+  Sent as script, style sheet and decoder, each under a name derived from its content, it compiles while it loads and
+  the browser caches the result. Upstream requests: a client build in separate files; `configure_environment_map`
+  and antialiasing as options that apply before the client starts.
+- **A bar above everything, and buttons that are held down.** viser's panels can be collapsed, scrolled and covered, and
+  its button events share a connection with images. overlay.js and overlay.css add a bar above the client, and use the
+  WebSocket at `CONTROL_PATH` (control_socket.py). `send_key` tells the script which of viser's connections belongs to
+  its page. Upstream requests: a panel that is always visible; an application's WebSocket path; a button release event.
+- **Messages from any thread.** viser sets an `asyncio.Event` from foreign threads, which may fail or wake no task. It
+  sets it again on its loop, which is sufficient (`_ThreadSafeEvent`). Upstream request: remove the first call.
 
-The style sheets in markup.py and overlay.css name a class and a width of the client's; without them the page only looks
-different. Upstream requests: a checkbox whose label stands behind it; a panel as wide as a phone.
+markup.py and overlay.css select a class and a width of the client; without a match the page only looks different.
+Upstream requests: a checkbox with its label behind it; a panel as wide as a phone.
 """
 
 from __future__ import annotations
@@ -62,69 +59,70 @@ from websockets.http11 import Request, Response
 if TYPE_CHECKING:
     import socket
 
-LINE = "/line"  # the path of our own WebSocket
-Beside = Callable[[websocket_server.ServerConnection], Awaitable[None]]
-Process = Callable[[websocket_server.ServerConnection, Request], "Awaitable[Response | None] | Response | None"]
+CONTROL_PATH = "/control"  # path of our WebSocket
+SocketHandler = Callable[[websocket_server.ServerConnection], Awaitable[None]]
+RequestCheck = Callable[[websocket_server.ServerConnection, Request], "Awaitable[Response | None] | Response | None"]
 
-_replacing = threading.Lock()
+_patching = threading.Lock()
 
 # --- messages from any thread ---
 
 
-class _Event(asyncio.Event):
-    """An event that any thread may set: those who wait for it are woken where they wait, when it is set there."""
+class _ThreadSafeEvent(asyncio.Event):
+    """An event that any thread may set; waiting tasks wake up when it is set on their own loop."""
 
     def set(self) -> None:
-        here, self._value = asyncio._get_running_loop(), False  # it may have been set elsewhere, which woke nobody
+        here, self._value = asyncio._get_running_loop(), False  # a call on another thread has set it and woken no task
         if here is not None and here is self._loop:  # type: ignore[attr-defined]
             super().set()
         else:
             self._value = True
 
 
-_begin = AsyncMessageBuffer.__init__
+_init = AsyncMessageBuffer.__init__
 
 
-def _begin_safely(buffer: AsyncMessageBuffer, *args: Any, **more: Any) -> None:
-    _begin(buffer, *args, **more)
-    buffer.message_event = _Event()
+def _init_with_safe_event(buffer: AsyncMessageBuffer, *args: Any, **options: Any) -> None:
+    _init(buffer, *args, **options)
+    buffer.message_event = _ThreadSafeEvent()
 
 
-AsyncMessageBuffer.__init__ = _begin_safely  # type: ignore[method-assign, assignment]
+AsyncMessageBuffer.__init__ = _init_with_safe_event  # type: ignore[method-assign, assignment]
 
 # --- the server ---
 
 
-def made_server(
-    listening: socket.socket, before: Callable[[Process], Process], options: Mapping[str, Any], beside: Beside,
+def create_server(
+    listening: socket.socket, wrap_check: Callable[[RequestCheck], RequestCheck], options: Mapping[str, Any],
+    control: SocketHandler,
 ) -> viser.ViserServer:
-    """A viser server that listens at a socket, and nowhere else.
+    """Return a viser server that listens at one socket only.
 
     Args:
-        listening: the socket; closed if that fails.
-        before: makes of the function that viser asks about each request the one that is asked instead.
-        options: of the WebSocket server, in place of viser's.
-        beside: has the WebSocket connections at `LINE`, on the server's own loop; ends with them.
+        listening: the socket; closed if this fails.
+        wrap_check: returns the request check to use instead of viser's.
+        options: of the WebSocket server; they replace viser's.
+        control: handles the WebSocket connections at `CONTROL_PATH`, on the loop of the server.
 
     Raises:
-        RuntimeError: viser serves in another way than this file knows.
+        RuntimeError: the installed viser starts its server in an unknown way.
     """
-    in_place = []
+    checks = []
 
-    def serve(handler: Any, host: Any, port: Any, *, process_request: Process | None = None, **theirs: Any) -> Any:
-        del host, port  # viser would try the next port, and the next, when one is taken
+    def serve(handler: Any, host: Any, port: Any, *, process_request: RequestCheck | None = None, **more: Any) -> Any:
+        del host, port  # viser would try the next ports if one is in use
 
-        async def either(connection: websocket_server.ServerConnection) -> None:
-            at = urlsplit(connection.request.path).path if connection.request is not None else ""
-            await (beside if at == LINE else handler)(connection)
+        async def dispatch(connection: websocket_server.ServerConnection) -> None:
+            path = urlsplit(connection.request.path).path if connection.request is not None else ""
+            await (control if path == CONTROL_PATH else handler)(connection)
 
         if process_request is not None:
-            in_place.append(process_request)
-            theirs["process_request"] = before(process_request)
-        return original(either, **theirs | {**options, "sock": listening})
+            checks.append(process_request)
+            more["process_request"] = wrap_check(process_request)
+        return original(dispatch, **more | {**options, "sock": listening})
 
     try:
-        with _replacing, quiet():
+        with _patching, silence_console():
             original = websocket_server.serve
             websocket_server.serve = serve  # type: ignore[assignment,misc]
             try:
@@ -134,57 +132,18 @@ def made_server(
     except BaseException:
         listening.close()
         raise
-    if not in_place:
+    if not checks:
         server.stop()
         listening.close()
-        raise RuntimeError(f"viser {viser.__version__} serves in another way than the guard of its page knows")
+        raise RuntimeError(f"viser {viser.__version__} starts its server in an unknown way: see page/viser_inside.py")
     for message in (ShareUrlRequest, ShareUrlDisconnect):
         server._websock_server.unregister_handler(message)
     return server
 
 
-# From a browser: what nobody else sees. All else changes something for everybody.
-_OWN = (ViewerCameraMessage, GetRenderResponseMessage)
-
-
-def let_in(server: viser.ViserServer, may: Callable[[str, object], bool]) -> None:
-    """Have each message of a browser that changes something for others dropped, unless it may be.
-
-    Args:
-        server: of the page.
-        may: is asked with the id of the part of the page (empty: the scene) and the value that it is given, on the
-            server's own loop and in the context of the connection.
-    """
-    inside = server._websock_server
-    handle = inside._handle_incoming_message
-
-    def show_again(client_id: Any, part: str) -> None:
-        """What a field really says, for the browser that shows something else now."""
-        field, client = server.gui._gui_input_handle_from_uuid.get(part), server.get_clients().get(client_id)
-        if field is not None and client is not None and not isinstance(field, viser.GuiButtonHandle):
-            client._websock_connection.queue_message(GuiUpdateMessage(part, {"value": field.value}))
-
-    async def handle_what_may_be(client_id: Any, message: Any) -> None:
-        if not isinstance(message, _OWN):
-            if isinstance(message, GuiUpdateMessage) and set(message.updates) != {"value"}:
-                return  # a browser gives values; viser would set any attribute of ours
-            value = message.updates.get("value") if isinstance(message, GuiUpdateMessage) else None
-            if not may(getattr(message, "uuid", ""), value):
-                show_again(client_id, getattr(message, "uuid", ""))
-                return
-        await handle(client_id, message)
-
-    inside._handle_incoming_message = handle_what_may_be  # type: ignore[method-assign]
-
-
-def introduce(client: viser.ClientHandle, key: str) -> None:
-    """Tell the script in a browser by which key its page is known."""
-    client._websock_connection.queue_message(RunJavascriptMessage(f"window.zencellPage?.({json.dumps(key)})"))
-
-
 @contextmanager
-def quiet() -> Iterator[None]:
-    """A block in which viser writes no frames around its address on stdout."""
+def silence_console() -> Iterator[None]:
+    """Suppress the table that viser prints to stdout."""
     console = get_console()
     before, console.quiet = console.quiet, True
     try:
@@ -193,24 +152,66 @@ def quiet() -> Iterator[None]:
         console.quiet = before
 
 
+# Messages that affect their own browser only; all others change the page for every browser.
+_PRIVATE = (ViewerCameraMessage, GetRenderResponseMessage)
+
+
+def filter_messages(server: viser.ViserServer, allowed: Callable[[str, object], bool]) -> None:
+    """Drop messages of browsers that would change the page for others, unless they are allowed.
+
+    Args:
+        server: of the page.
+        allowed: called with the element id (empty: the 3D scene) and the new value, on the server's loop and in the
+            context of the connection.
+    """
+    inside = server._websock_server
+    handle = inside._handle_incoming_message
+
+    def restore_value(client_id: Any, element: str) -> None:
+        """Send the value of a field to the browser that shows another value now."""
+        field, client = server.gui._gui_input_handle_from_uuid.get(element), server.get_clients().get(client_id)
+        if field is not None and client is not None and not isinstance(field, viser.GuiButtonHandle):
+            client._websock_connection.queue_message(GuiUpdateMessage(element, {"value": field.value}))
+
+    async def handle_if_allowed(client_id: Any, message: Any) -> None:
+        if not isinstance(message, _PRIVATE):
+            if isinstance(message, GuiUpdateMessage) and set(message.updates) != {"value"}:
+                return  # viser would set any attribute of our handle
+            value = message.updates.get("value") if isinstance(message, GuiUpdateMessage) else None
+            if not allowed(getattr(message, "uuid", ""), value):
+                restore_value(client_id, getattr(message, "uuid", ""))
+                return
+        await handle(client_id, message)
+
+    inside._handle_incoming_message = handle_if_allowed  # type: ignore[method-assign]
+
+
+def send_key(client: viser.ClientHandle, key: str) -> None:
+    """Send the script in a browser the key of its page."""
+    client._websock_connection.queue_message(RunJavascriptMessage(f"window.zencellPage?.({json.dumps(key)})"))
+
+
+def element_id(element: Any) -> str:
+    """Return the id by which browsers refer to a GUI element."""
+    return str(element._impl.uuid)
+
+
 # --- the client ---
 
-PACKED = re.compile(r'<script data-p="([^"]*)" data-ss="(\d+)" data-cs="(\d+)">(.*?)</script>', re.DOTALL)
-DECODER = re.compile(r'const gzWasm=("[^"]*")')
-# Its alphabet: printable characters that need no escaping in an attribute. Five of them are four bytes.
+_PACKED = re.compile(r'<script data-p="([^"]*)" data-ss="(\d+)" data-cs="(\d+)">(.*?)</script>', re.DOTALL)
+_DECODER = re.compile(r'const gzWasm=("[^"]*")')
+# Base 88: printable characters that need no escaping in an attribute. Five characters encode four bytes.
 ALPHABET = "".join(chr(code) for code in range(0x21, 0x7F) if chr(code) not in "\"&<>'`")
-HTML = "text/html; charset=utf-8"
 
-# Runs before the client. It begins with an environment map of its own and decodes it, before the first message says
-# that the scene has none; and it smooths edges by drawing them four times over, which without a graphics card takes a
-# quarter of the time of each picture.
-PRELUDE = """<script>
+# Runs before the client. The client starts with an environment map and decodes it before the first message removes it.
+# It draws with antialiasing, which takes a quarter of the frame time if the browser renders in software.
+_PRELUDE = """<script>
 (() => {
   const load = window.fetch, context = HTMLCanvasElement.prototype.getContext;
   window.fetch = (what, ...more) => String(what?.url ?? what).startsWith("data:image/jpeg")
     ? new Promise(() => {}) : load(what, ...more);
   let software;
-  const drawnByProcessor = () => {
+  const rendersInSoftware = () => {
     const gl = context.call(document.createElement("canvas"), "webgl2");
     const info = gl?.getExtension("WEBGL_debug_renderer_info");
     const name = info ? gl.getParameter(info.UNMASKED_RENDERER_WEBGL) : "";
@@ -218,13 +219,13 @@ PRELUDE = """<script>
     return /swiftshader|llvmpipe|softpipe|software/i.test(name);
   };
   HTMLCanvasElement.prototype.getContext = function (kind, options) {
-    if (kind === "webgl2" && options?.antialias && (software ??= drawnByProcessor()))
+    if (kind === "webgl2" && options?.antialias && (software ??= rendersInSoftware()))
       options = {...options, antialias: false};
     return context.call(this, kind, options);
   };
 })();
 </script>"""
-START = """<link rel="stylesheet" href="{style}"><link rel="modulepreload" href="{script}">
+_START = """<link rel="stylesheet" href="{style}"><link rel="modulepreload" href="{script}">
 <script type="module">
 globalThis.__viserZstdWasm = await WebAssembly.compileStreaming(fetch("{decoder}"));
 await import("{script}");
@@ -232,73 +233,69 @@ await import("{script}");
 
 
 @dataclass(frozen=True)
-class File:
-    """What is sent for a path.
+class ClientFile:
+    """A file of the page.
 
     Attributes:
-        kind: its media type.
-        body: as it is sent, compressed by gzip.
-        lasts: the path tells its contents, so that a browser may keep it.
+        media_type: for the header.
+        body: compressed by gzip.
+        immutable: the path depends on the content, so that a browser may cache it for good.
     """
 
-    kind: str
+    media_type: str
     body: bytes
-    lasts: bool
+    immutable: bool
 
 
 @cache
-def client_files() -> Mapping[str, File]:
-    """The files of the installed viser's client by path; takes a third of a second, once."""
+def client_files() -> Mapping[str, ClientFile]:
+    """Return the files of the installed viser's client by path; the first call takes a third of a second."""
     page = Path(viser.__file__).parent / "client" / "build" / "index.html"
-    return files_of(page.read_text(encoding="utf-8"), overlay())
+    return unpack_client(page.read_text(encoding="utf-8"), overlay())
 
 
 def overlay() -> str:
-    """The bar above the page, as HTML for its head."""
+    """Return style sheet and script of the bar above the page, as HTML for the head."""
     style, script = (Path(__file__).with_name(f"overlay.{end}").read_text(encoding="utf-8") for end in ("css", "js"))
     return f"<style>{style}</style><script>{script}</script>"
 
 
-def files_of(page: str, more: str = "") -> Mapping[str, File]:
-    """The files that a packed page becomes; of one that is packed in another way, itself with the prelude and more."""
-    packed = PACKED.search(page)
-    decoder = DECODER.search(packed[4]) if packed else None
-    files: dict[str, File] = {}
+def unpack_client(page: str, head: str = "") -> Mapping[str, ClientFile]:
+    """Return the files of a packed client by path, with `head` added; an unknown packing stays in one file."""
+    packed = _PACKED.search(page)
+    decoder = _DECODER.search(packed[4]) if packed else None
+    files: dict[str, ClientFile] = {}
     start = ""
     if packed is not None and decoder is not None:
         style_size, script_size = int(packed[2]), int(packed[3])
-        both = zstandard.decompress(decoded(packed[1]), max_output_size=style_size + script_size)
-        names = {}
-        for name, ending, kind, contents in (
+        both = zstandard.decompress(decode_base88(packed[1]), max_output_size=style_size + script_size)
+        paths = {}
+        for name, suffix, media_type, content in (
             ("style", "css", "text/css; charset=utf-8", both[:style_size]),
             ("script", "js", "text/javascript; charset=utf-8", both[style_size:]),
-            ("decoder", "wasm", "application/wasm", gzip.decompress(decoded(json.loads(decoder[1])))),
+            ("decoder", "wasm", "application/wasm", gzip.decompress(decode_base88(json.loads(decoder[1])))),
         ):
-            names[name] = f"/{hashlib.sha256(contents).hexdigest()[:20]}.{ending}"
-            files[names[name]] = _file(kind, contents, lasts=True)
-        start = START.format(**names)
+            paths[name] = f"/{hashlib.sha256(content).hexdigest()[:20]}.{suffix}"
+            files[paths[name]] = ClientFile(media_type, gzip.compress(content, 6), immutable=True)
+        start = _START.format(**paths)
         page = page.replace(packed[0], "")
-    page = page.replace("<head>", f"<head>{PRELUDE}{more}", 1).replace("</head>", f"{start}</head>", 1)
-    files["/"] = files["/index.html"] = _file(HTML, page.encode(), lasts=False)
-    return files
+    page = page.replace("<head>", f"<head>{_PRELUDE}{head}", 1).replace("</head>", f"{start}</head>", 1)
+    index = ClientFile("text/html; charset=utf-8", gzip.compress(page.encode(), 6), immutable=False)
+    return files | {"/": index, "/index.html": index}
 
 
-def decoded(text: str) -> bytes:
-    """The bytes that were written in `ALPHABET`: each five characters are four bytes, the last k characters k - 1."""
+def decode_base88(text: str) -> bytes:
+    """Return the encoded bytes: five characters encode four bytes, the last k characters k - 1 bytes."""
     digits = np.zeros(128, np.int64)
     digits[[ord(c) for c in ALPHABET]] = np.arange(len(ALPHABET))
     missing = -len(text) % 5
     values = digits[np.frombuffer(text.encode("ascii"), np.uint8)]
-    whole = len(text) // 5
+    full = len(text) // 5
     weights = len(ALPHABET) ** np.arange(4, -1, -1)
-    found = (values[: 5 * whole].reshape(-1, 5) @ weights).astype(">u4").tobytes()
+    found = (values[: 5 * full].reshape(-1, 5) @ weights).astype(">u4").tobytes()
     if missing:
         rest = 0
-        for digit in values[5 * whole :]:
+        for digit in values[5 * full :]:
             rest = len(ALPHABET) * rest + int(digit)
         found += rest.to_bytes(4 - missing, "big")
     return found
-
-
-def _file(kind: str, contents: bytes, *, lasts: bool) -> File:
-    return File(kind, gzip.compress(contents, 6), lasts)

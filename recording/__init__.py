@@ -1,5 +1,5 @@
-"""Recordings: MCAP files of what travelled in a cell, byte for byte. See https://mcap.dev/spec.
+"""Recordings: MCAP files of the messages of a cell, byte for byte. See https://mcap.dev/spec.
 
-One channel for each key and writer, message encoding `msgpack`, schema the JSON schema of the message class; the log
-time is when a message arrived, the publish time the stamp of its header, the sequence number the writer's own.
+Each key and writer has a channel with message encoding `msgpack` and the JSON schema of the message class. The log time
+is the time of arrival, the publish time the stamp of the header, the sequence number that of the writer.
 """

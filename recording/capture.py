@@ -1,4 +1,4 @@
-"""Takes what travels in a cell from the network to a recording."""
+"""Captures messages of a cell from the network for a recording."""
 
 from __future__ import annotations
 
@@ -30,73 +30,110 @@ if TYPE_CHECKING:
     from recording.selection import Selection
     from recording.sink import Sink
 
+QUERY_TIMEOUT = 1.0  # [s] for the values of states
 
-ASK_TIMEOUT = 1.0  # [s] for the values of states
+
+@dataclass(frozen=True)
+class CustomTopics:
+    """Topics of a cell that do not come with the project, and remapped keys."""
+
+    modules: tuple[str, ...] = ()  # of the user
+    renamed: tuple[Mapping[str, str], ...] = ()  # remapping of each service, see common/remapping.py
+
+    @classmethod
+    def of(cls, cell: Cell) -> CustomTopics:
+        """Return those of a cell."""
+        services = cell.services.values()
+        modules = dict.fromkeys([cell.application, *(entry.module for entry in services)])
+        custom = (name for name in modules if "." in name and not name.startswith("services."))
+        return cls(tuple(custom), tuple(entry.topics for entry in services if entry.topics))
+
+    @classmethod
+    def read(cls, text: str) -> CustomTopics:
+        """Return the object that `str` wrote."""
+        return cls(*(tuple(part) for part in json.loads(text)))
+
+    def __str__(self) -> str:
+        return json.dumps([self.modules, self.renamed])
+
+    def topics(self) -> dict[str, Any]:
+        """Import the modules, so that their messages can be decoded; return all topics by key before remapping."""
+        return {**all_topics(), **import_topics(self.modules)}
+
+    def kinds(self, known: Mapping[str, Any]) -> dict[str, str]:
+        """Return the kinds of known topics by key in the cell."""
+        kinds = {key: str(topic.kind) for key, topic in known.items()}
+        return kinds | {Remapping(table).key(key): kind for table in self.renamed for key, kind in kinds.items()}
 
 
 class Capture:
-    """Hands every wanted message to a sink, repetitions left out and gaps counted."""
+    """Passes each selected message once to a sink, and counts gaps."""
 
-    def __init__(self, bus: Bus, selection: Selection, sink: Sink, own: CustomTopics | None = None) -> None:
-        """Take nothing yet.
+    def __init__(self, bus: Bus, selection: Selection, sink: Sink, custom: CustomTopics | None = None) -> None:
+        """Prepare without subscribing.
 
         Args:
             bus: in the cell.
-            selection: what is wanted.
-            sink: where it goes.
-            own: what there is in the cell beside what comes with the project.
+            selection: of the messages.
+            sink: receives them.
+            custom: topics of the cell that do not come with the project.
         """
         self.sequences = Sequences()
         self._bus = bus
         self._selection = selection
         self._sink = sink
         self._lock = threading.Lock()
-        self._ahead = time.time_ns() - time.monotonic_ns()  # a step of the system clock must not turn messages round
-        own = own or CustomTopics()
-        self._known = own.topics()
-        self._kinds = own.kinds(self._known)
+        # A step of the system clock must not reorder messages.
+        self._wall_offset = time.time_ns() - time.monotonic_ns()
+        custom = custom or CustomTopics()
+        self._known = custom.topics()
+        self._kinds = custom.kinds(self._known)
         self._run_known = False
         self._declared: list[Declaration] = []
 
-    async def begin(self) -> None:
-        """Listen from now on; returns when the values of all states that were there are in the recording."""
-        wanted = [f"{self._bus.cell}/{key}" for key in self._selection.expressions]
-        # Where no file of the cell was given, tokens tell which services have their keys under other names.
+    async def start(self) -> None:
+        """Subscribe; returns when the current values of all states are recorded."""
+        expressions = [f"{self._bus.cell}/{key}" for key in self._selection.expressions]
+        # Without the cell's file, liveliness tokens show which services have remapped keys.
         self._declared = [self._bus.raw_watch_tokens(owns_key(self._bus.cell), self._on_owner)]
         status = f"{self._bus.cell}/{topics.SUPERVISOR_STATUS.key}"
-        self._declared += [self._bus.raw_subscriber(key, self.on_sample) for key in wanted]
-        if f"{self._bus.cell}/**" not in wanted and status not in wanted:
+        self._declared += [self._bus.raw_subscriber(key, self.on_sample) for key in expressions]
+        if f"{self._bus.cell}/**" not in expressions and status not in expressions:
             self._declared.append(self._bus.raw_subscriber(status, self._on_status))
-            for sample in await self._bus.raw_get(status, ASK_TIMEOUT):
+            for sample in await self._bus.raw_get(status, QUERY_TIMEOUT):
                 self._on_status(sample)
-        for answers in await asyncio.gather(*(self._bus.raw_get(key, ASK_TIMEOUT) for key in self._asked(wanted))):
-            for sample in answers:
+        queries = (self._bus.raw_get(key, QUERY_TIMEOUT) for key in self._queried(expressions))
+        for replies in await asyncio.gather(*queries):
+            for sample in replies:
                 self.on_sample(sample, kind="state")
 
-    def _asked(self, wanted: list[str]) -> list[str]:
-        if secure_folder() is None or f"{self._bus.cell}/**" not in wanted:
-            return wanted
-        # Who may ask for every key could call every request, so the rules name the states one by one.
+    def _queried(self, expressions: list[str]) -> list[str]:
+        """Return the keys to query for states; with access rules one by one.
+
+        A client with the right to query every key could call every request, so the rules name the states.
+        """
+        if secure_folder() is None or f"{self._bus.cell}/**" not in expressions:
+            return expressions
         return [f"{self._bus.cell}/{key}" for key, kind in self._kinds.items() if kind == "state"]
 
-    def end(self) -> None:
-        """Listen no more."""
+    def stop(self) -> None:
+        """Unsubscribe."""
         while self._declared:
             self._declared.pop().undeclare()
 
     def on_sample(self, raw: RawSample, kind: str = "") -> None:
-        """Take one message; on any thread. `kind` is what a key that is not ours is then known to be."""
+        """Take one message; thread-safe. `kind` is that of an unknown topic."""
         topic = raw.key.partition("/")[2]
         if topic == topics.SUPERVISOR_STATUS.key:
             self._on_status(raw)
         if not self._selection.wants(topic):
             return
         writer, sequence, trace = _origin(raw)
-        with self._lock:  # the order of times is the order in the file
+        with self._lock:  # so that times increase in the file
             if writer and not self.sequences.is_new(raw.key, writer, sequence):
                 return
             self._sink.offer(Sample(
-                raw.key, raw.payload, time.monotonic_ns() + self._ahead, message=message_of(raw.encoding),
+                raw.key, raw.payload, time.monotonic_ns() + self._wall_offset, message=message_of(raw.encoding),
                 kind=self._kinds.get(topics.general_key(topic)) or kind or "stream", writer=writer, sequence=sequence,
                 trace=trace,
             ))
@@ -107,55 +144,23 @@ class Capture:
             self._kinds[owner.key] = str(topic.kind)
 
     def _on_status(self, raw: RawSample) -> None:
+        """Describe the run from the first valid status of the supervisor."""
         if self._run_known:
             return
         try:
             status = decode(SupervisorStatus, raw.payload)
         except DecodeError:
-            return  # somebody else's
+            return
         if status.speed > MOST_SPEED or any(len(text) > MOST_TEXT for text in (status.world, *status.overrides)):
-            return  # no supervisor says that, and nobody would read a recording of it
+            return  # forged: `Recording` would refuse such a description
         self._run_known = True
         self._sink.describe(RUN, run_of(status))
 
 
 def _origin(raw: RawSample) -> tuple[str, int, str]:
-    """Writer id, sequence number and trace id of a message; empty for a sender that does not say."""
+    """Return writer id, sequence number and trace id of a message; empty if it has no attachment."""
     try:
         attachment = decode_attachment(raw.attachment)
     except DecodeError:
         attachment = None
     return (attachment.writer, attachment.sequence, attachment.trace) if attachment else ("", 0, "")
-
-
-@dataclass(frozen=True)
-class CustomTopics:
-    """Modules of a person's own, and keys under other names."""
-
-    modules: tuple[str, ...] = ()
-    renamed: tuple[Mapping[str, str], ...] = ()  # as common/remapping.py has it, by service
-
-    @classmethod
-    def of(cls, cell: Cell) -> CustomTopics:
-        """That of a cell file."""
-        services = cell.services.values()
-        named = dict.fromkeys([cell.application, *(entry.module for entry in services)])
-        own = (name for name in named if "." in name and not name.startswith("services."))
-        return cls(tuple(own), tuple(entry.topics for entry in services if entry.topics))
-
-    @classmethod
-    def read(cls, text: str) -> CustomTopics:
-        """What `str` wrote."""
-        return cls(*(tuple(part) for part in json.loads(text)))
-
-    def __str__(self) -> str:
-        return json.dumps([self.modules, self.renamed])
-
-    def topics(self) -> dict[str, Any]:
-        """Every topic by its key before it is renamed; the messages of all modules are known from now on."""
-        return {**all_topics(), **import_topics(self.modules)}
-
-    def kinds(self, known: Mapping[str, Any]) -> dict[str, str]:
-        """Kinds of topics by key in the cell."""
-        kinds = {key: str(topic.kind) for key, topic in known.items()}
-        return kinds | {Remapping(table).key(key): kind for table in self.renamed for key, kind in kinds.items()}

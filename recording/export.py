@@ -1,4 +1,4 @@
-"""Recordings as CSV: a file for each topic, a row for each message."""
+"""Exports recordings: CSV tables, PNG images, and video."""
 
 from __future__ import annotations
 
@@ -22,26 +22,30 @@ from recording.reader import Recording, Wanted
 from recording.sample import Decoder, RecordingError
 from recording.writer import ExportFailed
 
-NOT_TABLES = (Image, PointCloud2)
+NO_TABLES = (Image, PointCloud2)
+NO_TABLE_NAMES = ("Image", "PointCloud2")
 MOST_COLUMNS = 5000  # of a table
-OTHER_NAMES = ("Image", "PointCloud2")
+COLORS = ("bgr8", "rgb8", "mono8")
+CODEC = "mp4v"
+DEFAULT_RATE = 10.0  # [Hz] of a video of one image
+LONGEST = 100  # [characters] of a file name
 
 
 def export_tables(recording: Recording, folder: Path, wants: Wanted, decoder: Decoder) -> dict[str, int]:
-    """Rows that were written, by name of the file; the folder is made.
+    """Write a CSV file for each wanted topic, with a row for each message; return the rows by file name.
 
-    Joint states have a column for each joint and quantity. Of other messages each single value is a column, named by
-    its path; a list is written as JSON.
+    Joint states have a column for each joint and quantity. Other messages have a column for each value, named by its
+    path; a list is written as JSON.
 
     Raises:
         RecordingError: the recording is damaged.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    topics = [topic for topic, (name, _) in recording.topics().items() if name not in OTHER_NAMES and wants(topic)]
+    topics = [topic for topic, (name, _) in recording.topics().items() if name not in NO_TABLE_NAMES and wants(topic)]
     counts: dict[str, int] = {}
     names = file_names(sorted(topics))
     for topic, name in names.items():
-        # Twice over the topic: the columns are known only when every row was seen.
+        # Two passes over the topic: the columns are known only after the last row.
         columns: dict[str, None] = {}
         for row in _rows(recording, topic, Decoder()):
             columns |= dict.fromkeys(row)
@@ -64,16 +68,16 @@ def export_tables(recording: Recording, folder: Path, wants: Wanted, decoder: De
 def _rows(recording: Recording, topic: str, decoder: Decoder) -> Iterator[dict[str, Any]]:
     for sample in recording.samples(lambda name: name == topic):
         message = decoder.message(sample)
-        if message is not None and not isinstance(message, NOT_TABLES):
+        if message is not None and not isinstance(message, NO_TABLES):
             yield {"time": _seconds(sample.log_time), "stamp": _seconds(sample.publish_time), **row_of(message)}
 
 
 def _seconds(nanoseconds: int) -> str:
-    return f"{nanoseconds // 1_000_000_000}.{nanoseconds % 1_000_000_000:09d}"  # a float cannot hold it
+    return f"{nanoseconds // 1_000_000_000}.{nanoseconds % 1_000_000_000:09d}"  # a float is not precise enough
 
 
 def row_of(message: Message) -> dict[str, Any]:
-    """The values of a message by the names of their columns."""
+    """Return the values of a message by column name."""
     if isinstance(message, JointState):
         columns = {"position": message.position, "velocity": message.velocity, "effort": message.effort}
         return {
@@ -95,20 +99,30 @@ def _flat(path: str, value: Any) -> dict[str, Any]:
     return {path: json.dumps(value) if isinstance(value, list) else value}
 
 
-COLOURS = ("bgr8", "rgb8", "mono8")
-CODEC = "mp4v"
-DEFAULT_RATE = 10.0  # [Hz] of a video of one picture
+def file_names(topics: Iterable[str]) -> dict[str, str]:
+    """Return a unique file name, without extension, for each topic; none leads out of its folder."""
+    names: dict[str, str] = {}
+    taken: set[str] = set()
+    for topic in topics:
+        plain = re.sub(r"[^\w.-]|^\.", "_", topic, flags=re.ASCII)[:LONGEST] or "_"
+        name = next(each for k in count(1) if (each := plain if k == 1 else f"{plain}_{k}") not in taken)
+        taken.add(name)
+        names[topic] = name
+    return names
+
+
+# --- images -----------------------------------------------------------------------------------------------------------
 
 
 def image_topics(recording: Recording, wants: Wanted) -> list[str]:
-    """The wanted topics that carry pictures."""
+    """Return the wanted topics of images."""
     return sorted(topic for topic, (name, _) in recording.topics().items() if name == "Image" and wants(topic))
 
 
 def export_images(recording: Recording, folder: Path, wants: Wanted, decoder: Decoder) -> dict[str, int]:
-    """Pictures that were written, by topic: FOLDER/<topic>/<number>_<stamp in ns>.png.
+    """Write images to FOLDER/<topic>/<number>_<stamp in ns>.png; return their number by topic.
 
-    Depth is written as 16 bit millimetres with 0 for none, as in ROS.
+    Depth is written as 16 bit millimetres with 0 for no value, as in ROS.
 
     Raises:
         RecordingError: the recording is damaged, or a file cannot be written.
@@ -121,30 +135,31 @@ def export_images(recording: Recording, folder: Path, wants: Wanted, decoder: De
         if pixels is None:
             decoder.skipped[sample.topic] += 1
             continue
-        place = folder / names[sample.topic]
-        place.mkdir(parents=True, exist_ok=True)
+        subfolder = folder / names[sample.topic]
+        subfolder.mkdir(parents=True, exist_ok=True)
         counts[sample.topic] += 1
-        path = place / f"{counts[sample.topic]:06d}_{sample.publish_time}.png"
+        path = subfolder / f"{counts[sample.topic]:06d}_{sample.publish_time}.png"
         if not cv2.imwrite(str(path), pixels):
             raise RecordingError(f"{path}: cannot be written")
     return dict(counts)
 
 
 def export_video(recording: Recording, target: Path, topic: str, decoder: Decoder) -> tuple[int, float]:
-    """Number of pictures in a new MP4 file of a topic, and their rate [Hz], which is the median of the recording.
+    """Write the color images of a topic to an MP4 file; return their number and rate [Hz], the median of the recording.
 
     Raises:
-        RecordingError: no codec is there, no picture can be shown, the recording is damaged, or the disk takes no more.
+        RecordingError: the codec is missing, the topic has no color image, the recording is damaged, or the disk is
+            full.
     """
     times = [sample.log_time for sample in recording.samples(lambda name: name == topic)]
     gaps = [(later - earlier) * 1e-9 for earlier, later in pairwise(times) if later > earlier]
     rate = round(1 / median(gaps), 2) if gaps else DEFAULT_RATE
     writer: cv2.VideoWriter | None = None
     size = (0, 0)
-    count = 0
+    written = 0
     try:
         for sample in recording.samples(lambda name: name == topic):
-            pixels = _colour(decoder.message(sample))
+            pixels = _color_image(decoder.message(sample))
             if pixels is None or (writer is not None and pixels.shape[1::-1] != size):
                 decoder.skipped[topic] += 1
                 continue
@@ -154,20 +169,20 @@ def export_video(recording: Recording, target: Path, topic: str, decoder: Decode
                 if not writer.isOpened():
                     raise RecordingError(f"{target}: this OpenCV cannot write {CODEC} video there; try --images DIR")
             writer.write(pixels)
-            count += 1
+            written += 1
     finally:
         if writer is not None:
             writer.release()
-    if not count:
-        raise RecordingError(f"{recording.path}: {topic} has no colour picture; for depth use --images DIR")
-    if _pictures_in(target) != count:  # OpenCV says nothing of what it could not write
+    if not written:
+        raise RecordingError(f"{recording.path}: {topic} has no color image; for depth use --images DIR")
+    if _frame_count(target) != written:  # OpenCV does not report write errors
         target.unlink(missing_ok=True)
-        raise ExportFailed(target, "the disk takes no more")
-    return count, rate
+        raise ExportFailed(target, "the disk is full")
+    return written, rate
 
 
-def _pictures_in(video: Path) -> int:
-    """How many pictures a video file has, as it says itself; 0 for one that is not whole."""
+def _frame_count(video: Path) -> int:
+    """Return the number of images in a video file; 0 for a truncated one."""
     reader = cv2.VideoCapture(str(video))
     try:
         return round(reader.get(cv2.CAP_PROP_FRAME_COUNT)) if reader.isOpened() else 0
@@ -175,23 +190,8 @@ def _pictures_in(video: Path) -> int:
         reader.release()
 
 
-def _colour(message: Any) -> npt.NDArray[Any] | None:
+def _color_image(message: Any) -> npt.NDArray[Any] | None:
     pixels = displayable(message)
-    if pixels is None or message.encoding not in COLOURS:
+    if pixels is None or message.encoding not in COLORS:
         return None
     return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_GRAY2BGR)) if pixels.ndim == 2 else pixels
-
-
-LONGEST = 100  # [characters]
-
-
-def file_names(topics: Iterable[str]) -> dict[str, str]:
-    """For each topic the name of a file or folder of its own, without an ending: none leads out of its folder."""
-    names: dict[str, str] = {}
-    taken: set[str] = set()
-    for topic in topics:
-        plain = re.sub(r"[^\w.-]|^\.", "_", topic, flags=re.ASCII)[:LONGEST] or "_"
-        name = next(each for k in count(1) if (each := plain if k == 1 else f"{plain}_{k}") not in taken)
-        taken.add(name)
-        names[topic] = name
-    return names

@@ -1,6 +1,6 @@
-"""Recordings for Foxglove: MCAP with JSON messages of its own schemas, where it has one for what was recorded.
+"""Exports recordings for Foxglove: MCAP with JSON messages of Foxglove's schemas where there is one for a message.
 
-An application says in its part `recording` which of its own messages are one of these: `FOXGLOVE`, a list as KINDS is.
+An application adds its own messages by its attribute `foxglove`, a list like KINDS.
 """
 
 from __future__ import annotations
@@ -41,21 +41,24 @@ from recording.writer import AppendedFile, ExportFailed, WriteFailed
 JPEG_QUALITY = 90
 LEVELS = {"debug": 1, "info": 2, "warning": 3, "error": 4, "critical": 5}
 FLOAT32, UINT8 = 7, 1
-CANNOT_BE_CONVERTED = (ZencellError, ArithmeticError, ValueError, LookupError, TypeError, cv2.error)
+CONVERSION_ERRORS = (ZencellError, ArithmeticError, ValueError, LookupError, TypeError, cv2.error)
 CHUNK_BYTES = 1024 * 1024
+
+# Not the package foxglove-sdk 0.30: it sets neither publish time nor sequence number of a message, needs the same
+# conversions (it saves only the schemas in foxglove_scene.py), and has 54 MB.
 
 
 def export_foxglove(recording: Recording, target: Path, wants: Wanted, decoder: Decoder) -> int:
-    """Number of messages that were written to a new file, which is whole or not there.
+    """Write a new file and return the number of messages; on failure the file is removed.
 
-    Colour pictures become JPEG. What Foxglove has no schema for is written as JSON of its own.
+    Color images become JPEG. A message without a Foxglove schema is written as JSON of its own schema.
 
     Raises:
-        RecordingError: the target is there already or cannot be written, or the recording is damaged.
+        RecordingError: the target exists already or cannot be written, or the recording is damaged.
     """
     file = AppendedFile(target)
     try:
-        return _written(recording, file, wants, decoder)
+        return _write(recording, file, wants, decoder)
     except BaseException as error:
         target.unlink(missing_ok=True)
         if isinstance(error, WriteFailed):
@@ -65,7 +68,7 @@ def export_foxglove(recording: Recording, target: Path, wants: Wanted, decoder: 
         file.close()
 
 
-def _written(recording: Recording, file: AppendedFile, wants: Wanted, decoder: Decoder) -> int:
+def _write(recording: Recording, file: AppendedFile, wants: Wanted, decoder: Decoder) -> int:
     count = 0
     writer = Writer(file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)  # type: ignore[arg-type]
     writer.start()
@@ -77,7 +80,7 @@ def _written(recording: Recording, file: AppendedFile, wants: Wanted, decoder: D
             continue
         try:
             name, value = convert(message)
-        except CANNOT_BE_CONVERTED:
+        except CONVERSION_ERRORS:
             decoder.skipped[sample.topic] += 1
             continue
         if name not in schemas:
@@ -93,24 +96,24 @@ def _written(recording: Recording, file: AppendedFile, wants: Wanted, decoder: D
 
 
 def convert(message: Message) -> tuple[str, dict[str, Any]]:
-    """Name of the schema, and the message as a JSON object of it."""
+    """Return the name of the Foxglove schema, and the message as a JSON object of that schema."""
     if isinstance(message, Image):
         return image(message)
-    for kind, name, make in _kinds():
+    for kind, name, to_json in _kinds():
         if isinstance(message, kind):
-            return name, make(message)
+            return name, to_json(message)
     return type(message).__name__, message.model_dump(mode="json")
 
 
 @cache
 def _kinds() -> list[Kind]:
-    """Those of applications first: their messages derive from what any message may be."""
-    own = [kind for found in applications() for kind in found.foxglove or ()]
-    return [*own, *KINDS]
+    """Return the conversions, those of applications first: their messages derive from the platform's."""
+    custom = [kind for found in applications() for kind in found.foxglove or ()]
+    return [*custom, *KINDS]
 
 
 def image(message: Image) -> tuple[str, dict[str, Any]]:
-    """A picture: JPEG of colours, depth as it is."""
+    """Convert an image: color to JPEG, depth unchanged."""
     header = {"timestamp": time_of(message.header.stamp), "frame_id": message.header.frame_id}
     if message.encoding not in ("bgr8", "rgb8", "mono8"):
         return "foxglove.RawImage", {
@@ -171,7 +174,7 @@ def _log(message: LogLine) -> dict[str, Any]:
 
 
 def _cloud(message: PointCloud2) -> dict[str, Any]:
-    # The packed colour is 0x00RRGGBB, little-endian: blue comes first.
+    # The packed color is 0x00RRGGBB, little-endian: blue comes first.
     fields = [(name, 4 * i, FLOAT32) for i, name in enumerate("xyz")]
     fields += [(name, 12 + i, UINT8) for i, name in enumerate(("blue", "green", "red"))]
     return {
@@ -181,7 +184,7 @@ def _cloud(message: PointCloud2) -> dict[str, Any]:
     }
 
 
-Kind = tuple[type[Message], str, Callable[[Any], dict[str, Any]]]  # message, schema, how it is made one
+Kind = tuple[type[Message], str, Callable[[Any], dict[str, Any]]]  # message, schema, conversion
 KINDS: list[Kind] = [
     (CameraInfo, "foxglove.CameraCalibration", _calibration),
     (TFMessage, "foxglove.FrameTransforms", _transforms),

@@ -1,4 +1,4 @@
-"""What can be seen in a scene, as Foxglove's scene entities."""
+"""Scenes as Foxglove's scene entities, and the JSON schemas of all exported messages."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from common.messages import (
 
 LINE_LOOP = 1
 DELETE_ALL = 1
-PRIMITIVES = ("arrows", "cubes", "spheres", "cylinders", "lines", "triangles", "texts", "models")  # all are required
+PRIMITIVES = ("arrows", "cubes", "spheres", "cylinders", "lines", "triangles", "texts", "models")  # all required
 THICKNESS = 0.004  # of lines [m]
 
 Entity = dict[str, Any]
 
 
 def time_of(stamp: int) -> dict[str, int]:
-    """A stamp [ns] as Foxglove has it."""
+    """Return a stamp [ns] as a Foxglove time."""
     return {"sec": stamp // 1_000_000_000, "nsec": stamp % 1_000_000_000}
 
 
 def update(stamp: int, entities: list[Entity]) -> dict[str, Any]:
-    """A scene that replaces the one before on its topic."""
+    """Return a scene that replaces the one before on its topic."""
     return {
         "deletions": [{"timestamp": time_of(stamp), "type": DELETE_ALL, "id": ""}],
         "entities": entities,
@@ -39,7 +39,7 @@ def update(stamp: int, entities: list[Entity]) -> dict[str, Any]:
 
 
 def entity(name: str, frame: str, stamp: int, **primitives: list[dict[str, Any]]) -> Entity:
-    """A thing in a scene, which stays until it is replaced or deleted."""
+    """Return an entity that stays until it is replaced or deleted."""
     return {
         "timestamp": time_of(stamp), "frame_id": frame, "id": name, "lifetime": {"sec": 0, "nsec": 0},
         "frame_locked": True, "metadata": [], **{key: [] for key in PRIMITIVES}, **primitives,
@@ -47,7 +47,7 @@ def entity(name: str, frame: str, stamp: int, **primitives: list[dict[str, Any]]
 
 
 def of_markers(message: MarkerArray) -> dict[str, Any]:
-    """Markers as a scene."""
+    """Convert markers."""
     stamp, frame = message.header.stamp, message.header.frame_id
     entities = []
     for marker in message.markers:
@@ -57,7 +57,7 @@ def of_markers(message: MarkerArray) -> dict[str, Any]:
 
 
 def of_scene(message: PlanningScene) -> dict[str, Any]:
-    """Objects of a planning scene; attached ones move with their link."""
+    """Convert the objects of a planning scene; attached ones move with their link."""
     stamp = message.header.stamp
     entities = [entity(solid.id, message.header.frame_id, stamp, **_solid(solid)) for solid in message.objects]
     for held in message.attached:
@@ -66,7 +66,7 @@ def of_scene(message: PlanningScene) -> dict[str, Any]:
 
 
 def of_world(message: WorldObjects) -> dict[str, Any]:
-    """The solids of the simulated world: what stands upright by the edges of its top and base."""
+    """Convert the solids of the simulated world; upright prisms become the edges of their top and base."""
     stamp = message.header.stamp
     return update(stamp, [entity(solid.id, "world", stamp, **_of_object(solid)) for solid in message.objects])
 
@@ -114,7 +114,7 @@ def _of_object(solid: WorldObject) -> dict[str, list[dict[str, Any]]]:
 
 
 def _sections(solid: WorldObject) -> list[list[tuple[float, float]]]:
-    """Edges of the cross-section of a prism or ring, in its own frame."""
+    """Return the outlines of the cross-section of a prism or ring, in its own frame [m]."""
     if solid.shape == "prism":
         return [solid.polygon]
     turns = [2 * math.pi * k / 36 for k in range(36)]
@@ -128,7 +128,7 @@ def _edges(solid: WorldObject) -> list[dict[str, Any]]:
 
 
 def closed_line(points: Sequence[tuple[float, float, float]], color: Color) -> dict[str, Any]:
-    """A closed line through points [m]."""
+    """Return a closed line through points [m]."""
     return {
         "type": LINE_LOOP, "pose": Pose().model_dump(), "thickness": THICKNESS, "scale_invariant": False,
         "points": [{"x": x, "y": y, "z": z} for x, y, z in points], "color": color.model_dump(),

@@ -1,4 +1,4 @@
-"""Keys that a person presses at a terminal, by name."""
+"""Keys pressed in a terminal, by name."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ NAMES = {b"\x1b[C": "right", b"\x1b[D": "left", b"\x1b[B": "down", b"\x1b[A": "u
 
 
 class Keys:
-    """Calls back with the name of each key while the block runs; does nothing without a terminal.
+    """Calls back with the name of each key during the block; does nothing without a terminal.
 
-    The terminal is as before when the block ends, however it ends. Ctrl-C stays a signal.
+    The end of the block restores the terminal. Ctrl-C stays a signal.
     """
 
     def __init__(self, on_key: Callable[[str], None], *, on_terminal: bool) -> None:
-        """Take the terminal over only in the block, if standard input is one; on the running loop."""
+        """Prepare without changing the terminal; the block needs a running loop."""
         self._on_terminal = on_terminal
         self._on_key = on_key
         self._before: list[Any] | None = None
@@ -42,14 +42,14 @@ class Keys:
 
     def _read(self) -> None:
         data = os.read(sys.stdin.fileno(), 64)
-        if not data:  # the terminal is gone
+        if not data:  # the terminal was closed
             asyncio.get_running_loop().remove_reader(sys.stdin.fileno())
         for name in names_of(data):
             self._on_key(name)
 
 
 def names_of(data: bytes) -> list[str]:
-    """Names of the keys that the terminal's bytes stand for: right, left, up, down, space, or a letter."""
+    """Return the keys of bytes from a terminal: right, left, up, down, space, or a letter."""
     names = []
     while data:
         known = next((code for code in NAMES if data.startswith(code)), None)
@@ -57,7 +57,7 @@ def names_of(data: bytes) -> list[str]:
             names.append(NAMES[known])
         elif data[0] != 0x1B:
             names.append(chr(data[0]))
-        else:  # another sequence, or Escape alone: a letter of it must not be taken for a key
+        else:  # another escape sequence, whose letters are no keys
             break
         data = data[len(known) if known else 1 :]
     return names

@@ -1,4 +1,4 @@
-"""What lies where in an MCAP file, found by walking over its records; so that a file that was cut can be read too."""
+"""Scans an MCAP file record by record, so that a truncated or damaged file can be read too."""
 
 from __future__ import annotations
 
@@ -20,28 +20,28 @@ from mcap.writer import MCAP0_MAGIC
 
 from recording.sample import RecordingError
 
-_HEAD = struct.Struct("<BQ")  # opcode, length of what follows
+_HEAD = struct.Struct("<BQ")  # opcode, length of the record's content
 _CHUNK_HEAD = struct.Struct("<QQQ")  # first and last log time [ns], size before compression
 _DESCRIPTIONS = (Opcode.METADATA, Opcode.SCHEMA, Opcode.CHANNEL)
-_HIGHEST, _PRIVATE = 0x0F, 0x80  # opcodes beyond and below these are nobody's
+_HIGHEST, _PRIVATE = 0x0F, 0x80  # opcodes between these are undefined
 DAMAGE = (McapError, zstandard.ZstdError, struct.error, ValueError, RuntimeError, MemoryError, OverflowError, EOFError)
 
-# What no recording has: whoever made such a file wants to cost its reader time or memory.
+# No recording exceeds these limits; a file that does was made to exhaust its reader's time or memory.
 MOST_CHUNK = 48 * 1024 * 1024  # [bytes] before compression: the largest message has 40 MB
-MOST_WINDOW = 2**27  # [bytes] that unpacking may look back, and hold
-MOST_RECORDS = 50_000  # of a chunk; the recorder writes 512 kB
-MOST_CHANNELS = 5000  # and schemas that are told of in a chunk
-MOST_DESCRIBED = 32 * 1024 * 1024  # [bytes] of schemas, channels and metadata beside the chunks
-MOST_DESCRIPTIONS = 20_000  # of these
-MOST_SHORT, SHORT = 20_000, 24  # records, when they have fewer bytes on average: the index of one message has 31
-MOST_GROWTH, GROWTH_FREE = 5000, 2**30  # times the size of the file; and [bytes] that need no file of a size
+MOST_WINDOW = 2**27  # [bytes] window of the decompressor
+MOST_RECORDS = 50_000  # per chunk; the recorder writes 512 kB
+MOST_CHANNELS = 5000  # channels and schemas per chunk
+MOST_DESCRIBED = 32 * 1024 * 1024  # [bytes] of schemas, channels and metadata outside of chunks
+MOST_DESCRIPTIONS = 20_000  # their number
+MOST_SHORT, SHORT = 20_000, 24  # records, if their mean size is below 24 bytes: the index of one message has 31
+MOST_GROWTH, GROWTH_FREE = 5000, 2**30  # decompressed size over file size, above a decompressed size [bytes]
 
 
 @dataclass
-class ChunkPlace:
-    """Where a chunk lies, which time it covers and which channels have messages in it, where the file says so."""
+class ChunkPosition:
+    """Where a chunk is, which log times it covers, and which channels have messages in it if the file is indexed."""
 
-    offset: int  # [bytes] of its contents
+    offset: int  # [bytes] of its content
     length: int  # [bytes]
     start: int  # log time of its first message [ns]
     end: int  # of its last
@@ -51,12 +51,12 @@ class ChunkPlace:
 
 @dataclass
 class Layout:
-    """The records of a file as far as they are whole."""
+    """Complete records of a file."""
 
-    finished: bool = False  # down to the footer: nobody was interrupted
-    whole: int = 0  # bytes from the front that are whole records
+    finished: bool = False  # whether the file has its footer
+    complete: int = 0  # [bytes] from the start that are complete records
     size: int = 0  # of the file [bytes]
-    chunks: list[ChunkPlace] = field(default_factory=list)
+    chunks: list[ChunkPosition] = field(default_factory=list)
     metadata: list[Metadata] = field(default_factory=list)
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
@@ -64,37 +64,38 @@ class Layout:
 
 
 def read_layout(file: BinaryIO, path: Path) -> Layout:
-    """What lies where in a file, which may end anywhere.
+    """Return the layout of a file, which may end anywhere.
 
     Raises:
-        RecordingError: it is no MCAP file, or one that no recorder makes.
+        RecordingError: it is no MCAP file, or exceeds the limits of recordings.
     """
     count = described = descriptions = grown = 0
     found = Layout(size=file.seek(0, 2))
     file.seek(0)
-    front = file.read(len(MCAP0_MAGIC))
-    if front != MCAP0_MAGIC[: len(front)]:
+    start = file.read(len(MCAP0_MAGIC))
+    if start != MCAP0_MAGIC[: len(start)]:
         raise RecordingError(f"{path}: is no MCAP file")
-    found.whole = len(front)
-    if len(front) < len(MCAP0_MAGIC):
+    found.complete = len(start)
+    if len(start) < len(MCAP0_MAGIC):
         return found
     while True:
         head = file.read(_HEAD.size)
         if len(head) < _HEAD.size:
             return found
         opcode, length = _HEAD.unpack(head)
-        begin = found.whole + _HEAD.size
-        if begin + length > found.size or opcode == 0 or _HIGHEST < opcode < _PRIVATE:
+        content = found.complete + _HEAD.size
+        if content + length > found.size or opcode == 0 or _HIGHEST < opcode < _PRIVATE:
             return found
         count += 1
         if opcode in _DESCRIPTIONS:
             described, descriptions = described + length, descriptions + 1
         if described > MOST_DESCRIBED or descriptions > MOST_DESCRIPTIONS:
-            raise RecordingError(f"{path}: has {descriptions:,} descriptions in {described:,} B, as no recording has")
-        if count > MOST_SHORT and begin < count * SHORT:
-            raise RecordingError(f"{path}: has {count:,} records in its first {begin:,} B, as no recording has")
+            raise RecordingError(f"{path}: has {descriptions:,} descriptions in {described:,} B, "
+                                 "more than any recording")
+        if count > MOST_SHORT and content < count * SHORT:
+            raise RecordingError(f"{path}: has {count:,} records in its first {content:,} B, more than any recording")
         try:
-            _note(found, opcode, begin, length, file)
+            _add_record(found, opcode, content, length, file)
         except DAMAGE:
             return found
         if opcode == Opcode.CHUNK:
@@ -102,18 +103,18 @@ def read_layout(file: BinaryIO, path: Path) -> Layout:
             if grown > GROWTH_FREE + MOST_GROWTH * found.size:
                 raise RecordingError(f"{path}: would have {grown:,} B or more without its compression, "
                                      f"from {found.size:,} B")
-        found.whole = begin + length
+        found.complete = content + length
         if opcode == Opcode.FOOTER:
-            file.seek(found.whole)
+            file.seek(found.complete)
             found.finished = file.read(len(MCAP0_MAGIC)) == MCAP0_MAGIC
             return found
-        file.seek(found.whole)
+        file.seek(found.complete)
 
 
-def _note(found: Layout, opcode: int, begin: int, length: int, file: BinaryIO) -> None:
+def _add_record(found: Layout, opcode: int, content: int, length: int, file: BinaryIO) -> None:
     if opcode == Opcode.CHUNK:
         start, end, size = _CHUNK_HEAD.unpack(file.read(_CHUNK_HEAD.size))
-        found.chunks.append(ChunkPlace(begin, length, start, end, size))
+        found.chunks.append(ChunkPosition(content, length, start, end, size))
     elif opcode == Opcode.MESSAGE_INDEX and found.chunks:
         found.chunks[-1].channels.add(int.from_bytes(file.read(2), "little"))
     elif opcode == Opcode.MESSAGE:
@@ -130,27 +131,27 @@ def _note(found: Layout, opcode: int, begin: int, length: int, file: BinaryIO) -
             found.channels[channel.id] = channel
 
 
-def records_of(file: BinaryIO, place: ChunkPlace) -> list[McapRecord]:
-    """The schemas, channels and messages of a chunk.
+def records_of(file: BinaryIO, position: ChunkPosition) -> list[McapRecord]:
+    """Return the schemas, channels and messages of a chunk.
 
     Raises:
-        DAMAGE: any of these, when the chunk is damaged, or larger than any is.
+        DAMAGE: one of these, if the chunk is damaged or too large.
     """
-    if place.size > MOST_CHUNK or place.length > place.size + MOST_CHUNK:
+    if position.size > MOST_CHUNK or position.length > position.size + MOST_CHUNK:
         raise ValueError
-    file.seek(place.offset)
-    data = file.read(place.length)
-    if len(data) < place.length:
+    file.seek(position.offset)
+    data = file.read(position.length)
+    if len(data) < position.length:
         raise EOFError
     chunk = Chunk.read(ReadDataStream(BytesIO(data)))
-    contents = _unpacked(chunk)
+    contents = _decompressed(chunk)
     if chunk.uncompressed_crc and zlib.crc32(contents) != chunk.uncompressed_crc:
         raise ValueError
     return list(_records(contents))
 
 
-def _unpacked(chunk: Chunk) -> bytes:
-    """The contents of a chunk, which are as long as it says: nothing longer is ever made of it."""
+def _decompressed(chunk: Chunk) -> bytes:
+    """Return the contents of a chunk, decompressing no more than its declared size."""
     size = chunk.uncompressed_size
     if chunk.compression == "zstd":
         with zstandard.ZstdDecompressor(max_window_size=MOST_WINDOW).stream_reader(chunk.data) as stream:

@@ -1,4 +1,4 @@
-"""Publishes what was recorded, when it is due, and does what the person at the keys says meanwhile."""
+"""Plays a recording: publishes its messages at their times, controlled by keys of the terminal."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from collections.abc import AsyncIterator, Callable
 from typing import TYPE_CHECKING, Protocol
 
 from common.client.joining import is_listening
-from common.client.publishing import writers_of
+from common.client.keys import writers_of
 from common.clock import Clock
 from common.errors import ConfigError
 from common.remapping import is_key
@@ -23,19 +23,70 @@ from common.transport.zenoh_session import connect as connect_to
 from recording.keyboard import Keys
 from recording.reader import Recording
 from recording.sample import RecordingError, encoding_of, restamp
-from recording.selection import Playhead, Selection
+from recording.selection import Selection
 
 if TYPE_CHECKING:
     from common.transport.writer import RawWriter
     from recording.sample import Sample
 
+BACK = 5.0  # [s] of a jump back
+IMAGE = "Image"
+TOOL = "player"
+SHOW_PERIOD = 0.2  # [s]
+LINGER = 2.0  # [s] that the player's own router stays, so that subscribers can publish what the last message causes
+CLOSE = 0.5  # [s] limit for closing it
+HELP = "space: pause; right: next message; down: next image; left: back 5 s; q: quit"
 
-BACK = 5.0  # [s] that a key jumps back
-PICTURE = "Image"
+
+class Playhead:
+    """Position of a playback. Log times and the wall clock are both in ns since the Unix epoch."""
+
+    def __init__(self, position: int, now: int, *, rate: float = 1.0, paused: bool = False) -> None:
+        """Start at a log time.
+
+        Args:
+            position: the log time [ns].
+            now: wall time [ns].
+            rate: seconds of recording per second.
+            paused: whether to wait for `resume`.
+        """
+        self.rate = rate
+        self._position = position  # at _since
+        self._since = now
+        self._paused = paused
+
+    @property
+    def paused(self) -> bool:
+        """Whether the playback waits for `resume`."""
+        return self._paused
+
+    def position(self, now: int) -> int:
+        """Return the log time at a wall time [ns]."""
+        return self._position if self._paused else self._position + round((now - self._since) * self.rate)
+
+    def due(self, log_time: int) -> int:
+        """Return the wall time [ns] of a log time if there is no further pause."""
+        return self._since + round((log_time - self._position) / self.rate)
+
+    def pause(self, now: int) -> None:
+        """Stop at the current position."""
+        self._position = self.position(now)
+        self._since = now
+        self._paused = True
+
+    def resume(self, now: int) -> None:
+        """Continue from the current position."""
+        self._since = now
+        self._paused = False
+
+    def jump(self, position: int, now: int) -> None:
+        """Move to a log time; a paused playback stays paused."""
+        self._position = position
+        self._since = now
 
 
 class _Jump(Exception):
-    """The person wants to be elsewhere in the recording."""
+    """The user has moved to another position."""
 
 
 class Player:
@@ -49,13 +100,13 @@ class Player:
 
         Args:
             recording: open.
-            wants: whether a topic is played.
-            rename: the topic under which a topic is published.
+            wants: returns whether a topic is played.
+            rename: returns the topic to publish under.
             rate: seconds of recording per second.
-            offset: where to begin [s].
-            loop: begin again at the end.
-            paused: wait for a key at the start.
-            stamp_now: move all stamps to the present, so that ages are what they were when it was recorded.
+            offset: start position [s].
+            loop: whether to start again at the end.
+            paused: whether to wait for a key at the start.
+            stamp_now: whether to shift all stamps to the present, so that ages are as recorded.
         """
         self.published = 0
         self.quit = False
@@ -68,7 +119,7 @@ class Player:
         self._writers: dict[str, RawWriter] = {}
         self.head = Playhead(self._start, time.time_ns(), rate=rate, paused=paused)
         self._steps = 0
-        self._to_picture = False
+        self._to_image = False
         self._jumped = False
         self._changed = asyncio.Event()
         run = recording.run
@@ -76,19 +127,19 @@ class Player:
 
     @property
     def position(self) -> float:
-        """Where in the recording it is [s]."""
+        """Position in the recording [s]."""
         now = self.head.position(time.time_ns())
         return max(0.0, min(now, self._recording.end) - self._recording.start) * 1e-9
 
     @property
-    def heard(self) -> bool:
-        """Whether anybody listens to what is played."""
+    def has_subscribers(self) -> bool:
+        """Whether any played topic has a subscriber."""
         return any(writer.matched for writer in self._writers.values())
 
     def declare(self, bus: Bus, topics: dict[str, tuple[str, str]]) -> None:
-        """Declare a writer for each topic, given with message class and kind: who listens is known before it speaks.
+        """Declare a writer for each topic (with message class and kind), so that subscribers are known in time.
 
-        Its ids and numbers are its own, so that readers which have heard the topic before take what it says for new.
+        Its writer ids and sequence numbers are new, so that readers of the original messages accept the played ones.
         """
         for topic, (message, kind) in topics.items():
             key = f"{bus.cell}/{self.renamed(topic)}"
@@ -96,12 +147,12 @@ class Player:
             self._writers[topic] = bus.raw_writer(key, encoding_of(message), known)  # type: ignore[arg-type]
 
     def on_key(self, name: str) -> None:
-        """Do what a key says."""
+        """Handle a key."""
         now = time.time_ns()
         if name == "space":
             (self.head.resume if self.head.paused else self.head.pause)(now)
         elif name in ("right", "down") and self.head.paused:
-            self._steps, self._to_picture = 1, name == "down"
+            self._steps, self._to_image = 1, name == "down"
         elif name == "left":
             self.head.jump(max(self._recording.start, self.head.position(now) - round(BACK * 1e9)), now)
             self._jumped = True
@@ -110,12 +161,12 @@ class Player:
         self._changed.set()
 
     async def run(self) -> None:
-        """Play to the end, or until a key says otherwise."""
+        """Play to the end, or until a key quits."""
         since = self._start
         self.head.jump(since, time.time_ns())
         while not self.quit:
             try:
-                await self._through(since)
+                await self._play_from(since)
             except _Jump:
                 since = self.head.position(time.time_ns())
                 continue
@@ -124,7 +175,7 @@ class Player:
             since = self._start
             self.head.jump(since, time.time_ns())
 
-    async def _through(self, since: int) -> None:
+    async def _play_from(self, since: int) -> None:
         for state in self._recording.states_before(since, self._wants):
             self._publish(state)
         for sample in self._recording.samples(self._wants, since):
@@ -134,7 +185,7 @@ class Player:
             self._publish(sample)
 
     async def _until_due(self, sample: Sample) -> None:
-        await asyncio.sleep(0)  # keys are heard also when all is late
+        await asyncio.sleep(0)  # so that keys are handled even if all messages are late
         while not self.quit:
             if self._jumped:
                 self._jumped = False
@@ -144,7 +195,7 @@ class Player:
             if wait is not None and wait <= 0:
                 return
             if self.head.paused and self._steps:
-                if not self._to_picture or sample.message == PICTURE:
+                if not self._to_image or sample.message == IMAGE:
                     self._steps = 0
                 self.head.jump(sample.log_time, now)
                 return
@@ -157,35 +208,31 @@ class Player:
 
     def _publish(self, sample: Sample) -> None:
         payload = restamp(sample.payload, self._present) if self._stamp_now else sample.payload
-        if writer := self._writers.get(sample.topic):  # the index of a file may leave one out
+        if writer := self._writers.get(sample.topic):  # a damaged index may omit a topic
             writer.put(payload, sample.trace)
             self.published += 1
 
     def _present(self, stamp: int) -> int:
-        """The stamp [ns] that belongs to a recorded one: from cell time to wall time, and from then to now."""
-        then = self._epoch + round((stamp - self._epoch) / self._speed) if self._epoch else stamp
-        return self.head.due(then)
+        """Return a recorded stamp [ns] shifted to the present: from cell time to wall time, then to now."""
+        recorded = self._epoch + round((stamp - self._epoch) / self._speed) if self._epoch else stamp
+        return self.head.due(recorded)
 
 
-TOOL = "player"
-SHOW_PERIOD = 0.2  # [s]
-LINGER = 2.0  # [s] that a router of our own stays for who listens: what they make of the last message travels over it
-CLOSE = 0.5  # [s] that its end may take
-HELP = "space pauses, right steps a message, down a picture, left goes back 5 s, q quits"
+# --- the `play` command -----------------------------------------------------------------------------------------------
 
 
-class Tell(Protocol):
-    """Is called with lines for a person; those about what is not well go to stderr."""
+class Echo(Protocol):
+    """Called with lines for the user; warnings go to stderr."""
 
     def __call__(self, text: str, *, err: bool = False) -> None:
         """Show a line."""
 
 
 def renaming(pairs: list[str]) -> Callable[[str], str]:
-    """What maps a topic to the one under which it is published.
+    """Return the function of `--remap FROM:=TO` options, which maps a topic to the one to publish under.
 
     Raises:
-        ConfigError: a pair is none.
+        ConfigError: a pair is invalid.
     """
     table: dict[str, str] = {}
     for pair in pairs:
@@ -197,63 +244,63 @@ def renaming(pairs: list[str]) -> Callable[[str], str]:
     return lambda topic: table.get(topic, topic)
 
 
-def played_of(recording: Recording, selection: Selection) -> dict[str, tuple[str, str]]:
-    """The topics that are played, with message class and kind.
+def played_topics(recording: Recording, selection: Selection) -> dict[str, tuple[str, str]]:
+    """Return the selected topics, with message class and kind.
 
     Raises:
-        ConfigError: one is not in the recording, or there is none.
-        RecordingError: one is no key.
+        ConfigError: a selected topic is not in the recording, or none is.
+        RecordingError: a topic is not a valid key.
     """
     every = recording.topics()
     selection.require_in(every, recording.path, "KEY")
-    wanted = {topic: what for topic, what in every.items() if selection.wants(topic)}
-    for topic in wanted:
+    selected = {topic: what for topic, what in every.items() if selection.wants(topic)}
+    for topic in selected:
         if not is_key(topic):
-            raise RecordingError(f"{recording.path}: has messages of {topic[:60]!r}, which is no key to publish under")
-    if not wanted:
-        raise ConfigError(str(recording.path), ..., "has no message that is to be played")
-    return wanted
+            raise RecordingError(f"{recording.path}: has messages of {topic[:60]!r}, which is not a key")
+    if not selected:
+        raise ConfigError(str(recording.path), ..., "has no message of the selected topics")
+    return selected
 
 
 async def play(
-    make: Callable[[], Player], recording: Recording, played: dict[str, tuple[str, str]], cell: str, wait: list[str],
-    domain: str | None, connect: str | None, tell: Tell, show: Callable[[str], None] | None,
+    create: Callable[[], Player], recording: Recording, topics: dict[str, tuple[str, str]], cell: str, wait: list[str],
+    domain: str | None, connect: str | None, echo: Echo, show: Callable[[str], None] | None,
 ) -> int:
-    """Exit code of playing a recording to its end, or until a signal or key.
+    """Play a recording to its end, or until a signal or key; return the exit code.
 
     Args:
-        make: the player; called on the running loop.
-        recording: that is played.
-        played: message class and kind of its topics that are played.
-        cell: as which it is played.
+        create: creates the player; called on the running loop.
+        recording: to play.
+        topics: message class and kind of the topics to play.
+        cell: name to play as.
         wait: services that must be ready before.
-        domain: where, as given to `--domain`; a router is started if none is there.
-        connect: where, as given to `--connect`; none is started.
-        tell: is called with lines for a person.
-        show: is called with a line that takes the place of the one before; None where nobody is at the keys.
+        domain: of `--domain`; a router is started if there is none.
+        connect: of `--connect`; no router is started.
+        echo: called with lines for the user.
+        show: called with a line that replaces the one before; None without a terminal.
     """
     interrupts = Interrupts()
     interrupts.install()
     endpoint = endpoint_of(domain, connect)
     async with (
-        _router(endpoint, may_start=connect is None) as own,
+        _router(endpoint, may_start=connect is None) as own_router,
         connect_to(cell=cell, service=TOOL, endpoint=endpoint, clock=Clock.from_environment()) as bus,
     ):
-        player = make()
-        player.declare(bus, played)
+        player = create()
+        player.declare(bus, topics)
         with Keys(player.on_key, on_terminal=show is not None):
             tasks = [asyncio.create_task(_wait_and_run(player, bus, wait)), asyncio.create_task(interrupts.stop.wait())]
             ending = set(tasks)
             if show:
                 tasks.append(asyncio.create_task(_show(player, recording, show)))
-            where = f"{endpoint}{', a router of its own' if own else ''}"
-            tell(f"playing {recording.path} ({recording.seconds:.1f} s) as {cell} at {where}")
+            where = f"{endpoint}{', a router of its own' if own_router else ''}"
+            echo(f"playing {recording.path} ({recording.seconds:.1f} s) as {cell} at {where}")
             if show:
-                tell(HELP)
+                echo(HELP)
             if not recording.finished:
-                tell(f"it is not finished; zencell recover {recording.path} makes it whole", err=True)
-            for name, topic in await writers_of(bus, map(player.renamed, played)):
-                tell(f"{name} is up and writes {topic} too: whoever reads it hears both", err=True)
+                echo(f"the recording is not finished; to repair it: zencell recover {recording.path}", err=True)
+            for name, topic in await writers_of(bus, map(player.renamed, topics)):
+                echo(f"{name} is up and publishes {topic} too: subscribers receive both", err=True)
             try:
                 await asyncio.wait(ending, return_when=asyncio.FIRST_COMPLETED)
                 if tasks[0].done():
@@ -264,8 +311,8 @@ async def play(
                 await asyncio.gather(*tasks, return_exceptions=True)
                 if show:
                     show("")
-        tell(f"played {player.published:,} messages")
-        if own and player.heard:
+        echo(f"played {player.published:,} messages")
+        if own_router and player.has_subscribers:
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(LINGER):
                     await interrupts.stop.wait()
@@ -274,7 +321,7 @@ async def play(
 
 @contextlib.asynccontextmanager
 async def _router(endpoint: str, *, may_start: bool) -> AsyncIterator[bool]:
-    """A router at the endpoint during the block; whether it is our own."""
+    """Ensure a router at the endpoint during the block; yield whether it was started here."""
     if not may_start or await asyncio.to_thread(is_listening, endpoint):
         yield False
         return

@@ -1,4 +1,4 @@
-"""A recording of a cell, made until a signal, the end of its time or of the disk."""
+"""Records a cell until a signal, the end of the requested time, or a full disk."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from common.application import find_topic
-from common.client.foreign import require_messages
-from common.client.keys import published
+from common.client.keys import published_topic, require_messages
 from common.supervision.lifecycle import Interrupts
 from common.transport.bus import Bus
 from common.transport.credentials import RECORDER
@@ -20,27 +19,27 @@ from common.transport.endpoint import endpoint_of
 from common.transport.session import call_on_loop
 from common.transport.zenoh_session import connect as connect_to
 from recording.capture import Capture, CustomTopics
+from recording.formatting import about, format_progress, format_result
 from recording.selection import Selection
 from recording.sink import Sink
-from recording.summary import about, outcome, progress
 from recording.writer import SplitWriter
 
 SHOW_PERIOD = 0.5  # [s]
 
-Tell = Callable[[str], None]
+Echo = Callable[[str], None]
 
 
 @dataclass(frozen=True)
 class RecordRequest:
-    """What is to be recorded.
+    """What to record.
 
     Attributes:
         selection: of the messages.
-        output: the file; one named after cell and time if None.
-        max_bytes: after which another file is begun.
-        seconds: after which it ends.
-        gate: it is under a supervisor: ready before its services are let through, ended with it.
-        own: what there is in the cell beside what comes with the project.
+        output: the file; None names it after cell and time.
+        max_bytes: size after which another file is started.
+        seconds: duration; None records until a signal.
+        gate: whether a supervisor starts the recorder: it is ready before the services start, and ends with them.
+        custom: topics of the cell that do not come with the project.
     """
 
     selection: Selection
@@ -48,98 +47,99 @@ class RecordRequest:
     max_bytes: int | None = None
     seconds: float | None = None
     gate: bool = False
-    own: CustomTopics = field(default_factory=CustomTopics)
+    custom: CustomTopics = field(default_factory=CustomTopics)
 
 
 def require_published(selection: Selection) -> None:
-    """Return when no key is one that answers requests: these do not travel as messages that can be heard.
+    """Return if no selected key is that of a request, whose messages cannot be subscribed to.
 
     Raises:
-        UnknownName: with the keys that are published.
+        UnknownName: with the published keys.
     """
     for key in selection.keys:
         if find_topic(key) is not None:
-            published(key)
+            published_topic(key)
 
 
 async def record_gated(
-    asked: RecordRequest, cell: str | None, domain: str | None, connect: str | None, tell: Tell, show: Tell | None
+    request: RecordRequest, cell: str | None, domain: str | None, connect: str | None, echo: Echo, show: Echo | None
 ) -> None:
-    """Record under a supervisor: be ready before its services are let through, end with its SIGTERM or with it."""
+    """Record under a supervisor: be ready before its services start, end with its SIGTERM or its death."""
     endpoint = endpoint_of(domain, connect)
     joining = connect_to(cell=cell or "_", service=RECORDER, endpoint=endpoint, timeout=None, identity=RECORDER)
     async with joining as bus:
-        await record(bus, asked, tell, show)
+        await record(bus, request, echo, show)
 
 
-async def record(bus: Bus, asked: RecordRequest, tell: Tell, show: Tell | None) -> None:
-    """Record in a cell.
+async def record(bus: Bus, request: RecordRequest, echo: Echo, show: Echo | None) -> None:
+    """Record a cell.
 
     Args:
         bus: in the cell.
-        asked: what.
-        tell: is called with lines for a person.
-        show: is called with a line that takes the place of the one before, empty at the end; None: nobody looks.
+        request: what to record.
+        echo: called with lines for the user.
+        show: called with a line that replaces the one before, empty at the end; None without a terminal.
 
     Raises:
-        SilentKey: nothing came on a key that the project does not have: it may be a slip of the hand.
+        SilentKey: no message arrived on a key that the project does not know: it may be misspelled.
     """
     interrupts = Interrupts()
     interrupts.install()
     loop = asyncio.get_running_loop()
-    if asked.gate:
+    if request.gate:
         _end_with_stdin(interrupts)
-    for key in asked.selection.keys:
+    for key in request.selection.keys:
         if find_topic(key) is None and "*" not in key:
             await require_messages(bus, key)
-    path = asked.output or Path(f"{bus.cell}_{time.strftime('%Y%m%d_%H%M%S')}.mcap")
-    writer = SplitWriter(path, about(bus.cell), asked.max_bytes)
+    path = request.output or Path(f"{bus.cell}_{time.strftime('%Y%m%d_%H%M%S')}.mcap")
+    writer = SplitWriter(path, about(bus.cell), request.max_bytes)
     sink = Sink(writer, on_failure=lambda: call_on_loop(loop, interrupts.stop.set))
-    capture = Capture(bus, asked.selection, sink, asked.own)
+    capture = Capture(bus, request.selection, sink, request.custom)
     reason = "interrupted"
     try:
-        await capture.begin()
-        tell(f"recording {bus.cell} to {path}")
-        if asked.gate:
+        await capture.start()
+        echo(f"recording {bus.cell} to {path}")
+        if request.gate:
             await bus.ready()
-        if await _until_ended(interrupts, asked.seconds, sink, capture, show):
+        if await _wait_for_end(interrupts, request.seconds, sink, capture, show):
             reason = "duration"
     finally:
-        capture.end()
-        figures = await asyncio.to_thread(sink.close, {"reason": reason, "missed": dict(capture.sequences.missed)})
-    for line in outcome([str(file) for file in writer.files], figures, dict(capture.sequences.missed)):
-        tell(line)
+        capture.stop()
+        stats = await asyncio.to_thread(sink.close, {"reason": reason, "missed": dict(capture.sequences.missed)})
+    for line in format_result([str(file) for file in writer.files], stats, dict(capture.sequences.missed)):
+        echo(line)
 
 
 def _end_with_stdin(interrupts: Interrupts) -> None:
+    """End the recording at the end of stdin, which the supervisor holds open."""
     loop = asyncio.get_running_loop()
 
-    def look() -> None:
+    def read() -> None:
         if not os.read(sys.stdin.fileno(), 4096):
             loop.remove_reader(sys.stdin.fileno())
-            interrupts.stop.set()  # the supervisor is gone
+            interrupts.stop.set()
 
-    loop.add_reader(sys.stdin.fileno(), look)
+    loop.add_reader(sys.stdin.fileno(), read)
 
 
-async def _until_ended(
-    interrupts: Interrupts, seconds: float | None, sink: Sink, capture: Capture, show: Tell | None
+async def _wait_for_end(
+    interrupts: Interrupts, seconds: float | None, sink: Sink, capture: Capture, show: Echo | None
 ) -> bool:
-    """Show how it goes until a signal, the end of the time (then True) or of the disk."""
-    began = time.monotonic()
-    before = sink.figures
+    """Show the progress until a signal, the end of the time (then return True) or a full disk."""
+    started_at = time.monotonic()
+    before = sink.stats
     while not interrupts.stop.is_set():
-        left = SHOW_PERIOD if seconds is None else min(SHOW_PERIOD, began + seconds - time.monotonic())
-        if left <= 0:
+        wait = SHOW_PERIOD if seconds is None else min(SHOW_PERIOD, started_at + seconds - time.monotonic())
+        if wait <= 0:
             break
         try:
-            async with asyncio.timeout(left):
+            async with asyncio.timeout(wait):
                 await interrupts.stop.wait()
         except TimeoutError:
             pass
         if show:
-            now = sink.figures
-            show(progress(now, before, sum(capture.sequences.missed.values())))
+            now = sink.stats
+            show(format_progress(now, before, sum(capture.sequences.missed.values())))
             before = now
     if show:
         show("")

@@ -1,4 +1,4 @@
-"""One message as it travelled, with when it came and who wrote it."""
+"""A recorded message: its sample, header stamp, sequence number, and decoded form."""
 
 from __future__ import annotations
 
@@ -19,6 +19,11 @@ from common.messages.basics import MAX_STAMP
 
 PREFIX = "application/msgpack;"  # of an encoding; the name of the message class follows
 
+# Any client of the network can invent writers and keys: the most recently seen and the first counted are remembered.
+MOST_WRITERS, MAX_KEYS = 10_000, 1000
+HEADER_BYTES = 512  # from the start of a payload, where the header is
+BAD_PAYLOAD = (ValueError, TypeError, msgpack.UnpackException, RecursionError)
+
 
 class RecordingError(ZencellError):
     """A recording that cannot be read, written or used like this: names the file and what to do."""
@@ -26,18 +31,18 @@ class RecordingError(ZencellError):
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """One message as it travelled. Times are wall clock, `publish_time` is cell time [ns since the Unix epoch]."""
+    """One message as it travelled. `log_time` is wall time, `publish_time` cell time [ns since the Unix epoch]."""
 
-    key: str  # full: <cell>/<topic>
+    key: str  # complete: <cell>/<topic>
     payload: bytes
     log_time: int  # of arrival
-    publish_time: int = 0  # stamp of its header; the log time where it has none
-    message: str = ""  # name of its class, empty where the sender does not say
+    publish_time: int = 0  # stamp of its header; the log time if it has none
+    message: str = ""  # name of its class; empty if unknown
     kind: str = "stream"  # or event, state
-    writer: str = ""  # empty for a sender that does not say who it is
+    writer: str = ""  # id; empty if the sender gives none
     sequence: int = 0
     trace: str = ""
-    schema: bytes = field(default=b"", repr=False, compare=False)  # JSON, where a recording tells it
+    schema: bytes = field(default=b"", repr=False, compare=False)  # JSON schema from the recording
 
     @property
     def topic(self) -> str:
@@ -51,31 +56,29 @@ class Sample:
 
 
 def message_of(encoding: str) -> str:
-    """Name of the message class in an encoding such as `application/msgpack;Image`; empty if there is none."""
+    """Return the message class named in an encoding such as `application/msgpack;Image`; empty if there is none."""
     return encoding.removeprefix(PREFIX) if encoding.startswith(PREFIX) else ""
 
 
 def encoding_of(message: str) -> str:
-    """The encoding under which messages of the class travel."""
+    """Return the encoding of a message class."""
     return PREFIX + message if message else PREFIX.rstrip(";")
 
 
-# Whoever is on the network can make up any number of them: known are those heard of last, and counted the first.
-MOST_WRITERS, MAX_KEYS = 10_000, 1000
-SEEN_BYTES = 512  # from the front of a payload, where the header is
+# --- stamps -----------------------------------------------------------------------------------------------------------
 
 
 def stamp_of(payload: bytes) -> int | None:
-    """The stamp [ns] of a payload's header, or of its first transform; None where it has none.
+    """Return the stamp [ns] of a payload's header, or of its first transform; None if it has none.
 
-    Messages have their header in front, so that a picture is not decoded for it.
+    Only the first bytes are decoded, since messages start with their header.
     """
     unpacker = msgpack.Unpacker(raw=False, strict_map_key=False)
-    unpacker.feed(payload[:SEEN_BYTES])
+    unpacker.feed(payload[:HEADER_BYTES])
     try:
         return _first_stamp(unpacker)
-    except (msgpack.UnpackException, ValueError, TypeError, RecursionError):
-        return None  # not msgpack, or no header in front
+    except BAD_PAYLOAD:
+        return None
 
 
 def _first_stamp(unpacker: Any) -> int | None:
@@ -92,14 +95,14 @@ def _first_stamp(unpacker: Any) -> int | None:
 
 
 def restamp(payload: bytes, moved: Callable[[int], int]) -> bytes:
-    """The payload with each stamp [ns] of its headers replaced by `moved(stamp)`; as it was where it has none.
+    """Return the payload with each header stamp [ns] replaced by `moved(stamp)`; unchanged if it has none.
 
-    A stamp of 0 says that there is none and stays.
+    A stamp of 0 means that there is none, and stays.
     """
     try:
         value = msgpack.unpackb(payload, raw=False, strict_map_key=False)
-    except (ValueError, TypeError, msgpack.UnpackException, RecursionError):
-        return payload  # whoever reads it refuses it as before
+    except BAD_PAYLOAD:
+        return payload  # readers reject it as before
     if not isinstance(value, dict):
         return payload
     transforms = value.get("transforms")
@@ -112,23 +115,22 @@ def restamp(payload: bytes, moved: Callable[[int], int]) -> bytes:
             changed = True
     try:
         packed: bytes = msgpack.packb(value, use_bin_type=True) if changed else payload
-    except (ValueError, OverflowError):  # a stamp that no clock shows
+    except (ValueError, OverflowError):  # a stamp out of range
         return payload
     return packed
 
 
 class Sequences:
-    """The newest sequence number of each key and writer. Not thread-safe: one thread calls it at a time."""
+    """Newest sequence number of each key and writer. Not thread-safe."""
 
     def __init__(self) -> None:
-        """Nothing came yet."""
-        self.missed: Counter[str] = Counter()  # by key: numbers that never came
-        self._newest: dict[tuple[str, str], int] = {}  # that which was heard of last at the end
+        self.missed: Counter[str] = Counter()  # sequence numbers that never arrived, by key
+        self._newest: dict[tuple[str, str], int] = {}  # least recently seen first
 
     def is_new(self, key: str, writer: str, sequence: int) -> bool:
-        """Whether a message is newer than what its writer said before; a gap before it is counted.
+        """Return whether a message is newer than the last of its writer, and count a gap before it.
 
-        A state comes again each second under the same number, and by a question beside the subscription.
+        A state arrives again each second under the same number, and in the reply to a query.
         """
         before = self._newest.pop((key, writer), None)
         self._newest[key, writer] = sequence if before is None else max(sequence, before)
@@ -142,41 +144,40 @@ class Sequences:
         return True
 
 
+# --- decoding ---------------------------------------------------------------------------------------------------------
+
+
 class Decoder:
-    """Turns samples into messages and counts, by topic, what could not be: somebody else's, or of another version."""
+    """Decodes samples, and counts by topic those of unknown class or version in `skipped`."""
 
-    def __init__(self, own: Iterable[type[Message]] = ()) -> None:
-        """Nothing was skipped yet.
-
-        Args:
-            own: message classes of a person's own, beside those that come with the project.
-        """
-        self._own = {model.__name__: model for model in own}
+    def __init__(self, custom: Iterable[type[Message]] = ()) -> None:
+        """Know message classes of the user besides those of the project."""
+        self._custom = {model.__name__: model for model in custom}
         self.skipped: Counter[str] = Counter()
 
     def message(self, sample: Sample) -> Message | None:
-        """The message that a sample holds, or None for one that cannot be told."""
-        known = self._own.get(sample.message) or message_class(sample.message)
+        """Return the message of a sample; None if it cannot be decoded."""
+        known = self._custom.get(sample.message) or message_class(sample.message)
         if known is not None or sample.schema:
             try:
-                model = known or _told(sample.message)
+                model = known or _open_model(sample.message)
                 values = msgpack.unpackb(sample.payload, raw=False, strict_map_key=True)
-                # A field that the class has no more does not make the rest of an old recording worthless.
+                # A field that the class no longer has must not invalidate the rest of an old recording.
                 return model.model_validate(values, extra="ignore" if known else "allow")
-            except (ValidationError, ValueError, TypeError, msgpack.UnpackException, RecursionError):
+            except (ValidationError, *BAD_PAYLOAD):
                 pass
         self.skipped[sample.topic] += 1
         return None
 
 
 @cache
-def _told(name: str) -> type[Message]:
-    """What stands for a message class that is not here: whatever fields its messages have."""
+def _open_model(name: str) -> type[Message]:
+    """Return a substitute for a message class that is not installed: it accepts any fields."""
     config = ConfigDict(extra="allow", ser_json_bytes="base64", ser_json_inf_nan="strings")
     return cast("type[Message]", type(name, (BaseModel,), {"model_config": config, "__module__": __name__}))
 
 
 def schema_of(name: str) -> bytes:
-    """The JSON schema of a message class as UTF-8; empty for one of somebody else's."""
+    """Return the JSON schema of a message class as UTF-8; empty for an unknown class."""
     found = message_class(name)
     return json.dumps(found.model_json_schema(mode="serialization")).encode() if found else b""

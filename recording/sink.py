@@ -1,4 +1,4 @@
-"""Between the network and the disk: a bounded queue, and the thread that empties it into a file."""
+"""Bounded queue between network and disk, with a thread that writes it to a file."""
 
 from __future__ import annotations
 
@@ -12,85 +12,85 @@ from typing import Any
 from recording.sample import RecordingError, Sample
 from recording.writer import SplitWriter
 
-MOST_BYTES = 256 * 1024 * 1024  # that wait while the disk stalls: ten seconds of the most that cameras send
-MOST_SAMPLES = 200_000
-MAX_KEYS, OTHERS = 1000, "others"  # of which it is counted what was dropped, and what all others are called
-BATCH_SECONDS = 0.1  # between looks into the queue
-FLUSH_SECONDS = 0.8  # between chunks: with the batch, a kill costs less than a second
+MOST_BYTES = 256 * 1024 * 1024  # of queued payload: ten seconds of the highest camera rates
+MOST_SAMPLES = 200_000  # in the queue
+MAX_KEYS, OTHERS = 1000, "others"  # keys with a count of dropped messages of their own; name of the rest
+BATCH_SECONDS = 0.1  # between two reads of the queue
+FLUSH_SECONDS = 0.8  # between chunks: together with a batch, a kill costs less than a second
 
 
 @dataclass(frozen=True)
 class RecordingStats:
-    """How a recording goes."""
+    """Progress of a recording."""
 
     messages: int
     size: int  # [bytes] on disk
     seconds: float
-    dropped: dict[str, int] = field(default_factory=dict)  # by key: the disk was too slow, or the file is full of keys
+    dropped: dict[str, int] = field(default_factory=dict)  # by key: slow disk, or too many keys
 
 
 class Sink:
-    """Takes samples from any thread without ever blocking, and writes them in one of its own.
+    """Takes samples from any thread without blocking and writes them in a thread of its own.
 
-    What does not fit while the disk stalls is dropped and counted by key, and so is what is under one key too many.
+    While the disk stalls, samples that do not fit into the queue are dropped and counted by key.
     """
 
     def __init__(
         self, writer: SplitWriter, *, max_bytes: int = MOST_BYTES, on_failure: Callable[[], None] = lambda: None,
     ) -> None:
-        """Start writing.
+        """Start the writing thread.
 
         Args:
-            writer: is used by this sink alone from now on.
-            max_bytes: payload that may wait [bytes].
-            on_failure: called once, on the writing thread, when the disk takes no more; `error` says why.
+            writer: used by this sink only.
+            max_bytes: payload in the queue [bytes].
+            on_failure: called once in the writing thread when the disk fails; `error` has the reason.
         """
         self.error: RecordingError | None = None
         self._writer = writer
         self._most = max_bytes
         self._on_failure = on_failure
         self._changed = threading.Condition()
-        self._waiting: deque[Sample] = deque()
+        self._queue: deque[Sample] = deque()
         self._descriptions: deque[tuple[str, Mapping[str, Any]]] = deque()
         self._bytes = 0
         self._dropped: Counter[str] = Counter()
         self._closing = False
-        self._began = time.monotonic()
+        self._started_at = time.monotonic()
         self._crash: BaseException | None = None
-        self._thread = threading.Thread(target=self._guarded, name="write recording", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="write recording", daemon=True)
         self._thread.start()
 
     def offer(self, sample: Sample) -> None:
-        """Have a sample written, or dropped and counted; from any thread."""
+        """Queue a sample, or drop and count it; thread-safe."""
         with self._changed:
             if self._closing or self.error is not None:
                 return
-            if self._bytes + len(sample.payload) > self._most or len(self._waiting) >= MOST_SAMPLES:
+            if self._bytes + len(sample.payload) > self._most or len(self._queue) >= MOST_SAMPLES:
                 self._drop(sample.key)
                 return
-            self._waiting.append(sample)
+            self._queue.append(sample)
             self._bytes += len(sample.payload)
 
     def _drop(self, key: str) -> None:
         self._dropped[key if key in self._dropped or len(self._dropped) < MAX_KEYS else OTHERS] += 1
 
     def describe(self, name: str, values: Mapping[str, Any]) -> None:
-        """Have a metadata record written; from any thread."""
+        """Queue a metadata record; thread-safe."""
         with self._changed:
             self._descriptions.append((name, values))
 
     @property
-    def figures(self) -> RecordingStats:
-        """How it goes."""
+    def stats(self) -> RecordingStats:
+        """Progress so far."""
         with self._changed:
             dropped = dict(self._dropped)
-        return RecordingStats(self._writer.messages, self._writer.size, time.monotonic() - self._began, dropped)
+        return RecordingStats(self._writer.messages, self._writer.size, time.monotonic() - self._started_at, dropped)
 
     def close(self, ended: Mapping[str, Any]) -> RecordingStats:
-        """Write what waits and how it ended, close the file, and say how it went; may block.
+        """Write the queue and how the recording ended, and close the file; may block.
 
         Raises:
-            RecordingError: the disk took no more, now or earlier.
+            RecordingError: the disk failed, now or earlier.
         """
         with self._changed:
             self._closing = True
@@ -101,30 +101,30 @@ class Sink:
         if self.error is not None:
             self._writer.abandon()
             raise self.error
-        self._writer.close({**ended, "dropped": self.figures.dropped})
-        return self.figures
+        self._writer.close({**ended, "dropped": self.stats.dropped})
+        return self.stats
 
-    def _guarded(self) -> None:
+    def _run(self) -> None:
         try:
-            self._work()
+            self._write()
         except RecordingError as error:
             self.error = error
-        except BaseException as error:  # a bug: is raised where the sink is closed
+        except BaseException as error:  # a bug: raised in `close`
             self._crash = error
         else:
             return
         with self._changed:
-            self._waiting.clear()
+            self._queue.clear()
             self.error = self.error or RecordingError("recording stopped")
         self._on_failure()
 
-    def _work(self) -> None:
+    def _write(self) -> None:
         flush_at = time.monotonic() + FLUSH_SECONDS
         while True:
             with self._changed:
-                # Not for each message: a wake-up costs more than writing a small one.
+                # Not woken for each message: a wake-up costs more than writing a small one.
                 self._changed.wait_for(lambda: self._closing, timeout=BATCH_SECONDS)
-                samples, self._waiting = self._waiting, deque()
+                samples, self._queue = self._queue, deque()
                 descriptions, self._descriptions = self._descriptions, deque()
                 closing = self._closing
             for name, values in descriptions:
@@ -139,7 +139,7 @@ class Sink:
                 if time.monotonic() >= flush_at:
                     self._writer.flush()
                     flush_at = time.monotonic() + FLUSH_SECONDS
-            if closing:  # nothing is taken any more since
+            if closing:  # nothing was queued since
                 return
             if time.monotonic() >= flush_at:
                 self._writer.flush()

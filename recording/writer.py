@@ -1,4 +1,4 @@
-"""Writes samples to one MCAP file, in chunks that are whole on disk a second later at most."""
+"""Writes samples to MCAP files in chunks that are complete on disk within a second."""
 
 from __future__ import annotations
 
@@ -17,74 +17,75 @@ from common.messages import SupervisorStatus
 from common.messages.basics import MAX_NAME
 from recording.sample import RecordingError, Sample, schema_of, stamp_of
 
-# Of a file; whoever is on the network can make any number up, and readers take no file of many more. One of another
-# writer is found room for where its key is known.
+# Limits of a file: any client of the network can invent keys and writers, and readers refuse files with many more.
+# Messages of a further writer share one channel if their key is known.
 MOST_CHANNELS = 2000
 LONGEST_KEY = 500  # characters
-CHUNK_BYTES = 512 * 1024  # before compression; a picture has a chunk of its own
-_BESIDE = 40  # [bytes] about, that a message takes beside its payload: readers take no chunk of very many tiny ones
+CHUNK_BYTES = 512 * 1024  # before compression; an image has a chunk of its own
+_OVERHEAD = 40  # [bytes] of a message besides its payload, about: readers refuse chunks of very many tiny messages
 PROFILE = "zencell"
 ABOUT, RUN, ENDED = "zencell", "run", "ended"  # names of metadata records
 TRACES_TOPIC, TRACES_SCHEMA = "recording/traces", "zencell.Traces"
-_OURS_ALONE = 2**62  # chunk size that the library never reaches: where chunks end is decided here
+_NEVER = 2**62  # chunk size that the library never reaches: this writer decides where chunks end
 _TRACES = {
     "type": "object",
     "description": "Trace ids of the messages of this chunk: [channel id, sequence number, trace id].",
     "properties": {"traces": {"type": "array", "items": {"type": "array"}}},
 }
-FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # the disk takes no more
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+MOST_STATES = 500  # newest states that are copied to the start of the next file
 
 
 def run_of(status: SupervisorStatus) -> dict[str, Any]:
-    """What a recording says of the run, from what the supervisor says."""
+    """Return the description of a run from the supervisor's status."""
     return status.model_dump(include={"speed", "epoch", "seed", "world", "overrides"})
 
 
 class WriteFailed(RecordingError):
-    """The disk takes no more; what was written before is kept."""
+    """The disk fails or is full; what was written before stays."""
 
     exit_code = 1
 
     def __init__(self, path: Path, error: OSError) -> None:
         self.why = "the disk is full" if error.errno in FULL else (error.strerror or str(error))
-        super().__init__(f"{path}: recording stopped, {self.why}; what was written is kept: zencell recover {path}")
+        super().__init__(f"{path}: recording stopped, {self.why}; to use what was written: zencell recover {path}")
         self.path = path
         self.errno = error.errno
 
 
 class ExportFailed(RecordingError):
-    """A file that is made of a recording does not fit on the disk; nothing of it is kept."""
+    """A file made from a recording does not fit on the disk, and was removed."""
 
     exit_code = 1
 
     def __init__(self, path: Path, why: str) -> None:
-        super().__init__(f"{path}: cannot be written, {why}; nothing of it is kept")
+        super().__init__(f"{path}: cannot be written, {why}; the incomplete file was removed")
 
 
 class AppendedFile:
-    """What an MCAP writer needs of a stream."""
+    """New file with the stream interface that an MCAP writer needs."""
 
     def __init__(self, path: Path) -> None:
         """Create the file.
 
         Raises:
-            RecordingError: it is there already, or cannot be made.
+            RecordingError: it exists already, or cannot be created.
         """
         self.path = path
         self._closed = False
         try:
             self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
         except FileExistsError:
-            raise RecordingError(f"{path}: is there already; choose another name") from None
+            raise RecordingError(f"{path}: exists already; choose another name") from None
         except OSError as error:
             raise RecordingError(f"{path}: cannot be written: {error.strerror}") from None
         self._size = 0
 
     def write(self, data: bytes) -> int:
-        """Append all of the data, which are whole records.
+        """Append complete records.
 
         Raises:
-            WriteFailed: the disk takes no more; none of the data are in the file then.
+            WriteFailed: the disk failed; the file then contains none of the data.
         """
         view = memoryview(data)
         while view:
@@ -98,41 +99,41 @@ class AppendedFile:
         return len(data)
 
     def tell(self) -> int:
-        """Bytes written so far."""
+        """Return the number of bytes written."""
         return self._size
 
     def flush(self) -> None:
-        """Nothing is held back."""
+        """Do nothing: nothing is buffered."""
 
     def close(self) -> None:
-        """Close the file, once: its number may be another's by then."""
+        """Close the file if it is open: a second close could hit another file with the same number."""
         if not self._closed:
             self._closed = True
             os.close(self._file)
 
 
 class RecordingWriter:
-    """One file. Not thread-safe.
+    """Writes one file. Not thread-safe.
 
-    Trace ids have no place in an MCAP message: those of a chunk are its last message, on a topic of their own.
+    MCAP messages have no field for trace ids: the last message of a chunk lists those of the chunk, on its own topic.
     """
 
     def __init__(self, path: Path, about: Mapping[str, Any]) -> None:
-        """Create the file and write what the recording is about.
+        """Create the file and write the description of the recording.
 
         Raises:
-            RecordingError: it is there already, or cannot be written.
+            RecordingError: the file exists already, or cannot be written.
         """
         self.path = path
         self.messages = 0
         self._file = AppendedFile(path)
-        self._writer = Writer(self._file, chunk_size=_OURS_ALONE, compression=CompressionType.ZSTD)  # type: ignore[arg-type]
-        self._channels: dict[tuple[tuple[str, str, str], str], int] = {}  # by key, message and kind, and writer
-        self._about: set[tuple[str, str, str]] = set()
+        self._writer = Writer(self._file, chunk_size=_NEVER, compression=CompressionType.ZSTD)  # type: ignore[arg-type]
+        self._channels: dict[tuple[tuple[str, str, str], str], int] = {}  # by (key, message, kind) and writer
+        self._known: set[tuple[str, str, str]] = set()
         self._schemas: dict[str, int] = {"": 0}
         self._traces: list[tuple[int, int, str]] = []
         self._traces_channel = 0
-        self._waiting = 0  # bytes in the chunk that is not written yet
+        self._pending = 0  # bytes in the chunk that is not written yet
         self._newest = 0
         self._writer.start(profile=PROFILE)
         self.describe(ABOUT, about)
@@ -143,17 +144,17 @@ class RecordingWriter:
         return self._file.tell()
 
     def describe(self, name: str, values: Mapping[str, Any]) -> None:
-        """Write a metadata record; what is not text is written as JSON."""
+        """Write a metadata record; values other than text are written as JSON."""
         texts = {key: value if isinstance(value, str) else json.dumps(value) for key, value in values.items()}
         self._writer.add_metadata(name, texts)
 
     def add(self, sample: Sample) -> bool:
-        """Write a message, unless too many keys are in the file for one more; whether it was.
+        """Write a message; return False if the file has too many keys already.
 
         It is on disk after the next `flush`, or when the chunk is full.
 
         Raises:
-            WriteFailed: the disk takes no more.
+            WriteFailed: the disk failed.
         """
         channel = self._channel_of(sample)
         if channel is None:
@@ -165,22 +166,22 @@ class RecordingWriter:
             self._traces.append((channel, sequence, sample.trace))
         self.messages += 1
         self._newest = max(self._newest, sample.log_time)
-        self._waiting += _BESIDE + len(sample.payload)
-        if self._waiting >= CHUNK_BYTES:
+        self._pending += _OVERHEAD + len(sample.payload)
+        if self._pending >= CHUNK_BYTES:
             self.flush()
         return True
 
     def _channel_of(self, sample: Sample) -> int | None:
-        """The channel of a message; of too many writers one for all others, of a key too many or too long none."""
+        """Return the channel of a message; None for a key that is one too many, or too long."""
         writer, about = sample.writer, (sample.key, sample.message, sample.kind)
         if (about, writer) not in self._channels and len(self._channels) >= MOST_CHANNELS:
-            if about not in self._about:
+            if about not in self._known:
                 return None
-            writer = ""
+            writer = ""  # the channel that all further writers share
         if len(sample.key) > LONGEST_KEY or len(sample.message) > MAX_NAME:
             return None
         if (about, writer) not in self._channels:
-            self._about.add(about)
+            self._known.add(about)
             self._channels[about, writer] = self._writer.register_channel(
                 sample.key, "msgpack", self._schema_of(sample), {"kind": sample.kind, "writer": writer}
             )
@@ -194,14 +195,14 @@ class RecordingWriter:
         return self._schemas[message]
 
     def flush(self) -> None:
-        """Put everything on disk that was written so far, as one chunk.
+        """Write everything so far to disk as one chunk.
 
         Raises:
-            WriteFailed: the disk takes no more.
+            WriteFailed: the disk failed.
         """
         self._add_traces()
         self._writer.flush()  # type: ignore[no-untyped-call]
-        self._waiting = 0
+        self._pending = 0
 
     def _add_traces(self) -> None:
         if not self._traces:
@@ -214,10 +215,10 @@ class RecordingWriter:
         self._traces = []
 
     def close(self, ended: Mapping[str, Any] | None = None) -> None:
-        """Write the rest, how it ended and the index, and close the file.
+        """Write the rest, how the recording ended, and the index; close the file.
 
         Raises:
-            WriteFailed: the disk takes no more.
+            WriteFailed: the disk failed.
         """
         try:
             self.flush()
@@ -228,25 +229,21 @@ class RecordingWriter:
             self._file.close()
 
     def abandon(self) -> None:
-        """Close the file as it is, after a failure."""
+        """Close the file without an index, after a failure."""
         self._file.close()
-
-
-MOST_STATES = 500  # with which a file begins: those that were said last
 
 
 class SplitWriter:
     """Writes FILE.mcap, or FILE_0.mcap, FILE_1.mcap, ... of about `max_bytes` each.
 
-    A file after the first begins with the last value of every state and with the same descriptions, so that each can
-    be used alone.
+    Each further file starts with the newest value of every state and the same descriptions, so that it is usable alone.
     """
 
     def __init__(self, path: Path, about: Mapping[str, Any], max_bytes: int | None = None) -> None:
         """Create the first file.
 
         Raises:
-            RecordingError: it is there already, or cannot be written.
+            RecordingError: it exists already, or cannot be written.
         """
         self._path = path
         self._most = max_bytes
@@ -259,7 +256,7 @@ class SplitWriter:
 
     @property
     def messages(self) -> int:
-        """Messages in all files; a state that opens a file counts again."""
+        """Messages in all files; states at the start of a file count again."""
         return self._earlier_messages + self._file.messages
 
     @property
@@ -275,15 +272,15 @@ class SplitWriter:
         return writer
 
     def describe(self, name: str, values: Mapping[str, Any]) -> None:
-        """Write a metadata record, also into the files that follow."""
+        """Write a metadata record to this file and those that follow."""
         self._descriptions[name] = values
         self._file.describe(name, values)
 
     def add(self, sample: Sample) -> bool:
-        """Write a message; whether there was room for its key.
+        """Write a message; return False if the file has too many keys already.
 
         Raises:
-            RecordingError: the disk takes no more.
+            RecordingError: the disk failed.
         """
         written = self._file.add(sample)
         if self._most is None or not written:
@@ -294,10 +291,10 @@ class SplitWriter:
             while len(self._states) > MOST_STATES:
                 del self._states[next(iter(self._states))]
         if self._file.size >= self._most:
-            self._next(sample.log_time)
+            self._start_next(sample.log_time)
         return written
 
-    def _next(self, now: int) -> None:
+    def _start_next(self, now: int) -> None:
         full = self._file
         full.close()
         self._earlier_messages += full.messages
@@ -310,21 +307,21 @@ class SplitWriter:
             self._file.add(replace(state, log_time=now))
 
     def flush(self) -> None:
-        """Put everything on disk.
+        """Write everything so far to disk.
 
         Raises:
-            WriteFailed: the disk takes no more.
+            WriteFailed: the disk failed.
         """
         self._file.flush()
 
     def close(self, ended: Mapping[str, Any] | None = None) -> None:
-        """Write the rest and how it ended, and close.
+        """Write the rest and how the recording ended, and close the file.
 
         Raises:
-            WriteFailed: the disk takes no more.
+            WriteFailed: the disk failed.
         """
         self._file.close(ended)
 
     def abandon(self) -> None:
-        """Close as it is, after a failure."""
+        """Close the file without an index, after a failure."""
         self._file.abandon()

@@ -1,4 +1,4 @@
-"""Finds boxes of known colours and sizes in the pictures of a depth camera, and says where they are in the world."""
+"""Detect boxes of known colors and sizes in depth camera images and publish their positions in world."""
 
 from __future__ import annotations
 
@@ -27,21 +27,21 @@ from common.process.camera_reader import CameraReader
 from common.process.service import main
 from common.transport.bus import Bus
 
-KEPT = 5  # depth images that wait for their pictures
+BUFFERED = 5  # depth images that wait for their color images
 WORLD = "world"
 
 
 class Config(BoxOptions):
-    """Which boxes are looked for."""
+    """Which boxes are detected."""
 
     world: Surroundings = Surroundings()
 
 
 def markers(found: list[DetectedBox], config: Config, stamp: int, blind: str = "") -> MarkerArray:
-    """The message of what was found in the picture that was exposed at `stamp`, or of why that tells nothing.
+    """Return the message with the detections in the image with this stamp, or why it is unusable.
 
     Raises:
-        FrameError: that is more, or farther away, than there is room for.
+        FrameError: more detections, or farther ones, than fit.
     """
     require_capacity(len(found))
     require_in_range([box.position for box in found])
@@ -62,21 +62,21 @@ def _marker(index: int, box: DetectedBox, config: Config) -> Marker:
 
 
 async def run(bus: Bus, config: Config) -> None:
-    """Look at every picture once its depth is here; what cannot be looked at is dropped, counted and told once."""
+    """Process every image once its depth has arrived; unusable ones are dropped, counted and reported once."""
     images, depths = bus.reader(topics.DEPTH_CAMERA_IMAGE), bus.reader(topics.DEPTH_CAMERA_DEPTH)
     cameras = CameraReader(bus, config.world, topics.DEPTH_CAMERA_INFO)
     found, shown = bus.writer(DETECTED_OBJECTS), bus.writer(DETECTION_IMAGE)
     masks = bus.writer(DETECTION_MASK)
-    cv2.setNumThreads(1)  # the other cores have other services
+    cv2.setNumThreads(1)  # other services use the other cores
     detector = BoxDetector(config)
     left_out = SkippedFrames(bus.log, "image")
-    kept: deque[Image] = deque(maxlen=KEPT)
+    buffered: deque[Image] = deque(maxlen=BUFFERED)
     newest, turn = 0, asyncio.Lock()
     await bus.ready()
 
     async def look(image: Image | None) -> None:
         nonlocal newest
-        depth = next((one for one in kept if image is not None and one.header.stamp == image.header.stamp), None)
+        depth = next((one for one in buffered if image is not None and one.header.stamp == image.header.stamp), None)
         if image is None or depth is None or image.header.stamp == newest:
             return
         newest = image.header.stamp
@@ -103,7 +103,7 @@ async def run(bus: Bus, config: Config) -> None:
 
     async def watch_depths() -> None:
         async for depth in depths:
-            kept.append(depth)
+            buffered.append(depth)
             async with turn:
                 await look(images.latest)
 

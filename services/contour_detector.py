@@ -1,4 +1,4 @@
-"""Finds the contours of objects in the picture, and keeps the one that was chosen."""
+"""Find the contours of objects in the image, and follow the selected one."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from common.transport.bus import Bus
 
 
 class Config(ContourOptions):
-    """How contours are found, and which is chosen at the start."""
+    """How contours are found, and which one is selected at the start."""
 
     select: str | int = Field(
         "auto", description="at the start: none, auto (largest that does not touch the border), a colour, or an index"
@@ -36,10 +36,10 @@ class Config(ContourOptions):
 
 
 def initial_choice(select: str | int) -> OutlineSelect | None:
-    """The choice at the start.
+    """Return the selection at the start.
 
     Raises:
-        ConfigError: it is none.
+        ConfigError: it is invalid.
     """
     try:
         return parse_choice(select)
@@ -48,17 +48,17 @@ def initial_choice(select: str | int) -> OutlineSelect | None:
 
 
 async def run(bus: Bus, config: Config) -> None:
-    """Look at every picture as it comes; what cannot be looked at is dropped, counted and told once."""
+    """Process every image; unusable ones are dropped, counted and reported once."""
     images = bus.reader(topics.DEPTH_CAMERA_IMAGE)
     found, shown = bus.writer(CONTOURS), bus.writer(CONTOUR_IMAGE)
-    cv2.setNumThreads(1)  # the other cores have other services
+    cv2.setNumThreads(1)  # other services use the other cores
     following = ContourTracker(initial_choice(config.select))
     last: tuple[Image, Picture, list[Contour]] | None = None
-    told = ""
+    last_warning = ""
     left_out = SkippedFrames(bus.log, "image")
 
     def publish(selected: int, message: str) -> None:
-        nonlocal told
+        nonlocal last_warning
         if last is None:
             return
         image, picture, contours = last
@@ -67,9 +67,9 @@ async def run(bus: Bus, config: Config) -> None:
             message=message,
         ))
         shown.put(array_to_image(annotate_contours(picture, contours, selected), "bgr8", image.header))
-        if message and message != told:
+        if message and message != last_warning:
             bus.log.warning("%s", message)
-        told = message
+        last_warning = message
 
     async def select(wanted: OutlineSelect) -> OutlineSelection:
         if last is None:

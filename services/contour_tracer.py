@@ -1,4 +1,4 @@
-"""Runs the outline task: watches contour, scene, gripper and motion, and asks for plans and motion."""
+"""Run the outlining task: reads contour, scene, gripper and motion; requests plans and motions."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from common.transport.bus import Bus
 
 
 async def run(bus: Bus, config: Config) -> None:
-    """Step the task whenever something is heard, and at least 20 times a second."""
+    """Step the task on every message, and at least 20 times a second."""
     await run_task(bus, config, Outline, OUTLINE_STATUS, OutlineView, path=CONTOUR_PATH)
 
 

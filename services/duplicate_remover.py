@@ -1,4 +1,4 @@
-"""Clears the outline of points that add nothing: what is left is the path to trace."""
+"""Remove redundant points from the outline; the rest is the path to trace."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from common.transport.bus import Bus
 
 
 class Config(Parameters):
-    """What counts as nothing."""
+    """Which points are redundant."""
 
     tolerance: Tunable[float] = Field(
         0.00005, ge=0, le=0.1, description="points without which the outline moves by no more than this go [m]; 0: none"
@@ -31,19 +31,19 @@ class Config(Parameters):
 
 
 def cleared(poses: list[Pose], tolerance: float) -> list[Pose]:
-    """The same outline without duplicates and without points that are not needed."""
+    """Return the outline without duplicates and redundant points."""
     if not poses:
         return poses
     places = np.array([(p.position.x, p.position.y, p.position.z) for p in poses])
-    kept = simplified(without_duplicates(places), tolerance)
-    return [Pose(position=Vector3(x=x, y=y, z=z)) for x, y, z in kept.tolist()]
+    simplified_places = simplified(without_duplicates(places), tolerance)
+    return [Pose(position=Vector3(x=x, y=y, z=z)) for x, y, z in simplified_places.tolist()]
 
 
 def points_of(file: Path) -> list[Pose]:
-    """The points in a file.
+    """Return the points in a file.
 
     Raises:
-        ConfigError: it is missing or malformed, or says more than a path has room for.
+        ConfigError: it is missing, malformed, or too long for a path.
     """
     try:
         points = read_coordinates(file).tolist()
@@ -56,7 +56,7 @@ def points_of(file: Path) -> list[Pose]:
 
 
 async def run(bus: Bus, config: Config) -> None:
-    """Clear every outline as it comes, or answer it with the points of a file."""
+    """Publish a path for every outline, or the points of a file instead."""
     outlines = bus.reader(CONTOUR_POINTS)
     paths = bus.writer(CONTOUR_PATH)
     file = Path(config.coordinates)

@@ -93,12 +93,7 @@ async def run(bus: Bus, config: Config, helpers: Sequence[PlanningWorker] = ()) 
 
     bus.serve(topics.MOTION_PLAN, handle)
     pipeline = await asyncio.to_thread(_load, config)
-    used = config.helpers if config.points is None else 0
-    for worker in helpers[used:]:
-        worker.close()
-    for worker in helpers[:used]:
-        worker.set_up(config.robot, config.motion, config.pipeline, seed=config.run.seed)
-        pool.add(partial(plan_in_worker, worker))
+    _add_workers(pool, helpers, config)
     pool.add(partial(plan_in_thread, pipeline))
     if cameras is not None:
         await asyncio.to_thread(cameras.load, pipeline)
@@ -113,6 +108,16 @@ async def run(bus: Bus, config: Config, helpers: Sequence[PlanningWorker] = ()) 
     finally:
         for worker in helpers:  # no worker outlives the service
             worker.close()
+
+
+def _add_workers(pool: PlannerPool, workers: Sequence[PlanningWorker], config: Config) -> None:
+    """Set up as many workers as configured, and close the others."""
+    used = config.helpers if config.points is None else 0
+    for worker in workers[used:]:
+        worker.close()
+    for worker in workers[:used]:
+        worker.set_up(config.robot, config.motion, config.pipeline, seed=config.run.seed)
+        pool.add(partial(plan_in_worker, worker))
 
 
 def _load(config: Config) -> PlanningPipeline:

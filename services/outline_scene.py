@@ -1,4 +1,4 @@
-"""Keeps the planning scene of the outlining cell: fixtures, and every solid in the newest picture without the arm."""
+"""Publish the planning scene of the outlining cell: fixtures, and every solid in the newest image without the arm."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from common.process.service import main
 from common.robot.home import HomeMonitor
 from common.transport.bus import Bus
 
-KEPT = 5  # depth images that wait for their contours
+BUFFERED = 5  # depth images that wait for their contours
 
 
 class Config(Parameters):
-    """What is fixed in the cell, and where the arm is at home."""
+    """Fixtures of the cell, and the home pose of the arm."""
 
     robot: RobotConfig
     world: Surroundings
 
 
 def seen(found: Contours, image: Image, camera: Pinhole, around: Surroundings) -> PlanningScene:
-    """What the contours of a picture and its depth show.
+    """Return the planning scene from the contours of an image and its depth.
 
     Raises:
         FrameError: no pixel has a depth, so free space is unknown; or there are more objects than there is time for.
@@ -45,14 +45,14 @@ def seen(found: Contours, image: Image, camera: Pinhole, around: Surroundings) -
 
 
 async def run(bus: Bus, config: Config) -> None:
-    """Publish the planning scene for every picture that was taken with the arm at home."""
+    """Publish the planning scene for every image that was taken with the arm at home."""
     contours = bus.reader(CONTOURS)
     depths = bus.reader(topics.DEPTH_CAMERA_DEPTH)
     cameras = CameraReader(bus, config.world, topics.DEPTH_CAMERA_INFO)
     joints = bus.reader(topics.JOINT_STATES)
     out = SceneWriter(bus)
     home = HomeMonitor(config.robot.named_poses["home"])
-    kept: deque[Image] = deque(maxlen=KEPT)
+    buffered: deque[Image] = deque(maxlen=BUFFERED)
     left_out = SkippedFrames(bus.log, "image")
     await out.begin(planning_scene(config.world, [], 0))
     await bus.ready()
@@ -65,7 +65,7 @@ async def run(bus: Bus, config: Config) -> None:
 
     async def watch_depth() -> None:
         async for image in depths:
-            kept.append(image)
+            buffered.append(image)
             await look(contours.latest)
 
     async def watch_contours() -> None:
@@ -75,11 +75,11 @@ async def run(bus: Bus, config: Config) -> None:
     newest = 0
 
     async def look(found: Contours | None) -> None:
-        """Publish what a picture shows once its contours and its depth are both here."""
+        """Publish the scene of an image once its contours and its depth have both arrived."""
         nonlocal newest
         if found is None or found.header.stamp == newest or not home.was_home(found.header.stamp):
             return
-        depth = next((image for image in kept if image.header.stamp == found.header.stamp), None)
+        depth = next((image for image in buffered if image.header.stamp == found.header.stamp), None)
         if depth is None:
             return
         newest = found.header.stamp

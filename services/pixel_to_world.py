@@ -1,4 +1,4 @@
-"""Turns the chosen contour into the outline of the object's top face in world, with the depth of its pixels."""
+"""Convert the selected contour to the outline of the object's top face in world, by the depth of its pixels."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from common.process.service import main
 from common.transport.bus import Bus
 
 WORLD = "world"
-KEPT = 4  # depth images that wait for the contours of their picture
+BUFFERED = 4  # depth images that wait for the contours of their image
 
 
 class Config(TopFaceOptions):
@@ -30,10 +30,10 @@ class Config(TopFaceOptions):
 
 
 def outline(contours: Contours, image: Image, camera: Pinhole, config: Config) -> TopFace:
-    """The outline of the chosen object.
+    """Return the outline of the selected object.
 
     Raises:
-        FrameError, DepthError: one line that says why there is none.
+        FrameError, DepthError: there is none; one line with the reason.
     """
     depth = depth_of(image)
     check_depth(depth, contours.width, contours.height)
@@ -47,17 +47,17 @@ def outline(contours: Contours, image: Image, camera: Pinhole, config: Config) -
 
 
 async def run(bus: Bus, config: Config) -> None:
-    """Answer the contours of each picture with an outline, or with why there is none."""
+    """Publish an outline for the contours of each image, or why there is none."""
     contours, depths = bus.reader(CONTOURS), bus.reader(topics.DEPTH_CAMERA_DEPTH)
     cameras = CameraReader(bus, config.world, topics.DEPTH_CAMERA_INFO)
     out = bus.writer(CONTOUR_POINTS)
     images: OrderedDict[int, Image] = OrderedDict()
-    waiting: Contours | None = None  # contours whose depth image has not come yet
-    told = ""
+    waiting: Contours | None = None  # contours whose depth image has not arrived yet
+    last_warning = ""
     await bus.ready()
 
     async def answer() -> None:
-        nonlocal waiting, told
+        nonlocal waiting, last_warning
         now = waiting
         if now is None or (now.selected >= 0 and now.header.stamp not in images):
             return
@@ -76,14 +76,14 @@ async def run(bus: Bus, config: Config) -> None:
                 found = {"object": label, "poses": poses, "invalid_depth": face.filled}
                 points = points.model_copy(update=found)
         out.put(points)
-        if points.message and points.message != told and points.object:
+        if points.message and points.message != last_warning and points.object:
             bus.log.warning("%s", points.message)
-        told = points.message
+        last_warning = points.message
 
     async def collect() -> None:
         async for image in depths:
             images[image.header.stamp] = image
-            while len(images) > KEPT:
+            while len(images) > BUFFERED:
                 images.popitem(last=False)
             await answer()
 

@@ -49,7 +49,7 @@ async def run(bus: Bus, config: Config) -> None:
         q = robot.order(measured.name, measured.position) if measured else None
         T_world_tcp = robot.fk(q) if q is not None else None
         if state is not None:
-            scene.feel(state, T_world_tcp)
+            scene.update_gripper(state, T_world_tcp)
         return T_world_tcp
 
     async def watch_gripper() -> None:
@@ -61,7 +61,7 @@ async def run(bus: Bus, config: Config) -> None:
                 out.put(scene.scene())
 
     async def update(view: int, seen: CameraDetections) -> None:
-        scene.see(seen.frame, seen.camera, update_gripper(), view, seen.at_times, seen.hidden)
+        scene.update_detections(seen.frame, seen.camera, update_gripper(), view, seen.at_times, seen.hidden)
         if scene.crowded:  # publish no scene without some obstacles: clients that wait for a newer one do not move
             skipped.note(FrameError("crowded", "more objects are detected than a planning scene can contain"))
         else:

@@ -1,4 +1,4 @@
-"""Runs the pick-and-place task: watches targets, scene, gripper and motion, and asks for plans and motion."""
+"""Run the pick-and-place task: reads targets, scene, gripper and motion; requests plans and motions."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from common.transport.bus import Bus
 
 
 async def run(bus: Bus, config: Config) -> None:
-    """Step the task whenever something is heard, and at least 20 times a second."""
+    """Step the task on every message, and at least 20 times a second."""
     await run_task(bus, config, PickPlace, PICK_PLACE_STATUS, PickPlaceView, seen=VALIDATED_TARGETS)
 
 

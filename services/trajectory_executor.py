@@ -33,7 +33,7 @@ from common.robot.model import RobotModel
 from common.scene.workspace import configured_bounds
 from common.sim.interface import GraspTolerances, PhysicalWorld
 from common.sim.simulated_cell import Saver, SimulatedCell, create_world, matching_state
-from common.sim.standing import SavedBeside, StateFile, state_file
+from common.sim.state_file import BackgroundSaver, StateFile, state_file
 from common.transport.bus import Bus
 from common.transport.writer import Writer
 
@@ -104,7 +104,7 @@ class Publishers:
 
 def create_executor(
     bus: Bus, config: Config, store: InterlockStore, simulated: bool, period: float,
-    saver_for: Callable[[StateFile], Saver] = SavedBeside,
+    saver_for: Callable[[StateFile], Saver] = BackgroundSaver,
 ) -> Executor:
     """Create the executor with its hardware at the home pose and, when simulated, all objects laid out.
 
@@ -158,7 +158,7 @@ def serve(bus: Bus, config: Config, handlers: RequestHandlers, simulated: bool) 
 
 async def run(
     bus: Bus, config: Config, *, file_lock: FileLock = exclusive_lock,
-    saver_for: Callable[[StateFile], Saver] = SavedBeside,
+    saver_for: Callable[[StateFile], Saver] = BackgroundSaver,
 ) -> None:
     """Control the arm until cancelled.
 

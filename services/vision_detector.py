@@ -1,4 +1,4 @@
-"""Finds the balls in the picture and says where they are in the world."""
+"""Detect balls in camera images and publish their positions in world."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ from common.perception.image import array_to_image
 from common.perception.pinhole import Pinhole
 from common.process.camera_reader import CameraReader
 from common.process.service import main
-from common.transport.bus import Bus
+from common.transport.bus import Bus, Reader
 
-KEPT = 5  # depth images that wait for their pictures
-PATIENCE = 0.3  # [s, wall time] for which a picture waits for its depth
+BUFFERED = 5  # depth images that wait for their color images
+DEPTH_WAIT = 0.3  # [s, wall time] for which a color image waits for its depth image
 WORLD = "world"
 
 
 class Config(DetectorOptions):
-    """How red is told from the rest."""
+    """How red is separated from other colors."""
 
     world: Surroundings
     depth: bool = Field(False, description="pictures come with depth, on depth_camera/depth/image_raw: balls are where "
@@ -50,12 +50,12 @@ def markers(
     detections: list[Detection], around: Surroundings, stamp: int, remark: str = "", blind: str = "",
     odd: Sequence[Outlier] = (),
 ) -> MarkerArray:
-    """The message of what was found in the frame that was exposed at `stamp`, or of why that tells nothing.
+    """Return the message with the detections in the image with this stamp, or why it is unusable.
 
-    What is `odd` is among it with the reason as its text: it stands in the way, and is not to be taken.
+    An `odd` object is included with the reason as its text: an obstacle, and no target.
 
     Raises:
-        FrameError: that is more, or farther away, than there is room for.
+        FrameError: more detections, or farther ones, than fit.
     """
     require_capacity(len(detections) + len(odd))
     require_in_range([*(one.position for one in detections), *(one.position for one in odd)])
@@ -74,7 +74,7 @@ def markers(
     )
 
 
-@lru_cache(maxsize=64)  # what lies still is described once
+@lru_cache(maxsize=64)  # a marker of an object at rest is created once
 def _marker(
     index: int, position: Place, pixel: tuple[float, float], partial: bool, radius: float, color: Rgb, odd: str = "",
 ) -> Marker:
@@ -87,7 +87,7 @@ def _marker(
 
 
 def _remark(detector: Detector, service: str) -> str:
-    """What there is in the last picture that is too small or too large to be a ball; empty without."""
+    """Describe red blobs of the last image that are too small or too large for a ball; empty without any."""
     parts = []
     if count := detector.too_small:
         parts.append(f"{count} red {'blob is' if count == 1 else 'blobs are'} smaller than "
@@ -98,35 +98,33 @@ def _remark(detector: Detector, service: str) -> str:
     return ", and ".join(parts)
 
 
-async def run(bus: Bus, config: Config) -> None:
-    """Look at every picture as it comes; what cannot be looked at is dropped, counted and told once."""
-    images = bus.reader(topics.CAMERA_IMAGE)
-    cameras = CameraReader(bus, config.world)
-    found, shown = bus.writer(DETECTED_OBJECTS), bus.writer(DETECTION_IMAGE)
-    masks = bus.writer(DETECTION_MASK)
-    cv2.setNumThreads(1)  # the other cores have other services
-    depths = bus.reader(topics.DEPTH_CAMERA_DEPTH) if config.depth else None
-    kept: deque[Image] = deque(maxlen=KEPT)
-    news = asyncio.Event()
-    detector = Detector(config.world, config)
-    left_out = SkippedFrames(bus.log, "image")
-    await bus.acquire_keys()
-    warm_up(config.world, config)
-    await bus.ready()
+class DepthBuffer:
+    """The newest depth images, found by the stamps of their color images."""
 
-    async def watch_depths() -> None:
-        if depths is not None:
-            async for depth in depths:
-                kept.append(depth)
-                news.set()
+    def __init__(self, reader: Reader[Image]) -> None:
+        """Buffer what a reader receives."""
+        self._reader = reader
+        self._images: deque[Image] = deque(maxlen=BUFFERED)
+        self._arrived = asyncio.Event()
 
-    async def depth_with(stamp: int, camera: Pinhole) -> Depth:
+    async def collect(self) -> None:
+        """Receive depth images; never returns."""
+        async for image in self._reader:
+            self._images.append(image)
+            self._arrived.set()
+
+    async def at(self, stamp: int, camera: Pinhole) -> Depth:
+        """Return the depth image with a stamp; wait for it up to `DEPTH_WAIT`.
+
+        Raises:
+            FrameError: it did not arrive, or does not fit the camera.
+        """
         with suppress(TimeoutError):
-            async with asyncio.timeout(PATIENCE):
-                while all(one.header.stamp != stamp for one in kept):
-                    news.clear()
-                    await news.wait()
-        found = next((one for one in kept if one.header.stamp == stamp), None)
+            async with asyncio.timeout(DEPTH_WAIT):
+                while all(image.header.stamp != stamp for image in self._images):
+                    self._arrived.clear()
+                    await self._arrived.wait()
+        found = next((image for image in self._images if image.header.stamp == stamp), None)
         if found is None:
             raise FrameError("depth", "no depth image of the same time came")
         depth = depth_of(found)
@@ -136,12 +134,27 @@ async def run(bus: Bus, config: Config) -> None:
             raise FrameError(error.kind, str(error)) from None
         return depth
 
+
+async def run(bus: Bus, config: Config) -> None:
+    """Process every image; unusable ones are dropped, counted and reported once."""
+    images = bus.reader(topics.CAMERA_IMAGE)
+    cameras = CameraReader(bus, config.world)
+    found, shown = bus.writer(DETECTED_OBJECTS), bus.writer(DETECTION_IMAGE)
+    masks = bus.writer(DETECTION_MASK)
+    cv2.setNumThreads(1)  # other services use the other cores
+    depths = DepthBuffer(bus.reader(topics.DEPTH_CAMERA_DEPTH)) if config.depth else None
+    detector = Detector(config.world, config)
+    left_out = SkippedFrames(bus.log, "image")
+    await bus.acquire_keys()
+    warm_up(config.world, config)
+    await bus.ready()
+
     async def look() -> None:
         async for image in images:
             try:
                 camera = await cameras.of(image.header)
                 picture = decode_image(image, camera)
-                depth = await depth_with(image.header.stamp, camera) if config.depth else None
+                depth = await depths.at(image.header.stamp, camera) if depths is not None else None
             except FrameError as error:
                 left_out.note(error)
                 continue
@@ -162,7 +175,8 @@ async def run(bus: Bus, config: Config) -> None:
 
     async with asyncio.TaskGroup() as group:
         group.create_task(cameras.follow())
-        group.create_task(watch_depths())
+        if depths is not None:
+            group.create_task(depths.collect())
         group.create_task(look())
 
 

@@ -1,10 +1,11 @@
-"""Offers the detections that the arm can take to the task, and says why it does not offer the others."""
+"""Offer the detections within reach to the task, and report why others are rejected."""
 
 from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
 from contextlib import suppress
+from typing import Any
 
 from pydantic import Field
 
@@ -17,6 +18,7 @@ from applications.pick_place.detections import (
     Validation,
     ViewsParameters,
 )
+from applications.pick_place.perceived_scene import Place
 from applications.pick_place.topics import (
     REJECTED_TARGETS,
     VALIDATED_TARGETS,
@@ -24,14 +26,14 @@ from applications.pick_place.topics import (
 )
 from common.config import Grasp, RobotConfig, Surroundings, Tunable
 from common.messages import Color, Header, Marker, MarkerArray, Pose, PoseArray, Rejections, Vector3
-from common.messages.geometry import MOST_POSES
+from common.messages.basics import MAX_POSES
 from common.process.service import main
 from common.robot.model import RobotModel
 from common.scene.workspace import ReachCache, WorkspaceBounds
 from common.transport.bus import Bus
 
 WORLD = "world"
-PATIENCE = 0.008  # wall time for which a frame with new places waits for their inverse kinematics [s]
+IK_WAIT = 0.008  # [s, wall time] for which a frame waits for the inverse kinematics of new positions
 
 
 class Config(ViewsParameters, WorkspaceBounds):
@@ -44,22 +46,22 @@ class Config(ViewsParameters, WorkspaceBounds):
         MOST_HIDDEN, ge=0, le=1, description="part of the table within reach that may be hidden while it counts as seen"
     )
     forget_after: Tunable[float] = Field(
-        2.0, ge=0, le=3600, description="a rejection is told again once its place was empty for so long [s, cell time]"
+        2.0, ge=0, le=3600, description="time unseen after which a rejection is reported again [s, cell time]"
     )
 
 
 class OcclusionReport:
-    """Says what the newest pictures do not show of where things may lie."""
+    """Reports which part of the table the newest images do not show."""
 
     def __init__(self, around: Surroundings, bounds: WorkspaceBounds) -> None:
-        """Begin; the table is divided up when something is hidden for the first time."""
+        """Start; the grid of the table is created on the first occlusion."""
         self._around, self._bounds = around, bounds
         self._region: VisibleTable | None = None
 
     def unseen(self, seen: list[CameraDetections], views: DetectionViews, most: float) -> tuple[str, bool]:
-        """In words, empty where at most that share of the table is hidden; and whether nothing is seen at all.
+        """Return a description, empty while at most this fraction is occluded, and whether nothing is visible at all.
 
-        Of several views all are needed: what only one of them sees is not known without it.
+        All views are needed: what only one of them sees is unknown without it.
         """
         if missing := views.missing():
             return f"no picture comes from {' and '.join(missing)}", False
@@ -76,7 +78,7 @@ class OcclusionReport:
 
 
 def hiding(seen: list[CameraDetections], radius: float) -> Callable[[tuple[float, float, float]], bool] | None:
-    """Whether a place is hidden in all views, for what is as large as that [m]; None where any shows everything."""
+    """Return whether a position is occluded in all views, for an object of this radius [m]; None: nothing is."""
     hidden = [one.hidden for one in seen if one.hidden is not None]
     if len(hidden) < len(seen) or not hidden:
         return None
@@ -84,7 +86,7 @@ def hiding(seen: list[CameraDetections], radius: float) -> Callable[[tuple[float
 
 
 def shells(config: Config, header: Header) -> MarkerArray:
-    """The reachable shell, and the column about the base axis that is left out of it."""
+    """Return the reachable shell, and the excluded column around the base axis."""
     height = config.max_height - config.min_height
     inner = max(config.min_radius, config.singularity_radius)
     cylinders = (("reachable shell", config.max_radius, (0.2, 0.8, 0.3)), ("excluded column", inner, (0.9, 0.2, 0.2)))
@@ -101,8 +103,15 @@ def shells(config: Config, header: Header) -> MarkerArray:
     )
 
 
+def targets(visible: list[Place], occluded: list[Place], **fields: Any) -> PoseArray:
+    """Return targets as a message with these other fields; labels only if some targets are occluded."""
+    poses = [Pose(position=Vector3(x=x, y=y, z=z)) for x, y, z in [*visible, *occluded]]
+    labels = [*("" for _ in visible), *(HIDDEN for _ in occluded)] if occluded else []
+    return PoseArray(poses=poses, labels=labels, **fields)
+
+
 async def run(bus: Bus, config: Config) -> None:
-    """Judge every frame with what is known; the inverse kinematics of new places is worked out beside that."""
+    """Validate every frame with the known reachability; compute that of new positions concurrently."""
     views = DetectionViews(bus, config.views, config.world, config.robot, bus.log)
     validated, rejected = bus.writer(VALIDATED_TARGETS), bus.writer(REJECTED_TARGETS)
     markers = bus.writer(WORKSPACE_MARKERS)
@@ -111,47 +120,45 @@ async def run(bus: Bus, config: Config) -> None:
 
     watched, remembered, radius = OcclusionReport(config.world, config), OccludedTargets(), config.world.ball_radius
 
-    def show() -> None:
+    def publish_shells() -> None:
         markers.put(shells(config, bus.header(WORLD)))
 
-    show()
-    bus.on_parameters(show)
+    publish_shells()
+    bus.on_parameters(publish_shells)
     places: list[tuple[float, float, float]] = []
     work, idle = asyncio.Event(), asyncio.Event()
-    unfinished: list[CameraDetections] = []  # sent without the places that were still worked on
+    unfinished: list[CameraDetections] = []  # sent without the positions that were still being computed
     await bus.ready()
 
-    def send(seen: list[CameraDetections]) -> None:
+    def publish(seen: list[CameraDetections]) -> None:
         nonlocal unfinished
         validation.forget_after = config.forget_after
-        verdict = validation.validate_views([(one.frame, one.camera) for one in seen])
-        unfinished = seen if verdict.unknown else []
+        result = validation.validate_views([(one.frame, one.camera) for one in seen])
+        unfinished = seen if result.unknown else []
         header = Header(stamp=min(one.frame.header.stamp for one in seen), frame_id=WORLD)
-        kept = remembered.hidden(verdict.targets, [place for place, _ in verdict.refused], hiding(seen, radius))
-        # Of several crowded views not all can be told of: what is left out is nobody's target for now.
-        verdict.targets, kept = verdict.targets[:MOST_POSES], kept[: max(0, MOST_POSES - len(verdict.targets))]
-        poses = [Pose(position=Vector3(x=x, y=y, z=z)) for x, y, z in [*verdict.targets, *kept]]
-        labels = [*("" for _ in verdict.targets), *(HIDDEN for _ in kept)] if kept else []
+        occluded = remembered.hidden(result.targets, [place for place, _ in result.refused], hiding(seen, radius))
+        # Several crowded views may not fit: the rest is offered later.
+        result.targets, occluded = result.targets[:MAX_POSES], occluded[: max(0, MAX_POSES - len(result.targets))]
         unseen, blind = watched.unseen(seen, views, config.may_hide)
-        validated.put(PoseArray(header=header, poses=poses, labels=labels, remark=verdict.remark, unseen=unseen,
-                                blind=blind))
-        if verdict.rejections:
-            rejected.put(Rejections(header=header, rejected=verdict.rejections))
-        for one in verdict.rejections:
+        validated.put(targets(
+            result.targets, occluded, header=header, remark=result.remark, unseen=unseen, blind=blind))
+        if result.rejections:
+            rejected.put(Rejections(header=header, rejected=result.rejections))
+        for one in result.rejections:
             bus.log.info("rejected (%s, %s): %s", f"{one.position.x:z.3f}", f"{one.position.y:z.3f}", one.reason)
 
-    async def look(_view: int, _seen: CameraDetections) -> None:
+    async def validate(_view: int, _seen: CameraDetections) -> None:
         seen = views.newest()
         places[:] = [place for one in seen for place in validation.unknown(one.frame, one.camera)]
         if places:
             idle.clear()
             work.set()
-            with suppress(TimeoutError):  # what is not known by then goes out with a later frame
-                async with asyncio.timeout(PATIENCE):  # wait_for of Python 3.11 can lose a cancellation
+            with suppress(TimeoutError):  # the rest goes out with a later frame
+                async with asyncio.timeout(IK_WAIT):  # wait_for of Python 3.11 can lose a cancellation
                     await idle.wait()
-        send(seen)
+        publish(seen)
 
-    async def work_out() -> None:
+    async def compute_reach() -> None:
         while True:
             await work.wait()
             work.clear()
@@ -159,11 +166,11 @@ async def run(bus: Bus, config: Config) -> None:
                 await asyncio.to_thread(reach.reason, places.pop(0))
             idle.set()
             if unfinished:
-                send(unfinished)
+                publish(unfinished)
 
     async with asyncio.TaskGroup() as group:
-        group.create_task(views.watch(look))
-        group.create_task(work_out())
+        group.create_task(views.watch(validate))
+        group.create_task(compute_reach())
 
 
 if __name__ == "__main__":

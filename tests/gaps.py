@@ -1,5 +1,5 @@
 """Gaps in the joint states of a cell of real processes, and whether they are the machine's load: who tests that nothing
-holds the executor up has to tell them apart.
+delays the executor must distinguish them.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def stolen() -> int:
 
 
 class Spending:
-    """Looks again and again, from a thread, at what a process spends; nothing where the system does not tell."""
+    """Samples the processor time of a process in a thread; nothing where the system does not report it."""
 
     def __init__(self, pid: int) -> None:
         self._threads = Path(f"/proc/{pid}/task")
@@ -62,8 +62,8 @@ class Spending:
             began, computing, waiting = time.time_ns(), 0, 0
             for thread in self._threads.glob("[0-9]*"):
                 with suppress(OSError):
-                    told = (thread / "schedstat").read_text().split()
-                    computing, waiting = computing + int(told[0]), waiting + int(told[1])
+                    report = (thread / "schedstat").read_text().split()
+                    computing, waiting = computing + int(report[0]), waiting + int(report[1])
             waiting += stolen()
             self.looks.append(Spent((began + time.time_ns()) // 2, computing, waiting))
 
@@ -136,16 +136,16 @@ class Gaps:
             if gap <= GAP:
                 continue
             computing, waiting = self._spending.between(before, after)
-            told = f"{side.what}: {1e3 * gap:.0f} ms, {1e3 * computing:.0f} computing, {1e3 * waiting:.0f} waiting"
+            report = f"{side.what}: {1e3 * gap:.0f} ms, {1e3 * computing:.0f} computing, {1e3 * waiting:.0f} waiting"
             if following - number != 1:
                 side.lost += 1
             elif computing > gap / 2:
                 side.computed += 1
-                side.own.append(told)
+                side.own.append(report)
             elif computing + waiting > gap / 2:
                 side.waited += 1
                 continue
             else:
                 side.held += 1
-                side.own.append(told)
+                side.own.append(report)
             side.held_up += gap

@@ -1,4 +1,4 @@
-"""Payloads that somebody might send: those of real messages, changed in bytes or in structure, by a seed."""
+"""Payloads of real messages with seeded changes of bytes or structure."""
 
 from __future__ import annotations
 
@@ -51,12 +51,12 @@ def _more() -> Iterator[Message]:
                               outline=[(0.0, 0.0), (0.1, 0.0), (0.0, 0.1)])
     thing = m.WorldObject(id="ball_1", shape="mesh", pose=pose, vertices=[(0.0, 0.0, 0.0)] * 3, triangles=[(0, 1, 2)])
     old = m.WorldObject(id="block", shape="box", outline=[(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])
-    kept = m.PathConstraints(tilt=0.3, region=m.Box(pose=pose, size=m.Vector3(x=1.0, y=1.0, z=1.0)), tool_speed=0.2)
+    limits = m.PathConstraints(tilt=0.3, region=m.Box(pose=pose, size=m.Vector3(x=1.0, y=1.0, z=1.0)), tool_speed=0.2)
     goals = [m.JointGoal(positions=[0.1] * 7), m.PoseGoal(pose=pose), m.PathGoal(waypoints=[pose, pose], step=0.01),
              m.ArcGoal(pose=pose, via=m.Vector3(x=0.5)),
              m.SequenceGoal(items=[m.SequenceItem(goal=m.PoseGoal(pose=pose), blend_radius=0.0, straight=True)])]
     yield from (m.PlanRequest(header=header, id="a", stage="s", start=[0.1] * 7, goal=goal, attach_pose=pose,
-                              allowed_collisions=[("a", "b")], planning_time=0.1, constraints=kept) for goal in goals)
+                              allowed_collisions=[("a", "b")], planning_time=0.1, constraints=limits) for goal in goals)
     yield from (
         trajectory, m.ExecuteRequest(header=header, id="a", trajectory=trajectory),
         m.PlanResponse(id="a", ok=True, trajectory=trajectory, attempts=[m.PlanAttempt(planner="ompl", seconds=0.1)]),

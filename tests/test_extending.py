@@ -1,4 +1,4 @@
-"""docs/extending.md: its files in a folder of their own, and its commands word for word, with real processes."""
+"""docs/extending.md: its files in a separate folder, and its commands, with real processes."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from common.tasks.stages import View
 from common.topics import CAMERA_IMAGE, CAMERA_INFO, GRIPPER_STATE, SCENE_OBJECTS
 from common.transport.codec import decode
 from common.transport.local import LocalNetwork
-from page.guard import close_server, make_server
+from page.server import close_server, make_server
 from recording.reader import Recording
 from tests import pages
 from tests.harness import ask, free_domain
@@ -58,11 +58,11 @@ DONE = "DONE, 1 of 1 placed (truth: 1 in the box, 0 on the table)"
 
 
 def environment(**more: str) -> dict[str, str]:
-    kept = {name: value for name, value in os.environ.items() if not name.startswith(("ZENCELL_", "PYTHONPATH"))}
-    return {**kept, "PATH": f"{BIN}:{os.environ['PATH']}", "ZENCELL_DOMAIN": str(free_domain()), **more}
+    inherited = {name: value for name, value in os.environ.items() if not name.startswith(("ZENCELL_", "PYTHONPATH"))}
+    return {**inherited, "PATH": f"{BIN}:{os.environ['PATH']}", "ZENCELL_DOMAIN": str(free_domain()), **more}
 
 
-def tell(line: str, folder: Path, **more: str) -> subprocess.CompletedProcess[str]:
+def run_command(line: str, folder: Path, **more: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(shlex.split(line), cwd=folder, env=environment(**more), text=True, capture_output=True,
                           timeout=PATIENCE, check=False)
 
@@ -76,7 +76,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         (folder / name).write_text(text, encoding="utf-8")
     for line in COMMANDS:
         if line.startswith(("xacro ", "zencell robot ")):
-            made = tell(line, folder)
+            made = run_command(line, folder)
             assert made.returncode == 0, made.stderr
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(folder)
@@ -85,14 +85,14 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         del sys.modules[name]
 
 
-def test_page_says_where_every_file_goes() -> None:
+def test_page_lists_every_file() -> None:
     listed = re.search(r"^```\nmy_cell/\n(.*?)^```$", PAGE, re.DOTALL | re.MULTILINE)
     assert listed is not None
     assert set(re.findall(r"[\w.]+\.\w+", listed[1])) == {Path(name).name for name in FILES}
     assert len(HERE) == 2 and len(ANYWHERE) == 1
 
 
-def test_robot_is_made_of_its_files_wherever_one_stands(folder: Path) -> None:
+def test_robot_loads_from_any_working_directory(folder: Path) -> None:
     cell = load_cell(str(folder / "my_cell.yaml"))
     robot = RobotModel.load(cell.robot)
     assert {"tool0", "palm", "left_finger", "my_tcp"} <= set(robot.link_names)
@@ -102,7 +102,7 @@ def test_robot_is_made_of_its_files_wherever_one_stands(folder: Path) -> None:
     assert 'link1="palm" link2="left_finger"' in srdf and 'link1="forearm_link" link2="palm"' not in srdf
 
 
-def test_folders_of_descriptions_may_lie_beside_the_robot_file(folder: Path) -> None:
+def test_package_folders_may_be_next_to_the_robot_file(folder: Path) -> None:
     package = folder / "descriptions" / "my_description"
     package.mkdir(parents=True)
     (package / "my_gripper.urdf").write_bytes((folder / "my_gripper.urdf").read_bytes())
@@ -112,7 +112,9 @@ def test_folders_of_descriptions_may_lie_beside_the_robot_file(folder: Path) -> 
     assert "palm" in RobotModel.load(cell.robot).link_names
 
 
-def test_paths_on_the_command_line_are_those_of_where_one_stands(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_command_line_paths_are_relative_to_the_working_directory(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(folder.parent)
     world = load_cell("panda", world="my_cell/my_world.yaml").world
     assert world == load_cell(str(folder / "my_cell.yaml")).world
@@ -121,7 +123,7 @@ def test_paths_on_the_command_line_are_those_of_where_one_stands(folder: Path, m
         load_cell("panda", world="my_world.yaml")
 
 
-def test_hardware_reads_in_steps_of_its_encoders(folder: Path) -> None:
+def test_custom_hardware_reads_in_encoder_steps(folder: Path) -> None:
     options = ["robot.hardware.backend=my_pkg.encoder_arm", "robot.hardware.options.resolution=0.01"]
     config = load_cell("panda", options).robot
     robot = RobotModel.load(config)
@@ -138,7 +140,7 @@ def test_hardware_reads_in_steps_of_its_encoders(folder: Path) -> None:
         find_backend(load_cell("panda", ["robot.hardware.backend=my_pkg.no_arm"]).robot)
 
 
-def test_options_of_the_planner_are_checked_as_all_are(folder: Path) -> None:
+def test_custom_planner_options_are_validated(folder: Path) -> None:
     with pytest.raises(ConfigError, match=r"my_pkg\.over_home\.goals: 0 must be greater than or equal to 1"):
         load_planner("my_pkg.over_home", {"goals": 0})
     with pytest.raises(ConfigError, match=r"my_pkg\.over_hill.*cannot be imported"):
@@ -147,7 +149,7 @@ def test_options_of_the_planner_are_checked_as_all_are(folder: Path) -> None:
         load_planner("my_pkg.my_topics", {})
 
 
-async def test_services_read_and_write_what_the_page_says(folder: Path) -> None:
+async def test_custom_services_have_the_documented_wiring(folder: Path) -> None:
     cell = load_cell(str(folder / "my_cell.yaml"))
     keys = {}
     for name in ("evening_camera", "nearest_target"):
@@ -163,7 +165,7 @@ async def test_services_read_and_write_what_the_page_says(folder: Path) -> None:
         load_cell(str(folder / "my_cell.yaml"), ["services.camera_simulator.rate=5"])
 
 
-async def test_camera_sends_pictures_with_less_blue(folder: Path) -> None:
+async def test_custom_camera_sends_images_with_less_blue(folder: Path) -> None:
     module = importlib.import_module("my_pkg.evening_camera")
     config = check(module.Config, {"world": service_config_world(folder), "blue": 0.5})
     net = LocalNetwork()
@@ -186,7 +188,7 @@ def service_config_world(folder: Path) -> object:
 
 
 def run_to_end(line: str, where: Path, summary: Path, **more: str) -> dict[str, object]:
-    ran = tell(f"{line} --speed 10 --set world.count=1 --summary {summary}", where, **more)
+    ran = run_command(f"{line} --speed 10 --set world.count=1 --summary {summary}", where, **more)
     assert ran.returncode == 0, ran.stdout + ran.stderr
     assert DONE in ran.stdout
     loaded: dict[str, object] = json.loads(summary.read_text(encoding="utf-8"))
@@ -201,7 +203,7 @@ def planners(summary: dict[str, object]) -> set[str]:
 
 @pytest.mark.parametrize("line", HERE)
 @pytest.mark.slow
-def test_cell_of_the_clone_runs_with_one_part_of_ours(line: str, folder: Path, tmp_path: Path) -> None:
+def test_project_cell_runs_with_one_custom_part(line: str, folder: Path, tmp_path: Path) -> None:
     file = tmp_path / "summary.json"
     with no_processes():
         ran = ask(folder, *shlex.split(line)[1:], "--set", "world.count=1", "--summary", str(file), "--domain",
@@ -213,7 +215,7 @@ def test_cell_of_the_clone_runs_with_one_part_of_ours(line: str, folder: Path, t
 
 @pytest.mark.slow
 @pytest.mark.cell
-def test_cell_of_ours_runs_from_anywhere(folder: Path, tmp_path: Path) -> None:
+def test_custom_cell_runs_from_any_folder(folder: Path, tmp_path: Path) -> None:
     variable, line = ANYWHERE[0].replace("~/my_cell", str(folder)).split(" ", 1)
     name, _, path = variable.partition("=")
     summary = run_to_end(line, tmp_path, tmp_path / "summary.json", **{name: path})
@@ -225,7 +227,7 @@ def test_cell_of_ours_runs_from_anywhere(folder: Path, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.cell
-def test_service_of_ours_joins_a_cell_and_its_topic_is_shown(folder: Path) -> None:
+def test_custom_service_joins_a_cell(folder: Path) -> None:
     up, join, echo = COMMANDS[COMMANDS.index("zencell up panda"):][:3]
     env = environment()
     with start(up, folder, env) as cell:
@@ -233,7 +235,7 @@ def test_service_of_ours_joins_a_cell_and_its_topic_is_shown(folder: Path) -> No
         while "is up at" not in (said := cell.stdout.readline()):
             assert said, "the cell did not come up"
         with start(join, folder, env) as service:
-            while "panda/nearest_target" not in tell("zencell node list", folder, **env).stdout:
+            while "panda/nearest_target" not in run_command("zencell node list", folder, **env).stdout:
                 assert service.poll() is None, service.communicate()
             asked = [start(line, folder, env) for line in (
                 echo, "zencell topic hz nearest_target -n 1", "zencell topic echo neerest_target")]
@@ -251,41 +253,41 @@ def test_service_of_ours_joins_a_cell_and_its_topic_is_shown(folder: Path) -> No
 
 
 def assert_cube_moved(file: Path, said: str, recording: Path, folder: Path, elsewhere: Path) -> None:
-    """What a run told, and what its recording tells where the task's module is not found."""
+    """Check a run, and its recording without the task module."""
     summary = json.loads(file.read_text(encoding="utf-8"))
     assert (summary["state"], summary["placed"], summary["targets"], summary["failures"]) == ("DONE", 1, 1, 0)
     assert set(summary["figures"]) == {"off_mm"} and summary["figures"]["off_mm"] < 5
     assert "off_mm" in said
-    with Recording(recording) as kept:
-        states = list(kept.samples(lambda topic: topic == "move_cube_status"))
+    with Recording(recording) as recorded:
+        states = list(recorded.samples(lambda topic: topic == "move_cube_status"))
         assert {(sample.kind, json.loads(sample.schema)["title"]) for sample in states} == {("state", "MoveCubeStatus")}
-        newest = {sample.topic: sample.payload for sample in kept.samples(
+        newest = {sample.topic: sample.payload for sample in recorded.samples(
             lambda topic: topic in ("scene_objects", "move_cube_status"))}
     status = decode(m.TaskStatus, newest["move_cube_status"])
     assert (status.state, status.figures) == ("DONE", summary["figures"])
     place = decode(m.WorldObjects, newest["scene_objects"]).objects[0].pose.position
     assert (place.x, place.y) == pytest.approx((0.52, 0.1), abs=0.005), "where it really is"
     elsewhere.mkdir()
-    exported = tell(f"zencell export {recording} --csv tables --topics move_cube_status", elsewhere)
+    exported = run_command(f"zencell export {recording} --csv tables --topics move_cube_status", elsewhere)
     assert exported.returncode == 0 and not exported.stderr, exported.stderr
     rows = list(csv.DictReader((elsewhere / "tables" / "move_cube_status.csv").read_text().splitlines()))
     assert (len(rows), rows[-1]["state"]) == (len(states), "DONE")
     assert float(rows[-1]["figures.off_mm"]) == summary["figures"]["off_mm"]
-    reported = tell(f"zencell report {recording} --cell cube.yaml -o {elsewhere / 'run.html'}", folder)
+    reported = run_command(f"zencell report {recording} --cell cube.yaml -o {elsewhere / 'run.html'}", folder)
     assert reported.returncode == 0 and "off_mm" in (elsewhere / "run.html").read_text(encoding="utf-8")
 
 
 @pytest.mark.slow
 @pytest.mark.cell
-def test_task_of_one_file_moves_a_cube_as_processes(folder: Path, tmp_path: Path) -> None:
+def test_single_file_task_moves_a_cube_as_processes(folder: Path, tmp_path: Path) -> None:
     file, recording = tmp_path / "summary.json", tmp_path / "run.mcap"
-    ran = tell(f"{CUBE} --speed 5 --no-viewer --summary {file} --record {recording}", folder)
+    ran = run_command(f"{CUBE} --speed 5 --no-viewer --summary {file} --record {recording}", folder)
     assert ran.returncode == 0, ran.stdout + ran.stderr
     assert_cube_moved(file, ran.stdout, recording, folder, tmp_path / "elsewhere")
 
 
 @pytest.mark.slow
-def test_task_of_one_file_moves_a_cube_and_ends_the_run_with_a_status_and_figures_of_its_own(
+def test_single_file_task_moves_a_cube_with_its_own_status_and_figures(
     folder: Path, tmp_path: Path
 ) -> None:
     assert len(FILES["my_pkg/move_cube.py"].splitlines()) < 120
@@ -301,7 +303,7 @@ def test_task_of_one_file_moves_a_cube_and_ends_the_run_with_a_status_and_figure
 
 
 @pytest.mark.slow
-def test_new_task_runs_at_once(tmp_path: Path) -> None:
+def test_new_task_runs_unchanged(tmp_path: Path) -> None:
     new, = (line for line in COMMANDS if line.startswith("zencell new"))
     made = ask(tmp_path, *shlex.split(new)[1:])
     assert (made.returncode, made.stderr) == (0, "")
@@ -310,7 +312,7 @@ def test_new_task_runs_at_once(tmp_path: Path) -> None:
     assert simulated.returncode == 0 and "1 of 1 (100.0%)" in simulated.stdout, simulated.stdout + simulated.stderr
 
 
-def test_task_of_one_file_goes_on_with_what_is_in_the_hand(folder: Path) -> None:
+def test_single_file_task_continues_with_a_held_object(folder: Path) -> None:
     cell = load_cell(str(folder / "cube.yaml"))
     module = importlib.import_module("my_pkg.move_cube")
     config = service_config(cell, "move_cube", module.Config)
@@ -322,7 +324,7 @@ def test_task_of_one_file_goes_on_with_what_is_in_the_hand(folder: Path) -> None
     assert (plan.goal.pose.position.x, plan.goal.pose.position.y) == config.to
 
 
-def test_application_that_is_no_module_or_declares_none_is_refused_by_name(
+def test_invalid_application_module_is_rejected_by_name(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(folder)
@@ -337,10 +339,10 @@ def start(line: str, folder: Path, env: dict[str, str]) -> subprocess.Popen[str]
                             stderr=subprocess.PIPE)
 
 
-def test_layer_of_ours_is_drawn_on_the_page(folder: Path) -> None:
+def test_custom_layer_is_drawn_on_the_page(folder: Path) -> None:
     server = make_server("127.0.0.1", 0)
     try:
-        stage = Stage(server, "panda", own=["my_pkg.hand_width"])
+        stage = Stage(server, "panda", custom=["my_pkg.hand_width"])
         stage.say(GRIPPER_STATE, m.GripperState(width=0.04))
         label = server.scene.get_handle_by_name("/my_pkg.hand_width/words")
         assert isinstance(label, viser.LabelHandle) and label.text == "40 mm"
@@ -350,7 +352,8 @@ def test_layer_of_ours_is_drawn_on_the_page(folder: Path) -> None:
         close_server(server)
 
 
-def test_service_that_is_no_module_is_refused_by_name(folder: Path) -> None:
-    told = tell("zencell service my_pkg.farthest_target --cell panda", folder)
-    assert told.returncode == 2
-    assert told.stderr.count("\n") == 1 and "'my_pkg.farthest_target' is not a module on the search path" in told.stderr
+def test_unknown_service_module_is_rejected_by_name(folder: Path) -> None:
+    result = run_command("zencell service my_pkg.farthest_target --cell panda", folder)
+    assert result.returncode == 2
+    assert result.stderr.count("\n") == 1
+    assert "'my_pkg.farthest_target' is not a module on the search path" in result.stderr

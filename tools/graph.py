@@ -1,4 +1,8 @@
-"""Services and topics of a cell as a picture: DOT and Mermaid as text; SVG is beside this."""
+"""Graph of services and topics of a cell as DOT, Mermaid or SVG.
+
+In the SVG writers and clients are on the left, keys in the middle, readers and servers on the right. Every service is
+on both sides in start order, so that data flows from left to right. Lines have the color of the service at their start.
+"""
 
 from __future__ import annotations
 
@@ -12,14 +16,14 @@ if TYPE_CHECKING:
     from common.supervision.wiring import ServiceWiring
 
 
-OUTSIDE = "zencell, you"  # who sends the requests that no service of the cell sends
+OUTSIDE = "zencell, you"  # client of requests that no service of the cell sends
 SUPERVISOR = "supervisor"
-PARAMETERS = "param/"  # served by every service, and so no news
+PARAMETERS = "param/"  # served by every service, so not shown
 
 
 @dataclass(frozen=True)
 class Graph:
-    """A cell as services with the keys between them. `alive` is None while the cell is not up."""
+    """Services with the keys between them. `alive` is None while the cell is not up."""
 
     cell: str
     services: list[ServiceWiring]  # in start order
@@ -28,12 +32,12 @@ class Graph:
     outside: list[str] = field(default_factory=list)  # requests that no service of the cell sends
 
     def is_lit(self, service: str) -> bool:
-        """Whether a service is ready; while the cell is not up, all look the same."""
+        """Return whether a service is ready, or the cell is not up."""
         return self.alive is None or service in self.alive
 
 
 def graph_of(cell: str, services: list[ServiceWiring], alive: frozenset[str] | None = None) -> Graph:
-    """The graph of a cell's wired services.
+    """Return the graph of a cell.
 
     Args:
         cell: its name.
@@ -50,7 +54,7 @@ def graph_of(cell: str, services: list[ServiceWiring], alive: frozenset[str] | N
     called = {key for service in services for key in service.calls}
     outside = [key for service in services for key in service.serves if key not in called]
     keys = [key for service in services for key in (*service.writes, *service.calls)] + outside
-    keys += [key for service in services for key in service.reads]  # written by nobody in this cell
+    keys += [key for service in services for key in service.reads]  # written by no service of this cell
     kinds: dict[str, str] = {}
     for key in keys:
         topic = next((each.topics[key] for each in services if key in each.topics), None) or find_topic(key)
@@ -59,7 +63,7 @@ def graph_of(cell: str, services: list[ServiceWiring], alive: frozenset[str] | N
 
 
 def names(graph: Graph) -> list[str]:
-    """The services of a graph."""
+    """Return the names of the services."""
     return [service.name for service in graph.services]
 
 
@@ -68,7 +72,7 @@ DOT_FILLS = {"stream": "#e3effb", "event": "#e4f4e1", "state": "#fdf3d4", "reque
 
 
 def edges(graph: Graph) -> Iterator[tuple[str, str, bool, bool]]:
-    """From, to, whether a request goes there, and whether all of it is alive; each end a service or a key."""
+    """Yield start and end (a service or a key), whether it is a request, and whether the service is alive."""
     for service in graph.services:
         lit = graph.is_lit(service.name)
         for key in service.writes:
@@ -84,7 +88,7 @@ def edges(graph: Graph) -> Iterator[tuple[str, str, bool, bool]]:
 
 
 def dot(graph: Graph) -> str:
-    """The graph as Graphviz DOT: `dot -Tsvg`."""
+    """Return the graph as Graphviz DOT."""
     lines = [
         f"digraph {json.dumps(graph.cell)} {{", "  rankdir=LR;", '  node [fontname="sans-serif", fontsize=11];',
         '  edge [color="#666666", arrowsize=0.7];',
@@ -105,7 +109,7 @@ def dot(graph: Graph) -> str:
 
 
 def mermaid(graph: Graph) -> str:
-    """The graph as Mermaid: what GitHub draws in a ```mermaid block."""
+    """Return the graph as Mermaid, which GitHub draws in a ```mermaid block."""
     ids = {service.name: f"s{number}" for number, service in enumerate(graph.services)}
     ids |= {f"key {key}": f"k{number}" for number, key in enumerate(graph.kinds)}
     ids[OUTSIDE] = "you"
@@ -125,12 +129,12 @@ def mermaid(graph: Graph) -> str:
     return "\n".join([*lines, ""])
 
 
-ROW, GAP = 21.0, 13.0  # [px] of a key, and between the services on the left
-LEFT, WIDE = 20.0, 176.0  # [px] where the boxes of services begin, and how wide they are
-KEYS, KEY_WIDE = 262.0, 216.0  # [px] where the keys begin, and how wide they are
-RIGHT = 760.0  # [px] where the services on the right begin
+ROW, GAP = 21.0, 13.0  # [px] height of a key, and gap between services on the left
+LEFT, WIDE = 20.0, 176.0  # [px] position and width of services
+KEYS, KEY_WIDE = 262.0, 216.0  # [px] position and width of keys
+RIGHT = 760.0  # [px] position of the services on the right
 TOP = 62.0  # [px] of the drawing proper
-PORT = 8.0  # [px] between two lines that end at one service, at least
+PORT = 8.0  # [px] least distance between two lines that end at one service
 FILLS = {"stream": "#e3effb", "event": "#e4f4e1", "state": "#fdf3d4", "request": "#efe4f7"}
 COLOURS = ("#1f77b4", "#d6620a", "#2a8a2a", "#c22f2f", "#7d58ad", "#8c564b", "#c14fa0", "#4d6a00", "#007d8c", "#5a5a5a",
            "#a07800", "#3b4cc0")
@@ -138,9 +142,9 @@ COLOURS = ("#1f77b4", "#d6620a", "#2a8a2a", "#c22f2f", "#7d58ad", "#8c564b", "#c
 
 @dataclass(frozen=True)
 class Row:
-    """A key beside the service that writes or asks it."""
+    """A key next to the service that writes or calls it."""
 
-    service: str  # "" when nobody in the cell does
+    service: str  # empty if no service of the cell does
     key: str
     y: float  # [px] of its middle
 
@@ -155,7 +159,7 @@ class Box:
 
 
 def svg(graph: Graph) -> str:
-    """The graph as an SVG document of its own, on white."""
+    """Return the graph as an SVG document on white."""
     rows, writers, bottom = _left_side(graph)
     readers, bottom = _right_side(graph, rows, bottom)
     colours = {service.name: COLOURS[number % len(COLOURS)] for number, service in enumerate(graph.services)}
@@ -166,8 +170,8 @@ def svg(graph: Graph) -> str:
         f"<title>{escape(graph.cell)}: services and topics</title>",
         '<rect width="100%" height="100%" fill="white"/>',
         _text(LEFT, 26, f"{graph.cell}: services and topics", size=17, weight="bold"),
-        _text(LEFT + WIDE / 2, 50, "writes, asks", anchor="middle", fill="#777"),
-        _text(RIGHT + WIDE / 2, 50, "reads, answers", anchor="middle", fill="#777"),
+        _text(LEFT + WIDE / 2, 50, "writes, calls", anchor="middle", fill="#777"),
+        _text(RIGHT + WIDE / 2, 50, "reads, serves", anchor="middle", fill="#777"),
     ]
     parts += _lines(graph, rows, readers, colours)
     parts += [_box(graph, box, LEFT, colours) for box in writers]
@@ -178,7 +182,7 @@ def svg(graph: Graph) -> str:
 
 
 def _left_side(graph: Graph) -> tuple[list[Row], list[Box], float]:
-    """The keys from top to bottom, the boxes of those who write or ask them, and where they end."""
+    """Return the keys from top to bottom, the boxes of their writers and clients, and the bottom [px]."""
     groups = [(service.name, [*service.writes, *service.calls]) for service in graph.services]
     groups = [(name, keys) for name, keys in groups if keys]
     if graph.outside:
@@ -195,7 +199,7 @@ def _left_side(graph: Graph) -> tuple[list[Row], list[Box], float]:
 
 
 def _right_side(graph: Graph, rows: list[Row], bottom: float) -> tuple[list[Box], float]:
-    """The boxes of those who read or answer, spread over the height of the keys; and where all of it ends."""
+    """Return the boxes of readers and servers, spread over the height of the keys, and the bottom [px]."""
     ports = {service.name: len(_ending_at(graph, service.name, rows)) for service in graph.services}
     heights = {name: max(ROW, PORT * (count + 1)) for name, count in ports.items() if count}
     free = bottom - TOP - sum(heights.values())
@@ -208,7 +212,7 @@ def _right_side(graph: Graph, rows: list[Row], bottom: float) -> tuple[list[Box]
 
 
 def _ending_at(graph: Graph, service: str, rows: list[Row]) -> list[Row]:
-    """The rows from which a line goes to a service, from top to bottom."""
+    """Return the rows with a line to a service, from top to bottom."""
     wire_service = next(each for each in graph.services if each.name == service)
     return [row for row in rows if row.key in wire_service.reads or row.key in wire_service.serves]
 
@@ -229,7 +233,7 @@ def _lines(graph: Graph, rows: list[Row], readers: list[Box], colours: dict[str,
 def _line(
     graph: Graph, row: Row, start: tuple[float, float], end: tuple[float, float], colours: dict[str, str], other: str
 ) -> str:
-    """A curve that leaves and arrives level, with an arrow's head."""
+    """Return a curve with horizontal ends and an arrow head."""
     lit = all(name in ("", OUTSIDE) or graph.is_lit(name) for name in (row.service, other))
     colour = colours.get(row.service, "#888") if lit else "#c4c4c4"
     asked = graph.kinds[row.key] == "request"
@@ -273,8 +277,8 @@ def _legend(graph: Graph, y: float) -> list[str]:
                      f'rx="{2 if kind == "request" else 6}" fill="{fill}" stroke="#999" stroke-width="0.8"/>')
         parts.append(_text(x + 32, y + 1, kind, fill="#555"))
         x += 104
-    said = "the cell is not up" if graph.alive is None else "green: alive; dashed and grey: not alive"
-    parts.append(_text(RIGHT + WIDE, y + 1, said, anchor="end", fill="#555"))
+    note = "the cell is not up" if graph.alive is None else "green: alive; dashed and grey: not alive"
+    parts.append(_text(RIGHT + WIDE, y + 1, note, anchor="end", fill="#555"))
     return parts
 
 

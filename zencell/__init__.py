@@ -1,8 +1,8 @@
 """Robot work cells as a mesh of processes over Zenoh, and the client for programs: `from zencell import Cell`.
 
-After `import zencell` the project's modules can be imported, too. In a clone `common`, `services`, `cli` and `config`
-lie beside this package. In a wheel they lie below it, in a folder whose name is no Python name, so that no module has a
-second name there: docs/architecture.md, "Where modules live".
+`import zencell` also makes the project's other modules importable. In a clone `common`, `services`, `cli` and `config`
+are next to this package. In a wheel they are in a folder below it that is not a valid Python name, so that no module
+can be imported under two names: docs/architecture.md, "Where modules live".
 """
 
 from __future__ import annotations
@@ -19,11 +19,10 @@ if _FOLDER not in sys.path:
     sys.path.insert(0, _FOLDER)
 
 if TYPE_CHECKING:
-    from common.client.arm import JogFailed
     from common.client.cell import Cell
     from common.client.goals import Plan, any_of, pose, region, through
     from common.client.joining import NoCellRunning
-    from common.client.operator_motion import MotionFailed
+    from common.client.operator_motion import JogFailed, MotionFailed
     from common.client.starting import NotStarted
     from common.client.subscriptions import NothingReceived
     from common.errors import (
@@ -38,8 +37,7 @@ if TYPE_CHECKING:
     )
     from common.messages import Pose
 
-_FROM = {  # imported when they are asked for: the command line starts without them
-    "common.client.arm": ("JogFailed",),
+_FROM = {  # imported at first use: the command line starts without them
     "common.client.cell": ("Cell",),
     "common.client.goals": ("Plan", "any_of", "pose", "region", "through"),
     "common.client.subscriptions": ("NothingReceived",),
@@ -48,9 +46,11 @@ _FROM = {  # imported when they are asked for: the command line starts without t
     "common.errors": ("ConfigError", "NoResponder", "RemoteError", "RequestFailed", "RequestLost", "RequestTimeout",
                       "UnknownName", "ZencellError"),
     "common.messages": ("Pose",),
-    "common.client.operator_motion": ("MotionFailed",),
+    "common.client.operator_motion": ("JogFailed", "MotionFailed"),
 }
-_WHERE = {name: module for module, names in _FROM.items() for name in names}
+_MODULE = {name: module for module, names in _FROM.items() for name in names}
+# Names of earlier releases, for scripts that use them.
+_FORMER = {"JogFailed": "JogFailed", "NothingReceived": "NothingReceived", "NoCellRunning": "NoCellRunning"}
 
 __all__ = [
     "Cell",
@@ -77,9 +77,10 @@ __all__ = [
 
 
 def __getattr__(name: str) -> object:
-    if name not in _WHERE:
+    current = _FORMER.get(name, name)
+    if current not in _MODULE:
         raise AttributeError(f"module 'zencell' has no attribute {name!r}")
-    return getattr(importlib.import_module(_WHERE[name]), name)
+    return getattr(importlib.import_module(_MODULE[current]), current)
 
 
 def __dir__() -> list[str]:

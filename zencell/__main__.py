@@ -1,13 +1,13 @@
-"""The `zencell` command, also as `python -m zencell`."""
+"""The `zencell` command, also `python -m zencell`."""
 
 import signal
 
-# Ctrl-C while we still import ends the process without a traceback: nothing was started yet. cli.main undoes it.
+# Ctrl-C during the imports ends the process without a traceback: nothing was started yet. cli.main restores it.
 signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def main() -> None:
-    """Run the verb that the process's arguments name and end the process with its code."""
+    """Run the command of the process arguments and exit with its code."""
     from common.process.environment import set_startup_variables
 
     set_startup_variables()

@@ -1,4 +1,4 @@
-"""Where zenoh-cli finds the codec `msgpack`: the package is imported first, and with it the project can be."""
+"""The codec `msgpack` of zenoh-cli; importing it through this package makes the project importable."""
 
 from common.client.json_codec import decode, encode
 

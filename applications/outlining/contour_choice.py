@@ -16,12 +16,12 @@ from common.errors import ZencellError
 from common.messages import Color
 
 HUES = {"red": 0, "orange": 30, "yellow": 60, "green": 120, "cyan": 180, "blue": 240, "magenta": 300}  # [degrees]
-SAME_MIDDLE = 3.0  # [px] contours whose middles are this near lie in one another
+SAME_MIDDLE = 3.0  # [px] contours whose centers are this close are nested
 NAMES = [*HUES, "white", "grey", "black"]
 
 
 class NoSuchContour(ZencellError):
-    """Nothing in the picture fits the request. `code` is for programs: empty, border, colour, index or rule."""
+    """No contour in the image fits the request. `code` is for programs: empty, border, colour, index or rule."""
 
     def __init__(self, code: str, message: str) -> None:
         super().__init__(message)
@@ -29,7 +29,7 @@ class NoSuchContour(ZencellError):
 
 
 def colour_name(color: Color) -> str:
-    """The nearest of `NAMES`."""
+    """Return the nearest of `NAMES`."""
     hue, saturation, value = colorsys.rgb_to_hsv(color.r, color.g, color.b)
     if value < 0.2:
         return "black"
@@ -39,7 +39,7 @@ def colour_name(color: Color) -> str:
 
 
 def described(contours: Sequence[Contour], some: Sequence[Contour] | None = None) -> str:
-    """The contours, or some of them, one after the other: number, label, colour and what is special."""
+    """List contours with index, label, color and special properties."""
     shown = contours if some is None else some
     if not shown:
         return "none"
@@ -55,10 +55,10 @@ def described(contours: Sequence[Contour], some: Sequence[Contour] | None = None
 
 
 def parse_choice(text: str | int) -> OutlineSelect | None:
-    """The request that a word stands for: auto, a colour, an index, a label such as Object_2; None for none.
+    """Convert auto, a color, an index or a label such as Object_2 to a request; none to None.
 
     Raises:
-        NoSuchContour: it is none of those.
+        NoSuchContour: the text is none of those.
     """
     word = str(text).strip()
     if word in ("", "none"):
@@ -74,13 +74,13 @@ def parse_choice(text: str | int) -> OutlineSelect | None:
 
 
 def choose(contours: Sequence[Contour], wanted: OutlineSelect) -> Contour:
-    """The contour that a request means.
+    """Return the contour that a request selects.
 
-    auto: the largest object that does not touch the border of the picture; colour: the largest such of that colour;
-    index: exactly that one, whatever it is; where it is told where that was seen, the one that is there.
+    auto: the largest object that does not touch the image border; colour: the largest such object of that color; index:
+    exactly that one, or the one at the position `at` where it was seen.
 
     Raises:
-        NoSuchContour: with the choices.
+        NoSuchContour: there is none; lists the choices.
     """
     if wanted.rule == "index":
         if wanted.index is None:
@@ -109,13 +109,13 @@ def choose(contours: Sequence[Contour], wanted: OutlineSelect) -> Contour:
 
 
 def middle_of(contour: Contour) -> tuple[float, float]:
-    """The mean of its pixels."""
+    """Return the mean of its pixels."""
     us, vs = zip(*contour.pixels, strict=True)
     return sum(us) / len(us), sum(vs) / len(vs)
 
 
 def _seen_at(contours: Sequence[Contour], index: int, at: tuple[float, float]) -> Contour:
-    """The contour with its middle at a pixel; of several that have one middle the one with that index.
+    """Return the contour with its center at a pixel; of nested ones the one with that index.
 
     Raises:
         NoSuchContour: there is none.
@@ -128,39 +128,39 @@ def _seen_at(contours: Sequence[Contour], index: int, at: tuple[float, float]) -
     return min(near, key=lambda each: (each.index != index, away[each.index]))
 
 
-LARGEST_CHANGE = 2.0  # of the area of an object between two pictures
-PART = 0.9  # of the edge of a part that lies within the whole
-SAMPLED = 500  # points of that edge are looked at, at least
-NEAR = 3.0  # [px] without or within
-LARGEST_TURN = 1 / 6  # of the circle of hues, by which an object may look another: from red to yellow
-COLOURFUL = 0.25  # saturation from which on a hue says something
+LARGEST_CHANGE = 2.0  # factor of an object's area between two images
+PART = 0.9  # fraction of a part's edge that must lie within the complete object
+SAMPLED = 500  # smallest number of points of that edge to test
+NEAR = 3.0  # [px] tolerance
+LARGEST_TURN = 1 / 6  # of the hue circle, by which an object's hue may change: red to yellow
+COLOURFUL = 0.25  # saturation from which the hue is meaningful
 
 
 class ContourTracker:
-    """The choice, and the object it fell upon: found again in each picture by its place and size.
+    """The selected object, found again in each image by its position and size.
 
-    It is looked for as it was last seen, and as it was when it was chosen: what is seen while the arm hides more and
-    more of it is a smaller and smaller part.
+    It is compared with its last contour and with the one at its selection: while the arm occludes more and more of it,
+    the visible part shrinks.
 
-    A choice that nothing fits yet is tried on every picture. Once it fell upon an object it stays with it: when that
-    is not seen (the arm may be before it), nothing is chosen, rather than something else. What was chosen by itself in
-    the first picture may have been a part of an object, with the arm before the rest: then it falls upon the whole.
-    What goes on outside of the picture is not chosen instead: its outline would be a part of it.
+    A selection without a match is tried on every image. Once it has matched an object it stays with it: while that
+    object is not visible (the arm may occlude it), nothing is selected. An automatic selection in the first image may
+    have matched a part of an object, with the arm in front of the rest; it then switches to the complete object. An
+    object cut off by the image border is not selected instead: its outline would be incomplete.
     """
 
     def __init__(self, wanted: OutlineSelect | None) -> None:
-        """Begin with a choice, or with none."""
+        """Start with a selection, or with none."""
         self._wanted = wanted
         self._chosen: Contour | None = None
         self._last: Contour | None = None
-        self._hole = False  # whether it is the edge of one
+        self._hole = False  # whether it is the edge of a hole
         self._by_itself = True
 
     def select(self, contours: Sequence[Contour], wanted: OutlineSelect) -> Contour:
-        """The contour that a new choice falls upon; if there is none, the choice before it stays.
+        """Return the contour that a new selection matches; without a match the previous selection stays.
 
         Raises:
-            NoSuchContour: with the choices.
+            NoSuchContour: nothing matches; lists the choices.
         """
         contour = choose(contours, wanted)
         self._wanted, self._by_itself = wanted, False
@@ -168,7 +168,7 @@ class ContourTracker:
         return contour
 
     def find(self, contours: Sequence[Contour]) -> tuple[int, str]:
-        """Index of the chosen contour in a new picture, or -1 and why there is none."""
+        """Return the index of the selected contour in a new image, or -1 and the reason."""
         if self._chosen is not None:
             border = self._chosen.touches_border
             seen = [contour for contour in contours
@@ -195,11 +195,11 @@ class ContourTracker:
         self._hole = is_hole(contours, contour.index)
 
     def _distance(self, contour: Contour) -> float:
-        """How far a contour is from the chosen one [px]; infinite when it cannot be the same."""
+        """Return the distance of a contour from the selected one [px]; infinite if it cannot be the same object."""
         return min((distance(contour, known) for known in (self._last, self._chosen) if known), default=math.inf)
 
     def _whole(self, contours: Sequence[Contour]) -> Contour | None:
-        """The only contour that has in it what was chosen, as far as it was seen; else None."""
+        """Return the only contour that contains the selected one, as far as it was visible; else None."""
         assert self._chosen is not None
         edge = self._chosen.pixels
         found = [contour for contour in contours if _same_kind(contour, self._chosen)
@@ -209,24 +209,24 @@ class ContourTracker:
 
 def _share_within(edge: Sequence[tuple[float, float]], contour: Contour) -> float:
     around = np.array(contour.pixels, np.float32)
-    some = edge[::max(1, len(edge) // SAMPLED)]  # each costs time in proportion to the points of the contour
+    some = edge[::max(1, len(edge) // SAMPLED)]  # the cost of each test is proportional to the contour's points
     return float(np.mean([cv2.pointPolygonTest(around, at, measureDist=True) > -NEAR for at in some]))
 
 
 def _same_kind(contour: Contour, known: Contour) -> bool:
-    """Whether both are outer edges or both lie within another, and what they hold may have one colour."""
+    """Return whether both are outer edges or both are nested, and their colors may be the same."""
     return (contour.parent < 0) == (known.parent < 0) and _hues_apart(contour.color, known.color) <= LARGEST_TURN
 
 
 def _hues_apart(a: Color, b: Color) -> float:
-    """How far two colours are from each other around the circle of hues, 0 to 0.5; 0 for what is grey."""
+    """Return the distance of two colors on the hue circle, 0 to 0.5; 0 for gray."""
     (hue_a, saturation_a, _), (hue_b, saturation_b, _) = (colorsys.rgb_to_hsv(c.r, c.g, c.b) for c in (a, b))
     turn = abs(hue_a - hue_b)
     return min(turn, 1 - turn) if min(saturation_a, saturation_b) >= COLOURFUL else 0.0
 
 
 def distance(contour: Contour, known: Contour) -> float:
-    """How far a contour is from one that is known [px]; infinite when it cannot be the same object."""
+    """Return the distance of two contours [px]; infinite if they cannot belong to the same object."""
     smaller, larger = sorted((contour.area + 1, known.area + 1))
     away = float(np.linalg.norm(np.mean(contour.pixels, axis=0) - np.mean(known.pixels, axis=0)))
     fits = _same_kind(contour, known) and larger <= LARGEST_CHANGE * smaller and away <= math.sqrt(larger)
@@ -235,11 +235,11 @@ def distance(contour: Contour, known: Contour) -> float:
 
 Picture = npt.NDArray[np.uint8]
 
-OBJECT, HOLE, BORDER, CHOSEN = (0, 140, 255), (255, 160, 0), (128, 128, 128), (255, 0, 255)  # bgr
+OBJECT, HOLE, BORDER, CHOSEN = (0, 140, 255), (255, 160, 0), (128, 128, 128), (255, 0, 255)  # BGR
 
 
 def annotate_contours(picture: Picture, contours: Sequence[Contour], selected: int = -1) -> Picture:
-    """A copy of the bgr8 picture with all contours and their labels; the selected one stands out."""
+    """Return a copy of the bgr8 image with all contours and labels; the selected one is highlighted."""
     shown = picture.copy()
     for contour in contours:
         color = HOLE if is_hole(contours, contour.index) else BORDER if contour.touches_border else OBJECT

@@ -18,31 +18,31 @@ from common.messages import Color
 
 Array = npt.NDArray[np.float64]
 
-RUN = 6  # points to each side with which a point of a noisy contour is smoothed out
-SHORTEST = 80  # contours with fewer points are left as they are
-NOISE = 0.05, 0.14  # [px] likewise those with less, and with more, which is detail; measured, see `smoothed`
-WHITE = 1.1  # times what each point does by itself, so much may be noise: what is more goes on as a wave does
-FITS = 1.7  # times the noise, so far from the points may be what is put through them: else there is some detail
+RUN = 6  # points to each side that smooth a point of a noisy contour
+SHORTEST = 80  # contours with fewer points are not smoothed
+NOISE = 0.05, 0.14  # [px] nor those with less noise, or more, which is detail; measured, see `smoothed`
+WHITE = 1.1  # largest ratio of noise to uncorrelated noise: correlated deviations are waves of the object
+FITS = 1.7  # largest distance of a fit from the points relative to the noise: beyond it there is detail
 
 
 def smoothed(points: Array) -> Array:
-    """The points of a closed contour (n, 2) [px] without the noise that moves each by itself.
+    """Return the points of a closed contour (n, 2) [px] without uncorrelated noise.
 
-    That is noise of the picture, and edges that were drawn from few samples for each pixel. It is how far the points of
-    most runs are off a parabola: 0.00 to 0.04 px in clean pictures, 0.06 to 0.10 px in those of OpenGL, 0.09 to 0.14 px
-    with noise of a fifteenth of the step, more than that where sides are shorter than a run, as those of gears. That of
-    fine waves and low teeth is as large, but a point tells where the next one is (`_by_itself`).
+    Noise comes from the image, and from edges rendered from few samples per pixel. It is measured as the distance of
+    most runs of points from a parabola: 0.00 to 0.04 px in clean images, 0.06 to 0.10 px in those of OpenGL, 0.09 to
+    0.14 px with noise of a fifteenth of the step, more where sides are shorter than a run, as on gears. Fine waves and
+    low teeth deviate as much, but their neighboring points are correlated (`_uncorrelated`).
 
-    Each point is taken to a parabola through its neighbours (Savitzky and Golay, "Smoothing and differentiation of data
-    by simplified least squares procedures", 1964); at a corner through those of one side, so that it stays sharp. Where
-    neither goes along the points as well as their noise allows, they stay where they are.
+    Each point moves to a parabola through its neighbors (Savitzky and Golay, "Smoothing and differentiation of data by
+    simplified least squares procedures", 1964); at a corner through those of one side, so that it stays sharp. Points
+    stay where neither fits within their noise.
     """
     if len(points) < SHORTEST:
         return points
-    found = [_parabolas(points, first) for first in (-RUN, -2 * RUN, 0)]  # about each point, before, and behind it
+    found = [_parabolas(points, first) for first in (-RUN, -2 * RUN, 0)]  # around each point, before it, and after it
     middle, before, behind = (off for _, off in found)
     noise = float(np.median(np.minimum(middle, np.minimum(before, behind))))
-    if not NOISE[0] <= noise <= min(NOISE[1], WHITE * _by_itself(points)):
+    if not NOISE[0] <= noise <= min(NOISE[1], WHITE * _uncorrelated(points)):
         return points
     which = np.where(middle <= FITS * noise, 0, np.where(before < behind, 1, 2))
     even = np.choose(which[:, None], [on for on, _ in found])
@@ -51,9 +51,9 @@ def smoothed(points: Array) -> Array:
 
 
 def _parabolas(points: Array, first: int) -> tuple[Array, Array]:
-    """Where a parabola through a run of points has each of them (n, 2) [px], and how far off the run it is (n,) [px].
+    """Return the points (n, 2) on parabolas fitted to runs [px], and the RMS deviation of each run (n,) [px].
 
-    The run of a point begins with the one that comes `first` after it, or before it.
+    `first` is the offset of a run's first point from its point.
     """
     steps = np.arange(first, first + 2 * RUN + 1)
     powers, solve = _fit(first)
@@ -61,39 +61,39 @@ def _parabolas(points: Array, first: int) -> tuple[Array, Array]:
     terms = np.tensordot(solve, runs, axes=1)  # (3, n, 2)
     off = np.tensordot(powers, terms, axes=1) - runs
     along = terms[1] / np.maximum(np.linalg.norm(terms[1], axis=1, keepdims=True), 1e-9)
-    across = off[..., 0] * along[:, 1] - off[..., 1] * along[:, 0]  # the step from pixel to pixel is no noise
+    across = off[..., 0] * along[:, 1] - off[..., 1] * along[:, 0]  # deviation along the contour is no noise
     return terms[0], np.sqrt((across**2).mean(axis=0))
 
 
-def _by_itself(points: Array) -> float:
-    """How far points are moved each by itself, across the contour [px], as their fourth differences tell.
+def _uncorrelated(points: Array) -> float:
+    """Return the uncorrelated noise across the contour [px], from fourth differences.
 
-    Those of what is smooth are next to nothing, those of independent errors of variance 1 have 1 + 16 + 36 + 16 + 1.
+    They vanish for a smooth contour; independent errors of variance 1 give a variance of 1 + 16 + 36 + 16 + 1.
     """
     about = {k: np.roll(points, -k, axis=0) for k in range(-3, 4)}
     along = about[3] - about[-3]
     along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
     change = about[-2] - 4 * about[-1] + 6 * points - 4 * about[1] + about[2]
     across = change[:, 0] * along[:, 1] - change[:, 1] * along[:, 0]
-    return float(np.median(np.abs(across))) / (0.6745 * math.sqrt(70))  # of what is normal, half is within 0.6745
+    return float(np.median(np.abs(across))) / (0.6745 * math.sqrt(70))  # median of a normal distribution: 0.6745
 
 
 @lru_cache
 def _fit(first: int) -> tuple[Array, Array]:
-    """Powers (m, 3) of the steps of a run, and what fits a parabola to its points (3, m)."""
+    """Return powers (m, 3) of a run's steps, and the matrix (3, m) that fits a parabola to its points."""
     powers = np.vander(np.arange(first, first + 2 * RUN + 1, dtype=float), 3, increasing=True)
     return powers, np.linalg.pinv(powers)
 
 
-REACH = 3.0  # the channel is looked at so far to both sides of a contour [px]
+REACH = 3.0  # range of the channel's profile to both sides of a contour [px]
 STEP = 0.25  # [px]
-LEVELS = 2.0  # from here on outwards it is that of the object, or of what is beside it [px]
+LEVELS = 2.0  # distance from the contour at which the profile has the level of the object, or of its surroundings [px]
 LEAST_CONTRAST = 20.0  # [0..255]
-NEIGHBOURS = 2  # points to each side from which the direction of the edge is found
+NEIGHBOURS = 2  # points to each side for the direction of the edge
 
 
 def normals(points: npt.ArrayLike, *, hole: bool) -> Array:
-    """Unit vectors (n, 2) out of the object at each point of a closed contour (n, 2); zero where there is none."""
+    """Return outward unit vectors (n, 2) at each point of a closed contour (n, 2); zero where undefined."""
     p = np.asarray(points, dtype=float)
     tangent = sum(np.roll(p, -k, axis=0) - np.roll(p, k, axis=0) for k in range(1, NEIGHBOURS + 1))
     length = np.linalg.norm(tangent, axis=1, keepdims=True)
@@ -104,11 +104,11 @@ def normals(points: npt.ArrayLike, *, hole: bool) -> Array:
 
 
 def refine(channel: npt.NDArray[np.uint8], chain: npt.NDArray[np.int32], *, hole: bool) -> Array:
-    """The points of a closed contour (n, 2) [px], each moved across the edge to where the edge really is.
+    """Return the points of a closed contour (n, 2) [px], moved across the edge to sub-pixel accuracy.
 
-    A pixel has the mean of what it sees. The step from inside to outside, summed up along a line across it, then
-    tells where on that line a straight edge lies, whatever its direction. Where there is no clear step (another object
-    is too near) a point stays in the middle between the last pixel inside and the first one outside.
+    A pixel is the mean of what it sees. The integral of the profile across the edge gives the position of a straight
+    edge, whatever its direction. Without a clear step (another object is too close) a point stays halfway between the
+    last pixel inside and the first one outside.
     """
     out = normals(chain, hole=hole)
     along = np.arange(-REACH, REACH + STEP / 2, STEP)
@@ -125,9 +125,9 @@ def refine(channel: npt.NDArray[np.uint8], chain: npt.NDArray[np.int32], *, hole
 
 
 def _sample(channel: npt.NDArray[np.uint8], at: Array) -> Array:
-    """Values (n, m) between the pixels at places (n, m, 2) [px]; beyond the border those of the border."""
+    """Return interpolated values (n, m) at positions (n, m, 2) [px]; the border is replicated."""
     places = at.astype(np.float32)
-    rows = 32000  # cv2.remap takes no more
+    rows = 32000  # limit of cv2.remap
     parts = [
         cv2.remap(channel.astype(np.float32), part[..., 0], part[..., 1], cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE)
         for part in np.array_split(places, max(1, -(-len(places) // rows)))
@@ -137,7 +137,7 @@ def _sample(channel: npt.NDArray[np.uint8], at: Array) -> Array:
 
 Picture = npt.NDArray[np.uint8]
 Channel = Literal["saturation", "maximum", "grey"]
-MOST, MAX_POINTS, MOST_ALONG_ONE = 1000, 100_000, 65_536  # contours and points that a message has room for
+MOST, MAX_POINTS, MOST_ALONG_ONE = 1000, 100_000, 65_536  # limits of a message: contours, points of all, points of one
 
 
 class ContourOptions(Parameters):
@@ -156,11 +156,11 @@ class ContourOptions(Parameters):
 
 
 def channel_of(picture: Picture, channel: Channel) -> Picture:
-    """One value for each pixel of a bgr8 picture, (height, width).
+    """Return one value for each pixel of a bgr8 image, (height, width).
 
-    Saturation is the difference of the largest and the smallest colour. (The S of HSV is its ratio to the largest: a
-    pixel at the edge of black that is a tenth yellow would count as wholly yellow.) Like the others it grows evenly
-    with the part of a pixel that something covers.
+    Saturation is the difference of the largest and the smallest color. (The S of HSV is its ratio to the largest: a
+    pixel at the edge of black that is a tenth yellow would count as fully yellow.) Like the others it is proportional
+    to the covered fraction of a pixel.
     """
     if channel == "grey":
         return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY), np.uint8)
@@ -172,10 +172,10 @@ def channel_of(picture: Picture, channel: Channel) -> Picture:
 
 
 def find_contours(picture: Picture, options: ContourOptions) -> list[Contour]:
-    """All contours of a bgr8 picture, outer edges and edges of holes, with their hierarchy.
+    """Return all contours of a bgr8 image, outer edges and edges of holes, with their hierarchy.
 
-    Of more than a message has room for, as of a picture full of noise, the largest.
-    Without sub-pixel refinement the pixels are those of the object that lie along the edge, as the seed has them.
+    A message holds a limited number; of a noisy image it gets the largest contours. Without sub-pixel refinement the
+    points are the object's pixels along the edge, as in the original system.
     """
     channel = channel_of(picture, options.channel)
     above = (channel > options.threshold).astype(np.uint8)
@@ -184,12 +184,12 @@ def find_contours(picture: Picture, options: ContourOptions) -> list[Contour]:
         return []
     parents = [int(parent) for parent in hierarchy[0, :, 3]]
     areas = [float(cv2.contourArea(chain)) for chain in chains]
-    kept = _with_room([i for i, area in enumerate(areas) if area >= options.min_area],
+    selected = _with_room([i for i, area in enumerate(areas) if area >= options.min_area],
                       [len(chain) for chain in chains], areas, parents)
-    index_of = {-1: -1} | {old: new for new, old in enumerate(kept)}
+    index_of = {-1: -1} | {old: new for new, old in enumerate(selected)}
     height, width = above.shape
     found = []
-    for index, old in enumerate(kept):
+    for index, old in enumerate(selected):
         chain = np.asarray(chains[old].reshape(-1, 2), np.int32)
         hole = _is_hole(parents, old)
         points = refine(channel, chain, hole=hole) if options.subpixel else chain.astype(float)
@@ -205,19 +205,19 @@ def find_contours(picture: Picture, options: ContourOptions) -> list[Contour]:
 def _with_room(
     wanted: Sequence[int], lengths: Sequence[int], areas: Sequence[float], parents: Sequence[int]
 ) -> list[int]:
-    """Those of the contours that a message has room for, the largest first: none without the one around it."""
-    kept, points = set[int](), 0
-    for index in sorted(wanted, key=lambda i: -areas[i]):  # a thin ring is before its hole, which is as large
+    """Return the largest contours that fit into a message; a contour needs the one around it."""
+    selected, points = set[int](), 0
+    for index in sorted(wanted, key=lambda i: -areas[i]):  # a thin ring comes before its hole of the same area
         size = lengths[index]
-        inside = parents[index] in kept or parents[index] < 0
-        if inside and size <= MOST_ALONG_ONE and points + size <= MAX_POINTS and len(kept) < MOST:
-            kept.add(index)
+        inside = parents[index] in selected or parents[index] < 0
+        if inside and size <= MOST_ALONG_ONE and points + size <= MAX_POINTS and len(selected) < MOST:
+            selected.add(index)
             points += size
-    return sorted(kept)
+    return sorted(selected)
 
 
 def is_hole(contours: Sequence[Contour], index: int) -> bool:
-    """Whether a contour is the edge of a hole in an object: it lies within an odd number of others."""
+    """Return whether a contour is the edge of a hole: it lies within an odd number of others."""
     return _is_hole([c.parent for c in contours], index)
 
 
@@ -229,7 +229,7 @@ def _is_hole(parents: Sequence[int], index: int) -> bool:
 
 
 def _inside(picture: Picture, above: Picture, chain: npt.NDArray[np.int32], *, hole: bool) -> Color:
-    """The mean colour of what a contour holds: the object without its holes, or what is seen through a hole."""
+    """Return the mean color inside a contour: of the object without its holes, or of what a hole shows."""
     left, top, width, height = cv2.boundingRect(chain)
     mask = np.zeros((height, width), np.uint8)
     cv2.fillPoly(mask, [(chain - (left, top)).astype(np.int32)], 1)

@@ -1,4 +1,4 @@
-"""A double of perception, for simulations: says what stands there and its outline, and needs no picture."""
+"""Replacement of the perception in simulations: reports solids and the first outline, without images."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ WORLD = "world"
 
 
 class Config(Parameters):
-    """How often is looked, and how much is told."""
+    """How often the scene is published, and in how much detail."""
 
     robot: RobotConfig
     world: Surroundings
@@ -28,12 +28,12 @@ class Config(Parameters):
 
 
 def perceived(index: int, thing: WorldObject) -> PerceivedSolid:
-    """A solid that stands upright, as it would be perceived."""
+    """Return an upright object as it would be perceived."""
     return PerceivedSolid(index, thing.id, np.array(thing.outline), thing.base, thing.height, thing.color, False)
 
 
 def path(solid: PerceivedSolid, points: int, header: Header) -> OutlinePoints:
-    """The outline of its top face in so many points at most."""
+    """Return the outline of its top face with at most this number of points."""
     step = max(1, len(solid.outline) // points)
     top = solid.base + solid.height
     poses = [Pose(position=Vector3(x=x, y=y, z=top)) for x, y in solid.outline[::step].tolist()]
@@ -41,7 +41,7 @@ def path(solid: PerceivedSolid, points: int, header: Header) -> OutlinePoints:
 
 
 async def run(bus: Bus, config: Config) -> None:
-    """While the arm is at home, tell of all that stands there, and of the first one's outline."""
+    """Publish all solids and the outline of the first one while the arm is at home."""
     truth, joints = bus.reader(topics.SCENE_OBJECTS), bus.reader(topics.JOINT_STATES)
     paths, out = bus.writer(CONTOUR_PATH), SceneWriter(bus)
     home = HomeMonitor(config.robot.named_poses["home"])

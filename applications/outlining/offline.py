@@ -1,4 +1,4 @@
-"""The stages of outlining without a cell: from a picture and its depth to planned motions."""
+"""Compute the stages of outlining without a cell: from image and depth to planned motions."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ Picture = NDArray[np.uint8]
 
 
 class OutlineError(ZencellError):
-    """An outline that cannot be found or traced; ends a command with exit code 1."""
+    """The outline cannot be found or traced; ends a command with exit code 1."""
 
     exit_code = 1
 
 
 @dataclass(frozen=True, eq=False)
 class Perceived:
-    """What the stages of perception found: the chosen contour (n, 2) [px], and points (n, 3) [m] in world."""
+    """Results of perception: the selected contour (n, 2) [px], and points (n, 3) [m] in world."""
 
     label: str
     contours: list[Contour]
@@ -47,20 +47,20 @@ def perceive(
     picture: Picture, depth: Depth, camera: Pinhole, wanted: OutlineSelect,
     contour_options: ContourOptions, face_options: TopFaceOptions, tolerance: float,
 ) -> Perceived:
-    """Contours, the chosen one, its points in world, and those without duplicates.
+    """Find contours, the selected one, its points in world, and those without duplicates.
 
     Args:
         picture: bgr8 (height, width, 3).
         depth: (height, width) [m].
         camera: that took both.
         wanted: which contour.
-        contour_options: of the first stage.
-        face_options: of the second.
-        tolerance: of the third [m].
+        contour_options: parameters of the first stage.
+        face_options: parameters of the second stage.
+        tolerance: of the third stage [m].
 
     Raises:
-        OutlineError: no contour fits the choice.
-        DepthError: the depth does not tell where the object is.
+        OutlineError: no contour fits the request.
+        DepthError: the depth does not show where the object is.
     """
     check_depth(depth, picture.shape[1], picture.shape[0])
     contours = find_contours(picture, contour_options)
@@ -80,18 +80,18 @@ def perceive(
 def plan_outline(
     pipeline: PlanningPipeline, legs: MotionSegments, points: Array, label: str, scene: m.PlanningScene, *, given: bool
 ) -> list[tuple[Move, m.PlanResponse]]:
-    """All motions of outlining points (n, 3) [m], from home to home, each planned from the end of the one before.
+    """Plan all motions that trace points (n, 3) [m], from home to home, each from the end of the one before.
 
     Args:
-        pipeline: plans.
-        legs: makes the motions.
+        pipeline: planning pipeline.
+        legs: creates the motions.
         points: of the outline, not closed.
         label: of the object.
-        scene: what is avoided.
-        given: the points need not go round anything in the scene.
+        scene: planning scene.
+        given: the points need not surround an object of the scene.
 
     Raises:
-        OutlineError: the first motion that cannot be planned says why.
+        OutlineError: a motion has no plan; gives the reason.
     """
     poses = [m.Pose(position=m.Vector3(x=x, y=y, z=z)) for x, y, z in points.tolist()]
     path = OutlinePoints(header=scene.header, poses=poses, object=label, given=given)

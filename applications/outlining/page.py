@@ -1,4 +1,4 @@
-"""Outlining on the operator's page: its words, the objects to choose from, as buttons and in the scene, the outline."""
+"""Outlining on the operator's page: objects to select, as buttons and in the scene, and the outline."""
 
 from __future__ import annotations
 
@@ -41,17 +41,17 @@ LARGEST = "Largest"
 OUTLINE = (255, 140, 40)
 CHOSEN = (255, 255, 255)
 _ENDED = ("IDLE", "DONE", "ERROR")
-_PATH_TIMEOUT = 5.0  # [s] wall: from choosing an object until its path is known
-_LIFTED = 0.002  # [m] lines lie this far above the faces, so as to be seen
+_PATH_TIMEOUT = 5.0  # [s] wall time from the selection of an object until its path is known
+_LIFTED = 0.002  # [m] height of lines above the faces, to stay visible
 _POINTS = 200  # of a contour
-_MOST = 100  # contours, the largest: to draw as many as noise has would keep the page from whoever presses STOP
-_PIN = 0.006  # radius of what is clicked [m]
+_MOST = 100  # largest contours that are drawn; drawing noise would block the page and its STOP button
+_PIN = 0.006  # radius of a clickable pin [m]
 
-_newest: WeakKeyDictionary[Console, OutlineSelection] = WeakKeyDictionary()  # what was chosen last on a page
+_newest: WeakKeyDictionary[Console, OutlineSelection] = WeakKeyDictionary()  # last selection of each page
 
 
 def counters(status: TaskStatus, rejected: int) -> dict[str, object]:
-    """The figures of the task by their names."""
+    """Figures of the task by label."""
     if not isinstance(status, OutlineStatus):
         return {}
     return {"points": status.points, "outline [mm]": f"{1e3 * status.length_m:.0f}",
@@ -59,55 +59,55 @@ def counters(status: TaskStatus, rejected: int) -> dict[str, object]:
 
 
 def progress(status: TaskStatus, motion: MotionStatus | None) -> float:
-    """How far the motion under way is."""
+    """Progress of the running motion."""
     return motion.progress if motion is not None and motion.state == "active" else 0.0
 
 
 def choice_of(contour: Contour) -> OutlineSelect:
-    """The choice of what is seen here, however later pictures count."""
+    """Return a selection by position, independent of the numbering in later images."""
     return OutlineSelect(rule="index", index=contour.index, at=middle_of(contour))
 
 
 async def choose(console: Console, choice: OutlineSelect) -> None:
-    """Have an object outlined: it is chosen, and the task starts once its path is known. Tells which it is.
+    """Select an object and start the task once its path is known; report which object it is.
 
-    Whoever stops or holds the arm until then has the last word, and of several choices the last one counts.
+    A stop or hold in the meantime prevents the start; of several selections the last one counts.
     """
-    console.tell("")
-    acknowledged, stops = console.acknowledged, console.stops
-    chosen = _newest[console] = await console.ask(OUTLINE_SELECT, choice)
+    console.notify("")
+    acknowledged, stops = console.acknowledged, console.stop_count
+    chosen = _newest[console] = await console.call(OUTLINE_SELECT, choice)
     status = console.latest(OUTLINE_STATUS)
-    if status is not None and (not status.started or status.state in _ENDED):  # else it traces what is chosen by itself
+    if status is not None and (not status.started or status.state in _ENDED):  # else it starts by itself
         try:
             async with asyncio.timeout(_PATH_TIMEOUT):
                 while (path := console.latest(CONTOUR_PATH)) is None or path.object != chosen.label:  # noqa: ASYNC110
-                    await asyncio.sleep(0.02)  # others read the messages themselves
+                    await asyncio.sleep(0.02)  # other tasks read the messages
         except TimeoutError:
-            pass  # the task tells what is wrong with the object
-        if _newest[console] is not chosen:  # that one starts the task, if anything
+            pass  # the task reports what is wrong with the object
+        if _newest[console] is not chosen:  # the newer selection starts the task
             return
-        if console.stops > stops or (console.acknowledged or 0) > (acknowledged or 0):
-            console.tell(f"{chosen.label} is chosen, but not traced: the arm was stopped or held meanwhile", "busy")
+        if console.stop_count > stops or (console.acknowledged or 0) > (acknowledged or 0):
+            console.notify(f"{chosen.label} is chosen, but not traced: the arm was stopped or held meanwhile", "busy")
             return
         await console.command("start", acknowledged=acknowledged)
-    console.tell(f"{chosen.label} is chosen", "good")
+    console.notify(f"{chosen.label} is chosen", "good")
 
 
 class Controls:
-    """A button for each object of the picture, the chosen one marked."""
+    """A button for each object of the image; the selected one is marked."""
 
     TOPICS = (CONTOURS,)
     PERIOD = 0.5  # [s]
 
     def __init__(self, gui: viser.GuiApi, console: Console) -> None:
-        """Lay the buttons out where the GUI stands."""
+        """Create the buttons at the current position in the GUI."""
         self._console = console
         self._offered: dict[str, Contour] = {}
         self._buttons = gui.add_button_group("Outline", (LARGEST,), hint="choose an object: it is traced")
         console.on_choice(self._buttons, self._choose)
 
     def show(self, topic: Topic[Any], message: Any) -> None:
-        """Offer the objects of a picture."""
+        """Update the buttons to the objects of an image."""
         self._offered = {contour.label: contour for contour in message.contours}
         marked = (f"{'● ' if c.index == message.selected else ''}{c.label}" for c in message.contours)
         options = (*marked, LARGEST)
@@ -120,14 +120,14 @@ class Controls:
 
 
 class Outline(Layer):
-    """The outline of the chosen object as a closed line."""
+    """The outline of the selected object as a closed line."""
 
     LABEL = "Outline"
     LEGEND = (("outline that is traced", OUTLINE),)
     TOPICS = (CONTOUR_PATH,)
 
     def build(self) -> None:
-        """Start without one."""
+        """Start without an outline."""
         self.node: viser.LineSegmentsHandle | None = None
         self._points: Array = np.empty((0, 3))
 
@@ -141,12 +141,12 @@ class Outline(Layer):
             self.node.remove()
             self.node = None
         if len(points) > 1:
-            above = points + np.array([0.0, 0.0, 2 * _LIFTED])  # the line of its contour, too
+            above = points + np.array([0.0, 0.0, 2 * _LIFTED])  # above the line of its contour
             self.node = add_line(self.scene, f"{self.root}/line", above, OUTLINE, 4.0, closed=True)
 
 
 class ContourChoice(Layer):
-    """The contours of the picture, laid on what they are the contours of, each with a pin to click and its label."""
+    """The contours of the image on the objects, each with a clickable pin and its label."""
 
     NAME = "contours"
     LABEL = "Contours to choose from"
@@ -155,18 +155,18 @@ class ContourChoice(Layer):
     PERIOD = 0.5
 
     def build(self) -> None:
-        """Start without any."""
+        """Start without contours."""
         self._shown: object = None
         self.nodes: list[viser.LineSegmentsHandle | viser.LabelHandle | viser.IcosphereHandle] = []
 
     def show(self, topic: Topic[Any], message: Any) -> None:
-        """Show the newest contours, as their camera sees them, on the objects that have their labels."""
+        """Show the newest contours on the objects with their labels, as their camera sees them."""
         m, info = self.stage.latest(CONTOURS), self.stage.latest(topics.DEPTH_CAMERA_INFO)
         if m is None or info is None:
             return
         try:
             camera = Pinhole.from_info(info, self.stage.transforms.pose(info.header.frame_id))
-        except CameraError:  # a distorted camera: pixels are not where a pinhole would see them
+        except CameraError:  # distorted camera: its pixels do not fit the pinhole model
             return
         scene = self.stage.latest(topics.PLANNING_SCENE)
         tops = {thing.id: _top(thing) for thing in scene.objects} if scene else {}
@@ -206,7 +206,7 @@ class ContourChoice(Layer):
         self.nodes += [line, pin, label]
 
     def _support(self, contour: Contour, camera: Pinhole) -> float:
-        """Height [m] of the highest flat fixture that the contour lies on, else of the table."""
+        """Height [m] of the highest flat fixture below the contour, else of the table."""
         middle = np.array(contour.pixels).mean(axis=0)
         fixtures = self.stage.around.fixtures
         for height, fixture in sorted(((fixture_top(f), f) for f in fixtures), key=lambda pair: -pair[0]):
@@ -243,5 +243,5 @@ PAGE = ApplicationPage(
     layers=(Outline, ContourChoice), controls=Controls, requests=(OUTLINE_SELECT,),
     states={"SELECTING": "Waiting for a choice", "PLANNING": "Planning", "APPROACHING": "Approaching",
             "TRACING": "Tracing", "RETREATING": "Retreating"},
-    latency="Picture to path", counters=counters, progress=progress,
+    latency="Image to path", counters=counters, progress=progress,
 )

@@ -22,26 +22,26 @@ Array = NDArray[np.float64]
 
 BEFORE = ("IDLE", "SELECTING", "PLANNING")
 UNDER_WAY = ("APPROACHING", "TRACING", "RETREATING")
-CLOSED = 1e-3  # [m] first and last place of a closed outline are no farther apart, but for what lies between two looks
-UNHEARD = 2.0  # [s] at begin and end in which the tool may have gone on without a joint state being heard
-MOST_STATES = 100_000  # joint states of one tracing that are kept: a quarter of an hour at 100 Hz
+CLOSED = 1e-3  # [m] distance of first and last point of a closed outline, besides the motion between two joint states
+MAX_GAP = 2.0  # [s] at start and end without joint states, in which the tool may have moved on
+MOST_STATES = 100_000  # joint states of one outline: a quarter of an hour at 100 Hz
 
 
 class OutlineFigures(application.Figures):
-    """The block "outline" of a summary, and what a report shows of the outline."""
+    """Block "outline" of a summary, and the section of a report."""
 
     STATE_COLORS: ClassVar = {
         "SELECTING": "#e6c229", "PLANNING": "#e6c229", "APPROACHING": "#2f7ed8", "TRACING": "#17a398",
         "RETREATING": "#8d6cc2", "HOMING": "#8d6cc2",
     }
 
-    def __init__(self, robot: RobotConfig | None = None, *, pictured: bool = False) -> None:
-        """Start with nothing heard; without a robot only what the task itself tells is known."""
-        super().__init__(robot, pictured=pictured)
+    def __init__(self, robot: RobotConfig | None = None, *, for_report: bool = False) -> None:
+        """Start without data; without a robot only the task's own figures are known."""
+        super().__init__(robot, for_report=for_report)
         self.traced = TraceEvaluation(robot)
 
     def listeners(self) -> dict[Topic[Any], Callable[[float, Any], None]]:
-        """The task, the contour, the arm and the truth."""
+        """Return listeners for task, contour, joints and ground truth."""
         traced = self.traced
         return {
             OUTLINE_STATUS: lambda _, status: traced.on_status(status),
@@ -51,20 +51,20 @@ class OutlineFigures(application.Figures):
         }
 
     def exposed(self, message: OutlinePoints) -> int:
-        """Stamp of the picture in which a contour was found; what was given by a file is in none."""
+        """Return the stamp of the image of a contour; 0 for coordinates from a file."""
         return 0 if message.given else message.header.stamp
 
     def blocks(self) -> dict[str, Any]:
-        """How much of what was traced, and how exactly."""
+        """Return the traced fraction and the accuracy."""
         return {"outline": self.traced.figures()}
 
     def progress(self, status: TaskStatus) -> str:
-        """As "TRACING Object_1, 0.400 m"."""
+        """Return a line such as "TRACING Object_1, 0.400 m"."""
         assert isinstance(status, OutlineStatus)
         return f"{status.state} {status.object}, {status.length_m:.3f} m" if status.object else status.state
 
     def headline(self, summary: Mapping[str, Any]) -> str:
-        """What was traced and how exactly."""
+        """Return what was traced and how accurately."""
         outline = summary["outline"]
         if not outline["object"]:
             return "nothing outlined"
@@ -75,7 +75,7 @@ class OutlineFigures(application.Figures):
         return text
 
     def facts(self, summary: Mapping[str, Any]) -> list[tuple[str, str]]:
-        """The same, each by its name."""
+        """Return the same as labeled values."""
         outline = summary["outline"]
         traced = f"{outline['fraction']:.1%} of {outline['length_m']:.3f} m"
         facts = [("outlined", outline["object"] or "nothing"), ("traced", traced)]
@@ -85,7 +85,7 @@ class OutlineFigures(application.Figures):
         return facts
 
     def picture(self, run: RunHistory, tool: Array) -> application.Section:
-        """The contour that was detected and the way that the tool tip took along it, from above."""
+        """Return a top view of the detected contour and the motion of the tool tip along it."""
         return application.Section("outline", "Outline", (
             f"{self.traced.picture()}<p>{self.traced.figures()['points']} points of the contour; the true edge is "
             "shown for comparison only.</p>"
@@ -93,52 +93,55 @@ class OutlineFigures(application.Figures):
 
 
 class TraceEvaluation:
-    """Follows one cell that outlines objects; tells of the newest outline."""
+    """Evaluates the newest outline of a cell: motion of the tool tip against contour and ground truth.
+
+    The ground truth is used for this evaluation only.
+    """
 
     def __init__(self, robot: RobotConfig | None) -> None:
-        """Start with nothing seen.
+        """Start without data.
 
         Args:
-            robot: whose tool tip traces; None when that is not known.
+            robot: whose tool tip traces; None if unknown.
         """
         self._robot = robot
         self._status = OutlineStatus()
         self._path: OutlinePoints | None = None
-        self._truth: WorldObjects | None = None  # when the arm began to approach
+        self._truth: WorldObjects | None = None  # when the arm started to approach
         self._newest_truth: WorldObjects | None = None
         self._states: list[JointState] = []
-        self._began: int | None = None  # stamps [ns] of the statuses between which the outline was traced
+        self._began: int | None = None  # stamps of the statuses between which the outline was traced [ns]
         self._ended: int | None = None
 
     def on_status(self, status: OutlineStatus) -> None:
-        """Take note of how far the task is."""
+        """Record the state of the task."""
         before, self._status = self._status.state, status
         if status.state == before:
             return
         if status.state == "APPROACHING":
             self._states, self._began, self._ended = [], None, None
-            self._truth = self._newest_truth  # a person may move what was traced
+            self._truth = self._newest_truth  # the operator may move the object later
         elif status.state == "TRACING":
             self._began = status.header.stamp
         elif before == "TRACING":
             self._ended = status.header.stamp
 
     def on_path(self, path: OutlinePoints) -> None:
-        """Take note of the contour; once the arm moves it may hide a part of it."""
+        """Record the contour; once the arm moves it may occlude a part of it."""
         if path.poses and self._status.state in BEFORE:
             self._path = path
 
     def on_truth(self, truth: WorldObjects) -> None:
-        """Take note of where everything really is."""
+        """Record the ground truth."""
         self._newest_truth = truth
 
     def on_joints(self, state: JointState) -> None:
-        """Take note of where the joints are. Statuses and joint states overtake each other: their stamps decide."""
+        """Record joint states. They arrive out of order with the statuses; their stamps decide later."""
         if self._status.state in UNDER_WAY and len(self._states) < MOST_STATES:
             self._states.append(state)
 
     def figures(self) -> dict[str, Any]:
-        """The block "outline" of a summary; without deviations where nothing was traced or no truth is known."""
+        """Return the block "outline" of a summary; deviations are None without a trace or a ground truth."""
         times, tips = self._tips()
         tips[:, 2] -= self._status.standoff
         path, outlines = self._path_points(), self._outlines()
@@ -154,7 +157,7 @@ class TraceEvaluation:
         }
 
     def picture(self) -> str:
-        """The contour, the true edges and the way of the tool tip from above, as an `svg` element."""
+        """Return an `svg` element with contour, true edges and motion of the tool tip from above."""
         import matplotlib as mpl
         from matplotlib.figure import Figure
 
@@ -180,18 +183,18 @@ class TraceEvaluation:
             return svg(figure, "outline")
 
     def _fraction(self, tips: Array) -> float:
-        """How much of the contour was traced; what the status tells is how much of it was planned."""
+        """Return the traced fraction of the contour; the status has the planned fraction."""
         if self._status.closed or not self._status.length_m or self._robot is None:
             return self._status.fraction
         way = float(np.linalg.norm(np.diff(tips, axis=0), axis=1).sum()) if len(tips) > 1 else 0.0
         return min(self._status.fraction, way / self._status.length_m)
 
     def _tips(self) -> tuple[Array, Array]:
-        """Times (N + 2,) [s] and places (N, 3) [m] of the tool tip while it traced; the outer times: begin and end."""
+        """Return times (N + 2,) [s] and positions (N, 3) [m] of the tool tip; the outer times are start and end."""
         began, ended = self._began, self._ended
         if began is None or self._robot is None:
             return np.zeros(2), np.zeros((0, 3))
-        from common.robot.model import RobotModel  # takes as long to load as all else: only when it is needed
+        from common.robot.model import RobotModel  # slow import, only when needed
 
         robot = RobotModel.load(self._robot)
         stamps, tips = [], []
@@ -208,7 +211,7 @@ class TraceEvaluation:
         return np.array([(p.position.x, p.position.y, p.position.z) for p in poses]).reshape(-1, 3)
 
     def _outlines(self) -> list[Array]:
-        """Edges (n, 3) [m] of the true top faces, outer and inner."""
+        """Return the edges (n, 3) [m] of the true top faces, outer and inner."""
         truth = self._truth or self._newest_truth
         objects = truth.objects if truth else []
         edges: list[tuple[Sequence[tuple[float, float]], float]] = []
@@ -218,22 +221,22 @@ class TraceEvaluation:
 
 
 def _is_closed(tips: Array, times: Array) -> bool:
-    """Whether the first and the last place (N, 3) are the same, as well as joint states that come now and then show.
+    """Return whether the first and the last position (N, 3) are equal, within what the joint states can show.
 
-    Between the begin and the first of them, and between the last and the end, the tool may have gone on at the fastest
-    that was seen, for UNHEARD at most; `times` (N + 2,) [s] are those of the places, and outside them begin and end.
+    Between the start and the first joint state, and between the last one and the end, the tool may have moved at its
+    highest observed speed, for MAX_GAP at most. `times` (N + 2,) [s]: start, those of the positions, end.
     """
     if len(tips) < 2:
         return False
     steps = np.linalg.norm(np.diff(tips, axis=0), axis=1)
     gaps = np.diff(times)
     speed = float((steps / np.maximum(gaps[1:-1], 1e-3)).max())
-    unseen = float(steps.max()) + speed * min(float(gaps[0] + gaps[-1]), UNHEARD)
+    unseen = float(steps.max()) + speed * min(float(gaps[0] + gaps[-1]), MAX_GAP)
     return float(np.linalg.norm(tips[0] - tips[-1])) <= CLOSED + unseen
 
 
 def distances(places: Array, corners: Array) -> Array:
-    """Distance (N,) [m] of places (N, 3) from the closed polyline through corners (M, 3)."""
+    """Return the distances (N,) [m] of positions (N, 3) from the closed polyline through corners (M, 3)."""
     edges = np.roll(corners, -1, axis=0) - corners
     squares = np.maximum((edges**2).sum(axis=1), 1e-18)
     nearest = np.empty(len(places))
@@ -254,7 +257,7 @@ COLOR = Color(r=0.1, g=0.9, b=0.3)
 
 
 def of_outline(message: OutlinePoints) -> dict[str, Any]:
-    """An outline as a closed line."""
+    """Convert an outline to a closed line."""
     points = [(pose.position.x, pose.position.y, pose.position.z) for pose in message.poses]
     lines, stamp = [closed_line(points, COLOR)] if points else [], message.header.stamp
     return update(stamp, [entity(message.object or "outline", message.header.frame_id, stamp, lines=lines)])

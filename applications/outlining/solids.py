@@ -21,25 +21,25 @@ from common.scene.fixtures import fixture_objects
 
 Array = npt.NDArray[np.float64]
 
-SAME = 1e-9  # points nearer than this are one [m]
+SAME = 1e-9  # points closer than this are equal [m]
 
 
 def without_duplicates(points: npt.ArrayLike) -> Array:
-    """Points (n, d) [m] of a closed outline without those that equal the one before, or at the end the first one."""
+    """Return points (n, d) [m] of a closed outline without consecutive duplicates, also across its end."""
     p = np.asarray(points, dtype=float)
     if len(p) < 2:
         return p
-    kept = p[np.concatenate([[True], np.linalg.norm(np.diff(p, axis=0), axis=1) > SAME])]
-    if len(kept) > 1 and np.linalg.norm(kept[-1] - kept[0]) <= SAME:
-        kept = kept[:-1]
-    return np.asarray(kept)
+    distinct = p[np.concatenate([[True], np.linalg.norm(np.diff(p, axis=0), axis=1) > SAME])]
+    if len(distinct) > 1 and np.linalg.norm(distinct[-1] - distinct[0]) <= SAME:
+        distinct = distinct[:-1]
+    return np.asarray(distinct)
 
 
 def simplified(points: npt.ArrayLike, tolerance: float) -> Array:
-    """Those of the points (n, d) [m] of a closed outline without which it would move by more than the tolerance [m].
+    """Return the points (n, d) [m] of a closed outline needed to keep it within the tolerance [m].
 
-    Douglas and Peucker, "Algorithms for the reduction of the number of points" (1973), begun at the first point and the
-    one that is farthest from it. The first point stays the first.
+    Douglas and Peucker, "Algorithms for the reduction of the number of points" (1973), started with the first point and
+    the one farthest from it. The first point stays the first.
     """
     p = np.asarray(points, dtype=float)
     if len(p) < 4 or tolerance <= 0:
@@ -63,7 +63,7 @@ def simplified(points: npt.ArrayLike, tolerance: float) -> Array:
 
 
 def _distance(points: Array, a: Array, b: Array) -> Array:
-    """Distances (n,) of points from the line segment between a and b."""
+    """Return the distances (n,) of points from the line segment between a and b."""
     side = b - a
     along = np.clip((points - a) @ side / max(float(side @ side), SAME**2), 0.0, 1.0)
     return np.asarray(np.linalg.norm(points - (a + along[:, None] * side), axis=1))
@@ -73,7 +73,7 @@ def _distance(points: Array, a: Array, b: Array) -> Array:
 class PerceivedSolid:
     """A prism: `outline` (n, 2) [m] in world, from the height `base` upwards by `height` [m].
 
-    `index` is that of its contour. `touches_border` solids may go on outside of the picture.
+    `index` is that of its contour. A solid with `touches_border` may extend beyond the image.
     """
 
     index: int
@@ -88,14 +88,14 @@ class PerceivedSolid:
 def perceived_solids(
     contours: Sequence[Contour], depth: Depth, camera: Pinhole, *, floor: float = 0.0, tolerance: float = 0.001
 ) -> list[PerceivedSolid]:
-    """A solid for every object of the picture whose depth is known.
+    """Return a solid for every object of the image with known depth.
 
     Args:
-        contours: of the picture; holes are filled, which is on the safe side.
+        contours: of the image; holes are filled, which is the safe side.
         depth: image (height, width) [m].
         camera: that took both.
-        floor: height [m] down to which an object is thought to go when nothing around it is within the range.
-        tolerance: by which outlines are simplified [m].
+        floor: height [m] assumed below an object without anything lower within range around it.
+        tolerance: for simplified outlines [m].
     """
     solids = []
     for contour in contours:
@@ -103,7 +103,7 @@ def perceived_solids(
             continue
         try:
             face = top_face(contour.pixels, depth, camera, TopFaceOptions())
-        except DepthError:  # such as the ground: out of the camera's range, so out of the arm's way
+        except DepthError:  # such as the ground: out of the camera's range, so out of the arm's reach
             continue
         outline = simplified(without_duplicates(face.outline[:, :2]), tolerance)
         base = floor if face.base is None else face.base
@@ -114,15 +114,15 @@ def perceived_solids(
     return solids
 
 
-MOST_PICTURES = 20  # that the boxes about all contours of a picture cover together: to look into more takes minutes
-MOST, MOST_CORNERS, MOST_OF_ONE = 400, 5000, 2000  # solids and corners that a planning scene has room for
+MOST_PICTURES = 20  # image areas that the bounding boxes of all contours may cover together: more takes minutes
+MOST, MOST_CORNERS, MOST_OF_ONE = 400, 5000, 2000  # limits of a planning scene: solids, corners of all, corners of one
 
 
 def require_apart(contours: Contours) -> None:
-    """Return when contours lie so much beside one another in their picture as those of things do.
+    """Return if the contours overlap no more than those of real objects.
 
     Raises:
-        FrameError: they do not.
+        FrameError: they overlap more.
     """
     covered = 0.0
     for contour in contours.contours:
@@ -133,11 +133,10 @@ def require_apart(contours: Contours) -> None:
 
 
 def planning_scene(around: Surroundings, solids: Sequence[PerceivedSolid], stamp: int) -> m.PlanningScene:
-    """Fixtures and perceived solids, in world, as seen in the picture with that stamp.
+    """Return fixtures and perceived solids in world, with the stamp of their image.
 
     Raises:
-        FrameError: more is seen, or farther away, than there is room for; what stands somewhere is not left out of a
-            scene.
+        FrameError: more objects, or farther ones, than fit; none may be missing from a planning scene.
     """
     corners = [len(solid.outline) for solid in solids]
     if len(corners) > MOST or sum(corners) > MOST_CORNERS or max(corners, default=0) > MOST_OF_ONE:
@@ -151,7 +150,7 @@ def planning_scene(around: Surroundings, solids: Sequence[PerceivedSolid], stamp
 
 
 def collision_object(solid: PerceivedSolid) -> m.CollisionObject:
-    """A perceived solid as an upright prism; its id is the label of its contour."""
+    """Convert a perceived solid to an upright prism; its id is the label of its contour."""
     x, y = (solid.outline.min(axis=0) + solid.outline.max(axis=0)) / 2
     return m.CollisionObject(
         id=solid.label, role="target", shape="prism", dimensions=[solid.height], color=solid.color,

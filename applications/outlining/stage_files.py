@@ -1,12 +1,12 @@
-"""The files between the stages, under the names that the seed system gave them.
+"""Files between the stages, under the names of the original system.
 
-    camera_image.png                             the colour picture
-    depth_data.npy                               depth along the optical axis [m], float32, NaN where there is none
-    depth_camera_image.png                       the same in millimetres, 16 bit, 0 where there is none: to look at
-    depth_camera_image_normalized.png            the same from black (far) to white (near): to look at
-    relevant_contours_pixels.json                [[u, v], ...] pixels of the chosen contour
+    camera_image.png                             color image
+    depth_data.npy                               depth along the optical axis [m], float32, NaN where unknown
+    depth_camera_image.png                       the same in millimeters, 16 bit, 0 where unknown: for viewing
+    depth_camera_image_normalized.png            the same from black (far) to white (near): for viewing
+    relevant_contours_pixels.json                [[u, v], ...] pixels of the selected contour
     relevant_contours_coordinates.json           [[x, y, z], ...] [m] in world
-    relevant_contours_cleared_coordinates.json   the same without duplicates: what is traced
+    relevant_contours_cleared_coordinates.json   the same without duplicates: the path to trace
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ CLEARED = "relevant_contours_cleared_coordinates.json"
 
 
 class StageFileError(ZencellError):
-    """A file of a stage that cannot be used: names the file and what is wrong with it."""
+    """A stage file cannot be used; names the file and the problem."""
 
     def __init__(self, path: Path, message: str) -> None:
         super().__init__(f"{path}: {message}")
@@ -44,7 +44,7 @@ class StageFileError(ZencellError):
 
 
 def write_pictures(folder: Path, picture: Picture, depth: Depth) -> None:
-    """Put the bgr8 picture and the depth image (height, width) [m] into a folder, which is made when it is not there.
+    """Write the bgr8 image and the depth image (height, width) [m] into a folder, which is created if missing.
 
     Raises:
         StageFileError: a file cannot be written.
@@ -67,7 +67,7 @@ def write_pictures(folder: Path, picture: Picture, depth: Depth) -> None:
 
 
 def write_points(path: Path, points: npt.ArrayLike) -> None:
-    """Write pixels (n, 2) or points (n, 3) as a list of lists, one to a line; whole numbers without a decimal point.
+    """Write pixels (n, 2) or points (n, 3) as a list of lists, one per line; integral pixels without a decimal point.
 
     Raises:
         StageFileError: the file cannot be written.
@@ -83,10 +83,10 @@ def write_points(path: Path, points: npt.ArrayLike) -> None:
 
 
 def read_pictures(folder: Path) -> tuple[Picture, Depth]:
-    """The bgr8 picture and the depth image [m] of a folder.
+    """Return the bgr8 image and the depth image [m] of a folder.
 
     Raises:
-        StageFileError: one is missing or malformed, their sizes differ, or the depth image has no depth at all.
+        StageFileError: one is missing or malformed, their sizes differ, or the depth image has no valid depth.
     """
     picture, depth = read_picture(folder / PICTURE), read_depth(folder / DEPTH)
     if picture.shape[:2] != depth.shape:
@@ -96,10 +96,10 @@ def read_pictures(folder: Path) -> tuple[Picture, Depth]:
 
 
 def read_picture(path: Path) -> Picture:
-    """A bgr8 picture (height, width, 3).
+    """Return a bgr8 image (height, width, 3).
 
     Raises:
-        StageFileError: it is missing or no picture.
+        StageFileError: it is missing or no image.
     """
     picture = cv2.imdecode(np.frombuffer(_bytes(path), np.uint8), cv2.IMREAD_COLOR) if _bytes(path) else None
     if picture is None:
@@ -108,10 +108,10 @@ def read_picture(path: Path) -> Picture:
 
 
 def read_depth(path: Path) -> Depth:
-    """A depth image (height, width) [m], float32.
+    """Return a depth image (height, width) [m], float32.
 
     Raises:
-        StageFileError: it is missing, is no array of numbers of that form, or has no valid depth at all.
+        StageFileError: it is missing, is no such array of numbers, or has no valid depth.
     """
     if not path.is_file():
         raise StageFileError(path, "is missing")
@@ -129,19 +129,19 @@ def read_depth(path: Path) -> Depth:
 
 
 def read_pixels(path: Path) -> Array:
-    """The pixels (n, 2) of the chosen contour.
+    """Return the pixels (n, 2) of the selected contour.
 
     Raises:
-        StageFileError: it is missing or malformed.
+        StageFileError: the file is missing or malformed.
     """
     return _read_points(path, 2, "[u, v]")
 
 
 def read_coordinates(path: Path) -> Array:
-    """The points (n, 3) [m] of an outline.
+    """Return the points (n, 3) [m] of an outline.
 
     Raises:
-        StageFileError: it is missing or malformed; names the entry.
+        StageFileError: the file is missing or malformed; names the entry.
     """
     return _read_points(path, 3, "[x, y, z]")
 

@@ -1,4 +1,8 @@
-"""The outlining task: trace the selected contour once, then return home."""
+"""The outlining task: trace the selected contour once, then return home.
+
+All motions, including the return home, are planned before the arm moves: above the objects it occludes them. A failure
+ends in ERROR with one line and the arm at rest, at home if it can get there.
+"""
 
 from __future__ import annotations
 
@@ -18,37 +22,37 @@ from common.tasks.decisions import TaskConfig
 from common.tasks.engine import Task
 from common.tasks.stages import AwaitImage, Cycle, Grip, Move, Place, Stage, View, place_of
 
-NEAR = 0.01  # [m] an object that was perceived is this exact
+NEAR = 0.01  # [m] accuracy of a perceived object
 
 
 @dataclass
 class OutlineView(View):
-    """What the task knows, and the path along the contour that was chosen."""
+    """View with the path along the selected contour."""
 
     path: OutlinePoints | None = None
 
     @property
     def stamps(self) -> tuple[float, ...]:
-        """When the picture was taken in which the contour was found [s]."""
+        """Time of the image with the contour [s]."""
         return (self.path.header.stamp * 1e-9 if self.path else 0.0,)
 
     def solid(self) -> str | None:
-        """Id of the perceived object that the path goes round; None while the planning scene does not have it.
+        """Return the id of the perceived object that the path surrounds; None while it is not in the planning scene.
 
-        A path that was given need not go round anything: then the id of what it comes near, or an empty string.
+        A path from a file need not surround an object: then the id of the nearest one, or an empty string.
         """
         if self.path is None or self.scene is None or self.scene.header.stamp < self.path.header.stamp:
             return None
         places = [place_of(pose) for pose in self.path.poses]
-        beside = {o.id: sum(_beside(o, at) for at in places) for o in self.scene.objects if o.role == "target"}
+        near_counts = {o.id: sum(_is_near(o, at) for at in places) for o in self.scene.objects if o.role == "target"}
         if self.path.given:
-            return max((name for name, count in beside.items() if count), key=beside.__getitem__, default="")
-        around = [o for o in self.scene.objects if beside.get(o.id) == len(places)]
+            return max((name for name, count in near_counts.items() if count), key=near_counts.__getitem__, default="")
+        around = [o for o in self.scene.objects if near_counts.get(o.id) == len(places)]
         return min(around, key=_area).id if around else None
 
 
-def _beside(thing: m.CollisionObject, place: Place) -> bool:
-    """Whether a place lies within the box about an upright prism."""
+def _is_near(thing: m.CollisionObject, place: Place) -> bool:
+    """Return whether a position lies within the bounding box of an upright prism."""
     at = thing.pose.position
     xs, ys = zip(*thing.outline, strict=True) if thing.outline else ((0.0,), (0.0,))
     x, y, z = place
@@ -62,13 +66,13 @@ def _area(thing: m.CollisionObject) -> float:
 
 
 def closed(path: OutlinePoints) -> list[Place]:
-    """The points of a path [m] and the first once more."""
+    """Return the points of a path [m], followed by the first one."""
     points = [place_of(pose) for pose in path.poses]
     return [*points, points[0]]
 
 
 def same_place(path: OutlinePoints, other: OutlinePoints | None) -> bool:
-    """Whether the boxes about two paths are the same, as exactly as is perceived."""
+    """Return whether the bounding boxes of two paths are equal within the accuracy of perception."""
     if other is None or not path.poses or not other.poses:
         return False
     a, b = (np.array([place_of(pose) for pose in each.poses]) for each in (path, other))
@@ -76,12 +80,12 @@ def same_place(path: OutlinePoints, other: OutlinePoints | None) -> bool:
 
 
 def length(points: list[Place]) -> float:
-    """Length [m] of the lines through points."""
+    """Return the length [m] of the polyline through points."""
     return sum(math.dist(a, b) for a, b in pairwise(points))
 
 
 class TracingParameters(Parameters):
-    """How the tool goes along a contour."""
+    """Parameters of the motion along a contour."""
 
     standoff: Tunable[float] = Field(
         0.002, ge=0, le=0.2, description="of the finger tips above the contour, which they must not drag [m]"
@@ -101,13 +105,13 @@ class TracingParameters(Parameters):
 
 @dataclass(frozen=True)
 class MotionSegments:
-    """Builds the motions; knows heights and speed, nothing of what happens."""
+    """Creates the motion segments from heights and speed; has no state."""
 
     p: TracingParameters
     gripper: GripperConfig
 
     def outline(self, points: list[Place], solid: str, cycle: Cycle) -> list[Move]:
-        """Above the first point, down, along all points, up, home."""
+        """Return above the first point, down, along all points, up, home."""
         x, y, z = points[0]
         touches = [(link, solid) for link in self.gripper.links] if solid else []
         trace = m.PathGoal(waypoints=[self._pose(p) for p in points], step=self.p.step,
@@ -123,7 +127,7 @@ class MotionSegments:
         ]
 
     def home(self, cycle: Cycle) -> Move:
-        """To the pose from which the camera sees everything."""
+        """Return the motion to the pose from which the camera sees everything."""
         return Move("home", "HOMING", cycle, goal=m.JointGoal(named="home"))
 
     def _pose(self, at: Place) -> m.Pose:
@@ -131,13 +135,13 @@ class MotionSegments:
         return matrix_to_pose(transform(rpy_to_matrix(*self.p.tool_rpy), (x, y, z + self.p.standoff)))
 
 
-AT_HOME = 0.01  # [rad] from it
-MOST_FORGOTTEN = 5  # motions in a row, each by a controller that was started again
+AT_HOME = 0.01  # [rad] tolerance
+MOST_FORGOTTEN = 5  # consecutive motions interrupted by a restart of the controller
 SHUT = 0.002  # [m] fingers this close together count as closed
 
 
 class Config(TracingParameters, TaskConfig):
-    """How the task behaves; times are cell time unless they say wall."""
+    """Parameters of the task; times are cell time unless they say wall."""
 
     planning_time: Tunable[float] = Field(10.0, gt=0, le=600, description="wall time for one plan [s]")
     overtime: Tunable[float] = Field(
@@ -157,13 +161,13 @@ class Config(TracingParameters, TaskConfig):
 
 
 class Outline(Task[OutlineView]):
-    """Traces a contour. After a stop the arm goes home and outlines anew: half an outline is no outline."""
+    """Traces a contour. After a stop the arm returns home and starts again: outlines are traced completely."""
 
     p: Config
     status: OutlineStatus
 
     def __init__(self, config: Config, status: OutlineStatus, prefix: str, speed: float = 1.0) -> None:
-        """Start from nothing known: see `Task`."""
+        """Start with nothing known: see `Task`."""
         super().__init__(config, status, prefix, speed)
         self.status.standoff = config.standoff
         self._segments = MotionSegments(config, self.gripper)
@@ -171,12 +175,12 @@ class Outline(Task[OutlineView]):
         self._cycle = Cycle()
         self._traced = False
         self._returned = False  # home was reached and not left since
-        self._error = ""  # what went wrong, while the arm is brought home
-        self._forgotten = 0  # motions since the last that ended well
-        self._up: Move | None = None  # the first motion of the way home from anywhere
-        self._excused: tuple[str, str] | None = None  # contact from which the arm has to be freed
-        self._path: OutlinePoints | None = None  # for which the motions were made
-        self._named: dict[str, Place] = {}  # where what stood when they were made, as it was called then
+        self._error = ""  # the failure that ends the task once the arm is home
+        self._forgotten = 0  # interrupted motions since the last successful one
+        self._up: Move | None = None  # first motion of a return home from anywhere
+        self._excused: tuple[str, str] | None = None  # contact that the arm has to be freed from
+        self._path: OutlinePoints | None = None  # path that the motions were created for
+        self._named: dict[str, Place] = {}  # positions of the objects at that time, by id
 
     # --- what to do next -------------------------------------------------------------------------------------
 
@@ -194,7 +198,7 @@ class Outline(Task[OutlineView]):
             self._select(view)
 
     def _select(self, view: OutlineView) -> None:
-        """Take the chosen contour once the planning scene holds its object; give up after a while without one."""
+        """Take the selected contour once the planning scene has its object; fail after a while without one."""
         self.status.state, self.status.stage = "SELECTING", ""
         path = view.path
         if path is not None and min(view.stamps) < self.images_after:
@@ -213,19 +217,19 @@ class Outline(Task[OutlineView]):
         else:
             problem = f"the planning scene does not hold {path.object or 'the object'} around which the contour goes"
         self.status.message = problem
-        # Waiting for a person or for pictures is by the clock on the wall, also in a fast cell.
+        # Waiting for an operator or for images takes wall time, also in a fast cell.
         limit = self.p.picture_timeout if unseen else self.p.selection_timeout
         waited = self.wait_timer.elapsed(bool(unseen), view.now)
         if 0 < limit * self.speed < waited:
             self.fail(problem, view)
 
     def _take(self, path: OutlinePoints, solid: str, view: OutlineView) -> None:
-        """Make the motions for a contour that goes round a solid of the planning scene."""
+        """Queue the motions for a contour around a solid of the planning scene."""
         assert view.gripper is not None
         points, cycle = closed(path), Cycle(path.object)
         try:
             motions = self._segments.outline(points, solid, cycle)
-        except ValidationError:  # a path may be all that a message of it can hold
+        except ValidationError:  # a path may fill a message completely
             self.fail(f"the contour of {path.object} has too many points, or lies too far away", view)
             return
         status = self.status
@@ -246,21 +250,21 @@ class Outline(Task[OutlineView]):
     # --- what happened ---------------------------------------------------------------------------------------
 
     def on_restart(self) -> None:
-        """Forget the outline of before."""
+        """Forget the last outline."""
         self.status.closed = self._traced = False
 
     def note(self, view: OutlineView) -> None:
-        """Whoever moves the arm, it is no longer at home."""
+        """Note that the arm has left home when another client moves it."""
         if self.running is None and view.motion is not None and view.motion.state == "active":
             self._returned = False
 
     def planned(self, move: Move, response: m.PlanResponse) -> None:
-        """How much of the contour can be traced is told also when it is too little."""
+        """Record the traceable fraction of the contour, also when it is too small."""
         if move.name == "trace":
             self.status.fraction = response.fraction
 
     def may_start(self, stage: Stage, view: OutlineView) -> bool:
-        """Without a fresh picture nothing begins, nor where it shows the contour elsewhere than was planned."""
+        """Start only with a fresh image that shows the contour where it was planned."""
         if isinstance(stage, Move) and stage.needs_fresh_image and self.unseen(view):
             self.clear()
             self.wait_timer.reset()
@@ -273,7 +277,7 @@ class Outline(Task[OutlineView]):
         return True
 
     def succeeded(self, stage: Stage, view: OutlineView) -> None:
-        """Take note of what a stage has done."""
+        """Record the success of a stage."""
         self._forgotten = 0
         if stage.name == "trace":
             self._traced, self.status.closed = True, self.status.fraction >= 1
@@ -281,11 +285,11 @@ class Outline(Task[OutlineView]):
             self._returned, self._excused = True, None
 
     def forgotten(self, stage: Stage, view: OutlineView) -> None:
-        """Decide anew, from home: the controller was started again, and what it was asked for was no mistake."""
+        """Decide again from home: a restart of the controller is no fault of the motion."""
         self.displaced(stage, view, f"{stage.name} was forgotten by the controller")
 
     def displaced(self, stage: Stage, view: OutlineView, problem: str) -> None:
-        """Decide anew, from home: nor is it one where the controller was started again before it could answer."""
+        """Decide again from home, also when the controller was restarted before it could answer."""
         self._forgotten += 1
         if self._forgotten > MOST_FORGOTTEN:
             self.fail(problem, view)
@@ -296,15 +300,15 @@ class Outline(Task[OutlineView]):
         self._returned, self.status.message = False, problem
 
     def obstructed(self, stage: Stage, view: OutlineView, problem: str) -> None:
-        """Decide anew, from home: half an outline is none, and from home it is seen what is in the way."""
+        """Decide again from home, where the obstacle is visible; outlines are traced completely."""
         self.displaced(stage, view, problem)
 
     # --- failure ---------------------------------------------------------------------------------------------
 
     def plan_failed(self, move: Move, response: m.PlanResponse, view: OutlineView) -> None:
-        """End, or leave out what cannot be on the way home: the arm may stand as high as it reaches."""
+        """Fail, or skip an impossible part of the return home: the arm may be at its highest point."""
         if move is self._up and response.colliding and self._excused is None:
-            self._excused = response.colliding  # free the arm from what it stands against
+            self._excused = response.colliding  # free the arm from the contact
             self._recover(view)
         elif move is self._up:
             self.clear()
@@ -318,18 +322,18 @@ class Outline(Task[OutlineView]):
             self._give_up(f"{self._error}; the arm stays where it is: {response.message}")
 
     def _is_new(self, names: Sequence[str], view: OutlineView) -> bool:
-        """Whether one of these was not there when the motions were made, or something else was called so."""
+        """Return whether one of these objects is new since the motions were created, or has moved."""
         now, before = _places(view), self._named
         return any(name in now and (name not in before or math.dist(now[name], before[name]) > NEAR) for name in names)
 
     def fail(self, message: str, view: OutlineView, *, go_home: bool = True) -> None:
-        """End in ERROR, by way of home when the arm is somewhere else."""
+        """End in ERROR, after a return home if the arm is elsewhere."""
         self.clear()
         self.status.failures += 1
         first, self._error = self._error, self._error or message
         self.status.message = self._error
         self.wait_timer.reset()
-        if self.running is not None:  # the fingers are still closing: they may finish
+        if self.running is not None:  # the fingers may finish closing
             return
         if first:
             self._give_up(f"{first}; the arm stays where it is: {message}")
@@ -339,7 +343,7 @@ class Outline(Task[OutlineView]):
             self._recover(view)
 
     def _recover(self, view: OutlineView) -> None:
-        """Up and home, from wherever the arm is."""
+        """Move up and home, from wherever the arm is."""
         self.clear()
         up = self._up = self.retreat(view, self._excused, self.p.approach_clearance)
         up.state, up.cycle, up.needs_full_plan = "RETREATING", self._cycle, True
@@ -352,11 +356,11 @@ class Outline(Task[OutlineView]):
     # --- what its motions need -------------------------------------------------------------------------------
 
     def obstacles(self, move: Move, view: OutlineView) -> list[tuple[float, float]]:
-        """Nothing: what stands around is seen from home only."""
+        """Return none: the surroundings are only visible from home."""
         return []
 
     def time_limit(self, stage: Stage) -> float:
-        """A stage that takes longer is stopped [s]."""
+        """Time after which a stage is stopped [s]."""
         return self.p.overtime + (stage.seconds if isinstance(stage, Move) else 0.0)
 
 

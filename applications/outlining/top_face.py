@@ -1,4 +1,14 @@
-"""Find the outline of the top face of an object from its contour and the depth image."""
+"""Find the outline of an object's top face from its contour and the depth image.
+
+A camera above sees the walls that face its axis, so the contour is that of top and walls together. Depth gives the
+height of the top face (the highest plateau within the contour) and of the support. Where an edge faces away from the
+axis, the contour is the edge of the top. Where it faces the axis and the wall is upright, the contour is the foot of
+that wall, which has the x and y of the edge above it. In between, the contour follows upright edges, which are single
+points of the outline: those parts are left out.
+
+The result must follow the edge of the plateau. If it does not (sloping or overhanging walls, stacked objects), the edge
+of the plateau itself is used, to the pixel.
+"""
 
 from __future__ import annotations
 
@@ -20,25 +30,25 @@ Array = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]
 
 CORNER = 3.0  # narrower gaps are closed by a straight line [px]
-UNSURE = 2  # points at each end of a gap that are not used: there the contour is rounded
-RUN = 12  # points from which the direction of an end is found
-BOW = 0.6  # two ends that turn by less than this [rad] go over into each other
-ASTRAY = 1.5  # what closes a gap is at most so far from the edge of the plateau [px]
-LONGEST = 1.5  # ends are extended by at most so many widths of the gap
+UNSURE = 2  # unused points at each end of a gap, where the contour is rounded
+RUN = 12  # points for the direction of an end
+BOW = 0.6  # ends that turn by less than this [rad] are joined by a curve
+ASTRAY = 1.5  # largest distance of a bridge from the edge of the plateau [px]
+LONGEST = 1.5  # ends are extended by at most this many widths of the gap
 
 
 def joined(points: Array, contour: Array, is_foot: Bools, pixel: float, edge: Array) -> Array:
-    """The outline with the gaps closed that lie between parts seen as foot and parts seen as top.
+    """Close the gaps of an outline between parts seen as foot and parts seen as top.
 
-    Where an upright edge was left out, a straight line closes the gap. In a notch, though, the top on one side can
-    hide the foot of the other, so that both sides end before they meet: the contour is much shorter there than the gap.
-    Both are extended then, to a corner where they meet at an angle, in a bow where one goes over into the other. What
-    does not go along the edge of the plateau is replaced by that part of the edge.
+    A straight line closes the gap of a left-out upright edge. In a notch, however, the top on one side can occlude the
+    foot of the other, so that both ends stop before they meet: the contour is much shorter there than the gap. Then
+    both are extended, to a corner if they meet at an angle, else along a curve. A bridge that does not follow the edge
+    of the plateau is replaced by that part of the edge.
 
     Args:
         points: outline (n, 3) [m].
-        contour: where each is seen (n, 2) [px].
-        is_foot: whether as foot (n,).
+        contour: pixel of each point (n, 2) [px].
+        is_foot: whether it was seen as foot (n,).
         pixel: size of a pixel at the top [m].
         edge: of the plateau (m, 3) [m].
     """
@@ -65,7 +75,7 @@ def joined(points: Array, contour: Array, is_foot: Bools, pixel: float, edge: Ar
 
 
 def _farthest(line: Array, edge: Array, pixel: float) -> float:
-    """How far a line (n, 3) [m] goes astray from an edge (m, 3) [m] at most [px]; infinite where it is far longer."""
+    """Return the largest distance of a line (n, 3) [m] from an edge (m, 3) [m] [px]; infinite if far longer."""
     if np.linalg.norm(np.diff(line, axis=0), axis=1).sum() > 2 * (len(edge) + RUN) * pixel:
         return math.inf
     parts = [a + (b - a) * np.linspace(0, 1, 2 + int(np.linalg.norm(b - a) / pixel))[:, None]
@@ -75,7 +85,7 @@ def _farthest(line: Array, edge: Array, pixel: float) -> float:
 
 
 def _along(edge: Array, first: Array, last: Array) -> Array:
-    """The part of a closed edge (m, 3) between two points near it, the shorter way round."""
+    """Return the shorter part of a closed edge (m, 3) between two points near it."""
     i, j = (int(np.argmin(np.linalg.norm(edge - point, axis=1))) for point in (first, last))
     forth = (i + np.arange((j - i) % len(edge) + 1)) % len(edge)
     back = (i - np.arange((i - j) % len(edge) + 1)) % len(edge)
@@ -83,7 +93,7 @@ def _along(edge: Array, first: Array, last: Array) -> Array:
 
 
 def _bridge(before: Array, behind: Array) -> Array | None:
-    """Points (k, 3) between two runs (n, 3) that begin at a gap and lead away from it; None when they do not meet."""
+    """Return points (k, 3) that join two runs (n, 3), each starting at the gap; None if they do not meet."""
     (a, u), (b, v) = _end(before), _end(behind)
     cross = float(u[0] * v[1] - u[1] * v[0])
     if abs(cross) < 0.05:
@@ -94,14 +104,14 @@ def _bridge(before: Array, behind: Array) -> Array | None:
     corner = a + s * u
     if u @ v > -math.cos(BOW):
         flat = corner[None, :]
-    else:  # a parabola that touches both (a Bezier curve of second degree)
+    else:  # a parabola tangent to both (Bezier curve of degree 2)
         steps = np.linspace(0, 1, 12)[1:-1, None]
         flat = (1 - steps) ** 2 * a + 2 * steps * (1 - steps) * corner + steps**2 * b
     return np.column_stack([flat, np.full(len(flat), before[0, 2])])
 
 
 def _end(run: Array) -> tuple[Array, Array]:
-    """The first point (2,) of a run (n, 3) and the unit direction (2,) in which it would go on beyond it."""
+    """Return the first point (2,) of a run (n, 3) and the unit direction (2,) that extends it."""
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(run[:, :2], axis=0), axis=1))])
     fit = np.polynomial.polynomial.polyfit(along, run[:, :2], 2)
     return fit[0], -fit[1] / max(float(np.linalg.norm(fit[1])), 1e-12)
@@ -109,13 +119,13 @@ def _end(run: Array) -> tuple[Array, Array]:
 
 Mask = npt.NDArray[np.uint8]
 
-MARGIN = 12  # of the cut about a contour [px]
-AROUND = 4  # the object about a hole is looked at so far from its edge [px]
-INWARDS = 0.75  # from a point of a sub-pixel contour to the pixel of the object beside it [px]
-OUTSIDE = 3.0  # the height beside an object is looked at so far from its contour [px]
-FRAYED = 2  # cameras that measure depth by a pattern lose it so far from an edge [px]: what is beside it stands for it
-HIGHEST = 98  # percentile of the heights in a contour that lies on the top face
-SHORT = 0.3  # upright edges that are seen shorter than this are not looked for [px]
+MARGIN = 12  # around a contour [px]
+AROUND = 4  # width of the ring around a hole that is evaluated [px]
+INWARDS = 0.75  # from a point of a sub-pixel contour to the next pixel of the object [px]
+OUTSIDE = 3.0  # distance from the contour at which the height around an object is measured [px]
+FRAYED = 2  # pattern-based depth cameras lose this much at an edge [px]; neighboring pixels replace it
+HIGHEST = 98  # percentile of the heights within a contour that lies on the top face
+SHORT = 0.3  # shorter visible upright edges are ignored [px]
 SQUARE = np.ones((3, 3), np.uint8)
 
 
@@ -133,10 +143,10 @@ class TopFaceOptions(Parameters):
 
 @dataclass(frozen=True, eq=False)
 class TopFace:
-    """The outline (n, 3) [m] in world, heights [m] of the top and of what lies around it, and how it was found.
+    """The outline (n, 3) [m] in world, heights [m] of top and surroundings, and how it was found.
 
-    `base` is None when nothing lower around the object is within the camera's range. `filled` counts pixels of the
-    contour without depth; `upright` is whether the walls are.
+    `base` is None when nothing lower around the object is within the camera's range. `filled` counts contour pixels
+    without depth; `upright`: whether the walls are.
     """
 
     outline: Array
@@ -148,7 +158,7 @@ class TopFace:
 
 @dataclass(frozen=True, eq=False)
 class _Cut:
-    """What lies about a contour: heights [m] in world, NaN where unknown, the object and the hole in it."""
+    """Cut around a contour: heights [m] in world, NaN where unknown, masks of the object and of its hole."""
 
     low: npt.NDArray[np.int_]
     heights: Array
@@ -159,17 +169,17 @@ class _Cut:
 def top_face(
     pixels: npt.ArrayLike, depth: Depth, camera: Pinhole, options: TopFaceOptions, *, hole: bool = False
 ) -> TopFace:
-    """The outline of the top face of the object with this contour.
+    """Return the outline of the top face of the object with this contour.
 
     Args:
         pixels: closed contour (n, 2) [px], to the pixel or finer.
-        depth: image (height, width) [m] along the optical axis, NaN where there is none.
+        depth: image (height, width) [m] along the optical axis, NaN where unknown.
         camera: that took both.
         options: tolerances.
         hole: the contour is the edge of a hole; the object lies outside of it.
 
     Raises:
-        DepthError: too much of the contour has no depth, or nothing of it.
+        DepthError: too many contour pixels have no depth, or no pixel inside has.
     """
     contour = np.asarray(pixels, dtype=float)
     height, width = depth.shape
@@ -190,8 +200,8 @@ def top_face(
     tolerance = max(options.top_tolerance, 4 * _noise(cut.heights, core))
     about = core if not hole else core & (cv2.dilate(cut.hole, np.ones((2 * AROUND + 1,) * 2, np.uint8)) > 0)
     top = _plateau(cut.heights[about if about.any() else core], tolerance)
-    beside = _heights_beside(contour, out, depth, camera)
-    lower = beside[beside < top - tolerance]
+    around = _heights_around(contour, out, depth, camera)
+    lower = around[around < top - tolerance]
     base = float(np.median(lower)) if len(lower) else None
     level = np.abs(cut.heights - top) <= tolerance
     edge = _edge_of_hole(cut, level) if hole else _edge_of_plateau(cut, level)
@@ -203,7 +213,7 @@ def top_face(
 
 
 def rounded(points: Array, step: float) -> Array:
-    """Points (n, 3) at multiples of a step [m]; as they are when it is 0."""
+    """Round points (n, 3) to multiples of a step [m]; 0: unchanged."""
     return np.round(np.rint(points / step) * step, 9) if step else points
 
 
@@ -211,9 +221,9 @@ def rounded(points: Array, step: float) -> Array:
 
 
 def _cut(cells: npt.NDArray[np.int_], depth: Depth, camera: Pinhole, *, hole: bool) -> _Cut:
-    """What lies about a contour. A pixel without depth has none here either: its neighbours stand for it."""
+    """Cut around a contour; pixels without depth stay NaN, and their neighbors represent them."""
     height, width = depth.shape
-    margin = MARGIN + (int(np.ptp(cells, axis=0).max()) // 2 if hole else 0)  # the top may be seen far from a hole
+    margin = MARGIN + (int(np.ptp(cells, axis=0).max()) // 2 if hole else 0)  # the top may be visible far from a hole
     low = np.maximum(cells.min(axis=0) - margin, 0)
     high = np.minimum(cells.max(axis=0) + margin + 1, (width, height))
     part = depth[low[1] : high[1], low[0] : high[0]]
@@ -230,28 +240,28 @@ def _cut(cells: npt.NDArray[np.int_], depth: Depth, camera: Pinhole, *, hole: bo
 
 
 def _core(inside: Mask) -> Bools:
-    """Pixels whose rays certainly meet the object: not those at its edge, unless it is too thin."""
+    """Return the pixels whose rays certainly meet the object: without its edge, unless it is too thin."""
     core = cv2.erode(inside, SQUARE, borderType=cv2.BORDER_CONSTANT, borderValue=0)
     return np.asarray((core if np.count_nonzero(core) >= 9 else inside) > 0)
 
 
 def _noise(heights: Array, usable: Bools) -> float:
-    """Standard deviation [m] of the noise of heights, from the differences of neighbours."""
+    """Standard deviation [m] of the noise of heights, from differences of neighbors."""
     pairs = usable[:, 1:] & usable[:, :-1]
     steps = np.abs(heights[:, 1:] - heights[:, :-1])[pairs]
     return float(np.median(steps) / 0.6745 / np.sqrt(2)) if len(steps) else 0.0
 
 
 def _plateau(heights: Array, tolerance: float) -> float:
-    """Height [m] of the highest face."""
-    top = float(np.percentile(heights, HIGHEST, method="lower"))  # that was measured: between two there may be none
+    """Height [m] of the highest plateau."""
+    top = float(np.percentile(heights, HIGHEST, method="lower"))  # a measured height, not one interpolated between two
     for _ in range(4):
         top = float(np.median(heights[np.abs(heights - top) <= tolerance]))
     return top
 
 
-def _heights_beside(contour: Array, out: Array, depth: Depth, camera: Pinhole) -> Array:
-    """Height [m] of what is seen a little outside of each point of the contour (n,); NaN where that is unknown."""
+def _heights_around(contour: Array, out: Array, depth: Depth, camera: Pinhole) -> Array:
+    """Height [m] a little outside of each contour point (n,); NaN where unknown."""
     cells = np.rint(contour + OUTSIDE * out).astype(int)
     height, width = depth.shape
     inside = (cells >= 0).all(axis=1) & (cells < (width, height)).all(axis=1)
@@ -265,17 +275,17 @@ def _heights_beside(contour: Array, out: Array, depth: Depth, camera: Pinhole) -
 
 
 def _edges(contour: Array, camera: Pinhole, top: float, base: float | None, edge: Array, *, hole: bool) -> Array:
-    """The outline (n, 3) [m] at the height `top` of an upright object with this contour that stands at `base`."""
+    """Return the outline (n, 3) [m] at the height `top` of an upright object on a support at `base`."""
     rays = Rays.through(camera, contour)
     at_top = rays.at_height(np.full(len(contour), top))
     if base is None:
         return at_top
     at_foot = rays.at_height(np.full(len(contour), base))
     at_foot[:, 2] = top
-    lifted = camera.project(at_foot)  # where the contour would be seen if it were all foot
+    lifted = camera.project(at_foot)  # pixels of the contour if all of it were foot
     fine = not _to_the_pixel(contour)
     near_radial, slack = (0.06, 0.25) if fine else (0.1, 1.0)
-    away = contour - lifted  # towards the camera's axis, as long as an upright edge is seen
+    away = contour - lifted  # towards the camera axis, with the visible length of an upright edge
     length = np.linalg.norm(away, axis=1)
     out = normals(contour if fine else _smoothed(contour), hole=hole)
     facing = (out * away).sum(axis=1) / np.maximum(length, 1e-9)
@@ -292,7 +302,7 @@ def _edges(contour: Array, camera: Pinhole, top: float, base: float | None, edge
 
 
 def _depth_within(points: Array, polygon: Array) -> Array:
-    """How far inside of a polygon (m, 2) points (n, 2) are [px], negative outside."""
+    """Return how far points (n, 2) are inside of a polygon (m, 2) [px]; negative outside."""
     corners = polygon.astype(np.float32)[:, None, :]
     return np.array([cv2.pointPolygonTest(corners, (float(x), float(y)), True) for x, y in points])
 
@@ -302,7 +312,7 @@ def _to_the_pixel(contour: Array) -> bool:
 
 
 def _smoothed(contour: Array) -> Array:
-    """A closed contour whose steps from pixel to pixel are smoothed out."""
+    """Return a closed contour with smoothed pixel steps."""
     return np.asarray(sum(np.roll(contour, k, axis=0) for k in range(-2, 3)) / 5)
 
 
@@ -310,12 +320,12 @@ def _smoothed(contour: Array) -> Array:
 
 
 def _edge_of_plateau(cut: _Cut, level: Bools) -> Array:
-    """The outer edge of the plateau as points (n, 2) [px], half a pixel outside of its last pixels."""
+    """Return the outer edge of the plateau as points (n, 2) [px], half a pixel outside of its last pixels."""
     return _outline(((cut.inside > 0) & level).astype(np.uint8)) + cut.low
 
 
 def _edge_of_hole(cut: _Cut, level: Bools) -> Array:
-    """The edge of the plateau around a hole, as `_edge_of_plateau`."""
+    """Return the edge of the plateau around a hole, as `_edge_of_plateau`."""
     below = ((cut.inside == 0) | ~level).astype(np.uint8)
     count, parts = cv2.connectedComponents(below, connectivity=4)
     seen = parts[cut.hole > 0]
@@ -323,14 +333,14 @@ def _edge_of_hole(cut: _Cut, level: Bools) -> Array:
 
 
 def _outline(mask: Mask) -> Array:
-    """The outer edge (n, 2) of the largest part of a mask, half a pixel outside of the centres of its pixels."""
+    """Return the outer edge (n, 2) of a mask's largest part, half a pixel outside of its pixel centers."""
     chains, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     chain = max(chains, key=cv2.contourArea).reshape(-1, 2).astype(float)
     return np.asarray(chain + 0.5 * normals(chain, hole=False))
 
 
 def _goes_along(points: Array, edge: Array, cut: _Cut, camera: Pinhole) -> bool:
-    """Whether an outline goes along the edge of the plateau: they differ by no more than two lines of pixels."""
+    """Return whether an outline follows the edge of the plateau within two rows of pixels."""
     first, second = (
         cv2.fillPoly(np.zeros_like(cut.inside), [np.rint((line - cut.low) * 16).astype(np.int32)], 1, cv2.LINE_8, 4)
         for line in (camera.project(points), edge)

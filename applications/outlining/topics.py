@@ -8,16 +8,27 @@ from pydantic import Field, computed_field, model_validator
 
 from common import messages as m
 from common.application import ApplicationTopics
-from common.messages.basics import SMALL_BYTES, Count, Finite, Header, Label, Message, Name, Text
-from common.messages.geometry import Color, Pose, PoseArray
-from common.messages.task import TaskStatus
+from common.messages.basics import (
+    SMALL_BYTES,
+    Color,
+    Count,
+    Finite,
+    Header,
+    Label,
+    Message,
+    Name,
+    Pose,
+    PoseArray,
+    Text,
+)
+from common.messages.execution import TaskStatus
 from common.topics import Request, Topic
 
 MAX_POINTS = 20_000  # of an outline
 
 
 class Contour(Message):
-    """One closed contour in a picture. `pixels` are (u, v) [px], every one along the edge."""
+    """One closed contour in an image. `pixels` are (u, v) [px], every one along the edge."""
 
     index: Count
     label: Name
@@ -29,7 +40,7 @@ class Contour(Message):
 
 
 class Contours(Message):
-    """All contours of one picture, and the one that was chosen."""
+    """All contours of one image, and the selected one."""
 
     max_bytes: ClassVar[int] = 4 * 1024 * 1024
     max_parts: ClassVar[int] = 128 * 1024
@@ -48,7 +59,7 @@ class Contours(Message):
             raise ValueError("the indices of contours must be 0, 1, ... in their order")
         if self.selected != -1 and self.selected not in places:
             raise ValueError(f"contour {self.selected} is selected, of {len(places)}")
-        within = {-1}  # what is known to lie in no circle
+        within = {-1}  # contours known to be in no cycle
         for contour in self.contours:
             way, at = set[int](), contour.index
             while at not in within:
@@ -76,7 +87,7 @@ class OutlineSelect(Message):
 
 
 class OutlineSelection(Message):
-    """What was chosen."""
+    """The selected contour."""
 
     max_bytes: ClassVar[int] = SMALL_BYTES
 
@@ -85,10 +96,10 @@ class OutlineSelection(Message):
 
 
 class OutlinePoints(PoseArray):
-    """The outline of the top face of the chosen object, closed: the last point is followed by the first.
+    """Outline of the selected object's top face, closed: the last point is followed by the first.
 
-    The stamp is that of the picture. Without a chosen object, or when its outline cannot be told, there are no poses
-    and `message` says why.
+    The stamp is that of the image. Without a selected object, or without a known outline, there are no poses, and
+    `message` has the reason.
     """
 
     max_bytes: ClassVar[int] = 4 * 1024 * 1024
@@ -109,7 +120,7 @@ OutlineState = Literal[
 
 
 class OutlineStatus(TaskStatus):
-    """State and figures of the outline task. `subject` is the label of the object that is outlined."""
+    """State and figures of the outlining task. `subject` is the label of the outlined object."""
 
     state: OutlineState = "IDLE"
     points: Count = 0
@@ -129,7 +140,7 @@ class OutlineStatus(TaskStatus):
     @computed_field  # type: ignore[prop-decorator]
     @property
     def object(self) -> str:
-        """Label of the object that is outlined."""
+        """Label of the outlined object."""
         return self.subject
 
 

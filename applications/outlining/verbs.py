@@ -1,7 +1,7 @@
-"""Outlining on the command line.
+"""Commands of outlining.
 
-`snapshot` stores what the camera sees, `outline` goes on from the files alone, `task select` chooses the object; and
-`run --ask` and `run --from` choose it before the cell is up.
+`snapshot` stores what the camera sees, `outline` continues from the files alone, `task select` selects the object;
+`run --ask` and `run --from` select it before the cell starts.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from common.config import Cell
     from common.verbs import Shell
 
-CELL = "ur5"  # that comes with the project
+CELL = "ur5"  # a cell of the project
 Folder = Annotated[str, typer.Argument(metavar="DIR", help="folder of the files")]
 Select = Annotated[
     str, typer.Option("--select", metavar="WHICH", help="auto, a colour or an index, as `zencell task select`")
@@ -35,9 +35,9 @@ def snapshot(
     context: typer.Context, cell: str, folder: Folder, select: Select = "auto", overrides: list[str] | None = None,
     world: str | None = None, seed: str | None = None, domain: str | None = None, connect: str | None = None,
 ) -> None:
-    """Store what a cell's depth camera sees, and the three stages of its outline, under the names of the seed.
+    """Store the images of a cell's depth camera and the three stages of its outline, under the original file names.
 
-    A cell that is up is asked; else its services are started for it, without the task, and stopped again.
+    Uses a running cell; else starts its services without the task, and stops them again.
     """
     from applications.outlining.contour_choice import parse_choice
     from applications.outlining.visits import store_stages
@@ -54,7 +54,7 @@ def outline(
     keep: Annotated[bool, typer.Option("--keep", help="plan along the cleared coordinates as they are")] = False,
     overrides: list[str] | None = None, world: str | None = None,
 ) -> None:
-    """Find the outline in the files of a folder, write its stages there and plan its tracing; nothing moves."""
+    """Find the outline in the files of a folder, write its stages there and plan its motions; nothing moves."""
     from applications.outlining.contour_choice import parse_choice
     from common.config import load_cell
 
@@ -70,7 +70,7 @@ def select(
     which: Annotated[str, typer.Argument(metavar="N", help="an index, a label such as Object_2, a colour, or auto")],
     cell: str | None = None, domain: str | None = None, connect: str | None = None,
 ) -> None:
-    """Choose the object to outline."""
+    """Select the object to outline."""
     from applications.outlining.contour_choice import parse_choice
     from applications.outlining.topics import OUTLINE_SELECT
 
@@ -84,10 +84,10 @@ def select(
 def before_run(
     cell: str, overrides: list[str], world: str | None, *, ask: Ask = False, source: From = None
 ) -> BeforeRun:
-    """How the object to outline is chosen.
+    """Prepare the selection of the object to outline.
 
     Raises:
-        ConfigError: nobody can be asked, the coordinates cannot be used, or the cell outlines nothing.
+        ConfigError: there is no terminal, the coordinates cannot be used, or the cell outlines nothing.
     """
     if not ask and source is None:
         return BeforeRun(overrides)
@@ -139,7 +139,7 @@ def _stages(shell: Shell, cell: Cell, place: Path, wanted: OutlineSelect, *, kee
         stage_files.write_points(place / stage_files.CLEARED, cleared)
     echo(f"{found.label}: {len(found.pixels)} pixels, {len(cleared)} points to trace; the stages are in {place}")
     parameters = shell.parameters(cell, "contour_tracer")
-    assert parameters.robot.gripper is not None  # the tracer needs one as well
+    assert parameters.robot.gripper is not None  # the tracer requires one
     pipeline = PlanningPipeline(RobotModel.load(cell.robot), cell.motion, cell.pipeline, seed=cell.run.seed)
     scene = planning_scene(around, found.solids, 1)
     legs = MotionSegments(parameters, parameters.robot.gripper)

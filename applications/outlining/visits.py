@@ -1,9 +1,10 @@
-"""Visits to a cell that outlines: the person at the terminal is asked which object; what the camera sees is stored."""
+"""Visits to an outlining cell: ask the operator at the terminal for an object, store what the camera sees."""
 
 from __future__ import annotations
 
 import asyncio
 import sys
+from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
@@ -33,34 +34,34 @@ if TYPE_CHECKING:
     from common.transport.bus import Bus, Reader
     from common.transport.requests import Client
 
-TRIES = 3  # of a choice
-AGAIN_WITHIN = 5.0  # [s]
-TIMEOUT = 30.0  # [s] for a picture and its outline
-KEPT = 100  # pictures of which contours and points are known until their path comes
-ALL_WITHIN = 3.0  # [s, cell time] after the first picture for a contour to be chosen
+TRIES = 3  # of a selection request
+AGAIN_WITHIN = 5.0  # [s] for the connection to recover
+TIMEOUT = 30.0  # [s] for an image and its outline
+CACHED = 100  # images whose contours and points are cached until their path arrives
+ALL_WITHIN = 3.0  # [s, cell time] after the first image for a contour to be selected
 CHOOSE_BY_HAND = ("services.contour_detector.select=none", "services.contour_tracer.selection_timeout=0")
 
 M = TypeVar("M", Contours, OutlinePoints)
 
 
 class NoOutline(ZencellError):
-    """The picture was stored, but it has no outline."""
+    """The images were stored, but they have no outline."""
 
     exit_code = 1
 
 
 def require_terminal() -> None:
-    """Return when somebody can be asked.
+    """Return if an operator can be asked.
 
     Raises:
-        ConfigError: nobody can.
+        ConfigError: standard input is no terminal.
     """
     if not sys.stdin.isatty():
         raise ConfigError("--ask", ..., "needs a terminal; without one choose with `zencell task select N`")
 
 
-async def ask_operator(bus: Bus, folder: Path) -> None:
-    """Store the picture with its contours in a folder, and ask until one of them is chosen."""
+async def ask_operator(bus: Bus, folder: Path, read_line: Callable[[], Awaitable[str]] | None = None) -> None:
+    """Store the image with its contours in a folder, and ask until one of them is selected."""
     contours, images = bus.reader(CONTOURS), bus.reader(CONTOUR_IMAGE)
     select = bus.client(OUTLINE_SELECT)
     found, image = await _drawn(contours, images)
@@ -70,10 +71,10 @@ async def ask_operator(bus: Bus, folder: Path) -> None:
     while True:
         print_line("outline which one? ", end="")
         try:
-            wanted = parse_choice(await _line())
+            wanted = parse_choice(await (read_line or _line)())
             if wanted is not None:
                 if wanted.index is not None and wanted.index < len(found.contours):
-                    wanted.at = middle_of(found.contours[wanted.index])  # in the picture that the person looks at
+                    wanted.at = middle_of(found.contours[wanted.index])  # in the image that the operator sees
                 answer = await _chosen(select, wanted)
                 print_line(f"{answer.label} is chosen")
                 return
@@ -86,23 +87,23 @@ async def ask_operator(bus: Bus, folder: Path) -> None:
 
 
 async def _chosen(select: Client[OutlineSelect, OutlineSelection], wanted: OutlineSelect) -> OutlineSelection:
-    """The answer to a choice, which is made again where its answer was lost: that chooses the same."""
+    """Request a selection; repeat it after a lost answer, since the result is the same."""
     for _ in range(TRIES - 1):
         with suppress(RequestLost):
             return await select.call(wanted)
-        with suppress(NoResponder):  # the link to the router may be what was lost
+        with suppress(NoResponder):  # the connection to the router may be lost
             await select.wait_available(AGAIN_WITHIN)
     return await select.call(wanted)
 
 
 def print_line(text: str, end: str = "\n") -> None:
-    """Show a text to the person."""
+    """Print a text for the operator."""
     sys.stdout.write(printable(text) + end)
     sys.stdout.flush()
 
 
 async def _drawn(contours: Reader[Contours], images: Reader[Image]) -> tuple[Contours, Image]:
-    """The first contours that there are, and the picture into which they were drawn: another may count otherwise."""
+    """Return the first contours and the image with these drawn in: another image may be numbered differently."""
     found, image = await contours.next(), await images.next()
     while not found.contours or found.header.stamp != image.header.stamp:
         if not found.contours:
@@ -118,7 +119,7 @@ async def _write_image(path: Path, image: Image) -> None:
     import cv2
 
     written, data = cv2.imencode(".png", image_to_array(image))
-    assert written  # a picture of 8 bits can be
+    assert written  # 8 bit images can be encoded
     try:
         await asyncio.to_thread(path.write_bytes, data.tobytes())
     except OSError as error:
@@ -126,10 +127,10 @@ async def _write_image(path: Path, image: Image) -> None:
 
 
 async def _line() -> str:
-    """The next line from the terminal. Read without a thread, which could not be ended by Ctrl-C.
+    """Return the next line from the terminal. Reads without a thread, which Ctrl-C could not end.
 
     Raises:
-        ConfigError: there will be none.
+        ConfigError: the input has ended.
     """
     loop, arrived = asyncio.get_running_loop(), asyncio.Event()
     loop.add_reader(sys.stdin.fileno(), arrived.set)
@@ -137,17 +138,17 @@ async def _line() -> str:
         await arrived.wait()
     finally:
         loop.remove_reader(sys.stdin.fileno())
-    line = sys.stdin.readline()  # a terminal gives whole lines
+    line = sys.stdin.readline()  # a terminal delivers complete lines
     if not line:
         raise ConfigError("--ask", ..., "nothing was chosen")
     return line.strip()
 
 
 async def store_stages(bus: Bus, folder: Path, wanted: OutlineSelect | None) -> str:
-    """Put a picture, its depth and the stages of its outline into a folder; returns what was stored.
+    """Store an image, its depth and the stages of its outline in a folder; return a line that names them.
 
     Raises:
-        NoOutline: there is a picture and no outline in it.
+        NoOutline: the image has no outline.
         StageFileError: a file cannot be written.
     """
     pictures, depths = bus.reader(topics.DEPTH_CAMERA_IMAGE), bus.reader(topics.DEPTH_CAMERA_DEPTH)
@@ -158,21 +159,21 @@ async def store_stages(bus: Bus, folder: Path, wanted: OutlineSelect | None) -> 
     try:
         async with asyncio.timeout(TIMEOUT):
             first = await pictures.next()
-            chosen_at = -1  # stamp of the newest picture that may have had another choice
+            chosen_at = -1  # stamp of the newest image that may have had another selection
             if wanted is not None and wanted.rule != "auto":
                 await contours.next()
                 await _chosen(bus.client(OUTLINE_SELECT), wanted)
                 chosen_at = max(each.latest.header.stamp for each in (pictures, contours) if each.latest is not None)
-            noting += [asyncio.create_task(_note(*each, more))  # what comes while files are written, too
+            noting += [asyncio.create_task(_note(*each, more))  # also while files are written
                        for each in ((points, found), (paths, cleared))]
             noting.append(asyncio.create_task(_note(contours, seen, more)))
             picture, depth = await _pair(pictures, depths, chosen_at)
-            # Beside the loop: of what comes while it is held up all but the newest would be lost.
+            # In a thread: a blocked loop would lose all but the newest messages.
             await asyncio.to_thread(stage_files.write_pictures, folder, decode_color_image(picture), depth_of(depth))
             while True:
                 more.clear()
                 since = [path for stamp, path in sorted(cleared.items()) if stamp >= picture.header.stamp]
-                # All of the path's own picture: in another the object may have another label.
+                # All stages of the path's own image: in another image the object may have another label.
                 whole = [path for path in since if path.poses and path.header.stamp in seen.keys() & found.keys()]
                 if whole:
                     break
@@ -194,17 +195,17 @@ async def store_stages(bus: Bus, folder: Path, wanted: OutlineSelect | None) -> 
     return f"{path.object}, {len(path.poses)} points: the picture and the stages are in {folder}"
 
 
-async def _note(reader: Reader[M], kept: dict[int, M], more: asyncio.Event) -> None:
-    """Keep the newest messages by the stamps of their pictures."""
+async def _note(reader: Reader[M], cache: dict[int, M], more: asyncio.Event) -> None:
+    """Cache the newest messages by the stamps of their images."""
     async for message in reader:
-        kept[message.header.stamp] = message
-        while len(kept) > KEPT:
-            del kept[next(iter(kept))]
+        cache[message.header.stamp] = message
+        while len(cache) > CACHED:
+            del cache[next(iter(cache))]
         more.set()
 
 
 async def _pair(pictures: Reader[Image], depths: Reader[Image], after: int) -> tuple[Image, Image]:
-    """A picture later than a stamp, and the depth image that was taken with it."""
+    """Return an image later than a stamp, and the depth image taken with it."""
     while True:
         picture, depth = await pictures.next(), depths.latest
         if depth is not None and depth.header.stamp == picture.header.stamp > after:

@@ -32,8 +32,8 @@ def shows_table(around: Surroundings, camera: Pinhole, pixels: Array) -> npt.NDA
     shown = np.zeros(places.shape[:-1], bool)
     for fixture in around.fixtures:
         if is_table(fixture, around.table_height):
-            beside = np.abs(places - fixture.position[:2])  # NaN above the horizon: no table there
-            shown |= (beside <= np.array(fixture.dimensions[:2]) / 2).all(axis=-1)
+            offset = np.abs(places - fixture.position[:2])  # NaN above the horizon: no table there
+            shown |= (offset <= np.array(fixture.dimensions[:2]) / 2).all(axis=-1)
     return shown
 
 
@@ -101,7 +101,7 @@ class BallGeometry:
         """Return the heights [m] that the center of a ball seen at a pixel can have."""
         if not self.shows_container(camera, pixel):
             return [self.plane]
-        # Heights that differ by a few millimeters cannot be told apart by the apparent size of a ball.
+        # Heights that differ by a few millimeters cannot be distinguished by the apparent size of a ball.
         apart = all(abs(z - self.plane) > self.radius / 3 for z in self.layers)
         return [self.plane, *self.layers] if apart else self.layers
 

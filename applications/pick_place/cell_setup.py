@@ -148,8 +148,8 @@ def reach(cell: Cell, arm: Arm) -> Iterator[Finding]:
         low = cell.grasp.height(z)
         poses = [tool_down(x, y, low, turn) for turn in turns]
         if reason := cache.reason((x, y, z)):
-            told = reason.startswith(("too ", "singular")) or not controls_full_pose(arm.robot)
-            why = "" if told else arm.why_not(poses, width, tilt)
+            explained = reason.startswith(("too ", "singular")) or not controls_full_pose(arm.robot)
+            why = "" if explained else arm.why_not(poses, width, tilt)
             yield error(f"{what}, {reason}{f' ({why})' if why else ''}", "move it, or robot.base_position")
         elif why := arm.why_not(poses, width, tilt):
             yield error(f"{what}, {why} {turned}",
@@ -225,7 +225,7 @@ def fit_world(robot: RobotModel, cell: dict[str, Any]) -> dict[str, Any]:
         }
         return {**cell, "world": world, **({"grasp": heights} if heights else {}), "services": services}
     raise ConfigError("--cell", ..., f"the arm takes things from {most} of the places {STEP:g} m apart in front of it, "
-                      f"tool down: too few for {BALLS} balls and a box beside them")
+                      f"tool down: too few for {BALLS} balls and a box next to them")
 
 
 def _reached(robot: RobotModel, grasp: Grasp, bounds: WorkspaceBounds, radius: float) -> list[Place]:

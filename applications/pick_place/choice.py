@@ -1,4 +1,4 @@
-"""Choose the next ball and the gripper yaws for it.
+"""Choose the next ball and the gripper yaws for it; count the balls in the container and on the table.
 
 The next ball is the nearest one that is seen, validated, not abandoned, and free for the open fingers.
 """
@@ -13,58 +13,24 @@ from typing import Any
 from pydantic import BaseModel, FiniteFloat
 
 from applications.pick_place.detections import HIDDEN
-from applications.pick_place.grasping import Config, HandShape
+from applications.pick_place.grasping import FINE, Config, Target, YawRange, grasp_yaws, yaw_ranges, yaws_of
+from applications.pick_place.topics import PickPlaceStatus
 from common import messages as m
 from common.config import Container
-from common.robot.transforms import matrix_to_rpy, pose_to_matrix
 from common.scene.fixtures import column_at, low_columns
 from common.scene.workspace import yaw_candidates
 from common.tasks.engine import appeared
-from common.tasks.stages import Cycle, Place, View, place_of
-from common.tasks.watchdogs import DwellTimer
+from common.tasks.stages import Cycle, DwellTimer, Place, View, place_of
 
 Spot = tuple[float, float]  # (x, y) [m]
 Spots = list[Spot]
-YawRange = tuple[float, float]  # center and half width [rad]
 FULL = "the container is full"
-FINE = 36  # yaws per half turn at which the gripper's clearance is checked
 TIPS = 0.012  # [m] reach of the finger tips below the center of a gripped object
 SAME_PLACE = 0.02  # [m] an occluded target and a track closer than this are one object
 EMPTY_FOR = 0.5  # [s] without detections after which a container is empty
+CONTAINED_FOR = 0.5  # [s] for which balls must be seen in the container to count
+AT_REST = 0.3  # [s] for which a dropped ball must be seen at one position: it may still roll out of view
 SETTLING = 1.5  # [s] from the release until the ball is at rest in the container and was seen there
-
-
-@dataclass
-class Target:
-    """A detected object: its position [m] in world, and its track id in the planning scene.
-
-    `size` (x, y) [m] and `yaw` [rad] are set for a box, seen from above. `grip_effort` [N] and `mass` [kg] are those of
-    the planning scene, 0 for unknown.
-    """
-
-    id: str
-    position: Place
-    radius: float = 0.0  # of the circle around it, seen from above [m]
-    size: tuple[float, float] | None = None
-    yaw: float = 0.0
-    grip_effort: float = 0.0
-    mass: float = 0.0
-
-    @classmethod
-    def of(cls, thing: m.CollisionObject) -> Target:
-        """Create a target from an object of the planning scene."""
-        d = thing.dimensions
-        if thing.shape != "box":
-            return cls(thing.id, place_of(thing.pose), d[0], grip_effort=thing.grip_effort, mass=thing.mass)
-        yaw = matrix_to_rpy(pose_to_matrix(thing.pose)[:3, :3])[2]
-        radius = math.hypot(d[0], d[1]) / 2
-        return cls(thing.id, place_of(thing.pose), radius, (d[0], d[1]), yaw, thing.grip_effort, thing.mass)
-
-    def width(self, yaw: float) -> float | None:
-        """Return the finger width for a gripper yaw [rad] [m]; None for unknown size."""
-        if self.size is None:
-            return 2 * self.radius or None
-        return self.size[1] if abs(math.cos(yaw - self.yaw)) > math.sqrt(0.5) else self.size[0]
 
 
 @dataclass(eq=False)
@@ -167,7 +133,7 @@ class Choice:
         self._judged_by: dict[str, Any] = {}  # parameter values
         self._empty = DwellTimer()
         self._expected = (0, 0.0)  # balls expected in the container, and until when they count unseen [s]
-        self.let_go = ReleasePositions()
+        self.releases = ReleasePositions()
 
     def next(self, view: PickPlaceView, origin: Sequence[float], under_way: Sequence[Pick]) -> Pick | None:
         """Return the nearest takable ball to `origin` (x, y) with its yaws; None when there is none."""
@@ -193,7 +159,7 @@ class Choice:
             if full:
                 self.give_up(ball, FULL, view)
             elif not yaws:
-                self.give_up(ball, "no turn of the hand clears what stands beside it", view)
+                self.give_up(ball, "its neighbors leave no room for the fingers at any yaw", view)
             else:
                 again = self._given_up_at(ball.position) is not None
                 clear = [] if flat is not None else grasp_yaws(
@@ -227,16 +193,16 @@ class Choice:
         """
         seen = [place_of(thing.pose) for thing in view.objects("contained")]
         empty = not seen and 0 < view.scene_stamp >= self._expected[1] and not _hidden(view)
-        if self._empty.elapsed(empty, view.scene_stamp) >= EMPTY_FOR and empty and self.let_go.places:
-            self.let_go = ReleasePositions()
-        return [*seen, *self.let_go.places]
+        if self._empty.elapsed(empty, view.scene_stamp) >= EMPTY_FOR and empty and self.releases.places:
+            self.releases = ReleasePositions()
+        return [*seen, *self.releases.places]
 
     def _top(self, over: Spot, lie: Sequence[Place]) -> float:
         """Height of the center of one more ball on top of a column [m]."""
         below = [z for x, y, z in lie if math.dist((x, y), over) < self.radius]
         return max(below, default=self.p.world.table_height - self.radius) + 2 * self.radius
 
-    def once_more(self) -> bool:
+    def allow_retries(self) -> bool:
         """Allow one retry for every target without a plan; return whether there is any."""
         again = [g for g in self._given_up if g.retry]
         for g in again:
@@ -266,7 +232,8 @@ class Choice:
         """Record the release of a ball above the container; it is seen there once it is at rest."""
         over = column_at(self.container, view.tool[:2])  # the fallback goal is anywhere above it
         place = (*over, self._top(over, self._lie(view)))
-        self.let_go = ReleasePositions(places=[*(other for other in self.let_go.places if other[:2] != over), place])
+        others = (other for other in self.releases.places if other[:2] != over)
+        self.releases = ReleasePositions(places=[*others, place])
         self._expected = self._contained(view) + 1, view.now + SETTLING
         self._forget(pick.target)
 
@@ -297,6 +264,62 @@ class Choice:
         ]
 
 
+class ObjectCounter:
+    """Counts the objects in the container and on the table, for the status of the task."""
+
+    def __init__(self, config: Config) -> None:
+        """Start with nothing counted."""
+        self.p = config
+        self.expected = 0  # number of objects when one fell out of the gripper, until all are seen again
+        self.released = False  # whether this task has released an object
+        self._contained, self._still = DwellTimer(), DwellTimer()
+        self._carried = False
+        self._spots: Spots = []  # positions of the visible objects while they stay
+
+    def update(self, view: PickPlaceView, status: PickPlaceStatus, *, releases: bool, counts_table: bool) -> None:
+        """Count objects in the container, and objects on the table while none is held or falling.
+
+        Objects in the container were placed before a restart of the task, or by another program; a restarted scene
+        manager may report them later. A released ball counts at its release: before, it may hang above others, and an
+        image shows one more.
+
+        Args:
+            view: what the task knows.
+            status: gets `done` and `total`.
+            releases: a ball is being released, or will be at the end of the running motion.
+            counts_table: no ball is being moved, and the image is newer than the last motion.
+        """
+        if self._carried and not view.holding and not releases:
+            self.expected, self._spots = max(self.expected, status.total), []
+        self._carried = view.holding and not releases
+        contained = self.contained(view)
+        if releases:
+            self._contained.reset()
+        elif self._contained.elapsed(contained, view.scene_stamp) >= min(CONTAINED_FOR, self.p.empty):
+            status.done = max(status.done, contained)
+        if counts_table and not view.holding:
+            found = status.done + len(view.targets)
+            if found >= self.expected and self._are_still(view):
+                self.expected = 0
+            status.total = max(found, self.expected)
+
+    def contained(self, view: PickPlaceView) -> int:
+        """Return the number of objects in the container: only visible ones once this task has placed some.
+
+        Before that, objects below visible ones count as well. A rolling object appears in one slot after another; what
+        would carry it was counted already, or does not exist.
+        """
+        return sum(not (self.released and thing.unseen) for thing in view.objects("contained"))
+
+    def _are_still(self, view: PickPlaceView) -> bool:
+        """Return whether everything on the table has stayed at its position for a while."""
+        spots = [place[:2] for place in view.targets]
+        if any(all(math.dist(spot, before) > self.p.moved for before in self._spots) for spot in spots):
+            self._spots = spots
+            self._still.reset()
+        return self._still.elapsed(True, min(view.stamps)) >= AT_REST
+
+
 def _hidden(view: PickPlaceView) -> bool:
     """Return whether part of the image is occluded, perhaps the container."""
     return view.seen is None or bool(view.seen.unseen)
@@ -314,92 +337,3 @@ def lies_below(ball: Target, balls: Sequence[Target]) -> bool:
         b.position[2] - z > 0.5 * ball.radius and math.dist(b.position[:2], (x, y)) < 0.98 * (b.radius + ball.radius)
         for b in balls
     )
-
-
-def finger_clearance(
-    shape: HandShape, center: Sequence[float], yaw: float, neighbours: Sequence[Sequence[float]], radius: float,
-    container: Container | None = None,
-) -> float:
-    """Return the smallest gap [m] between the open fingers and any neighbor; negative for overlap.
-
-    The fingers open along the tool's y axis: the -y axis of world for a tool pointing down at yaw 0.
-
-    Args:
-        shape: the fingers.
-        center: (x, y) of the object to take [m], world.
-        yaw: of the tool about world z [rad].
-        neighbours: (x, y) of other balls [m], world, followed by a radius that differs from `radius`.
-        radius: of the balls [m].
-        container: an open box whose walls must be cleared as well.
-    """
-    c, s = math.cos(yaw), math.sin(yaw)
-    half_length = (shape.finger_outer - shape.finger_inner) / 2
-    middle = (shape.finger_outer + shape.finger_inner) / 2
-    best = math.inf
-    for x, y, *own in neighbours:
-        dx, dy = x - center[0], y - center[1]
-        lateral, along = c * dx + s * dy, -s * dx + c * dy
-        gap_lateral = max(abs(lateral) - shape.finger_half_width, 0.0)
-        gap_along = max(abs(abs(along) - middle) - half_length, 0.0)
-        best = min(best, math.hypot(gap_lateral, gap_along) - (own[0] if own else radius))
-    if container is not None:
-        best = min(best, _container_gap(shape, center, c, s, container))
-    return best
-
-
-def _container_gap(shape: HandShape, center: Sequence[float], c: float, s: float, container: Container) -> float:
-    """Return the gap between the fingers' corners and the container's outer square [m]; negative inside."""
-    best = math.inf
-    for along in (-shape.finger_outer, -shape.finger_inner, shape.finger_inner, shape.finger_outer):
-        for lateral in (-shape.finger_half_width, shape.finger_half_width):
-            x = center[0] + c * lateral - s * along - container.x
-            y = center[1] + s * lateral + c * along - container.y
-            dx, dy = abs(x) - container.half_side, abs(y) - container.half_side
-            inside = min(max(dx, dy), 0.0)
-            best = min(best, math.hypot(max(dx, 0.0), max(dy, 0.0)) + inside)
-    return best
-
-
-def grasp_yaws(
-    shape: HandShape, center: Sequence[float], neighbours: Sequence[Sequence[float]], radius: float,
-    container: Container | None = None, yaws: Sequence[float] | None = None,
-) -> list[float]:
-    """Return the yaws [rad] with clear fingers, smallest rotation first; empty when there is no room.
-
-    `yaws` restricts the candidates to those that the object allows.
-    """
-    near = [n for n in neighbours if math.dist(n[:2], center[:2]) < shape.finger_outer + 2 * radius + 0.05]
-    return [
-        yaw
-        for yaw in (yaw_candidates(shape.yaw_count) if yaws is None else yaws)
-        if finger_clearance(shape, center, yaw, near, radius, container) >= shape.min_clearance
-    ]
-
-
-def yaw_ranges(clear: Sequence[float]) -> list[YawRange]:
-    """Group yaws of `yaw_candidates(FINE)` into contiguous ranges of a full turn."""
-    if len(clear) == FINE:
-        return [(0.0, math.pi)]
-    step = math.pi / FINE
-    free = {round(yaw / step) % FINE for yaw in clear}
-    ranges: list[YawRange] = []
-    for first in sorted(number for number in free if (number - 1) % FINE not in free):
-        count = next(n for n in range(1, FINE + 1) if (first + n) % FINE not in free)
-        half = (count - 1) / 2
-        middle = (first + half) * step
-        ranges += [(math.remainder(middle + turn, 2 * math.pi), half * step) for turn in (0.0, math.pi)]
-    return ranges
-
-
-def yaws_of(target: Target, shape: HandShape) -> list[float] | None:
-    """Return the yaws [rad] at which the finger pads lie flat on two faces of a box that fits between them.
-
-    None for a round object and for a suction cup: any yaw will do.
-    """
-    if target.size is None or not shape.finger_inner:
-        return None
-    # At the box's yaw the fingers close along its y axis, a quarter turn from there along its x axis.
-    fitting = [target.yaw + turn for width, turn in ((target.size[1], 0.0), (target.size[0], math.pi / 2))
-               if width <= 2 * (shape.finger_inner - shape.min_clearance)]
-    turned = [math.remainder(yaw, math.pi) for yaw in fitting]  # a parallel gripper repeats after half a turn
-    return sorted(turned, key=lambda yaw: (abs(yaw), -yaw))

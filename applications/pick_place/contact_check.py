@@ -42,15 +42,15 @@ class RecordedMotion:
     def listeners(self) -> dict[Topic[Any], Callable[[float, Any], None]]:
         """Return the listeners for the run aggregator."""
         return {
-            topics.JOINT_STATES: lambda _, state: _keep(self.joints, state),
-            topics.GRIPPER_STATE: lambda _, state: _keep(self.grips, state),
-            SCENE_BALLS: lambda _, balls: _keep(self.balls, balls),
+            topics.JOINT_STATES: lambda _, state: _append_new(self.joints, state),
+            topics.GRIPPER_STATE: lambda _, state: _append_new(self.grips, state),
+            SCENE_BALLS: lambda _, balls: _append_new(self.balls, balls),
         }
 
 
-def _keep(kept: list[S], message: S) -> None:
-    if not kept or message.header.stamp > kept[-1].header.stamp:  # a state is published again each second
-        kept.append(message)
+def _append_new(messages: list[S], message: S) -> None:
+    if not messages or message.header.stamp > messages[-1].header.stamp:  # a state is published again each second
+        messages.append(message)
 
 
 @dataclass(frozen=True)
@@ -127,13 +127,13 @@ class ContactCheck:
 
     def _spans(self, recording: RecordedMotion, stamps: NDArray[np.int64]) -> Iterator[tuple[PoseArray, int, int]]:
         """Yield ground truths between which only held and falling balls move, with their first and last sample."""
-        kept: list[PoseArray] = []
+        changes: list[PoseArray] = []
         for balls in recording.balls:
-            if not kept or _resting(balls) != _resting(kept[-1]):
-                kept.append(balls)
-        starts = [max(0, int(np.searchsorted(stamps, b.header.stamp, side="right")) - 1) for b in kept]
+            if not changes or _resting(balls) != _resting(changes[-1]):
+                changes.append(balls)
+        starts = [max(0, int(np.searchsorted(stamps, b.header.stamp, side="right")) - 1) for b in changes]
         starts[0] = 0
-        for balls, first, last in zip(kept, starts, [*starts[1:], len(stamps) - 1], strict=True):
+        for balls, first, last in zip(changes, starts, [*starts[1:], len(stamps) - 1], strict=True):
             if last > first:
                 yield balls, first, last
 

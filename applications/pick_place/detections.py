@@ -62,8 +62,8 @@ class DetectionViews:
 
         Args:
             bus: of the service.
-            names: of the views; none stands for a single view without a prefix.
-            around: tells which cameras are on the robot; only their images taken from home count.
+            names: of the views; none means a single view without a prefix.
+            around: which cameras are on the robot; only their images taken from home count.
             robot: its home pose.
             only_at_home: treat all cameras like that.
             log: receives each reason for a skipped frame once.
@@ -158,11 +158,11 @@ class DetectionViews:
         """Return the frame without detections cut off by its border that another view shows completely."""
         others = [seen for index, seen in enumerate(self._newest) if seen is not None and index != number]
         whole = [marker for seen in others for marker in seen.frame.markers if not marker.partial]
-        kept = [
+        remaining = [
             marker for marker in frame.markers
             if not (marker.partial and any(math.dist(_place(marker), _place(one)) < marker.scale.x for one in whole))
         ]
-        return frame if len(kept) == len(frame.markers) else frame.model_copy(update={"markers": kept})
+        return frame if len(remaining) == len(frame.markers) else frame.model_copy(update={"markers": remaining})
 
 
 def _clear_of(frame: MarkerArray, hidden: Occlusion | None, radius: float) -> MarkerArray:
@@ -170,8 +170,8 @@ def _clear_of(frame: MarkerArray, hidden: Occlusion | None, radius: float) -> Ma
     if hidden is None or not frame.markers:
         return frame
     behind = hidden.touches([_place(marker) for marker in frame.markers], radius)
-    kept = [marker for marker, away in zip(frame.markers, behind, strict=True) if not away]
-    return frame if len(kept) == len(frame.markers) else frame.model_copy(update={"markers": kept})
+    remaining = [marker for marker, away in zip(frame.markers, behind, strict=True) if not away]
+    return frame if len(remaining) == len(frame.markers) else frame.model_copy(update={"markers": remaining})
 
 
 def _place(marker: Marker) -> tuple[float, float, float]:
@@ -206,12 +206,12 @@ class OccludedTargets:
             hides: whether a position is occluded; None: no position is.
         """
         shown = [*targets, *others]
-        kept = [] if hides is None else [
+        remaining = [] if hides is None else [
             place for place in self._before
             if all(math.dist(place, one) >= self._same_place for one in shown) and hides(place)
         ]
-        self._before = [*targets, *kept]
-        return kept
+        self._before = [*targets, *remaining]
+        return remaining
 
 
 ODD_FOR = 0.5  # [s] for which an outlier must be detected at a position before it is reported
@@ -297,10 +297,10 @@ class Validation:
         return joined
 
     def validate(self, frame: MarkerArray, camera: Pinhole) -> ValidationResult:
-        """Validate a frame. The same frame may be validated again once more is known."""
+        """Validate a frame. The same frame may be validated again when more is known."""
         result = ValidationResult(remarks=[frame.remark] if frame.remark else [])
         stamp = frame.header.stamp
-        self._reported = [told for told in self._reported if stamp - told.seen <= self.forget_after * 1e9]
+        self._reported = [known for known in self._reported if stamp - known.seen <= self.forget_after * 1e9]
         for marker in frame.markers:
             place, reason = self._reason(marker, camera)
             if reason is None:
@@ -310,7 +310,7 @@ class Validation:
             elif reason:
                 result.refused.append((place, reason))
                 if not marker.text or self._stays(place, stamp):  # a falling object is an outlier for a moment
-                    self._tell(result, place, reason, stamp)
+                    self._report(result, place, reason, stamp)
             else:
                 result.targets.append(place)
         return result
@@ -340,10 +340,10 @@ class Validation:
         self._outliers.append(_Suspect(place, stamp, stamp))
         return False
 
-    def _tell(self, result: ValidationResult, place: Place, reason: str, stamp: int) -> None:
-        for told in self._reported:
-            if math.dist(told.place, place) < self._same_place:
-                told.seen, told.place = max(told.seen, stamp), place
+    def _report(self, result: ValidationResult, place: Place, reason: str, stamp: int) -> None:
+        for known in self._reported:
+            if math.dist(known.place, place) < self._same_place:
+                known.seen, known.place = max(known.seen, stamp), place
                 return
         self._reported.append(_Reported(place, stamp))
         result.rejections.append(Rejection(position=Vector3(x=place[0], y=place[1], z=place[2]), reason=reason))

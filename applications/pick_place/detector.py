@@ -257,6 +257,39 @@ class Detector:
 
         A round blob larger than any ball can look there is ignored: it is something else, or falling.
         """
+        tried, crowded = self._fit_singles(blobs, camera, offset, pixel_size)
+        alone: list[_Seen] = []
+        offsets: list[float] = []
+        sizes: list[float] = []
+        for blob, tries in tried:
+            if min(one.close for one in tries) < _ROUND:
+                crowded.append(blob)
+                continue
+            there = self._pixel_size(camera, blob.centroid)
+            best = min(tries, key=lambda one: abs(one.offset - offset))
+            if best.offset - offset > FALLING:
+                self.too_large += not self.resting.shows_container(camera, blob.centroid)
+                continue
+            if abs(best.offset - offset) > self.options.max_offset_px * pixel_size:
+                self.outliers.append(self._outlier(blob.centroid, camera, sized(best.offset, offset)))
+            elif best.oval > MOST_OVAL * there and not self.resting.shows_container(camera, blob.centroid):
+                self.outliers.append(self._outlier(blob.centroid, camera, FLAT))
+            else:
+                alone.append(_Seen(best.center, blob.area, blob.border))
+                offsets.append(best.offset / there)
+                sizes.append(there)
+        usual = float(np.median(offsets)) if offsets else 0.0
+        for k in np.flatnonzero(unlike(np.array(offsets), MOST_UNLIKE))[::-1].tolist():
+            pixel = camera.project(alone[k].center + camera.position)
+            if not self.resting.shows_container(camera, pixel):
+                self.outliers.append(self._outlier(pixel, camera, sized(offsets[k] * sizes[k], usual * sizes[k])))
+                del alone[k], offsets[k]
+        return alone, crowded, offsets
+
+    def _fit_singles(
+        self, blobs: list[Blob], camera: Pinhole, offset: float, pixel_size: float
+    ) -> tuple[list[tuple[Blob, list[_Round]]], list[Blob]]:
+        """Fit one sphere at each possible height to every complete blob; return these, and the other blobs."""
         crowded: list[Blob] = []
         tried: list[tuple[Blob, _Key]] = []
         starts: dict[_Key, list[Array]] = {}  # of blobs that were not in the last image
@@ -285,35 +318,7 @@ class Detector:
                 longer = oval(outline, center, camera) if close >= _ROUND else 0.0
                 fits[key].append(_Round(center, float(off), float(close), longer))
         self._fits = fits
-        alone: list[_Seen] = []
-        offsets: list[float] = []
-        sizes: list[float] = []
-        for blob, key in tried:
-            if not (tries := fits[key]):
-                continue
-            if min(one.close for one in tries) < _ROUND:
-                crowded.append(blob)
-                continue
-            there = self._pixel_size(camera, blob.centroid)
-            best = min(tries, key=lambda one: abs(one.offset - offset))
-            if best.offset - offset > FALLING:
-                self.too_large += not self.resting.shows_container(camera, blob.centroid)
-                continue
-            if abs(best.offset - offset) > self.options.max_offset_px * pixel_size:
-                self.outliers.append(self._outlier(blob.centroid, camera, sized(best.offset, offset)))
-            elif best.oval > MOST_OVAL * there and not self.resting.shows_container(camera, blob.centroid):
-                self.outliers.append(self._outlier(blob.centroid, camera, FLAT))
-            else:
-                alone.append(_Seen(best.center, blob.area, blob.border))
-                offsets.append(best.offset / there)
-                sizes.append(there)
-        usual = float(np.median(offsets)) if offsets else 0.0
-        for k in np.flatnonzero(unlike(np.array(offsets), MOST_UNLIKE))[::-1].tolist():
-            pixel = camera.project(alone[k].center + camera.position)
-            if not self.resting.shows_container(camera, pixel):
-                self.outliers.append(self._outlier(pixel, camera, sized(offsets[k] * sizes[k], usual * sizes[k])))
-                del alone[k], offsets[k]
-        return alone, crowded, offsets
+        return [(blob, fits[key]) for blob, key in tried if fits[key]], crowded
 
     def _is_explained(self, blob: Blob, owner: npt.NDArray[np.intp], camera: Pinhole) -> bool:
         """Return whether the balls explain the outline of their blob; blobs in the container are exempt."""

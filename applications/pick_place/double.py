@@ -51,12 +51,12 @@ async def run(bus: Bus, config: Config) -> None:
         q = robot.order(measured.name, measured.position) if measured else None
         T_world_tcp = robot.fk(q) if q is not None else None
         if state is not None:
-            scene.feel(state, T_world_tcp)
+            scene.update_gripper(state, T_world_tcp)
         if objects is not None:
             header = Header(stamp=bus.header().stamp, frame_id=WORLD)
             seen = [thing for thing in objects.objects if thing.state in ("table", "contained")]
             markers = [marker(index, thing) for index, thing in enumerate(seen)]
-            scene.see(MarkerArray(header=header, markers=markers), camera, T_world_tcp)
+            scene.update_detections(MarkerArray(header=header, markers=markers), camera, T_world_tcp)
             out.put(scene.scene())
             validated.put(PoseArray(header=header, poses=[
                 Pose(position=Vector3(x=at.x, y=at.y, z=at.z))

@@ -28,7 +28,7 @@ class PickPlaceFigures(application.Figures):
         """Return listeners for detections and targets, if they are plotted."""
         self._detections: dict[tuple[int, int], int] = {}  # counts by position
         self._targets: dict[tuple[int, int], int] = {}
-        if not self.pictured:
+        if not self.for_report:
             return {}
         return {DETECTED_OBJECTS: self._on_detections, VALIDATED_TARGETS: self._on_targets}
 

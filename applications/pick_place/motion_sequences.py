@@ -40,9 +40,9 @@ class MotionSequences:
             Move("descend", "GRASPING", cycle, goal=grasp, straight=True, needs_fresh_image=not self.p.world.on_hand),
         ]
         lifted = self._region((x, y, low + self.p.grasp.lift_height), yaw)
-        carry: list[Stage] = [Move("lift", "GRASPING", cycle, goal=lifted, carries=True), self._across(cycle, yaw)]
+        carry: list[Stage] = [Move("lift", "GRASPING", cycle, goal=lifted, carries=True), self.across(cycle, yaw)]
         if self.p.joined:
-            across = self._across(cycle, yaw)
+            across = self.across(cycle, yaw)
             across.goal = _through(lifted, across.goal, self.p.grasp.lift_height / 2)
             across.fallback, carry = carry, [across]
         # A suction cup touches what it takes. After a failed joint plan each yaw is tried by itself.
@@ -88,9 +88,9 @@ class MotionSequences:
         x, y, z = tcp
         height = self.grasp_height(self.p.world.table_height + self.p.world.ball_radius) + self.p.grasp.lift_height
         lift = Move("lift", "GRASPING", cycle, goal=self._region((x, y, height), 0.0), carries=True)
-        return [*([lift] if z < height - 0.01 else []), self._across(cycle, 0.0), self._release(cycle)]
+        return [*([lift] if z < height - 0.01 else []), self.across(cycle, 0.0), self._release(cycle)]
 
-    def _across(self, cycle: Pick, yaw: float) -> Move:
+    def across(self, cycle: Pick, yaw: float) -> Move:
         """Return the motion above the lowest column of the container, with anywhere above it as the fallback."""
         box, wide = self.p.world.container, self.p.place_pos_tol
         anywhere = Move("across", "PLACING", cycle, goal=self._above((box.x, box.y), yaw, wide), carries=True)

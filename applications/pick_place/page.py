@@ -15,10 +15,9 @@ from applications.pick_place.topics import (
 from common.messages import TaskStatus
 from common.topics import Topic
 from page.application import ApplicationPage
-from page.labels import Labels
 from page.layers import Layer
-from page.nodes import FLAT, Markers, points_of, ring
-from page.rejections import Place, RejectedPlaces
+from page.nodes import FLAT, Labels, Markers, points_of, ring
+from page.rejections import RejectedPosition, RejectedPositions
 
 if TYPE_CHECKING:
     import viser
@@ -73,28 +72,28 @@ class Rejected(Layer):
     def build(self) -> None:
         """Start without rejections."""
         self._ring = ring(_WIDER * self.stage.around.ball_radius)
-        self.rejected = RejectedPlaces()
-        self.nodes: dict[Place, tuple[str, viser.MeshHandle]] = {}  # with the name of its label
+        self.rejected = RejectedPositions()
+        self.nodes: dict[RejectedPosition, tuple[str, viser.MeshHandle]] = {}  # with the name of its label
         self._count = 0
         self.labels = Labels(self.scene, self.root, scale=0.75)
 
     def show(self, topic: Topic[Any], message: Any) -> None:
         """Add rejections; remove those at a target, or without a detection for a while."""
-        self.rejected.hear(message)
-        for place in [place for place in self.nodes if place not in self.rejected.places]:
+        self.rejected.update(message)
+        for place in [place for place in self.nodes if place not in self.rejected.positions]:
             self.nodes.pop(place)[1].remove()
-        for place in self.rejected.places:
+        for place in self.rejected.positions:
             if place not in self.nodes:
                 self._count += 1
                 self.nodes[place] = str(self._count), self.scene.add_mesh_simple(
                     f"{self.root}/{self._count}_ring", *self._ring, color=REJECTED, position=place.at, **FLAT)
         self.labels.show({name: (place.reason, np.array(place.at)) for place, (name, _) in self.nodes.items()},
-                         self.stage.view())
+                         self.stage.projection())
 
     @property
     def reasons(self) -> list[str]:
         """Displayed reasons, oldest first."""
-        return [place.reason for place in self.rejected.places]
+        return [place.reason for place in self.rejected.positions]
 
 
 class Workspace(Layer):
@@ -113,6 +112,6 @@ class Workspace(Layer):
 
 
 PAGE = ApplicationPage(
-    layers=(Targets, Rejected, Workspace), states={"GRASPING": "Taking", "PLACING": "Placing"},
-    latency="Picture to targets", counters=counters,
+    layers=(Targets, Rejected, Workspace), states={"GRASPING": "Grasping", "PLACING": "Placing"},
+    latency="Image to targets", counters=counters,
 )

@@ -186,7 +186,7 @@ Array = NDArray[np.float64]
 
 GREY = m.Color(r=0.6, g=0.6, b=0.6)  # color of what is not seen
 LEVEL = 0.005  # [m] an object this little above the table lies on it
-MOST_BESIDE = 50  # objects in containers but in no slot
+MAX_UNSORTED = 50  # objects in containers but in no slot
 AT_REST = 0.5  # [s] for which a slot must look occupied before the object counts as at rest
 
 
@@ -224,15 +224,15 @@ class PerceivedScene:
             for k, (x, y, z) in enumerate(self._slots.tolist(), 1)
         ]
         self._occupied: dict[int, Occupied] = {}  # by view
-        self._lasts: set[int] = set()  # views that look at times
+        self._occasional_views: set[int] = set()  # views that look at times
         self._free: set[int] = set()  # slots empty at the last grasp, without an object at rest since
         self._since: dict[int, int] = {}  # stamp since which a slot looks occupied
-        self._beside_slots: dict[int, list[Sighting]] = {}  # other objects in containers, by view
+        self._unsorted: dict[int, list[Sighting]] = {}  # other objects in containers, by view
         self._held: m.AttachedObject | None = None
         self._changed_hands_at = 0
         self._stamp = 0
 
-    def see(self, detections: m.MarkerArray, camera: Pinhole, T_world_tcp: Array | None, view: int = 0,
+    def update_detections(self, detections: m.MarkerArray, camera: Pinhole, T_world_tcp: Array | None, view: int = 0,
             at_times: bool = False, hidden: Occlusion | None = None) -> None:
         """Process the detections of one frame of one view.
 
@@ -248,7 +248,7 @@ class PerceivedScene:
         if self._held is not None and T_world_tcp is not None:
             hand = tuple(T_world_tcp[:3, 3])
         on_table: list[Sighting] = []
-        beside_slots: list[Sighting] = []
+        unsorted: list[Sighting] = []
         in_container: list[tuple[float, float]] = []
         for marker in detections.markers:
             thing = Sighting.of(marker)
@@ -259,7 +259,7 @@ class PerceivedScene:
             if shown and thing.shape == "sphere" and shown[0].container is self._with_slots:
                 in_container.append((pixel[0], pixel[1]))
             elif shown:
-                beside_slots.append(thing)
+                unsorted.append(thing)
             elif hand is None or math.dist(hand, thing.position) > max(thing.size) / 2:
                 on_table.append(thing)
         radius = self.around.ball_radius
@@ -267,30 +267,30 @@ class PerceivedScene:
             lambda place: bool(hidden.occludes([place], radius)[0])))
         now = Occupied(stamp, *occupied_slots(in_container, camera, self._slots, radius, self._free))
         if hidden is None:
-            self._beside_slots[view] = beside_slots
+            self._unsorted[view] = unsorted
         else:
-            self._keep_hidden(view, now, hidden)
-            if beside_slots or not hidden.everything:
-                self._beside_slots[view] = beside_slots
+            self._retain_occluded(view, now, hidden)
+            if unsorted or not hidden.everything:
+                self._unsorted[view] = unsorted
         self._occupied[view] = now
         self._since = {slot: self._since.get(slot, stamp) for slot in self._occupied_slots(beneath=False)}
         # A falling or rolling object appears in one slot after another, and in none of them once another covers it.
         self._free -= {slot for slot, since in self._since.items() if (stamp - since) * 1e-9 >= AT_REST}
         if at_times:
-            self._lasts.add(view)
+            self._occasional_views.add(view)
 
-    def _keep_hidden(self, view: int, now: Occupied, hidden: Occlusion) -> None:
+    def _retain_occluded(self, view: int, now: Occupied, hidden: Occlusion) -> None:
         """Keep the state of occupied slots that are occluded now."""
         before = self._occupied.get(view)
         slots = sorted((before.seen | before.beneath) - now.seen - now.beneath) if before else []
         if not before or not slots:
             return
         behind = hidden.occludes(self._slots[slots], self.around.ball_radius)
-        kept = {slot for slot, away in zip(slots, behind, strict=True) if away}
-        now.seen |= kept & before.seen
-        now.beneath |= kept - before.seen
+        occluded = {slot for slot, away in zip(slots, behind, strict=True) if away}
+        now.seen |= occluded & before.seen
+        now.beneath |= occluded - before.seen
 
-    def feel(self, gripper: m.GripperState, T_world_tcp: Array | None) -> None:
+    def update_gripper(self, gripper: m.GripperState, T_world_tcp: Array | None) -> None:
         """Process a change of the gripper: the nearest object becomes the held one with its id, or it is released."""
         if gripper.holding == (self._held is not None) or (gripper.holding and T_world_tcp is None):
             return
@@ -326,7 +326,7 @@ class PerceivedScene:
     @property
     def crowded(self) -> bool:
         """Whether more was detected than a planning scene can hold."""
-        return self._tracks.crowded or any(len(things) > MOST_BESIDE for things in self._beside_slots.values())
+        return self._tracks.crowded or any(len(things) > MAX_UNSORTED for things in self._unsorted.values())
 
     def scene(self) -> m.PlanningScene:
         """Return the planning scene; its stamp is that of its newest frame."""
@@ -334,12 +334,12 @@ class PerceivedScene:
         seen = self._occupied_slots(beneath=False)
         contained = [self._in_slots[k] if k in seen else self._in_slots[k].model_copy(update={"unseen": True})
                      for k in sorted(self._occupied_slots())]
-        beside: list[Sighting] = []
-        for things in self._beside_slots.values():
-            beside = things if len(things) > len(beside) else beside
+        unsorted: list[Sighting] = []
+        for things in self._unsorted.values():
+            unsorted = things if len(things) > len(unsorted) else unsorted
         contained += [  # of the view that shows most of them
             self._object(f"contained_{k + 1}", "contained", thing, _pose(Track("", thing.position, 0, 0.0, thing)))
-            for k, thing in enumerate(beside[:MOST_BESIDE])
+            for k, thing in enumerate(unsorted[:MAX_UNSORTED])
         ]
         held = [self._held] if self._held is not None else []
         return m.PlanningScene(
@@ -365,7 +365,7 @@ class PerceivedScene:
     def _occupied_slots(self, *, beneath: bool = True) -> set[int]:
         """Return the slots that any current view shows occupied, with or without the ones below that carry them."""
         return {slot for view, one in self._occupied.items() for slot in one.seen | (one.beneath if beneath else set())
-                if view in self._lasts or (self._stamp - one.stamp) * 1e-9 <= self.p.forget_after}
+                if view in self._occasional_views or (self._stamp - one.stamp) * 1e-9 <= self.p.forget_after}
 
     def _ball(self, name: str, role: str, pose: m.Pose) -> m.CollisionObject:
         return m.CollisionObject.model_validate({

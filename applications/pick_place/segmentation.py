@@ -102,9 +102,9 @@ def find_blobs(
                 break
     blobs = []
     traced = [tuple((part.tobytes(), is_hole) for part, is_hole in parts) for parts in within]
-    again = known or {}
-    anew = iter(_outlines([parts for parts, key in zip(within, traced, strict=True) if key not in again], camera))
-    outlines = [again[key] if key in again else next(anew) for key in traced]
+    cached = known or {}
+    computed = iter(_outlines([parts for parts, key in zip(within, traced, strict=True) if key not in cached], camera))
+    outlines = [cached[key] if key in cached else next(computed) for key in traced]
     for (contour, area), outline, key in zip(large, outlines, traced, strict=True):
         moments = cv2.moments(contour)
         centroid = np.array([moments["m10"], moments["m01"]]) / moments["m00"]

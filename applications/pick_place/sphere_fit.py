@@ -236,8 +236,8 @@ def separate(outline: Outline, mask: Mask, camera: Pinhole, resting: BallGeometr
             chosen.append(candidate)
             free &= ~candidate.points
     centers = np.array([c.center for c in chosen]).reshape(-1, 3)
-    kept: Array = centers[_end(centers, mask, camera, resting.radius)]
-    return kept
+    separated: Array = centers[_end(centers, mask, camera, resting.radius)]
+    return separated
 
 
 def _votes(outline: Outline, camera: Pinhole, resting: BallGeometry, offset: float) -> Array:
@@ -251,8 +251,8 @@ def _votes(outline: Outline, camera: Pinhole, resting: BallGeometry, offset: flo
         t = drop / toward[:, 2]
     votes = camera.position[:2] + t[:, None] * toward[:, :2]
     good = np.isfinite(votes).all(axis=1) & (t > 0) & (np.abs(votes - camera.position[:2]).max(axis=1) < 20)
-    kept: Array = votes[good]
-    return kept
+    usable: Array = votes[good]
+    return usable
 
 
 def _peaks(votes: Array, camera: Pinhole, resting: BallGeometry) -> Array:

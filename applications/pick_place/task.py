@@ -10,21 +10,26 @@ import math
 from pydantic import BaseModel
 
 from applications.pick_place.ball_places import ViewingPoses
-from applications.pick_place.choice import Choice, Pick, PickPlaceView, ReleasePositions, Spot, Spots, same_place
+from applications.pick_place.choice import (
+    Choice,
+    ObjectCounter,
+    Pick,
+    PickPlaceView,
+    ReleasePositions,
+    Spots,
+    same_place,
+)
 from applications.pick_place.grasping import Config
 from applications.pick_place.motion_sequences import MotionSequences
 from applications.pick_place.topics import PickPlaceStatus
 from common import messages as m
 from common.robot.home import is_home
 from common.tasks.engine import Task
-from common.tasks.stages import MISSES, AwaitImage, Cycle, Grip, Move, Stage
-from common.tasks.watchdogs import DwellTimer
+from common.tasks.stages import MISSES, AwaitImage, Cycle, DwellTimer, Grip, Move, Stage
 
 GONE = "the ball is no longer where it was seen"
 MOST = 400  # characters of a message
 STANDING = 0.5  # [s] of occlusion before the arm moves aside: images arrive with a delay
-CONTAINED_FOR = 0.5  # [s] for which balls must be seen in the container to count
-AT_REST = 0.3  # [s] for which a dropped ball must be seen at one position: it may still roll out of view
 
 
 class PickPlace(Task[PickPlaceView]):
@@ -39,11 +44,8 @@ class PickPlace(Task[PickPlaceView]):
         self._around = config.world
         self._sequences = MotionSequences(config, self.gripper)
         self._choice = Choice(config, config.world.container, config.world.ball_radius, lambda: self.status.done)
-        self._contained, self._released = DwellTimer(), False
         self._viewing, self._hidden = ViewingPoses(config), DwellTimer()
-        self._carried = False
-        self._expected = 0  # objects there were when one fell out of the gripper, until all are seen again
-        self._still, self._places = DwellTimer(), list[Spot]()  # positions of all visible objects since then
+        self._counter = ObjectCounter(config)
 
     # --- what to do next -------------------------------------------------------------------------------------
 
@@ -51,7 +53,7 @@ class PickPlace(Task[PickPlaceView]):
         """Carry a held object to the container, take the nearest ball, or end."""
         assert view.gripper is not None
         if view.holding and view.gripper.outcome in MISSES:  # another object than intended
-            self._let_go(view)
+            self._drop(view)
         elif view.holding:
             if view.attached:  # else the planning scene is not up to date yet
                 self.queue += self._sequences.place_held(self._choice.held(view.attached, view), view.tool)
@@ -65,7 +67,7 @@ class PickPlace(Task[PickPlaceView]):
         waiting = any(stage.cycle is not None and not stage.cycle.started for stage in self.queue)
         if running.name == "across" and self._around.on_hand:
             if not any(isinstance(stage, AwaitImage) for stage in self.queue):
-                self.queue += [self.home(view.let_go()), AwaitImage()]
+                self.queue += [self.home(view.released()), AwaitImage()]
         elif running.name == "across" and not waiting:
             self._queue_next(view)
 
@@ -84,7 +86,7 @@ class PickPlace(Task[PickPlaceView]):
         running = _pick_of(self.running.stage) if self.running else None
         box = self._around.container
         cycle = self._choice.next(view, (box.x, box.y) if running else view.tool, [running] if running else [])
-        if cycle is None and not running and self._choice.once_more():
+        if cycle is None and not running and self._choice.allow_retries():
             # Whether the last descent has a plan depends on the arm posture above it.
             self.queue.append(Move("home", "HOMING", Cycle(), goal=m.JointGoal(named="home")))
             return True
@@ -110,8 +112,8 @@ class PickPlace(Task[PickPlaceView]):
             # Time of images, not of the clock: without new images the table is not known to be empty.
             seen = max(self.images_after, min(view.stamps))
             done = self.wait_timer.elapsed(bool(left), seen) >= (self.p.grace if left else self.p.empty)
-            done = done and self._counted(view) <= self.status.done  # else it is about to be counted
-            missing = self._expected - self.status.done - left
+            done = done and self._counter.contained(view) <= self.status.done  # else it is about to be counted
+            missing = self._counter.expected - self.status.done - left
             remarks = [view.seen.remark if view.seen else "",
                        f"{missing} that was seen before something fell out of the hand was not seen again"
                        if missing > 0 else ""]
@@ -149,77 +151,45 @@ class PickPlace(Task[PickPlaceView]):
     # --- what happened ---------------------------------------------------------------------------------------
 
     def note(self, view: PickPlaceView) -> None:
-        """Count objects in the container, and objects on the table while none is held or falling."""
-        status = self.status
+        """Update the counters of the status."""
         if not self._waits(view):  # the time without a view only counts while the task waits for one
             self._hidden.reset()
-        status.skipped = self._choice.rejections()
-        # Objects in the container were placed before a restart of the task, or by another program; a restarted scene
-        # manager may report them later. A released ball counts at its release: before, it may hang above others, and an
-        # image shows one more.
-        contained = self._counted(view)
-        stages = {status.stage, *(stage.name for stage in self.active_stages)}
+        self.status.skipped = self._choice.rejections()
+        stages = {self.status.stage, *(stage.name for stage in self.active_stages)}
         releases = "release" in stages or self.deferred_grip == "release"
-        if self._carried and not view.holding and not releases:
-            self._expected, self._places = max(self._expected, status.total), []
-        self._carried = view.holding and not releases
-        if releases:
-            self._contained.reset()
-        elif self._contained.elapsed(contained, view.scene_stamp) >= min(CONTAINED_FOR, self.p.empty):
-            status.done = max(status.done, contained)
         looked = not self._around.on_hand or min(view.stamps) > self.images_after
-        if looked and not view.holding and not stages & {"close", "lift", "across", "release"}:
-            found = status.done + len(view.targets)
-            if found >= self._expected and self._lie_still(view):
-                self._expected = 0
-            status.total = max(found, self._expected)
-
-    def _lie_still(self, view: PickPlaceView) -> bool:
-        """Return whether everything on the table has stayed at its position for a while."""
-        spots = [place[:2] for place in view.targets]
-        if any(all(math.dist(spot, before) > self.p.moved for before in self._places) for spot in spots):
-            self._places = spots
-            self._still.reset()
-        return self._still.elapsed(True, min(view.stamps)) >= AT_REST
-
-    def _counted(self, view: PickPlaceView) -> int:
-        """Return the number of objects in the container: only visible ones once this task has placed some.
-
-        Before that, objects below visible ones count as well. A rolling object appears in one slot after another; what
-        would carry it was counted already, or does not exist.
-        """
-        contained = view.objects("contained")
-        return sum(not (self._released and thing.unseen) for thing in contained)
+        moves_object = bool(stages & {"close", "lift", "across", "release"})
+        self._counter.update(view, self.status, releases=releases, counts_table=looked and not moves_object)
 
     def _waits(self, view: PickPlaceView) -> bool:
         """Return whether nothing runs and nothing prevents the next decision."""
         assert view.motion is not None
         idle = self.running is None and not self.queue and view.motion.state != "active"
-        kept = self.status.paused or view.motion.held or view.motion.fault or view.motion.stopped
-        return idle and self.status.started and not kept
+        blocked = self.status.paused or view.motion.held or view.motion.fault or view.motion.stopped
+        return idle and self.status.started and not blocked
 
     def on_restart(self) -> None:
         """Try all viewing poses again: the obstacle may be gone."""
         self._viewing.found()
         self._hidden.reset()
-        self._expected = 0
+        self._counter.expected = 0
 
     @property
     def memory(self) -> ReleasePositions:
         """Release positions: a ball leaning on others may look as if it lay on the floor."""
-        return self._choice.let_go
+        return self._choice.releases
 
     def remember(self, memory: BaseModel) -> None:
         """Restore the release positions."""
         assert isinstance(memory, ReleasePositions)
-        self._choice.let_go = memory
+        self._choice.releases = memory
 
     def succeeded(self, stage: Stage, view: PickPlaceView) -> None:
         """Count a released ball."""
         pick = _pick_of(stage)
         if stage.name == "release" and pick is not None:
             self.status.done += 1
-            self._released = True
+            self._counter.released = True
             if self._around.on_hand:
                 self.images_after = view.now
             self._choice.released(pick, view)
@@ -231,12 +201,12 @@ class PickPlace(Task[PickPlaceView]):
         self.status.retries += 1
         x, y, _ = pick.target.position
         self.status.message = f"{stage.problem} at ({x:.3f}, {y:.3f})"
-        self._choice.missed(pick.target, view.let_go(), stage.problem)
-        self._let_go(view)
+        self._choice.missed(pick.target, view.released(), stage.problem)
+        self._drop(view)
 
-    def _let_go(self, view: PickPlaceView) -> None:
+    def _drop(self, view: PickPlaceView) -> None:
         self.clear()
-        self.queue += [self._sequences.open(), *self.back_off(view.let_go())]
+        self.queue += [self._sequences.open(), *self.back_off(view.released())]
         if view.seen is not None and view.seen.unseen and (pose := self._viewing.best()):
             # The gripper occludes the ball that it did not take; the ball may have moved.
             self.queue += [Move("look", "HOMING", goal=m.JointGoal(positions=pose)), AwaitImage()]

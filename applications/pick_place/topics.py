@@ -8,7 +8,7 @@ from pydantic import computed_field, model_validator
 
 from common import messages as m
 from common.application import ApplicationTopics
-from common.messages.task import TaskStatus
+from common.messages.execution import TaskStatus
 from common.topics import Topic
 
 TaskState = Literal["IDLE", "GRASPING", "PLACING", "HOMING", "DONE", "ERROR"]

@@ -1,1 +1,1 @@
-"""One cell that is up for whoever asked for it: checked, started, shown, told of, and ended."""
+"""A cell session at a terminal: check the options, start the cell, show it, run its task, shut it down."""

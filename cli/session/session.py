@@ -1,8 +1,9 @@
-"""One cell that is up at a terminal, from what was asked for to its end."""
+"""One cell at a terminal: bring it up, run its task or wait for Ctrl-C, and shut it down."""
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import os
 import signal
@@ -11,171 +12,136 @@ import tempfile
 import time
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
-from cli.session.interlocks import persisted_interlocks
+from cli.session.resolve import resolve, without
 from common.supervision.multi_host import HostOptions
 from common.terminal import printable
 
 if TYPE_CHECKING:
     from cli.session.live_table import Content
     from cli.session.screens import Screen
-    from common.config import Cell
     from common.messages import Interlock
     from common.supervision.supervisor import Supervisor
     from common.transport.bus import Bus
     from lab.chaos.agent import Chaos
-    from page.serving import Page
+    from page.address import PageAddress
     from recording.report.aggregator import Collector
 
 T = TypeVar("T")
 
-START_REQUEST_TIMEOUT = 5.0  # [s]
-DOUBTS_TIMEOUT = 10.0  # [s] for the quick look at the cell, which is nicer than its services
-LAST_WORDS = 5.0  # [s] for whoever is slow to read what became of a run
-LEFT = 3  # exit code
+EXECUTOR = "trajectory_executor"
+STATUS_TIMEOUT = 2.0  # [s] for the first motion status of the executor
+START_TIMEOUT = 5.0  # [s] for the answer to the start of the task
+CHECK_TIMEOUT = 10.0  # [s] for the quick check of the cell, which has a lower priority than its services
+SUMMARY_TIMEOUT = 5.0  # [s] for a slow reader of the summary
+UNEXPLAINED_EXIT = 3  # exit code of a task that is DONE although the simulated world has objects left
 
 
-class Disturbance(NamedTuple):
-    """Faults that were asked for."""
+class Faults(NamedTuple):
+    """Injected faults, as requested."""
 
     seed: int
     per_minute: float
-    until_ended: bool  # rather than without end
+    until_ended: bool  # stop in time for the run to finish; otherwise never
 
 
 class CellSession:
-    """One bring-up, as a person asked for it."""
+    """One cell, from its options to its shutdown."""
 
     def __init__(
         self, cell: str, overrides: Sequence[str] | None = None, *, world: str | None = None, seed: int | None = None,
         speed: float = 1.0, domain: str | None = None, connect: str | None = None, no_viewer: bool = False,
-        summary: str | None = None, log_json: bool = False, share: HostOptions | None = None,
+        summary: str | None = None, log_json: bool = False, host: HostOptions | None = None,
     ) -> None:
-        """Check everything that was asked for; nothing is started yet.
+        """Check all options; nothing is started yet.
 
         Args:
             cell: name or path of its file.
-            overrides: as given to `--set`.
-            world: another one, by name or path.
-            seed: of everything random.
+            overrides: as for `--set`.
+            world: another world, by name or path.
+            seed: of all random numbers.
             speed: cell time per wall time.
-            domain: where, as given to `--domain`.
-            connect: where, as given to `--connect`.
+            domain: of the router, as for `--domain`.
+            connect: endpoint of another router, as for `--connect`.
             no_viewer: without the operator's page.
             summary: file for the figures of a run.
-            log_json: log lines are JSON objects.
-            share: of this host in the cell.
+            log_json: write log lines as JSON.
+            host: what runs on this host.
 
         Raises:
             ConfigError, UnknownName: one line naming the option, the value and the choices.
         """
-        from common.application import find_application
-        from common.config import expanded, load_cell
-        from common.errors import ConfigError
-        from common.supervision.launch import (
-            Launch,
-            clock_at_speed,
-            process_start_time,
-            require_free_port,
-            require_modules,
-            router_location,
-        )
-        from common.transport.endpoint import endpoint_of
-        from page.access import VIEWER
-        from recording.report.aggregator import RunAggregator
-        from security.requiring import require_secured, with_near
-        from tools.check.cell import require_safe
+        from common.supervision.launch import process_start_time
 
         self.began = process_start_time()
-        self.file = Path(summary) if summary else None
-        if self.file and not self.file.absolute().parent.is_dir():
-            raise ConfigError("--summary", summary, "is in a folder that does not exist")
-        if self.file and self.file.is_dir():
-            raise ConfigError("--summary", summary, "is a folder")
-        share = share or HostOptions()
-        number, endpoint = router_location(domain, connect)
-        self.launch = share.linked(Launch(
-            cell=cell, overrides=tuple(expanded(overrides or ())), world=world, seed=seed, domain=number,
-            connect=endpoint, log_json=log_json, clock=clock_at_speed(speed, share.epoch(speed)),
-        ))
-        loaded = load_cell(cell, self.launch.overrides, world=world, seed=self.launch.seed)
-        if no_viewer:
-            kept = {name: entry for name, entry in loaded.services.items() if entry.kind != VIEWER}
-            loaded = loaded.model_copy(update={"services": kept})
-        self.cell: Cell = loaded
-        self.fold = RunAggregator(
-            loaded.name, find_application(loaded.application), robot=loaded.robot, seed=loaded.run.seed,
-            speed=self.launch.clock.speed, containers=list(loaded.world.containers))
-        self.summary = self.fold.summary
-        require_modules(loaded)
-        require_safe(loaded)
-        if endpoint is None:
-            require_free_port(endpoint_of(number))
-        self.cell = share.part_of(loaded)
-        require_secured(self.launch, self.cell)
-        self.launch = with_near(self.launch)
+        resolved = resolve(
+            cell, overrides, world=world, seed=seed, speed=speed, domain=domain, connect=connect, no_viewer=no_viewer,
+            summary=summary, log_json=log_json, host=host or HostOptions())
+        self.launch, self.cell, self.file = resolved.launch, resolved.cell, resolved.summary_file
+        self.aggregator = resolved.aggregator
+        self.summary = self.aggregator.summary
+        self.first: Callable[[Bus], Awaitable[None]] | None = None  # runs at the terminal once the cell is up
         self._supervisor: Supervisor | None = None
         self._collector: Collector | None = None
         self._screen: Screen | None = None
-        self._page: Page | None = None
-        self._watchers: dict[str, list[str]] = {}  # commands by name
-        self._disturbance: Disturbance | None = None
+        self._page: PageAddress | None = None
+        self._watchers: dict[str, list[str]] = {}  # commands of observing processes by name
+        self._faults: Faults | None = None
         self._chaos: Chaos | None = None
-        self._doubts: asyncio.Task[None] | None = None
-        self.first: Callable[[Bus], Awaitable[None]] | None = None  # is done at the terminal once the cell is up
+        self._checking: asyncio.Task[None] | None = None
 
     def serve_page(self, host: str | None, port: str | None) -> None:
-        """Say where the operator's page is to be, if the cell has one; without this the cell's own words hold.
+        """Set where the operator's page listens, if the cell has one.
 
         Raises:
-            ConfigError: there is no page, the port is taken, or host or port cannot be used.
+            ConfigError: the cell has no page, the port is in use, or host or port are not valid.
         """
-        from page.serving import build_report
+        from page.address import plan_page
 
-        self._page = page = build_report(self.cell, host, port)
+        self._page = page = plan_page(self.cell, host, port)
         if page is not None:
             overrides = (*self.launch.overrides, *page.overrides)
             self.launch = replace(self.launch, overrides=overrides, extra=page.environment)
 
     def record_to(self, file: str | None) -> None:
-        """Have a process beside the services record all that travels, from before they are ready to after their end.
+        """Record everything, from before the services are ready until after their end.
 
         Raises:
-            ConfigError: no recording can be made there.
+            ConfigError: the file cannot be a recording.
         """
         if file is None:
             return
         from common.supervision.launch import module_command
         from common.transport.credentials import RECORDER
         from recording.capture import CustomTopics
-        from recording.summary import require_new
-        from security.requiring import require_recorder
+        from recording.formatting import require_new
+        from security.preflight import require_recorder
 
         path = Path(file).absolute()
         require_new(path, "--record")
         require_recorder(self.launch, self.cell)
-        place = ["--connect", self.launch.connect] if self.launch.connect else ["--domain", str(self.launch.domain)]
+        router = ["--connect", self.launch.connect] if self.launch.connect else ["--domain", str(self.launch.domain)]
         self._watchers[RECORDER] = [
-            *module_command("cli.main"), "record", "--cell", self.cell.name, "-o", str(path), *place, "--gate",
+            *module_command("cli.main"), "record", "--cell", self.cell.name, "-o", str(path), *router, "--gate",
             "--own", str(CustomTopics.of(self.cell)),
         ]
 
-    def disturb(self, seed: int, per_minute: float, *, until_ended: bool) -> None:
-        """Have faults made on purpose once the cell is up: without end, or until a run has time left to finish."""
-        self._disturbance = Disturbance(seed, per_minute, until_ended)
+    def inject_faults(self, seed: int, per_minute: float, *, until_ended: bool) -> None:
+        """Inject faults once the cell is up: without end, or until a run has time left to finish."""
+        self._faults = Faults(seed, per_minute, until_ended)
 
     def leave_out(self, name: str) -> None:
         """Do not start a service."""
-        kept = {key: entry for key, entry in self.cell.services.items() if entry.name != name}
-        self.cell = self.cell.model_copy(update={"services": kept})
+        self.cell = without(self.cell, [name])
 
     def visit(self, visit: Callable[[Bus], Awaitable[T]]) -> T:
-        """What a visit to the cell returns that is brought up for it.
+        """Bring the cell up, and return the result of `visit`.
 
         Raises:
-            KeyboardInterrupt: a signal ended it.
+            KeyboardInterrupt: a signal ended the cell.
         """
         results: list[T] = []
 
@@ -183,62 +149,63 @@ class CellSession:
             results.append(await visit(bus))
             return 0
 
-        if asyncio.run(self._operate(work)) or not results:
+        if asyncio.run(self._run(work)) or not results:
             raise KeyboardInterrupt
         return results[0]
 
     def run_to_end(self) -> int:
-        """Exit code of a run: 0 when the task is DONE, 1 when it is not, 130 after Ctrl-C.
+        """Run the task to its end and print a summary.
 
-        3 when it is DONE and something was left of which the summary says no reason: the simulated world knows.
+        Returns:
+            Exit code: 0 if the task is DONE, 1 if not, 130 after Ctrl-C, 3 if it is DONE but the simulated world has
+            objects left for which the summary gives no reason.
         """
         from common.process.dropping_writer import DroppingWriter
         from common.supervision.supervisor import StartFailed
         from recording.report.summary import describe
 
         try:
-            code = asyncio.run(self._operate(self._until_ended))
+            code = asyncio.run(self._run(self._until_ended))
         except StartFailed:
             self.summary.failed = True
-            self.write_summary()
+            self._write_summary()
             raise
         try:
-            self.write_summary()
-        finally:  # what became of the run is said also where the disk takes no file
+            self._write_summary()
+        finally:  # also when the file cannot be written
             out = DroppingWriter(sys.stdout)
-            for line in describe(self.summary.as_dict(), self.fold.figures):
+            for line in describe(self.summary.as_dict(), self.aggregator.figures):
                 out.put(printable(line) + "\n")
-            out.flush(LAST_WORDS)
-        return LEFT if code == 0 and self.summary.unexplained else code
+            out.flush(SUMMARY_TIMEOUT)
+        return UNEXPLAINED_EXIT if code == 0 and self.summary.unexplained else code
 
-    def write_summary(self) -> None:
-        """Write the figures, if a file was named for them."""
+    def stay(self) -> int:
+        """Stay up until a signal, and return the exit code: 0 if the cell was up."""
+        code = asyncio.run(self._run(self._until_interrupted))
+        self._write_summary()
+        return 0 if self.summary.ready is not None else code
+
+    def _write_summary(self) -> None:
         if self.file is not None:
             self.summary.write(self.file)
 
-    def stay(self) -> int:
-        """Exit code of staying up until a signal: 0 when that came after the cell was up."""
-        code = asyncio.run(self._operate(self._until_interrupted))
-        self.write_summary()
-        return 0 if self.summary.ready is not None else code
+    async def _run(self, work: Callable[[Bus], Awaitable[int]]) -> int:
+        """Do the work in the cell and return its exit code.
 
-    async def _operate(self, work: Callable[[Bus], Awaitable[int]]) -> int:
-        """Exit code of the work, done in the cell.
-
-        What is simulated stays as it is through restarts, until the end; what persons decided outlives that.
+        The state of simulated hardware lasts as long as the cell; interlocks of operators last longer.
         """
         from common.atomic_file import RUNTIME_VARIABLE, STATE_VARIABLE, state_folder
         from common.transport.endpoint import DEFAULT_DOMAIN
 
         if os.environ.get(STATE_VARIABLE):
-            return await self._in_cell(work)
-        kept = state_folder()
+            return await self._supervised(work)
+        folder = state_folder()
         if self._simulated and not self.launch.connect and self.launch.domain != DEFAULT_DOMAIN:
-            kept /= f"domain-{self.launch.domain}"  # there may be many of a simulated robot
-        with tempfile.TemporaryDirectory(prefix="zencell-") as folder:
-            extra = {**self.launch.extra, STATE_VARIABLE: str(kept), RUNTIME_VARIABLE: folder}
+            folder /= f"domain-{self.launch.domain}"  # several simulated robots may run on this host
+        with tempfile.TemporaryDirectory(prefix="zencell-") as until_end:
+            extra = {**self.launch.extra, STATE_VARIABLE: str(folder), RUNTIME_VARIABLE: until_end}
             self.launch = replace(self.launch, extra=extra)
-            return await self._in_cell(work)
+            return await self._supervised(work)
 
     @property
     def _simulated(self) -> bool:
@@ -246,7 +213,11 @@ class CellSession:
 
         return is_simulated(self.cell.robot)
 
-    async def _in_cell(self, work: Callable[[Bus], Awaitable[int]]) -> int:
+    async def _supervised(self, work: Callable[[Bus], Awaitable[int]]) -> int:
+        from common.supervision.preloaded import Preloaded
+
+        preloaded = Preloaded(self.launch.environment())  # its imports overlap with ours
+        from common.supervision.child import Child
         from common.supervision.lifecycle import Interrupted, Interrupts, run_cell
         from common.supervision.supervisor import Supervisor
 
@@ -260,20 +231,22 @@ class CellSession:
             else:
                 self._screen.line(name, text)
 
-        self._supervisor = Supervisor(self.cell, self.launch, show, self._watchers)
-        self._supervisor.start()  # before the rest of our own imports, which take as long as theirs
+        await asyncio.to_thread(preloaded.wait_ready)
+        self._supervisor = Supervisor(self.cell, self.launch, show, self._watchers, partial(Child, preloaded=preloaded))
+        self._supervisor.start()  # before the rest of our imports, which take as long as those of the services
         try:
             self._open_screen(early)
             return await run_cell(self.cell, self.launch, self._supervisor, interrupts, work, self._prepare)
         except Interrupted:
             return 128 + (interrupts.signal or signal.SIGINT)
         finally:
-            if self._doubts:
-                self._doubts.cancel()
+            if self._checking:
+                self._checking.cancel()
             if self._collector:
                 self._collector.read_truth()
             self.summary.restarts = self._supervisor.restarts
             self.summary.chaos = self._chaos.as_dicts() if self._chaos else None
+            preloaded.close()
             if self._screen:
                 self._screen.close()
 
@@ -293,32 +266,21 @@ class CellSession:
         assert self._supervisor is not None
         statuses = self._supervisor.statuses
         if self._collector is None:
-            return Content(statuses, {}, self.fold.progress)
+            return Content(statuses, {}, self.aggregator.progress)
         rates = {status.name: self._collector.rates.busiest_of(status.name) for status in statuses}
-        return Content(statuses, {name: rate for name, rate in rates.items() if rate}, self.fold.progress)
+        return Content(statuses, {name: rate for name, rate in rates.items() if rate}, self.aggregator.progress)
 
     def _prepare(self, bus: Bus) -> None:
         from recording.report.aggregator import Collector
 
         assert self._screen is not None
-        self._collector = Collector(bus, self.fold, self.began, self._screen.progress)
+        self._collector = Collector(bus, self.aggregator, self.began, self._screen.progress)
 
     async def _until_ended(self, bus: Bus) -> int:
-        from common import topics
-        from common.client.joining import person
-        from common.messages import TaskCommand
         from common.supervision.lifecycle import run_with_background
 
-        collector = await self._came_up(bus)
-        kept = await persisted_interlocks(bus, self.cell, self._note)
-        if not self._simulated:
-            self._tell_kept(kept)
-        if (self._simulated and kept) or (not self.cell.run.autostart and not kept):  # who says `run` says start
-            acknowledged = max((interlock.since for interlock in kept), default=0)  # a stop that comes now stays
-            start = TaskCommand(command="start", by=person(), override=bool(kept), acknowledged=acknowledged)
-            await bus.client(topics.TASK_COMMAND).call(start, START_REQUEST_TIMEOUT)
-            for interlock in kept:
-                self._note(f"Let go: {self.cell.name} was {interlock.description}")
+        collector = await self._on_up(bus)
+        await self._start_task(bus)
 
         async def end() -> None:
             if self.first is not None:
@@ -326,66 +288,100 @@ class CellSession:
             await collector.ended.wait()
             await collector.settle()
 
-        await run_with_background(self._disturbing(), run_with_background(collector.run(), end()))
-        if self._doubts is not None:  # of a short run: they may say why it was short
-            await asyncio.wait({self._doubts}, timeout=DOUBTS_TIMEOUT)
+        await run_with_background(self._inject_faults(), run_with_background(collector.run(), end()))
+        if self._checking is not None:  # its warnings may explain a short run
+            await asyncio.wait({self._checking}, timeout=CHECK_TIMEOUT)
         return 0 if self.summary.state == "DONE" else 1
+
+    async def _start_task(self, bus: Bus) -> None:
+        """Start the task if it does not start by itself; `run` also releases interlocks of a simulated robot."""
+        from common import topics
+        from common.client.joining import operator_name
+        from common.client.task import send_task_command
+
+        interlocks = await self._persisted_interlocks(bus)
+        if not self._simulated:
+            self._report(interlocks)
+        if (self._simulated and interlocks) or (not self.cell.run.autostart and not interlocks):
+            newest = max((interlock.since for interlock in interlocks), default=0)  # a newer stop is not released
+            await send_task_command(
+                bus.client(topics.TASK_COMMAND), "start", operator_name(), override=bool(interlocks),
+                acknowledged=newest, timeout=START_TIMEOUT)
+            for interlock in interlocks:
+                self._note(f"Released: {self.cell.name} was {interlock.description}")
 
     async def _until_interrupted(self, bus: Bus) -> int:
         from common.supervision.lifecycle import run_with_background
         from common.transport.endpoint import endpoint_of
 
-        collector = await self._came_up(bus)
-        assert self._screen is not None
+        collector = await self._on_up(bus)
         endpoint = endpoint_of(None if self.launch.connect else self.launch.domain, self.launch.connect)
         took = f"{self.summary.ready:.1f} s"
-        self._screen.note(f"{self.cell.name} is up at {endpoint} after {took}. Read it from outside:")
-        self._screen.note(zenoh_cli_line(endpoint, self.cell.name))
-        self._tell_kept(await persisted_interlocks(bus, self.cell, self._note))
-        await run_with_background(self._disturbing(), collector.run())
+        self._note(f"{self.cell.name} is up at {endpoint} after {took}. To see all its messages:")
+        self._note(zenoh_cli_line(endpoint, self.cell.name))
+        self._report(await self._persisted_interlocks(bus))
+        await run_with_background(self._inject_faults(), collector.run())
         return 0
 
-    def _tell_kept(self, kept: list[Interlock]) -> None:
-        for interlock in kept:
-            verb = "start" if interlock.kind == "stopped" else "resume"
-            self._note(f"{self.cell.name} is {interlock.description}: `zencell task {verb}` lets it go on")
+    async def _persisted_interlocks(self, bus: Bus) -> list[Interlock]:
+        """Return stops and holds of operators from before the cell came up; report a reduced speed."""
+        from common import topics
+        from common.messages import SELF_RELEASING
+
+        if not any(entry.kind == EXECUTOR for entry in self.cell.services.values()):
+            return []  # it runs on another host, or the cell has no arm
+        reader, motion = bus.reader(topics.MOTION_STATUS), None
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(STATUS_TIMEOUT):
+                motion = reader.latest or await reader.next()
+        if motion is None:
+            return []
+        if motion.speed_scaling < 1:
+            self._note(f"Motions run at {100 * motion.speed_scaling:.0f} % of their speed; for full speed: "
+                       f"`zencell param set services.{EXECUTOR}.speed_scaling=1`")
+        return [interlock for interlock in motion.interlocks if interlock.by not in SELF_RELEASING]
+
+    def _report(self, interlocks: list[Interlock]) -> None:
+        for interlock in interlocks:
+            command = "start" if interlock.kind == "stopped" else "resume"
+            self._note(f"{self.cell.name} is {interlock.description}: `zencell task {command}` lets it continue")
 
     def _note(self, line: str) -> None:
         assert self._screen is not None
         self._screen.note(line)
 
-    async def _tell_doubts(self) -> None:
+    async def _check_cell(self) -> None:
+        """Show the warnings of a quick check of the cell."""
         from tools.check.cell import QuickCheckFailed, warnings_in_subprocess
 
         try:
             for found in await warnings_in_subprocess(self.cell, self.launch.environment()):
                 self._note(f"{found.severity}: {printable(found.line)}")
-        except QuickCheckFailed as told:
-            self._note(f"warning: {told}")
+        except QuickCheckFailed as error:
+            self._note(f"warning: {error}")
 
-    async def _disturbing(self) -> None:
+    async def _inject_faults(self) -> None:
         if self._chaos is not None:
             await self._chaos.run()
 
-    async def _came_up(self, bus: Bus) -> Collector:
+    async def _on_up(self, bus: Bus) -> Collector:
         assert self._collector is not None
         self.summary.ready = time.monotonic() - self.began
-        if self._page and self._screen:
-            self._screen.note(f"Open {self._page.address}")
-        self._doubts = asyncio.create_task(self._tell_doubts(), name="doubts")
-        if self._disturbance is not None:
+        if self._page:
+            self._note(f"Open {self._page.url}")
+        self._checking = asyncio.create_task(self._check_cell(), name="check")
+        if self._faults is not None:
             from lab.chaos.agent import create_chaos, keys_of
 
             assert self._supervisor is not None
-            seed, per_minute, until_ended = self._disturbance
+            seed, per_minute, until_ended = self._faults
             known = keys_of(await bus.owners(), [entry.name for entry in self.cell.services.values()])
             self._chaos = create_chaos(
                 bus, self.cell, self._supervisor, known, seed, per_minute, until_ended=until_ended)
         return self._collector
 
 
-
 def zenoh_cli_line(endpoint: str, cell: str) -> str:
-    """A command line to paste that shows all of a cell with zenoh-cli."""
+    """Return a command line that shows all messages of a cell with zenoh-cli."""
     line = "{key} {value}"
     return f"zenoh --mode client --connect {endpoint} subscribe -k '{cell}/**' --decoder msgpack --line '{line}'"

@@ -1,1 +1,1 @@
-"""A cell as a program sees it: what `from zencell import Cell` gives, and what the command line stands on."""
+"""A cell as programs see it: `from zencell import Cell`, and the basis of the command line."""

@@ -1,7 +1,7 @@
-"""The same `Cell` for scripts and notebooks that do not `await`: each call returns when it is done.
+"""The same `Cell` without `await`, for scripts and notebooks: each call returns when it is done.
 
-A thread of its own has the loop, so it works inside a loop that runs already, as in a notebook. What the asynchronous
-one awaits is called, `async with` is `with`, `async for` is `for`; `cell.param["path"] = 3` changes a parameter.
+A thread runs the event loop, so this also works where a loop already runs, as in a notebook. Awaited methods are called
+instead, `async with` becomes `with`, `async for` becomes `for`; `cell.param["path"] = 3` changes a parameter.
 """
 
 from __future__ import annotations
@@ -17,29 +17,31 @@ import weakref
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from typing import Any, TypeVar
 
-from common.client import arm, cell, parameters, scene, task
-from common.client import subscriptions as hearing
+from common.client import arm, cell, gripper, parameters, scene, subscriptions, task
 from common.errors import ZencellError
 
 T = TypeVar("T")
 
-ENDS = 5.0  # [s] in which what was begun has ended
-WRAPPED = (arm.Arm, arm.Gripper, hearing.Camera, parameters.Parameters, task.TaskControl, scene.Scene,
-           cell.World)
+END_TIMEOUT = 5.0  # [s] for pending calls to end
+WRAPPED = (arm.Arm, gripper.Gripper, subscriptions.Camera, parameters.Parameters, task.TaskControl, scene.Scene,
+           scene.World)
 
 
 class LoopThread:
-    """A running loop in a thread of its own."""
+    """An event loop in a thread.
+
+    Not anyio's blocking portal: its `call` leaves the coroutine running after Ctrl-C, and a motion must stop.
+    """
 
     def __init__(self) -> None:
-        """Begin it."""
+        """Start the thread."""
         self.ended = False
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, name="zencell", daemon=True)
         self._thread.start()
 
     def wait(self, begin: Callable[[], Awaitable[T]]) -> T:
-        """The result of what is begun on the loop. Ctrl-C cancels it, waits until it has ended, and is raised then."""
+        """Run a coroutine on the loop and return its result. Ctrl-C cancels it, waits for its end, and is raised."""
         if self.ended:
             raise ZencellError("the cell was closed")
         done: concurrent.futures.Future[T] = concurrent.futures.Future()
@@ -66,37 +68,36 @@ class LoopThread:
             raise
 
     @property
-    def is_here(self) -> bool:
-        """Whether this is the loop's own thread, which must not wait for it."""
+    def is_current(self) -> bool:
+        """Whether this is called on the loop's own thread, which must not wait for the loop."""
         return threading.current_thread() is self._thread
 
-    def soon(self, begin: Callable[[], Awaitable[object]]) -> None:
-        """Begin something that nobody waits for."""
+    def schedule(self, begin: Callable[[], Awaitable[object]]) -> None:
+        """Run a coroutine on the loop without waiting for it."""
         self._loop.call_soon_threadsafe(lambda: asyncio.ensure_future(begin()))
 
     def end(self) -> None:
-        """End it."""
+        """Cancel pending calls and end the thread."""
         if not self.ended:
-            self.wait(self._cancelled)
+            self.wait(self._cancel_all)
             self.ended = True
             self._loop.call_soon_threadsafe(self._loop.stop)
             self._thread.join()
             self._loop.close()
 
-    async def _cancelled(self) -> None:
-        """Whoever still waits is told that there is nothing to wait for."""
+    async def _cancel_all(self) -> None:
         others = asyncio.all_tasks() - {asyncio.current_task()}
         for other in others:
             other.cancel()
         if others:
-            await asyncio.wait(others, timeout=ENDS)
+            await asyncio.wait(others, timeout=END_TIMEOUT)
 
 
 class Blocking:
-    """An object whose asynchronous methods are called without `await`."""
+    """Wraps an object so that its coroutine methods block."""
 
     def __init__(self, loop: LoopThread, inner: Any) -> None:
-        """Stand for an object that lives on a loop."""
+        """Wrap an object whose coroutines run on a loop."""
         self.__dict__.update(_loop=loop, _inner=inner, __doc__=inner.__doc__)
 
     def __repr__(self) -> str:
@@ -106,41 +107,41 @@ class Blocking:
         return dir(self._inner)
 
     def __getattr__(self, name: str) -> Any:
-        if name.startswith("__") or "_inner" not in self.__dict__:  # what copies and pickles ask for
+        if name.startswith("__") or "_inner" not in self.__dict__:  # looked up by copy and pickle
             raise AttributeError(name)
         value = getattr(self._inner, name)
         if self._loop is None:
             raise ZencellError(f"cell.{name}: the cell {cell.NOT_JOINED}")
-        return given(self._loop, value)
+        return wrap(self._loop, value)
 
     def __setattr__(self, name: str, value: object) -> None:
         setattr(self._inner, name, value)
 
     def __getitem__(self, key: str) -> Any:
-        return called(self._loop, self._inner.__getitem__, key)
+        return call(self._loop, self._inner.__getitem__, key)
 
     def __setitem__(self, key: str, value: object) -> None:
-        called(self._loop, self._inner.set, key, value)
+        call(self._loop, self._inner.set, key, value)
 
     def __iter__(self) -> Iterator[Any]:
-        return iterated(self._loop, self._inner)
+        return iterate(self._loop, self._inner)
 
 
-def given(loop: LoopThread, value: Any) -> Any:
-    """A value as who blocks can use it."""
+def wrap(loop: LoopThread, value: Any) -> Any:
+    """Return parts of a cell and functions in their blocking form, and any other value as it is."""
     if isinstance(value, WRAPPED):
         return Blocking(loop, value)
     if inspect.ismethod(value) or inspect.isfunction(value):
         @functools.wraps(value)
-        def call(*args: Any, **kwargs: Any) -> Any:
-            return called(loop, value, *args, **kwargs)
+        def blocking(*args: Any, **kwargs: Any) -> Any:
+            return call(loop, value, *args, **kwargs)
 
-        return call
+        return blocking
     return value
 
 
-def called(loop: LoopThread, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-    """What a function returns that is called on the loop, and awaited there if need be."""
+def call(loop: LoopThread, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+    """Call a function on the loop, await its result if necessary, and return it in its blocking form."""
 
     async def work() -> Any:
         result = function(*args, **kwargs)
@@ -148,12 +149,12 @@ def called(loop: LoopThread, function: Callable[..., Any], *args: Any, **kwargs:
 
     result = loop.wait(work)
     if isinstance(result, contextlib.AbstractAsyncContextManager):
-        return entered(loop, result)
-    return iterated(loop, result) if hasattr(result, "__anext__") else given(loop, result)
+        return enter(loop, result)
+    return iterate(loop, result) if hasattr(result, "__anext__") else wrap(loop, result)
 
 
-def iterated(loop: LoopThread, messages: Any) -> Iterator[Any]:
-    """What comes of an asynchronous iterator."""
+def iterate(loop: LoopThread, messages: Any) -> Iterator[Any]:
+    """Yield the items of an asynchronous iterator."""
     found: AsyncIterator[Any] = aiter(messages)
     try:
         while True:
@@ -163,25 +164,25 @@ def iterated(loop: LoopThread, messages: Any) -> Iterator[Any]:
                 return
     finally:
         if (close := getattr(found, "aclose", None)) is not None and not loop.ended:
-            (loop.soon if loop.is_here else loop.wait)(close)  # here, where it is collected as garbage
+            (loop.schedule if loop.is_current else loop.wait)(close)  # garbage collection may run on the loop's thread
 
 
 @contextlib.contextmanager
-def entered(loop: LoopThread, block: contextlib.AbstractAsyncContextManager[Any]) -> Iterator[Any]:
-    """An asynchronous context as a plain one."""
+def enter(loop: LoopThread, block: contextlib.AbstractAsyncContextManager[Any]) -> Iterator[Any]:
+    """Use an asynchronous context manager as a blocking one."""
     values: list[Any] = []
 
-    async def enter() -> None:
+    async def enter_block() -> None:
         values.append(await block.__aenter__())
 
     try:
-        loop.wait(enter)
+        loop.wait(enter_block)
     except KeyboardInterrupt:
-        if values:  # it was entered as Ctrl-C came: what was taken is given back
+        if values:  # it was entered when Ctrl-C came: release it
             loop.wait(functools.partial(block.__aexit__, None, None, None))
         raise
     try:
-        yield given(loop, values[0])
+        yield wrap(loop, values[0])
     except BaseException as error:
         if not loop.wait(functools.partial(block.__aexit__, type(error), error, error.__traceback__)):
             raise
@@ -190,10 +191,10 @@ def entered(loop: LoopThread, block: contextlib.AbstractAsyncContextManager[Any]
 
 
 class Cell(Blocking):
-    """A work cell: as the asynchronous one, which says what there is. Use `with`, or `open` and `close`."""
+    """A work cell with the methods of the asynchronous `Cell`. Use `with`, or `open` and `close`."""
 
     def __init__(self, name: str | None = None, **where: Any) -> None:
-        """A cell that is up: see `common.client.cell.Cell`."""
+        """A running cell; for the arguments see `common.client.cell.Cell`."""
         self._hold(cell.Cell(name, **where))
 
     def _hold(self, inner: cell.Cell) -> None:
@@ -201,13 +202,13 @@ class Cell(Blocking):
 
     @classmethod
     def start(cls, name: str, **how: Any) -> Cell:
-        """A cell that is brought up when it is entered or opened, and ended when it is left or closed."""
-        made = cls.__new__(cls)
-        made._hold(cell.Cell.start(name, **how))
-        return made
+        """Return a cell that is started when it is entered or opened, and ended when it is left or closed."""
+        started = cls.__new__(cls)
+        started._hold(cell.Cell.start(name, **how))
+        return started
 
     def open(self) -> Cell:
-        """Join it; at the latest when the program ends it is closed."""
+        """Join the cell; it is closed at the latest when the program ends."""
         if self._loop is None:
             self.__dict__["_loop"] = loop = LoopThread()
             try:
@@ -219,7 +220,7 @@ class Cell(Blocking):
         return self
 
     def close(self) -> None:
-        """Leave it; what was started is ended."""
+        """Leave the cell, and end it if it was started here."""
         if self._loop is not None:
             try:
                 self._loop.wait(self._inner.__aexit__)

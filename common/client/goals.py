@@ -1,4 +1,4 @@
-"""Where a motion is to go, as a program says it, and what was planned."""
+"""Goals of motions as a program writes them, and planned motions."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ Array = NDArray[np.float64]
 GoalLike = AnyGoal | Pose | str | Sequence[float] | Array
 Point = Sequence[float] | Array
 
-SAYS = ("must be the name of a pose, joint positions, a pose as a matrix (4, 4) or `Pose`, or a goal such as "
-        "`PoseGoal`, `any_of(...)` or `through(...)`")
+GOAL_CHOICES = ("must be the name of a pose, joint positions, a pose as a matrix (4, 4) or `Pose`, or a goal such as "
+                "`PoseGoal`, `any_of(...)` or `through(...)`")
 
 
 def pose(x: float, y: float, z: float, *, rpy: Sequence[float] = (np.pi, 0.0, 0.0)) -> Array:
-    """A pose (4, 4) in world: position [m], and roll, pitch, yaw [rad] about fixed x, y, z. Left out: straight down."""
+    """Return a pose (4, 4) in world from position [m] and roll, pitch, yaw [rad] about fixed axes; default: down."""
     roll, pitch, yaw = numbers("rpy", rpy)
     return transform(rpy_to_matrix(roll, pitch, yaw), numbers("x, y, z", (x, y, z)))
 
@@ -42,50 +42,50 @@ def pose(x: float, y: float, z: float, *, rpy: Sequence[float] = (np.pi, 0.0, 0.
 def region(
     at: Pose | Array, *, size: Point = (0.0, 0.0, 0.0), tilt: float = 0.0, yaw: float = 0.0
 ) -> PoseGoal:
-    """Anywhere in a box about a pose.
+    """Return a goal that is reached anywhere in a box around a pose.
 
     Args:
-        at: the middle.
+        at: centre of the box.
         size: sides of the box [m], along the axes of world.
-        tilt: at most so far may the tool lean [rad].
-        yaw: at most so far may it be turned about its axis [rad].
+        tilt: largest tilt of the tool axis [rad].
+        yaw: largest rotation of the tool about its axis [rad].
     """
     return check(PoseGoal, {"pose": _pose(at), "position_tolerance": _vector("size", size), "tilt_tolerance": tilt,
                             "yaw_tolerance": yaw}, "region")
 
 
 def any_of(*goals: GoalLike) -> GoalSet:
-    """Whichever of the goals is reached best: names, joint positions, poses and regions."""
+    """Return a goal that is reached at the best of several: names, joint positions, poses and regions."""
     return check(GoalSet, {"goals": [goal_of(each) for each in goals]}, "any_of")
 
 
 @dataclass(frozen=True)
 class WaypointPath:
-    """Poses to pass in straight lines of the tool; see `through`."""
+    """Poses that the tool passes in straight lines; see `through`."""
 
     poses: tuple[Pose, ...]
     tool_speed: float | None
 
     def starting_at(self, start: Array) -> PathGoal:
-        """The path from a pose (4, 4) of the tool."""
+        """Return the path from a pose (4, 4) of the tool."""
         return check(PathGoal, {"waypoints": [_pose(start), *self.poses], "tool_speed": self.tool_speed}, "through")
 
 
 def through(*poses: Pose | Array, tool_speed: float | None = None) -> WaypointPath:
-    """Straight lines of the tool through poses, from where it is to the last, at a speed [m/s] where there is room."""
+    """Return a path of straight lines from the current pose of the tool to the last pose, at a tool speed [m/s]."""
     return WaypointPath(tuple(_pose(each) for each in poses), tool_speed)
 
 
 def goal_of(to: GoalLike, *, via: Point | None = None, around: Point | None = None) -> AnyGoal:
-    """What is asked of the planner.
+    """Return the goal of a plan request.
 
     Args:
-        to: where to.
+        to: where to move.
         via: a point that the tool passes on an arc [m].
         around: the centre of that arc [m].
 
     Raises:
-        ConfigError: it is no goal.
+        ConfigError: it is not a goal.
     """
     if via is not None or around is not None:
         return check(ArcGoal, {"pose": _pose(to), "via": None if via is None else _vector("via", via),
@@ -101,19 +101,19 @@ def goal_of(to: GoalLike, *, via: Point | None = None, around: Point | None = No
         return PoseGoal(pose=_pose(values))
     if values.ndim == 1 and values.size:
         return check(JointGoal, {"positions": values.tolist()}, "to")
-    raise ConfigError("to", to, SAYS)
+    raise ConfigError("to", to, GOAL_CHOICES)
 
 
 def array_of(name: str, given: object) -> Array:
-    """Finite numbers, of any shape.
+    """Return finite numbers of any shape as an array.
 
     Raises:
-        ConfigError: it is something else.
+        ConfigError: they are not.
     """
     try:
         values = np.array(given, dtype=float)
     except (TypeError, ValueError):
-        raise ConfigError(name, given, SAYS if name == "to" else "must be numbers") from None
+        raise ConfigError(name, given, GOAL_CHOICES if name == "to" else "must be numbers") from None
     if not np.all(np.isfinite(values)):
         raise ConfigError(name, given, "must be finite")
     return values
@@ -126,22 +126,22 @@ def _pose(at: Any, name: str = "to") -> Pose:
     if T.shape != (4, 4):
         raise ConfigError(name, at, "must be a pose here: a matrix (4, 4) or `Pose`")
     if not np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-3) or np.linalg.det(T[:3, :3]) < 0:
-        raise ConfigError(name, at, "has no rotation in its first three rows and columns")
+        raise ConfigError(name, at, "must have a rotation in its first three rows and columns")
     return check(Pose, pose_fields(T), name)
 
 
-def place(name: str, at: Pose | Point) -> Pose:
-    """The pose that a pose, a matrix (4, 4) or a point (3,) [m] says: turned like world where nothing else is said."""
+def pose_of(name: str, at: Pose | Point) -> Pose:
+    """Return a pose from a pose, a matrix (4, 4) or a point (3,) [m]; a point has the orientation of world."""
     if isinstance(at, Pose) or array_of(name, at).shape != (3,):
         return _pose(at, name)
     return Pose(position=_vector(name, at))
 
 
 def numbers(name: str, given: object) -> Array:
-    """Three finite numbers (3,).
+    """Return three finite numbers (3,).
 
     Raises:
-        ConfigError: it is something else.
+        ConfigError: they are not.
     """
     values = array_of(name, given)
     if values.shape != (3,):
@@ -156,16 +156,16 @@ def _vector(name: str, given: Point) -> Vector3:
 
 @dataclass(frozen=True)
 class Plan:
-    """A trajectory that was planned and not followed yet: positions [rad or m] of `joints` at `times` [s].
+    """A planned trajectory: positions [rad or m] of `joints` at `times` [s].
 
     Attributes:
         joints: names, in the order of the columns.
-        times: (n,), from 0.
-        positions: (n, dof).
-        velocities: (n, dof).
-        planner: who planned it.
-        seconds: how long that took.
-        response: all that the planner said.
+        times: (n,), from 0 [s].
+        positions: (n, dof) [rad or m].
+        velocities: (n, dof) [rad/s or m/s].
+        planner: name of the planner.
+        seconds: planning time [s].
+        response: complete response of the planner.
     """
 
     joints: tuple[str, ...]
@@ -178,12 +178,12 @@ class Plan:
 
     @property
     def duration(self) -> float:
-        """Cell time that the motion takes at full speed [s]."""
+        """Duration of the motion at full speed [s, cell time]."""
         return float(self.times[-1])
 
     @classmethod
     def of(cls, response: PlanResponse) -> Plan:
-        """What a planner answered, which has a trajectory."""
+        """Return the plan in a response with a trajectory."""
         assert response.trajectory is not None
         points = response.trajectory.points
         return cls(

@@ -1,4 +1,4 @@
-"""Taking part in a cell that is up, from a tool or a script: finding it, its clock, and who is there."""
+"""Joining a running cell from a tool or a script: its router, name, clock and services."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from common.transport.zenoh_session import connect as connect_to
 
 TOOL = "zencell"
 CONNECT_TIMEOUT = 2.0  # [s] to reach the router
-PROBE_TIMEOUT, PROBE_PERIOD = 0.5, 0.1  # [s] to see whether anything listens where a router would; between two tries
-LOOK_TIMEOUT = 3.0  # [s] to hear who is there: a busy host stands still for a second
-ASK_TIMEOUT = 1.0  # [s]
+PROBE_TIMEOUT, PROBE_PERIOD = 0.5, 0.1  # [s] to connect to the router's port, and between two attempts
+TOKENS_TIMEOUT = 3.0  # [s] for readiness tokens: a busy host may stall for a second
+QUERY_TIMEOUT = 1.0  # [s] for the value of a state
 
 
 class NoCellRunning(RequestFailed):
-    """There is no cell to look at."""
+    """No router or cell is running at an endpoint."""
 
     def __init__(self, endpoint: str, what: str) -> None:
         first = min(names_of("cells"), default="CELL")
@@ -41,7 +41,7 @@ class NoCellRunning(RequestFailed):
 
 
 class SeveralCellsRunning(UnknownName):
-    """It is not clear which cell is meant."""
+    """Several cells are running and none was named."""
 
     def __init__(self, cells: Iterable[str]) -> None:
         super().__init__("cell", "", cells)
@@ -50,7 +50,7 @@ class SeveralCellsRunning(UnknownName):
 
 
 def is_listening(endpoint: str) -> bool:
-    """Whether something takes connections at an endpoint; True where that cannot be told without Zenoh."""
+    """Return whether a program accepts connections at an endpoint; True for UDP and QUIC, where only Zenoh can tell."""
     protocol, _, address = endpoint.partition("/")
     if protocol in ("udp", "quic"):
         return True
@@ -58,19 +58,19 @@ def is_listening(endpoint: str) -> bool:
     try:
         with socket.create_connection((host.strip("[]"), int(port)), timeout=PROBE_TIMEOUT):
             return True
-    except (OSError, UnicodeError):  # the latter: a name that no host can have
+    except (OSError, UnicodeError):  # the latter: an invalid host name
         return False
 
 
 async def wait_for_listener(endpoint: str, seconds: float) -> None:
-    """Return when something takes connections there: what Zenoh tries meanwhile would go on after this program's end.
+    """Return when a program accepts connections there; Zenoh's own attempts would outlive this program's end.
 
     Raises:
-        NoCellRunning: nothing does.
+        NoCellRunning: none does within `seconds`.
     """
     try:
         async with asyncio.timeout(seconds):
-            while not await asyncio.to_thread(is_listening, endpoint):  # noqa: ASYNC110 - nothing tells of it
+            while not await asyncio.to_thread(is_listening, endpoint):  # noqa: ASYNC110 - there is no event for it
                 await asyncio.sleep(PROBE_PERIOD)
     except TimeoutError:
         raise NoCellRunning(endpoint, "no router") from None
@@ -81,24 +81,24 @@ async def joined(
     cell: str | None = None, *, domain: str | int | None = None, connect: str | None = None, any_cell: bool = False,
     identity: str = OPERATOR, remapped: Mapping[str, str] | None = None, secure: str | None = None,
 ) -> AsyncIterator[Bus]:
-    """A bus in a cell that is up.
+    """Yield a bus in a running cell.
 
     Args:
-        cell: its name; when not given, the one cell that is up.
-        domain: where, as given to `--domain`.
-        connect: where, as given to `--connect`.
-        any_cell: the visit is to the network, no cell needs to be up.
-        identity: whose certificate is shown in a secured cell.
-        remapped: keys of the cell by the platform's words for them, as `topics:` of a service in a cell file.
-        secure: folder of certificates; that of the environment when not given.
+        cell: its name; default: the only running cell.
+        domain: of its router, as for `--domain`.
+        connect: endpoint of its router, as for `--connect`.
+        any_cell: connect to the network; no cell needs to be running.
+        identity: certificate to use in a secured cell.
+        remapped: keys of the cell by the platform's names, like `topics:` of a service in a cell file.
+        secure: folder of certificates; default: that of the environment.
 
     Raises:
         NoCellRunning: there is no router, or no cell.
-        UnknownName: several cells are up and none was named.
-        ConfigError: no cell can have that name.
+        UnknownName: several cells are running and none was named.
+        ConfigError: the name is not valid for a cell.
     """
     if cell is not None and not is_cell(cell):
-        raise ConfigError("cell", cell, "is no name that a cell can have")
+        raise ConfigError("cell", cell, "is not a valid name of a cell")
     environ = {**os.environ, SECURE_VARIABLE: secure} if secure else os.environ
     endpoint = endpoint_of(domain, connect, environ)
     await wait_for_listener(endpoint, CONNECT_TIMEOUT)
@@ -109,7 +109,7 @@ async def joined(
                     cell="_", service=TOOL, endpoint=endpoint, timeout=CONNECT_TIMEOUT, identity=identity,
                     secure=secure,
                 ) as bus:
-                    cell = _only({name for name, _ in await alive(bus)}, endpoint)
+                    cell = _only({name for name, _ in await ready_services(bus)}, endpoint)
             bus = await stack.enter_async_context(connect_to(
                 cell=cell or "_", service=TOOL, endpoint=endpoint, clock=Clock.from_environment(),
                 timeout=CONNECT_TIMEOUT, identity=identity, remapped=remapped,
@@ -127,33 +127,33 @@ def _only(cells: set[str], endpoint: str) -> str:
     return cells.pop()
 
 
-async def alive(bus: Bus) -> list[tuple[str, str]]:
-    """Cell and name of every service on the network that is ready."""
-    tokens = [token.split("/") for token in await bus.raw_tokens("*/alive/*", LOOK_TIMEOUT)]
+async def ready_services(bus: Bus) -> list[tuple[str, str]]:
+    """Return cell and name of every ready service on the network."""
+    tokens = [token.split("/") for token in await bus.raw_tokens("*/alive/*", TOKENS_TIMEOUT)]
     return [(token[0], token[2]) for token in tokens]
 
 
 @dataclass(frozen=True)
 class RunningCell:
-    """What there is of a cell that is up."""
+    """A running cell: its ready services, and the status of its supervisor, if it has one."""
 
-    ready: frozenset[str]  # services
-    status: SupervisorStatus | None  # what its supervisor says, where there is one
+    ready: frozenset[str]
+    status: SupervisorStatus | None
 
 
-async def look(domain: str | None, connect: str | None) -> dict[str, RunningCell]:
-    """The cells that are up, by name; none when nothing is up there, for which nobody is waited for.
+async def running_cells(domain: str | None, connect: str | None) -> dict[str, RunningCell]:
+    """Return the running cells by name; empty at once if no router is running.
 
     Args:
-        domain: where, as given to `--domain`.
-        connect: where, as given to `--connect`.
+        domain: of the router, as for `--domain`.
+        connect: endpoint of the router, as for `--connect`.
     """
     if not await asyncio.to_thread(is_listening, endpoint_of(domain, connect)):
         return {}
     ready: dict[str, set[str]] = {}
     try:
         async with joined(any_cell=True, domain=domain, connect=connect) as bus:
-            for cell, service in await alive(bus):
+            for cell, service in await ready_services(bus):
                 ready.setdefault(cell, set()).add(service)
             return {cell: RunningCell(frozenset(names), await supervisor_status(bus, cell))
                     for cell, names in ready.items()}
@@ -162,11 +162,11 @@ async def look(domain: str | None, connect: str | None) -> dict[str, RunningCell
 
 
 async def supervisor_status(bus: Bus, cell: str = "") -> SupervisorStatus | None:
-    """What the supervisor of a cell, or of this one, says now; None without one, as in containers.
+    """Return the status of a cell's supervisor (default: this cell); None without one, as in containers.
 
-    There is one in a cell, whose key nobody renames.
+    Each cell has at most one, and its key is never remapped.
     """
-    for sample in await bus.raw_get(f"{cell or bus.cell}/{topics.SUPERVISOR_STATUS.key}", ASK_TIMEOUT):
+    for sample in await bus.raw_get(f"{cell or bus.cell}/{topics.SUPERVISOR_STATUS.key}", QUERY_TIMEOUT):
         try:
             return decode(SupervisorStatus, sample.payload)
         except DecodeError as error:
@@ -175,35 +175,35 @@ async def supervisor_status(bus: Bus, cell: str = "") -> SupervisorStatus | None
 
 
 async def cell_clock(bus: Bus) -> Clock:
-    """The clock that the cell runs by; the environment's where no supervisor tells, or of none that there can be."""
+    """Return the clock of the cell; without a supervisor, or if its clock is invalid, that of the environment."""
     status = await supervisor_status(bus)
     if status is None or not status.epoch:
         return bus.clock
-    here = status.host == socket.gethostname()  # another host has a clock of its own
+    here = status.host == socket.gethostname()  # other hosts have another boot time
     try:
         clock = Clock(status.speed, status.epoch, status.booted if here and status.booted else None)
         if 0 <= clock.now_ns() <= MAX_STAMP:
             return clock
-        told = "its time is none that a stamp can say"
+        problem = "its time is out of the range of stamps"
     except ValueError as error:
-        told = str(error)
-    bus.log.warning("%s: the clock that it tells of is left out: %s", topics.SUPERVISOR_STATUS.key, told)
+        problem = str(error)
+    bus.log.warning("%s: its clock is ignored: %s", topics.SUPERVISOR_STATUS.key, problem)
     return bus.clock
 
 
 async def newest_interlock(bus: Bus) -> int:
-    """`since` of the newest stop or hold that can be known now: a start lets go of nothing later, 0 of nothing."""
+    """Return `since` of the newest interlock, 0 if unknown; a start releases no newer one."""
     newest = 0
-    for sample in await bus.raw_get(bus.full_key(topics.MOTION_STATUS), ASK_TIMEOUT):
+    for sample in await bus.raw_get(bus.full_key(topics.MOTION_STATUS), QUERY_TIMEOUT):
         with contextlib.suppress(DecodeError):
             newest = max(newest, decode(MotionStatus, sample.payload).newest)
     return newest
 
 
-def person() -> str:
-    """Who gives a command here: what a cell remembers of who stopped or holds a robot."""
+def operator_name() -> str:
+    """Return USER@HOST, by which a cell remembers who stopped or holds its robot."""
     try:
         user = getpass.getuser()
     except (KeyError, OSError):  # a user without a name, as in a container
-        user = str(os.getuid()) if hasattr(os, "getuid") else "somebody"
+        user = str(os.getuid()) if hasattr(os, "getuid") else "unknown"
     return "".join(filter(str.isprintable, f"{user}@{socket.gethostname()}"))[:120]

@@ -1,4 +1,4 @@
-"""Figures of a cell that is up, by service and by topic, gathered without asking more of the cell than it sends."""
+"""Load of a running cell's services and rates of its topics, without making the cell work more."""
 
 from __future__ import annotations
 
@@ -9,25 +9,26 @@ from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
 
+from common import topics
 from common.application import all_topics, applications
-from common.client.statistics import TopicStatistics
+from common.client.statistics import Rates, TopicStatistics
+from common.messages import ServiceCounters, ServiceStatus, SupervisorStatus
 from common.remapping import is_key
 
 if TYPE_CHECKING:
     import psutil
 
     from common.clock import Clock
-    from common.messages import ServiceCounters, ServiceStatus, SupervisorStatus
     from common.transport.bus import Bus
 
 SUPERVISOR, ROUTER = "supervisor", "router"
-ASK_TIMEOUT = 1.0  # [s]
-MAX_KEYS = 300  # that are listened to
+QUERY_TIMEOUT = 1.0  # [s]
+MAX_KEYS = 300  # subscriptions
 
 
 @dataclass
 class ServiceRow:
-    """One process. What is not known, as of a service on another host, is None."""
+    """One process. Unknown values are None, such as those of a service on another host."""
 
     service: str
     state: str
@@ -36,7 +37,7 @@ class ServiceRow:
     memory: float | None = None  # resident [MB]
     restarts: int = 0
     received: float | None = None  # [1/s]
-    dropped: int | None = None  # since it was started
+    dropped: int | None = None  # since its start
     invalid: int | None = None
     overflow: int | None = None
 
@@ -48,46 +49,43 @@ class TopicRow:
     topic: str
     hz: float
     bytes_per_second: float | None
-    messages: int | None  # that came since we listen
+    messages: int | None  # since the monitor was started
     p50: float | None  # [ms]
     p99: float | None  # [ms]
 
 
 @dataclass
 class View:
-    """What is shown at one moment."""
+    """A snapshot of a cell."""
 
     cell: str
     speed: float
     connected: bool
-    own_cpu: float  # [%] of one core, of this tool
+    own_cpu: float  # [%] of one core, of this process
     services: list[ServiceRow] = field(default_factory=list)
     topics: list[TopicRow] = field(default_factory=list)
-    notices: list[tuple[bool, str]] = field(default_factory=list)  # whether urgent, and a line
+    notices: list[tuple[bool, str]] = field(default_factory=list)  # urgent or not, and a line
 
     def as_dict(self) -> dict[str, Any]:
-        """The view as JSON can hold it."""
+        """Return the view as JSON."""
         return asdict(self)
 
 
 class CellMonitor:
-    """Listens to a cell inside an `async with`; `view` says what was heard."""
+    """Subscribes to a cell inside `async with`; `view` returns a snapshot."""
 
     def __init__(self, bus: Bus, clock: Clock) -> None:
-        """Subscribe to what the cell sends anyway.
+        """Subscribe to what the cell publishes anyway.
 
         Args:
             bus: in the cell.
-            clock: the cell's.
+            clock: of the cell.
         """
-        from common import topics
-        from common.client.rates import Rates
-
         self._bus = bus
         self._clock = clock
         self._known = all_topics()
         self._on_demand = on_demand()
-        self._hearing: dict[str, TopicStatistics] = {}
+        self._statistics: dict[str, TopicStatistics] = {}
         self._rates = Rates()
         self._processes = Processes()
         self._alive = bus.alive
@@ -98,15 +96,15 @@ class CellMonitor:
     async def __aenter__(self) -> CellMonitor:
         states = {key: topic.expression for key, topic in self._known.items() if topic.kind == "state"}
         latched = await asyncio.gather(
-            *(self._bus.raw_get(f"{self._bus.cell}/{expression}", ASK_TIMEOUT) for expression in states.values()))
-        said = dict(zip(states, latched, strict=True))
+            *(self._bus.raw_get(f"{self._bus.cell}/{expression}", QUERY_TIMEOUT) for expression in states.values()))
+        values = dict(zip(states, latched, strict=True))
         for key, topic in self._known.items():
             if topic.kind != "request" and key not in self._on_demand:
-                self._listen(key, topic.expression)
-                for sample in said.get(key, ()):
-                    self._hearing[key].know(sample)
+                self._subscribe(key, topic.expression)
+                for sample in values.get(key, ()):
+                    self._statistics[key].mark_known(sample)
         self._following = asyncio.create_task(self._follow_counters())
-        self.view()  # from here on CPU is measured
+        self.view()  # starts the measurement of CPU
         return self
 
     async def __aexit__(self, *_: object) -> None:
@@ -114,31 +112,31 @@ class CellMonitor:
             self._following.cancel()
             await asyncio.wait({self._following})
 
-    def _listen(self, key: str, expression: str = "") -> None:
-        hearing = self._hearing[key] = TopicStatistics(self._clock)
-        self._bus.raw_subscriber(f"{self._bus.cell}/{expression or key}", hearing.arrive)
+    def _subscribe(self, key: str, expression: str = "") -> None:
+        statistics = self._statistics[key] = TopicStatistics(self._clock)
+        self._bus.raw_subscriber(f"{self._bus.cell}/{expression or key}", statistics.add)
 
     async def _follow_counters(self) -> None:
         async for counters in self._counters:
             self.count(counters, time.monotonic())
 
     def count(self, counters: ServiceCounters, now: float) -> None:
-        """Take note of what a service has counted until a time [s]; keys of a person's own are listened to from now."""
+        """Add the counters of a service at a time [s]; subscribe to custom keys that they name."""
         self._rates.update(counters, now)
         for key in counters.received:
-            known = key in self._hearing or key in self._known or key.startswith("param/")
-            if not known and is_key(key) and len(self._hearing) < MAX_KEYS:  # whoever counts may say anything
-                self._listen(key)
+            known = key in self._statistics or key in self._known or key.startswith("param/")
+            if not known and is_key(key) and len(self._statistics) < MAX_KEYS:  # counters can name invented keys
+                self._subscribe(key)
 
     def view(self) -> View:
-        """What is known now."""
+        """Return a snapshot."""
         status = self._status.latest
         alive = self._alive.names
-        found = View(self._bus.cell, self._clock.speed, self._bus.connected, self._processes.own_cpu())
-        found.services = [self._service_row(each) for each in statuses(status, alive, self._bus.connected)]
-        found.topics = list(self._topic_rows())
-        found.notices = [(each.urgent, each.message) for each in (status.notices if status else ())]
-        return found
+        view = View(self._bus.cell, self._clock.speed, self._bus.connected, self._processes.own_cpu())
+        view.services = [self._service_row(each) for each in statuses(status, alive, self._bus.connected)]
+        view.topics = list(self._topic_rows())
+        view.notices = [(each.urgent, each.message) for each in (status.notices if status else ())]
+        return view
 
     def _service_row(self, status: ServiceStatus) -> ServiceRow:
         row = ServiceRow(status.name, status.state, restarts=status.restarts)
@@ -155,8 +153,8 @@ class CellMonitor:
         return row
 
     def _topic_rows(self) -> Iterable[TopicRow]:
-        for key, hearing in self._hearing.items():
-            arrived, aged = hearing.arrivals(), hearing.delays()
+        for key, statistics in self._statistics.items():
+            arrived, aged = statistics.arrivals(), statistics.delays()
             if arrived["messages"]:
                 yield TopicRow(
                     key, float(arrived["hz"] or 0), float(arrived["bytes_per_second"] or 0), int(arrived["messages"]),
@@ -168,26 +166,22 @@ class CellMonitor:
 
 
 def on_demand() -> list[str]:
-    """Keys of what is made only while somebody listens: if we did, the cell would work more.
+    """Return keys that are published only while they have subscribers; a subscription would load the cell.
 
-    Those are clouds of points, and pictures into which what was found is drawn. Their rates are those of their readers.
+    These are point clouds and annotated images. Their rates are those of their readers.
     """
-    from common.topics import DEPTH_CAMERA_POINTS
-
     drawn = [found.topics.annotated for found in applications() if found.topics is not None]
-    return [topic.key for topic in (*drawn, DEPTH_CAMERA_POINTS) if topic is not None and topic.kind == "stream"]
+    return [topic.key for topic in (*drawn, topics.DEPTH_CAMERA_POINTS) if topic is not None and topic.kind == "stream"]
 
 
 def statuses(status: SupervisorStatus | None, alive: frozenset[str], connected: bool) -> list[ServiceStatus]:
-    """The processes of a cell: those that the supervisor has, and those that are ready without it.
+    """Return the processes of a cell: those of the supervisor, and services that are ready without it.
 
     Args:
-        status: what the supervisor said last; None where there is none.
+        status: last status of the supervisor; None without one.
         alive: services that hold a readiness token.
         connected: whether the router is reached.
     """
-    from common.messages import ServiceStatus
-
     found: list[ServiceStatus] = []
     for each in status.services if status else []:
         there = connected if each.name == ROUTER else each.name in alive or SUPERVISOR in alive
@@ -200,7 +194,7 @@ class Processes:
     """Load of the processes of this host."""
 
     def __init__(self) -> None:
-        """Measure from the first question on."""
+        """Start to measure this process."""
         import psutil
 
         self._psutil = psutil
@@ -208,16 +202,16 @@ class Processes:
         self._own = psutil.Process(os.getpid())
 
     def own_cpu(self) -> float:
-        """CPU [% of one core] of this process since the last question."""
+        """Return CPU [% of one core] of this process since the last call."""
         return self._own.cpu_percent()
 
     def load_of(self, pid: int, service: str) -> tuple[float | None, float | None]:
-        """CPU [% of one core] since the last question, and memory [MB], of a service; None when it is not here."""
+        """Return CPU [% of one core] since the last call, and memory [MB], of a service; None if it is not here."""
         try:
             process = self._known.get(pid)
             if process is None or not process.is_running():
                 process = self._psutil.Process(pid)
-                # The same number may be another process here when the service is on another host.
+                # If the service runs on another host, this number belongs to another process here.
                 if service != SUPERVISOR and not any(part.rpartition(".")[2] == service for part in process.cmdline()):
                     return None, None
                 self._known[pid] = process
@@ -228,7 +222,7 @@ class Processes:
             return None, None
 
     def parent_of(self, services: list[ServiceStatus]) -> int | None:
-        """The process that started the services, when it is on this host."""
+        """Return the process that started the services, if it runs on this host."""
         for each in services:
             if each.pid is not None and each.pid in self._known:
                 try:

@@ -1,4 +1,4 @@
-"""Bringing a cell up for a program, in processes of its own, and ending it."""
+"""Starting a cell for a program, in processes of its own, and ending it."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from common.supervision.launch import module_command, pythonpath, require_free_p
 from common.transport.endpoint import MAX_DOMAIN, endpoint_of, parse_domain
 from common.transport.router import PortInUse
 
-READY = 60.0  # [s] wall in which it is up
-LOOK = 0.1  # [s] between looks whether it is
-ENDS = 15.0  # [s] in which it ends when it is told to
-TRIES, TAKEN = 3, "is in use by"  # of domains; what `up` says of one that is not free
-LAST_LINES = 5  # that are told of a start that failed
+START_TIMEOUT = 60.0  # [s] wall
+POLL_PERIOD = 0.1  # [s] between two checks of its state
+END_TIMEOUT = 15.0  # [s] after which it is killed
+ATTEMPTS, IN_USE = 3, "is in use by"  # domains to try; text in the output of `up` about a domain in use
+LAST_LINES = 5  # of the output, in the error of a failed start
 
 
 class NotStarted(ZencellError):
@@ -36,14 +36,14 @@ class NotStarted(ZencellError):
 
 
 class StartedCell:
-    """A cell that is up inside `async with`: `name` and `domain` say where."""
+    """A cell that runs inside `async with`, with its `name` and `domain`."""
 
     def __init__(
         self, cell: str, *, speed: float, world: str | None, seed: int | None, overrides: Sequence[str], viewer: bool,
         domain: int | str | None,
     ) -> None:
-        """Take note of what is to be started; see `Cell.start`."""
-        self._cell, self._domain = cell, domain
+        """Describe the cell to start; see `Cell.start`."""
+        self._domain = domain
         self.name, self.domain = "", -1
         self._arguments = ["up", cell, "--until-stdin-ends", "--speed", f"{speed:g}"]
         self._arguments += [] if viewer else ["--no-viewer"]
@@ -57,33 +57,33 @@ class StartedCell:
 
     async def __aenter__(self) -> StartedCell:
         cell, overrides, world, seed = self._loaded
-        loaded = await asyncio.to_thread(load_cell, cell, overrides, world=world, seed=seed)  # says what is wrong
+        loaded = await asyncio.to_thread(load_cell, cell, overrides, world=world, seed=seed)  # raises on bad input
         self.name = loaded.name
-        for left in reversed(range(TRIES)):
+        for left in reversed(range(ATTEMPTS)):
             self.domain = free_domain() if self._domain is None else parse_domain(self._domain)
             try:
                 return await self._bring_up()
-            except NotStarted as error:  # somebody else may have found the same domain free
-                if TAKEN not in str(error) or self._domain is not None or not left:
+            except NotStarted as error:  # another program may have taken the same free domain
+                if IN_USE not in str(error) or self._domain is not None or not left:
                     raise
         raise AssertionError
 
     async def _bring_up(self) -> StartedCell:
         self._folder = tempfile.TemporaryDirectory(prefix="zencell-")
         self._log = Path(self._folder.name, "log")
-        self._process = await asyncio.to_thread(self._begin)
+        self._process = await asyncio.to_thread(self._spawn)
         try:
-            async with asyncio.timeout(READY):
+            async with asyncio.timeout(START_TIMEOUT):
                 await self._until_up()
         except BaseException as error:
-            said = self._last_lines()
+            output = self._last_lines()
             await self._end()
             if isinstance(error, TimeoutError):
-                raise NotStarted(self.name, f"not within {READY:g} s; {said}") from None
+                raise NotStarted(self.name, f"not within {START_TIMEOUT:g} s; {output}") from None
             raise
         return self
 
-    def _begin(self) -> subprocess.Popen[bytes]:
+    def _spawn(self) -> subprocess.Popen[bytes]:
         with self._log.open("wb") as out:
             return subprocess.Popen(
                 [*module_command("zencell"), *self._arguments, "--domain", str(self.domain)],
@@ -94,13 +94,13 @@ class StartedCell:
         """Return when all services are ready.
 
         Raises:
-            NotStarted: it has ended instead.
+            NotStarted: the process has ended instead.
         """
         while not await self._is_up():
             assert self._process is not None
             if self._process.poll() is not None:
                 raise NotStarted(self.name, self._last_lines())
-            await asyncio.sleep(LOOK)
+            await asyncio.sleep(POLL_PERIOD)
 
     async def _is_up(self) -> bool:
         if not await asyncio.to_thread(is_listening, endpoint_of(self.domain)):
@@ -114,7 +114,7 @@ class StartedCell:
 
     def _last_lines(self) -> str:
         lines = [line for line in self._log.read_text(errors="replace").splitlines() if line.strip()]
-        return " | ".join(lines[-LAST_LINES:]) or "it said nothing"
+        return " | ".join(lines[-LAST_LINES:]) or "it wrote nothing"
 
     async def __aexit__(self, *_: object) -> None:
         await self._end()
@@ -123,31 +123,31 @@ class StartedCell:
         process, folder = self._process, self._folder
         self._process = self._folder = None
         if process is not None:
-            await asyncio.shield(_ended(process))
+            await asyncio.shield(_end_process(process))
         if folder is not None:
             folder.cleanup()
 
 
-async def _ended(process: subprocess.Popen[bytes]) -> None:
-    """Have a process end, without a thread: there are no new ones any more when the program itself ends."""
+async def _end_process(process: subprocess.Popen[bytes]) -> None:
+    """End a process without a thread: none can be started while the interpreter exits."""
     if process.poll() is None:
         process.send_signal(signal.SIGINT)
     if process.stdin is not None:
         process.stdin.close()
     with contextlib.suppress(TimeoutError):
-        async with asyncio.timeout(ENDS):
-            while process.poll() is None:  # noqa: ASYNC110 - nothing tells of a child's end
-                await asyncio.sleep(LOOK / 2)
+        async with asyncio.timeout(END_TIMEOUT):
+            while process.poll() is None:  # noqa: ASYNC110 - there is no event for it
+                await asyncio.sleep(POLL_PERIOD / 2)
     if process.poll() is None:
         process.kill()
         process.wait()
 
 
 def free_domain() -> int:
-    """A domain at whose port nobody listens.
+    """Return a random domain whose port is free.
 
     Raises:
-        NotStarted: all are taken.
+        NotStarted: all are in use.
     """
     for domain in random.SystemRandom().sample(range(MAX_DOMAIN + 1), MAX_DOMAIN + 1):
         try:
@@ -155,4 +155,4 @@ def free_domain() -> int:
         except PortInUse:
             continue
         return domain
-    raise NotStarted("the cell", "all domains are taken")
+    raise NotStarted("the cell", "all domains are in use")

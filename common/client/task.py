@@ -1,115 +1,167 @@
-"""The task of a cell, for a program: start, pause, resume, stop, and how far it is."""
+"""The task of a cell, for a program: start, pause, resume, stop, and its status."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
 from collections.abc import AsyncGenerator, Awaitable
-from dataclasses import replace
-from typing import TypeVar
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
 
 from common import topics
 from common.application import find_application
 from common.client.joining import newest_interlock
-from common.client.part import Part
-from common.client.subscriptions import Subscriptions, local_key, topic_of_owner
+from common.client.subscriptions import Part, Subscriptions, local_key, topic_of_owner
 from common.errors import RequestFailed, UnknownName, ZencellError
 from common.messages import MotionStatus, StopRequest, TaskCommand, TaskStatus
 from common.topics import Topic
+from common.transport.requests import Client
 
 TIMEOUT = 5.0  # [s] wall for an answer
 ENDED = ("DONE", "ERROR")
 A = TypeVar("A")
 
+_stopping: set[asyncio.Future[Any]] = set()  # keeps stops alive whose caller was cancelled
 
-async def _answer(asked: Awaitable[A]) -> A | RequestFailed:
+
+class TaskStopFailed(ZencellError):
+    """The arm was stopped, but the task did not confirm the stop."""
+
+    exit_code = 1
+
+    def __init__(self, error: ZencellError) -> None:
+        super().__init__(f"the arm is stopped and stays so until a start; the task did not confirm the stop: {error}")
+
+
+class ArmStopFailed(ZencellError):
+    """The task has stopped, but the executor of the arm did not confirm the stop."""
+
+    exit_code = 1
+
+    def __init__(self, error: ZencellError) -> None:
+        super().__init__(f"the task has stopped; the executor of the arm did not confirm the stop: {error}")
+
+
+async def send_task_command(
+    client: Client[TaskCommand, TaskStatus], command: str, operator: str, *, override: bool = False,
+    acknowledged: int | None = None, timeout: float = TIMEOUT,
+) -> TaskStatus:
+    """Send start, pause, resume or stop to the task.
+
+    Args:
+        client: of task/command.
+        command: to send.
+        operator: who sends it.
+        override: also release holds of other operators.
+        acknowledged: `since` of the newest interlock that the operator knows; a start or resume releases no newer one.
+        timeout: [s, wall].
+    """
+    request = TaskCommand.model_validate(
+        {"command": command, "by": operator, "override": override, "acknowledged": acknowledged})
+    return await client.call(request, timeout)
+
+
+@dataclass(frozen=True)
+class StopResult:
+    """The answers of arm and task to a stop, or why there is none."""
+
+    arm: MotionStatus | RequestFailed
+    task: TaskStatus | RequestFailed
+
+
+async def stop_arm_and_task(
+    arm: Client[StopRequest, MotionStatus], task: Client[TaskCommand, TaskStatus], operator: str, reason: str = "",
+    timeout: float = TIMEOUT,
+) -> StopResult:
+    """Stop arm and task concurrently, so that a task that hangs cannot delay the stop of the arm.
+
+    Both requests are completed even if the caller is cancelled.
+
+    Args:
+        arm: client of motion/stop.
+        task: client of task/command.
+        operator: who stops them.
+        reason: for the log and the motion status.
+        timeout: [s, wall].
+    """
+    both = asyncio.gather(
+        _answer(arm.call(StopRequest(reason=reason, owner=operator), timeout)),
+        _answer(send_task_command(task, "stop", operator, timeout=timeout)))
+    _stopping.add(both)
+    both.add_done_callback(_stopping.discard)
+    return StopResult(*await asyncio.shield(both))
+
+
+async def _answer(request: Awaitable[A]) -> A | RequestFailed:
     try:
-        return await asked
+        return await request
     except RequestFailed as error:
         return error
 
 
-class TaskStopFailed(ZencellError):
-    """The arm was stopped, though the task could not be told."""
-
-    exit_code = 1
-
-    def __init__(self, error: ZencellError) -> None:
-        super().__init__(f"the arm is stopped and stays so until a start; the task did not hear of it: {error}")
-
-
-class ArmStopFailed(ZencellError):
-    """The task has stopped; who moves the arm has refused to be told, or not answered."""
-
-    exit_code = 1
-
-    def __init__(self, error: ZencellError) -> None:
-        super().__init__(f"the task has stopped; who moves the arm did not take that: {error}")
-
-
 class TaskControl(Part):
-    """What a person may tell the task. `async for status in cell.task` hears of every change, until it is left."""
+    """Commands of an operator to the task. `async for status in cell.task` yields its status after each change."""
 
-    def __init__(self, ear: Subscriptions, owner: str, application: str = "") -> None:
-        """The task of a cell; of an application of one's own, its dotted module is needed to hear of it."""
-        self._ear, self._bus, self._owner, self._application = ear, ear.bus, owner, application
-        self._unkept = ""
-        self._stopping: asyncio.Future[tuple[MotionStatus | RequestFailed, TaskStatus | RequestFailed]]
+    def __init__(self, subscriptions: Subscriptions, owner: str, application: str = "") -> None:
+        """The task of a cell.
+
+        Args:
+            subscriptions: of the cell.
+            owner: in whose name it is commanded.
+            application: dotted module of a custom application, needed for its status.
+        """
+        self._subscriptions, self._bus = subscriptions, subscriptions.bus
+        self._owner, self._application = owner, application
+        self._unsaved = ""
 
     async def start(self, *, override: bool = False) -> TaskStatus:
-        """Start it, or start it again; a robot that you hold is let go, with `override` also one that others hold.
+        """Start the task, or restart it; releases your own holds, and with `override` those of others too.
 
         Raises:
-            RemoteError: somebody else holds the robot or has its motion. Stops of others are ended by a start.
+            RemoteError: another operator holds the robot or has motion authority. A start ends stops of others.
         """
-        return await self._tell("start", override)
+        return await self._send("start", override)
 
     async def pause(self) -> TaskStatus:
-        """Bring the robot to rest on its path at once and hold it there."""
-        return await self._tell("pause")
+        """Stop the robot on its path at once and hold it there."""
+        return await self._send("pause")
 
     async def resume(self, *, override: bool = False) -> TaskStatus:
-        """Let the robot go on along its path after a pause of yours."""
-        return await self._tell("resume", override)
+        """Let the robot continue along its path after your pause."""
+        return await self._send("resume", override)
 
     async def stop(self) -> TaskStatus:
-        """Stop the robot, give up its motion, and wait for a start, also if the task does not answer.
+        """Stop the robot, abandon its motion, and wait for a start; works also if the task does not answer.
 
         Raises:
-            TaskStopFailed: the arm is stopped, but the task did not hear of it.
-            ArmStopFailed: the task has stopped; who moves the arm has refused to be told, or not answered.
-            RequestFailed: neither heard of it.
+            TaskStopFailed: the arm is stopped, but the task did not confirm the stop.
+            ArmStopFailed: the task has stopped, but the executor refused the stop or did not answer.
+            RequestFailed: neither confirmed the stop.
         """
-        stop = StopRequest(owner=self._owner)
-        self._stopping = asyncio.gather(
-            _answer(self._bus.client(topics.MOTION_STOP).call(stop, TIMEOUT)), _answer(self._tell("stop")))
-        arm, told = await asyncio.shield(self._stopping)  # who is cancelled now has asked all the same
-        if isinstance(arm, RequestFailed):
-            raise told if isinstance(told, RequestFailed) else ArmStopFailed(arm)
-        self._note(arm)
-        if isinstance(told, RequestFailed):
-            raise TaskStopFailed(told)
-        return told
+        result = await stop_arm_and_task(
+            self._bus.client(topics.MOTION_STOP), self._bus.client(topics.TASK_COMMAND), self._owner)
+        if isinstance(result.arm, RequestFailed):
+            raise result.task if isinstance(result.task, RequestFailed) else ArmStopFailed(result.arm)
+        self._unsaved = result.arm.unsaved
+        if isinstance(result.task, RequestFailed):
+            raise TaskStopFailed(result.task)
+        return result.task
 
     @property
     def unsaved(self) -> str:
-        """What the last stop would not outlive, in words."""
-        return self._unkept
+        """Warning about the last stop if it could not be saved and would be lost at a restart; else empty."""
+        return self._unsaved
 
-    def _note(self, answer: MotionStatus) -> None:
-        self._unkept = answer.unsaved
-
-    async def _tell(self, command: str, override: bool = False) -> TaskStatus:
+    async def _send(self, command: str, override: bool = False) -> TaskStatus:
         acknowledged = await newest_interlock(self._bus) if command in ("start", "resume") else None
-        asked = TaskCommand.model_validate({
-            "command": command, "by": self._owner, "override": override, "acknowledged": acknowledged})
-        return await self._bus.client(topics.TASK_COMMAND).call(asked, TIMEOUT)
+        return await send_task_command(self._bus.client(topics.TASK_COMMAND), command, self._owner, override=override,
+                                       acknowledged=acknowledged)
 
     async def topic(self) -> Topic[TaskStatus]:
-        """Where the task says how far it is.
+        """Return the topic of the task's status.
 
         Raises:
-            UnknownName: no task is there, or none that is known here.
+            UnknownName: no task is running, or only unknown ones or several.
         """
         if self._application:
             return find_application(self._application).status
@@ -122,12 +174,12 @@ class TaskControl(Part):
                 found[owner.key] = topic
         if len(found) == 1:
             return found.popitem()[1]
-        raise UnknownName("task (application=MODULE names one of your own, remapped= one of several)",
+        raise UnknownName("task (application=MODULE names a custom one, remapped= one of several)",
                           self._bus.cell, found)
 
     async def status(self) -> TaskStatus:
-        """How far it is: its newest status."""
-        return await self._ear.newest(await self.topic())
+        """Return its newest status."""
+        return await self._subscriptions.latest(await self.topic())
 
     async def __aiter__(self) -> AsyncGenerator[TaskStatus, None]:
         reader = self._bus.reader(await self.topic())
@@ -138,13 +190,13 @@ class TaskControl(Part):
             self._bus.listen(reader, False)
 
     async def ended(self, timeout: float | None = None) -> TaskStatus:
-        """Its last status, once it is DONE or in ERROR.
+        """Wait until the task is DONE or in ERROR, and return its last status.
 
         Raises:
-            TimeoutError: it is not, after so long [s, wall]; without one that is waited for without end.
+            TimeoutError: it is not after `timeout` [s, wall]; without one this waits forever.
         """
         async with asyncio.timeout(timeout), contextlib.aclosing(aiter(self)) as statuses:
             async for status in statuses:
                 if status.state in ENDED:
                     return status
-        raise AssertionError  # it is heard of until the connection ends
+        raise AssertionError  # the iterator ends only with the connection

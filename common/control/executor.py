@@ -215,16 +215,14 @@ class Executor:
         """Return whether and how the arm can follow the trajectory; any thread may call it."""
         return self.arm.assess(request.trajectory, self._q)
 
-    def execute(
-        self, request: ExecuteRequest, now: float, refusal: Refused | None = None, assessment: Assessment | None = None
-    ) -> MotionStatus:
+    def execute(self, request: ExecuteRequest, now: float, refusal: Refused | None = None,
+                assessment: Assessment | None = None) -> MotionStatus:
         """Return the state of the goal: active, or rejected with the reason; of a known id its present state."""
         authority, known = self.authority, self.arm.knows(request.id)
         refusal = (authority.check_interlocks(request, request.id) or refusal or authority.check_owner(request.owner)
                    or self._check_devices())
-        status = self.arm.accept(
-            request.id, request.trajectory, now, self._q, refusal, assessment, request.plan, request.scene_stamp,
-        )
+        status = self.arm.accept(request.id, request.trajectory, now, self._q, refusal, assessment, request.plan,
+                                 request.scene_stamp)
         if not known:
             authority.note_refusal(request, status)
         if request.id == self.arm.goal and (self._followed is None or self._followed.id != request.id):
@@ -314,7 +312,7 @@ class Executor:
 
     @property
     def _late(self) -> float:
-        return self._controlled.late if self._controlled is not None else 0.0
+        return 0.0 if self._controlled is None else self._controlled.late
 
     @property
     def speed_scaling(self) -> float:

@@ -84,9 +84,11 @@ def is_simulated(robot: RobotConfig) -> bool:
     """Return whether a simulated world belongs to the robot's hardware; some backends have an option for that.
 
     Raises:
-        UnknownName, ConfigError: no such backend, or an invalid option.
+        UnknownName, ConfigError: no such backend, also of the gripper, or an invalid option.
     """
     backend = find_backend(robot)
+    if robot.gripper is not None and robot.gripper.hardware is not None:
+        _gripper_options(find_gripper_backend(robot.gripper.hardware), robot.gripper.hardware)
     if callable(backend.simulated):
         return backend.simulated(check(backend.Options, robot.hardware.options, "robot.hardware.options"))
     return backend.simulated
@@ -112,10 +114,14 @@ def load_hardware(
     if world_arm is not None:
         raise ConfigError(f"{GRIPPER_FIELD}.backend", own.backend, "moves the gripper, and so does world.simulator: "
                           "leave it out, or set world.simulator to kinematic")
-    options = check(backend.GripperOptions, own.options, f"{GRIPPER_FIELD}.options")
+    options = _gripper_options(backend, own)
     arm = _load_arm(robot.model_copy(update={"gripper": None}), limits, start, None)
     arm.gripper = backend.create_gripper(robot.gripper, options)
     return arm
+
+
+def _gripper_options(backend: GripperBackend, hardware: HardwareConfig) -> Parameters:
+    return check(backend.GripperOptions, hardware.options, f"{GRIPPER_FIELD}.options")
 
 
 def _load_arm(

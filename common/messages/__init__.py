@@ -1,14 +1,31 @@
-"""Every message that travels between services: SI units, quaternions x, y, z, w, names as in ROS where ROS has one.
+"""All messages between services: SI units, quaternions x, y, z, w, names as in ROS where ROS has one.
 
-All models refuse unknown fields and numbers that are not finite. A pose is that of the named thing in
-`header.frame_id`. Stamps are cell time in ns since the Unix epoch and are taken once, when the frame is exposed.
+All models refuse unknown fields and numbers that are not finite. A pose is that of the named object in
+`header.frame_id`. Stamps are cell time in ns since the Unix epoch, taken once, when the frame is exposed.
 """
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from common.messages.basics import SCHEMA_VERSION, UNKNOWN_OPERATOR, Finite, Fraction, Header, Message, Name, Positive
+from common.messages.basics import (
+    SCHEMA_VERSION,
+    SELF_RELEASING,
+    UNKNOWN_OPERATOR,
+    Color,
+    Finite,
+    Fraction,
+    Header,
+    Message,
+    Name,
+    Pose,
+    PoseArray,
+    Positive,
+    Quaternion,
+    TFMessage,
+    TransformStamped,
+    Vector3,
+)
 from common.messages.camera import CameraInfo, Image, Marker, MarkerArray, PointCloud2, Rejection, Rejections
 from common.messages.execution import (
     CLOSED_BEFORE,
@@ -24,12 +41,11 @@ from common.messages.execution import (
     MotionOwner,
     MotionStatus,
     OwnRequest,
-    RobotCommand,
-    RobotMode,
-    RobotStatus,
+    PlanFigure,
     StopRequest,
+    TaskCommand,
+    TaskStatus,
 )
-from common.messages.geometry import Color, Pose, PoseArray, Quaternion, TFMessage, TransformStamped, Vector3
 from common.messages.planning import (
     AnyGoal,
     ArcGoal,
@@ -55,7 +71,24 @@ from common.messages.processes import (
     ServiceStatus,
     SupervisorStatus,
 )
-from common.messages.robot import JointState, JointTrajectory, JointTrajectoryPoint, RobotDescription
-from common.messages.scene import AttachedObject, CollisionObject, PlanningScene, SceneEdit, SceneEditReply
-from common.messages.task import PlanFigure, TaskCommand, TaskStatus
-from common.messages.world import SceneUpdate, WorldEdit, WorldEditReply, WorldObject, WorldObjects
+from common.messages.robot import (
+    JointState,
+    JointTrajectory,
+    JointTrajectoryPoint,
+    RobotCommand,
+    RobotDescription,
+    RobotMode,
+    RobotStatus,
+)
+from common.messages.scene import (
+    AttachedObject,
+    CollisionObject,
+    PlanningScene,
+    SceneEdit,
+    SceneEditReply,
+    SceneUpdate,
+    WorldEdit,
+    WorldEditReply,
+    WorldObject,
+    WorldObjects,
+)

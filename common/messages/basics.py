@@ -1,7 +1,8 @@
-"""Base class, field types and limits of all messages."""
+"""Base class, field types and limits of all messages; points, poses and transforms."""
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping
 from copy import deepcopy
@@ -16,6 +17,7 @@ from pydantic import (
     GetCoreSchemaHandler,
     JsonValue,
     PlainValidator,
+    model_validator,
 )
 from pydantic_core import CoreSchema
 
@@ -109,6 +111,7 @@ Plain = Annotated[JsonValue, PlainValidator(_plain)]  # any JSON value
 
 # Former names, which older programs, recordings and record files still contain: read, never written.
 UNKNOWN_OPERATOR = "operator"  # name of an operator who gives none, and `by` of an operator's requests
+SELF_RELEASING = ("watchdog", "controller", "scene_monitor")  # values of `by` whose holds end without an operator
 FORMER_FIELDS: Mapping[str, str] = {"acknowledged": "heard", "interlocks": "inhibits"}
 _FORMER_OPERATOR = "person"
 
@@ -204,3 +207,92 @@ class Header(Message):
 
     stamp: int = Field(0, ge=0, le=MAX_STAMP, description="cell time [ns since the Unix epoch]")
     frame_id: Label = ""
+
+
+Unit = Annotated[float, Field(ge=-1.001, le=1.001)]  # component of a unit quaternion
+MAX_POSES = 256
+Labels = Annotated[list[Label], Field(max_length=MAX_POSES)]
+Corner = tuple[Metres, Metres]  # of a drawing in a plane [m]
+Corners = Annotated[list[Corner], Field(max_length=2000)]
+
+
+class Vector3(Message):
+    """A point, displacement or box size [m]."""
+
+    x: Metres = 0.0
+    y: Metres = 0.0
+    z: Metres = 0.0
+
+
+class Quaternion(Message):
+    """A unit quaternion; refused if its norm differs from 1 by more than 1e-3."""
+
+    x: Unit = 0.0
+    y: Unit = 0.0
+    z: Unit = 0.0
+    w: Unit = 1.0
+
+    @model_validator(mode="after")
+    def _require_unit_norm(self) -> Quaternion:
+        norm = math.hypot(self.x, self.y, self.z, self.w)
+        if abs(norm - 1) > 1e-3:
+            raise ValueError(f"quaternion has norm {norm:.4f}, not 1")
+        return self
+
+
+class Pose(Message):
+    """Position [m] and orientation."""
+
+    position: Vector3 = Vector3()
+    orientation: Quaternion = Quaternion()
+
+
+class PoseArray(Message):
+    """Poses of several objects; `ids[i]` and `labels[i]`, if present, belong to `poses[i]`."""
+
+    max_bytes: ClassVar[int] = 2 * SMALL_BYTES
+    max_parts: ClassVar[int] = 1024
+    omitted_defaults: ClassVar[tuple[str, ...]] = ("unseen", "blind")
+
+    header: Header = Header()
+    poses: list[Pose] = Field([], max_length=MAX_POSES)
+    ids: Labels = []
+    labels: Labels = Field([], description="of ground truth: table, held, falling, box, or elsewhere (out of view); of "
+                                           "perceived objects: hidden for one seen before it was occluded")
+    remark: Text = Field("", description="what was detected and is none of the poses, and why")
+    unseen: Text = Field("", description="which part of the area with objects the image did not show; empty: none")
+    blind: bool = Field(False, description="the image showed nothing at all")
+
+    @model_validator(mode="after")
+    def _require_same_length(self) -> PoseArray:
+        for field in ("ids", "labels"):
+            count = len(getattr(self, field))
+            if count not in (0, len(self.poses)):
+                raise ValueError(f"{field} has {count} entries for {len(self.poses)} poses")
+        return self
+
+
+class TransformStamped(Message):
+    """Pose of `child_frame_id` in `header.frame_id`."""
+
+    header: Header
+    child_frame_id: Name
+    transform: Pose
+
+
+class TFMessage(Message):
+    """Transforms of one instant."""
+
+    max_bytes: ClassVar[int] = 256 * 1024
+    max_parts: ClassVar[int] = 8 * 1024
+
+    transforms: list[TransformStamped] = Field(max_length=1000)
+
+
+class Color(Message):
+    """Red, green, blue and opacity, each 0 to 1."""
+
+    r: Fraction = 1.0
+    g: Fraction = 1.0
+    b: Fraction = 1.0
+    a: Fraction = 1.0

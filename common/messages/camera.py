@@ -1,4 +1,4 @@
-"""Pictures, calibrations and what was found in them."""
+"""Images, calibrations and detections."""
 
 from __future__ import annotations
 
@@ -6,12 +6,22 @@ from typing import ClassVar, Literal
 
 from pydantic import Field, model_validator
 
-from common.messages.basics import MAX_PAYLOAD_BYTES, SMALL_BYTES, Finite, Header, Label, Message, Text
-from common.messages.geometry import Color, Pose, Vector3
+from common.messages.basics import (
+    MAX_PAYLOAD_BYTES,
+    SMALL_BYTES,
+    Color,
+    Finite,
+    Header,
+    Label,
+    Message,
+    Pose,
+    Text,
+    Vector3,
+)
 
 
 class Image(Message):
-    """Pixels, row by row. `step` is the row stride in bytes; 0 means unpadded. See common/perception/image.py."""
+    """Pixels in row-major order. `step` is the row stride [bytes], 0: unpadded. See common/perception/image.py."""
 
     max_bytes: ClassVar[int] = MAX_PAYLOAD_BYTES
     max_parts: ClassVar[int] = 16
@@ -26,7 +36,7 @@ class Image(Message):
 
 
 class CameraInfo(Message):
-    """Pinhole calibration, as sensor_msgs/CameraInfo: `k` is the 3x3 intrinsic matrix [px], row by row."""
+    """Pinhole calibration, as sensor_msgs/CameraInfo: `k` is the 3x3 intrinsic matrix [px] in row-major order."""
 
     max_bytes: ClassVar[int] = SMALL_BYTES
     omitted_defaults: ClassVar[tuple[str, ...]] = ("without_robot",)
@@ -37,17 +47,17 @@ class CameraInfo(Message):
     distortion_model: Label = "plumb_bob"
     d: list[Finite] = Field([], max_length=64)
     k: list[Finite] = Field(min_length=9, max_length=9)
-    without_robot: bool = Field(False, description="its pictures are drawn, and show what lies behind the robot")
+    without_robot: bool = Field(False, description="images are rendered without the robot and show what is behind it")
 
     @model_validator(mode="after")
-    def _has_focal_lengths(self) -> CameraInfo:
+    def _require_focal_lengths(self) -> CameraInfo:
         if self.k[0] <= 0 or self.k[4] <= 0:
             raise ValueError(f"focal lengths must be positive, not {self.k[0]:g} and {self.k[4]:g}")
         return self
 
 
 class Marker(Message):
-    """Something to look at: a detection or a shape for the operator. `scale` is the full size [m]."""
+    """A detection, or a shape for the operator. `scale` is the full size [m]."""
 
     ns: Label
     id: int
@@ -56,8 +66,8 @@ class Marker(Message):
     scale: Vector3
     color: Color = Color()
     text: Text = ""
-    pixel: tuple[Finite, Finite] | None = Field(None, description="where the centre is seen, (u, v) [px]")
-    partial: bool = Field(False, description="touches the border of the picture: not wholly in view")
+    pixel: tuple[Finite, Finite] | None = Field(None, description="centre in the image, (u, v) [px]")
+    partial: bool = Field(False, description="touches the border of the image: partly out of view")
 
 
 class MarkerArray(Message):
@@ -69,12 +79,12 @@ class MarkerArray(Message):
 
     header: Header
     markers: list[Marker] = Field(max_length=1000)
-    remark: Text = Field("", description="what was seen there and is no marker, and why")
-    blind: Text = Field("", description="why the picture tells nothing; empty when it does")
+    remark: Text = Field("", description="what was detected and is no marker, and why")
+    blind: Text = Field("", description="why the image is unusable; empty if it is usable")
 
 
 class PointCloud2(Message):
-    """Points as rows of little-endian float32 x, y, z and one packed colour, as sensor_msgs/PointCloud2."""
+    """Points as rows of little-endian float32 x, y, z and one packed color, as sensor_msgs/PointCloud2."""
 
     max_bytes: ClassVar[int] = MAX_PAYLOAD_BYTES
     max_parts: ClassVar[int] = 16
@@ -89,14 +99,14 @@ class PointCloud2(Message):
 
 
 class Rejection(Message):
-    """A detected object that is not offered to the task, and why."""
+    """A detected object that is not offered to the task, and the reason."""
 
     position: Vector3
     reason: Text
 
 
 class Rejections(Message):
-    """Rejections that are new: one is sent once for each place."""
+    """New rejections: one is sent once for each position."""
 
     max_bytes: ClassVar[int] = 256 * 1024
     max_parts: ClassVar[int] = 8 * 1024

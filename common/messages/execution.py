@@ -1,4 +1,4 @@
-"""Messages that move the arm and the gripper, stop and hold them, and report their state."""
+"""Messages that move the arm and the gripper, stop and hold them, run the task, and report their states."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from common.messages.basics import (
     MAX_STAMP,
     SMALL_BYTES,
     UNKNOWN_OPERATOR,
+    Count,
     Finite,
     FormerOperator,
     Fraction,
@@ -22,16 +23,14 @@ from common.messages.basics import (
     OperatorName,
     Remark,
     Text,
+    Vector3,
     either_name,
 )
-from common.messages.geometry import Vector3
+from common.messages.camera import Rejection
 from common.messages.robot import TRAJECTORY_BYTES, JointTrajectory
 
 GoalState = Literal["none", "rejected", "active", "succeeded", "aborted", "cancelled"]
 GripOutcome = Literal["", "grasped", "too_wide", "too_narrow", "empty", "slipping"]
-RobotMode = Literal[
-    "disconnected", "off", "idle", "running", "freedrive", "protective_stop", "emergency_stop", "fault"
-]
 Holder = Annotated[Literal["operator", "watchdog", "controller", "scene_monitor"], FormerOperator]
 OwnerKind = Literal["none", "task", "operator", "script"]
 JogFrame = Literal["base", "tool", "world"]
@@ -225,49 +224,6 @@ class GripperState(Message):
     source: Label = Field("", description="name of the gripper's controller")
 
 
-class RobotStatus(Message):
-    """State of the arm's own controller: its mode, speed slider, timing and digital inputs and outputs."""
-
-    omitted_defaults: ClassVar[tuple[str, ...]] = ("controller",)
-
-    header: Header = Header()
-    mode: RobotMode
-    message: Text = Field("", description="why the arm cannot move; empty while it can")
-    speed: Fraction = Field(1.0, description="share of the speed that the arm's own slider allows")
-    late: Finite = Field(0.0, description="largest delay of a cycle of its driver so far [s]")
-    inputs: int = Field(0, ge=0, lt=2**32, description="digital inputs, one bit each")
-    outputs: int = Field(0, ge=0, lt=2**32, description="digital outputs, one bit each")
-    controller: bool = Field(False, description="whether the arm has a controller that accepts robot/command")
-
-
-class RobotCommand(Message):
-    """Command the arm's own controller to do something other than a motion.
-
-    The stamp of the header is the time of the decision: a command that arrives too late is refused, one without a
-    stamp never is.
-    """
-
-    max_bytes: ClassVar[int] = SMALL_BYTES
-
-    omitted_defaults: ClassVar[tuple[str, ...]] = ("header", "output", "com")
-
-    header: Header = Header()
-    act: Literal["enable", "recover", "freedrive", "payload", "output"] = Field(
-        description="enable: power and brakes; recover: from a protective stop; freedrive: move by hand, value 1 or 0; "
-                    "payload: mass carried by the tool, value in kg; output: a digital output, value 1 or 0")
-    value: Annotated[float, Field(ge=0, le=1000, allow_inf_nan=False)] = 0.0
-    output: int = Field(0, ge=0, lt=32, description="number of the digital output")
-    com: Vector3 = Field(Vector3(), description="centre of mass of the payload, from the flange [m]")
-    owner: OperatorName = Field("", description="name of the operator")
-
-    @property
-    def values(self) -> tuple[float, ...]:
-        """Arguments of the act for the arm's driver."""
-        if self.act == "payload":
-            return self.value, self.com.x, self.com.y, self.com.z
-        return (self.value, float(self.output)) if self.act == "output" else (self.value,)
-
-
 class JogCommand(Message):
     """Move at these velocities of joints or of the tool while the command is repeated. A late one has no effect.
 
@@ -319,3 +275,53 @@ class MotionOwner(Message):
             return "free"
         when = datetime.fromtimestamp(self.since * 1e-9, UTC)
         return f"owned by {self.owner or 'a task'} ({self.kind}) since {when:%Y-%m-%d %H:%M:%S} UTC"
+
+
+class TaskCommand(Message):
+    """Start, pause, resume or stop the task. An operator without a name has no holds of their own."""
+
+    max_bytes: ClassVar[int] = SMALL_BYTES
+
+    command: Literal["start", "pause", "resume", "stop"]
+    by: OperatorName = Field("", description="name of the operator")
+    override: bool = Field(False, description="start or resume although another operator holds the robot; is logged")
+    acknowledged: Acknowledged = Field(
+        None, description="`since` of the newest interlock that the operator has seen: later ones stay")
+
+
+class PlanFigure(Message):
+    """One successful plan, for the summary."""
+
+    planner: Label
+    seconds: Finite
+    fraction: Finite
+    attempts: Count
+
+
+class TaskStatus(Message):
+    """Progress of a task, and the reply to a command. Each task derives its own status from this.
+
+    `figures` are the task's own, by name; the summary of a run repeats them.
+    """
+
+    max_bytes: ClassVar[int] = 256 * 1024
+    max_parts: ClassVar[int] = 8 * 1024
+
+    header: Header = Header()
+    state: Label = Field("IDLE", description="DONE and ERROR end a run; IDLE is at rest; others are the task's own")
+    paused: bool = False
+    started: bool = False
+    stage: Label = ""
+    subject: Label = Field("", description="current subject, such as the id of an object")
+    done: Count = Field(0, description="of `total`")
+    total: Count = Field(0, description="what the task has perceived and can do or has done")
+    failures: Count = 0
+    retries: Count = 0
+    skipped: list[Rejection] = Field([], max_length=1000, description="what could not be done, where, and why")
+    plans: list[PlanFigure] = Field([], max_length=1000)
+    moving_seconds: Finite = Field(0.0, description="cell time in motion [s]")
+    planning_seconds: Finite = Field(0.0, description="wall time spent in plan requests [s]")
+    task_seconds: Finite = Field(0.0, description="cell time since the start of the task [s]")
+    figures: dict[Name, bool | int | Finite | Text | None] = Field({}, max_length=200)
+    message: Text = ""
+    overlooked: Text = Field("", description="what was perceived and not done when the task ended")

@@ -1,4 +1,4 @@
-"""Asking for a plan, and the answer."""
+"""Plan requests and their answers."""
 
 from __future__ import annotations
 
@@ -7,16 +7,28 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
-from common.messages.basics import MAX_STAMP, SMALL_BYTES, Count, Finite, Fraction, Header, Label, Message, Name, Text
-from common.messages.geometry import Pose, Vector3
+from common.messages.basics import (
+    MAX_STAMP,
+    SMALL_BYTES,
+    Count,
+    Finite,
+    Fraction,
+    Header,
+    Label,
+    Message,
+    Name,
+    Pose,
+    Text,
+    Vector3,
+)
 from common.messages.robot import TRAJECTORY_BYTES, Joints, JointTrajectory
 from common.messages.scene import Pairs
 
-_THINNEST = 1e-3  # [m]
+_MIN_SIDE = 1e-3  # [m]
 
 
 class JointGoal(Message):
-    """Joint positions to end at [rad], in the order of the robot's group; or the name of a named pose."""
+    """Goal joint positions [rad], in the order of the robot's group; or the name of a named pose."""
 
     kind: Literal["joints"] = "joints"
     positions: Joints = []
@@ -24,12 +36,12 @@ class JointGoal(Message):
 
 
 class PoseGoal(Message):
-    """A pose for the tool centre point, with a region about it for planners that can use one.
+    """A pose of the tool centre point, with a goal region for planners that can use one.
 
     The straight-line planner ends at the pose itself. Sampling planners may end anywhere in the region: a box with
     the sides `position_tolerance` [m] centred on the pose, tilted by at most `tilt_tolerance` [rad] from the pose's
     tool axis and turned about it by at most `yaw_tolerance` [rad]. An arm of fewer than six joints, which cannot choose
-    tilt and yaw, may use up both of these on straight lines as well, and ends them at the place of the pose.
+    tilt and yaw, may use both of these on straight lines as well, and ends them at the position of the pose.
     """
 
     kind: Literal["pose"] = "pose"
@@ -40,25 +52,25 @@ class PoseGoal(Message):
 
 
 class PathGoal(Message):
-    """Poses for the tool centre point to pass in straight lines, in order, from the first, which is where it starts.
+    """Poses that the tool centre point passes in order on straight lines, from the first, where it starts.
 
-    `tool_speed` is kept wherever joint limits and corners allow; without one the path is as fast as limits allow.
+    `tool_speed` is held wherever joint limits and corners allow; without it the path is as fast as limits allow.
     """
 
     kind: Literal["path"] = "path"
     waypoints: list[Pose] = Field(min_length=1, max_length=20000)
     step: Annotated[float, Field(gt=0, le=0.1)] | None = Field(
-        None, description="way between poses for which joint positions are solved [m]; None: the planner's"
+        None, description="distance between poses with solved joint positions [m]; None: the planner's"
     )
-    min_fraction: Fraction | None = Field(None, description="less of the path is refused; None: the planner's")
+    min_fraction: Fraction | None = Field(None, description="least accepted fraction of the path; None: the planner's")
     tool_speed: Annotated[float, Field(ge=1e-5, le=5)] | None = Field(None, description="[m/s]")
 
 
 class ArcGoal(Message):
     """A pose that the tool centre point reaches on a circular arc from where it starts.
 
-    The circle is told by a point `via` which the arc passes, or by its `center`; then the shorter arc is taken. The
-    orientation turns evenly along it.
+    The circle is defined by a point `via` on the arc, or by its `center`; then the shorter arc is used. The orientation
+    turns evenly along it.
     """
 
     kind: Literal["arc"] = "arc"
@@ -67,17 +79,17 @@ class ArcGoal(Message):
     center: Vector3 | None = Field(None, description="of the circle [m]")
 
     @model_validator(mode="after")
-    def _tells_one_circle(self) -> ArcGoal:
+    def _require_one_circle(self) -> ArcGoal:
         if (self.via is None) == (self.center is None):
             raise ValueError("an arc has either via or center")
         return self
 
 
 class GoalSet(Message):
-    """Several goals of which any will do, such as all grasps of an object.
+    """Alternative goals, such as all grasps of an object.
 
-    With `straight` it is the one at the end of the shortest line that can be followed; else the one that the arm can
-    turn straight to in the least time; where obstacles are in the way of all, the one of the best of the attempts.
+    With `straight` the planner reaches the one at the end of the shortest feasible line; else the one with the fastest
+    direct joint motion; where obstacles block all of these, the one of the best attempt.
     """
 
     kind: Literal["any"] = "any"
@@ -85,10 +97,10 @@ class GoalSet(Message):
 
 
 class SequenceItem(Message):
-    """One motion of a sequence: point to point, a straight line where `straight`, an arc for an arc goal.
+    """One motion of a sequence: point to point, a straight line if `straight`, an arc for an arc goal.
 
-    The tool rounds the corner to the next item off within `blend_radius` of this goal; with none it stops there.
-    Where the goal leaves some freedom, it is reached where the whole motion takes the least time that was found.
+    The tool blends the corner to the next item within `blend_radius` of this goal; without it stops there. A goal with
+    freedom is reached where the complete motion takes the least time found.
     """
 
     goal: Annotated[JointGoal | PoseGoal | ArcGoal | GoalSet, Field(discriminator="kind")]
@@ -97,13 +109,13 @@ class SequenceItem(Message):
 
 
 class SequenceGoal(Message):
-    """Goals to reach one after the other, in one trajectory."""
+    """Goals to reach in order, in one trajectory."""
 
     kind: Literal["sequence"] = "sequence"
     items: list[SequenceItem] = Field(min_length=1, max_length=200)
 
     @model_validator(mode="after")
-    def _stops_at_the_end(self) -> SequenceGoal:
+    def _require_stop_at_the_end(self) -> SequenceGoal:
         if self.items[-1].blend_radius:
             raise ValueError(f"the last item has blend_radius {self.items[-1].blend_radius:g}, but nothing follows it")
         return self
@@ -113,25 +125,25 @@ AnyGoal = JointGoal | PoseGoal | PathGoal | ArcGoal | SequenceGoal | GoalSet
 
 
 class Box(Message):
-    """A box: the pose of its middle, and its full sides [m]."""
+    """A box: the pose of its centre, and its full sides [m]."""
 
     pose: Pose
     size: Vector3
 
     @model_validator(mode="after")
-    def _has_sides(self) -> Box:
-        if (least := min(self.size.x, self.size.y, self.size.z)) < _THINNEST:
-            raise ValueError(f"a box has a side of {least:g} m, {_THINNEST:g} m is the least")
+    def _require_sides(self) -> Box:
+        if (least := min(self.size.x, self.size.y, self.size.z)) < _MIN_SIDE:
+            raise ValueError(f"a box has a side of {least:g} m, {_MIN_SIDE:g} m is the least")
         return self
 
 
 class PathConstraints(Message):
-    """What is kept to all along the way, the start and the goal included.
+    """Constraints on the complete path, start and goal included.
 
-    `tilt`: the direction `tool_axis` of the tool's frame leans by at most this angle from `axis` in world: the tool's z
-    axis from straight down, unless told. With `upright_at_start` the tool stands upright at the start, whatever of it
-    lies along `axis` there: a glass held from the side. `region`: the tool centre point stays inside. `tool_speed`:
-    it never moves faster.
+    `tilt`: largest angle between `tool_axis` in the tool's frame and `axis` in world, by default between the tool's z
+    axis and straight down. With `upright_at_start` the tool counts as upright at the start, and the direction in its
+    frame that is along `axis` there replaces `tool_axis`: a glass held from the side. `region`: the tool centre point
+    stays inside. `tool_speed`: its highest speed.
     """
 
     tilt: Annotated[float, Field(ge=0.005, le=math.pi)] | None = Field(None, description="[rad]")
@@ -142,7 +154,7 @@ class PathConstraints(Message):
     tool_speed: Annotated[float, Field(ge=1e-5, le=5)] | None = Field(None, description="[m/s]")
 
     @model_validator(mode="after")
-    def _tells_directions(self) -> PathConstraints:
+    def _require_directions(self) -> PathConstraints:
         for name, axis in (("axis", self.axis), ("tool_axis", self.tool_axis)):
             if not 1e-6 < (length := math.hypot(axis.x, axis.y, axis.z)) < 1e6:
                 raise ValueError(f"{name} has length {length:g}, and so no direction")
@@ -150,11 +162,11 @@ class PathConstraints(Message):
 
 
 class PlanRequest(Message):
-    """Ask for a trajectory. Poses are in the robot's base frame, `world`.
+    """Request a trajectory. Poses are in the robot's base frame, `world`.
 
-    `attach` names an object of the planning scene that is to be planned with as if it were already held (or as held
-    now); `release` plans as if nothing were held. Contact that an attached object has at the start is allowed until
-    the tool has moved `contact_distance`.
+    `attach` names an object of the planning scene to plan with as if it were held already; `release` plans as if
+    nothing were held. Contact of an attached object at the start is allowed until the tool has moved
+    `contact_distance`.
     """
 
     max_bytes: ClassVar[int] = 4 * 1024 * 1024  # a path of 20000 poses
@@ -162,29 +174,29 @@ class PlanRequest(Message):
 
     header: Header = Header()
     id: Name
-    stage: Label = Field("", description="what the motion is for: appears in every error")
+    stage: Label = Field("", description="purpose of the motion: appears in every error")
     start: Joints = Field([], description="joint positions [rad]; empty: where the robot is now")
     goal: Annotated[AnyGoal, Field(discriminator="kind")]
-    straight: bool = Field(False, description="only a straight line of the tool will do")
-    allowed_collisions: Pairs = Field([], description="in addition to the planning scene's")
+    straight: bool = Field(False, description="require a straight line of the tool")
+    allowed_collisions: Pairs = Field([], description="in addition to those of the planning scene")
     attach: Label = ""
-    attach_pose: Pose | None = Field(None, description="of the attached object in the tool frame, when not held yet")
+    attach_pose: Pose | None = Field(None, description="of the attached object in the tool frame, if not held yet")
     release: bool = False
     contact_distance: Annotated[float, Field(ge=0, le=0.2)] = 0.02
-    constraints: PathConstraints | None = Field(None, description="of the way, whoever plans it")
+    constraints: PathConstraints | None = Field(None, description="on the path, for any planner")
     gripper_width: Annotated[float, Field(ge=0, le=0.2)] | None = Field(
-        None, description="between the fingers on the way, the widest where they move [m]; else as they stand now"
+        None, description="between the fingers on the path, the widest if they move [m]; None: the current width"
     )
     velocity_scaling: Annotated[float, Field(ge=1e-4, le=1)] | None = None
     acceleration_scaling: Annotated[float, Field(ge=1e-4, le=1)] | None = None
     planning_time: Annotated[float, Field(gt=0, le=600)] | None = Field(None, description="wall time [s]")
     planning_attempts: Annotated[int, Field(ge=1, le=100)] | None = None
-    planner: Label = Field("", description="use only this one, of the pipeline or of the project")
+    planner: Label = Field("", description="use only this planner of the pipeline or of the project")
     seed: int | None = None
 
     @model_serializer(mode="wrap")
     def _written(self, write: SerializerFunctionWrapHandler) -> Any:
-        """The fields; those that came later only where there are some, so that who knows none can read the rest."""
+        """Return the fields; omit unset new ones, so that former versions can read the others."""
         fields: dict[str, Any] = write(self)
         for name in ("constraints", "gripper_width"):
             if getattr(self, name) is None:
@@ -193,7 +205,7 @@ class PlanRequest(Message):
 
 
 class PlanAttempt(Message):
-    """One try of one planner. `error` is empty for a success."""
+    """One attempt of one planner. `error` is empty for a success."""
 
     planner: Label
     seconds: Finite
@@ -205,9 +217,9 @@ class PlanAttempt(Message):
 
 
 class PlanResponse(Message):
-    """A trajectory, or the error of the planner that got furthest. All attempts are listed."""
+    """A trajectory, or the error of the planner that got furthest, with all attempts."""
 
-    max_bytes: ClassVar[int] = TRAJECTORY_BYTES + 64 * SMALL_BYTES  # with all that was tried
+    max_bytes: ClassVar[int] = TRAJECTORY_BYTES + 64 * SMALL_BYTES  # with all attempts
     max_parts: ClassVar[int] = 128 * 1024
     omitted_defaults: ClassVar[tuple[str, ...]] = ("scene_stamp",)
 
@@ -216,10 +228,10 @@ class PlanResponse(Message):
     ok: bool
     trajectory: JointTrajectory | None = None
     planner: Label = ""
-    goal_index: Count = Field(0, description="which goal of a set is reached, from 0; of a sequence, of its last")
-    seconds: Finite = Field(0.0, description="wall time [s] of the whole request")
+    goal_index: Count = Field(0, description="index of the reached goal of a set, from 0; of a sequence: its last set")
+    seconds: Finite = Field(0.0, description="wall time [s] of the complete request")
     scene_stamp: Annotated[int, Field(ge=0, le=MAX_STAMP)] = Field(
-        0, description="of the planning scene that it was planned on; 0: not known")
+        0, description="stamp of the planning scene it was planned on; 0: unknown")
     fraction: Finite = 0.0
     error: Label = Field("", description="code: start_in_collision, no_ik, collision, incomplete, timeout, ...")
     message: Text = Field("", description="one line naming stage, planner, waypoint and colliding pair")

@@ -33,15 +33,15 @@ class ServiceStatus(Message):
     restarts: Count = 0
     ready_seconds: Finite | None = Field(None, description="wall time from its start to its readiness token [s]")
     message: Text = ""
-    host: Label = Field("", description="name of the computer that it runs on")
+    host: Label = Field("", description="name of the host that it runs on")
 
 
 class Notice(Message):
-    """Something about a host that a person should know, such as a certificate that ends soon."""
+    """A notice about a host for the operator, such as a certificate that expires soon."""
 
     urgent: bool = False
     message: Text
-    host: Label = Field("", description="name of the computer that it is about")
+    host: Label = Field("", description="name of the host")
 
 
 class SupervisorStatus(Message):
@@ -53,20 +53,20 @@ class SupervisorStatus(Message):
     header: Header = Header()
     cell: Label
     services: list[ServiceStatus] = Field(max_length=1000)
-    host: Label = Field("", description="name of the computer of this supervisor; each tells of the whole cell")
+    host: Label = Field("", description="name of the host of this supervisor; each reports the complete cell")
     speed: Positive = Field(1.0, description="cell time per wall time")
     epoch: int = Field(
         0, ge=0, le=MAX_STAMP, description="when cell time and wall time were equal [ns since the Unix epoch]"
     )
     booted: int = Field(
-        0, ge=-MAX_STAMP, le=MAX_STAMP, description="when the clock of that host was at 0 [ns since the Unix epoch]"
+        0, ge=-MAX_STAMP, le=MAX_STAMP, description="time at which its boot clock was at 0 [ns since the Unix epoch]"
     )
     seed: int = 0
-    world: Text = Field("", description="that replaces the cell's, as it was asked for")
+    world: Text = Field("", description="world that replaces the cell's, as requested")
     overrides: list[Text] = Field(
-        [], max_length=1000, description="PATH=VALUE, as they were asked for; secrets are left out"
+        [], max_length=1000, description="PATH=VALUE, as requested, without secrets"
     )
-    notices: list[Notice] = Field([], max_length=1000, description="certificates that end soon or have ended")
+    notices: list[Notice] = Field([], max_length=1000, description="certificates that expire soon or have expired")
 
 
 class LogLine(Message):
@@ -81,7 +81,7 @@ class LogLine(Message):
 
 
 class ServiceCounters(Message):
-    """What a service's transport counted: dropped, refused and handled messages by key."""
+    """Numbers of received, dropped and refused messages of a service by key."""
 
     max_bytes: ClassVar[int] = SMALL_BYTES
 
@@ -89,13 +89,13 @@ class ServiceCounters(Message):
     service: Label
     writes: list[Label] = Field([], max_length=MAX_KEYS, description="keys that it writes")
     received: Counts = {}
-    dropped: Counts = Field({}, description="newer message came before this one was read")
+    dropped: Counts = Field({}, description="replaced by a newer message before it was read")
     invalid: Counts = Field({}, description="payloads that did not parse or validate")
     overflow: Counts = Field({}, description="events lost because the reader fell behind")
 
 
 class Parameter(Message):
-    """One parameter as it is now. `path` is what `--set` and a cell file call it."""
+    """One parameter with its current value. `path` is its name in `--set` and in cell files."""
 
     path: Name = Field(description="such as services.camera_simulator.rate or motion.velocity_scaling")
     value: Plain
@@ -107,22 +107,22 @@ class Parameter(Message):
     unit: Label = ""
     description: Text = ""
     runtime: bool = Field(False, description="may be changed while the service runs")
-    changed: bool = Field(False, description="is no longer what the service was started with")
+    changed: bool = Field(False, description="differs from the value at the start of the service")
 
 
 class ParameterRequest(Message):
-    """Change parameters of a service, all of them or none; with nothing to set, ask what there is."""
+    """Change parameters of a service, all or none; an empty request reads them."""
 
     max_bytes: ClassVar[int] = 4 * SMALL_BYTES
     max_parts: ClassVar[int] = 1024
 
     set: dict[Name, Plain] = Field({}, max_length=256, description="by path")
-    dry_run: bool = Field(False, description="only say whether it could be done")
-    by: Label = Field("", description="who asks: is logged")
+    dry_run: bool = Field(False, description="only validate the change")
+    by: Label = Field("", description="name of the requester, for the log")
 
 
 class ParameterReply(Message):
-    """All parameters of the service, after the change. The stamp tells how the clocks of two hosts differ."""
+    """All parameters of the service after the change. The stamp shows the clock offset between two hosts."""
 
     header: Header = Header()
     service: Label

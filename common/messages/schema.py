@@ -1,4 +1,4 @@
-"""What a message is made of, in lines for people, and an example of a request."""
+"""Fields of a message as text, an example of each request, and decoded payloads as text."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from typing import Any
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-# What a person would send first, by message. Each is checked by a test.
+# A typical first request, by message. A test validates each.
 EXAMPLES: dict[str, dict[str, Any]] = {
     "PlanRequest": {"id": "try-1", "goal": {"kind": "joints", "named": "home"}},
-    "StopRequest": {"reason": "asked to"},
+    "StopRequest": {"reason": "requested"},
     "GripperCommand": {"id": "open-1", "width": 0.08},
     "WorldEdit": {"op": "add", "position": {"x": 0.45, "y": -0.1, "z": 0.03}},
     "SceneEdit": {"op": "add", "id": "post", "shape": "cylinder", "dimensions": [0.03, 0.6],
@@ -26,12 +26,12 @@ EXAMPLES: dict[str, dict[str, Any]] = {
 
 
 def example_of(model: type[BaseModel]) -> dict[str, Any]:
-    """An example of a request: one made of the fields that are required, or what a person would rather send."""
+    """Return an example of a request: a typical one, or one with the required fields only."""
     return EXAMPLES.get(model.__name__) or {name: _sample(field.annotation) for name, field in _required(model)}
 
 
 def fields_of(model: type[BaseModel], indent: int = 0, seen: tuple[type[BaseModel], ...] = ()) -> Iterator[str]:
-    """The fields of a message and of the messages in it: name, type, default, description."""
+    """Yield the fields of a message and of its nested messages: name, type, default, description."""
     for name, field in model.model_fields.items():
         line = f"{'  ' * indent}{name}: {type_name(field.annotation)}"
         if bounds := ", ".join(text for text in map(_bound, field.metadata) if text):
@@ -49,7 +49,7 @@ def fields_of(model: type[BaseModel], indent: int = 0, seen: tuple[type[BaseMode
 
 
 def type_name(annotation: Any) -> str:
-    """A type as a person would write it."""
+    """Return the name of a type as in its annotation."""
     origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
     if origin is typing.Annotated:
         return type_name(arguments[0])
@@ -64,7 +64,7 @@ def type_name(annotation: Any) -> str:
 
 
 def models_in(annotation: Any) -> Iterator[type[BaseModel]]:
-    """The models that a type is made of."""
+    """Yield the models in a type."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         yield annotation
     for argument in typing.get_args(annotation):
@@ -83,7 +83,7 @@ def _required(model: type[BaseModel]) -> Iterator[tuple[str, FieldInfo]]:
 
 
 def _sample(annotation: Any) -> Any:
-    """A value of the type that is valid in most places."""
+    """Return a value of the type that most fields accept."""
     origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
     if origin is typing.Annotated:
         return _sample(arguments[0])
@@ -100,7 +100,7 @@ IMAGE_FIELDS = {"height", "width", "encoding", "data"}
 
 
 def plain(value: Any) -> Any:
-    """The value as JSON can hold it: bytes and numbers that are not finite become a description."""
+    """Return the value for JSON: bytes and numbers that are not finite become a description."""
     if isinstance(value, bytes | bytearray | memoryview):
         return f"<{len(value)} bytes>"
     if isinstance(value, float) and not math.isfinite(value):
@@ -115,17 +115,17 @@ def plain(value: Any) -> Any:
 
 
 def to_json(value: Any) -> str:
-    """The value as one line of JSON."""
+    """Return the value as one line of JSON."""
     return json.dumps(plain(value), ensure_ascii=False)
 
 
 def is_image(value: Any) -> bool:
-    """Whether a decoded payload is a picture."""
+    """Return whether a decoded payload is an image."""
     return isinstance(value, Mapping) and value.keys() >= IMAGE_FIELDS and isinstance(value["data"], bytes)
 
 
 def image_line(value: Mapping[str, Any]) -> str:
-    """A picture in one line, as "Image 640x480 bgr8 921600 B stamp 1763737000.123 camera_optical_frame"."""
+    """Return an image in one line: "Image 640x480 bgr8 921600 B stamp 1763737000.123 camera_optical_frame"."""
     line = f"Image {value['width']}x{value['height']} {value['encoding']} {len(value['data'])} B"
     header = value.get("header")
     if isinstance(header, Mapping):
@@ -137,12 +137,12 @@ def image_line(value: Mapping[str, Any]) -> str:
 
 
 def one_line(value: Any) -> str:
-    """A decoded payload in one line: a picture as its description, anything else as JSON."""
+    """Return a decoded payload in one line: an image as its description, any other as JSON."""
     return image_line(value) if is_image(value) else to_json(value)
 
 
 def from_json(value: Any) -> Any:
-    """What a person wrote as JSON, with {"base64": "..."} turned into bytes."""
+    """Return a parsed JSON value with {"base64": "..."} decoded to bytes."""
     if isinstance(value, dict):
         if value.keys() == {"base64"} and isinstance(value["base64"], str):
             return base64.b64decode(value["base64"], validate=True)

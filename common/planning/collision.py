@@ -110,24 +110,8 @@ class CollisionWorld:
         self._origin = T_world_tcp_start[:3, 3].copy()
         self.contact_distance = contact_distance
         environment, held = _split_scene(robot, scene, T_world_tcp_start, attach, attach_pose, release)
-        objects = [*environment, *(item for item, _, _ in held)]
-        solids = [Solid.of(o) for o in environment]
-        solids += [Solid.of(o, robot.model.frames[frame].parentJoint, frame) for o, frame, _ in held]
-        self._bank = self.cache.bank(tuple(solids), len(points))
-        self._bank.open_fingers(width)
-        self._bank.set_points([seen.spheres for seen in points])
-        self._bank.place([pose_to_matrix(o.pose) for o in environment] + [pose for _, _, pose in held])
-        self._names = [*self.cache.robot.links, *(o.id for o in objects), *(seen.name for seen in points)]
-        self._held_from = self._bank.robot_count + len(environment)
-        self._points_from = self._held_from + len(held)
-        self.attached: list[str] = [o.id for o, _, _ in held]
-        padded = np.array(
-            [0.0] * self._bank.robot_count
-            + [padding if o.role in PERCEIVED else 0.0 for o in objects]
-            + [padding] * len(points)
-        )
-        margins = padded[self._bank.first] + padded[self._bank.second]
-        disabled = self._pairs_named((*scene.allowed_collisions, *allowed))
+        margins = self._load(environment, held, points, width, padding)
+        disabled = _pairs_named(self._bank, self._names, (*scene.allowed_collisions, *allowed))
         self._far = self._bank.far
         self._far.set(disabled, margins)
         self._kernel = self._bank.kernel()
@@ -141,10 +125,30 @@ class CollisionWorld:
         if held and not self._lever.max() <= _FARTHEST_HELD:  # pieces of 1 mm of its path would be too many
             raise InvalidShape(f"{held[0][0].id}: the attached object reaches {self._lever.max():.3g} m from a joint; "
                                f"the limit is {_FARTHEST_HELD:g} m")
-        # The TCP may lie outside the hulls, so it has a lever of its own.
-        tcp = robot.model.frames[robot.tcp_frame]
-        point = pin.GeometryObject("tcp", tcp.parentJoint, robot.tcp_frame, tcp.placement, coal.Sphere(1e-6))
-        self._tcp_lever = self.cache.robot.lever(point)
+        self._tcp_lever = _tcp_lever(self.cache.robot)
+
+    def _load(
+        self, environment: list[CollisionObject], held: list[tuple[CollisionObject, int, Array]],
+        points: Sequence[PointObstacle], width: float | None, padding: float,
+    ) -> Array:
+        """Place all geometry; return (pairs,) the required distances [m]."""
+        objects = [*environment, *(item for item, _, _ in held)]
+        solids = [Solid.of(o) for o in environment]
+        solids += [Solid.of(o, self.robot.model.frames[frame].parentJoint, frame) for o, frame, _ in held]
+        self._bank = self.cache.bank(tuple(solids), len(points))
+        self._bank.open_fingers(width)
+        self._bank.set_points([seen.spheres for seen in points])
+        self._bank.place([pose_to_matrix(o.pose) for o in environment] + [pose for _, _, pose in held])
+        self._names = [*self.cache.robot.links, *(o.id for o in objects), *(seen.name for seen in points)]
+        self._held_from = self._bank.robot_count + len(environment)
+        self._points_from = self._held_from + len(held)
+        self.attached: list[str] = [o.id for o, _, _ in held]
+        padded = np.array(
+            [0.0] * self._bank.robot_count
+            + [padding if o.role in PERCEIVED else 0.0 for o in objects]
+            + [padding] * len(points)
+        )
+        return np.asarray(padded[self._bank.first] + padded[self._bank.second])
 
     def _send_rules_to_kernel(self) -> None:
         if self._kernel is None or self._near is self._far:
@@ -181,19 +185,6 @@ class CollisionWorld:
             self._penetrating = self._bank.penetrating
             self._penetrating.set(frozenset(range(self._bank.pair_count)).difference(touching), near_margins)
         return self._bank.near
-
-    def _pairs_named(self, allowed: Iterable[Pair]) -> frozenset[int]:
-        """Return indices of the pairs with these names, in either order; unknown names are ignored."""
-        indices: dict[str, list[int]] = {}
-        for i, name in enumerate(self._names):
-            indices.setdefault(name, []).append(i)
-        first, second = self._bank.first, self._bank.second
-        found: set[int] = set()
-        for a, b in allowed:
-            one, other = indices.get(a, []), indices.get(b, [])
-            either = (np.isin(first, one) & np.isin(second, other)) | (np.isin(first, other) & np.isin(second, one))
-            found.update(np.flatnonzero(either).tolist())
-        return frozenset(found)
 
     @property
     def kernel(self) -> KernelWorld | None:
@@ -353,19 +344,22 @@ class CollisionWorld:
         pair = self.colliding_pair(q)
         return False, None if pair is None else Hit(piece, q, pair)
 
-    def edge_collision(self, a: Array, b: Array, step: float = 0.005) -> Hit | None:
-        """Return the first collision on the straight line from a to b (dof,) [rad], checked in steps [rad]."""
-        return self.first_collision(interpolate([a, b], step))
-
     def obstruction(self, a: Array, b: Array, step: float) -> Obstruction:
         """Return why the straight line from a to b (dof,) [rad] is not free; collisions are checked in steps [rad]."""
-        hit = self.edge_collision(a, b, step)
+        hit = self.first_collision(interpolate([a, b], step))
         if hit is None and self.constraints is not None:
             violation = self.constraints.edge_violation(a, b)
             if violation:
                 return Obstruction("constraint", violation, None)
         pair = hit.pair if hit else ("robot", "scene")
         return Obstruction("collision", f"{pair[0]} collides with {pair[1]}", pair)
+
+
+def _tcp_lever(geometry: RobotGeometry) -> Array:
+    """Return (dof,) [m] how far the TCP moves per radian: it may lie outside the hulls, which have levers too."""
+    frame = geometry.robot.tcp_frame
+    tcp = geometry.robot.model.frames[frame]
+    return geometry.lever(pin.GeometryObject("tcp", tcp.parentJoint, frame, tcp.placement, coal.Sphere(1e-6)))
 
 
 def _split_scene(
@@ -397,6 +391,20 @@ def _split_scene(
         held.append((found, frame, T_joint_tcp @ T_tcp_object))
     names = {item.id for item, _, _ in held}
     return [o for o in environment if o.id not in names], held
+
+
+def _pairs_named(bank: ObstacleBank, names: Sequence[str], allowed: Iterable[Pair]) -> frozenset[int]:
+    """Return indices of the pairs with these names, in either order; unknown names are ignored."""
+    indices: dict[str, list[int]] = {}
+    for i, name in enumerate(names):
+        indices.setdefault(name, []).append(i)
+    first, second = bank.first, bank.second
+    found: set[int] = set()
+    for a, b in allowed:
+        one, other = indices.get(a, []), indices.get(b, [])
+        either = (np.isin(first, one) & np.isin(second, other)) | (np.isin(first, other) & np.isin(second, one))
+        found.update(np.flatnonzero(either).tolist())
+    return frozenset(found)
 
 
 def _least(rules: Rules) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -18,6 +18,7 @@ from common.planning.goal_sampling import distance_outside
 from common.planning.obstacles import InvalidShape, ObstacleCache
 from common.planning.planners import Plan, load_planner, planner_names
 from common.planning.planners.joint_move import straight_profile
+from common.planning.planners.sequence import SEGMENTS, NoOptions, join_segments
 from common.planning.point_obstacles import PointObstacle
 from common.planning.problem import (
     NOT_APPLICABLE,
@@ -38,7 +39,6 @@ from common.planning.request_checks import (
 )
 from common.planning.retiming import RetimingFailed, limited_jerk
 from common.planning.robot_geometry import RobotGeometry
-from common.planning.segments import SEGMENTS, NoOptions, join_segments
 from common.planning.trajectory import TimedPath, TooLong, cubics, join, require_sendable, stretch, trajectory_message
 from common.planning.validation import Fault, validate
 from common.planning.waypoint_timing import BLENDS, limit_tool_speed, retime
@@ -56,8 +56,11 @@ FINISHING_SHARE = 0.1  # of the planning time, added to it for timing and checki
 class PlanningPipeline:
     """Answers plan requests one after the other. Not thread-safe."""
 
-    def __init__(self, robot: RobotModel, motion: Motion, pipeline: Pipeline, *, seed: int = 0) -> None:
-        """Load the robot's collision geometry and the planners.
+    def __init__(
+        self, robot: RobotModel, motion: Motion, pipeline: Pipeline, *, seed: int = 0,
+        validator: Callable[..., Fault | None] = validate,
+    ) -> None:
+        """Load the robot's collision geometry and the planners; `validator` checks every timed path.
 
         Raises:
             ConfigError, UnknownName: a planner, an option or a mesh that cannot be used.
@@ -66,6 +69,7 @@ class PlanningPipeline:
         self._motion = motion
         self._pipeline = pipeline
         self._seed = seed
+        self._validate = validator
         self._planners: Planners = {}
         for entry in pipeline.planners:
             self._planners[entry.name.rpartition(".")[2]] = load_planner(entry.name, entry.options)
@@ -291,7 +295,7 @@ class PlanningPipeline:
             yield limit_tool_speed(robot, trajectory, limit)
 
     def _fault(self, problem: Problem, trajectory: TimedPath) -> Fault | None:
-        fault = validate(
+        fault = self._validate(
             trajectory,
             problem.robot,
             problem.world,

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Generic, NoReturn, Protocol, TypeVar
 
 from common import topics
-from common.clock import BOOTED_VARIABLE, EPOCH_VARIABLE, KEPT_VARIABLE, SPEED_VARIABLE, Clock
+from common.clock import BOOTED_VARIABLE, CLOCK_FOLDER_VARIABLE, EPOCH_VARIABLE, SPEED_VARIABLE, Clock
 from common.config import Cell, Parameters, Watchdogs, load_cell, service_config
 from common.config.tunables import apply, checked, describe, values_of
 from common.errors import ConfigError, UnknownName, ZencellError
@@ -101,7 +101,7 @@ def clock_from(speed: float | None, environ: Mapping[str, str] = os.environ) -> 
     try:
         return Clock.from_environment(variables)
     except ValueError as error:
-        names = (SPEED_VARIABLE, EPOCH_VARIABLE, BOOTED_VARIABLE, KEPT_VARIABLE)
+        names = (SPEED_VARIABLE, EPOCH_VARIABLE, BOOTED_VARIABLE, CLOCK_FOLDER_VARIABLE)
         given = {name: variables[name] for name in names if name in variables}
         raise ConfigError("speed", given, f"is not valid: {error}") from None
 

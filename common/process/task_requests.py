@@ -19,7 +19,7 @@ PLAN_OVERTIME = 5.0  # [s] wall: that a plan may take beyond its planning time
 REFUSAL_DELAY = 0.1  # [s] wall: after the second refused motion in a row; doubles with each further one
 LONGEST_REFUSAL_DELAY = 2.0  # [s] wall
 RELEASE = "release"  # kind of a command that ends an operator's hold
-BY_THEMSELVES = ("watchdog", "controller", "scene_monitor")  # owners of holds that they release themselves
+SELF_RELEASING = ("watchdog", "controller", "scene_monitor")  # owners of holds that they release themselves
 
 # Unanswered stops and holds of an operator, each with its interlock's kind and owner.
 Pending = dict[asyncio.Task[m.MotionStatus | None], tuple[str, str]]
@@ -187,7 +187,7 @@ def _release_until(seen: int, before: Pending) -> int:
     """
     answers = [sending.result() for sending in before if not sending.cancelled() and sending.exception() is None]
     interlocks = {one.since: one for answer in answers if answer is not None for one in answer.interlocks
-                if one.kind == "stopped" or one.by not in BY_THEMSELVES}
+                if one.kind == "stopped" or one.by not in SELF_RELEASING}
     for since in sorted(interlocks):
         if since > seen:
             if (interlocks[since].kind, interlocks[since].by) not in before.values():

@@ -11,13 +11,13 @@ from common import messages as m
 from common import topics
 from common.atomic_file import AtomicFile, Unreadable, runtime_folder
 from common.errors import Refused, RequestFailed
-from common.process.task_requests import BY_THEMSELVES, GOAL_TIMEOUT, AnswerHandler, TaskRequests
+from common.process.task_requests import GOAL_TIMEOUT, SELF_RELEASING, AnswerHandler, TaskRequests
 from common.robot.model import RobotModel
 from common.robot.transforms import matrix_to_pose
 from common.tasks.decisions import TaskConfig
 from common.tasks.engine import Task
+from common.tasks.monitoring import LOOK_PERIOD, LivenessWatchdog
 from common.tasks.stages import Command, View, within_range
-from common.tasks.watchdogs import LOOK_PERIOD, LivenessWatchdog
 from common.time_source import monotonic, new_id
 from common.topics import Topic
 from common.transport.bus import Bus
@@ -29,7 +29,7 @@ WAITS = "the arm waits: "
 ENDED = ("DONE", "ERROR")
 NOT_ANSWERED = "trajectory_executor has not answered yet: until it does, this is lost when the task ends"
 OWN_PERIOD = 0.2  # [s] wall between two requests for motion authority, in which the new owner is received
-UNNAMED = ("", m.UNKNOWN_OPERATOR, *BY_THEMSELVES)  # owners whose holds any operator may release
+UNNAMED = ("", m.UNKNOWN_OPERATOR, *SELF_RELEASING)  # owners whose holds any operator may release
 SAVE_RETRY = 2.0  # [s] wall after the memory could not be written
 
 C = TypeVar("C", bound=TaskConfig)
@@ -172,7 +172,7 @@ class TaskRunner(Generic[V]):
         """Return holds to request or release because of missing messages or services; the view gets the reason."""
         if self._watchdog is None:
             return []
-        holds = self._watchdog.look(monotonic(), self._requests.serving, view.motion)
+        holds = self._watchdog.update(monotonic(), self._requests.serving, view.motion)
         view.trouble = self._watchdog.trouble
         return holds
 

@@ -19,7 +19,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from common.errors import ConfigError
-from common.mesh_files import parts_of
+from common.robot.mesh_files import parts_of
 from common.robot.model import RobotModel
 from common.robot.transforms import rpy_to_matrix, transform
 from common.robot.urdf import find_description

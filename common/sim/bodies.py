@@ -1,4 +1,4 @@
-"""Bodies of the kinematic world: state, message and snapshot of each."""
+"""Bodies of a simulated world: state, message and snapshot of each, and the events of all."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from common.messages import WorldObject
-from common.robot.transforms import matrix_to_quaternion, quaternion_to_matrix, transform
+from common.messages import Pose, SceneUpdate, Vector3, WorldObject
+from common.robot.transforms import matrix_to_pose, matrix_to_quaternion, quaternion_to_matrix, transform
 from common.sim.footprints import boxes_disjoint, convex_parts, parts_meet
-from common.sim.interface import StandingObject
+from common.sim.interface import ObjectSnapshot
 from common.sim.objects import Solid, object_message
 from common.sim.table import Slot
 
@@ -50,7 +50,7 @@ class Body:
     added: bool = False  # by an operator
     like: str = ""  # id of the object of the initial layout whose shape it shares
     _message: WorldObject | None = None  # cached until the body changes
-    _snapshot: StandingObject | None = None  # cached until the body changes
+    _snapshot: ObjectSnapshot | None = None  # cached until the body changes
 
     def rest_at(self, rest: Rest) -> None:
         """Put the body at rest."""
@@ -101,12 +101,13 @@ class Body:
         outline = self.solid.footprint(T[:3, :3]) + T[:2, 3]
         return Block(self.name, outline, low, high, flat=self.solid.shape != "sphere")
 
-    def standing(self) -> StandingObject:
+    def snapshot(self) -> ObjectSnapshot:
         """Complete state, for `restored`."""
         if self._snapshot is None:
             rest = self.rest
-            self._snapshot = StandingObject(
-                pose=_numbers(self.T), like=self.like, made=self.message() if self.added and not self.like else None,
+            self._snapshot = ObjectSnapshot(
+                pose=_numbers(self.T), like=self.like,
+                definition=self.message() if self.added and not self.like else None,
                 details={
                     "state": self.state, "container": self.container, "slot": self.slot, "dropped": self.drop_height,
                     "since": self.drop_time, "width": self.width, "added": self.added,
@@ -138,13 +139,39 @@ class Block:
             convex_parts(outline) if parts is None else parts, self.parts)
 
 
-def restored(name: str, kept: StandingObject, solid: Solid, color: tuple[float, float, float]) -> Body:
+class WorldEvents:
+    """Collects objects removed and come to rest.
+
+    Attributes:
+        version: increases with every change worth publishing.
+    """
+
+    def __init__(self) -> None:
+        """Start without events."""
+        self.version = 0
+        self._events: list[SceneUpdate] = []
+
+    def take_events(self) -> list[SceneUpdate]:
+        """Return objects removed or come to rest since the last call, in order."""
+        events, self._events = self._events, []
+        return events
+
+    def _add_event(self, what: Literal["add", "remove"], body: Body) -> None:
+        pose = None
+        if what == "add":
+            x, y, z = (float(v) for v in body.T[:3, 3])
+            pose = Pose(position=Vector3(x=x, y=y, z=z)) if body.solid.shape == "sphere" else matrix_to_pose(body.T)
+        self._events.append(SceneUpdate(data=f"{what}:{body.name}", pose=pose))
+        self.version += 1
+
+
+def restored(name: str, snapshot: ObjectSnapshot, solid: Solid, color: tuple[float, float, float]) -> Body:
     """Restore a body from its snapshot."""
-    d: dict[str, Any] = kept.details
+    d: dict[str, Any] = snapshot.details
     body = Body(
-        name, solid, color, _matrix(kept.pose), d["state"], d["container"], _slot(d["slot"]),
+        name, solid, color, _matrix(snapshot.pose), d["state"], d["container"], _slot(d["slot"]),
         None if d["grip"] is None else _matrix(d["grip"]), d["width"], d["dropped"], d["since"],
-        added=d["added"], like=kept.like,
+        added=d["added"], like=snapshot.like,
     )
     if d["rest"] is not None:
         T, state, container, slot = d["rest"]

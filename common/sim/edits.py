@@ -101,7 +101,7 @@ def requested_position(request: WorldEdit) -> Vector3:
 
 
 def require_room(solids: Iterable[Solid], count: int) -> None:
-    """Check that the world may hold these shapes, including a new one, beside `count` existing objects.
+    """Check that the world may hold these shapes, including a new one, in addition to `count` objects.
 
     Raises:
         Refused: a limit would be exceeded.

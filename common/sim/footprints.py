@@ -61,7 +61,7 @@ def parts_meet(a: Array, b: Array) -> bool:
     """Whether a convex part (n, N, 2) of one outline overlaps a convex part (m, K, 2) of another."""
     low_a, high_a, low_b, high_b = a.min(axis=1), a.max(axis=1), b.min(axis=1), b.max(axis=1)
     near = ((high_a[:, None] >= low_b + TOUCH) & (high_b >= low_a[:, None] + TOUCH)).all(axis=2)
-    return any(_meet(a[i], b[j]) for i, j in np.argwhere(near))
+    return any(convex_overlap(a[i], b[j]) for i, j in np.argwhere(near))
 
 
 def convex_parts(outline: Array) -> Array:
@@ -76,7 +76,7 @@ def is_convex(outline: Array) -> bool:
     return bool((side[:, 0] * following[:, 1] - side[:, 1] * following[:, 0] >= -1e-12).all())
 
 
-def _meet(a: Array, b: Array) -> bool:
+def convex_overlap(a: Array, b: Array) -> bool:
     """Whether two convex outlines overlap: no side of either separates them."""
     for one, other in ((a, b), (b, a)):
         side = np.roll(one, -1, axis=0) - one

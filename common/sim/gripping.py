@@ -17,24 +17,24 @@ Array = NDArray[np.float64]
 
 TOUCH = 1e-6  # [m]
 LIP_POINTS = 8  # on the ring of a suction cup
-LINES = 5  # across a finger pad, along which it is felt what is between the fingers
+LINES = 5  # sampled across a finger pad to find the object between the fingers
 
 
-def felt(
+def pressed_ends(
     gripper: GripperConfig | None, allowed: GraspTolerances, body: Body, T_world_tcp: Array, width: float,
     before: tuple[float, float] | None,
 ) -> tuple[float, float] | None:
-    """The ends along tool y [m] of what the pads would press on; None when the body is not between them.
+    """Ends along tool y [m] of the part of a body between the pads; None if it is not between them.
 
-    Once clear of both fingers a thing stays between them: the closing finger pushes it to the middle.
+    A body that was clear of both fingers stays between them: the closing finger pushes it to the center.
 
     Args:
-        gripper: whose fingers or cup they are; the fingers of nobody known without one.
-        allowed: how far off a grasp may be.
-        body: what may be there.
+        gripper: fingers or cup; None: unknown fingers.
+        allowed: grasp tolerances.
+        body: the candidate.
         T_world_tcp: (4, 4) of a tool whose fingers close along its y axis.
         width: between the fingers [m].
-        before: the ends that were felt before; None when it was not between them.
+        before: ends in the previous cycle; None if it was not between them.
     """
     if gripper is not None and gripper.cup is not None:
         half = gripper.held_width / 2
@@ -43,11 +43,11 @@ def felt(
     reach = allowed.across + allowed.along + max(width / 2, solid.reach) + solid.reach
     if abs(body.T[2, 3] - T_world_tcp[2, 3]) > reach:
         return None
-    away = body.T[:3, 3] - T_world_tcp[:3, 3]
-    if math.hypot(*away.tolist()) > reach:
+    offset = body.T[:3, 3] - T_world_tcp[:3, 3]
+    if math.hypot(*offset.tolist()) > reach:
         return None
     if solid.shape == "sphere":
-        x, y, z = T_world_tcp[:3, :3].T @ away
+        x, y, z = T_world_tcp[:3, :3].T @ offset
         if abs(x) > allowed.across or abs(z) > allowed.along:
             return None
         low, high, half = float(y - solid.radius), float(y + solid.radius), solid.radius
@@ -56,7 +56,7 @@ def felt(
         ends = _pressed(solid, invert(T_world_tcp) @ body.T, width, allowed)
         if ends is None:
             return None
-        # The closing finger may hide an end by pushing it.
+        # The closing finger may cover an end by pushing it.
         low, high = ends if before is None or ends[1] - ends[0] >= before[1] - before[0] else before
         half = (high - low) / 2
         fits = low >= -width / 2 - allowed.sideways and high <= width / 2 + allowed.sideways
@@ -66,7 +66,7 @@ def felt(
 
 
 def lies_on(cup: SuctionCup, solid: Solid, T_tcp_object: Array) -> bool:
-    """Whether the whole lip of a cup lies on a solid: middle and ring meet it, no further away than the lip gives."""
+    """Whether the complete lip of a cup lies on a solid: center and ring meet it within the give of the lip."""
     around = np.linspace(0.0, 2 * math.pi, LIP_POINTS, endpoint=False)
     lip = np.vstack([(0.0, 0.0), cup.lip_radius * np.column_stack([np.cos(around), np.sin(around)])])
     if solid.shape == "sphere":
@@ -76,7 +76,7 @@ def lies_on(cup: SuctionCup, solid: Solid, T_tcp_object: Array) -> bool:
             return False
         near = z - np.sqrt(inside)
     else:
-        # Seen along the tool's z axis, which is the y axis of lines through (x, -y).
+        # Along the tool's z axis, which is the y axis of lines through (x, -y).
         T_along_tcp = np.eye(4)
         T_along_tcp[:3, :3] = [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]
         spans = solid.spans(T_along_tcp @ T_tcp_object, lip * (1.0, -1.0))[: len(lip)]
@@ -89,15 +89,14 @@ def lies_on(cup: SuctionCup, solid: Solid, T_tcp_object: Array) -> bool:
 def _pressed(
     solid: Solid, T_tcp_object: Array, width: float, allowed: GraspTolerances
 ) -> tuple[float, float] | None:
-    """The ends along tool y [m] of what of a solid is between the pads; None when the line between their middles
-    meets nothing of it."""
+    """Ends along tool y [m] of a solid between the pads; None if the line between their centers misses it."""
     if not solid.may_meet(T_tcp_object):
         return None
     x, z = (np.linspace(-half, half, LINES) for half in (allowed.across, allowed.along))
     lines = np.stack(np.meshgrid(x, z, indexing="ij"), axis=-1).reshape(-1, 2)
     spans = solid.spans(T_tcp_object, lines)
-    middle = spans[len(lines) // 2]
-    if not (np.abs(middle).min(axis=1) < width / 2).any() and not ((middle[:, 0] < 0) & (middle[:, 1] > 0)).any():
+    center = spans[len(lines) // 2]
+    if not (np.abs(center).min(axis=1) < width / 2).any() and not ((center[:, 0] < 0) & (center[:, 1] > 0)).any():
         return None
     parts = sorted(tuple(span) for found in spans for span in found.tolist())
     merged: list[list[float]] = []

@@ -1,18 +1,19 @@
-"""The seam between the controller and whatever simulates the world about the arm: small, so that physics fits behind.
+"""Interface between the controller and a simulated world: kinematic, or with physics.
 
-A simulator is a module (of this folder, or a dotted one of the user's own) that `world.simulator` names, with
+A simulator is a module (in this folder, in `drivers/`, or a user's dotted one) that `world.simulator` names, with
 
     def create(world: World, objects: Sequence[ObjectConfig], tolerances: GraspTolerances,
                gripper: GripperConfig | None) -> SimulatedWorld
 
-where `objects` are those of the world, each with a place, and `tolerances` tell when the fingers catch something. What
-it gives is a `FeltWorld`, or a `PhysicalWorld` that brings an arm of its own for robot files with the backend `mock`.
-Times are cell time [s], passed in. What cameras see of it is drawn by what its module offers as
+where each of the `objects` has a position, and `tolerances` define when the fingers grasp. It returns a
+`GripperDrivenWorld`, or a `PhysicalWorld` that brings its own arm for robot files with the backend `mock`. Times are
+cell time [s], passed as arguments. In the process of each camera, images are rendered from `scene_objects` and
+`joint_states` by the module's
 
     def renderer(around: Surroundings, scenery: Scenery, robot: Callable[[], RobotModel], *, plain: bool,
                  camera: Pinhole, arm: bool) -> Renderer
 
-in the process of each camera, from `scene_objects` and `joint_states`; a module without it is drawn as `kinematic` is.
+and as for `kinematic` if it has none.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from typing import TYPE_CHECKING, Any, Protocol, cast, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, Field
+from pydantic import AliasChoices, BaseModel, ConfigDict, Field
 
 from common.config import GripperConfig, ObjectConfig, Parameters, Scenery, Surroundings, Tunable, World
 from common.errors import ConfigError
@@ -40,73 +41,75 @@ Array = NDArray[np.float64]
 Numbers = tuple[float, ...]
 
 GROUP = "zencell.worlds"
-KINEMATIC = "kinematic"  # the default; it draws for worlds that draw nothing themselves
+KINEMATIC = "kinematic"  # the default; its renderer serves worlds without one
 
 
-class StandingObject(BaseModel):
-    """An object as it is found after a restart; poses are x, y, z [m] and a quaternion x, y, z, w.
+class ObjectSnapshot(BaseModel):
+    """State of an object for a restart; poses are x, y, z [m] and a quaternion x, y, z, w.
 
-    `made` is what it is when a person added it; `like` names the object of the first layout whose shape it has.
-    `details` are the simulator's own.
+    `definition` describes an object that an operator added; `like` names the object of the initial layout whose shape
+    it shares. `details` belong to the simulator.
     """
 
+    model_config = ConfigDict(populate_by_name=True)
+
     pose: Numbers
-    made: WorldObject | None = None
+    definition: WorldObject | None = Field(None, validation_alias=AliasChoices("definition", "made"))
     like: str = ""
     details: dict[str, Any] = {}
 
 
 class SimulatedWorld(Protocol):
-    """What is asked of a simulated world: the truth. `version` grows whenever something has changed."""
+    """Ground truth of a simulated world. `version` increases with every change."""
 
     version: int
 
     def edit(self, request: WorldEdit, now: float) -> str:
-        """Change the world as a person asks; the id of what was changed, empty for a reset.
+        """Change the world as an operator requests; return the id of the changed object, empty for a reset.
 
         Raises:
-            Refused: says why, and what would do. Nothing has changed then.
+            Refused: with the reason and the valid choices; nothing has changed.
         """
 
     @property
     def ids(self) -> list[str]:
-        """What is in it."""
+        """Ids of all objects."""
 
     def objects(self, header: Header) -> WorldObjects:
-        """Where everything is."""
+        """State of all objects."""
 
     def take_events(self) -> list[SceneUpdate]:
-        """What was taken away or came to lie since the last call, in order."""
+        """Return objects removed or come to rest since the last call, in order."""
 
     @property
     def layout(self) -> dict[str, Numbers]:
-        """Where everything was at first, (x, y, z) [m] by id."""
+        """Initial positions (x, y, z) [m] by id."""
 
-    def standing(self) -> dict[str, StandingObject]:
-        """Everything as it is, for `restore`."""
+    def snapshot(self) -> dict[str, ObjectSnapshot]:
+        """Complete state, for `restore`."""
 
-    def restore(self, objects: Mapping[str, StandingObject]) -> None:
-        """Put everything where it was."""
+    def restore(self, objects: Mapping[str, ObjectSnapshot]) -> None:
+        """Restore a state."""
 
 
 @runtime_checkable
-class FeltWorld(SimulatedWorld, Protocol):
-    """A world without forces: the hand, which others move, is asked for, and told what is in its way."""
+class GripperDrivenWorld(SimulatedWorld, Protocol):
+    """A world without forces: others move the gripper, ask what obstructs it, and report its state."""
 
     def obstruction(self, T_world_tcp: Array, width: float) -> float:
-        """The width [m] that the fingers cannot close below: what is between them now, or 0.
+        """Width [m] below which the fingers cannot close: of the object between them, or 0.
 
         Args:
-            T_world_tcp: (4, 4) pose of the tool centre point.
+            T_world_tcp: (4, 4) pose of the tool center point.
             width: between the inner faces of the fingers, or the valve of a cup [m].
         """
 
     def tick(self, now: float, T_world_tcp: Array, width: float, gripping: bool) -> None:
-        """Move on to a time: grasp what the fingers press on, carry it, let it go, let it fall.
+        """Advance to a time: grasp what the fingers press on, carry, release and drop it.
 
         Args:
             now: cell time [s].
-            T_world_tcp: (4, 4) pose of the hand.
+            T_world_tcp: (4, 4) pose of the tool center point.
             width: between the fingers [m].
             gripping: whether the fingers press on something.
         """
@@ -114,10 +117,10 @@ class FeltWorld(SimulatedWorld, Protocol):
 
 @runtime_checkable
 class PhysicalWorld(SimulatedWorld, Protocol):
-    """A world with forces, which has an arm of its own: time passes in it when that is read."""
+    """A world with forces and its own arm; reading the arm advances it."""
 
     def hardware(self, robot: RobotModel, limits: Limits, start: Array) -> Hardware:
-        """The arm in this world, at rest at `start` (dof,) [rad]. Called once, before anything else but `layout`.
+        """Return the arm in this world, at rest at `start` (dof,) [rad]. Called once, before anything but `layout`.
 
         Raises:
             ConfigError: the robot cannot be simulated.
@@ -125,18 +128,18 @@ class PhysicalWorld(SimulatedWorld, Protocol):
 
 
 class GraspTolerances(Parameters):
-    """Where a thing must be for the fingers to catch it, in the frame of the tool centre point."""
+    """Where an object must be for the fingers to grasp it, in the frame of the tool center point."""
 
     across: Tunable[float] = Field(
-        0.010, gt=0, le=0.05, description="half the width of a finger pad: off its middle, tool x axis [m]"
+        0.010, gt=0, le=0.05, description="half the width of a finger pad: offset from its center along tool x [m]"
     )
     along: Tunable[float] = Field(
-        0.010, gt=0, le=0.05, description="half the height of a finger pad: off its middle, tool z axis [m]"
+        0.010, gt=0, le=0.05, description="half the height of a finger pad: offset from its center along tool z [m]"
     )
     sideways: Tunable[float] = Field(
-        0.002, ge=0, le=0.05, description="a thing may overlap an open finger by this, tool y [m]"
+        0.002, ge=0, le=0.05, description="allowed overlap of an object with an open finger along tool y [m]"
     )
-    release: Tunable[float] = Field(0.002, gt=0, le=0.02, description="let go when the fingers are this much wider [m]")
+    release: Tunable[float] = Field(0.002, gt=0, le=0.02, description="opening beyond the object that releases it [m]")
 
 
 class Simulator(Protocol):
@@ -146,20 +149,20 @@ class Simulator(Protocol):
         self, world: World, objects: Sequence[ObjectConfig], tolerances: GraspTolerances,
         gripper: GripperConfig | None, /,
     ) -> SimulatedWorld:
-        """The world with its objects, each of which has a place."""
+        """Create the world with objects that all have a position."""
 
 
 def load_world(
     world: World, objects: Sequence[ObjectConfig], tolerances: GraspTolerances | None = None,
     gripper: GripperConfig | None = None,
 ) -> SimulatedWorld:
-    """The simulated world that `world.simulator` names, with these objects, each of which has a place.
+    """Create the world of the simulator that `world.simulator` names, with objects that all have a position.
 
-    Without a gripper fingers close along the tool's y axis.
+    Without a gripper, fingers close along the tool's y axis.
 
     Raises:
         UnknownName: no such simulator; lists the choices.
-        ConfigError: a module that cannot be imported or is no simulator, or an object that cannot be where it is.
+        ConfigError: the module cannot be imported or is no simulator, or an object cannot be at its position.
     """
     module = _module(world.simulator)
     if not hasattr(module, "create"):
@@ -168,11 +171,11 @@ def load_world(
 
 
 def require_simulator(name: str) -> None:
-    """Return when there is a simulator of that name, with what it says by its own `require`, if any, that it needs.
+    """Check that a simulator exists and that its own `require`, if any, is satisfied.
 
     Raises:
         UnknownName: no such simulator; lists the choices.
-        ConfigError: a module that cannot be imported, or something that is not installed.
+        ConfigError: the module cannot be imported, or a package is missing.
     """
     if name != KINEMATIC:
         require = getattr(_module(name), "require", None)
@@ -181,29 +184,29 @@ def require_simulator(name: str) -> None:
 
 
 class Renderer(Protocol):
-    """Draws what one camera sees. Its calls may block and may come from any thread, one at a time."""
+    """Renders one camera. Calls may block and may come from any thread, one at a time."""
 
     camera: Pinhole
     needs_arm: bool
-    """Whether the arm is in the picture, so that `render` wants the state of its joints."""
+    """Whether the arm is visible, so that `render` needs the joint state."""
 
     @property
     def level(self) -> Array:
-        """(3,) [lx] of blue, green and red light that the value 255 of a white surface stands for."""
+        """(3,) [lx] of blue, green and red light at which a white surface has the value 255."""
 
     def move_camera(self, camera: Pinhole) -> None:
-        """Take the camera elsewhere; its intrinsics stay."""
+        """Move the camera; its intrinsics stay."""
 
     def set_light(self, scenery: Scenery) -> None:
         """Take the light of the scenery."""
 
     def takes_long(self, objects: Sequence[WorldObject]) -> bool:
-        """Whether to `render` the objects may take longer than a moment."""
+        """Whether rendering the objects may take long."""
 
     def render(self, objects: Sequence[WorldObject], joints: JointState | None = None) -> View:
-        """The view of the objects, and of the arm in that state if it is complete; what is "elsewhere" is not seen.
+        """Return the view of the objects, and of the arm if its joint state is complete.
 
-        Nothing in it is changed afterwards; when nothing moved it is the same as before.
+        Objects in state "elsewhere" are not shown. A view is never modified; an unchanged scene returns the same one.
         """
 
 
@@ -211,25 +214,25 @@ def load_renderer(
     around: Surroundings, scenery: Scenery, robot: Callable[[], RobotModel], *, plain: bool, camera: Pinhole,
     arm: bool = False,
 ) -> Renderer:
-    """What draws the world of the scenery's simulator for a camera.
+    """Create the renderer of the scenery's simulator for a camera.
 
     Args:
         around: fixtures and containers.
         scenery: the simulator and the light.
-        robot: gives the robot; not asked when it is not in the picture.
-        plain: for a camera that a drawn world shows without arm and depth.
+        robot: returns the robot model; called only if the arm is visible.
+        plain: for a camera whose simplified images need neither arm nor depth.
         camera: intrinsics and pose.
-        arm: have the arm in plain pictures, too.
+        arm: show the arm in plain images, too.
 
     Raises:
         UnknownName: no such simulator; lists the choices.
-        ConfigError: a module that cannot be imported, a mesh of the robot that is not there.
+        ConfigError: the module cannot be imported, or a mesh of the robot is missing.
     """
     module = _module(scenery.simulator)
     if not hasattr(module, "renderer"):
         module = _module(KINEMATIC)
-    made: Renderer = module.renderer(around, scenery, robot, plain=plain, camera=camera, arm=arm)
-    return made
+    created: Renderer = module.renderer(around, scenery, robot, plain=plain, camera=camera, arm=arm)
+    return created
 
 
 def _module(name: str) -> ModuleType:

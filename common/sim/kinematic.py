@@ -18,11 +18,10 @@ from common.errors import ConfigError, Refused, UnknownName
 from common.messages import Header, WorldEdit, WorldObject, WorldObjects
 from common.robot.finger_joints import closing_frame
 from common.robot.transforms import invert, transform
-from common.sim.bodies import Body, Rest, restored
+from common.sim.bodies import Body, Rest, WorldEvents, restored
 from common.sim.edits import new_body, requested_position, require_room
-from common.sim.gripping import felt
-from common.sim.interface import GraspTolerances, StandingObject
-from common.sim.news import News
+from common.sim.gripping import pressed_ends
+from common.sim.interface import GraspTolerances, ObjectSnapshot
 from common.sim.objects import initial_pose, solid_of, solid_of_message
 from common.sim.resting import Ground
 
@@ -55,7 +54,7 @@ def renderer(
     return Renderer(around, seen, plain=plain, camera=camera, scenery=scenery)
 
 
-class KinematicWorld(News):
+class KinematicWorld(WorldEvents):
     """The objects, and their motion as the gripper moves among them.
 
     Attributes:
@@ -95,20 +94,20 @@ class KinematicWorld(News):
         return {name: tuple(initial_pose(obj, self._solids[name])[:3, 3].tolist())
                 for name, obj in self._first.items()}
 
-    def standing(self) -> dict[str, StandingObject]:
+    def snapshot(self) -> dict[str, ObjectSnapshot]:
         """Complete state, for `restore`."""
-        return {name: body.standing() for name, body in self._bodies.items()}
+        return {name: body.snapshot() for name, body in self._bodies.items()}
 
-    def restore(self, objects: Mapping[str, StandingObject]) -> None:
+    def restore(self, objects: Mapping[str, ObjectSnapshot]) -> None:
         """Restore a state; objects of unknown shape are skipped."""
         self._bodies = {name: body for name, snapshot in objects.items() if (body := self._restored(name, snapshot))}
         self._between = {}
         self.version += 1
 
-    def _restored(self, name: str, snapshot: StandingObject) -> Body | None:
+    def _restored(self, name: str, snapshot: ObjectSnapshot) -> Body | None:
         first = self._first.get(snapshot.like or name)
-        if snapshot.made is not None:
-            solid, c = solid_of_message(snapshot.made), snapshot.made.color
+        if snapshot.definition is not None:
+            solid, c = solid_of_message(snapshot.definition), snapshot.definition.color
             color = (c.r, c.g, c.b)
         elif first is not None:
             solid, color = self._solids[first.id], first.color
@@ -126,7 +125,8 @@ class KinematicWorld(News):
         T_world_hand = T_world_tcp @ self._T_tcp_closing
         for name, body in self._bodies.items():
             if body.state in ("table", "contained") and (
-                ends := felt(self._gripper, self._tolerances, body, T_world_hand, width, self._between.get(name))
+                ends := pressed_ends(
+                    self._gripper, self._tolerances, body, T_world_hand, width, self._between.get(name))
             ):
                 found[name] = ends
         self._between = found
@@ -134,14 +134,15 @@ class KinematicWorld(News):
 
     def takes_long(self, width: float, gripping: bool) -> bool:
         """Whether the next `tick` may take longer than a control cycle, since it searches for a rest position."""
-        if self._is_simple:
+        if self.is_simple:
             return False
         if held := self.held:
             return width > self._bodies[held].width + self._tolerances.release
         return gripping and bool(self._between)
 
     @property
-    def _is_simple(self) -> bool:
+    def is_simple(self) -> bool:
+        """Whether searches for rest positions are fast: few objects, all spheres."""
         return len(self._bodies) <= FEW and all(body.solid.shape == "sphere" for body in self._bodies.values())
 
     def tick(self, now: float, T_world_tcp: Array, width: float, gripping: bool) -> None:
@@ -170,7 +171,7 @@ class KinematicWorld(News):
         body.state, body.container, body.slot = "held", "", None
         body.changed()
         self._between = {}
-        self._say("remove", body)
+        self._add_event("remove", body)
         self._lower_layers(slot, now)
         self._drop_supported(block, now)
 
@@ -204,7 +205,7 @@ class KinematicWorld(News):
             return
         body.rest_at(body.rest)
         if body.state != "elsewhere":
-            self._say("add", body)
+            self._add_event("add", body)
 
     def _lower_layers(self, taken: tuple[str, tuple[int, int]] | None, now: float) -> None:
         """Let the spheres above a slot that was vacated fall by one layer."""
@@ -220,14 +221,14 @@ class KinematicWorld(News):
                 body.rest = Rest(transform(body.T[:3, :3], position), "contained", container, slot)
                 body.changed()
                 if settled:
-                    self._say("remove", body)
+                    self._add_event("remove", body)
                     self._drop(body, now)
 
     def _drop_supported(self, gone: Any, now: float) -> None:
         """Let what lay on something fall, which is no longer there."""
         for body in self._ground.unsupported_by(gone, self._bodies):
             block = body.block()
-            self._say("remove", body)
+            self._add_event("remove", body)
             self._release(body, now)
             self._drop_supported(block, now)
 
@@ -235,7 +236,7 @@ class KinematicWorld(News):
 
     def edit_takes_long(self, request: WorldEdit) -> bool:
         """Whether an edit may take longer than a control cycle."""
-        return not self._is_simple or request.shape not in (None, "sphere") or any(
+        return not self.is_simple or request.shape not in (None, "sphere") or any(
             solid.shape != "sphere" for solid in self._solids.values())
 
     def edit(self, request: WorldEdit, now: float) -> str:
@@ -260,11 +261,11 @@ class KinematicWorld(News):
         rested, slot = old is not None and old.state in ("table", "contained"), body.slot_taken
         block = body.block() if rested else None
         if rested:
-            self._say("remove", body)
+            self._add_event("remove", body)
         if rest is not None:
             body.rest_at(rest)
             self._bodies[body.name] = body
-            self._say("add", body)
+            self._add_event("add", body)
         else:
             del self._bodies[name]
         self._between.pop(body.name, None)
@@ -286,7 +287,7 @@ class KinematicWorld(News):
     def _reset(self) -> str:
         for body in self._bodies.values():
             if body.state in ("table", "contained"):
-                self._say("remove", body)
+                self._add_event("remove", body)
         self._bodies, self._between = {}, {}
         self._lay_out()
         return ""
@@ -302,7 +303,7 @@ class KinematicWorld(News):
             elif container := self._ground.container_of(body):
                 body.rest_at(Rest(body.T, "contained", container))
             self._bodies[name] = body
-            self._say("add", body)
+            self._add_event("add", body)
 
     # --- queries ---
 

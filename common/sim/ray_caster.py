@@ -107,13 +107,13 @@ def _in_front(meshes: Sequence[Mesh], camera: Pinhole) -> tuple[Array, Ints]:
 
 def _clip(triangle: Array) -> Array:
     """Clip a triangle at z = `NEAREST` to one or two triangles (k, 3, 3)."""
-    kept: list[Array] = []
+    clipped: list[Array] = []
     for a, b in zip(triangle, np.roll(triangle, -1, axis=0), strict=True):
         if a[2] > NEAREST:
-            kept.append(a)
+            clipped.append(a)
         if (a[2] > NEAREST) != (b[2] > NEAREST):
-            kept.append(a + (NEAREST - a[2]) / (b[2] - a[2]) * (b - a))
-    return np.array([[kept[0], kept[i], kept[i + 1]] for i in range(1, len(kept) - 1)])
+            clipped.append(a + (NEAREST - a[2]) / (b[2] - a[2]) * (b - a))
+    return np.array([[clipped[0], clipped[i], clipped[i + 1]] for i in range(1, len(clipped) - 1)])
 
 
 def _project(corners: Array, camera: Pinhole) -> tuple[Array, Array]:
@@ -131,7 +131,7 @@ def _project(corners: Array, camera: Pinhole) -> tuple[Array, Array]:
     return pixels, plane
 
 
-def _spans(pixels: Array, width: int, height: int, reach: float) -> tuple[Ints, Ints, Ints, Ints]:
+def pixel_spans(pixels: Array, width: int, height: int, reach: float) -> tuple[Ints, Ints, Ints, Ints]:
     """For each triangle and row that it meets: index, row, first and last column.
 
     With `reach` 0: pixels whose centers are inside; with 0.5: a superset of the pixels that it touches.
@@ -201,7 +201,7 @@ def _cast_centers(pixels: Array, plane: Array, camera: Pinhole, depth: Depth) ->
         best = (1.0 / depth.astype(np.float64)).ravel()
     winner = np.full(best.shape, -1, np.int64)
     for batch in _batches(pixels, camera.width, camera.height):
-        triangle, row, start, end = _spans(pixels[batch], camera.width, camera.height, 0.0)
+        triangle, row, start, end = pixel_spans(pixels[batch], camera.width, camera.height, 0.0)
         span, step = _ramps(np.arange(len(triangle)), end - start + 1)
         of, column = triangle[span] + batch.start, start[span] + step
         near = plane[of, 0] * column + plane[of, 1] * row[span] + plane[of, 2]
@@ -233,7 +233,7 @@ def _antialias(pixels: Array, plane: Array, colors: Pixels, meshes: Ints, colour
         best = np.repeat((1.0 / behind.depth.ravel()[flat_edges].astype(np.float64))[:, None], SAMPLES, axis=1)
     mixed = np.repeat(behind.colour.reshape(-1, 3)[flat_edges][:, None], SAMPLES, axis=1)
     for batch in _batches(pixels, width, height):
-        triangle, row, start, end = _spans(pixels[batch], width, height, 0.5)
+        triangle, row, start, end = pixel_spans(pixels[batch], width, height, 0.5)
         near_edge = some_edge[row, end + 1] > some_edge[row, start]
         triangle, row, start, end = triangle[near_edge] + batch.start, row[near_edge], start[near_edge], end[near_edge]
         span, step = _ramps(np.arange(len(triangle)), end - start + 1)

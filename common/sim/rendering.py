@@ -21,8 +21,8 @@ from common.perception.pinhole import Pinhole
 from common.perception.sphere import silhouette
 from common.robot.transforms import pose_to_matrix
 from common.scene.fixtures import container_panels
-from common.sim.lighting import white_level
 from common.sim.objects import appearance_of, solid_of_message
+from common.sim.photometry import white_level
 from common.sim.ray_caster import Mesh, View, cast, empty_view
 from common.sim.solids import fixture_mesh, primitive, transformed
 from common.sim.table import tables
@@ -77,7 +77,8 @@ class Renderer:
         self._last_request: Sequence[WorldObject] | None = None
         self._objects: list[WorldObject] | None = None
         self._joints: Array | None = None
-        self._spheres: dict[tuple[float, ...], _Sphere | None] = {}  # of the last plain image, by center and radius
+        # Of the last plain image, by center and radius.
+        self._spheres: dict[tuple[float, ...], SphereCoverage | None] = {}
         self._draw_background()
 
     def set_light(self, scenery: Scenery) -> None:
@@ -124,6 +125,11 @@ class Renderer:
                 self._view = cast(arm, self.camera, self._static_view) if arm else self._static_view
         return self._view
 
+    @property
+    def cached_shapes(self) -> int:
+        """Number of cached shapes: those of visible objects."""
+        return len(self._meshes)
+
     def _plain_background(self, around: Surroundings) -> View:
         """Table, fixtures and containers of a plain image."""
         tops = tables(around)
@@ -148,7 +154,7 @@ class Renderer:
         for index in sorted(range(len(spheres)), key=lambda i: -distances[i]):  # farthest first
             obj = spheres[index]
             key = *_centre(obj).tolist(), obj.size.x / 2
-            coverage = before[key] if key in before else _sphere_coverage(
+            coverage = before[key] if key in before else sphere_coverage(
                 self.camera, _centre(obj), obj.size.x / 2, self._rim_width)
             self._spheres[key] = coverage
             if coverage is not None:
@@ -231,7 +237,7 @@ def add_depth_noise(depth: Depth, rng: np.random.Generator, noise_std: float, dr
 
 
 @dataclass(frozen=True)
-class _Sphere:
+class SphereCoverage:
     """Coverage of a sphere within columns and rows `low` to `high` of an image; arrays are (rows, columns, 1)."""
 
     low: npt.NDArray[np.int_]
@@ -241,7 +247,7 @@ class _Sphere:
     near: Array  # depth [m]
 
 
-def _sphere_coverage(camera: Pinhole, center: Array, radius: float, rim_width: float) -> _Sphere | None:
+def sphere_coverage(camera: Pinhole, center: Array, radius: float, rim_width: float) -> SphereCoverage | None:
     """Coverage of each pixel by a sphere; None if it is not visible.
 
     The rim straddles the outline. Filled polygons in OpenCV are half a pixel too large all around, as much as the total
@@ -265,10 +271,10 @@ def _sphere_coverage(camera: Pinhole, center: Array, radius: float, rim_width: f
     near = (np.sqrt(along) - np.sqrt(np.maximum(radius**2 - away, 0.0))) / np.sqrt(1 + a * a + b * b)
     rim = np.clip(0.5 + rim_width / 2 - outside, 0, 1) if rim_width else np.zeros_like(outside)
     inner = np.clip(0.5 - rim_width / 2 - outside, 0, 1)
-    return _Sphere(low, high, rim[..., None], inner[..., None], near[..., None])
+    return SphereCoverage(low, high, rim[..., None], inner[..., None], near[..., None])
 
 
-def _blend_sphere(view: View, sphere: _Sphere, color: tuple[int, int, int], *, occluded: bool) -> None:
+def _blend_sphere(view: View, sphere: SphereCoverage, color: tuple[int, int, int], *, occluded: bool) -> None:
     """Blend a sphere into the image; with `hidden`, nearer depth in the view occludes it."""
     (left, top), (right, bottom) = sphere.low, sphere.high
     weight: float | npt.NDArray[np.float32] = 1.0

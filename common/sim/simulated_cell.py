@@ -24,9 +24,9 @@ from common.messages import Header, SceneUpdate, WorldEdit, WorldEditReply, Worl
 from common.perception.pinhole import cameras_at_home
 from common.robot.model import RobotModel
 from common.scene.workspace import WorkspaceBounds, unreachable_reason
-from common.sim.interface import FeltWorld, GraspTolerances, SimulatedWorld, StandingObject, load_world
+from common.sim.interface import GraspTolerances, GripperDrivenWorld, ObjectSnapshot, SimulatedWorld, load_world
 from common.sim.layout import layout
-from common.sim.standing import Standing
+from common.sim.state_file import SimulationState
 
 CONTACT = 1e-3  # [m] by which fingers may be wider than the object that they press on
 WORLD_PERIOD = 0.05  # [s] cell time between reports of a moving object
@@ -43,7 +43,7 @@ class Kinematics(Protocol):
 class Saver(Protocol):
     """Where the state of the simulated hardware is written."""
 
-    def save(self, state: Standing) -> None:
+    def save(self, state: SimulationState) -> None:
         """Write a state."""
 
     def close(self) -> None:
@@ -74,7 +74,9 @@ def _within_reach(
     return all(not unreachable_reason(robot, (s * x, s * y, z), grasp, bounds, explained=False) for s in scales)
 
 
-def matching_state(state: Standing | None, simulator: str, world: SimulatedWorld, dof: int) -> Standing | None:
+def matching_state(
+    state: SimulationState | None, simulator: str, world: SimulatedWorld, dof: int
+) -> SimulationState | None:
     """Return a persisted state if it is of this simulator, layout and robot; else None."""
     fits = state is not None and (
         state.simulator == simulator and state.layout == world.layout and len(state.q) == dof)
@@ -90,7 +92,7 @@ class SimulatedCell:
 
     def __init__(
         self, world: SimulatedWorld, hardware: Hardware, kinematics: Kinematics | None, *,
-        simulator: str = "kinematic", persisted: Standing | None = None, saver: Saver | None = None,
+        simulator: str = "kinematic", persisted: SimulationState | None = None, saver: Saver | None = None,
     ) -> None:
         """Surround this hardware; `persisted` is the state before a restart, which `restore` applies.
 
@@ -99,7 +101,7 @@ class SimulatedCell:
         """
         self._world, self._kinematics, self._saver = world, kinematics, saver
         self._simulator, self._persisted = simulator, persisted
-        self._felt = world if isinstance(world, FeltWorld) else None
+        self._felt = world if isinstance(world, GripperDrivenWorld) else None
         self._gripper = hardware.gripper
         self._blockable = self._gripper if isinstance(self._gripper, SimulatedGripper) else None
         if self._felt is not None and self._gripper is not None and self._blockable is None:
@@ -108,7 +110,7 @@ class SimulatedCell:
         self._width = 0.0  # of the newest reading [m]
         self._published_version, self._published_at = -1, -math.inf  # cell time [s]
         self._saved: tuple[object, ...] = ()
-        self._saved_objects: tuple[int, dict[str, StandingObject]] | None = None  # with the version of the world
+        self._saved_objects: tuple[int, dict[str, ObjectSnapshot]] | None = None  # with the version of the world
         self.suspended = False
         self.defers_steps = False
         self.deferred: Callable[[], None] | None = None
@@ -168,11 +170,12 @@ class SimulatedCell:
         # Physics moves objects between its reports: gripper and held object must be saved as of one moment, or they
         # overlap when they are restored, and fly apart.
         if self._felt is None or self._saved_objects is None or self._saved_objects[0] != self._world.version:
-            self._saved_objects = self._world.version, dict(self._world.standing())
+            self._saved_objects = self._world.version, dict(self._world.snapshot())
         self._saved = mark
-        self._saver.save(Standing.model_construct(  # copies nothing: equal objects are not written again
+        self._saver.save(SimulationState.model_construct(  # copies nothing: equal objects are not written again
             simulator=self._simulator, layout=self._world.layout, q=state.q.tolist(), width=state.width,
-            told_width=state.commanded_width, told_effort=state.commanded_effort, objects=self._saved_objects[1],
+            commanded_width=state.commanded_width, commanded_effort=state.commanded_effort,
+            objects=self._saved_objects[1],
         ))
 
     def restore(self, stopped: bool) -> PersistedState | None:
@@ -188,7 +191,7 @@ class SimulatedCell:
         if not isinstance(gripper, PlaceableGripper) or state.width is None:
             return None
         gripper.place(state.width)
-        self._width, target = state.width, state.told_width
+        self._width, target = state.width, state.commanded_width
         q = np.array(state.q)
         if self._felt is not None and self._blockable is not None and self._kinematics is not None:
             between = self._felt.obstruction(self._kinematics.fk(q), state.width)
@@ -196,7 +199,7 @@ class SimulatedCell:
             pressing = target is not None and target < state.width <= between + CONTACT
             if stopped and not pressing:  # pressing goes on, moving does not
                 target = state.width
-        return PersistedState(q, state.width, target, state.told_effort)
+        return PersistedState(q, state.width, target, state.commanded_effort)
 
     def close(self) -> None:
         """Write what is not persisted yet."""

@@ -76,7 +76,7 @@ def triangulate(outline: Array) -> Array:
     left = list(range(len(corners)))
     ears = []
     while len(left) > 3:
-        ear = next((i for i in range(len(left)) if _is_ear(corners, left, i)), None)
+        ear = next((i for i in range(len(left)) if is_ear(corners, left, i)), None)
         if ear is None:
             break
         ears.append([left[ear - 1], left[ear], left[(ear + 1) % len(left)]])
@@ -84,7 +84,8 @@ def triangulate(outline: Array) -> Array:
     return np.asarray(corners[np.array([*ears, *([left[0], b, c] for b, c in pairwise(left[1:]))])])
 
 
-def _is_ear(corners: Array, left: Sequence[int], i: int) -> bool:
+def is_ear(corners: Array, left: Sequence[int], i: int) -> bool:
+    """Whether corner i of the remaining polygon is an ear: convex, with no other corner inside its triangle."""
     a, b, c = corners[left[i - 1]], corners[left[i]], corners[left[(i + 1) % len(left)]]
     if _cross(b - a, c - b) <= 0:
         return False

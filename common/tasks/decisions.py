@@ -14,8 +14,7 @@ from pydantic import BaseModel, Field
 from common import messages as m
 from common.config import GripperConfig, Parameters, RobotConfig, Run, Tunable
 from common.errors import ConfigError
-from common.tasks.stages import AwaitImage, Command, Execution, Grip, Move, Stage, View
-from common.tasks.watchdogs import DwellTimer, ImageAge
+from common.tasks.stages import AwaitImage, Command, DwellTimer, Execution, Grip, ImageAge, Move, Stage, View
 
 V = TypeVar("V", bound=View)
 
@@ -43,7 +42,7 @@ class TaskConfig(Parameters):
         0.2, ge=0.05, le=60, description="without joint states for so long the arm is held on its path [s, wall time]"
     )
     obstacle_patience: Tunable[float] = Field(
-        1.0, ge=0, le=3600, description="what is in the way of a motion for longer has it planned anew [s]"
+        1.0, ge=0, le=3600, description="an obstacle that blocks a motion for longer has it planned again [s]"
     )
 
 
@@ -88,7 +87,7 @@ class TaskDecisions(Generic[V]):
         self.images_after = 0.0  # only a later image may decide [s]
         self._frames = ImageAge(speed)
         self._planning: tuple[Move, str] | None = None
-        self._in_the_way = DwellTimer()
+        self._obstructed = DwellTimer()
         self._stopping = False
         self._found = False  # whether the robot state was read, or an operator sent a command
         self._began: float | None = None
@@ -135,7 +134,7 @@ class TaskDecisions(Generic[V]):
         self.status.retries += 1
         self.fail(f"{stage.name}: {stage.problem}", view, go_home=False)
         if self.status.state != "ERROR":
-            self.queue += [Grip("open", stage.state, width=self.gripper.max_width), *self.back_off(view.let_go())]
+            self.queue += [Grip("open", stage.state, width=self.gripper.max_width), *self.back_off(view.released())]
 
     def forgotten(self, stage: Stage, view: V) -> None:
         """Handle a restarted controller that no longer knows the stage it had started."""

@@ -11,31 +11,29 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import replace
 
 from common import messages as m
-from common.tasks.decisions import TaskDecisions, V
-from common.tasks.stages import MISSES, AwaitImage, Command, Execution, Grip, Move, Report, Stage
+from common.tasks.decisions import V
+from common.tasks.monitoring import ExecutionMonitor
+from common.tasks.stages import AwaitImage, Command, Execution, Grip, Move, Report, Stage
 
 # Rejections that say nothing about the motion itself: the task decides again.
-ANEW = ("busy", "stale_request", "clock_ahead", "stopped", "not_owner")
+NOT_ITS_FAULT = ("busy", "stale_request", "clock_ahead", "stopped", "not_owner")
 START = ": start to go on"
-BLOCKED_BY = "scene_monitor"  # source of the hold while an obstacle blocks the path
 NO_ARM = "the arm cannot be moved: "
 FOUND_HELD = "the robot was found held; resume or start to go on"
 FINGERS_OFF = 0.003  # [m] tolerated difference between the finger width now and the one of the plan
 LOOSE = 0.5e-3  # [m] opening after which the fingers hold nothing any more
 AHEAD = 1.0  # [s] before the end of a motion: earliest time to send a gripper command that waits for it
 CLOSE_WITHIN = 0.05  # [m] from the end of the motion the fingers may start to close, touching nothing
-OPENED_BY = 0.5  # progress of a motion at which fingers that open during it must have opened
-MOST_FIGURES = 200  # plans kept in a status: a cell may run for days
+MOST_FIGURES = 200  # plans in a status: a cell may run for days
 
 
-class Task(TaskDecisions[V]):
+class Task(ExecutionMonitor[V]):
     """State machine of a task. Implement `decide`; override other hooks where the task differs.
 
     A task uses `queue` (to which `decide` appends stages), `running` (the running stage), `status`, `wait_timer` (time
-    spent waiting) and all of `TaskDecisions`.
+    spent waiting) and all hooks and helpers of `TaskDecisions`.
     """
 
     # --- commands of the operator ----------------------------------------------------------------------------
@@ -48,7 +46,7 @@ class Task(TaskDecisions[V]):
         if command == "pause":
             status.paused = True
             return [m.HoldRequest(hold=True, reason="the task is paused")]
-        reason = f"the task was told to {command}"
+        reason = f"the operator sent {command} to the task"
         if command in ("start", "resume"):
             status.started, status.paused = status.started or command == "start", False
             if command == "start" and status.state in ("DONE", "ERROR"):
@@ -92,11 +90,11 @@ class Task(TaskDecisions[V]):
 
     def on_goal(self, answer: Report, view: V) -> None:
         """Handle the answer to an execute or gripper request: accepted, or rejected with a reason."""
-        begun = next((one for one in (self.running, self._early) if one and one.command.id == answer.id), None)
-        if begun is None or begun.accept(answer):
+        execution = next((one for one in (self.running, self._early) if one and one.command.id == answer.id), None)
+        if execution is None or execution.accept(answer):
             return
-        stage = begun.stage
-        if begun is self._early:  # then send it when the arm is at rest
+        stage = execution.stage
+        if execution is self._early:  # then send it when the arm is at rest
             assert isinstance(stage, Grip)
             self._early, stage.early = None, False
             if self.running is not None:
@@ -104,8 +102,8 @@ class Task(TaskDecisions[V]):
             return
         self.running = None
         # Rejected because of another client or a late request, not because of the motion: no failure.
-        if answer.error in ANEW:
-            self._decide_anew(f"{stage.name} has to wait: {answer.message}", view)
+        if answer.error in NOT_ITS_FAULT:
+            self._decide_again(f"{stage.name} has to wait: {answer.message}", view)
             return
         problem = f"{stage.name} was refused: {answer.message}"
         if isinstance(answer, m.MotionStatus) and answer.error == "start_mismatch":
@@ -128,7 +126,7 @@ class Task(TaskDecisions[V]):
                 status.message = FOUND_HELD + "".join(f"; {one.description}" for one in view.motion.interlocks)
             if view.motion.stopped:  # an operator stopped it: a restart must not undo that
                 status.started = status.paused = False
-        self._tell_stopped(view.motion.stopped)
+        self._report_stopped(view.motion.stopped)
         if self._began is None and status.started:
             self._began = view.now
         if self._early is not None and view.gripper.id == self._early.command.id:
@@ -165,154 +163,11 @@ class Task(TaskDecisions[V]):
             self._failures_in_a_row = 0
         self._done_before = self.status.done
 
-    def _tell_stopped(self, stopped: str) -> None:
+    def _report_stopped(self, stopped: str) -> None:
         if stopped and self.status.state not in ("DONE", "ERROR"):
             self.status.message = stopped + START
         elif self.status.message.endswith(START):
             self.status.message = ""
-
-    def _watch(self, view: V) -> list[Command]:
-        """Monitor the running stage: its end, its failure, and the loss of a held object."""
-        if self.running is None:
-            self._watch_early(view)
-            return self._watch_opening(view)
-        assert view.motion is not None and view.gripper is not None
-        running, stage = self.running, self.running.stage
-        running.count(view.now, view.motion)
-        if self._early is not None:  # waiting does not count against its time limit
-            self._early.counted = view.now
-        outcome = running.outcome(view.motion, view.gripper)
-        limit = self.time_limit(stage)
-        if running.let_go(view.gripper):  # the arm may leave while the fingers continue to open
-            self.running, self._opening = None, running
-            self.status.moving_seconds += running.moving
-            self.succeeded(stage, view)
-        elif outcome == "ended":
-            self.running = None
-            self.status.moving_seconds += running.moving
-            self._ended(stage, running.report(view.motion, view.gripper), view)
-        elif outcome == "forgotten":
-            self.running = None
-            if self._early is not None and isinstance(self._early.stage, Grip):  # the release position is unknown now
-                self._early = replace(self._early, stage=replace(self._early.stage, holds=None))
-            self.forgotten(stage, view)
-        elif running.moves_arm and stage.carries and not view.holding and not (self._early and self._early.started):
-            stop = self.stop(view, "what it held fell")
-            slipped = f": {view.gripper.message}" if view.gripper.outcome == "slipping" else ""
-            self.fail(f"what the hand held fell during {stage.name}{slipped}", view, go_home=False)
-            return stop
-        elif running.spent > limit:
-            stop = self.stop(view, "it takes too long")
-            self.fail(f"{stage.name} took longer than {round(limit, 2):g} s", view)
-            return stop
-        elif running.moves_arm and (why := self.outdated(stage, view)):
-            stop = self.stop(view, why)
-            self.status.message = f"{stage.name}: {why}"
-            return stop
-        elif blocked := self._blocked(view):
-            stop = self.stop(view, blocked)
-            self.obstructed(stage, view, f"{stage.name}: {blocked}")
-            return stop
-        elif stage.carries and view.gripper.outcome == "slipping":  # the object may still arrive
-            self.status.message = f"{stage.name}: {view.gripper.message}"
-        return self._watch_opening(view)
-
-    def _watch_early(self, view: V) -> None:
-        """Monitor a gripper command whose motion ended without success: a release counts, a grasp is decided again."""
-        if (early := self._early) is None:
-            return
-        assert view.motion is not None and view.gripper is not None
-        early.count(view.now, view.motion)
-        if view.motion.state == "active":  # until it is at standstill
-            return
-        if view.motion.id == getattr(early.command, "after", ""):
-            early.wait_no_more(view.motion, view.gripper)
-        outcome = early.outcome(view.motion, view.gripper)
-        if outcome == "running" and early.spent <= self.time_limit(early.stage):
-            return
-        self._early, self.images_after = None, view.now
-        stage, reported = early.stage, early.report(view.motion, view.gripper)
-        if outcome != "ended" or not isinstance(stage, Grip):
-            return
-        if stage.holds is False and reported.state == "succeeded" and not view.holding:
-            self.succeeded(stage, view)
-        elif stage.holds and isinstance(reported, m.GripperState) and reported.outcome in MISSES:
-            self._shut = True
-        elif reported.error == "hardware_fault":
-            self.fail(f"{stage.name} {reported.state}: {reported.message}", view)
-
-    def _watch_opening(self, view: V) -> list[Command]:
-        """Monitor fingers that open while the arm already leaves; stop the arm if they do not open in time."""
-        opening, running = self._opening, self.running
-        if opening is None:
-            return []
-        assert view.motion is not None and view.gripper is not None
-        state = view.gripper.state if view.gripper.id == opening.command.id else "cancelled"
-        if state == "active":
-            ours = running is not None and running.moves_arm and view.motion.id == running.command.id
-            if not ours or view.motion.progress < OPENED_BY:
-                return []
-            why = "the fingers have not opened yet"
-        else:
-            self._opening, why = None, f"the fingers did not open: {view.gripper.message}"
-        if state in ("succeeded", "cancelled"):  # whoever commanded the gripper since then handles the result
-            return []
-        stop = self.stop(view, why)
-        self._opening = None
-        if state == "active" and self.running is None:  # continue as an open stage with its full time limit
-            assert isinstance(opening.stage, Grip)
-            self.running = replace(opening, stage=Grip("open", opening.stage.state, width=opening.stage.width))
-            self.status.message = why
-        else:
-            self.fail(why, view)
-        return stop
-
-    def _blocked(self, view: V) -> str:
-        """Return what blocks the running motion for longer than `obstacle_patience`; empty for nothing."""
-        assert view.motion is not None and self.running is not None
-        ours = view.motion.id == self.running.command.id and view.motion.state == "active"
-        held = [one.reason for one in view.motion.interlocks if one.by == BLOCKED_BY and one.kind == "held"]
-        if not held or not ours or view.trouble or view.motion.paused or self.status.paused:
-            self._in_the_way.reset()
-            return ""
-        return held[0] if self._in_the_way.elapsed("in the way", view.now) >= self.p.obstacle_patience else ""
-
-    def _decide_anew(self, message: str, view: V) -> None:
-        self.clear()
-        self.images_after = view.now
-        self.status.message = message
-
-    def _ended(self, stage: Stage, reported: Report, view: V) -> None:
-        holds = stage.holds if isinstance(stage, Grip) else None
-        if reported.state == "cancelled" and isinstance(stage, Move):
-            self.clear()
-            if view.motion is not None and view.motion.stopped:  # the operator's stop was not addressed to this task
-                self.status.started = False
-                return
-            self.status.paused = True
-            self.status.message = f"{stage.name} was stopped from outside ({reported.message}); resume to go on"
-        elif reported.state == "cancelled":  # another client commanded the gripper: no failure
-            self._decide_anew(f"{stage.name} was cancelled: {reported.message}", view)
-        elif isinstance(stage, Grip) and holds and isinstance(reported, m.GripperState) and reported.outcome in MISSES:
-            stage.problem = reported.message
-            self.missed(stage, view)
-        elif reported.error in ("hardware_fault", m.CLOSED_BEFORE) and isinstance(stage, Move):  # not its fault
-            self._held_up = reported.error == m.CLOSED_BEFORE
-            self._decide_anew(f"{stage.name} {reported.state}: {reported.message}", view)
-        elif reported.state != "succeeded":
-            self.fail(f"{stage.name} {reported.state}: {reported.message}", view)
-        elif isinstance(stage, Grip) and holds and not view.holding:
-            self.missed(stage, view)
-        elif holds is False and view.holding:
-            self.fail("the fingers opened and still hold something", view)
-        else:
-            self._held_up = self._held_up and not holds
-            self.succeeded(stage, view)
-            if self._early is not None and view.motion is not None and view.gripper is not None:
-                self.running, self._early = self._early, None
-                self.running.wait_no_more(view.motion, view.gripper)
-                self.running.started = True
-                self._tell_stage(self.running.stage)
 
     # --- planning and execution ------------------------------------------------------------------------------
 
@@ -410,12 +265,8 @@ class Task(TaskDecisions[V]):
     def _begin(self, stage: Stage, view: V) -> Command:
         self.queue.popleft()
         self.running = self._execution(stage, view)
-        self._tell_stage(stage)
+        self._report_stage(stage)
         return self.running.command
-
-    def _tell_stage(self, stage: Stage) -> None:
-        self.status.state, self.status.stage = stage.state, stage.name
-        self.status.subject = stage.cycle.subject if stage.cycle else ""
 
     def _execution(self, stage: Stage, view: V) -> Execution:
         command: m.ExecuteRequest | m.GripperCommand
@@ -430,13 +281,13 @@ class Task(TaskDecisions[V]):
                 command.expected_width, command.width_tolerance = stage.expected_width, stage.width_tolerance
         if stage.cycle is not None:
             stage.cycle.started = True
-        begun = Execution(stage, command, view.now)
+        execution = Execution(stage, command, view.now)
         assert view.motion is not None and view.gripper is not None
         if isinstance(stage, Grip):
             self._opening = None  # the new command replaces it
-            begun.held = view.gripper.width if view.holding else None
-        begun.before = begun.report(view.motion, view.gripper).id
-        return begun
+            execution.held = view.gripper.width if view.holding else None
+        execution.before = execution.report(view.motion, view.gripper).id
+        return execution
 
     def _is_planned(self, move: Move) -> bool:
         needed = [move]

@@ -137,7 +137,7 @@ class Handling(Task[View]):
         if self.status.state == "DONE":  # no operator asked for more
             return
         if view.holding and view.gripper.outcome in MISSES:  # another object than intended
-            self.queue += [self._open(None), *self.back_off(view.let_go())]
+            self.queue += [self._open(None), *self.back_off(view.released())]
         elif view.holding and not view.scene.header.stamp:  # the surroundings are only seen from home
             self.queue += [self.home(view), AwaitImage()] if away else []
         elif view.holding:

@@ -16,6 +16,7 @@ Report = m.MotionStatus | m.GripperState
 OVER = ("succeeded", "aborted", "cancelled")
 MISSES = ("too_wide", "too_narrow", "empty")  # outcomes of a grasp that took nothing or something unexpected
 FARTHEST = 1e4  # [m] objects farther away or larger than this are ignored
+STEADY = 0.2  # [s] change of a camera clock's lead that is reported again
 FREE = 0.01  # [m] opening beyond the held width at which a released object falls freely
 
 
@@ -70,9 +71,9 @@ class Move(Stage):
 
 @dataclass(eq=False)
 class Grip(Stage):
-    """A motion of the fingers to a width [m]; `holds` tells whether an object must be held at its end.
+    """A motion of the fingers to a width [m]; `holds`: whether an object must be held at its end.
 
-    A held object must have the expected width, if that is known; `problem` tells how it differs.
+    A held object must have the expected width, if that is known; `problem` describes the difference.
     """
 
     width: float = field(kw_only=True)
@@ -138,7 +139,7 @@ class Execution:
             self.over = answer
         return answer.state != "rejected"
 
-    def wait_no_more(self, motion: m.MotionStatus, gripper: m.GripperState) -> None:
+    def motion_ended(self, motion: m.MotionStatus, gripper: m.GripperState) -> None:
         """Update a waiting gripper command once the motion it waits for has ended.
 
         A report of the same time already includes the result.
@@ -155,7 +156,7 @@ class Execution:
         later = self.accepted is not None and reported.header.stamp > self.accepted
         return "forgotten" if later else "running"
 
-    def let_go(self, gripper: m.GripperState) -> bool:
+    def has_released(self, gripper: m.GripperState) -> bool:
         """Return whether opening fingers are already clear of the released object."""
         if self.held is None or gripper.id != self.command.id or gripper.state != "active" or gripper.holding:
             return False
@@ -232,7 +233,7 @@ class View:
         """Whether the gripper reports a held object."""
         return self.gripper is not None and self.gripper.holding
 
-    def let_go(self) -> Self:
+    def released(self) -> Self:
         """Return the view after opening the fingers: a held object stays where it is."""
         gripper = self.gripper and self.gripper.model_copy(update={"holding": False})
         if self.scene is None or self.tcp is None:
@@ -254,3 +255,49 @@ class View:
 def place_of(pose: m.Pose) -> Place:
     """Position of a pose [m]."""
     return pose.position.x, pose.position.y, pose.position.z
+
+
+class ImageAge:
+    """Checks the age of images by their stamps. Tolerances are wall time [s], stamps cell time [s]."""
+
+    def __init__(self, speed: float) -> None:
+        """Check in a cell whose time runs `speed` times as fast as wall time."""
+        self._speed = speed
+        self._ahead: float | None = None  # last reported lead of the camera clock [s, wall]
+
+    def problem(self, now: float, stamps: tuple[float, ...], frame_timeout: float, clock_tolerance: float) -> str:
+        """Return why images cannot be used to decide; empty when they can.
+
+        Wall-time delays grow with the speed of the cell.
+
+        Args:
+            now: cell time.
+            stamps: times of the newest images, one for each source.
+            frame_timeout: age from which an image is too old.
+            clock_tolerance: lead from which a camera clock is unusable.
+        """
+        ahead = (max(stamps) - now) / self._speed
+        if ahead > clock_tolerance:
+            if self._ahead is None or abs(ahead - self._ahead) > STEADY:  # else every image would change the message
+                self._ahead = ahead
+            return f"the camera's clock is {self._ahead:.1f} s ahead"
+        self._ahead = None
+        return "" if now - min(stamps) < frame_timeout * self._speed else "no fresh picture"
+
+
+class DwellTimer:
+    """Measures for how long the same reason has been given without interruption."""
+
+    def __init__(self) -> None:
+        """Start without a reason."""
+        self._since: tuple[object, float] | None = None
+
+    def elapsed(self, reason: object, now: float) -> float:
+        """Return the time since this reason was first given [s]; another reason restarts the timer."""
+        if self._since is None or self._since[0] != reason:
+            self._since = reason, now
+        return now - self._since[1]
+
+    def reset(self) -> None:
+        """Restart the timer."""
+        self._since = None

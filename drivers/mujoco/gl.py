@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from common.config import Scenery
 from common.perception.pinhole import Pinhole
-from common.sim.lighting import CUTOFF, ambient, lamps, tint
+from common.sim.photometry import CUTOFF, ambient, lamps, tint
 from common.sim.ray_caster import View
 
 Array = NDArray[np.float64]
@@ -52,7 +52,7 @@ def select_gl() -> str:
         return ""
     if named in CHOICES:
         found, why = named, f"set by {VARIABLE}"
-    elif _has_egl():
+    elif has_egl():
         found, why = "egl", "detected"
     elif ctypes.util.find_library("OSMesa"):
         found, why = "osmesa", "detected, no EGL"
@@ -66,7 +66,7 @@ def select_gl() -> str:
     return found
 
 
-def _has_egl() -> bool:
+def has_egl() -> bool:
     """Whether EGL opens a device without a screen."""
     try:
         egl = ctypes.CDLL(ctypes.util.find_library("EGL") or "libEGL.so.1")

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from common.mesh_files import triangles_of
+from common.robot.mesh_files import triangles_of
 from common.robot.model import RobotModel
 
 CACHE_VARIABLE = "ZENCELL_CACHE"  # cache folder; default: zencell in the user's cache

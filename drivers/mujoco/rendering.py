@@ -1,7 +1,7 @@
 """Render the physics world with light, shadow and the arm: by OpenGL, or by ray casting without it.
 
 Pixel values are proportional to light and use their full range: `level` is the light of the value 255, and a sensor
-(`common/sim/sensor.py`) applies the exposure.
+(`common/sim/photometry.py`) applies the exposure.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from common.config import Scenery, Surroundings
 from common.messages import JointState, WorldObject
 from common.perception.pinhole import Pinhole
 from common.robot.model import RobotModel
-from common.sim.lighting import CUTOFF, ambient, lamps, tint, white_level
 from common.sim.objects import appearance_of
+from common.sim.photometry import CUTOFF, ambient, lamps, tint, white_level
 from common.sim.ray_caster import View
 from common.sim.rendering import STILL, STILL_POSE, link_poses
 from drivers.mujoco.drawn_model import DrawnModel

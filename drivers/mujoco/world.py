@@ -17,10 +17,9 @@ from common.errors import ConfigError, Refused
 from common.hardware.interface import Hardware, Limits, Vector
 from common.messages import Header, WorldEdit, WorldObjects
 from common.robot.model import RobotModel
-from common.sim.bodies import Body
-from common.sim.interface import GraspTolerances, Numbers, StandingObject
+from common.sim.bodies import Body, WorldEvents
+from common.sim.interface import GraspTolerances, Numbers, ObjectSnapshot
 from common.sim.kinematic import KinematicWorld
-from common.sim.news import News
 from drivers.mujoco.arm import PhysicsArm, tune
 from drivers.mujoco.model import CellModel, build_model
 from drivers.mujoco.object_states import REST_SPEED, Contacts, ObjectStates, pose_changed, snap_upright
@@ -35,7 +34,7 @@ QUIET = 1e-6  # [m] or quaternion entries: no motion since the last update
 ASLEEP = 1e-3  # [m/s] or [rad/s]: smaller velocities are restored as zero
 
 
-class PhysicsWorld(News):
+class PhysicsWorld(WorldEvents):
     """The objects and the arm.
 
     Attributes:
@@ -78,7 +77,7 @@ class PhysicsWorld(News):
         self._robot = robot
         self._arm = PhysicsArm(robot, start, self.advance)
         self._build()
-        cell, data = self._built
+        cell, data = self.simulation
         cell.set_joints(data, robot.joint_names, start)
         if self._arm.fingers is not None and robot.config.gripper is not None:
             self._arm.fingers.place(robot.config.gripper.max_width)
@@ -86,7 +85,8 @@ class PhysicsWorld(News):
         return self._arm
 
     @property
-    def _built(self) -> tuple[CellModel, mujoco.MjData]:
+    def simulation(self) -> tuple[CellModel, mujoco.MjData]:
+        """The compiled model and its state."""
         if self._cell is None:
             raise RuntimeError("the world has no arm yet: call `hardware` first")
         return self._cell, self._data
@@ -117,7 +117,7 @@ class PhysicsWorld(News):
 
     def advance(self, now: float) -> None:
         """Advance to a time [s]."""
-        cell, data = self._built
+        cell, data = self.simulation
         if self._time is None or now - self._time > MAX_CATCH_UP:
             self._time = now
         steps = math.floor((now - self._time) / TIMESTEP + 1e-6)
@@ -131,7 +131,7 @@ class PhysicsWorld(News):
 
     def _update(self, now: float) -> None:
         """Update bodies and events from physics."""
-        cell, data = self._built
+        cell, data = self.simulation
         for name in [name for name, until in self._slippery.items() if now >= until and not self._within_robot(name)]:
             del self._slippery[name]
             self._set_robot_contact(name, True)
@@ -162,14 +162,14 @@ class PhysicsWorld(News):
     def _publish_events(self, body: Body) -> None:
         if body.state == "held" and body.name not in self._removed:
             self._removed.add(body.name)
-            self._say("remove", body)
+            self._add_event("remove", body)
         elif body.state in ("table", "contained") and body.name in self._removed and (
                 self._speed(body.name) < REST_SPEED):
             self._removed.discard(body.name)
-            self._say("add", body)
+            self._add_event("add", body)
 
     def _speed(self, name: str) -> float:
-        cell, data = self._built
+        cell, data = self.simulation
         at = cell.objects[name].dof
         return float(np.linalg.norm(data.qvel[at: at + 3]))
 
@@ -196,12 +196,12 @@ class PhysicsWorld(News):
 
     # --- snapshot ---
 
-    def standing(self) -> dict[str, StandingObject]:
+    def snapshot(self) -> dict[str, ObjectSnapshot]:
         """Complete state with velocities, for `restore`."""
-        cell, data = self._built
+        cell, data = self.simulation
         found = {}
         for name, body in self._kinematic.bodies.items():
-            snapshot, at = body.standing(), cell.objects[name]
+            snapshot, at = body.snapshot(), cell.objects[name]
             speeds = data.qvel[at.dof: at.dof + 6]
             details = {**snapshot.details, "mass": self._masses.get(name, DEFAULT_MASS),
                        "slippery": name in self._slippery,
@@ -210,14 +210,14 @@ class PhysicsWorld(News):
             found[name] = snapshot.model_copy(update={"details": details})
         return found
 
-    def restore(self, objects: Mapping[str, StandingObject]) -> None:
+    def restore(self, objects: Mapping[str, ObjectSnapshot]) -> None:
         """Restore a state with velocities; a held object is at rest, like the restarted arm."""
         self._kinematic.restore(objects)
         self._masses = {name: float(snapshot.details.get("mass", DEFAULT_MASS)) for name, snapshot in objects.items()}
         self._removed = {name for name, body in self._kinematic.bodies.items() if body.state in ("held", "falling")}
         self._slippery = {name: -math.inf for name, snapshot in objects.items() if snapshot.details.get("slippery")}
         self._build()
-        cell, data = self._built
+        cell, data = self.simulation
         for name, snapshot in objects.items():
             if name in cell.objects and "qpos" in snapshot.details:
                 address = cell.objects[name]
@@ -253,7 +253,7 @@ class PhysicsWorld(News):
                 self._masses.pop(name, None)
                 raise Refused("no_size", f"{name}: {error}") from None
         self._events += [each for each in updates if request.op == "reset" or each.data.partition(":")[2] == name]
-        cell, data = self._built
+        cell, data = self.simulation
         for each in changed:
             address, body = cell.objects[each], self._kinematic.bodies[each]
             body.rest = None
@@ -279,7 +279,7 @@ class PhysicsWorld(News):
         return held
 
     def _set_robot_contact(self, name: str, by_robot: bool) -> None:
-        cell, _ = self._built
+        cell, _ = self.simulation
         if name in cell.objects:
             geoms = cell.model.geom_bodyid == cell.objects[name].body
             affinity = cell.model.geom_conaffinity[geoms]
@@ -287,7 +287,7 @@ class PhysicsWorld(News):
 
     def _within_robot(self, name: str) -> bool:
         """Whether the robot overlaps an object: restoring contact would fling them apart."""
-        cell, data = self._built
+        cell, data = self.simulation
         if name not in cell.objects:
             return False
         of_object = np.flatnonzero(cell.model.geom_bodyid == cell.objects[name].body)

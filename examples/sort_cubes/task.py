@@ -1,4 +1,4 @@
-"""Sorts cubes into boxes: each goes into the box that is called as its colour is."""
+"""Sort cubes into boxes: each goes into the box named after its color."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from common.transport.bus import Bus
 
 
 class SortStatus(HandlingStatus):
-    """What every task says; `done` are the cubes that are seen in their own box."""
+    """Status of the task; `done` counts the cubes seen in their own box."""
 
 
-STATUS = Topic("sort_cubes_status", SortStatus, "state", "how many cubes are in the box of their colour")
+STATUS = Topic("sort_cubes_status", SortStatus, "state", "number of cubes in the box of their color")
 
 
 class Config(HandlingConfig):
-    """All that there is to set is what every task has that brings objects somewhere."""
+    """Parameters; nothing besides those of every task that moves objects."""
 
 
 class SortCubes(Handling):
-    """Decides by what is seen alone, so it goes on where it was when it was started again."""
+    """Decides only by what is seen, so it continues after a restart."""
 
     def choose(self, view: View) -> None:
-        """The nearest cube that is not in its box, until there is none."""
+        """Bring the nearest cube that is not in its box; finish without any."""
         left = [cube for cube in self._cubes(view) if self.container_of(cube) != cube.kind]
         if left:
             self.bring(sorted(left, key=lambda cube: math.hypot(cube.pose.position.x, cube.pose.position.y)), view)
@@ -40,30 +40,31 @@ class SortCubes(Handling):
             self.finish(view, **{kind: len(self.inside(kind, view)) for kind in self.p.world.containers})
 
     def destination(self, thing: m.CollisionObject, view: View) -> m.Pose:
-        """Above the box of its colour, where there is most room."""
+        """Return the pose above the box of its color with most room."""
         return self.room_in(thing.kind, thing, view)
 
     def note(self, view: View) -> None:
-        """Count what a picture shows in which nothing is under way."""
+        """Count the cubes in an image taken while nothing moves."""
         if self.shown(view):
             cubes = self._cubes(view)
             self.status.total = len(cubes)
             self.status.done = sum(self.container_of(cube) == cube.kind for cube in cubes)
 
     def _cubes(self, view: View) -> list[m.CollisionObject]:
-        """What there is a box for."""
+        """Cubes that have a box."""
         seen = [*view.objects("target"), *view.objects("contained")]
         return [thing for thing in seen if thing.kind in self.p.world.containers]
 
 
 def find_misplaced(truth: m.WorldObjects) -> str:
-    """What is not where it belongs in the end, by truth: `zencell simulate` asks, nothing that decides does."""
-    lost = [cube.id for cube in truth.objects if cube.container != ("red" if cube.color.r > cube.color.g else "green")]
-    return f"not in their own box: {', '.join(lost)}" if lost else ""
+    """Return which cubes are misplaced at the end, by ground truth: for `zencell simulate` only."""
+    misplaced = [cube.id for cube in truth.objects
+                 if cube.container != ("red" if cube.color.r > cube.color.g else "green")]
+    return f"not in their own box: {', '.join(misplaced)}" if misplaced else ""
 
 
 async def run(bus: Bus, config: Config) -> None:
-    """Be the service of the task."""
+    """Run the task as a service."""
     await run_task(bus, config, SortCubes, STATUS, View)
 
 

@@ -1,4 +1,4 @@
-"""The whole cell on a virtual clock: nothing of it waits."""
+"""Test of the complete cell on a virtual clock."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-import zencell  # noqa: F401 - `from common...` can be imported from then on, also where zencell came as a wheel
+import zencell  # noqa: F401 - makes `common` importable, also from an installed wheel
 from common import topics
 from common.application import find_application
 from common.config import load_cell
@@ -18,31 +18,31 @@ from lab.simulation import Simulation
 CELL = str(Path(__file__).with_name("cell.yaml"))
 
 
-async def heard(status: Reader[TaskStatus], stage: str) -> None:
+async def wait_for_stage(status: Reader[TaskStatus], stage: str) -> None:
     """Return when the task is at a stage."""
-    async for told in status:
-        if told.stage == stage:
+    async for message in status:
+        if message.stage == stage:
             return
 
 
-def test_every_cube_is_in_its_own_box_by_truth() -> None:
-    outcome = Simulation(load_cell(CELL, seed=2), 1).run()  # at the end it calls the truth check
+def test_every_cube_ends_in_its_own_box() -> None:
+    outcome = Simulation(load_cell(CELL, seed=2), 1).run()  # includes the truth check
     assert (outcome.state, outcome.done, outcome.total, outcome.crashes) == ("DONE", 4, 4, []), outcome
 
 
 @pytest.mark.parametrize("stage", ["descend", "across"])
-def test_task_goes_on_where_it_was_after_pause_stop_and_the_end_of_its_process(stage: str) -> None:
+def test_task_continues_after_pause_stop_and_restart_of_its_process(stage: str) -> None:
     cell = load_cell(CELL, seed=3)
 
     async def visit(bus: Bus) -> None:
         status = bus.reader(find_application(cell.application).status)
         task = bus.client(topics.TASK_COMMAND)
         for commands in (("pause", "resume"), ("stop", "start")):
-            await heard(status, stage)
+            await wait_for_stage(status, stage)
             for command in commands:
-                told = await task.call(TaskCommand.model_validate({"command": command}))
-                assert told.paused == (command == "pause")
-        await heard(status, stage)
+                answer = await task.call(TaskCommand.model_validate({"command": command}))
+                assert answer.paused == (command == "pause")
+        await wait_for_stage(status, stage)
         simulation.kill(cell.task)
 
     simulation = Simulation(cell, 2, visit=visit)

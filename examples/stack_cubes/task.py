@@ -1,4 +1,4 @@
-"""Stacks cubes: each is put on the highest that is seen, until enough stand upon each other."""
+"""Stack cubes: put each on the highest one until the stack is complete."""
 
 from __future__ import annotations
 
@@ -17,29 +17,29 @@ from common.tasks.stages import View
 from common.topics import Topic
 from common.transport.bus import Bus
 
-HIGH = 3  # cubes
+HEIGHT = 3  # cubes
 
 
 class StackStatus(HandlingStatus):
-    """What every task says; `done` is how many cubes the highest stack has."""
+    """Status of the task; `done` is the number of cubes in the highest stack."""
 
 
-STATUS = Topic("stack_cubes_status", StackStatus, "state", "how many cubes stand upon each other")
+STATUS = Topic("stack_cubes_status", StackStatus, "state", "number of cubes in the stack")
 
 
 class Config(HandlingConfig):
-    """How high the stack is to be."""
+    """Parameters: the height of the stack."""
 
-    cubes: Tunable[int] = Field(HIGH, ge=2, le=4, description="that are to stand upon each other")
+    cubes: Tunable[int] = Field(HEIGHT, ge=2, le=4, description="number of cubes in a complete stack")
 
 
 class StackCubes(Handling):
-    """Decides by what is seen alone, so it goes on where it was when it was started again."""
+    """Decides only by what is seen, so it continues after a restart."""
 
     p: Config
 
     def choose(self, view: View) -> None:
-        """The nearest cube beside the stack, until that is high enough."""
+        """Bring the nearest other cube until the stack is high enough."""
         stack = self._stack(view)
         if stack is None:
             self.lack("no cube is seen", view)
@@ -48,27 +48,27 @@ class StackCubes(Handling):
         elif others := [cube for cube in view.objects("target") if cube is not stack]:
             self.bring(sorted(others, key=lambda cube: _away(cube, stack)), view)
         else:
-            self.lack(f"{self._cubes_to(stack)} cubes stand upon each other, and no other is seen", view)
+            self.lack(f"{self._cubes_to(stack)} cubes are stacked, and no other is seen", view)
 
     def destination(self, thing: m.CollisionObject, view: View) -> m.Pose | None:
-        """On top of the stack; aside while none is known, to be seen from home."""
+        """Return the pose on top of the stack; None while none is known: put the cube aside first."""
         stack = self._stack(view)
         return self.on_top(thing, stack) if stack is not None and stack.id != thing.id else None
 
     def note(self, view: View) -> None:
-        """Count what a picture shows in which nothing is under way."""
+        """Count the cubes in an image taken while nothing moves."""
         stack = self._stack(view)
         self.status.total = self.p.cubes
         if stack is not None and self.shown(view):
             self.status.done = min(self._cubes_to(stack), self.p.cubes)
 
     def _stack(self, view: View) -> m.CollisionObject | None:
-        """The top cube of the highest stack, or of those the nearest to the robot; None while none is seen."""
+        """Return the top cube of the highest stack, the nearest one of several; None while none is seen."""
         return max(view.objects("target"), default=None, key=lambda cube: (
             self._cubes_to(cube), -math.hypot(cube.pose.position.x, cube.pose.position.y)))
 
     def _cubes_to(self, cube: m.CollisionObject) -> int:
-        """How many cubes there are from the table to the top of one."""
+        """Return the number of cubes from the table to the top of one."""
         return round((top_of(cube) - self.p.world.table_height) / height_of(cube))
 
 
@@ -77,17 +77,17 @@ def _away(a: m.CollisionObject | m.WorldObject, b: m.CollisionObject | m.WorldOb
 
 
 def find_misplaced(truth: m.WorldObjects) -> str:
-    """What does not stand in the end, by truth: `zencell simulate` asks, nothing that decides does."""
+    """Return what is wrong with the stack at the end, by ground truth: for `zencell simulate` only."""
     cubes = sorted(truth.objects, key=lambda cube: cube.pose.position.z)
-    for number, cube in enumerate(cubes[:HIGH]):
+    for number, cube in enumerate(cubes[:HEIGHT]):
         off, low = _away(cube, cubes[0]), abs(cube.pose.position.z - (number + 0.5) * cube.size.z)
         if cube.state != "table" or off > cube.size.x / 4 or low > 1e-3:
             return f"{cube.id} is not number {number + 1} of a stack from below"
-    return "" if len(cubes) >= HIGH else f"there are {len(cubes)} cubes, {HIGH} are to stand"
+    return "" if len(cubes) >= HEIGHT else f"there are {len(cubes)} of {HEIGHT} cubes"
 
 
 async def run(bus: Bus, config: Config) -> None:
-    """Be the service of the task."""
+    """Run the task as a service."""
     await run_task(bus, config, StackCubes, STATUS, View)
 
 

@@ -1,4 +1,4 @@
-"""What an application says of a run in its summary, its report and on the line that tells how far it is."""
+"""What an application adds to the summary, the report and the progress line of a run."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ if TYPE_CHECKING:
     from common.config import RobotConfig
     from recording.report.history import RunHistory
 
-Listener = Callable[[float, Any], None]  # is given wall time [s] since the run or its recording began, and a message
+Listener = Callable[[float, Any], None]  # takes wall time [s] since the start of the run or recording, and a message
 
 
 class Section(NamedTuple):
-    """A part of a report: HTML under a title."""
+    """Section of a report: HTML below a title."""
 
     name: str
     title: str
@@ -28,48 +28,48 @@ class Section(NamedTuple):
 
 
 class Figures:
-    """What is said of a run where its application says nothing else.
+    """Figures of a run, with the platform's defaults.
 
     An application names a subclass as `Application.figures` and overrides only what differs.
     """
 
-    COUNTED: ClassVar[str] = "done"  # what became of that which a task counts
-    STATE_COLORS: ClassVar[Mapping[str, str]] = {}  # of the timeline; states without one get one
-    TRUTH: ClassVar[Topic[PoseArray] | None] = None  # where things are, by their labels, if objects do not tell it
+    COUNTED: ClassVar[str] = "done"  # label of what the task counts
+    STATE_COLORS: ClassVar[Mapping[str, str]] = {}  # of task states in the timeline; the others get default colors
+    TRUTH: ClassVar[Topic[PoseArray] | None] = None  # labelled positions, if world objects have no state
 
-    def __init__(self, robot: RobotConfig | None = None, *, pictured: bool = False) -> None:
-        """Start with nothing heard.
+    def __init__(self, robot: RobotConfig | None = None, *, for_report: bool = False) -> None:
+        """Start without messages.
 
         Args:
-            robot: of the cell; None when it is not known.
-            pictured: `picture` will be asked for, which may need more than is kept of a run that goes on for days.
+            robot: of the cell; None if unknown.
+            for_report: whether `picture` will be called, which may need data that must not grow for days otherwise.
         """
-        self.robot, self.pictured = robot, pictured
+        self.robot, self.for_report = robot, for_report
 
     def listeners(self) -> dict[Topic[Any], Listener]:
-        """Topics that are listened to beside what every run is judged by, each with who is given its messages."""
+        """Return listeners of topics that not every run needs."""
         return {}
 
     def exposed(self, message: Any) -> int:
-        """Stamp [ns] of the picture by which a message of `decided_by` was decided; 0 for none."""
+        """Return the stamp [ns] of the image that a message of the topic `decided_by` is based on; 0 for none."""
         return int(message.header.stamp)
 
     def blocks(self) -> dict[str, Any]:
-        """What stands in the summary beside the fields of every run."""
+        """Return additional fields of the summary."""
         return {}
 
     def progress(self, status: TaskStatus) -> str:
-        """How far the task is, in a few words."""
+        """Return the progress of the task in a few words."""
         line = f"{status.done} of {status.total} {self.COUNTED} - {status.state}"
         return f"{line} {status.subject}" if status.subject else line
 
     def headline(self, summary: Mapping[str, Any]) -> str:
-        """How the run of a summary ended, in a few words."""
+        """Return the result of a run in a few words."""
         line = f"{summary['placed']} of {summary['targets']} {self.COUNTED}"
         return f"{line} (truth: {format_truth(summary['truth'])})" if summary["truth"] else line
 
     def facts(self, summary: Mapping[str, Any]) -> list[tuple[str, str]]:
-        """What the head of a report says first: names and values."""
+        """Return names and values for the head of a report."""
         facts = [(self.COUNTED, f"{summary['placed']} of {summary['targets']}")]
         facts += [(name, str(value)) for name, value in summary["figures"].items()]
         facts.append(("rejected places", str(len(summary["rejected"]))))
@@ -78,23 +78,23 @@ class Figures:
         return facts
 
     def picture(self, run: RunHistory, tool: npt.NDArray[np.float64]) -> Section | None:
-        """What a report shows of the place of work; None when there is nothing to show.
+        """Return a section that shows the work area; None if there is nothing to show.
 
         Args:
-            run: what was gathered of the run.
-            tool: (n, 3) way of the tool [m]; empty when it is not known.
+            run: history of the run.
+            tool: (n, 3) path of the tool [m]; empty if unknown.
         """
         return top_view_section(run, tool)
 
 
 def figures_of(application: Application | None) -> type[Figures]:
-    """The class with which an application tells of its runs."""
+    """Return the figures class of an application."""
     found = application.figures if application else None
     return found if isinstance(found, type) and issubclass(found, Figures) else Figures
 
 
 def format_truth(truth: Mapping[str, Any]) -> str:
-    """Where everything really lies, as "6 in the box, 1 on the table"."""
+    """Return the final positions of objects as "6 in the box, 1 on the table"."""
     containers = truth["containers"]
     parts = [f"{truth['in_box']} in the box"]
     if len(containers) > 1:
@@ -106,12 +106,12 @@ def format_truth(truth: Mapping[str, Any]) -> str:
 def top_view_section(
     run: RunHistory, tool: npt.NDArray[np.float64], marks: Mapping[str, Mapping[tuple[int, int], int]] | None = None
 ) -> Section | None:
-    """The place of work from above; None when nothing was seen there.
+    """Return the work area from above; None if there is nothing to show.
 
     Args:
-        run: what was gathered of the run.
-        tool: (n, 3) way of the tool [m].
-        marks: more places by what they are, in steps of `gathering.SAME_PLACE`, the lowest first.
+        run: history of the run.
+        tool: (n, 3) path of the tool [m].
+        marks: further positions by label, in steps of `history.SAME_PLACE`, the lowest first.
     """
     from recording.report import charts
 

@@ -1,4 +1,4 @@
-"""The pictures of a report, each as an SVG element to be put into a page."""
+"""Charts of a report as SVG elements."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from recording.report.history import SAME_PLACE, RunHistory, Span
 
 Array = npt.NDArray[np.float64]
 
-MAX_POINTS = 1200  # of a line: more than a page has pixels for
-STATE_COLORS = {"IDLE": "#c9ced6", "DONE": "#5fb35f", "ERROR": "#d64545"}  # those of every task
+MAX_POINTS = 1200  # of a line: more than the pixels of a page
+STATE_COLORS = {"IDLE": "#c9ced6", "DONE": "#5fb35f", "ERROR": "#d64545"}  # of every task
 MOTION_COLORS = {"succeeded": "#5d6a7a", "cancelled": "#e6a229", "aborted": "#d64545", "rejected": "#d64545",
                  "not ended": "#c9ced6"}
 LINES = ("#2f7ed8", "#d64545", "#17a398", "#e6a229", "#8d6cc2", "#5d6a7a", "#b3528c", "#7a9a01")
 MARKS = ("#e6a229", LINES[0], "#b3528c")
 BAD, QUIET = "#d64545", "#8a94a3"
-STYLE: Any = {  # matplotlib lists every name in its type
+STYLE: Any = {  # matplotlib's type lists every name
     "svg.fonttype": "none", "font.family": "sans-serif", "font.size": 9, "axes.spines.top": False,
     "axes.spines.right": False, "axes.edgecolor": QUIET, "axes.labelcolor": "#3c4654", "xtick.color": "#3c4654",
     "ytick.color": "#3c4654", "axes.grid": True, "grid.color": "#e8ebef", "axes.axisbelow": True,
@@ -44,11 +44,11 @@ class JointLimits:
 
 
 def timeline(run: RunHistory, state_colors: Mapping[str, str]) -> str:
-    """What the task, the motion, the gripper and the processes did, over time.
+    """Draw the states of task, motion and gripper and the restarts of processes over time.
 
     Args:
-        run: what was gathered of the run.
-        state_colors: of the task's own states; one without gets one.
+        run: history of the run.
+        state_colors: of the task's own states; the others get default colors.
     """
     colors = {**STATE_COLORS, **state_colors}
     for k, state in enumerate(dict.fromkeys(span.label for span in run.tasks if span.label not in colors)):
@@ -57,7 +57,7 @@ def timeline(run: RunHistory, state_colors: Mapping[str, str]) -> str:
         ("task", [(s, colors[s.label], s.label) for s in run.tasks]),
         ("motion", [(s, MOTION_COLORS.get(s.note, QUIET), s.note) for s in run.motions]),
         ("held", [(s, "#e6a229", "held") for s in [*run.held, *run.paused]]),
-        ("gripper", [(s, "#b3528c", "holds something") for s in run.holding]),
+        ("gripper", [(s, "#b3528c", "holding") for s in run.holding]),
     ]
     rows = [row for row in rows if row[1] or row[0] != "held"]
     with mpl.rc_context(STYLE):
@@ -70,7 +70,7 @@ def timeline(run: RunHistory, state_colors: Mapping[str, str]) -> str:
                 handles.setdefault(label, axes.barh(y, width, left=span.since, height=0.62, color=color, linewidth=0))
         names = [name for name, _ in rows]
         for event in run.restarts:
-            handles.setdefault("started again", axes.axvline(event.time, color=BAD, linewidth=1.5, linestyle="--"))
+            handles.setdefault("restarted", axes.axvline(event.time, color=BAD, linewidth=1.5, linestyle="--"))
         if run.log:
             handles["warning or error"] = axes.scatter(
                 [event.time for event in run.log], [len(rows) - 0.3] * len(run.log), marker="v", s=14, color=BAD
@@ -86,7 +86,7 @@ def timeline(run: RunHistory, state_colors: Mapping[str, str]) -> str:
 
 
 def plans(planners: Sequence[str], milliseconds: Sequence[float], durations: Sequence[float]) -> str:
-    """Planning time of each plan by planner, and below it how long the planned motions take."""
+    """Draw the planning time of each plan by planner, and the duration of the planned motions."""
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(10, 4.2), layout="constrained")
         above, below = figure.subplots(2, 1, sharex=True)
@@ -104,7 +104,7 @@ def plans(planners: Sequence[str], milliseconds: Sequence[float], durations: Seq
 
 
 def latency(milliseconds: Sequence[float], marks: dict[str, float]) -> str:
-    """How long frames took, as a histogram with marks."""
+    """Draw a histogram of frame ages with marks."""
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(10, 2.8), layout="constrained")
         axes = figure.subplots()
@@ -120,7 +120,7 @@ def latency(milliseconds: Sequence[float], marks: dict[str, float]) -> str:
 
 
 def joints(times: Array, positions: Array, velocities: Array, names: Sequence[str], limits: JointLimits | None) -> str:
-    """Positions and speeds of each joint over time, with their limits."""
+    """Draw positions and velocities of each joint over time with their limits."""
     chosen = thinned(times, velocities)
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(10, 1.15 * len(names) + 0.8), layout="constrained")
@@ -145,21 +145,21 @@ def joints(times: Array, positions: Array, velocities: Array, names: Sequence[st
 
 
 def top_view(run: RunHistory, tool: Array, marks: Mapping[str, Mapping[tuple[int, int], int]]) -> str:
-    """The place of work from above, as a person at the robot sees it: +x up, +y to the left.
+    """Draw the work area from above, as seen from the robot: +x up, +y to the left.
 
     Args:
-        run: what was gathered of the run.
-        tool: (n, 3) way of the tool [m].
-        marks: more places by what they are, in steps of `SAME_PLACE`; what comes later is smaller and lies above.
+        run: history of the run.
+        tool: (n, 3) path of the tool [m].
+        marks: further positions by label, in steps of `SAME_PLACE`; later labels are smaller and drawn on top.
     """
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(7.5, 6.5), layout="constrained")
         axes = figure.subplots()
-        for thing in run.footprints.values():
-            axes.fill(thing.corners[:, 1], thing.corners[:, 0], facecolor=(*thing.color, 0.18),
-                      edgecolor=(*thing.color, 0.7), linewidth=0.8)
+        for solid in run.footprints.values():
+            axes.fill(solid.corners[:, 1], solid.corners[:, 0], facecolor=(*solid.color, 0.18),
+                      edgecolor=(*solid.color, 0.7), linewidth=0.8)
         if len(tool):
-            axes.plot(tool[:, 1], tool[:, 0], color=QUIET, linewidth=0.6, alpha=0.8, label="way of the tool")
+            axes.plot(tool[:, 1], tool[:, 0], color=QUIET, linewidth=0.6, alpha=0.8, label="path of the tool")
         for k, (label, places) in enumerate(marks.items()):
             x, y = (np.array(list(places), dtype=float) * SAME_PLACE).T
             axes.scatter(y, x, s=34 / 4**k, color=MARKS[k % len(MARKS)], label=label, linewidths=0)
@@ -168,7 +168,7 @@ def top_view(run: RunHistory, tool: Array, marks: Mapping[str, Mapping[tuple[int
             if crosses:
                 axes.scatter([p.position[1] for p in crosses], [p.position[0] for p in crosses], marker=marker,
                              s=70, color=color, linewidths=1.8, label=label)
-        if truth := run.truth.things:
+        if truth := run.truth.objects:
             axes.scatter([p.position[1] for p in truth], [p.position[0] for p in truth], s=200,
                          facecolors="none", edgecolors="#3c4654", linewidths=0.8, label="truth at the end")
         from_above(figure, axes)
@@ -176,19 +176,19 @@ def top_view(run: RunHistory, tool: Array, marks: Mapping[str, Mapping[tuple[int
 
 
 def thinned(times: Array, values: Array) -> npt.NDArray[np.intp]:
-    """Indices of at most so many samples as a picture can show, among them the extremes of each column."""
+    """Return indices of at most about `MAX_POINTS` samples that include the extremes of each column."""
     if len(times) <= MAX_POINTS:
         return np.arange(len(times))
     step = -(-len(times) // MAX_POINTS)
-    kept = set(range(0, len(times), step)) | {len(times) - 1}
+    selected = set(range(0, len(times), step)) | {len(times) - 1}
     for column in values.T:
         if np.isfinite(column).any():
-            kept |= {int(np.nanargmax(column)), int(np.nanargmin(column))}
-    return np.array(sorted(kept))
+            selected |= {int(np.nanargmax(column)), int(np.nanargmin(column))}
+    return np.array(sorted(selected))
 
 
 def svg(figure: Figure, name: str) -> str:
-    """The figure as an `svg` element that can stand in a page beside others."""
+    """Return the figure as an `svg` element without ids, so that a page can contain several."""
     text = StringIO()
     with mpl.rc_context({"svg.hashsalt": name}):
         figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None})
@@ -199,7 +199,7 @@ def svg(figure: Figure, name: str) -> str:
 
 
 def from_above(figure: Figure, axes: Axes) -> None:
-    """Axes as a person at the robot sees the place of work: +x up, +y to the left."""
+    """Orient the axes as seen from the robot: +x up, +y to the left."""
     axes.set_aspect("equal")
     axes.invert_xaxis()
     axes.set_xlabel("y [m]")

@@ -1,4 +1,4 @@
-"""Gathers from the messages of a run what every report shows. Times are wall time since the recording began [s]."""
+"""History of a run for its report, and its ground truth. Times are wall time since the start of the recording [s]."""
 
 from __future__ import annotations
 
@@ -12,95 +12,88 @@ import numpy.typing as npt
 
 from common import messages as m
 from common import topics as t
-from common.messages import PoseArray, WorldObjects
 from common.topics import Topic
 
-SAME = 0.05  # [m] from where something is to where it was seen: less well where the picture cuts it off
-BOX = "box"  # the container of recordings that do not tell its id
+Array = npt.NDArray[np.float64]
+Position = tuple[float, float, float]  # x, y, z [m] in world
+
+SAME_OBJECT = 0.05  # [m] from an object to its detection: less accurate at the image border
+BOX = "box"  # the container in recordings without container ids
+MOST_LINES = 300  # of the log, and of any other list
+SAME_PLACE = 0.002  # [m] detections closer than this are shown as one
+_LEVELS = ("warning", "error", "critical")
+_ENDED = ("succeeded", "aborted", "cancelled", "rejected")
+
+
+# --- ground truth, for evaluation only --------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class TrueObject:
-    """An object: its centre [m] in world, what becomes of it, and the container in which it lies."""
+    """An object: centre in world, state, and the container that it is in."""
 
-    position: tuple[float, float, float]
+    position: Position
     state: str
     container: str = ""
 
 
 @dataclass
 class Truth:
-    """Where everything is, as it was said last."""
+    """Newest ground truth of the objects."""
 
-    containers: tuple[str, ...] = ()  # of the cell, as far as they are known
+    containers: tuple[str, ...] = ()  # ids of the cell's containers, if known
     _objects: list[TrueObject] | None = None
     _labelled: list[TrueObject] | None = None
 
-    def on_objects(self, message: WorldObjects) -> None:
-        """Take note of all objects; in old recordings they do not tell what becomes of them."""
-        if all("state" in thing.model_fields_set for thing in message.objects):
-            self._objects = [
-                TrueObject((thing.pose.position.x, thing.pose.position.y, thing.pose.position.z), thing.state,
-                      thing.container)
-                for thing in message.objects
-            ]
+    def on_objects(self, message: m.WorldObjects) -> None:
+        """Take world objects; in old recordings they have no state."""
+        if all("state" in each.model_fields_set for each in message.objects):
+            self._objects = [TrueObject(_xyz(each.pose), each.state, each.container) for each in message.objects]
 
-    def on_labels(self, message: PoseArray) -> None:
-        """Take note of what is told as poses with labels."""
+    def on_labels(self, message: m.PoseArray) -> None:
+        """Take labelled poses."""
         labels = message.labels or [""] * len(message.poses)
         self._labelled = [
-            TrueObject((pose.position.x, pose.position.y, pose.position.z), "contained" if label == BOX else label,
-                  BOX if label == BOX else "")
+            TrueObject(_xyz(pose), "contained" if label == BOX else label, BOX if label == BOX else "")
             for pose, label in zip(message.poses, labels, strict=False)
         ]
 
     @property
-    def things(self) -> list[TrueObject] | None:
-        """Everything that there is; None when nobody said anything, as with real hardware."""
+    def objects(self) -> list[TrueObject] | None:
+        """All objects; None if no ground truth is published, as with real hardware."""
         if self._objects or self._labelled is None:
             return self._objects
         return self._labelled
 
     @property
     def settled(self) -> bool:
-        """Whether nothing is on its way any more."""
-        return not any(thing.state in ("falling", "held") for thing in self.things or ())
+        """Whether no object falls or is held."""
+        return not any(each.state in ("falling", "held") for each in self.objects or ())
 
-    def left(self, named: Sequence[Sequence[float]]) -> list[TrueObject]:
-        """What lies in no container and at none of the places (x, y, ...) [m] that are named."""
-        return [thing for thing in self.things or () if thing.state != "contained" and all(
-            math.dist(thing.position[:2], place[:2]) > SAME for place in named)]
+    def left(self, explained: Sequence[Sequence[float]]) -> list[TrueObject]:
+        """Return the objects outside of containers that are at none of the explained positions (x, y, ...) [m]."""
+        return [each for each in self.objects or () if each.state != "contained" and all(
+            math.dist(each.position[:2], place[:2]) > SAME_OBJECT for place in explained)]
 
     def counted(self) -> dict[str, Any] | None:
-        """How much lies in containers, on the table and anywhere else; None without simulated hardware."""
-        if self.things is None:
+        """Return the number of objects in containers, on the table and elsewhere; None without ground truth."""
+        if self.objects is None:
             return None
-        contained = _counts(self.containers, (t.container for t in self.things if t.state == "contained"))
-        in_box, on_table = sum(contained.values()), sum(thing.state == "table" for thing in self.things)
-        elsewhere = len(self.things) - in_box - on_table
+        contained = dict.fromkeys(self.containers, 0)
+        for each in self.objects:
+            if each.state == "contained":
+                contained[each.container] = contained.get(each.container, 0) + 1
+        in_box, on_table = sum(contained.values()), sum(each.state == "table" for each in self.objects)
+        elsewhere = len(self.objects) - in_box - on_table
         return {"in_box": in_box, "on_table": on_table, "elsewhere": elsewhere, "containers": contained}
 
 
-def _counts(known: Iterable[str], found: Iterable[str]) -> dict[str, int]:
-    counts = dict.fromkeys(known, 0)
-    for name in found:
-        counts[name] = counts.get(name, 0) + 1
-    return counts
-
-
-
-
-Array = npt.NDArray[np.float64]
-
-MOST_LINES = 300  # of the log, and of anything else that is listed
-SAME_PLACE = 0.002  # [m] detections closer than this are shown as one
-_LEVELS = ("warning", "error", "critical")
-_ENDED = ("succeeded", "aborted", "cancelled", "rejected")
+# --- history ----------------------------------------------------------------------------------------------------------
 
 
 @dataclass
 class Span:
-    """Something that lasted: `label` says what, `note` more of it. `until` is None while it lasts."""
+    """A period with a label and a note. `until` is None while it is open."""
 
     label: str
     since: float
@@ -110,7 +103,7 @@ class Span:
 
 @dataclass
 class Motion(Span):
-    """A goal of the controller: its label is the id, its note the state in which it ended."""
+    """A goal of the controller: the label is its id, the note its end state."""
 
     error: str = ""
     message: str = ""
@@ -119,7 +112,7 @@ class Motion(Span):
 
 @dataclass(frozen=True)
 class Event:
-    """Something that happened: `what` is who or which, `note` the rest."""
+    """A moment: `what` names the subject, `note` the rest."""
 
     time: float
     what: str
@@ -128,17 +121,17 @@ class Event:
 
 
 @dataclass(frozen=True)
-class Place:
-    """Something at a place in world [m]."""
+class Mark:
+    """A labelled position."""
 
     time: float
-    position: tuple[float, float, float]
+    position: Position
     label: str = ""
 
 
 @dataclass(frozen=True, eq=False)
 class Footprint:
-    """A solid seen from above: corners (n, 2) in world [m]."""
+    """A solid from above: corners (n, 2) in world [m]."""
 
     label: str
     role: str
@@ -157,38 +150,38 @@ class Service:
 
 @dataclass
 class RunHistory:
-    """Feed it the messages of a run in the order in which they came."""
+    """What happened in a run, from its messages in order of arrival."""
 
-    tasks: list[Span] = field(default_factory=list)  # label: state, note: what is worked on
+    tasks: list[Span] = field(default_factory=list)  # label: state, note: subject
     paused: list[Span] = field(default_factory=list)
     held: list[Span] = field(default_factory=list)
     motions: list[Motion] = field(default_factory=list)
     holding: list[Span] = field(default_factory=list)
-    trajectories: list[tuple[float, float]] = field(default_factory=list)  # when planned, how long it takes [s]
+    trajectories: list[tuple[float, float]] = field(default_factory=list)  # time of planning, duration [s]
     latencies: list[float] = field(default_factory=list)  # of frames [ms]
     joint_times: list[float] = field(default_factory=list)
     joint_states: list[m.JointState] = field(default_factory=list)
-    rejections: list[Place] = field(default_factory=list)
-    skipped: dict[tuple[float, float, float], Place] = field(default_factory=dict)
-    picks: list[Place] = field(default_factory=list)
+    rejections: list[Mark] = field(default_factory=list)
+    skipped: dict[Position, Mark] = field(default_factory=dict)
+    picks: list[Mark] = field(default_factory=list)
     footprints: dict[str, Footprint] = field(default_factory=dict)
     services: dict[str, Service] = field(default_factory=dict)
     restarts: list[Event] = field(default_factory=list)
-    failures: list[Event] = field(default_factory=list)  # of the task, and what it tries again
-    losses: list[Event] = field(default_factory=list)  # by truth: what came to lie out of reach of everything
+    failures: list[Event] = field(default_factory=list)  # failures and retries of the task
+    losses: list[Event] = field(default_factory=list)  # by ground truth: objects out of reach
     log: list[Event] = field(default_factory=list)
     lines_left_out: int = 0
     counters: dict[str, m.ServiceCounters] = field(default_factory=dict)
-    truth: Truth = field(default_factory=Truth)  # that of the fold which feeds this
+    truth: Truth = field(default_factory=Truth)  # that of the aggregator
     end: float = 0.0
     _target: str = ""
-    _failed: int | None = None  # so far; what there was before the recording began is no event of it
-    _before: str | None = None  # the goal that had ended by then
-    _scene: dict[str, tuple[float, float, float]] = field(default_factory=dict)
-    _in_place: set[str] = field(default_factory=set)  # ids of objects that lay or moved where they may
+    _failed: int | None = None  # failures so far; those before the recording are no events
+    _ended_before: str | None = None  # goal that had ended before the recording
+    _scene: dict[str, Position] = field(default_factory=dict)
+    _in_place: set[str] = field(default_factory=set)  # ids of objects that were not lost
 
     def listeners(self) -> dict[Topic[Any], Callable[[float, Any], None]]:
-        """What of the platform's topics is listened to."""
+        """Return listeners of the platform's topics."""
         return {
             t.MOTION_STATUS: self.on_motion, t.GRIPPER_STATE: self.on_gripper, t.DISPLAY_TRAJECTORY: self.on_trajectory,
             t.JOINT_STATES: self.on_joints, t.PLANNING_SCENE: self.on_scene, t.SUPERVISOR_STATUS: self.on_services,
@@ -196,24 +189,24 @@ class RunHistory:
         }
 
     def on_task(self, time: float, status: m.TaskStatus) -> None:
-        """Take note of how far the task is."""
+        """Add a task status."""
         self._target = status.subject or self._target
         _change(self.tasks, time, status.state, status.subject)
         failed = status.failures + status.retries
         if self._failed is not None and failed > self._failed:
             self.failures.append(Event(time, f"{status.state} {status.subject}".strip(), status.message))
-        self._failed = failed  # fewer after the task was started again
+        self._failed = failed  # lower after a restart of the task
         _while(self.paused, time, status.paused, "paused")
         for place in status.skipped:
             p = place.position
-            self.skipped.setdefault((p.x, p.y, p.z), Place(time, (p.x, p.y, p.z), place.reason))
+            self.skipped.setdefault((p.x, p.y, p.z), Mark(time, (p.x, p.y, p.z), place.reason))
 
     def on_motion(self, time: float, status: m.MotionStatus) -> None:
-        """Take note of the state of a goal."""
+        """Add a motion status."""
         _while(self.held, time, status.held, "held")
-        if self._before is None:
-            self._before = status.id if status.state in _ENDED else ""
-        if status.id and status.id == self._before:
+        if self._ended_before is None:
+            self._ended_before = status.id if status.state in _ENDED else ""
+        if status.id and status.id == self._ended_before:
             return
         current = self.motions[-1] if self.motions else None
         if status.id and (current is None or current.label != status.id) and status.state != "none":
@@ -224,45 +217,44 @@ class RunHistory:
             current.error, current.message, current.source = status.error, status.message, status.source
 
     def on_gripper(self, time: float, state: m.GripperState) -> None:
-        """Take note of what the fingers hold; what they begin to hold was picked."""
+        """Add a gripper state; the start of holding is a pick."""
         if _while(self.holding, time, state.holding, self._target or "something") and self._target in self._scene:
-            self.picks.append(Place(time, self._scene[self._target], self._target))
+            self.picks.append(Mark(time, self._scene[self._target], self._target))
 
     def on_trajectory(self, time: float, trajectory: m.JointTrajectory) -> None:
-        """Take note of a plan."""
+        """Add a plan."""
         self.trajectories.append((time, trajectory.points[-1].time_from_start if trajectory.points else 0.0))
 
     def on_joints(self, time: float, state: m.JointState) -> None:
-        """Take note of where the joints are."""
+        """Add joint states."""
         self.joint_times.append(time)
         self.joint_states.append(state)
 
     def on_rejections(self, time: float, rejections: m.Rejections) -> None:
-        """Take note of what is not offered, and why."""
+        """Add rejected targets."""
         for one in rejections.rejected:
-            self.rejections.append(Place(time, (one.position.x, one.position.y, one.position.z), one.reason))
+            self.rejections.append(Mark(time, (one.position.x, one.position.y, one.position.z), one.reason))
 
     def on_scene(self, _time: float, scene: m.PlanningScene) -> None:
-        """Take note of what the planner avoids. Where a target was seen last counts: the hand hides what it takes."""
-        for thing in scene.objects:
-            p = thing.pose.position
-            if thing.role in ("target", "contained"):
-                self._scene[thing.id] = (p.x, p.y, p.z)
-            elif thing.id not in self.footprints:
-                self.footprints[thing.id] = footprint(thing)
+        """Add obstacles, and the newest position of each target: the gripper occludes it during the grasp."""
+        for item in scene.objects:
+            if item.role in ("target", "contained"):
+                self._scene[item.id] = _xyz(item.pose)
+            elif item.id not in self.footprints:
+                self.footprints[item.id] = footprint(item)
 
     def on_objects(self, time: float, world: m.WorldObjects) -> None:
-        """Take note of what is lost; what lay there before the recording began was lost before."""
-        for thing in world.objects:
-            if thing.state != "elsewhere":
-                self._in_place.add(thing.id)
-            elif thing.id in self._in_place:
-                self._in_place.discard(thing.id)
-                p = thing.pose.position
-                self.losses.append(Event(time, thing.id, f"lies elsewhere, at ({p.x:.3f}, {p.y:.3f}, {p.z:.3f})"))
+        """Add objects that are lost, unless they were before the recording."""
+        for each in world.objects:
+            if each.state != "elsewhere":
+                self._in_place.add(each.id)
+            elif each.id in self._in_place:
+                self._in_place.discard(each.id)
+                position = "({:.3f}, {:.3f}, {:.3f})".format(*_xyz(each.pose))
+                self.losses.append(Event(time, each.id, f"lies elsewhere, at {position}"))
 
     def on_services(self, time: float, status: m.SupervisorStatus) -> None:
-        """Take note of the processes."""
+        """Add the states of processes."""
         for one in status.services:
             before = self.services.get(one.name)
             if before is not None and one.restarts > before.restarts:
@@ -270,7 +262,7 @@ class RunHistory:
             self.services[one.name] = Service(one.state, one.restarts, one.ready_seconds)
 
     def on_log(self, time: float, line: m.LogLine) -> None:
-        """Take note of a warning or an error."""
+        """Add a warning or error."""
         if line.level not in _LEVELS:
             return
         if len(self.log) < MOST_LINES:
@@ -279,11 +271,11 @@ class RunHistory:
             self.lines_left_out += 1
 
     def on_counters(self, _time: float, counters: m.ServiceCounters) -> None:
-        """Take note of what a service has counted since it was started."""
+        """Add the counters of a service since its start."""
         self.counters[counters.service] = counters
 
     def finish(self, end: float) -> None:
-        """End what still lasts."""
+        """Close all open spans."""
         self.end = end
         for spans in (self.tasks, self.paused, self.held, self.holding, self.motions):
             for span in spans:
@@ -293,7 +285,7 @@ class RunHistory:
                         span.note = "not ended"
 
     def joints(self, names: list[str]) -> tuple[Array, Array, Array]:
-        """Times (n,) [s], positions (n, dof) [rad], velocities (n, dof) [rad/s] of joints; nan where none is told."""
+        """Return times (n,) [s], positions (n, dof) [rad] and velocities (n, dof) [rad/s], NaN where not recorded."""
         empty = [float("nan")] * len(names)
         times, positions, velocities = [], [], []
         for time, state in zip(self.joint_times, self.joint_states, strict=True):
@@ -306,24 +298,29 @@ class RunHistory:
         return np.array(times), np.array(positions).reshape(shape), np.array(velocities).reshape(shape)
 
 
-def footprint(thing: m.CollisionObject) -> Footprint:
-    """A solid of the planning scene, seen from above; a cylinder or sphere as a polygon."""
-    q, p = thing.pose.orientation, thing.pose.position
+def footprint(item: m.CollisionObject) -> Footprint:
+    """Return a solid of the planning scene from above; a cylinder or sphere as a polygon."""
+    q, p = item.pose.orientation, item.pose.position
     x = (1 - 2 * (q.y**2 + q.z**2), 2 * (q.x * q.y + q.z * q.w))
     y = (2 * (q.x * q.y - q.z * q.w), 1 - 2 * (q.x**2 + q.z**2))
-    if thing.shape == "box":
-        a, b = thing.dimensions[0] / 2, thing.dimensions[1] / 2
+    if item.shape == "box":
+        a, b = item.dimensions[0] / 2, item.dimensions[1] / 2
         flat = np.array([(a, b), (-a, b), (-a, -b), (a, -b)])
-    elif thing.shape == "prism":
-        flat = np.array(thing.outline)
+    elif item.shape == "prism":
+        flat = np.array(item.outline)
     else:
         turn = np.linspace(0, 2 * np.pi, 49)[:-1]
-        flat = thing.dimensions[0] * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+        flat = item.dimensions[0] * np.stack([np.cos(turn), np.sin(turn)], axis=1)
     corners = flat @ np.array([x, y]) + (p.x, p.y)
-    return Footprint(thing.id, thing.role, corners, (thing.color.r, thing.color.g, thing.color.b))
+    return Footprint(item.id, item.role, corners, (item.color.r, item.color.g, item.color.b))
+
+
+def _xyz(pose: m.Pose) -> Position:
+    return pose.position.x, pose.position.y, pose.position.z
 
 
 def _change(spans: list[Span], time: float, label: str, note: str) -> None:
+    """Start a new span if label or note change."""
     if spans and (spans[-1].label, spans[-1].note) == (label, note):
         return
     if spans:
@@ -331,19 +328,19 @@ def _change(spans: list[Span], time: float, label: str, note: str) -> None:
     spans.append(Span(label, time, None, note))
 
 
-def _while(spans: list[Span], time: float, lasts: bool, label: str) -> bool:
-    """Begin or end a span; whether one began."""
+def _while(spans: list[Span], time: float, active: bool, label: str) -> bool:
+    """Open or close a span; return whether one was opened."""
     open_one = spans[-1] if spans and spans[-1].until is None else None
-    if lasts and open_one is None:
+    if active and open_one is None:
         spans.append(Span(label, time))
         return True
-    if not lasts and open_one is not None:
+    if not active and open_one is not None:
         open_one.until = time
     return False
 
 
 def count_places(places: dict[tuple[int, int], int], poses: Iterable[m.Pose]) -> None:
-    """Count how often something was at a place from above, by place in steps of `SAME_PLACE`."""
+    """Count poses by their position from above, in steps of `SAME_PLACE`."""
     for pose in poses:
         key = round(pose.position.x / SAME_PLACE), round(pose.position.y / SAME_PLACE)
         places[key] = places.get(key, 0) + 1

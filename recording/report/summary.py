@@ -1,4 +1,4 @@
-"""The figures of a run that every cell has; the file that `run` writes."""
+"""Summary of a run: figures that every cell has; the file that `zencell run --summary` writes."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ from common.messages import (
 from recording.report.application import Figures
 from recording.report.history import Truth
 
-SAME_PLACE = 0.03  # [m] rejections closer than this are of the same thing
-NOT_LEFT_BEHIND = "inside the container"  # such a detection is of what was placed
-MOST_PLACES = 1000  # that are listed as rejected: the newest
-MOST_PLANS = 10_000  # of all lives of the task, the newest
-MAX_LATENCIES = 20_000  # of frames; the older half is forgotten then: the last quarter of an hour stays at 10 Hz
+SAME_PLACE = 0.03  # [m] rejections closer than this are of the same object
+NOT_LEFT_BEHIND = "inside the container"  # reason of a rejected detection of a placed object
+MOST_PLACES = 1000  # newest rejected positions that are listed
+MOST_PLANS = 10_000  # newest plans, over restarts of the task
+MAX_LATENCIES = 20_000  # of frames; then the older half is dropped: at 10 Hz the last quarter of an hour stays
 
 
 @dataclass
 class Rejected:
-    """Places that were rejected, each once."""
+    """Rejected positions without duplicates."""
 
     places: list[Rejection] = field(default_factory=list)
 
     def add(self, rejections: Iterable[Rejection]) -> None:
-        """Take note of rejections; of the same place only the newest reason is kept."""
+        """Add rejections; a newer one replaces that of the same position."""
         at = [_place(known.position) for known in self.places]
         for rejection in rejections:
             if NOT_LEFT_BEHIND in rejection.reason:
@@ -53,7 +53,7 @@ class Rejected:
 
 @dataclass
 class Counted:
-    """Figures of the task that start over when its process does."""
+    """Figures of the task that start at zero when its process restarts."""
 
     failures: int = 0
     retries: int = 0
@@ -63,11 +63,11 @@ class Counted:
 
     @classmethod
     def of(cls, status: TaskStatus) -> Counted:
-        """The figures in a status."""
+        """Return the figures of a status."""
         return cls(status.failures, status.retries, status.moving_seconds, status.planning_seconds, list(status.plans))
 
     def __add__(self, other: Counted) -> Counted:
-        """Figures of one life of the process and of the next."""
+        """Return the sum over two lives of the process."""
         return Counted(
             self.failures + other.failures,
             self.retries + other.retries,
@@ -77,7 +77,7 @@ class Counted:
         )
 
     def restarted_since(self, earlier: Counted) -> bool:
-        """Whether these figures cannot follow the earlier ones in one life of the process."""
+        """Return whether the process must have restarted since the earlier figures."""
         return (
             self.failures < earlier.failures
             or self.retries < earlier.retries
@@ -88,35 +88,35 @@ class Counted:
 
 
 class Summary:
-    """Gathers the figures of one run."""
+    """Figures of one run."""
 
     def __init__(
         self, cell: str, seed: int, speed: float, figures: Figures | None = None, containers: Sequence[str] = (),
         *, fills: bool = False,
     ) -> None:
-        """Start with nothing seen.
+        """Start without messages.
 
         Args:
             cell: name of the cell.
             seed: of the run.
-            speed: seconds of cell time per second of wall time.
-            figures: what the application says of the run.
-            containers: ids of those that the cell has.
-            fills: the task brings all that there is into containers.
+            speed: cell seconds per wall second.
+            figures: of the application.
+            containers: ids of the cell's containers.
+            fills: whether the task moves all objects into containers.
         """
         self.figures = figures or Figures()
         self.cell = cell
         self.seed = seed
         self.speed = speed
         self.status = TaskStatus()
-        self.ready: float | None = None  # wall time [s] from the start of the process to the cell being ready
-        self.first_motion: float | None = None  # wall time [s] from the start of the process
+        self.ready: float | None = None  # wall time from the start of this process until the cell was ready [s]
+        self.first_motion: float | None = None  # wall time since the start of this process [s]
         self.truth = Truth(tuple(containers))
         self.fills = fills
         self.rejected = Rejected()
         self.restarts: dict[str, int] = {}
-        self.failed = False  # the cell did not come up
-        self.chaos: list[dict[str, object]] | None = None  # faults that were made on purpose, if any were to be
+        self.failed = False  # whether the cell did not come up
+        self.chaos: list[dict[str, object]] | None = None  # injected faults, if enabled
         self._latencies = array("d")  # [ms]
         self._before = Counted()  # of earlier lives of the task's process
         self._now = Counted()
@@ -124,7 +124,7 @@ class Summary:
         self._task_until = 0.0  # cell time [s]
 
     def on_status(self, status: TaskStatus) -> None:
-        """Take note of the task's status."""
+        """Add a task status."""
         figures = Counted.of(status)
         if figures.restarted_since(self._now):
             self._before = self._before + self._now
@@ -137,32 +137,32 @@ class Summary:
             self._task_until = stamp
 
     def on_motion(self, time: float, status: MotionStatus) -> None:
-        """Take note of a motion's status at a wall time [s] from the start of the process."""
+        """Add a motion status; `time` is wall time since the start of this process [s]."""
         if status.state == "active" and self.first_motion is None:
             self.first_motion = time
 
     def on_rejections(self, _time: float, rejections: Rejections) -> None:
-        """Take note of what the task is not offered, and why."""
+        """Add rejected targets."""
         self.rejected.add(rejections.rejected)
 
     def on_latency(self, milliseconds: float) -> None:
-        """Take note of the time [ms] from a frame's exposure to the arrival of the targets seen in it."""
+        """Add the time from a frame's exposure to the arrival of the targets detected in it [ms]."""
         if len(self._latencies) == MAX_LATENCIES:
             del self._latencies[: MAX_LATENCIES // 2]
         self._latencies.append(milliseconds)
 
     @property
     def state(self) -> str:
-        """Where the task ended; ERROR too when the cell did not come up."""
+        """State of the task; ERROR if the cell did not come up."""
         return "ERROR" if self.failed else self.status.state
 
     @property
     def unexplained(self) -> list[list[float]]:
-        """Where [m] a task that is DONE left what it does not call rejected, by the truth of a simulated world."""
+        """Positions [m] of objects that a task left though it is DONE and did not reject them, by ground truth."""
         if not (self.fills and self.state == "DONE"):
             return []
-        named = [_xyz(place.position) for place in self._all_rejected().places]
-        return [[round(value, 4) for value in thing.position] for thing in self.truth.left(named)]
+        explained = [_xyz(place.position) for place in self._all_rejected().places]
+        return [[round(value, 4) for value in each.position] for each in self.truth.left(explained)]
 
     def _all_rejected(self) -> Rejected:
         rejected = Rejected(list(self.rejected.places))
@@ -170,16 +170,16 @@ class Summary:
         return rejected
 
     def write(self, file: Path) -> None:
-        """Write it as JSON, at once: a reader sees all of it or none."""
-        beside_it = file.with_name(file.name + ".part")
-        beside_it.write_text(json.dumps(self.as_dict(), indent=2) + "\n", encoding="utf-8")
-        beside_it.replace(file)
+        """Write the summary as JSON, atomically."""
+        part = file.with_name(file.name + ".part")
+        part.write_text(json.dumps(self.as_dict(), indent=2) + "\n", encoding="utf-8")
+        part.replace(file)
 
     def as_dict(self) -> dict[str, Any]:
-        """The summary file."""
+        """Return the content of the summary file."""
         rejected = self._all_rejected()
         figures = self._before + self._now
-        took = self._task_until - self._task_since if self._task_since is not None else 0.0
+        seconds = self._task_until - self._task_since if self._task_since is not None else 0.0
         return {
             "cell": self.cell,
             "state": self.state,
@@ -191,7 +191,7 @@ class Summary:
             "seconds": {
                 "ready": _rounded(self.ready),
                 "first_motion": _rounded(self.first_motion),
-                "task": _rounded(took),
+                "task": _rounded(seconds),
                 "moving": _rounded(figures.moving),
                 "planning": _rounded(figures.planning),
             },
@@ -213,18 +213,18 @@ class Summary:
 
 
 def percentile(values: Sequence[float], fraction: float) -> float | None:
-    """The value below which this fraction of the values lies (nearest rank); None of nothing."""
+    """Return the percentile for a fraction (nearest rank); None without values."""
     if not values:
         return None
     return sorted(values)[max(0, math.ceil(fraction * len(values)) - 1)]
 
 
 def describe(summary: dict[str, Any], application: Figures) -> list[str]:
-    """A summary in a few lines for people.
+    """Return a summary as a few lines of text.
 
     Args:
-        summary: as a file has it.
-        application: says how the run ended.
+        summary: content of a summary file.
+        application: provides the headline.
     """
     seconds = summary["seconds"]
     lines = [f"{summary['cell']}: {summary['state']}, {application.headline(summary)}"]
@@ -236,7 +236,7 @@ def describe(summary: dict[str, Any], application: Figures) -> list[str]:
     if summary.get("overlooked"):
         lines.append(f"  {summary['overlooked']}")
     for x, y, z in summary.get("unexplained", ()):
-        lines.append(f"  left at ({x:.3f}, {y:.3f}, {z:.3f}): not among what was rejected")
+        lines.append(f"  left at ({x:.3f}, {y:.3f}, {z:.3f}): not rejected by the task")
     times = [
         f"ready {_seconds(seconds['ready'])}",
         f"first motion {_seconds(seconds['first_motion'])}",
@@ -251,9 +251,9 @@ def describe(summary: dict[str, Any], application: Figures) -> list[str]:
         latency = summary["frame_to_target_ms"]
         lines.append(f"  frame to target {latency['p50']:.1f} ms (median), {latency['p99']:.1f} ms (99 %)")
     if "chaos" in summary:
-        lines.append(f"  {len(summary['chaos'])} faults on purpose")
+        lines.append(f"  {len(summary['chaos'])} injected faults")
     if restarted := {name: count for name, count in summary["restarts"].items() if count}:
-        lines.append("  started again: " + ", ".join(f"{name} {count} x" for name, count in restarted.items()))
+        lines.append("  restarts: " + ", ".join(f"{name} {count} x" for name, count in restarted.items()))
     return lines
 
 

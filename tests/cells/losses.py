@@ -33,7 +33,7 @@ class Arrivals:
         return (self.came - 1) / (self.last - self.first) if self.came > 1 else 0.0
 
     def add(self, sample: RawSample) -> None:
-        """Take note of a message."""
+        """Count a message."""
         now = time.monotonic()
         try:
             attachment = decode_attachment(sample.attachment)

@@ -1,6 +1,6 @@
 """Subscribers that do not keep up, as processes of their own: one reads slowly, one has stopped reading at all.
 
-`python -m tests.cells.subscribers ENDPOINT KEY SECONDS` is such a subscriber: it rests for so long over each message.
+`python -m tests.cells.subscribers ENDPOINT KEY SECONDS` is a subscriber that sleeps in each callback.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ class Subscriber:
         command = [sys.executable, "-m", "tests.cells.subscribers", endpoint, key, str(rest)]
         self.process = subprocess.Popen(command, cwd=ROOT, env=environment(), stdout=subprocess.PIPE, text=True)
         assert self.process.stdout is not None
-        self._told: IO[str] = self.process.stdout
-        if not self._told.readline():
+        self._output: IO[str] = self.process.stdout
+        if not self._output.readline():
             raise RuntimeError(f"a subscriber ended with {self.process.wait()}")
 
     def freeze(self) -> None:
@@ -57,7 +57,7 @@ class Subscriber:
         with suppress(ProcessLookupError):
             self.process.kill()
         self.process.wait()
-        self._told.close()
+        self._output.close()
 
 
 def main() -> int:
@@ -73,7 +73,7 @@ def main() -> int:
     print("subscribed to", subscriber.key_expr, flush=True)  # noqa: T201
     while os.getppid() == parent:
         time.sleep(0.5)
-    os._exit(0)  # closing would wait for the callback that rests
+    os._exit(0)  # closing would wait for the sleeping callback
 
 
 if __name__ == "__main__":

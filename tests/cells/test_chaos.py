@@ -13,7 +13,7 @@ pytestmark = [pytest.mark.cell, pytest.mark.slow]
 BALLS = 3
 
 
-async def test_a_run_under_a_plan_of_faults_ends_done_with_every_ball_in_the_box(tmp_path: Path) -> None:
+async def test_run_with_chaos_ends_done_with_every_ball_in_the_box(tmp_path: Path) -> None:
     options = ["--speed", "5", "--set", f"world.count={BALLS}", "--chaos", "7"]
     with RunningCell(tmp_path, "run", "panda", *options) as cell:
         assert await cell.ended(150) == 0, cell.tail(80)

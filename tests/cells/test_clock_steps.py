@@ -1,4 +1,4 @@
-"""Somebody sets the system clock of a host while a cell runs on it: real processes whose system clock is a file's."""
+"""The system clock of a host is set while a cell runs: real processes that read it from a file."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ time.time_ns = lambda: _time_ns() + int(1e9 * float(_step.read_text()))
 
 
 @pytest.mark.parametrize("step", [3600.0, -600.0])
-async def test_what_is_started_again_after_a_step_of_the_clock_keeps_the_time_of_the_cell(
+async def test_restarted_service_keeps_cell_time_after_a_clock_step(
     tmp_path: Path, step: float
 ) -> None:
     hook, file = tmp_path / "hook", tmp_path / "step"

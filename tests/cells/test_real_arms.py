@@ -51,8 +51,8 @@ def check_traced(cell: RunningCell, host: UrHost, stops: int = 0) -> None:
     assert host.tell()["stops"] == stops, cell.tail()
 
 
-async def check_told(cell: RunningCell) -> None:
-    """What a person tells the arm's controller from a terminal, while it moves."""
+async def check_commands(cell: RunningCell) -> None:
+    """Send commands to the arm's controller from a terminal while it moves."""
     for words, said in (
         (("io",), "inputs on: none\noutputs on: none"),
         (("io", "3", "up"), "zencell: io: 'up' must be on or off"),
@@ -63,17 +63,17 @@ async def check_told(cell: RunningCell) -> None:
 
 
 @on_ur
-async def test_an_outline_is_traced_through_a_protective_stop_and_a_pulled_cable(tmp_path: Path) -> None:
+async def test_outline_survives_a_protective_stop_and_a_pulled_cable(tmp_path: Path) -> None:
     with UrHost("127.0.0.51", q=HOME) as host, outliner(tmp_path, host) as cell:
         async with cell.listen() as bus:
             robot, motion = bus.reader(topics.ROBOT_STATUS), bus.reader(topics.MOTION_STATUS)
             await until(motion, lambda status: status.progress > 0.2, WHOLE)
             host.tell("protect")
-            told: RobotStatus = await until(robot, lambda status: status.mode == "protective_stop", SOON)
-            assert "recover" in told.message
+            reported: RobotStatus = await until(robot, lambda status: status.mode == "protective_stop", SOON)
+            assert "recover" in reported.message
             failed: MotionStatus = await until(motion, lambda status: bool(status.fault), SOON)
             assert failed.state == "aborted" and failed.error == "hardware_fault"
-            before = host.tell("normal")  # the pendant alone lets nothing go
+            before = host.tell("normal")  # the pendant alone releases nothing
             await until(robot, lambda status: "was stopped" in status.message, SOON)
             now = host.tell()
             assert now["commands"] == before["commands"] and not any(now["qd"])
@@ -84,11 +84,11 @@ async def test_an_outline_is_traced_through_a_protective_stop_and_a_pulled_cable
             await until(robot, lambda status: status.mode == "running", SOON)
             assert await cell.ended(WHOLE) == 0, cell.tail()
         check_traced(cell, host, stops=1)
-    assert "tester asks the arm: recover" in cell.text
+    assert "tester orders the arm: recover" in cell.text
 
 
 @on_ur
-async def test_an_outline_is_traced_through_a_cable_that_is_out_for_long_and_a_controller_that_is_rebooted(
+async def test_outline_survives_a_long_disconnection_and_a_controller_reboot(
     tmp_path: Path,
 ) -> None:
     with UrHost("127.0.0.52", q=HOME) as host, outliner(tmp_path, host) as cell:
@@ -111,14 +111,14 @@ async def test_an_outline_is_traced_through_a_cable_that_is_out_for_long_and_a_c
 
 
 @on_ur
-async def test_an_outline_is_traced_at_thirty_percent_of_the_slider(tmp_path: Path) -> None:
+async def test_outline_is_traced_at_thirty_percent_of_the_speed_slider(tmp_path: Path) -> None:
     with UrHost("127.0.0.53", q=HOME) as host, outliner(tmp_path, host) as cell:
         host.tell("slider 0.3")
         async with cell.listen() as bus:
             motion = bus.reader(topics.MOTION_STATUS)
             await until(motion, lambda status: status.state == "active" and status.progress > 0.2, WHOLE)
             assert motion.latest is not None and motion.latest.speed_scaling == pytest.approx(0.3)
-            await check_told(cell)
+            await check_commands(cell)
             assert await cell.ended(WHOLE + SOON) == 0, cell.tail()
         check_traced(cell, host)
         assert host.tell()["fastest"] <= 0.3 * 3.14159 * 1.05
@@ -133,7 +133,7 @@ def picker(folder: Path) -> RunningCell:
 
 @on_franka
 @pytest.mark.timeout(600)
-async def test_balls_are_brought_through_a_reflex_silences_and_a_controller_that_is_started_again(
+async def test_balls_are_placed_despite_a_reflex_silences_and_a_controller_restart(
     tmp_path: Path,
 ) -> None:
     with FrankaHost() as host, picker(tmp_path) as cell:
@@ -146,14 +146,14 @@ async def test_balls_are_brought_through_a_reflex_silences_and_a_controller_that
 
             await under_way()
             host.hit()
-            told: RobotStatus = await until(robot, lambda status: status.mode == "protective_stop", SOON)
-            assert "cartesian reflex" in told.message and "recover" in told.message
+            reported: RobotStatus = await until(robot, lambda status: status.mode == "protective_stop", SOON)
+            assert "cartesian reflex" in reported.message and "recover" in reported.message
             failed: MotionStatus = await until(motion, lambda status: bool(status.fault), SOON)
             assert failed.state == "aborted" and failed.error == "hardware_fault"
             await asyncio.sleep(BRAKES)
-            stood = host.stands
+            stopped_at = host.stands
             await asyncio.sleep(2.0)
-            assert host.stands == pytest.approx(stood, abs=1e-3), "nobody has asked for that"
+            assert host.stands == pytest.approx(stopped_at, abs=1e-3), "no motion was requested"
             await bus.client(topics.ROBOT_COMMAND).call(RobotCommand(act="recover", owner="tester"), SOON)
             for silent in (1.0, PULLED):
                 await under_way()
@@ -162,12 +162,12 @@ async def test_balls_are_brought_through_a_reflex_silences_and_a_controller_that
             await under_way()
             host.crash()
             await until(robot, lambda status: status.mode == "disconnected", SOON)
-            stood = host.stands
+            stopped_at = host.stands
             await asyncio.to_thread(host.boot)
             await until(robot, lambda status: status.mode == "running", SOON)
-            assert host.stands == pytest.approx(stood, abs=0.05), "it went on from where it stood"
+            assert host.stands == pytest.approx(stopped_at, abs=0.05), "it resumed from where it stopped"
             assert await cell.ended(2 * WHOLE) == 0, cell.tail()
     summary = cell.summary
     assert summary["state"] == "DONE" and summary["failures"] == 0, cell.text
     assert summary["placed"] == summary["truth"]["in_box"] == 7, summary
-    assert "tester asks the arm: recover" in cell.text
+    assert "tester orders the arm: recover" in cell.text

@@ -88,7 +88,7 @@ async def replay(folder: Path) -> dict[int, Any]:
     return replayed
 
 
-def test_replayed_pictures_give_what_they_gave_live(tmp_path: Path) -> None:
+def test_replayed_images_give_the_live_detections(tmp_path: Path) -> None:
     recording = asyncio.run(record_live(tmp_path))
     live = found_in(recording, TOPIC.key)
     replayed = asyncio.run(replay(tmp_path))

@@ -23,14 +23,14 @@ async def until_all_are_up(cell: RunningCell) -> None:
         await bus.alive.wait(SERVICES[-1], 60.0)
 
 
-def test_a_cell_that_is_up_knows_them_by_their_names(tmp_path: Path) -> None:
+def test_running_cell_lists_several_services_of_a_kind_by_name(tmp_path: Path) -> None:
     with RunningCell(tmp_path, "up", CELL, "--set", "autostart=false") as cell:
         asyncio.run(until_all_are_up(cell))
         place = Place(tmp_path, cell.domain)
         listed = place.ask("node", "list").stdout.split()
         assert {f"two_cameras/{name}" for name in SERVICES} <= set(listed)
-        told = json.loads(place.ask("topic", "info", "left/camera/image_raw", "--json").stdout)
-        assert (told["writer"], told["message"], told["kind"]) == ("left_camera", "Image", "stream")
+        topic = json.loads(place.ask("topic", "info", "left/camera/image_raw", "--json").stdout)
+        assert (topic["writer"], topic["message"], topic["kind"]) == ("left_camera", "Image", "stream")
         listed = [json.loads(line) for line in place.ask("topic", "list", "--json").stdout.splitlines()]
         own = {one["key"]: (one["writer"], one["message"], one["kind"]) for one in listed}
         assert own["right/camera/camera_info"] == ("right_camera", "CameraInfo", "state")
@@ -40,7 +40,7 @@ def test_a_cell_that_is_up_knows_them_by_their_names(tmp_path: Path) -> None:
         assert [float(rate) for rate in rates] == [10.0, 5.0]
         info = json.loads(place.ask("topic", "echo", "left/camera/camera_info", "-n", "1", "--json").stdout)
         assert info["header"]["frame_id"] == "left_optical_frame"
-        # One more of what is there is refused, also when a person starts it.
+        # A second instance is refused, also when a user starts it.
         twice = cell.tell("service", "left_camera", "--cell", CELL)
         assert twice.returncode == 2
         assert "another left_camera is up, which has left/camera/camera_info already" in twice.stderr.splitlines()[-1]

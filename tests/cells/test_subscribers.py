@@ -1,4 +1,4 @@
-"""Subscribers that do not keep up beside a whole cell: it does not notice."""
+"""Slow and frozen subscribers of a complete cell, which must not be affected."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from tests.harness import RunningCell, beside, until
 pytestmark = [pytest.mark.cell, pytest.mark.slow]
 
 
-async def newest_counters(bus: Bus, told: dict[str, ServiceCounters]) -> None:
+async def newest_counters(bus: Bus, newest: dict[str, ServiceCounters]) -> None:
     async for counters in bus.reader(topics.COUNTERS):
-        told[counters.service] = counters
+        newest[counters.service] = counters
 
 
-async def test_a_slow_and_a_frozen_subscriber_keep_nobody_from_anything(tmp_path: Path) -> None:
-    told: dict[str, ServiceCounters] = {}
+async def test_slow_and_frozen_subscribers_block_no_service(tmp_path: Path) -> None:
+    newest: dict[str, ServiceCounters] = {}
     settings = ("autostart=false", "world.count=2", "services.camera_simulator.rate=30")
     with RunningCell(tmp_path, "up", "panda", "--speed", "5", *(f"--set={one}" for one in settings)) as cell:
         async with cell.listen() as bus:
@@ -36,7 +36,7 @@ async def test_a_slow_and_a_frozen_subscriber_keep_nobody_from_anything(tmp_path
             )
             with slow, stuck:
                 stuck.freeze()
-                async with beside(newest_counters(bus, told)):
+                async with beside(newest_counters(bus, newest)):
                     await task.call(TaskCommand(command="start"), 10.0)
                     await until(status, lambda one: one.state in ("DONE", "ERROR"), 90.0)
                     losses.stop()
@@ -51,5 +51,5 @@ async def test_a_slow_and_a_frozen_subscriber_keep_nobody_from_anything(tmp_path
                            topics.COUNTERS.key}
     # On a machine that is too busy a state may be replaced on its way by the next one; `make soak` counts those too.
     assert not {key: one.lost for key, one in came.items() if one.lost and losses.kind(key) == "event"}
-    overflow = sum((Counter(counters.overflow) for counters in told.values()), Counter())
-    assert told and not overflow
+    overflow = sum((Counter(counters.overflow) for counters in newest.values()), Counter())
+    assert newest and not overflow

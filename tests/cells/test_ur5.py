@@ -1,4 +1,4 @@
-"""The UR5 cell as a person at a terminal meets it: a snapshot, a choice, a question."""
+"""The UR5 cell from a terminal: snapshot, selection of an object, a question."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def up(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningCell]:
         yield cell
 
 
-def test_snapshot_of_a_cell_that_is_up_can_be_planned_from_its_files_alone(up: RunningCell, tmp_path: Path) -> None:
+def test_snapshot_of_a_running_cell_can_be_planned_from_its_files(up: RunningCell, tmp_path: Path) -> None:
     stored = up.tell("snapshot", "ur5", str(tmp_path), "--select", "green")
     assert stored.returncode == 0, stored.stderr
     names = {"camera_image.png", "depth_camera_image.png", "depth_camera_image_normalized.png", "depth_data.npy",
@@ -65,7 +65,7 @@ def test_snapshot_of_a_cell_that_is_up_can_be_planned_from_its_files_alone(up: R
     assert {path.name for path in tmp_path.iterdir()} == names
 
 
-def test_object_that_is_not_there_is_refused_with_the_choices_and_another_is_chosen_and_begun(up: RunningCell) -> None:
+def test_missing_object_is_rejected_with_choices_and_another_is_selected(up: RunningCell) -> None:
     refused = up.tell("task", "select", "7")
     assert refused.returncode == 1
     assert "there is no contour 7; choices: 0 (Object_0, " in refused.stderr
@@ -81,7 +81,7 @@ def test_object_that_is_not_there_is_refused_with_the_choices_and_another_is_cho
             started = up.tell("task", "start")
             assert started.returncode == 0, started.stderr
             status = bus.reader(OUTLINE_STATUS)
-            await until(status, lambda told: told.object == label and told.stage == "approach", 60)
+            await until(status, lambda s: s.object == label and s.stage == "approach", 60)
 
     asyncio.run(begin())
     up.interrupt()
@@ -89,7 +89,7 @@ def test_object_that_is_not_there_is_refused_with_the_choices_and_another_is_cho
     assert up.summary["outline"]["object"] == label
 
 
-def test_person_at_the_terminal_is_asked_and_gets_a_picture(tmp_path: Path) -> None:
+def test_terminal_user_selects_an_object_from_an_image(tmp_path: Path) -> None:
     domain = str(free_domain())
     command = command_line("run", "ur5", "--ask", "--world", "w5", "--speed", "10", "--no-viewer", "--domain", domain)
     child, terminal = pty.fork()

@@ -38,7 +38,7 @@ async def freeze(bus: Bus, cell: RunningCell, name: str) -> None:
 
 
 @pytest.mark.slow
-async def test_processes_that_are_frozen_are_started_again_and_no_other(tmp_path: Path) -> None:
+async def test_frozen_processes_and_no_others_are_restarted(tmp_path: Path) -> None:
     options = ("--speed", "3", "--set", "world.count=3", "--set", "watchdogs.silence=4")
     with RunningCell(tmp_path, "run", "panda", *options) as cell:
         async with cell.listen() as bus:
@@ -68,7 +68,7 @@ def up(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningCell]:
 
 
 @pytest.mark.slow
-async def test_a_service_whose_loop_is_stuck_tells_where_and_is_started_again(up: RunningCell) -> None:
+async def test_service_with_a_stuck_loop_reports_where_and_is_restarted(up: RunningCell) -> None:
     async with up.listen() as bus:
         supervisor = bus.reader(topics.SUPERVISOR_STATUS)
         client = bus.client(topics.parameters_of("stuck"))
@@ -84,7 +84,7 @@ async def test_a_service_whose_loop_is_stuck_tells_where_and_is_started_again(up
 
 
 @pytest.mark.slow  # `make test` does it with tiny services, in tests/cli/test_bring_up.py
-async def test_nothing_is_left_of_a_cell_whose_supervisor_is_killed_not_even_what_is_frozen(up: RunningCell) -> None:
+async def test_killed_supervisor_leaves_no_process_not_even_frozen_ones(up: RunningCell) -> None:
     async with up.listen() as bus:
         task = bus.client(topics.TASK_COMMAND)
         await task.wait_available(60.0)

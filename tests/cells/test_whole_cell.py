@@ -1,4 +1,4 @@
-"""The Panda cell as a person starts it: processes, the closed loop, figures, what is read from outside, the end."""
+"""The Panda cell with real processes: start, closed loop, figures, external clients, end."""
 
 from __future__ import annotations
 
@@ -51,11 +51,11 @@ def up(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningCell]:
         yield cell
 
 
-def test_every_process_is_there_once(up: RunningCell) -> None:
+def test_every_process_runs_once(up: RunningCell) -> None:
     assert sorted(up.processes()) == sorted(["router", *SERVICES])
 
 
-def test_zenoh_cli_decodes_the_topics_with_the_line_that_is_printed(up: RunningCell) -> None:
+def test_printed_zenoh_cli_command_decodes_the_topics(up: RunningCell) -> None:
     printed = next(line for line in up.text.splitlines() if line.startswith("zenoh --mode client"))
     program, *arguments = shlex.split(printed)
     assert arguments == ["--mode", "client", "--connect", up.endpoint, "subscribe", "-k", "panda/**", "--decoder",
@@ -87,14 +87,14 @@ def test_zenoh_cli_decodes_the_topics_with_the_line_that_is_printed(up: RunningC
 
 
 @pytest.mark.slow
-def test_the_camera_sends_no_more_than_about_ten_pictures_each_second(up: RunningCell) -> None:
+def test_camera_publishes_at_most_about_ten_images_a_second(up: RunningCell) -> None:
     answer = up.tell("topic", "hz", "camera/image_raw", "--count", "3", "--json")
     assert answer.returncode == 0, answer.stderr
     last = json.loads(answer.stdout.splitlines()[-1])
     assert 1 < last["hz"] < 13  # fewer on a machine that is busy
 
 
-async def test_it_is_jogged_from_a_terminal_until_that_dies_and_is_nobodys_then(up: RunningCell) -> None:
+async def test_terminal_jogs_the_arm_and_releases_it_when_killed(up: RunningCell) -> None:
     jogging = await asyncio.to_thread(
         subprocess.Popen, command_line("robot", "jog", "--linear", "0,0,0.05", "--seconds", "60", "--domain",
                                        str(up.domain)), env=environment(up.folder), stdout=subprocess.DEVNULL)
@@ -107,10 +107,10 @@ async def test_it_is_jogged_from_a_terminal_until_that_dies_and_is_nobodys_then(
             await until(joints, lambda j: largest_way(first, j) > 0.05)
             jogging.kill()
             await until(owner, lambda o: o.kind == "none" and not o.jogging)
-            rests = await joints.next()
-            later = await until(joints, lambda j: j.header.stamp > rests.header.stamp + 1_000_000_000)
+            at_rest = await joints.next()
+            later = await until(joints, lambda j: j.header.stamp > at_rest.header.stamp + 1_000_000_000)
             # Brakes end where rounding of a ramp puts them: some 1e-31 rad from one message to the next.
-            assert largest_way(rests, later) < 1e-12 and max(map(abs, later.velocity)) < 1e-12
+            assert largest_way(at_rest, later) < 1e-12 and max(map(abs, later.velocity)) < 1e-12
     finally:
         jogging.kill()
         jogging.wait()
@@ -121,25 +121,26 @@ async def test_it_is_jogged_from_a_terminal_until_that_dies_and_is_nobodys_then(
     (["take"], "the motion is .* \\(operator\\) since .* UTC\n"), (["give"], "the motion is free\n"),
     (["give"], "the motion is free\n"),
     (["jog"], "zencell: jog: needs --joint NAME=V, --linear X,Y,Z or --angular X,Y,Z\n"),
-    (["jog", "--linear", "1,2"], "zencell: --linear: '1,2' must be three numbers apart by commas, as 0.3,-0.1,0\n"),
+    (["jog", "--linear", "1,2"],
+     "zencell: --linear: '1,2' must be three numbers separated by commas, such as 0.3,-0.1,0\n"),
     (["jog", "--joint", "nose=1"], "zencell: unknown joint 'nose'; choices: panda_finger_joint1, .*\n"),
     (["jog", "--linear", "0,0,1", "--frame", "moon"], "zencell: jog.frame: 'moon' must be .*\n"),
     (["jog", "--linear", "0,0,1", "--seconds", "99"],
      "zencell: --seconds: 99.0 must be more than 0 and at most 60 s\n"),
 ])
-def test_who_takes_gives_and_jogs_is_told_in_one_line(up: RunningCell, arguments: list[str], wanted: str) -> None:
+def test_taking_releasing_and_jogging_print_one_line(up: RunningCell, arguments: list[str], wanted: str) -> None:
     said = up.tell("robot", *arguments)
     assert re.fullmatch(wanted, said.stdout + said.stderr)
 
 
-def test_interrupted_while_waiting_it_is_gone_and_says_so(up: RunningCell) -> None:
+def test_interrupted_waiting_run_ends_with_a_message(up: RunningCell) -> None:
     up.interrupt()
     assert asyncio.run(up.ended(GONE)) == 0
     assert not up.processes()
     assert up.summary["state"] == "IDLE"
 
 
-def test_a_run_ends_with_everything_in_the_box_and_all_figures(tmp_path: Path) -> None:
+def test_run_ends_with_all_balls_in_the_box_and_all_figures(tmp_path: Path) -> None:
     with RunningCell(tmp_path, "run", "panda", "--speed", "10", "--seed", "5", "--set", "world.count=2") as cell:
         assert asyncio.run(cell.ended(90)) == 0, cell.tail()
         assert not cell.processes()
@@ -178,7 +179,7 @@ def descendants(cell: RunningCell) -> list[str]:
 
 
 @pytest.mark.slow
-def test_interrupted_with_a_ball_in_the_hand_it_is_gone_and_has_written_the_summary(tmp_path: Path) -> None:
+def test_interrupted_run_writes_the_summary_and_leaves_no_process(tmp_path: Path) -> None:
     with RunningCell(tmp_path, "run", "panda", "--speed", "5") as cell:
 
         async def hold() -> None:
@@ -195,7 +196,7 @@ def test_interrupted_with_a_ball_in_the_hand_it_is_gone_and_has_written_the_summ
 
 
 @pytest.mark.slow
-def test_a_value_that_only_a_service_can_judge_exits_2_with_one_line(tmp_path: Path) -> None:
+def test_value_that_only_a_service_can_check_exits_2_with_one_line(tmp_path: Path) -> None:
     with RunningCell(tmp_path, "run", "panda", "--set", "services.camera_simulator.rate=-1") as cell:
         assert asyncio.run(cell.ended(30)) == 2
         said = [line for line in cell.text.splitlines() if line.startswith("zencell: ")]

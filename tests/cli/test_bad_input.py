@@ -59,7 +59,7 @@ CASES: dict[str, tuple[list[str], list[str]]] = {
     "no cell": (["run"], ["CELL"]),
     "unknown topic": (["topic", "info", "joint_state"], ["unknown key", "did you mean 'joint_states'?"]),
     "cell file whose name begins no key": (["check", "a cell.yaml"], ["'a cell' is no name of a cell", "letters"]),
-    "cell that stands for several": (["task", "stop", "--cell", "*"], ["cell: '*'", "is no name that a cell can have"]),
+    "cell that stands for several": (["task", "stop", "--cell", "*"], ["cell: '*'", "is not a valid name of a cell"]),
     "cell of two parts": (["play", RECORDING, "--cell", "a/b"], ["--cell: 'a/b'", "is no name"]),
     "key of a part without a name": (["topic", "pub", "my//key", "{}"], ["unknown key 'my//key'", "choices:"]),
     "key that stands for several": (["topic", "pub", "my/*", "{}"], ["unknown key 'my/*'", "choices:"]),
@@ -132,7 +132,7 @@ def test_what_became_of_a_run_is_said_although_its_file_cannot_be_written(
 
     folder = tmp_path / "figures"
     folder.mkdir()
-    monkeypatch.setattr(CellSession, "_operate", operate)
+    monkeypatch.setattr(CellSession, "_run", operate)
     assert app.execute(["run", "panda", "--domain", str(domain), "--summary", str(folder / "s.json")]) == 1
     shown = capsys.readouterr()
     assert "panda: IDLE, 0 of 0 placed" in shown.out

@@ -92,7 +92,7 @@ def test_a_frozen_service_is_killed_and_a_second_interrupt_does_so_at_once(zence
     command.interrupt()
     command.until("stopped")  # the last one; the middle cannot
     command.interrupt()
-    command.until("middle does not end; killed")
+    command.until("middle did not end in time; killed")
     assert command.end() == 0
     assert not command.children()
 

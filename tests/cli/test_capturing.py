@@ -49,7 +49,7 @@ async def kind_of(network: LocalNetwork, own: CustomTopics | None, *, ready_firs
     """What a renamed state, first written after the recorder began, is recorded as."""
     kept, recorder = Kept(), bus_of(network, "recorder")
     capture = Capture(recorder, Selection.of(), kept, own)  # type: ignore[arg-type]
-    await capture.begin()
+    await capture.start()
     camera = bus_of(network, "left_camera", RENAMED)
     infos = camera.writer(topics.CAMERA_INFO)
     if ready_first:
@@ -57,7 +57,7 @@ async def kind_of(network: LocalNetwork, own: CustomTopics | None, *, ready_firs
     infos.put(INFO)
     async with asyncio.timeout(10):
         found = await kept.kind
-    capture.end()
+    capture.stop()
     for bus in (camera, recorder):
         await bus.close()
     return found

@@ -31,7 +31,7 @@ QUICK = [
                "robot.gripper.max_width=0.04003"], "error", "'panda_finger_joint1' slides (prismatic)", True),
     ("panda", ["robot.gripper.max_width=0.2"], "warning", "would go from 0 to 0.1 m", False),
     ("panda", ["world.camera.position=[2.0,0,0.8]"], "warning", "100 % of the top of table is outside", False),
-    ("panda", ["world.camera.position=[2.0,0,0.8]"], "warning", "ball_1 at (0.4, -0.3) is wholly outside", False),
+    ("panda", ["world.camera.position=[2.0,0,0.8]"], "warning", "ball_1 at (0.4, -0.3) is completely outside", False),
     ("panda", ["world.balls=[[0.77,0.0]]"], "warning", "ball_1 at (0.77, 0) is to", False),
     ("panda", ["services.vision_detector.min_contour_area_px=3000"], "error", "ball_1 appears on 1227 px^2", False),
     ("panda", ["world.ball_color=[0,1,0]"], "error", "which no window of vision_detector holds", False),
@@ -42,16 +42,16 @@ QUICK = [
     ("panda", ["world.objects=[{id: cube, shape: box, size: [0.04,0.04,0.04], x: 0.4, y: -0.29}]"], "error",
      "ball_1 at (0.4, -0.3) and cube at (0.4, -0.29) overlap", False),
     ("panda", ["world.objects=[{id: cube, shape: box, size: [0.04,0.04,0.04], x: 0.47, y: 0.25}]"], "warning",
-     "cube at (0.47, 0.25) stands in a wall of box", False),
+     "cube at (0.47, 0.25) intersects a wall of box", False),
     ("panda", ["world.objects=[{id: cube, shape: box, size: [0.04,0.04,0.04], x: 0.5, y: 0.7}]"], "warning",
-     "cube at (0.5, 0.7) is beside the table", False),
+     "cube at (0.5, 0.7) is not on the table", False),
     ("panda", ["world.objects=[{id: cube, shape: box, size: [0.04,0.04,0.04], x: 0.5, y: -0.1}]"], "warning",
      "cube is a box, vision_detector looks for spheres", False),
 ]
 HAND = str(Path(__file__).parents[1] / "data" / "hand_camera.yaml")  # what is seen is seen from home
 QUICK += [
     (HAND, ["world.camera.position=[1.06,0,-0.1]"], "warning",
-     "ball_1 at (0.4, -0.3) is wholly outside of the picture from home", False),
+     "ball_1 at (0.4, -0.3) is completely outside of the image from home", False),
     (HAND, ["services.vision_detector.min_contour_area_px=3000"], "error", "ball_1 appears on", False),
 ]
 THOROUGH = [
@@ -85,7 +85,7 @@ def test_link_that_a_camera_sits_on_and_that_the_robot_has_not_is_told_with_the_
     both = str(Path(HAND).with_name("hand_and_fixed.yaml"))
     (found, *_) = check_files(load_cell(both, ["world.cameras.hand.mount=x"]))
     assert found.what.startswith("world.cameras.hand.mount: 'x' is")
-    with pytest.raises(ConfigError, match="needs position and rpy: where it sits on tcp"):
+    with pytest.raises(ConfigError, match="needs position and rpy in tcp"):
         load_cell("panda", ["world.camera={mount: tcp}"])
 
 
@@ -121,12 +121,12 @@ def test_task_that_is_no_service_of_the_cell_is_told():
 def test_two_writers_and_readers_of_what_nobody_writes_are_told():
     found = list(check_wiring([
         Keys("left", ["image"], ["found"], [], ["motion/plan"]), Keys("right", [], ["found"], ["move"], ["move"]),
-        Keys("page", ["anything"], [], [], [], shows=True), Keys("log_reader", ["log"], [], [], []),
+        Keys("page", ["anything"], [], [], [], reads_any=True), Keys("log_reader", ["log"], [], [], []),
     ]))
     assert [(each.severity, each.refused, each.what) for each in found] == [
         ("error", True, "services.right: left has found already, and a key is written or served by one service"),
-        ("warning", False, "services.left: reads image, which nobody in the cell writes"),
-        ("warning", False, "services.left: asks motion/plan, which nobody in the cell serves"),
+        ("warning", False, "services.left: reads image, which no service of the cell writes"),
+        ("warning", False, "services.left: calls motion/plan, which no service of the cell serves"),
     ]
 
 
@@ -137,7 +137,7 @@ def test_parameter_that_nobody_reads_and_key_that_names_nothing_are_told_once_ea
     assert done.returncode == 1 and all(each["severity"] == "error" and each["refused"] for each in found)
     assert [each["what"].partition(";")[0] for each in found] == [
         "services.vision_detector.speling: 3 is not a parameter",
-        "services.scene_manager.topics: 'camra/*' is no key that it reads, writes, serves or asks"]
+        "services.scene_manager.topics: 'camra/*' is no key that it reads, writes, serves or calls"]
 
 
 def test_cell_that_is_well_says_so_and_bad_input_is_one_line(tmp_path):

@@ -12,7 +12,7 @@ from common.config import Parameters
 from common.process.service import serve_parameters
 from common.transport.bus import Bus
 from common.transport.local import LocalNetwork
-from tools.doctor.clocks import Skew, judged, skews_of
+from tools.doctor.clocks import Skew, clock_findings, skews_of
 
 
 class Shifted(Clock):
@@ -53,14 +53,14 @@ async def test_service_that_does_not_answer_is_left_out() -> None:
 
 
 def test_clocks_that_agree_take_one_line() -> None:
-    (finding,) = judged("panda", {"a": Skew(0.001, 0.0005), "b": Skew(-0.004, 0.0006)})
+    (finding,) = clock_findings("panda", {"a": Skew(0.001, 0.0005), "b": Skew(-0.004, 0.0006)})
     assert finding.level == "ok" and "2 services" in finding.what
     assert "4.0 ms behind this one (± 0.6 ms)" in finding.what
 
 
 @pytest.mark.parametrize(("ahead", "level"), [(0.04, "ok"), (-0.1, "warn"), (1.3, "fail"), (-1.3, "fail")])
 def test_clock_that_is_off_is_named_with_what_to_do(ahead: float, level: str) -> None:
-    findings = list(judged("panda", {"camera_simulator": Skew(ahead, 0.001)}))
+    findings = list(clock_findings("panda", {"camera_simulator": Skew(ahead, 0.001)}))
     assert [finding.level for finding in findings] == [level]
     if level != "ok":
         assert "panda/camera_simulator" in findings[0].what and "chrony" in findings[0].remedy
@@ -68,5 +68,5 @@ def test_clock_that_is_off_is_named_with_what_to_do(ahead: float, level: str) ->
 
 
 def test_what_the_round_trip_can_not_tell_is_no_fault_of_a_clock() -> None:
-    (finding,) = judged("panda", {"camera_simulator": Skew(1.3, 1.3)})
+    (finding,) = clock_findings("panda", {"camera_simulator": Skew(1.3, 1.3)})
     assert finding.level == "ok"

@@ -5,8 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from cli import choices as offers
-from cli import completion
+from cli import choices, completion
 from common.application import all_topics
 from common.config import load_cell, service_config, service_names
 from common.planning.planners import planner_names
@@ -94,37 +93,37 @@ def words(offered: list[tuple[str, str]]) -> set[str]:
 
 def test_keys_are_those_of_the_topic_table() -> None:
     topics = all_topics()
-    assert words(offers.keys("")) == set(topics)
-    assert words(offers.published("")) == {key for key, topic in topics.items() if isinstance(topic, Topic)}
-    assert dict(offers.keys("tf")) == {key: topics[key].doc for key in ("tf", "tf_static")}
-    for _, about in (*offers.parameters(""), *offers.keys(""), *offers.services("")):
-        assert len(about) <= offers.LONGEST_DOC and "[" not in about
+    assert words(choices.keys("")) == set(topics)
+    assert words(choices.published("")) == {key for key, topic in topics.items() if isinstance(topic, Topic)}
+    assert dict(choices.keys("tf")) == {key: topics[key].doc for key in ("tf", "tf_static")}
+    for _, about in (*choices.parameters(""), *choices.keys(""), *choices.services("")):
+        assert len(about) <= choices.LONGEST_DOC and "[" not in about
 
 
 def test_services_and_planners_are_those_that_there_are() -> None:
-    assert words(offers.services("")) == set(service_names()) - {"router"}
-    assert words(offers.planners("")) == set(planner_names())
+    assert words(choices.services("")) == set(service_names()) - {"router"}
+    assert words(choices.planners("")) == set(planner_names())
 
 
 def test_parameters_are_those_of_the_models() -> None:
     from common.config.tunables import leaves
 
     cell = load_cell("panda")
-    found = words(offers.parameters("services."))
+    found = words(choices.parameters("services."))
     names = [name for name in service_names() if name != "router"]
     wanted: set[str] = set()
     for name in names:
         config = service_config(cell, name, importlib.import_module(f"services.{name}").Config)
         wanted |= {path for path in leaves(config, name) if path.startswith("services.")}
     assert found == wanted
-    assert {"motion.velocity_scaling", "world.count", "robot.hardware.backend"} <= words(offers.parameters(""))
+    assert {"motion.velocity_scaling", "world.count", "robot.hardware.backend"} <= words(choices.parameters(""))
 
 
 @pytest.mark.parametrize("typed", ["", "s", "services", "services.v", "services.viewer.po", "motion", "motion.", "x"])
 def test_what_was_typed_leaves_out_nothing_that_begins_so(typed: str) -> None:
-    wanted = {word for word in words(offers.parameters("")) if word.startswith(typed)}
-    assert words(offers.parameters(typed)) == wanted
+    wanted = {word for word in words(choices.parameters("")) if word.startswith(typed)}
+    assert words(choices.parameters(typed)) == wanted
 
 
 def test_every_override_can_be_completed_further() -> None:
-    assert all(word.endswith("=") for word in words(offers.overrides("world.")))
+    assert all(word.endswith("=") for word in words(choices.overrides("world.")))

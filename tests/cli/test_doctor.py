@@ -20,7 +20,7 @@ from common.transport.local import LocalNetwork
 from tests.harness import Zencell
 from tools.doctor import Finding, examination, machine, network, software
 from tools.doctor.examination import examine
-from tools.doctor.machine import Seen
+from tools.doctor.machine import Process, process_findings
 
 Disk = namedtuple("Disk", "total used free")
 NOWHERE = "tcp/127.0.0.1:1"
@@ -262,48 +262,48 @@ async def test_version_is_read_from_what_the_supervisor_says(monkeypatch: pytest
 
 
 def seen(pid: int, ppid: int, command: tuple[str, ...], status: str = "sleeping", age: float = 100.0,
-         name: str = "python") -> Seen:
-    return Seen(pid, ppid, name, status, age, command)
+         name: str = "python") -> Process:
+    return Process(pid, ppid, name, status, age, command)
 
 
 def test_cell_that_is_up_is_no_leftover() -> None:
-    findings = list(machine.judge([seen(1, 0, ("init",)), seen(10, 1, RUNNING, age=7300), seen(11, 10, SERVICE)]))
+    findings = list(process_findings([seen(1, 0, ("init",)), seen(10, 1, RUNNING, age=7300), seen(11, 10, SERVICE)]))
     assert [finding.level for finding in findings] == ["ok", "ok"]
-    assert findings[0].what == "a cell is up, or comes up: zencell up panda (10), for 2 h"
+    assert findings[0].what == "a cell runs or starts: zencell up panda (10), for 2 h"
 
 
 @pytest.mark.parametrize("parent", [seen(1, 0, ("/sbin/init",)), seen(5, 1, ("/usr/bin/tini",), name="tini")])
-def test_service_whose_supervisor_was_killed_is_to_be_killed(parent: Seen) -> None:
-    (finding,) = machine.judge([parent, seen(11, parent.pid, SERVICE, "stopped"), seen(12, parent.pid, SERVICE)])
+def test_service_whose_supervisor_was_killed_is_to_be_killed(parent: Process) -> None:
+    (finding,) = process_findings([parent, seen(11, parent.pid, SERVICE, "stopped"), seen(12, parent.pid, SERVICE)])
     not_well(finding, "without a supervisor: vision_detector (11), vision_detector (12)", "kill -9 11 12")
 
 
 def test_service_of_a_parent_that_can_not_be_seen_is_without_a_supervisor() -> None:
-    (finding,) = machine.judge([seen(11, 10, SERVICE)])
+    (finding,) = process_findings([seen(11, 10, SERVICE)])
     not_well(finding, "kill -9 11")
 
 
 def test_stopped_service_of_a_living_cell_can_go_on() -> None:
-    finding, up = machine.judge([seen(10, 1, RUNNING), seen(11, 10, SERVICE, "stopped"), seen(12, 10, SERVICE)])
+    finding, up = process_findings([seen(10, 1, RUNNING), seen(11, 10, SERVICE, "stopped"), seen(12, 10, SERVICE)])
     not_well(finding, "stopped (SIGSTOP): vision_detector (11)", "kill -CONT 11")
     assert up.level == "ok"
 
 
 def test_stopped_supervisor_can_go_on_or_be_ended() -> None:
-    (finding,) = machine.judge([seen(10, 1, RUNNING, "stopped"), seen(11, 10, SERVICE)])
+    (finding,) = process_findings([seen(10, 1, RUNNING, "stopped"), seen(11, 10, SERVICE)])
     not_well(finding, "a supervisor is stopped", "zencell up panda (10)", "kill -CONT 10", "kill -9 10")
 
 
 def test_old_supervisor_without_services_is_to_be_ended() -> None:
-    (finding,) = machine.judge([seen(10, 1, RUNNING)])
+    (finding,) = process_findings([seen(10, 1, RUNNING)])
     not_well(finding, "a supervisor without services", "kill 10")
-    assert [f.level for f in machine.judge([seen(10, 1, RUNNING, age=2.0)])] == ["ok", "ok"]  # it has just begun
+    assert [f.level for f in process_findings([seen(10, 1, RUNNING, age=2.0)])] == ["ok", "ok"]  # it has just begun
 
 
 def test_other_programs_are_none_of_our_business() -> None:
     others = [seen(2, 1, ("vim", "zencell.txt")), seen(3, 1, ("python", "-m", "services")), seen(4, 1, ()),
               seen(5, 1, (sys.executable, "zencell", "topic", "echo", "tf"))]
-    assert list(machine.judge(others)) == [Finding("ok", "no process is left over from an earlier run")]
+    assert list(process_findings(others)) == [Finding("ok", "no process is left from an earlier run")]
 
 
 @pytest.mark.slow

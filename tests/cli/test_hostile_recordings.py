@@ -133,7 +133,7 @@ def test_metadata_that_cannot_be_is_one_line(
     assert app.execute(["report", str(path)]) == 2
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 1
-    assert "tells a" in lines[0]
+    assert "which is not" in lines[0]
     assert not STEERING.search(lines[0])
     for each in ("info", "export", "recover"):
         app.execute(verb(each, path))
@@ -167,7 +167,7 @@ def test_no_file_is_read_that_a_recording_names(
     assert app.execute(["report", str(path)]) == 0, capsys.readouterr().err
     assert not [file for file in opened if "secret" in file]
     page = path.with_suffix(".html").read_text()
-    assert "no file is read that a recording names" in page or "not shown, since the cell is not here" in page
+    assert "a file named in a recording is not read" in page or "missing, since the cell is not installed" in page
 
 
 TOPICS = ["..", "../../up", "/etc/passwd", ".hidden", "a/b", "a_b", "nul\0", "x" * 300, EVIL, "", "con/../../x"]
@@ -204,7 +204,7 @@ def test_what_is_no_key_is_not_played(topic: str, tmp_path: Path, capsys: pytest
     assert app.execute(["play", str(tmp_path / "run.mcap")]) == 2
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 1
-    assert "which is no key to publish under" in lines[0]
+    assert "which is not a key" in lines[0]
 
 
 def test_text_of_a_recording_steers_neither_terminal_nor_page(

@@ -43,7 +43,7 @@ def test_only_and_without_are_two_halves_of_a_cell_in_start_order() -> None:
 def test_bad_shares_are_refused_with_the_choices() -> None:
     with pytest.raises(UnknownName, match=r"--only 'vision_detektor'.*did you mean 'vision_detector'"):
         HostOptions(only=["vision_detektor"]).part_of(CELL)
-    with pytest.raises(ConfigError, match="two ways"):
+    with pytest.raises(ConfigError, match="exclude each other"):
         HostOptions(only=["viewer"], without=["viewer"]).part_of(CELL)
     with pytest.raises(ConfigError, match="leaves no service"):
         HostOptions(without=names(HostOptions())).part_of(CELL)

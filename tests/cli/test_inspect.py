@@ -78,7 +78,7 @@ def test_hz_and_bw_measure(place: Place) -> None:
 def test_stop_that_would_not_outlive_the_executor_is_told_to_who_stops(place: Place) -> None:
     told, task = place.ask("task", "stop").stderr.splitlines()
     assert told == "zencell: stopped since 1970-01-01 00:00:00 UTC by anna (not saved on disk (it is full))"
-    assert "the arm is stopped and stays so until a start; the task did not hear of it" in task
+    assert "the arm is stopped and stays so until a start; the task did not confirm the stop" in task
 
 
 def test_call_prints_the_answer_as_json(place: Place) -> None:
@@ -101,9 +101,9 @@ def test_call_prints_the_answer_as_json(place: Place) -> None:
         (["call", "gripper/command", '{"id": "a"}'], 2, "gripper/command.width: is missing"),
         (["call", "joint_states", "{}"], 2, "unknown request 'joint_states'"),
         (["topic", "echo", "motion/plan"], 2, "unknown published key 'motion/plan'"),
-        (["topic", "echo", "tf", "--save", "tf.png"], 2, "--save: 'tf.png' is for pictures: tf carries TFMessage"),
-        (["topic", "echo", "camera/image_raw", "--save", "seen.jpg"], 2, "'seen.jpg' must be the name of a .png file"),
-        (["topic", "echo", "camera/image_raw", "--save", "no/seen.png"], 2, "in a folder that is there"),
+        (["topic", "echo", "tf", "--save", "tf.png"], 2, "--save: 'tf.png' is for images: tf carries TFMessage"),
+        (["topic", "echo", "camera/image_raw", "--save", "seen.jpg"], 2, "'seen.jpg' must be a .png file"),
+        (["topic", "echo", "camera/image_raw", "--save", "no/seen.png"], 2, "in an existing folder"),
         (["topic", "hz", "camera/image"], 2, "unknown key 'camera/image' (did you mean 'camera/image_raw'?)"),
         (["world", "add", "0.4", "nan"], 2, "Y: 'nan' must be a number"),
     ],

@@ -153,8 +153,8 @@ async def test_player_knows_whether_anybody_listens(tmp_path: Path) -> None:
     with Recording(write(tmp_path / "a.mcap", [image(0)])) as recording:
         player = Player(recording, lambda topic: True, lambda topic: topic)
         player.declare(net.bus("player", cell="panda"), recording.topics())
-        assert not player.heard
+        assert not player.has_subscribers
         reader = net.bus("listener", cell="panda").reader(topics.CAMERA_IMAGE)
-        assert player.heard
+        assert player.has_subscribers
         await player.run()
         assert (await reader.next()).data == b"x"

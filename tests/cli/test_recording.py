@@ -14,10 +14,11 @@ from pathlib import Path
 
 import pytest
 
+from recording.formatting import format_bytes, format_progress, format_result
 from recording.keyboard import names_of
 from recording.reader import Recording
 from recording.sink import RecordingStats
-from recording.summary import in_bytes, outcome, progress, summarise
+from recording.summary import summarise
 from tests.cli.conftest import CELL, make_folder
 from tests.harness import PATIENCE, Place, Zencell, ask, command_line, environment, free_domain, place_of
 from tests.recording.samples import joints, status, write
@@ -150,7 +151,7 @@ def test_full_disk_stops_the_recording_with_one_line(place: Recorded) -> None:
     )
     assert done.returncode == 1
     assert done.stderr.splitlines() == [
-        "zencell: full.mcap: recording stopped, the disk is full; what was written is kept: zencell recover full.mcap"]
+        "zencell: full.mcap: recording stopped, the disk is full; to use what was written: zencell recover full.mcap"]
     recovered = ask(place.folder, "recover", "full.mcap", "-o", "kept.mcap")
     assert recovered.returncode == 0 and "lost nothing" in recovered.stdout
     with Recording(place.folder / "kept.mcap") as recording:
@@ -185,7 +186,7 @@ def test_play_says_who_else_writes_the_same(place: Recorded) -> None:
     done = place.ask("play", "twice.mcap", "--cell", "talk", "--wait", "camera_simulator")
     assert done.returncode == 0
     assert done.stderr.splitlines() == [
-        "camera_simulator is up and writes camera/image_raw too: whoever reads it hears both"]
+        "camera_simulator is up and publishes camera/image_raw too: subscribers receive both"]
 
 
 def test_play_needs_neither_cell_nor_router_and_loops_until_ctrl_c(tmp_path: Path, zencell: Start) -> None:
@@ -225,7 +226,7 @@ def test_keys_pause_step_and_quit_and_the_terminal_is_given_back(tmp_path: Path)
         seen = seen.partition(text)[2]
 
     try:
-        until(b"space pauses")
+        until(b"space: pause")
         until(b"paused  0 messages")
         assert not termios.tcgetattr(theirs)[3] & termios.ICANON
         os.write(ours, b"\x1b[C")
@@ -306,18 +307,18 @@ BAD = [
     (("record", "--regex", "["), "--regex: '[' is not a regular expression"),
     (("record", "--duration", "0"), "--duration: '0' must be more than 0"),
     (("record", "--max-size", "0.1"), "--max-size: '0.1' must be 1 or more"),
-    (("record", "-o", "there.mcap"), "is there already; choose another name"),
+    (("record", "-o", "there.mcap"), "exists already; choose another name"),
     (("record", "-o", "no/such/a.mcap"), "is in a folder that does not exist"),
     (("record", "-o", "a.bag"), "must end in .mcap"),
-    (("info", "none.mcap"), "none.mcap: there is no such file"),
+    (("info", "none.mcap"), "none.mcap: no such file"),
     (("info", "tiny.yaml"), "tiny.yaml: is no MCAP file"),
-    (("recover", "there.mcap", "-o", "there.mcap"), "is there already"),
+    (("recover", "there.mcap", "-o", "there.mcap"), "exists already"),
     (("play", "there.mcap", "--rate", "0"), "--rate: '0' must be more than 0"),
     (("play", "there.mcap", "--rate", "fast"), "--rate: 'fast' must be a number"),
     (("play", "there.mcap", "--start-offset", "99"), "--start-offset: '99' must be 0 to 0.1"),
     (("play", "there.mcap", "--remap", "a=b"), "--remap: 'a=b' must be FROM:=TO"),
     (("play", "there.mcap", "camera/image_raw"), "is not in there.mcap; choices: joint_states"),
-    (("play", "there.mcap", "--exclude", "."), "has no message that is to be played"),
+    (("play", "there.mcap", "--exclude", "."), "has no message of the selected topics"),
     (("play", "there.mcap", "--start-paused"), "--start-paused: needs a terminal"),
     (("export", "there.mcap"), "needs one or more of --foxglove"),
     (("export", "there.mcap", "--video", "v.mp4"), "needs one topic with pictures"),
@@ -358,10 +359,10 @@ def test_keys_are_told_apart_and_unknown_sequences_are_none() -> None:
 
 def test_lines_for_people() -> None:
     before, now = RecordingStats(10, 1000, 1.0), RecordingStats(1234, 2_001_000, 2.0, {"panda/tf": 3})
-    assert progress(now, before, 2) == "   2.0 s  1,234 messages  2.0 MB  2.0 MB/s  5 lost"
-    assert outcome(["a_0.mcap", "a_1.mcap"], now, {"panda/log": 1}) == [
+    assert format_progress(now, before, 2) == "   2.0 s  1,234 messages  2.0 MB  2.0 MB/s  5 lost"
+    assert format_result(["a_0.mcap", "a_1.mcap"], now, {"panda/log": 1}) == [
         "recorded 1,234 messages, 2.0 MB, 2.0 s: a_0.mcap to a_1.mcap",
         "  panda/tf: 3 dropped, the disk was too slow, or there were too many keys",
-        "  panda/log: 1 lost on the way here"]
-    assert outcome(["a.mcap"], before, {})[1] == "nothing was lost"
-    assert [in_bytes(n) for n in (5, 5e3, 5e6, 5e9)] == ["5 B", "5.0 kB", "5.0 MB", "5.0 GB"]
+        "  panda/log: 1 lost on the network"]
+    assert format_result(["a.mcap"], before, {})[1] == "no message was lost"
+    assert [format_bytes(n) for n in (5, 5e3, 5e6, 5e9)] == ["5 B", "5.0 kB", "5.0 MB", "5.0 GB"]

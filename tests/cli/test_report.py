@@ -161,7 +161,7 @@ def test_the_page_has_every_section_and_asks_nobody(page, recorded):
 def test_its_numbers_are_those_that_were_recorded(page):
     head = " ".join(page.sections["summary"].split())
     for part in ("panda: DONE", "placed 1 of 2", "rejected places 2", "truth 1 in the box, 1 on the table",
-                 "moving 1.8 s", "planning 0.4 s in 2 plans", "failures, retries 4, 5", "started again 1 x", "seed 7",
+                 "moving 1.8 s", "planning 0.4 s in 2 plans", "failures, retries 4, 5", "restarts 1 x", "seed 7",
                  "2.5 s", "frame to target 5.0 ms (median)", "zencell 0.1.0"):
         assert part in head, part
     assert page.table("plans") == [["1", "0.60", "cartesian", "12.0", "1", "1.00", "2.50"],
@@ -180,9 +180,9 @@ def test_joints_stand_beside_their_limits(page):
 def test_what_failed_is_listed_in_time_with_its_reason(page):
     assert page.table("problems") == [
         ["0.50", "rejected", "(0.200, 0.000, 0.030)", f"too near {NASTY}"],
-        ["1.90", "started again", "vision_detector", "killed by SIGKILL"],
+        ["1.90", "restarted", "vision_detector", "killed by SIGKILL"],
         ["2.20", "motion aborted", "goal_1", "joint 3 is 0.2 rad off [arm_controller]"],
-        ["2.50", "given up", "(0.300, 0.300, 0.030)", "given up after 3 tries"],
+        ["2.50", "skipped", "(0.300, 0.300, 0.030)", "given up after 3 tries"],
     ]
     assert page.table("log") == [["2.00", "warning", "motion_planner", f"no way: {NASTY}"]]
     assert page.table("services") == [["vision_detector", "ready", "1.25", "1", "12", "3", "1"]]
@@ -270,7 +270,7 @@ def test_the_recording_of_a_cell_that_is_not_here_has_no_limits_and_says_so(tmp_
     assert app.execute(["report", str(path)]) == 0
     page = Page((tmp_path / "away.html").read_text())
     assert "elsewhere: ERROR" in " ".join(page.sections["summary"].split())
-    assert "Limits and the way of the tool are not shown" in page.sections["summary"]
+    assert "Joint limits and the path of the tool are missing" in page.sections["summary"]
     assert page.table("joints")[0] == ["panda_joint1", "0.500", "0.500", "0.000"] and len(page.table("joints")) == 7
     assert app.execute(["report", str(path), "--cell", "panda"]) == 0
     page = Page((tmp_path / "away.html").read_text())
@@ -286,9 +286,9 @@ def test_a_recording_that_was_cut_is_reported_as_far_as_it_goes(tmp_path, capsys
     tape.writer.abandon()
     assert app.execute(["report", str(path)]) == 0
     (line,) = capsys.readouterr().err.splitlines()
-    assert "was cut" in line and "zencell recover" in line
+    assert "is truncated" in line and "zencell recover" in line
     page = Page((tmp_path / "cut.html").read_text())
-    assert "was cut" in page.sections["summary"] and "zencell recover" in page.sections["summary"]
+    assert "is truncated" in page.sections["summary"] and "zencell recover" in page.sections["summary"]
     assert "panda: GRASPING" in " ".join(page.sections["summary"].split())
     for section in ("plans", "latency", "joints"):
         assert page.sections[section].strip()
@@ -297,11 +297,11 @@ def test_a_recording_that_was_cut_is_reported_as_far_as_it_goes(tmp_path, capsys
 @pytest.mark.parametrize(
     ("content", "code", "wanted"),
     [
-        (None, 2, ["there is no such file"]),
-        (b"", 2, ["says nothing about a run"]),
+        (None, 2, ["no such file"]),
+        (b"", 2, ["has no messages of a run"]),
         (b"PK\x03\x04 a picture book", 2, ["is no MCAP file"]),
-        ("empty", 2, ["says nothing about a run", "joint_states"]),
-        ("foreign", 2, ["says nothing about a run"]),
+        ("empty", 2, ["has no messages of a run", "joint_states"]),
+        ("foreign", 2, ["has no messages of a run"]),
     ],
 )
 def test_what_is_no_recording_of_a_run_is_one_line(content, code, wanted, tmp_path, capsys):
@@ -377,8 +377,8 @@ def failures(tape, *times):
 
 def test_only_pictures_that_a_film_shows_are_looked_at_and_each_film_has_the_size_of_its_own(tmp_path, monkeypatch):
     tape, looked_at = Tape(tmp_path / "cut.mcap"), []
-    small = clips._small
-    monkeypatch.setattr(clips, "_small", lambda message: looked_at.append(message) or small(message))
+    small = clips._scaled
+    monkeypatch.setattr(clips, "_scaled", lambda message: looked_at.append(message) or small(message))
     failures(tape, 10, 50)
     for k in range(60):
         tape.put(k, "camera/image_raw", picture(tape, k, k, *((100, 80) if k < 30 else (80, 60))))
@@ -457,7 +457,7 @@ def test_run_that_ends_done_with_something_left_that_it_does_not_name_has_a_film
     assert app.execute(["report", str(tmp_path / "run.mcap")]) == 0
     text = (tmp_path / "run.html").read_text()
     assert len(films_of(text)) == 1
-    assert "8.00 s: DONE but left at (0.500, 0.200, 0.030): not among what was rejected" in text
+    assert "8.00 s: DONE but left at (0.500, 0.200, 0.030): not rejected by the task" in text
 
 
 @pytest.mark.parametrize("state", ["PLACING", "IDLE"])

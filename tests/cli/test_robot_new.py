@@ -133,7 +133,7 @@ def test_a_xacro_file_is_read_and_its_urdf_overwrites_none(tmp_path: Path) -> No
 
 
 BAD: dict[str, tuple[str, list[str], list[str]]] = {
-    "no file": ("", ["gone.urdf"], ["gone.urdf", "is not there"]),
+    "no file": ("", ["gone.urdf"], ["gone.urdf", "is missing"]),
     "no XML": ("joint: 1", ["bad.urdf"], ["bad.urdf", "does not parse"]),
     "no URDF": ("<sdf/>", ["bad.urdf"], ["its root is <sdf>"]),
     "no joint that moves": (NO_ARM, ["bad.urdf"], ["bad.urdf", "no joint that moves"]),

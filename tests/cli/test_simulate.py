@@ -27,7 +27,7 @@ def test_campaign_with_faults_tells_what_was_made_and_checked(capfd):
     assert "2 of 2 (100.0%)" in told
     crashes = re.search(r"fault: crash +│ (\d+) ", told)
     assert crashes and int(crashes[1]) >= 6
-    for what in ("fault: lost", "fault: doubled", "invariant: never two goals", "invariant: a goal id acts once"):
+    for what in ("fault: lost", "fault: duplicated", "invariant: one goal at a time", "invariant: a goal id acts once"):
         assert what in told
 
 

@@ -1,4 +1,4 @@
-"""The client without `await`: a loop in a thread of its own, and what Ctrl-C does to what is waited for."""
+"""The client without `await`: an event loop in a thread, and Ctrl-C during a call."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 
 import pytest
 
-from common.client.blocking import Blocking, Cell, LoopThread, called
+from common.client.blocking import Blocking, Cell, LoopThread, call
 from common.errors import ZencellError
 
 pytestmark = pytest.mark.timeout(30)
@@ -27,15 +27,15 @@ def loop() -> Iterator[LoopThread]:
     assert made.ended and not any(thread.name == "zencell" for thread in threading.enumerate())
 
 
-class Thing:
-    """Says things."""
+class Fake:
+    """Fake."""
 
     async def twice(self, value: int) -> int:
-        """Twice of it."""
+        """Return the double."""
         return 2 * value
 
     async def fails(self) -> None:
-        raise ZencellError("as it has to")
+        raise ZencellError("always fails")
 
     async def count(self, most: int) -> AsyncIterator[int]:
         try:
@@ -52,47 +52,47 @@ class Thing:
         finally:
             self.entered = False
 
-    async def for_ever(self) -> None:
+    async def forever(self) -> None:
         try:
             await asyncio.Event().wait()
         finally:
-            await asyncio.sleep(0.05)  # something is still to be done
+            await asyncio.sleep(0.05)  # cleaning up takes time
             self.ended = True
 
 
-def test_what_is_awaited_is_called_and_its_errors_are_raised_where_it_was(loop: LoopThread) -> None:
-    thing = Blocking(loop, Thing())
-    assert thing.twice(3) == 6 and thing.twice.__doc__ == "Twice of it." and thing.__doc__ == "Says things."
-    assert "twice" in dir(thing)
-    with pytest.raises(ZencellError, match="as it has to"):
-        thing.fails()
+def test_coroutine_methods_block_and_raise_their_errors(loop: LoopThread) -> None:
+    fake = Blocking(loop, Fake())
+    assert fake.twice(3) == 6 and fake.twice.__doc__ == "Return the double." and fake.__doc__ == "Fake."
+    assert "twice" in dir(fake)
+    with pytest.raises(ZencellError, match="always fails"):
+        fake.fails()
     with pytest.raises(AttributeError):
-        thing.thrice()
+        fake.thrice()
 
 
-def test_async_for_is_for_and_is_closed_when_it_is_left(loop: LoopThread) -> None:
-    thing = Thing()
-    assert list(Blocking(loop, thing).count(3)) == [0, 1, 2]
-    thing.left = False
-    for _ in Blocking(loop, thing).count(100):
+def test_async_for_becomes_for_and_is_closed_when_it_is_left(loop: LoopThread) -> None:
+    fake = Fake()
+    assert list(Blocking(loop, fake).count(3)) == [0, 1, 2]
+    fake.left = False
+    for _ in Blocking(loop, fake).count(100):
         break
-    assert thing.left
+    assert fake.left
 
 
-def test_async_with_is_with_also_when_it_ends_by_an_error(loop: LoopThread) -> None:
-    thing = Thing()
-    with Blocking(loop, thing).block() as value:
-        assert value == "inside" and thing.entered
-    assert not thing.entered
-    with pytest.raises(ValueError, match="inside"), Blocking(loop, thing).block():
+def test_async_with_becomes_with_also_with_an_error(loop: LoopThread) -> None:
+    fake = Fake()
+    with Blocking(loop, fake).block() as value:
+        assert value == "inside" and fake.entered
+    assert not fake.entered
+    with pytest.raises(ValueError, match="inside"), Blocking(loop, fake).block():
         raise ValueError("inside")
-    assert not thing.entered
+    assert not fake.entered
 
 
 @pytest.mark.parametrize("when", ["before", "as it is entered"])
-def test_ctrl_c_as_a_block_is_entered_leaves_it(loop: LoopThread, monkeypatch: pytest.MonkeyPatch, when: str) -> None:
-    thing, wait = Thing(), loop.wait
-    thing.entered = False
+def test_ctrl_c_while_a_block_is_entered_leaves_it(loop: LoopThread, monkeypatch, when: str) -> None:
+    fake, wait = Fake(), loop.wait
+    fake.entered = False
 
     def interrupted(begin: Callable[[], Awaitable[object]]) -> None:
         monkeypatch.undo()
@@ -107,65 +107,65 @@ def test_ctrl_c_as_a_block_is_entered_leaves_it(loop: LoopThread, monkeypatch: p
         entering.cancel()
         await asyncio.wait({entering})
 
-    block = Blocking(loop, thing).block()
+    block = Blocking(loop, fake).block()
     monkeypatch.setattr(loop, "wait", interrupted)
     with pytest.raises(KeyboardInterrupt), block:
-        raise AssertionError("nothing is done in it")
-    assert not thing.entered
-    assert called(loop, thing.twice, 4) == 8, "and the loop goes on"
+        raise AssertionError("the block must not run")
+    assert not fake.entered
+    assert call(loop, fake.twice, 4) == 8, "the loop still works"
 
 
-def test_ctrl_c_cancels_what_is_waited_for_and_waits_for_its_end(loop: LoopThread) -> None:
-    thing = Thing()
+def test_ctrl_c_cancels_the_call_and_waits_for_its_end(loop: LoopThread) -> None:
+    fake = Fake()
     threading.Timer(0.2, lambda: signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)).start()
     with pytest.raises(KeyboardInterrupt):
-        called(loop, thing.for_ever)
-    assert thing.ended
-    assert called(loop, thing.twice, 4) == 8, "and the loop goes on"
+        call(loop, fake.forever)
+    assert fake.ended
+    assert call(loop, fake.twice, 4) == 8, "the loop still works"
 
 
-def test_ctrl_c_while_the_loop_is_busy_is_no_different(loop: LoopThread) -> None:
-    thing = Thing()
+def test_ctrl_c_works_while_the_loop_is_busy(loop: LoopThread) -> None:
+    fake = Fake()
     loop._loop.call_soon_threadsafe(time.sleep, 0.5)
     threading.Timer(0.1, lambda: signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)).start()
     with pytest.raises(KeyboardInterrupt):
-        called(loop, thing.for_ever)
-    assert called(loop, thing.twice, 4) == 8
+        call(loop, fake.forever)
+    assert call(loop, fake.twice, 4) == 8
 
 
-def test_who_waits_in_another_thread_is_told_when_the_cell_is_closed() -> None:
-    loop, told = LoopThread(), list[str]()
+def test_call_in_another_thread_raises_when_the_cell_is_closed() -> None:
+    loop, errors = LoopThread(), list[str]()
 
     def wait() -> None:
         try:
-            called(loop, Thing().for_ever)
+            call(loop, Fake().forever)
         except ZencellError as error:
-            told.append(str(error))
+            errors.append(str(error))
 
     waiting = threading.Thread(target=wait)
     waiting.start()
-    called(loop, asyncio.sleep, 0.05)
+    call(loop, asyncio.sleep, 0.05)
     loop.end()
     waiting.join(10.0)
-    assert told == ["the cell was closed meanwhile"]
+    assert errors == ["the cell was closed meanwhile"]
     with pytest.raises(ZencellError, match="was closed"):
-        called(loop, Thing().twice, 1)
+        call(loop, Fake().twice, 1)
 
 
-def test_an_iterator_that_is_collected_as_garbage_on_the_loops_own_thread_holds_nobody_up(loop: LoopThread) -> None:
-    thing = Thing()
-    kept = {"numbers": Blocking(loop, thing).count(100)}
-    next(kept["numbers"])
+def test_iterator_collected_on_the_loops_own_thread_does_not_block_it(loop: LoopThread) -> None:
+    fake = Fake()
+    held = {"numbers": Blocking(loop, fake).count(100)}
+    next(held["numbers"])
 
     async def drop() -> None:
-        kept.clear()
+        held.clear()
 
-    called(loop, drop)
-    called(loop, asyncio.sleep, 0.01)
-    assert thing.left
+    call(loop, drop)
+    call(loop, asyncio.sleep, 0.01)
+    assert fake.left
 
 
-def test_a_cell_that_is_not_open_says_so_and_can_be_looked_at() -> None:
+def test_cell_that_is_not_open_says_so_and_can_be_inspected() -> None:
     cell = Cell("nowhere")
     for name in ("arm", "cameras", "listen"):
         with pytest.raises(ZencellError, match="is not joined"):

@@ -1,4 +1,4 @@
-"""What a program does in a whole cell, on the virtual clock: `Cell` on the bus of a visitor."""
+"""`Cell` of the Python client in complete simulated cells on the virtual clock."""
 
 from __future__ import annotations
 
@@ -14,12 +14,11 @@ import numpy as np
 import pytest
 
 from common import topics
-from common.client import arm
-from common.client.arm import JogFailed
+from common.client import operator_motion
 from common.client.cell import Cell
-from common.client.frames import poses
+from common.client.frames import Frames
 from common.client.goals import any_of, pose, region, through
-from common.client.operator_motion import MotionFailed
+from common.client.operator_motion import JogFailed, MotionFailed
 from common.client.subscriptions import NothingReceived
 from common.config import load_cell
 from common.errors import ConfigError, DecodeError, NoResponder, RemoteError, UnknownName, ZencellError
@@ -43,7 +42,7 @@ Program = Callable[[Cell], Awaitable[None]]
 
 
 class Over(Exception):
-    """The program has come to its end."""
+    """The program has ended."""
 
 
 def run(program: Program, cell: str = "panda", *overrides: str, autostart: bool = False) -> None:
@@ -58,7 +57,7 @@ def run(program: Program, cell: str = "panda", *overrides: str, autostart: bool 
                 await program(joined)
         except BaseException as error:
             raised.append(error)
-        raise Over  # the rest of the run is nobody's business here
+        raise Over  # the rest of the run does not matter here
 
     simulation = Simulation(loaded, 1, visit=visit)
     with pytest.raises(Over):
@@ -74,17 +73,17 @@ async def until_moving(cell: Cell) -> None:
             pass
 
 
-def test_arm_is_read_planned_for_and_moved_in_numbers() -> None:
+def test_arm_is_read_planned_for_and_moved() -> None:
     async def program(cell: Cell) -> None:
-        told = await cell.arm.description()
-        assert len(told.joints) == 7 and "home" in told.named_poses
+        description = await cell.arm.description()
+        assert len(description.joints) == 7 and "home" in description.named_poses
         q = await cell.arm.joints()
-        assert np.allclose(q, told.named_poses["home"], atol=1e-3)
+        assert np.allclose(q, description.named_poses["home"], atol=1e-3)
         T = await cell.arm.pose()
         assert np.allclose(T, await cell.tf("world", "tcp")) and np.allclose(T[2, :3], [0, 0, -1], atol=1e-3)
 
         plan = await cell.arm.plan(pose(0.45, 0.1, 0.4), speed=0.5)
-        assert plan.joints == tuple(told.joints) and np.allclose(plan.positions[0], q, atol=1e-3)
+        assert plan.joints == tuple(description.joints) and np.allclose(plan.positions[0], q, atol=1e-3)
         assert plan.times[0] == 0 and plan.duration > 0.2
         assert np.allclose(await cell.arm.joints(), q, atol=1e-3), "planning moves nothing"
         assert (await cell.arm.execute(plan)).state == "succeeded"
@@ -105,7 +104,7 @@ def test_arm_is_read_planned_for_and_moved_in_numbers() -> None:
     run(program)
 
 
-def test_what_cannot_be_reached_or_asked_for_is_said_in_one_line_and_moves_nothing() -> None:
+def test_unreachable_and_invalid_goals_raise_one_line_and_move_nothing() -> None:
     async def program(cell: Cell) -> None:
         before = await cell.arm.joints()
         for to, how, error, words in (
@@ -125,15 +124,15 @@ def test_what_cannot_be_reached_or_asked_for_is_said_in_one_line_and_moves_nothi
             (pose(0.4, 0.0, 0.4), {"goal": 3}, ConfigError, "goal"),
             ("home", {"sped": 2.0}, ConfigError, "choices"),
             ("home", {"via": (1, 2)}, ConfigError, "pose"),
-            ("home", {"planner": "nobody"}, (MotionFailed, RemoteError), "nobody"),
+            ("home", {"planner": "unknown"}, (MotionFailed, RemoteError), "unknown"),
         ):
-            with pytest.raises(error, match=words) as told:
+            with pytest.raises(error, match=words) as caught:
                 await cell.arm.move(to, **how)  # type: ignore[arg-type]
-            assert "\n" not in str(told.value)
-        for asked in (cell.arm.execute(None), cell.arm.stop(None), cell.call(None), cell.call("motion/hold", 3),  # type: ignore[arg-type]
+            assert "\n" not in str(caught.value)
+        for request in (cell.arm.execute(None), cell.arm.stop(None), cell.call(None), cell.call("motion/hold", 3),  # type: ignore[arg-type]
                       cell.arm.jog(linear=(1, 0)), anext(cell.listen(None))):  # type: ignore[arg-type]
             with pytest.raises(ConfigError):
-                await asked
+                await request
         with pytest.raises(ConfigError, match="rpy"):
             pose(0.4, 0.0, 0.4, rpy=(0.0, 0.0))
         assert np.allclose(await cell.arm.joints(), before, atol=1e-6)
@@ -141,7 +140,7 @@ def test_what_cannot_be_reached_or_asked_for_is_said_in_one_line_and_moves_nothi
     run(program)
 
 
-def test_a_motion_that_is_cancelled_comes_to_rest_and_the_next_one_goes() -> None:
+def test_cancelled_motion_stops_and_the_next_one_succeeds() -> None:
     async def program(cell: Cell) -> None:
         moving = asyncio.create_task(cell.arm.move(pose(0.4, 0.4, 0.3), speed=0.1))
         await until_moving(cell)
@@ -155,7 +154,7 @@ def test_a_motion_that_is_cancelled_comes_to_rest_and_the_next_one_goes() -> Non
     run(program)
 
 
-def test_a_motion_stops_when_its_cell_is_left_and_whoever_waits_is_told() -> None:
+def test_motion_stops_and_its_task_is_cancelled_when_the_cell_is_left() -> None:
     async def program(cell: Cell) -> None:
         async with Cell.on(cell.bus, owner="program") as inner:
             moving = asyncio.create_task(inner.arm.move(pose(0.4, 0.4, 0.3), speed=0.1))
@@ -169,7 +168,7 @@ def test_a_motion_stops_when_its_cell_is_left_and_whoever_waits_is_told() -> Non
     run(program)
 
 
-def test_stop_of_ones_own_is_ended_by_the_next_motion_and_that_of_others_is_not() -> None:
+def test_motion_releases_the_stop_of_its_own_operator_but_not_that_of_another() -> None:
     async def program(cell: Cell) -> None:
         await cell.arm.stop("lunch")
         assert "lunch" in (await cell.arm.status()).stopped
@@ -180,7 +179,7 @@ def test_stop_of_ones_own_is_ended_by_the_next_motion_and_that_of_others_is_not(
             with pytest.raises(JogFailed, match="lunch"):
                 await other.arm.jog(linear=(0.0, 0.0, 0.1), seconds=seconds)
         stop = cell.bus.client(topics.MOTION_STOP)
-        await stop.call(StopRequest(owner="another", reason="in the way"))
+        await stop.call(StopRequest(owner="another", reason="obstructed"))
         with pytest.raises(MotionFailed, match="another") as refused:
             await cell.arm.move("home")
         assert refused.value.code == "stopped"
@@ -190,29 +189,29 @@ def test_stop_of_ones_own_is_ended_by_the_next_motion_and_that_of_others_is_not(
     run(program)
 
 
-def test_jog_of_a_program_that_was_held_up_says_that_its_words_came_too_late(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_jog_of_a_stalled_program_reports_late_commands(monkeypatch: pytest.MonkeyPatch) -> None:
     async def program(cell: Cell) -> None:
-        async def hold_up() -> None:
-            while not (await cell.arm.owner_now()).jogging:  # noqa: ASYNC110 - nothing else tells of it
+        async def stall() -> None:
+            while not (await cell.arm.owner_now()).jogging:  # noqa: ASYNC110 - there is no event for it
                 await asyncio.sleep(0.01)
-            monkeypatch.setattr(arm, "JOG_PERIOD", 1.0)  # longer than the arm goes on without a word
+            monkeypatch.setattr(operator_motion, "JOG_PERIOD", 1.0)  # longer than the arm moves without a command
 
-        holding = asyncio.create_task(hold_up())
-        with pytest.raises(JogFailed, match="nobody's; words of this program came too late"):
+        stalling = asyncio.create_task(stall())
+        with pytest.raises(JogFailed, match="; commands of this program arrived too late"):
             await cell.arm.jog(linear=(0.0, 0.0, 0.05), seconds=10.0)
-        await holding
+        await stalling
         assert np.abs(await cell.arm.velocities()).max() < 1e-3
 
     run(program)
 
 
-def test_stop_of_ones_own_that_comes_while_a_motion_is_planned_keeps_the_arm() -> None:
+def test_own_stop_during_planning_blocks_the_motion() -> None:
     async def program(cell: Cell) -> None:
         before, plan = await cell.arm.joints(), cell.arm._motion.plan
 
         async def stopped_meanwhile(*goal: Any, **more: Any) -> Any:
             found = await plan(*goal, **more)
-            await Cell.on(cell.bus, owner="program").arm.stop("wait")  # the same person, in another terminal
+            await Cell.on(cell.bus, owner="program").arm.stop("wait")  # the same operator, in another terminal
             return found
 
         cell.arm._motion.plan = stopped_meanwhile  # type: ignore[method-assign]
@@ -225,11 +224,11 @@ def test_stop_of_ones_own_that_comes_while_a_motion_is_planned_keeps_the_arm() -
     run(program)
 
 
-def test_hold_keeps_a_motion_on_its_path_until_it_is_released() -> None:
+def test_held_motion_continues_after_its_release() -> None:
     async def program(cell: Cell) -> None:
         moving = asyncio.create_task(cell.arm.move(pose(0.4, 0.4, 0.3), speed=0.2))
         await until_moving(cell)
-        await cell.arm.hold("somebody comes")
+        await cell.arm.hold("a visitor comes")
         await asyncio.sleep(1.0)
         where = await cell.arm.joints()
         await asyncio.sleep(0.5)
@@ -240,7 +239,7 @@ def test_hold_keeps_a_motion_on_its_path_until_it_is_released() -> None:
     run(program)
 
 
-def test_motion_that_is_owned_is_nobody_elses_until_the_block_ends() -> None:
+def test_owned_block_keeps_other_clients_from_moving() -> None:
     async def program(cell: Cell) -> None:
         other = Cell.on(cell.bus, owner="other")
         async with cell.arm.owned() as owner:
@@ -259,7 +258,7 @@ def test_motion_that_is_owned_is_nobody_elses_until_the_block_ends() -> None:
     run(program)
 
 
-def test_motion_that_is_owned_is_not_given_back_by_a_block_within() -> None:
+def test_nested_owned_block_does_not_give_authority_back() -> None:
     async def program(cell: Cell) -> None:
         async with cell.arm.owned():
             async with cell.arm.owned():
@@ -273,14 +272,14 @@ def test_motion_that_is_owned_is_not_given_back_by_a_block_within() -> None:
         async with cell.arm.owned(lease=1.0):
             async with cell.arm.owned():
                 pass
-            await asyncio.sleep(2.0)  # as a program that hangs
+            await asyncio.sleep(2.0)  # like a program that hangs
             assert (await cell.arm.owner_now()).kind == "none"
 
     run(program)
 
 
 @pytest.mark.parametrize("after", [0.0, 0.001, 0.002, 0.01])
-def test_whoever_is_cancelled_while_taking_the_motion_does_not_keep_it(after: float) -> None:
+def test_cancelled_take_leaves_no_motion_authority(after: float) -> None:
     async def program(cell: Cell) -> None:
         async def own() -> None:
             async with cell.arm.owned():
@@ -291,13 +290,13 @@ def test_whoever_is_cancelled_while_taking_the_motion_does_not_keep_it(after: fl
         owning.cancel()
         with pytest.raises(asyncio.CancelledError):
             await owning
-        await asyncio.sleep(0.05)  # in which the executor tells
+        await asyncio.sleep(0.05)  # until the executor publishes the owner
         assert (await cell.arm.owner_now()).kind == "none"
 
     run(program)
 
 
-def test_jogging_moves_as_long_as_it_is_asked_for_and_no_longer() -> None:
+def test_jogging_moves_for_the_requested_time() -> None:
     async def program(cell: Cell) -> None:
         before = await cell.arm.pose()
         await cell.arm.jog(linear=(0.0, 0.1, 0.0), seconds=1.0)
@@ -307,7 +306,7 @@ def test_jogging_moves_as_long_as_it_is_asked_for_and_no_longer() -> None:
         for seconds in (0.01, 0.1, 0.2):
             await cell.arm.jog(linear=(0.0, -0.1, 0.0), seconds=seconds)
             assert not (await cell.arm.owner_now()).jogging
-        await cell.arm.move("home")  # it rests when jogging returns
+        await cell.arm.move("home")  # the arm is at rest when jogging returns
         assert 0.03 < moved[1] < 0.11 and abs(moved[0]) < 5e-3 and abs(moved[2]) < 5e-3
         assert np.abs(await cell.arm.velocities()).max() < 1e-3
         with pytest.raises(UnknownName, match="elbow"):
@@ -318,7 +317,7 @@ def test_jogging_moves_as_long_as_it_is_asked_for_and_no_longer() -> None:
     run(program)
 
 
-def test_fingers_open_close_and_say_what_they_hold() -> None:
+def test_gripper_opens_closes_and_reports_whether_it_holds() -> None:
     async def program(cell: Cell) -> None:
         opened = await cell.gripper.open()
         assert opened.state == "succeeded" and opened.width == pytest.approx(0.08, abs=2e-3)
@@ -348,7 +347,7 @@ def test_a_pick_takes_ten_lines() -> None:
     run(program, "panda", "world.count=1")
 
 
-def test_pictures_come_as_arrays_with_the_camera_that_took_them() -> None:
+def test_images_are_arrays_with_their_camera() -> None:
     async def program(cell: Cell) -> None:
         (name,) = await cell.cameras()
         camera = await cell.camera()
@@ -366,7 +365,7 @@ def test_pictures_come_as_arrays_with_the_camera_that_took_them() -> None:
     run(program)
 
 
-def test_camera_is_asked_in_one_line_and_looked_up_then() -> None:
+def test_camera_is_looked_up_at_first_use() -> None:
     async def program(cell: Cell) -> None:
         (name,) = await cell.cameras()
         assert (await cell.camera().image()).shape == (await cell.camera(name).image()).shape
@@ -386,7 +385,7 @@ def test_depth_is_in_metres() -> None:
     run(program, "ur5")
 
 
-def test_objects_are_those_that_were_seen_and_the_world_is_edited_by_name() -> None:
+def test_objects_are_perceived_and_the_world_is_edited_by_name() -> None:
     async def program(cell: Cell) -> None:
         seen, truth = await cell.objects(least=2), await cell.world.objects()
         assert len(seen) == len(truth) == 2 and all(each.role == "target" for each in seen)
@@ -394,7 +393,7 @@ def test_objects_are_those_that_were_seen_and_the_world_is_edited_by_name() -> N
             nearest = min(seen, key=lambda found: np.hypot(
                 found.pose.position.x - each.pose.position.x, found.pose.position.y - each.pose.position.y))
             assert nearest.pose.position.x == pytest.approx(each.pose.position.x, abs=0.01)
-        with pytest.raises(NothingReceived, match="of 3 objects, but of 2"):
+        with pytest.raises(NothingReceived, match="with 3 objects, only with 2"):
             await cell.objects(least=3, timeout=1.0)
         before = {each.id for each in truth}
         ids = await cell.world.add(0.45, -0.1)
@@ -414,7 +413,7 @@ def test_parameters_are_read_and_changed_by_path() -> None:
         before = await cell.param[path]
         await cell.param.set(path, before + 5)
         assert await cell.param[path] == before + 5 == (await cell.param.all())[f"services.{path}"]
-        for value in (np.int64(7), np.float32(8), np.array(9)):  # what is counted in pictures is
+        for value in (np.int64(7), np.float32(8), np.array(9)):  # numpy values, as computed from images
             await cell.param.set(path, value)
             assert await cell.param[path] == value
         for value in (object(), np.array([1, 2])):
@@ -429,7 +428,7 @@ def test_parameters_are_read_and_changed_by_path() -> None:
     run(program)
 
 
-def test_task_is_started_heard_of_and_stopped() -> None:
+def test_task_is_started_observed_and_stopped() -> None:
     async def program(cell: Cell) -> None:
         assert not (await cell.task.status()).started
         await cell.task.start()
@@ -451,7 +450,7 @@ def test_task_is_started_heard_of_and_stopped() -> None:
     run(program, "panda", "world.count=2")
 
 
-def test_any_key_is_called_and_listened_to() -> None:
+def test_any_key_can_be_called_or_listened_to() -> None:
     async def program(cell: Cell) -> None:
         async for state in cell.listen("joint_states"):
             assert len(state.position) >= 7
@@ -460,7 +459,7 @@ def test_any_key_is_called_and_listened_to() -> None:
         again = await cell.call(topics.MOTION_HOLD, HoldRequest(hold=True, owner="program"))
         assert answer.held and again.held and [each.by for each in again.interlocks] == ["program"]
         await cell.arm.release()
-        for asked, error, words in (
+        for request, error, words in (
             (cell.call("motion/hodl"), UnknownName, "motion/hold"),
             (cell.call("motion/hold", hodl=True), ConfigError, "hold"),
             (cell.call("motion/hold", hold=True, timeout=-1), ConfigError, "timeout"),
@@ -469,78 +468,80 @@ def test_any_key_is_called_and_listened_to() -> None:
             (anext(cell.listen("/joint_states", plain=True)), UnknownName, "did you mean 'joint_states'"),
         ):
             with pytest.raises(error, match=words):
-                await asked
+                await request
         with pytest.raises(NothingReceived, match="scene_object_updates"):
             async for _ in cell.listen("scene_object_updates", timeout=0.5):
                 pass
         async for packed in cell.listen("joint_states", plain=True):
             assert len(packed["position"]) >= 7
             break
-        for payload, heard in ((msgpack.packb({1: 2}), {1: 2}), (b"hello", DecodeError), (b"", DecodeError)):
+        for payload, expected in ((msgpack.packb({1: 2}), {1: 2}), (b"hello", DecodeError), (b"", DecodeError)):
             coming = asyncio.create_task(anext(cell.listen("others", plain=True)))
-            await asyncio.sleep(0.1)  # of virtual time, in which it is listened to
+            await asyncio.sleep(0.1)  # virtual time, until the subscription exists
             cell.bus.raw_writer(f"{cell.name}/others", "", "event").put(payload)
-            if heard is DecodeError:
+            if expected is DecodeError:
                 with pytest.raises(DecodeError, match=r"panda/others: .* are not msgpack"):
                     await coming
             else:
-                assert await coming == heard
+                assert await coming == expected
         assert any(service.name == "motion_planner" for service in (await cell.services()).services)
 
     run(program)
 
 
-def test_what_nobody_answers_ends_in_the_exception_that_says_so() -> None:
+def test_unanswered_requests_raise_the_matching_exception() -> None:
     async def program(cell: Cell) -> None:
-        with pytest.raises(NoResponder, match="param/nobody"):
-            await cell.call("param/nobody")
-        with pytest.raises(NothingReceived, match="nobody/camera_info"):
-            await cell._ear.newest(replace(topics.CAMERA_INFO, key="nobody/camera_info"))
+        with pytest.raises(NoResponder, match="param/missing"):
+            await cell.call("param/missing")
+        with pytest.raises(NothingReceived, match="missing/camera_info"):
+            await cell._subscriptions.latest(replace(topics.CAMERA_INFO, key="missing/camera_info"))
         with pytest.raises(RemoteError, match="controller"):
             await cell.arm.order("enable")
 
     run(program, "ur5")
 
 
-async def test_where_a_frame_was_when_it_was_last_told_of_is_not_where_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("common.client.frames.PATIENCE", 0.2)
+async def test_outdated_transform_is_not_the_current_pose(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("common.client.frames.TIMEOUT", 0.2)
     net = LocalNetwork()
-    said, cell = net.bus("robot_state_publisher").writer(topics.TF), Cell.on(net.bus("program"))
+    writer, cell = net.bus("robot_state_publisher").writer(topics.TF), Cell.on(net.bus("program"))
 
-    async def told(stamp: int, *names: str) -> None:
+    async def publish(stamp: int, *names: str) -> None:
         for _ in range(50):
             await asyncio.sleep(0)
-        said.put(TFMessage(transforms=[
+        writer.put(TFMessage(transforms=[
             TransformStamped(header=Header(stamp=stamp, frame_id="world"), child_frame_id=name, transform=Pose(
                 position=Vector3(x=float(stamp)))) for name in names]))
 
     for stamp in (1, 2):
         where = asyncio.create_task(cell.tf("world", "link"))
-        await told(stamp, "link", "other")
+        await publish(stamp, "link", "other")
         assert (await where)[0, 3] == stamp
-    for _ in range(2):  # also when the other one goes on moving
+    for _ in range(2):  # also while the other one moves
         where = asyncio.create_task(cell.tf("world", "link"))
-        await told(3, "other")
+        await publish(3, "other")
         with pytest.raises(NothingReceived, match="tf of link within"):
             await where
-    shown = poses(cell.bus, "world", "link", 0.01)
-    where = asyncio.create_task(anext(shown))
-    await told(4, "link", "other")
-    assert (await where)["position"][0] == 4
-    with pytest.raises(NothingReceived, match="tf of link within"):
-        while True:
-            await told(5, "other")
-            assert (await anext(shown))["position"][0] == 4
+    async with Frames(cell.bus) as frames:
+        known = asyncio.create_task(frames.until_known("world", "link"))
+        await publish(4, "link", "other")
+        await known
+        with pytest.raises(NothingReceived, match="tf of link within"):
+            while True:
+                await publish(5, "other")
+                frames.require_recent("world", "link")
+                assert frames.tree.pose("world", "link")[0, 3] == 4
+                await asyncio.sleep(0.01)
 
 
 @pytest.mark.parametrize("owner", ["x" * 121, "two\nlines", 5])
-def test_a_name_that_nobody_may_have_is_told_before_anything_is_asked_for(owner: Any) -> None:
+def test_invalid_owner_is_refused_before_any_request(owner: Any) -> None:
     for made in (Cell, partial(Cell.start, "panda")):
         with pytest.raises(ConfigError, match="owner"):
             made(owner=owner)
 
 
-async def test_a_cell_that_is_not_joined_says_how_to_join_it() -> None:
+async def test_cell_that_is_not_joined_explains_how_to_join_it() -> None:
     cell = Cell("panda")
     for name in ("arm", "gripper", "task", "param", "world", "bus"):
         with pytest.raises(ZencellError, match="async with"):
@@ -551,19 +552,19 @@ async def test_a_cell_that_is_not_joined_says_how_to_join_it() -> None:
         _: Any = cell.amr
 
 
-def test_slip_of_the_hand_is_told_and_changes_nothing() -> None:
+def test_assignment_to_an_attribute_is_refused_with_a_suggestion() -> None:
     async def program(cell: Cell) -> None:
         for part, name, words in (
-            (cell, "parm", "Cell.parm is not there: did you mean 'param'?"),
+            (cell, "parm", "Cell.parm does not exist: did you mean 'param'?"),
             (cell, "param", "Cell.param cannot be set"),
-            (cell.arm, "speeed", "Arm.speeed is not there"), (cell.arm, "owner", "Arm.owner cannot be set"),
+            (cell.arm, "speeed", "Arm.speeed does not exist"), (cell.arm, "owner", "Arm.owner cannot be set"),
             (cell.gripper, "wdith", "Gripper.wdith"), (cell.task, "pausse", "did you mean 'pause'"),
             (cell.world, "ad", "'add'"), (cell.scene, "ad", "'add'"), (cell.param, "sett", "'set'"),
             (await cell.camera(), "imgae", "'image'"),
         ):
-            with pytest.raises(ZencellError, match=re.escape(words)) as told:
+            with pytest.raises(ZencellError, match=re.escape(words)) as caught:
                 setattr(part, name, 3)
-            assert "\n" not in str(told.value) and isinstance(told.value, AttributeError)
+            assert "\n" not in str(caught.value) and isinstance(caught.value, AttributeError)
         assert cell.owner == cell.arm.owner == "program"
         await cell.objects(least=1)
         with pytest.raises(UnknownName, match=r"unknown object to touch 'track_l' \(did you mean 'track_\d'\?\)"):

@@ -1,4 +1,4 @@
-"""Which cell, which task and which keys a program means. The network is one without ports."""
+"""Which cell, task and keys a program joins, on a network without ports."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ LEFT = {"*": "left/*"}
 
 
 @pytest.mark.parametrize("host", ["a..b", "a" * 80])
-def test_nobody_listens_at_a_name_that_no_host_can_have(host: str) -> None:
+def test_invalid_host_name_is_not_listening(host: str) -> None:
     assert not joining.is_listening(f"tcp/{host}:7489")
 
 
 @pytest.fixture
 def net(monkeypatch: pytest.MonkeyPatch) -> LocalNetwork:
-    """What programs join in place of a router."""
+    """Replace the router by a local network."""
     network = LocalNetwork()
 
     async def listens(endpoint: str, seconds: float) -> None:
-        """Somebody does."""
+        """Return at once."""
 
     @contextlib.asynccontextmanager
     async def connected(
@@ -58,26 +58,26 @@ def net(monkeypatch: pytest.MonkeyPatch) -> LocalNetwork:
 
 
 async def stays(bus: Bus, config: None) -> None:
-    """A service that says nothing."""
+    """Be ready and publish nothing."""
     await bus.ready()
     await asyncio.Event().wait()
 
 
-async def test_the_only_cell_that_is_up_is_meant_and_one_of_several_must_be_named(net: LocalNetwork) -> None:
+async def test_only_running_cell_is_joined_and_one_of_several_must_be_named(net: LocalNetwork) -> None:
     async with running_service(net, stays, None, cell="anna"):
         async with Cell() as cell:
             assert cell.name == "anna"
         async with running_service(net, stays, None, cell="bert"):
-            with pytest.raises(SeveralCellsRunning) as told:
+            with pytest.raises(SeveralCellsRunning) as caught:
                 async with Cell():
                     pass
-            assert str(told.value) == ("several cells are up: name one, by Cell(NAME) or --cell NAME; "
+            assert str(caught.value) == ("several cells are up: name one, by Cell(NAME) or --cell NAME; "
                                        "choices: anna, bert")
             async with Cell("bert") as cell:
                 assert cell.name == "bert"
 
 
-async def test_arm_is_stopped_and_task_started_under_the_keys_that_the_program_means(net: LocalNetwork) -> None:
+async def test_arm_is_stopped_and_task_started_under_remapped_keys(net: LocalNetwork) -> None:
     loaded = load_cell("panda", ["autostart=false"])
     configs = {service: service_config(loaded, service.__name__.rpartition(".")[2], service.Config)
                for service in (trajectory_executor, smart_pick_place)}
@@ -95,14 +95,14 @@ async def test_arm_is_stopped_and_task_started_under_the_keys_that_the_program_m
         assert left.bus.full_key(await left.task.topic()) == "two_arms/left/pick_place_status"
         await left.task.start()
         async with asyncio.timeout(5.0):
-            while (await left.arm.status()).stopped:  # noqa: ASYNC110 - the start goes on to the executor
+            while (await left.arm.status()).stopped:  # noqa: ASYNC110 - the task passes the start on to the executor
                 await asyncio.sleep(0.01)
-        for asked in (right.arm.status(), right.services(), left.services()):
+        for request in (right.arm.status(), right.services(), left.services()):
             with pytest.raises(NothingReceived, match="two_arms/"):
-                await asked
+                await request
 
 
-async def test_camera_is_named_in_the_words_of_the_program(net: LocalNetwork) -> None:
+async def test_camera_has_the_name_that_the_program_uses(net: LocalNetwork) -> None:
     async def films(bus: Bus, config: None) -> None:
         bus.writer(CAMERA_INFO).put(CameraInfo(
             header=Header(frame_id=bus.service), width=2, height=1, k=[1.0, 0.0, 1.0, 0.0, 1.0, 0.5, 0.0, 0.0, 1.0]))
@@ -120,16 +120,16 @@ async def test_camera_is_named_in_the_words_of_the_program(net: LocalNetwork) ->
                 assert info.header.frame_id == ("one" if remapped else "two")
 
 
-async def test_of_several_tasks_the_one_whose_keys_are_meant_is_the_task(net: LocalNetwork) -> None:
-    async def tells(bus: Bus, config: None) -> None:
+async def test_of_several_tasks_the_one_under_remapped_keys_is_used(net: LocalNetwork) -> None:
+    async def publishes(bus: Bus, config: None) -> None:
         out = bus.writer(PICK_PLACE_STATUS)
         out.put(PickPlaceStatus(header=Header(stamp=1), message=bus.service))
         await bus.ready()
         await asyncio.Event().wait()
 
     async with (
-        running_service(net, tells, None, name="one", topics=LEFT),
-        running_service(net, tells, None, name="two", topics={"*": "right/*"}),
+        running_service(net, publishes, None, name="one", topics=LEFT),
+        running_service(net, publishes, None, name="two", topics={"*": "right/*"}),
     ):
         async with Cell("test", remapped=LEFT) as cell:
             assert (await cell.task.status()).message == "one"
@@ -141,13 +141,13 @@ async def test_of_several_tasks_the_one_whose_keys_are_meant_is_the_task(net: Lo
 
 
 class OwnStatus(TaskStatus):
-    """Of an application of one's own."""
+    """Status of a custom application."""
 
 
-OWN = Topic("own_status", OwnStatus, "state", "how far it is")
+OWN = Topic("own_status", OwnStatus, "state", "progress")
 
 
-async def test_task_of_an_application_of_ones_own_is_heard_when_its_module_is_named(
+async def test_task_of_a_custom_application_needs_its_module(
     net: LocalNetwork, tmp_path: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.syspath_prepend(tmp_path)
@@ -156,20 +156,20 @@ async def test_task_of_an_application_of_ones_own_is_heard_when_its_module_is_na
         f"from common.application import Application, ApplicationTopics\nfrom {__name__} import OWN\n"
         "APPLICATION = Application(topics=ApplicationTopics(status=OWN))\n")
 
-    async def tells(bus: Bus, config: None) -> None:
+    async def publishes(bus: Bus, config: None) -> None:
         out = bus.writer(OWN)
-        out.put(OwnStatus(header=Header(stamp=1), message="it goes on"))
+        out.put(OwnStatus(header=Header(stamp=1), message="it runs"))
         await bus.ready()
         await asyncio.Event().wait()
 
-    async with running_service(net, tells, None, name="own"):
+    async with running_service(net, publishes, None, name="own"):
         async with Cell("test", application="own.application") as cell:
-            assert (await cell.task.status()).message == "it goes on"
+            assert (await cell.task.status()).message == "it runs"
         async with Cell("test") as cell:
-            with pytest.raises(UnknownName, match="application=MODULE names one of your own"):
+            with pytest.raises(UnknownName, match="application=MODULE names a custom one"):
                 await cell.task.status()
         for name in ("nosuch", "own.nosuch"):
             async with Cell("test", application=name) as cell:
-                with pytest.raises(ZencellError, match=f"{name}.*") as told:
+                with pytest.raises(ZencellError, match=f"{name}.*") as caught:
                     await cell.task.status()
-                assert "\n" not in str(told.value)
+                assert "\n" not in str(caught.value)

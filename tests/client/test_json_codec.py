@@ -14,7 +14,7 @@ from common.transport.codec import decode as decode_message
 from common.transport.codec import encode as encode_message
 
 
-def test_a_picture_is_one_line() -> None:
+def test_image_is_one_line() -> None:
     image = Image(header=Header(stamp=1_500_000_000_250_000_000, frame_id="c"), height=480, width=640, encoding="bgr8",
                   data=bytes(921600))
     assert decode("panda/camera/image_raw", encode_message(image)) == (
@@ -22,7 +22,7 @@ def test_a_picture_is_one_line() -> None:
     )
 
 
-def test_a_message_is_json_as_it_was_sent() -> None:
+def test_message_is_shown_as_json() -> None:
     state = JointState(header=Header(stamp=5), name=["a", "b"], position=[0.5, -1.0])
     assert json.loads(decode("panda/joint_states", encode_message(state))) == state.model_dump()
 
@@ -49,13 +49,13 @@ def test_bytes_are_named_and_not_dumped() -> None:
     assert decode("a/b", msgpack.packb({"blob": bytes(1000)})) == '{"blob": "<1000 bytes>"}'
 
 
-def test_what_is_no_map_is_said() -> None:
+def test_payload_that_is_not_a_map_is_reported() -> None:
     assert decode("a/b", b"A") == "<not a message: int 65>"
     assert decode("a/b", b"") == "<empty payload>"
     assert decode("a/b", b"\xc1 no") == "<not msgpack: 4 bytes c1206e6f: " + decode("a/b", b"\xc1 no").split(": ", 2)[2]
 
 
-def test_encoding_checks_what_the_key_carries() -> None:
+def test_encoding_checks_the_message_of_the_key() -> None:
     payload = encode("panda/motion/stop?x=1", '{"reason": "lunch"}')
     assert decode_message(StopRequest, payload) == StopRequest(reason="lunch")
     wanted = r"motion/stop\.raeson: 'lunch' is not a parameter; choices: by, id, owner, reason"
@@ -67,7 +67,7 @@ def test_encoding_checks_what_the_key_carries() -> None:
         encode("panda/motion/stop", "3")
 
 
-def test_a_key_that_is_not_ours_takes_any_json() -> None:
+def test_unknown_key_takes_any_json() -> None:
     assert msgpack.unpackb(encode("other/key", '{"a": {"base64": "AAE="}}')) == {"a": b"\x00\x01"}
     with pytest.raises(ConfigError, match="cannot be sent"):
         encode("other/key", "1" + 30 * "0")
@@ -76,7 +76,7 @@ def test_a_key_that_is_not_ours_takes_any_json() -> None:
 
 
 @pytest.mark.parametrize("topic", all_topics().values(), ids=str)
-def test_every_topic_has_a_message_that_can_be_shown(topic: topics.AnyTopic) -> None:
+def test_every_topic_can_be_described(topic: topics.AnyTopic) -> None:
     from common.messages.schema import example_of, fields_of
 
     assert list(fields_of(topic.message))

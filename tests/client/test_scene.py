@@ -1,4 +1,4 @@
-"""Solids that a person adds, in a whole cell on the virtual clock."""
+"""Solids that an operator adds, in a simulated cell on the virtual clock."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ WALL = ("box", (0.3, 0.02, 0.7))  # between them
 
 
 
-def test_added_solid_is_planned_around_outlives_the_keeper_of_the_scene_and_is_gone_when_it_is_removed() -> None:
+def test_added_solid_is_avoided_also_after_a_restart_until_it_is_removed() -> None:
     async def visit(simulated: SimulatedCell, bus: Bus) -> None:
         async with Cell.on(bus, owner="anna") as cell:
             await cell.arm.move(LEFT)
             free = await cell.arm.plan(RIGHT, straight=True)
             assert free.duration > 0
             assert await cell.scene.add("wall", *WALL, at=(0.45, 0.0, 0.35)) == "added/wall"
-            assert await cell.scene.add("wall", *WALL, at=(0.45, 0.0, 0.35)) == "added/wall", "said again"
+            assert await cell.scene.add("wall", *WALL, at=(0.45, 0.0, 0.35)) == "added/wall", "added again"
             (wall,) = await cell.scene.objects()
             assert (wall.id, wall.shape, wall.dimensions, wall.pose.position.x) == ("added/wall", *WALL[:1],
                                                                                    list(WALL[1]), 0.45)
-            assert "added/wall" not in [thing.id for thing in await cell.objects()], "it is not perceived"
+            assert "added/wall" not in [each.id for each in await cell.objects()], "it is not perceived"
             with pytest.raises(MotionFailed, match="added/wall"):
                 await cell.arm.plan(RIGHT, straight=True)
             with pytest.raises(MotionFailed, match="added/wall"):
@@ -45,7 +45,7 @@ def test_added_solid_is_planned_around_outlives_the_keeper_of_the_scene_and_is_g
                 await cell.scene.add("wall", *WALL, at=(0.5, 0.0, 0.35))
 
             await again(simulated, bus, "scene_manager")
-            assert [thing.id for thing in await cell.scene.objects()] == ["added/wall"]
+            assert [each.id for each in await cell.scene.objects()] == ["added/wall"]
             with pytest.raises(MotionFailed, match="added/wall"):
                 await cell.arm.plan(RIGHT, straight=True)
             around = await cell.arm.plan(RIGHT)
@@ -64,7 +64,7 @@ def test_added_solid_is_planned_around_outlives_the_keeper_of_the_scene_and_is_g
         SimulatedCell("panda", ["autostart=false", "world.count=1"], visit=visit)
 
 
-def test_solid_that_is_added_in_the_way_of_a_motion_has_the_arm_brake_until_it_is_removed() -> None:
+def test_solid_added_on_the_path_of_a_motion_stops_the_arm_until_it_is_removed() -> None:
     async def visit(simulated: SimulatedCell, bus: Bus) -> None:
         motion = bus.reader(topics.MOTION_STATUS)
         async with Cell.on(bus, owner="anna") as cell:
@@ -82,7 +82,7 @@ def test_solid_that_is_added_in_the_way_of_a_motion_has_the_arm_brake_until_it_i
         SimulatedCell("panda", ["autostart=false", "world.count=1"], visit=visit)
 
 
-def test_what_is_no_solid_is_told_in_one_line_and_nothing_is_added() -> None:
+def test_invalid_solid_is_refused_in_one_line() -> None:
     async def visit(simulated: SimulatedCell, bus: Bus) -> None:
         async with Cell.on(bus) as cell:
             for name, shape, dimensions, at, words in (
@@ -93,16 +93,16 @@ def test_what_is_no_solid_is_told_in_one_line_and_nothing_is_added() -> None:
                 ("", "sphere", (1,), (0, 0, 0), "id"), ("a", "sphere", (np.nan,), (0, 0, 0), "finite"),
                 ("a", "sphere", (1,), 2 * np.eye(4), "at"),
             ):
-                with pytest.raises(ConfigError, match=words) as told:
+                with pytest.raises(ConfigError, match=words) as caught:
                     await cell.scene.add(name, shape, dimensions, at)  # type: ignore[arg-type]
-                assert "\n" not in str(told.value)
+                assert "\n" not in str(caught.value)
             with pytest.raises(ConfigError, match="color"):
                 await cell.scene.add("a", "sphere", (1,), (0, 0, 0), color=(2, 0, 0))
             assert await cell.scene.objects() == []
             await cell.scene.add("a", "sphere", (0.05,), (0.0, 0.6, 0.8))
             scenes = bus.reader(topics.PLANNING_SCENE)
-            seen = await until(scenes, lambda scene: any(thing.role == "target" for thing in scene.objects))
-            assert "added/a" in [thing.id for thing in seen.objects], "what is perceived does not remove it"
+            seen = await until(scenes, lambda scene: any(each.role == "target" for each in scene.objects))
+            assert "added/a" in [each.id for each in seen.objects], "perception does not remove it"
         raise Over
 
     with pytest.raises(Over):

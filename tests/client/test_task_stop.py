@@ -1,4 +1,4 @@
-"""Stopping by the client, which tells the arm and the task: what is said when one of the two does not take it."""
+"""A stop of arm and task by the client, also when one of the two does not confirm it."""
 
 from __future__ import annotations
 
@@ -14,30 +14,30 @@ from common.errors import Refused, RemoteError, ZencellError
 from common.messages.execution import NOT_PERSISTED
 from common.transport.local import LocalNetwork
 
-UNKEPT = m.Interlock(kind="stopped", by="ann", reason=f"{NOT_PERSISTED}: the disk is full", since=1)
+UNSAVED = m.Interlock(kind="stopped", by="ann", reason=f"{NOT_PERSISTED}: the disk is full", since=1)
 
 
-@pytest.mark.parametrize(("arm", "task", "raised", "said"), [
+@pytest.mark.parametrize(("arm", "task", "raised", "message"), [
     (True, True, None, ""),
     (True, False, TaskStopFailed,
-     "the arm is stopped and stays so until a start; the task did not hear.*from the task"),
-    (False, True, ArmStopFailed, "the task has stopped; who moves the arm did not take that.*from the arm"),
+     "the arm is stopped and stays so until a start; the task did not confirm.*from the task"),
+    (False, True, ArmStopFailed, "the task has stopped; the executor of the arm did not confirm.*from the arm"),
     (False, False, RemoteError, "from the task"),
 ])
-async def test_stop_says_who_of_arm_and_task_did_not_take_it(
-    arm: bool, task: bool, raised: type[ZencellError] | None, said: str,
+async def test_stop_reports_which_of_arm_and_task_did_not_confirm_it(
+    arm: bool, task: bool, raised: type[ZencellError] | None, message: str,
 ) -> None:
-    network, told = LocalNetwork(), list[str]()
-    cell, person = network.bus("cell"), network.bus("person")
+    network, received = LocalNetwork(), list[str]()
+    cell, operator = network.bus("cell"), network.bus("operator")
 
     async def stop_arm(_: m.StopRequest) -> m.MotionStatus:
-        told.append("arm")
+        received.append("arm")
         if not arm:
             raise Refused("busy", "from the arm")
-        return m.MotionStatus(interlocks=[UNKEPT])
+        return m.MotionStatus(interlocks=[UNSAVED])
 
     async def stop_task(_: m.TaskCommand) -> m.TaskStatus:
-        told.append("task")
+        received.append("task")
         if not task:
             raise Refused("busy", "from the task")
         return m.TaskStatus(state="READY")
@@ -45,20 +45,20 @@ async def test_stop_says_who_of_arm_and_task_did_not_take_it(
     cell.serve(topics.MOTION_STOP, stop_arm)
     cell.serve(topics.TASK_COMMAND, stop_task)
     await cell.ready()
-    control = TaskControl(Subscriptions(person), "ann")
+    control = TaskControl(Subscriptions(operator), "ann")
     if raised is None:
         assert (await control.stop()).state == "READY"
     else:
-        with pytest.raises(raised, match=said):
+        with pytest.raises(raised, match=message):
             await control.stop()
-    assert sorted(told) == ["arm", "task"], "both, whatever the other says"
+    assert sorted(received) == ["arm", "task"], "both, whatever the other answers"
     assert ("disk is full" in control.unsaved) == arm
 
 
 @pytest.mark.parametrize("turns", range(1, 6))
-async def test_stop_that_is_cancelled_reaches_both_all_the_same(turns: int) -> None:
+async def test_cancelled_stop_still_reaches_both(turns: int) -> None:
     network, arm, task = LocalNetwork(), asyncio.Event(), asyncio.Event()
-    cell, person = network.bus("cell"), network.bus("person")
+    cell, operator = network.bus("cell"), network.bus("operator")
 
     async def stop_arm(_: m.StopRequest) -> m.MotionStatus:
         arm.set()
@@ -71,7 +71,7 @@ async def test_stop_that_is_cancelled_reaches_both_all_the_same(turns: int) -> N
     cell.serve(topics.MOTION_STOP, stop_arm)
     cell.serve(topics.TASK_COMMAND, stop_task)
     await cell.ready()
-    control = TaskControl(Subscriptions(person), "ann")
+    control = TaskControl(Subscriptions(operator), "ann")
     stopping = asyncio.create_task(control.stop())
     for _ in range(turns):
         await asyncio.sleep(0)

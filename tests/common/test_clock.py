@@ -3,7 +3,7 @@
 import pytest
 
 from common import clock as clocks
-from common.clock import BOOTED_VARIABLE, KEPT_VARIABLE, Clock
+from common.clock import BOOTED_VARIABLE, CLOCK_FOLDER_VARIABLE, Clock
 from common.time_source import use_time_source
 
 HOUR = 3600 * 10**9
@@ -33,10 +33,9 @@ class Host:
 
 @pytest.fixture
 def host():
-    with use_time_source(Host()) as _:
-        from common.time_source import _Chosen
-
-        yield _Chosen.sources
+    source = Host()
+    with use_time_source(source):
+        yield source
 
 
 @pytest.mark.parametrize("step", [HOUR, -HOUR, 600 * 10**9])
@@ -64,7 +63,7 @@ def test_processes_without_a_supervisor_agree_by_a_folder_that_they_share(host, 
     boot_id = tmp_path / "boot_id"
     boot_id.write_text("a\n")
     monkeypatch.setattr(clocks, "BOOT_ID", boot_id)
-    shared = {KEPT_VARIABLE: str(tmp_path)}
+    shared = {CLOCK_FOLDER_VARIABLE: str(tmp_path)}
     first = Clock.from_environment(shared)
     host.wall += HOUR
     assert Clock.from_environment(shared).now_ns() == first.now_ns()
@@ -75,9 +74,9 @@ def test_processes_without_a_supervisor_agree_by_a_folder_that_they_share(host, 
 
 
 def test_what_was_handed_down_goes_before_what_is_kept_and_nonsense_is_told(host, tmp_path):
-    both = {BOOTED_VARIABLE: "17", KEPT_VARIABLE: str(tmp_path)}
+    both = {BOOTED_VARIABLE: "17", CLOCK_FOLDER_VARIABLE: str(tmp_path)}
     assert Clock.from_environment(both).booted_ns == 17 and not list(tmp_path.iterdir())
     with pytest.raises(ValueError, match="invalid literal"):
         Clock.from_environment({BOOTED_VARIABLE: "yesterday"})
     with pytest.raises(ValueError, match=r"ZENCELL_CLOCK .*/none: No such file"):
-        Clock.from_environment({KEPT_VARIABLE: str(tmp_path / "none")})
+        Clock.from_environment({CLOCK_FOLDER_VARIABLE: str(tmp_path / "none")})

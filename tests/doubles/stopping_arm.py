@@ -1,13 +1,13 @@
-"""A backend for tests: a simulated arm with a controller of its own, which a test stops for safety."""
+"""A backend for tests: a simulated arm with a controller of its own, on which a test triggers safety stops."""
 
 from __future__ import annotations
 
 from common.config import Parameters, RobotConfig
 from common.hardware.interface import ArmState, HardwareFault, Limits, Vector
-from common.hardware.mock import MockHardware, SimulatedFingers
+from common.hardware.mock import MockHardware, SimulatedFingers, simulated_fingers
 
 simulated = True
-made: list[StoppingArm] = []  # the newest last
+created: list[StoppingArm] = []  # the newest last
 
 
 class Options(Parameters):
@@ -15,12 +15,11 @@ class Options(Parameters):
 
 
 class StoppingArm(MockHardware):
-    """Does all it is told at once."""
+    """Executes orders at once; `stopped` is a safety stop, `refuses` the outcome of orders."""
 
     delay = ahead = late = 0.0
 
     def __init__(self, start: Vector, gripper: SimulatedFingers | None) -> None:
-        """Not stopped."""
         super().__init__(start, gripper)
         self.stopped = False
         self.orders: list[tuple[object, ...]] = []
@@ -28,28 +27,24 @@ class StoppingArm(MockHardware):
 
     @property
     def state(self) -> ArmState:
-        """Stopped or running."""
         q, dq = self.read(0.0)
         return ArmState(q.tolist(), dq.tolist(), "protective_stop" if self.stopped else "running", "stopped for safety")
 
     def write(self, positions: Vector, velocities: Vector, now: float) -> None:
-        """Move, unless it is stopped."""
         if self.stopped:
             raise HardwareFault("stopped for safety")
         super().write(positions, velocities, now)
 
     def order(self, act: str, *values: float) -> int:
-        """Recover, or take note."""
         self.orders.append((act, *values))
         self.stopped = self.stopped and act != "recover"
         return len(self.orders)
 
     def outcome(self, number: int) -> str:
-        """It is done, unless it is refused."""
         return self.refuses
 
 
 def create(robot: RobotConfig, limits: Limits, start: Vector, options: Options) -> StoppingArm:
-    """The arm at `start` with open fingers."""
-    made.append(StoppingArm(start, SimulatedFingers(robot.gripper, robot.gripper.max_width) if robot.gripper else None))
-    return made[-1]
+    """Create the arm at `start` with open fingers."""
+    created.append(StoppingArm(start, simulated_fingers(robot)))
+    return created[-1]

@@ -38,29 +38,29 @@ LIMITS = Limits(
     tuple(MODEL.joint_names), MODEL.lower, MODEL.upper, MODEL.velocity, MODEL.acceleration, None, MODEL.jerk)
 
 
-def test_the_hand_grasps_what_is_there_and_opens() -> None:
+def test_hand_grasps_an_object_and_opens() -> None:
     config = ROBOT.gripper
     assert config is not None
     with FrankaHost("--gripper-physics", "--gripper-object-width", "0.06"):
         gripper = DrivenGripper("drivers.franka_hand", {"host": "127.0.0.1"}, config, name="hand")
         controller, end = GripperController(gripper, config), time.monotonic() + TIMEOUT
         for name, width, expected, outcome in (("close", 0.0, 0.06, "grasped"), ("open", 0.08, None, "")):
-            said = None
-            while said is None or said.state == "active":
-                assert time.monotonic() < end, said
+            state = None
+            while state is None or state.state == "active":
+                assert time.monotonic() < end, state
                 now = time.monotonic()
                 try:
-                    said = controller.update(gripper.read(now), now)
-                    if said.id != name:
-                        said = controller.command(GripperCommand(id=name, width=width, expected_width=expected), now)
+                    state = controller.update(gripper.read(now), now)
+                    if state.id != name:
+                        state = controller.command(GripperCommand(id=name, width=width, expected_width=expected), now)
                 except HardwareFault:
-                    pass  # it is being connected to
+                    pass  # not connected yet
                 time.sleep(PERIOD)
-            assert (said.state, said.outcome) == ("succeeded", outcome), said
+            assert (state.state, state.outcome) == ("succeeded", outcome), state
         gripper.close()
 
 
-def made(host: str = "127.0.0.1") -> DrivenArm:
+def create_arm(host: str = "127.0.0.1") -> DrivenArm:
     options = {**ROBOT.hardware.options, "host": host, "ahead": 0.1}
     arm = load_hardware(ROBOT.model_copy(update={"hardware": ROBOT.hardware.model_copy(update={"options": options})}),
                         LIMITS, np.zeros(7))
@@ -70,7 +70,7 @@ def made(host: str = "127.0.0.1") -> DrivenArm:
 
 @contextmanager
 def rigged() -> Iterator[Rig]:
-    rig = Rig(made(), np.zeros(7))
+    rig = Rig(create_arm(), np.zeros(7))
     try:
         yield rig
     finally:
@@ -115,7 +115,7 @@ def goes(rig: Rig, target: np.ndarray, share: float = 1.0) -> str:
 
 
 @in_real_time
-def test_the_arm_finds_nothing_against_motions_at_all_limits() -> None:
+def test_arm_accepts_motions_at_all_limits() -> None:
     with FrankaHost("--enforce-motion-limits", "--enforce-comm-constraints") as judging, rigged() as rig:
         said = goes(rig, MODEL.named("home"), 0.3)
         if said or rig.arm.state.speed < 1.0:
@@ -129,7 +129,7 @@ def test_the_arm_finds_nothing_against_motions_at_all_limits() -> None:
 
 
 @in_real_time
-def test_a_reflex_says_why_and_is_left_only_when_somebody_asks() -> None:
+def test_reflex_reports_its_reason_and_ends_only_on_request() -> None:
     with FrankaHost("--enforce-comm-constraints"), rigged() as rig:
         rig.until("")
         for _ in range(30):
@@ -148,7 +148,7 @@ def test_a_reflex_says_why_and_is_left_only_when_somebody_asks() -> None:
         rig.until("")
 
 
-def test_nothing_moves_before_somebody_asks_and_it_follows_from_where_it_stands(
+def test_nothing_moves_without_a_request_and_motions_start_where_the_arm_is(
     host: FrankaHost, rig: Rig,
 ) -> None:
     rig.until("")
@@ -158,11 +158,11 @@ def test_nothing_moves_before_somebody_asks_and_it_follows_from_where_it_stands(
     assert np.abs(rig.arm.read(0.0)[0] - MODEL.named("home")).max() < 5e-3
 
 
-def test_set_points_that_cease_bring_the_arm_to_rest_by_itself(rig: Rig) -> None:
+def test_ceasing_set_points_bring_the_arm_to_rest(rig: Rig) -> None:
     rig.until("")
     assert rig.swing(SWING / 4) == ""
     end = time.monotonic() + TIMEOUT
-    while max(map(abs, rig.arm.state.dq)) > 1e-3:  # nobody sends anything
+    while max(map(abs, rig.arm.state.dq)) > 1e-3:  # without set-points
         assert time.monotonic() < end
         time.sleep(PERIOD)
     assert "ceased to come" in rig.until("ceased to come")
@@ -170,19 +170,19 @@ def test_set_points_that_cease_bring_the_arm_to_rest_by_itself(rig: Rig) -> None
     assert rig.arm.state.mode == "running", "it had no reason to stop for protection"
 
 
-def test_what_only_desk_can_do_is_refused_with_a_line(rig: Rig) -> None:
+def test_functions_of_desk_are_refused_with_one_line(rig: Rig) -> None:
     assert "in Desk" in rig.done(rig.arm.order("enable"))
     assert "buttons" in rig.done(rig.arm.order("freedrive", 1.0))
     assert "cannot output" in rig.done(rig.arm.order("output", 1.0, 0.0))
 
 
-def test_the_load_is_told_while_the_arm_rests(rig: Rig) -> None:
+def test_payload_is_set_at_rest(rig: Rig) -> None:
     rig.until("")
     assert rig.done(rig.arm.order("payload", 0.4, 0.0, 0.0, 0.05)) == ""
     rig.until_it_moves()
 
 
-def test_a_controller_that_is_frozen_or_started_again_is_found_again_where_it_stands(
+def test_frozen_or_restarted_controller_is_connected_again_without_motion(
     host: FrankaHost, rig: Rig,
 ) -> None:
     rig.until("")
@@ -193,4 +193,4 @@ def test_a_controller_that_is_frozen_or_started_again_is_found_again_where_it_st
     rig.until("no message") if rig.arm.state.mode == "running" else None
     host.boot()
     rig.until("")
-    assert np.allclose(rig.arm.read(0.0)[0], stood, atol=5e-3), "nothing has moved it"
+    assert np.allclose(rig.arm.read(0.0)[0], stood, atol=5e-3), "it has not moved"

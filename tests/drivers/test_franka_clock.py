@@ -63,7 +63,7 @@ def clocks(monkeypatch: pytest.MonkeyPatch) -> Iterator[Clocks]:
 
 
 @pytest.mark.parametrize("share", [1.0, 0.95, 0.7, 0.35])
-def test_set_points_are_those_of_now_however_slow_the_clock_of_the_arm_is(clocks: Clocks, share: float) -> None:
+def test_set_points_are_current_at_any_speed_of_the_arms_clock(clocks: Clocks, share: float) -> None:
     clocks.share = share
     clocks.run(1.0)
     host, due = np.array(clocks.run(2.0)).T
@@ -74,7 +74,7 @@ def test_set_points_are_those_of_now_however_slow_the_clock_of_the_arm_is(clocks
     assert 1 / clocks.driver.rate == pytest.approx(np.diff(due)[-1], rel=0.02)
 
 
-def test_clock_that_changes_is_followed_without_asking_for_what_is_yet_to_come(clocks: Clocks) -> None:
+def test_changing_clock_is_followed_without_requesting_future_set_points(clocks: Clocks) -> None:
     clocks.share = 0.35
     clocks.run(2.0)
     for share in (0.8, 0.3, 0.6):
@@ -85,7 +85,7 @@ def test_clock_that_changes_is_followed_without_asking_for_what_is_yet_to_come(c
         assert (host - due).max() < 0.4, share
 
 
-def test_clock_like_the_hosts_is_followed_evenly(clocks: Clocks) -> None:
+def test_clock_at_the_hosts_rate_is_followed_evenly(clocks: Clocks) -> None:
     clocks.share = 0.9999
     clocks.run(1.0)
     due = np.array(clocks.run(2.0))[:, 1]

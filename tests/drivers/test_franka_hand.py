@@ -37,7 +37,7 @@ class Gripper:
 
 
 @pytest.mark.parametrize(("between", "holds"), [(0.0, False), (0.0004, False), (0.002, True), (0.06, True)])
-def test_fingers_that_met_hold_nothing(monkeypatch: pytest.MonkeyPatch, between: float, holds: bool) -> None:
+def test_closed_fingers_hold_nothing(monkeypatch: pytest.MonkeyPatch, between: float, holds: bool) -> None:
     monkeypatch.setattr(Gripper, "between", between)
     library = SimpleNamespace(Gripper=Gripper, CommandException=RuntimeError)
     monkeypatch.setitem(sys.modules, "pylibfranka", library)

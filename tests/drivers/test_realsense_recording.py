@@ -95,7 +95,7 @@ def config_of(**options: Any) -> real_depth_camera.Config:
 
 
 @pytest.mark.parametrize("colours", ["rgb8", "bgr8"])
-async def test_recording_is_seen_as_it_was_drawn_again_and_again(tmp_path: Path, colours: str) -> None:
+async def test_recording_is_played_as_it_was_rendered_in_a_loop(tmp_path: Path, colours: str) -> None:
     shots = [drawn(number) for number in range(3)]
     record(tmp_path / "table.db3", shots, colours)
     net = LocalNetwork()
@@ -117,7 +117,7 @@ async def test_recording_is_seen_as_it_was_drawn_again_and_again(tmp_path: Path,
     assert (info.k[0], info.k[4], info.k[2], info.k[5]) == (FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
 
 
-async def test_stamps_of_a_recording_are_of_now(tmp_path: Path) -> None:
+async def test_stamps_of_a_recording_are_current(tmp_path: Path) -> None:
     record(tmp_path / "table.db3", [drawn(0)])
     net = LocalNetwork()
     images = net.bus().reader(topics.DEPTH_CAMERA_IMAGE)
@@ -131,7 +131,7 @@ async def test_stamps_of_a_recording_are_of_now(tmp_path: Path) -> None:
     ({"file": "/nowhere/table.db3"}, "options.file: '/nowhere/table.db3' is no file"),
     ({"file": __file__, "serial": "0123"}, "options.serial: '0123' selects a camera, but options.file "),
 ])
-async def test_recording_that_cannot_be_meant_ends_the_start_with_one_line(options: dict[str, str], told: str) -> None:
+async def test_invalid_recording_option_ends_the_start_with_one_line(options: dict[str, str], told: str) -> None:
     with pytest.raises(ConfigError) as refused:
         async with running_service(LocalNetwork(), real_depth_camera.run, config_of(**options), name="camera"):
             await asyncio.sleep(10)
@@ -139,7 +139,7 @@ async def test_recording_that_cannot_be_meant_ends_the_start_with_one_line(optio
 
 
 @pytest.mark.parametrize("made", ["text", "without depth"])
-async def test_file_that_is_no_recording_or_lacks_depth_is_told_and_tried_again(tmp_path: Path, made: str) -> None:
+async def test_file_that_is_no_recording_or_lacks_depth_is_logged_and_retried(tmp_path: Path, made: str) -> None:
     file = tmp_path / "table.db3"
     if made == "text":
         file.write_text("colours and depth", encoding="utf-8")

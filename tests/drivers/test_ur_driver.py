@@ -63,7 +63,7 @@ def arm(controller: Controller) -> UrArm:
     return arm
 
 
-def test_arm_that_could_not_be_moved_by_hand_is_not_said_to_be_once_it_is_powered_at_the_pendant(
+def test_refused_freedrive_is_not_reported_after_power_on(
     controller: Controller, arm: UrArm
 ) -> None:
     controller.mode = OFF
@@ -74,7 +74,7 @@ def test_arm_that_could_not_be_moved_by_hand_is_not_said_to_be_once_it_is_powere
     assert arm.read().mode == "running" and not controller.by_hand
 
 
-def test_a_protective_stop_ends_freedrive_also_when_it_is_unlocked_at_the_pendant(
+def test_protective_stop_ends_freedrive(
     controller: Controller, arm: UrArm
 ) -> None:
     arm.do("freedrive", 1.0)
@@ -89,7 +89,7 @@ def test_a_protective_stop_ends_freedrive_also_when_it_is_unlocked_at_the_pendan
     assert arm.read().mode == "running" and not controller.by_hand
 
 
-def test_a_program_that_is_ended_at_the_pendant_ends_freedrive(controller: Controller, arm: UrArm) -> None:
+def test_program_ended_at_the_pendant_ends_freedrive(controller: Controller, arm: UrArm) -> None:
     arm.do("freedrive", 1.0)
     assert arm.read().mode == "freedrive"
     controller.program, controller.by_hand = False, False

@@ -1,4 +1,4 @@
-"""A scene without a browser: what was sent is counted, time stands still until told, messages are short to write."""
+"""A scene without a browser: sent messages are recorded, time is set by the test, messages are short to write."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def around_of(name: str) -> Surroundings:
 
 
 class Clock:
-    """Says the time that it is told [s]."""
+    """Returns the time that the test sets [s]."""
 
     def __init__(self) -> None:
         self.now = 100.0
@@ -64,45 +64,44 @@ class Clock:
         return self.now
 
 
-class ConsoleDouble:
-    """Does at once what would be brought to the cell, and keeps it."""
+class FakeConsole:
+    """Runs actions at once, and records moved and selected objects."""
 
     def __init__(self) -> None:
         self.moved: list[tuple[str, float, float]] = []
-        self.put_acts: list[Any] = []
+        self.selected = ""
 
-    def put(self, act: Any) -> None:
-        self.put_acts.append(act)
-        if (doing := act()) is not None:
-            asyncio.run(doing)
+    def put(self, action: Any) -> None:
+        if (coroutine := action()) is not None:
+            asyncio.run(coroutine)
 
-    def picked(self, name: str) -> None:
-        self.chosen = name
+    def on_object_selected(self, name: str) -> None:
+        self.selected = name
 
-    def move(self, name: str, x: float, y: float) -> None:
+    def on_object_moved(self, name: str, x: float, y: float) -> None:
         self.moved.append((name, round(x, 6), round(y, 6)))
 
 
 class Stage:
-    """The scene of a cell on a server of its own, watched or not: `say` is what the cell says."""
+    """The scene of a cell on a server; `say` publishes a message, `watched` is whether a page is open."""
 
     def __init__(
-        self, server: viser.ViserServer, cell: str, own: Sequence[str] = (), keys: Any = (), **options: Any
+        self, server: viser.ViserServer, cell: str, custom: Sequence[str] = (), keys: Any = (), **options: Any
     ) -> None:
         self.server = server
         self.robot = robot_of(cell)
         self.clock = Clock()
         self.watched = True
-        self.console: Any = ConsoleDouble()
-        self.said: dict[str, m.Message] = {}
+        self.console: Any = FakeConsole()
+        self.messages: dict[str, m.Message] = {}
         server.scene.reset()
-        few = {  # reading meshes takes a second; here few triangles do
-            "visual_pieces": lambda _robot: rough_of(cell), "coarse": lambda pieces, _kept: pieces,
+        few_triangles = {  # reading all meshes would take a second
+            "visual_pieces": lambda _robot: rough_of(cell), "coarse": lambda pieces, _share: pieces,
         }
-        layers = find_layers(find_application(cell_of(cell).application), own, keys)
-        with patch.multiple("page.scene", **few):
+        layers = find_layers(find_application(cell_of(cell).application), custom, keys)
+        with patch.multiple("page.scene", **few_triangles):
             self.view = Scene(
-                server, self.robot, around_of(cell), layers, self.console, lambda topic: self.said.get(topic.key),
+                server, self.robot, around_of(cell), layers, self.console, lambda topic: self.messages.get(topic.key),
                 clock=self.clock, **options,
             )
 
@@ -110,31 +109,28 @@ class Stage:
         return self.view.layers[name]
 
     def say(self, topic: Topic[Any], message: Any, wait: float = 1.0) -> None:
-        """Have the cell say something after a while [s]; it is shown if somebody looks."""
+        """Publish a message after a while [s]; it is displayed if a page is open."""
         self.clock.now += wait
         if topic.kind == "event":
-            self.view.happened(topic, message)
+            self.view.handle_event(topic, message)
             return
-        self.said[topic.key] = message
-        self.look()
+        self.messages[topic.key] = message
+        self.refresh()
 
     def show(self, layer: str, on: bool) -> None:
-        """Show or hide a layer."""
         self.view.set_shown(layer, on)
-        self.look()
+        self.refresh()
 
     def edit(self, on: bool) -> None:
-        """Let the simulated world be edited, or not."""
         self.view.set_editing(on)
-        self.look()
+        self.refresh()
 
-    def look(self) -> None:
-        """Let what is due be shown."""
+    def refresh(self) -> None:
         if self.watched:
             self.view.refresh(self.clock.now)
 
     def joints(self, q: Any, others: dict[str, float] | None = None) -> None:
-        """Have the robot say where its joints are."""
+        """Publish joint states."""
         self.say(topics.JOINT_STATES, self.joint_state(q, others), 0.0)
 
     def joint_state(self, q: Any, others: dict[str, float] | None = None) -> m.JointState:
@@ -143,15 +139,15 @@ class Stage:
 
     @contextmanager
     def sent(self) -> Iterator[list[Any]]:
-        """Everything that is sent to browsers meanwhile."""
+        """Record everything that is sent to browsers inside the block."""
         scene: Any = self.server.scene
         original, found = scene._queue_scene_message, []
 
-        def note(message: Any) -> None:
+        def record(message: Any) -> None:
             found.append(message)
             original(message)
 
-        scene._queue_scene_message = note
+        scene._queue_scene_message = record
         try:
             yield found
         finally:
@@ -172,7 +168,7 @@ def scene_of(*objects: m.CollisionObject, held: dict[str, m.CollisionObject] | N
 
 
 def in_world(server: viser.ViserServer, node: Any) -> NDArray[np.float64]:
-    """(4, 4) pose of a node, through all nodes above it."""
+    """Return the (4, 4) pose of a node, through all its parents."""
     T = np.eye(4)
     parts = node.name.split("/")[1:]
     for depth in range(1, len(parts) + 1):
@@ -186,7 +182,7 @@ def in_world(server: viser.ViserServer, node: Any) -> NDArray[np.float64]:
 
 
 def is_shown(server: viser.ViserServer, node: Any) -> bool:
-    """Whether a node and all those above it are visible."""
+    """Return whether a node and all its parents are visible."""
     parts = node.name.split("/")[1:]
-    above = (server.scene.get_handle_by_name("/" + "/".join(parts[:i])) for i in range(1, len(parts) + 1))
-    return all(handle is None or handle.visible for handle in above)
+    parents = (server.scene.get_handle_by_name("/" + "/".join(parts[:i])) for i in range(1, len(parts) + 1))
+    return all(handle is None or handle.visible for handle in parents)

@@ -1,4 +1,4 @@
-"""The rules of who may open the page, without a network."""
+"""Admission of HTTP requests to the page, without a network."""
 
 import socket
 from http import HTTPStatus
@@ -7,41 +7,37 @@ from pathlib import Path
 import pytest
 
 from common.errors import ConfigError
-from page.access import (
-    ROLES,
-    TOKEN,
-    Access,
-    address_of,
-    gateways,
-    is_loopback,
-    make_token,
-    token_file,
-    tokens_in,
-)
+from page.access import Access, gateways
+from page.address import is_loopback, page_url
 from security.certificates import write_secret
+from security.page_tokens import ROLES, TOKEN_PATTERN, make_token, read_tokens, token_file
 
 SECRET = "correct-horse-battery"
-HERE = Access("127.0.0.1", 8080)
-WIDE = Access("0.0.0.0", 8080, SECRET)
+LOCAL = Access("127.0.0.1", 8080)
+REMOTE = Access("0.0.0.0", 8080, SECRET)
 NAMED = Access("cell.lab", 8080, SECRET)
 COOKIE = f"other=1; zencell-8080={SECRET}"
 
 
 def status(access: Access, host: str | list[str], origin: str | list[str] = [], cookie: str = "",  # noqa: B006
            path: str = "/", upgrade: bool = True) -> int:
-    """Status of the answer to a request, 0 when it may pass."""
+    """Return the status of the answer to a request, 0 for an admitted one."""
     headers = {
         "host": [host] if isinstance(host, str) else host,
         "origin": [origin] if isinstance(origin, str) else origin,
         "cookie": [cookie] if cookie else [],
     }
-    answer = access.answer(path, headers, upgrade=upgrade)
+    answer = access.check(path, headers, upgrade=upgrade)
     return answer.status.value if answer else 0
 
 
-@pytest.mark.parametrize("host", ["127.0.0.1", "127.0.0.1:8080", "localhost:8080", "LocalHost:9000", "[::1]:8080"])
-def test_names_of_this_machine_itself_are_served_by_whatever_port_they_came(host: str) -> None:
-    assert status(HERE, host) == 0
+@pytest.mark.parametrize(("access", "host", "cookie"), [
+    *((LOCAL, host, "") for host in ("127.0.0.1", "127.0.0.1:8080", "localhost:8080", "LocalHost:9000", "[::1]:8080")),
+    *((REMOTE, host, COOKIE) for host in ("192.168.1.7:8080", "[fe80::1]:8080", "localhost", socket.gethostname())),
+    *((NAMED, host, COOKIE) for host in ("cell.lab:8080", "CELL.lab:8080")),
+])
+def test_own_host_names_are_served(access: Access, host: str, cookie: str) -> None:
+    assert status(access, host, [], cookie) == 0
 
 
 @pytest.mark.parametrize("host", [
@@ -49,8 +45,13 @@ def test_names_of_this_machine_itself_are_served_by_whatever_port_they_came(host
     "127.0.0.1@evil.example", "localhost:", "localhost/", "[::1", "::1", [], ["localhost", "localhost"],
     ["localhost", "evil.example"],
 ])
-def test_other_names_are_refused(host: str | list[str]) -> None:
-    assert status(HERE, host) == status(HERE, host, upgrade=False) == HTTPStatus.FORBIDDEN
+def test_foreign_host_names_are_rejected(host: str | list[str]) -> None:
+    assert status(LOCAL, host) == status(LOCAL, host, upgrade=False) == HTTPStatus.FORBIDDEN
+
+
+@pytest.mark.parametrize("access", [REMOTE, NAMED])
+def test_foreign_host_name_is_rejected_on_other_addresses_too(access: Access) -> None:
+    assert status(access, "evil.example:8080", [], COOKIE) == HTTPStatus.FORBIDDEN
 
 
 @pytest.mark.parametrize(("host", "origin"), [
@@ -58,8 +59,8 @@ def test_other_names_are_refused(host: str | list[str]) -> None:
     ("LOCALHOST:8080", "http://localhost:8080"), ("localhost", "http://localhost:80"),
     ("localhost:80", "http://localhost"), ("localhost", "https://localhost"), ("[::1]:8080", "http://[::1]:8080"),
 ])
-def test_page_of_our_own_may_open_its_socket(host: str, origin: str) -> None:
-    assert status(HERE, host, origin) == 0
+def test_own_page_may_open_a_websocket(host: str, origin: str) -> None:
+    assert status(LOCAL, host, origin) == 0
 
 
 @pytest.mark.parametrize("origin", [
@@ -67,84 +68,58 @@ def test_page_of_our_own_may_open_its_socket(host: str, origin: str) -> None:
     "http://127.0.0.1:8080.evil.example", "http://evil.example@127.0.0.1:8080", "file://", "http://127.0.0.1:8080/",
     "chrome-extension://127.0.0.1:8080", ["http://127.0.0.1:8080", "http://evil.example"],
 ])
-def test_another_web_page_is_refused_whatever_token_its_browser_has(origin: str | list[str]) -> None:
-    assert status(HERE, "127.0.0.1:8080", origin) == HTTPStatus.FORBIDDEN
-    assert status(WIDE, "127.0.0.1:8080", origin, COOKIE) == HTTPStatus.FORBIDDEN
+def test_foreign_origins_are_rejected_even_with_a_token(origin: str | list[str]) -> None:
+    assert status(LOCAL, "127.0.0.1:8080", origin) == HTTPStatus.FORBIDDEN
+    assert status(REMOTE, "127.0.0.1:8080", origin, COOKIE) == HTTPStatus.FORBIDDEN
 
 
 @pytest.mark.parametrize("upgrade", [True, False])
-def test_without_the_token_nothing_is_served(upgrade: bool) -> None:
+def test_nothing_is_served_without_the_token(upgrade: bool) -> None:
     for path in ("/", "/index.html", "/?token=", "/?token=correct-horse-batterx", "/?tokem=" + SECRET, "/" + SECRET):
         for cookie in ("", f"zencell-8081={SECRET}", "zencell-8080=", "zencell-8080=wrong", SECRET):
-            assert status(WIDE, "127.0.0.1:8080", [], cookie, path, upgrade) == HTTPStatus.UNAUTHORIZED
+            assert status(REMOTE, "127.0.0.1:8080", [], cookie, path, upgrade) == HTTPStatus.UNAUTHORIZED
+    assert status(REMOTE, "127.0.0.1:8080", [], "zencell-8080=é\udcff", "/?token=%ff%C3%A9") == HTTPStatus.UNAUTHORIZED
 
 
-def test_token_in_the_address_becomes_a_cookie_that_opens_the_page() -> None:
-    answer = WIDE.answer(f"/?token={SECRET}", {"host": ["127.0.0.1:8080"]}, upgrade=False)
+def test_token_in_the_url_becomes_a_cookie_and_may_come_with_a_websocket() -> None:
+    answer = REMOTE.check(f"/?token={SECRET}", {"host": ["127.0.0.1:8080"]}, upgrade=False)
     assert answer is not None and answer.status == HTTPStatus.OK and SECRET not in answer.text
     cookie, *flags = answer.headers["Set-Cookie"].split("; ")
     assert {"HttpOnly", "SameSite=Strict"} <= set(flags)
-    assert status(WIDE, "127.0.0.1:8080", [], cookie, upgrade=False) == 0
-    assert status(WIDE, "127.0.0.1:8080", "http://127.0.0.1:8080", cookie) == 0
+    assert status(REMOTE, "127.0.0.1:8080", [], cookie, upgrade=False) == 0
+    assert status(REMOTE, "127.0.0.1:8080", "http://127.0.0.1:8080", cookie) == 0
+    assert status(REMOTE, "127.0.0.1:8080", path=f"/?token={SECRET}") == 0
 
 
-def test_program_may_bring_the_token_with_its_socket() -> None:
-    assert status(WIDE, "127.0.0.1:8080", path=f"/?token={SECRET}") == 0
-
-
-def test_letters_beyond_ascii_are_no_token_and_no_error() -> None:
-    assert status(WIDE, "127.0.0.1:8080", [], "zencell-8080=é\udcff", "/?token=%ff%C3%A9") == HTTPStatus.UNAUTHORIZED
-
-
-@pytest.mark.parametrize("host", ["192.168.1.7:8080", "[fe80::1]:8080", "localhost", socket.gethostname()])
-def test_beyond_this_machine_addresses_and_its_own_name_are_served(host: str) -> None:
-    assert status(WIDE, host, [], COOKIE) == 0
-
-
-def test_name_that_was_configured_is_served_and_other_names_are_not() -> None:
-    assert status(NAMED, "cell.lab:8080", [], COOKIE) == status(NAMED, "CELL.lab:8080", [], COOKIE) == 0
-    assert status(NAMED, "evil.example:8080", [], COOKIE) == HTTPStatus.FORBIDDEN
-    assert status(WIDE, "evil.example:8080", [], COOKIE) == HTTPStatus.FORBIDDEN
-
-
-@pytest.mark.parametrize(("host", "only_here"), [
+@pytest.mark.parametrize(("host", "loopback"), [
     ("127.0.0.1", True), ("127.8.9.10", True), ("localhost", True), ("::1", True), ("0.0.0.0", False), ("::", False),
     ("192.168.0.1", False), ("cell.lab", False), ("localhost.evil.example", False), ("", False),
 ])
-def test_only_addresses_of_the_machine_itself_count_as_loopback(host: str, only_here: bool) -> None:
-    assert is_loopback(host) is only_here
+def test_loopback_addresses_are_recognized(host: str, loopback: bool) -> None:
+    assert is_loopback(host) is loopback
 
 
-def test_address_to_open_is_one_that_can_be_opened() -> None:
-    assert address_of("127.0.0.1", 8080) == "http://127.0.0.1:8080"
-    assert address_of("::1", 8080) == "http://[::1]:8080"
-    assert address_of("cell.lab", 80) == "http://cell.lab:80"
-    assert "0.0.0.0" not in address_of("0.0.0.0", 8080) and "::" not in address_of("::", 8080)
+def test_page_url_can_be_opened() -> None:
+    assert page_url("127.0.0.1", 8080) == "http://127.0.0.1:8080"
+    assert page_url("::1", 8080) == "http://[::1]:8080"
+    assert page_url("cell.lab", 80) == "http://cell.lab:80"
+    assert "0.0.0.0" not in page_url("0.0.0.0", 8080) and "::" not in page_url("::", 8080)
 
 
-def test_made_tokens_are_long_differ_and_need_no_escaping() -> None:
-    made = {make_token() for _ in range(100)}
-    assert len(made) == 100 and all(len(token) >= 40 and TOKEN.fullmatch(token) for token in made)
-
-
-def test_secret_is_not_in_what_is_logged_of_the_rules() -> None:
-    assert SECRET not in repr(WIDE)
-
-
-@pytest.mark.parametrize(("peer", "passes"), [
+@pytest.mark.parametrize(("peer", "admitted"), [
     ("127.0.0.1", True), ("127.8.9.1", True), ("::1", True), ("::ffff:127.0.0.1", True), ("172.18.0.1", True),
-    ("::ffff:172.18.0.1", True), ("172.18.0.7", False),
-    ("::ffff:172.18.0.7", False), ("fe80::1%eth0", False), ("", False),
+    ("::ffff:172.18.0.1", True), ("172.18.0.7", False), ("::ffff:172.18.0.7", False), ("fe80::1%eth0", False),
+    ("", False),
 ])
-def test_where_no_token_is_asked_for_the_socket_tells_who_is_near_and_not_the_request(peer: str, passes: bool) -> None:
-    published = Access("127.0.0.1", 8080, near=frozenset({"172.18.0.1"}))
-    answer = published.answer("/", {"host": ["127.0.0.1:8080"]}, upgrade=True, peer=peer)
-    assert (answer is None) is passes
+def test_without_a_token_the_peer_address_decides(peer: str, admitted: bool) -> None:
+    published = Access("127.0.0.1", 8080, trusted_peers=frozenset({"172.18.0.1"}))
+    answer = published.check("/", {"host": ["127.0.0.1:8080"]}, upgrade=True, peer=peer)
+    assert (answer is None) is admitted
     if answer is not None:
         assert answer.status is HTTPStatus.UNAUTHORIZED and "ZENCELL_VIEWER_TOKEN" in answer.text
 
 
-def test_gateway_of_a_container_is_that_of_its_default_route(tmp_path: Path) -> None:
+def test_gateway_of_a_container_is_that_of_the_default_route(tmp_path: Path) -> None:
     table = tmp_path / "route"
     rows = ["Iface Destination Gateway Flags", "eth1 00000000 010012AC 0003", "eth0 000013AC 00000000 0001", ""]
     table.write_text("\n".join(rows).replace(" ", "\t"))
@@ -152,28 +127,35 @@ def test_gateway_of_a_container_is_that_of_its_default_route(tmp_path: Path) -> 
     assert gateways(tmp_path / "none") == frozenset()
 
 
-def test_each_token_opens_for_its_role_and_the_one_of_before_for_everything() -> None:
+# --- tokens ---
+
+
+def test_each_token_grants_its_role_and_the_general_one_all_roles() -> None:
     tokens = {role: f"{role}-token-of-the-page" for role in ROLES}
     access = Access("127.0.0.1", 8080, SECRET, tokens)
     for role, token in tokens.items():
         assert status(access, "127.0.0.1:8080", cookie=f"zencell-8080={token}") == 0
         assert access.roles([f"zencell-8080={token}"]) == {"look", role}
         assert status(access, "127.0.0.1:8080", path=f"/?token={token}") == 0
-    assert access.roles([f"zencell-8080={SECRET}"]) == set(ROLES)
+    assert access.roles([f"zencell-8080={SECRET}"]) == LOCAL.roles([]) == set(ROLES)
     assert not access.roles(["zencell-8080=look", "zencell-8081=" + SECRET])
     assert status(access, "127.0.0.1:8080") == HTTPStatus.UNAUTHORIZED
-    assert SECRET not in repr(access) and "of-the-page" not in repr(access)
-    assert HERE.roles([]) == set(ROLES)
+    assert SECRET not in repr(access) and "of-the-page" not in repr(access), "a log must not show tokens"
 
 
-def test_tokens_of_a_folder_are_those_that_only_its_owner_reads(tmp_path: Path) -> None:
-    assert tokens_in(tmp_path, "panda") == {}
+def test_new_tokens_are_long_and_unique_and_need_no_escaping() -> None:
+    tokens = {make_token() for _ in range(100)}
+    assert len(tokens) == 100 and all(len(token) >= 40 and TOKEN_PATTERN.fullmatch(token) for token in tokens)
+
+
+def test_token_files_must_be_private_and_valid(tmp_path: Path) -> None:
+    assert read_tokens(tmp_path, "panda") == {}
     for role in ROLES[:2]:
         write_secret(token_file(tmp_path, "panda", role), f"{role}-token-of-the-page\n".encode())
-    assert tokens_in(tmp_path, "panda") == {role: f"{role}-token-of-the-page" for role in ROLES[:2]}
+    assert read_tokens(tmp_path, "panda") == {role: f"{role}-token-of-the-page" for role in ROLES[:2]}
     token_file(tmp_path, "panda", "look").chmod(0o640)
-    with pytest.raises(ConfigError, match=r"panda\.page\.look' can be read by others: chmod 600 it"):
-        tokens_in(tmp_path, "panda")
+    with pytest.raises(ConfigError, match=r"panda\.page\.look' is readable by other users: run chmod 600 on it"):
+        read_tokens(tmp_path, "panda")
     write_secret(token_file(tmp_path, "panda", "look"), b"short\n")
-    with pytest.raises(ConfigError, match=r"panda\.page\.look' holds no token"):
-        tokens_in(tmp_path, "panda")
+    with pytest.raises(ConfigError, match=r"panda\.page\.look' contains no valid token"):
+        read_tokens(tmp_path, "panda")

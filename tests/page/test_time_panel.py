@@ -1,4 +1,4 @@
-"""The field that says what is looked at says what is, however long reading takes and whatever comes of it."""
+"""The source field of the Time tab while recordings are loading, or cannot be read."""
 
 from __future__ import annotations
 
@@ -9,94 +9,84 @@ from typing import Any
 import pytest
 import viser
 
-from page.console import Desk
-from page.past import Memory
-from page.time_panel import THIS, TimePanel
-from page.timeline import Timeline
+from page.console import ActionQueue
+from page.history import RecentHistory, Timeline
+from page.time_panel import LIVE_SOURCE, TimePanel
 from recording.sample import RecordingError
 
 
-class Shelf:
-    """Recordings that are read when a test says so; one of them is damaged."""
+class Recordings:
+    """Recordings that are read when the test allows it; one of them is damaged."""
 
     def __init__(self) -> None:
-        self.read = {name: threading.Event() for name in ("a.mcap", "b.mcap", "damaged.mcap")}
+        self.readable = {name: threading.Event() for name in ("a.mcap", "b.mcap", "damaged.mcap")}
         self.closed: list[str] = []
 
     def open(self, name: str) -> Any:
-        assert self.read[name].wait(10)
+        assert self.readable[name].wait(10)
         if name == "damaged.mcap":
             raise RecordingError("damaged.mcap: is damaged")
-        past = Memory()
-        past.now, past.close = 10.0, lambda: self.closed.append(name)  # type: ignore[method-assign]
-        return past
+        history = RecentHistory()
+        history.now, history.close = 10.0, lambda: self.closed.append(name)  # type: ignore[method-assign]
+        return history
 
 
 class Panel:
-    """A time panel, whom persons and the clock make do something."""
+    """A time panel with its timeline."""
 
-    def __init__(self, server: viser.ViserServer, shelf: Shelf) -> None:
-        self.timeline, self.now = Timeline(lambda _topic: None, Memory()), 0.0
-        self.panel = TimePanel(server.gui, Desk(), self.timeline,  # type: ignore[arg-type]
-                               names=lambda: list(shelf.read), open_one=shelf.open)
-        assert self.source == THIS
+    def __init__(self, gui: viser.GuiApi) -> None:
+        self.recordings = Recordings()
+        self.timeline, self.now = Timeline(lambda _topic: None, RecentHistory()), 0.0
+        self.panel = TimePanel(gui, ActionQueue(), self.timeline,  # type: ignore[arg-type]
+                               names=lambda: list(self.recordings.readable), open_recording=self.recordings.open)
+        assert self.source == LIVE_SOURCE
 
     @property
     def source(self) -> str:
-        """What the field says after a while."""
+        """The value of the field after an update."""
         self.now += 10.0
         self.panel.show(self.now)
         return str(self.panel._source.value)
 
-    async def choose(self, name: str) -> None:
-        """As a browser does."""
+    async def select(self, name: str) -> None:
+        """Select a source as a browser does."""
         self.panel._source.value = name
-        await self.panel._choose(name)
+        await self.panel._select(name)
 
 
 @pytest.fixture
-async def shelf() -> Shelf:
-    return Shelf()
+async def panel(gui: viser.GuiApi) -> Panel:
+    return Panel(gui)
 
 
-async def test_what_is_being_read_stays_chosen_and_stands_there_until_somebody_goes_back_to_now(
-    server: viser.ViserServer, shelf: Shelf
-) -> None:
-    panel = Panel(server, shelf)
-    chosen = asyncio.create_task(panel.choose("a.mcap"))
+async def test_loading_recording_remains_selected_until_the_page_returns_to_the_present(panel: Panel) -> None:
+    selection = asyncio.create_task(panel.select("a.mcap"))
     await asyncio.sleep(0)
-    assert panel.source == "a.mcap" and panel.timeline.is_now
-    shelf.read["a.mcap"].set()
-    await chosen
+    assert panel.source == "a.mcap" and panel.timeline.is_present
+    panel.recordings.readable["a.mcap"].set()
+    await selection
     assert panel.source == "a.mcap" and panel.timeline.recording is not None
-    panel.timeline.now()
-    assert panel.source == THIS
+    panel.timeline.return_to_present()
+    assert panel.source == LIVE_SOURCE
 
 
-async def test_recording_that_cannot_be_read_leaves_the_one_that_is_looked_at(
-    server: viser.ViserServer, shelf: Shelf
-) -> None:
-    panel = Panel(server, shelf)
-    for event in shelf.read.values():
+async def test_unreadable_recording_leaves_the_displayed_one(panel: Panel) -> None:
+    for event in panel.recordings.readable.values():
         event.set()
-    await panel.choose("a.mcap")
+    await panel.select("a.mcap")
     with pytest.raises(RecordingError):
-        await panel.choose("damaged.mcap")
+        await panel.select("damaged.mcap")
     assert panel.source == "a.mcap" and panel.timeline.recording is not None
-    del shelf.read["a.mcap"]
-    assert panel.source == "a.mcap", "also when its file has gone"
+    del panel.recordings.readable["a.mcap"]
+    assert panel.source == "a.mcap", "even if its file was deleted"
 
 
-async def test_of_two_that_are_read_at_a_time_the_one_that_was_chosen_last_is_shown(
-    server: viser.ViserServer, shelf: Shelf
-) -> None:
-    panel = Panel(server, shelf)
-    first = asyncio.create_task(panel.choose("a.mcap"))
-    await asyncio.sleep(0)
-    second = asyncio.create_task(panel.choose("b.mcap"))
-    await asyncio.sleep(0)
-    shelf.read["b.mcap"].set()
-    await second
-    shelf.read["a.mcap"].set()
-    await first
-    assert panel.source == "b.mcap" and shelf.closed == ["a.mcap"]
+async def test_of_two_loading_recordings_the_last_selected_one_is_displayed(panel: Panel) -> None:
+    selections = {}
+    for name in ("a.mcap", "b.mcap"):
+        selections[name] = asyncio.create_task(panel.select(name))
+        await asyncio.sleep(0)
+    for name in ("b.mcap", "a.mcap"):
+        panel.recordings.readable[name].set()
+        await selections[name]
+    assert panel.source == "b.mcap" and panel.recordings.closed == ["a.mcap"]

@@ -1,4 +1,4 @@
-"""The page's files: what the packed page holds, in parts that a browser can keep."""
+"""The files of viser's client, unpacked so that a browser can cache them; and messages from any thread."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from hypothesis import strategies as st
 from viser._messages import RunJavascriptMessage
 from viser.infra._async_message_buffer import AsyncMessageBuffer
 
-from page.viser_inside import ALPHABET, client_files, decoded, files_of, overlay
+from page.viser_inside import ALPHABET, client_files, decode_base88, overlay, unpack_client
 
 PAGE = (Path(viser.__file__).parent / "client" / "build" / "index.html").read_text(encoding="utf-8")
 
 
 def encoded(data: bytes) -> str:
-    """As viser's build writes it."""
+    """Encode as viser's build does."""
     text = ""
     for start in range(0, len(data), 4):
         group = data[start : start + 4]
@@ -33,11 +33,11 @@ def encoded(data: bytes) -> str:
 
 
 @given(st.binary(max_size=40))
-def test_what_was_written_in_letters_is_read_again(data: bytes) -> None:
-    assert decoded(encoded(data)) == data
+def test_decoding_inverts_encoding(data: bytes) -> None:
+    assert decode_base88(encoded(data)) == data
 
 
-def test_client_of_the_installed_viser_is_taken_apart() -> None:
+def test_client_of_the_installed_viser_is_unpacked() -> None:
     files = client_files()
     page = gzip.decompress(files["/"].body).decode()
     parts = set(re.findall(r'"(/[0-9a-f]+\.(?:css|js|wasm))"', page))
@@ -46,26 +46,26 @@ def test_client_of_the_installed_viser_is_taken_apart() -> None:
     assert len(page) < 10_000 + len(overlay()) < len(PAGE) and "data-p=" not in page
     assert 'id="zc-stop"' in page and "STOP" in page
     assert b"WebSocket" in contents["js"] and contents["wasm"].startswith(b"\0asm") and b"mantine" in contents["css"]
-    assert all(files[path].lasts for path in parts) and not files["/"].lasts
+    assert all(files[path].immutable for path in parts) and not files["/"].immutable
 
 
-def test_name_of_a_part_tells_its_contents() -> None:
+def test_path_of_a_file_depends_on_its_content() -> None:
     changed = PAGE.replace('data-ss="', 'data-ss="0', 1)
-    assert set(files_of(changed)) == set(client_files())  # the bar is in the page itself
+    assert set(unpack_client(changed)) == set(client_files())  # the bar is in the page itself
     size = int(re.search(r'data-ss="(\d+)"', PAGE)[1])  # type: ignore[index]
     other = PAGE.replace(f'data-ss="{size}"', f'data-ss="{size - 1}"', 1)
-    assert not {path for path in files_of(other) if path.endswith("css")} & set(client_files())
+    assert not {path for path in unpack_client(other) if path.endswith("css")} & set(client_files())
 
 
 @pytest.mark.parametrize("page", ["<html><head><title>x</title></head></html>", PAGE.replace("data-p=", "data-q=")])
-def test_page_that_is_packed_in_another_way_is_sent_as_it_is(page: str) -> None:
-    files = files_of(page)
+def test_page_with_an_unknown_packing_is_sent_unchanged(page: str) -> None:
+    files = unpack_client(page)
     assert set(files) == {"/", "/index.html"}
     sent = gzip.decompress(files["/"].body).decode()
     assert re.sub(r"<head><script>.*?</script>", "<head>", sent, count=1, flags=re.DOTALL) == page
 
 
-async def test_messages_from_another_thread_wake_who_waits_for_them_and_nobody_elsewhere() -> None:
+async def test_message_from_another_thread_wakes_waiting_tasks_on_their_loop() -> None:
     buffer = AsyncMessageBuffer(asyncio.get_running_loop(), persistent_messages=False)
     for number in range(100):
         waiting = asyncio.create_task(buffer.message_event.wait())
@@ -78,7 +78,7 @@ async def test_messages_from_another_thread_wake_who_waits_for_them_and_nobody_e
 
 
 def _pushed(buffer: AsyncMessageBuffer, number: int, woken: list[asyncio.Future[bool]]) -> list[bool]:
-    """Whether who waits was woken by this thread instead of by the loop."""
+    """Return whether each waiting task was woken by this thread instead of by the loop."""
     buffer.message_event.set()
     found = [future.done() for future in woken]
     buffer.push(RunJavascriptMessage(f"{number}"))

@@ -77,7 +77,7 @@ def hold(value: Any, schema: dict[str, Any], path: str = "") -> None:
 
 
 @pytest.mark.parametrize(("message", "schema"), CONVERTED, ids=[f"{type(c).__name__}-{n}" for c, n in CONVERTED])
-def test_message_becomes_what_foxglove_knows(message: Message, schema: str) -> None:
+def test_messages_are_converted_to_foxglove_schemas(message: Message, schema: str) -> None:
     name, value = convert(message)
     assert name == schema
     value = json.loads(json.dumps(value, allow_nan=False))
@@ -87,7 +87,7 @@ def test_message_becomes_what_foxglove_knows(message: Message, schema: str) -> N
         assert value["timestamp"] == TIME
 
 
-def test_picture_is_the_one_that_was_recorded() -> None:
+def test_exported_image_has_the_recorded_pixels() -> None:
     for encoding in ("bgr8", "rgb8"):
         smooth = np.zeros((16, 16, 3), np.uint8)
         smooth[..., 0] = 200
@@ -96,7 +96,7 @@ def test_picture_is_the_one_that_was_recorded() -> None:
         assert abs(int(pixels[8, 8, 0 if encoding == "bgr8" else 2]) - 200) < 5
 
 
-def test_scene_replaces_the_one_before_and_attached_things_move_with_their_link() -> None:
+def test_scene_replaces_the_one_before_and_attached_objects_move_with_their_link() -> None:
     _, value = convert(next(message for message, _ in CONVERTED if isinstance(message, m.PlanningScene)))
     assert value["deletions"] == [{"timestamp": TIME, "type": 1, "id": ""}]
     frames = {entity["id"]: entity["frame_id"] for entity in value["entities"]}
@@ -115,7 +115,7 @@ def foreign() -> Sample:
     return Sample("panda/mine", b"\x81\xa1a\x01", START, message="Somebodys", kind="event")
 
 
-def test_file_for_foxglove_is_whole_and_says_what_was_left_out(tmp_path: Path) -> None:
+def test_foxglove_file_is_complete_and_skipped_messages_are_counted(tmp_path: Path) -> None:
     source = write(tmp_path / "a.mcap", [joints(0), joints(1), status(2), image(3, PICTURE), foreign()])
     decoder = Decoder()
     with Recording(source) as recording:
@@ -128,7 +128,7 @@ def test_file_for_foxglove_is_whole_and_says_what_was_left_out(tmp_path: Path) -
         "foxglove.JointStates", "foxglove.JointStates", "PickPlaceStatus", "foxglove.CompressedImage"]
 
 
-def test_file_for_foxglove_that_does_not_fit_on_the_disk_is_not_there(
+def test_foxglove_file_that_does_not_fit_on_the_disk_is_removed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     source = write(tmp_path / "a.mcap", [joints(n) for n in range(100)])
@@ -138,15 +138,15 @@ def test_file_for_foxglove_that_does_not_fit_on_the_disk_is_not_there(
     assert list(tmp_path.iterdir()) == [source]
 
 
-def told(number: int) -> Sample:
+def custom_message(number: int) -> Sample:
     """A message whose class is not here, with the schema that was recorded."""
     values = {"header": {"stamp": START + number, "frame_id": "w"}, "gloss": number / 4, "raw": b"\xff\x00"}
     return Sample("panda/gloss", msgpack.packb(values), START + number * STEP, message="Gloss", writer="polisher.1",
                   sequence=number + 1, schema=json.dumps({"title": "Gloss", "type": "object"}).encode())
 
 
-def test_messages_whose_class_is_not_here_are_exported_by_the_schema_that_was_recorded(tmp_path: Path) -> None:
-    cut = write(tmp_path / "a.mcap", [told(0), told(1), foreign()])
+def test_messages_of_unknown_classes_are_exported_by_their_recorded_schema(tmp_path: Path) -> None:
+    cut = write(tmp_path / "a.mcap", [custom_message(0), custom_message(1), foreign()])
     recover(cut, tmp_path / "b.mcap")
     decoder = Decoder()
     with Recording(tmp_path / "b.mcap") as recording:
@@ -178,7 +178,7 @@ def test_tables_have_a_row_for_each_message_and_a_column_for_each_joint(tmp_path
     assert [row["placed"] for row in states] == list("01234") and states[0]["plans"] == "[]"
 
 
-def test_pictures_are_files_with_the_same_pixels(tmp_path: Path) -> None:
+def test_png_files_have_the_recorded_pixels(tmp_path: Path) -> None:
     depth = image(1, DEPTH, "32FC1", "panda/depth_camera/depth/image_raw")
     source = write(tmp_path / "a.mcap", [image(0, PICTURE), depth, image(2, PICTURE[..., ::-1].copy(), "rgb8")])
     with Recording(source) as recording:
@@ -191,7 +191,7 @@ def test_pictures_are_files_with_the_same_pixels(tmp_path: Path) -> None:
     assert np.array_equal(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), np.full((6, 8), 1250, np.uint16))
 
 
-def test_video_has_every_picture_at_the_rate_of_the_recording(tmp_path: Path) -> None:
+def test_video_has_every_image_at_the_recorded_rate(tmp_path: Path) -> None:
     pixels = np.zeros((64, 80, 3), np.uint8)
     source = write(tmp_path / "a.mcap", [image(n, pixels + np.uint8(20 * n)) for n in range(10)])
     with Recording(source) as recording:
@@ -204,7 +204,7 @@ def test_video_has_every_picture_at_the_rate_of_the_recording(tmp_path: Path) ->
     video.release()
 
 
-def test_video_that_does_not_fit_on_the_disk_is_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_video_that_does_not_fit_on_the_disk_is_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     source, target = write(tmp_path / "a.mcap", [image(n, PICTURE) for n in range(10)]), tmp_path / "v.mp4"
     open_writer = cv2.VideoWriter
 
@@ -227,13 +227,13 @@ def test_video_that_does_not_fit_on_the_disk_is_not_there(tmp_path: Path, monkey
     assert list(tmp_path.iterdir()) == [source]
 
 
-def test_video_of_depth_alone_is_refused_in_one_line(tmp_path: Path) -> None:
+def test_video_of_a_depth_topic_is_rejected(tmp_path: Path) -> None:
     source = write(tmp_path / "a.mcap", [image(0, DEPTH, "32FC1")])
-    with Recording(source) as recording, pytest.raises(RecordingError, match="has no colour picture"):
+    with Recording(source) as recording, pytest.raises(RecordingError, match="has no color image"):
         export.export_video(recording, tmp_path / "v.mp4", "camera/image_raw", Decoder())
 
 
-def test_field_that_a_class_has_no_more_is_left_out_of_an_old_recording() -> None:
+def test_field_that_a_class_no_longer_has_is_ignored() -> None:
     decoder = Decoder()
     values = {**msgpack.unpackb(joints(0).payload), "torque_of_old": 1}
     values["header"]["sequence_of_old"] = 7
@@ -241,7 +241,7 @@ def test_field_that_a_class_has_no_more_is_left_out_of_an_old_recording() -> Non
     assert message == decoder.message(joints(0)) and not decoder.skipped
 
 
-def test_payload_that_does_not_hold_is_counted_and_left_out() -> None:
+def test_invalid_payload_is_counted_and_left_out() -> None:
     decoder = Decoder()
     assert decoder.message(joints(0)) is not None
     assert decoder.message(joints(0, payload=b"\xc1")) is None

@@ -28,7 +28,7 @@ anything = st.builds(
 
 
 @given(st.lists(anything, max_size=30, unique_by=lambda s: (s.key, s.writer, s.sequence)), st.integers(1, 7))
-def test_everything_comes_back_as_it_was(
+def test_samples_are_read_as_they_were_written(
     tmp_path_factory: pytest.TempPathFactory, samples: list[Sample], every: int
 ) -> None:
     path = write(tmp_path_factory.mktemp("files") / "a.mcap", samples, every=every)
@@ -60,7 +60,7 @@ def test_each_writer_of_a_key_has_a_channel(tmp_path: Path) -> None:
         assert [sample.writer for sample in recording.samples()] == ["executor.1", "executor.2"]
 
 
-def test_what_was_flushed_is_there_while_the_file_is_still_written(tmp_path: Path) -> None:
+def test_flushed_messages_can_be_read_while_the_file_is_written(tmp_path: Path) -> None:
     writer = RecordingWriter(tmp_path / "a.mcap", {"cell": "panda"})
     for number in range(5):
         writer.add(joints(number))
@@ -75,7 +75,7 @@ def test_what_was_flushed_is_there_while_the_file_is_still_written(tmp_path: Pat
     writer.close()
 
 
-def test_wanted_topics_from_a_time_on(tmp_path: Path) -> None:
+def test_samples_are_selected_by_topic_and_time(tmp_path: Path) -> None:
     path = write(tmp_path / "a.mcap", [f(n) for n in range(30) for f in (joints, status)], every=6)
     with Recording(path) as recording:
         found = list(recording.samples(lambda topic: topic == "joint_states", START + 20 * STEP))
@@ -83,7 +83,7 @@ def test_wanted_topics_from_a_time_on(tmp_path: Path) -> None:
         assert recording.seconds == pytest.approx(0.29)
 
 
-def test_of_one_that_was_cut_no_more_is_read_than_is_asked_for_once_its_channels_are_known(
+def test_truncated_file_is_read_selectively_once_its_channels_are_known(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     writer = RecordingWriter(tmp_path / "a.mcap", {"cell": "panda"})
@@ -102,7 +102,7 @@ def test_of_one_that_was_cut_no_more_is_read_than_is_asked_for_once_its_channels
             assert len(read) == most
 
 
-def test_states_before_a_time_are_the_last_of_each_whoever_wrote_it(tmp_path: Path) -> None:
+def test_states_before_a_time_are_the_newest_of_each_key(tmp_path: Path) -> None:
     restarted = status(3, writer="task.2", sequence=1)
     other = status(1, key="panda/gripper/state", message="GripperState")
     path = write(tmp_path / "a.mcap", [status(0), other, joints(2), restarted, status(4)], every=1)
@@ -113,7 +113,7 @@ def test_states_before_a_time_are_the_last_of_each_whoever_wrote_it(tmp_path: Pa
         assert recording.states_before(START) == []
 
 
-def test_files_of_a_split_are_complete_alone(tmp_path: Path) -> None:
+def test_each_file_of_a_split_recording_is_usable_alone(tmp_path: Path) -> None:
     writer = SplitWriter(tmp_path / "a.mcap", {"cell": "panda"}, max_bytes=6000)
     writer.describe("run", {"seed": 3})
     writer.add(status(0, "GRASPING"))
@@ -135,14 +135,14 @@ def test_files_of_a_split_are_complete_alone(tmp_path: Path) -> None:
     assert writer.size == sum(file.stat().st_size for file in writer.files)
 
 
-def test_nothing_is_written_over(tmp_path: Path) -> None:
+def test_existing_file_is_not_overwritten(tmp_path: Path) -> None:
     path = write(tmp_path / "a.mcap", [joints(0)])
-    with pytest.raises(RecordingError, match="is there already"):
+    with pytest.raises(RecordingError, match="exists already"):
         RecordingWriter(path, {})
 
 
-@pytest.mark.parametrize(("content", "why"), [(None, "there is no such file"), (b"hello world", "is no MCAP file")])
-def test_what_is_no_recording_is_said_in_one_line(tmp_path: Path, content: bytes | None, why: str) -> None:
+@pytest.mark.parametrize(("content", "why"), [(None, "no such file"), (b"hello world", "is no MCAP file")])
+def test_file_that_is_no_recording_is_rejected(tmp_path: Path, content: bytes | None, why: str) -> None:
     path = tmp_path / "a.mcap"
     if content is not None:
         path.write_bytes(content)
@@ -150,7 +150,7 @@ def test_what_is_no_recording_is_said_in_one_line(tmp_path: Path, content: bytes
         Recording(path)
 
 
-def test_summary_counts_by_topic_and_tells_what_was_lost(tmp_path: Path) -> None:
+def test_summary_counts_messages_and_losses_by_topic(tmp_path: Path) -> None:
     writer = RecordingWriter(tmp_path / "a.mcap", {"cell": "panda"})
     for number in range(11):
         writer.add(joints(number))
@@ -167,34 +167,34 @@ def test_summary_counts_by_topic_and_tells_what_was_lost(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("cell", ["panda", "1", "true", "null", "k\u00fcche", "a.b-c_2"])
-def test_a_cell_is_read_by_the_name_that_it_may_have(tmp_path: Path, cell: str) -> None:
+def test_cell_name_is_read_as_text(tmp_path: Path, cell: str) -> None:
     assert is_cell(cell)
     RecordingWriter(tmp_path / "a.mcap", {"cell": cell}).close()
     with Recording(tmp_path / "a.mcap") as recording:
         assert recording.cell == cell
 
 
-def test_encoding_names_the_class() -> None:
+def test_encoding_names_the_message_class() -> None:
     assert message_of("application/msgpack;Image") == "Image"
     assert message_of("zenoh/bytes") == ""
     assert encoding_of("Image") == "application/msgpack;Image"
     assert encoding_of("") == "application/msgpack"
 
 
-def test_repetitions_are_known_and_gaps_counted() -> None:
+def test_repetitions_are_dropped_and_gaps_counted() -> None:
     sequences = Sequences()
     assert [sequences.is_new("k", "w", n) for n in (5, 5, 6, 4, 9)] == [True, False, True, False, True]
     assert sequences.missed == {"k": 2}
     assert sequences.is_new("k", "restarted", 1)
 
 
-def test_many_tiny_messages_at_once_can_be_read_again(tmp_path: Path) -> None:
+def test_many_tiny_messages_can_be_read(tmp_path: Path) -> None:
     samples = [joints(number, payload=b"\x80") for number in range(60_000)]
     with Recording(write(tmp_path / "a.mcap", samples, every=len(samples))) as recording:
         assert sum(1 for _ in recording.samples()) == 60_000
 
 
-def test_tiny_messages_under_many_keys_and_long_ones_can_be_read_again(tmp_path: Path) -> None:
+def test_tiny_messages_under_many_and_long_keys_can_be_read(tmp_path: Path) -> None:
     writer = RecordingWriter(tmp_path / "a.mcap", {"cell": "panda"})
     for turn in range(12):
         for number in range(2000):

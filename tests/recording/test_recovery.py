@@ -50,7 +50,7 @@ def saved_of(names: list[Path], content: bytes) -> tuple[int, bool]:
 
 
 @given(data=st.data())
-def test_cut_anywhere_no_whole_chunk_is_lost(
+def test_file_truncated_anywhere_keeps_all_complete_chunks(
     data: st.DataObject, whole: bytes, ends: list[int], names: list[Path]
 ) -> None:
     cut = data.draw(st.integers(0, len(whole)))
@@ -59,7 +59,7 @@ def test_cut_anywhere_no_whole_chunk_is_lost(
     assert finished == (cut == len(whole))
 
 
-def test_an_unfinished_file_is_read_as_far_as_it_goes(whole: bytes, ends: list[int], folder: Path) -> None:
+def test_unfinished_file_is_read_up_to_its_end(whole: bytes, ends: list[int], folder: Path) -> None:
     path = folder / "unfinished.mcap"
     path.write_bytes(whole[: ends[3] + 5])
     with Recording(path) as recording:
@@ -68,7 +68,7 @@ def test_an_unfinished_file_is_read_as_far_as_it_goes(whole: bytes, ends: list[i
 
 
 @given(data=st.data())
-def test_a_file_that_is_damaged_anywhere_is_recovered_or_refused_in_one_line(
+def test_damaged_file_is_recovered_or_rejected(
     data: st.DataObject, whole: bytes, names: list[Path]
 ) -> None:
     content = bytearray(whole)
@@ -85,7 +85,7 @@ def test_a_file_that_is_damaged_anywhere_is_recovered_or_refused_in_one_line(
         assert recording.finished and recovered.messages == len(list(recording.samples()))
 
 
-def test_a_damaged_chunk_is_left_out_and_the_rest_is_kept(whole: bytes, ends: list[int], folder: Path) -> None:
+def test_recovery_skips_a_damaged_chunk(whole: bytes, ends: list[int], folder: Path) -> None:
     content = bytearray(whole)
     content[ends[4] - 20] ^= 0xFF
     source, target = folder / "damaged.mcap", folder / "mended.mcap"
@@ -100,18 +100,18 @@ def test_zeros_after_the_last_chunk_are_no_records(whole: bytes, ends: list[int]
     assert saved_of(names, whole[: ends[1]] + bytes(5000))[0] == 20
 
 
-def test_recovery_writes_over_nothing(whole: bytes, folder: Path) -> None:
-    with pytest.raises(RecordingError, match="is there already"):
+def test_recovery_overwrites_no_file(whole: bytes, folder: Path) -> None:
+    with pytest.raises(RecordingError, match="exists already"):
         recover(folder / "whole.mcap", folder / "whole.mcap")
     assert (folder / "whole.mcap").read_bytes() == whole
 
 
-def test_disk_that_is_full_leaves_nothing_and_is_told_in_one_line(
+def test_recovery_on_a_full_disk_leaves_no_file(
     whole: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     source, target = tmp_path / "a.mcap", tmp_path / "b.mcap"
     source.write_bytes(whole)
     fill_disk(monkeypatch, 600)
-    with pytest.raises(RecordingError, match=r"b.mcap: cannot be written, the disk is full; nothing of it is kept"):
+    with pytest.raises(RecordingError, match=r"b.mcap: cannot be written, the disk is full; the incomplete file was"):
         recover(source, target)
     assert list(tmp_path.iterdir()) == [source]

@@ -11,15 +11,15 @@ def chosen(*keys: str, regex: str | None = None, exclude: str | None = None) -> 
     return [key for key in KEYS if selection.wants(key)]
 
 
-def test_nothing_said_means_everything() -> None:
+def test_empty_selection_selects_everything() -> None:
     assert chosen() == KEYS
 
 
-def test_keys_are_whole_keys() -> None:
+def test_keys_match_completely() -> None:
     assert chosen("tf", "log") == ["tf", "log"]
 
 
-def test_wildcards_stand_for_parts_as_in_zenoh() -> None:
+def test_wildcards_match_as_in_zenoh() -> None:
     assert chosen("camera/*") == ["camera/image_raw", "camera/camera_info"]
     assert chosen("**/image_raw") == ["camera/image_raw", "depth_camera/depth/image_raw"]
     assert chosen("depth_camera/**") == ["depth_camera/depth/image_raw"]
@@ -27,29 +27,29 @@ def test_wildcards_stand_for_parts_as_in_zenoh() -> None:
     assert chosen("**") == KEYS
 
 
-def test_expression_is_found_anywhere_and_adds_to_keys() -> None:
+def test_regular_expression_matches_anywhere_and_adds_to_keys() -> None:
     assert chosen(regex="^tf") == ["tf", "tf_static"]
     assert chosen("log", regex="info$") == ["camera/camera_info", "log"]
 
 
-def test_exclusion_wins() -> None:
+def test_exclusion_takes_precedence() -> None:
     assert chosen(exclude="image") == ["camera/camera_info", "tf", "tf_static", "log"]
     assert chosen("tf", "tf_static", exclude="static") == ["tf"]
 
 
 @pytest.mark.parametrize(("option", "value"), [("regex", "["), ("exclude", "(?P<")])
-def test_bad_expression_is_named(option: str, value: str) -> None:
+def test_invalid_expression_is_rejected_by_name(option: str, value: str) -> None:
     with pytest.raises(ConfigError, match=f"--{option}.*is not a regular expression"):
         Selection.of([], **{option: value})
 
 
 @pytest.mark.parametrize("key", ["", "/tf", "tf/", "a//b", "a b", "a?b", "a#", "a**", "a/b**/c"])
-def test_bad_key_is_named(key: str) -> None:
+def test_invalid_key_is_rejected_by_name(key: str) -> None:
     with pytest.raises(ConfigError, match="is not a key"):
         Selection.of([key])
 
 
-def test_expressions_cover_what_is_wanted_and_no_more_than_needed() -> None:
+def test_key_expressions_cover_the_selection_and_little_else() -> None:
     assert Selection.of().expressions == ("**",)
     assert Selection.of(["tf"], regex="x").expressions == ("**",)
     assert Selection.of(["tf", "camera/*", "depth_camera/**", "tf*", "tf"]).expressions == (

@@ -15,7 +15,7 @@ from recording.writer import SplitWriter, WriteFailed
 from tests.recording.samples import fill_disk, joints, status
 
 
-def test_everything_offered_is_in_the_file_with_how_it_ended(tmp_path: Path) -> None:
+def test_all_samples_are_written_with_the_reason_of_the_end(tmp_path: Path) -> None:
     writer = SplitWriter(tmp_path / "a.mcap", {"cell": "panda"})
     sink = Sink(writer)
     sink.describe("run", {"seed": 7})
@@ -29,7 +29,7 @@ def test_everything_offered_is_in_the_file_with_how_it_ended(tmp_path: Path) -> 
         assert recording.metadata("ended") == {"reason": "test", "dropped": {}}
 
 
-def test_what_does_not_fit_while_the_disk_stalls_is_dropped_and_counted(
+def test_samples_beyond_the_queue_are_dropped_and_counted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     disk, written_to = threading.Event(), threading.Event()
@@ -46,14 +46,14 @@ def test_what_does_not_fit_while_the_disk_stalls_is_dropped_and_counted(
     assert written_to.wait(10)  # the first is on its way to the disk and still counts
     for number in range(1, 6):
         sink.offer(joints(number))
-    assert sink.figures.dropped == {"panda/joint_states": 3}
+    assert sink.stats.dropped == {"panda/joint_states": 3}
     disk.set()
     assert sink.close({}).messages == 3
     with Recording(tmp_path / "a.mcap") as recording:
         assert recording.metadata("ended")["dropped"] == {"panda/joint_states": 3}
 
 
-def test_whatever_keys_and_writers_somebody_makes_up_the_recording_goes_on_and_can_be_read(tmp_path: Path) -> None:
+def test_invented_keys_and_writers_do_not_stop_the_recording(tmp_path: Path) -> None:
     sink = Sink(SplitWriter(tmp_path / "a.mcap", {"cell": "panda"}))
     sink.offer(joints(0))
     for number in range(33_000):
@@ -69,7 +69,7 @@ def test_whatever_keys_and_writers_somebody_makes_up_the_recording_goes_on_and_c
     assert [sample.writer for sample in states[-3:]] == ["", "executor.1", ""]
 
 
-def test_of_writers_that_somebody_makes_up_those_are_known_that_were_heard_of_last() -> None:
+def test_of_invented_writers_the_most_recent_are_remembered() -> None:
     sequences = Sequences()
     for number in range(MOST_WRITERS + 10):
         for sequence in (1, 5):
@@ -80,7 +80,7 @@ def test_of_writers_that_somebody_makes_up_those_are_known_that_were_heard_of_la
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EFBIG])
-def test_full_disk_ends_it_with_one_line_and_keeps_whole_chunks(
+def test_full_disk_ends_the_recording_and_leaves_complete_chunks(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
 ) -> None:
     writer = SplitWriter(tmp_path / "a.mcap", {"cell": "panda"})
@@ -107,11 +107,11 @@ def test_full_disk_ends_it_with_one_line_and_keeps_whole_chunks(
     assert error.value.exit_code == 1 and "\n" not in str(error.value)
     with Recording(tmp_path / "a.mcap") as recording:
         assert not recording.finished
-        assert recording.layout.whole == recording.layout.size <= 40_000
-    sink.offer(joints(0))  # what still comes is let go
+        assert recording.layout.complete == recording.layout.size <= 40_000
+    sink.offer(joints(0))  # later samples are dropped
 
 
-def test_failure_while_closing_is_told_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failure_while_closing_is_raised(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     sink = Sink(SplitWriter(tmp_path / "a.mcap", {}))
     sink.offer(status(0))
 
@@ -124,7 +124,7 @@ def test_failure_while_closing_is_told_too(tmp_path: Path, monkeypatch: pytest.M
 
 
 @pytest.mark.parametrize("missing", [0, 1])  # bytes that the end of the first file lacks, or the start of the next one
-def test_disk_that_is_full_as_the_next_file_is_due_is_told_in_one_line(
+def test_disk_full_at_the_start_of_the_next_file_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, missing: int
 ) -> None:
     def recorded(name: str) -> None:
@@ -139,16 +139,16 @@ def test_disk_that_is_full_as_the_next_file_is_due_is_told_in_one_line(
         recorded("b.mcap")
 
 
-def test_a_file_that_is_there_where_the_next_one_is_due_is_told_in_one_line(tmp_path: Path) -> None:
+def test_existing_next_file_is_reported(tmp_path: Path) -> None:
     (tmp_path / "a_1.mcap").touch()
     sink = Sink(SplitWriter(tmp_path / "a.mcap", {"cell": "panda"}, max_bytes=1_000_000))
     for number in range(4):
         sink.offer(joints(number, payload=os.urandom(600_000)))
-    with pytest.raises(RecordingError, match=r"a_1.mcap: is there already"):
+    with pytest.raises(RecordingError, match=r"a_1.mcap: exists already"):
         sink.close({})
 
 
-def test_a_bug_while_writing_is_not_hidden(tmp_path: Path) -> None:
+def test_bug_in_the_writing_thread_is_raised(tmp_path: Path) -> None:
     class Broken(SplitWriter):
         def add(self, sample):
             raise RuntimeError("a bug")

@@ -13,7 +13,7 @@ TF = TFMessage(transforms=[
 ])
 
 
-def test_stamp_of_a_picture_is_read_without_its_pixels() -> None:
+def test_stamp_of_an_image_is_read_without_its_pixels() -> None:
     image = Image(header=Header(stamp=123, frame_id="c"), height=480, width=640, encoding="bgr8", data=bytes(921600))
     assert stamp_of(packed(image)) == 123
     assert stamp_of(packed(image)[:600]) == 123
@@ -25,28 +25,28 @@ def test_stamp_of_transforms_is_that_of_the_first() -> None:
 
 @pytest.mark.parametrize("payload", [b"", b"\xc1", b"hello", msgpack.packb({"a": 1}), msgpack.packb({"header": 3}),
                                      msgpack.packb({"transforms": []}), msgpack.packb([1, 2])])
-def test_payload_without_a_header_has_no_stamp_and_is_left_alone(payload: bytes) -> None:
+def test_payload_without_a_header_has_no_stamp_and_stays_unchanged(payload: bytes) -> None:
     assert stamp_of(payload) is None
     assert restamp(payload, lambda stamp: stamp + 1) == payload
 
 
 @pytest.mark.parametrize("stamp", [-1, 2**63, 2**64 - 1, "7", 1.0])
-def test_a_stamp_that_no_clock_shows_is_none(stamp: object) -> None:  # a file has no room for it either
+def test_stamp_out_of_range_is_ignored(stamp: object) -> None:  # a file has no room for it either
     assert stamp_of(msgpack.packb({"header": {"stamp": stamp}})) is None
 
 
 @given(st.binary(max_size=700))
-def test_rubbish_never_raises(payload: bytes) -> None:
+def test_random_bytes_never_raise(payload: bytes) -> None:
     stamp_of(payload)
     restamp(payload, lambda stamp: stamp + 1)
 
 
-def test_restamping_moves_every_stamp_and_nothing_else() -> None:
+def test_restamping_changes_every_stamp_and_nothing_else() -> None:
     moved = TFMessage.model_validate(msgpack.unpackb(restamp(packed(TF), lambda stamp: stamp + 100)))
     assert [t.header.stamp for t in moved.transforms] == [105, 106]
     assert moved.transforms[0].transform == TF.transforms[0].transform
 
 
-def test_a_stamp_of_zero_says_that_there_is_none() -> None:
+def test_stamp_of_zero_means_none() -> None:
     line = LogLine(service="s", level="info", message="m")
     assert restamp(packed(line), lambda stamp: stamp + 100) == packed(line)

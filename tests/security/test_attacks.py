@@ -31,9 +31,9 @@ from common.transport.credentials import ROUTER_NAME, Credentials, credentials_o
 from common.transport.endpoint import MAX_BYTES, MAX_OTHER_BYTES, client_config, router_config
 from common.transport.session import RawSample
 from common.transport.zenoh_session import connect
-from page.access import ROLES, tokens_in
 from recording.reader import Recording
 from security.certificates import Authority
+from security.page_tokens import ROLES, read_tokens
 from tests.harness import RunningCell, command_line, environment, until
 from tests.security.holders import REFUSED, Heard, Holder
 from zencell.blocking import Cell
@@ -556,7 +556,7 @@ def test_no_secret_is_in_anything_that_a_cell_leaves(secured: Secured) -> None:
         lines = key.read_text().splitlines()
         secrets += [line.encode() for line in lines[1:-1]] + [base64.b64decode("".join(lines[1:-1]))]
         assert key.stat().st_mode & 0o777 == 0o600
-    assert tokens_in(secured.folder, "panda").keys() == set(ROLES)
+    assert read_tokens(secured.folder, "panda").keys() == set(ROLES)
     assert len(secrets) > 50
     with Recording(secured.recording) as recording:
         written = [sample.payload for sample in recording.samples()]

@@ -1,4 +1,4 @@
-"""Services at work: what each is given to do, over and over."""
+"""Repeated work for each service."""
 
 from __future__ import annotations
 
@@ -64,10 +64,10 @@ async def tune(bus: Bus, service: str, values: dict[str, Any]) -> list[m.Paramet
 async def later(bus: Bus, reader: Any) -> Any:
     """The first message that was stamped after now."""
     now = bus.clock.now_ns()
-    return await heard(reader, lambda message: message.header.stamp > now)
+    return await receive(reader, lambda message: message.header.stamp > now)
 
 
-async def heard(reader: Any, wanted: Callable[[Any], bool] = lambda _: True) -> Any:
+async def receive(reader: Any, wanted: Callable[[Any], bool] = lambda _: True) -> Any:
     async with asyncio.timeout(PATIENCE):
         while not wanted(message := await reader.next()):
             pass
@@ -99,7 +99,7 @@ async def detect(bus: Bus) -> AsyncIterator[list[m.Marker]]:
     for turn in itertools.count():
         picture = pictures[turn // 2 % 2]  # the same twice: it would not be looked at again without a change
         images.put(array_to_image(picture, "bgr8", bus.header(frame)))
-        yield (await heard(found)).markers
+        yield (await receive(found)).markers
 
 
 async def validate(bus: Bus) -> AsyncIterator[m.PoseArray]:
@@ -111,7 +111,7 @@ async def validate(bus: Bus) -> AsyncIterator[m.PoseArray]:
         turn += 1
         frame = markers(bus, place)
         detected.put(frame)
-        yield await heard(targets, lambda t, stamp=frame.header.stamp: t.header.stamp == stamp and len(t.poses) == 1)
+        yield await receive(targets, lambda t, stamp=frame.header.stamp: t.header.stamp == stamp and len(t.poses) == 1)
 
 
 def markers(bus: Bus, *places: tuple[float, float, float]) -> m.MarkerArray:
@@ -129,7 +129,7 @@ async def keep_scene(bus: Bus) -> AsyncIterator[list[m.CollisionObject]]:
     while True:
         frame = markers(bus, (0.40, 0.0, 0.03))
         detected.put(frame)
-        scene = await heard(scenes, lambda s, stamp=frame.header.stamp: s.header.stamp == stamp)
+        scene = await receive(scenes, lambda s, stamp=frame.header.stamp: s.header.stamp == stamp)
         yield [o for o in scene.objects if o.role == "target"]
 
 
@@ -139,7 +139,7 @@ async def publish_state(bus: Bus) -> AsyncIterator[m.TFMessage]:
     while True:
         stamp += 10**9
         joints.put(m.JointState(header=m.Header(stamp=stamp), name=PANDA.robot.joints, position=HOME))
-        yield await heard(tf, lambda t, stamp=stamp: t.transforms[0].header.stamp == stamp)
+        yield await receive(tf, lambda t, stamp=stamp: t.transforms[0].header.stamp == stamp)
 
 
 async def pick_and_place(bus: Bus) -> AsyncIterator[m.PlanRequest]:
@@ -192,7 +192,7 @@ async def execute(bus: Bus) -> AsyncIterator[m.MotionStatus]:
     turn, seconds, distance = 0, 0.5, 0.05
     while True:
         points = []
-        off = 1e-3 * (turn % 2 == 0)  # each begins a little beside where the one before it ended
+        off = 1e-3 * (turn % 2 == 0)  # each starts slightly off the end of the one before
         for u in np.linspace(0.0, 1.0, 26):
             s = u**3 * (10 - 15 * u + 6 * u * u)
             ds, dds = 30 * u**2 * (1 - u) ** 2 / seconds, 60 * u * (1 - u) * (1 - 2 * u) / seconds**2
@@ -205,7 +205,7 @@ async def execute(bus: Bus) -> AsyncIterator[m.MotionStatus]:
         request = m.ExecuteRequest(header=bus.header(), id=f"goal-{turn}", trajectory=trajectory)
         answer = await call.call(request, PATIENCE)
         if answer.state == "active":
-            answer = await heard(status, lambda s, turn=turn: s.id == f"goal-{turn}" and s.state != "active")
+            answer = await receive(status, lambda s, turn=turn: s.id == f"goal-{turn}" and s.state != "active")
         yield answer
 
 
@@ -230,7 +230,7 @@ async def contour(bus: Bus) -> AsyncIterator[Contours]:
     while True:
         header = bus.header(UR5.world.camera.frame)
         images.put(array_to_image(square(), "bgr8", header))
-        yield await heard(contours, lambda c, stamp=header.stamp: c.header.stamp == stamp)
+        yield await receive(contours, lambda c, stamp=header.stamp: c.header.stamp == stamp)
 
 
 async def to_world(bus: Bus) -> AsyncIterator[OutlinePoints]:
@@ -246,7 +246,7 @@ async def to_world(bus: Bus) -> AsyncIterator[OutlinePoints]:
         depths.put(array_to_image(depth, "32FC1", header))
         contours.put(Contours(header=header, width=DEPTH_CAMERA.width, height=DEPTH_CAMERA.height, contours=found,
                                 selected=0))
-        yield await heard(points, lambda p, stamp=header.stamp: p.header.stamp == stamp)
+        yield await receive(points, lambda p, stamp=header.stamp: p.header.stamp == stamp)
 
 
 async def clear(bus: Bus) -> AsyncIterator[OutlinePoints]:
@@ -256,7 +256,7 @@ async def clear(bus: Bus) -> AsyncIterator[OutlinePoints]:
     while True:
         header = bus.header("world")
         outlines.put(OutlinePoints(header=header, poses=round_, object="Object_0"))
-        yield await heard(paths, lambda p, stamp=header.stamp: p.header.stamp == stamp)
+        yield await receive(paths, lambda p, stamp=header.stamp: p.header.stamp == stamp)
 
 
 async def trace(bus: Bus) -> AsyncIterator[m.PlanRequest]:
@@ -292,7 +292,7 @@ async def trace(bus: Bus) -> AsyncIterator[m.PlanRequest]:
             while (request := await asked.get()).stage != "trace":
                 pass
         yield request
-        await heard(status, lambda s: s.state == "ERROR")
+        await receive(status, lambda s: s.state == "ERROR")
         await command.call(m.TaskCommand(command="start"), PATIENCE)
 
 

@@ -52,7 +52,7 @@ class Camera:
         self.images.put(array_to_image(picture, "bgr8", m.Header(stamp=stamp, frame_id=FRAME)))
 
 
-async def test_cube_is_told_with_kind_size_place_and_the_stamp_of_its_picture_whichever_comes_first() -> None:
+async def test_cube_is_detected_whichever_image_arrives_first() -> None:
     net = LocalNetwork()
     camera = Camera(net)
     async with running_service(net, box_detector.run, CONFIG):
@@ -72,7 +72,7 @@ async def test_cube_is_told_with_kind_size_place_and_the_stamp_of_its_picture_wh
         assert (mask[110:130, 150:170] == 255).all() and (mask == 255).sum() == 400
 
 
-async def test_picture_of_a_time_to_come_keeps_none_from_being_looked_at() -> None:
+async def test_future_image_does_not_block_later_ones() -> None:
     net = LocalNetwork()
     camera = Camera(net)
     async with running_service(net, box_detector.run, CONFIG):
@@ -82,7 +82,7 @@ async def test_picture_of_a_time_to_come_keeps_none_from_being_looked_at() -> No
             assert (await asyncio.wait_for(camera.found.next(), 20)).header.stamp == stamp
 
 
-async def test_depth_in_millimetres_is_told_by_its_encoding() -> None:
+async def test_encoding_identifies_depth_in_millimeters() -> None:
     net = LocalNetwork()
     camera = Camera(net)
     async with running_service(net, box_detector.run, CONFIG):
@@ -92,7 +92,7 @@ async def test_depth_in_millimetres_is_told_by_its_encoding() -> None:
         assert abs(marker.pose.position.z - 0.02) < 2e-3
 
 
-async def test_dark_picture_tells_nothing_though_depth_is_measured_in_the_dark_too() -> None:
+async def test_dark_image_is_unusable_despite_valid_depth() -> None:
     net = LocalNetwork()
     camera = Camera(net)
     async with running_service(net, box_detector.run, CONFIG):
@@ -103,7 +103,7 @@ async def test_dark_picture_tells_nothing_though_depth_is_measured_in_the_dark_t
             assert (len(frame.markers), bool(frame.blind)) == ((1, False) if light == 1.0 else (0, True))
 
 
-def test_more_boxes_than_there_is_room_for_are_not_told_of_in_part() -> None:
+def test_too_many_boxes_are_rejected_completely() -> None:
     box = DetectedBox("red", (0.5, 0.0, 0.02), 0.0, np.zeros((4, 2)), False)
     assert len(box_detector.markers([box] * MAX_DETECTIONS, CONFIG, 0).markers) == MAX_DETECTIONS
     with pytest.raises(FrameError, match=f"{MAX_DETECTIONS + 1} objects in it are more than"):
@@ -111,12 +111,12 @@ def test_more_boxes_than_there_is_room_for_are_not_told_of_in_part() -> None:
 
 
 @pytest.mark.parametrize("x", [1.1e7, -math.inf, math.nan])
-def test_box_that_is_farther_away_than_can_be_told_is_not_told_of(x: float) -> None:
+def test_box_out_of_message_range_is_rejected(x: float) -> None:
     with pytest.raises(FrameError, match=r"more than 1e\+07 m away"):
         box_detector.markers([DetectedBox("red", (x, 0.0, 0.02), 0.0, np.zeros((4, 2)), False)], CONFIG, 0)
 
 
-async def test_picture_with_the_depth_of_another_one_or_of_another_size_is_left_out() -> None:
+async def test_image_without_matching_depth_is_dropped() -> None:
     net = LocalNetwork()
     camera = Camera(net)
     async with running_service(net, box_detector.run, CONFIG):

@@ -1,4 +1,4 @@
-"""From a calibration to places in the world: a camera whose lens and pose nobody told the cell but the board."""
+"""From a calibration to positions in the world: the cell uses the lens and pose found with the board."""
 
 import asyncio
 from contextlib import AsyncExitStack
@@ -60,7 +60,7 @@ def cell(tmp_path_factory):
 
 
 @pytest.mark.slow
-async def test_balls_are_found_where_they_are_within_two_millimetres(cell):
+async def test_detection_through_a_distorted_lens_is_accurate_to_two_millimeters(cell):
     loaded, net = load_cell(cell), LocalNetwork()
     bus = net.bus()
     found, infos, images = (bus.reader(t) for t in (DETECTED_OBJECTS, topics.CAMERA_INFO, topics.CAMERA_IMAGE))
@@ -78,7 +78,7 @@ async def test_balls_are_found_where_they_are_within_two_millimetres(cell):
     assert image_to_array(image).shape == (480, 640, 3)
 
 
-async def test_pictures_as_they_come_are_sent_with_their_distortion_when_asked_for(cell):
+async def test_unrectified_images_are_published_with_their_distortion(cell):
     loaded, net = load_cell(cell, ["services.camera_opencv.rectify=false"]), LocalNetwork()
     bus = net.bus()
     infos, images = bus.reader(topics.CAMERA_INFO), bus.reader(topics.CAMERA_IMAGE)

@@ -59,7 +59,7 @@ async def read_until(images, done):
     return found
 
 
-async def test_images_of_a_folder_are_sent_in_order_and_over_again(folder, intrinsics):
+async def test_folder_images_are_published_in_order_and_repeated(folder, intrinsics):
     net = LocalNetwork()
     bus = net.bus()
     images, infos = bus.reader(topics.CAMERA_IMAGE), bus.reader(topics.CAMERA_INFO)
@@ -73,7 +73,7 @@ async def test_images_of_a_folder_are_sent_in_order_and_over_again(folder, intri
     assert info.k == [50, 0, 32, 0, 51, 24, 0, 0, 1] and not any(info.d)
 
 
-async def test_a_folder_that_does_not_loop_ends_and_the_service_stays(folder, intrinsics):
+async def test_service_stays_after_a_folder_without_loop_ends(folder, intrinsics):
     net = LocalNetwork()
     images = net.bus().reader(topics.CAMERA_IMAGE)
     async with running_service(net, run, config(source=folder, intrinsics=intrinsics, loop=False)):
@@ -82,7 +82,7 @@ async def test_a_folder_that_does_not_loop_ends_and_the_service_stays(folder, in
             await asyncio.wait_for(images.next(), 0.1)
 
 
-async def test_a_video_file_is_sent(tmp_path, intrinsics):
+async def test_video_file_is_published(tmp_path, intrinsics):
     path = str(tmp_path / "clip.avi")
     writer = cv2.VideoWriter(path, cv2.VideoWriter.fourcc(*"MJPG"), 10, (64, 48))
     if not writer.isOpened():
@@ -96,7 +96,7 @@ async def test_a_video_file_is_sent(tmp_path, intrinsics):
         await read_until(images, lambda values: values[-3:] == pytest.approx([80, 160, 40], abs=4))
 
 
-async def test_pictures_of_another_size_than_the_intrinsics_are_refused_in_one_line(folder):
+async def test_image_of_another_size_is_a_one_line_error(folder):
     net = LocalNetwork()
     with pytest.raises(ConfigError) as caught:
         async with running_service(net, run, config(source=folder)):
@@ -129,7 +129,7 @@ class Flaky:
         pass
 
 
-async def test_a_device_that_vanishes_is_told_and_opened_again(monkeypatch, intrinsics, caplog):
+async def test_vanished_device_is_reported_and_reopened(monkeypatch, intrinsics, caplog):
     device = Flaky()
     monkeypatch.setattr(camera_opencv, "open_source", device.open)
     net = LocalNetwork()
@@ -146,31 +146,31 @@ async def test_a_device_that_vanishes_is_told_and_opened_again(monkeypatch, intr
 
 
 @pytest.mark.parametrize(
-    ("make", "told"),
+    ("make", "message"),
     [
         (lambda p: p / "nothing.mp4", "is not a device number, /dev path, video file or image folder"),
         (lambda p: p, "contains no image"),
     ],
 )
-def test_a_source_that_is_nothing_is_named_with_the_choices(tmp_path, make, told):
-    with pytest.raises(ConfigError, match=told):
+def test_unknown_source_is_named_with_the_choices(tmp_path, make, message):
+    with pytest.raises(ConfigError, match=message):
         open_source(str(make(tmp_path)), (64, 48), 10, loop=True)
 
 
 @pytest.mark.parametrize("content", [b"not a picture", b""])
-def test_a_file_in_the_folder_that_is_no_image_is_named(tmp_path, content):
+def test_non_image_file_in_a_folder_is_named(tmp_path, content):
     (tmp_path / "a.png").write_bytes(content)
     source = open_source(str(tmp_path), (64, 48), 10, loop=True)
     with pytest.raises(ConfigError, match=r"a\.png' is not a readable image"):
         source.read()
 
 
-def test_a_device_that_is_not_there_is_none():
+def test_missing_device_is_none():
     assert open_source("/dev/zencell-has-no-such-camera", (64, 48), 10, loop=True) is None
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("content", "message"),
     [
         ("width: 64", "height"),
         ("{width: 64, height: 48, fx: -1, fy: 50, cx: 32, cy: 24}", "fx"),
@@ -179,19 +179,19 @@ def test_a_device_that_is_not_there_is_none():
         ("width: [", "does not parse"),
     ],
 )
-def test_intrinsics_that_do_not_fit_are_named(tmp_path, text, told):
+def test_invalid_intrinsics_are_named(tmp_path, content, message):
     path = tmp_path / "camera.yaml"
-    path.write_text(text)
-    with pytest.raises(ConfigError, match=told):
+    path.write_text(content)
+    with pytest.raises(ConfigError, match=message):
         CameraFile.load(str(path))
 
 
-def test_without_a_file_the_intrinsics_are_those_of_the_worlds_camera():
+def test_default_intrinsics_are_those_of_the_worlds_camera():
     i = calibrated(config(source=0))
     assert (i.width, i.height, i.fx, i.fy, i.cx, i.cy, i.d) == (640, 480, 520, 520, 320, 240, [])
 
 
-def test_intrinsics_whose_pose_is_not_that_of_the_world_are_refused(tmp_path):
+def test_intrinsics_with_another_pose_than_the_world_are_rejected(tmp_path):
     path = tmp_path / "camera.yaml"
     path.write_text(yaml.safe_dump(SMALL | {"position": [0.1, 0.2, 0.9], "rpy": [3.1, 0.0, 0.0]}))
     with pytest.raises(ConfigError, match=r"another pose than the world's camera: .*--set world\.camera="):
@@ -201,7 +201,7 @@ def test_intrinsics_whose_pose_is_not_that_of_the_world_are_refused(tmp_path):
     assert calibrated(config(source=0, intrinsics=str(path))).fx == 50
 
 
-def test_distortion_is_taken_out():
+def test_distortion_is_removed():
     i = CameraFile(width=320, height=240, fx=250, fy=250, cx=160, cy=120, d=[-0.3, 0.08])
     k = np.array([[250, 0, 160], [0, 250, 120], [0, 0, 1.0]])
     spot = np.array([[[0.4, 0.3, 1.0]]])
@@ -213,7 +213,7 @@ def test_distortion_is_taken_out():
     np.testing.assert_allclose(found, (160 + 100, 120 + 75), atol=0.7)
 
 
-def test_a_grey_picture_becomes_a_colour_picture():
+def test_grey_image_becomes_a_color_image():
     class Capture:
         def read(self):
             return True, np.full((48, 64), 7, np.uint8)
@@ -222,7 +222,7 @@ def test_a_grey_picture_becomes_a_colour_picture():
     assert sources.IMAGE_SUFFIXES[0] == ".png"
 
 
-async def test_it_writes_what_the_simulated_camera_writes_and_reads_nothing():
+async def test_service_writes_the_topics_of_the_simulated_camera():
     found = await wiring(run, config(source="/dev/null"))
     assert found.writes == {topics.CAMERA_IMAGE, topics.CAMERA_INFO}
     assert not found.reads

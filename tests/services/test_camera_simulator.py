@@ -34,7 +34,7 @@ def red_at(image, x, y):
     return image_to_array(image)[v, u].tolist() == [26, 38, 255]
 
 
-async def test_one_layout_in_pictures_and_camera_info_out():
+async def test_world_state_gives_images_and_camera_info():
     net = LocalNetwork()
     tester = net.bus()
     images, infos = tester.reader(topics.CAMERA_IMAGE), tester.reader(topics.CAMERA_INFO)
@@ -48,7 +48,7 @@ async def test_one_layout_in_pictures_and_camera_info_out():
         assert red_at(image, 0.5, -0.2)
 
 
-async def test_nothing_is_sent_before_the_world_says_where_its_balls_are():
+async def test_no_image_before_the_first_world_state():
     net = LocalNetwork()
     tester = net.bus()
     images, infos = tester.reader(topics.CAMERA_IMAGE), tester.reader(topics.CAMERA_INFO)
@@ -60,7 +60,7 @@ async def test_nothing_is_sent_before_the_world_says_where_its_balls_are():
         await next_of(images)
 
 
-async def test_what_is_drawn_follows_the_world_and_leaves_out_what_can_not_be_seen():
+async def test_images_follow_the_world_and_omit_invisible_objects():
     net = LocalNetwork()
     tester = net.bus()
     images, truth = tester.reader(topics.CAMERA_IMAGE), tester.writer(topics.SCENE_OBJECTS)
@@ -76,12 +76,12 @@ async def test_what_is_drawn_follows_the_world_and_leaves_out_what_can_not_be_se
 
 @pytest.mark.parametrize(("state", "shown"), [
     ("table", True), ("held", False), ("falling", True), ("contained", True), ("elsewhere", False)])
-def test_what_is_held_or_lost_is_not_seen_but_what_falls_or_lies_in_a_container_is(state, shown):
+def test_held_and_elsewhere_objects_are_not_rendered(state, shown):
     picture = draw(spheres([(0.5, -0.2, 0.03)], states=[state]).objects, Pinhole.from_config(around.camera), around)
     assert red_at(array_to_image(picture, "bgr8", Header()), 0.5, -0.2) == shown
 
 
-async def test_stamps_are_cell_time_at_the_rate_in_cell_time():
+async def test_stamps_follow_the_rate_in_cell_time():
     net = LocalNetwork()
     clock = Clock(speed=5.0)
     tester = net.bus(clock=clock)
@@ -94,7 +94,7 @@ async def test_stamps_are_cell_time_at_the_rate_in_cell_time():
         assert np.median(np.diff(stamps)) > 0.05e9
 
 
-async def test_noise_comes_from_the_seed_of_the_run():
+async def test_noise_depends_on_the_seed_of_the_run():
     async def first(seed):
         net = LocalNetwork()
         tester = net.bus()
@@ -111,14 +111,14 @@ async def test_noise_comes_from_the_seed_of_the_run():
     assert one[300:, 300:].mean() == pytest.approx(128 - 20 - 1, abs=1)
 
 
-async def test_it_is_the_only_one_here_that_reads_the_truth():
+async def test_camera_reads_only_the_ground_truth():
     found = await wiring(run, config)
     assert found.reads == {topics.SCENE_OBJECTS}
     assert found.writes == {topics.CAMERA_IMAGE, topics.CAMERA_INFO}
     assert not found.serves and not found.calls
 
 
-async def test_loop_turns_while_a_picture_takes_long(monkeypatch):
+async def test_slow_rendering_does_not_block_the_event_loop(monkeypatch):
     net, loop = LocalNetwork(), asyncio.get_running_loop()
     tester = net.bus()
     images, truth = tester.reader(topics.CAMERA_IMAGE), tester.writer(topics.SCENE_OBJECTS)

@@ -35,13 +35,13 @@ def show(bus: Bus) -> None:
 
 
 async def keep_showing(bus: Bus) -> None:
-    """Show it again and again: on what was said only once, long ago, nobody acts."""
+    """Publish it repeatedly: old messages are ignored."""
     while True:
         show(bus)
         await asyncio.sleep(0.1)
 
 
-async def test_chosen_contour_makes_it_ask_for_plans_from_above_to_home() -> None:
+async def test_selected_contour_causes_plan_requests() -> None:
     net = LocalNetwork()
     bus = net.bus("tester", cell="test", clock=Clock())
     asked: asyncio.Queue[m.PlanRequest] = asyncio.Queue()
@@ -75,7 +75,7 @@ async def test_chosen_contour_makes_it_ask_for_plans_from_above_to_home() -> Non
     assert (said.object, said.points, said.fraction) == ("Object_3", 4, 1.0)
 
 
-async def test_planner_that_does_not_know_the_scene_yet_is_asked_again() -> None:
+async def test_planner_without_a_scene_is_asked_again() -> None:
     net = LocalNetwork()
     bus = net.bus("tester", cell="test", clock=Clock())
     asked: asyncio.Queue[str] = asyncio.Queue()
@@ -101,7 +101,7 @@ async def test_pause_is_answered_with_the_status() -> None:
         assert not (await command.call(m.TaskCommand(command="resume"))).paused
 
 
-async def test_status_is_a_state_that_a_late_reader_gets() -> None:
+async def test_late_reader_gets_the_status() -> None:
     net = LocalNetwork()
     bus = net.bus("tester", cell="test", clock=Clock())
     async with running_service(net, contour_tracer.run, CONFIG, name="contour_tracer"):

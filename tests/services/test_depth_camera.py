@@ -172,7 +172,7 @@ def config_of(size: tuple[int, int] = (WIDTH, HEIGHT), **more: Any) -> real_dept
     return check(real_depth_camera.Config, {**given, "world": around}, "services.real_depth_camera")
 
 
-async def test_colour_depth_in_metres_points_and_the_cameras_own_lens_are_sent_in_its_frame(camera: FakeCamera) -> None:
+async def test_color_depth_points_and_intrinsics_are_published(camera: FakeCamera) -> None:
     net = LocalNetwork()
     bus = net.bus()
     images, depths = bus.reader(topics.DEPTH_CAMERA_IMAGE), bus.reader(topics.DEPTH_CAMERA_DEPTH)
@@ -194,24 +194,24 @@ async def test_colour_depth_in_metres_points_and_the_cameras_own_lens_are_sent_i
     assert age >= 0.2  # it was exposed before it came
 
 
-async def told(log: Reader[LogLine], line: str) -> None:
+async def wait_for_line(log: Reader[LogLine], line: str) -> None:
     """Return when a line of the log begins so."""
     async for message in log:
         if message.message.startswith(line):
             return
 
 
-async def test_a_camera_that_is_unplugged_is_told_and_comes_back(camera: FakeCamera) -> None:
+async def test_unplugged_realsense_is_reported_and_reopened(camera: FakeCamera) -> None:
     net = LocalNetwork()
     bus = net.bus()
     images, log = bus.reader(topics.DEPTH_CAMERA_IMAGE), bus.reader(topics.LOG)
     camera.plugged = False
     async with running_service(net, real_depth_camera.run, config_of(), name="camera"), asyncio.timeout(30):
-        await told(log, f"camera {DRIVER}: no RealSense is plugged in; opening it again in 0.01 s")
+        await wait_for_line(log, f"camera {DRIVER}: no RealSense is plugged in; opening it again in 0.01 s")
         camera.plugged = True
         first = await images.next()
         camera.plugged = False
-        await told(log, f"camera {DRIVER}: Frame didn't arrive within 1000; opening it again in 0.01 s")
+        await wait_for_line(log, f"camera {DRIVER}: Frame didn't arrive within 1000; opening it again in 0.01 s")
         camera.plugged = True
         again = await images.next()
         while camera.opened < 2:  # the newest picture from before may not have been read yet
@@ -219,9 +219,9 @@ async def test_a_camera_that_is_unplugged_is_told_and_comes_back(camera: FakeCam
     assert again.header.stamp > first.header.stamp and (camera.opened, camera.stopped) == (2, 1)
 
 
-async def test_lens_that_is_distorted_is_refused_and_that_of_depth_taken_where_asked_for(camera: FakeCamera) -> None:
+async def test_distorted_lens_is_rejected_and_depth_lens_is_selectable(camera: FakeCamera) -> None:
     camera.coeffs = [0.1, 0.0, 0.0, 0.0, 0.0]
-    with pytest.raises(ConfigError, match=r"options\.align: 'color' has distortion .* cannot have: depth"):
+    with pytest.raises(ConfigError, match=r"options\.align: 'color' has distortion .* corrected: choose depth"):
         async with running_service(LocalNetwork(), real_depth_camera.run, config_of(), name="camera"):
             await asyncio.sleep(10)
     net = LocalNetwork()
@@ -231,31 +231,31 @@ async def test_lens_that_is_distorted_is_refused_and_that_of_depth_taken_where_a
         assert (await infos.next()).k[0] == camera.lenses["depth"][0]
 
 
-async def test_mode_that_the_camera_does_not_have_is_told_with_what_was_asked(camera: FakeCamera) -> None:
+async def test_unsupported_mode_is_reported_with_the_request(camera: FakeCamera) -> None:
     net = LocalNetwork()
     log = net.bus().reader(topics.LOG)
     asked = config_of((128, 96))
     async with running_service(net, real_depth_camera.run, asked, name="camera"), asyncio.timeout(30):
-        await told(log, f"camera {DRIVER}: 128x96 at 30 Hz: Couldn't resolve requests; opening it again in")
+        await wait_for_line(log, f"camera {DRIVER}: 128x96 at 30 Hz: Couldn't resolve requests; opening it again in")
 
 
-@pytest.mark.parametrize(("given", "told"), [
+@pytest.mark.parametrize(("options", "message"), [
     ({"driver": ""}, "services.camera.driver: '' must be one of oak, realsense, or the dotted name of a module"),
     ({"driver": "my_pkg.nothing"}, "services.camera.driver: 'my_pkg.nothing' cannot be imported: No module named"),
     ({"driver": "common.errors"}, "'common.errors' is no camera driver: it lacks Options, open_camera"),
     ({"options": {"fps": 900}}, "services.camera.options.fps: 900 must be less than or equal to 90"),
     ({"options": {"speed": 3}}, "services.camera.options.speed: "),
 ])
-async def test_driver_or_option_that_there_is_not_ends_the_start_with_one_line(
-    camera: FakeCamera, given: dict[str, Any], told: str,
+async def test_unknown_driver_or_option_is_a_one_line_error(
+    camera: FakeCamera, options: dict[str, Any], message: str,
 ) -> None:
     with pytest.raises(ConfigError) as refused:
-        async with running_service(LocalNetwork(), real_depth_camera.run, config_of(**given), name="camera"):
+        async with running_service(LocalNetwork(), real_depth_camera.run, config_of(**options), name="camera"):
             await asyncio.sleep(10)
-    assert told in str(refused.value) and "\n" not in str(refused.value)
+    assert message in str(refused.value) and "\n" not in str(refused.value)
 
 
-async def test_pictures_that_are_not_as_the_lens_says_end_the_service_with_one_line(
+async def test_frame_of_unexpected_shape_is_a_one_line_error(
     camera: FakeCamera, monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     driver = importlib.import_module(f"drivers.{DRIVER}")
@@ -266,7 +266,7 @@ async def test_pictures_that_are_not_as_the_lens_says_end_the_service_with_one_l
             await asyncio.sleep(10)
 
 
-async def test_it_writes_what_the_simulated_camera_writes_and_reads_nothing(camera: FakeCamera) -> None:
+async def test_service_writes_the_topics_of_the_simulated_camera(camera: FakeCamera) -> None:
     ur5 = load_cell("ur5")
     simulated = await wiring(depth_camera.run, service_config(ur5, "depth_camera", depth_camera.Config))
     real = await wiring(real_depth_camera.run, config_of())
@@ -287,7 +287,7 @@ def drawn() -> RgbdFrame:
     view = Renderer(cell.world, camera=camera).render(objects)
     depth = view.depth_within(0.1, 10.0)
     depth[:, 3] = np.nan
-    assert len(np.unique(depth[np.isfinite(depth)])) > 1, "something stands there"
+    assert len(np.unique(depth[np.isfinite(depth)])) > 1, "an object is visible"
     return RgbdFrame(view.colour, depth)
 
 
@@ -380,7 +380,7 @@ async def seen(config: real_depth_camera.Config) -> tuple[np.ndarray, np.ndarray
         return image_to_array(await images.next()), depth_of(await depths.next()), (await infos.next()).k
 
 
-async def test_realsense_sends_what_was_drawn_to_half_a_step_of_its_depth(camera: FakeCamera) -> None:
+async def test_realsense_publishes_depth_within_half_a_step(camera: FakeCamera) -> None:
     camera.shot = drawn()
     picture, depth, _ = await seen(config_of())
     np.testing.assert_array_equal(picture, camera.shot.colour)
@@ -389,7 +389,7 @@ async def test_realsense_sends_what_was_drawn_to_half_a_step_of_its_depth(camera
 
 
 @pytest.mark.parametrize(("platform", "aligned_by"), [("RVC2", "stereo"), ("RVC4", "align")])
-async def test_oak_sends_what_was_drawn_to_half_a_millimetre_through_its_own_lens(
+async def test_oak_publishes_depth_within_half_a_millimeter(
     monkeypatch: pytest.MonkeyPatch, platform: str, aligned_by: str,
 ) -> None:
     fake = FakeOak(drawn())
@@ -403,7 +403,7 @@ async def test_oak_sends_what_was_drawn_to_half_a_millimetre_through_its_own_len
     assert fake.asked["color"] == ((WIDTH, HEIGHT), {"type": "bgr", "fps": 20.0, "enableUndistortion": True})
 
 
-async def test_oak_that_is_unplugged_is_told_and_comes_back(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_unplugged_oak_is_reported_and_reopened(monkeypatch: pytest.MonkeyPatch) -> None:
     fake = FakeOak(drawn())
     monkeypatch.setitem(sys.modules, "depthai", fake.module())
     net = LocalNetwork()
@@ -412,18 +412,18 @@ async def test_oak_that_is_unplugged_is_told_and_comes_back(monkeypatch: pytest.
     fake.plugged = False
     async with running_service(net, real_depth_camera.run, config_of(driver="oak", options={}), name="camera"):
         async with asyncio.timeout(30):
-            await told(log, "camera oak: No available devices; opening it again in")
+            await wait_for_line(log, "camera oak: No available devices; opening it again in")
             fake.plugged = True
             await images.next()
             fake.plugged = False
-            await told(log, "camera oak: queue was closed; opening it again in")
+            await wait_for_line(log, "camera oak: queue was closed; opening it again in")
             fake.plugged = True
             while not fake.closed:
                 await images.next()
 
 
 @pytest.mark.parametrize(("driver", "package"), [("realsense", "pyrealsense2"), ("oak", "depthai")])
-async def test_package_that_is_not_installed_is_told_with_its_extra(
+async def test_missing_package_is_reported_with_its_extra(
     monkeypatch: pytest.MonkeyPatch, driver: str, package: str,
 ) -> None:
     monkeypatch.setitem(sys.modules, package, None)
@@ -433,7 +433,7 @@ async def test_package_that_is_not_installed_is_told_with_its_extra(
             await asyncio.sleep(10)
 
 
-async def test_driver_of_the_page_plays_recorded_shots(camera: FakeCamera, tmp_path: Path) -> None:
+async def test_driver_from_the_docs_plays_recorded_frames(camera: FakeCamera, tmp_path: Path) -> None:
     shot = drawn()
     np.savez(tmp_path / "shot_1.npz", colour=shot.colour, depth=shot.depth, lens=np.array(LENS))
     picture, depth, k = await seen(config_of(driver=OWN, options={"folder": str(tmp_path)}))

@@ -1,4 +1,4 @@
-"""Coordinates of a file that are traced in place of what is seen."""
+"""Coordinates from a file instead of perception."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from services import duplicate_remover
 TRIANGLE = [(0.5, 0.0, 1.0), (0.6, 0.0, 1.0), (0.5, 0.1, 1.0)]
 
 
-@pytest.mark.parametrize(("points", "told"), [
+@pytest.mark.parametrize(("points", "problem"), [
     (TRIANGLE * 7000, "at most 20000"), ([*TRIANGLE, (5e8, 0.0, 0.0)], "10000000"),
 ], ids=["too many", "too far"])
-def test_coordinates_that_no_path_has_room_for_are_told_of_at_the_start(
-    tmp_path: Path, points: list[tuple[float, float, float]], told: str
+def test_too_many_coordinates_are_rejected_at_the_start(
+    tmp_path: Path, points: list[tuple[float, float, float]], problem: str
 ) -> None:
     write_points(file := tmp_path / "a.json", points)
-    with pytest.raises(ConfigError, match=told):
+    with pytest.raises(ConfigError, match=problem):
         duplicate_remover.points_of(file)
 
 
-async def test_coordinates_are_traced_from_a_folder_whatever_it_is_called(tmp_path: Path) -> None:
+async def test_coordinates_are_read_from_any_folder_name(tmp_path: Path) -> None:
     write_points(file := tmp_path / ("a" * 200) / "b\tc.json", TRIANGLE)
     net, bus = (net := LocalNetwork()), net.bus("tester")
     outlines, paths = bus.writer(CONTOUR_POINTS), bus.reader(CONTOUR_PATH)

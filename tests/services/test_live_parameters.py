@@ -1,4 +1,4 @@
-"""A parameter that is marked as tunable is read where it is used: a change has an effect on the next thing done."""
+"""Tunable parameters are read where they are used, so a change takes effect at once."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def change(parameters: Parameters, **values: Any) -> None:
 # --- what is read only when something rare happens ----------------------------------------------------------------
 
 
-def test_a_place_is_tried_more_often_once_more_retries_are_allowed() -> None:
+def test_more_retries_take_effect() -> None:
     cell = CellDouble([(0.40, -0.30)], max_retries=0)
     cell.slips = 3
     cell.until("close")
@@ -45,18 +45,19 @@ def test_a_place_is_tried_more_often_once_more_retries_are_allowed() -> None:
     assert (cell.contained, cell.task.status.retries) == (1, 3)
 
 
-def test_what_was_given_up_is_tried_again_when_a_parameter_changes() -> None:
+def test_abandoned_objects_are_retried_after_a_parameter_change() -> None:
     cell = CellDouble([(0.40, -0.30), (0.47, -0.30)])
     change(cell.task.p, **{"hand.min_clearance": 0.05, "grace": 600.0})
     for _ in range(20):
         cell.step()
-    assert [r.reason for r in cell.task.status.skipped] == ["no turn of the hand clears what stands beside it"] * 2
+    reasons = [rejection.reason for rejection in cell.task.status.skipped]
+    assert reasons == ["its neighbors leave no room for the fingers at any yaw"] * 2
     change(cell.task.p, **{"hand.min_clearance": 0.003})
     cell.until("DONE")
     assert cell.contained == 2
 
 
-def test_the_task_waits_as_long_as_it_is_told_while_it_waits() -> None:
+def test_changed_grace_period_takes_effect_while_waiting() -> None:
     cell = CellDouble([], empty=600.0)
     for _ in range(50):
         cell.step()
@@ -73,7 +74,7 @@ def test_the_task_waits_as_long_as_it_is_told_while_it_waits() -> None:
     assert left.task.status.state == "DONE"
 
 
-def test_a_motion_under_way_is_stopped_after_a_shorter_time() -> None:
+def test_shorter_time_limit_stops_a_running_motion() -> None:
     cell = CellDouble([(0.40, -0.30)])
     cell.until("pre-grasp")
     change(cell.task.p, goal_timeout=0.05)
@@ -84,12 +85,12 @@ def test_a_motion_under_way_is_stopped_after_a_shorter_time() -> None:
 
 @pytest.mark.parametrize("make", [lambda: CellDouble([(0.40, -0.30)], obstacle_patience=600.0),
                                   lambda: OutlineDouble(obstacle_patience=600.0)])
-def test_what_is_in_the_way_is_planned_around_after_a_shorter_time(make: Callable[[], Any]) -> None:
+def test_shorter_obstacle_patience_takes_effect(make: Callable[[], Any]) -> None:
     cell = make()
     cell.until("pre-grasp" if isinstance(cell, CellDouble) else "trace")
-    in_the_way = Interlock(kind="held", by="scene_monitor", reason="a mug is in the way", since=1)
+    obstacle = Interlock(kind="held", by="scene_monitor", reason="a mug is in the way", since=1)
     cell.motion = cell.motion.model_copy(update={
-        "held": True, "held_by": ["scene_monitor"], "interlocks": [in_the_way]})
+        "held": True, "held_by": ["scene_monitor"], "interlocks": [obstacle]})
     for _ in range(50):
         cell.step()
     assert cell.task.running is not None
@@ -98,7 +99,7 @@ def test_what_is_in_the_way_is_planned_around_after_a_shorter_time(make: Callabl
     assert "a mug is in the way" in cell.task.status.message
 
 
-def test_the_task_gives_up_after_fewer_failures() -> None:
+def test_lower_failure_limit_takes_effect() -> None:
     cell = CellDouble([(0.40, -0.30)], max_failures=1000)
     cell.unplannable = lambda request: "no_path" if request.stage == "home" else ""
     change(cell.task.p, goal_timeout=0.05, max_failures=2)
@@ -107,7 +108,7 @@ def test_the_task_gives_up_after_fewer_failures() -> None:
 
 
 @pytest.mark.parametrize("camera_on", [True, False])
-def test_the_outline_waits_for_a_contour_as_long_as_it_is_told_while_it_waits(camera_on: bool) -> None:
+def test_changed_selection_timeout_takes_effect_while_waiting(camera_on: bool) -> None:
     cell = OutlineDouble(selection_timeout=0.0, picture_timeout=0.0)
     cell.path = OutlinePoints(message="no object is chosen") if camera_on else None
     for _ in range(200):
@@ -118,28 +119,28 @@ def test_the_outline_waits_for_a_contour_as_long_as_it_is_told_while_it_waits(ca
     assert cell.status.state == "ERROR"
 
 
-def test_an_outline_under_way_is_stopped_after_a_shorter_time() -> None:
+def test_shorter_overtime_stops_a_running_trace() -> None:
     cell = OutlineDouble()
     cell.until("trace")
     change(cell.task.p, overtime=1e-3)
-    cell._arrival += 100
+    cell.arrival += 100
     cell.until("ERROR")
     assert "took longer than 1 s" in cell.status.message
 
 
-def test_fingers_catch_and_let_go_by_the_tolerances_of_now() -> None:
+def test_simulated_grasps_use_current_tolerances() -> None:
     tolerances = GraspTolerances()
     world = KinematicWorld(World(balls=[(0.5, 0.0)]), tolerances=tolerances)
-    beside = tool_down(0.5, 0.015, 0.03)
-    assert world.obstruction(beside, 0.08) == 0.0  # 5 mm into a finger
+    near = tool_down(0.5, 0.015, 0.03)
+    assert world.obstruction(near, 0.08) == 0.0  # 5 mm into a finger
     change(tolerances, sideways=0.01)
-    assert world.obstruction(beside, 0.08) == pytest.approx(0.06)
-    world.tick(1.0, beside, 0.06, True)
+    assert world.obstruction(near, 0.08) == pytest.approx(0.06)
+    world.tick(1.0, near, 0.06, True)
     change(tolerances, release=0.02)
-    world.tick(1.1, beside, 0.07, False)
+    world.tick(1.1, near, 0.07, False)
     assert world.held
     change(tolerances, release=0.005)
-    world.tick(1.2, beside, 0.07, False)
+    world.tick(1.2, near, 0.07, False)
     assert not world.held
 
 
@@ -164,11 +165,11 @@ async def waits(running: Running, values: list[dict[str, float]], said: list[str
         log = running.bus.reader(topics.LOG)
         for change_, wait in zip(values, said, strict=True):
             await running.tune(**change_)
-            while not (await log.next()).message.endswith(f"opened again in {wait} s"):
+            while not (await log.next()).message.endswith(f"opening it again in {wait} s"):
                 pass
 
 
-async def test_a_camera_that_is_lost_is_waited_for_as_long_as_it_is_said_now(
+async def test_lost_camera_uses_the_current_timeout(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     running = Running("camera_opencv", tmp_path)
@@ -182,23 +183,23 @@ async def test_a_camera_that_is_lost_is_waited_for_as_long_as_it_is_said_now(
 
 
 RARE: dict[str, Callable[..., Any]] = {
-    "services.camera_opencv.reopen_after": test_a_camera_that_is_lost_is_waited_for_as_long_as_it_is_said_now,
-    "services.camera_opencv.reopen_at_most": test_a_camera_that_is_lost_is_waited_for_as_long_as_it_is_said_now,
-    "services.smart_pick_place.max_retries": test_a_place_is_tried_more_often_once_more_retries_are_allowed,
-    "services.smart_pick_place.grace": test_the_task_waits_as_long_as_it_is_told_while_it_waits,
-    "services.smart_pick_place.empty": test_the_task_waits_as_long_as_it_is_told_while_it_waits,
-    "services.smart_pick_place.goal_timeout": test_a_motion_under_way_is_stopped_after_a_shorter_time,
-    "services.smart_pick_place.max_failures": test_the_task_gives_up_after_fewer_failures,
-    "services.smart_pick_place.obstacle_patience": test_what_is_in_the_way_is_planned_around_after_a_shorter_time,
-    "services.contour_tracer.obstacle_patience": test_what_is_in_the_way_is_planned_around_after_a_shorter_time,
-    "services.contour_tracer.overtime": test_an_outline_under_way_is_stopped_after_a_shorter_time,
+    "services.camera_opencv.reopen_after": test_lost_camera_uses_the_current_timeout,
+    "services.camera_opencv.reopen_at_most": test_lost_camera_uses_the_current_timeout,
+    "services.smart_pick_place.max_retries": test_more_retries_take_effect,
+    "services.smart_pick_place.grace": test_changed_grace_period_takes_effect_while_waiting,
+    "services.smart_pick_place.empty": test_changed_grace_period_takes_effect_while_waiting,
+    "services.smart_pick_place.goal_timeout": test_shorter_time_limit_stops_a_running_motion,
+    "services.smart_pick_place.max_failures": test_lower_failure_limit_takes_effect,
+    "services.smart_pick_place.obstacle_patience": test_shorter_obstacle_patience_takes_effect,
+    "services.contour_tracer.obstacle_patience": test_shorter_obstacle_patience_takes_effect,
+    "services.contour_tracer.overtime": test_shorter_overtime_stops_a_running_trace,
     "services.contour_tracer.picture_timeout":
-        test_the_outline_waits_for_a_contour_as_long_as_it_is_told_while_it_waits,
+        test_changed_selection_timeout_takes_effect_while_waiting,
     "services.contour_tracer.selection_timeout":
-        test_the_outline_waits_for_a_contour_as_long_as_it_is_told_while_it_waits,
+        test_changed_selection_timeout_takes_effect_while_waiting,
     "services.trajectory_executor.grasp_tolerances.sideways":
-        test_fingers_catch_and_let_go_by_the_tolerances_of_now,
-    "services.trajectory_executor.grasp_tolerances.release": test_fingers_catch_and_let_go_by_the_tolerances_of_now,
+        test_simulated_grasps_use_current_tolerances,
+    "services.trajectory_executor.grasp_tolerances.release": test_simulated_grasps_use_current_tolerances,
 }
 
 
@@ -207,7 +208,7 @@ RARE: dict[str, Callable[..., Any]] = {
 
 @pytest.mark.parametrize("service", TUNABLE)
 @pytest.mark.slow
-async def test_every_tunable_parameter_is_read_anew_for_the_next_thing_that_a_service_does(
+async def test_every_tunable_parameter_is_read_when_it_is_used(
     service: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     running = Running(service, tmp_path)
@@ -222,14 +223,14 @@ async def test_every_tunable_parameter_is_read_anew_for_the_next_thing_that_a_se
 
 
 @pytest.mark.parametrize("path", RARE)
-def test_what_is_read_rarely_is_kept_in_the_same_model_as_something_that_is_read_always(path: str) -> None:
+def test_rarely_read_parameters_share_a_model_with_frequent_ones(path: str) -> None:
     """So the test above shows that the service works with that model itself, and not with a copy."""
     service = path.split(".")[1]
     owners = {p: leaf.owner for p, leaf in leaves(config_of(service), service).items() if leaf.runtime}
     assert [p for p, owner in owners.items() if owner is owners[path] and p not in RARE]
 
 
-def test_rare_parameters_are_parameters_that_there_are() -> None:
+def test_listed_rare_parameters_exist() -> None:
     tunable = {p for name in TUNABLE for p, leaf in leaves(config_of(name), name).items() if leaf.runtime}
     assert set(RARE) <= tunable
     assert set(TUNABLE) <= set(SCENARIOS)
@@ -244,7 +245,7 @@ def test_a_section_with_parameters_to_change_is_declared_by_one_service_of_the_c
 # --- what the next thing done is like -----------------------------------------------------------------------------
 
 
-async def test_a_larger_least_area_hides_the_balls_of_the_next_picture_though_it_is_the_same(tmp_path: Path) -> None:
+async def test_larger_minimum_area_takes_effect_on_an_unchanged_image(tmp_path: Path) -> None:
     async with Running("vision_detector", tmp_path) as service:
         assert len(await service.turn()) == 3
         await service.tune(min_contour_area_px=9000.0)
@@ -255,7 +256,7 @@ async def test_a_larger_least_area_hides_the_balls_of_the_next_picture_though_it
         assert await service.turn() == []
 
 
-async def test_noise_and_brightness_show_in_the_next_picture_of_a_still_world(tmp_path: Path) -> None:
+async def test_noise_and_brightness_take_effect_in_a_static_world(tmp_path: Path) -> None:
     def pixels(image: Any) -> Any:
         return np.frombuffer(image.data, np.uint8).astype(int)
 
@@ -269,7 +270,7 @@ async def test_noise_and_brightness_show_in_the_next_picture_of_a_still_world(tm
         assert (pixels(await service.turn()) == before).all()
 
 
-async def test_a_camera_that_waits_for_its_next_picture_takes_it_when_the_rate_is_raised(tmp_path: Path) -> None:
+async def test_raised_camera_rate_takes_effect_at_once(tmp_path: Path) -> None:
     async with Running("camera_simulator", tmp_path) as service:
         await service.turn()
         await service.tune(rate=1e-4)
@@ -280,7 +281,7 @@ async def test_a_camera_that_waits_for_its_next_picture_takes_it_when_the_rate_i
         await service.turn()
 
 
-async def test_the_next_plan_is_slower_by_the_velocity_scaling(tmp_path: Path) -> None:
+async def test_velocity_scaling_takes_effect_in_the_next_plan(tmp_path: Path) -> None:
     def seconds(answer: Any) -> float:
         return float(answer.trajectory.points[-1].time_from_start)
 
@@ -293,7 +294,7 @@ async def test_the_next_plan_is_slower_by_the_velocity_scaling(tmp_path: Path) -
         assert seconds(await service.turn()) == pytest.approx(2 * slow, rel=1e-6)
 
 
-async def test_a_goal_box_and_a_planning_time_are_those_of_the_next_request(tmp_path: Path) -> None:
+async def test_goal_tolerance_and_planning_time_take_effect_in_the_next_request(tmp_path: Path) -> None:
     async with Running("smart_pick_place", tmp_path) as service:
         request: PlanRequest = await service.turn()
         assert (request.goal.position_tolerance.x, request.planning_time) == (0.04, 2.0)  # type: ignore[union-attr]
@@ -302,14 +303,14 @@ async def test_a_goal_box_and_a_planning_time_are_those_of_the_next_request(tmp_
         assert (request.goal.position_tolerance.x, request.planning_time) == (0.02, 3.0)  # type: ignore[union-attr]
 
 
-async def test_a_goal_is_refused_by_the_tolerances_of_now(tmp_path: Path) -> None:
+async def test_goal_tolerances_take_effect(tmp_path: Path) -> None:
     async with Running("trajectory_executor", tmp_path, speed=10.0) as service:
         assert (await service.turn()).state == "succeeded"
         await service.tune(**{"tolerances.start": 1e-4})
         assert (await service.turn()).error == "start_mismatch"
 
 
-async def test_the_shell_is_drawn_anew_and_the_next_target_judged_by_it(tmp_path: Path) -> None:
+async def test_workspace_bounds_take_effect_on_markers_and_targets(tmp_path: Path) -> None:
     async with Running("workspace_validator", tmp_path) as service:
         shells, rejected = service.bus.reader(WORKSPACE_MARKERS), service.bus.reader(REJECTED_TARGETS)
         await service.turn()
@@ -323,7 +324,7 @@ async def test_the_shell_is_drawn_anew_and_the_next_target_judged_by_it(tmp_path
         await asyncio.wait({turn})
 
 
-async def test_a_ball_needs_as_many_frames_as_are_asked_for_now(tmp_path: Path) -> None:
+async def test_confirm_frames_take_effect(tmp_path: Path) -> None:
     async with Running("scene_manager", tmp_path) as service:
         await service.tune(confirm_frames=100, forget_after=60.0)
         assert [await service.turn() for _ in range(5)] == [[]] * 5
@@ -331,7 +332,7 @@ async def test_a_ball_needs_as_many_frames_as_are_asked_for_now(tmp_path: Path) 
         assert len(await service.turn()) == 1
 
 
-async def test_the_next_depth_image_ends_where_the_camera_sees_no_farther(tmp_path: Path) -> None:
+async def test_depth_range_takes_effect(tmp_path: Path) -> None:
     async with Running("depth_camera", tmp_path) as service:
         farthest = float(np.nanmax(await service.turn()))
         await service.tune(farthest=farthest - 0.05, depth_dropout=0.0)
@@ -340,7 +341,7 @@ async def test_the_next_depth_image_ends_where_the_camera_sees_no_farther(tmp_pa
         assert np.isnan(await service.turn()).all()
 
 
-async def test_the_next_contours_are_those_of_the_threshold_of_now(tmp_path: Path) -> None:
+async def test_contour_threshold_takes_effect(tmp_path: Path) -> None:
     async with Running("contour_detector", tmp_path) as service:
         assert len((await service.turn()).contours) == 1
         await service.tune(threshold=220)
@@ -352,7 +353,7 @@ async def test_the_next_contours_are_those_of_the_threshold_of_now(tmp_path: Pat
         assert all(u == round(u) for u, _ in found.pixels)
 
 
-async def test_the_next_outline_is_rounded_and_cleared_as_it_is_said_now(tmp_path: Path) -> None:
+async def test_rounding_and_tolerance_take_effect_in_the_next_outline(tmp_path: Path) -> None:
     async with Running("pixel_to_world", tmp_path) as service:
         await service.turn()
         await service.tune(rounding=0.05)
@@ -364,7 +365,7 @@ async def test_the_next_outline_is_rounded_and_cleared_as_it_is_said_now(tmp_pat
         assert len((await service.turn()).poses) < many / 4
 
 
-async def test_the_next_trace_keeps_the_standoff_and_speed_of_now(tmp_path: Path) -> None:
+async def test_standoff_and_speed_take_effect_in_the_next_trace(tmp_path: Path) -> None:
     async with Running("contour_tracer", tmp_path) as service:
         trace = (await service.turn()).goal
         assert (trace.waypoints[0].position.z, trace.tool_speed) == (1.102, 0.05)
@@ -373,7 +374,7 @@ async def test_the_next_trace_keeps_the_standoff_and_speed_of_now(tmp_path: Path
         assert (trace.waypoints[0].position.z, trace.tool_speed, trace.step) == (1.12, 0.1, 0.002)
 
 
-async def test_tf_comes_as_rarely_as_it_is_said_now(tmp_path: Path) -> None:
+async def test_tf_rate_takes_effect(tmp_path: Path) -> None:
     async with Running("robot_state_publisher", tmp_path) as service:
         await service.turn()
         await service.tune(rate=1.0)

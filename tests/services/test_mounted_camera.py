@@ -38,7 +38,7 @@ def joints(stamp: int, q: np.ndarray) -> JointState:
     return JointState(header=Header(stamp=stamp), name=ROBOT.joint_names, position=q.tolist())
 
 
-async def test_depth_of_a_camera_on_the_hand_lies_on_the_table_wherever_the_hand_is() -> None:
+async def test_depth_of_a_mounted_camera_lies_on_the_table_at_any_pose() -> None:
     net = LocalNetwork()
     bus = net.bus()
     arm, depths = bus.writer(topics.JOINT_STATES), bus.reader(topics.DEPTH_CAMERA_DEPTH)
@@ -80,7 +80,7 @@ async def test_depth_of_a_camera_on_the_hand_lies_on_the_table_wherever_the_hand
         assert np.abs(places[0] - places[1]).max() > 0.02  # it looked elsewhere
 
 
-async def test_picture_waits_for_the_transform_of_its_time_and_is_left_out_where_none_comes() -> None:
+async def test_image_waits_for_its_transform_and_is_skipped_without_one() -> None:
     net = LocalNetwork()
     bus = net.bus()
     arm, infos = bus.writer(topics.JOINT_STATES), bus.writer(topics.CAMERA_INFO)
@@ -114,7 +114,7 @@ async def test_only_cells_with_a_camera_on_the_robot_read_tf() -> None:
         assert (topics.TF in found.reads) == reads
 
 
-def test_camera_that_was_taken_elsewhere_sees_what_one_does_that_always_was_there() -> None:
+def test_moved_camera_renders_like_a_new_one() -> None:
     things = spheres([(0.4, -0.1, 0.03), (0.5, 0.05, 0.03)]).objects
     mounted = MountedCamera(AROUND.camera, ROBOT)
     there = mounted.at(HOME + 0.1)

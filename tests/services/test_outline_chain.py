@@ -1,4 +1,4 @@
-"""From the truth to the path: camera, contours, world points and cleared path, on a network within the process."""
+"""From ground truth to path: camera, contours, world points and path, on an in-process network."""
 
 import asyncio
 from contextlib import AsyncExitStack
@@ -43,7 +43,7 @@ DETECTOR, WORLD, REMOVER = contour_detector.Config(), pixel_to_world.Config(), d
 
 
 class Cell:
-    """The services, and what a tester says and hears."""
+    """The services, with the readers and clients of the test."""
 
     def __init__(self):
         self.net = LocalNetwork()
@@ -79,7 +79,7 @@ async def running(stack, cell, *, detector=DETECTOR, world=WORLD, camera=True):
         await stack.enter_async_context(running_service(cell.net, module.run, config, name=name))
 
 
-async def test_the_largest_object_is_chosen_and_its_outline_becomes_a_path():
+async def test_largest_object_becomes_the_path():
     async with AsyncExitStack() as stack:
         cell = Cell()
         await running(stack, cell)
@@ -92,7 +92,7 @@ async def test_the_largest_object_is_chosen_and_its_outline_becomes_a_path():
         assert path.object == points.object
 
 
-async def test_object_that_was_moved_is_seen_and_outlined_where_it_lies_now():
+async def test_moved_object_is_outlined_at_its_new_position():
     world = KinematicWorld(W5)
     async with AsyncExitStack() as stack:
         cell = Cell()
@@ -108,7 +108,7 @@ async def test_object_that_was_moved_is_seen_and_outlined_where_it_lies_now():
         np.testing.assert_allclose((corners.min(axis=0) + corners.max(axis=0)) / 2, (0.5, -0.15), atol=1e-3)
 
 
-async def test_another_object_can_be_chosen_by_colour_and_stays_chosen():
+async def test_object_selected_by_color_stays_selected():
     async with AsyncExitStack() as stack:
         cell = Cell()
         await running(stack, cell, detector=DETECTOR.model_copy(update={"select": "none"}))
@@ -122,7 +122,7 @@ async def test_another_object_can_be_chosen_by_colour_and_stays_chosen():
         np.testing.assert_allclose(middle(later), (0.52, 0.02, 1.08), atol=1e-3)
 
 
-async def test_a_choice_that_is_not_there_is_refused_with_the_choices():
+async def test_selection_of_a_missing_object_is_rejected_with_the_choices():
     async with AsyncExitStack() as stack:
         cell = Cell()
         await running(stack, cell)
@@ -136,7 +136,7 @@ async def test_a_choice_that_is_not_there_is_refused_with_the_choices():
             await cell.select.call(OutlineSelect(rule="colour", colour="yellow"))
 
 
-async def test_an_empty_world_and_one_with_an_object_at_the_border_say_why_there_is_no_path():
+async def test_missing_path_has_a_reason():
     async with AsyncExitStack() as stack:
         cell = Cell()
         await running(stack, cell)
@@ -148,7 +148,7 @@ async def test_an_empty_world_and_one_with_an_object_at_the_border_say_why_there
         assert path.message.startswith("every contour touches the border") and not path.poses
 
 
-async def test_exposure_stamps_picture_depth_and_points_alike_and_points_come_only_when_listened_to():
+async def test_image_depth_and_points_share_a_stamp_and_points_need_a_subscriber():
     async with AsyncExitStack() as stack:
         cell = Cell()
         readers = [cell.bus.reader(t) for t in (
@@ -163,7 +163,7 @@ async def test_exposure_stamps_picture_depth_and_points_alike_and_points_come_on
         assert np.nanmin(depth) == pytest.approx(2.75 - 1.08) and np.isnan(depth).any()
 
 
-async def test_depth_that_does_not_fit_the_picture_is_told_in_one_line():
+async def test_mismatched_depth_is_reported_in_one_line():
     async with AsyncExitStack() as stack:
         cell = Cell()
         depths, infos = cell.bus.writer(topics.DEPTH_CAMERA_DEPTH), cell.bus.writer(topics.DEPTH_CAMERA_INFO)
@@ -175,7 +175,7 @@ async def test_depth_that_does_not_fit_the_picture_is_told_in_one_line():
         picture = np.zeros((768, 1024, 3), np.uint8)
         picture[300:400, 400:500] = (0, 255, 255)
         nothing = np.full((768, 1024), np.nan, np.float32)
-        for stamp, depth, said in ((5, nothing[::2], "the depth image is 1024x384, but the picture is 1024x768"),
+        for stamp, depth, said in ((5, nothing[::2], "the depth image is 1024x384, but the color image is 1024x768"),
                                    (6, nothing, "the depth image has no valid depth at all")):
             header = Header(stamp=stamp, frame_id=AROUND.camera.frame)
             depths.put(array_to_image(np.ascontiguousarray(depth), "32FC1", header))
@@ -184,7 +184,7 @@ async def test_depth_that_does_not_fit_the_picture_is_told_in_one_line():
             assert said in path.message and path.message.startswith("Object_0: ") and not path.poses
 
 
-async def test_outline_that_no_message_has_room_for_is_told_and_not_sent(monkeypatch):
+async def test_too_long_outline_is_reported_and_not_sent(monkeypatch):
     long = TopFace(np.zeros((20_001, 3)), 1.0, 0.9, 0, True)
     monkeypatch.setattr(pixel_to_world, "top_face", lambda *_, **__: long)
     async with AsyncExitStack() as stack:
@@ -195,7 +195,7 @@ async def test_outline_that_no_message_has_room_for_is_told_and_not_sent(monkeyp
         assert "20001 points are more than an outline has room for" in path.message and not path.poses
 
 
-async def test_the_camera_alone_reads_the_truth():
+async def test_only_the_camera_reads_the_ground_truth():
     assert topics.SCENE_OBJECTS in (await wiring(depth_camera.run, CAMERA)).reads
     for module, config in ((contour_detector, DETECTOR), (pixel_to_world, WORLD), (duplicate_remover, REMOVER)):
         assert topics.SCENE_OBJECTS not in (await wiring(module.run, config)).reads
@@ -206,11 +206,11 @@ async def test_the_camera_alone_reads_the_truth():
                             "depth_camera/camera_info"}),
     (contour_detector, DETECTOR, {"contours", "contour_image", "outline/select"}),
     (pixel_to_world, WORLD, {"contour_points"}), (duplicate_remover, REMOVER, {"contour_path"})])
-async def test_stage_writes_and_serves_what_the_next_one_needs(module, config, owned):
+async def test_each_stage_writes_the_input_of_the_next(module, config, owned):
     assert {topic.key for topic in (await wiring(module.run, config)).owns} == owned
 
 
-def test_a_choice_at_the_start_that_is_none_is_a_bad_parameter():
+def test_invalid_initial_selection_is_a_config_error():
     with pytest.raises(ConfigError, match=r"services.contour_detector.select.*'bleu'.*choices: none, auto"):
         contour_detector.initial_choice("bleu")
 

@@ -28,7 +28,7 @@ AROUND = CELL.section(Surroundings)
 assert isinstance(AROUND, Surroundings)
 CAMERA = Pinhole.from_config(AROUND.camera)
 HOME = CELL.robot.named_poses["home"]
-TOP, BASE = 1.65, 1.75  # depths [m] of a cube's top and of what it stands on
+TOP, BASE = 1.65, 1.75  # depths [m] of a cube's top and of its support
 
 
 def cube_depth() -> NDArray[np.float32]:
@@ -84,7 +84,7 @@ class Neighbours:
         raise AssertionError("no picture became a scene")
 
 
-async def test_fixtures_are_known_at_once_and_what_was_seen_with_the_arm_at_home() -> None:
+async def test_scene_starts_with_fixtures_and_adds_solids_seen_from_home() -> None:
     net = LocalNetwork()
     async with running_service(net, outline_scene.run, CONFIG, name="outline_scene"):
         around = Neighbours(net)
@@ -99,25 +99,25 @@ async def test_fixtures_are_known_at_once_and_what_was_seen_with_the_arm_at_home
         assert np.allclose(np.abs(np.array(cube.outline)).max(axis=0), half, atol=0.001)
 
 
-def test_depth_in_millimetres_is_told_by_its_encoding() -> None:
+def test_encoding_identifies_depth_in_millimeters() -> None:
     image = array_to_image(np.rint(1000 * cube_depth()).astype(np.uint16), "16UC1")
     cube = outline_scene.seen(cube_contours(), image, CAMERA, AROUND).objects[-1]
     assert cube.id == "Object_0" and abs(cube.pose.position.z - 1.05) < 0.002
 
 
-def test_without_any_depth_it_is_not_known_that_nothing_stands_there() -> None:
+def test_image_without_depth_is_not_an_empty_scene() -> None:
     image = array_to_image(np.full_like(cube_depth(), np.nan), "32FC1")
     with pytest.raises(FrameError, match="no valid depth at all"):
         outline_scene.seen(cube_contours(), image, CAMERA, AROUND)
 
 
-def test_depth_of_another_size_than_the_contours_is_left_out() -> None:
+def test_depth_of_another_size_is_dropped() -> None:
     image = array_to_image(cube_depth()[::2, ::2], "32FC1")
-    with pytest.raises(FrameError, match=f"512x384, but the picture is {CAMERA.width}x{CAMERA.height}"):
+    with pytest.raises(FrameError, match=f"512x384, but the color image is {CAMERA.width}x{CAMERA.height}"):
         outline_scene.seen(cube_contours(), image, CAMERA, AROUND)
 
 
-def test_contours_that_lie_over_one_another_again_and_again_are_not_looked_into() -> None:
+def test_heavily_overlapping_contours_are_dropped() -> None:
     found = cube_contours()
     around = [(-1e12, -1e12), (1e12, -1e12), (1e12, 1e12), (-1e12, 1e12)]
     many = [Contour.model_construct(index=i, label=f"Object_{i}", pixels=around) for i in range(1000)]
@@ -127,20 +127,20 @@ def test_contours_that_lie_over_one_another_again_and_again_are_not_looked_into(
 
 
 @pytest.mark.parametrize("change", [{"fx": 1e-6}, {"cy": 1e12}])
-def test_what_would_be_farther_away_than_a_scene_can_tell_is_left_out(change: dict[str, float]) -> None:
+def test_solid_out_of_message_range_is_dropped(change: dict[str, float]) -> None:
     image = array_to_image(cube_depth(), "32FC1")
     with pytest.raises(FrameError, match=r"more than 1e\+07 m away"):
         outline_scene.seen(cube_contours(), image, replace(CAMERA, **change), AROUND)
 
 
 @pytest.mark.parametrize("change", [{"fx": 1e-6}, {"cy": 1e12}])
-def test_what_would_be_farther_away_than_an_outline_can_tell_has_none(change: dict[str, float]) -> None:
+def test_outline_out_of_message_range_is_rejected(change: dict[str, float]) -> None:
     image = array_to_image(cube_depth(), "32FC1")
     with pytest.raises(FrameError, match=r"more than 1e\+07 m away"):
         pixel_to_world.outline(cube_contours(), image, replace(CAMERA, **change), pixel_to_world.Config())
 
 
-async def test_picture_with_the_arm_in_it_is_left_out() -> None:
+async def test_image_with_the_arm_is_dropped() -> None:
     net = LocalNetwork()
     async with running_service(net, outline_scene.run, CONFIG, name="outline_scene"):
         around = Neighbours(net)
@@ -151,7 +151,7 @@ async def test_picture_with_the_arm_in_it_is_left_out() -> None:
         assert (await around.seen(since=15)).header.stamp >= 15
 
 
-async def test_picture_of_a_time_to_come_keeps_none_from_being_looked_at() -> None:
+async def test_future_image_does_not_block_later_ones() -> None:
     net = LocalNetwork()
     async with running_service(net, outline_scene.run, CONFIG, name="outline_scene"):
         around = Neighbours(net)
@@ -161,7 +161,7 @@ async def test_picture_of_a_time_to_come_keeps_none_from_being_looked_at() -> No
         assert (await around.seen(since=5)).header.stamp < 2000
 
 
-async def test_picture_with_more_in_it_than_a_scene_has_room_for_is_left_out() -> None:
+async def test_image_with_too_many_objects_is_dropped() -> None:
     net = LocalNetwork()
     async with running_service(net, outline_scene.run, CONFIG, name="outline_scene"):
         around = Neighbours(net)
@@ -178,7 +178,7 @@ async def test_picture_with_more_in_it_than_a_scene_has_room_for_is_left_out() -
         header = m.Header(stamp=crowded, frame_id=AROUND.camera.frame)
         around.depths.put(array_to_image(depth, "32FC1", header))
         around.contours.put(Contours(header=header, width=CAMERA.width, height=CAMERA.height, contours=spots))
-        for _ in range(50):  # until it is looked at: of what comes before that only the newest is
+        for _ in range(50):  # until it is processed: only the newest message counts
             await asyncio.sleep(0)
         since = crowded + 1
         while (scene := await around.seen(since)).header.stamp < crowded:  # of the first pictures, on a busy machine

@@ -1,4 +1,4 @@
-"""Camera, detector and validator together: from where balls are to what may be taken, only by way of the picture."""
+"""Camera, detector and validator together: from ground truth to targets through images only."""
 
 import asyncio
 from contextlib import AsyncExitStack
@@ -52,7 +52,7 @@ async def targets_like(reader, places):
             return message
 
 
-async def test_what_lies_on_the_table_is_offered_and_follows_what_happens_there():
+async def test_targets_follow_the_objects_on_the_table():
     net, clock = LocalNetwork(), Clock()
     bus = net.bus(clock=clock)
     world, statics = bus.writer(topics.SCENE_OBJECTS), bus.writer(topics.TF_STATIC)
@@ -72,11 +72,11 @@ async def test_what_lies_on_the_table_is_offered_and_follows_what_happens_there(
         assert rejected.received == 0
         world.put(truth([(0.2, 0.0), (0.46, 0.0), (0.52, 0.0), (0.49, 0.052)]))
         await targets_like(offered, [(0.46, 0.0), (0.52, 0.0), (0.49, 0.052)])
-        told = await asyncio.wait_for(rejected.next(), 20)
-        assert told.rejected[0].reason.startswith("pre-grasp at (0.200, 0.000, 0.130)")
+        rejections = await asyncio.wait_for(rejected.next(), 20)
+        assert rejections.rejected[0].reason.startswith("pre-grasp at (0.200, 0.000, 0.130)")
 
 
-async def test_noise_and_a_darker_picture_change_nothing():
+async def test_noise_and_dimming_change_nothing():
     net, clock = LocalNetwork(), Clock()
     bus = net.bus(clock=clock)
     world, statics = bus.writer(topics.SCENE_OBJECTS), bus.writer(topics.TF_STATIC)

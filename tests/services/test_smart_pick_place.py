@@ -43,7 +43,7 @@ def show(bus: Bus, targets: list[tuple[float, float]], age: float = 0.0) -> None
         header=header, poses=[m.Pose(position=m.Vector3(x=x, y=y, z=0.03)) for x, y in targets]))
 
 
-async def test_validated_target_makes_it_ask_for_a_plan_to_above_that_ball() -> None:
+async def test_validated_target_causes_a_plan_request_above_the_ball() -> None:
     net = LocalNetwork()
     bus = net.bus("tester", cell="test", clock=Clock())
     asked: asyncio.Queue[m.PlanRequest] = asyncio.Queue()
@@ -65,7 +65,7 @@ async def test_validated_target_makes_it_ask_for_a_plan_to_above_that_ball() -> 
             assert abs(goal.pose.position.z - height) < 1e-9
 
 
-async def test_picture_that_is_late_by_the_fast_clock_of_the_cell_only_is_fresh() -> None:
+async def test_image_age_is_measured_in_wall_time() -> None:
     net = LocalNetwork()
     clock = Clock(speed=10.0)
     bus = net.bus("tester", cell="test", clock=clock)
@@ -83,7 +83,7 @@ async def test_picture_that_is_late_by_the_fast_clock_of_the_cell_only_is_fresh(
         assert (await asyncio.wait_for(asked.get(), 5)).stage == "pre-grasp"
 
 
-async def test_status_is_a_state_that_a_late_reader_gets() -> None:
+async def test_late_reader_gets_the_status() -> None:
     net = LocalNetwork()
     bus = net.bus("tester", cell="test", clock=Clock())
     async with running_service(net, smart_pick_place.run, CONFIG, name="smart_pick_place"):
@@ -94,7 +94,7 @@ async def test_status_is_a_state_that_a_late_reader_gets() -> None:
 
 
 @pytest.mark.parametrize("damaged", ["{", '{"places": [[0.5, 0.2, NaN]]}', '{"places": 3}', "[]"])
-async def test_what_a_task_knows_of_what_it_let_go_outlives_it(damaged, monkeypatch, tmp_path, caplog) -> None:
+async def test_release_positions_survive_a_restart(damaged, monkeypatch, tmp_path, caplog) -> None:
     monkeypatch.setenv(RUNTIME_VARIABLE, str(tmp_path))
     tasks: list[PickPlace] = []
 
@@ -106,49 +106,49 @@ async def test_what_a_task_knows_of_what_it_let_go_outlives_it(damaged, monkeypa
     async def run(bus: Bus, config: Config) -> None:
         await run_task(bus, config, Seen, PICK_PLACE_STATUS, PickPlaceView, seen=VALIDATED_TARGETS)
 
-    kept, places = tmp_path / "test.smart_pick_place.json", [(0.5, 0.2, 0.095)]
+    saved, places = tmp_path / "test.smart_pick_place.json", [(0.5, 0.2, 0.095)]
     async with running_service(LocalNetwork(), run, CONFIG, name="smart_pick_place"):
         tasks[0].remember(ReleasePositions(places=places))
         async with asyncio.timeout(10):
-            while not kept.exists():  # noqa: ASYNC110  # nobody tells
+            while not saved.exists():  # noqa: ASYNC110
                 await asyncio.sleep(0.01)
     async with running_service(LocalNetwork(), run, CONFIG, name="smart_pick_place"):
         assert tasks[1].memory == ReleasePositions(places=places)
-    kept.write_text(damaged)
+    saved.write_text(damaged)
     async with running_service(LocalNetwork(), run, CONFIG, name="smart_pick_place"):
         assert tasks[2].memory == ReleasePositions()
-    assert f"the memory of the task is lost: {kept} cannot be read: it is damaged" in caplog.text
+    assert f"the memory of the task is lost: {saved} cannot be read: it is damaged" in caplog.text
 
 
-async def test_memory_that_a_task_begins_with_stays_where_none_was_kept_and_is_written_as_soon_as_it_can_be(
+async def test_initial_memory_is_used_and_saved_as_soon_as_possible(
     monkeypatch, tmp_path, caplog,
 ) -> None:
-    in_the_way = tmp_path / "standing"
-    in_the_way.write_text("no folder")
-    monkeypatch.setenv(RUNTIME_VARIABLE, str(in_the_way / "cell"))
+    blocker = tmp_path / "standing"
+    blocker.write_text("no folder")
+    monkeypatch.setenv(RUNTIME_VARIABLE, str(blocker / "cell"))
     monkeypatch.setattr(task_runner, "SAVE_RETRY", 0.01)
-    begun, later = ReleasePositions(places=[(0.5, 0.2, 0.095)]), ReleasePositions(places=[(0.5, 0.3, 0.035)])
+    initial, later = ReleasePositions(places=[(0.5, 0.2, 0.095)]), ReleasePositions(places=[(0.5, 0.3, 0.035)])
     tasks: list[PickPlace] = []
 
-    class Begun(PickPlace):
+    class WithMemory(PickPlace):
         def __init__(self, *given: Any) -> None:
             super().__init__(*given)
-            self.remember(begun)
+            self.remember(initial)
             tasks.append(self)
 
     async def run(bus: Bus, config: Config) -> None:
-        await run_task(bus, config, Begun, PICK_PLACE_STATUS, PickPlaceView, seen=VALIDATED_TARGETS)
+        await run_task(bus, config, WithMemory, PICK_PLACE_STATUS, PickPlaceView, seen=VALIDATED_TARGETS)
 
-    kept = in_the_way / "cell" / "test.smart_pick_place.json"
+    saved = blocker / "cell" / "test.smart_pick_place.json"
     async with running_service(LocalNetwork(), run, CONFIG, name="smart_pick_place"), asyncio.timeout(10):
-        assert tasks[0].memory == begun
+        assert tasks[0].memory == initial
         tasks[0].remember(later)
-        while "cannot be written" not in caplog.text:  # noqa: ASYNC110  # nobody tells
+        while "cannot be written" not in caplog.text:  # noqa: ASYNC110
             await asyncio.sleep(0.01)
-        in_the_way.unlink()
-        while not kept.exists():  # noqa: ASYNC110
+        blocker.unlink()
+        while not saved.exists():  # noqa: ASYNC110
             await asyncio.sleep(0.01)
-    assert ReleasePositions.model_validate_json(kept.read_text()) == later
+    assert ReleasePositions.model_validate_json(saved.read_text()) == later
     assert caplog.text.count("cannot be written") == 1
 
 
@@ -161,7 +161,7 @@ async def test_pause_is_answered_with_the_status() -> None:
         assert not (await command.call(m.TaskCommand(command="resume"))).paused
 
 
-async def test_plan_without_points_and_a_scene_with_something_far_away_in_the_hand_do_not_end_it() -> None:
+async def test_empty_plan_and_out_of_range_held_object_do_not_end_the_task() -> None:
     net = LocalNetwork()
     bus = net.bus("tester", cell="test", clock=Clock())
     asked: asyncio.Queue[m.PlanRequest] = asyncio.Queue()
@@ -176,7 +176,7 @@ async def test_plan_without_points_and_a_scene_with_something_far_away_in_the_ha
     async with running_service(net, smart_pick_place.run, CONFIG, name="smart_pick_place"):
         show(bus, [(0.40, -0.17)])
         await asyncio.wait_for(asked.get(), 5)
-        await asyncio.wait_for(asked.get(), 5)  # it is planned anew
+        await asyncio.wait_for(asked.get(), 5)  # it is planned again
         far = ball("far", 1e7, 1e7)
         held = [m.AttachedObject(link="panda_hand_tcp", object=far)]
         header = m.Header(stamp=bus.clock.now_ns(), frame_id="world")

@@ -62,7 +62,7 @@ class Rig:
         return await asyncio.wait_for(self.found.next(), 10)
 
 
-async def test_one_picture_in_detections_in_world_out_under_the_same_stamp():
+async def test_one_image_gives_detections_with_its_stamp():
     net = LocalNetwork()
     rig = Rig(net)
     rig.calibrate()
@@ -81,7 +81,7 @@ async def test_one_picture_in_detections_in_world_out_under_the_same_stamp():
         np.testing.assert_allclose(mark.pixel, camera.project(position), atol=1e-6)
 
 
-async def test_pose_of_the_camera_comes_from_tf_and_from_nowhere_else():
+async def test_camera_pose_comes_from_tf():
     net = LocalNetwork()
     rig = Rig(net)
     moved = camera.T_world_optical.copy()
@@ -107,7 +107,7 @@ async def test_intrinsics_come_from_camera_info():
 
 
 @pytest.mark.parametrize(
-    ("bad", "told"),
+    ("bad", "problem"),
     [
         (Image(header=Header(frame_id=FRAME), width=1, height=1, encoding="bgr8", data=b"abc"), "image of 1x1"),
         (
@@ -122,7 +122,7 @@ async def test_intrinsics_come_from_camera_info():
         (Image(header=Header(frame_id="nowhere"), width=640, height=480, encoding="bgr8", data=b"x"), "'nowhere'"),
     ],
 )
-async def test_a_picture_that_can_not_be_looked_at_is_dropped_and_told_once(bad, told, caplog):
+async def test_unusable_image_is_dropped_and_reported_once(bad, problem, caplog):
     net = LocalNetwork()
     rig = Rig(net)
     rig.calibrate()
@@ -138,11 +138,11 @@ async def test_a_picture_that_can_not_be_looked_at_is_dropped_and_told_once(bad,
             rig.images.put(picture(stamp=3))
             while (await rig.next()).header.stamp != 3:
                 pass
-    lines = [record.getMessage() for record in caplog.records if "picture left out" in record.getMessage()]
-    assert len(lines) == 1 and told in lines[0]
+    lines = [record.getMessage() for record in caplog.records if "image skipped" in record.getMessage()]
+    assert len(lines) == 1 and problem in lines[0]
 
 
-async def test_pictures_before_the_camera_is_known_are_dropped():
+async def test_images_before_camera_info_are_dropped():
     net = LocalNetwork()
     rig = Rig(net)
     async with running_service(net, run, config):
@@ -153,7 +153,7 @@ async def test_pictures_before_the_camera_is_known_are_dropped():
         assert (await rig.next()).header.stamp == 2
 
 
-async def test_a_camera_that_no_pinhole_is_does_not_end_the_service():
+async def test_unsupported_camera_model_does_not_end_the_service():
     net = LocalNetwork()
     rig = Rig(net)
     bent = camera.info(Header(frame_id=FRAME)).model_copy(update={"d": [0.2, 0.0, 0.0, 0.0, 0.0]})
@@ -168,7 +168,7 @@ async def test_a_camera_that_no_pinhole_is_does_not_end_the_service():
         assert (await rig.next()).header.stamp == 2
 
 
-async def test_a_camera_that_sees_things_farther_away_than_can_be_told_does_not_end_the_service(caplog):
+async def test_detections_out_of_message_range_do_not_end_the_service(caplog):
     net = LocalNetwork()
     rig = Rig(net)
     with caplog.at_level(logging.WARNING):
@@ -186,7 +186,7 @@ async def test_a_camera_that_sees_things_farther_away_than_can_be_told_does_not_
     assert "more than 1e+07 m away" in caplog.text
 
 
-async def test_annotated_picture_is_drawn_for_whoever_listens():
+async def test_annotated_image_is_published_for_subscribers():
     net = LocalNetwork()
     rig = Rig(net)
     rig.calibrate()
@@ -198,7 +198,7 @@ async def test_annotated_picture_is_drawn_for_whoever_listens():
     assert (image_to_array(image) != draw_spheres(PLACES, camera, around)).any()
 
 
-async def test_mask_shows_what_the_colour_windows_let_through_as_they_are_now_and_only_to_who_listens(monkeypatch):
+async def test_mask_follows_the_color_windows_and_needs_a_subscriber(monkeypatch):
     net, asked = LocalNetwork(), []
     rig = Rig(net)
     rig.calibrate()
@@ -226,7 +226,7 @@ async def test_mask_shows_what_the_colour_windows_let_through_as_they_are_now_an
         assert not image_to_array(image).any()
 
 
-async def test_an_rgb_picture_is_understood():
+async def test_rgb_image_is_accepted():
     net = LocalNetwork()
     rig = Rig(net)
     rig.calibrate()
@@ -236,14 +236,14 @@ async def test_an_rgb_picture_is_understood():
         assert len((await rig.next()).markers) == 3
 
 
-async def test_it_reads_no_truth():
+async def test_detector_reads_no_ground_truth():
     found = await wiring(run, config)
     assert found.reads == {topics.CAMERA_IMAGE, topics.CAMERA_INFO, topics.TF_STATIC}
     assert found.writes == {DETECTED_OBJECTS, DETECTION_IMAGE, DETECTION_MASK}
 
 
 @pytest.mark.parametrize(
-    ("values", "told"),
+    ("values", "problem"),
     [
         ({"hsv_red_lo1": [0, 300, 80]}, "hsv_red_lo1.1"),
         ({"hsv_red_hi1": [10, 100, 255]}, "hsv_red_lo1 s = 120 is above hsv_red_hi1 s = 100"),
@@ -251,7 +251,7 @@ async def test_it_reads_no_truth():
         ({"hsv_red": [0, 0, 0]}, "choices: depth, hsv_red_hi1, hsv_red_hi2, hsv_red_lo1, hsv_red_lo2"),
     ],
 )
-def test_a_parameter_out_of_bounds_is_named(values, told):
+def test_a_parameter_out_of_bounds_is_named(values, problem):
     with pytest.raises(ConfigError, match=r"hsv_red|min_contour") as caught:
         check(Config, {"world": around, **values}, "services.vision_detector")
-    assert told in str(caught.value)
+    assert problem in str(caught.value)

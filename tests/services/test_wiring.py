@@ -1,4 +1,4 @@
-"""What each service reads, writes and serves, seen by running it with a recorder in the place of the bus."""
+"""What each service reads, writes and serves, recorded in place of the bus."""
 
 from __future__ import annotations
 
@@ -27,25 +27,25 @@ async def wired(cell: str, name: str) -> Wiring:
 
 
 @pytest.mark.parametrize(("cell", "name"), DECIDING)
-async def test_nothing_that_decides_reads_the_truth(cell: str, name: str) -> None:
+async def test_no_deciding_service_reads_the_ground_truth(cell: str, name: str) -> None:
     assert not (await wired(cell, name)).reads & TRUTH
     config = importlib.import_module(CELLS[cell].services[name].module).Config
     assert not [f for f, info in config.model_fields.items() if info.annotation is World]
 
 
 @pytest.mark.parametrize(("cell", "camera"), list(zip(CELLS, CAMERAS, strict=True)))
-async def test_only_the_camera_and_the_page_read_the_truth(cell: str, camera: str) -> None:
+async def test_only_camera_and_page_read_the_ground_truth(cell: str, camera: str) -> None:
     readers = [name for name in CELLS[cell].services if (await wired(cell, name)).reads & TRUTH]
     assert set(readers) == {camera, SHOWING}
 
 
 @pytest.mark.parametrize("camera", CAMERAS)
-async def test_the_camera_knows_the_truth_from_the_topic_alone(camera: str) -> None:
+async def test_camera_gets_the_ground_truth_from_the_topic(camera: str) -> None:
     config = importlib.import_module(f"services.{camera}").Config
     assert World not in [info.annotation for info in config.model_fields.values()]
 
 
-async def test_every_topic_that_is_known_has_an_owner_in_a_cell_and_only_such_are_owned() -> None:
+async def test_every_known_topic_has_an_owner() -> None:
     owned = {topic for cell, name in SERVICES for topic in (await wired(cell, name)).owns}
     of_no_service = {topics.SUPERVISOR_STATUS, topics.LOG, topics.COUNTERS, topics.PARAMETERS, topics.MOTION_JOG}
     assert owned == set(all_topics().values()) - of_no_service
@@ -62,12 +62,12 @@ async def test_no_two_services_of_a_cell_own_one_key(cell: str) -> None:
 
 
 @pytest.mark.parametrize("cell", CELLS)
-async def test_every_topic_that_is_read_or_asked_is_written_or_served_by_one_service_of_the_cell(cell: str) -> None:
+async def test_every_input_has_exactly_one_source(cell: str) -> None:
     all_wired = [await wired(cell, name) for name in CELLS[cell].services]
     written = [topic for found in all_wired for topic in found.writes]
     served = [topic for found in all_wired for topic in found.serves]
     by_others = {topics.SUPERVISOR_STATUS, topics.LOG, topics.COUNTERS, topics.MOTION_JOG}  # and by everybody
-    parameters = {topics.parameters_of(name) for name in CELLS[cell].services}  # which nobody serves by itself
+    parameters = {topics.parameters_of(name) for name in CELLS[cell].services}  # not served by the services themselves
     assert len(written) == len(set(written)) and len(served) == len(set(served))
     for name, found in zip(CELLS[cell].services, all_wired, strict=True):
         if name != SHOWING:  # which shows whatever there is
@@ -75,7 +75,7 @@ async def test_every_topic_that_is_read_or_asked_is_written_or_served_by_one_ser
         assert found.calls <= set(served) | parameters
 
 
-async def test_device_camera_has_the_wiring_of_the_simulated_one_but_for_the_truth() -> None:
+async def test_device_camera_is_wired_like_the_simulated_one() -> None:
     simulated = await wired("panda", "camera_simulator")
     module = importlib.import_module("services.camera_opencv")
     section = CELLS["panda"].section(Surroundings)

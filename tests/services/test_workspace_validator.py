@@ -68,10 +68,10 @@ class Rig:
                 return message
 
     async def reasons(self, count):
-        told = []
-        while len(told) < count:
-            told += (await asyncio.wait_for(self.rejected.next(), 10)).rejected
-        return [one.reason for one in told]
+        reported = []
+        while len(reported) < count:
+            reported += (await asyncio.wait_for(self.rejected.next(), 10)).rejected
+        return [one.reason for one in reported]
 
 
 async def test_detections_in_targets_out_under_the_same_stamp():
@@ -97,7 +97,7 @@ async def test_each_kind_of_rejection_has_its_reason():
     assert sorted(next(s for s in starts if reason.startswith(s)) for reason in reasons) == sorted(starts)
 
 
-async def test_a_place_is_told_and_logged_once_while_something_lies_there(caplog):
+async def test_rejected_position_is_published_and_logged_once(caplog):
     net = LocalNetwork()
     rig = Rig(net)
     with caplog.at_level(logging.INFO):
@@ -110,7 +110,7 @@ async def test_a_place_is_told_and_logged_once_while_something_lies_there(caplog
     assert len([r for r in caplog.records if "singularity column" in r.getMessage()]) == 1
 
 
-async def test_something_put_back_after_a_while_is_told_again():
+async def test_object_put_back_later_is_reported_again():
     net = LocalNetwork()
     rig = Rig(net)
     bad, good = (0.05, 0.0, 0.03), (0.5, 0, 0.03)
@@ -124,7 +124,7 @@ async def test_something_put_back_after_a_while_is_told_again():
         assert len(await rig.reasons(2)) == 2
 
 
-async def test_balls_in_the_box_are_neither_targets_nor_told():
+async def test_balls_in_the_container_are_neither_targets_nor_rejections():
     net = LocalNetwork()
     rig = Rig(net)
     c = around.container
@@ -134,21 +134,21 @@ async def test_balls_in_the_box_are_neither_targets_nor_told():
         assert rig.rejected.received == 0
 
 
-async def test_detections_without_a_pixel_are_judged_by_their_place():
+async def test_detections_without_a_pixel_are_validated_by_position():
     net = LocalNetwork()
     rig = Rig(net)
     async with running_service(net, run, config, name="workspace_validator"):
         await rig.answer(seen((0.55, 0.25, 0.035), (0.5, -0.2, 0.03), pixel=False), 1)
 
 
-async def test_an_empty_table_is_an_answer_too():
+async def test_empty_table_is_published():
     net = LocalNetwork()
     rig = Rig(net)
     async with running_service(net, run, config):
         assert (await rig.answer(seen(stamp=5), 0)).poses == []
 
 
-async def test_frames_before_the_camera_is_known_are_dropped():
+async def test_detections_before_camera_info_are_dropped():
     net = LocalNetwork()
     rig = Rig(net, calibrated=False)
     async with running_service(net, run, config):
@@ -159,7 +159,7 @@ async def test_frames_before_the_camera_is_known_are_dropped():
         assert rig.targets.latest.header.stamp == 2
 
 
-async def test_shell_and_column_are_there_for_whoever_comes_late():
+async def test_late_subscriber_gets_shell_and_column():
     net = LocalNetwork()
     async with running_service(net, run, config, name="workspace_validator"):
         message = await asyncio.wait_for(Rig(net).markers.next(), 10)
@@ -172,19 +172,19 @@ async def test_shell_and_column_are_there_for_whoever_comes_late():
     assert 0 < shell.color.a < 0.5 and 0 < column.color.a < 0.5
 
 
-async def test_it_reads_no_truth():
+async def test_detector_reads_no_ground_truth():
     found = await wiring(run, config)
     assert found.reads == {DETECTED_OBJECTS, topics.CAMERA_INFO, topics.TF_STATIC, topics.JOINT_STATES}
     assert found.writes == {VALIDATED_TARGETS, REJECTED_TARGETS, WORKSPACE_MARKERS}
 
 
-async def test_frame_with_more_in_it_than_there_is_room_for_is_left_out_and_told():
+async def test_frame_with_too_many_detections_is_dropped_and_reported():
     net = LocalNetwork()
-    rig, told = Rig(net), asyncio.Queue()
+    rig, reported = Rig(net), asyncio.Queue()
 
     class Listening(logging.Handler):
         def emit(self, record):
-            told.put_nowait(record.getMessage())
+            reported.put_nowait(record.getMessage())
 
     async with running_service(net, run, config, name="workspace_validator"):
         await rig.answer(seen((0.45, -0.2, 0.03)), 1)
@@ -192,7 +192,7 @@ async def test_frame_with_more_in_it_than_there_is_room_for_is_left_out_and_told
         log, listening = logging.getLogger("workspace_validator"), Listening()
         log.addHandler(listening)
         rig.found.put(seen(*crowd, stamp=2_000))
-        line = await asyncio.wait_for(told.get(), 10)
+        line = await asyncio.wait_for(reported.get(), 10)
         log.removeHandler(listening)
         assert line.startswith("frame of detections skipped: 300 objects in it are more than")
         await rig.answer(seen((0.45, -0.2, 0.03), stamp=3_000), 1)

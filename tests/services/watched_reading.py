@@ -1,4 +1,4 @@
-"""Notes which fields of a configuration are read, in the original and in copies that are younger than `begin`."""
+"""Records which fields of a configuration are read, in the original and in copies made after `begin`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class Watch:
     def __init__(self, monkeypatch: pytest.MonkeyPatch, config: Parameters, service: str) -> None:
         self.read: set[str] = set()
         self.tunable = {path for path, leaf in leaves(config, service).items() if leaf.runtime}
-        self._models: dict[int, tuple[Any, str]] = {}  # kept alive, so that no other gets the same id
+        self._models: dict[int, tuple[Any, str]] = {}  # references, so that no other model gets the same id
         self._copies: list[int] = []
         for path, leaf in leaves(config, service).items():
             self._models[id(leaf.owner)] = (leaf.owner, path.rpartition(".")[0])

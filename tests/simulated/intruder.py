@@ -1,4 +1,4 @@
-"""Somebody who puts a pillar into the way of running motions and takes it away again, and judges by the truth."""
+"""An intruder that puts a pillar into the path of running motions, removes it, and checks by ground truth."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Intrusion:
 
     expected: float  # [s] later the arm would have touched it
     stays: float  # [s] from when the arm is held
-    nearest: float = np.inf  # [m] that any link came to it while it stood there, by coal
+    nearest: float = np.inf  # [m] distance of any link to it, by coal
     latency: float = np.inf  # [s] from the scene message to the first set-point that brakes; nan: it was not held
     given_up: bool = False  # the motion, before the pillar was gone
 
@@ -77,7 +77,7 @@ class Intruder:
         self._joints = bus.reader(topics.JOINT_STATES)
         self._edit, self._followed = bus.client(topics.WORLD_EDIT), bus.client(topics.MOTION_FOLLOWED)
         self._pillar: tuple[coal.Box, coal.Transform3s, Intrusion] | None = None
-        async with beside(self._judge()):
+        async with beside(self._check()):
             while len(self.found) < self.most and not simulated.ended.is_set():
                 await asyncio.sleep(float(self._rng.uniform(0.3, 3.0)))
                 status = self._motion.latest
@@ -137,7 +137,7 @@ class Intruder:
         SEEN.clear()
 
     def _ground(self, x: float, y: float) -> float:
-        """Height of what a pillar there stands on [m]."""
+        """Return the height of the surface below a pillar [m]."""
         tops = [thing.position[2] + thing.dimensions[2] / 2 for thing in self._world.fixtures if thing.shape == "box"
                 and abs(x - thing.position[0]) < thing.dimensions[0] / 2
                 and abs(y - thing.position[1]) < thing.dimensions[1] / 2]
@@ -146,7 +146,7 @@ class Intruder:
     def _in_a_container(self, x: float, y: float) -> bool:
         return any(max(abs(x - box.x), abs(y - box.y)) < ABOUT_CONTAINERS for box in self._world.containers.values())
 
-    async def _judge(self) -> None:
+    async def _check(self) -> None:
         async for state in self._joints:
             q = self._robot.order(state.name, state.position)
             if self._pillar is not None and q is not None:

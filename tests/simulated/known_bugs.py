@@ -1,4 +1,4 @@
-"""Ten bugs to put back, one at a time, into code that was cured of them; and after how many seeds each is found.
+"""Known bugs, each put back into the fixed code, and the number of seeds until a simulation finds it.
 
 `python -m tests.simulated.known_bugs [MOST]` prints the table.
 """
@@ -87,7 +87,7 @@ def _clock_of_its_own():
 
 
 def _waits_without_end():
-    async def ask(self, payload, seconds, timeout):
+    async def send(self, payload, seconds, timeout):
         future = self._loop.create_future()
 
         def settle(reply):
@@ -96,7 +96,7 @@ def _waits_without_end():
         self._session.get(self._key, settle, lambda: None, payload=payload, timeout=1e9)
         return await future
 
-    return patch.object(requests.Client, "_ask", ask)
+    return patch.object(requests.Client, "_send", send)
 
 
 def _never_asked_again():
@@ -107,7 +107,7 @@ def _never_asked_again():
             note(str(error))
             await asyncio.Event().wait()
 
-    return patch("common.process.orders.persist", once)
+    return patch("common.process.task_requests.call_until_answered", once)
 
 
 BUGS = {
@@ -140,7 +140,7 @@ def cell_with(bug):
 
 
 def found_within(bug, most):
-    """The number of seeds that were run until one told of the bug, and what it told; None when none did."""
+    """Return the number of seeds until the bug is found, and its report; None if it is not."""
     cell = cell_with(bug)
     for seed in range(1, most + 1):
         with BUGS[bug]():

@@ -1,4 +1,4 @@
-"""Bugs about what persons decided, to put back one at a time; and in how many seeds with doubles each is found.
+"""Bugs of operators' interlocks, each put back into the fixed code, and the seeds with doubles that find it.
 
 `python -m tests.simulated.lost_decisions [SEEDS] [NAMES]` prints the table.
 """
@@ -27,10 +27,10 @@ def _without(**left_out):
 
 
 def _let_in():
-    async def nobody(self, *_):
+    async def allow(self, *_):
         return None
 
-    return patch.object(Ownership, "_require_only", nobody)
+    return patch.object(Ownership, "_require_only", allow)
 
 
 def _late_start_counts():
@@ -44,14 +44,14 @@ DECISIONS = {
     "a remembered stop of an unknown goal is forgotten": lambda: patch.object(
         Interlocks, "block_goals", lambda self, goals: None),
     "the speed is forgotten": lambda: patch.object(
-        trajectory_executor, "effective_speed", lambda kept, configured: configured),
+        trajectory_executor, "effective_speed", lambda saved, configured: configured),
     "a second instance is let in": _let_in,
     "a start undoes a later stop": _late_start_counts,
 }
 
 
 def found_in(name, bug, seeds, enough=None):
-    """Seeds that told of the bug, and what the first told; the search ends when there are enough."""
+    """Return the seeds that find the bug, until there are enough, and the report of the first."""
     application = load_cell(name).application
     cell, found, first = with_doubles(load_cell(name, settings_of(application))), [], ""
     for seed in seeds:
@@ -69,7 +69,7 @@ def found_in(name, bug, seeds, enough=None):
 if __name__ == "__main__":
     count = int(sys.argv[1]) if len(sys.argv) > 1 else 100
     for bug in sys.argv[2:] or DECISIONS:
-        seeds, told = found_in("panda", bug, range(1, count + 1))
+        seeds, report = found_in("panda", bug, range(1, count + 1))
         with contextlib.suppress(BrokenPipeError):
-            sys.stdout.write(f"{bug}: {len(seeds)} of {count}, first {seeds[:1]}: {told}\n")
+            sys.stdout.write(f"{bug}: {len(seeds)} of {count}, first {seeds[:1]}: {report}\n")
             sys.stdout.flush()

@@ -25,7 +25,7 @@ async def keys_in(cell: Cell) -> list[str]:
 
 
 @pytest.mark.slow
-def test_bad_messages_stop_no_service_and_a_ball_that_slips_is_taken_again() -> None:
+def test_bad_messages_stop_no_service_and_a_slipped_ball_is_grasped_again() -> None:
     happened: set[tuple[str, str]] = set()
     keys: list[str] = []
 

@@ -47,7 +47,7 @@ def cell(tmp_path: Path) -> Cell:
     return load_cell(str(path))
 
 
-class Heard:
+class Observer:
     """Takes the messages of a run in the place of a trace: how wide the fingers held, and the truth as it was last."""
 
     def __init__(self) -> None:
@@ -62,10 +62,10 @@ class Heard:
 
 
 @pytest.mark.slow
-def test_boxes_are_taken_by_their_narrow_sides_and_lie_in_the_container(cell: Cell) -> None:
-    heard = Heard()
-    outcome = Simulation(cell, 2, trace=cast(Trace, heard)).run()
+def test_boxes_are_grasped_at_their_narrow_sides_and_placed_in_the_container(cell: Cell) -> None:
+    observer = Observer()
+    outcome = Simulation(cell, 2, trace=cast(Trace, observer)).run()
     assert (outcome.state, outcome.done, outcome.total) == ("DONE", 2, 2), outcome
-    where = {thing.id: (thing.state, thing.container) for thing in heard.truth.objects}
+    where = {item.id: (item.state, item.container) for item in observer.truth.objects}
     assert where == {"along": ("contained", "tray"), "turned": ("contained", "tray"), "can": ("table", "")}
-    assert heard.widths == {0.03}, "as wide as the box is across"
+    assert observer.widths == {0.03}, "as wide as the box is across"

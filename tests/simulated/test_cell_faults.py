@@ -1,4 +1,4 @@
-"""Processes that die at the worst moments, and a table that somebody else changes: every ball ends where it should."""
+"""Processes that die at bad moments, and edits of the world during a run: every ball ends where it should."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def halfway(status: MotionStatus) -> bool:
 
 
 @pytest.mark.slow
-def test_task_and_scene_manager_are_killed_with_a_ball_in_the_hand() -> None:
+def test_task_and_scene_manager_are_killed_while_a_ball_is_held() -> None:
     async def visit(cell: SimulatedCell, bus: Bus) -> None:
         gripper = bus.reader(topics.GRIPPER_STATE)
         for victim in ("smart_pick_place", "scene_manager"):
@@ -41,7 +41,7 @@ def test_task_and_scene_manager_are_killed_with_a_ball_in_the_hand() -> None:
     assert summary["restarts"] == {"smart_pick_place": 1, "scene_manager": 1}
 
 
-def test_the_router_is_lost_in_the_middle_of_a_motion_which_goes_on_to_its_end() -> None:
+def test_motion_completes_though_the_router_is_lost() -> None:
     async def visit(cell: SimulatedCell, bus: Bus) -> None:
         motion = bus.reader(topics.MOTION_STATUS)
         await until(bus.reader(topics.GRIPPER_STATE), holding)
@@ -56,7 +56,7 @@ def test_the_router_is_lost_in_the_middle_of_a_motion_which_goes_on_to_its_end()
 
 
 @pytest.mark.slow
-def test_balls_that_are_moved_added_and_taken_away_end_up_where_they_should() -> None:
+def test_balls_that_are_moved_added_and_removed_end_in_the_box() -> None:
     def placing(status: PickPlaceStatus) -> bool:
         return status.state == "PLACING"
 
@@ -80,7 +80,7 @@ def test_balls_that_are_moved_added_and_taken_away_end_up_where_they_should() ->
 
 
 @pytest.mark.slow
-def test_what_can_not_be_taken_is_reported_and_the_run_ends_done() -> None:
+def test_unreachable_ball_is_reported_and_the_run_ends_done() -> None:
     places = {  # by how the reason begins
         "": [(0.40, -0.30), (0.52, -0.30), (0.62, -0.25), (0.40, -0.17), (0.52, -0.17), (0.64, -0.13), (0.40, -0.04)],
         "the container is full": [(0.52, -0.04)],
@@ -94,6 +94,6 @@ def test_what_can_not_be_taken_is_reported_and_the_run_ends_done() -> None:
     summary = SimulatedCell("panda", [f"world.balls={balls}", camera]).summary
     assert summary["state"] == "DONE"
     assert summary["truth"] == {"in_box": 8, "on_table": 4, "elsewhere": 0, "containers": {"box": 8}}
-    told = {place["reason"].partition(":")[0] for place in summary["rejected"]}
-    assert told == set(places) - {"", "inside the container"}
+    reasons = {place["reason"].partition(":")[0] for place in summary["rejected"]}
+    assert reasons == set(places) - {"", "inside the container"}
     assert len(summary["rejected"]) == 4

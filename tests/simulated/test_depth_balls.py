@@ -26,7 +26,7 @@ services:
 
 
 @pytest.mark.slow
-def test_table_is_cleared_by_colour_and_depth(tmp_path: Path) -> None:
+def test_table_is_cleared_by_color_and_depth(tmp_path: Path) -> None:
     path = tmp_path / "depth.yaml"
     path.write_text(CELL, encoding="utf-8")
     summary = SimulatedCell(str(path), ["world.count=3"]).summary

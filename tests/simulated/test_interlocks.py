@@ -1,4 +1,4 @@
-"""What a person decided about motion in whole cells: no process that starts again makes anything of it undone."""
+"""Operators' interlocks in complete cells, which no restart of a process may undo."""
 
 from __future__ import annotations
 
@@ -41,15 +41,15 @@ async def moving(cell: SimulatedCell, bus: Bus, status: Reader[PickPlaceStatus],
     await until(bus.reader(topics.JOINT_STATES), lambda s: moves(cell, s))
 
 
-async def assert_rests(cell: SimulatedCell, bus: Bus) -> None:
-    """It stands still for five seconds, in which every service has had the time to begin."""
+async def assert_standstill(cell: SimulatedCell, bus: Bus) -> None:
+    """Check standstill for five seconds, in which every service has time to start."""
     joints = bus.reader(topics.JOINT_STATES)
     first = await assert_still(cell, joints, bus.clock.now_ns())
     await asyncio.sleep(5.0)
     assert await assert_still(cell, joints, bus.clock.now_ns()) == first
 
 
-def test_stopped_robot_stays_where_it_is_whoever_starts_again_until_a_person_starts_it() -> None:
+def test_stopped_robot_stays_stopped_over_restarts_until_an_operator_starts_it() -> None:
     async def visit(cell: SimulatedCell, bus: Bus) -> None:
         motion, status = bus.reader(topics.MOTION_STATUS), bus.reader(PICK_PLACE_STATUS)
         await moving(cell, bus, status, "pre-grasp")
@@ -57,27 +57,27 @@ def test_stopped_robot_stays_where_it_is_whoever_starts_again_until_a_person_sta
         answer = await bus.client(topics.MOTION_STOP).call(StopRequest(reason="smoke", owner="anna"))
         assert answer.stopped.endswith("UTC by anna (smoke)")
         cell.kill(TASK)
-        told = await until(status, lambda s: not s.started and "by anna (smoke): start to go on" in s.message)
-        assert told.state == "IDLE" and not told.paused
-        await assert_rests(cell, bus)
+        stopped = await until(status, lambda s: not s.started and "by anna (smoke): start to go on" in s.message)
+        assert stopped.state == "IDLE" and not stopped.paused
+        await assert_standstill(cell, bus)
         await again(cell, bus, TASK, EXECUTOR)
-        await assert_rests(cell, bus)
+        await assert_standstill(cell, bus)
         with pytest.raises(RemoteError, match=r"stopped since .* by anna .*: start the task"):
             await command(bus, "resume", "anna")
         with pytest.raises(MotionFailed, match=r"the robot is stopped since .* by anna"):
             await OperatorMotion(bus, [status], "bert").move(JointGoal(named="home"))
         there = await OperatorMotion(bus, [status], "anna").move(JointGoal(named="home"))
-        assert there.state == "succeeded" and there.stopped, "for who stopped it, and for nobody else"
+        assert there.state == "succeeded" and there.stopped, "only the operator who stopped it may move it"
         await again(cell, bus, TASK)
-        await assert_rests(cell, bus)
+        await assert_standstill(cell, bus)
         await command(bus, "start", "bert")
-        # Told by the task, which then dies: with autostart it may not begin by itself either.
+        # Reported by the task, which then dies: with autostart it must not start by itself either.
         await moving(cell, bus, status, "pre-grasp")
         await command(bus, "stop", "bert")
         assert motion.latest is not None and "by bert" in (await until(motion, lambda m: bool(m.stopped))).stopped
         await again(cell, bus, TASK)
         await until(status, lambda s: not s.started and "by bert" in s.message)
-        await assert_rests(cell, bus)
+        await assert_standstill(cell, bus)
         await command(bus, "start", "anna")
         assert not (await until(motion, lambda m: not m.interlocks)).stopped
 
@@ -86,7 +86,7 @@ def test_stopped_robot_stays_where_it_is_whoever_starts_again_until_a_person_sta
 
 
 @pytest.mark.slow
-def test_hold_of_a_person_and_the_speed_outlive_executor_and_task_and_nobody_else_lets_go() -> None:
+def test_operators_hold_and_speed_survive_restarts_and_only_the_operator_releases_them() -> None:
     path = "services.trajectory_executor.speed_scaling"
 
     async def visit(cell: SimulatedCell, bus: Bus) -> None:
@@ -98,20 +98,20 @@ def test_hold_of_a_person_and_the_speed_outlive_executor_and_task_and_nobody_els
         await again(cell, bus, EXECUTOR)
         found = await until(motion, lambda m: m.state == "none")
         assert found.held and [hold.by for hold in found.interlocks] == ["anna"] and found.speed_scaling == 0.05
-        await assert_rests(cell, bus)
+        await assert_standstill(cell, bus)
         await again(cell, bus, TASK, EXECUTOR)
         assert "by anna" in (await until(status, lambda s: s.paused and "found held" in s.message)).message
-        await assert_rests(cell, bus)
+        await assert_standstill(cell, bus)
         for said in ("resume", "start"):
             with pytest.raises(RemoteError, match=r"held since .* by anna .*: only they can release it, unless"):
                 await command(bus, said, "bert")
         with pytest.raises(MotionFailed):
             await OperatorMotion(bus, [], "bert").move(JointGoal(named="home"))
-        await assert_rests(cell, bus)
+        await assert_standstill(cell, bus)
         await bus.client(topics.parameters_of(EXECUTOR)).call(ParameterRequest(set={path: 1.0}, by="anna"))
         await command(bus, "resume", "bert", override=True)
         await until(motion, lambda m: not m.held)
-        assert any("bert let go of what another said: held since" in line for line in cell.lines)
+        assert any("bert released an interlock of another operator: held since" in line for line in cell.lines)
 
     summary = SimulatedCell("panda", ["world.count=1"], visit=visit).summary
     assert summary["state"] == "DONE"

@@ -1,4 +1,4 @@
-"""Things that come in the way of running motions in whole cells: the arm brakes, waits, goes on or is planned anew."""
+"""Obstacles in the path of running motions in complete cells: the arm brakes, waits, resumes or is replanned."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ pytestmark = pytest.mark.timeout(600)  # some seconds of work, on a machine that
     ("panda", ["world.count=1"]), pytest.param("ur5", [], marks=pytest.mark.slow),
 ])
 @pytest.mark.slow
-def test_what_is_put_into_the_way_is_never_touched_and_the_task_is_done(name: str, overrides: list[str]) -> None:
+def test_added_obstacle_is_never_touched_and_the_task_is_done(name: str, overrides: list[str]) -> None:
     intruder = Intruder(seed=1, most=2)
     cell = SimulatedCell(watched_cell(name, overrides), seed=1, visit=intruder.visit)
     assert cell.outcome.state == "DONE" and len(intruder.found) == 2
@@ -67,7 +67,7 @@ class Way:
                                pose=Pose(position=Vector3(x=x, y=y, z=z)))
 
 
-def test_what_goes_away_lets_the_motion_go_on_but_not_while_a_person_holds_the_arm() -> None:
+def test_removed_obstacle_resumes_the_motion_unless_an_operator_holds_the_arm() -> None:
     async def visit(cell: SimulatedCell, bus: Bus) -> None:
         way, hold = Way(cell, bus), bus.client(topics.MOTION_HOLD)
         held = await way.block()
@@ -89,7 +89,7 @@ def test_what_goes_away_lets_the_motion_go_on_but_not_while_a_person_holds_the_a
 
 @pytest.mark.parametrize("stays", [False, True])
 @pytest.mark.slow
-def test_planner_that_dies_while_it_holds_the_arm_judges_anew_when_it_is_back(stays: bool) -> None:
+def test_restarted_planner_rechecks_the_motion_it_held(stays: bool) -> None:
     async def visit(cell: SimulatedCell, bus: Bus) -> None:
         way = Way(cell, bus)
         held = await way.block()

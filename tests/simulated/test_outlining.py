@@ -1,4 +1,4 @@
-"""The UR5 cell: an outline that was seen, one that a person chose or wrote, and what cannot be outlined."""
+"""The UR5 cell: detected, selected and edited outlines, and outlines that cannot be traced."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ pytestmark = pytest.mark.timeout(600)  # some seconds of work, on a machine that
 
 
 @pytest.mark.slow  # `make test` asks it of a trace that was paused, in test_pausing.py
-def test_the_cube_is_outlined_and_every_figure_is_told() -> None:
+def test_cube_is_outlined_and_all_figures_are_reported() -> None:
     summary = SimulatedCell("ur5", world="w2").summary
     assert_cube_outlined(summary)
     assert 0 < summary["seconds"]["moving"] <= summary["seconds"]["task"]
 
 
 @pytest.mark.slow
-def test_the_object_that_was_chosen_is_outlined() -> None:
+def test_selected_object_is_outlined() -> None:
     chosen: list[str] = []
 
     async def visit(_cell: SimulatedCell, bus: Bus) -> None:
@@ -49,11 +49,11 @@ def test_the_object_that_was_chosen_is_outlined() -> None:
 
 
 @pytest.mark.slow
-def test_coordinates_edited_by_hand_are_traced(tmp_path: Path) -> None:
+def test_edited_coordinates_are_traced(tmp_path: Path) -> None:
     smaller = [[0.5 + dx, dy, 1.105] for dx, dy in ((-0.03, -0.03), (0.03, -0.03), (0.03, 0.03), (-0.03, 0.03))]
     stage_files.write_points(tmp_path / stage_files.CLEARED, smaller)
-    told = before_run("ur5", [], None, source=str(tmp_path)).overrides  # of `run ur5 --from`
-    outline = SimulatedCell("ur5", told).summary["outline"]
+    overrides = before_run("ur5", [], None, source=str(tmp_path)).overrides  # of `run ur5 --from`
+    outline = SimulatedCell("ur5", overrides).summary["outline"]
     assert outline["closed"] and outline["points"] == 4
     assert outline["length_m"] == pytest.approx(0.24)
     assert outline["tracking_mm"]["max"] < 0.15
@@ -67,12 +67,12 @@ def test_coordinates_edited_by_hand_are_traced(tmp_path: Path) -> None:
     ],
     ids=["nothing there", "out of reach"],
 )
-def test_what_can_not_be_outlined_ends_with_one_line_and_the_arm_at_home(objects: str, said: str) -> None:
+def test_unreachable_outline_ends_with_an_error_and_the_arm_at_home(objects: str, said: str) -> None:
     cell = SimulatedCell("ur5", [f"world.objects={objects}", "services.contour_tracer.selection_timeout=4"])
     summary = cell.summary
     assert summary["state"] == "ERROR"
     assert summary["seconds"]["moving"] < 4  # cell time: the fingers at most
     assert summary["seconds"]["first_motion"] is None
-    told = [line for line in cell.lines if "  ERROR contour_tracer: " in line]
-    assert len(told) == 1 and said in told[0]
+    errors = [line for line in cell.lines if "  ERROR contour_tracer: " in line]
+    assert len(errors) == 1 and said in errors[0]
     assert "Traceback" not in cell.text

@@ -1,4 +1,4 @@
-"""An empty result is no success: what was seen and not taken is said, and what was left unsaid is told apart."""
+"""Objects that a task detected but did not grasp are reported; unexplained ones fail the run."""
 
 import pytest
 
@@ -8,7 +8,7 @@ from tests.simulated.visited import SimulatedCell
 LEAST = "services.vision_detector.min_contour_area_px"
 
 
-def test_balls_below_the_least_area_are_told_with_it_and_as_left() -> None:
+def test_balls_below_the_least_area_are_reported_as_left() -> None:
     summary = SimulatedCell("panda", ["world.count=2", f"{LEAST}=3000"]).summary
     assert (summary["state"], summary["placed"]) == ("DONE", 0)
     assert summary["overlooked"] == ("the table looks empty, but 2 red blobs are smaller than "
@@ -24,14 +24,14 @@ def test_balls_that_were_rejected_are_explained() -> None:
     assert summary["unexplained"] == []
 
 
-def test_run_that_took_everything_overlooked_nothing() -> None:
+def test_complete_run_reports_nothing_overlooked() -> None:
     summary = SimulatedCell("panda", ["world.count=1"]).summary
     assert (summary["placed"], summary["overlooked"], summary["unexplained"]) == (1, "", [])
 
 
 @pytest.mark.slow
 @pytest.mark.cell
-async def test_run_that_left_something_without_a_word_exits_3_and_warns_before(tmp_path) -> None:
+async def test_run_with_unexplained_objects_warns_and_exits_3(tmp_path) -> None:
     with RunningCell(tmp_path, "run", "panda", "--set", "world.count=1", "--set", f"{LEAST}=3000") as cell:
         assert await cell.ended(120.0) == 3
     assert "error: world.objects: ball_1 appears on" in cell.text

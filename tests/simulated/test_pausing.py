@@ -1,4 +1,4 @@
-"""Pause, resume and stop in whole cells: the joints really stand still, and what was begun is ended."""
+"""Pause, resume and stop in complete cells: the joints stop, and a paused motion is completed."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ STATUS = {"panda": PICK_PLACE_STATUS, "ur5": OUTLINE_STATUS}
 STILL = 30  # joint states in a row
 
 
-async def tell(bus: Bus, command: str) -> None:
+async def send(bus: Bus, command: str) -> None:
     await bus.client(topics.TASK_COMMAND).call(TaskCommand.model_validate({"command": command}), 10.0)
 
 
@@ -51,21 +51,21 @@ async def pause_in_motion(cell: SimulatedCell, bus: Bus, stage: str) -> Any:
     status = bus.reader(STATUS[cell.cell.name])
     await until(status, lambda s: s.stage == stage, 90)
     await until(joints, lambda s: moves(cell, s))
-    await tell(bus, "pause")
+    await send(bus, "pause")
     at_rest = await held(motion)
     assert at_rest.state == "active" and 0 < at_rest.progress < 1, at_rest
     assert (await until(status, lambda s: s.paused)).stage == stage
     await assert_still(cell, joints, at_rest.header.stamp)
     with pytest.raises(MotionFailed, match=r"is paused.*stop the task first"):
         await OperatorMotion(bus, [status]).move(JointGoal(named="home"))
-    await tell(bus, "resume")
+    await send(bus, "resume")
     ended = await until(motion, lambda m: m.id != at_rest.id or m.state != "active")
-    assert (ended.id, ended.state) == (at_rest.id, "succeeded"), "the same motion goes on"
+    assert (ended.id, ended.state) == (at_rest.id, "succeeded"), "the same motion resumes"
     return await until(status, lambda s: s.state in ("DONE", "ERROR"), 120)
 
 
 @pytest.mark.slow
-def test_panda_paused_on_its_way_goes_on_and_puts_every_ball_in_the_box() -> None:
+def test_paused_panda_resumes_and_places_every_ball() -> None:
     async def visit(cell: SimulatedCell, bus: Bus) -> None:
         await pause_in_motion(cell, bus, "across")
 
@@ -77,7 +77,7 @@ def test_panda_paused_on_its_way_goes_on_and_puts_every_ball_in_the_box() -> Non
 
 
 @pytest.mark.slow
-def test_ur5_paused_in_mid_trace_goes_on_with_the_same_trace() -> None:
+def test_ur5_paused_while_tracing_resumes_the_same_trace() -> None:
     async def visit(cell: SimulatedCell, bus: Bus) -> None:
         status = await pause_in_motion(cell, bus, "trace")
         assert status.closed and (status.object, status.failures) == ("Object_0", 0)
@@ -87,45 +87,45 @@ def test_ur5_paused_in_mid_trace_goes_on_with_the_same_trace() -> None:
     assert summary["seconds"]["moving"] < summary["seconds"]["task"]
 
 
-def test_task_service_that_dies_while_paused_leaves_the_robot_held_until_somebody_says_resume() -> None:
+def test_robot_stays_held_when_a_paused_task_dies_until_resume() -> None:
     async def visit(cell: SimulatedCell, bus: Bus) -> None:
         joints, motion = bus.reader(topics.JOINT_STATES), bus.reader(topics.MOTION_STATUS)
         status = bus.reader(PICK_PLACE_STATUS)
         await until(status, lambda s: s.stage == "across", 90)
         await until(joints, lambda s: moves(cell, s))
-        await tell(bus, "pause")
+        await send(bus, "pause")
         at_rest = await held(motion)
         assert at_rest.state == "active" and 0 < at_rest.progress < 1, at_rest
         cell.kill("smart_pick_place")
         found = await until(status, lambda s: s.paused and "found held" in s.message)
         assert found.stage == "" and found.started
         await assert_still(cell, joints, at_rest.header.stamp)
-        await tell(bus, "resume")
+        await send(bus, "resume")
         ended = await until(motion, lambda m: m.id != at_rest.id or m.state != "active")
-        assert (ended.id, ended.state) == (at_rest.id, "succeeded"), "the same motion goes on"
+        assert (ended.id, ended.state) == (at_rest.id, "succeeded"), "the same motion resumes"
 
     summary = SimulatedCell("panda", ["world.count=1"], visit=visit).summary
     assert summary["truth"]["in_box"] == 1 and summary["restarts"] == {"smart_pick_place": 1}
 
 
 @pytest.mark.slow
-def test_stopped_robot_is_brought_home_by_a_person_and_the_task_starts_again() -> None:
+def test_operator_moves_a_stopped_robot_home_and_starts_the_task() -> None:
     async def visit(cell: SimulatedCell, bus: Bus) -> None:
         joints, motion = bus.reader(topics.JOINT_STATES), bus.reader(topics.MOTION_STATUS)
         status = bus.reader(PICK_PLACE_STATUS)
-        person = OperatorMotion(bus, [status])
+        operator = OperatorMotion(bus, [status])
         await until(status, lambda s: s.stage == "pre-grasp", 90)
         with pytest.raises(MotionFailed, match=r"the task is GRASPING .*stop the task first"):
-            await person.move(JointGoal(named="home"))
+            await operator.move(JointGoal(named="home"))
         await until(motion, lambda m: m.state == "active")
-        await tell(bus, "pause")
+        await send(bus, "pause")
         await held(motion)
-        await tell(bus, "stop")
+        await send(bus, "stop")
         stopped = await until(motion, lambda m: m.state == "cancelled")
         assert stopped.held, "until the next start"
-        await person.move(JointGoal(named="home"))
+        await operator.move(JointGoal(named="home"))
         there = await assert_still(cell, joints, (motion.latest or stopped).header.stamp)
         assert there == pytest.approx(cell.cell.robot.named_poses["home"], abs=1e-3)
-        await tell(bus, "start")
+        await send(bus, "start")
 
     assert SimulatedCell("panda", ["world.count=1"], visit=visit).summary["truth"]["in_box"] == 1

@@ -20,7 +20,7 @@ def test_table_is_cleared_by_friction_alone() -> None:
 
 
 @pytest.mark.slow
-def test_executor_that_dies_with_something_in_the_hand_finds_it_there_again() -> None:
+def test_executor_killed_while_holding_finds_the_object_again() -> None:
     async def visit(cell: SimulatedCell, bus: Bus) -> None:
         async for state in bus.reader(topics.GRIPPER_STATE):
             if state.holding and state.outcome == "grasped":
@@ -42,7 +42,7 @@ def test_pile_of_seven_stays_in_the_box(seed: int) -> None:
 
 
 @pytest.mark.slow
-def test_outline_is_traced_with_servos_as_exactly_as_without() -> None:
+def test_outline_with_servo_physics_is_as_accurate_as_without() -> None:
     summary = SimulatedCell("ur5", [PHYSICS], world="w2").summary
     assert summary["state"] == "DONE"
     assert summary["outline"]["deviation_mm"]["mean"] < 0.5 and summary["outline"]["closed"]

@@ -60,7 +60,7 @@ async def replay(path: Path, name: str, service: str, topic: Topic[Any], states:
 
 @pytest.mark.parametrize(("cell", "service", "topic", "states", "pictures"), CASES, ids=[case[0] for case in CASES])
 @pytest.mark.slow
-def test_replayed_pictures_give_what_they_gave_live(
+def test_replayed_images_give_the_live_detections(
     tmp_path: Path, cell: str, service: str, topic: Topic[Any], states: list[str], pictures: str
 ) -> None:
     recording = tmp_path / "live.mcap"

@@ -25,7 +25,7 @@ CELL = str(Path(__file__).parents[1] / "data" / "two_cameras.yaml")
 
 
 @pytest.mark.slow
-def test_two_cameras_two_detectors_and_one_scene_clear_a_table_that_neither_camera_sees_wholly(tmp_path: Path) -> None:
+def test_two_cameras_clear_a_table_that_neither_sees_completely(tmp_path: Path) -> None:
     cell = load_cell(CELL)
     trace = Trace(tmp_path / "run.mcap", {"cell": cell.name}, CustomTopics.of(cell))
     outcome = Simulation(cell, 1, trace=trace).run()
@@ -38,20 +38,20 @@ def test_two_cameras_two_detectors_and_one_scene_clear_a_table_that_neither_came
     assert outcome.crashes == [] and outcome.restarts == {}
 
 
-def test_one_camera_alone_leaves_what_it_does_not_see() -> None:
+def test_single_camera_leaves_objects_out_of_its_view() -> None:
     blind = [f"services.{name}.views=[left]" for name in ("scene_manager", "workspace_validator")]
     outcome = Simulation(load_cell(CELL, blind), 1).run()
     assert (outcome.state, outcome.done) == ("DONE", 2), outcome  # the third lies where only the right one looks
 
 
-def test_task_is_not_done_while_one_of_two_cameras_shows_nothing() -> None:
+def test_task_is_not_done_while_one_of_two_cameras_is_silent() -> None:
     lost = "services.right_detector.topics={camera/*: nowhere/camera/*, detect*: right/detect*}"
     outcome = Simulation(load_cell(CELL, [lost]), 1).run()
     assert (outcome.state, outcome.done) == ("ERROR", 2), outcome
     assert "no picture comes from right, for 20 s" in outcome.message
 
 
-def test_two_cameras_on_one_key_end_the_start_with_one_line() -> None:
+def test_two_cameras_on_one_key_are_rejected_at_the_start() -> None:
     outcome = Simulation(load_cell(CELL, ["services.right_camera.topics={camera/*: left/camera/*}"]), 1).run()
     assert outcome.state == "NOT STARTED"
     assert outcome.message == (
@@ -73,8 +73,8 @@ async def test_keys_and_owners_follow_from_the_cell() -> None:
     assert {"left/detected_objects", "right/detected_objects", "left/camera/camera_info"} < read
 
 
-async def test_each_camera_says_its_own_frame_and_tf_has_both(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ownership, "GIVE_UP", 0.0)
+async def test_each_camera_has_its_own_frame_in_tf(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ownership, "CLAIM_SECONDS", 0.0)
     cell, net = load_cell(CELL), LocalNetwork()
     bus = net.bus("tester")
     infos = {side: bus.reader(replace(topics.CAMERA_INFO, key=f"{side}/camera/camera_info"))
@@ -100,6 +100,6 @@ CUP = "robot.gripper={cup: {}, links: [panda_hand, panda_leftfinger, panda_right
 
 @pytest.mark.parametrize("gripper", [CUP, "robot.gripper.closing_axis=x"])
 @pytest.mark.slow
-def test_task_goes_by_what_the_robot_file_says_of_the_gripper(gripper: str) -> None:
+def test_task_uses_the_gripper_of_the_robot_file(gripper: str) -> None:
     outcome = Simulation(load_cell("panda", ["world.count=1", gripper]), 1).run()
     assert (outcome.state, outcome.done, outcome.broken) == ("DONE", 1, []), outcome

@@ -18,14 +18,14 @@ def under_way(status: MotionStatus) -> bool:
     return status.state == "active" and status.progress > 0.2
 
 
-def test_the_arm_is_held_while_the_planner_is_dead_and_the_same_motion_goes_on_when_it_is_back() -> None:
+def test_arm_is_held_while_the_planner_is_down_and_then_resumes() -> None:
     async def visit(cell: SimulatedCell, bus: Bus) -> None:
         motion, status = bus.reader(topics.MOTION_STATUS), bus.reader(PICK_PLACE_STATUS)
         before = await until(motion, under_way, 60)
         cell.kill("motion_planner")
-        told = await until(status, lambda s: s.message == "the arm waits: motion_planner is gone", 20)
+        waiting = await until(status, lambda s: s.message == "the arm waits: motion_planner is gone", 20)
         held = await until(motion, lambda m: m.held, 20)
-        assert held.held_by == ["watchdog"] and not told.paused
+        assert held.held_by == ["watchdog"] and not waiting.paused
         assert held.id == before.id and "motion_planner is gone" in held.message
         ended = await until(motion, lambda m: not m.held and m.state != "active", 60)
         assert (ended.id, ended.state) == (before.id, "succeeded")

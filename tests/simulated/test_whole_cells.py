@@ -29,7 +29,7 @@ def digest_in_another_process(hash_seed: int, *arguments: str) -> str:
     return done.stdout.strip()
 
 
-def test_panda_clears_the_table_without_any_time_passing():
+def test_panda_clears_the_table_in_no_wall_time():
     summary = SimulatedCell("panda").summary
     assert (summary["state"], summary["placed"], summary["targets"], summary["rejected"]) == ("DONE", 7, 7, [])
     assert summary["truth"] == {"in_box": 7, "on_table": 0, "elsewhere": 0, "containers": {"box": 7}}
@@ -41,7 +41,7 @@ def test_panda_clears_the_table_without_any_time_passing():
     ("panda", ["world.count=1"]), pytest.param("ur5", [], marks=pytest.mark.slow),
 ])
 @pytest.mark.slow
-def test_same_seed_is_the_same_run_to_the_byte_in_any_process_and_another_is_not(cell, overrides):
+def test_same_seed_gives_the_same_bytes_in_any_process(cell, overrides):
     here = Simulation(load_cell(cell, overrides), 3, digest=True).run()
     assert here.messages > 1000
     assert digest_in_another_process(7, cell, "3", *overrides) == here.digest
@@ -49,6 +49,6 @@ def test_same_seed_is_the_same_run_to_the_byte_in_any_process_and_another_is_not
     assert other.digest != here.digest, "another seed is another run"
 
 
-def test_task_that_does_not_end_is_told_with_its_state():
+def test_task_that_does_not_end_is_reported_with_its_state():
     outcome = Simulation(load_cell("panda", ["autostart=false", "world.count=1"]), 1, limit=6.0).run()
     assert outcome.state == "NOT ENDED" and "IDLE" in outcome.message

@@ -1,6 +1,6 @@
-"""Whole cells on the virtual clock: with somebody in it who looks and breaks things, or in the place of `zencell run`.
+"""Complete cells on virtual time, with a visitor that observes and breaks things, or in place of `zencell run`.
 
-What a run of it comes to is told as `zencell run` tells it: in the figures of its summary.
+The result has the figures of the summary of `zencell run`.
 """
 
 from __future__ import annotations
@@ -31,40 +31,41 @@ Visit = Callable[["SimulatedCell", Bus], Coroutine[Any, Any, None]]
 
 
 class SimulatedCell:
-    """A run of a cell: its outcome, its summary, and the lines that it wrote."""
+    """A run of a cell: outcome, summary and log lines."""
 
     def __init__(
         self, cell: str | Path | Cell, overrides: Sequence[str] = (), *, world: str | None = None, seed: int = 1,
         visit: Visit | None = None, limit: float = 300.0, record: Path | None = None,
     ) -> None:
-        """Run it to the end of its task, after which the invariants have held and nobody crashed by itself.
+        """Run the cell to the end of its task; invariants must hold, and no service may crash by itself.
 
         Args:
             cell: name or file, or resolved.
             overrides: as of `--set`.
             world: name of another.
             seed: of the simulation.
-            visit: what somebody does in it from when it is up, on a bus of the cell.
+            visit: coroutine that runs once the cell is ready, with a bus of the cell.
             limit: virtual time in which the task has to end [s].
-            record: a recording is made there.
+            record: file for a recording.
         """
         loaded = cell if isinstance(cell, Cell) else load_cell(str(cell), overrides, world=world)
         self.cell = loaded
         self.lines: list[str] = []
         self.ended = asyncio.Event()  # the task
         self._visit = visit
-        self._fold = RunAggregator(
+        self._aggregator = RunAggregator(
             loaded.name, find_application(loaded.application), robot=loaded.robot, seed=loaded.run.seed,
             containers=list(loaded.world.containers))
         trace = None if record is None else Trace(record, {"cell": loaded.name}, CustomTopics.of(loaded))
-        self._simulation = Simulation(loaded, seed, limit=limit, trace=trace, log=self.lines.append, visit=self._look)
+        self._simulation = Simulation(
+            loaded, seed, limit=limit, trace=trace, log=self.lines.append, visit=self._observe)
         self.outcome: Outcome = self._simulation.run()
         if trace is not None:
             trace.close("simulated")
         assert not self.outcome.broken and not self.outcome.crashes, self.outcome
 
-    async def _look(self, bus: Bus) -> None:
-        collector = Collector(bus, self._fold, 0.0, lambda line: None)
+    async def _observe(self, bus: Bus) -> None:
+        collector = Collector(bus, self._aggregator, 0.0, lambda line: None)
         self.ended = collector.ended
         async with beside(collector.run()):
             if self._visit is not None:
@@ -73,7 +74,7 @@ class SimulatedCell:
             await collector.settle()
 
     def kill(self, name: str) -> None:
-        """End a process where it is, as SIGKILL does."""
+        """Kill a process, as SIGKILL does."""
         self._simulation.kill(name)
 
     def lose_router(self, seconds: float) -> None:
@@ -82,26 +83,26 @@ class SimulatedCell:
 
     @property
     def summary(self) -> dict[str, Any]:
-        """The figures of the run, as `--summary` writes them."""
-        self._fold.summary.restarts = self.outcome.restarts
-        return self._fold.summary.as_dict()
+        """Summary of the run, as `--summary` writes it."""
+        self._aggregator.summary.restarts = self.outcome.restarts
+        return self._aggregator.summary.as_dict()
 
     @property
     def text(self) -> str:
-        """All that its processes wrote."""
+        """All log lines."""
         return "\n".join(self.lines)
 
 
 @contextmanager
 def no_processes() -> Iterator[None]:
-    """Inside, `zencell run` in this process runs its cell on the virtual clock; all the rest of it is as it is."""
+    """Let `zencell run` in this process run its cell on virtual time during the block."""
     with patch.object(CellSession, "run_to_end", _run_to_end):
         yield
 
 
 def _run_to_end(operation: CellSession) -> int:
     async def work(bus: Bus) -> None:
-        collector = Collector(bus, operation.fold, 0.0, lambda line: None)
+        collector = Collector(bus, operation.aggregator, 0.0, lambda line: None)
         async with beside(collector.run()):
             if not operation.cell.run.autostart:
                 await bus.client(topics.TASK_COMMAND).call(TaskCommand(command="start"))
@@ -112,6 +113,6 @@ def _run_to_end(operation: CellSession) -> int:
     assert not outcome.broken and not outcome.crashes, outcome
     operation.summary.restarts = outcome.restarts
     operation.write_summary()
-    for line in describe(operation.summary.as_dict(), operation.fold.figures):
+    for line in describe(operation.summary.as_dict(), operation.aggregator.figures):
         typer.echo(line)
     return 0 if operation.summary.state == "DONE" else 1

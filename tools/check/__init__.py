@@ -1,4 +1,4 @@
-"""One thing in a cell that will not work."""
+"""Checks of a cell before anything moves: problems that its files show, without processes or network."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from common.errors import ConfigError
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that will not work, and what helps.
+    """One problem and its remedy.
 
     Attributes:
-        severity: with an error the cell does not do what it is for; with a warning it may.
-        what: the field or thing with its value, and what is wrong with it.
+        severity: with an error the cell cannot do its task; with a warning it may.
+        what: field or object with its value, and what is wrong with it.
         remedy: what to change.
-        refused: the arm or its fingers would move wrongly, so `run` and `up` do not begin.
+        refused: whether the arm or its fingers would move wrongly, so that `run` and `up` refuse the cell.
     """
 
     severity: Literal["error", "warning"]
@@ -26,20 +26,20 @@ class Finding:
 
     @property
     def line(self) -> str:
-        """All of it in one line."""
+        """Problem and remedy in one line."""
         return f"{self.what}: {self.remedy}"
 
 
 def error(what: str, remedy: str, *, refused: bool = False) -> Finding:
-    """Something because of which the cell does not do what it is for."""
+    """Return a finding because of which the cell cannot do its task."""
     return Finding("error", what, remedy, refused)
 
 
 def warning(what: str, remedy: str) -> Finding:
-    """Something that may go wrong."""
+    """Return a finding about what may go wrong."""
     return Finding("warning", what, remedy)
 
 
-def refusal(told: ConfigError) -> Finding:
-    """An error that ends the start of a service, too."""
-    return Finding("error", str(told), "correct it; the cell does not come up so", refused=True)
+def refusal(problem: ConfigError) -> Finding:
+    """Return a finding of a configuration error, with which a service does not start either."""
+    return Finding("error", str(problem), "correct it; the cell does not come up", refused=True)

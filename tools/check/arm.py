@@ -1,4 +1,4 @@
-"""The arm of a cell among what never moves: where it gets to, and what it would touch there."""
+"""Reach and collisions of the arm among the fixed parts of a cell."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ from tools.check import Finding, error, warning
 
 Array = NDArray[np.float64]
 
-RESTARTS = 5  # postures beside that from home in which a place is tried
+RESTARTS = 5  # further IK seeds besides the home pose
 SEEDS = 4
 
 
 class Arm:
-    """A robot and its surroundings, as planning has them before anything was seen."""
+    """Robot and surroundings as the planner knows them before any detection."""
 
     def __init__(self, config: RobotConfig, around: Surroundings, geometry: RobotGeometry | None = None) -> None:
-        """Load it.
+        """Load the robot.
 
         Args:
             config: the robot file.
             around: fixtures and containers.
-            geometry: of the robot, where that is loaded already.
+            geometry: of the robot, if already loaded.
 
         Raises:
             ConfigError: the robot file does not fit its description.
@@ -48,12 +48,12 @@ class Arm:
         self._scene = PlanningScene(header=Header(frame_id="world"), objects=objects)
 
     def touching(self, q: Array, width: float | None = None) -> tuple[str, str] | None:
-        """What touches what at joint positions (dof,) [rad], with so much between the fingers [m]; None when free."""
-        # What touches at the start of a motion may do so: where it begins elsewhere, nothing is excused.
+        """Return the colliding pair at joint positions (dof,) [rad] and a gripper width [m]; None if free."""
+        # Contacts at the start are allowed for attached and perceived objects only, and there are none here.
         return CollisionWorld(self.robot, self._scene, start=q, cache=self._cache, width=width).colliding_pair(q)
 
     def check_poses(self) -> Iterator[Finding]:
-        """Named poses in which the arm touches itself or what stands there."""
+        """Yield named poses in which the arm collides."""
         for name in self.robot.config.named_poses:
             q = self.robot.named(name)
             if pair := self.touching(q):
@@ -63,14 +63,14 @@ class Arm:
                 yield error(what, remedy, refused=True) if name == "home" else warning(what, remedy)
 
     def why_not(self, poses: Sequence[Array], width: float | None = None, tilt: float = 0.0) -> str:
-        """Why the tool gets to none of some poses (4, 4), world; empty when it gets to one and touches nothing there.
+        """Return why the tool reaches none of some poses without collision; empty if it reaches one.
 
         Args:
-            poses: any of which will do.
-            width: between the fingers [m].
-            tilt: by which an arm that cannot choose the pose may be off [rad]; its yaw is any.
+            poses: (4, 4) alternatives in world.
+            width: of the gripper [m].
+            tilt: tolerance for an arm with fewer than six joints [rad]; its yaw is free.
         """
-        touches = ""
+        collision = ""
         for T in poses:
             for seed in range(SEEDS):
                 rng = np.random.default_rng(seed)
@@ -84,15 +84,15 @@ class Arm:
                 pair = self.touching(q, width)
                 if pair is None:
                     return ""
-                touches = touches or f"{pair[0]} would touch {pair[1]}"
-        return touches or explain_region_unreachable(self.robot, pose_region(self.robot, poses[0], tilt), self.home)
+                collision = collision or f"{pair[0]} would touch {pair[1]}"
+        return collision or explain_region_unreachable(self.robot, pose_region(self.robot, poses[0], tilt), self.home)
 
 
 def require_free_home(config: RobotConfig, around: Surroundings, geometry: RobotGeometry) -> None:
-    """Return when the arm touches nothing at home.
+    """Return if the home pose is free of collisions.
 
     Raises:
-        ConfigError: it does; names what touches what.
+        ConfigError: it is not; names the colliding pair.
     """
     for found in Arm(config, around, geometry).check_poses():
         if found.refused:

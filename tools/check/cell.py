@@ -22,25 +22,25 @@ if TYPE_CHECKING:
 
 
 def blocking_errors(cell: Cell) -> list[Finding]:
-    """What nothing may begin with, as far as the robot file tells it: within milliseconds.
+    """Return errors of the robot file with which nothing may start; takes milliseconds.
 
-    What services refuse by themselves as they come up is left to them: their parameters, joints and links of the
-    robot, keys that two of them own, and an arm that touches something at home.
+    Errors that services find when they start are left out: parameters, joints and links of the robot, keys with two
+    owners, and collisions at the home pose.
     """
     from tools.check.robot_file import check_robot_file
 
     try:
         return [found for found in check_robot_file(cell.robot) if found.refused]
-    except ConfigError:  # a service says it
+    except ConfigError:  # a service reports it
         return []
 
 
 def require_safe(cell: Cell) -> None:
-    """Return when nothing is known because of which the arm or its fingers would move wrongly.
+    """Return if the arm and its fingers would move correctly as far as the files show.
 
     Raises:
-        ConfigError: something is; as `zencell check` says it. Or the simulator cannot simulate.
-        UnknownName: there is no such simulator.
+        ConfigError: they would not, with the finding of `zencell check`; or the simulator is not usable.
+        UnknownName: the simulator does not exist.
     """
     if is_simulated(cell.robot):
         require_simulator(cell.world.simulator)
@@ -50,28 +50,28 @@ def require_safe(cell: Cell) -> None:
 
 
 def quick_warnings(cell: Cell) -> list[Finding]:
-    """What else will not work, as far as it is told quickly."""
+    """Return the findings of `check_files` with which the cell still starts."""
     return [found for found in check_files(cell) if not found.refused]
 
 
 def check_files(cell: Cell) -> list[Finding]:
-    """What the files tell; a model of the robot is loaded only to see where a camera on it looks from home."""
+    """Return findings from the files; the robot model is loaded only for a camera on the arm."""
     from tools.check.robot_file import check_robot_file
     from tools.check.world import check_world
 
-    of_robot = _each(lambda: check_robot_file(cell.robot))
+    of_robot = _collect(lambda: check_robot_file(cell.robot))
     try:
         seen = seen_from_home(cell)
-    except ConfigError as told:
-        return [*of_robot, refusal(told)]
+    except ConfigError as problem:
+        return [*of_robot, refusal(problem)]
     checks = find_application(cell.application).checks
     place = " from home" if cell.world.on_hand else ""
-    return [*of_robot, *_each(lambda: check_world(seen, find_application(cell.application), place)),
+    return [*of_robot, *_collect(lambda: check_world(seen, find_application(cell.application), place)),
             *_of_application(checks.quick if checks else None, seen)]
 
 
 def seen_from_home(cell: Cell, robot: RobotModel | None = None) -> Cell:
-    """The cell with cameras on the robot fixed where they are at home.
+    """Return the cell with cameras on the arm fixed where they are at the home pose.
 
     Raises:
         ConfigError: the robot file does not fit its description, or has no such link.
@@ -85,13 +85,13 @@ def seen_from_home(cell: Cell, robot: RobotModel | None = None) -> Cell:
 
 
 def check_model(cell: Cell) -> Iterator[Finding]:
-    """What it takes a model of the robot to tell."""
+    """Yield findings that need the robot model."""
     from tools.check.arm import Arm
 
     try:
         arm = Arm(cell.robot, cell.section(Surroundings))  # type: ignore[arg-type]
-    except ConfigError as told:
-        yield refusal(told)
+    except ConfigError as problem:
+        yield refusal(problem)
         return
     yield from arm.check_poses()
     checks = find_application(cell.application).checks
@@ -99,61 +99,64 @@ def check_model(cell: Cell) -> Iterator[Finding]:
 
 
 def _of_application(check: Callable[..., Iterator[Finding]] | None, *args: object) -> list[Finding]:
-    return _each(lambda: check(*args)) if check is not None else []
+    return _collect(lambda: check(*args)) if check is not None else []
 
 
-def _each(look: Callable[[], Iterator[Finding]]) -> list[Finding]:
-    """What a look finds; an error of the configuration on the way is one more."""
+def _collect(check: Callable[[], Iterator[Finding]]) -> list[Finding]:
+    """Return the findings of a check; a configuration error that ends it is one more."""
     found: list[Finding] = []
     try:
-        found.extend(look())
-    except ConfigError as told:
-        found.append(refusal(told))
+        found.extend(check())
+    except ConfigError as problem:
+        found.append(refusal(problem))
     return found
 
 
-NICE = 10  # the cell goes first
+# --- quick checks in a subprocess, whose imports, half a planner, are gone afterwards ---------------------------------
+
+
+NICE = 10  # the services have priority
 
 
 class QuickCheckFailed(ZencellError):
-    """The process ended without a word of what it found."""
+    """The subprocess failed."""
 
 
 async def warnings_in_subprocess(cell: Cell, environ: Mapping[str, str]) -> list[Finding]:
-    """What will not work in a cell, as `tools.check.cell.quick_warnings` tells it; the process dies with the call.
+    """Return `quick_warnings` of a cell, computed in a subprocess that ends with the call.
 
     Args:
         cell: as it was loaded.
-        environ: of the process; its PYTHONPATH leads to what the cell names.
+        environ: of the subprocess; its PYTHONPATH has the modules that the cell names.
 
     Raises:
-        QuickCheckFailed: it failed; what it said of that is on stderr.
+        QuickCheckFailed: the subprocess failed; stderr has its output.
     """
     process = await asyncio.create_subprocess_exec(
         *module_command(__name__), stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE, env=environ,
-        start_new_session=True,  # Ctrl-C is for us
+        start_new_session=True,  # so that it does not get Ctrl-C
     )
     try:
-        told, _ = await process.communicate(pickle.dumps(cell))
+        output, _ = await process.communicate(pickle.dumps(cell))
     finally:
         if process.returncode is None:
             process.kill()
             await process.wait()
     if process.returncode:
         raise QuickCheckFailed(f"the quick check failed (exit code {process.returncode}); see `zencell check`")
-    found: list[Finding] = pickle.loads(told)
+    found: list[Finding] = pickle.loads(output)
     return found
 
 
 def main() -> None:
-    """Look at the cell from stdin."""
+    """Check the pickled cell from stdin and write the pickled findings to stdout."""
     from common.process.lifeline import die_when_orphaned
 
     die_when_orphaned()
     os.nice(NICE)
     with os.fdopen(os.dup(1), "wb") as answer:
-        os.dup2(2, 1)  # what a module of a person's own prints is no part of the answer
-        from tools.check.cell import quick_warnings  # not of __main__: Finding is unpickled by this name
+        os.dup2(2, 1)  # so that prints of the user's modules do not mix with the answer
+        from tools.check.cell import quick_warnings  # not of __main__: the parent unpickles by this name
 
         answer.write(pickle.dumps(quick_warnings(pickle.load(sys.stdin.buffer))))
 

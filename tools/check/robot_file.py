@@ -1,6 +1,6 @@
-"""The robot file against the description that it names, read as text: within milliseconds, without loading a model.
+"""Checks a robot file against its description, read as text: takes milliseconds and loads no model.
 
-What `RobotModel` refuses by itself (joints, locked_joints, tcp_link, base_link, named poses beyond limits) is its own.
+`RobotModel` itself checks joints, locked_joints, tcp_link, base_link and the limits of named poses.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ from common.robot.finger_joints import driven_position
 from common.robot.urdf import merged_urdf
 from tools.check import Finding, error, warning
 
-TURNS, SLIDES = ("revolute", "continuous"), ("prismatic",)
-SLACK = 1e-3  # [m] or [rad] by which a finger may be asked beyond its limit: rounded numbers of two files
+TURNS, SLIDES = ("revolute", "continuous"), ("prismatic",)  # joint types
+SLACK = 1e-3  # [m] or [rad] by which a finger position may exceed its limit: both files have rounded numbers
 
 
 def check_robot_file(config: RobotConfig) -> Iterator[Finding]:
-    """What does not fit between a robot file and its description.
+    """Yield contradictions between a robot file and its description.
 
     Raises:
-        ConfigError: the description is not there, or does not parse.
+        ConfigError: the description does not exist, or cannot be parsed.
     """
     gripper = config.gripper
     if gripper is None:
@@ -47,7 +47,7 @@ def check_robot_file(config: RobotConfig) -> Iterator[Finding]:
 
 
 def _opening(gripper: GripperConfig, number: int, joint: ET.Element) -> Iterator[Finding]:
-    """Whether a finger's joint moves as widths are turned into its positions."""
+    """Check that a finger's joint fits the conversion of widths to its positions."""
     name, turns = gripper.joints[number], joint.get("type") in TURNS
     angles = "linkage" if gripper.linkage is not None else "jaw" if gripper.jaw is not None else ""
     if turns and not angles and number == 0:

@@ -1,4 +1,4 @@
-"""One thing that was looked at."""
+"""Checks whether this machine can run cells, and says what to do about problems."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that was looked at, and what to do when it is not well."""
+    """Result of one check, with a remedy unless it is ok."""
 
     level: Literal["ok", "warn", "fail"]
     what: str
@@ -16,15 +16,15 @@ class Finding:
 
 
 def ok(what: str) -> Finding:
-    """All is well with something."""
+    """Return a passed check."""
     return Finding("ok", what)
 
 
 def warn(what: str, remedy: str) -> Finding:
-    """A cell may run, but not as it should."""
+    """Return a problem with which a cell may run, but not as it should."""
     return Finding("warn", what, remedy)
 
 
 def fail(what: str, remedy: str) -> Finding:
-    """A cell will not run."""
+    """Return a problem with which a cell does not run."""
     return Finding("fail", what, remedy)

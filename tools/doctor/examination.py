@@ -1,4 +1,4 @@
-"""All that is looked at on a machine, in the order in which it matters."""
+"""All checks of a machine in order of importance, and the checks of its robot and cell files."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tools.doctor import Finding, clocks, fail, machine, network, ok, software
 
 
 def examine(endpoint: str) -> Iterator[Finding]:
-    """All findings; the router and its cells are looked for at an endpoint."""
+    """Yield all findings; router and cells are checked at an endpoint."""
     yield software.python()
     yield from software.packages()
     yield software.extras()
@@ -36,7 +36,7 @@ def examine(endpoint: str) -> Iterator[Finding]:
 
 
 def robots() -> Iterator[Finding]:
-    """Whether every robot file can be read and names a description that is there."""
+    """Check that every robot file is valid and its description exists."""
     from common.config import RobotConfig, check, config_root, names_of, read_robot
     from common.errors import ZencellError
 
@@ -55,7 +55,7 @@ def robots() -> Iterator[Finding]:
 
 
 def _described(uri: str, package_dirs: list[str]) -> bool:
-    """Whether a robot description is there, found without loading any of the robotics packages."""
+    """Return whether a robot description exists, without importing robotics packages."""
     if not uri.startswith("package://"):
         return Path(uri).expanduser().is_file()
     relative = uri.removeprefix("package://")
@@ -66,7 +66,7 @@ def _described(uri: str, package_dirs: list[str]) -> bool:
 
 
 def cells() -> Iterator[Finding]:
-    """Whether every cell resolves, and every service in it takes its parameters."""
+    """Check that every cell is valid, with the parameters of all its services."""
     from common.config import config_root, names_of
 
     root = config_root()
@@ -82,7 +82,7 @@ def cells() -> Iterator[Finding]:
 
 
 def cell(name: str) -> Finding:
-    """Whether a cell resolves, and every service in it takes its parameters."""
+    """Check that a cell is valid, with the parameters of all its services."""
     from common.config import config_root, load_cell, service_config
     from common.errors import ZencellError
     from common.supervision.launch import require_module
@@ -95,6 +95,6 @@ def cell(name: str) -> Finding:
             service_config(loaded, entry.name, importlib.import_module(entry.module).Config)
     except ZencellError as error:
         return fail(f"cell {name}: {error}", f"correct {file}")
-    except Exception as error:  # whatever a person's own module does
+    except Exception as error:  # a module of the user may raise anything
         return fail(f"cell {name}: services cannot be imported: {error!r}", "install what is missing, or correct it")
     return ok(f"cell {name}: {len(loaded.services)} services, all parameters valid")

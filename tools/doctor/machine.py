@@ -1,4 +1,4 @@
-"""Room and limits of the machine: memory, processors, disk, open files, clock."""
+"""Checks memory, processors, disk, limits and clock of the machine, and processes left by earlier runs."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from tools.doctor import Finding, ok, warn
 LEAST_MEMORY = 1.0  # [GB]
 LEAST_SHM = 64.0  # [MB]
 LEAST_DISK = 2.0  # [GB]
-RECORDED = 0.6  # [GB per minute] of a recording of all of a cell with its pictures
+RECORDED = 0.6  # [GB per minute] of a recording with images
 LEAST_FILES = 256
-CELL_LOAD = 0.7  # [cores] that a cell takes at speed 1
-LOOK = 0.3  # [s] at how busy the processors are
-CLOCK_YEAR = 2024  # the system clock is wrong when it says an earlier year
+CELL_LOAD = 0.7  # [cores] load of a cell at speed 1
+LOAD_PERIOD = 0.3  # [s] over which processor load is measured
+CLOCK_YEAR = 2024  # earlier years mean that the system clock is wrong
 
 
 def shared_memory() -> Finding:
-    """Whether /dev/shm has room."""
+    """Check free space in /dev/shm."""
     try:
         free = shutil.disk_usage("/dev/shm").free / 1e6
     except OSError:
-        return ok("no /dev/shm here, and none is needed")
+        return ok("no /dev/shm, and none is needed")
     if free < LEAST_SHM:
         return warn(f"/dev/shm has {free:.0f} MB left",
                     f"remove old files there, or give it {LEAST_SHM:.0f} MB (docker run --shm-size)")
@@ -35,7 +35,7 @@ def shared_memory() -> Finding:
 
 
 def memory() -> Finding:
-    """Whether a cell has room in memory, also within the limit of a container."""
+    """Check free memory, within the limit of a container too."""
     import psutil
 
     free, limit = psutil.virtual_memory().available / 1e9, ""
@@ -44,12 +44,12 @@ def memory() -> Finding:
         free, limit = group, " within the limit of this container"
     what = f"{free:.1f} GB of memory left{limit}"
     if free < LEAST_MEMORY:
-        return warn(what, f"a cell needs {LEAST_MEMORY:g} GB: close something{', or raise the limit' if limit else ''}")
+        return warn(what, f"a cell needs {LEAST_MEMORY:g} GB: close programs{', or raise the limit' if limit else ''}")
     return ok(what)
 
 
 def group_memory(group: Path) -> float | None:
-    """Memory [GB] that is left within the limit of a control group (v2); None without a limit."""
+    """Return free memory within the limit of a control group (v2) [GB]; None without a limit."""
     try:
         most = (group / "memory.max").read_text(encoding="ascii").strip()
         used = (group / "memory.current").read_text(encoding="ascii").strip()
@@ -59,30 +59,30 @@ def group_memory(group: Path) -> float | None:
 
 
 def cores() -> Finding:
-    """Whether a cell has room on the processors."""
+    """Check free processor capacity."""
     import psutil
 
     count = environment.usable_cores()
-    free = max(0.0, count * (1 - psutil.cpu_percent(LOOK) / 100))
+    free = max(0.0, count * (1 - psutil.cpu_percent(LOAD_PERIOD) / 100))
     what = f"{count:g} cores, {free:.1f} of them free, load {os.getloadavg()[0]:.1f}"
     if count < 2:
-        return warn(what, "two cores are the least for speed 1 and more: use a lower --speed, or a larger machine")
+        return warn(what, "speed 1 and more needs two cores: use a lower --speed, or a larger machine")
     if free < CELL_LOAD:
-        return warn(what, f"a cell takes {CELL_LOAD:g} of a core at speed 1: close what keeps the machine busy")
+        return warn(what, f"a cell takes {CELL_LOAD:g} of a core at speed 1: close other programs")
     return ok(what)
 
 
 def disk() -> Finding:
-    """Whether a recording has room where the person stands."""
+    """Check free disk space for a recording in the working directory."""
     free = shutil.disk_usage(Path.cwd()).free / 1e9
     what = f"{free:.1f} GB of disk left in {Path.cwd()}"
     if free < LEAST_DISK:
-        return warn(what, f"a recording with pictures takes {RECORDED:g} GB a minute: make room, or record elsewhere")
+        return warn(what, f"a recording with images takes {RECORDED:g} GB a minute: make room, or record elsewhere")
     return ok(what)
 
 
 def open_files() -> Finding:
-    """Whether a process may open as many files and connections as it needs."""
+    """Check the limit of open files per process."""
     import resource
 
     most = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
@@ -92,7 +92,7 @@ def open_files() -> Finding:
 
 
 def clock() -> Finding:
-    """Whether the clock is set and fine enough."""
+    """Check time and resolution of the system clock."""
     now = time.gmtime()
     resolution = time.get_clock_info("monotonic").resolution
     if now.tm_year < CLOCK_YEAR:
@@ -104,20 +104,20 @@ def clock() -> Finding:
 
 
 def container_engine() -> Finding:
-    """Whether the image can be built and run here, which nothing else needs."""
+    """List container engines, which only the image needs."""
     found = [name for name in ("docker", "podman") if shutil.which(name)]
-    return ok(f"{' and '.join(found)} for the image" if found else "no docker or podman: only the image needs one")
+    return ok(f"{' and '.join(found)} for the image" if found else "no docker or podman; only the image needs one")
 
 
-INITS = ("init", "systemd", "docker-init", "tini", "dumb-init", "catatonit")  # who adopts orphans
+INITS = ("init", "systemd", "docker-init", "tini", "dumb-init", "catatonit")  # parents of orphans
 STOPPED = ("stopped", "tracing-stop")
-STARTING = 30.0  # [s] in which a supervisor may have no process yet
+STARTING = 30.0  # [s] after which a supervisor must have services
 VERBS = ("run", "up", "snapshot")
 
 
 @dataclass(frozen=True)
-class Seen:
-    """A process as the system shows it."""
+class Process:
+    """A process of this host."""
 
     pid: int
     ppid: int
@@ -128,23 +128,23 @@ class Seen:
 
     @property
     def is_service(self) -> bool:
-        """Whether a supervisor started it."""
+        """Whether a supervisor started the process."""
         return "--gate" in self.command and "-m" in self.command
 
     @property
     def is_supervisor(self) -> bool:
-        """Whether it is a zencell command that has a cell up."""
+        """Whether the process is a zencell command that runs a cell."""
         programs = {Path(part).name for part in self.command[:2]} | set(self.command[:4])
         return bool({"zencell", "cli.main"} & programs) and any(verb in self.command for verb in VERBS)
 
 
 def processes() -> Iterator[Finding]:
-    """What is left of earlier runs, and the cells that are up on this host."""
-    yield from judge(list(_seen()))
+    """Check for processes left by earlier runs, and list running cells."""
+    yield from process_findings(list(_processes()))
 
 
-def judge(seen: list[Seen]) -> Iterator[Finding]:
-    """What is left of earlier runs among the processes of this host."""
+def process_findings(seen: list[Process]) -> Iterator[Finding]:
+    """Yield findings about the processes of this host."""
     by_pid = {each.pid: each for each in seen}
     services = [each for each in seen if each.is_service and each.status != "zombie"]
     supervisors = [each for each in seen if each.is_supervisor and each.status != "zombie"]
@@ -153,7 +153,7 @@ def judge(seen: list[Seen]) -> Iterator[Finding]:
     fine = True
     if orphans:
         fine = False
-        # What was stopped hears nothing but SIGKILL; the others were asked to end by the death of their supervisor.
+        # Stopped processes react to SIGKILL only; the others were to end with their supervisor.
         yield warn(f"services without a supervisor: {_listed(orphans)}", f"kill -9 {_pids(orphans)}")
     if frozen:
         fine = False
@@ -162,23 +162,23 @@ def judge(seen: list[Seen]) -> Iterator[Finding]:
         if each.status in STOPPED:
             fine = False
             yield warn(f"a supervisor is stopped (SIGSTOP): {_listed([each])}",
-                       f"kill -CONT {each.pid} to let it go on, kill -9 {each.pid} to end it and its cell")
+                       f"kill -CONT {each.pid} to continue it, kill -9 {each.pid} to end it and its cell")
         elif each.age > STARTING and not any(_descends(service, each, by_pid) for service in services):
             fine = False
             yield warn(f"a supervisor without services: {_listed([each])}", f"kill {each.pid}")
         else:
-            yield ok(f"a cell is up, or comes up: {_listed([each])}, for {_duration(each.age)}")
+            yield ok(f"a cell runs or starts: {_listed([each])}, for {_duration(each.age)}")
     if fine:
-        yield ok("no process is left over from an earlier run")
+        yield ok("no process is left from an earlier run")
 
 
-def _is_orphan(service: Seen, by_pid: dict[int, Seen]) -> bool:
+def _is_orphan(service: Process, by_pid: dict[int, Process]) -> bool:
     parent = by_pid.get(service.ppid)
     return service.ppid <= 1 or parent is None or parent.name in INITS
 
 
-def _descends(service: Seen, ancestor: Seen, by_pid: dict[int, Seen]) -> bool:
-    at: Seen | None = service
+def _descends(service: Process, ancestor: Process, by_pid: dict[int, Process]) -> bool:
+    at: Process | None = service
     steps: set[int] = set()
     while at is not None and at.pid not in steps:
         if at.ppid == ancestor.pid:
@@ -188,28 +188,28 @@ def _descends(service: Seen, ancestor: Seen, by_pid: dict[int, Seen]) -> bool:
     return False
 
 
-def _seen() -> Iterator[Seen]:
+def _processes() -> Iterator[Process]:
     import psutil
 
     now = time.time()
     for process in psutil.process_iter(["pid", "ppid", "name", "status", "create_time", "cmdline"]):
         facts = process.info
-        yield Seen(
+        yield Process(
             facts["pid"], facts["ppid"] or 0, facts["name"] or "", facts["status"] or "",
             now - (facts["create_time"] or now), tuple(facts["cmdline"] or ()),
         )
 
 
-def _pids(seen: list[Seen]) -> str:
+def _pids(seen: list[Process]) -> str:
     return " ".join(str(each.pid) for each in seen)
 
 
-def _listed(seen: list[Seen]) -> str:
+def _listed(seen: list[Process]) -> str:
     return ", ".join(f"{_what(each)} ({each.pid})" for each in seen)
 
 
-def _what(each: Seen) -> str:
-    """What a process is, in the words of the command line."""
+def _what(each: Process) -> str:
+    """Return the service or command of a process."""
     if each.is_service:
         module, option, name, *_ = (*each.command[list(each.command).index("-m") + 1:], "", "")
         return name if option == "--name" else module.rpartition(".")[2]

@@ -1,4 +1,4 @@
-"""Ports, and the versions of what answers at them."""
+"""Checks ports, message versions of running cells, and certificates."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ TIMEOUT = 1.0  # [s]
 
 
 def router(endpoint: str) -> Finding:
-    """Who listens where the router of the domain would."""
+    """Check the port of the domain's router."""
     from common.transport.router import port_holder
 
     host, _, port = endpoint.partition("/")[2].rpartition(":")
@@ -36,7 +36,7 @@ def router(endpoint: str) -> Finding:
 
 
 def page() -> Finding:
-    """Who listens where the operator's page would."""
+    """Check the port of the operator's page."""
     from common.transport.router import port_holder
 
     where = f"port {PAGE_PORT} of the operator's page"
@@ -51,7 +51,7 @@ def page() -> Finding:
 
 
 def versions(endpoint: str) -> Iterator[Finding]:
-    """Whether the cells that are up speak the same version of the messages, and are run by this Python."""
+    """Check that running cells use the same message version and the same Python."""
     from common.client.joining import is_listening
 
     if not is_listening(endpoint):
@@ -60,7 +60,7 @@ def versions(endpoint: str) -> Iterator[Finding]:
         if problem:
             yield fail(f"cell {cell} at {endpoint}: {problem}", "run the cell and this tool from the same version")
         else:
-            yield ok(f"cell {cell} at {endpoint} speaks the version of this tool")
+            yield ok(f"cell {cell} at {endpoint} has the message version of this tool")
     foreign = foreign_interpreters(service_commands())
     if foreign:
         listed = ", ".join(f"{pid} ({python})" for pid, python in foreign.items())
@@ -69,9 +69,9 @@ def versions(endpoint: str) -> Iterator[Finding]:
 
 
 async def schema_problems(endpoint: str) -> dict[str, str]:
-    """By cell that is up: what is wrong with the version of its messages; empty when nothing is."""
+    """Return the problem with the message version by running cell; empty if there is none."""
     from common import topics
-    from common.client.joining import TOOL, alive
+    from common.client.joining import TOOL, ready_services
     from common.errors import DecodeError, NoRouter
     from common.messages import SupervisorStatus
     from common.transport.codec import decode, decode_attachment
@@ -80,7 +80,7 @@ async def schema_problems(endpoint: str) -> dict[str, str]:
     found: dict[str, str] = {}
     try:
         async with connect(cell="_", service=TOOL, endpoint=endpoint, timeout=TIMEOUT) as bus:
-            for cell in {name for name, _ in await alive(bus)}:
+            for cell in {name for name, _ in await ready_services(bus)}:
                 found[cell] = ""
                 for sample in await bus.raw_get(f"{cell}/{topics.SUPERVISOR_STATUS.key}", TIMEOUT):
                     try:
@@ -89,12 +89,12 @@ async def schema_problems(endpoint: str) -> dict[str, str]:
                     except DecodeError as error:
                         found[cell] = str(error)
     except NoRouter:
-        return {}  # what listens there is no router: the line on the port says so
+        return {}  # no router listens there: `router` reports it
     return found
 
 
 def service_commands() -> dict[int, list[str]]:
-    """Command lines of all services on this host, by process."""
+    """Return the command lines of all services on this host by process id."""
     import psutil
 
     found = {}
@@ -106,13 +106,13 @@ def service_commands() -> dict[int, list[str]]:
 
 
 def foreign_interpreters(commands: dict[int, list[str]]) -> dict[int, str]:
-    """By process: the Python that runs it, where that is not this one."""
+    """Return the Python executable by process id, for processes that another Python runs."""
     here = Path(sys.executable).parent
     return {pid: command[0] for pid, command in commands.items() if Path(command[0]).parent != here}
 
 
 def certificates(now: datetime.datetime | None = None) -> Iterator[Finding]:
-    """Until when those of `ZENCELL_SECURE` are valid; nothing for an open cell."""
+    """Check how long the certificates of `ZENCELL_SECURE` are valid; without access control there are none."""
     from common.transport.credentials import expiries_in, expiry_warning, secure_folder
 
     folder = secure_folder()
@@ -121,11 +121,11 @@ def certificates(now: datetime.datetime | None = None) -> Iterator[Finding]:
     at = now or datetime.datetime.now(datetime.UTC)
     ends = expiries_in(folder)
     if not ends:
-        yield fail(f"{folder} has no certificates that can be read", "make them with `zencell secure init`")
+        yield fail(f"{folder} has no readable certificates", "create them with `zencell secure init`")
     found = {name: expiry_warning(name, until, at) for name, until in ends.items()}
-    for told in found.values():
-        if told is not None:
-            urgent, line = told
+    for problem in found.values():
+        if problem is not None:
+            urgent, line = problem
             yield (fail if urgent else warn)(line, f"zencell secure renew {folder}")
     if ends and not any(found.values()):
         yield ok(f"{len(ends)} certificates in {folder}, the first expires on {min(ends.values()):%Y-%m-%d}")

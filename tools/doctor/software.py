@@ -1,4 +1,4 @@
-"""Python and the packages: whether they are there, and those that were tested together."""
+"""Checks Python, packages and their tested versions, the planning kernel, and plugged-in cameras."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _OF_DEVELOPERS = ("dev",)
 
 
 def python() -> Finding:
-    """Whether this Python will do."""
+    """Check the Python version."""
     what = f"Python {platform.python_version()} ({sys.executable})"
     if sys.version_info < OLDEST:
         return fail(what, f"install Python {'.'.join(map(str, OLDEST))} or newer")
@@ -28,11 +28,11 @@ def python() -> Finding:
 
 
 def packages() -> Iterator[Finding]:
-    """Whether what the project needs is installed, in the versions that were tested."""
+    """Check that all dependencies are installed in the tested versions."""
     try:
         needed = [text for text in requires("zencell") or [] if "extra ==" not in text]
     except PackageNotFoundError:
-        yield warn("zencell is not installed, only found", INSTALL)
+        yield warn("zencell is importable but not installed", INSTALL)
         return
     tested = constraints()
     found, other = [], []
@@ -53,7 +53,7 @@ def packages() -> Iterator[Finding]:
 
 
 def extras() -> Finding:
-    """Which of what is installed on demand is there."""
+    """List installed extras."""
     found, known = [], []
     with contextlib.suppress(PackageNotFoundError):
         known = requires("zencell") or []
@@ -68,7 +68,7 @@ def extras() -> Finding:
 
 
 def kernel() -> Finding:
-    """Whether the compiled planning kernel is there."""
+    """Check that the planning kernel is compiled."""
     path = library_path()
     if path is None:
         return warn("the planning kernel is not compiled: planning takes many times longer", INSTALL)
@@ -76,7 +76,7 @@ def kernel() -> Finding:
 
 
 def constraints(path: Path | None = None) -> dict[str, str]:
-    """Versions that were tested together, by package; empty where the file is not there, as in an image."""
+    """Return the tested version by package; empty if the file does not exist, as in an image."""
     path = path or CONSTRAINTS
     if not path.is_file():
         return {}
@@ -89,7 +89,7 @@ def _normal(name: str) -> str:
 
 
 SYS = Path("/sys")
-# By maker and, where the maker makes other things too, a word of the product: what it is, its driver and its package.
+# USB vendor and, if it makes other devices too, a word of the product name: label, driver and package.
 DEPTH_CAMERAS = (
     ("8086", "realsense", "RealSense", "realsense", "pyrealsense2"),
     ("03e7", "", "OAK", "oak", "depthai"),  # the chip of a Luxonis camera, by Intel Movidius
@@ -97,33 +97,33 @@ DEPTH_CAMERAS = (
 
 
 def cameras(sys: Path = SYS) -> Iterator[Finding]:
-    """What is plugged in, as Linux tells it; nothing on other systems.
+    """List plugged-in cameras on Linux; none on other systems.
 
     Args:
-        sys: where sysfs is.
+        sys: mount point of sysfs.
     """
     depth = dict(_depth_cameras(sys))
     yield from depth.values()
     for path in sorted((sys / "class/video4linux").glob("video*"), key=lambda path: (len(path.name), path.name)):
         if any((path / "device").resolve().is_relative_to(camera) for camera in depth):
-            continue  # told already, with the driver that reads all of it
-        if _read(path / "index") in ("", "0"):  # others of the same camera give no pictures
+            continue  # listed already
+        if _read(path / "index") in ("", "0"):  # other nodes of a camera give no images
             yield ok(f"camera /dev/{path.name}: {_read(path / 'name') or 'without a name'} (camera_opencv)")
 
 
 def _depth_cameras(sys: Path) -> Iterator[tuple[Path, Finding]]:
-    """Where each is in sysfs, and what there is to say of it."""
+    """Yield path in sysfs and finding of each depth camera."""
     for path in sorted((sys / "bus/usb/devices").glob("*")):
         maker, product = _read(path / "idVendor"), _read(path / "product")
         for vendor, word, what, driver, package in DEPTH_CAMERAS:
             if maker != vendor or word not in product.lower():
                 continue
-            told = " ".join(part for part in (what, product, _read(path / "serial")) if part)
+            name = " ".join(part for part in (what, product, _read(path / "serial")) if part)
             if find_spec(package) is None:
-                found = warn(f"depth camera {told}: {package} is not installed",
+                found = warn(f"depth camera {name}: {package} is not installed",
                              f"pip install 'zencell[{driver}]' for driver: {driver} of real_depth_camera")
             else:
-                found = ok(f"depth camera {told} (driver: {driver} of real_depth_camera)")
+                found = ok(f"depth camera {name} (driver: {driver} of real_depth_camera)")
             yield path.resolve(), found
 
 

@@ -1,1 +1,1 @@
-"""A robot file proposed for a URDF that nobody has set up: what is read, measured and guessed."""
+"""Proposes a robot file for a URDF: values are read, measured or guessed."""

@@ -1,4 +1,4 @@
-"""A gripper as the platform drives one, found in the joints beyond the wrist."""
+"""The end of an arm: its flange, and a gripper found in the joints beyond the wrist."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from tools.robot_setup.tree import Arm, Joint, Tree
 Array = NDArray[np.float64]
 
 STEPS = 9  # positions of the driven joint at which fingers are measured
-MISFIT = 0.001  # between measured widths and those of a linkage [m]
-SPEED = 0.1  # of the width, where the URDF gives none for the driven joint [m/s]
+MISFIT = 0.001  # largest error of the linkage model [m]
+SPEED = 0.1  # of the width, if the URDF gives none for the driven joint [m/s]
 
 
 @dataclass
 class GripperProposal:
-    """What the `gripper` section of a robot file says, and what was measured, in the frame of the palm."""
+    """Values of a `gripper` section, and the measured grip in the frame of the palm."""
 
     palm: str
     joints: list[str]  # the driven one first
@@ -42,13 +42,13 @@ class GripperProposal:
 def find_gripper(
     robot: RobotModel, tree: Tree, fingers: Sequence[Joint], points: dict[str, Array]
 ) -> GripperProposal | str:
-    """The gripper that some joints make, or why they make none that the platform drives.
+    """Return the gripper that joints form, or why the platform cannot drive it.
 
-    One joint is driven and the others follow it: as the URDF says by `mimic`, or two slides that move alike. Slides
-    are closed at their lower end; fingers on parallelograms are open at 0, and their pads stay parallel. What moves on
-    its own beside fingers that follow each other, and carries none of them, stands still.
+    One joint is driven and the others follow: by `mimic` of the URDF, or as a pair of equal slides. Slides are closed
+    at their lower end; fingers on parallelograms are open at 0, and their pads stay parallel. An independent joint
+    that carries none of the coupled fingers is locked.
     """
-    fingers, still = _without_others(tree, fingers)
+    fingers, locked = _without_others(tree, fingers)
     names = [joint.name for joint in fingers]
     if len(fingers) == 1:
         return _jaw(robot, fingers[0], points)
@@ -56,13 +56,13 @@ def find_gripper(
     free = [joint for joint in fingers if joint.mimic is None]
     if driven is None:
         if len(fingers) != 2:
-            return f"its {len(fingers)} joints move on their own: {', '.join(names)}"
+            return f"its {len(fingers)} joints move independently: {', '.join(names)}"
         driven = fingers[0]
         factors = {driven.name: 1.0}
     else:
-        strange = [joint.name for joint in free if joint is not driven]
-        if strange:
-            return f"{', '.join(strange)} move on their own beside {driven.name}"
+        independent = [joint.name for joint in free if joint is not driven]
+        if independent:
+            return f"{', '.join(independent)} move independently of {driven.name}"
         factors = {driven.name: 1.0} | {joint.name: joint.mimic[1] for joint in fingers if joint.mimic}
     order = [driven, *(joint for joint in fingers if joint is not driven)]
     palm = _palm(tree, order)
@@ -75,34 +75,35 @@ def find_gripper(
     mimic = [factors[joint.name] for joint in order]
     slides = driven.kind == "prismatic"
     if not low < high or low < -1e-6:
-        begin = "begin at 0 or more" if slides else "begin at 0"
-        return f"{driven.name} runs from {low:g} to {high:g}; the platform drives joints that {begin}"
+        start = "start at 0 or more" if slides else "start at 0"
+        return f"{driven.name} runs from {low:g} to {high:g}; the platform drives joints that {start}"
     travel = np.linspace(low if slides else 0.0, high, STEPS)
     rows = [[factor * float(at) for factor in mimic] for at in (travel if slides else travel[::-1])]
     grip = measure(robot, palm, links, [joint.name for joint in order], rows, points)
     if grip is None:
-        return f"no two links that {', '.join(names)} move come together"
+        return f"no two links that {', '.join(names)} move approach each other"
     if grip.widths[-1] <= grip.widths[0]:
         return (f"the fingers are {'open' if slides else 'closed'} where {driven.name} is 0; the platform takes slides "
                 "to be closed there, and linkages to be open")
     if grip.turned > PARALLEL:
-        return (f"the pads {' and '.join(grip.pads)} turn by {math.degrees(grip.turned):.0f} degrees while they close; "
-                "the platform drives pads that stay parallel")
-    hand = GripperProposal(palm, [joint.name for joint in order], mimic, None, [palm, *grip.pads], round(2 * high, 4),
-                round(min(2 * (driven.velocity or SPEED / 2), 0.2), 4), grip)
-    if still:
-        hand.remarks.append(f"gripper: {', '.join(still)} stands still: it moves on its own beside {driven.name}")
-    return _slides(hand, low, high) if slides else _with_linkage(hand, driven, travel[::-1])
+        return (f"the pads {' and '.join(grip.pads)} turn by {math.degrees(grip.turned):.0f} degrees while "
+                "they close; the platform drives pads that stay parallel")
+    gripper = GripperProposal(
+        palm, [joint.name for joint in order], mimic, None, [palm, *grip.pads], round(2 * high, 4),
+        round(min(2 * (driven.velocity or SPEED / 2), 0.2), 4), grip)
+    if locked:
+        gripper.remarks.append(f"gripper: {', '.join(locked)} is locked: it moves independently of {driven.name}")
+    return _slides(gripper, low, high) if slides else _with_linkage(gripper, driven, travel[::-1])
 
 
-def complaints(robot: RobotModel) -> list[str]:
-    """What of the tool's frame and the fingers is not as the platform takes it to be, in one line each."""
-    gripper = robot.config.gripper
-    return check_jaw(robot) if gripper is not None and gripper.jaw is not None else check_tool_frame(robot)
+def check_gripper(robot: RobotModel) -> list[str]:
+    """Return deviations of tool frame and fingers from the platform's conventions, one line each."""
+    config = robot.config.gripper
+    return check_jaw(robot) if config is not None and config.jaw is not None else check_tool_frame(robot)
 
 
 def _jaw(robot: RobotModel, joint: Joint, points: dict[str, Array]) -> GripperProposal | str:
-    """The hand of one finger against a fixed one, where it turns."""
+    """Return the gripper of one turning finger and a fixed one, or why there is none."""
     if joint.kind != "revolute":
         return f"{joint.name} slides one finger against a fixed one; the platform drives jaws that turn, or pairs"
     found = measure_jaw(robot, joint.name, points)
@@ -113,95 +114,98 @@ def _jaw(robot: RobotModel, joint: Joint, points: dict[str, Array]) -> GripperPr
     jaw = {"radius": found.radius, "angle": found.angle, "closed": found.closed, "opens": found.opens}
     links = list(dict.fromkeys([found.carrier, *found.grip.pads]))
     speed = round(min(found.radius * 0.5 * (joint.velocity or 0.5), 0.2), 4)
-    hand = GripperProposal(found.carrier, [joint.name], [1.0], None, links, found.max_width, speed, found.grip, jaw=jaw)
-    hand.remarks.append("gripper.jaw: one finger is fixed; the tool centre point is in the middle of the open jaws, so "
-                        "that closing brings the fixed finger and what is W mm wide together by "
-                        f"({1e3 * found.max_width:.0f} - W) / 2 mm")
-    return hand
+    gripper = GripperProposal(
+        found.carrier, [joint.name], [1.0], None, links, found.max_width, speed, found.grip, jaw=jaw)
+    gripper.remarks.append(
+        "gripper.jaw: one finger is fixed; the tool centre point is in the middle of the open jaws, so that closing on "
+        f"an object of W mm moves it and the fixed finger together by ({1e3 * found.max_width:.0f} - W) / 2 mm")
+    return gripper
 
 
 def _without_others(tree: Tree, fingers: Sequence[Joint]) -> tuple[list[Joint], list[str]]:
-    """Fingers of which one is driven and followed, and the names of the joints beside them that carry none of them."""
+    """Return the coupled fingers, and the names of joints that carry none of them."""
     followed = {joint.mimic[0] for joint in fingers if joint.mimic}
     if len(followed) != 1:
         return list(fingers), []
     carried = {above.name for joint in fingers if joint.mimic or joint.name in followed
                for above in tree.above(joint.child)}
-    still = [joint.name for joint in fingers if joint.mimic is None and joint.name not in followed | carried]
-    return [joint for joint in fingers if joint.name not in still], still
+    locked = [joint.name for joint in fingers if joint.mimic is None and joint.name not in followed | carried]
+    return [joint for joint in fingers if joint.name not in locked], locked
 
 
-def _slides(hand: GripperProposal, low: float, high: float) -> GripperProposal:
-    closed = hand.grip.widths[0]
-    if low > 0:  # they may be farther out than where they would meet, which the shapes tell
-        hand.closed = round(low - closed / 2, 5)
-        hand.max_width = round(2 * (high - hand.closed), 4)
-        if hand.closed < low - 1e-4:
-            hand.remarks.append(f"gripper.closed: the fingers would meet at {hand.closed:g}, beyond the end of "
-                                f"{hand.joints[0]}, {low:g}")
-        return hand
+def _slides(gripper: GripperProposal, low: float, high: float) -> GripperProposal:
+    closed = gripper.grip.widths[0]
+    if low > 0:  # the shapes show whether the fingers touch at their lower end
+        gripper.closed = round(low - closed / 2, 5)
+        gripper.max_width = round(2 * (high - gripper.closed), 4)
+        if gripper.closed < low - 1e-4:
+            gripper.remarks.append(
+                f"gripper.closed: the fingers would meet at {gripper.closed:g}, beyond the end of {gripper.joints[0]}, "
+                f"{low:g}")
+        return gripper
     if abs(closed) > 0.003:
-        hand.remarks.append(f"gripper.max_width: the fingers are {1e3 * closed:.0f} mm apart where the platform takes "
-                            "them to meet; what they hold seems narrower by that")
-    return hand
+        gripper.remarks.append(
+            f"gripper.max_width: the fingers are {1e3 * closed:.0f} mm apart where the platform assumes contact; held "
+            "objects are measured too narrow by that")
+    return gripper
 
 
-def _with_linkage(hand: GripperProposal, driven: Joint, angles: Array) -> GripperProposal | str:
-    """With the parallelogram that fits the measured widths: 2 L (sin(open - a) - sin(open - closed)) at an angle a."""
-    grip = hand.grip
+def _with_linkage(gripper: GripperProposal, driven: Joint, angles: Array) -> GripperProposal | str:
+    """Fit a parallelogram to the measured widths: 2 L (sin(open - a) - sin(open - closed)) at an angle a."""
+    grip = gripper.grip
     columns = np.column_stack([np.cos(angles), -np.sin(angles), np.ones(len(angles))])
     (sine, cosine, offset), *_ = np.linalg.lstsq(columns, np.array(grip.widths), rcond=None)
     misfit = float(np.abs(columns @ np.array([sine, cosine, offset]) - grip.widths).max())
     length, opened = math.hypot(sine, cosine) / 2, math.atan2(sine, cosine)
     if misfit > MISFIT or not 0 < length < 1:
-        return f"the pads of {driven.name} move as no parallelogram lets them, {1e3 * misfit:.1f} mm off"
+        return f"the pads of {driven.name} do not move on a parallelogram, {1e3 * misfit:.1f} mm off"
     reached = -offset / (2 * length)
     if not -1 <= reached <= 1:
         return f"the pads of {driven.name} never meet"
     closed = opened - math.asin(reached)
     if closed > (driven.upper or 0.0) + 0.02:
-        hand.remarks.append(f"gripper.linkage: the pads meet at {closed:.2f} rad, beyond the end of {driven.name}, "
+        gripper.remarks.append(f"gripper.linkage: the pads meet at {closed:.2f} rad, beyond the end of {driven.name}, "
                             f"{driven.upper or 0.0:.2f}")
     linkage = {"length": round(length, 6), "open_angle": round(opened, 6), "closed": round(closed, 6)}
-    hand.linkage = linkage
-    hand.max_width = round(2 * linkage["length"] * (
+    gripper.linkage = linkage
+    gripper.max_width = round(2 * linkage["length"] * (
         math.sin(linkage["open_angle"]) - math.sin(linkage["open_angle"] - linkage["closed"])), 5)
     fastest = 2 * length * max(math.cos(opened - float(angle)) for angle in angles) * (driven.velocity or 0.5)
-    hand.speed = round(min(fastest / 2, 0.2), 4)
-    hand.links = list(grip.pads)
-    return hand
+    gripper.speed = round(min(fastest / 2, 0.2), 4)
+    gripper.links = list(grip.pads)
+    return gripper
 
 
 def _palm(tree: Tree, fingers: Sequence[Joint]) -> str:
-    """The link that carries all of the fingers: the last on the way to each of them."""
-    ways = [[joint.parent for joint in tree.above(finger.child)] for finger in fingers]
-    shared = [link for link in ways[0] if all(link in way for way in ways)]
+    """Return the last link that carries all fingers."""
+    chains = [[joint.parent for joint in tree.above(finger.child)] for finger in fingers]
+    shared = [link for link in chains[0] if all(link in chain for chain in chains)]
     return shared[-1]
 
 
-def section(hand: GripperProposal, closing: str) -> dict[str, Any]:
-    """The `gripper` section of a robot file whose tool closes along an axis."""
-    values: dict[str, Any] = {"joints": hand.joints}
-    if any(factor != 1 for factor in hand.mimic):
-        values["mimic"] = hand.mimic
-    if hand.linkage:
-        values["linkage"] = hand.linkage
-    if hand.closed:
-        values["closed"] = hand.closed
-    if hand.jaw:
-        values["jaw"] = hand.jaw
+def section(gripper: GripperProposal, closing: str) -> dict[str, Any]:
+    """Return the `gripper` section of a robot file with a closing axis of the tool frame."""
+    values: dict[str, Any] = {"joints": gripper.joints}
+    if any(factor != 1 for factor in gripper.mimic):
+        values["mimic"] = gripper.mimic
+    if gripper.linkage:
+        values["linkage"] = gripper.linkage
+    if gripper.closed:
+        values["closed"] = gripper.closed
+    if gripper.jaw:
+        values["jaw"] = gripper.jaw
     return values | {
-        "links": hand.links, "max_width": hand.max_width, "closing_axis": closing, "speed": hand.speed,
-        "fingers": {"depth": round(hand.grip.depth, 4), "half_width": round(hand.grip.half_width, 4)},
+        "links": gripper.links, "max_width": gripper.max_width, "closing_axis": closing, "speed": gripper.speed,
+        "fingers": {"depth": round(gripper.grip.depth, 4), "half_width": round(gripper.grip.half_width, 4)},
     }
 
 
 
 
 def out_of(robot: RobotModel, arm: Arm, links: Sequence[str]) -> Array:
-    """(3,) unit vector out of the tool, in the frame of the wrist: along the last joint, away from the arm.
+    """Return the (3,) unit vector out of the tool in the frame of the wrist: along the last joint, away from the arm.
 
-    Which way that is say the links at the end, seen from the joints before: the first from which they are off.
+    The sign follows from the offset of the end links to the nearest joint from which they have one.
     """
     q = (robot.lower + robot.upper) / 2
     poses = robot.link_poses(q)
@@ -222,15 +226,15 @@ def out_of(robot: RobotModel, arm: Arm, links: Sequence[str]) -> Array:
 
 
 def flange_links(tree: Tree, arm: Arm) -> list[str]:
-    """Links at the end of the arm that may be its flange: those without shapes, where there are some."""
+    """Return links at the end of the arm that may be its flange: those without shapes, if there are any."""
     rigid = tree.rigid_with(arm.wrist)
     return [link for link in rigid[1:] if link not in tree.shaped] or rigid
 
 
 def find_flange(robot: RobotModel, tree: Tree, arm: Arm, tip: str | None) -> tuple[str, Array]:
-    """The link that a tool is mounted on, and out of the tool (3,) in its frame: `tip`, or the outermost.
+    """Return the mounting link, and the direction out of the tool (3,) in its frame: `tip`, or the outermost link.
 
-    Of several at one place the one whose z axis points out.
+    Of several links at one position, the one whose z axis points out.
     """
     links = flange_links(tree, arm)
     poses = robot.link_poses((robot.lower + robot.upper) / 2)
@@ -242,7 +246,7 @@ def find_flange(robot: RobotModel, tree: Tree, arm: Arm, tip: str | None) -> tup
 
 
 def rotation_between(one: Array, other: Array) -> Array:
-    """(3, 3) the shortest rotation that takes a unit vector to another, of several any."""
+    """Return the shortest rotation (3, 3) from a unit vector to another; any if there are several."""
     axis, cosine = np.cross(one, other), float(one @ other)
     if np.linalg.norm(axis) < 1e-6:
         if cosine > 0:

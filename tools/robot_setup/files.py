@@ -1,4 +1,4 @@
-"""A URDF made of a xacro file, where the tool for that is installed."""
+"""Files of `zencell robot new`: URDFs from xacro, mesh folders, the robot file as text, and a cell for the robot."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from tools.robot_setup.proposal import Proposal
 
 
 def urdf_of_xacro(reference: str, folder: Path, *, overwrite: bool) -> str:
-    """Path of the URDF that was made of a xacro file and written to a folder.
+    """Convert a xacro file to a URDF in a folder and return its path.
 
     Raises:
-        ConfigError: the tool is not installed, or does not read the file, or a URDF of that name is there already.
+        ConfigError: xacro is not installed or cannot read the file, or a URDF of that name exists.
     """
     path = find_description("urdf", reference)
     try:
@@ -32,7 +32,7 @@ def urdf_of_xacro(reference: str, folder: Path, *, overwrite: bool) -> str:
         raise ConfigError("urdf", reference, "is a xacro file: pip install xacro, which makes a URDF of it") from None
     try:
         text = xacro.process_file(str(path)).toxml()
-    except Exception as error:  # whatever the tool makes of it
+    except Exception as error:  # xacro may raise anything
         said = " ".join(str(error).split()) or type(error).__name__
         raise ConfigError("urdf", reference, f"is no xacro file that can be read: {said}") from None
     name = path.name.removesuffix(".xacro").removesuffix(".urdf")
@@ -44,10 +44,10 @@ def urdf_of_xacro(reference: str, folder: Path, *, overwrite: bool) -> str:
 
 
 def folders_of_meshes(field: str, urdf: str, configured: Sequence[str], source: str = "") -> list[str]:
-    """Folders above a URDF, or above the file that it was made of, that hold packages which are not found otherwise.
+    """Return folders above a URDF (or its xacro file) that contain packages not found otherwise.
 
     Raises:
-        ConfigError: a mesh is nowhere.
+        ConfigError: a mesh does not exist.
     """
     root = read_urdf(field, urdf, configured)
     above = find_description(field, source or urdf, configured).parents
@@ -66,8 +66,8 @@ def folders_of_meshes(field: str, urdf: str, configured: Sequence[str], source: 
                 found.append(str(holder))
     if missing:
         more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
-        raise ConfigError(field, urdf, f"has meshes that are not there: {missing[0]}{more}; --package-dir DIR names "
-                                       "the folder that holds their package")
+        raise ConfigError(field, urdf, f"has missing meshes: {missing[0]}{more}; --package-dir DIR names "
+                                       "the folder of their package")
     return found
 
 
@@ -77,16 +77,16 @@ ORDER = ("name", "urdf", "srdf", "package_dirs", "attachments", "joints", "base_
          "gripper")
 
 
-def robot_file(made: Proposal, head: str, folder: Path, srdf: str) -> str:
-    """The text of the file.
+def robot_file(proposal: Proposal, head: str, folder: Path, srdf: str) -> str:
+    """Return the text of a robot file.
 
     Args:
-        made: what stands in it.
+        proposal: its content.
         head: first lines, a comment.
-        folder: where it will lie: descriptions that are no packages are named from there.
-        srdf: name of the file beside it with the pairs that are not checked.
+        folder: of the file; paths of descriptions are relative to it.
+        srdf: name of the file next to it with the unchecked pairs.
     """
-    values = dict(made.values)
+    values = dict(proposal.values)
     values["urdf"] = reference(values["urdf"], folder)
     values["srdf"] = srdf
     values["package_dirs"] = [_from(folder, Path(each)) for each in values["package_dirs"]]
@@ -96,15 +96,15 @@ def robot_file(made: Proposal, head: str, folder: Path, srdf: str) -> str:
         value = values.get(name)
         if value is None or value in ([], {}, ""):
             continue
-        lines += _comment(made.notes.get(name, ""))
+        lines += _comment(proposal.notes.get(name, ""))
         lines += _entry(name, value)
     return "\n".join([*lines, "hardware: {backend: mock}   # simulated; docs/robots.md has the real ones", ""])
 
 
 def reference(urdf: str, folder: Path) -> str:
-    """What a robot file in a folder calls a description: package://... where it is installed, else a path.
+    """Return the reference to a description in a robot file: package://... if installed, else a relative path.
 
-    One of config/robots that was given by its name stays a name.
+    The name of a file in config/robots stays a name.
     """
     by_name = not Path(urdf).expanduser().is_file() and (config_root() / "robots" / urdf).is_file()
     if urdf.startswith(SCHEME) or by_name:
@@ -124,7 +124,7 @@ def _comment(text: str) -> list[str]:
 
 
 def _entry(name: str, value: Any) -> list[str]:
-    """A field in block style, whose innermost values stand in one line."""
+    """Return a field in block style, with inner values in one line each."""
     if name in ("named_poses", "gripper"):
         inner = [f"  {key}: {_flow(each)}" for key, each in value.items()]
         return [f"{name}:", *inner]
@@ -134,7 +134,7 @@ def _entry(name: str, value: Any) -> list[str]:
 
 
 def _flow(value: Any) -> str:
-    """In one line of YAML."""
+    """Return a value as one line of YAML."""
     text = yaml.safe_dump(_plain(value), default_flow_style=True, width=10**6, sort_keys=False)
     return text.removesuffix("\n").removesuffix("\n...").strip()
 
@@ -151,10 +151,10 @@ Layout = Callable[[RobotModel, dict[str, Any]], dict[str, Any]]
 
 
 def world_layout(template: str) -> Layout:
-    """What lays out a world in reach of an arm, for the application of a cell.
+    """Return the function with which a cell's application lays out a world in reach of an arm.
 
     Raises:
-        ConfigError: it lays out none by reach.
+        ConfigError: the application has none.
     """
     application = find_application(load_cell(template).application)
     layout: Layout | None = application.fit_world
@@ -164,7 +164,7 @@ def world_layout(template: str) -> Layout:
 
 
 def write_cell(path: Path, template: str, robot_path: Path, layout: Layout) -> None:
-    """Write a cell like another, with this robot and a world in its reach."""
+    """Write a cell like a template, with this robot and a world in its reach."""
     robot = RobotModel.load(load_robot(robot_path))
     tree = layout(robot, read_yaml(find_file("cells", template)))
     tree |= {"cell": path.stem, "robot": os.path.relpath(robot_path.resolve(), path.parent.resolve())}

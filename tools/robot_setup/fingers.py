@@ -1,4 +1,4 @@
-"""Which way fingers close, where they point and how wide they open, measured on the model."""
+"""Measures fingers on the model: closing direction, approach direction and widths, of pairs and of turning jaws."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ from common.robot.transforms import invert
 
 Array = NDArray[np.float64]
 
-TIP = 0.02  # of a finger, from its end on: what presses on things [m]
-VAGUE = 0.01  # [m] from where fingers begin to their middle: it does not tell which way they point
-PARALLEL = 0.03  # pads that turn by less while they close [rad]
+TIP = 0.02  # length of a finger tip, which presses on objects [m]
+VAGUE = 0.01  # [m] from the start of fingers to their middle: too short to show their direction
+PARALLEL = 0.03  # largest rotation of parallel pads while they close [rad]
 ALIGNED = math.cos(math.radians(10))
 
 
 @dataclass(frozen=True)
 class Grip:
-    """What two fingers do, in the frame of a link that carries both; all but the axes in [m].
+    """Motion of two fingers in the frame of a link that carries both; all but the axes in [m].
 
     Attributes:
-        pads: the links at their ends, the first lies farther along `closing`.
-        closing: (3,) unit axis along which they come together; approach: (3,) from where they begin to their tips.
+        pads: end links; the first is farther along `closing`.
+        closing: (3,) unit axis of closing; approach: (3,) from the start of the fingers to their tips.
         middle: (3,) between the closed pads, at the height of the tips.
-        widths: between the pads at each of the positions that were asked for.
-        turned: most that a pad turns meanwhile [rad].
-        depth: of a tip along `closing`; half_width: half of it across.
+        widths: between the pads at each requested position.
+        turned: largest rotation of a pad [rad].
+        depth: of a tip along `closing`; half_width: half its size across.
     """
 
     pads: tuple[str, str]
@@ -47,10 +47,10 @@ class Grip:
 
 
 def link_points(robot: RobotModel) -> dict[str, Array]:
-    """Corners (N, 3) [m] of the collision shapes of each link that has some, in its own frame.
+    """Return corners (N, 3) [m] of the collision shapes of each link in its own frame.
 
     Raises:
-        ConfigError: a mesh is not there.
+        ConfigError: a mesh does not exist.
     """
     found: dict[str, list[Array]] = {}
     for item in convex_hulls(robot.full_geometry(pin.GeometryType.COLLISION)).geometryObjects:
@@ -69,18 +69,18 @@ def measure(
     robot: RobotModel, carrier: str, links: Sequence[str], joints: Sequence[str],
     positions: Sequence[Sequence[float]], points: dict[str, Array],
 ) -> Grip | None:
-    """What the fingers do from the first of the positions of their joints, where they are closed, to the last, open.
+    """Measure the fingers from the first joint positions (closed) to the last (open).
 
     Args:
         robot: the model.
-        carrier: a link that they all hang on.
-        links: those that the joints move.
+        carrier: a link that carries all of them.
+        links: moved by the joints.
         joints: of the fingers.
         positions: of those joints, in their order [rad or m]; at least two.
-        points: as of `link_points`.
+        points: result of `link_points`.
 
     Returns:
-        None where no two links with shapes move against each other.
+        None if no two links with shapes move against each other.
     """
     q = np.clip(np.zeros(robot.dof), robot.lower, robot.upper)
     seen = [robot.link_poses(q, dict(zip(joints, row, strict=True))) for row in positions]
@@ -107,7 +107,7 @@ def measure(
     closing = _unit(moved[one] - moved[other])
     along = (cloud(one, 0).mean(axis=0) + cloud(other, 0).mean(axis=0)) / 2 - start
     approach = along - (along @ closing) * closing
-    if np.linalg.norm(approach) < VAGUE:  # fingers about their own frames: they point away from the arm
+    if np.linalg.norm(approach) < VAGUE:  # the fingers surround their frames: they point away from the arm
         robot.fk(q)
         T_carrier_world, wrist = invert(seen[0][carrier]), robot.data.oMi[robot.dof].translation
         along = along + start - (T_carrier_world[:3, :3] @ wrist + T_carrier_world[:3, 3])
@@ -141,7 +141,7 @@ def measure(
 
 
 def _unit(vector: Array) -> Array:
-    """Of length 1, and along an axis where it nearly is."""
+    """Return the unit vector, snapped to a coordinate axis if it is close to one."""
     unit = vector / np.linalg.norm(vector)
     nearest = int(np.argmax(np.abs(unit)))
     if abs(unit[nearest]) > ALIGNED:
@@ -150,7 +150,7 @@ def _unit(vector: Array) -> Array:
 
 
 def links_moved(robot: RobotModel, joints: Sequence[str]) -> list[str]:
-    """Links that any of some joints moves."""
+    """Return the links that any of the joints moves."""
     model = robot.full_model
     ids = {model.getJointId(name) for name in joints}
     return [link for link in robot.link_parents if ids & set(model.supports[_joint_of(model, link)])]
@@ -161,10 +161,10 @@ def _joint_of(model: pin.Model, link: str) -> int:
 
 
 def check_tool_frame(robot: RobotModel, points: dict[str, Array] | None = None) -> list[str]:
-    """What of the tool's frame is not as the platform takes it to be, in one line each: none where all is well.
+    """Return deviations of the tool frame from the platform's conventions, one line each.
 
-    The z axis of the tool centre point points from the palm to the tips of the fingers, which come together along the
-    axis that `gripper.closing_axis` names, as wide apart as they are said to be.
+    The z axis of the tool centre point must point from the palm to the finger tips. The fingers must close along
+    `gripper.closing_axis` and open to `gripper.max_width`.
     """
     gripper = robot.config.gripper
     if gripper is None or not gripper.joints:
@@ -174,22 +174,22 @@ def check_tool_frame(robot: RobotModel, points: dict[str, Array] | None = None) 
     found = measure(robot, name, links_moved(robot, gripper.joints), gripper.joints,
                     [finger_positions(gripper, width) for width in widths], points or link_points(robot))
     if found is None:
-        return [f"gripper.joints: no two links that {', '.join(gripper.joints)} move come together"]
-    complaints = []
+        return [f"gripper.joints: no two links that {', '.join(gripper.joints)} move approach each other"]
+    problems = []
     if abs(found.closing["xy".index(axis)]) < ALIGNED:
         way = axis_name(found.closing).removeprefix("-")
-        complaints.append(f"gripper.closing_axis: the fingers close along {way} of {name}, not along {axis}")
+        problems.append(f"gripper.closing_axis: the fingers close along {way} of {name}, not along {axis}")
     if found.approach[2] < ALIGNED:
-        complaints.append(f"tcp_link: z of {name} must point from the palm to the tips of the fingers, which is "
+        problems.append(f"tcp_link: z of {name} must point from the palm to the tips of the fingers, which is "
                           f"{axis_name(found.approach)}")
     elif abs(found.widths[1] - found.widths[0] - gripper.max_width) > 0.1 * gripper.max_width:
-        complaints.append(f"gripper.max_width: the fingers open by {found.widths[1] - found.widths[0]:.4f} m, not by "
+        problems.append(f"gripper.max_width: the fingers open by {found.widths[1] - found.widths[0]:.4f} m, not by "
                           f"{gripper.max_width:g} m")
-    return complaints
+    return problems
 
 
 def axis_name(axis: Array) -> str:
-    """An axis in words: x, -z, or its numbers."""
+    """Return an axis as text: x, -z, or its numbers."""
     nearest = int(np.argmax(np.abs(axis)))
     if abs(axis[nearest]) > 0.999:
         return f"{'-' if axis[nearest] < 0 else ''}{'xyz'[nearest]}"
@@ -197,15 +197,15 @@ def axis_name(axis: Array) -> str:
 
 
 
-ALONG = math.cos(math.radians(35))  # of the last joint's axis with the way to the tip: then that is the tool's axis
-DROP = 0.012  # of the tip of the jaw behind where it is when closed, up to which it is opened [m]
-CLOSED = 0.05  # by which the joint may be said to be closed elsewhere than it was measured to be [rad]
-APART = 0.03  # between the tips when closed: more is no gripper [m]
+ALONG = math.cos(math.radians(35))  # largest angle between last joint axis and tip direction for a tool axis
+DROP = 0.012  # largest retreat of the jaw's tip while it opens [m]
+CLOSED = 0.05  # tolerance between configured and measured closed position [rad]
+APART = 0.03  # largest gap between closed tips of a gripper [m]
 
 
 @dataclass(frozen=True)
 class Jaw:
-    """What a jaw does: see `common.config.TurningJaw`; `grip` is in the frame of the link that carries it."""
+    """Motion of a jaw, see `common.config.TurningJaw`; `grip` is in the frame of the link that carries it."""
 
     carrier: str
     radius: float
@@ -217,16 +217,16 @@ class Jaw:
 
 
 def measure_jaw(robot: RobotModel, joint: str, points: dict[str, Array]) -> Jaw | str:
-    """The jaw that a joint turns, or why it is none.
+    """Return the jaw that a joint turns, or why there is none.
 
-    Closed is that end of the joint at which its tip is nearer to that of what does not turn with it. The middle of the
-    grip is half the width from the fixed finger, at which the hand is to come to what it takes: closing moves the one
-    jaw alone, so that the last of the way the fixed finger moves the object, or the object the hand.
+    The jaw is closed at the joint limit where its tip is nearer to the fixed finger. The middle of the grip is half the
+    width from the fixed finger. Closing moves one jaw only, so that at the end the jaw moves the object against the
+    fixed finger, or the gripper moves.
 
     Args:
         robot: the model.
         joint: of the jaw.
-        points: as of `tools.robot_setup.fingers.link_points`.
+        points: result of `link_points`.
     """
     model = robot.full_model
     index = model.joints[model.getJointId(joint)].idx_q
@@ -250,7 +250,7 @@ def measure_jaw(robot: RobotModel, joint: str, points: dict[str, Array]) -> Jaw 
     axis = turn / np.linalg.norm(turn)
 
     def far(cloud: Array) -> Array:
-        """How far points are from the axis (N,)."""
+        """Return the distances of points from the axis (N,)."""
         away = cloud - pivot
         return np.asarray(np.linalg.norm(away - np.outer(away @ axis, axis), axis=1))
 
@@ -258,20 +258,20 @@ def measure_jaw(robot: RobotModel, joint: str, points: dict[str, Array]) -> Jaw 
         return np.asarray(cloud[int(np.argmax(far(cloud)))])
 
     def gap(at: float) -> float:
-        """Between the corners at the tips of jaw and finger, seen along the axis [m]."""
+        """Return the gap between the tips of jaw and finger, seen along the axis [m]."""
         one, other = (cloud[far(cloud) > far(cloud).max() - TIP] for cloud in (jaws[at], still))
         ways = (one[:, None] - other[None]).reshape(-1, 3)
         return float(np.linalg.norm(ways - np.outer(ways @ axis, axis), axis=1).min())
 
     closed, opened = sorted(ends, key=gap)
     approach = _tool_axis(robot, q, seen[closed][carrier], _flat(farthest(jaws[closed]) - pivot, axis))
-    closing = np.cross(approach, axis)  # either way of these
+    closing = np.cross(approach, axis)  # the sign follows
     tip = jaws[closed][jaws[closed] @ approach > (jaws[closed] @ approach).max() - TIP]
     if (farthest(jaws[opened]) - farthest(jaws[closed])) @ closing < 0:
         closing = -closing
     inner = tip[int(np.argmin(tip @ closing))]
     if gap(closed) > APART:
-        return f"the jaw of {joint} does not come to what is fixed: they are more than {1e3 * APART:.0f} mm apart"
+        return f"the jaw of {joint} does not reach the fixed finger: the gap is more than {1e3 * APART:.0f} mm"
     along, out = float((inner - pivot) @ approach), float((inner - pivot) @ closing)
     radius, angle = math.hypot(along, out), math.atan2(out, along)
     most = min(abs(opened - closed), math.acos(max(0.0, math.cos(angle) - DROP / radius)) - angle)
@@ -288,7 +288,7 @@ def measure_jaw(robot: RobotModel, joint: str, points: dict[str, Array]) -> Jaw 
 
 
 def check_jaw(robot: RobotModel, points: dict[str, Array] | None = None) -> list[str]:
-    """As `tools.robot_setup.fingers.check_tool_frame`, of a robot with a jaw."""
+    """Return deviations like `check_tool_frame`, for a robot with a jaw."""
     gripper = robot.config.gripper
     assert gripper is not None and gripper.jaw is not None
     found = measure_jaw(robot, gripper.joints[0], points or link_points(robot))
@@ -298,19 +298,19 @@ def check_jaw(robot: RobotModel, points: dict[str, Array] | None = None) -> list
     poses = robot.link_poses(np.clip(np.zeros(robot.dof), robot.lower, robot.upper))
     R = invert(poses[name])[:3, :3] @ poses[found.carrier][:3, :3]
     closing, approach = R @ found.grip.closing, R @ found.grip.approach
-    complaints = []
+    problems = []
     if abs(closing["xy".index(axis)]) < ALIGNED:
         way = axis_name(closing).removeprefix("-")
-        complaints.append(f"gripper.closing_axis: the jaw closes along {way} of {name}, not along {axis}")
+        problems.append(f"gripper.closing_axis: the jaw closes along {way} of {name}, not along {axis}")
     if approach[2] < ALIGNED:
-        complaints.append(f"tcp_link: z of {name} must point from the palm to the tips of the jaws, which is "
+        problems.append(f"tcp_link: z of {name} must point from the palm to the tips of the jaws, which is "
                           f"{axis_name(approach)}")
     if given.opens != found.opens or abs(given.closed - found.closed) > CLOSED:
-        complaints.append(f"gripper.jaw: it is closed at {found.closed:g} and opens by {found.opens:+d}, not at "
+        problems.append(f"gripper.jaw: it is closed at {found.closed:g} and opens by {found.opens:+d}, not at "
                           f"{given.closed:g} and by {given.opens:+d}")
     elif abs(given.radius - found.radius) > 0.1 * found.radius:
-        complaints.append(f"gripper.jaw.radius: its tip is {found.radius:.4f} m from its axis, not {given.radius:g} m")
-    return complaints
+        problems.append(f"gripper.jaw.radius: its tip is {found.radius:.4f} m from its axis, not {given.radius:g} m")
+    return problems
 
 
 def _rigid(robot: RobotModel, link: str) -> int:
@@ -324,12 +324,12 @@ def _placed(T_world_carrier: Array, T_world_link: Array, points: Array) -> Array
 
 
 def _flat(way: Array, axis: Array) -> Array:
-    """Of a way (3,) what is across an axis."""
+    """Return the component of a vector (3,) across an axis."""
     return np.asarray(way - (way @ axis) * axis)
 
 
 def _tool_axis(robot: RobotModel, q: Array, T_world_carrier: Array, out: Array) -> Array:
-    """(3,) in the carrier: the axis about which the last joint turns, where it points out of the hand; else `out`."""
+    """Return the tool axis (3,) in the carrier: that of the last joint if it points out of the gripper, else `out`."""
     out = out / np.linalg.norm(out)
     last = robot.jacobian(q)[3:, -1]
     if np.linalg.norm(last) > 0.5:

@@ -1,4 +1,4 @@
-"""The robot file of a URDF: read where the URDF says it, measured on the model, or guessed by rules that it states."""
+"""Proposes the robot file of a URDF: values from the URDF, measured on the model, or guessed by documented rules."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from numpy.typing import NDArray
 
 from common.config import RobotConfig, check
 from common.errors import ConfigError
-from common.planning.disabled_collisions import disabled_pairs, srdf
 from common.planning.robot_geometry import RobotGeometry
 from common.robot.finger_joints import finger_positions
 from common.robot.model import RobotModel
 from common.robot.transforms import invert, matrix_to_rpy, transform
 from common.robot.urdf import read_urdf
+from tools.robot_setup.disabled_collisions import disabled_pairs, srdf
 from tools.robot_setup.end_effector import (
     GripperProposal,
-    complaints,
+    check_gripper,
     find_flange,
     find_gripper,
     flange_links,
@@ -47,13 +47,13 @@ from tools.robot_setup.tree import (
 
 Array = NDArray[np.float64]
 
-NEAR_GRIP = 0.03  # a link of the URDF so close to where fingers grip may be the tool centre point [m]
-BEHIND_TIPS = 0.01  # where fingers grip [m]
+NEAR_GRIP = 0.03  # a link this close to the grip may be the tool centre point [m]
+BEHIND_TIPS = 0.01  # of the fingers is the grip [m]
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A link that may be the tool centre point: which way its z axis points, and whether that is out of the tool."""
+    """A link that may be the tool centre point: direction of its z axis, and whether that is out of the tool."""
 
     link: str
     z: str
@@ -62,14 +62,14 @@ class Candidate:
 
 @dataclass
 class Proposal:
-    """A robot file that is still to be written.
+    """Content of a robot file.
 
     Attributes:
         values: of the file, by field.
         notes: comments, by field.
         candidates: for the tool centre point.
-        guessed: what nobody said; check: what a person should look at; lost: what the robot cannot do so.
-        srdf: text of the pairs of links that are not checked.
+        guessed: guessed values; check: what the user should check; lost: what the robot cannot do.
+        srdf: pairs of links without collision checks, as text.
     """
 
     values: dict[str, Any]
@@ -84,179 +84,180 @@ class Proposal:
 def draft(
     urdf: str, name: str, *, gripper: str = "", tip: str | None = None, package_dirs: Sequence[str] = (),
 ) -> Proposal:
-    """The robot file of an arm, whose home and pairs of links that need no check are still to be found: see `finish`.
+    """Return the robot file of an arm without home pose and unchecked pairs, which `finish` adds.
 
     Args:
-        urdf: its description: a path, or package://...
+        urdf: its description: a path or package://...
         name: of the robot.
         gripper: description of a gripper that is mounted at its end.
-        tip: a link at its end, where it has several: the tool centre point, or what a gripper is mounted on.
-        package_dirs: folders in which package:// is looked up.
+        tip: the tool centre point or mounting link, if the arm has several ends.
+        package_dirs: folders that resolve package://.
 
     Raises:
-        ConfigError, UnknownName: what is wrong with the descriptions, in one line.
+        ConfigError, UnknownName: a description is invalid.
     """
     tree = read_tree(read_urdf("urdf", urdf, package_dirs), urdf)
     arm = find_arm(tree, urdf, tip)
-    made = Proposal({
+    proposal = Proposal({
         "name": name, "urdf": urdf, "package_dirs": list(package_dirs),
         "joints": [joint.name for joint in arm.joints], "base_link": arm.base, "tcp_link": arm.wrist,
     })
-    _limits(made, arm)
+    _limits(proposal, arm)
     others = [joint for joint in tree.joints if joint.moves and joint not in arm.joints]
     fingers = list(arm.fingers)
     if gripper:
         if fingers:
             raise ConfigError("--gripper", gripper, f"cannot be mounted: {fingers[0].name} moves there already")
-        fingers = _mount(made, tree, arm, gripper, tip, package_dirs)
+        fingers = _mount(proposal, tree, arm, gripper, tip, package_dirs)
         others += fingers
-    made.values["locked_joints"] = {joint.name: _rest(joint) for joint in others}
-    middle = [(low + high) / 2 for low, high in made.values["position_limits"]]
-    made.values["named_poses"] = {"home": middle}
-    robot = _model(made)
+    proposal.values["locked_joints"] = {joint.name: _rest(joint) for joint in others}
+    middle = [(low + high) / 2 for low, high in proposal.values["position_limits"]]
+    proposal.values["named_poses"] = {"home": middle}
+    robot = _model(proposal)
     points = link_points(robot)
-    whole = read_tree(ET.fromstring(robot.urdf), urdf)
-    hand: GripperProposal | None = None
+    complete = read_tree(ET.fromstring(robot.urdf), urdf)
+    effector: GripperProposal | None = None
     if fingers:
-        found = find_gripper(robot, whole, fingers, points)
+        found = find_gripper(robot, complete, fingers, points)
         if isinstance(found, GripperProposal):
-            hand = found
+            effector = found
         else:
-            made.lost.append(f"no gripper: {found}")
-    if hand is not None and gripper:
-        robot, hand = _turned(made, robot, tree, arm, whole, fingers, points, hand)
-    _tool(made, robot, whole, arm, hand, points, tip if not gripper else None)
-    return made
+            proposal.lost.append(f"no gripper: {found}")
+    if effector is not None and gripper:
+        robot, effector = _turned(proposal, robot, tree, arm, complete, fingers, points, effector)
+    _tool(proposal, robot, complete, arm, effector, points, tip if not gripper else None)
+    return proposal
 
 
-def _model(made: Proposal) -> RobotModel:
-    return RobotModel.load(check(RobotConfig, made.values, "robot"))
+def _model(proposal: Proposal) -> RobotModel:
+    return RobotModel.load(check(RobotConfig, proposal.values, "robot"))
 
 
 def _rest(joint: Joint) -> float:
-    """Where a joint that is not planned for is held: 0, or as near as its limits let it."""
+    """Return the position of a locked joint: 0, or the nearest within its limits."""
     low, high = (joint.lower or 0.0, joint.upper or 0.0) if joint.kind != "continuous" else (0.0, 0.0)
     return min(max(0.0, low), high)
 
 
-def _limits(made: Proposal, arm: Arm) -> None:
-    """What the joints may do: as the URDF says, narrower where they turn on, and guessed where it is silent."""
+def _limits(proposal: Proposal, arm: Arm) -> None:
+    """Add joint limits: those of the URDF, narrower for continuous joints, and guessed where it has none."""
     positions: list[tuple[float, float]] = []
     speeds: list[float] = []
-    narrowed, silent = [], []
+    narrowed, missing = [], []
     for joint in arm.joints:
         low, high, changed = position_range(joint)
         positions.append((low, high))
         if changed:
             narrowed.append(joint.name)
         if not joint.velocity:
-            silent.append(joint.name)
+            missing.append(joint.name)
         speeds.append(joint.velocity or SPEED)
     accelerations = [guessed_acceleration(speed) for speed in speeds]
-    made.values["position_limits"], made.values["velocity_limits"] = positions, speeds
-    made.values["acceleration_limits"] = accelerations
-    made.values["jerk_limits"] = [guessed_jerk(acceleration) for acceleration in accelerations]
+    proposal.values["position_limits"], proposal.values["velocity_limits"] = positions, speeds
+    proposal.values["acceleration_limits"] = accelerations
+    proposal.values["jerk_limits"] = [guessed_jerk(acceleration) for acceleration in accelerations]
     if narrowed:
-        made.notes["position_limits"] = (
+        proposal.notes["position_limits"] = (
             f"The URDF's, but for {', '.join(narrowed)}, which turn farther than once round: half a turn either way, "
             "since a second way round only misleads planning.")
-        made.guessed.append(f"position_limits of {', '.join(narrowed)}: half a turn either way")
-    if silent:
-        made.guessed.append(f"velocity_limits of {', '.join(silent)}: the URDF gives none, so {SPEED:g}")
-        made.notes["velocity_limits"] = f"GUESSED for {', '.join(silent)}, for which the URDF gives none."
-    made.notes["acceleration_limits"] = (
+        proposal.guessed.append(f"position_limits of {', '.join(narrowed)}: half a turn either way")
+    if missing:
+        proposal.guessed.append(f"velocity_limits of {', '.join(missing)}: the URDF gives none, so {SPEED:g}")
+        proposal.notes["velocity_limits"] = f"GUESSED for {', '.join(missing)}, for which the URDF gives none."
+    proposal.notes["acceleration_limits"] = (
         f"GUESSED: each joint comes to its speed limit in {TO_SPEED:g} s. A URDF does not say it; the data sheet does.")
-    made.notes["jerk_limits"] = f"GUESSED: each joint comes to its acceleration limit in {TO_ACCELERATION:g} s."
-    made.guessed += [f"acceleration_limits: to the speed limit in {TO_SPEED:g} s",
+    proposal.notes["jerk_limits"] = f"GUESSED: each joint comes to its acceleration limit in {TO_ACCELERATION:g} s."
+    proposal.guessed += [f"acceleration_limits: to the speed limit in {TO_SPEED:g} s",
                      f"jerk_limits: to the acceleration limit in {TO_ACCELERATION:g} s"]
 
 
 def _mount(
-    made: Proposal, tree: Tree, arm: Arm, gripper: str, tip: str | None, package_dirs: Sequence[str]
+    proposal: Proposal, tree: Tree, arm: Arm, gripper: str, tip: str | None, package_dirs: Sequence[str]
 ) -> list[Joint]:
-    """Attach a gripper to the flange; its joints that move."""
+    """Attach a gripper to the flange; return its moving joints."""
     part = read_tree(read_urdf("--gripper", gripper, package_dirs), gripper)
     moving = [joint for joint in part.joints if joint.moves]
     if not moving:
-        raise ConfigError("--gripper", gripper, "has no joint that moves: it is no gripper")
+        raise ConfigError("--gripper", gripper, "has no moving joint: it is no gripper")
     others = {joint.name: _rest(joint) for joint in tree.joints if joint.moves and joint not in arm.joints}
-    middle = [(low + high) / 2 for low, high in made.values["position_limits"]]
-    alone = Proposal(made.values | {"locked_joints": others, "named_poses": {"home": middle}})
+    middle = [(low + high) / 2 for low, high in proposal.values["position_limits"]]
+    alone = Proposal(proposal.values | {"locked_joints": others, "named_poses": {"home": middle}})
     flange, _ = find_flange(_model(alone), tree, arm, tip)
-    made.values["attachments"] = [{"urdf": gripper, "parent_link": flange}]
+    proposal.values["attachments"] = [{"urdf": gripper, "parent_link": flange}]
     return moving
 
 
 def _turned(
-    made: Proposal, robot: RobotModel, tree: Tree, arm: Arm, whole: Tree, fingers: list[Joint],
-    points: dict[str, Array], hand: GripperProposal,
+    proposal: Proposal, robot: RobotModel, tree: Tree, arm: Arm, complete: Tree, fingers: list[Joint],
+    points: dict[str, Array], effector: GripperProposal,
 ) -> tuple[RobotModel, GripperProposal]:
     """Turn a mounted gripper so that its fingers point out of the flange."""
-    (attachment,) = made.values["attachments"]
+    (attachment,) = proposal.values["attachments"]
     flange, out = find_flange(robot, tree, arm, attachment["parent_link"])
     poses = robot.link_poses((robot.lower + robot.upper) / 2)
-    T_flange_palm = invert(poses[flange]) @ poses[hand.palm]
-    points_out = T_flange_palm[:3, :3] @ hand.grip.approach
-    made.guessed.append(f"attachments: the gripper sits at {flange} itself, without a plate between")
+    T_flange_palm = invert(poses[flange]) @ poses[effector.palm]
+    points_out = T_flange_palm[:3, :3] @ effector.grip.approach
+    proposal.guessed.append(f"attachments: the gripper sits at {flange} itself, without a plate between")
     if points_out @ out > ALIGNED:
-        return robot, hand
+        return robot, effector
     attachment["rpy"] = [round(value, 6) for value in matrix_to_rpy(rotation_between(points_out, out))]
-    robot = _model(made)
-    found = find_gripper(robot, whole, fingers, points)
-    assert isinstance(found, GripperProposal)  # as before: it was only turned
+    robot = _model(proposal)
+    found = find_gripper(robot, complete, fingers, points)
+    assert isinstance(found, GripperProposal)  # it was found before the turn too
     return robot, found
 
 
 def _tool(
-    made: Proposal, robot: RobotModel, whole: Tree, arm: Arm, hand: GripperProposal | None, points: dict[str, Array],
-    tip: str | None,
+    proposal: Proposal, robot: RobotModel, complete: Tree, arm: Arm, effector: GripperProposal | None,
+    points: dict[str, Array], tip: str | None,
 ) -> None:
-    """The tool centre point: a link of the URDF that is where it should be, else a frame of its own; the gripper."""
+    """Add the tool centre point, a link of the URDF if one fits, else a new frame; and the gripper."""
     poses = robot.link_poses((robot.lower + robot.upper) / 2)
-    links = whole.rigid_with(arm.wrist)
-    if hand is not None:
-        grip, palm = hand.grip, hand.palm
+    links = complete.rigid_with(arm.wrist)
+    if effector is not None:
+        grip, palm = effector.grip, effector.palm
         T_palm_tcp = transform(np.column_stack([np.cross(grip.closing, grip.approach), grip.closing, grip.approach]),
                                grip.middle - BEHIND_TIPS * grip.approach)
         parent = palm
         out = poses[palm][:3, :3] @ grip.approach
         near = [link for link in links if _distance(poses[link], poses[palm] @ T_palm_tcp) < NEAR_GRIP]
-        if hand.jaw:  # between the open jaws is no link of a description
+        if effector.jaw:  # descriptions have no link between the open jaws
             near = []
     else:
-        parent, out_in_flange = find_flange(robot, whole, arm, tip)
+        parent, out_in_flange = find_flange(robot, complete, arm, tip)
         out = poses[parent][:3, :3] @ out_in_flange
         T_palm_tcp = transform(rotation_between(np.array([0.0, 0.0, 1.0]), out_in_flange), (0.0, 0.0, 0.0))
-        near = flange_links(whole, arm) if tip is None else [tip]
+        near = flange_links(complete, arm) if tip is None else [tip]
         if tip is None:
             near = [link for link in near if _distance(poses[link], poses[parent]) < 1e-3] or near
-    made.candidates = [
+    proposal.candidates = [
         Candidate(link, _direction(poses[link][:3, :3].T @ out),
-                  float(poses[link][:3, 2] @ out) > ALIGNED and _closes(poses, link, hand) != "")
-        for link in (near if near else flange_links(whole, arm))
+                  float(poses[link][:3, 2] @ out) > ALIGNED and _closes(poses, link, effector) != "")
+        for link in (near if near else flange_links(complete, arm))
     ]
-    fitting = [each.link for each in made.candidates if each.fits]
-    if hand is None and parent in fitting:
+    fitting = [each.link for each in proposal.candidates if each.fits]
+    if effector is None and parent in fitting:
         fitting = [parent]
     asked = tip if tip in fitting else None
     if fitting and (asked or near):
-        made.values["tcp_link"] = asked or min(
+        proposal.values["tcp_link"] = asked or min(
             fitting, key=lambda link: _distance(poses[link], poses[parent] @ T_palm_tcp))
-        closing = _closes(poses, made.values["tcp_link"], hand)
+        closing = _closes(poses, proposal.values["tcp_link"], effector)
     else:
         rpy = [round(value, 6) + 0.0 for value in matrix_to_rpy(T_palm_tcp[:3, :3])]
         place = [round(float(value), 5) + 0.0 for value in T_palm_tcp[:3, 3]]
-        made.values["tcp"] = {"link": f"{made.values['name']}_tcp", "parent": parent, "position": place, "rpy": rpy}
-        del made.values["tcp_link"]
+        name = f"{proposal.values['name']}_tcp"
+        proposal.values["tcp"] = {"link": name, "parent": parent, "position": place, "rpy": rpy}
+        del proposal.values["tcp_link"]
         closing = "y"
-        made.notes["tcp"] = ("No link of the URDF is there with z out of the tool: this frame is, "
-                             + ("1 cm behind the tips of the fingers, which close along its y axis." if hand else
+        proposal.notes["tcp"] = ("No link of the URDF at this position has z out of the tool, so this frame was added, "
+                             + ("1 cm behind the tips of the fingers, which close along its y axis." if effector else
                                 f"at {parent}."))
-        made.guessed.append(f"tcp: a frame of its own at {parent}")
-    if hand is not None:
-        _write_gripper(made, hand, closing)
+        proposal.guessed.append(f"tcp: a frame of its own at {parent}")
+    if effector is not None:
+        _write_gripper(proposal, effector, closing)
     else:
-        made.check.append("gripper: the robot file has none, so the robot grasps nothing; --gripper mounts one")
+        proposal.check.append("gripper: the robot file has none, so the robot grasps nothing; --gripper mounts one")
 
 
 def _distance(one: Array, other: Array) -> float:
@@ -264,53 +265,55 @@ def _distance(one: Array, other: Array) -> float:
 
 
 def _direction(out: Array) -> str:
-    """Which way z of a frame points, where out of the tool is `out` in that frame."""
+    """Return the direction of a frame's z axis; `out` points out of the tool in that frame."""
     if out[2] > ALIGNED:
         return "out of the tool"
     return "back into the arm" if out[2] < -ALIGNED else "sideways"
 
 
-def _closes(poses: dict[str, Array], link: str, hand: GripperProposal | None) -> str:
-    """The axis of a link along which the fingers close; empty where they close between them."""
-    if hand is None:
+def _closes(poses: dict[str, Array], link: str, effector: GripperProposal | None) -> str:
+    """Return the axis of a link along which the fingers close; empty if there is none."""
+    if effector is None:
         return "y"
-    closing = poses[link][:3, :3].T @ poses[hand.palm][:3, :3] @ hand.grip.closing
+    closing = poses[link][:3, :3].T @ poses[effector.palm][:3, :3] @ effector.grip.closing
     return next((axis for axis, value in zip("xy", closing, strict=False) if abs(value) > ALIGNED), "")
 
 
-def _write_gripper(made: Proposal, hand: GripperProposal, closing: str) -> None:
-    made.values["gripper"] = section(hand, closing)
-    made.notes["gripper"] = "Widths and tips are measured on the model. GUESSED by the platform: effort, acceleration."
-    made.guessed.append("gripper.effort, max_effort, acceleration, jerk: the platform's defaults")
-    made.check += hand.remarks
-    config = check(RobotConfig, made.values, "robot")
+def _write_gripper(proposal: Proposal, effector: GripperProposal, closing: str) -> None:
+    proposal.values["gripper"] = section(effector, closing)
+    proposal.notes["gripper"] = (
+        "Widths and tips are measured on the model. GUESSED by the platform: effort, acceleration.")
+    proposal.guessed.append("gripper.effort, max_effort, acceleration, jerk: the platform's defaults")
+    proposal.check += effector.remarks
+    config = check(RobotConfig, proposal.values, "robot")
     assert config.gripper is not None
-    opened = zip(hand.joints, finger_positions(config.gripper, hand.max_width), strict=True)
-    made.values["locked_joints"] |= {name: round(position, 6) + 0.0 for name, position in opened}
-    made.notes["locked_joints"] = "Joints outside the arm, where planning holds them; fingers are open."
+    opened = zip(effector.joints, finger_positions(config.gripper, effector.max_width), strict=True)
+    proposal.values["locked_joints"] |= {name: round(position, 6) + 0.0 for name, position in opened}
+    proposal.notes["locked_joints"] = (
+        "Joints outside the arm, at the positions that planning assumes; fingers are open.")
 
 
-def finish(made: Proposal) -> RobotModel:
-    """Find the pairs of links that need no check, and a home: some seconds of work, a minute with detailed meshes."""
-    robot = _model(made)
+def finish(proposal: Proposal) -> RobotModel:
+    """Add the home pose and the unchecked pairs: seconds of work, a minute with detailed meshes."""
+    robot = _model(proposal)
     pairs = disabled_pairs(robot)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "pairs.srdf"
         path.write_text(srdf(robot, pairs), encoding="utf-8")
         robot = RobotModel.load(robot.config.model_copy(update={"srdf": str(path)}))
         home = find_home(robot, RobotGeometry(robot))
-    made.values["named_poses"] = {"home": [round(float(value), 4) + 0.0 for value in home.positions]}
-    robot = _model(made)
-    made.srdf = srdf(robot, pairs)
+    proposal.values["named_poses"] = {"home": [round(float(value), 4) + 0.0 for value in home.positions]}
+    robot = _model(proposal)
+    proposal.srdf = srdf(robot, pairs)
     x, y, z = robot.fk(robot.named("home"))[:3, 3]
     if home.down:
-        made.notes["named_poses"] = f"Tool down, {robot.config.tcp_link} at ({x:.2f}, {y:.2f}, {z:.2f})."
+        proposal.notes["named_poses"] = f"Tool down, {robot.config.tcp_link} at ({x:.2f}, {y:.2f}, {z:.2f})."
     else:
-        made.lost.append("no pose was found in which the tool points down: tasks that take things from above will fail")
+        proposal.lost.append("no pose was found in which the tool points down: tasks that grasp from above will fail")
     if home.hits:
-        made.lost.append(f"no pose is free of collisions; in the middle of the joints these touch: "
+        proposal.lost.append("no pose is free of collisions; in the middle of the joint ranges these collide: "
                          f"{', '.join(home.hits[:3])}")
-    made.guessed.append(f"named_poses.home: the tool at ({x:.2f}, {y:.2f}, {z:.2f})")
-    made.check += complaints(robot)
-    made.check.append("base_position: is not given, so the base stands at the origin of the world")
+    proposal.guessed.append(f"named_poses.home: the tool at ({x:.2f}, {y:.2f}, {z:.2f})")
+    proposal.check += check_gripper(robot)
+    proposal.check.append("base_position: not set, so the base is at the origin of the world")
     return robot

@@ -1,4 +1,4 @@
-"""Links and joints as a URDF has them, and which of them are the arm and which the fingers."""
+"""Links and joints of a URDF, which of them form the arm and the fingers, and the limits of joints."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from common.errors import ConfigError, UnknownName
 
 MOVING = ("revolute", "continuous", "prismatic")
 FINGER_WORDS = ("finger", "gripper", "jaw", "knuckle", "claw")
-LEAST_JOINTS = 3  # of an arm: what splits up before is a body with several of them
-FINGER_JOINTS = 3  # one after the other, at most
+LEAST_JOINTS = 3  # of an arm: a tree that branches earlier has several arms
+FINGER_JOINTS = 3  # longest chain of a finger
 
 
 @dataclass(frozen=True)
 class Joint:
-    """A joint of a URDF; `lower`, `upper` [rad or m] and `velocity` [rad/s or m/s] are None where it gives none.
+    """A joint of a URDF; `lower`, `upper` [rad or m] and `velocity` [rad/s or m/s] are None if not given.
 
-    `mimic` is the joint that it follows, and how many times as far it moves.
+    `mimic` is the joint that it follows, and the multiplier.
     """
 
     name: str
@@ -34,7 +34,7 @@ class Joint:
 
     @property
     def moves(self) -> bool:
-        """Whether it is no fixed one."""
+        """Whether the joint is not fixed."""
         return self.kind in MOVING
 
 
@@ -53,11 +53,11 @@ class Tree:
 
     @cached_property
     def root(self) -> str:
-        """The link that hangs on none."""
+        """The link without a parent."""
         return next(link for link in self.links if link not in self._by_child)
 
     def above(self, link: str) -> list[Joint]:
-        """Joints between the root and a link, from the root on."""
+        """Return the joints between the root and a link, from the root on."""
         found: list[Joint] = []
         while (joint := self._by_child.get(link)) is not None:
             found.append(joint)
@@ -65,22 +65,22 @@ class Tree:
         return found[::-1]
 
     def on(self, link: str) -> list[Joint]:
-        """Joints that a link carries itself."""
+        """Return the joints that a link carries directly."""
         return [joint for joint in self.joints if joint.parent == link]
 
     def below(self, link: str) -> list[Joint]:
-        """All joints beyond a link, whatever lies between."""
+        """Return all joints beyond a link."""
         found = []
         for joint in self.on(link):
             found += [joint, *self.below(joint.child)]
         return found
 
     def moving_below(self, link: str) -> list[Joint]:
-        """Those of them that move."""
+        """Return the moving joints beyond a link."""
         return [joint for joint in self.below(link) if joint.moves]
 
     def rigid_with(self, link: str) -> list[str]:
-        """Links beyond a link that no joint moves against it, and itself, which comes first."""
+        """Return the link itself and the links that are rigidly connected beyond it."""
         found = [link]
         for joint in self.on(link):
             if not joint.moves:
@@ -94,9 +94,9 @@ class Arm:
 
     Attributes:
         joints: those of the arm, from the base on.
-        base: its first link, as a robot file wants it: all that is above is dropped.
+        base: its first link for the robot file; links above it are dropped.
         wrist: the link that the last joint moves.
-        fingers: joints beyond the wrist that move, without those that stand still.
+        fingers: moving joints beyond the wrist.
     """
 
     joints: list[Joint]
@@ -106,11 +106,11 @@ class Arm:
 
 
 def read_tree(root: ET.Element, source: str) -> Tree:
-    """The links and joints of a URDF that was parsed.
+    """Return the links and joints of a parsed URDF.
 
     Raises:
-        ConfigError: it is no tree: without links or with several roots, with a link on two joints, or with links that
-            hang on each other; or a joint is not whole.
+        ConfigError: it is no tree: no link, several roots, a link with two parents, or a cycle; or a joint is
+            incomplete.
     """
     links = [link.get("name", "") for link in root.findall("link")]
     joints = [_joint(element, links, source) for element in root.findall("joint")]
@@ -161,7 +161,7 @@ def _joint(element: ET.Element, links: Sequence[str], source: str) -> Joint:
 
 
 def _may_turn(text: str) -> bool:
-    """Whether a number of an axis is not 0; whoever loads the URDF says what is none."""
+    """Return whether a number of an axis is not 0; the URDF loader reports invalid ones."""
     try:
         return float(text) != 0
     except ValueError:
@@ -169,10 +169,10 @@ def _may_turn(text: str) -> bool:
 
 
 def find_arm(tree: Tree, source: str, tip: str | None = None) -> Arm:
-    """The longest series of moving joints that ends where fingers begin, or that which carries `tip`.
+    """Return the longest chain of moving joints up to the fingers, or the one that carries `tip`.
 
     Raises:
-        ConfigError: no joint moves, or none moves `tip`. UnknownName: there is no link `tip`.
+        ConfigError: no joint moves, or none moves `tip`. UnknownName: the link `tip` does not exist.
     """
     if tip is not None and tip not in tree.links:
         raise UnknownName("link", tip, tree.links)
@@ -189,7 +189,7 @@ def find_arm(tree: Tree, source: str, tip: str | None = None) -> Arm:
 
 
 def find_wrists(tree: Tree) -> list[str]:
-    """The last link of each arm that a joint moves: what moves beyond it are fingers, or nothing does."""
+    """Return the last moved link of each arm: only fingers or nothing move beyond it."""
     found = []
     for joint in tree.joints:
         finger = any(_ends_arm(tree, other.child) for other in _moving(tree, joint.parent))
@@ -203,7 +203,7 @@ def _moving(tree: Tree, link: str) -> list[Joint]:
 
 
 def _ends_arm(tree: Tree, link: str) -> bool:
-    """Whether what moves on a link are fingers: short and several, or one that is called so."""
+    """Return whether the moving parts on a link are fingers: several short ones, or one named so."""
     rigid = tree.rigid_with(link)
     moving = [joint for joint in tree.joints if joint.moves and joint.parent in rigid]
     if len(_moving(tree, link)) < LEAST_JOINTS or not moving or max(_depth(tree, j) for j in moving) > FINGER_JOINTS:
@@ -213,29 +213,29 @@ def _ends_arm(tree: Tree, link: str) -> bool:
 
 
 def _depth(tree: Tree, joint: Joint) -> int:
-    """How many joints a finger has one after the other, this the first."""
+    """Return the number of joints in a chain that starts with this one."""
     return 1 + max((_depth(tree, other) for other in tree.moving_below(joint.child)), default=0)
 
 
 def _base(tree: Tree) -> str:
-    """The root; what only holds it in a world is left out."""
+    """Return the root, without links that only fix it in a world."""
     link = tree.root
     while link not in tree.shaped and len(held := tree.on(link)) == 1 and not held[0].moves:
         link = held[0].child
     return link
 
 
-SPEED = 1.0  # of a joint whose URDF gives none [rad/s or m/s]
-TO_SPEED = 0.5  # a joint takes so long to its speed limit [s]: acceleration = velocity / 0.5
-TO_ACCELERATION = 0.05  # and so long to its acceleration limit [s]: jerk = acceleration / 0.05
-WIDEST = math.pi  # a joint that turns on and on, or farther than a full turn, is planned for within +- this [rad]
+SPEED = 1.0  # of a joint without one in the URDF [rad/s or m/s]
+TO_SPEED = 0.5  # time to the speed limit [s]: acceleration = velocity / 0.5
+TO_ACCELERATION = 0.05  # time to the acceleration limit [s]: jerk = acceleration / 0.05
+WIDEST = math.pi  # planned range of a joint with more than a full turn: +- this [rad]
 
 
 def position_range(joint: Joint) -> tuple[float, float, bool]:
-    """Lowest and highest position [rad or m] that is planned for, and whether the URDF says otherwise.
+    """Return the planned range [rad or m], and whether it is narrower than in the URDF.
 
     Raises:
-        ConfigError: a joint that has ends says not where.
+        ConfigError: a joint with limits has none in the URDF.
     """
     low, high = joint.lower, joint.upper
     if joint.kind == "continuous":
@@ -248,10 +248,10 @@ def position_range(joint: Joint) -> tuple[float, float, bool]:
 
 
 def guessed_acceleration(speed: float) -> float:
-    """[rad/s^2 or m/s^2] of a joint with such a speed limit [rad/s or m/s]."""
+    """Return the acceleration limit [rad/s^2 or m/s^2] for a speed limit [rad/s or m/s]."""
     return round(speed / TO_SPEED, 3)
 
 
 def guessed_jerk(acceleration: float) -> float:
-    """[rad/s^3 or m/s^3] of a joint with such an acceleration limit."""
+    """Return the jerk limit [rad/s^3 or m/s^3] for an acceleration limit."""
     return round(acceleration / TO_ACCELERATION, 2)

@@ -144,28 +144,37 @@ def compare(
             found.faults.append(f"{_named(geometry, hit)}: not free, coal has {least:g} m more than the margin")
         if hit < 0:
             free.append(q)
-    for _ in range(edges if len(free) > 1 else 0):
-        i, j = rng.choice(len(free), 2, replace=False)
-        span = (free[j] - free[i]) * rng.uniform() ** 2
-        bend, twist = rng.normal(size=(2, len(span))) * rng.choice([0.0, 0.3]) * np.linalg.norm(span)
-        cubic = np.array([free[i], span - bend - twist, bend, twist])
-        if bend.any():
-            hit, at = kernel.cubics_collision(cubic[None])
-        else:
-            hit, at = kernel.edge_collision(free[i], free[i] + span)
-        if hit >= 0:
-            found.blocked_edges += 1
-            least = float(oracle.distances(at ** np.arange(4) @ cubic)[hit]) - margin
-            if least > 1e-5:
-                found.faults.append(f"{_named(geometry, hit)}: edge not free where coal has {least:g} m to spare")
-            continue
-        found.free_edges += 1
-        for share in rng.uniform(size=samples):
-            truth = oracle.distances(share ** np.arange(4) @ cubic)
-            if truth.min(initial=np.inf) - margin < -DEPTH:
-                where = _named(geometry, int(truth.argmin()))
-                found.faults.append(f"{where}: edge free, coal has {truth.min():g} m at {share:.6f}")
+    if len(free) > 1:
+        for _ in range(edges):
+            _compare_edge(kernel, oracle, geometry, free, rng, samples, margin, found)
     return found
+
+
+def _compare_edge(
+    kernel: KernelWorld, oracle: Oracle, geometry: pin.GeometryModel, free: list[Array], rng: np.random.Generator,
+    samples: int, margin: float, found: Comparison,
+) -> None:
+    """Compare both on an edge or cubic between two of the free positions."""
+    i, j = rng.choice(len(free), 2, replace=False)
+    span = (free[j] - free[i]) * rng.uniform() ** 2
+    bend, twist = rng.normal(size=(2, len(span))) * rng.choice([0.0, 0.3]) * np.linalg.norm(span)
+    cubic = np.array([free[i], span - bend - twist, bend, twist])
+    if bend.any():
+        hit, at = kernel.cubics_collision(cubic[None])
+    else:
+        hit, at = kernel.edge_collision(free[i], free[i] + span)
+    if hit >= 0:
+        found.blocked_edges += 1
+        least = float(oracle.distances(at ** np.arange(4) @ cubic)[hit]) - margin
+        if least > 1e-5:
+            found.faults.append(f"{_named(geometry, hit)}: edge not free where coal has {least:g} m to spare")
+        return
+    found.free_edges += 1
+    for share in rng.uniform(size=samples):
+        truth = oracle.distances(share ** np.arange(4) @ cubic)
+        if truth.min(initial=np.inf) - margin < -DEPTH:
+            where = _named(geometry, int(truth.argmin()))
+            found.faults.append(f"{where}: edge free, coal has {truth.min():g} m at {share:.6f}")
 
 
 def _named(geometry: pin.GeometryModel, index: int) -> str:

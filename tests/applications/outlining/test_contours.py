@@ -54,7 +54,7 @@ def test_default_sees_every_object_and_nothing_else(name):
     assert not any(c.touches_border for c in contours)
 
 
-def test_hole_of_a_ring_as_thin_as_a_pixel_is_told():
+def test_hole_of_a_ring_one_pixel_thin_is_detected():
     seen = picture()
     for u, v in ((50, 49), (49, 50), (51, 50), (50, 51)):
         seen[v, u] = RED
@@ -63,7 +63,7 @@ def test_hole_of_a_ring_as_thin_as_a_pixel_is_told():
 
 
 @pytest.mark.parametrize("spots", ["small ones", "rings, each in another"])
-def test_of_more_contours_than_a_message_has_room_for_the_largest_are_told(spots):
+def test_largest_contours_are_sent_when_there_are_too_many(spots):
     seen = picture((4, 4, 40, 30, BLUE), size=(1400, 1500))
     if spots == "small ones":
         seen[60::6, 60::6] = RED
@@ -71,32 +71,32 @@ def test_of_more_contours_than_a_message_has_room_for_the_largest_are_told(spots
         for at in range(60, 700, 4):
             cv2.rectangle(seen, (at, at), (1499 - at, 1399 - at), RED)
     found = find_contours(seen, SEED)
-    told = decode(Contours, encode(Contours(header=Header(), width=1500, height=1400, contours=found)))
-    assert 10 < len(told.contours) <= 1000
+    decoded = decode(Contours, encode(Contours(header=Header(), width=1500, height=1400, contours=found)))
+    assert 10 < len(decoded.contours) <= 1000
     assert all(is_hole(found, each.index) == (colour_name(each.color) == "black") for each in found)
     assert choose(found, OutlineSelect(rule="colour", colour="blue")).area == 39 * 29
 
 
-@pytest.mark.parametrize("told, problem", [
+@pytest.mark.parametrize("tree, problem", [
     ([(0, -1, 2)], "contour 2 is selected, of 1"), ([(0, -1, -2)], "contour -2 is selected"),
     ([(1, -1, 0)], "indices"), ([(0, 3, 0)], "within 3"), ([(0, -2, 0)], "within -2"), ([(0, 0, 0)], "within 0"),
     ([(0, 1, 0), (1, 2, 0), (2, 1, 0)], "contour 0 lies within 1"),
 ])
-def test_contours_that_do_not_fit_together_are_refused(told, problem):
-    contours = [{"index": index, "label": "a", "pixels": [(1.0, 1.0)], "parent": parent} for index, parent, _ in told]
-    message = {"header": {}, "width": 4, "height": 4, "contours": contours, "selected": told[0][2]}
+def test_inconsistent_contours_are_rejected(tree, problem):
+    contours = [{"index": index, "label": "a", "pixels": [(1.0, 1.0)], "parent": parent} for index, parent, _ in tree]
+    message = {"header": {}, "width": 4, "height": 4, "contours": contours, "selected": tree[0][2]}
     with pytest.raises(DecodeError, match=problem):
         decode(Contours, msgpack.packb(message))
 
 
 @pytest.mark.parametrize("channel, seen", [("grey", ["green"]), ("maximum", ["blue", "green", "red"])])
-def test_other_channels_see_what_they_see_and_the_ground_at_the_border(channel, seen):
+def test_maximum_and_grey_channels_also_see_the_ground_at_the_border(channel, seen):
     contours = find_contours(seen_world("w5")[1], ContourOptions(channel=channel, subpixel=False))
     assert sorted(colour_name(c.color) for c in contours if not c.touches_border) == seen
     assert {colour_name(c.color) for c in contours if c.touches_border} == {"grey"}
 
 
-def test_pixels_are_those_along_the_edge_of_the_object_each_once_and_next_to_the_one_before():
+def test_contour_pixels_are_unique_connected_and_on_the_edge():
     contour, = find_contours(picture((10, 20, 30, 12, YELLOW)), SEED)
     edge = {(u, v) for u in range(10, 40) for v in range(20, 32) if u in (10, 39) or v in (20, 31)}
     assert set(contour.pixels) == edge and len(contour.pixels) == len(edge)
@@ -172,7 +172,7 @@ def outlined(shape, noise):
 
 
 @pytest.mark.parametrize(("shape", "turns"), [(box(120, 80), 45), (wheel(70), 80)])
-def test_noise_of_the_picture_is_evened_out_and_corners_stay_sharp(shape, turns, monkeypatch):
+def test_image_noise_is_smoothed_and_corners_stay_sharp(shape, turns, monkeypatch):
     even, off = outlined(shape, 12.0)
     assert off.mean() < 0.08 and off.max() < 0.6
     assert len(simplified(even, 0.2)) < turns, "an outline that zigzags is not followed at an even speed"
@@ -184,7 +184,7 @@ def test_noise_of_the_picture_is_evened_out_and_corners_stay_sharp(shape, turns,
 @pytest.mark.parametrize("shape", [box(120, 80), box(14, 14), box(20, 12), wheel(70), wheel(60, 40), wheel(60, 24),
                                    wheel(60, 20, 1.0), wheel(60, 25, 0.3),
                                    wheel(70, 24, 0.5, square), wheel(70, 16, 0.3, square)])
-def test_without_noise_a_contour_stays_as_it_is_and_with_it_details_do(shape, monkeypatch):
+def test_clean_contours_and_details_in_noise_stay_unchanged(shape, monkeypatch):
     clean, _ = outlined(shape, 0.0)
     _, off = outlined(shape, 12.0)
     monkeypatch.setattr("applications.outlining.contours.SHORTEST", np.inf)
@@ -192,7 +192,7 @@ def test_without_noise_a_contour_stays_as_it_is_and_with_it_details_do(shape, mo
     assert off.mean() < 1.1 * outlined(shape, 12.0)[1].mean()
 
 
-def test_contour_that_is_too_short_to_be_evened_out_stays_as_it_is():
+def test_short_contour_is_not_smoothed():
     few = np.random.default_rng(0).normal(0, 5, (SHORTEST - 1, 2))
     assert smoothed(few) is few
 
@@ -208,21 +208,21 @@ def test_normals_point_out_of_the_object_at_its_edge_and_into_a_hole():
 
 
 @given(share=st.floats(0, 1), ground=st.integers(0, 178))
-def test_every_channel_grows_evenly_with_the_part_of_a_pixel_that_is_covered(share, ground):
+def test_every_channel_is_linear_in_the_covered_part_of_a_pixel(share, ground):
     for channel in ("grey", "maximum", "saturation"):
         ends = [float(channel_of(np.full((1, 1, 3), c, np.uint8), channel)[0, 0]) for c in (ground, YELLOW)]
         mixed = np.rint(share * np.array(YELLOW) + (1 - share) * ground).astype(np.uint8)[None, None]
         assert float(channel_of(mixed, channel)[0, 0]) == pytest.approx(ends[0] + share * (ends[1] - ends[0]), abs=2)
 
 
-def test_an_empty_picture_has_no_contour_and_auto_says_so():
+def test_empty_image_has_no_contour_to_select():
     assert find_contours(picture(), ContourOptions()) == []
     with pytest.raises(NoSuchContour, match="the picture has no contour"):
         choose([], OutlineSelect())
     assert described([]) == "none"
 
 
-def test_auto_takes_the_largest_that_does_not_touch_the_border():
+def test_auto_selects_the_largest_contour_off_the_border():
     contours = find_contours(picture((0, 0, 80, 80, RED), (100, 20, 20, 20, BLUE), (100, 60, 30, 30, GREEN)), SEED)
     assert colour_name(choose(contours, OutlineSelect()).color) == "green"
     assert colour_name(choose(contours, OutlineSelect(rule="colour", colour="Blue")).color) == "blue"
@@ -238,7 +238,7 @@ def test_auto_takes_the_largest_that_does_not_touch_the_border():
     (OutlineSelect(rule="colour", colour="green"), r"no green contour; choices: 0 \(Object_0, red\)"),
     (OutlineSelect(rule="colour", colour="beige"), "'beige' is no colour; choices: red, orange"),
 ])
-def test_what_is_not_there_is_refused_with_the_choices(wanted, said):
+def test_missing_contour_is_rejected_with_the_choices(wanted, said):
     contours = find_contours(picture((20, 20, 30, 30, RED)), SEED)
     with pytest.raises(NoSuchContour, match=said):
         choose(contours, wanted)
@@ -246,12 +246,12 @@ def test_what_is_not_there_is_refused_with_the_choices(wanted, said):
 
 @pytest.mark.parametrize("text, rule, value", [
     ("auto", "auto", None), (3, "index", 3), ("3", "index", 3), ("Object_2", "index", 2), ("gray", "colour", "gray")])
-def test_words_stand_for_choices(text, rule, value):
+def test_text_is_parsed_to_a_selection(text, rule, value):
     wanted = parse_choice(text)
     assert wanted.rule == rule and value in (None, wanted.index, wanted.colour)
 
 
-def test_no_word_is_no_choice_and_nonsense_is_refused():
+def test_empty_text_selects_nothing_and_nonsense_is_rejected():
     assert parse_choice("none") is parse_choice("") is None
     with pytest.raises(NoSuchContour, match="choices: none, auto, an index, red"):
         parse_choice("largest")
@@ -260,11 +260,11 @@ def test_no_word_is_no_choice_and_nonsense_is_refused():
 @pytest.mark.parametrize("rgb, name", [
     ((1, 1, 0), "yellow"), ((1, 0, 0), "red"), ((0, 1, 0), "green"), ((0, 0, 1), "blue"), ((0, 0, 0), "black"),
     ((1, 1, 1), "white"), ((0.7, 0.7, 0.7), "grey"), ((1, 0, 0.05), "red"), ((1, 0.5, 0), "orange")])
-def test_colours_have_the_names_people_give_them(rgb, name):
+def test_colors_have_their_common_names(rgb, name):
     assert colour_name(Color(r=rgb[0], g=rgb[1], b=rgb[2])) == name and name in NAMES
 
 
-def test_the_chosen_object_is_followed_and_not_exchanged_for_another():
+def test_selected_object_is_followed_and_not_replaced():
     here = find_contours(picture((20, 20, 30, 30, RED), (80, 60, 20, 20, BLUE)), SEED)
     following = ContourTracker(OutlineSelect())
     chosen, said = following.find(here)
@@ -276,7 +276,7 @@ def test_the_chosen_object_is_followed_and_not_exchanged_for_another():
     assert colour_name(moved[following.find(moved)[0]].color) == "red"
 
 
-def test_a_choice_that_can_not_be_is_tried_again_and_a_refused_one_changes_nothing():
+def test_selection_without_match_is_retried_and_a_rejected_one_changes_nothing():
     following = ContourTracker(OutlineSelect(rule="colour", colour="blue"))
     assert following.find(find_contours(picture((20, 20, 30, 30, RED)), SEED))[0] == -1
     both = find_contours(picture((20, 20, 30, 30, RED), (80, 60, 20, 20, BLUE)), SEED)
@@ -287,7 +287,7 @@ def test_a_choice_that_can_not_be_is_tried_again_and_a_refused_one_changes_nothi
     assert ContourTracker(None).find(both) == (-1, f"no object is chosen; choices: {described(both)}")
 
 
-def test_annotation_draws_the_chosen_contour_and_leaves_the_picture_alone():
+def test_annotation_draws_the_selected_contour_on_a_copy():
     drawn = picture((20, 20, 60, 60, RED), (100, 60, 20, 20, BLUE))
     before = drawn.copy()
     contours = find_contours(drawn, SEED)

@@ -16,7 +16,7 @@ def square(index: int, u: float, v: float, side: float) -> Contour:
     return Contour(index=index, label=f"Object_{index}", pixels=pixels, area=side**2)
 
 
-def test_object_that_the_arm_hid_bit_by_bit_is_found_again_when_it_is_whole() -> None:
+def test_gradually_occluded_object_is_found_again() -> None:
     whole = square(0, 100, 100, 100)
     following = ContourTracker(OutlineSelect())
     assert following.find([whole]) == (0, "")
@@ -27,17 +27,17 @@ def test_object_that_the_arm_hid_bit_by_bit_is_found_again_when_it_is_whole() ->
     assert following.find([square(0, 400, 400, 30), square(1, 100, 100, 100)]) == (1, "")
 
 
-@pytest.mark.parametrize(("by_person", "found"), [(False, (1, "")), (True, (-1, "Object_0 is not seen any more"))])
-def test_part_that_was_chosen_by_itself_while_the_arm_hid_the_rest_becomes_the_whole(by_person, found) -> None:
+@pytest.mark.parametrize(("by_operator", "found"), [(False, (1, "")), (True, (-1, "Object_0 is not seen any more"))])
+def test_automatically_selected_part_is_replaced_by_the_complete_object(by_operator, found) -> None:
     part, others = square(0, 110, 110, 20), [square(0, 300, 100, 200), square(1, 100, 100, 100)]
     following = ContourTracker(OutlineSelect())
     assert following.find([part]) == (0, "")
-    if by_person:
+    if by_operator:
         following.select([part], OutlineSelect())
     assert following.find([square(0, 300, 100, 200)])[0] == -1
     index, why = following.find(others)
     assert (index, why[:len(found[1])]) == found
-    assert following.find([square(0, 110, 110, 90), square(1, 300, 100, 200)])[0] == (-1 if by_person else 0)
+    assert following.find([square(0, 110, 110, 90), square(1, 300, 100, 200)])[0] == (-1 if by_operator else 0)
 
 
 def drawn(*boxes: tuple[int, int, int, int, tuple[int, int, int]]) -> list[Contour]:
@@ -53,7 +53,7 @@ FRAME = [(0, 50, 400, 380, RED), (50, 100, 300, 280, GREY)]
 
 
 @pytest.mark.parametrize("inner", [(150, 180, 100, 100, RED), (60, 110, 280, 260, RED)], ids=["small", "large"])
-def test_hole_in_which_the_chosen_object_lay_is_not_taken_for_it(inner: tuple[int, int, int, int, Any]) -> None:
+def test_surrounding_hole_does_not_replace_the_selected_object(inner: tuple[int, int, int, int, Any]) -> None:
     following = ContourTracker(OutlineSelect())
     assert following.find(drawn(*FRAME, inner)) == (2, "")
     assert following.find(drawn(*FRAME))[0] == -1
@@ -61,7 +61,7 @@ def test_hole_in_which_the_chosen_object_lay_is_not_taken_for_it(inner: tuple[in
 
 
 @pytest.mark.parametrize("arm", [200, 130], ids=["much", "little"])
-def test_object_that_goes_on_outside_of_the_picture_is_not_chosen_when_the_arm_hid_that(arm: int) -> None:
+def test_object_cut_off_by_the_border_does_not_replace_the_selected_one(arm: int) -> None:
     whole = (0, 100, 300, 100, RED)
     following = ContourTracker(OutlineSelect())
     assert following.find(drawn(whole, (0, 100, arm, 100, GREY))) == (0, "")
@@ -72,7 +72,7 @@ def test_object_that_goes_on_outside_of_the_picture_is_not_chosen_when_the_arm_h
 
 
 @pytest.mark.parametrize("size", [60, 160])
-def test_object_of_another_colour_in_its_place_is_not_the_chosen_one(size: int) -> None:
+def test_object_of_another_color_does_not_replace_the_selected_one(size: int) -> None:
     following = ContourTracker(OutlineSelect(rule="colour", colour="red"))
     red, green = ((230 - s // 2, 230 - s // 2, s, s, colour) for s, colour in ((60, RED), (size, GREEN)))
     assert following.find(drawn(red)) == (0, "")
@@ -80,7 +80,7 @@ def test_object_of_another_colour_in_its_place_is_not_the_chosen_one(size: int) 
     assert following.find(drawn(red)) == (0, "")
 
 
-def test_what_was_seen_somewhere_is_chosen_there_however_the_newest_picture_counts() -> None:
+def test_selection_by_position_is_independent_of_the_numbering() -> None:
     seen = [square(0, 100, 300, 50), square(1, 400, 100, 50)]
     now = [square(0, 300, 400, 50), square(1, 101, 300, 50), square(2, 400, 100, 50)]
     following = ContourTracker(None)
@@ -91,14 +91,14 @@ def test_what_was_seen_somewhere_is_chosen_there_however_the_newest_picture_coun
         following.select(now[:2], OutlineSelect(rule="index", index=1, at=middle_of(seen[1])))
 
 
-def test_of_an_object_and_the_hole_in_its_middle_the_one_of_that_number_is_chosen() -> None:
+def test_index_distinguishes_an_object_from_its_central_hole() -> None:
     contours = [square(0, 100, 100, 100), square(1, 130, 131, 40)]
     for contour in contours:
         choice = OutlineSelect(rule="index", index=contour.index, at=middle_of(contour))
         assert ContourTracker(None).select(contours, choice) is contour
 
 
-def test_object_that_moves_and_grows_slowly_stays_chosen() -> None:
+def test_slowly_changing_object_stays_selected() -> None:
     following = ContourTracker(OutlineSelect())
     following.find([square(0, 100, 100, 50)])
     for step in range(1, 12):

@@ -12,42 +12,42 @@ MILLIMETRES = arrays(float, st.tuples(st.integers(1, 40), st.just(3)), elements=
 
 
 @given(points=MILLIMETRES)
-def test_no_point_equals_the_one_before_it_all_the_way_round(points):
-    kept = without_duplicates(points)
-    assert {tuple(p) for p in kept} == {tuple(p) for p in points}
-    if len(kept) > 1:
-        assert (np.abs(kept - np.roll(kept, 1, axis=0)).max(axis=1) > 0).all()
+def test_no_consecutive_points_are_equal(points):
+    remaining = without_duplicates(points)
+    assert {tuple(p) for p in remaining} == {tuple(p) for p in points}
+    if len(remaining) > 1:
+        assert (np.abs(remaining - np.roll(remaining, 1, axis=0)).max(axis=1) > 0).all()
 
 
-def test_points_that_come_again_later_are_kept():
+def test_points_repeated_later_remain():
     eight = np.array([[0, 0], [1, 1], [0, 2], [-1, 1], [0, 0], [1, -1], [0, -2]], float)
     np.testing.assert_array_equal(without_duplicates(eight), eight)
     np.testing.assert_array_equal(without_duplicates([[0, 0], [0, 0], [1, 0], [1, 0], [0, 0]]), [[0, 0], [1, 0]])
 
 
 @given(seed=st.integers(0, 10**6), tolerance=st.sampled_from([1e-5, 1e-4, 1e-3]))
-def test_simplified_outline_stays_within_the_tolerance_and_begins_where_it_began(seed, tolerance):
+def test_simplified_outline_stays_within_tolerance_with_the_same_first_point(seed, tolerance):
     rng = np.random.default_rng(seed)
     angles = np.linspace(0, 2 * np.pi, 150, endpoint=False)
     radius = 0.05 + rng.normal(0, tolerance / 2, 150) + 0.01 * np.sin(rng.integers(1, 5) * angles)
     points = np.column_stack([radius * np.cos(angles), radius * np.sin(angles)])
-    kept = simplified(points, tolerance)
-    assert distances(points, kept).max() <= tolerance + 1e-12
-    assert distances(dense(kept, 1e-3), points).max() <= tolerance + 1e-12
-    np.testing.assert_array_equal(kept[0], points[0])
-    assert len(kept) <= len(points)
+    remaining = simplified(points, tolerance)
+    assert distances(points, remaining).max() <= tolerance + 1e-12
+    assert distances(dense(remaining, 1e-3), points).max() <= tolerance + 1e-12
+    np.testing.assert_array_equal(remaining[0], points[0])
+    assert len(remaining) <= len(points)
 
 
-def test_corners_of_a_square_are_all_that_is_needed():
+def test_square_is_reduced_to_its_corners():
     side = np.linspace(0, 0.1, 50, endpoint=False)
     square = np.vstack([np.column_stack(pair) for pair in (
         (side, 0 * side), (0.1 + 0 * side, side), (0.1 - side, 0.1 + 0 * side), (0 * side, 0.1 - side))])
-    kept = simplified(square, 5e-5)
-    np.testing.assert_allclose(kept, [[0, 0], [0.1, 0], [0.1, 0.1], [0, 0.1]], atol=1e-12)
+    remaining = simplified(square, 5e-5)
+    np.testing.assert_allclose(remaining, [[0, 0], [0.1, 0], [0.1, 0.1], [0, 0.1]], atol=1e-12)
     assert simplified(square, 0.0) is square
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 3])
-def test_few_points_are_left_as_they_are(count):
+def test_few_points_stay_unchanged(count):
     points = np.arange(3.0 * count).reshape(count, 3)
     np.testing.assert_array_equal(simplified(without_duplicates(points), 1.0), points)

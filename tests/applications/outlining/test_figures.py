@@ -69,7 +69,7 @@ def traced(standoff: float = 0.0, off: float = 0.0, there: m.WorldObjects | None
     return follower
 
 
-def test_only_places_while_it_traced_count_and_are_on_the_outline() -> None:
+def test_only_joint_states_while_tracing_count() -> None:
     figures = traced().figures()
     assert figures["object"] == "Object_1" and figures["closed"] and figures["fraction"] == 1.0
     assert (figures["points"], figures["length_m"]) == (4, 0.4)
@@ -78,13 +78,13 @@ def test_only_places_while_it_traced_count_and_are_on_the_outline() -> None:
     json.dumps(figures)
 
 
-def test_tool_that_is_off_by_a_millimetre_is_a_millimetre_off() -> None:
+def test_tool_offset_of_one_millimeter_is_measured() -> None:
     figures = traced(off=0.001).figures()
     assert figures["deviation_mm"]["mean"] == pytest.approx(1.0, abs=0.02)
     assert figures["tracking_mm"]["max"] == pytest.approx(1.0, abs=0.02)
 
 
-def test_contour_that_is_off_counts_against_the_truth_and_not_as_tracking() -> None:
+def test_contour_error_is_deviation_not_tracking() -> None:
     figures = traced(there=truth(shift=0.002)).figures()
     assert figures["deviation_mm"]["max"] == pytest.approx(2.0, abs=0.03)
     assert figures["tracking_mm"]["max"] < 0.02
@@ -100,7 +100,7 @@ def test_inner_edge_of_a_ring_is_compared_with_the_edge_of_its_hole() -> None:
     assert traced(there=m.WorldObjects(objects=[ring])).figures()["deviation_mm"]["max"] < 0.02
 
 
-def test_object_that_is_moved_once_the_arm_approaches_was_traced_where_it_lay() -> None:
+def test_object_moved_after_the_approach_is_evaluated_at_its_old_position() -> None:
     follower = traced()
     follower.on_truth(truth(shift=0.05))
     assert follower.figures()["deviation_mm"]["max"] < 0.02
@@ -112,8 +112,8 @@ def test_outline_that_ends_elsewhere_is_not_closed() -> None:
     assert not follower.figures()["closed"]
 
 
-def test_outline_whose_first_moments_nobody_heard_is_closed_where_the_speed_allows_it() -> None:
-    def heard(missing: float, end: float) -> bool:
+def test_outline_with_lost_first_joint_states_counts_as_closed_within_speed() -> None:
+    def is_closed(missing: float, end: float) -> bool:
         """Whether a square that is traced at 0.05 m/s until `end` [s] counts as closed without its first states."""
         follower, second = TraceEvaluation(CELL.robot), 1_000_000_000
         follower.on_path(path())
@@ -127,11 +127,11 @@ def test_outline_whose_first_moments_nobody_heard_is_closed_where_the_speed_allo
         follower.on_status(status("RETREATING", second + int(8 * second), closed=True))
         return bool(follower.figures()["closed"])
 
-    assert heard(0.0, 8.0) and heard(1.0, 8.0)
-    assert not heard(0.0, 4.0)
+    assert is_closed(0.0, 8.0) and is_closed(1.0, 8.0)
+    assert not is_closed(0.0, 4.0)
 
 
-def test_nothing_traced_and_no_truth_give_no_deviation() -> None:
+def test_no_deviation_without_trace_or_truth() -> None:
     empty = TraceEvaluation(CELL.robot).figures()
     assert (empty["deviation_mm"], empty["tracking_mm"], empty["closed"], empty["object"]) == (None, None, False, "")
     follower = traced(there=m.WorldObjects())
@@ -139,7 +139,7 @@ def test_nothing_traced_and_no_truth_give_no_deviation() -> None:
     assert follower.figures()["tracking_mm"] is not None
 
 
-def test_distance_from_a_closed_polyline_counts_its_last_side_too() -> None:
+def test_distance_includes_the_closing_side_of_a_polyline() -> None:
     square = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)], dtype=float)
     places = np.array([(0.5, 0, 0), (0, 0.5, 0), (0.5, 0.4, 0), (2, 2, 0), (0.5, 1, 0.3)])
     assert np.allclose(distances(places, square), [0, 0, 0.4, math.sqrt(2), 0.3])
@@ -150,15 +150,15 @@ def test_progress_of_an_outline_in_one_line() -> None:
     assert OutlineFigures().progress(OutlineStatus(started=True, state="SELECTING")) == "SELECTING"
 
 
-def test_without_its_robot_what_the_task_tells_is_all_that_is_known() -> None:
-    told = OutlineFigures()
-    told.listeners()[OUTLINE_STATUS](0.0, status("DONE", 1, closed=True, fraction=0.75))
-    outline = told.blocks()["outline"]
+def test_without_a_robot_only_task_figures_are_known() -> None:
+    figures = OutlineFigures()
+    figures.listeners()[OUTLINE_STATUS](0.0, status("DONE", 1, closed=True, fraction=0.75))
+    outline = figures.blocks()["outline"]
     assert outline["object"] == "Object_1" and outline["closed"] and outline["fraction"] == 0.75
     assert outline["deviation_mm"] is None and outline["tracking_mm"] is None
 
 
-def test_an_outline_that_a_file_gave_is_no_picture() -> None:
+def test_outline_from_a_file_has_no_image_stamp() -> None:
     assert OutlineFigures().exposed(path(stamp=5)) == 5
     assert OutlineFigures().exposed(path(stamp=5).model_copy(update={"given": True})) == 0
 
@@ -191,7 +191,7 @@ async def test_collector_follows_an_outline_to_its_end() -> None:
     assert describe(figures, fold.figures)[0].startswith("test: DONE, Object_1 outlined: 100.0% of 0.400 m, 0.0")
 
 
-def test_trace_that_was_interrupted_counts_as_far_as_it_went_however_much_was_planned() -> None:
+def test_interrupted_trace_counts_its_traced_fraction() -> None:
     follower = TraceEvaluation(CELL.robot)
     follower.on_path(path())
     follower.on_status(status("TRACING", 20))

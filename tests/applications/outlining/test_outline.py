@@ -22,7 +22,7 @@ from tests.applications.outlining.outline_double import (
 WHOLE = ["approach", "descend", "trace", "retreat", "home"]
 
 
-def test_chosen_contour_is_traced_and_the_arm_goes_home() -> None:
+def test_selected_contour_is_traced_and_the_arm_goes_home() -> None:
     cell = OutlineDouble()
     cell.until("DONE")
     assert cell.moves() == WHOLE
@@ -43,14 +43,14 @@ def test_nothing_moves_before_everything_is_planned_and_the_fingers_are_closed()
     assert kinds.index(m.GripperCommand) < kinds.index(m.ExecuteRequest)
 
 
-def test_fingers_that_are_closed_are_left_alone() -> None:
+def test_closed_fingers_are_not_commanded() -> None:
     cell = OutlineDouble()
     cell.gripper = m.GripperState(width=0.0)
     cell.until("DONE")
     assert not [r for r in cell.requests if isinstance(r, m.GripperCommand)]
 
 
-def test_path_is_closed_and_keeps_tool_standoff_and_speed() -> None:
+def test_path_is_closed_with_standoff_and_tool_speed() -> None:
     cell = OutlineDouble(standoff=0.005, tool_speed=0.03, step=0.002)
     cell.until("DONE")
     goal = next(r.goal for r in cell.plans() if r.stage == "trace")
@@ -66,7 +66,7 @@ def test_path_is_closed_and_keeps_tool_standoff_and_speed() -> None:
 @pytest.mark.parametrize("path", [
     outline_of(5000 * SQUARE, 0), outline_of(SQUARE, 0).model_copy(update={
         "poses": [m.Pose(position=m.Vector3(x=0.5, z=1e7))] * 4})], ids=["too long to be closed", "too far away"])
-def test_path_along_which_no_motion_can_be_asked_for_is_an_error_of_the_task(path: OutlinePoints) -> None:
+def test_path_too_long_for_a_request_ends_in_error(path: OutlinePoints) -> None:
     cell = OutlineDouble()
     cell.path = path.model_copy(update={"given": True})
     cell.until("ERROR")
@@ -79,7 +79,7 @@ def test_each_motion_is_planned_from_where_the_one_before_ends() -> None:
     assert [r.start for r in cell.plans()] == [[], AWAY, AWAY, AWAY, AWAY]
 
 
-def test_only_finger_tips_may_touch_and_only_what_is_traced() -> None:
+def test_only_fingers_may_touch_and_only_the_traced_object() -> None:
     cell = OutlineDouble()
     cell.until("DONE")
     assert ROBOT.gripper is not None
@@ -96,7 +96,7 @@ def test_inner_edge_of_a_hole_is_traced_touching_the_solid_around_it() -> None:
     assert {name for _, name in trace.allowed_collisions} == {"Object_0"}
 
 
-def test_path_that_was_given_need_not_go_round_anything() -> None:
+def test_path_from_a_file_need_not_surround_an_object() -> None:
     cell = OutlineDouble()
     assert cell.path is not None
     away = outline_of([(0.5, -0.3), (0.52, -0.3), (0.5, -0.28)], 0, "a.json")
@@ -110,7 +110,7 @@ def test_path_that_was_given_need_not_go_round_anything() -> None:
 
 
 @pytest.mark.parametrize("stage", ["approach", "descend", "trace", "retreat", "home"])
-def test_way_that_can_not_be_planned_ends_in_error_before_the_arm_moves(stage: str) -> None:
+def test_impossible_motion_ends_in_error_before_the_arm_moves(stage: str) -> None:
     cell = OutlineDouble()
     cell.unplannable = lambda r: "no_ik" if r.stage == stage else ""
     cell.until("ERROR")
@@ -121,7 +121,7 @@ def test_way_that_can_not_be_planned_ends_in_error_before_the_arm_moves(stage: s
         assert cell.status.fraction == 0.5
 
 
-def test_object_that_got_another_name_while_motions_were_planned_is_traced_under_that_name() -> None:
+def test_object_renamed_during_planning_is_traced_under_the_new_name() -> None:
     double = OutlineDouble()
 
     def collides(request: m.PlanRequest) -> str:
@@ -138,7 +138,7 @@ def test_object_that_got_another_name_while_motions_were_planned_is_traced_under
     assert (double.status.state, double.status.subject, double.status.failures) == ("DONE", "Object_7", 1)
 
 
-def test_objects_that_changed_their_names_while_motions_were_planned_are_told_apart_by_where_they_are() -> None:
+def test_objects_that_swap_names_during_planning_are_identified_by_position() -> None:
     double = OutlineDouble()
 
     def collides(request: m.PlanRequest) -> str:
@@ -156,12 +156,12 @@ def test_objects_that_changed_their_names_while_motions_were_planned_are_told_ap
 
 
 def moved(double: OutlineDouble, dy: float) -> None:
-    """The object stands elsewhere from now on."""
+    """Move the object."""
     double.objects[0] = prism("Object_1", 0.5, dy, 0.05)
     double.path = outline_of([(x, y + dy) for x, y in SQUARE], double.stamp)
 
 
-def test_object_that_was_moved_while_its_motions_were_planned_is_traced_where_it_is() -> None:
+def test_object_moved_during_planning_is_traced_at_its_new_position() -> None:
     double = OutlineDouble()
     double.unplannable = lambda request: (request.stage == "home" and moved(double, -0.2)) or ""
     double.until("DONE", "ERROR")
@@ -171,7 +171,7 @@ def test_object_that_was_moved_while_its_motions_were_planned_is_traced_where_it
     assert double.status.state == "DONE" and double.status.failures == 1
 
 
-def test_object_that_was_taken_away_while_its_motions_were_planned_is_not_traced_in_the_air() -> None:
+def test_object_removed_during_planning_is_not_traced() -> None:
     double = OutlineDouble()
 
     def taken(request: m.PlanRequest) -> str:
@@ -186,7 +186,7 @@ def test_object_that_was_taken_away_while_its_motions_were_planned_is_not_traced
     assert double.status.message == "Object_1 is not seen any more"
 
 
-def test_object_that_never_stands_still_ends_in_error_before_the_arm_moves() -> None:
+def test_object_that_keeps_moving_ends_in_error_before_the_arm_moves() -> None:
     double, places = OutlineDouble(), iter(range(1, 100))
     double.unplannable = lambda request: (request.stage == "home" and moved(double, 0.02 * next(places))) or ""
     double.until("DONE", "ERROR")
@@ -205,7 +205,7 @@ def test_motion_that_fails_brings_the_arm_home_and_ends_in_error() -> None:
 
 
 @pytest.mark.parametrize("stage", WHOLE)
-def test_outline_is_traced_whole_although_the_controller_was_started_again(stage: str) -> None:
+def test_outline_is_complete_after_a_controller_restart(stage: str) -> None:
     cell = OutlineDouble()
     cell.until(stage)
     cell.step()
@@ -219,7 +219,7 @@ def test_outline_is_traced_whole_although_the_controller_was_started_again(stage
 
 
 @pytest.mark.parametrize("stage", WHOLE)
-def test_outline_is_traced_whole_although_the_controller_was_started_again_before_it_answered(stage: str) -> None:
+def test_outline_is_complete_after_a_controller_restart_before_its_answer(stage: str) -> None:
     cell = OutlineDouble()
     cell.unanswered = stage
     cell.until("DONE")
@@ -227,7 +227,7 @@ def test_outline_is_traced_whole_although_the_controller_was_started_again_befor
     assert cell.status.closed and cell.status.failures == 1 and cell.q == HOME
 
 
-def test_controller_that_is_started_again_and_again_is_given_up() -> None:
+def test_repeated_controller_restarts_end_in_error() -> None:
     cell = OutlineDouble()
     for _ in range(100):
         cell.step()
@@ -239,7 +239,7 @@ def test_controller_that_is_started_again_and_again_is_given_up() -> None:
     assert len(cell.moves()) == MOST_FORGOTTEN + 2
 
 
-def test_arm_that_stands_against_something_is_freed_from_it() -> None:
+def test_arm_in_contact_is_freed() -> None:
     cell = OutlineDouble()
     cell.abort = "trace"
     pair = ("robotiq_85_base_link", "Object_2")
@@ -251,7 +251,7 @@ def test_arm_that_stands_against_something_is_freed_from_it() -> None:
     assert cell.q == HOME
 
 
-def test_arm_that_can_not_go_home_stays_and_says_so() -> None:
+def test_arm_that_cannot_go_home_stays_and_reports_it() -> None:
     cell = OutlineDouble()
     cell.abort = "trace"
     cell.unplannable = lambda r: "no_path" if "trace" in cell.moves() else ""
@@ -282,7 +282,7 @@ def test_without_a_usable_contour_it_ends_in_error_with_the_reason(path: Outline
     assert cell.requests == []
 
 
-def test_camera_that_is_started_again_costs_no_time_of_the_selection() -> None:
+def test_camera_restart_does_not_count_as_selection_time() -> None:
     cell = OutlineDouble(selection_timeout=3.0, picture_timeout=30.0)
     chosen, cell.path = cell.path, OutlinePoints(message="no object is chosen")
     cell.until("SELECTING")
@@ -298,7 +298,7 @@ def test_camera_that_is_started_again_costs_no_time_of_the_selection() -> None:
     cell.until("DONE")
 
 
-def test_selection_is_waited_for_as_long_as_it_takes_when_asked_to() -> None:
+def test_zero_timeout_waits_for_a_selection_without_limit() -> None:
     cell = OutlineDouble(selection_timeout=0.0)
     chosen, cell.path = cell.path, OutlinePoints(message="no object is chosen")
     for _ in range(500):
@@ -308,7 +308,7 @@ def test_selection_is_waited_for_as_long_as_it_takes_when_asked_to() -> None:
     cell.until("DONE")
 
 
-def test_contour_seen_before_the_arm_came_home_is_not_trusted() -> None:
+def test_contour_from_before_the_return_home_is_ignored() -> None:
     cell = OutlineDouble()
     cell.until("DONE")
     cell.camera_on = False
@@ -322,7 +322,7 @@ def test_contour_seen_before_the_arm_came_home_is_not_trusted() -> None:
     assert cell.moves() == WHOLE * 2
 
 
-def test_picture_that_is_too_old_starts_no_motion() -> None:
+def test_stale_image_starts_no_motion() -> None:
     cell = OutlineDouble(selection_timeout=0.0)
     cell.camera_on = False
     cell.now += 10
@@ -335,7 +335,7 @@ def test_picture_that_is_too_old_starts_no_motion() -> None:
     assert cell.moves() == WHOLE
 
 
-def test_camera_that_freezes_while_the_motions_are_planned_has_them_planned_anew_from_a_newer_picture() -> None:
+def test_camera_frozen_during_planning_causes_a_new_plan() -> None:
     cell = OutlineDouble(selection_timeout=0.0)
     plan, frozen = cell.unplannable, []
 
@@ -356,7 +356,7 @@ def test_camera_that_freezes_while_the_motions_are_planned_has_them_planned_anew
     assert cell.moves() == WHOLE
 
 
-def test_camera_that_stays_frozen_ends_the_task_with_that_reason() -> None:
+def test_frozen_camera_ends_the_task_with_the_reason() -> None:
     cell = OutlineDouble()
     cell.camera_on = False
     cell.now += 10
@@ -364,7 +364,7 @@ def test_camera_that_stays_frozen_ends_the_task_with_that_reason() -> None:
     assert cell.status.message == "no fresh picture" and cell.moves() == []
 
 
-def test_arm_that_is_not_at_home_at_the_start_goes_there_first() -> None:
+def test_arm_goes_home_first() -> None:
     cell = OutlineDouble()
     cell.q = list(AWAY)
     cell.until("DONE")
@@ -372,7 +372,7 @@ def test_arm_that_is_not_at_home_at_the_start_goes_there_first() -> None:
 
 
 @pytest.mark.parametrize("colliding", [None, ("base", "Object_2")])
-def test_arm_that_can_not_go_up_from_where_it_is_found_goes_home_nevertheless(
+def test_arm_that_cannot_retreat_still_goes_home(
     colliding: tuple[str, str] | None,
 ) -> None:
     cell = OutlineDouble()
@@ -383,7 +383,7 @@ def test_arm_that_can_not_go_up_from_where_it_is_found_goes_home_nevertheless(
     assert cell.status.failures == 0
 
 
-def test_motion_of_a_task_before_this_one_is_let_finish() -> None:
+def test_motion_of_an_earlier_task_process_may_finish() -> None:
     cell = OutlineDouble()
     cell.motion = m.MotionStatus(id="other", state="active")
     for _ in range(20):
@@ -393,7 +393,7 @@ def test_motion_of_a_task_before_this_one_is_let_finish() -> None:
     cell.until("DONE")
 
 
-def test_motion_stopped_from_outside_pauses_the_task() -> None:
+def test_motion_stopped_by_another_client_pauses_the_task() -> None:
     cell = OutlineDouble()
     cell.until("TRACING")
     cell.motion = cell.motion.model_copy(update={"state": "cancelled", "message": "asked to"})
@@ -402,7 +402,7 @@ def test_motion_stopped_from_outside_pauses_the_task() -> None:
     assert "resume" in cell.status.message
 
 
-def test_task_that_was_not_started_waits() -> None:
+def test_unstarted_task_waits() -> None:
     cell = OutlineDouble(started=False)
     for _ in range(20):
         cell.step()
@@ -411,7 +411,7 @@ def test_task_that_was_not_started_waits() -> None:
     cell.until("DONE")
 
 
-def test_task_that_ended_in_error_can_be_started_again() -> None:
+def test_failed_task_can_be_restarted() -> None:
     cell = OutlineDouble()
     cell.unplannable = lambda r: "no_ik"
     cell.until("ERROR")
@@ -421,31 +421,31 @@ def test_task_that_ended_in_error_can_be_started_again() -> None:
     assert cell.moves() == WHOLE
 
 
-def test_motion_that_takes_far_longer_than_planned_is_stopped() -> None:
+def test_overdue_motion_is_stopped() -> None:
     cell = OutlineDouble(overtime=2.0)
     cell.until("TRACING")
-    cell._arrival = math.inf
+    cell.arrival = math.inf
     cell.until("ERROR")
     assert [type(r) for r in cell.requests].count(m.StopRequest) == 1
     assert "took longer than 3 s" in cell.status.message
     assert cell.q == HOME
 
 
-def test_refused_motion_ends_in_error() -> None:
+def test_rejected_motion_ends_in_error() -> None:
     cell = OutlineDouble()
     cell.refuse = "approach"
     cell.until("ERROR")
     assert cell.status.message == "approach was refused: no"
 
 
-def test_nearly_whole_contour_is_done_and_not_closed() -> None:
+def test_nearly_complete_contour_is_done_and_not_closed() -> None:
     cell = OutlineDouble()
     cell.fraction = 0.995
     cell.until("DONE")
     assert (cell.status.fraction, cell.status.closed) == (0.995, False)
 
 
-def test_what_has_not_been_heard_yet_is_named() -> None:
+def test_missing_topics_are_named() -> None:
     cell = OutlineDouble()
     view = cell.view()
     view.gripper, view.q = None, None

@@ -7,7 +7,7 @@ import numpy as np
 from applications.outlining.top_face import joined
 
 
-def test_a_gap_far_longer_than_the_edge_of_the_plateau_takes_no_more_room_than_others():
+def test_very_long_gap_adds_no_more_points_than_others():
     turn = np.linspace(0, 2 * np.pi, 40, endpoint=False)
     edge = 1e-4 * np.column_stack([np.cos(turn), np.sin(turn), 0 * turn])
     far = edge + np.where(turn < np.pi, 0.0, 1.0)[:, None] * [1.0, 0.0, 0.0]

@@ -65,7 +65,7 @@ def world(name: str) -> Cell:
 
 
 @pytest.mark.parametrize("name", ["w1", "w2", "w3", "w4", "w5", "w6"])
-def test_every_world_is_outlined_from_its_picture_to_its_last_motion(name: str) -> None:
+def test_every_world_is_planned_from_image_to_last_motion(name: str) -> None:
     objects = list(world(name).world.objects)
     found = perceived(objects)
     truth = [world_object(thing) for thing in objects]
@@ -82,24 +82,24 @@ def test_object_out_of_reach_is_named_with_the_reason() -> None:
         planned(perceived([TALL]))
 
 
-def test_picture_without_an_object_has_no_outline() -> None:
+def test_image_without_an_object_has_no_outline() -> None:
     with pytest.raises(OutlineError, match="no contour"):
         perceived([])
 
 
-def test_contour_that_is_not_there_is_refused_with_the_choices() -> None:
+def test_unknown_contour_is_rejected_with_the_choices() -> None:
     with pytest.raises(OutlineError, match=r"no contour 7; choices: 0 \(Object_0, yellow\)"):
         perceived(list(CELL.world.objects), OutlineSelect(rule="index", index=7))
 
 
-def test_depth_image_without_depth_is_refused() -> None:
+def test_empty_depth_image_is_rejected() -> None:
     colour, depth = photographed(list(CELL.world.objects))
     nothing = np.full_like(depth, np.nan)
     with pytest.raises(DepthError, match="no valid depth at all"):
         perceive(colour, nothing, CAMERA, OutlineSelect(), ContourOptions(), TopFaceOptions(), 5e-5)
 
 
-def test_points_that_were_given_are_traced_wherever_they_are() -> None:
+def test_points_from_a_file_are_traced_anywhere() -> None:
     found = perceived(list(CELL.world.objects))
     moved = Perceived(found.label, found.contours, found.pixels, found.coordinates,
                       found.cleared + np.array([0.0, 0.15, 0.05]), found.solids)

@@ -1,4 +1,4 @@
-"""Choosing an object on the page: it is traced once its path is known, unless somebody stops the arm until then."""
+"""Selecting an object on the page starts its trace once the path is known, unless the arm is stopped before."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Cell:
 
     async def until(self, condition: Callable[[], bool]) -> None:
         async with asyncio.timeout(10):
-            while not condition():  # noqa: ASYNC110  # nobody tells
+            while not condition():  # noqa: ASYNC110
                 await asyncio.sleep(0)
 
     async def _select(self, _wanted: OutlineSelect) -> OutlineSelection:
@@ -74,7 +74,7 @@ async def cell() -> Cell:
 
 
 async def chosen(cell: Cell, meanwhile: Any) -> list[tuple[str, int | None]]:
-    """What the task is told when an object is chosen, something happens, and then its path is there."""
+    """Return the task commands after a selection, an event, and the arrival of the path."""
     choosing = asyncio.create_task(choose(cell.console, OutlineSelect()))
     for _ in range(50):
         await asyncio.sleep(0)
@@ -84,7 +84,7 @@ async def chosen(cell: Cell, meanwhile: Any) -> list[tuple[str, int | None]]:
     return cell.commands
 
 
-async def test_choice_lets_go_of_the_stop_that_was_there_as_it_was_made(cell: Cell) -> None:
+async def test_selection_releases_an_earlier_stop(cell: Cell) -> None:
     async def nothing() -> None:
         pass
 
@@ -92,9 +92,9 @@ async def test_choice_lets_go_of_the_stop_that_was_there_as_it_was_made(cell: Ce
 
 
 @pytest.mark.parametrize("by", ["the page", "the page, and the arm does not answer", "the command line"])
-async def test_stop_between_choice_and_path_stays_a_stop(cell: Cell, by: str) -> None:
-    told: list[str] = []
-    cell.console.tell = lambda line, _kind="bad": told.append(line)
+async def test_stop_after_the_selection_stays(cell: Cell, by: str) -> None:
+    notices: list[str] = []
+    cell.console.notify = lambda line, _kind="bad": notices.append(line)
     cell.executor_answers = by == "the page"
 
     async def stop() -> None:
@@ -108,12 +108,12 @@ async def test_stop_between_choice_and_path_stays_a_stop(cell: Cell, by: str) ->
             assert not cell.executor_answers
 
     assert [command for command, _ in await chosen(cell, stop) if command != "stop"] == []
-    assert told[-1].startswith("Object_0 is chosen, but not traced")
+    assert notices[-1].startswith("Object_0 is chosen, but not traced")
 
 
-async def test_of_two_objects_chosen_one_after_the_other_only_the_second_is_traced_and_once(cell: Cell) -> None:
-    told: list[str] = []
-    cell.console.tell = lambda line, _kind="bad": told.append(line)
+async def test_only_the_second_of_two_selections_is_traced_once(cell: Cell) -> None:
+    notices: list[str] = []
+    cell.console.notify = lambda line, _kind="bad": notices.append(line)
     cell.labels = ["Object_0", "Object_1"]
     first = asyncio.create_task(choose(cell.console, OutlineSelect()))
     await cell.until(lambda: cell.labels == ["Object_1"])
@@ -124,4 +124,4 @@ async def test_of_two_objects_chosen_one_after_the_other_only_the_second_is_trac
     cell.path.put(OutlinePoints(object="Object_0"))  # as the next picture counts
     await first
     assert cell.commands == [("start", 3)]
-    assert told[-1] == "Object_1 is chosen"
+    assert notices[-1] == "Object_1 is chosen"

@@ -13,7 +13,7 @@ def solids_of(scene, channel="saturation"):
     return perceived_solids(find_contours(picture, ContourOptions(channel=channel)), depth, camera)
 
 
-def test_every_object_of_a_picture_becomes_a_solid_of_its_place_and_height():
+def test_every_object_becomes_a_solid_with_position_and_height():
     solids = solids_of(seen_world("w5"))
     truth = [world_object(o) for o in world("w5").objects]
     assert len(solids) == len(truth)
@@ -25,22 +25,22 @@ def test_every_object_of_a_picture_becomes_a_solid_of_its_place_and_height():
         assert solid.height == pytest.approx(thing.height, abs=1e-5)
 
 
-def test_a_ring_is_one_solid_and_the_ground_is_none():
+def test_ring_is_one_solid_and_the_ground_none():
     assert len(solids_of(seen_world("w6"))) == 1
     assert len(solids_of(seen_world("w6"), "maximum")) == 1
 
 
-def test_an_object_that_leaves_the_picture_is_a_solid_as_far_as_it_is_seen():
+def test_object_at_the_border_is_a_solid_as_far_as_visible():
     thing = upright(shape="box", x=0.5, y=0.25, size=(0.06, 0.06), height=0.05)
     solid, = solids_of(seen([thing]))
     assert solid.touches_border and solid.outline[:, 1].max() < 0.27 and solid.height == pytest.approx(0.05, abs=1e-5)
 
 
 @pytest.mark.parametrize("none", [np.inf, np.finfo(np.float32).max, 1e9])
-def test_what_a_camera_says_where_it_measures_nothing_is_no_distance(none):
+def test_invalid_depth_values_are_no_distances(none):
     camera, picture, depth = seen_world("w5")
     contours = find_contours(picture, ContourOptions())
     lies_on = depth > np.nanmax(depth) - 1e-3
     bare, known = (np.where(lies_on, np.float32(value), depth) for value in (none, np.nan))
-    told, expected = (planning_scene(Surroundings(), perceived_solids(contours, d, camera), 1) for d in (bare, known))
-    assert told == expected and told.objects
+    actual, expected = (planning_scene(Surroundings(), perceived_solids(contours, d, camera), 1) for d in (bare, known))
+    assert actual == expected and actual.objects

@@ -23,7 +23,7 @@ def solid(label: str = "Object_1") -> PerceivedSolid:
     return PerceivedSolid(0, label, outline, 1.0, 0.1, Color(r=1, g=1, b=0), False)
 
 
-def test_solid_stands_where_it_was_seen() -> None:
+def test_solid_is_at_its_detected_position() -> None:
     thing = collision_object(solid())
     at = thing.pose.position
     assert (thing.id, thing.role, thing.shape, thing.dimensions) == ("Object_1", "target", "prism", [0.1])
@@ -32,7 +32,7 @@ def test_solid_stands_where_it_was_seen() -> None:
     assert np.allclose(placed, solid().outline)
 
 
-def test_scene_holds_fixtures_and_solids_of_the_picture_and_no_container() -> None:
+def test_scene_has_fixtures_and_solids_but_no_container() -> None:
     around = CELL.section(Surroundings)
     assert isinstance(around, Surroundings)
     scene = planning_scene(around, [solid("Object_1"), solid("Object_2")], 7)
@@ -40,7 +40,7 @@ def test_scene_holds_fixtures_and_solids_of_the_picture_and_no_container() -> No
     assert (scene.header.stamp, scene.header.frame_id) == (7, "world")
 
 
-def test_scene_that_is_as_full_as_it_may_be_can_be_read_and_a_fuller_one_is_not_made() -> None:
+def test_scene_at_its_limit_is_valid_and_beyond_rejected() -> None:
     around = CELL.section(Surroundings)
     assert isinstance(around, Surroundings)
     turn = np.linspace(0, 2 * math.pi, 12, endpoint=False)
@@ -53,14 +53,14 @@ def test_scene_that_is_as_full_as_it_may_be_can_be_read_and_a_fuller_one_is_not_
             planning_scene(around, crowd, 7)
 
 
-def test_arm_that_never_left_home_was_always_there() -> None:
+def test_arm_first_seen_at_home_covers_earlier_times() -> None:
     watch = HomeMonitor(HOME)
     assert not watch.was_home(5)
     watch.add(HOME, 10)
     assert watch.was_home(5) and watch.was_home(20)
 
 
-def test_pictures_count_from_the_return_home_until_the_arm_leaves_again() -> None:
+def test_images_count_from_return_home_until_departure() -> None:
     watch = HomeMonitor(HOME)
     watch.add(HOME, 10)
     watch.add(AWAY, 20)
@@ -71,14 +71,14 @@ def test_pictures_count_from_the_return_home_until_the_arm_leaves_again() -> Non
     assert watch.was_home(40) and watch.was_home(100)
 
 
-def test_return_home_at_a_time_to_come_counts_until_the_next_word_of_the_arm() -> None:
+def test_return_home_in_the_future_counts_until_the_next_joint_state() -> None:
     watch = HomeMonitor(HOME)
     for q, stamp in ((AWAY, 10), (HOME, 2**63 - 1), (HOME, 40)):
         watch.add(q, stamp)
     assert not watch.was_home(39) and watch.was_home(40) and watch.was_home(100)
 
 
-def test_arm_that_was_elsewhere_at_first_has_to_come_home() -> None:
+def test_arm_first_seen_elsewhere_must_come_home() -> None:
     watch = HomeMonitor(HOME)
     watch.add(AWAY, 10)
     assert not watch.was_home(5) and not watch.was_home(15)

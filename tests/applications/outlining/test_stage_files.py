@@ -8,7 +8,7 @@ from applications.outlining.stage_files import StageFileError
 from tests.applications.outlining.outline_scenes import seen_world
 
 
-def test_pictures_come_back_as_they_were(tmp_path):
+def test_images_round_trip(tmp_path):
     _, picture, depth = seen_world("w2")
     files.write_pictures(tmp_path / "new" / "folder", picture, depth)
     again, metres = files.read_pictures(tmp_path / "new" / "folder")
@@ -20,7 +20,7 @@ def test_pictures_come_back_as_they_were(tmp_path):
     assert shown[384, 512] == 255 and shown[0, 0] == 0 and 0 < shown[384, 5] < 255
 
 
-def test_points_come_back_and_whole_pixels_have_no_decimal_point(tmp_path):
+def test_points_round_trip_and_integral_pixels_have_no_decimal_point(tmp_path):
     pixels, points = np.array([[1, 2], [3, 4], [5, 6]]), np.array([[0.1, -0.2, 1.1], [0.123456789, 0, 1], [1, 2, 3]])
     files.write_points(tmp_path / files.PIXELS, pixels)
     files.write_points(tmp_path / files.CLEARED, points)
@@ -38,7 +38,7 @@ def test_points_come_back_and_whole_pixels_have_no_decimal_point(tmp_path):
     ("[[1,2,3],[1,2,true],[1,2,3]]", "entry 1 "), ("[[1,2,3],7,[1,2,3]]", "entry 1 .*not 7"),
     ("[[1,2,3],[1,2,1e400],[1,2,3]]", "entry 1 "), ("[" * 100_000, "is not valid JSON"),
 ])
-def test_malformed_points_are_refused_in_one_line_that_names_the_file(tmp_path, text, said):
+def test_malformed_points_are_rejected_with_the_file_name(tmp_path, text, said):
     path = tmp_path / files.CLEARED
     path.write_text(text)
     with pytest.raises(StageFileError, match=said) as caught:
@@ -54,7 +54,7 @@ def test_missing_files_are_named(tmp_path):
             read(path)
 
 
-def test_binary_files_that_are_something_else_are_refused(tmp_path):
+def test_wrong_binary_files_are_rejected(tmp_path):
     picture, depth = tmp_path / files.PICTURE, tmp_path / files.DEPTH
     for content in (b"", b"not a picture"):
         picture.write_bytes(content)
@@ -72,7 +72,7 @@ def test_binary_files_that_are_something_else_are_refused(tmp_path):
     (np.zeros((4, 5, 3), np.float32), "must be an array"), (np.array([["a"]]), "must be an array"),
     (np.full((4, 5), np.nan), "no valid depth at all"), (np.zeros((4, 5)), "no valid depth at all"),
 ])
-def test_depth_that_is_none_is_refused(tmp_path, array, said):
+def test_invalid_depth_is_rejected(tmp_path, array, said):
     np.save(tmp_path / files.DEPTH, array)
     with pytest.raises(StageFileError, match=said):
         files.read_depth(tmp_path / files.DEPTH)
@@ -84,7 +84,7 @@ def test_objects_in_an_array_file_are_never_unpickled(tmp_path):
         files.read_depth(tmp_path / files.DEPTH)
 
 
-def test_picture_and_depth_of_different_sizes_are_refused(tmp_path):
+def test_image_and_depth_of_different_sizes_are_rejected(tmp_path):
     _, picture, depth = seen_world("w2")
     files.write_pictures(tmp_path, picture, depth)
     np.save(tmp_path / files.DEPTH, depth[::2])
@@ -92,7 +92,7 @@ def test_picture_and_depth_of_different_sizes_are_refused(tmp_path):
         files.read_pictures(tmp_path)
 
 
-def test_a_folder_that_can_not_be_written_is_named(tmp_path):
+def test_unwritable_folder_is_named(tmp_path):
     (tmp_path / "file").write_text("")
     _, picture, depth = seen_world("w2")
     with pytest.raises(StageFileError, match="cannot be written"):

@@ -1,4 +1,4 @@
-"""How near the outline that is perceived comes to the true one, in both modes, wherever an object stands."""
+"""Accuracy of the perceived outline in both modes, for objects anywhere."""
 
 import math
 
@@ -52,7 +52,7 @@ def outlines(scene, objects, mode):
 
 
 @pytest.mark.parametrize("name", WORLDS)
-def test_pixels_and_millimetres_are_within_the_bounds_of_the_seed(name):
+def test_pixel_mode_is_within_the_bounds_of_the_original_system(name):
     found = list(outlines(seen_world(name), world(name).objects, SEED))
     assert len(found) == {"w5": 3, "w6": 2}.get(name, 1)
     for face, thing, true in found:
@@ -64,7 +64,7 @@ def test_pixels_and_millimetres_are_within_the_bounds_of_the_seed(name):
 
 
 @pytest.mark.parametrize("name", WORLDS)
-def test_sub_pixel_outlines_are_within_a_third_of_a_millimetre_both_ways(name):
+def test_sub_pixel_outlines_are_within_a_third_of_a_millimeter_in_both_directions(name):
     for face, thing, true in outlines(seen_world(name), world(name).objects, FINE):
         off = distances(dense(face.outline), true)
         assert off.max() < 0.25e-3 and off.mean() < 0.03e-3
@@ -73,7 +73,7 @@ def test_sub_pixel_outlines_are_within_a_third_of_a_millimetre_both_ways(name):
 
 
 @pytest.mark.parametrize("name", ELSEWHERE)
-def test_objects_that_show_a_wall_are_outlined_as_well_as_those_that_do_not(name):
+def test_visible_walls_do_not_degrade_the_outline(name):
     scene = seen([ELSEWHERE[name]])
     for face, _, true in outlines(scene, [ELSEWHERE[name]], FINE):
         off = distances(dense(face.outline), true)
@@ -86,13 +86,13 @@ def test_objects_that_show_a_wall_are_outlined_as_well_as_those_that_do_not(name
 @given(x=st.floats(0.43, 0.57), y=st.floats(-0.18, 0.18), yaw=st.floats(0, 3.2), height=st.floats(0.01, 0.2),
        a=st.floats(0.03, 0.09), b=st.floats(0.03, 0.09))
 @settings(max_examples=12, deadline=None)
-def test_boxes_anywhere_on_the_base_are_outlined_to_half_a_millimetre(x, y, yaw, height, a, b):
+def test_boxes_anywhere_are_outlined_to_half_a_millimeter(x, y, yaw, height, a, b):
     thing = upright(shape="box", x=x, y=y, yaw=yaw, height=height, size=(a, b))
     for face, _, true in outlines(seen([thing]), [thing], FINE):
         assert distances(dense(face.outline), true).max() < 0.5e-3
 
 
-def test_points_go_round_in_small_steps_without_turning_back():
+def test_outline_advances_in_small_steps():
     for name in WORLDS:
         for face, _, _ in outlines(seen_world(name), world(name).objects, FINE):
             step = np.roll(face.outline, -1, axis=0)[:, :2] - face.outline[:, :2]
@@ -102,7 +102,7 @@ def test_points_go_round_in_small_steps_without_turning_back():
             assert not (back & (lengths > 2e-4) & (np.roll(lengths, -1) > 2e-4)).any()
 
 
-def test_noise_of_the_depth_hardly_moves_the_outline():
+def test_depth_noise_hardly_moves_the_outline():
     thing = ELSEWHERE["tall box far off the axis"]
     camera, picture, depth = seen([thing])
     noisy = (depth + np.random.default_rng(0).normal(0, 0.001, depth.shape)).astype(np.float32)
@@ -112,7 +112,7 @@ def test_noise_of_the_depth_hardly_moves_the_outline():
 
 
 @pytest.mark.parametrize("name", ["w2", "w3", "w6"])
-def test_depth_of_a_stereo_camera_with_its_frayed_edges_hardly_moves_the_outline(name):
+def test_stereo_depth_with_frayed_edges_hardly_moves_the_outline(name):
     camera, picture, depth = seen_world(name)
     stereo = DepthSensorParameters(baseline=0.075)
     measured = simulate_depth(depth, camera, stereo, np.random.default_rng(1))
@@ -146,7 +146,7 @@ def test_missing_depth_is_filled_from_the_object_and_counted(mode):
 
 @pytest.mark.parametrize("size", [3, 5, 7])
 @pytest.mark.parametrize("mode", [SEED, FINE], ids=["seed", "fine"])
-def test_one_wrong_depth_in_an_object_of_few_pixels_is_not_its_top(size, mode):
+def test_single_wrong_depth_is_not_the_top_of_a_small_object(size, mode):
     camera, picture, depth = seen([])
     part = slice(384, 384 + size), slice(512, 512 + size)
     picture[part], depth[part] = (0, 255, 255), 1.7
@@ -155,7 +155,7 @@ def test_one_wrong_depth_in_an_object_of_few_pixels_is_not_its_top(size, mode):
     assert face.top == pytest.approx(2.75 - 1.7, abs=1e-6) and len(face.outline) > 3
 
 
-def test_object_out_of_the_range_is_told():
+def test_object_out_of_range_is_reported():
     scene = camera, _, depth = seen_world("w3")
     far = np.where(depth < 1.7, np.float32(np.nan), depth)
     with pytest.raises(DepthError, match="within the camera's range"):
@@ -163,7 +163,7 @@ def test_object_out_of_the_range_is_told():
 
 
 @pytest.mark.parametrize("wide", [0.07, 0.03])
-def test_walls_that_slope_do_not_shift_the_outline_of_the_top(wide):
+def test_sloping_walls_do_not_shift_the_outline(wide):
     """A truncated pyramid: its contour is that of its foot (or of its top, where it hangs over)."""
     around = world("w2")
     camera, _, _ = seen_world("w2")
@@ -187,7 +187,7 @@ def test_contour_pixels_are_centres_of_pixels():
         assert math.dist(middle, (0.5, 0.0)) < close
 
 
-def test_rounding_is_to_the_step_and_none_keeps_the_points():
+def test_points_are_rounded_to_the_step_if_any():
     points = np.array([[0.12345, -0.5001, 1.0004]])
     np.testing.assert_allclose(rounded(points, 0.001), [[0.123, -0.5, 1.0]], atol=1e-12)
     assert rounded(points, 0.0) is points

@@ -1,4 +1,4 @@
-"""What is stored of a picture is of that one, however the next ones count."""
+"""Stored stages belong to one image, however later images are numbered."""
 
 from __future__ import annotations
 
@@ -52,8 +52,8 @@ async def soon() -> None:
 
 
 @pytest.mark.parametrize("path_is", ["first", "last"])
-async def test_stages_are_those_of_the_picture_of_the_path(tmp_path: Path, path_is: str) -> None:
-    """Three services tell of one picture: what they say comes in any order."""
+async def test_stored_stages_belong_to_the_image_of_the_path(tmp_path: Path, path_is: str) -> None:
+    """Messages of three services about one image arrive in any order."""
     bus = LocalNetwork().bus()
     picture, depth = bus.writer(topics.DEPTH_CAMERA_IMAGE), bus.writer(topics.DEPTH_CAMERA_DEPTH)
     seen, found, paths = bus.writer(CONTOURS), bus.writer(CONTOUR_POINTS), bus.writer(CONTOUR_PATH)
@@ -80,10 +80,10 @@ async def test_stages_are_those_of_the_picture_of_the_path(tmp_path: Path, path_
     assert stage_files.read_coordinates(tmp_path / stage_files.COORDINATES)[:, 0].tolist() == [0.5] * 3
 
 
-async def test_the_person_looks_at_the_picture_whose_contours_are_asked_for(
+async def test_operator_sees_the_image_of_the_requested_contours(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The picture of the one before comes first, and the next ones come while nobody has answered yet."""
+    """An image of earlier contours comes first, and more arrive before the answer."""
     network = LocalNetwork()
     bus, detector = network.bus(), network.bus(service="contour_detector")
     seen, drawn = detector.writer(CONTOURS), detector.writer(CONTOUR_IMAGE)
@@ -114,7 +114,7 @@ async def test_the_person_looks_at_the_picture_whose_contours_are_asked_for(
     assert chosen[0].at == pytest.approx(middles[int(shown[0, 0, 0])])
 
 
-async def test_choice_whose_answer_was_lost_is_made_again_and_one_that_nobody_answers_is_not_the_end(
+async def test_selection_with_lost_answer_is_repeated_and_an_unanswered_one_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     network = LocalNetwork()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from common import messages as m
-from common.tasks.watchdogs import ImageAge
+from common.tasks.stages import ImageAge
 from tests.applications.outlining.outline_double import OutlineDouble
 from tests.applications.pick_place.cell_double import CellDouble
 
@@ -19,7 +19,7 @@ def motions(cell: CellDouble | OutlineDouble) -> list[m.Message]:
 @pytest.mark.parametrize(("stamp", "problem"), [
     (100.0, ""), (99.1, ""), (98.9, "no fresh picture"), (100.15, ""), (101.3, AHEAD)
 ])
-def test_picture_is_judged_by_its_age_and_by_how_far_it_is_in_the_future(stamp: float, problem: str) -> None:
+def test_images_are_checked_for_age_and_future_stamps(stamp: float, problem: str) -> None:
     assert ImageAge(1.0).problem(100.0, (stamp,), 1.0, 0.2) == problem
 
 
@@ -30,12 +30,12 @@ def test_tolerances_are_wall_time_whatever_the_speed() -> None:
     assert pictures.problem(100.0, (100.0, 106.5), 1.0, 0.2) == AHEAD
 
 
-def test_skew_that_trembles_is_not_told_anew_with_each_picture() -> None:
+def test_small_changes_of_clock_skew_keep_the_message() -> None:
     pictures = ImageAge(1.0)
     assert len({pictures.problem(100.0, (101.3 + 0.02 * (k % 5),), 1.0, 0.2) for k in range(20)}) == 1
 
 
-def test_picking_waits_for_a_camera_whose_clock_is_ahead_and_says_so() -> None:
+def test_picking_waits_for_a_camera_clock_that_is_ahead() -> None:
     cell = CellDouble([(0.40, -0.30)])
     cell.camera_ahead = 1.3
     for _ in range(100):
@@ -46,7 +46,7 @@ def test_picking_waits_for_a_camera_whose_clock_is_ahead_and_says_so() -> None:
     assert cell.contained == 1
 
 
-def test_clock_that_goes_wrong_after_the_plan_stops_the_motion_before_it_begins() -> None:
+def test_wrong_clock_after_planning_prevents_the_motion() -> None:
     cell = CellDouble([(0.40, -0.30)])
     plan = cell.unplannable
 
@@ -65,7 +65,7 @@ def test_clock_that_goes_wrong_after_the_plan_stops_the_motion_before_it_begins(
     assert cell.contained == 1
 
 
-def test_outlining_waits_for_a_camera_whose_clock_is_ahead_and_says_so() -> None:
+def test_outlining_waits_for_a_camera_clock_that_is_ahead() -> None:
     cell = OutlineDouble(selection_timeout=0.0)
     cell.camera_ahead = 1.3
     for _ in range(100):
@@ -75,7 +75,7 @@ def test_outlining_waits_for_a_camera_whose_clock_is_ahead_and_says_so() -> None
     cell.until("DONE")
 
 
-def test_picking_decides_anew_what_reached_the_controller_too_late() -> None:
+def test_picking_decides_again_after_a_late_request() -> None:
     cell = CellDouble([(0.40, -0.30), (0.50, -0.30)])
     for _ in range(12):  # more than the failures in a row that are borne
         cell.late = 1
@@ -85,7 +85,7 @@ def test_picking_decides_anew_what_reached_the_controller_too_late() -> None:
     assert cell.contained == 2 and cell.task.status.failures == 0
 
 
-def test_outlining_begins_anew_when_a_motion_reached_the_controller_too_late() -> None:
+def test_outlining_starts_again_after_a_late_request() -> None:
     cell = OutlineDouble()
     cell.late = 2
     cell.until("DONE")

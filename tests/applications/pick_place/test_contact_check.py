@@ -50,21 +50,21 @@ def fingers(second: float, name: str, *, holding: bool) -> GripperState:
     return GripperState(header=Header(stamp=int(second * SECOND)), id=name, holding=holding, width=0.06)
 
 
-def test_way_through_a_ball_touches_it_then() -> None:
+def test_motion_through_a_ball_is_a_contact() -> None:
     joints = arm(at(0.5, -0.25, 0.04), at(0.5, -0.25, 0.3), at(0.5, -0.25, 0.04), at(0.5, 0.1, 0.04))
     contacts = recheck().contacts(RecordedMotion(joints, [], [truth(0, "table", *BALL)]))
     assert {(contact.time, contact.pair[1]) for contact in contacts} == {(2.0, "ball")}  # one finger after the other
 
 
 @pytest.mark.parametrize("label", ["falling", "elsewhere"])
-def test_way_over_a_ball_or_where_none_lies_touches_nothing(label: str) -> None:
+def test_motion_above_or_without_a_ball_is_no_contact(label: str) -> None:
     high = arm(at(0.5, -0.2, 0.2), at(0.5, 0.2, 0.2))
     assert recheck().contacts(RecordedMotion(high, [], [truth(0, "table", *BALL)])) == []
     low = arm(at(0.5, -0.2, 0.04), at(0.5, 0.0, 0.04))
     assert recheck().contacts(RecordedMotion(low, [], [truth(0, label, *BALL)])) == []
 
 
-def test_way_into_the_table_or_the_box_touches_it() -> None:
+def test_motion_into_table_or_container_is_a_contact() -> None:
     balls = [truth(0, "elsewhere", 0, 0, -0.7)]
     for low, high, name in ((at(0.5, 0.0, -0.02), at(0.5, 0.0, 0.2), "table"),
                             (at(0.55, 0.17, 0.03), at(0.55, 0.17, 0.3), "box_wall_right")):
@@ -72,7 +72,7 @@ def test_way_into_the_table_or_the_box_touches_it() -> None:
         assert [contact.pair[1] for contact in contacts] == [name]
 
 
-def test_ball_that_is_taken_lifts_off_the_table_with_the_hand_and_may_touch_it_only_there() -> None:
+def test_held_ball_may_touch_the_table_only_at_the_grasp() -> None:
     down, up, across = at(0.5, 0.0, 0.03), at(0.5, 0.0, 0.2), at(0.5, -0.3, 0.2)
     taken = [truth(0, "table", *BALL), truth(1, "held", *BALL)]
     grips = [fingers(1, "close", holding=True)]
@@ -81,7 +81,7 @@ def test_ball_that_is_taken_lifts_off_the_table_with_the_hand_and_may_touch_it_o
     assert {c.pair for c in recheck().contacts(RecordedMotion(dragged, grips, taken))} == {("ball", "table")}
 
 
-def test_what_is_repeated_counts_once() -> None:
+def test_repeated_states_count_once() -> None:
     recording = RecordedMotion()
     fold = RunAggregator("panda", find_application("pick_place"), listeners=recording.listeners())
     for second in (0, 0, 1):

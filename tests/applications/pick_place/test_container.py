@@ -1,4 +1,4 @@
-"""Where balls are let go above the container, and which of those in it count as placed."""
+"""Release positions above the container, and which balls in it count as placed."""
 
 from __future__ import annotations
 
@@ -8,12 +8,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from applications.pick_place.choice import Pick, Target
+from applications.pick_place.choice import Pick
+from applications.pick_place.grasping import Target
+from applications.pick_place.motion_sequences import MotionSequences
 from common import messages as m
 from tests.applications.pick_place.cell_double import SEVEN, CellDouble
 
 
-def test_nothing_is_let_go_above_what_leans_on_others_and_looks_as_if_it_lay_on_the_floor() -> None:
+def test_no_release_above_a_leaning_ball_that_looks_like_one_on_the_floor() -> None:
     cell = CellDouble([(0.40, -0.30)])
     choice = cell.task._choice
     cell.fell = [(x, y, 0.035) for x in (0.526, 0.574) for y in (0.226, 0.274)]
@@ -25,17 +27,17 @@ def test_nothing_is_let_go_above_what_leans_on_others_and_looks_as_if_it_lay_on_
     cell.fell.append((*pick.over, 0.035))
     restarted = CellDouble([(0.40, -0.30)]).task
     restarted.remember(type(cell.task.memory).model_validate_json(cell.task.memory.model_dump_json()))
-    begun = cell.view()  # of a scene manager that was started again too, and has seen nothing yet
-    begun.scene = m.PlanningScene(header=m.Header(stamp=0))
-    assert restarted._choice.held("track_1", begun).over != pick.over
-    for contained, same in ((5, False), (0, False), (0, True)):  # then somebody empties the container
+    initial = cell.view()  # of a restarted scene manager without images
+    initial.scene = m.PlanningScene(header=m.Header(stamp=0))
+    assert restarted._choice.held("track_1", initial).over != pick.over
+    for contained, same in ((5, False), (0, False), (0, True)):  # then the container is emptied
         cell.now, cell.contained = cell.now + 10.0, contained
         for one in (choice, restarted._choice):
             after = one.next(cell.view(), (0.4, -0.3), [])
             assert after is not None and (after.over == pick.over) == same
 
 
-def test_what_a_task_finds_in_the_hand_as_it_is_started_again_is_let_go_where_there_is_most_room() -> None:
+def test_held_object_after_a_restart_is_released_above_the_lowest_column() -> None:
     cell = CellDouble([(0.40, -0.30)])
     cell.until("across")
     again = CellDouble([])
@@ -49,7 +51,7 @@ def test_what_a_task_finds_in_the_hand_as_it_is_started_again_is_let_go_where_th
     assert place.x - tolerance.x / 2 >= 0.55 and place.y - tolerance.y / 2 >= 0.25
 
 
-def test_balls_are_let_go_above_the_columns_in_which_least_lies() -> None:
+def test_balls_are_released_above_the_lowest_columns() -> None:
     cell = CellDouble([(0.40, -0.30), (0.52, -0.30), (0.40, -0.17), (0.52, -0.17), (0.64, -0.13)])
     cell.until("DONE")
     ends = [plan.goal.items[1].goal for plan in cell.requests
@@ -67,13 +69,14 @@ def test_balls_are_let_go_above_the_columns_in_which_least_lies() -> None:
 
 
 @given(st.floats(0.005, 0.08), st.floats(0.01, 0.2), st.booleans())
-def test_what_is_let_go_above_a_column_falls_clear_of_the_walls_however_large_it_is(
+def test_released_object_of_any_size_falls_clear_of_the_walls(
     radius: float, wide: float, flat: bool,
 ) -> None:
     task = CellDouble([], place_pos_tol=wide).task
-    box, size = task.p.world.container, (math.sqrt(2) * radius, math.sqrt(2) * radius) if flat else None
+    sequences, box = MotionSequences(task.p, task.gripper), task.p.world.container
+    size = (math.sqrt(2) * radius, math.sqrt(2) * radius) if flat else None
     over = box.x + box.slot_offset, box.y - box.slot_offset
-    goal = task._rows._across(Pick(target=Target("t", (0.4, -0.3, 0.03), radius, size), over=over), 0.0).goal
+    goal = sequences.across(Pick(target=Target("t", (0.4, -0.3, 0.03), radius, size), over=over), 0.0).goal
     assert isinstance(goal, m.PoseGoal)
     at, side = goal.pose.position, goal.position_tolerance
     inside = box.half_side - box.wall_thickness
@@ -87,7 +90,7 @@ def _side(goal: m.AnyGoal) -> float:
     return end.position_tolerance.x
 
 
-def test_where_there_is_no_way_to_the_emptiest_column_a_ball_is_let_go_anywhere_above_the_container() -> None:
+def test_ball_is_released_anywhere_if_the_lowest_column_is_unreachable() -> None:
     cell = CellDouble([(0.40, -0.30)])
     cell.unplannable = lambda request: (  # noqa: E731 - as the double has it
         "no way" if request.stage == "across" and _side(request.goal) == pytest.approx(0.03) else "")
@@ -98,7 +101,7 @@ def test_where_there_is_no_way_to_the_emptiest_column_a_ball_is_let_go_anywhere_
     assert _side(last.goal) == pytest.approx(0.06)
 
 
-def test_ninth_ball_is_reported_because_the_container_is_full() -> None:
+def test_ninth_ball_is_skipped_because_the_container_is_full() -> None:
     cell = CellDouble([(0.40, -0.30)])
     cell.contained = 8
     cell.until("DONE")
@@ -106,7 +109,7 @@ def test_ninth_ball_is_reported_because_the_container_is_full() -> None:
     assert cell.task.status.skipped[0].reason == "the container is full"
 
 
-def test_balls_are_taken_again_once_the_container_is_emptied_and_nothing_on_the_table_has_changed() -> None:
+def test_emptied_container_is_filled_again() -> None:
     cell = CellDouble([(0.40, -0.30)])
     cell.contained = 8
     cell.until("DONE")
@@ -118,7 +121,7 @@ def test_balls_are_taken_again_once_the_container_is_emptied_and_nothing_on_the_
 
 
 @pytest.mark.parametrize("late", [0, 5, 15])
-def test_after_a_restart_what_lies_in_the_container_counts_as_placed_however_late_it_is_seen(late: int) -> None:
+def test_objects_in_the_container_count_after_a_restart(late: int) -> None:
     cell = CellDouble([(0.40, -0.30)])
     cell.restart()
     cell.contained, contained = 0, 6  # as a scene manager says that was started again as well
@@ -130,7 +133,7 @@ def test_after_a_restart_what_lies_in_the_container_counts_as_placed_however_lat
 
 
 @pytest.mark.parametrize("stage", ["pre-grasp", "lift", "across", "release"])
-def test_every_ball_counts_once_when_the_task_was_started_again_in_any_stage(stage: str) -> None:
+def test_every_ball_counts_once_after_a_restart_in_any_stage(stage: str) -> None:
     cell = CellDouble(SEVEN, joined=stage != "lift")
     cell.until("release")
     cell.until("pre-grasp")
@@ -141,7 +144,7 @@ def test_every_ball_counts_once_when_the_task_was_started_again_in_any_stage(sta
     assert (cell.contained, cell.task.status.placed, cell.task.status.targets) == (7, 7, 7)
 
 
-def test_what_must_carry_what_is_seen_counts_until_the_task_has_put_a_ball_there_itself() -> None:
+def test_supporting_balls_count_until_the_task_has_placed_one() -> None:
     cell = CellDouble([(0.40, -0.30), (0.52, -0.30)])
     cell.contained, cell.beneath = 1, 1
     cell.until("close")
@@ -153,7 +156,7 @@ def test_what_must_carry_what_is_seen_counts_until_the_task_has_put_a_ball_there
     assert (cell.contained, cell.task.status.placed) == (3, 4)
 
 
-def test_container_is_not_full_of_balls_that_nobody_sees_nor_has_put_there() -> None:
+def test_unseen_and_unplaced_balls_do_not_fill_the_container() -> None:
     cell = CellDouble([(0.40, -0.30), (0.52, -0.30)])
     cell.until("release")
     cell.beneath = 7
@@ -161,7 +164,7 @@ def test_container_is_not_full_of_balls_that_nobody_sees_nor_has_put_there() -> 
     assert (cell.contained, cell.task.status.placed) == (2, 2)
 
 
-def test_what_is_seen_in_the_container_for_a_moment_only_does_not_count() -> None:
+def test_ball_seen_in_the_container_for_a_moment_does_not_count() -> None:
     cell = CellDouble([(0.40, -0.30)])
     for k in range(300):
         cell.contained += {10: 3, 12: -3}.get(k, 0)
@@ -169,17 +172,17 @@ def test_what_is_seen_in_the_container_for_a_moment_only_does_not_count() -> Non
     assert (cell.contained, cell.task.status.placed) == (1, 1)
 
 
-def test_ball_that_hangs_over_the_container_while_it_is_let_go_counts_once() -> None:
+def test_ball_above_the_container_during_release_counts_once() -> None:
     cell = CellDouble([(0.40, -0.30)])
     cell.until("across")
     asked: list[m.GripperCommand] = []
-    cell._grip = asked.append
+    cell._close_or_open = asked.append
     cell.until("release")
     cell.contained = 2  # one above the other, as a picture shows it while the fingers open
     for _ in range(20):
         cell.step()
-    del cell._grip
-    cell._grip(asked[-1])
+    del cell._close_or_open
+    cell._close_or_open(asked[-1])
     cell.contained = 2  # as the picture before still says
     cell.step()
     cell.contained = 1
@@ -188,14 +191,14 @@ def test_ball_that_hangs_over_the_container_while_it_is_let_go_counts_once() -> 
 
 
 def until_fingers_open(cell: CellDouble) -> None:
-    """Until they have been told to above the container, and the arm has not arrived."""
+    """Step until the release is commanded before the arm arrives."""
     cell.until("across")
     until_fingers_move(cell)
     assert cell.task.status.stage == "across"
 
 
 def until_fingers_move(cell: CellDouble) -> None:
-    """Before the arm stands."""
+    """Before standstill."""
     for _ in range(10):
         cell.step()
         if cell._fingers is not None:
@@ -203,39 +206,39 @@ def until_fingers_move(cell: CellDouble) -> None:
     raise AssertionError("they did not begin")
 
 
-def test_ball_that_was_let_go_a_moment_before_a_pause_counts_once() -> None:
+def test_ball_released_just_before_a_pause_counts_once() -> None:
     cell = CellDouble([(0.40, -0.30), (0.52, -0.30)])
     until_fingers_open(cell)
-    cell.tell("pause")
+    cell.command("pause")
     for _ in range(20):
         cell.step()
         assert cell.task.status.targets == 2
     assert cell.contained == 1 and cell.task.status.stage == "across"
-    cell.tell("resume")
+    cell.command("resume")
     cell.until("DONE")
     assert (cell.contained, cell.task.status.placed, cell.task.status.targets) == (2, 2, 2)
 
 
-def test_ball_that_was_let_go_a_moment_before_a_stop_counts_though_it_hides_another() -> None:
+def test_ball_released_just_before_a_stop_counts_though_it_occludes_another() -> None:
     cell = CellDouble([(0.40, -0.30), (0.52, -0.30)])
     cell.until("release")
     cell.until("pre-grasp")
     until_fingers_open(cell)
-    cell.tell("stop")
+    cell.command("stop")
     for _ in range(20):
         cell.step()
         cell.contained = min(cell.contained, 1)  # the other one is not seen any more
-    cell.tell("start")
+    cell.command("start")
     cell.until("DONE")
     assert (cell.task.status.placed, cell.task.status.targets) == (2, 2)
 
 
-def test_ball_that_was_taken_a_moment_before_a_pause_is_one_of_those_to_be_placed() -> None:
+def test_ball_taken_just_before_a_pause_is_in_the_total() -> None:
     cell = CellDouble([(0.40, -0.30), (0.52, -0.30)])
     cell.until("pre-grasp")
     until_fingers_move(cell)
     assert cell.task.status.stage == "pre-grasp"
-    cell.tell("pause")
+    cell.command("pause")
     for _ in range(20):
         cell.step()
         assert cell.task.status.targets == 2

@@ -1,4 +1,4 @@
-"""With depth, balls are found where they are: stacked, touching, in noise; and the upper one is taken first."""
+"""Detection with depth: stacked, touching and noisy balls; the upper one is taken first."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from applications.pick_place import depth_spheres as depth_balls
-from applications.pick_place.choice import Choice, Target, lies_below
+from applications.pick_place.choice import Choice, lies_below
 from applications.pick_place.detector import Detector
+from applications.pick_place.grasping import Target
 from applications.pick_place.outliers import NOT_ROUND
 from common import messages as m
 from common.config import Surroundings, load_cell
@@ -49,13 +50,13 @@ def look(things: list[WorldObject], noise: float = 0.0) -> tuple[Detector, np.nd
 
 @pytest.mark.parametrize("name", LAYOUTS)
 @pytest.mark.parametrize(("noise", "most"), [(0.0, 0.001), (0.002, 0.005)])
-def test_balls_are_found_where_they_are_stacked_or_not(name: str, noise: float, most: float) -> None:
+def test_stacked_and_single_balls_are_found_at_their_positions(name: str, noise: float, most: float) -> None:
     detector, found = look([thing(at) for at in LAYOUTS[name]], noise)
     assert len(found) == len(LAYOUTS[name]) and detector.outliers == []
     assert all(np.linalg.norm(found - np.array(at), axis=1).min() < most for at in LAYOUTS[name])
 
 
-def test_one_that_is_hidden_below_another_is_found_once_that_is_gone() -> None:
+def test_occluded_lower_ball_is_found_after_the_upper_is_gone() -> None:
     lower, upper = (0.42, 0.02, R), (0.42, 0.02, 3 * R)
     _, both = look([thing(lower), thing(upper)])
     _, left = look([thing(lower)])
@@ -63,23 +64,23 @@ def test_one_that_is_hidden_below_another_is_found_once_that_is_gone() -> None:
     np.testing.assert_allclose(left, [lower], atol=0.001)
 
 
-def test_cube_is_reported_and_is_no_ball() -> None:
+def test_cube_is_an_outlier() -> None:
     detector, found = look([thing((0.5, -0.1, 0.025), "box", 0.05, 0.05, 0.05), thing((0.3, 0.1, R))])
     assert len(found) == 1 and [one.reason for one in detector.outliers] == [NOT_ROUND]
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.002])
 @pytest.mark.parametrize(("shape", "size"), [
-    ("cylinder", (0.04, 0.04, 0.001)),  # as wide as the part of a ball on which depth is told from that of a plane
+    ("cylinder", (0.04, 0.04, 0.001)),  # as wide as the part of a ball that differs from a plane
     ("cylinder", (0.04, 0.04, 0.12)),
     ("box", (0.2, 0.15, 0.001)),  # at its edges a ball would be seen only in part, too
 ])
-def test_what_is_flat_is_reported_and_is_no_ball(shape: str, size: tuple[float, float, float], noise: float) -> None:
+def test_flat_object_is_an_outlier(shape: str, size: tuple[float, float, float], noise: float) -> None:
     detector, found = look([thing((0.4, 0.0, size[2] / 2), shape, *size), thing((0.3, 0.2, R))], noise)
     assert len(found) == 1 and [one.reason for one in detector.outliers] == [NOT_ROUND]
 
 
-def test_balls_on_a_large_red_cloth_are_found_and_no_more_is_tried_than_it_takes(
+def test_balls_on_a_red_cloth_are_found_with_few_attempts(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     tries, fitted = [], depth_balls._fitted
@@ -91,7 +92,7 @@ def test_balls_on_a_large_red_cloth_are_found_and_no_more_is_tried_than_it_takes
     assert len(found) == len(places) and len(tries) < 40
 
 
-def test_what_is_odd_without_depth_is_told_again_after_a_look_with_it() -> None:
+def test_outliers_are_reported_again_after_detection_with_depth() -> None:
     view = Renderer(AROUND, camera=CAMERA).render([thing(at) for at in PYRAMID])
     detector = Detector(AROUND)
     detector.detect(view.colour, CAMERA)
@@ -107,7 +108,7 @@ def test_nothing_red_gives_nothing() -> None:
     assert len(found) == 0 and detector.outliers == [] and detector.blind == ""
 
 
-def test_the_upper_one_is_taken_first_whatever_lies_nearer() -> None:
+def test_upper_ball_is_taken_before_nearer_ones() -> None:
     for order in itertools.permutations(PYRAMID):
         cell = CellDouble([])
         cell.balls = {f"track_{k}": at for k, at in enumerate(order)}
@@ -118,18 +119,18 @@ def test_the_upper_one_is_taken_first_whatever_lies_nearer() -> None:
             assert chosen is not None and chosen.target.position == PYRAMID[-1]
 
 
-def test_what_is_below_comes_next_when_the_upper_one_is_gone() -> None:
+def test_lower_ball_is_taken_after_the_upper_one() -> None:
     cell = CellDouble([])
     cell.balls = {f"track_{k}": at for k, at in enumerate(PYRAMID[:-1])}
     chosen = Choice(cell.task.p, AROUND.container, R).next(cell.view(), (0.3, 0.1), [])  # type: ignore[arg-type]
     assert chosen is not None and chosen.target.position == PYRAMID[0]
 
 
-def test_one_lies_below_another_only_where_that_rests_on_it() -> None:
-    lower, upper, beside = (Target(name, at, R) for name, at in (
-        ("lower", (0.4, 0.0, R)), ("upper", (0.42, 0.0, 0.085)), ("beside", (0.47, 0.0, 0.085))))
+def test_ball_is_below_another_only_if_it_carries_it() -> None:
+    lower, upper, near = (Target(name, at, R) for name, at in (
+        ("lower", (0.4, 0.0, R)), ("upper", (0.42, 0.0, 0.085)), ("near", (0.47, 0.0, 0.085))))
     assert lies_below(lower, [lower, upper]) and not lies_below(upper, [lower, upper])
-    assert not lies_below(lower, [lower, beside])
+    assert not lies_below(lower, [lower, near])
 
 
 def test_stacked_balls_are_two_objects_of_the_task() -> None:

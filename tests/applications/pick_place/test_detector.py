@@ -113,7 +113,7 @@ def test_every_ball_of_random_layouts_is_found_within_a_millimetre(noise, bright
     [(name, *p) for name in CLUSTERS for p in PICTURES if p[2] or name != "seven close together"],
 )
 @pytest.mark.slow
-def test_balls_that_touch_are_told_apart(name, noise, brightness, rim):
+def test_touching_balls_are_separated(name, noise, brightness, rim):
     rng = np.random.default_rng(2)
     for _ in range(5):
         balls = moved_into_view(CLUSTERS[name](rng), rng)
@@ -130,7 +130,7 @@ def test_any_layout_without_overlap_is_found(seed):
     check(balls, draw_spheres(balls, camera, around, noise_std=rng.choice([0, 8]), rng=rng))
 
 
-def test_balls_cut_by_the_border_are_found_and_marked_and_disturb_no_other():
+def test_balls_cut_by_the_border_are_marked_partial():
     rng = np.random.default_rng(3)
     partial = 0
     for _ in range(25):
@@ -170,7 +170,7 @@ def shown_whole(ball, balls):
 
 @pytest.mark.parametrize("count", range(1, 9))
 @pytest.mark.parametrize("noise", [0, 8])
-def test_every_ball_in_the_box_that_is_not_covered_is_seen_where_it_is(count, noise):
+def test_uncovered_balls_in_the_container_are_found_at_their_positions(count, noise):
     rng = np.random.default_rng(count)
     for _ in range(3):
         order = rng.permutation(4)
@@ -186,13 +186,13 @@ def test_every_ball_in_the_box_that_is_not_covered_is_seen_where_it_is(count, no
         assert len(whole) <= len(found) <= count
 
 
-def test_a_ball_in_the_air_is_not_taken_for_one_on_the_table():
+def test_ball_in_the_air_is_not_detected_on_the_table():
     for z in np.arange(0.16, 0.40, 0.02):
         assert detector.detect(draw_spheres([(0.5, -0.2, z)], camera, around), camera) == []
 
 
 @pytest.mark.parametrize("count", [0, 4, 7])
-def test_a_ball_that_falls_into_the_box_is_seen_nowhere_outside_of_it(count):
+def test_ball_falling_into_the_container_is_not_detected_outside(count):
     c = around.container
     below = boxed(count, range(4)) if count else np.empty((0, 3))
     for z in np.arange(0.10, 0.32, 0.02):
@@ -201,7 +201,7 @@ def test_a_ball_that_falls_into_the_box_is_seen_nowhere_outside_of_it(count):
             assert detector.resting.meets_container(*camera.ray(d.pixel))
 
 
-def test_a_blurred_picture_still_gives_every_ball():
+def test_blurred_image_still_shows_every_ball():
     rng = np.random.default_rng(5)
     for shape in ("block of five", "triangle"):
         balls = moved_into_view(CLUSTERS[shape](rng), rng)
@@ -209,19 +209,19 @@ def test_a_blurred_picture_still_gives_every_ball():
         check(balls, cv2.GaussianBlur(picture, (0, 0), 1.0))
 
 
-def test_position_lies_on_the_ray_of_the_pixel_at_the_height_of_the_centres():
+def test_position_is_on_the_pixel_ray_at_center_height():
     for d in detector.detect(draw_spheres(boxed(8, range(4)), camera, around), camera):
         assert d.position[2] == 0.03
         np.testing.assert_allclose(camera.on_plane(d.pixel, 0.03), d.position[:2], atol=1e-9)
 
 
-def test_left_of_the_robot_is_left_in_the_picture():
+def test_left_of_the_robot_is_left_in_the_image():
     balls = on_table([(0.4, 0.2), (0.4, -0.2)])
     left, right = sorted(check(balls, draw_spheres(balls, camera, around)), key=lambda d: d.pixel[0])
     assert left.pixel[0] < 320 < right.pixel[0] and left.position[1] > 0 > right.position[1]
 
 
-def test_a_tilted_camera_gives_the_same_places():
+def test_tilted_camera_gives_the_same_positions():
     T = transform(rpy_to_matrix(math.pi - 0.25, 0.1, -math.pi / 2 + 0.3), (0.35, -0.15, 0.85))
     tilted = Pinhole(540, 530, 330, 225, 640, 480, T)
     rng = np.random.default_rng(4)
@@ -237,7 +237,7 @@ def test_nothing_red_gives_nothing():
     assert detector.detect(noise, camera) == []
 
 
-def test_a_picture_that_is_all_red_gives_nothing_and_no_error():
+def test_all_red_image_gives_no_detection():
     red = np.full((480, 640, 3), (26, 38, 255), np.uint8)
     assert detector.detect(red, camera) == []
 
@@ -248,12 +248,12 @@ def test_a_red_square_is_no_ball():
     assert detector.detect(picture, camera) == []
 
 
-def test_the_tiniest_picture_is_looked_at_without_an_error():
+def test_smallest_image_is_processed():
     tiny = Pinhole(520, 520, 0, 0, 1, 1, camera.T_world_optical)
     assert detector.detect(np.full((1, 1, 3), (26, 38, 255), np.uint8), tiny) == []
 
 
-def test_windows_choose_what_is_a_ball():
+def test_color_windows_define_a_ball():
     blue = around.model_copy(update={"ball_color": (0.1, 0.2, 1.0)})
     picture = draw_spheres(on_table([(0.4, 0.0)]), camera, blue)
     assert detector.detect(picture, camera) == []
@@ -261,7 +261,7 @@ def test_windows_choose_what_is_a_ball():
     assert len(Detector(blue, options).detect(picture, camera)) == 1
 
 
-def test_smaller_blobs_than_the_least_area_are_ignored():
+def test_blobs_below_the_minimum_area_are_ignored():
     picture = draw_spheres(on_table([(0.4, 0.0)]), camera, around)
     (only,) = detector.detect(picture, camera)
     assert 900 < only.area < 1300
@@ -269,7 +269,7 @@ def test_smaller_blobs_than_the_least_area_are_ignored():
     assert Detector(around, options).detect(picture, camera) == []
 
 
-def test_annotation_marks_what_was_found_on_a_copy():
+def test_annotation_draws_detections_on_a_copy():
     balls = on_table([(0.5, -0.2), (0.4, 0.465)])
     picture = draw_spheres(balls, camera, around)
     before = picture.copy()
@@ -286,7 +286,7 @@ def places(detections):
     return [d.position for d in detections]
 
 
-def test_picture_that_comes_again_and_one_that_differs_are_both_looked_at_rightly():
+def test_repeated_and_changed_images_are_processed_correctly():
     one, other = (draw_spheres(on_table(spots), camera, around) for spots in ([(0.4, 0.1)], [(0.4, 0.1), (0.6, -0.2)]))
     remembering = Detector(around)
     fresh = [places(Detector(around).detect(picture, camera)) for picture in (one, one, other, one)]
@@ -294,7 +294,7 @@ def test_picture_that_comes_again_and_one_that_differs_are_both_looked_at_rightl
     assert [len(found) for found in fresh] == [1, 1, 2, 1]
 
 
-def test_same_picture_of_another_camera_shows_balls_elsewhere():
+def test_same_image_of_another_camera_gives_other_positions():
     remembering = Detector(around)
     moved = camera.T_world_optical.copy()
     moved[0, 3] += 0.1
@@ -304,7 +304,7 @@ def test_same_picture_of_another_camera_shows_balls_elsewhere():
     np.testing.assert_allclose(np.subtract(there, here), [0.1, 0.0, 0.0], atol=1e-6)
 
 
-def test_caller_that_draws_into_the_picture_or_the_list_spoils_nothing():
+def test_modifying_the_input_or_result_has_no_effect():
     remembering = Detector(around)
     picture = draw_spheres(on_table([(0.4, 0.1)]), camera, around)
     mine = picture.copy()
@@ -315,15 +315,15 @@ def test_caller_that_draws_into_the_picture_or_the_list_spoils_nothing():
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_what_was_found_in_a_picture_does_not_depend_on_the_pictures_before(seed):
+def test_detections_are_independent_of_earlier_images(seed):
     rng = np.random.default_rng(seed)
     one_after_the_other = Detector(around)
     balls = random_layout(rng)
     looked_at = 0
     for _ in range(12):
-        kept = balls[rng.random(len(balls)) < 0.8]  # some are taken, others come, some of those touch
+        remaining = balls[rng.random(len(balls)) < 0.8]  # some are taken, others come, some of those touch
         new = random_layout(rng)[: rng.integers(0, 3)]
-        balls = np.concatenate([kept, new])
+        balls = np.concatenate([remaining, new])
         picture = draw_spheres(balls, camera, around)
         found = one_after_the_other.detect(picture, camera)
         alone = Detector(around).detect(picture, camera)
@@ -334,7 +334,7 @@ def test_what_was_found_in_a_picture_does_not_depend_on_the_pictures_before(seed
 
 
 @pytest.mark.parametrize("height", [-1.0, 0.0, 5.0])
-def test_rehearsal_is_possible_wherever_the_table_is(height):
+def test_warm_up_works_for_any_table_height(height):
     found = []
     with patch.object(Detector, "detect", lambda self, picture, camera: found.append(DETECT(self, picture, camera))):
         warm_up(around.model_copy(update={"table_height": height}), DetectorOptions())

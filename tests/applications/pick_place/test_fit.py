@@ -32,7 +32,7 @@ steps = st.tuples(st.floats(-0.006, 0.006), st.floats(-0.006, 0.006), st.just(0.
 
 @given(st.lists(st.tuples(places, steps, st.floats(-0.002, 0.002)), min_size=1, max_size=4))
 @settings(deadline=None)
-def test_each_sphere_and_the_offset_of_its_outline_are_found_from_a_guess_nearby(spheres):
+def test_spheres_and_offsets_are_fitted_from_nearby_values(spheres):
     centers = np.array([center for center, _, _ in spheres])
     starts = centers + [step for _, step, _ in spheres] - camera.position
     outlines = [outline_of(center, R + offset) for center, _, offset in spheres]
@@ -44,7 +44,7 @@ def test_each_sphere_and_the_offset_of_its_outline_are_found_from_a_guess_nearby
 
 
 @given(places, steps, st.integers(0, 119), st.integers(50, 100))
-def test_a_part_of_the_outline_is_enough_when_its_offset_is_known(center, step, first, length):
+def test_partial_outline_with_known_offset_is_enough(center, step, first, length):
     outline = outline_of(center, R - 0.001, (first + np.arange(length)) % 120)
     start = np.array([center]) + step - camera.position
     gates = (0.02, 0.02, 0.01, 0.01, 0.005, 0.005)
@@ -53,7 +53,7 @@ def test_a_part_of_the_outline_is_enough_when_its_offset_is_known(center, step, 
     assert offsets[0] == -0.001
 
 
-def test_points_near_a_silhouette_are_those_that_face_as_it_does():
+def test_points_near_a_silhouette_face_the_same_direction():
     center = np.array((0.4, 0.1, 0.03))
     outline = outline_of(center)
     turned = Outline(outline.pixels, outline.rays, -outline.inward)
@@ -65,7 +65,7 @@ def test_points_near_a_silhouette_are_those_that_face_as_it_does():
 
 @given(places, st.floats(-0.002, 0.002), st.floats(-1, 1))
 @settings(deadline=None)
-def test_touching_spheres_and_the_offset_of_their_outline_are_found_together(center, offset, angle):
+def test_touching_spheres_are_fitted_with_their_offset(center, offset, angle):
     other = np.array(center) + 2 * R * np.array((np.cos(angle), np.sin(angle), 0))
     outline = joined(outline_of(center, R + offset), outline_of(other, R + offset))
     start = np.array([center, other]) + np.array((0.003, -0.002, 0)) - camera.position
@@ -75,7 +75,7 @@ def test_touching_spheres_and_the_offset_of_their_outline_are_found_together(cen
     assert (fit.owner == np.repeat([0, 1], 120)).mean() > 0.95
 
 
-def test_an_expected_offset_holds_where_little_of_the_outline_is_seen():
+def test_expected_offset_dominates_for_a_short_outline():
     center = (0.4, 0.1, 0.03)
     outline = outline_of(center, R - 0.001, slice(0, 24))
     start = np.array([center]) - camera.position
@@ -83,7 +83,7 @@ def test_an_expected_offset_holds_where_little_of_the_outline_is_seen():
     np.testing.assert_allclose(sure.centers[0] + camera.position, center, atol=1e-4)
 
 
-def test_what_is_not_part_of_any_outline_is_left_out():
+def test_points_off_all_outlines_are_ignored():
     center = np.array((0.4, 0.1, 0.03))
     stray = outline_of(center + np.array((0.05, 0, 0)), 0.01)
     fit = fit_spheres(joined(outline_of(center), stray), center[None] - camera.position, R, offset=0.0, offset_std=1e-3)
@@ -91,7 +91,7 @@ def test_what_is_not_part_of_any_outline_is_left_out():
     assert (fit.owner[:120] == 0).all() and (fit.owner[120:] == -1).all()
 
 
-def test_nothing_to_fit_leaves_the_guess():
+def test_fit_without_points_keeps_the_initial_values():
     guess = np.array([(0.4, 0.0, 0.03)]) - camera.position
     fit = fit_spheres(outline_of((0.4, 0.0, 0.03), part=slice(0, 0)), guess, R, offset=-0.001, offset_std=1e-3)
     np.testing.assert_allclose(fit.centers, guess)

@@ -1,4 +1,4 @@
-"""What is hidden is not gone: tracks, targets and slots are kept, and the end waits for a picture that shows it."""
+"""Occlusion: tracks, targets and slots stay, and the task does not end before an image shows their positions."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def at_place(place: tuple[float, float, float]) -> bool:
     return place[:2] == PLACE[:2]
 
 
-def test_hidden_track_is_kept_and_one_whose_place_is_seen_empty_is_forgotten() -> None:
+def test_occluded_track_stays_and_a_visibly_missing_one_is_removed() -> None:
     tracks = Tracks(SceneParameters(confirm_frames=1))
     tracks.update([Sighting(PLACE), Sighting(ELSEWHERE)], 0.0)
     for k in range(1, 30):
@@ -42,7 +42,7 @@ def test_hidden_track_is_kept_and_one_whose_place_is_seen_empty_is_forgotten() -
     assert tracks.confirmed() == []
 
 
-def test_what_one_view_hides_and_another_one_sees_empty_is_forgotten() -> None:
+def test_track_visibly_missing_in_one_view_is_removed() -> None:
     tracks = Tracks(SceneParameters(confirm_frames=1))
     tracks.update([Sighting(PLACE)], 0.0, view=0)
     for k in range(1, 10):
@@ -51,7 +51,7 @@ def test_what_one_view_hides_and_another_one_sees_empty_is_forgotten() -> None:
     assert tracks.confirmed() == []
 
 
-def test_target_is_remembered_while_hidden_and_not_beside_a_new_detection_of_it() -> None:
+def test_target_is_remembered_while_occluded_unless_detected_again() -> None:
     remembered = OccludedTargets()
     assert remembered.hidden([PLACE, ELSEWHERE], [], None) == []
     assert remembered.hidden([ELSEWHERE], [], at_place) == [PLACE]
@@ -59,7 +59,7 @@ def test_target_is_remembered_while_hidden_and_not_beside_a_new_detection_of_it(
     assert remembered.hidden([], [], None) == []
 
 
-def test_what_lies_in_the_container_is_kept_while_the_hand_hides_it() -> None:
+def test_contained_objects_stay_while_occluded() -> None:
     assert CELL.robot.gripper is not None
     scene = PerceivedScene(SceneParameters(), AROUND, CELL.robot.gripper, "panda_hand_tcp")
     u, v = CAMERA.project([0.55 - 0.033, 0.25 - 0.033, 0.035])
@@ -67,11 +67,11 @@ def test_what_lies_in_the_container_is_kept_while_the_hand_hides_it() -> None:
                     pixel=(u, v))
     for k in range(20):
         frame = m.MarkerArray(header=m.Header(stamp=int(1e9 + k * 1e8)), markers=[ball] if k < 2 else [])
-        scene.see(frame, CAMERA, None, hidden=BLIND if k >= 2 else None)
+        scene.update_detections(frame, CAMERA, None, hidden=BLIND if k >= 2 else None)
     assert [thing.role for thing in scene.scene().objects].count("contained") == 1
 
 
-def test_arm_is_turned_out_of_the_way_as_little_as_need_be() -> None:
+def test_viewing_pose_is_the_smallest_rotation() -> None:
     robot, region = RobotModel.load(CELL.robot), VisibleTable(AROUND, WorkspaceBounds())
     silhouettes = RobotSilhouettes(robot, 0.03)
     within = region.within(CAMERA, silhouettes, robot)
@@ -102,14 +102,14 @@ class Behind(CellDouble):
             self.motion.state == "succeeded"
 
 
-def test_task_goes_out_of_the_way_and_looks_before_it_is_done() -> None:
+def test_task_moves_aside_and_looks_before_done() -> None:
     cell = Behind([])
     cell.until("DONE")
     assert cell.stages() == ["look"]
 
 
 @pytest.mark.parametrize("blind", [True, False])
-def test_task_that_cannot_see_never_ends_as_done_and_says_what_it_could_not_see(blind: bool) -> None:
+def test_task_without_a_view_ends_in_error_with_the_reason(blind: bool) -> None:
     cell = Behind([])
     cell.is_blind = blind
     cell.tcp_away = lambda: False  # type: ignore[method-assign]
@@ -118,7 +118,7 @@ def test_task_that_cannot_see_never_ends_as_done_and_says_what_it_could_not_see(
     assert (len(cell.stages()) == 0) if blind else (set(cell.stages()) == {"look"})
 
 
-def test_what_each_look_brings_to_light_is_taken_and_the_next_look_begins_with_the_first_pose_again() -> None:
+def test_revealed_balls_are_taken_and_the_next_look_starts_with_the_first_pose() -> None:
     cell = Behind([])
     clear, moved, left = False, False, [(0.4, -0.05 * k) for k in range(6)]
     cell.tcp_away = lambda: clear  # type: ignore[method-assign]
@@ -133,7 +133,7 @@ def test_what_each_look_brings_to_light_is_taken_and_the_next_look_begins_with_t
     assert (cell.task.status.state, cell.task.status.done) == ("DONE", 6)
 
 
-def test_two_moments_without_sight_are_not_all_the_time_between_them() -> None:
+def test_separate_moments_without_view_do_not_add_up() -> None:
     cell = Behind([(0.4, 0.0), (0.4, -0.1)])
     cell.tcp_away = lambda: True  # type: ignore[method-assign]
     for done in (1, 2):
@@ -146,20 +146,20 @@ def test_two_moments_without_sight_are_not_all_the_time_between_them() -> None:
         cell.is_blind = False
         for _ in range(4):
             cell.step()
-        cell._arrival += 2 * cell.task.p.look_timeout  # the next motion takes its time
+        cell.arrival += 2 * cell.task.p.look_timeout  # the next motion takes its time
     cell.until("DONE")
 
 
 @pytest.mark.parametrize("blind", [True, False])
-def test_task_that_is_started_again_after_it_could_not_see_looks_for_as_long_as_before(blind: bool) -> None:
+def test_restarted_task_gets_the_full_look_timeout(blind: bool) -> None:
     cell = Behind([])
     cell.is_blind = blind
     cell.tcp_away = lambda: False  # type: ignore[method-assign]
     cell.until("ERROR")
     looks = len(cell.stages())
-    for _ in range(5 * int(cell.task.p.look_timeout)):  # a person comes
+    for _ in range(5 * int(cell.task.p.look_timeout)):  # an operator comes
         cell.step()
-    cell.tell("start")
+    cell.command("start")
     for _ in range(100):
         cell.step()
         assert cell.task.status.state != "ERROR"
@@ -167,22 +167,22 @@ def test_task_that_is_started_again_after_it_could_not_see_looks_for_as_long_as_
     assert len(cell.stages()) == 2 * looks
 
 
-def test_time_for_which_a_person_keeps_the_task_from_looking_does_not_count() -> None:
+def test_time_held_by_the_operator_does_not_count_as_look_timeout() -> None:
     cell = Behind([])
     cell.is_blind = True
     cell.tcp_away = lambda: False  # type: ignore[method-assign]
     for _ in range(20):
         cell.step()
-    cell.tell("pause")
+    cell.command("pause")
     for _ in range(20 * int(cell.task.p.look_timeout)):
         cell.step()
-    cell.tell("resume")
+    cell.command("resume")
     for _ in range(20):
         cell.step()
     assert cell.task.status.state == "IDLE"
 
 
-def test_task_begins_nothing_by_a_picture_that_shows_nothing() -> None:
+def test_blank_image_starts_nothing() -> None:
     cell = Behind([(0.4, 0.0)])
     cell.is_blind = True
     for _ in range(50):
@@ -190,7 +190,7 @@ def test_task_begins_nothing_by_a_picture_that_shows_nothing() -> None:
     assert cell.stages() == [] and "nothing can be seen" in cell.task.status.message
 
 
-def test_hidden_target_counts_only_while_the_planning_scene_has_it() -> None:
+def test_occluded_target_counts_only_while_in_the_planning_scene() -> None:
     view = CellDouble([(0.4, 0.0)]).view()
     poses = [m.Pose(position=m.Vector3(x=0.4, z=0.03)), m.Pose(position=m.Vector3(x=0.6, z=0.03))]
     seen = m.PoseArray(header=view.seen.header, poses=poses, labels=[HIDDEN, HIDDEN])  # type: ignore[union-attr]

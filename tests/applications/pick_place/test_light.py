@@ -16,7 +16,7 @@ from common.perception.pinhole import Pinhole
 from common.perception.sphere import silhouettes
 from common.robot.model import RobotModel
 from common.sim.camera import CameraParameters, SimulatedCamera
-from common.sim.lighting import tint
+from common.sim.photometry import tint
 from common.sim.rendering import Renderer
 
 CELL = load_cell("panda")
@@ -46,7 +46,7 @@ def scene() -> np.ndarray:
 
 @pytest.mark.parametrize("kelvin", [2700, 4000, 6500, 10_000])
 @pytest.mark.parametrize(("bright", "shade"), [(1.0, 0.1), (0.5, 0.3), (0.15, 1.0)])
-def test_balls_are_found_to_3_mm_and_none_is_made_up(
+def test_balls_are_found_within_3_mm_without_false_detections(
     scene: np.ndarray, kelvin: float, bright: float, shade: float
 ) -> None:
     rng = np.random.default_rng(1)
@@ -58,7 +58,7 @@ def test_balls_are_found_to_3_mm_and_none_is_made_up(
 
 @pytest.mark.parametrize("bright", [1.0, 0.5])
 @pytest.mark.parametrize("kelvin", [2700, 3000, 3500])
-def test_the_floor_beside_a_table_does_not_tell_the_light_on_it(kelvin: float, bright: float) -> None:
+def test_floor_next_to_the_table_does_not_affect_the_light_estimate(kelvin: float, bright: float) -> None:
     camera = Pinhole.from_config(SIDE)
     picture = Renderer(AROUND, camera=camera).render(balls()).colour
     warm = np.clip(np.rint(picture * tint(kelvin) * bright), 0, 255).astype(np.uint8)
@@ -67,7 +67,7 @@ def test_the_floor_beside_a_table_does_not_tell_the_light_on_it(kelvin: float, b
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", range(4))
-def test_balls_are_found_in_drawn_light_and_shadow(number: int) -> None:
+def test_balls_are_found_in_rendered_light_and_shadow(number: int) -> None:
     pytest.importorskip("mujoco")
     rng, robot = np.random.default_rng(number), RobotModel.load(CELL.robot)
     turn, lux = rng.uniform(0, 2 * math.pi), 10 ** rng.uniform(2, 4)
@@ -86,7 +86,7 @@ def test_balls_are_found_in_drawn_light_and_shadow(number: int) -> None:
 @pytest.mark.parametrize(("color", "count"), [
     ((0, 85, 255), 0), ((14, 85, 255), 1), ((0, 40, 170), 1),  # the floor's; a ball's as bright; one in the shadow
 ])
-def test_overexposed_in_warm_light_the_floor_of_an_orange_container_is_no_ball(
+def test_overexposed_orange_container_floor_is_no_ball(
     color: tuple[int, int, int], count: int,
 ) -> None:
     box = AROUND.container
@@ -115,7 +115,7 @@ def test_balls_in_a_container_are_found_however_warm_and_bright_the_light_is(
 
 
 @pytest.mark.parametrize("color", [(1.0, 0.0, 0.1), (1.0, 0.01, 0.1), (0.8, 0.0, 0.2), (1.0, 0.15, 0.1)])
-def test_however_little_green_balls_are_said_to_have_those_in_the_container_are_found(
+def test_balls_in_the_container_are_found_for_any_configured_color(
     color: tuple[float, float, float],
 ) -> None:
     around, box = AROUND.model_copy(update={"ball_color": color}), AROUND.container

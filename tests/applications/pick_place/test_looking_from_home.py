@@ -44,8 +44,8 @@ class HandCell(CellDouble):
             self._homes.add(request.id)
         super().answer(request)
 
-    def _arrive(self, request: m.ExecuteRequest) -> None:
-        super()._arrive(request)
+    def arrive(self, request: m.ExecuteRequest) -> None:
+        super().arrive(request)
         self.q = HOME if request.plan in self._homes else AWAY
 
     def stages(self) -> list[str]:
@@ -53,7 +53,7 @@ class HandCell(CellDouble):
         return [request.stage for request in self.requests if isinstance(request, m.PlanRequest)]
 
 
-def test_it_goes_home_to_look_before_it_chooses_the_next_one_and_before_it_is_done() -> None:
+def test_task_looks_from_home_before_each_choice_and_before_done() -> None:
     cell = HandCell([(0.40, -0.10), (0.52, -0.10)], HOME)
     totals = set()
     for _ in range(400):
@@ -66,7 +66,7 @@ def test_it_goes_home_to_look_before_it_chooses_the_next_one_and_before_it_is_do
     assert totals == {2} and cell.q == HOME
 
 
-def test_it_goes_home_first_from_wherever_it_is_started() -> None:
+def test_task_goes_home_first_from_anywhere() -> None:
     cell = HandCell([(0.40, -0.10)], AWAY)
     for _ in range(3):
         cell.step()
@@ -76,7 +76,7 @@ def test_it_goes_home_first_from_wherever_it_is_started() -> None:
     assert cell.contained == 1
 
 
-def test_at_the_end_an_arm_that_somebody_brought_elsewhere_stays_there() -> None:
+def test_arm_moved_after_the_end_stays_there() -> None:
     cell = HandCell([], HOME)
     while cell.task.status.state != "DONE":
         cell.step()
@@ -85,12 +85,12 @@ def test_at_the_end_an_arm_that_somebody_brought_elsewhere_stays_there() -> None
     for _ in range(50):
         cell.step()
     assert len(cell.requests) == before
-    cell.tell("start")
+    cell.command("start")
     cell.step()
     assert cell.stages()[-1] == "home"
 
 
-def test_the_camera_of_the_page_is_that_of_the_cell() -> None:
+def test_page_uses_the_camera_of_the_cell() -> None:
     said = [yaml.safe_load(text) for kind, text in pages.blocks(pages.text_of("docs/calibration.md")) if kind == "yaml"]
     camera = next(block["world"]["camera"] for block in said if isinstance(block.get("world"), dict))
     assert CameraConfig(**camera) == CELL.world.camera

@@ -1,4 +1,4 @@
-"""Masks of pictures that follow each other are those of each picture by itself."""
+"""Masks of successive images equal those of single images."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def spot(picture: Picture, rng: np.random.Generator) -> None:
 
 @pytest.mark.parametrize("kernel_px", [1, 3, 4, 7, 12])
 @pytest.mark.parametrize("width", [120, 77])  # rows that are whole words, and not
-def test_masks_are_those_of_each_picture_whatever_came_before(kernel_px: int, width: int) -> None:
+def test_masks_are_independent_of_earlier_images(kernel_px: int, width: int) -> None:
     rng = np.random.default_rng(kernel_px * width)
     colours, one_after_the_other = Colours(WINDOWS, kernel_px), Masks()
     picture = scene(rng, width, 90)
@@ -47,14 +47,14 @@ def test_masks_are_those_of_each_picture_whatever_came_before(kernel_px: int, wi
     assert narrow > 30 or kernel_px == 1, "which nothing is too narrow for"
 
 
-def test_a_picture_that_is_the_last_one_again_has_the_very_same_masks() -> None:
+def test_repeated_image_returns_the_identical_masks() -> None:
     picture, masks = scene(np.random.default_rng(1), 120, 90), Masks()
     first = masks.of(picture, Colours(WINDOWS, 7))
     assert masks.of(picture.copy(), Colours(WINDOWS, 7))[1] is first[1]
     assert masks.of(picture, Colours(WINDOWS, 9))[1] is not first[1]
 
 
-def test_where_the_table_is_seen_tells_what_is_red() -> None:
+def test_visible_table_area_affects_the_masks() -> None:
     picture = np.full((96, 128, 3), (40, 65, 90), np.uint8)
     picture[48:] = (5, 50, 230)  # a brown table in warm light
     picture[10:40, 20:60] = RED
@@ -62,23 +62,23 @@ def test_where_the_table_is_seen_tells_what_is_red() -> None:
     lower[6:] = True
     masks, colours = Masks(), Colours(WINDOWS, 7)
     assert masks.of(picture, colours, ~lower).closed[48:].any()
-    told = masks.of(picture, colours, lower)
-    assert told.closed[20, 40] and not told.closed[48:].any(), "of the same picture, too"
-    assert masks.of(picture.copy(), colours, lower) is told
+    result = masks.of(picture, colours, lower)
+    assert result.closed[20, 40] and not result.closed[48:].any(), "of the same picture, too"
+    assert masks.of(picture.copy(), colours, lower) is result
 
 
-def test_masks_that_were_given_stay_as_they_are() -> None:
+def test_returned_masks_are_not_modified_later() -> None:
     rng = np.random.default_rng(2)
     picture, masks = scene(rng, 120, 90), Masks()
     first = masks.of(picture, Colours(WINDOWS, 7))
-    kept = first[0].copy(), first[1].copy()
+    copies = first[0].copy(), first[1].copy()
     picture[20:50, 20:50] = RED
     masks.of(picture, Colours(WINDOWS, 7))
-    assert np.array_equal(first[0], kept[0]) and np.array_equal(first[1], kept[1])
+    assert np.array_equal(first[0], copies[0]) and np.array_equal(first[1], copies[1])
 
 
 @pytest.mark.parametrize("width", [120, 77])
-def test_what_has_changed_lies_within_the_rectangle(width: int) -> None:
+def test_changed_pixels_lie_within_the_rectangle(width: int) -> None:
     rng = np.random.default_rng(3)
     before = rng.integers(0, 255, (40, width, 3), np.uint8)
     assert changed(before, before.copy()) is None

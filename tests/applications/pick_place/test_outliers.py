@@ -1,4 +1,4 @@
-"""Red things that are no balls on the table are told from these, and reported: cubes, cables, discs, stacked balls."""
+"""Red objects that are no balls on the table are reported: cubes, cables, discs, stacked balls."""
 
 from __future__ import annotations
 
@@ -41,11 +41,11 @@ def ball(x: float, y: float, z: float = 0.03) -> WorldObject:
 
 
 def look(*things: WorldObject, others: bool = True) -> Detector:
-    """A detector that saw them, with other balls or alone: of those all are found and nothing beside them."""
+    """Return a detector that processed them, with or without other balls, and found only those."""
     detector = Detector(AROUND)
-    beside = [ball(x, y) for x, y in OTHERS] if others else []
-    found = detector.detect(Renderer(AROUND, camera=CAMERA).render([*things, *beside]).colour, CAMERA)
-    assert len(found) == len(beside), found
+    nearby = [ball(x, y) for x, y in OTHERS] if others else []
+    found = detector.detect(Renderer(AROUND, camera=CAMERA).render([*things, *nearby]).colour, CAMERA)
+    assert len(found) == len(nearby), found
     assert all(min(math.dist(one.position[:2], place) for place in OTHERS) < 0.003 for one in found)
     return detector
 
@@ -53,39 +53,39 @@ def look(*things: WorldObject, others: bool = True) -> Detector:
 @pytest.mark.parametrize("place", PLACES)
 @pytest.mark.parametrize("others", [True, False])
 @pytest.mark.parametrize("side", [0.045, 0.05, 0.06])
-def test_cube_is_told_by_its_outline(place: tuple[float, float], side: float, others: bool) -> None:
+def test_cube_is_detected_by_its_outline(place: tuple[float, float], side: float, others: bool) -> None:
     odd = look(red("box", (*place, side / 2), (side, side, side)), others=others).outliers
     assert {one.reason for one in odd} == {NOT_ROUND} and math.dist(odd[0].position[:2], place) < 0.03
 
 
 @pytest.mark.parametrize("place", [(0.30, 0.455), (0.44, 0.455), (0.74, -0.08), (0.06, -0.12)])
-def test_cube_that_the_border_cuts_is_told_by_what_shows_of_its_outline(place: tuple[float, float]) -> None:
+def test_cube_cut_by_the_border_is_detected_by_its_outline(place: tuple[float, float]) -> None:
     odd = look(red("box", (*place, 0.035), (0.07, 0.07, 0.07))).outliers
     assert {one.reason for one in odd} == {NOT_ROUND}
     assert min(math.dist(one.position[:2], place) for one in odd) < 0.06
 
 
 @pytest.mark.parametrize("place", PLACES)
-def test_cable_is_told_by_its_outline(place: tuple[float, float]) -> None:
+def test_cable_is_detected_by_its_outline(place: tuple[float, float]) -> None:
     odd = look(red("cylinder", (*place, 0.01), (0.02, 0.02, 0.2), roll=math.pi / 2)).outliers
     assert {one.reason for one in odd} == {NOT_ROUND}
 
 
 @pytest.mark.parametrize("eye", [AROUND.camera, SIDE])
-def test_thin_cable_is_reported_beside_balls(eye: CameraConfig) -> None:
+def test_thin_cable_is_reported_next_to_balls(eye: CameraConfig) -> None:
     camera, around = Pinhole.from_config(eye), AROUND.model_copy(update={"camera": eye})
     draw = Renderer(around, camera=camera)
     for width in (0.004, 0.006, 0.008):
         for place in PLACES:
             cable = red("cylinder", (*place, width / 2), (width, width, 0.25), roll=math.pi / 2)
-            beside = [ball(x, y) for x, y in OTHERS if math.dist((x, y), place) > 0.17]
+            nearby = [ball(x, y) for x, y in OTHERS if math.dist((x, y), place) > 0.17]
             detector = Detector(around)
-            assert len(detector.detect(draw.render([cable, *beside]).colour, camera)) == len(beside)
+            assert len(detector.detect(draw.render([cable, *nearby]).colour, camera)) == len(nearby)
             assert [one.reason for one in detector.outliers] in ([THIN], [NOT_ROUND] * (width > 0.006)), (width, place)
             assert math.dist(detector.outliers[0].position[:2], place) < 0.06
 
 
-def test_picture_full_of_red_specks_shows_no_cable() -> None:
+def test_red_noise_is_no_cable() -> None:
     rng = np.random.default_rng(5)
     picture = Renderer(AROUND, camera=CAMERA).render([ball(x, y) for x, y in OTHERS]).colour.copy()
     for share in (0.01, 0.1, 0.3, 0.7):
@@ -97,13 +97,13 @@ def test_picture_full_of_red_specks_shows_no_cable() -> None:
 
 
 @pytest.mark.parametrize("place", [(0.60, -0.30), (0.20, -0.35), (0.62, -0.25)])
-def test_disc_away_from_the_axis_is_told_by_its_shape(place: tuple[float, float]) -> None:
+def test_disc_off_axis_is_detected_by_its_shape(place: tuple[float, float]) -> None:
     for diameter in (0.06, 0.0624):  # the second one is as large in the picture as a ball
         odd = look(red("cylinder", (*place, 0.0005), (diameter, diameter, 0.001)), others=False).outliers
         assert [one.reason for one in odd] == [FLAT]
 
 
-def test_disc_below_the_camera_is_told_by_its_size_beside_balls() -> None:
+def test_disc_below_the_camera_is_detected_by_its_size() -> None:
     odd = look(red("cylinder", (0.40, 0.0, 0.0005), (0.06, 0.06, 0.001))).outliers
     assert len(odd) == 1 and "smaller than a ball on the table" in odd[0].reason
 
@@ -117,7 +117,7 @@ def test_ball_on_top_of_something_looks_too_large(place: tuple[float, float], he
 
 
 @pytest.mark.parametrize("place", PLACES)
-def test_of_a_stack_neither_ball_is_offered(place: tuple[float, float]) -> None:
+def test_no_ball_of_a_stack_is_offered(place: tuple[float, float]) -> None:
     detector = look(ball(*place), ball(*place, 0.09))
     assert detector.outliers
     frame = markers([], AROUND, 1, odd=detector.outliers)
@@ -126,20 +126,20 @@ def test_of_a_stack_neither_ball_is_offered(place: tuple[float, float]) -> None:
 
 @pytest.mark.parametrize("place", PLACES)
 @pytest.mark.parametrize("others", [True, False])
-def test_of_a_stack_neither_ball_is_offered_where_the_camera_sees_it_from_the_side(
+def test_no_ball_of_a_stack_is_offered_to_a_side_camera(
     place: tuple[float, float], others: bool,
 ) -> None:
     camera, around = Pinhole.from_config(SIDE), AROUND.model_copy(update={"camera": SIDE})
-    beside = [ball(x, y) for x, y in OTHERS] if others else []
-    picture = Renderer(around, camera=camera).render([ball(*place), ball(*place, 0.09), *beside]).colour
+    nearby = [ball(x, y) for x, y in OTHERS] if others else []
+    picture = Renderer(around, camera=camera).render([ball(*place), ball(*place, 0.09), *nearby]).colour
     detector = Detector(around)
-    assert len(detector.detect(picture, camera)) == len(beside)
+    assert len(detector.detect(picture, camera)) == len(nearby)
     assert sorted("it lies higher" in one.reason for one in detector.outliers) == [False, True]
     assert any(math.dist(one.position[:2], place) < 0.01 for one in detector.outliers), "the lower one is where it is"
 
 
 @pytest.mark.parametrize("gap", [0.0, 0.006])
-def test_three_balls_that_carry_one_are_not_offered_and_without_it_they_are(gap: float) -> None:
+def test_three_balls_are_offered_only_without_one_on_top(gap: float) -> None:
     draw, away = Renderer(AROUND, camera=CAMERA), (0.06 + gap) / math.sqrt(3)
     for place in PLACES:
         for turn in (0.0, 0.7):
@@ -153,7 +153,7 @@ def test_three_balls_that_carry_one_are_not_offered_and_without_it_they_are(gap:
 
 
 @pytest.mark.parametrize("blur", [0.6, 1.3])
-def test_three_balls_that_touch_are_offered_in_a_picture_that_is_blurred(blur: float) -> None:
+def test_three_touching_balls_are_offered_in_a_blurred_image(blur: float) -> None:
     away = 0.06 / math.sqrt(3)
     at = [0.30 + 0.20j + away * np.exp(1j * third * math.tau / 3) for third in range(3)]
     places = np.array([(z.real, z.imag, 0.03) for z in at] + [(x, y, 0.03) for x, y in OTHERS[:2]])
@@ -166,16 +166,16 @@ def test_three_balls_that_touch_are_offered_in_a_picture_that_is_blurred(blur: f
 
 @pytest.mark.parametrize("eye", [AROUND.camera, SIDE])
 @pytest.mark.parametrize("others", [True, False])
-def test_balls_that_touch_do_not_lie_on_each_other(eye: CameraConfig, others: bool) -> None:
+def test_touching_balls_are_no_stack(eye: CameraConfig, others: bool) -> None:
     camera, around = Pinhole.from_config(eye), AROUND.model_copy(update={"camera": eye})
     draw, detector = Renderer(around, camera=camera), Detector(around)
     touching = [(0.45, -0.30), (0.51, -0.30), (0.48, -0.248), (0.45, -0.19)]
     for turn in np.linspace(0, 2 * math.pi, 12, endpoint=False):
         about = complex(0.48, -0.26)
         turned = [about + (complex(*place) - about) * np.exp(1j * turn) for place in touching]
-        beside = [ball(x, y) for x, y in OTHERS[1:]] if others else []
-        picture = draw.render([*(ball(z.real, z.imag) for z in turned), *beside]).colour
-        assert len(detector.detect(picture, camera)) == len(touching) + len(beside) and detector.outliers == []
+        nearby = [ball(x, y) for x, y in OTHERS[1:]] if others else []
+        picture = draw.render([*(ball(z.real, z.imag) for z in turned), *nearby]).colour
+        assert len(detector.detect(picture, camera)) == len(touching) + len(nearby) and detector.outliers == []
 
 
 def painted(camera: Pinhole, places: list[tuple[float, float]], wider: list[float], higher: list[float]) -> np.ndarray:
@@ -193,7 +193,7 @@ def painted(camera: Pinhole, places: list[tuple[float, float]], wider: list[floa
 @pytest.mark.parametrize(("wider", "higher"), [
     ([0.45] * 4, [-0.45] * 4), ([-0.45] * 4, [0.45] * 4), ([0.41, 0, 0, 0], [0.41, 0, 0, 0]),
 ])
-def test_outline_of_a_ball_far_away_may_be_off_by_as_many_pixels_as_that_of_one_near(
+def test_outline_tolerance_in_pixels_is_independent_of_distance(
     wider: list[float], higher: list[float],
 ) -> None:
     camera, around = Pinhole.from_config(SIDE), AROUND.model_copy(update={"camera": SIDE})
@@ -211,17 +211,17 @@ def test_ball_on_top_of_something_looks_too_large_from_the_side(
     place: tuple[float, float], height: float, others: bool,
 ) -> None:
     camera, around = Pinhole.from_config(SIDE), AROUND.model_copy(update={"camera": SIDE})
-    beside = [ball(x, y) for x, y in OTHERS] if others else []
+    nearby = [ball(x, y) for x, y in OTHERS] if others else []
     detector = Detector(around)
-    picture = Renderer(around, camera=camera).render([ball(*place, height), *beside]).colour
-    assert len(detector.detect(picture, camera)) == len(beside)
+    picture = Renderer(around, camera=camera).render([ball(*place, height), *nearby]).colour
+    assert len(detector.detect(picture, camera)) == len(nearby)
     assert ["it lies higher" in one.reason for one in detector.outliers] == [True]
 
 
 @pytest.mark.parametrize("places", [
     [(0.544, 0.265), (0.514, 0.21), (0.579, 0.216)], [(0.552, 0.273), (0.539, 0.214)],
 ])
-def test_ball_that_leans_on_a_wall_of_the_container_carries_none_that_is_not_there(
+def test_ball_leaning_on_the_wall_carries_no_phantom_ball(
     places: list[tuple[float, float]],
 ) -> None:
     things = [ball(x, y, 0.035) for x, y in places]
@@ -231,7 +231,7 @@ def test_ball_that_leans_on_a_wall_of_the_container_carries_none_that_is_not_the
 
 @pytest.mark.parametrize("place", PLACES[:2])
 @pytest.mark.parametrize(("diameter", "below"), [(0.07, 0.0), (0.1, 0.0), (0.06, 0.17)])
-def test_what_looks_much_larger_than_a_ball_is_told_though_it_may_fall(
+def test_much_larger_blob_is_counted_as_too_large(
     place: tuple[float, float], diameter: float, below: float,
 ) -> None:
     detector = look(red("sphere", (*place, below + diameter / 2), (diameter, diameter, diameter)))
@@ -249,7 +249,7 @@ class Anywhere:
 
 @pytest.mark.parametrize("depth", [None, 1.5])
 @pytest.mark.parametrize("height", [40, 100])
-def test_red_thing_above_the_horizon_has_no_place_on_the_table(height: int, depth: float | None) -> None:
+def test_red_object_above_the_horizon_is_ignored(height: int, depth: float | None) -> None:
     camera = Pinhole.from_config(CameraConfig(position=(-1.0, 0.0, 0.6), rpy=(-math.pi / 2 - 0.2, 0.0, -math.pi / 2)))
     picture = np.full((camera.height, camera.width, 3), 128, np.uint8)
     cv2.rectangle(picture, (280, height - 20), (380, height + 20), (0, 0, 255), -1)
@@ -261,15 +261,15 @@ def test_red_thing_above_the_horizon_has_no_place_on_the_table(height: int, dept
     assert found == [] and markers(found, AROUND, 0, odd=detector.outliers).markers == []
 
 
-def test_what_is_odd_is_rejected_with_the_reason_of_the_detector() -> None:
+def test_outlier_is_rejected_with_the_detectors_reason() -> None:
     detector = look(red("box", (0.5, -0.1, 0.03), (0.06, 0.06, 0.06)))
     validation = Validation(AROUND, Anywhere())  # type: ignore[arg-type]
-    told = []
+    reported = []
     for k in range(10):
         verdict = validation.validate(markers([], AROUND, 1 + k * 100_000_000, odd=detector.outliers), CAMERA)
         assert verdict.targets == [] and [why for _, why in verdict.refused] == [NOT_ROUND]
-        told.append([one.reason for one in verdict.rejections])
-    assert [reasons for reasons in told if reasons] == [[NOT_ROUND]] and told[0] == [], "not what falls past"
+        reported.append([one.reason for one in verdict.rejections])
+    assert [reasons for reasons in reported if reasons] == [[NOT_ROUND]] and reported[0] == [], "not what falls past"
 
 
 CELL = """
@@ -297,7 +297,7 @@ services:
 
 
 @pytest.mark.slow
-def test_cell_takes_the_ball_and_leaves_and_reports_the_cube(tmp_path: Path) -> None:
+def test_cell_takes_the_ball_and_reports_the_cube(tmp_path: Path) -> None:
     path = tmp_path / "odd.yaml"
     path.write_text(CELL, encoding="utf-8")
     summary = SimulatedCell(str(path)).summary

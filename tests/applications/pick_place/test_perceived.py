@@ -50,32 +50,32 @@ def test_fixtures_and_five_panels_are_there_before_anything_is_seen() -> None:
     assert "target" not in found
 
 
-def test_taken_ball_keeps_its_id_in_the_hand_and_an_old_frame_does_not_bring_it_back() -> None:
+def test_held_ball_keeps_its_id_and_old_frames_are_ignored() -> None:
     s = scene()
     for t in (1.0, 1.1):
-        s.see(frame(t, (0.4, 0.0, 0.03), (0.52, 0.0, 0.03)), CAMERA, AWAY)
+        s.update_detections(frame(t, (0.4, 0.0, 0.03), (0.52, 0.0, 0.03)), CAMERA, AWAY)
     ids = {o.pose.position.x: o.id for o in s.scene().objects if o.role == "target"}
-    s.feel(gripper(1.25, True), tool_down(0.4, 0.0, 0.03))
+    s.update_gripper(gripper(1.25, True), tool_down(0.4, 0.0, 0.03))
     assert s.scene().attached[0].object.id == ids[0.4]
     assert roles(s)["target"] == [ids[0.52]]
-    s.see(frame(1.2, (0.4, 0.0, 0.03), (0.52, 0.0, 0.03)), CAMERA, tool_down(0.4, 0.0, 0.03))
-    s.see(frame(1.3, (0.4, 0.0, 0.03), (0.52, 0.0, 0.03)), CAMERA, tool_down(0.4, 0.0, 0.03))
+    s.update_detections(frame(1.2, (0.4, 0.0, 0.03), (0.52, 0.0, 0.03)), CAMERA, tool_down(0.4, 0.0, 0.03))
+    s.update_detections(frame(1.3, (0.4, 0.0, 0.03), (0.52, 0.0, 0.03)), CAMERA, tool_down(0.4, 0.0, 0.03))
     assert roles(s)["target"] == [ids[0.52]]
 
 
-def test_ball_held_by_a_hand_that_was_never_seen_to_take_it_is_attached_at_the_tool() -> None:
+def test_ball_held_at_the_start_is_attached_at_the_tool() -> None:
     s = scene()
-    s.feel(gripper(1.0, True), tool_down(0.4, 0.1, 0.2))
+    s.update_gripper(gripper(1.0, True), tool_down(0.4, 0.1, 0.2))
     attached = s.scene().attached[0]
     assert attached.link == "panda_hand_tcp"
     assert attached.object.pose.position == m.Vector3()
 
 
-def test_opened_hand_holds_nothing_and_the_ball_in_the_box_is_contained() -> None:
+def test_released_ball_in_the_container_is_contained() -> None:
     s = scene()
-    s.feel(gripper(1.0, True), tool_down(0.55, 0.25, 0.25))
-    s.feel(gripper(1.2, False), tool_down(0.55, 0.25, 0.25))
-    s.see(frame(1.5, (0.517, 0.217, 0.035)), CAMERA, AWAY)
+    s.update_gripper(gripper(1.0, True), tool_down(0.55, 0.25, 0.25))
+    s.update_gripper(gripper(1.2, False), tool_down(0.55, 0.25, 0.25))
+    s.update_detections(frame(1.5, (0.517, 0.217, 0.035)), CAMERA, AWAY)
     assert s.scene().attached == []
     assert roles(s)["contained"] == ["slot_1"]
     assert "target" not in roles(s)
@@ -85,64 +85,64 @@ LOW, HIGH = (0.517, 0.217, 0.035), (0.517, 0.217, 0.095)  # one above the other 
 OVER_BOX = tool_down(0.55, 0.25, 0.25)
 
 
-def test_ball_that_was_let_go_and_hangs_over_a_free_place_in_the_box_is_one_ball_until_it_lies_there() -> None:
+def test_falling_ball_above_a_free_slot_counts_once() -> None:
     s = scene()
-    s.see(frame(1.0, (0.4, 0.0, 0.03)), CAMERA, AWAY)
-    s.feel(gripper(1.1, True), tool_down(0.4, 0.0, 0.03))
-    s.see(frame(2.0), CAMERA, OVER_BOX)
-    s.feel(gripper(2.1, False), OVER_BOX)
+    s.update_detections(frame(1.0, (0.4, 0.0, 0.03)), CAMERA, AWAY)
+    s.update_gripper(gripper(1.1, True), tool_down(0.4, 0.0, 0.03))
+    s.update_detections(frame(2.0), CAMERA, OVER_BOX)
+    s.update_gripper(gripper(2.1, False), OVER_BOX)
     for t in (2.2, 2.3, 4.0):
-        s.see(frame(t, HIGH), CAMERA, AWAY)
+        s.update_detections(frame(t, HIGH), CAMERA, AWAY)
         assert roles(s)["contained"] == ["slot_5"]
-    s.see(frame(4.1, LOW), CAMERA, AWAY)
+    s.update_detections(frame(4.1, LOW), CAMERA, AWAY)
     assert roles(s)["contained"] == ["slot_1"]
 
 
-def test_ball_below_the_one_that_was_let_go_still_counts_though_the_hand_and_then_that_one_hide_it() -> None:
+def test_ball_occluded_by_the_released_one_still_counts() -> None:
     s = scene()
-    s.see(frame(1.0, (0.4, 0.0, 0.03), LOW), CAMERA, AWAY)
-    s.feel(gripper(1.1, True), tool_down(0.4, 0.0, 0.03))
-    s.see(frame(2.0), CAMERA, OVER_BOX)
-    s.feel(gripper(2.1, False), OVER_BOX)
-    s.see(frame(2.2, HIGH), CAMERA, AWAY)
+    s.update_detections(frame(1.0, (0.4, 0.0, 0.03), LOW), CAMERA, AWAY)
+    s.update_gripper(gripper(1.1, True), tool_down(0.4, 0.0, 0.03))
+    s.update_detections(frame(2.0), CAMERA, OVER_BOX)
+    s.update_gripper(gripper(2.1, False), OVER_BOX)
+    s.update_detections(frame(2.2, HIGH), CAMERA, AWAY)
     assert roles(s)["contained"] == ["slot_1", "slot_5"]
 
 
-def test_ball_that_filled_a_free_place_carries_the_next_one() -> None:
+def test_ball_in_a_former_free_slot_carries_the_next_one() -> None:
     s = scene()
-    s.see(frame(1.0, (0.4, 0.0, 0.03)), CAMERA, AWAY)
-    s.feel(gripper(1.1, True), tool_down(0.4, 0.0, 0.03))
-    s.feel(gripper(2.1, False), OVER_BOX)
+    s.update_detections(frame(1.0, (0.4, 0.0, 0.03)), CAMERA, AWAY)
+    s.update_gripper(gripper(1.1, True), tool_down(0.4, 0.0, 0.03))
+    s.update_gripper(gripper(2.1, False), OVER_BOX)
     for t in (2.2, 2.5, 2.8):
-        s.see(frame(t, LOW), CAMERA, AWAY)
-    s.see(frame(2.9, HIGH), CAMERA, AWAY)  # put there by somebody
+        s.update_detections(frame(t, LOW), CAMERA, AWAY)
+    s.update_detections(frame(2.9, HIGH), CAMERA, AWAY)  # placed by an operator
     assert roles(s)["contained"] == ["slot_1", "slot_5"]
 
 
-def test_ball_that_passed_a_free_place_before_it_came_to_rest_above_is_one_ball() -> None:
+def test_ball_bouncing_through_a_free_slot_counts_once() -> None:
     s = scene()
-    s.see(frame(1.0, (0.4, 0.0, 0.03)), CAMERA, AWAY)
-    s.feel(gripper(1.1, True), tool_down(0.4, 0.0, 0.03))
-    s.feel(gripper(2.1, False), OVER_BOX)
-    s.see(frame(2.2, LOW), CAMERA, AWAY)  # it bounces
+    s.update_detections(frame(1.0, (0.4, 0.0, 0.03)), CAMERA, AWAY)
+    s.update_gripper(gripper(1.1, True), tool_down(0.4, 0.0, 0.03))
+    s.update_gripper(gripper(2.1, False), OVER_BOX)
+    s.update_detections(frame(2.2, LOW), CAMERA, AWAY)  # it bounces
     for t in (2.3, 2.6, 2.9):
-        s.see(frame(t, HIGH), CAMERA, AWAY)
+        s.update_detections(frame(t, HIGH), CAMERA, AWAY)
     assert roles(s)["contained"] == ["slot_5"]
 
 
 @pytest.mark.parametrize("holding", [False, True])
-def test_after_a_restart_a_ball_that_is_hidden_in_the_box_is_taken_to_be_there(holding: bool) -> None:
+def test_occluded_ball_in_the_container_is_assumed_after_a_restart(holding: bool) -> None:
     s = scene()
-    s.feel(gripper(1.0, holding), OVER_BOX)
-    s.see(frame(1.1, HIGH), CAMERA, OVER_BOX)
+    s.update_gripper(gripper(1.0, holding), OVER_BOX)
+    s.update_detections(frame(1.1, HIGH), CAMERA, OVER_BOX)
     assert roles(s)["contained"] == ["slot_1", "slot_5"]
     assert [thing.id for thing in s.scene().objects if thing.unseen] == ["slot_1"]
 
 
-def test_perceived_place_is_where_the_ball_was_seen() -> None:
+def test_perceived_position_is_the_detected_position() -> None:
     s = scene()
     for t in (1.0, 1.1, 1.2):
-        s.see(frame(t, (0.5, -0.2, 0.03)), CAMERA, AWAY)
+        s.update_detections(frame(t, (0.5, -0.2, 0.03)), CAMERA, AWAY)
     ball = next(o for o in s.scene().objects if o.role == "target")
     assert np.allclose([ball.pose.position.x, ball.pose.position.y], [0.5, -0.2])
     assert ball.color.r > 0.9
@@ -159,48 +159,48 @@ def shown(stamp: float, *markers: m.Marker) -> m.MarkerArray:
     return m.MarkerArray(header=m.Header(stamp=int(stamp * 1e9), frame_id="world"), markers=list(markers))
 
 
-def test_shape_size_colour_and_turn_ride_from_the_detection_to_the_scene() -> None:
+def test_scene_has_shape_size_color_and_yaw_of_the_detection() -> None:
     s = scene()
     can = m.Marker(ns="can", id=1, type="cylinder", scale=m.Vector3(x=0.05, y=0.05, z=0.1),
                    pose=m.Pose(position=m.Vector3(x=0.6, y=-0.2, z=0.05)))
     note = m.Marker(ns="note", id=2, type="text", scale=m.Vector3(x=0.1), pose=m.Pose(), text="two things")
     for t in (1.0, 1.1):
-        s.see(shown(t, cube(0.4, 0.0, 0.3), can, note), CAMERA, AWAY)
+        s.update_detections(shown(t, cube(0.4, 0.0, 0.3), can, note), CAMERA, AWAY)
     box, cylinder = (o for o in s.scene().objects if o.role == "target")
     assert (box.shape, box.dimensions, box.color) == ("box", [0.04, 0.05, 0.04], m.Color(r=0, g=0.2, b=1))
     assert matrix_to_rpy(pose_to_matrix(box.pose)[:3, :3])[2] == pytest.approx(0.3)
     assert (cylinder.shape, cylinder.dimensions) == ("cylinder", [0.025, 0.1])
 
 
-def test_a_box_in_the_hand_keeps_its_shape_and_turn() -> None:
+def test_held_box_keeps_shape_and_yaw() -> None:
     s = scene()
     for t in (1.0, 1.1):
-        s.see(shown(t, cube(0.4, 0.0, 0.3)), CAMERA, AWAY)
+        s.update_detections(shown(t, cube(0.4, 0.0, 0.3)), CAMERA, AWAY)
     hand = tool_down(0.402, 0.0, 0.02, 0.3)
-    s.feel(gripper(1.2, True).model_copy(update={"width": 0.05}), hand)
+    s.update_gripper(gripper(1.2, True).model_copy(update={"width": 0.05}), hand)
     (held,) = s.scene().attached
     assert (held.object.shape, held.object.id) == ("box", "track_1")
     T_world_box = hand @ pose_to_matrix(held.object.pose)
     assert matrix_to_rpy(T_world_box[:3, :3]) == pytest.approx((0.0, 0.0, 0.3), abs=1e-9)
 
 
-def test_a_box_in_the_container_is_contained_as_what_it_is() -> None:
+def test_box_in_the_container_keeps_its_kind() -> None:
     s = scene()
     c = AROUND.container
     u, v = CAMERA.project([c.x, c.y, 0.025])
-    s.see(shown(1.0, cube(c.x, c.y, 0.0, u_v=(u, v))), CAMERA, AWAY)
+    s.update_detections(shown(1.0, cube(c.x, c.y, 0.0, u_v=(u, v))), CAMERA, AWAY)
     (inside,) = (o for o in s.scene().objects if o.role == "contained")
     assert (inside.id, inside.shape) == ("contained_1", "box")
 
 
-def test_objects_of_a_kind_say_how_hard_they_are_to_be_gripped() -> None:
+def test_objects_carry_the_grip_effort_of_their_kind() -> None:
     around = AROUND.model_copy(update={"grip_efforts": {"ball": 3.0}})
     assert CELL.robot.gripper is not None
     s = PerceivedScene(SceneParameters(), around, CELL.robot.gripper, "panda_hand_tcp")
     for t in (1.0, 1.1):
-        s.see(frame(t, (0.4, 0.0, 0.03)), CAMERA, AWAY)
+        s.update_detections(frame(t, (0.4, 0.0, 0.03)), CAMERA, AWAY)
     assert [o.grip_effort for o in s.scene().objects if o.role == "target"] == [3.0]
-    s.feel(gripper(1.2, True), tool_down(0.4, 0.0, 0.03))
+    s.update_gripper(gripper(1.2, True), tool_down(0.4, 0.0, 0.03))
     assert s.scene().attached[0].object.grip_effort == 3.0
 
 
@@ -213,14 +213,15 @@ def boxes(stamp: float, camera: Pinhole, *places: tuple[str, float, float, float
     return m.MarkerArray(header=m.Header(stamp=int(stamp * 1e9), frame_id="world"), markers=markers)
 
 
-def test_boxes_keep_their_kind_and_what_lies_in_any_of_several_containers_is_contained() -> None:
+def test_objects_in_any_container_are_contained_with_their_kind() -> None:
     around = Surroundings.model_validate({"containers": {"left": {"y": 0.3}, "right": {"y": -0.3}}})
     camera = Pinhole.from_config(around.camera)
     assert CELL.robot.gripper is not None
     s = PerceivedScene(SceneParameters(confirm_frames=1), around, CELL.robot.gripper, "panda_hand_tcp")
     assert sum(o.role == "container" for o in s.scene().objects) == 10
-    s.see(boxes(1.0, camera, ("red", 0.4, 0.0, 0.02), ("green", 0.55, 0.3, 0.025), ("red", 0.55, -0.3, 0.025)),
-          camera, AWAY)
+    s.update_detections(
+        boxes(1.0, camera, ("red", 0.4, 0.0, 0.02), ("green", 0.55, 0.3, 0.025), ("red", 0.55, -0.3, 0.025)),
+        camera, AWAY)
     found = [(o.role, o.kind, round(o.pose.position.y, 2)) for o in s.scene().objects if o.kind]
     assert found == [("target", "red", 0.0), ("contained", "green", 0.3), ("contained", "red", -0.3)]
 
@@ -232,12 +233,12 @@ def test_a_world_without_containers_has_no_panels() -> None:
     assert s.scene().objects == []
 
 
-def test_something_is_thought_to_carry_what_stands_above_the_table() -> None:
+def test_object_above_the_table_gets_a_supporting_column() -> None:
     around = Surroundings()
     camera = Pinhole.from_config(around.camera)
     assert CELL.robot.gripper is not None
     s = PerceivedScene(SceneParameters(confirm_frames=1), around, CELL.robot.gripper, "panda_hand_tcp")
-    s.see(boxes(1.0, camera, ("red", 0.4, 0.0, 0.02), ("green", 0.55, 0.1, 0.10)), camera, AWAY)
+    s.update_detections(boxes(1.0, camera, ("red", 0.4, 0.0, 0.02), ("green", 0.55, 0.1, 0.10)), camera, AWAY)
     column, = [o for o in s.scene().objects if o.role == "fixture"]
     assert column.dimensions == pytest.approx([0.04, 0.04, 0.08]) and column.pose.position.z == pytest.approx(0.04)
     assert (column.pose.position.x, column.pose.position.y) == (0.55, 0.1)
@@ -253,34 +254,34 @@ def frame_of(stamp: float, *markers: m.Marker) -> m.MarkerArray:
 
 
 @pytest.mark.parametrize("side", [0.0, -1.0])
-def test_what_has_no_size_is_no_object(side: float) -> None:
+def test_marker_without_size_is_no_object(side: float) -> None:
     s = scene()
     for t in (1.0, 1.1):
-        s.see(frame_of(t, thing(0, 0.4, 0.0, side), thing(1, 0.6, 0.0)), CAMERA, AWAY)
+        s.update_detections(frame_of(t, thing(0, 0.4, 0.0, side), thing(1, 0.6, 0.0)), CAMERA, AWAY)
     assert len(roles(s)["target"]) == 1
 
 
-def test_more_than_a_scene_has_room_for_is_told_and_breaks_nothing() -> None:
+def test_too_many_objects_are_reported() -> None:
     s = scene()
     many = [thing(k, 0.2 + 0.1 * (k % 30), -2.0 + 0.1 * (k // 30)) for k in range(1000)]
     for t in (1.0, 1.1):
-        s.see(frame_of(t, *many), CAMERA, AWAY)
+        s.update_detections(frame_of(t, *many), CAMERA, AWAY)
     assert s.crowded and len(s.scene().objects) <= 500
     for t in (2.0, 2.1):
-        s.see(frame_of(t, many[0]), CAMERA, AWAY)
+        s.update_detections(frame_of(t, many[0]), CAMERA, AWAY)
     assert not s.crowded and len(roles(s)["target"]) == 1
 
 
-def test_more_in_a_container_than_a_scene_has_room_for_is_told_and_breaks_nothing() -> None:
+def test_too_many_objects_in_a_container_are_reported() -> None:
     s = scene()
-    s.see(frame_of(1.0, *(thing(k, 0.55, 0.25, 0.01) for k in range(600))), CAMERA, AWAY)
+    s.update_detections(frame_of(1.0, *(thing(k, 0.55, 0.25, 0.01) for k in range(600))), CAMERA, AWAY)
     assert s.crowded and len(s.scene().objects) <= 500
 
 
-def test_what_a_wrong_clock_told_of_is_forgotten_with_the_next_frame_of_a_right_one() -> None:
+def test_detections_of_a_wrong_clock_are_removed_by_the_next_frame() -> None:
     s = scene()
     for t in (1000.0, 1000.1):
-        s.see(frame_of(t, thing(0, 0.4, 0.0)), CAMERA, AWAY)
+        s.update_detections(frame_of(t, thing(0, 0.4, 0.0)), CAMERA, AWAY)
     for t in (1.0, 1.1):
-        s.see(frame_of(t, thing(1, 0.6, 0.0)), CAMERA, AWAY)
+        s.update_detections(frame_of(t, thing(1, 0.6, 0.0)), CAMERA, AWAY)
     assert [round(o.pose.position.x, 3) for o in s.scene().objects if o.role == "target"] == [0.6]

@@ -6,7 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from applications.pick_place.choice import Pick, Target, finger_clearance
+from applications.pick_place.choice import Pick
+from applications.pick_place.grasping import Target, finger_clearance
 from applications.pick_place.motion_sequences import MotionSequences
 from common import messages as m
 from common.robot.transforms import matrix_to_pose, matrix_to_rpy, pose_to_matrix, rpy_to_matrix, tool_down, transform
@@ -14,7 +15,7 @@ from common.tasks.stages import Move
 from tests.applications.pick_place.cell_double import SEVEN, CellDouble
 
 
-def test_seven_balls_end_in_the_container_and_the_task_is_done() -> None:
+def test_seven_balls_end_in_the_container() -> None:
     cell = CellDouble(SEVEN)
     cell.until("DONE")
     assert (cell.contained, cell.balls, cell.task.status.placed) == (7, {}, 7)
@@ -36,14 +37,14 @@ def test_next_pick_is_planned_while_the_ball_is_carried_across() -> None:
     assert cell.motion.state == "active"
 
 
-def test_planned_ahead_motions_start_where_the_one_before_ends() -> None:
+def test_motions_planned_ahead_start_at_the_end_of_the_previous_one() -> None:
     cell = CellDouble([(0.40, -0.30), (0.52, -0.30)])
     cell.until("DONE")
     plans = [r for r in cell.requests if isinstance(r, m.PlanRequest)]
     assert [bool(p.start) for p in plans[:4]] == [False, True, True, True]
 
 
-def test_ball_that_fell_out_of_the_hand_and_is_not_seen_again_is_told_at_the_end() -> None:
+def test_lost_ball_is_reported_at_the_end() -> None:
     cell = CellDouble([(0.40, -0.30), (0.52, -0.30), (0.40, -0.17)])
     cell.until("across")
     cell.drop()
@@ -56,7 +57,7 @@ def test_ball_that_fell_out_of_the_hand_and_is_not_seen_again_is_told_at_the_end
         "the table looks empty, but 1 that was seen before something fell out of the hand was not seen again")
 
 
-def test_ball_that_fell_out_of_the_hand_is_told_at_the_end_if_it_was_only_seen_as_it_rolled_away() -> None:
+def test_lost_ball_seen_only_while_rolling_is_reported_at_the_end() -> None:
     cell = CellDouble([(0.40, -0.30), (0.52, -0.30), (0.40, -0.17)])
     cell.until("across")
     cell.drop()
@@ -74,7 +75,7 @@ def test_ball_that_fell_out_of_the_hand_is_told_at_the_end_if_it_was_only_seen_a
         "the table looks empty, but 1 that was seen before something fell out of the hand was not seen again")
 
 
-def test_ball_that_fell_out_of_the_hand_and_was_taken_again_is_no_loss_even_if_a_person_takes_another() -> None:
+def test_recovered_ball_is_not_reported_even_if_another_is_removed() -> None:
     cell = CellDouble([(0.40, -0.30), (0.52, -0.30), (0.40, -0.17)])
     cell.until("across")
     cell.drop()
@@ -85,7 +86,7 @@ def test_ball_that_fell_out_of_the_hand_and_was_taken_again_is_no_loss_even_if_a
     assert (cell.task.status.done, cell.task.status.total, cell.task.status.overlooked) == (2, 2, "")
 
 
-def test_one_motion_leads_to_a_ball_that_may_not_be_touched_and_one_across_with_it_attached() -> None:
+def test_joined_motions_approach_without_contact_and_carry_with_attachment() -> None:
     cell = CellDouble([(0.40, -0.30)])
     cell.until("DONE")
     plans = [r for r in cell.requests if isinstance(r, m.PlanRequest)]
@@ -101,7 +102,7 @@ def test_one_motion_leads_to_a_ball_that_may_not_be_touched_and_one_across_with_
     assert plans[1].attach == "track_0" and plans[1].attach_pose is not None
 
 
-def test_where_there_is_no_way_in_one_motion_each_stage_is_planned_by_itself() -> None:
+def test_stages_are_planned_separately_without_a_joined_plan() -> None:
     cell = CellDouble([(0.40, -0.30)])
     cell.unplannable = lambda r: "no_path" if isinstance(r.goal, m.SequenceGoal) else ""
     cell.until("DONE")
@@ -113,10 +114,10 @@ def test_where_there_is_no_way_in_one_motion_each_stage_is_planned_by_itself() -
     assert cell.stages() == ["pre-grasp", "across", "lift", "across"]
 
 
-def test_yaws_that_are_offered_for_a_round_thing_are_those_at_which_the_fingers_clear_what_stands_beside_it() -> None:
-    beside = [(0.40 + 0.068, -0.30), (0.40 - 0.068, -0.30)]  # along x: the fingers close along y only
-    cell = CellDouble([(0.40, -0.30), *beside])
-    cell.unreachable = beside
+def test_offered_yaw_ranges_of_a_round_object_are_clear() -> None:
+    near = [(0.40 + 0.068, -0.30), (0.40 - 0.068, -0.30)]  # along x: the fingers close along y only
+    cell = CellDouble([(0.40, -0.30), *near])
+    cell.unreachable = near
     cell.until("pre-grasp")
     request = next(r for r in cell.requests if isinstance(r, m.PlanRequest))
     assert isinstance(request.goal, m.SequenceGoal)
@@ -128,11 +129,11 @@ def test_yaws_that_are_offered_for_a_round_thing_are_those_at_which_the_fingers_
         assert 0.05 < goal.yaw_tolerance < 0.8
         shape = cell.task.p.hand
         for turn in (-goal.yaw_tolerance, 0.0, goal.yaw_tolerance):
-            assert finger_clearance(shape, (0.40, -0.30), yaw + turn, beside, 0.03) >= shape.min_clearance
+            assert finger_clearance(shape, (0.40, -0.30), yaw + turn, near, 0.03) >= shape.min_clearance
 
 
 @pytest.mark.parametrize("blind", [False, True])
-def test_arm_stops_on_the_way_to_a_ball_that_is_gone_or_no_longer_seen(blind: bool) -> None:
+def test_arm_stops_when_its_target_disappears(blind: bool) -> None:
     cell = CellDouble([(0.40, -0.30)])
     cell.until("pre-grasp")
     cell.step()
@@ -148,7 +149,7 @@ def test_arm_stops_on_the_way_to_a_ball_that_is_gone_or_no_longer_seen(blind: bo
     assert (cell.contained, cell.task.status.failures, cell.task.status.retries) == (1, 0, 0)
 
 
-def test_hand_that_is_above_the_ball_already_goes_on_without_seeing_it() -> None:
+def test_gripper_above_the_ball_continues_without_a_view() -> None:
     cell = CellDouble([(0.40, -0.30)])
     cell.until("pre-grasp")
     cell.tcp = (0.40, -0.30, 0.14)
@@ -166,7 +167,7 @@ def test_ball_is_an_obstacle_until_the_descent_then_may_be_touched_then_is_attac
     assert plans["across"].attach == "track_0"
 
 
-def test_grasp_that_closes_on_nothing_is_retried_from_a_fresh_picture() -> None:
+def test_empty_grasp_is_retried_from_a_fresh_image() -> None:
     cell = CellDouble([(0.40, -0.30)])
     cell.slips = 2
     cell.until("DONE")
@@ -174,7 +175,7 @@ def test_grasp_that_closes_on_nothing_is_retried_from_a_fresh_picture() -> None:
     assert cell.stages().count("retreat") == 2
 
 
-def test_grasp_asks_for_what_was_seen_as_hard_as_the_scene_says() -> None:
+def test_grasp_uses_expected_width_and_effort_of_the_scene() -> None:
     cell = CellDouble([(0.40, -0.30)], width_tolerance=0.004)
     cell.until("DONE")
     close = next(r for r in cell.requests if isinstance(r, m.GripperCommand) and r.width == 0)
@@ -188,7 +189,7 @@ def test_grasp_asks_for_what_was_seen_as_hard_as_the_scene_says() -> None:
         assert (close.expected_width, close.effort) == (pytest.approx(width), 2.0)
 
 
-def test_grasp_of_what_is_not_as_wide_as_it_was_seen_is_let_go_and_retried() -> None:
+def test_grasp_of_unexpected_width_is_released_and_retried() -> None:
     cell = CellDouble([(0.40, -0.30)])
     cell.outliers = 2
     cell.until("open")
@@ -200,7 +201,7 @@ def test_grasp_of_what_is_not_as_wide_as_it_was_seen_is_let_go_and_retried() -> 
     assert all(("panda_hand", "track_0") in r.allowed_collisions for r in retreats)
 
 
-def test_what_is_never_as_wide_as_it_was_seen_is_given_up() -> None:
+def test_object_of_wrong_width_is_abandoned() -> None:
     cell = CellDouble([(0.40, -0.30)], max_retries=2)
     cell.outliers = 1000
     cell.until("DONE")
@@ -208,22 +209,22 @@ def test_what_is_never_as_wide_as_it_was_seen_is_given_up() -> None:
     assert cell.task.status.skipped[0].reason == "the fingers closed on a brick 3 times"
 
 
-def test_what_was_not_to_be_taken_is_let_go_by_a_task_that_finds_it_in_the_hand() -> None:
+def test_wrong_object_found_in_the_gripper_is_released() -> None:
     cell = CellDouble([(0.40, -0.30)])
     cell.outliers = 1
     cell.until("open")
-    cell.tell("stop")
+    cell.command("stop")
     for _ in range(10):
         cell.step()
     cell.gripper = cell.gripper.model_copy(update={"holding": True, "outcome": "too_wide"})
-    cell.tell("start")
+    cell.command("start")
     cell.until("retreat")
     assert not cell.gripper.holding
     cell.until("DONE")
     assert cell.contained == 1
 
 
-def test_place_that_is_always_missed_is_given_up_and_reported() -> None:
+def test_repeatedly_missed_position_is_abandoned_and_reported() -> None:
     cell = CellDouble([(0.40, -0.30)], max_retries=2)
     cell.slips = 1000
     cell.until("DONE")
@@ -232,7 +233,7 @@ def test_place_that_is_always_missed_is_given_up_and_reported() -> None:
 
 
 @pytest.mark.parametrize("stage", ["lift", "across"])
-def test_ball_that_falls_on_the_way_is_picked_again(stage: str) -> None:
+def test_ball_lost_during_the_motion_is_picked_again(stage: str) -> None:
     cell = CellDouble([(0.40, -0.30), (0.40, 0.09)], joined=stage != "lift")
     cell.until(stage)
     cell.drop()
@@ -260,7 +261,7 @@ def test_empty_table_ends_the_task_after_a_second() -> None:
     assert 1.0 <= cell.now - start < 2.0
 
 
-def test_no_picture_never_ends_the_task_nor_starts_a_motion() -> None:
+def test_missing_image_neither_ends_the_task_nor_starts_a_motion() -> None:
     cell = CellDouble([(0.40, -0.30)])
     cell.camera_on = False
     cell.now += 10
@@ -273,7 +274,7 @@ def test_no_picture_never_ends_the_task_nor_starts_a_motion() -> None:
     assert cell.contained == 1
 
 
-def test_pictures_that_stop_coming_do_not_end_the_task_however_fresh_the_last_one_counts() -> None:
+def test_missing_images_do_not_end_the_task() -> None:
     cell = CellDouble([], frame_timeout=30.0)
     cell.step()
     cell.camera_on = False
@@ -284,7 +285,7 @@ def test_pictures_that_stop_coming_do_not_end_the_task_however_fresh_the_last_on
     cell.until("DONE")
 
 
-def test_first_picture_after_a_long_time_without_any_does_not_end_the_task() -> None:
+def test_first_image_after_an_outage_does_not_end_the_task() -> None:
     cell = CellDouble([])
     cell.camera_on, cell._stamp = False, 0.0  # as a scene manager that has seen nothing yet says
     cell.step()
@@ -294,7 +295,7 @@ def test_first_picture_after_a_long_time_without_any_does_not_end_the_task() -> 
     assert cell.now - start >= 1.0
 
 
-def test_scene_that_shows_nothing_yet_does_not_end_the_task_while_targets_are_seen() -> None:
+def test_empty_scene_does_not_end_the_task_while_there_are_targets() -> None:
     cell = CellDouble([(0.40, -0.30)])
     known, cell.balls = cell.balls, {}
     for _ in range(50):
@@ -309,7 +310,7 @@ def test_scene_that_shows_nothing_yet_does_not_end_the_task_while_targets_are_se
     assert cell.contained == 1
 
 
-def test_target_that_can_not_be_planned_is_tried_at_every_yaw_then_skipped_until_the_scene_changes() -> None:
+def test_unplannable_target_is_tried_at_every_yaw_then_skipped() -> None:
     cell = CellDouble([(0.40, -0.09), (0.40, 0.30)], joined=False)
     cell.unplannable = lambda r: "collision" if (
         r.stage == "descend" and len(cell.balls) > 1 and r.goal.pose.position.y < 0
@@ -320,7 +321,7 @@ def test_target_that_can_not_be_planned_is_tried_at_every_yaw_then_skipped_until
     assert cell.stages().count("descend") == yaws + 2
 
 
-def test_last_target_without_a_way_down_is_tried_once_more_from_home() -> None:
+def test_last_target_without_a_descent_is_retried_from_home() -> None:
     cell = CellDouble([(0.40, -0.09)], joined=False)
     cell.unplannable = lambda r: "joint_jump" if r.stage == "descend" and "home" not in cell.stages() else ""
     cell.until("DONE")
@@ -331,7 +332,7 @@ def test_last_target_without_a_way_down_is_tried_once_more_from_home() -> None:
     assert len(seeds) == 2  # else the same goals were drawn again
 
 
-def test_target_that_can_not_be_planned_is_tried_twice_and_then_left() -> None:
+def test_unplannable_target_is_tried_twice() -> None:
     cell = CellDouble([(0.40, -0.09)])
     cell.unplannable = lambda r: "joint_jump" if r.stage == "descend" or isinstance(r.goal, m.SequenceGoal) else ""
     cell.until("DONE")
@@ -340,7 +341,7 @@ def test_target_that_can_not_be_planned_is_tried_twice_and_then_left() -> None:
     assert cell.stages().count("home") == 1 and not cell.task.status.failures
 
 
-def test_ball_that_moves_before_the_grasp_is_chosen_anew() -> None:
+def test_ball_that_moves_before_the_grasp_is_chosen_again() -> None:
     cell = CellDouble([(0.40, -0.30)])
     cell.until("pre-grasp")
     cell.balls["track_0"] = (0.52, -0.10, 0.03)
@@ -348,7 +349,7 @@ def test_ball_that_moves_before_the_grasp_is_chosen_anew() -> None:
     assert cell.contained == 1
 
 
-def test_ball_added_beside_the_way_makes_what_was_planned_ahead_be_planned_again() -> None:
+def test_ball_added_near_the_path_invalidates_plans_made_ahead() -> None:
     cell = CellDouble([(0.40, -0.30)], joined=False)
     cell.until("pre-grasp")
     cell.balls["track_9"] = (0.50, -0.10, 0.03)
@@ -372,7 +373,7 @@ def test_restart_while_holding_carries_the_ball_to_the_container() -> None:
     assert (again.contained, again.held) == (2, "")
 
 
-def test_restart_waits_for_what_the_task_before_it_had_begun() -> None:
+def test_restarted_task_waits_for_the_running_motion() -> None:
     cell = CellDouble([(0.40, -0.30)])
     cell.motion = m.MotionStatus(id="other-1", state="active")
     for _ in range(20):
@@ -386,7 +387,7 @@ def test_home_only_after_a_failure() -> None:
     cell = CellDouble([(0.40, -0.30)])
     cell.until("pre-grasp")
     cell.motion = cell.motion.model_copy(update={"state": "aborted", "message": "path tolerance"})
-    cell._ends.clear()
+    cell.running.clear()
     cell.until("HOMING")
     cell.until("DONE")
     assert (cell.contained, cell.task.status.failures, cell.stages().count("home")) == (1, 1, 1)
@@ -397,17 +398,17 @@ def test_failures_in_a_row_end_in_error_and_start_tries_again() -> None:
     cell.until("pre-grasp")
     cell.unplannable = lambda r: "no_ik"
     cell.motion = cell.motion.model_copy(update={"state": "aborted", "message": "path tolerance"})
-    cell._ends.clear()
+    cell.running.clear()
     cell.until("DONE")  # the ball is given up, which is no failure of the arm
     assert cell.task.status.failures >= 2
     assert cell.task.status.skipped
 
 
-def test_motion_stopped_by_somebody_else_pauses_the_task() -> None:
+def test_motion_stopped_by_another_client_pauses_picking() -> None:
     cell = CellDouble([(0.40, -0.30)])
     cell.until("pre-grasp")
     cell.motion = cell.motion.model_copy(update={"state": "cancelled", "message": "asked to"})
-    cell._ends.clear()
+    cell.running.clear()
     cell.step()
     assert cell.task.status.paused
     assert cell.step() == []
@@ -415,7 +416,7 @@ def test_motion_stopped_by_somebody_else_pauses_the_task() -> None:
     cell.until("DONE")
 
 
-def test_task_that_is_not_started_waits_for_start() -> None:
+def test_picking_waits_for_start() -> None:
     cell = CellDouble([(0.40, -0.30)])
     cell.task.status.started = False
     for _ in range(50):
@@ -433,7 +434,7 @@ def test_ball_added_after_the_end_is_still_taken() -> None:
     assert cell.contained == 2
 
 
-def test_start_in_collision_is_left_by_a_retreat_that_may_touch_the_pair() -> None:
+def test_start_in_collision_causes_a_retreat_with_allowed_contact() -> None:
     cell = CellDouble([(0.40, -0.30)])
     failing = ["start_in_collision"]
 
@@ -452,7 +453,7 @@ def test_start_in_collision_is_left_by_a_retreat_that_may_touch_the_pair() -> No
 
 @settings(max_examples=40, deadline=None)
 @given(st.data())
-def test_whatever_slips_falls_moves_or_restarts_every_ball_ends_in_the_container(data: st.DataObject) -> None:
+def test_every_ball_ends_in_the_container_despite_faults(data: st.DataObject) -> None:
     cell = CellDouble(SEVEN)
     for _ in range(data.draw(st.integers(1, 6))):
         for _ in range(data.draw(st.integers(1, 60))):
@@ -461,7 +462,7 @@ def test_whatever_slips_falls_moves_or_restarts_every_ball_ends_in_the_container
         if event == "slip":
             cell.slips = 1
         elif event == "drop" and cell.held and cell.task.status.stage in ("lift", "across"):
-            # Once the fingers are to let go it is above the container, where this arm jumps to only at the end.
+            # The release happens above the container, where this arm jumps to only at the end.
             over = cell.task.deferred_grip == "release"
             if not over and all(abs(cell.tcp[0] - p[0]) + abs(cell.tcp[1] - p[1]) > 0.1 for p in cell.balls.values()):
                 cell.drop()
@@ -472,16 +473,16 @@ def test_whatever_slips_falls_moves_or_restarts_every_ball_ends_in_the_container
         elif event == "restart":
             cell.restart()
         elif event == "abort" and cell.motion.state == "active":
-            cell._ends.clear()
+            cell.running.clear()
             cell.motion = cell.motion.model_copy(update={"state": "aborted"})
         elif event == "forget" and cell.motion.state == "active":
-            cell._ends.clear()
+            cell.running.clear()
             cell.motion = m.MotionStatus(header=m.Header(stamp=int((cell.now + 0.01) * 1e9)))
     cell.until("DONE", most=5000)
     assert (cell.contained, cell.balls, cell.held, cell.task.status.placed) == (7, {}, "", 7)
 
 
-def test_an_arm_that_cannot_choose_is_left_any_clear_yaw_and_some_tilt_and_others_point_down() -> None:
+def test_arm_with_few_joints_gets_any_clear_yaw_and_tilt() -> None:
     cell = CellDouble([(0.40, -0.30)])
     few = cell.task.p.robot.model_copy(update={"joints": cell.task.p.robot.joints[:4]})
     ball, brick = Target("ball", (0.4, -0.3, 0.03), 0.03), Target("brick", (0.4, -0.3, 0.03), 0.03, (0.04, 0.03), 0.5)
@@ -497,11 +498,11 @@ def test_an_arm_that_cannot_choose_is_left_any_clear_yaw_and_some_tilt_and_other
         middle = tool_down(0.4, -0.3, 0.03, 0.3 if yaw else 0.5)  # of the range in which the hand is clear
         assert pose_to_matrix(descend.pose) == pytest.approx(middle)
         assert over.tilt_tolerance == max(tilt, cell.task.p.orient_tol_rad)
-        assert goals["across"].tilt_tolerance == (0.9 if tilt else cell.task.p.orient_tol_rad)  # what is let go falls
+        assert goals["across"].tilt_tolerance == (0.9 if tilt else cell.task.p.orient_tol_rad)
 
 
 @pytest.mark.parametrize("place", [(1e7, 0.0, 1e7), (0.4, -0.3, 1e7), (-1e7, 0.0, -1e7)])
-def test_ball_that_is_said_to_lie_farther_away_than_a_motion_can_be_asked_for_is_nobodys_target(
+def test_ball_out_of_message_range_is_no_target(
     place: tuple[float, float, float]
 ) -> None:
     cell = CellDouble([(0.40, -0.30)])

@@ -17,7 +17,7 @@ def test_heights_are_those_of_the_table_and_of_the_layers():
     assert resting.stack_height == pytest.approx(0.125)
 
 
-def test_walls_higher_than_the_stack_count():
+def test_stack_height_includes_higher_walls():
     assert BallGeometry(0.03, 0.1, Container(wall_height=0.3)).stack_height == pytest.approx(0.4)
 
 
@@ -25,7 +25,7 @@ unit = st.floats(-1, 1)
 
 
 @given(st.tuples(unit, unit, unit), st.tuples(unit, unit, unit))
-def test_a_ray_aimed_at_a_point_of_the_container_meets_it(inside, away):
+def test_ray_to_a_point_in_the_container_meets_it(inside, away):
     c, h = resting.container, resting.container.half_side
     point = np.array((c.x, c.y, 0.0625)) + 0.99 * np.array(inside) * (h, h, 0.0625)
     origin = point + np.array(away)
@@ -45,13 +45,13 @@ def test_rays_along_an_axis_are_handled(axis):
     assert not resting.meets_container(middle - direction + np.roll(direction, 1), direction)
 
 
-def test_only_between_the_walls_can_a_ball_lie_above_the_table():
+def test_balls_above_the_table_lie_only_between_the_walls():
     c = resting.container
     assert resting.can_lie((0.2, -0.3, 0.03)) and resting.can_lie((c.x + 0.033, c.y - 0.033, 0.095))
     assert not resting.can_lie((0.2, -0.3, 0.095)) and not resting.can_lie((c.x + 0.07, c.y, 0.095))
 
 
-def test_a_pixel_of_the_box_may_show_any_layer_and_one_of_the_table_only_the_table():
+def test_possible_heights_are_the_layers_or_the_table():
     c = resting.container
     assert resting.heights(camera, camera.project((c.x, c.y, 0.03))) == pytest.approx([0.035, 0.095])
     assert resting.heights(camera, camera.project((0.4, -0.3, 0.03))) == pytest.approx([0.03])

@@ -15,7 +15,7 @@ def tracks(**options: float) -> Tracks:
     return Tracks(SceneParameters(**{**defaults, **options}))
 
 
-def test_ball_exists_after_two_frames_and_is_forgotten_after_a_while() -> None:
+def test_track_exists_after_two_frames_and_expires() -> None:
     t = tracks()
     t.update([at(0.4, 0.0)], 1.0)
     assert t.confirmed() == []
@@ -27,7 +27,7 @@ def test_ball_exists_after_two_frames_and_is_forgotten_after_a_while() -> None:
     assert t.confirmed() == []
 
 
-def test_what_a_view_that_looks_at_times_showed_is_forgotten_when_it_looks_in_vain_and_not_before() -> None:
+def test_tracks_of_an_occasional_view_expire_only_when_it_looks_again() -> None:
     t = tracks()
     for now in (1.0, 1.1):
         t.update([at(0.4, 0.0)], now, 1, True)  # of the hand
@@ -55,7 +55,7 @@ def test_touching_balls_keep_their_ids_when_one_is_taken_away() -> None:
     assert ids[left[0].id] == b.position
 
 
-def test_ball_that_lies_still_is_smoothed_and_one_that_jumps_is_not() -> None:
+def test_still_ball_is_smoothed_and_a_jumping_one_not() -> None:
     t = tracks()
     t.update([at(0.40, 0.0)], 1.0)
     t.update([at(0.402, 0.0)], 1.1)
@@ -77,7 +77,7 @@ def test_matching_is_one_to_one_whatever_is_seen(frames: list[list[tuple[float, 
         assert len({b.id for b in found}) == len(found)
 
 
-def test_a_box_beside_a_ball_is_not_taken_for_it() -> None:
+def test_box_near_a_ball_track_does_not_match_it() -> None:
     t = tracks(confirm_frames=1)
     t.update([at(0.4, 0.0, kind="ball"), at(0.44, 0.0, kind="cube", shape="box", size=(0.04, 0.04, 0.04))], 1.0)
     ids = {b.sighting.kind: b.id for b in t.confirmed()}
@@ -85,7 +85,7 @@ def test_a_box_beside_a_ball_is_not_taken_for_it() -> None:
     assert {b.sighting.kind: b.id for b in t.confirmed() if b.last_seen == 1.1} == {"cube": ids["cube"]}
 
 
-def test_the_width_of_the_fingers_tells_which_of_two_neighbours_they_hold() -> None:
+def test_finger_width_selects_the_held_neighbor() -> None:
     for width, kind in ((0.06, "ball"), (0.03, "cube"), (0.0, "cube")):
         t = tracks(confirm_frames=1)
         t.update([at(0.41, 0.0, kind="ball", size=(0.06, 0.06, 0.06)),

@@ -11,7 +11,7 @@ SECOND = 10**9
 
 
 class Reach:
-    """Stands in for the cache: answers by the sign of y, nothing beyond x = 0.6."""
+    """Fake cache: answers by the sign of y, and not beyond x = 0.6."""
 
     def known(self, place):
         x, y, _ = place
@@ -35,7 +35,7 @@ def frame(*places, stamp=0, partial=False):
     )  # fmt: skip
 
 
-def test_detections_are_sorted_into_targets_rejections_and_what_is_not_known_yet():
+def test_detections_are_classified():
     places = frame((0.4, 0.05), (0.4, -0.2), (0.65, 0.0), (0.55, 0.25))
     judge = validation()
     verdict = judge.validate(places, camera)
@@ -45,49 +45,49 @@ def test_detections_are_sorted_into_targets_rejections_and_what_is_not_known_yet
     assert verdict.inside == 1
 
 
-def test_partly_out_of_view_comes_before_reach_and_the_container_before_that():
+def test_container_precedes_partial_view_precedes_reach():
     verdict = validation().validate(frame((0.4, 0.05), (0.55, 0.25), partial=True), camera)
     assert [one.reason for one in verdict.rejections] == ["partly out of view"]
     assert verdict.inside == 1 and not verdict.targets
 
 
-def test_a_place_is_told_once_and_again_after_it_was_empty_for_a_while():
+def test_rejected_position_is_reported_once_until_it_was_empty():
     judge = validation(forget_after=2.0)
 
-    def told(stamp, *places):
+    def reports(stamp, *places):
         return len(judge.validate(frame(*places, stamp=int(stamp * SECOND)), camera).rejections)
 
-    assert told(0, (0.4, -0.2)) == 1
-    assert told(1.5, (0.4, -0.201)) == 0
-    assert told(3.0, (0.402, -0.2)) == 0, "it was never empty"
-    assert told(4.0) == 0
-    assert told(4.9, (0.4, -0.2)) == 0, "a frame without it is no while"
-    assert told(6.0) == told(7.0) == 0
-    assert told(7.1, (0.4, -0.2)) == 1
+    assert reports(0, (0.4, -0.2)) == 1
+    assert reports(1.5, (0.4, -0.201)) == 0
+    assert reports(3.0, (0.402, -0.2)) == 0, "it was never empty"
+    assert reports(4.0) == 0
+    assert reports(4.9, (0.4, -0.2)) == 0, "a frame without it is no while"
+    assert reports(6.0) == reports(7.0) == 0
+    assert reports(7.1, (0.4, -0.2)) == 1
 
 
-def test_two_places_are_told_apart_when_balls_touch():
+def test_touching_balls_are_different_positions():
     verdict = validation().validate(frame((0.4, -0.2), (0.4, -0.26)), camera)
     assert len(verdict.rejections) == 2
 
 
-def test_judging_a_frame_again_tells_nothing_twice():
+def test_validating_a_frame_twice_reports_once():
     judge, seen = validation(), frame((0.4, -0.2), (0.4, 0.1))
     first, second = judge.validate(seen, camera), judge.validate(seen, camera)
     assert first.targets == second.targets and len(first.rejections) == 1 and not second.rejections
 
 
-def test_the_pixel_decides_what_is_in_the_container_when_there_is_one():
+def test_pixel_decides_whether_a_detection_is_in_the_container():
     place = camera.on_plane(camera.project((0.583, 0.283, 0.095)), 0.03)
     seen = frame((float(place[0]), float(place[1])))
     assert np.hypot(*(place - (0.583, 0.283))) > 0.02, "the top layer is seen far from where it is"
     assert validation().validate(seen, camera).inside == 1
 
 
-def test_what_is_no_target_is_told_in_words_as_long_as_it_is_seen():
+def test_remark_describes_visible_non_targets():
     judge = validation()
     small = frame((0.4, 0.05), (0.4, -0.2)).model_copy(update={"remark": "2 red blobs are smaller than 400"})
-    for _ in range(2):  # the rejection is told once, the remark with each frame
+    for _ in range(2):  # the rejection is reported once, the remark with each frame
         verdict = judge.validate_views([(small, camera)])
         assert verdict.remark == "2 red blobs are smaller than 400, and 1 of 2 was rejected, too far to the right"
     assert judge.validate_views([(frame((0.4, 0.05)), camera)]).remark == ""

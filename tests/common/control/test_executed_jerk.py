@@ -34,7 +34,7 @@ def motion(rng: np.random.Generator) -> JointTrajectory:
 
 
 def executed(event: str, seed: int) -> list[tuple[float, np.ndarray, np.ndarray]]:
-    """When [s], where [rad] and how fast [rad/s] to be in each cycle, with an event in mid-motion, until its end."""
+    """Return times [s] and set-points [rad], [rad/s] of a motion with an event in its middle, until its end."""
     rng = np.random.default_rng(seed)
     planned = motion(rng)
     q = np.array(planned.points[0].positions)
@@ -61,7 +61,7 @@ def executed(event: str, seed: int) -> list[tuple[float, np.ndarray, np.ndarray]
 
 
 @pytest.mark.parametrize(("event", "over"), [("stop", SLACK), ("hold", SLACK), ("held", 0.2), ("speed", 0.2)])
-def test_jerk_limits_hold_in_a_stop_and_nearly_where_the_speed_comes_back(event: str, over: float) -> None:
+def test_jerk_limits_hold_in_a_stop_and_nearly_while_the_speed_rises(event: str, over: float) -> None:
     for seed in range(20, 28):
         sent = [q for _, q, _ in executed(event, seed)]
         jerk = np.abs(np.diff([sent[0]] * 3 + sent, n=3, axis=0)) / PERIOD**3
@@ -70,22 +70,22 @@ def test_jerk_limits_hold_in_a_stop_and_nearly_where_the_speed_comes_back(event:
 
 @pytest.mark.parametrize("rate", [500.0, 125.0])
 @pytest.mark.parametrize("event", ["stop", "hold", "held", "speed"])
-def test_an_arm_with_a_rate_of_its_own_is_told_little_more_jerk_than_there_is_from_cycle_to_cycle(
+def test_driver_at_the_arms_rate_adds_little_jerk_to_that_of_the_cycles(
     event: str, rate: float,
 ) -> None:
-    period, most = 1 / rate, {"as they come": 0.0, "smoothed": 0.0}
+    period, most = 1 / rate, {"raw": 0.0, "smoothed": 0.0}
     for seed in range(20, 28):
-        stream, smoothing, told = SetPointStream(LIMITS, 0.05, period), Smoothing(1 / period), []
-        (begun, start, _), *sent = executed(event, seed)
-        stream.begin(start, begun)
+        stream, smoothing, raw = SetPointStream(LIMITS, 0.05, period), Smoothing(1 / period), []
+        (begin, start, _), *sent = executed(event, seed)
+        stream.begin(start, begin)
         for tick in range(int(4.2 / period)):
-            now = begun + (tick + 0.5) * period
+            now = begin + (tick + 0.5) * period
             while sent and sent[0][0] <= now:
                 stream.put(*sent.pop(0))
-            told.append(stream.at(now)[0])
+            raw.append(stream.at(now)[0])
         assert not stream.ceased
-        for name, rows in (("as they come", told), ("smoothed", [smoothing.add(q) for q in told])):
+        for name, rows in (("raw", raw), ("smoothed", [smoothing.add(q) for q in raw])):
             jerk = np.abs(np.diff([start] * 3 + rows, n=3, axis=0)).max() / period**3
             most[name] = max(most[name], jerk / LIMITS.jerks[0])
-    assert most["smoothed"] <= 1.1 and most["smoothed"] < most["as they come"], most
-    assert rate < 500 or most["as they come"] > 2, most
+    assert most["smoothed"] <= 1.1 and most["smoothed"] < most["raw"], most
+    assert rate < 500 or most["raw"] > 2, most

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from common.config import World
 from common.control.executor import Executor
 from common.errors import ConfigError, Refused
 from common.hardware.interface import GripperReading, HardwareFault
@@ -20,10 +21,10 @@ from common.messages import (
     WorldEdit,
     WorldObjects,
 )
-from common.sim.interface import StandingObject
+from common.sim.interface import ObjectSnapshot
 from common.sim.kinematic import KinematicWorld
 from common.transport.codec import decode, encode
-from tests.common.control.rig import GRIPPER, START, ExecutorRig, mock
+from tests.common.control.rig import GRIPPER, START, TABLE, ExecutorRig, mock
 
 FAR = [0.5, 0.5]
 
@@ -154,15 +155,20 @@ def test_backend_with_an_unsuitable_gripper_is_a_configuration_error(limits, fin
         ExecutorRig(limits, MockHardware(START, fingers))
 
 
-def test_long_step_of_the_world_is_deferred_and_the_arm_continues(rig, monkeypatch):
+def test_long_step_of_the_world_is_deferred_and_the_arm_continues(limits, monkeypatch):
+    class SlowWorld(KinematicWorld):
+        def takes_long(self, width, gripping):
+            return gripping and not self.held
+
+    rig = ExecutorRig(limits, world=SlowWorld(World(fixtures=[TABLE], balls=[(0.5, 0.0)])))
     rig.cell.defers_steps = True
-    monkeypatch.setattr(KinematicWorld, "_is_plain", False)
+    rig.step()
     rig.grip("close", 0.0)
     while rig.cell.deferred is None:
         rig.step()
     before, saved = len(rig.joints), len(rig.saver.states)
     with monkeypatch.context() as patched:
-        for name in ("tick", "obstruction", "objects", "take_events", "standing"):
+        for name in ("tick", "obstruction", "objects", "take_events", "snapshot"):
             owner = next(cls for cls in KinematicWorld.__mro__ if name in vars(cls))
             patched.delattr(owner, name)  # any call would fail
         rig.run(0.2)
@@ -194,8 +200,8 @@ def test_objects_of_physics_are_saved_as_of_the_same_moment_as_the_arm(limits, r
     class Physics:
         version, ids, layout, held = 1, [], {}, "ball"  # it reports moving objects only now and then
 
-        def standing(self):
-            return {"ball": StandingObject(pose=tuple(hardware.last[0]))}
+        def snapshot(self):
+            return {"ball": ObjectSnapshot(pose=tuple(hardware.last[0]))}
 
         def objects(self, header):
             return WorldObjects(header=header)

@@ -1,4 +1,4 @@
-"""A grasp is judged by what is between the fingers, however late they begin and say so; what is held is watched."""
+"""A grasp is checked by the measured width, also with late fingers and readings; a held object is watched."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ CONFIG = GripperConfig(joints=["left", "right"], links=[], max_effort=235.0)
 
 
 class LateFingers:
-    """Fingers that begin to move some time after they were told, and whose readings are old [s]."""
+    """Fingers that start to move after a delay, and whose readings are old [s]."""
 
     def __init__(self, begin: float, age: float, width: float = 0.08) -> None:
         self.fingers, self.begin, self.age = SimulatedFingers(CONFIG, width), begin, age
-        self.told: deque[tuple[float, float, float]] = deque()
+        self.pending: deque[tuple[float, float, float]] = deque()
         self.past: deque[tuple[float, GripperReading]] = deque()
         self.effort = 0.0
 
     def command(self, width: float, now: float, effort: float) -> None:
-        self.told.append((now + self.begin, width, effort))
+        self.pending.append((now + self.begin, width, effort))
 
     def read(self, now: float) -> GripperReading:
-        while self.told and self.told[0][0] <= now:
-            when, width, self.effort = self.told.popleft()
+        while self.pending and self.pending[0][0] <= now:
+            when, width, self.effort = self.pending.popleft()
             self.fingers.command(width, when, self.effort)
         self.past.append((now, self.fingers.read(now)))
         while len(self.past) > 1 and self.past[1][0] <= now - self.age:
@@ -52,7 +52,7 @@ class Rig:
             self.controller.update(self.hand.read(self.now), self.now)
         return self.controller.state
 
-    def told(self, width: float = 0.0, **more: float) -> GripperState:
+    def grip(self, width: float = 0.0, **more: float) -> GripperState:
         """The state when the goal is over."""
         self.controller.command(GripperCommand(id=f"goal {self.now:.2f}", width=width, **more), self.now)
         until = self.now + 5.0
@@ -75,26 +75,26 @@ DELAYS = [(0.0, 0.0), (0.0, 0.1), (0.1, 0.0), (0.08, 0.1)]
     (0.030, "aborted", "too_narrow", "the fingers closed on something too narrow (0.0300 m, not 0.0600 m)"),
     (0.0, "aborted", "empty", "the fingers closed on nothing"),
 ])
-def test_grasp_is_judged_by_the_width_of_what_is_held(begin, age, width, state, outcome, says):
+def test_grasp_is_checked_by_the_width_of_the_held_object(begin, age, width, state, outcome, says):
     rig = Rig(begin, age)
     rig.between(width)
-    found = rig.told(expected_width=0.06, width_tolerance=0.0051)
+    found = rig.grip(expected_width=0.06, width_tolerance=0.0051)
     assert (found.state, found.outcome, found.message) == (state, outcome, says)
     assert found.holding == (width > 0) and found.width == pytest.approx(width) and not found.moving
-    assert rig.run(1.0) == found, "what was said stays so"
-    opened = rig.told(0.08)
+    assert rig.run(1.0) == found, "the result stays"
+    opened = rig.grip(0.08)
     assert (opened.state, opened.outcome, opened.holding) == ("succeeded", "", False)
 
 
 @pytest.mark.parametrize(("begin", "age"), DELAYS)
-def test_fingers_that_are_late_have_not_missed(begin, age):
+def test_late_fingers_have_not_missed_the_object(begin, age):
     rig = Rig(begin, age)
     rig.between(0.06)
-    assert rig.told().outcome == "grasped"
+    assert rig.grip().outcome == "grasped"
 
 
 class Script:
-    """Readings as they are written down."""
+    """Scripted readings."""
 
     def __init__(self, *readings: GripperReading) -> None:
         self.readings = deque(readings)
@@ -106,7 +106,7 @@ class Script:
         return self.readings.popleft() if len(self.readings) > 1 else self.readings[0]
 
 
-def test_fingers_that_tell_late_that_they_hold_something_have_not_missed():
+def test_fingers_that_report_late_that_they_hold_have_not_missed_the_object():
     still = GripperReading(0.06, 0.0, False, False)
     script = Script(*[GripperReading(0.07, -0.1, True, False)] * 30, *[still] * 10, still._replace(holding=True))
     controller = GripperController(script, CONFIG)
@@ -121,12 +121,12 @@ def test_fingers_that_tell_late_that_they_hold_something_have_not_missed():
 
 
 @pytest.mark.parametrize("expected", [{}, {"expected_width": 0.06}])
-def test_what_is_held_and_slips_is_told_until_the_next_command(expected):
+def test_slipping_object_is_reported_until_the_next_command(expected):
     rig = Rig()
     rig.between(0.06)
-    goal = rig.told(**expected)
+    goal = rig.grip(**expected)
     rig.between(0.059)
-    assert rig.run(0.5).outcome == "grasped", "what is soft gives way a little"
+    assert rig.run(0.5).outcome == "grasped", "a soft object gives way a little"
     rig.between(0.055)
     slipping = rig.run(0.5)
     assert (slipping.id, slipping.state, slipping.outcome, slipping.holding) == (
@@ -136,37 +136,37 @@ def test_what_is_held_and_slips_is_told_until_the_next_command(expected):
     lost = rig.run(0.5)
     assert (lost.state, lost.outcome, lost.holding) == ("succeeded", "slipping", False)
     assert lost.message == "the held object slipped out: it was 0.0600 m wide, nothing is between the fingers now"
-    assert rig.told(0.08).outcome == ""
+    assert rig.grip(0.08).outcome == ""
 
 
-def test_letting_go_is_no_slipping():
+def test_release_is_no_slipping():
     rig = Rig()
     rig.between(0.06)
-    rig.told()
+    rig.grip()
     rig.controller.command(GripperCommand(id="open", width=0.08), rig.now)
     assert {rig.run(0.01).outcome for _ in range(100)} == {""}
 
 
-def test_fingers_press_with_what_the_command_says_or_a_few_newtons():
+def test_fingers_press_with_the_commanded_effort_or_the_default():
     rig = Rig()
     rig.between(0.06)
-    assert rig.told().effort == CONFIG.effort == 5.0
-    assert rig.told(effort=40.0).effort == 40.0
-    refused = rig.told(effort=300.0)
+    assert rig.grip().effort == CONFIG.effort == 5.0
+    assert rig.grip(effort=40.0).effort == 40.0
+    refused = rig.grip(effort=300.0)
     assert refused.state == "succeeded" and rig.hand.effort == 40.0
     answer = rig.controller.command(GripperCommand(id="wide", width=0.0, expected_width=0.1), rig.now)
     assert (answer.state, answer.message) == (
         "rejected", "expected_width 0.1 m is more than the fingers open (0.08 m)")
 
 
-def test_robot_file_says_how_hard_they_press():
-    assert load_cell("ur5").robot.gripper.effort == 20.0  # the least that it can
+def test_robot_file_sets_the_default_effort():
+    assert load_cell("ur5").robot.gripper.effort == 20.0  # its minimum
     assert GripperConfig(joints=["a"], links=[], max_effort=3.0).effort == 3.0
     with pytest.raises(ValidationError, match=r"gripper\.effort is 9 N, more than max_effort 3 N"):
         GripperConfig(joints=["a"], links=[], max_effort=3.0, effort=9.0)
 
 
-def test_on_the_wire_only_what_says_something_is_new():
+def test_fields_of_grasps_are_sent_only_when_they_are_set():
     ball = {"id": "ball", "role": "target", "shape": "sphere", "dimensions": [0.03], "pose": Pose()}
     plain = [GripperCommand(id="a", width=0.0), GripperState(), CollisionObject.model_validate(ball)]
     new = {"expected_width", "width_tolerance", "outcome", "grip_effort"}
@@ -180,18 +180,18 @@ def test_on_the_wire_only_what_says_something_is_new():
     assert decode(PlanningScene, encode(scene)) == scene
 
 
-def test_grasp_is_over_as_soon_as_fingers_that_were_seen_to_move_press_on_something() -> None:
+def test_grasp_succeeds_as_soon_as_fingers_seen_moving_press_on_an_object() -> None:
     rig = Rig()
     rig.between(0.06)
     began = rig.now
-    assert rig.told(expected_width=0.06).outcome == "grasped"
+    assert rig.grip(expected_width=0.06).outcome == "grasped"
     there = rig.hand.read(rig.now)
-    assert not there.moving and rig.now - began < CONFIG.latency, "readings say it already"
+    assert not there.moving and rig.now - began < CONFIG.latency, "as the readings show"
 
 
-def test_fingers_that_need_not_move_to_press_on_something_are_waited_for() -> None:
+def test_fingers_that_press_without_moving_are_given_their_latency() -> None:
     rig = Rig(width=0.06)
     rig.between(0.06)
     began = rig.now
-    assert rig.told(expected_width=0.06).outcome == "grasped"
-    assert rig.now - began >= CONFIG.latency - 1e-6, "readings may be of before"
+    assert rig.grip(expected_width=0.06).outcome == "grasped"
+    assert rig.now - began >= CONFIG.latency - 1e-6, "readings may be older than the command"

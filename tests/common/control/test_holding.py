@@ -1,4 +1,4 @@
-"""Held, let go, slowed down and sped up: the robot stays on its path and within its limits all the while."""
+"""Holds and changes of speed: the arm stays on its path and within its limits."""
 
 from dataclasses import replace
 
@@ -74,7 +74,7 @@ DEEDS = st.one_of(
     swings=st.integers(0, 6), share=st.sampled_from([0.5, 0.9, 0.999]), cycle=st.sampled_from([0.004, 0.01, 0.04]),
     deeds=st.lists(st.tuples(st.floats(0.0, 1.0), DEEDS), max_size=8), jitter=st.randoms(use_true_random=False),
 )
-def test_whatever_is_held_and_scaled_the_arm_stays_on_its_path_and_within_limits(swings, share, cycle, deeds, jitter):
+def test_arm_stays_on_its_path_and_within_limits_for_any_holds_and_speeds(swings, share, cycle, deeds, jitter):
     rig = Timed(LIMITS)
     assert rig.accept("a", winding(swings, share)).state == "active"
     for wait, (deed, value) in deeds:
@@ -93,7 +93,7 @@ def test_whatever_is_held_and_scaled_the_arm_stays_on_its_path_and_within_limits
     assert_within(rig, LIMITS, LIMITS.acceleration)
 
 
-def test_the_robot_moves_only_when_neither_a_person_nor_a_watchdog_holds_it():
+def test_arm_moves_only_when_neither_an_operator_nor_a_watchdog_holds_it():
     rig = Timed(LIMITS)
     rig.accept("a", winding(2, 0.5))
     controller = rig.controller
@@ -110,7 +110,7 @@ def test_the_robot_moves_only_when_neither_a_person_nor_a_watchdog_holds_it():
 @settings(max_examples=10, deadline=None)
 @given(swings=st.integers(0, 6), share=st.sampled_from([0.5, 0.9]), when=st.floats(0.02, 0.98),
        deed=st.sampled_from(["hold", "stop"]))
-def test_robot_that_may_brake_harder_does_so_and_stays_on_its_path(swings, share, when, deed):
+def test_deceleration_limit_is_used_for_holds_and_the_arm_stays_on_its_path(swings, share, when, deed):
     hard = replace(LIMITS, deceleration=3 * LIMITS.acceleration)
     took = []
     for limits in (LIMITS, hard):
@@ -148,20 +148,20 @@ def test_hold_takes_no_longer_than_braking_at_the_limit(share, when):
     assert rig.now - before <= max(0.03, fastest / (LIMITS.acceleration[0] * (1 - share**2))) + 3 * STEP
 
 
-def test_held_goal_stays_active_without_progress_and_says_why(limits, rest_to_rest):
+def test_held_goal_stays_active_without_progress_and_reports_the_reason(limits, rest_to_rest):
     rig = Timed(limits, goal_time=0.1)
     rig.accept("a", rest_to_rest([0, 0], [1, -0.5]))
     for _ in range(40):
         rig.step()
-    answer = rig.controller.hold(True, "somebody is near")
+    answer = rig.controller.hold(True, "people are near")
     assert (answer.id, answer.state, answer.held) == ("a", "active", True)
-    assert answer.message == "coming to rest: somebody is near"
+    assert answer.message == "coming to rest: people are near"
     while not rig.at_rest:
         rig.step()
     there = rig.q
     for _ in range(1000):
         status = rig.step(0.1)
-    assert (status.state, status.held, status.message) == ("active", True, "held: somebody is near")
+    assert (status.state, status.held, status.message) == ("active", True, "held: people are near")
     assert np.array_equal(rig.q, there) and 0.3 < status.progress < 0.6
     answer = rig.controller.hold(False, "gone")
     assert (answer.held, answer.message) == (False, "")
@@ -169,7 +169,7 @@ def test_held_goal_stays_active_without_progress_and_says_why(limits, rest_to_re
 
 
 @pytest.mark.parametrize("hardware", [None, LagHardware(START, 0.03, None)])
-def test_held_arm_that_lags_or_not_breaks_no_tolerance(limits, rest_to_rest, hardware):
+def test_held_arm_violates_no_tolerance_with_or_without_lag(limits, rest_to_rest, hardware):
     rig = Rig(limits, hardware, goal_time=0.05, path=0.2)
     rig.accept("a", rest_to_rest([0, 0], [1, -0.5]))
     for number in range(12):
@@ -180,7 +180,7 @@ def test_held_arm_that_lags_or_not_breaks_no_tolerance(limits, rest_to_rest, har
     assert rig.until_over().state == "succeeded"
 
 
-def test_goal_that_comes_while_held_waits_at_its_start_and_is_done_once(rig, rest_to_rest):
+def test_goal_accepted_while_held_waits_at_its_start_and_is_followed_once(rig, rest_to_rest):
     rig.controller.hold(True, "paused")
     there = rest_to_rest([0, 0], [1, 1])
     answer = rig.accept("a", there)
@@ -194,7 +194,7 @@ def test_goal_that_comes_while_held_waits_at_its_start_and_is_done_once(rig, res
     assert rig.until_over().state == "succeeded" and np.allclose(rig.q, [1, 1])
 
 
-def test_goal_that_is_refused_while_held_changes_nothing(rig, rest_to_rest):
+def test_goal_refused_while_held_changes_nothing(rig, rest_to_rest):
     rig.controller.hold(True, "paused")
     refused = rig.accept("a", rest_to_rest([0.5, 0], [1, 1]))
     assert (refused.state, refused.error, refused.held) == ("rejected", "start_mismatch", True)
@@ -221,7 +221,7 @@ def test_stop_while_held_cancels_and_the_robot_stays_held(rig, rest_to_rest, wai
     assert rig.until_over().state == "succeeded"
 
 
-def test_let_go_while_stopping_does_not_end_the_stop(rig, rest_to_rest):
+def test_release_during_a_stop_does_not_end_the_stop(rig, rest_to_rest):
     rig.accept("a", rest_to_rest([0, 0], [1, 1]))
     for _ in range(40):
         rig.step()
@@ -232,13 +232,13 @@ def test_let_go_while_stopping_does_not_end_the_stop(rig, rest_to_rest):
     assert rig.until_over().state == "cancelled"
 
 
-def test_robot_that_is_held_with_nothing_to_do_says_so(rig, rest_to_rest):
+def test_hold_without_a_goal_is_reported(rig, rest_to_rest):
     assert rig.controller.hold(True, "lunch").message == "held: lunch"
     assert rig.controller.status.state == "none"
     assert rig.controller.hold(False, "").message == ""
 
 
-def test_times_stretch_with_the_speed(limits, rest_to_rest):
+def test_duration_scales_with_the_speed(limits, rest_to_rest):
     took = []
     for scaling in (1.0, 0.5, 0.05):
         rig = Timed(limits)

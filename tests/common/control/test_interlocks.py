@@ -1,4 +1,4 @@
-"""What a person decided: who lets go of what, what outlives the process, and a record that nobody can read."""
+"""Interlocks: who releases them, what persists, and a file that cannot be read or written."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def held(interlocks: Interlocks) -> list[str]:
     return sorted(hold.by for hold in interlocks.holds)
 
 
-def test_a_hold_is_let_go_by_its_owner_only_and_one_without_a_name_by_everybody() -> None:
+def test_hold_is_released_only_by_its_owner_and_one_without_a_name_by_every_operator() -> None:
     interlocks = made()
     for owner in ("anna", "bert", ""):
         interlocks.hold(HoldRequest(hold=True, owner=owner, reason="lunch"))
@@ -59,7 +59,7 @@ def test_a_hold_is_let_go_by_its_owner_only_and_one_without_a_name_by_everybody(
     assert interlocks.all == []
 
 
-def test_a_stop_is_let_go_by_a_start_of_anybody_and_not_by_a_resume_of_its_owner() -> None:
+def test_stop_is_released_by_a_start_of_any_operator_and_not_by_a_resume_of_its_owner() -> None:
     interlocks = made()
     interlocks.stop(StopRequest(owner="anna", reason="fire"))
     interlocks.hold(HoldRequest(hold=False, owner="anna"))
@@ -70,11 +70,11 @@ def test_a_stop_is_let_go_by_a_start_of_anybody_and_not_by_a_resume_of_its_owner
     assert interlocks.check("a") is None
 
 
-def test_what_was_decided_before_a_stop_neither_lets_go_of_it_nor_moves() -> None:
+def test_request_decided_before_a_stop_neither_releases_it_nor_moves_the_arm() -> None:
     interlocks = made()
     interlocks.stop(StopRequest(owner="anna"))
     acknowledged = interlocks.stops[0].since
-    assert interlocks.check("go there", "anna", acknowledged) is None, "who stopped it moves it, knowing that"
+    assert interlocks.check("go there", "anna", acknowledged) is None, "the one who stopped it may move it"
     assert interlocks.check("go there", "bert", acknowledged) and interlocks.check("go there", "", acknowledged)
     interlocks.stop(StopRequest(owner="anna"))
     interlocks.hold(HoldRequest(hold=False, stops=True, override=True, acknowledged=acknowledged))
@@ -83,7 +83,7 @@ def test_what_was_decided_before_a_stop_neither_lets_go_of_it_nor_moves() -> Non
     assert interlocks.check("task") is None
 
 
-def test_hold_that_its_owner_turns_into_a_stop_still_keeps_everybody_else() -> None:
+def test_hold_turned_into_a_stop_still_blocks_all_others() -> None:
     interlocks = made()
     interlocks.hold(HoldRequest(hold=True, owner="anna"))
     since = interlocks.holds[0].since
@@ -93,7 +93,7 @@ def test_hold_that_its_owner_turns_into_a_stop_still_keeps_everybody_else() -> N
 
 
 @given(times=st.lists(st.integers(0, 2 * T0), min_size=2, max_size=8))
-def test_a_later_word_has_a_later_time_whatever_the_clock_does_also_after_a_restart(times: list[int]) -> None:
+def test_later_interlock_has_a_later_time_for_any_clock_also_after_a_restart(times: list[int]) -> None:
     interlocks, seen = Interlocks(None, at(*times)), []
     for number in range(len(times)):
         interlocks.stop(StopRequest(owner=f"{number % 3}"))
@@ -103,7 +103,7 @@ def test_a_later_word_has_a_later_time_whatever_the_clock_does_also_after_a_rest
     assert seen == sorted(set(seen))
 
 
-def test_holds_of_watchdog_and_controller_are_no_part_of_the_record() -> None:
+def test_holds_of_watchdog_and_controller_do_not_persist() -> None:
     interlocks = made()
     interlocks.hold(HoldRequest(hold=True, by="watchdog", reason="no joint states"))
     interlocks.set_internal_hold("controller", True, "the task is gone")
@@ -111,17 +111,17 @@ def test_holds_of_watchdog_and_controller_are_no_part_of_the_record() -> None:
     assert [one.by for one in interlocks.all] == ["watchdog", "watchdog", "controller"]
     assert [one.by for one in made(interlocks.record).all] == ["watchdog"]
     interlocks.hold(HoldRequest(hold=False, by="watchdog"))
-    assert held(interlocks) == ["watchdog"], "a person who calls himself so"
+    assert held(interlocks) == ["watchdog"], "an operator of that name"
 
 
-def test_goals_that_were_stopped_never_move_and_are_not_remembered_without_end() -> None:
+def test_stopped_goals_are_blocked_and_the_oldest_are_forgotten() -> None:
     interlocks = made()
     interlocks.block_goals(str(number) for number in range(MAX_GOALS + 5))
     again = made(interlocks.record)
     assert again.check("5") and again.check(str(MAX_GOALS + 4)) and not again.check("4")
 
 
-def test_so_many_persons_that_they_share_an_entry_still_hold_the_robot() -> None:
+def test_too_many_operators_share_an_entry_that_still_holds_the_robot() -> None:
     interlocks = made()
     for number in range(MAX_ENTRIES + 9):
         interlocks.hold(HoldRequest(hold=True, owner=f"{number}", reason="x" * 1000))
@@ -132,20 +132,20 @@ def test_so_many_persons_that_they_share_an_entry_still_hold_the_robot() -> None
     assert interlocks.hold(HoldRequest(hold=False, override=True)) and not interlocks.all
 
 
-@pytest.mark.parametrize(("kept", "configured", "now"), [
+@pytest.mark.parametrize(("saved", "configured", "now"), [
     (None, 0.5, 0.5), (Speed(scaling=0.05, configured=1.0), 1.0, 0.05), (Speed(scaling=1.0, configured=0.2), 0.2, 1.0),
     (Speed(scaling=1.0, configured=1.0), 0.2, 0.2), (Speed(scaling=0.05, configured=1.0), 0.2, 0.05),
 ])
-def test_speed_that_was_set_is_kept_and_the_slower_when_another_was_configured_since(
-    kept: Speed | None, configured: float, now: float
+def test_saved_speed_applies_or_the_slower_one_if_another_was_configured_since(
+    saved: Speed | None, configured: float, now: float
 ) -> None:
-    assert effective_speed(kept, configured) == now
+    assert effective_speed(saved, configured) == now
 
 
 # --- the file ---
 
 
-def test_what_was_saved_is_found_again(tmp_path: Path) -> None:
+def test_saved_record_is_loaded_again(tmp_path: Path) -> None:
     interlocks = made()
     interlocks.stop(StopRequest(owner="anna", reason="fire"))
     interlocks.block_goals(["a"])
@@ -157,7 +157,7 @@ def test_what_was_saved_is_found_again(tmp_path: Path) -> None:
     assert file.load() == (interlocks.record, "")
 
 
-def test_save_that_is_cut_off_anywhere_leaves_the_record_before_it(tmp_path: Path) -> None:
+def test_truncated_new_file_leaves_the_record_before_it(tmp_path: Path) -> None:
     file, interlocks = InterlockFile(tmp_path / "r"), made()
     interlocks.stop(StopRequest(owner="anna"))
     file.save(interlocks.record)
@@ -177,7 +177,7 @@ def step_or_cut(steps: Iterator[int], step: Callable[..., Any], *args: Any, **na
 
 
 @pytest.mark.parametrize("step", range(12))
-def test_save_that_is_cut_off_between_any_two_steps_leaves_one_of_both_records_and_room_for_the_next(
+def test_save_interrupted_at_any_step_leaves_one_of_both_records_and_room_for_the_next(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, full_disk: Callable[[], None], step: int
 ) -> None:
     file, interlocks = InterlockFile(tmp_path / "r"), made()
@@ -222,7 +222,7 @@ def largest() -> Interlocks:
     return interlocks
 
 
-def test_disk_that_becomes_full_takes_any_record_again_and_again(
+def test_disk_that_becomes_full_still_takes_any_record(
     tmp_path: Path, full_disk: Callable[[], None]
 ) -> None:
     file, interlocks = InterlockFile(tmp_path / "r"), made()
@@ -236,7 +236,7 @@ def test_disk_that_becomes_full_takes_any_record_again_and_again(
     assert {entry.name for entry in tmp_path.iterdir()} == {"r", "r.new"}
 
 
-def test_record_that_was_written_without_room_is_read_and_has_it_from_then_on(
+def test_short_file_of_an_earlier_version_is_loaded_and_enlarged(
     tmp_path: Path, full_disk: Callable[[], None]
 ) -> None:
     path, interlocks = tmp_path / "r", made()
@@ -253,7 +253,7 @@ def test_record_that_was_written_without_room_is_read_and_has_it_from_then_on(
 
 
 @pytest.mark.parametrize("left", [(), ("r.new",), ("r",)])
-def test_disk_that_is_full_from_the_start_is_refused_in_one_line(
+def test_full_disk_at_the_start_is_refused_in_one_line(
     tmp_path: Path, full_disk: Callable[[], None], left: tuple[str, ...]
 ) -> None:
     for name in left:
@@ -265,7 +265,7 @@ def test_disk_that_is_full_from_the_start_is_refused_in_one_line(
 
 
 @pytest.mark.parametrize("kind", ["second name of the record", "link to another file", "pipe"])
-def test_what_else_lies_in_the_place_of_the_next_record_is_never_written_over(tmp_path: Path, kind: str) -> None:
+def test_other_file_at_the_path_of_the_next_record_is_never_overwritten(tmp_path: Path, kind: str) -> None:
     file, other = InterlockFile(tmp_path / "r"), tmp_path / "other"
     file.save(largest().record)
     other.write_text("mine")
@@ -276,20 +276,20 @@ def test_what_else_lies_in_the_place_of_the_next_record_is_never_written_over(tm
     assert file.load() == (largest().record, "") and other.read_text() == "mine"
 
 
-def test_record_that_cannot_be_read_stays_to_be_looked_at_until_something_is_decided(tmp_path: Path) -> None:
+def test_unreadable_file_stays_for_inspection_until_the_next_save(tmp_path: Path) -> None:
     path = tmp_path / "r"
     path.write_bytes(b"{")
     InterlockFile(path).require_writable()
     assert path.read_bytes() == b"{"
 
 
-def test_what_is_not_kept_is_told_so_and_what_was_before_is_not() -> None:
+def test_only_unsaved_interlocks_say_that_they_are_not_on_disk() -> None:
     interlocks = made()
     interlocks.stop(StopRequest(owner="anna", reason="smoke"))
-    kept = interlocks.record
+    saved = interlocks.record
     interlocks.stop(StopRequest(owner="bert", reason="fire"))
     interlocks.hold(HoldRequest(hold=True, by="watchdog", reason="no joint states"))
-    interlocks.note_saved(kept, "No space left on device")
+    interlocks.note_saved(saved, "No space left on device")
     status = MotionStatus(interlocks=interlocks.all)
     lost = "not saved on disk (No space left on device), lost if the executor ends"
     assert [one.reason for one in status.interlocks] == ["smoke", f"{lost}; fire", "no joint states"]
@@ -307,7 +307,7 @@ MANY = json.dumps({"interlocks": [{"kind": "held", "by": f"p{number}", "since": 
     b'{"newest": 9223372036854775807}', b'{"newest": -1}', b'{"newest": 1e30}',
     b'{"interlocks": [{"kind": "stopped", "by": "a", "since": 9223372036854775807}]}',
 ])
-def test_record_that_cannot_be_read_counts_as_stopped_and_slow(tmp_path: Path, content: bytes) -> None:
+def test_unreadable_record_counts_as_a_stop_at_the_slowest_speed(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "r"
     path.write_bytes(content)
     record, problem = InterlockFile(path).load()
@@ -315,13 +315,13 @@ def test_record_that_cannot_be_read_counts_as_stopped_and_slow(tmp_path: Path, c
     interlocks = Interlocks(record)
     refused = interlocks.check("a")
     assert refused is not None and str(path) in str(refused) and effective_speed(interlocks.speed, 1.0) == SLOWEST
-    assert interlocks.arm_stopped, "nobody knows that it was not"
+    assert interlocks.arm_stopped, "it may have been stopped"
     interlocks.hold(HoldRequest(hold=False, stops=True))
     assert interlocks.check("a") is None
 
 
 @pytest.mark.parametrize("kind", ["link to nothing", "pipe", "folder", "link in a circle"])
-def test_what_is_no_file_in_the_place_of_the_record_counts_as_stopped_and_keeps_nobody_waiting(
+def test_path_that_is_no_regular_file_counts_as_a_stop_and_does_not_block(
     tmp_path: Path, kind: str
 ) -> None:
     path = tmp_path / "r"
@@ -332,7 +332,7 @@ def test_what_is_no_file_in_the_place_of_the_record_counts_as_stopped_and_keeps_
     assert Interlocks(record).check("a")
 
 
-def test_link_to_a_record_is_read(tmp_path: Path) -> None:
+def test_link_to_a_record_is_loaded(tmp_path: Path) -> None:
     interlocks = made()
     interlocks.stop(StopRequest(owner="anna"))
     InterlockFile(tmp_path / "there").save(interlocks.record)
@@ -340,7 +340,7 @@ def test_link_to_a_record_is_read(tmp_path: Path) -> None:
     assert InterlockFile(tmp_path / "r").load() == (interlocks.record, "")
 
 
-def test_folder_that_cannot_be_written_is_refused_in_one_line(tmp_path: Path) -> None:
+def test_unwritable_folder_is_refused_in_one_line(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     for folder in (tmp_path / "file", tmp_path / "file" / "below"):
         with pytest.raises(ConfigError, match=r"^ZENCELL_STATE: '.*' cannot be written \(.*\): stops") as caught:
@@ -348,7 +348,7 @@ def test_folder_that_cannot_be_written_is_refused_in_one_line(tmp_path: Path) ->
         assert "\n" not in str(caught.value)
 
 
-def test_the_folder_is_the_one_that_was_named_or_one_that_lasts() -> None:
+def test_folder_is_the_configured_one_or_one_in_the_home() -> None:
     assert state_folder({"ZENCELL_STATE": "/data", "XDG_STATE_HOME": "/x"}) == Path("/data")
     assert state_folder({"ZENCELL_STATE": "", "XDG_STATE_HOME": "/x"}) == Path("/x/zencell")
     assert state_folder({}) == Path.home() / ".local" / "state" / "zencell"

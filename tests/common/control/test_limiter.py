@@ -66,7 +66,7 @@ def test_full_acceleration_to_full_deceleration_within_a_cycle_passes():
 @example(  # on the way back of so little ruckig finds no profile
     jumps=[(27, [0.0, 4.28960194463659e-08], [0.0, -3.0]), (3, [0.0, 0.0], [0.0, -3.0])], share=1.0
 )
-def test_whatever_is_asked_for_what_is_sent_is_within_limits(jumps, share):
+def test_any_requests_become_set_points_within_limits(jumps, share):
     limiter = Limiter(LIMITS, STILL, PERIOD)
     sent = [STILL, STILL, STILL]
     for count, target, velocity in jumps:
@@ -76,13 +76,13 @@ def test_whatever_is_asked_for_what_is_sent_is_within_limits(jumps, share):
 
 
 @pytest.mark.parametrize("rested", range(4))
-@pytest.mark.parametrize("begun", [0.0, 0.3, 0.9])
-def test_whoever_comes_to_rest_goes_on_no_faster_than_from_rest(rested, begun):
+@pytest.mark.parametrize("begin", [0.0, 0.3, 0.9])
+def test_after_rest_set_points_start_as_from_rest(rested, begin):
     limiter, braking = Limiter(LIMITS, STILL, PERIOD), 0.9 * LIMITS.acceleration
     for k in range(15):  # up, and down again, at rest within a cycle
         limiter.step(braking * (k * PERIOD) ** 2 / 2, braking * k * PERIOD, PERIOD)
     q, dq = limiter.position, braking * 14 * PERIOD
-    ends = (14 - begun) * PERIOD  # from now on
+    ends = (14 - begin) * PERIOD  # from now on
     for t in np.arange(1, 15 + rested) * PERIOD:
         u = min(t, ends)
         asked = q + dq * u - dq / ends * u**2 / 2
@@ -92,14 +92,14 @@ def test_whoever_comes_to_rest_goes_on_no_faster_than_from_rest(rested, begun):
 
 
 @pytest.mark.parametrize("strange", [np.nan, np.inf, -np.inf])
-def test_what_is_not_a_number_moves_nothing(strange):
+def test_not_a_number_moves_nothing(strange):
     limiter = Limiter(LIMITS, STILL, PERIOD)
     for _ in range(20):
         q, dq = limiter.step(np.array([strange, 0.0]), np.array([strange, 0.0]), PERIOD)
         assert np.array_equal(q, STILL) and np.array_equal(dq, STILL)
 
 
-def test_what_was_left_is_caught_up_with_and_then_followed_exactly():
+def test_requested_set_points_are_reached_again_and_then_followed_exactly():
     limiter = Limiter(LIMITS, STILL, PERIOD)
     sent = [STILL, STILL, STILL]
     for q, dq in swing(1.0 + np.arange(1, 1000) * PERIOD, 0.3):  # begins far away
@@ -108,7 +108,7 @@ def test_what_was_left_is_caught_up_with_and_then_followed_exactly():
     assert_within(sent)
 
 
-def test_after_a_rest_it_goes_on_from_rest():
+def test_after_a_reset_set_points_start_from_rest():
     limiter = Limiter(LIMITS, STILL, PERIOD)
     sent = []
     for k in range(1, 30):
@@ -123,7 +123,7 @@ def test_after_a_rest_it_goes_on_from_rest():
 
 @pytest.mark.parametrize("beyond", [0.0, 0.0005, 0.03])
 @pytest.mark.parametrize("speed", [0.001, 0.02])
-def test_no_joint_creeps_out_through_its_limit(beyond, speed):
+def test_no_joint_creeps_beyond_its_limit(beyond, speed):
     """In steps that are small enough to be within all other limits, as a jog or a forged trajectory has them."""
     start = LIMITS.upper + beyond
     limiter, target = Limiter(LIMITS, start, PERIOD), start
@@ -141,7 +141,7 @@ def test_no_joint_creeps_out_through_its_limit(beyond, speed):
         st.booleans(),
     ), min_size=1, max_size=12),
 )
-def test_arm_beyond_a_limit_gets_no_farther_out(out, steps):
+def test_joint_beyond_its_limit_moves_no_farther(out, steps):
     """Whatever it follows: speeds, or jumps."""
     out = np.array(out)
     start = np.where(out > 0, LIMITS.upper, LIMITS.lower) + out

@@ -1,4 +1,4 @@
-"""What the arm's controller is told that it carries."""
+"""The payload that the arm's own controller gets: at rest, after a grasp and after a release."""
 
 import numpy as np
 import pytest
@@ -13,87 +13,82 @@ from tests.doubles.stopping_arm import StoppingArm
 PAYLOAD = {"mass": 0.9, "com": [0, 0, 0.06], "held": [0, 0, 0.16]}
 TWO = np.ones(2)
 LIMITS = Limits(("shoulder", "elbow"), -3 * TWO, 3 * TWO, 2 * TWO, 10 * TWO)
+EMPTY = ("payload", 0.9, 0.0, 0.0, 0.06)
+GRASP = {"width": 0.0, "expected_width": 0.05, "mass": 0.3}
 
 
-class Rig:
+class PayloadRig:
     def __init__(self, **gripper: object) -> None:
         config = GripperConfig.model_validate({"joints": ["left", "right"], "links": [], **gripper})
-        self.fingers = SimulatedFingers(config, 0.08)
+        self.fingers = SimulatedFingers(config)
         self.arm = StoppingArm(0 * TWO, self.fingers)
-        self.cycle, self.now, self.notes = Executor(self.arm, LIMITS, 0 * TWO, gripper=config), 10.0, []
+        self.executor, self.now, self.notes = Executor(self.arm, LIMITS, 0 * TWO, gripper=config), 10.0, list[str]()
         self.run()
 
     def run(self, seconds: float = 0.5) -> list[tuple[object, ...]]:
-        """What the arm was told since the last time."""
+        """Run cycles; return the orders that the arm got."""
         before = len(self.arm.orders)
         for _ in range(round(seconds / 0.01)):
             self.now += 0.01
-            self.notes += self.cycle.cycle(Header(stamp=round(self.now * 1e9))).notes
+            self.notes += self.executor.cycle(Header(stamp=round(self.now * 1e9))).notes
         return self.arm.orders[before:]
 
     def move(self, trajectory: JointTrajectory) -> None:
-        answer = self.cycle.execute(ExecuteRequest(id=f"{self.now:.2f}", trajectory=trajectory), self.now)
+        answer = self.executor.execute(ExecuteRequest(id=f"{self.now:.2f}", trajectory=trajectory), self.now)
         assert answer.state == "active", answer
 
-    def told(self, width: float, **more: float) -> list[tuple[object, ...]]:
-        self.cycle.command_gripper(GripperCommand(id=f"{self.now:.2f}", width=width, **more), self.now)
-        return self.run(1.5)
+    def grip(self, seconds: float = 1.5, **command: float) -> list[tuple[object, ...]]:
+        self.executor.command_gripper(GripperCommand(id=f"{self.now:.2f}", **command), self.now)
+        return self.run(seconds)
 
 
-def test_controller_is_told_what_the_hand_carries_from_the_grasp_to_its_end():
-    rig = Rig(payload=PAYLOAD)
-    assert rig.arm.orders == [("payload", 0.9, 0.0, 0.0, 0.06)]
+@pytest.fixture
+def rig() -> PayloadRig:
+    """The gripper, with an object between its fingers."""
+    rig = PayloadRig(payload=PAYLOAD)
+    assert rig.arm.orders == [EMPTY]
     rig.fingers.obstruct(0.05)
-    (told,) = rig.told(0.0, expected_width=0.05, mass=0.3)
-    assert told == ("payload", pytest.approx(1.2), 0.0, 0.0, pytest.approx((0.9 * 0.06 + 0.3 * 0.16) / 1.2))
-    assert rig.told(0.08) == [("payload", 0.9, 0.0, 0.0, 0.06)]
+    return rig
 
 
-def test_it_is_told_anew_when_the_arm_is_ready_again():
-    rig = Rig(payload=PAYLOAD)
+def test_held_object_counts_from_the_grasp_to_the_release(rig):
+    (order,) = rig.grip(**GRASP)
+    assert order == ("payload", pytest.approx(1.2), 0.0, 0.0, pytest.approx((0.9 * 0.06 + 0.3 * 0.16) / 1.2))
+    assert rig.grip(width=0.08) == [EMPTY]
+
+
+def test_object_that_slipped_or_was_not_grasped_does_not_count(rig):
+    rig.fingers.obstruct(0.0)
+    assert rig.grip(**GRASP) == []
+    rig.fingers.obstruct(0.05)
+    assert len(rig.grip(**GRASP)) == 1
+    rig.fingers.obstruct(0.0)
+    assert rig.run() == [EMPTY]
+
+
+def test_payload_is_sent_again_when_the_controller_becomes_ready(rig):
     rig.arm.stopped = True
     assert rig.run() == []
     rig.arm.stopped = False
-    assert rig.run() == [("payload", 0.9, 0.0, 0.0, 0.06)]
+    assert rig.run() == [EMPTY]
 
 
-def test_what_slipped_or_was_not_grasped_is_not_carried():
-    rig = Rig(payload=PAYLOAD)
-    assert rig.told(0.0, expected_width=0.05, mass=0.3) == []
-    rig.fingers.obstruct(0.05)
-    assert len(rig.told(0.0, expected_width=0.05, mass=0.3)) == 1
-    rig.fingers.obstruct(0.0)
-    assert rig.run() == [("payload", 0.9, 0.0, 0.0, 0.06)]
-
-
-def test_nothing_is_told_where_the_robot_file_says_nothing_and_a_refusal_is_said_once():
-    assert Rig().arm.orders == []
-    rig = Rig(payload=PAYLOAD)
-    rig.arm.refuses = "too heavy"
-    rig.arm.stopped = True
-    rig.run()
-    rig.arm.stopped = False
-    rig.run(3.0)
-    assert [note for note in rig.notes if "payload" in note] == ["the arm did not accept its payload: too heavy"]
-
-
-def test_what_came_to_nothing_is_told_again_after_a_motion(rest_to_rest):
-    rig = Rig(payload=PAYLOAD)
-    rig.fingers.obstruct(0.05)
+def test_refused_payload_is_logged_once_and_sent_again_after_a_motion(rig, rest_to_rest):
     rig.arm.refuses = "cannot be set while the arm moves"
-    first = rig.told(0.0, expected_width=0.05, mass=0.3)
+    first = rig.grip(**GRASP)
     rig.arm.refuses = ""
-    assert len(first) == 1 and rig.run() == []
+    assert len(first) == 1 and rig.run(3.0) == []
+    assert rig.notes == ["the arm did not accept its payload: cannot be set while the arm moves"]
     rig.move(rest_to_rest([0, 0], [0, 0.2]))
-    moving = rig.run(0.1)
-    assert not moving and rig.run(3.0) == first
+    assert rig.run(0.1) == [] and rig.run(3.0) == first
 
 
-def test_what_changes_while_the_arm_moves_is_told_when_it_rests(rest_to_rest):
-    rig = Rig(payload=PAYLOAD)
-    rig.fingers.obstruct(0.05)
-    rig.told(0.0, expected_width=0.05, mass=0.3)
+def test_change_during_a_motion_is_sent_at_rest(rig, rest_to_rest):
+    rig.grip(**GRASP)
     rig.move(rest_to_rest([0, 0], [0, 0.2]))
     rig.run(0.1)
-    rig.cycle.command_gripper(GripperCommand(id="let go", width=0.08), rig.now)
-    assert rig.run(0.1) == [] and rig.run(3.0) == [("payload", 0.9, 0.0, 0.0, 0.06)]
+    assert rig.grip(0.1, width=0.08) == [] and rig.run(3.0) == [EMPTY]
+
+
+def test_nothing_is_sent_without_a_payload_in_the_robot_file():
+    assert PayloadRig().arm.orders == []

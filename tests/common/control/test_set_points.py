@@ -40,21 +40,21 @@ class Sampled(Rig):
 
 
 class Pushed(MockHardware):
-    """An arm that is at once where it is told to be, unless somebody pushes it."""
+    """An arm that is at once at its set-point, unless it is pushed."""
 
     def __init__(self, start):
         super().__init__(start, None)
-        self.kept = None
+        self.fixed = None
 
     def push(self, by, stays=False):
-        """Move it; what it is pushed against may stay there."""
+        """Displace it, for good if it `stays`."""
         self._positions = self._positions + by
         self._velocities = 0 * by
-        self.kept = self._positions.copy() if stays else None
+        self.fixed = self._positions.copy() if stays else None
 
     def read(self, now):
         q, dq = super().read(now)
-        return (q, dq) if self.kept is None else (self.kept.copy(), 0 * dq)
+        return (q, dq) if self.fixed is None else (self.fixed.copy(), 0 * dq)
 
 
 def goal_at(place, seconds, names=LIMITS.names):
@@ -66,7 +66,7 @@ def goal_at(place, seconds, names=LIMITS.names):
 
 
 @pytest.mark.parametrize("share", [1.0, 0.05])
-def test_goals_of_a_microsecond_that_are_off_by_their_tolerance_move_within_limits_and_at_the_speed_asked(share):
+def test_goals_of_a_microsecond_off_by_their_tolerance_keep_limits_and_speed_scaling(share):
     rig = Sampled(LIMITS)
     rig.controller.reports.speed_scaling = share
     place, begin = START, rig.now
@@ -79,7 +79,7 @@ def test_goals_of_a_microsecond_that_are_off_by_their_tolerance_move_within_limi
     assert rig.now - begin > 20 * 0.05 / share
 
 
-def test_stop_and_go_between_points_too_close_for_their_times_is_followed_slowly_or_refused():
+def test_points_too_close_in_time_are_followed_slowly_or_refused():
     rig = Sampled(LIMITS)
     points = [JointTrajectoryPoint(time_from_start=k * 1e-6, positions=[k * 1e-6, 0], velocities=[0, 0],
                                    accelerations=[0, 0]) for k in range(20_000)]
@@ -91,7 +91,7 @@ def test_stop_and_go_between_points_too_close_for_their_times_is_followed_slowly
     rig.assert_within(LIMITS)
 
 
-def test_sharp_points_within_the_slack_of_acceptance_are_followed_slower_and_arrive():
+def test_sharp_points_within_the_slack_are_followed_slower_to_their_end():
     rig = Sampled(LIMITS)
     move = 0.24 * 10.0 * 0.2**2  # in 0.2 s: the cubic between needs half more than the acceleration there is
     points = [JointTrajectoryPoint(time_from_start=t, positions=[q, 0], velocities=[0, 0], accelerations=[0, 0])
@@ -103,7 +103,7 @@ def test_sharp_points_within_the_slack_of_acceptance_are_followed_slower_and_arr
 
 
 @pytest.mark.parametrize("seconds", [0.011, 0.05, 0.09, 0.2, 1.0, 3600.0])
-def test_stall_is_followed_by_a_short_step_or_by_a_start_from_rest(seconds):
+def test_after_a_stall_the_motion_resumes_by_a_short_step_or_from_rest(seconds):
     rig = Sampled(LIMITS)
     rig.accept("a", winding(0, 0.9))
     while rig.velocities[-1][0] < 1.0:
@@ -118,7 +118,7 @@ def test_stall_is_followed_by_a_short_step_or_by_a_start_from_rest(seconds):
     assert np.allclose(rig.q, [1, 0], atol=2e-3)
 
 
-def test_arm_that_something_keeps_off_its_path_is_let_go_there_within_limits():
+def test_arm_pushed_off_its_path_is_held_there_within_limits():
     hardware = Pushed(START)
     rig = Sampled(LIMITS, hardware)
     rig.accept("a", winding(0, 0.9))
@@ -135,7 +135,7 @@ def test_arm_that_something_keeps_off_its_path_is_let_go_there_within_limits():
     assert rig.accept("b", goal_at(where, 1e-6)).state == "active" and rig.until_over().state == "succeeded"
 
 
-def test_set_points_begin_where_the_arm_is_found():
+def test_set_points_start_where_the_arm_is():
     rig = Sampled(LIMITS, MockHardware(np.array([0.7, -0.4]), None))
     for _ in range(5):
         rig.step()
@@ -155,7 +155,7 @@ EVENTS = st.one_of(
 
 @settings(max_examples=40, deadline=None)
 @given(events=st.lists(st.tuples(st.integers(1, 60), EVENTS), min_size=2, max_size=12))
-def test_whatever_happens_set_points_stay_within_limits(events):
+def test_set_points_stay_within_limits_for_any_events(events):
     rig = Sampled(HARD)
     for number, (cycles, (event, value)) in enumerate(events):
         controller = rig.controller
@@ -185,7 +185,7 @@ def test_whatever_happens_set_points_stay_within_limits(events):
 
 @pytest.mark.parametrize("by", [0.02, 0.2])
 @pytest.mark.parametrize("moving", [0.0, 0.5])
-def test_arm_that_is_moved_from_outside_is_held_where_it_is_found_and_says_so(by, moving):
+def test_arm_moved_from_outside_is_held_where_it_is_and_reports_it(by, moving):
     hardware = Pushed(START)
     rig = Sampled(LIMITS, hardware)
     rig.accept("a", winding(0, 0.9))
@@ -206,7 +206,7 @@ def test_arm_that_is_moved_from_outside_is_held_where_it_is_found_and_says_so(by
     assert rig.accept("b", goal_at(rig.q, 1e-6)).state == "active" and rig.until_over().state == "succeeded"
 
 
-def test_arm_that_does_not_stay_where_it_is_held_is_left_alone():
+def test_arm_that_does_not_stay_where_it_is_held_is_a_fault():
     hardware = Pushed(START)
     rig = Rig(LIMITS, hardware)
     rig.step()
@@ -218,7 +218,7 @@ def test_arm_that_does_not_stay_where_it_is_held_is_left_alone():
 
 
 class Coasting(Pushed):
-    """An arm that goes on at its speed while nobody tells it anything."""
+    """An arm that continues at its speed without set-points."""
 
     def __init__(self, start, speed):
         super().__init__(start)
@@ -235,7 +235,7 @@ class Coasting(Pushed):
         super().write(positions, velocities, now)
 
 
-def test_arm_that_is_found_in_motion_is_braked_from_where_it_is():
+def test_arm_found_in_motion_is_braked_from_where_it_is():
     """As after a restart of the executor in the middle of a motion."""
     speed = np.array([1.5, -0.4])
     rig = Sampled(HARD, Coasting(START, speed))
@@ -248,8 +248,8 @@ def test_arm_that_is_found_in_motion_is_braked_from_where_it_is():
     rig.assert_within(HARD)
 
 
-def test_arm_that_only_says_that_it_moves_is_held_where_it_is_read():
-    """As one that reports the speed which it was told last."""
+def test_arm_that_only_reports_a_velocity_is_held_where_it_is():
+    """An arm that reports its commanded velocity."""
     rig = Sampled(LIMITS)
     rig.accept("a", winding(0, 0.9))
     while rig.velocities[-1][0] < 1.0:
@@ -264,7 +264,7 @@ def test_arm_that_only_says_that_it_moves_is_held_where_it_is_read():
 
 
 @pytest.mark.parametrize("amiss", [0.11, -0.3])
-def test_arm_that_reads_off_wherever_it_is_held_gets_no_jump_and_no_goal(amiss):
+def test_arm_with_a_constant_deviation_gets_no_jump_and_no_goal(amiss):
     class Amiss(MockHardware):
         by = 0.0
 
@@ -292,7 +292,7 @@ def test_arm_that_reads_off_wherever_it_is_held_gets_no_jump_and_no_goal(amiss):
 
 @pytest.mark.parametrize("seconds", [0.03, 0.4, 3.0])
 @pytest.mark.parametrize("coasted", [0.0, 0.005, 0.06])
-def test_after_a_stall_motion_goes_on_by_a_ramp_from_where_the_arm_is_read(seconds, coasted):
+def test_after_a_stall_the_motion_ramps_up_from_where_the_arm_is(seconds, coasted):
     hardware = Pushed(START)
     rig = Sampled(LIMITS, hardware)
     rig.accept("a", winding(3, 0.9))
@@ -307,7 +307,7 @@ def test_after_a_stall_motion_goes_on_by_a_ramp_from_where_the_arm_is_read(secon
     rig.assert_within(LIMITS)
 
 
-def test_arm_that_was_moved_far_during_a_stall_is_held_there_and_the_goal_is_over():
+def test_arm_moved_far_during_a_stall_is_held_there_and_the_goal_aborted():
     hardware = Pushed(START)
     rig = Sampled(LIMITS, hardware)
     rig.accept("a", winding(0, 0.9))
@@ -321,7 +321,7 @@ def test_arm_that_was_moved_far_during_a_stall_is_held_there_and_the_goal_is_ove
 
 
 @pytest.mark.parametrize("cycles", [1.0, 2.0, 5.0])
-def test_steps_of_acceleration_are_followed_so_slowly_that_jerk_keeps_its_limit(cycles):
+def test_acceleration_steps_are_followed_slowly_enough_to_keep_the_jerk_limit(cycles):
     """From the fullest acceleration to the fullest braking within no time, of arms that take some cycles for it."""
     limits = replace(LIMITS, jerk=LIMITS.acceleration / (cycles * STEP))
     rig = Sampled(limits)
@@ -338,7 +338,7 @@ def test_steps_of_acceleration_are_followed_so_slowly_that_jerk_keeps_its_limit(
 
 
 @pytest.mark.parametrize("seed", [0, 4])
-def test_trajectory_at_the_limits_is_gone_on_with_on_its_path_after_a_stall(seed):
+def test_trajectory_at_the_limits_continues_on_its_path_after_a_stall(seed):
     bends = np.concatenate([np.zeros((1, 2)), np.random.default_rng(seed).uniform(-1, 1, (4, 2))])
     path = blended_path(bends, np.full(5, 0.3))[0]
     timed = parametrise(path, 0.985 * LIMITS.velocity, 0.985 * LIMITS.acceleration)

@@ -27,7 +27,7 @@ def test_goal_is_followed_to_its_end(limits, rest_to_rest, hardware):
     assert np.allclose(rig.q, [1, -0.5], atol=2e-3)
 
 
-def test_each_place_of_a_path_is_worked_out_once(rig, rest_to_rest, monkeypatch):
+def test_each_point_of_a_path_is_computed_once(rig, rest_to_rest, monkeypatch):
     asked, honest = [], Trajectory.at
     monkeypatch.setattr(Trajectory, "at", lambda self, time: (asked.append(time), honest(self, time))[1])
     rig.accept("a", rest_to_rest([0, 0], [1, 1]))
@@ -49,7 +49,7 @@ def test_next_goal_starts_where_the_last_ended(rig, rest_to_rest):
     assert rig.until_over().state == "succeeded"
 
 
-def test_second_goal_is_rejected_as_busy_and_the_first_goes_on(rig, rest_to_rest):
+def test_second_goal_is_rejected_as_busy_and_the_first_continues(rig, rest_to_rest):
     rig.accept("a", rest_to_rest([0, 0], [1, 1]))
     rig.step()
     refused = rig.accept("b", rest_to_rest([0, 0], [1, 1]))
@@ -64,7 +64,7 @@ def test_rejected_goal_does_not_move_the_robot(rig, rest_to_rest):
 
 
 @pytest.mark.parametrize("when", ["active", "over", "rejected"])
-def test_same_id_again_gives_the_state_of_that_goal_and_moves_nothing(rig, rest_to_rest, when):
+def test_repeated_id_returns_the_state_of_that_goal_and_moves_nothing(rig, rest_to_rest, when):
     there, back = rest_to_rest([0, 0], [1, 1]), rest_to_rest([1, 1], [0, 0])
     if when == "rejected":
         first = rig.accept("a", back)
@@ -82,7 +82,7 @@ def test_same_id_again_gives_the_state_of_that_goal_and_moves_nothing(rig, rest_
         assert np.array_equal(rig.q, before)
 
 
-def test_goals_that_were_followed_are_remembered_however_many_are_refused(rig, rest_to_rest):
+def test_refused_goals_do_not_displace_followed_ones(rig, rest_to_rest):
     there, back = rest_to_rest([0, 0], [0.01, 0], 0.5), rest_to_rest([0.01, 0], [0, 0], 0.5)
     rig.accept("first", there)
     rig.until_over()
@@ -96,7 +96,7 @@ def test_goals_that_were_followed_are_remembered_however_many_are_refused(rig, r
     assert rig.accept("busy 0", there).state == "active", "forgotten by now: a new goal"
 
 
-def test_as_many_goals_are_remembered_as_the_docs_say():
+def test_number_of_remembered_goals_is_documented():
     said = re.search(r"newest goals by id \((\d+) accepted", (ROOT / "docs" / "security.md").read_text())
     assert said is not None and int(said[1]) == REMEMBERED
     memory = GoalMemory()
@@ -154,7 +154,7 @@ def test_stop_is_quick(limits, rest_to_rest):
     assert rig.now - T0 < 5.5
 
 
-def test_stop_with_another_id_is_ignored_and_told(rig, rest_to_rest):
+def test_stop_with_another_id_is_ignored_and_reported(rig, rest_to_rest):
     rig.accept("a", rest_to_rest([0, 0], [1, 1]))
     rig.step()
     unknown = rig.controller.cancel("b", "?", rig.now)
@@ -206,7 +206,7 @@ def test_start_within_tolerance_is_blended_without_a_jump(limits, rest_to_rest):
     assert np.all(np.abs(rig.positions[1] - START) < 1e-3) and np.allclose(rig.q, [0.5, 0.5])
 
 
-def test_arm_moved_from_outside_is_taken_from_where_it_is(limits, rest_to_rest):
+def test_goal_starts_where_an_arm_moved_from_outside_is(limits, rest_to_rest):
     hardware = MockHardware(START, None)
     rig = Rig(limits, hardware)
     hardware.write(np.array([0.3, 0.0]), START, rig.now)
@@ -215,7 +215,7 @@ def test_arm_moved_from_outside_is_taken_from_where_it_is(limits, rest_to_rest):
     assert rig.positions[-1][0] == pytest.approx(0.3, abs=1e-2)
 
 
-def test_stall_of_the_loop_does_not_make_the_set_point_jump(rig, limits, rest_to_rest):
+def test_stall_does_not_make_the_set_point_jump(rig, limits, rest_to_rest):
     rig.accept("a", rest_to_rest([0, 0], [1, 1]))
     for _ in range(30):
         rig.step()
@@ -224,7 +224,7 @@ def test_stall_of_the_loop_does_not_make_the_set_point_jump(rig, limits, rest_to
     assert rig.until_over().state == "succeeded"
 
 
-def test_fault_ends_the_goal_and_rejects_others_until_it_is_gone(rig, rest_to_rest):
+def test_fault_ends_the_goal_and_rejects_others_until_it_is_over(rig, rest_to_rest):
     rig.accept("a", rest_to_rest([0, 0], [1, 1]))
     rig.step()
     rig.controller.fault("bus is off")
@@ -253,7 +253,7 @@ class Behind(MockHardware):
         self._coming = deque([(here, 0 * here)] * len(self._coming))
 
 
-def test_arm_that_is_behind_its_set_points_is_judged_by_those_of_then_and_by_none_of_before_it_was_stopped(
+def test_arm_with_a_delay_is_compared_with_its_past_set_points_since_the_last_stop(
     limits, rest_to_rest
 ):
     rig = Rig(limits, Behind(10), path=0.02)
@@ -268,7 +268,7 @@ def test_arm_that_is_behind_its_set_points_is_judged_by_those_of_then_and_by_non
     assert rig.until_over().state == "succeeded"
 
 
-def test_progress_is_that_of_the_arm_where_it_is_behind_its_set_points_and_never_falls(limits, rest_to_rest):
+def test_progress_of_an_arm_with_a_delay_is_its_own_and_never_decreases(limits, rest_to_rest):
     rig, seen = Rig(limits, Behind(10)), []
     rig.controller.history.delay = 0.1
     rig.accept("a", rest_to_rest([0, 0], [1, 1]))
@@ -280,7 +280,7 @@ def test_progress_is_that_of_the_arm_where_it_is_behind_its_set_points_and_never
     assert rig.until_over().progress == 1.0
 
 
-def test_arm_whose_readings_are_held_up_is_judged_by_where_it_was_to_be_when_they_were_made(limits, rest_to_rest):
+def test_delayed_readings_are_compared_with_the_set_points_of_their_time(limits, rest_to_rest):
     rig = Rig(limits, Behind(10), path=0.02)
     rig.controller.history.delay = 0.1
     rig.accept("a", rest_to_rest([0, 0], [1, 1]))
@@ -295,7 +295,7 @@ def test_arm_whose_readings_are_held_up_is_judged_by_where_it_was_to_be_when_the
     assert rig.until_over().state == "succeeded"
 
 
-def test_arm_that_is_later_than_usual_is_on_its_path_and_one_that_stays_behind_is_not(limits, rest_to_rest):
+def test_arm_later_than_usual_is_on_its_path_and_one_that_stays_behind_is_not(limits, rest_to_rest):
     rig = Rig(limits, Behind(18), path=0.02)
     rig.controller.history.delay = 0.1
     rig.accept("a", rest_to_rest([0, 0], [1, 1]))

@@ -1,3 +1,5 @@
+"""Hardware backends by name: arms, grippers that go with any arm, and the arm of a simulated world."""
+
 import sys
 import types
 
@@ -6,23 +8,52 @@ import pytest
 
 from common.config import HardwareConfig, Parameters, RobotConfig
 from common.errors import ConfigError, UnknownName
+from common.hardware.driven_gripper import DrivenGripper
+from common.hardware.driver_process import DriverProcess
 from common.hardware.interface import Limits, SimulatedGripper
-from common.hardware.loading import backend_names, find_backend, is_simulated, load_hardware
+from common.hardware.loading import (
+    backend_names,
+    find_backend,
+    find_gripper_backend,
+    gripper_backend_names,
+    is_simulated,
+    load_hardware,
+)
+from common.hardware.mock import SimulatedFingers
 
 START = np.array([0.1, -0.2])
 
 
-def robot(backend: str, **options: object) -> RobotConfig:
+def robot(backend: str, gripper: dict[str, object] | None = None, **options: object) -> RobotConfig:
     return RobotConfig(
         name="two", urdf="two.urdf", joints=["shoulder", "elbow"], base_link="base", tcp_link="tip",
         named_poses={"home": [0, 0]}, acceleration_limits=[1, 1], jerk_limits=[1, 1],
-        gripper={"joints": ["finger"], "links": []},  # type: ignore[arg-type]
+        gripper={"joints": ["finger"], "links": [], "hardware": gripper},  # type: ignore[arg-type]
         hardware=HardwareConfig(backend=backend, options=options),
     )
 
 
+@pytest.fixture
+def own_arm(monkeypatch: pytest.MonkeyPatch) -> str:
+    """The name of a backend of the user, which brings a gripper if its robot has one."""
+    module = types.ModuleType("mine.arm")
+
+    class Options(Parameters):
+        port: int = 1
+
+    module.Options, module.simulated = Options, False  # type: ignore[attr-defined]
+    module.create = lambda robot, limits, start, options: types.SimpleNamespace(  # type: ignore[attr-defined]
+        names=limits.names, port=options.port, gripper="its own" if robot.gripper else None)
+    monkeypatch.setitem(sys.modules, "mine", types.ModuleType("mine"))
+    monkeypatch.setitem(sys.modules, "mine.arm", module)
+    return "mine.arm"
+
+
+# --- arms ---
+
+
 @pytest.mark.parametrize("name", ["mock", "lag"])
-def test_every_backend_starts_at_the_start_at_rest_and_goes_where_it_is_sent(limits: Limits, name: str) -> None:
+def test_simulated_arm_starts_at_rest_and_moves_where_it_is_sent(limits: Limits, name: str) -> None:
     hardware = load_hardware(robot(name), limits, START)
     q, dq = hardware.read(5.0)
     assert np.array_equal(q, START) and not dq.any() and isinstance(hardware.gripper, SimulatedGripper)
@@ -33,42 +64,33 @@ def test_every_backend_starts_at_the_start_at_rest_and_goes_where_it_is_sent(lim
 
 def test_backends_are_found_by_name() -> None:
     assert backend_names() == ["franka", "lag", "mock", "ur"]
+    assert gripper_backend_names() == ["franka_hand", "mock", "robotiq"]
     assert all(is_simulated(robot(name)) for name in ("lag", "mock"))
 
 
-def test_unknown_backend_names_the_choices() -> None:
-    with pytest.raises(UnknownName, match=r"'mok' \(did you mean 'mock'\?\); choices: franka, lag, mock, ur"):
-        find_backend(robot("mok"))
+def test_user_backend_is_a_dotted_module(limits: Limits, own_arm: str) -> None:
+    assert not find_backend(robot(own_arm)).simulated
+    arm = load_hardware(robot(own_arm, port=7), limits, START)
+    assert (arm.names, arm.port, arm.gripper) == (("shoulder", "elbow"), 7, "its own")  # type: ignore[attr-defined]
 
 
-@pytest.mark.parametrize("name", ["no.such.module", "common.control.trajectory_controller"])
-def test_module_that_is_no_backend_is_refused(name: str) -> None:
-    with pytest.raises(ConfigError, match=r"robot\.hardware\.backend: "):
+@pytest.mark.parametrize(("name", "error"), [
+    ("mok", r"'mok' \(did you mean 'mock'\?\); choices: franka, lag, mock, ur"),
+    ("no.such.module", r"robot\.hardware\.backend: "), ("common.control.executor", r"robot\.hardware\.backend: "),
+    ("mujoco", r"leave the backend at mock and set world\.simulator: mujoco in the cell"),
+])
+def test_unsuitable_backend_is_refused_with_the_choices(name: str, error: str) -> None:
+    with pytest.raises((ConfigError, UnknownName), match=error):
         find_backend(robot(name))
 
 
-def test_backend_of_ones_own_is_a_dotted_module(limits: Limits, monkeypatch: pytest.MonkeyPatch) -> None:
-    module = types.ModuleType("mine.arm")
-
-    class Options(Parameters):
-        port: int = 1
-
-    module.Options, module.simulated = Options, False  # type: ignore[attr-defined]
-    module.create = lambda robot, limits, start, options: (limits.names, options.port)  # type: ignore[attr-defined]
-    monkeypatch.setitem(sys.modules, "mine", types.ModuleType("mine"))
-    monkeypatch.setitem(sys.modules, "mine.arm", module)
-    assert not find_backend(robot("mine.arm")).simulated
-    made: object = load_hardware(robot("mine.arm", port=7), limits, START)
-    assert made == (("shoulder", "elbow"), 7)
-
-
 @pytest.mark.parametrize(("options", "field"), [({"time_constant": -1}, "time_constant"), ({"lag": 1}, "lag")])
-def test_bad_option_is_refused_by_name(limits: Limits, options: dict[str, object], field: str) -> None:
+def test_invalid_option_is_refused_by_name(limits: Limits, options: dict[str, object], field: str) -> None:
     with pytest.raises(ConfigError, match=rf"robot\.hardware\.options\.{field}"):
         load_hardware(robot("lag", **options), limits, START)
 
 
-def test_lag_is_first_order_whatever_the_steps(limits: Limits) -> None:
+def test_lag_is_first_order_at_any_step(limits: Limits) -> None:
     for steps in (1, 7, 100):
         hardware = load_hardware(robot("lag", time_constant=0.1), limits, START)
         hardware.write(START + 1, START, 0.0)
@@ -77,16 +99,69 @@ def test_lag_is_first_order_whatever_the_steps(limits: Limits) -> None:
         assert np.allclose(q, START + 1 - np.exp(-1)) and np.allclose(dq, np.exp(-1) / 0.1)
 
 
-# --- the arm of a simulated world -----------------------------------------------------------------------------------
+# --- grippers ---
+
+GRIPPERS = [
+    ({"backend": "mock"}, SimulatedFingers), ({"backend": "franka_hand", "options": {"host": "h"}}, DrivenGripper),
+    ({"backend": "robotiq", "options": {"host": "h", "model": "2f85"}}, DrivenGripper),
+]
 
 
-def test_arm_of_a_world_takes_the_place_of_mock_alone(limits: Limits) -> None:
+@pytest.mark.parametrize("arm", ["mock", "lag", "mine.arm"])
+@pytest.mark.parametrize(("gripper", "kind"), GRIPPERS)
+def test_any_gripper_goes_with_any_arm(
+    limits: Limits, monkeypatch: pytest.MonkeyPatch, own_arm: str, arm: str, gripper: dict[str, object], kind: type
+) -> None:
+    monkeypatch.setattr(DriverProcess, "keep_running", lambda process: None)
+    assert isinstance(load_hardware(robot(arm, gripper), limits, START).gripper, kind)
+
+
+def test_arm_is_created_without_its_own_gripper_if_another_one_is_named(
+    limits: Limits, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen = []
+    lag = find_backend(robot("lag"))
+    create = lag.create
+    monkeypatch.setattr(lag, "create", lambda robot, *args: (seen.append(robot.gripper), create(robot, *args))[1])
+    load_hardware(robot("lag"), limits, START)
+    load_hardware(robot("lag", {"backend": "mock"}), limits, START)
+    assert [gripper is None for gripper in seen] == [False, True]
+
+
+@pytest.mark.parametrize(("gripper", "error"), [
+    ({"backend": "robotik"}, r"'robotik' \(did you mean 'robotiq'\?\); choices: franka_hand, mock, robotiq"),
+    ({"backend": "no.such.module"}, r"robot\.gripper\.hardware\.backend: "),
+    ({"backend": "common.hardware.pace"}, r"robot\.gripper\.hardware\.backend: .*it has no GripperOptions"),
+    ({"backend": "robotiq", "options": {"host": "h", "model": "3f"}},
+     r"robot\.gripper\.hardware\.options\.model: '3f'"),
+    ({"backend": "robotiq", "options": {"model": "2f85"}}, r"robot\.gripper\.hardware\.options\.host"),
+])
+def test_unsuitable_gripper_backend_is_refused_with_the_choices(
+    limits: Limits, gripper: dict[str, object], error: str
+) -> None:
+    config = robot("mock", gripper)
+    for refuse in (is_simulated, lambda config: load_hardware(config, limits, START)):
+        with pytest.raises((ConfigError, UnknownName), match=error):
+            refuse(config)
+
+
+def test_gripper_backend_of_the_user_is_a_dotted_module(monkeypatch: pytest.MonkeyPatch) -> None:
+    module = types.ModuleType("mine.gripper")
+    module.GripperOptions, module.create_gripper = Parameters, None  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "mine", types.ModuleType("mine"))
+    monkeypatch.setitem(sys.modules, "mine.gripper", module)
+    assert find_gripper_backend(HardwareConfig(backend="mine.gripper")) is module
+
+
+# --- the arm of a simulated world ---
+
+
+def test_arm_of_a_world_replaces_only_mock(limits: Limits) -> None:
     arm: object = object()
     assert load_hardware(robot("mock"), limits, START, lambda: arm) is arm  # type: ignore[arg-type,return-value]
-    with pytest.raises(ConfigError, match=r"'lag' moves the joints itself.*set mock here, or kinematic there"):
-        load_hardware(robot("lag"), limits, START, lambda: arm)  # type: ignore[arg-type,return-value]
-
-
-def test_world_in_the_place_of_a_backend_says_where_it_is_named() -> None:
-    with pytest.raises(ConfigError, match=r"leave the backend at mock and set world\.simulator: mujoco in the cell"):
-        find_backend(robot("mujoco"))
+    for config, error in (
+        (robot("lag"), r"'lag' moves the joints itself.*set mock here, or kinematic there"),
+        (robot("mock", {"backend": "mock"}), r"robot\.gripper\.hardware\.backend: 'mock' moves the gripper, and so"),
+    ):
+        with pytest.raises(ConfigError, match=error):
+            load_hardware(config, limits, START, lambda: arm)  # type: ignore[arg-type,return-value]

@@ -1,4 +1,4 @@
-"""Grippers behind a process of their own: Robotiq's by its lines of text, and what every driver may do wrong."""
+"""Grippers behind a driver process: the protocol of Robotiq, and failures of any driver."""
 
 import time
 from collections.abc import Iterator
@@ -20,7 +20,7 @@ TIMEOUT = 20.0
 SIX = np.ones(6)
 LIMITS = Limits(tuple("abcdef"), -6 * SIX, 6 * SIX, 3 * SIX, 5 * SIX, 10 * SIX, 500 * SIX)
 CONFIG: GripperConfig = load_cell("ur5", ["robot.gripper.speed=0.15"]).robot.gripper  # a 2F-85
-TOUCH = 110  # counts at which the fingers meet what is between them,
+TOUCH = 110  # [counts] at which the fingers meet the object,
 WIDE = 0.085 * (228 - TOUCH) / 225  # [m] apart then
 
 
@@ -58,8 +58,8 @@ class Driven:
             assert time.monotonic() < end, (state, self.problem)
         return state
 
-    def told(self, name: str, width: float, **more: object) -> GripperState:
-        """What becomes of a command."""
+    def grip(self, name: str, width: float, **more: object) -> GripperState:
+        """Return the final state of a command."""
         self.until(lambda _: not self.problem)
         self.controller.command(GripperCommand(id=name, width=width, **more), time.monotonic())
         return self.until(lambda state: state.state != "active")
@@ -76,25 +76,25 @@ def driven(host: RobotiqHost) -> Iterator[Driven]:
 def test_fingers_open_and_close_to_a_width(host: RobotiqHost, driven: Driven, answers: bytes) -> None:
     host.gripper.answers = answers
     for n, width in enumerate((0.03, 0.085, 0.0)):
-        state = driven.told(f"g{n}", width)
+        state = driven.grip(f"g{n}", width)
         assert (state.state, state.holding) == ("succeeded", False)
         assert state.width == pytest.approx(width, abs=3e-4)  # a count
 
 
-def test_what_is_between_them_is_held_with_the_effort_that_was_asked_for_and_let_go(
+def test_object_is_held_with_the_commanded_effort_and_released(
     host: RobotiqHost, driven: Driven,
 ) -> None:
     host.gripper.thing = TOUCH
-    state = driven.told("close", 0.0, effort=100.0, expected_width=WIDE)
+    state = driven.grip("close", 0.0, effort=100.0, expected_width=WIDE)
     assert (state.state, state.outcome, state.holding) == ("succeeded", "grasped", True)
     assert state.width == pytest.approx(WIDE, abs=3e-4) and state.effort == pytest.approx(100.0, abs=1.0)
-    assert driven.told("again", 0.0, expected_width=0.02).outcome == "too_wide"
+    assert driven.grip("again", 0.0, expected_width=0.02).outcome == "too_wide"
     host.gripper.thing = None
-    state = driven.told("open", 0.08)
+    state = driven.grip("open", 0.08)
     assert (state.state, state.holding) == ("succeeded", False)
 
 
-def test_gripper_that_is_not_activated_or_has_a_fault_is_never_moved_and_says_so(host: RobotiqHost) -> None:
+def test_gripper_that_is_not_activated_or_has_a_fault_reports_it_and_never_moves(host: RobotiqHost) -> None:
     host.gripper.registers["STA"] = 0
     driven = Driven(DrivenGripper("drivers.robotiq", options(host), CONFIG, name="a 2f85"))
     driven.until(lambda _: "a 2f85: the gripper is not activated (state 0)" in driven.problem)
@@ -109,20 +109,20 @@ def test_gripper_that_is_not_activated_or_has_a_fault_is_never_moved_and_says_so
 
 
 @pytest.mark.slow
-def test_gripper_that_goes_away_is_a_fault_and_is_found_again() -> None:
+def test_lost_gripper_is_a_fault_and_is_connected_again() -> None:
     with RobotiqHost() as host:
         driven = Driven(DrivenGripper("drivers.robotiq", options(host), CONFIG, name="a 2f85"))
-        assert driven.told("first", 0.02).state == "succeeded"
+        assert driven.grip("first", 0.02).state == "succeeded"
     driven.until(lambda _: "the gripper's program has closed the connection" in driven.problem)
     driven.until(lambda _: "refused" in driven.problem)
     with RobotiqHost(host.port) as again:
         driven.until(lambda _: not driven.problem)
-        assert again.gripper.registers["GTO"] == 0  # nobody has asked
+        assert again.gripper.registers["GTO"] == 0  # without a command
         driven.gripper.close()
 
 
 @pytest.mark.parametrize("answer", [b"POS\n", b"POS x\n", b"?\n", b"y" * 300])
-def test_answers_that_are_none_end_the_driver_with_a_line(
+def test_invalid_answer_ends_the_driver_with_one_line(
     host: RobotiqHost, answer: bytes, monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     gripper = Robotiq("127.0.0.1", MODELS["2f85"], 0.1, host.port)
@@ -134,7 +134,7 @@ def test_answers_that_are_none_end_the_driver_with_a_line(
         gripper.close()
 
 
-def test_arm_takes_its_gripper_by_an_option() -> None:
+def test_ur_arm_brings_the_gripper_of_its_option() -> None:
     pytest.importorskip("rtde_control", reason="make setup EXTRAS=ur")
     robot = load_cell("ur5", ["robot.hardware.backend=ur", "robot.hardware.options.host=127.0.0.9",
                               "robot.hardware.options.model=ur5e", "robot.hardware.options.gripper=2f85"]).robot

@@ -25,7 +25,7 @@ def test_fingers_close_smoothly_and_stop_at_the_width() -> None:
 
 
 @given(st.lists(st.tuples(WIDTHS, st.floats(0.0, 0.5)), min_size=1, max_size=6))
-def test_commands_on_the_way_never_break_limits_and_the_last_is_reached(commands: list[tuple[float, float]]) -> None:
+def test_commands_during_a_motion_keep_limits_and_the_last_is_reached(commands: list[tuple[float, float]]) -> None:
     fingers, now, before = SimulatedFingers(CONFIG, 0.08), 0.0, 0.08
     for width, wait in [*commands, (commands[-1][0], 2.0)]:
         fingers.command(width, now)
@@ -39,7 +39,7 @@ def test_commands_on_the_way_never_break_limits_and_the_last_is_reached(commands
 
 
 @given(obstruction=st.floats(0.01, 0.07), step=st.floats(0.002, 0.3))
-def test_fingers_stop_at_what_is_between_them_and_hold_it(obstruction: float, step: float) -> None:
+def test_fingers_stop_at_an_object_and_hold_it(obstruction: float, step: float) -> None:
     fingers = SimulatedFingers(CONFIG, 0.08)
     fingers.command(0.0, 0.0)
     fingers.obstruct(obstruction)
@@ -48,7 +48,7 @@ def test_fingers_stop_at_what_is_between_them_and_hold_it(obstruction: float, st
     assert reading.width == obstruction and reading.holding and not reading.moving
 
 
-def test_fingers_that_lose_what_they_hold_close_on() -> None:
+def test_fingers_that_lose_their_object_continue_to_close() -> None:
     fingers = SimulatedFingers(CONFIG, 0.08)
     fingers.command(0.0, 0.0)
     fingers.obstruct(0.06)
@@ -58,7 +58,7 @@ def test_fingers_that_lose_what_they_hold_close_on() -> None:
     assert fingers.read(4.0).width == 0.0
 
 
-def test_opening_lets_go() -> None:
+def test_opening_releases_the_object() -> None:
     fingers = SimulatedFingers(CONFIG, 0.08)
     fingers.command(0.0, 0.0)
     fingers.obstruct(0.06)
@@ -77,7 +77,7 @@ def test_second_close_command_keeps_the_hold() -> None:
     assert fingers.read(2.0).holding and fingers.read(2.0).width == 0.06
 
 
-def test_fingers_told_to_be_where_they_are_do_not_move() -> None:
+def test_command_of_the_present_width_moves_nothing() -> None:
     fingers = SimulatedFingers(CONFIG, 0.08)
     fingers.command(0.08, 0.0)
     assert not fingers.read(0.0).moving

@@ -29,7 +29,7 @@ def played(until: float, sent: float | None = None, jitter: float = 0.0) -> tupl
 
 
 @pytest.mark.parametrize("jitter", [0.0, 0.04])
-def test_the_motion_is_played_as_it_was_sent_whether_set_points_come_evenly_or_not(jitter: float) -> None:
+def test_motion_is_played_as_sent_even_if_set_points_arrive_irregularly(jitter: float) -> None:
     q, stream = played(3.0, jitter=jitter)
     times = np.arange(0.0, 3.0, 1e-3) - AHEAD
     wanted = np.array([wave(max(0.0, time))[0] for time in times])
@@ -47,10 +47,10 @@ def bang(time: float) -> tuple[np.ndarray, np.ndarray]:
     return q * TWO, dq * TWO
 
 
-BANG = {0.025: 0.025, 0.175: 0.15, 0.225: 0.05, 0.375: 0.15, 0.4: 0.025}  # [s] that each part lasts, by its end
+BANG = {0.025: 0.025, 0.175: 0.15, 0.225: 0.05, 0.375: 0.15, 0.4: 0.025}  # [s] duration of each part, by its end
 
 
-def test_an_arm_that_asks_oftener_than_set_points_come_keeps_the_accelerations_that_the_motion_has() -> None:
+def test_interpolation_at_the_arms_rate_keeps_the_accelerations_of_the_motion() -> None:
     stream = SetPointStream(LIMITS, AHEAD, 1e-3)
     stream.begin(0 * TWO, 0.0)
     rows, number = [], 0
@@ -64,7 +64,7 @@ def test_an_arm_that_asks_oftener_than_set_points_come_keeps_the_accelerations_t
     assert rows[-1][0] == pytest.approx(bang(1.0)[0][0], abs=1e-12)
 
 
-def test_set_points_that_cease_in_the_middle_end_in_rest_within_the_limits() -> None:
+def test_ceasing_set_points_lead_to_rest_within_the_limits() -> None:
     q, stream = played(2.0, sent=0.6)
     assert "ceased to come" in stream.ceased
     v, a, j = (np.diff(q, n, axis=0) / 1e-3**n for n in (1, 2, 3))
@@ -72,13 +72,13 @@ def test_set_points_that_cease_in_the_middle_end_in_rest_within_the_limits() -> 
     assert np.abs(a).max() <= 20 * 1.01 and np.abs(j[100:]).max() <= 400 * 1.05
     ended = float(q[-1, 0])
     stream.put(2.0, *wave(2.0))
-    assert stream.at(2.1)[0][0] == ended, "what comes later would begin elsewhere"
+    assert stream.at(2.1)[0][0] == ended, "later set-points would start elsewhere"
     stream.begin(q[-1], 2.2)
     stream.put(2.21, q[-1], 0 * TWO)
     assert not stream.ceased and np.allclose(stream.at(2.4)[0], q[-1])
 
 
-def test_a_rest_may_last() -> None:
+def test_long_rest_is_no_fault() -> None:
     stream = SetPointStream(LIMITS, AHEAD, PERIOD / 2)
     stream.begin(TWO, 0.0)
     assert np.array_equal(stream.at(100.0)[0], TWO) and not stream.ceased
@@ -87,11 +87,11 @@ def test_a_rest_may_last() -> None:
     stream.put(100.03, 1.01 * TWO, 0 * TWO)
     assert not stream.ceased
     before = [stream.at(100.02 + AHEAD)[0], stream.at(100.025 + AHEAD)[0]]
-    assert np.array_equal(before[0], TWO), "it moves no earlier than it was told to"
+    assert np.array_equal(before[0], TWO), "it does not move early"
     assert np.all(before[1] > TWO) and np.all(before[1] < 1.005 * TWO), "it begins with no acceleration"
 
 
-def test_a_rest_beside_where_the_arm_is_kept_is_come_to_once() -> None:
+def test_nearby_rest_is_reached_once() -> None:
     stream, off = SetPointStream(LIMITS, AHEAD, 1e-3), 5e-4
     stream.begin(0 * TWO, 0.0)
     rows, number = [], 0
@@ -109,7 +109,7 @@ def test_a_rest_beside_where_the_arm_is_kept_is_come_to_once() -> None:
     (np.nan, 0.0, "shoulder would jump"), (0.0, np.nan, "the velocity of shoulder is no finite number"),
     (0.0, np.inf, "the velocity of shoulder is no finite number"),
 ])
-def test_what_is_no_number_is_not_played(q: float, dq: float, said: str) -> None:
+def test_not_a_number_is_not_played(q: float, dq: float, said: str) -> None:
     stream = SetPointStream(LIMITS, AHEAD)
     stream.begin(0 * TWO, 0.0)
     for n in range(20):
@@ -140,7 +140,7 @@ def held_up(gaps: dict[float, float], until: float) -> tuple[np.ndarray, np.ndar
             number += 1
         q, dq = stream.at(now)
         if stream.ceased and not dq.any():
-            break  # a controller finds the arm and begins anew there
+            break  # a controller would start again where the arm is
         times.append(now)
         rows.append(q)
         now += left.pop(0)[1] if left and left[0][0] <= now else 2e-3
@@ -163,7 +163,7 @@ def check_limits(times: np.ndarray, q: np.ndarray) -> None:
 
 
 @pytest.mark.parametrize("gap", [0.005, 0.01, 0.02, 0.04, 0.08])
-def test_a_driver_that_is_held_up_goes_on_where_it_was_by_a_ramp(gap: float) -> None:
+def test_held_up_driver_ramps_up_from_where_it_was(gap: float) -> None:
     times, q, stream = held_up({0.6: gap}, 2.0)
     check_limits(times, q)
     assert not stream.ceased and np.allclose(q[:, 1], 2 * q[:, 0]), "it stays on the path"
@@ -173,7 +173,7 @@ def test_a_driver_that_is_held_up_goes_on_where_it_was_by_a_ramp(gap: float) -> 
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_whatever_holds_a_driver_up_no_set_point_breaks_a_limit(seed: int) -> None:
+def test_no_hold_up_makes_a_set_point_exceed_a_limit(seed: int) -> None:
     random = np.random.default_rng(seed)
     gaps = {float(time): float(random.uniform(0.005, 0.2 if seed % 2 else 0.04)) for time in random.uniform(0, 1.2, 8)}
     times, q, stream = held_up(gaps, 4.0)
@@ -182,7 +182,7 @@ def test_whatever_holds_a_driver_up_no_set_point_breaks_a_limit(seed: int) -> No
     assert stream.ceased or np.allclose(q[-1], swing(9.0)[0])
 
 
-def test_what_was_held_up_catches_up_where_limits_leave_room_and_at_a_rest() -> None:
+def test_delay_is_made_up_where_limits_leave_room_and_at_rest() -> None:
     slow = SetPointStream(SWING, AHEAD)
     slow.begin(0 * TWO, 0.0)
     late, number, now = [], 0, 0.0
@@ -199,13 +199,13 @@ def test_what_was_held_up_catches_up_where_limits_leave_room_and_at_a_rest() -> 
     assert max(behind for time, behind in late if time > 3.0) <= 2.1e-3, "of the motion that ends at 5.6 s"
 
 
-def test_a_driver_that_is_held_up_again_and_again_ends_the_motion_before_a_stop_would_come_late() -> None:
+def test_repeated_hold_ups_end_the_motion_before_a_stop_would_be_late() -> None:
     times, q, stream = held_up({0.2 + n * 1e-6: 0.08 for n in range(12)}, 4.0)
     check_limits(times, q)
     assert "held up too often: it is 3" in stream.ceased
 
 
-def test_a_driver_that_is_held_up_in_the_middle_leaves_the_arm_where_it_has_stopped() -> None:
+def test_long_hold_up_leaves_the_arm_where_it_has_stopped() -> None:
     stream = SetPointStream(LIMITS, AHEAD)
     stream.begin(0 * TWO, 0.0)
     for n in range(60):
@@ -219,7 +219,7 @@ def test_a_driver_that_is_held_up_in_the_middle_leaves_the_arm_where_it_has_stop
 
 
 @pytest.mark.parametrize("jump", [0.5, np.nan, np.inf])
-def test_a_jump_is_not_played(jump: float) -> None:
+def test_jump_is_not_played(jump: float) -> None:
     stream = SetPointStream(LIMITS, AHEAD)
     stream.begin(0 * TWO, 0.0)
     stream.put(0.01, 0 * TWO, 0 * TWO)
@@ -228,7 +228,7 @@ def test_a_jump_is_not_played(jump: float) -> None:
     assert all(not stream.at(t)[0].any() for t in (0.05, 0.1, 1.0))
 
 
-def test_what_is_older_than_what_came_before_is_left_out() -> None:
+def test_set_point_older_than_the_newest_is_ignored() -> None:
     stream = SetPointStream(LIMITS, AHEAD)
     stream.begin(0 * TWO, 0.0)
     stream.put(0.02, 0.01 * TWO, 0 * TWO)
@@ -238,8 +238,8 @@ def test_what_is_older_than_what_came_before_is_left_out() -> None:
     assert not stream.ceased and q[0] == pytest.approx(0.01)
 
 
-@pytest.mark.parametrize("rests", [False, True])
-def test_set_points_after_a_gap_in_which_nothing_was_played_bring_the_arm_nowhere_else(rests: bool) -> None:
+@pytest.mark.parametrize("at_rest", [False, True])
+def test_set_points_after_a_gap_do_not_move_the_arm(at_rest: bool) -> None:
     stream = SetPointStream(LIMITS, AHEAD, 1e-3)
     stream.begin(0 * TWO, 0.0)
     rows = []
@@ -247,13 +247,13 @@ def test_set_points_after_a_gap_in_which_nothing_was_played_bring_the_arm_nowher
         stream.put(number * PERIOD, *wave(number * PERIOD))
         rows += [stream.at(number * PERIOD + each * 1e-3)[0] for each in range(10)]
     q, _ = wave(0.3)
-    if rests:  # all at once, which is how a program ends that was stopped
+    if at_rest:  # all at once, as when a stopped program ends
         stream.put(0.31, q, 0 * TWO)
     measured = rows[-1]
-    for number in range(30):  # the controller stood still for a second, and its clock with it
+    for number in range(30):  # the controller and its clock had stopped for a second
         stream.put(1.3 + number * PERIOD, measured, 0 * TWO)
     rows += [stream.at(0.31 + tick * 1e-3)[0] for tick in range(1200)]
-    assert bool(stream.ceased) != rests and "for 1000 ms" in (stream.ceased or "for 1000 ms")
+    assert bool(stream.ceased) != at_rest and "for 1000 ms" in (stream.ceased or "for 1000 ms")
     assert np.min(rows) > -1e-6 and np.max(rows) < q.max() + 0.05
     assert np.abs(np.diff(rows, axis=0)).max() / 1e-3 <= LIMITS.velocity[0]
     assert np.abs(rows[-1] - rows[-50]).max() < 1e-3

@@ -47,7 +47,7 @@ def quarter(angle: float) -> float:
 
 
 @pytest.mark.parametrize("yaw", [0.0, 0.3, math.pi / 4, 1.2, -2.0])
-def test_kind_place_and_turn_are_those_of_the_cube(yaw: float) -> None:
+def test_kind_position_and_yaw_of_a_cube_are_detected(yaw: float) -> None:
     cubes = [cube("red", 0.45, -0.15, yaw=yaw), cube("green", 0.7, 0.2, yaw=-yaw)]
     for thing, box in zip(cubes, seen(*cubes), strict=True):
         assert box.kind == thing.id and not box.partial
@@ -57,7 +57,7 @@ def test_kind_place_and_turn_are_those_of_the_cube(yaw: float) -> None:
         assert abs(quarter(box.yaw - turned)) < math.radians(3)
 
 
-def test_of_a_stack_the_top_is_seen_at_its_height_and_the_walls_below_are_no_cube() -> None:
+def test_top_of_a_stack_is_detected_at_its_height_without_walls() -> None:
     heights = [SIDE / 2, 1.5 * SIDE, 2.5 * SIDE]
     for names in (("red", "green", "red"), ("red", "red", "red")):
         stack = [cube(f"{name}_{k}", 0.75, 0.25, z) for k, (name, z) in enumerate(zip(names, heights, strict=True))]
@@ -65,21 +65,21 @@ def test_of_a_stack_the_top_is_seen_at_its_height_and_the_walls_below_are_no_cub
         assert box.kind == "red" and box.position[2] == pytest.approx(2.5 * SIDE, abs=1e-3)
 
 
-def test_cubes_of_one_colour_that_touch_are_told_apart() -> None:
+def test_touching_cubes_of_one_color_are_separated() -> None:
     boxes = seen(cube("red_1", 0.5, 0.0), cube("red_2", 0.5, SIDE), cube("red_3", 0.5, 2 * SIDE))
     assert sorted(round(box.position[1], 2) for box in boxes) == [0.0, 0.04, 0.08]
 
 
-def test_what_is_as_large_as_no_cube_of_its_colour_is_left_out() -> None:
+def test_region_of_another_size_is_not_detected() -> None:
     assert seen(cube("red", 0.5, 0.0, z=0.03, side=0.06), cube("green", 0.5, 0.2, z=0.0125, side=0.025)) == []
 
 
-def test_a_cube_that_another_one_hides_in_part_is_left_out() -> None:
+def test_partly_occluded_cube_is_not_detected() -> None:
     boxes = seen(cube("red", 0.6, 0.0), cube("green", 0.62, 0.02, z=0.09))
     assert [box.kind for box in boxes] == ["green"]
 
 
-def test_colours_that_nobody_asked_for_and_pictures_without_depth_show_nothing() -> None:
+def test_other_colors_and_missing_depth_give_no_detection() -> None:
     assert seen(cube("red", 0.5, 0.0), kinds={"green": KINDS["green"]}) == []
     view = Renderer(AROUND)
     shown = view.render([cube("red", 0.5, 0.0)])
@@ -87,7 +87,7 @@ def test_colours_that_nobody_asked_for_and_pictures_without_depth_show_nothing()
     assert BoxDetector(BoxOptions(kinds=KINDS)).detect(shown.colour, nothing, view.camera) == []
 
 
-def test_in_a_picture_full_of_noise_a_cube_is_found_and_specks_are_not_looked_into(
+def test_noise_specks_are_skipped_and_a_cube_is_found(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     looked_into = 0
@@ -107,7 +107,7 @@ def test_in_a_picture_full_of_noise_a_cube_is_found_and_specks_are_not_looked_in
     assert len(found) == 1 and looked_into < 10
 
 
-def test_camera_that_none_can_be_shows_no_boxes_and_says_so() -> None:
+def test_invalid_camera_is_rejected() -> None:
     camera = Pinhole(1e-300, 50.0, 1e5, 24.0, 64, 48, np.eye(4))
     picture, depth = np.full((48, 64, 3), (25, 25, 230), np.uint8), np.full((48, 64), 1.0, np.float32)
     with pytest.raises(FrameError, match=r"more than 1e\+07 m away"):

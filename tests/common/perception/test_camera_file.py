@@ -20,24 +20,24 @@ def path(tmp_path):
     return file
 
 
-def test_what_is_saved_is_loaded_again(path):
+def test_saved_camera_file_loads_equal(path):
     assert CameraFile.load(path) == FULL
     assert "world.camera=camera.yaml" in Path(path).read_text()
 
 
-def test_a_cell_takes_intrinsics_and_pose_from_the_file(path):
+def test_cell_reads_intrinsics_and_pose_from_the_file(path):
     camera = load_cell("panda", [f"world.camera={path}"]).world.camera
     assert (camera.width, camera.fx, camera.position, camera.rpy) == (800, 701.5, FULL.position, FULL.rpy)
     assert camera.d == FULL.d and camera.frame == "camera_optical_frame"
     assert CameraFile.of(camera).matrix.tolist() == FULL.matrix.tolist()
 
 
-def test_a_later_override_and_the_frame_of_the_world_stay(path):
+def test_later_override_and_world_frame_take_precedence(path):
     camera = load_cell("ur5", [f"world.camera={path}", "world.camera.fx=650"]).world.camera
     assert camera.fx == 650 and camera.fy == 702.25 and camera.frame == "depth_camera_optical_frame"
 
 
-def test_a_world_file_may_name_the_file_beside_it(path, tmp_path):
+def test_world_file_may_reference_a_camera_file_relative_to_it(path, tmp_path):
     world = tmp_path / "mine.yaml"
     world.write_text("camera: camera.yaml\ncount: 0\n")
     assert load_cell("panda", world=str(world)).world.camera.position == FULL.position
@@ -55,7 +55,7 @@ def test_a_world_file_may_name_the_file_beside_it(path, tmp_path):
         ({"skew": 1.0}, "skew"),
     ],
 )
-def test_a_file_that_a_cell_can_not_take_is_one_line(path, change, told):
+def test_unusable_camera_file_is_a_one_line_error(path, change, told):
     values = yaml.safe_load(Path(path).read_text()) | change
     Path(path).write_text(yaml.safe_dump({key: value for key, value in values.items() if value is not None}))
     with pytest.raises(ConfigError) as caught:
@@ -63,7 +63,7 @@ def test_a_file_that_a_cell_can_not_take_is_one_line(path, change, told):
     assert told in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_a_file_that_is_not_there_or_can_not_be_written_is_one_line(tmp_path):
+def test_missing_or_unwritable_camera_file_is_a_one_line_error(tmp_path):
     with pytest.raises(ConfigError, match="cannot be read"):
         load_cell("panda", [f"world.camera={tmp_path / 'none.yaml'}"])
     with pytest.raises(ConfigError, match="cannot be written"):
@@ -73,12 +73,12 @@ def test_a_file_that_is_not_there_or_can_not_be_written_is_one_line(tmp_path):
 @pytest.mark.parametrize(("d", "length", "model"), [
     ([], 4, "plumb_bob"), ([0.1, 0.2, 0, 0, 0.3], 5, "plumb_bob"), ([0.1] * 8, 8, "rational_polynomial"),
 ])
-def test_distortion_is_filled_up_and_named(d, length, model):
+def test_distortion_is_padded_and_its_model_named(d, length, model):
     camera = FULL.model_copy(update={"d": d})
     assert len(camera.distortion) == length and camera.distortion_model == model
 
 
-def test_undistorted_pixels_are_those_of_a_pinhole():
+def test_undistorted_pixels_match_a_pinhole():
     ray = np.array([[0.2, -0.1, 1.0], [-0.3, 0.25, 1.0]])
     seen = cv2.projectPoints(ray, np.zeros(3), np.zeros(3), FULL.matrix, FULL.distortion)[0][:, 0]
     ideal = ray @ FULL.matrix.T

@@ -19,14 +19,14 @@ tf = TFMessage(
 )
 
 
-def test_camera_is_put_together_from_camera_info_and_tf():
+def test_camera_is_resolved_from_camera_info_and_tf():
     for frame in ("", "optical"):
         made = resolve_camera(info, tf, frame)
         np.testing.assert_allclose(made.T_world_optical, camera.T_world_optical, atol=1e-12)
         assert (made.fx, made.cx, made.width) == (520, 16, 32)
 
 
-def test_camera_is_worked_out_again_for_other_messages_only():
+def test_camera_cache_resolves_again_only_for_new_messages():
     cameras = CameraCache()
     first = cameras.of(info, tf)
     assert cameras.of(info, tf) is first
@@ -48,13 +48,13 @@ def test_camera_is_worked_out_again_for_other_messages_only():
         ((info.model_copy(update={"d": [0.1]}), tf), "camera", "distortion"),
     ],
 )
-def test_what_is_missing_or_wrong_is_named(arguments, kind, told):
+def test_missing_or_invalid_message_is_named(arguments, kind, told):
     with pytest.raises(FrameError, match=told) as caught:
         resolve_camera(*arguments)
     assert caught.value.kind == kind
 
 
-def test_pictures_come_as_bgr_whatever_order_they_were_sent_in():
+def test_decoded_image_is_bgr_for_any_channel_order():
     pixels = np.random.default_rng(0).integers(0, 256, (24, 32, 3), dtype=np.uint8)
     np.testing.assert_array_equal(decode_image(array_to_image(pixels, "bgr8"), camera), pixels)
     np.testing.assert_array_equal(decode_image(array_to_image(pixels, "rgb8"), camera), pixels[..., ::-1])
@@ -71,7 +71,7 @@ def test_pictures_come_as_bgr_whatever_order_they_were_sent_in():
         (Image(header=Header(), width=32, height=24, encoding="bgr8", step=97, data=bytes(9999)), "step"),
     ],
 )
-def test_a_picture_that_is_none_has_its_kind(image, kind):
+def test_undecodable_image_reports_its_kind(image, kind):
     with pytest.raises(FrameError) as caught:
         decode_image(image, camera)
     assert caught.value.kind == kind

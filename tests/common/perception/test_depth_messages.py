@@ -10,14 +10,14 @@ from tests.applications.outlining.outline_scenes import seen_world
 HEADER = Header(frame_id="camera")
 
 
-def test_depth_in_metres_and_in_millimetres_is_the_same():
+def test_depth_in_meters_and_millimeters_is_equal():
     metres = np.array([[1.5, np.nan], [0.75, 2.0]], np.float32)
     np.testing.assert_array_equal(depth_of(array_to_image(metres, "32FC1", HEADER)), metres)
     millimetres = np.array([[1500, 0], [750, 2000]], np.uint16)
     np.testing.assert_allclose(depth_of(array_to_image(millimetres, "16UC1", HEADER)), metres)
 
 
-def test_what_is_no_depth_image_is_refused():
+def test_message_without_depth_is_rejected():
     picture = array_to_image(np.zeros((2, 2, 3), np.uint8), "bgr8", HEADER)
     with pytest.raises(FrameError, match="'bgr8' is no depth image; choices: 32FC1, 16UC1"):
         depth_of(picture)
@@ -28,7 +28,7 @@ def test_what_is_no_depth_image_is_refused():
         decode_color_image(depth)
 
 
-def test_sizes_and_a_depth_image_without_depth_are_told():
+def test_wrong_size_and_missing_depth_are_reported():
     with pytest.raises(DepthError, match="the depth image is 5x4, but the color image is 5x3"):
         check_depth(np.ones((4, 5), np.float32), 5, 3)
     for value in (np.nan, np.inf, 0.0, -1.0):
@@ -37,7 +37,7 @@ def test_sizes_and_a_depth_image_without_depth_are_told():
     check_depth(np.ones((4, 5), np.float32), 5, 4)
 
 
-def test_rays_lead_to_the_point_that_is_seen_at_a_pixel():
+def test_ray_at_depth_is_the_point_projected_to_the_pixel():
     camera, _, _ = seen_world("w2")
     pixels = np.random.default_rng(0).uniform(0, (1024, 768), (50, 2))
     for points in (Rays.through(camera, pixels).at_depth(np.full(50, 1.4)),
@@ -49,7 +49,7 @@ def test_rays_lead_to_the_point_that_is_seen_at_a_pixel():
     np.testing.assert_allclose(point, [(v - 384) * 1.5 / camera.fy + 0.5, (u - 512) * 1.5 / camera.fx, 1.25], atol=1e-9)
 
 
-def test_points_of_a_cloud_lie_on_their_rays_and_have_the_colour_of_their_pixel():
+def test_cloud_points_lie_on_their_rays_with_their_pixel_color():
     camera, picture, depth = seen_world("w5")
     cloud = point_cloud(picture, depth, camera, HEADER)
     rows = np.frombuffer(cloud.data, "<f4").reshape(cloud.height, cloud.width, 4)

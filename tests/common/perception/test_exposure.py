@@ -16,7 +16,7 @@ CAMERA = Pinhole.from_config(AROUND.camera)
 
 
 @pytest.mark.parametrize("plain", [True, False])
-def test_an_empty_table_shows_something_also_in_little_light_and_noise(plain: bool) -> None:
+def test_empty_table_is_not_blank_even_in_low_light_and_noise(plain: bool) -> None:
     picture = Renderer(AROUND, plain=plain, camera=CAMERA).render([]).colour
     dim = (picture * 0.3).astype(np.uint8)
     for shown in (picture, dim, add_image_noise(dim, 8.0, 0.0, np.random.default_rng(1))):
@@ -25,7 +25,7 @@ def test_an_empty_table_shows_something_also_in_little_light_and_noise(plain: bo
 
 @pytest.mark.parametrize(("level", "why"), [(0, "dark"), (4, "dark"), (255, "white"), (90, "single color")])
 @pytest.mark.parametrize("noise", [0.0, 6.0])
-def test_a_covered_or_blinded_camera_shows_nothing(level: int, why: str, noise: float) -> None:
+def test_covered_or_saturated_camera_gives_a_blank_image(level: int, why: str, noise: float) -> None:
     covered = np.full((480, 640, 3), level, np.uint8)
     covered[100, 100] = 255  # a hot pixel
     if not (noise and why == "white"):

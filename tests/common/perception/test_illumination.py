@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from common.perception.illumination import amplify_green, green_gain, sampled_pixels
-from common.sim.lighting import tint
+from common.sim.photometry import tint
 
 TABLE, RED = (0.10, 0.35, 0.55), (0.10, 0.15, 1.0)  # blue, green, red
 
@@ -28,7 +28,7 @@ def test_usual_light_changes_nothing(kelvin: float) -> None:
 @pytest.mark.parametrize("kelvin", [2000, 2400, 2700, 3000])
 @pytest.mark.parametrize("light", [120.0, 255.0])
 @pytest.mark.parametrize("red", [0.0, 0.3])
-def test_green_is_raised_in_warm_light_so_far_that_a_table_is_not_red(light: float, red: float, kelvin: float) -> None:
+def test_green_gain_keeps_the_table_from_being_red_in_warm_light(light: float, red: float, kelvin: float) -> None:
     picture = table(kelvin, 0.5 * light, red)
     raised = amplify_green(picture, green_gain(picture))
     assert green_gain(picture) > 1.2
@@ -38,12 +38,12 @@ def test_green_is_raised_in_warm_light_so_far_that_a_table_is_not_red(light: flo
     assert raised[-1, 0, 1] / raised[-1, 0, 2] <= 1.2 * 0.35 / 0.55, "no greener than in daylight"
 
 
-def test_grey_and_dark_pictures_stay_as_they_are() -> None:
+def test_grey_and_dark_images_are_unchanged() -> None:
     assert green_gain(np.full((48, 64, 3), 128, np.uint8)) == 1.0
     assert green_gain(np.zeros((48, 64, 3), np.uint8)) == 1.0
 
 
-def test_light_is_that_of_the_part_of_a_picture_that_shows_the_table() -> None:
+def test_green_gain_uses_only_pixels_of_the_table() -> None:
     picture = table(2700)
     picture[:120] = np.clip(128 * tint(2700), 0, 255)  # a grey floor
     pixels = sampled_pixels(240, 320)
@@ -53,7 +53,7 @@ def test_light_is_that_of_the_part_of_a_picture_that_shows_the_table() -> None:
     assert green_gain(picture, np.zeros(pixels.shape[:2], bool)) == 1.0
 
 
-def test_in_warm_light_a_highlight_on_a_ball_stays_red_and_the_table_is_none() -> None:
+def test_highlight_on_a_ball_stays_red_in_warm_light() -> None:
     picture = np.full((240, 320, 3), (4, 67, 238), np.uint8)  # of a lamp of 2700 K, overexposed
     picture[100:110, 100:110] = (6, 48, 255)
     hue = cv2.cvtColor(amplify_green(picture, green_gain(picture)), cv2.COLOR_BGR2HSV)[..., 0]

@@ -48,7 +48,7 @@ def test_padding_zero_stride_and_byte_order_do_not_change_the_pixels(picture, pa
 
 
 @given(pictures())
-def test_result_is_writable_contiguous_and_no_view_of_the_message(picture):
+def test_array_is_writable_contiguous_and_a_copy(picture):
     name, array = picture
     sent = array_to_image(array, name)
     before = bytes(sent.data)
@@ -58,7 +58,7 @@ def test_result_is_writable_contiguous_and_no_view_of_the_message(picture):
     assert sent.data == before
 
 
-def test_an_array_with_any_memory_layout_can_be_sent():
+def test_array_of_any_memory_layout_is_encoded():
     array = np.arange(60, dtype=np.uint8).reshape(4, 5, 3)
     for view in (array[::-1], array[:, ::2], array.transpose(1, 0, 2), np.asfortranarray(array)):
         np.testing.assert_array_equal(image_to_array(array_to_image(view, "rgb8")), view)
@@ -66,18 +66,18 @@ def test_an_array_with_any_memory_layout_can_be_sent():
     np.testing.assert_array_equal(image_to_array(array_to_image(big, "16UC1")), big)
 
 
-def test_one_pixel_is_a_picture():
+def test_single_pixel_image_is_valid():
     assert image_to_array(message(b"\x07\x08\x09", 1, 1, "bgr8")).tolist() == [[[7, 8, 9]]]
 
 
 @pytest.mark.parametrize("missing", [1, 5, 12])
-def test_truncated_buffer_is_refused(missing):
+def test_truncated_buffer_is_rejected(missing):
     with pytest.raises(ImageError, match="too few for 4x3 mono8") as caught:
         image_to_array(message(bytes(12 - missing), 4, 3))
     assert caught.value.kind == "truncated"
 
 
-def test_surplus_bytes_are_refused():
+def test_surplus_bytes_are_rejected():
     with pytest.raises(ImageError, match="13 bytes are more than 4x3 mono8"):
         image_to_array(message(bytes(13), 4, 3))
 
@@ -89,13 +89,13 @@ def test_unknown_encoding_names_the_choices():
         array_to_image(np.zeros((2, 2, 3), np.uint8), "BGR8")
 
 
-def test_step_shorter_than_a_row_is_refused():
+def test_step_shorter_than_a_row_is_rejected():
     with pytest.raises(ImageError, match="step 11 is shorter than a row of 4 bgr8 pixels"):
         image_to_array(message(bytes(100), 4, 3, "bgr8", step=11))
 
 
 @pytest.mark.parametrize(("encoding", "step"), [("bgr8", 13), ("16UC1", 9), ("32FC1", 18)])
-def test_step_that_is_not_whole_pixels_is_refused(encoding, step):
+def test_step_of_fractional_pixels_is_rejected(encoding, step):
     with pytest.raises(ImageError, match="not a whole number"):
         image_to_array(message(bytes(step * 3), 4, 3, encoding, step=step))
 
@@ -112,11 +112,11 @@ def test_step_that_is_not_whole_pixels_is_refused(encoding, step):
         (np.zeros((2, 2), np.float64), "32FC1"),
     ],
 )
-def test_an_array_that_does_not_fit_the_encoding_is_refused(array, encoding):
+def test_array_of_wrong_shape_or_type_is_rejected(array, encoding):
     with pytest.raises(ImageError, match=f"{encoding} needs"):
         array_to_image(array, encoding)
 
 
-def test_header_rides_along():
+def test_header_is_kept():
     header = Header(stamp=12345, frame_id="camera_optical_frame")
     assert array_to_image(np.zeros((2, 3), np.uint8), "mono8", header).header == header

@@ -26,7 +26,7 @@ def robot() -> RobotModel:
 
 
 @pytest.mark.parametrize("camera", [ABOVE, SIDE], ids=["above", "side"])
-def test_whatever_is_drawn_of_the_arm_is_hidden_and_little_more(robot: RobotModel, camera: Pinhole) -> None:
+def test_occlusion_covers_the_rendered_arm_tightly(robot: RobotModel, camera: Pinhole) -> None:
     silhouettes, rng = RobotSilhouettes(robot), np.random.default_rng(1)
     renderer, empty = (Renderer(AROUND, one, plain=True, camera=camera) for one in (robot, None))
     for _ in range(4):
@@ -41,14 +41,14 @@ def test_whatever_is_drawn_of_the_arm_is_hidden_and_little_more(robot: RobotMode
         assert mask.sum() < 2.0 * arm.sum() + 8000
 
 
-def test_places_below_the_hand_or_out_of_the_picture_are_hidden_and_others_are_not(robot: RobotModel) -> None:
+def test_positions_below_the_gripper_or_outside_the_image_are_occluded(robot: RobotModel) -> None:
     hidden = RobotSilhouettes(robot).occlusion(ABOVE, [robot.named("home")])
     below, clear, outside = (0.15, 0.0, 0.03), (0.6, 0.1, 0.03), (0.4, 0.6, 0.03)
     assert hidden.occludes([below, clear, outside], 0.03).tolist() == [True, False, True]
     assert hidden.touches([below, clear, outside], 0.03).tolist() == [True, False, False]
 
 
-def test_a_camera_that_looks_away_from_the_arm_sees_none_of_it(robot: RobotModel) -> None:
+def test_arm_behind_the_camera_occludes_nothing(robot: RobotModel) -> None:
     q = robot.named("home")
     q[0] += 2.0
     away = Pinhole(ABOVE.fx, ABOVE.fy, ABOVE.cx, ABOVE.cy, 640, 480, ABOVE.T_world_optical + np.array(
@@ -57,22 +57,22 @@ def test_a_camera_that_looks_away_from_the_arm_sees_none_of_it(robot: RobotModel
     assert not RobotSilhouettes(robot).occlusion(away, [q]).occludes(places, 0.03).any()
 
 
-def test_a_picture_of_which_nothing_can_be_judged_hides_everything() -> None:
+def test_unusable_image_occludes_everything() -> None:
     blind = Occlusion(ABOVE, "the lens is covered")
     assert blind.everything and blind.occludes([(0.4, 0.0, 0.03)])[0] and blind.touches([(0.4, 0.0, 0.03)])[0]
 
 
-def test_what_the_arm_swept_since_the_picture_is_hidden_until_one_is_taken_after_it_stands(robot: RobotModel) -> None:
+def test_swept_region_is_occluded_until_an_image_is_taken_at_standstill(robot: RobotModel) -> None:
     before, home = RobotOcclusion(RobotSilhouettes(robot)), robot.named("home")
     turned = home + np.array([1.2, 0, 0, 0, 0, 0, 0])
     below = [(0.15, 0.0, 0.03)]
     first = before.in_image(ABOVE, 100, home, 100)
     moving = before.in_image(ABOVE, 150, turned, 200)
-    stands = before.in_image(ABOVE, 250, turned, 300)
-    assert first is not None and moving is not None and stands is not None
-    assert [bool(one.occludes(below, 0.03)[0]) for one in (first, moving, stands)] == [True, True, False]
-    assert before.in_image(ABOVE, 350, turned, 400) is stands and stands.by == BY_ROBOT
+    at_rest = before.in_image(ABOVE, 250, turned, 300)
+    assert first is not None and moving is not None and at_rest is not None
+    assert [bool(one.occludes(below, 0.03)[0]) for one in (first, moving, at_rest)] == [True, True, False]
+    assert before.in_image(ABOVE, 350, turned, 400) is at_rest and at_rest.by == BY_ROBOT
 
 
-def test_nothing_is_said_as_long_as_nobody_knows_where_the_arm_is(robot: RobotModel) -> None:
+def test_occlusion_is_unknown_without_joint_readings(robot: RobotModel) -> None:
     assert RobotOcclusion(RobotSilhouettes(robot)).in_image(ABOVE, 1, None, 0) is None

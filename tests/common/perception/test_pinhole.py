@@ -28,19 +28,19 @@ def test_default_camera_maps_right_to_minus_y_and_down_to_minus_x(u, v, z):
     assert x == pytest.approx(0.40 - (v - 240) * h / 520, abs=1e-9)
 
 
-def test_the_robots_left_is_left_in_the_picture_and_far_is_up():
+def test_default_camera_shows_robot_left_as_left_and_far_as_up():
     middle, left, far = default.project([(0.4, 0, 0), (0.4, 0.2, 0), (0.6, 0, 0)])
     assert left[0] < middle[0] and left[1] == pytest.approx(middle[1])
     assert far[1] < middle[1] and far[0] == pytest.approx(middle[0])
 
 
-def test_default_view_is_what_the_numbers_say():
+def test_default_camera_sees_the_expected_area():
     corners = default.on_plane([(-0.5, -0.5), (639.5, 479.5)], 0.0)
     np.testing.assert_allclose(corners, [(0.769, 0.492), (0.031, -0.492)], atol=1.5e-3)
 
 
 @given(st.tuples(angle, angle, angle), st.floats(1, 639), st.floats(1, 479), st.floats(0.1, 5))
-def test_projection_takes_a_ray_back_to_its_pixel_for_any_pose(rpy, u, v, distance):
+def test_projection_inverts_rays_for_any_pose(rpy, u, v, distance):
     camera = Pinhole(500, 510, 310, 245, 640, 480, transform(rpy_to_matrix(*rpy), (0.3, -0.2, 0.9)))
     origin, direction = camera.ray((u, v))
     assert np.linalg.norm(direction) == pytest.approx(1)
@@ -49,7 +49,7 @@ def test_projection_takes_a_ray_back_to_its_pixel_for_any_pose(rpy, u, v, distan
 
 
 @given(st.floats(0.1, 0.7), st.floats(-0.4, 0.4), st.floats(0, 0.2))
-def test_back_projection_onto_the_plane_of_a_point_gives_the_point(x, y, z):
+def test_on_plane_inverts_projection(x, y, z):
     np.testing.assert_allclose(default.on_plane(default.project((x, y, z)), z), (x, y), atol=1e-9)
 
 
@@ -60,12 +60,12 @@ def test_camera_info_and_its_pose_describe_the_same_camera():
     assert (again.width, again.height) == (640, 480)
 
 
-def test_what_is_behind_the_camera_or_never_meets_the_plane_is_nan():
+def test_points_behind_the_camera_and_missed_planes_are_nan():
     assert np.isnan(default.project((0.4, 0.0, 0.9))).all()
     assert np.isnan(default.on_plane((320, 240), 0.9)).all()
 
 
-def test_a_pose_that_is_a_mirror_or_not_rigid_is_refused():
+def test_mirrored_or_non_rigid_pose_is_rejected():
     mirror = default.T_world_optical.copy()
     mirror[:3, 0] *= -1
     stretched = default.T_world_optical.copy()
@@ -75,7 +75,7 @@ def test_a_pose_that_is_a_mirror_or_not_rigid_is_refused():
             Pinhole(520, 520, 320, 240, 640, 480, T)
 
 
-def test_distortion_and_skew_are_refused():
+def test_distortion_and_skew_are_rejected():
     k = [520.0, 0, 320, 0, 520, 240, 0, 0, 1]
     with pytest.raises(CameraError, match="distortion"):
         Pinhole.from_info(CameraInfo(header=Header(), height=480, width=640, d=[0.1, 0, 0, 0, 0], k=k), np.eye(4))
@@ -84,7 +84,7 @@ def test_distortion_and_skew_are_refused():
         Pinhole.from_info(CameraInfo(header=Header(), height=480, width=640, k=k), np.eye(4))
 
 
-def test_the_picture_ends_half_a_pixel_beyond_the_centres_of_its_outer_pixels():
+def test_image_border_is_half_a_pixel_beyond_the_outer_pixel_centers():
     inside = default.in_image([(-0.4, 10), (-0.6, 10), (639.4, 479.4), (100, 479.6)])
     assert inside.tolist() == [True, False, True, False]
     assert not default.in_image((3.0, 100.0), margin=5)

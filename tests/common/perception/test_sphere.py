@@ -19,7 +19,7 @@ def test_rays_through_the_silhouette_touch_the_sphere(center, radius):
 
 
 @given(places)
-def test_gradient_of_the_ray_distance_is_the_unit_vector_from_the_ray_to_the_centre(center):
+def test_gradient_of_ray_distance_is_the_unit_vector_to_the_center(center):
     rays = camera.directions(np.random.default_rng(1).uniform((0, 0), (640, 480), (20, 2)))
     c = np.array([center]) - camera.position
     distance, along = ray_distances(rays, c)
@@ -32,7 +32,7 @@ def test_gradient_of_the_ray_distance_is_the_unit_vector_from_the_ray_to_the_cen
         np.testing.assert_allclose(change[far], gradient[far, axis], atol=1e-4)
 
 
-def test_a_sphere_below_the_camera_looks_round_and_one_aside_is_drawn_out():
+def test_sphere_on_the_axis_is_round_and_off_axis_elongated():
     below = silhouette(camera, (0.4, 0.0, 0.03), 0.03)
     np.testing.assert_allclose(np.linalg.norm(below - (320, 240), axis=1), 520 * 0.03 / np.sqrt(0.77**2 - 0.03**2))
     aside = silhouette(camera, (0.4, 0.4, 0.03), 0.03, 360)
@@ -40,7 +40,7 @@ def test_a_sphere_below_the_camera_looks_round_and_one_aside_is_drawn_out():
     assert width > 1.1 * height
 
 
-def test_the_centre_of_the_silhouette_is_not_the_image_of_the_centre():
+def test_silhouette_center_differs_from_the_projected_center():
     outline = silhouette(camera, (0.4, 0.4, 0.03), 0.03, 720)
     u = (outline[:, 0].min() + outline[:, 0].max()) / 2
     assert u - 320 == pytest.approx(-520 * 0.4 * 0.77 / (0.77**2 - 0.03**2), abs=0.01)
@@ -48,5 +48,5 @@ def test_the_centre_of_the_silhouette_is_not_the_image_of_the_centre():
 
 
 @pytest.mark.parametrize("center", [(0.4, 0.0, 0.81), (0.4, 0.0, 1.0), (0.4, 0.0, 0.78)])
-def test_a_sphere_at_or_behind_the_camera_has_no_silhouette(center):
+def test_sphere_at_or_behind_the_camera_has_no_silhouette(center):
     assert silhouette(camera, center, 0.03).shape == (0, 2)

@@ -1,7 +1,7 @@
-"""Problems whose ways keep to constraints, and what judges these apart from the code that keeps to them.
+"""Problems with constrained paths, and checks that are independent of the code that satisfies the constraints.
 
-Both ends of a problem have a solution near to the home pose: from one posture of the arm to another there may be no way
-that keeps the tool upright. Judged is by pinocchio's kinematics at every millisecond.
+Both ends of a problem have a solution near the home pose: between other postures of the arm there may be no path with
+an upright tool. The checks use pinocchio's kinematics at every millisecond.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from common.planning.trajectory import sample, timed_path
 from common.robot.model import RobotModel
 from common.robot.transforms import tool_down, transform
 
-FLOOR = {"panda": 0.0, "ur5": 1.0}  # [m] on which the wall stands
+FLOOR = {"panda": 0.0, "ur5": 1.0}  # [m] height of the wall's foot
 _WALL = 0.25  # [m] high
 _POSTURE = 2.0  # [rad] at most from the home pose
 _CORRIDOR = (0.3, 0.9, 0.35)  # [m] sides
 
 
 @dataclass(frozen=True)
-class Way:
-    """What the tool does at every millisecond: places (N, 3) [m], axes (N, 3), speeds (N,) [m/s]."""
+class ToolMotion:
+    """The tool at every millisecond: places (N, 3) [m], axes (N, 3), speeds (N,) [m/s]."""
 
     places: np.ndarray
     axes: np.ndarray
@@ -46,14 +46,14 @@ class Way:
         return float(np.arccos(np.clip(self.axes @ np.array(axis), -1, 1)).max())
 
     def outside(self, box: Box) -> float:
-        """The most [m] by which the tool is outside a box that stands straight."""
+        """The most [m] by which the tool is outside a box along the axes of world."""
         middle, size = box.pose.position, box.size
         away = np.abs(self.places - (middle.x, middle.y, middle.z))
         return float((away - np.array([size.x, size.y, size.z]) / 2).max())
 
 
-def driven(robot: RobotModel, response: PlanResponse) -> Way:
-    """The way of the tool as the controller drives it."""
+def driven(robot: RobotModel, response: PlanResponse) -> ToolMotion:
+    """The motion of the tool as the controller executes it."""
     assert response.ok, response.message
     trajectory = timed_path(response.trajectory)
     times = np.append(np.arange(0.0, trajectory.duration, 1e-3), trajectory.duration)
@@ -65,7 +65,7 @@ def driven(robot: RobotModel, response: PlanResponse) -> Way:
         poses.append(data.oMf[frame].homogeneous.copy())
     poses = np.array(poses)
     speeds = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1) / np.diff(times)
-    return Way(poses[:, :3, 3], poses[:, :3, 2], speeds)
+    return ToolMotion(poses[:, :3, 3], poses[:, :3, 2], speeds)
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ def _box(name: str, sides: list[float], z: float) -> CollisionObject:
 
 
 def constraints_of(name: str, robot: str) -> PathConstraints:
-    """What is kept to."""
+    """The constraints of a name such as "tilt 0.1, corridor"."""
     tilt = float(name.split()[1].rstrip(",")) if name.startswith("tilt") else None
     if "corridor" not in name:
         return PathConstraints(tilt=tilt)
@@ -108,16 +108,16 @@ def carries(robot: RobotModel, name: str, count: int, lean: float) -> list[Carry
     found: list[Carry] = []
     while len(found) < count:
         side = rng.choice([-1.0, 1.0])
-        ends = [_stand(robot, world, rng, name, y, lean) for y in (side, -side)]
+        ends = [_random_end(robot, world, rng, name, y, lean) for y in (side, -side)]
         if ends[0] is not None and ends[1] is not None:
             found.append(Carry(ends[0], robot.fk(ends[1])))
     return found
 
 
-def _stand(
+def _random_end(
     robot: RobotModel, world: CollisionWorld, rng: np.random.Generator, name: str, side: float, lean: float
 ) -> np.ndarray | None:
-    """(dof,) [rad] free, the tool near to upright on one side of the wall; None where what is drawn is out of reach."""
+    """(dof,) [rad] free, with a nearly upright tool on one side of the wall; None if out of reach."""
     z = FLOOR[name] + rng.uniform(0.1, 0.3)
     T = tool_down(rng.uniform(0.38, 0.58), side * rng.uniform(0.15, 0.35), z, rng.uniform(-1.5, 1.5))
     about = rng.uniform(-np.pi, np.pi)

@@ -1,4 +1,4 @@
-"""What every planner's answer must hold, and the scenes in which they are all asked."""
+"""Checks of every planner's response, and the scenes in which all plan."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def wall(height: float = 0.4, depth: float = 0.5) -> PlanningScene:
 def assert_sound(
     pipeline: PlanningPipeline, request: PlanRequest, of: PlanningScene, response: PlanResponse
 ) -> TimedPath:
-    """The trajectory, which starts at the start, rests at its ends, keeps limits and is free at a finer step."""
+    """Return the trajectory: from the start, at rest at its ends, within limits and free at a finer step."""
     assert response.ok, response.message
     trajectory = timed_path(PlanResponse.model_validate(response.model_dump()).trajectory)
     scaling = request.velocity_scaling or CELL.motion.velocity_scaling

@@ -29,13 +29,13 @@ GEOMETRY = RobotGeometry(ROBOT)
 HOME = ROBOT.named("home")
 FINGERS = ("panda_hand", "panda_leftfinger", "panda_rightfinger")
 
-# Seven balls about the table, and a block of five with 65 to 70 mm between the centres.
+# Seven balls on the table, and a block of five with 65 to 70 mm between the centres.
 SPREAD = [(0.30, -0.28), (0.35, -0.05), (0.42, -0.18), (0.48, 0.02), (0.55, -0.10), (0.60, -0.27), (0.33, 0.20)]
 BLOCK = [(0.50, -0.10), (0.565, -0.10), (0.435, -0.10), (0.50, -0.03), (0.50, -0.17)]
 
 
 def cache() -> ObstacleCache:
-    """A cache of its own: a world made with a shared one would end the worlds before."""
+    """A new cache: a world of a shared one would invalidate earlier worlds."""
     return ObstacleCache(GEOMETRY)
 
 
@@ -62,7 +62,7 @@ def scene(balls=(), *, box=True) -> PlanningScene:
 
 
 def held_scene(base: PlanningScene, name: str) -> PlanningScene:
-    """The scene with one of its balls between the fingers."""
+    """The scene with one of its balls attached to the gripper."""
     taken = next(o for o in base.objects if o.id == name)
     held = taken.model_copy(update={"role": "attached", "pose": Pose()})
     rest = [o for o in base.objects if o.id != name]

@@ -10,18 +10,18 @@ from common.robot.transforms import tool_down
 from tests.common.planning.planner_checks import AROUND, LEFT, RIGHT, assert_sound, wall, with_planner
 from tests.common.planning.planning_scenes import ROBOT, above, last, scene, solid, to_joints, to_pose
 
-JOINT_GOALS = ["chomp", "joint_move", "lerp", "ompl", "ptp", "trajopt"]
-POSE_GOALS = ["cartesian", "chomp", "lerp", "lin", "ompl", "ptp", "trajopt"]
+JOINT_GOALS = ["chomp", "joint_move", "lerp", "ompl", "ptp", "rrt_connect", "trajopt"]
+POSE_GOALS = ["cartesian", "chomp", "lerp", "lin", "ompl", "ptp", "rrt_connect", "trajopt"]
 ALL = sorted({*JOINT_GOALS, *POSE_GOALS})
 QUICK = {"chomp": {"iterations": 30, "restarts": 1}, "trajopt": {"iterations": 15, "restarts": 1}}
 PIPELINES = {name: with_planner(name) for name in ALL}
 GIVING_UP = {name: with_planner(name, **QUICK.get(name, {})) for name in ALL}
-AROUND_WALLS = ["chomp", "ompl", "trajopt"]
-NEVER_FOUND = [name for name in ALL if name != "ompl"]
+AROUND_WALLS = ["chomp", "ompl", "rrt_connect", "trajopt"]
+BLOCKED = [name for name in ALL if name not in ("ompl", "rrt_connect")]
 
 
 def request_for(planner, T, start, **more):
-    """A pose goal, or for planners that know none the joint positions which reach it."""
+    """A pose goal, or the joint positions that reach it for planners without pose goals."""
     if planner in POSE_GOALS:
         return to_pose(T, start, **more)
     return to_joints(above(*T[:3, 3]), start, **more)
@@ -47,7 +47,7 @@ def test_pose_goal_is_reached(planner):
 
 
 @pytest.mark.parametrize("planner", ALL)
-def test_goal_where_the_robot_stands_needs_no_motion(planner):
+def test_goal_at_the_start_needs_no_motion(planner):
     request = to_pose(ROBOT.fk(LEFT), LEFT) if planner in POSE_GOALS else to_joints(LEFT, LEFT)
     response = PIPELINES[planner].plan(request, AROUND)
     trajectory = assert_sound(PIPELINES[planner], request, AROUND, response)
@@ -62,7 +62,7 @@ def test_pose_out_of_reach_ends_with_no_ik(planner):
 
 
 @pytest.mark.parametrize("planner", POSE_GOALS)
-def test_pose_inside_an_obstacle_is_named(planner):
+def test_pose_inside_an_obstacle_is_refused_with_its_name(planner):
     crate = solid("crate", "fixture", "box", [0.2, 0.2, 0.2], (0.5, 0.3, 0.2))
     blocked = scene(box=False)
     blocked.objects.append(crate)
@@ -72,8 +72,8 @@ def test_pose_inside_an_obstacle_is_named(planner):
     assert "crate" in response.message
 
 
-@pytest.mark.parametrize("planner", NEVER_FOUND)
-def test_way_that_is_blocked_is_reported_with_waypoint_and_pair(planner):
+@pytest.mark.parametrize("planner", BLOCKED)
+def test_blocked_path_is_reported_with_waypoint_and_pair(planner):
     high = wall(height=2.0)
     request = request_for(planner, tool_down(0.5, 0.3, 0.2), RIGHT, stage="transfer")
     if planner in JOINT_GOALS:
@@ -84,14 +84,14 @@ def test_way_that_is_blocked_is_reported_with_waypoint_and_pair(planner):
     assert response.error == "collision"
     assert response.colliding[1] == "wall"
     assert re.match(rf"transfer: {planner}: .*\w+ collides with wall", response.message)
-    if planner != "joint_move":  # which looks at one edge
+    if planner != "joint_move":  # it checks a single edge
         found = re.search(r"waypoint (\d+) of \d+", response.message)
         assert int(found[1]) == response.attempts[-1].waypoint
     assert "\n" not in response.message
 
 
 @pytest.mark.parametrize("planner", AROUND_WALLS)
-def test_way_around_a_wall_is_found(planner):
+def test_path_around_a_wall_is_found(planner):
     low = wall(height=0.3, depth=0.3)
     request = to_joints(LEFT, RIGHT)
     assert not PIPELINES["lerp"].plan(request, low).ok
@@ -101,7 +101,7 @@ def test_way_around_a_wall_is_found(planner):
 
 
 @pytest.mark.parametrize("planner", ALL)
-def test_planner_that_is_cancelled_says_so_or_is_done(planner):
+def test_cancelled_planner_reports_it_or_has_finished(planner):
     cancel = Cancel()
     cancel.set()
     request = request_for(planner, tool_down(0.5, 0.3, 0.2), RIGHT)

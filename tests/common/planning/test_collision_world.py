@@ -31,8 +31,8 @@ def world(of: PlanningScene, start=HOME, **more) -> CollisionWorld:
     return CollisionWorld(ROBOT, of, start=start, cache=cache(), **more)
 
 
-def beside_finger(q, gap) -> tuple[float, float, float]:
-    """Centre of a ball at the left finger's outer side, `gap` [m] off within 0.5 mm."""
+def next_to_finger(q, gap) -> tuple[float, float, float]:
+    """Centre of a ball at the outer side of the left finger, with a gap [m] within 0.5 mm."""
     finger = ROBOT.link_poses(q)["panda_leftfinger"][:3, 3]
     tip = ROBOT.fk(q)[:3, 3]
     outwards = np.sign(finger[1] - tip[1])
@@ -40,7 +40,7 @@ def beside_finger(q, gap) -> tuple[float, float, float]:
         centre = (float(tip[0]), float(finger[1] + outwards * away), float(tip[2]))
         if not world(PlanningScene(header=WORLD, objects=[ball(0, *centre)])).collides(q):
             return centre[0], float(centre[1] + outwards * gap), centre[2]
-    raise AssertionError("no place beside the finger")
+    raise AssertionError("no position next to the finger")
 
 
 def test_home_is_free_above_the_table():
@@ -48,11 +48,11 @@ def test_home_is_free_above_the_table():
     assert AROUND.colliding_pair(HOME) is None
 
 
-def test_colliding_pair_has_names_of_link_and_object():
-    beside = scene([(0.35, -0.05)])
-    assert world(beside).colliding_pair(above(0.35, -0.09, 0.10)) is None
-    assert world(beside).colliding_pair(above(0.35, -0.05, 0.03)) is None  # between the open fingers
-    assert world(beside).colliding_pair(above(0.35, -0.09, 0.03)) == ("panda_rightfinger", "ball_0")
+def test_colliding_pair_names_link_and_object():
+    nearby = scene([(0.35, -0.05)])
+    assert world(nearby).colliding_pair(above(0.35, -0.09, 0.10)) is None
+    assert world(nearby).colliding_pair(above(0.35, -0.05, 0.03)) is None  # between the open fingers
+    assert world(nearby).colliding_pair(above(0.35, -0.09, 0.03)) == ("panda_rightfinger", "ball_0")
     assert world(scene()).colliding_pair(above(0.4, 0.1, -0.02))[1] == "table"
 
 
@@ -63,14 +63,14 @@ def test_links_that_fold_into_each_other_collide():
     assert b.startswith("panda_")
 
 
-def test_what_stands_at_the_base_link_is_no_collision():
-    beside = PlanningScene(header=WORLD, objects=[ball(0, 0.0, 0.05, z=0.03)])
-    assert not world(beside).collides(HOME)
+def test_object_at_the_base_link_is_no_collision():
+    nearby = PlanningScene(header=WORLD, objects=[ball(0, 0.0, 0.05, z=0.03)])
+    assert not world(nearby).collides(HOME)
 
 
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 2**31))
-def test_edges_said_to_be_free_are_free_at_every_small_step(seed):
+def test_free_edge_is_free_at_every_small_step(seed):
     rng = np.random.default_rng(seed)
     a = rng.uniform(ROBOT.lower, ROBOT.upper)
     b = np.clip(a + rng.normal(0, 0.4, 7), ROBOT.lower, ROBOT.upper)
@@ -84,7 +84,7 @@ def test_edges_said_to_be_free_are_free_at_every_small_step(seed):
         assert hit.index == colliding.index(True)
 
 
-def test_no_point_moves_farther_than_the_levers_say():
+def test_levers_bound_the_motion_of_link_origins():
     rng = np.random.default_rng(0)
     for _ in range(50):
         a = rng.uniform(ROBOT.lower, ROBOT.upper)
@@ -95,14 +95,14 @@ def test_no_point_moves_farther_than_the_levers_say():
             assert moved <= np.abs(b - a) @ lever + 1e-9
 
 
-def test_perceived_objects_are_kept_at_a_distance_and_fixtures_are_not():
+def test_padding_applies_to_perceived_objects_only():
     q = above(0.50, -0.10, 0.03)
-    x, y, z = beside_finger(q, 0.001)
+    x, y, z = next_to_finger(q, 0.001)
     for role, expected in (("target", True), ("contained", True), ("fixture", False)):
-        beside = PlanningScene(header=WORLD, objects=[solid("thing", role, "sphere", [0.03], (x, y, z))])
-        assert not world(beside).collides(q)
-        assert not world(beside, padding=0.0005).collides(q)
-        assert world(beside, padding=0.003).collides(q) is expected
+        nearby = PlanningScene(header=WORLD, objects=[solid("ball", role, "sphere", [0.03], (x, y, z))])
+        assert not world(nearby).collides(q)
+        assert not world(nearby, padding=0.0005).collides(q)
+        assert world(nearby, padding=0.003).collides(q) is expected
 
 
 def test_allowed_pairs_may_touch_in_either_order():
@@ -142,7 +142,7 @@ def test_contact_at_the_start_ends_after_the_contact_distance():
 
 
 def blocked(world, *ends):
-    """What each way of asking says of a straight edge; they agree."""
+    """Return the colliding pair of a straight edge; all kinds of checks agree."""
     path = interpolate(ends, 0.005)
     hit = world.first_collision(path)
     assert (hit is None) is world.edge_free(*ends) is all(not world.collides(q) for q in path)
@@ -151,7 +151,7 @@ def blocked(world, *ends):
 
 @pytest.mark.usefixtures("backend")
 @pytest.mark.parametrize("overlap", [0.002, 0.0, -0.0005])
-def test_what_is_held_goes_no_deeper_into_what_it_touches_at_the_start(overlap):
+def test_attached_object_penetrates_no_deeper_than_at_the_start(overlap):
     grasp = above(0.50, -0.10, 0.03)
     held = world(scene([(0.50, -0.10), (0.56 - overlap, -0.10)]), start=grasp, attach="ball_0", padding=0.003)
     assert not held.collides(grasp)
@@ -163,19 +163,19 @@ def test_what_is_held_goes_no_deeper_into_what_it_touches_at_the_start(overlap):
 
 
 @pytest.mark.usefixtures("backend")
-def test_turning_what_is_held_is_motion_too():
+def test_turning_attached_object_is_checked():
     grasp = above(0.50, 0.0, 0.2)
-    things = scene(box=False)
-    things.objects += [
+    objects = scene(box=False)
+    objects.objects += [
         solid("bar", "target", "box", [0.2, 0.02, 0.02], (0.5, 0.0, 0.19)),
         solid("post", "fixture", "box", [0.04, 0.04, 0.04], (0.58, 0.03, 0.19)),
     ]
-    held = world(things, start=grasp, attach="bar", allowed=[(link, "bar") for link in FINGERS])
+    held = world(objects, start=grasp, attach="bar", allowed=[(link, "bar") for link in FINGERS])
     assert not held.collides(grasp)
     assert {blocked(held, grasp, above(0.50, 0.0, 0.2, yaw)) for yaw in (-0.3, 0.3)} == {None, ("bar", "post")}
 
 
-def test_contact_that_begins_on_the_way_is_a_collision_near_the_start_too():
+def test_new_contact_near_the_start_is_a_collision():
     grasp = above(0.50, -0.10, 0.06)
     near = scene([(0.50, -0.10), (0.572, -0.10)])
     near.objects[-2].pose.position.z = 0.06
@@ -185,7 +185,7 @@ def test_contact_that_begins_on_the_way_is_a_collision_near_the_start_too():
     assert held.colliding_pair(above(0.515, -0.10, 0.06)) == ("ball_0", "ball_1")
 
 
-def test_object_held_in_the_scene_is_held_until_it_is_released():
+def test_attached_object_of_the_scene_stays_attached_until_release():
     held = held_scene(scene(BLOCK), "ball_0")
     low = above(0.45, 0.1, 0.02)
     assert world(held).colliding_pair(low) == ("ball_0", "table")
@@ -195,19 +195,19 @@ def test_object_held_in_the_scene_is_held_until_it_is_released():
 
 def test_padding_alone_does_not_put_the_start_in_collision():
     grasp = above(0.50, -0.10, 0.03)
-    x, y, z = beside_finger(grasp, 0.001)
-    beside = PlanningScene(header=WORLD, objects=[ball(0, x, y, z)])
-    padded = world(beside, start=grasp, padding=0.005)
+    x, y, z = next_to_finger(grasp, 0.001)
+    nearby = PlanningScene(header=WORLD, objects=[ball(0, x, y, z)])
+    padded = world(nearby, start=grasp, padding=0.005)
     assert not padded.collides(grasp)
-    assert world(beside, start=HOME, padding=0.005).collides(grasp)
+    assert world(nearby, start=HOME, padding=0.005).collides(grasp)
 
 
-def test_object_that_is_not_there_can_not_be_attached():
+def test_unknown_object_cannot_be_attached():
     with pytest.raises(UnknownName, match=r"ball_9.*ball_0"):
         world(scene(BLOCK), attach="ball_9")
 
 
-def test_worlds_from_one_cache_do_not_inherit_from_those_before():
+def test_worlds_of_one_cache_are_independent():
     shared = ObstacleCache(GEOMETRY)
     low = above(0.35, -0.09, 0.03)
 

@@ -23,7 +23,7 @@ kernel = pytest.mark.skipif(library() is None, reason="the planning kernel is no
 
 
 def sliding_arm() -> tuple[pin.Model, int]:
-    """A model whose first and fourth joints slide, axes askew, and a frame at its end; another branch hangs on it."""
+    """A model with sliding first and fourth joints, skew axes, a frame at its end, and another branch."""
     rng, model, parent = np.random.default_rng(4), pin.Model(), 0
     for number in range(8):
         axis = rng.normal(size=3)
@@ -38,7 +38,7 @@ def sliding_arm() -> tuple[pin.Model, int]:
 
 
 def away(model: pin.Model, frame: int, q, T) -> tuple[float, float]:
-    """How far the frame is from a pose by pinocchio: [m], [rad]."""
+    """Distance of the frame from a pose by pinocchio: [m], [rad]."""
     data = model.createData()
     pin.framesForwardKinematics(model, data, q)
     left = data.oMf[frame].actInv(pin.SE3(T))
@@ -56,14 +56,14 @@ def check(model: pin.Model, frame: int, q, T) -> None:
 @pytest.mark.parametrize("name", ROBOTS)
 @settings(max_examples=300, deadline=None)
 @given(seed=st.integers(0, 2**31))
-def test_solution_puts_the_tcp_at_any_pose_that_was_reached(name, seed):
+def test_ik_solves_any_reachable_pose(name, seed):
     model, rng = ROBOTS[name], np.random.default_rng(seed)
     T = model.fk(rng.uniform(model.lower, model.upper))
     check(model.model, model.tcp_frame, solve_ik(model, T, rng.uniform(model.lower, model.upper), rng=rng), T)
 
 
 @kernel
-def test_solution_puts_the_tip_of_an_arm_with_sliding_joints_at_any_pose_that_was_reached():
+def test_ik_solves_any_reachable_pose_with_sliding_joints():
     model, frame = sliding_arm()
     arm, data, rng = KernelArm(model, frame, 1e-5, 1e-4), model.createData(), np.random.default_rng(0)
     for number in range(300):
@@ -71,12 +71,12 @@ def test_solution_puts_the_tip_of_an_arm_with_sliding_joints_at_any_pose_that_wa
         T, seed = data.oMf[frame].homogeneous, rng.uniform(-3, 3, model.nq)
         q = arm.solve(T, seed, restarts=300, iterations=15, random=number)
         check(model, frame, q, T)
-        assert q[4] == np.clip(seed[4], -1, 1.5)  # the tip does not hang on it
+        assert q[4] == np.clip(seed[4], -1, 1.5)  # this joint does not move the tip
 
 
 @settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.integers(0, 2**31))
-def test_without_the_kernel_solution_puts_the_tcp_at_any_pose_that_was_reached(no_kernel, seed):
+def test_ik_without_the_kernel_solves_any_reachable_pose(no_kernel, seed):
     rng = np.random.default_rng(seed)
     T = robot.fk(rng.uniform(robot.lower, robot.upper))
     check(robot.model, robot.tcp_frame, solve_ik(robot, T, HOME, rng=rng), T)
@@ -84,7 +84,7 @@ def test_without_the_kernel_solution_puts_the_tcp_at_any_pose_that_was_reached(n
 
 @kernel
 @pytest.mark.parametrize("name", ROBOTS)
-def test_from_a_seed_nearby_the_kernel_and_pinocchio_find_the_same(name):
+def test_kernel_and_pinocchio_agree_from_a_close_seed(name):
     model, rng = ROBOTS[name], np.random.default_rng(3)
     ends = rng.uniform(model.lower, model.upper, (50, model.dof))
     seeds = ends + rng.uniform(-0.1, 0.1, ends.shape)
@@ -97,7 +97,7 @@ def test_from_a_seed_nearby_the_kernel_and_pinocchio_find_the_same(name):
 
 
 @pytest.mark.parametrize("yaw", [-1.0, 0.0, 1.0])
-def test_grasps_all_over_the_table_are_found_from_home_alone(yaw):
+def test_grasps_on_the_complete_table_are_solved_from_home(yaw):
     for x in (0.35, 0.5, 0.62):
         for y in (-0.3, 0.0, 0.3):
             assert solve_ik(robot, tool_down(x, y, 0.03, yaw), HOME, restarts=3) is not None
@@ -110,14 +110,14 @@ def test_pose_out_of_reach_has_no_solution():
 @kernel
 @pytest.mark.parametrize("name", ROBOTS)
 @pytest.mark.parametrize("place", [(1.5, 0, 0.3), (0, 0, 0.1), (1e6, 0, 0), (np.nan, 0, 0)])
-def test_pose_out_of_reach_is_said_to_be_in_bounded_time(name, place):
+def test_unreachable_pose_is_reported_in_bounded_time(name, place):
     began = time.process_time()
     assert solve_ik(ROBOTS[name], tool_down(*place), ROBOTS[name].named("home")) is None
     assert time.process_time() - began < 0.1
 
 
 @kernel
-def test_pose_and_seed_of_another_size_are_refused():
+def test_pose_and_seed_of_wrong_shape_are_refused():
     with pytest.raises(ValueError, match="shape"):
         solve_ik(robot, np.eye(4)[:3], HOME)
     with pytest.raises(ValueError, match="shape"):
@@ -148,7 +148,7 @@ def test_same_call_gives_the_same_solution():
 
 
 @kernel
-def test_threads_get_the_answers_that_they_asked_for():
+def test_threads_get_their_own_answers():
     rng = np.random.default_rng(5)
     poses = [robot.fk(q) for q in rng.uniform(robot.lower, robot.upper, (200, robot.dof))]
 

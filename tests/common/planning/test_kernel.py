@@ -1,4 +1,4 @@
-"""The compiled kernel: what it calls free is free for coal, all along edges, and its planner keeps to that."""
+"""The compiled kernel agrees with coal at states and along edges, and its planner returns free paths."""
 
 import ctypes
 import threading
@@ -67,7 +67,7 @@ def least_distance(kernel: KernelWorld, cubic: np.ndarray) -> float:
 
 
 def beads() -> pin.GeometryModel:
-    """One or two spheres on each joint of the arm: here the spheres about bodies and shapes are the shapes."""
+    """One or two spheres on each joint of the arm: bounding spheres equal the shapes."""
     geometry = pin.GeometryModel()
     for joint in range(1, ROBOT.model.njoints):
         for side in (-0.1, 0.1)[: 1 + joint % 2]:
@@ -80,7 +80,7 @@ def beads() -> pin.GeometryModel:
 
 @pytest.mark.parametrize("robot", ["hulls", "beads"])
 @pytest.mark.parametrize("bent", [False, True])
-def test_margin_up_to_which_an_edge_is_proved_is_the_least_distance_along_it(bent, robot):
+def test_largest_proved_margin_is_the_least_distance_along_an_edge(bent, robot):
     rng = np.random.default_rng(6)
     compared, shapes = 0, GEOMETRY.geometry if robot == "hulls" else beads()
     while compared < 4:
@@ -100,7 +100,7 @@ def test_margin_up_to_which_an_edge_is_proved_is_the_least_distance_along_it(ben
         compared += 1
 
 
-def test_joints_stand_where_pinocchio_puts_them():
+def test_joint_poses_agree_with_pinocchio():
     kernel, data = KernelWorld(ROBOT.model, GEOMETRY.geometry), ROBOT.model.createData()
     for q in np.random.default_rng(0).uniform(ROBOT.lower, ROBOT.upper, (20, ROBOT.dof)):
         pin.forwardKinematics(ROBOT.model, data, q)
@@ -109,7 +109,7 @@ def test_joints_stand_where_pinocchio_puts_them():
 
 
 @pytest.mark.parametrize("gap", [1e-7, 1e-5, 1e-3])
-def test_edge_that_passes_closely_is_free_and_one_that_grazes_is_not(gap):
+def test_close_edge_is_free_and_grazing_edge_is_not(gap):
     sphere, wall = coal.Sphere(0.1), coal.Box(0.2, 0.2, 0.2)
     for sign, free in ((1, True), (-1, False)):
         model, geometry = robot_with((sphere, (0, 0.2 + sign * gap, 0)), (wall, (0, 0, 0)))
@@ -128,7 +128,7 @@ def test_thin_wall_between_the_ends_of_an_edge_is_found():
 def test_cubic_that_bulges_into_a_wall_is_not_free():
     model, geometry = robot_with((coal.Sphere(0.1), (0, 0, 0)), (coal.Box(0.2, 1, 1), (0.7, 0, 0)))
     kernel = KernelWorld(model, geometry)
-    bulge = np.array([[[0.0], [2.0], [-2.0], [0.0]]])  # from 0 to 0, by way of 0.5
+    bulge = np.array([[[0.0], [2.0], [-2.0], [0.0]]])  # from 0 to 0 through 0.5
     assert kernel.edge_free(np.zeros(1), np.zeros(1))
     assert kernel.cubics_collision(bulge)[0] == 0
     assert kernel.cubics_collision(0.999 * bulge)[0] == -1
@@ -136,7 +136,7 @@ def test_cubic_that_bulges_into_a_wall_is_not_free():
     assert kernel.cubics_collision(bulge)[0] == -1
 
 
-def test_margin_is_kept_and_pairs_are_excused():
+def test_margins_and_allowed_contacts_are_applied():
     model, geometry = robot_with((coal.Sphere(0.1), (0, 0, 0)), (coal.Capsule(0.1, 0.3), (0.25, 0, 0)))
     kernel, q = KernelWorld(model, geometry), np.zeros(1)
     for margin, hit in ((0.0, -1), (0.0499, -1), (0.0501, 0), (CONTACT_ALLOWED, -1)):
@@ -144,19 +144,19 @@ def test_margin_is_kept_and_pairs_are_excused():
         assert kernel.colliding(q) == hit
 
 
-def test_contact_is_excused_while_the_tool_is_on_its_leash():
+def test_contact_is_allowed_within_the_contact_distance():
     model, geometry = robot_with((coal.Sphere(0.1), (0, 0, 0)), (coal.Box(0.2, 0.2, 0.2), (0.19, 0, 0)))
     kernel = KernelWorld(model, geometry)
     start, away, beyond = np.zeros(1), np.array([-0.5]), np.array([0.03])
     kernel.set_rules(np.zeros(1), np.full(1, CONTACT_ALLOWED), 1, np.zeros(3), np.zeros(3), 0.02)
     assert kernel.colliding(start) == -1
-    assert kernel.edge_free(start, away)  # out of the contact before the leash ends
+    assert kernel.edge_free(start, away)  # the contact ends within the contact distance
     assert not kernel.edge_free(start, beyond)
     kernel.set_rules(np.zeros(1), np.full(1, CONTACT_ALLOWED), 1, np.zeros(3), np.zeros(3), 0.005)
     assert not kernel.edge_free(start, away)
 
 
-def test_first_position_that_collides_is_found_on_a_path():
+def test_first_colliding_position_of_a_path_is_found():
     kernel = CollisionWorld(ROBOT, scene(BLOCK), start=HOME, cache=cache()).kernel
     path = interpolate([HOME, above(0.5, -0.1, 0.2), above(0.5, -0.1, 0.01)], 0.01)
     colliding = [kernel.colliding(q) >= 0 for q in path]
@@ -165,7 +165,7 @@ def test_first_position_that_collides_is_found_on_a_path():
     assert kernel.first_collision(path[: colliding.index(True)])[0] == -1
 
 
-def test_world_with_a_held_object_says_the_same_with_and_without_the_kernel():
+def test_world_with_an_attached_object_agrees_with_coal():
     held = held_scene(scene(SPREAD), "ball_3")
     fast = CollisionWorld(ROBOT, held, start=HOME, cache=cache())
     with library.without_kernel():
@@ -179,7 +179,7 @@ def test_world_with_a_held_object_says_the_same_with_and_without_the_kernel():
             assert all(not plain.collides(x) for x in interpolate(edge, 0.02))
 
 
-def test_paths_are_free_end_where_they_should_and_the_seed_decides_them():
+def test_paths_are_free_reach_their_ends_and_depend_on_the_seed():
     world = CollisionWorld(ROBOT, scene(SPREAD), start=HOME, cache=cache())
     left, right = above(0.45, 0.35, 0.03), above(0.45, 0.12, 0.03)
     assert not world.edge_free(left, right)
@@ -193,7 +193,7 @@ def test_paths_are_free_end_where_they_should_and_the_seed_decides_them():
     assert paths[2].shape != paths[0].shape or (paths[2] != paths[0]).any()
 
 
-def test_search_without_a_way_out_ends_on_time_and_when_it_is_cancelled():
+def test_impossible_search_ends_on_time_and_when_cancelled():
     model, geometry = robot_with((coal.Sphere(0.1), (0, 0, 0)), (coal.Box(0.1, 1, 1), (0, 0, 0)))
     kernel = KernelWorld(model, geometry)
     ends = np.array([-0.9]), np.array([[0.9]])
@@ -208,7 +208,7 @@ def test_search_without_a_way_out_ends_on_time_and_when_it_is_cancelled():
     assert find_path(kernel, *ends, nodes=10).error == "no_path"
 
 
-def test_shape_or_joint_that_the_kernel_does_not_know_is_refused():
+def test_unsupported_shape_or_joint_is_refused():
     with pytest.raises(KernelUnavailable, match="Cone"):
         KernelWorld(*robot_with((coal.Cone(0.1, 0.2), (0, 0, 0))))
     model = pin.Model()
@@ -217,7 +217,7 @@ def test_shape_or_joint_that_the_kernel_does_not_know_is_refused():
         KernelWorld(model, pin.GeometryModel())
 
 
-def test_positions_of_another_length_are_refused():
+def test_arrays_of_wrong_length_are_refused():
     kernel = KernelWorld(ROBOT.model, GEOMETRY.geometry)
     with pytest.raises(ValueError, match="shape"):
         kernel.colliding(np.zeros(6))
@@ -225,7 +225,7 @@ def test_positions_of_another_length_are_refused():
         kernel.set_rules(np.zeros(3))
 
 
-def test_both_libraries_say_the_same(monkeypatch):
+def test_both_libraries_agree(monkeypatch):
     if not (library.FOLDER / f"{library.NAME}_avx2.so").exists():
         pytest.skip("one library serves this processor")
     rng = np.random.default_rng(5)
@@ -239,7 +239,7 @@ def test_both_libraries_say_the_same(monkeypatch):
         assert (fast.colliding(q) < 0) == (slow.colliding(q) < 0)
 
 
-def test_nothing_is_built_without_a_compiler_and_a_library_of_another_version_is_not_used(tmp_path, monkeypatch):
+def test_missing_compiler_builds_nothing_and_other_versions_are_not_loaded(tmp_path, monkeypatch):
     monkeypatch.setenv("CC", "a-compiler-that-is-not-there")
     assert ["a-compiler-that-is-not-there"] not in compilers()
     for none in ([], [["false"]]):
@@ -251,14 +251,14 @@ def test_nothing_is_built_without_a_compiler_and_a_library_of_another_version_is
     assert library._open(library.FOLDER / f"{library.NAME}.so") is None
 
 
-def test_options_have_the_layout_of_the_source():
+def test_option_structures_have_the_size_of_the_source():
     from common.planning.kernel import solvers
 
     assert ctypes.sizeof(solvers._Options) == 6 * 8
     assert ctypes.sizeof(solvers._Report) == 7 * 8
 
 
-def test_paths_are_timed_the_same_with_and_without_the_kernel():
+def test_timing_is_the_same_without_the_kernel():
     rng = np.random.default_rng(2)
     path = blended_path(rng.uniform(-1, 1, (6, 7)), np.full(6, 0.2))[0]
     fast = parametrise(path, np.ones(7), np.full(7, 3.0))

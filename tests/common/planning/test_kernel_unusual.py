@@ -1,4 +1,4 @@
-"""The compiled kernel where questions are unusual: no numbers, joints out of limits, shapes that it has to refuse."""
+"""The compiled kernel with unusual input: NaN, joints outside limits, unsupported shapes."""
 
 import threading
 from itertools import pairwise
@@ -38,7 +38,7 @@ def reaching_arm(limit: float) -> KernelWorld:
 
 
 @pytest.mark.parametrize("number", [np.nan, np.inf, -np.inf])
-def test_what_is_no_number_is_not_free(number):
+def test_nan_and_infinity_are_not_free(number):
     free, none = np.zeros(1), np.array([number])
     for kernel in (far_from_everything(), CollisionWorld(ROBOT, scene(), start=HOME, cache=cache()).kernel):
         if kernel.dof > 1:
@@ -53,14 +53,14 @@ def test_what_is_no_number_is_not_free(number):
         assert kernel.cubics_collision(curve)[0] >= 0
 
 
-def test_edge_of_absurd_length_is_not_free_and_that_is_said_at_once():
+def test_extremely_long_edge_is_not_free():
     far = HOME.copy()
     far[0] = 1e7
     assert not CollisionWorld(ROBOT, scene(), start=HOME, cache=cache()).edge_free(HOME, far)
 
 
 @pytest.mark.parametrize("limit", [0.1, 3.0, 1e308, np.inf])
-def test_edge_out_of_the_limits_of_a_sliding_joint_is_judged_by_where_it_leads(limit):
+def test_edge_outside_the_limits_of_a_sliding_joint_is_checked(limit):
     kernel, rng = reaching_arm(limit), np.random.default_rng(0)
     for _ in range(50):
         a, b = np.array([1 - rng.uniform(0.2, 1), 2.0]), np.array([1 + rng.uniform(0.2, 1), 2.0])
@@ -74,7 +74,7 @@ def test_edge_out_of_the_limits_of_a_sliding_joint_is_judged_by_where_it_leads(l
 
 
 @pytest.mark.parametrize("kind", ["HX", "Composite"])
-def test_joint_that_neither_turns_nor_slides_alone_is_refused(kind):
+def test_unsupported_joint_kind_is_refused(kind):
     model, geometry = pin.Model(), pin.GeometryModel()
     joint = pin.JointModelHX(0.5) if kind == "HX" else pin.JointModelComposite()
     if kind == "Composite":
@@ -85,12 +85,12 @@ def test_joint_that_neither_turns_nor_slides_alone_is_refused(kind):
 
 
 @pytest.mark.parametrize("size", [1e8, 1e155, 1e308])
-def test_shape_so_large_that_rounding_counts_is_refused(size):
+def test_extremely_large_shape_is_refused(size):
     with pytest.raises(KernelUnavailable, match="larger than"):
         KernelWorld(*robot_with((coal.Box(0.2, 0.2, 0.2), (0, 0, 0)), (coal.Sphere(size), (0.05 + size, 0, 0))))
 
 
-def test_scene_with_such_a_shape_is_left_to_coal():
+def test_scene_with_an_extremely_large_shape_uses_coal():
     ground = solid("ground", "fixture", "box", [1e8, 1e8, 1.0], (0, 0, -0.6))
     huge = CollisionWorld(ROBOT, PlanningScene(header=WORLD, objects=[ground]), start=HOME, cache=cache())
     assert huge.kernel is None and not huge.collides(HOME)
@@ -103,7 +103,7 @@ def test_shape_with_a_swept_sphere_is_refused():
         KernelWorld(*robot_with((coal.Sphere(0.1), (0, 0, 0)), (wall, (0.25, 0, 0))))
 
 
-def test_pair_of_which_nothing_moves_is_judged_where_it_stands():
+def test_pair_of_two_fixed_shapes_is_checked():
     ball = coal.Sphere(0.1)
     for gap, free in ((0.3, True), (0.1, False)):
         model, geometry = robot_with((ball, (0, 0, 0)), (ball, (3, 0, 0)), (ball, (3 + gap, 0, 0)))
@@ -114,7 +114,7 @@ def test_pair_of_which_nothing_moves_is_judged_where_it_stands():
         assert kernel.edge_free(np.zeros(1), ONE) == free
 
 
-def test_search_without_goals_is_refused_and_one_in_tiny_steps_ends_when_it_should():
+def test_search_without_goals_is_refused_and_tiny_steps_respect_limits():
     kernel, ends = far_from_everything(), (np.array([-0.9]), np.array([[0.9]]))
     with pytest.raises(ValueError, match="goals"):
         find_path(kernel, ends[0], np.zeros((0, 1)))
@@ -124,12 +124,12 @@ def test_search_without_goals_is_refused_and_one_in_tiny_steps_ends_when_it_shou
     assert found.error == "timeout" and found.search_seconds < 1
 
 
-def test_shape_that_is_not_there_can_not_be_placed():
+def test_unknown_shape_index_is_refused():
     with pytest.raises(IndexError):
         far_from_everything().set_pose(2, np.eye(4))
 
 
-def test_threads_that_ask_the_same_world_get_the_same_answers():
+def test_threads_sharing_a_world_get_the_same_answers():
     world = CollisionWorld(ROBOT, scene(SPREAD), start=HOME, cache=cache())
     states = np.random.default_rng(0).uniform(ROBOT.lower, ROBOT.upper, (100, ROBOT.dof))
     edges = [*pairwise(states)]

@@ -27,7 +27,7 @@ def test_quintic_is_at_rest_at_its_ends():
     assert np.allclose(speed.max(axis=0)[LEFT > RIGHT], 1.875 * span[LEFT > RIGHT], rtol=0.01)
 
 
-def test_even_spacing_keeps_the_ends_and_the_way():
+def test_even_spacing_preserves_the_ends():
     path = quintic(RIGHT, LEFT, 30)
     even = evenly_spaced(path, 0.05)
     steps = np.linalg.norm(np.diff(even, axis=0), axis=1)
@@ -37,7 +37,7 @@ def test_even_spacing_keeps_the_ends_and_the_way():
     assert len(evenly_spaced(np.array([RIGHT, RIGHT, RIGHT]))) == 2
 
 
-def test_cost_of_accelerations_is_zero_for_rest_only():
+def test_cost_of_accelerations_is_zero_at_rest_only():
     A = accelerations(10)
     assert np.allclose(A @ np.ones(10), 0)
     path = np.linspace(0, 1, 10)
@@ -52,7 +52,7 @@ def test_obstacles_push_within_their_clearance_and_hardest_inside():
 
 
 @pytest.mark.parametrize("planner", ["chomp", "trajopt"])
-def test_straight_way_that_is_free_is_kept(planner):
+def test_free_straight_edge_is_not_changed(planner):
     pipeline = with_planner(planner)
     request = to_joints(LEFT, RIGHT)
     timed = assert_sound(pipeline, request, AROUND, pipeline.plan(request, AROUND))
@@ -62,7 +62,7 @@ def test_straight_way_that_is_free_is_kept(planner):
 
 
 @pytest.mark.parametrize("planner", ["chomp", "trajopt"])
-def test_planner_that_has_too_few_iterations_says_what_still_collides(planner):
+def test_too_few_iterations_report_the_remaining_collision(planner):
     response = with_planner(planner, iterations=1, restarts=0).plan(to_joints(LEFT, RIGHT), LOW_WALL)
     assert response.error == "collision"
     assert response.colliding[1] == "wall"
@@ -70,14 +70,14 @@ def test_planner_that_has_too_few_iterations_says_what_still_collides(planner):
 
 
 @pytest.mark.parametrize("planner", ["chomp", "trajopt"])
-def test_other_guesses_are_counted_when_they_lead_nowhere(planner):
+def test_failure_counts_the_other_first_guesses(planner):
     response = with_planner(planner, iterations=1, restarts=2).plan(to_joints(LEFT, RIGHT), wall(height=2.0))
     assert response.error == "collision"
     assert response.message.endswith("2 other first guesses also collide")
 
 
 @pytest.mark.parametrize("planner", ["chomp", "trajopt"])
-def test_larger_clearance_keeps_farther_from_the_wall(planner):
+def test_larger_clearance_leads_farther_from_the_wall(planner):
     least = []
     for clearance in (0.01, 0.1):
         pipeline = with_planner(planner, clearance=clearance)
@@ -104,7 +104,7 @@ def test_optimisation_ends_when_it_is_cancelled(planner):
     assert response.error == "cancelled"
 
 
-def test_chain_measures_edges_and_puts_middles_between_waypoints():
+def test_chain_has_waypoints_and_middles_and_measures_edges():
     path = line(RIGHT, LEFT, 6)
     chain = _chain(RIGHT, LEFT, 6)
     positions = chain.positions(path[1:-1])
@@ -116,7 +116,7 @@ def test_chain_measures_edges_and_puts_middles_between_waypoints():
     assert chain.cost(other[1:-1]) - chain.cost(path[1:-1]) == pytest.approx(edges[1] - edges[0])
 
 
-def test_shortest_path_is_kept_where_nothing_is_in_the_way_and_left_where_something_is():
+def test_step_changes_the_shortest_path_only_near_obstacles():
     chain = _chain(np.zeros(7), np.ones(7), 10)
     waypoints = line(np.zeros(7), np.ones(7), 10)[1:-1]
     problem = SimpleNamespace(robot=SimpleNamespace(lower=np.full(7, -3), upper=np.full(7, 3)))

@@ -31,14 +31,14 @@ START = above(0.45, -0.25, 0.2)
 
 
 def free_again(request, of, response) -> bool:
-    """Whether the trajectory is free in a world of its own, at a finer step, under the request's rules."""
+    """Whether the trajectory is free in a separate world, at a finer step, under the request's rules."""
     world = PIPELINE.world(request, of, request.start)
     path, _ = fine_samples(timed_path(response.trajectory), 0.005)
     return not any(world.collides(q) for q in path)
 
 
 @pytest.mark.parametrize("yaw", [-np.pi / 4, np.pi / 4])
-def test_ball_in_a_block_is_taken_out_and_carried_into_the_box(yaw):
+def test_ball_in_a_block_is_lifted_and_carried_into_the_box(yaw):
     x, y = BLOCK[0]
     block = scene(BLOCK)
     descend = to_pose(
@@ -49,7 +49,7 @@ def test_ball_in_a_block_is_taken_out_and_carried_into_the_box(yaw):
     assert np.linalg.norm(ROBOT.fk(last(down))[:3, 3] - (x, y, 0.03)) < 0.002
 
     held = held_scene(block, "ball_0")
-    for before in (block, held):  # planned ahead, and with the ball in the hand
+    for before in (block, held):  # planned ahead, and with the attached ball
         lift = to_pose(tool_down(x, y, 0.18, yaw), last(down), straight=True, attach="ball_0")
         up = PIPELINE.plan(lift, before)
         assert free_again(lift, before, up)
@@ -63,7 +63,7 @@ def test_ball_in_a_block_is_taken_out_and_carried_into_the_box(yaw):
     assert np.linalg.norm(ROBOT.fk(last(over))[:2, 3] - (0.55, 0.25)) < 0.05
 
 
-def test_fingers_that_would_land_on_a_neighbour_are_refused_with_the_pair():
+def test_grasp_that_hits_a_neighbour_is_refused_with_the_pair():
     x, y = BLOCK[0]
     request = to_pose(
         tool_down(x, y, 0.03, 0.0), above(x, y, 0.13, 0.0), straight=True, stage="grasp",
@@ -79,13 +79,13 @@ def test_fingers_that_would_land_on_a_neighbour_are_refused_with_the_pair():
 
 def test_ball_to_be_grasped_is_an_obstacle_until_contact_is_allowed():
     x, y = BLOCK[0]
-    beside = to_pose(tool_down(x, y + 0.04, 0.03), above(x, y + 0.04, 0.13), straight=True)
-    assert PIPELINE.plan(beside, scene(BLOCK[:1])).colliding[1] == "ball_0"
-    allowed = beside.model_copy(update={"allowed_collisions": touching("ball_0")})
+    nearby = to_pose(tool_down(x, y + 0.04, 0.03), above(x, y + 0.04, 0.13), straight=True)
+    assert PIPELINE.plan(nearby, scene(BLOCK[:1])).colliding[1] == "ball_0"
+    allowed = nearby.model_copy(update={"allowed_collisions": touching("ball_0")})
     assert PIPELINE.plan(allowed, scene(BLOCK[:1])).ok
 
 
-def test_held_ball_is_kept_clear_of_what_is_in_the_way():
+def test_attached_ball_is_checked_against_obstacles():
     held = held_scene(scene(BLOCK[:1]), "ball_0")
     low = to_pose(tool_down(0.55, 0.25, 0.08), above(0.55, 0.02, 0.08), straight=True)
     response = PIPELINE.plan(low, held)
@@ -124,7 +124,7 @@ def test_start_in_collision_is_refused_with_the_pair_and_the_next_request_is_ser
         (to_pose(tool_down(0.4, 0, 0.3), START, position_tolerance=Vector3(x=-1)), "bad_goal", "negative"),
     ],
 )
-def test_bad_request_is_answered_with_code_and_choice_and_nothing_is_lost(request_, code, text):
+def test_bad_request_is_refused_with_code_and_choices_and_the_next_is_served(request_, code, text):
     response = PIPELINE.plan(request_, scene(SPREAD))
     assert not response.ok
     assert response.error == code
@@ -134,9 +134,9 @@ def test_bad_request_is_answered_with_code_and_choice_and_nothing_is_lost(reques
     assert PIPELINE.plan(to_joints(HOME, START), scene(SPREAD)).ok
 
 
-def test_what_would_be_held_far_beyond_the_arm_is_refused():
+def test_attached_object_far_beyond_the_arm_is_refused():
     with_ball = scene(SPREAD)
-    ball = next(thing.id for thing in with_ball.objects if thing.role == "target")
+    ball = next(item.id for item in with_ball.objects if item.role == "target")
     far = {"attach": ball, "attach_pose": Pose(position=Vector3(z=1e7))}
     response = PIPELINE.plan(to_joints(HOME, START).model_copy(update=far), with_ball)
     assert response.error == "bad_scene" and "reaches 1e+07 m from a joint; the limit is 100 m" in response.message
@@ -147,14 +147,14 @@ def test_scene_in_another_frame_is_refused():
     assert PIPELINE.plan(to_joints(HOME, START), elsewhere).error == "bad_scene"
 
 
-def test_current_state_is_the_start_when_none_is_given():
+def test_current_state_is_the_default_start():
     request = PlanRequest(id="1", goal=JointGoal(named="home"))
     response = PIPELINE.plan(request, scene(), START)
     assert np.allclose(response.trajectory.points[0].positions, START, atol=1e-6)
     assert np.allclose(last(response), HOME, atol=1e-6)
 
 
-def test_scaling_of_the_request_makes_it_slower():
+def test_scaling_of_the_request_changes_the_duration():
     def duration(scaling) -> float:
         request = to_joints(HOME, START, velocity_scaling=scaling, acceleration_scaling=scaling)
         response = PIPELINE.plan(request, scene())
@@ -170,21 +170,21 @@ def test_speed_scale_stretches_straight_lines_only():
         assert times[0] / times[1] == pytest.approx(ratio)
 
 
-def test_scene_that_changes_is_planned_with_as_it_is_now():
+def test_plan_uses_the_newest_scene():
     request = to_pose(tool_down(0.45, 0.15, 0.1), above(0.45, -0.15, 0.1), straight=True)
     for y, ok in ((0.0, False), (0.4, True), (0.0, False)):
         objects = [*scene(box=False).objects, ball(0, 0.45, y, z=0.1)]
         assert PIPELINE.plan(request, scene().model_copy(update={"objects": objects})).ok is ok
 
 
-def test_planner_of_another_package_is_found_by_its_module():
-    given = Pipeline.model_validate({"planners": [{"name": "common.planning.planners.joint_move"}]})
-    pipeline = PlanningPipeline(ROBOT, CELL.motion, given)
+def test_planner_is_found_by_its_dotted_module():
+    entries = Pipeline.model_validate({"planners": [{"name": "common.planning.planners.joint_move"}]})
+    pipeline = PlanningPipeline(ROBOT, CELL.motion, entries)
     assert pipeline.planners == ["joint_move"]
     assert pipeline.plan(to_joints(HOME, START), scene()).planner == "joint_move"
 
 
-def test_validation_has_the_same_rule_for_contact_as_planning():
+def test_validation_applies_the_contact_rule_of_planning():
     x, y = BLOCK[0]
     close = scene([(x, y), (x + 0.0605, y)])
     start = above(x, y, 0.03, np.pi / 2 - 0.2)
@@ -203,35 +203,35 @@ def test_validation_has_the_same_rule_for_contact_as_planning():
     assert free_again(request, close, response)
 
 
-def test_path_whose_corners_turn_out_to_collide_is_stopped_at(monkeypatch):
+def test_colliding_blend_is_replaced_by_a_stop():
     wall = [*scene(box=False).objects, solid("wall", "fixture", "box", [0.5, 0.02, 0.4], (0.55, 0.0, 0.2))]
     blocked = scene().model_copy(update={"objects": wall})
     left, right = above(0.5, 0.3, 0.2), above(0.5, -0.3, 0.2)
 
-    def strict(trajectory, robot, world, **given):
+    def strict(trajectory, *_, **__):
         resting = np.abs(trajectory.velocities[1:-1]).max(axis=1) < 1e-9
         return None if resting.any() else Fault("collision", "waypoint 5 of 9: a collides with b", 5, ("a", "b"))
 
-    monkeypatch.setattr("common.planning.pipeline.validate", strict)
-    response = PIPELINE.plan(to_joints(left, right, planner="ompl"), blocked)
+    pipeline = PlanningPipeline(ROBOT, CELL.motion, CELL.pipeline, validator=strict)
+    response = pipeline.plan(to_joints(left, right, planner="ompl"), blocked)
     assert response.ok
     assert free_again(to_joints(left, right), blocked, response)
-    direct = PIPELINE.plan(to_joints(HOME, right, planner="ompl"), blocked)
+    direct = pipeline.plan(to_joints(HOME, right, planner="ompl"), blocked)
     assert direct.error == "collision"
     assert direct.message == "ompl: validation: waypoint 5 of 9: a collides with b"
     assert [a.error for a in direct.attempts] == ["", "collision"]
 
 
 @pytest.mark.parametrize("planner", ["lerp", "ptp", "trajopt"])
-def test_planner_that_the_pipeline_lacks_can_be_asked_for_by_name(planner):
+def test_planner_outside_the_pipeline_can_be_requested_by_name(planner):
     assert planner not in PIPELINE.planners
     request = to_joints(HOME, START, planner=planner)
     response = PIPELINE.plan(request, scene([]))
     assert response.ok and response.planner == planner, response.message
     assert free_again(request, scene([]), response)
     assert {a.planner for a in response.attempts} == {planner}
-    assert planner not in PIPELINE.planners, "and is not tried when nobody asks for it"
+    assert planner not in PIPELINE.planners, "it is not tried without a request"
 
 
-def test_module_that_the_pipeline_does_not_name_is_not_imported_for_a_request():
+def test_request_cannot_import_arbitrary_modules():
     assert PIPELINE.plan(to_joints(HOME, START, planner="os.path"), scene([])).error == "unknown_planner"

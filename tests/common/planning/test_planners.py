@@ -1,4 +1,4 @@
-"""All planners share the same checks: end at the goal, limits, free of collision at a finer step, times increase."""
+"""What distinguishes the planners: OMPL, straight lines of the tool, lerp; and time limits and cancellation."""
 
 import math
 import threading
@@ -8,24 +8,24 @@ import numpy as np
 import pytest
 from ompl import geometric as og
 
-from common.config import Pipeline
 from common.errors import ConfigError, UnknownName
-from common.messages import PlanningScene, PlanRequest, PlanResponse, Vector3
+from common.messages import Vector3
 from common.planning import retiming
 from common.planning.collision import CollisionWorld
 from common.planning.goal_sampling import distance_outside
+from common.planning.joint_paths import line
 from common.planning.kernel.library import library
 from common.planning.pipeline import PlanningPipeline
-from common.planning.planners import load_planner, planner_names
+from common.planning.planners import lerp, load_planner, planner_names
 from common.planning.problem import Cancel, Region
 from common.planning.trajectory import timed_path
 from common.planning.validation import fine_samples
 from common.robot.transforms import tool_down
+from tests.common.planning.planner_checks import AROUND, LEFT, RIGHT, assert_sound, wall, with_planner
 from tests.common.planning.planning_scenes import (
     CELL,
     HOME,
     ROBOT,
-    SPREAD,
     above,
     last,
     scene,
@@ -35,63 +35,13 @@ from tests.common.planning.planning_scenes import (
 )
 
 PIPELINE = PlanningPipeline(ROBOT, CELL.motion, CELL.pipeline)
-AROUND = scene(SPREAD)
 ALGORITHMS = ["RRTConnect", "RRT", "KPIECE1", "BKPIECE1", "LBKPIECE1", "AORRTC", "BITstar"]
 
 
-def with_planner(name: str, **options) -> PlanningPipeline:
-    entries = [{"name": name, "options": options}]
-    return PlanningPipeline(ROBOT, CELL.motion, Pipeline.model_validate({"planners": entries}))
-
-
-def assert_sound(request: PlanRequest, of: PlanningScene, response: PlanResponse) -> None:
-    assert response.ok, response.message
-    trajectory = timed_path(PlanResponse.model_validate(response.model_dump()).trajectory)
-    assert (np.diff(trajectory.times) > 0).all()
-    assert np.allclose(trajectory.positions[0], request.start, atol=1e-6)
-    assert np.abs(trajectory.velocities[[0, -1]]).max() < 1e-9
-    assert (np.abs(trajectory.velocities) <= 0.2 * ROBOT.velocity * 1.001).all()
-    assert (np.abs(trajectory.accelerations) <= 0.2 * ROBOT.acceleration * 1.001).all()
-    world = PIPELINE.world(request, of, request.start)
-    path, _ = fine_samples(trajectory, 0.005)
-    assert not any(world.collides(q) for q in path)
-    assert all(ROBOT.within_limits(q) for q in path)
-    assert response.attempts
-    assert response.attempts[-1].error == ""
-
-
-def wall() -> PlanningScene:
-    """A wall across the table that blocks the straight edge between both sides."""
-    extra = solid("wall", "fixture", "box", [0.5, 0.02, 0.4], (0.55, 0.0, 0.2))
-    return AROUND.model_copy(update={"objects": [*scene(box=False).objects, extra]})
-
-
-LEFT, RIGHT = above(0.5, 0.3, 0.2), above(0.5, -0.3, 0.2)
-
-
-@pytest.mark.parametrize("planner", ["joint_move", "ompl"])
-def test_joint_goal_is_reached(planner):
-    request = to_joints(LEFT, RIGHT, planner=planner)
-    response = PIPELINE.plan(request, AROUND)
-    assert_sound(request, AROUND, response)
-    assert np.allclose(last(response), LEFT, atol=1e-6)
-    assert response.planner == planner
-
-
-@pytest.mark.parametrize("planner", ["cartesian", "ompl"])
-def test_pose_goal_is_reached(planner):
-    T = tool_down(0.5, -0.05, 0.2, 0.3)
-    request = to_pose(T, above(0.4, -0.3, 0.2), planner=planner)
-    response = PIPELINE.plan(request, AROUND)
-    assert_sound(request, AROUND, response)
-    assert np.allclose(ROBOT.fk(last(response)), T, atol=2e-4)
-    assert response.fraction == 1.0
-
-
-def test_way_around_a_wall_is_found_where_the_straight_edge_is_blocked():
+def test_pipeline_finds_a_path_around_a_wall():
     request = to_joints(LEFT, RIGHT)
     response = PIPELINE.plan(request, wall())
-    assert_sound(request, wall(), response)
+    assert_sound(PIPELINE, request, wall(), response)
     errors = [a.error for a in response.attempts]
     if library() is None:
         assert response.planner == "ompl" and len(errors) == 1 + CELL.motion.planning_attempts
@@ -104,28 +54,28 @@ def test_way_around_a_wall_is_found_where_the_straight_edge_is_blocked():
 
 
 @pytest.mark.usefixtures("no_kernel")
-def test_ompl_finds_the_way_where_the_kernel_is_not_built():
+def test_ompl_plans_where_the_kernel_is_not_built():
     pipeline = PlanningPipeline(ROBOT, CELL.motion, CELL.pipeline)
     response = pipeline.plan(to_joints(LEFT, RIGHT, planning_attempts=1), wall())
-    assert_sound(to_joints(LEFT, RIGHT), wall(), response)
+    assert_sound(PIPELINE, to_joints(LEFT, RIGHT), wall(), response)
     assert response.planner == "ompl"
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 @pytest.mark.slow
-def test_each_algorithm_of_ompl_finds_a_way_around_a_wall(algorithm):
+def test_each_algorithm_of_ompl_finds_a_path_around_a_wall(algorithm):
     request = to_joints(LEFT, RIGHT, planning_attempts=1, planning_time=20)
     response = with_planner("ompl", algorithm=algorithm, improving_time=1.5).plan(request, wall())
-    assert_sound(request, wall(), response)
+    assert_sound(PIPELINE, request, wall(), response)
 
 
-def test_algorithm_that_is_not_known_is_refused_with_the_choices():
+def test_unknown_algorithm_or_planner_is_refused_with_the_choices():
     with pytest.raises(ConfigError, match=r"pipeline.planners.ompl.algorithm.*RRTConnect"):
         with_planner("ompl", algorithm="Dijkstra")
     with pytest.raises(UnknownName, match=r"cartesian, .*joint_move, .*ompl"):
         load_planner("dijkstra", {})
     with pytest.raises(ConfigError, match="cannot be imported"):
-        load_planner("nobody.planner", {})
+        load_planner("missing.planner", {})
     with pytest.raises(ConfigError, match=r"plan\(\) and Options"):
         load_planner("common.planning.path", {})
     assert {"cartesian", "joint_move", "lerp", "ompl"} <= set(planner_names())
@@ -140,7 +90,7 @@ def test_same_seed_gives_the_same_path_and_another_seed_another():
     assert path(1).shape != path(2).shape or not np.allclose(path(1), path(2))
 
 
-def test_best_of_several_attempts_is_kept():
+def test_best_of_several_attempts_is_returned():
     def least(attempts: int) -> float:
         request = to_joints(LEFT, RIGHT, seed=3, planner="ompl", planning_attempts=attempts)
         response = PIPELINE.plan(request, wall())
@@ -157,11 +107,11 @@ def test_sampled_path_ends_in_the_region_of_the_goal():
         T, RIGHT, planner="ompl", position_tolerance=tolerance, tilt_tolerance=0.25, yaw_tolerance=3.14
     )
     response = PIPELINE.plan(request, wall())
-    assert_sound(request, wall(), response)
+    assert_sound(PIPELINE, request, wall(), response)
     assert distance_outside(Region(T, np.full(3, 0.02), 0.25, 3.14), ROBOT.fk(last(response))) < 1e-3
 
 
-def test_region_knows_its_bounds():
+def test_distance_outside_a_region():
     T = tool_down(0.5, 0.0, 0.2, 0.0)
     region = Region(T, np.full(3, 0.02), 0.2, 0.5)
     assert distance_outside(region, tool_down(0.515, 0.0, 0.2, 0.4)) < 0
@@ -169,7 +119,7 @@ def test_region_knows_its_bounds():
     assert distance_outside(region, tool_down(0.5, 0.0, 0.2, 0.6)) == pytest.approx(0.1)
 
 
-def test_straight_line_keeps_the_tool_on_it_and_turns_it_evenly():
+def test_tool_follows_a_straight_line_and_turns_evenly():
     T_goal = tool_down(0.55, 0.1, 0.3, 0.8)
     start = above(0.4, -0.2, 0.2)
     T_start = ROBOT.fk(start)
@@ -185,7 +135,7 @@ def test_straight_line_keeps_the_tool_on_it_and_turns_it_evenly():
         assert T[2, 2] < -0.9999
 
 
-def test_line_that_ends_in_an_obstacle_says_where_and_between_what():
+def test_line_into_an_obstacle_is_reported_with_waypoint_and_pair():
     extra = solid("wall", "fixture", "box", [0.3, 0.02, 0.6], (0.5, 0.0, 0.3))
     blocked = scene(box=False)
     blocked.objects.append(extra)
@@ -199,33 +149,17 @@ def test_line_that_ends_in_an_obstacle_says_where_and_between_what():
     assert {a.planner for a in response.attempts} == {"cartesian"}
 
 
-def test_line_out_of_reach_says_how_far_it_goes():
+def test_line_out_of_reach_is_reported_with_its_fraction():
     response = PIPELINE.plan(to_pose(tool_down(1.2, -0.3, 0.2), RIGHT, straight=True), scene())
     assert response.error == "no_ik"
     assert 0 < response.fraction < 0.9
     assert "fraction" in response.message
 
 
-def test_goal_where_the_robot_stands_needs_no_motion():
-    for request in (to_joints(LEFT, LEFT), to_pose(ROBOT.fk(LEFT), LEFT), to_joints(LEFT, LEFT, planner="ompl")):
-        response = PIPELINE.plan(request, AROUND)
-        assert response.ok, response.message
-        assert np.allclose(last(response), LEFT, atol=1e-6)
-
-
-def test_unreachable_pose_ends_with_no_ik_from_every_planner():
+def test_unreachable_pose_ends_with_no_ik_of_every_planner():
     response = PIPELINE.plan(to_pose(tool_down(2.0, 0, 0.2), RIGHT, planning_time=5), AROUND)
     assert {a.error for a in response.attempts} == {"no_ik"}
     assert not response.ok
-
-
-def test_pose_inside_an_obstacle_is_named():
-    extra = solid("crate", "fixture", "box", [0.2, 0.2, 0.2], (0.5, 0.3, 0.2))
-    blocked = scene(box=False)
-    blocked.objects.append(extra)
-    response = PIPELINE.plan(to_pose(tool_down(0.5, 0.3, 0.2), RIGHT, planner="ompl"), blocked)
-    assert response.error == "goal_in_collision"
-    assert response.colliding[1] == "crate"
 
 
 @pytest.mark.parametrize("algorithm", ["AORRTC", "RRTConnect"])
@@ -248,29 +182,64 @@ def test_planning_ends_when_it_is_cancelled():
     assert PIPELINE.plan(to_joints(HOME, RIGHT), AROUND).ok
 
 
-def test_shortcuts_of_ompl_end_when_planning_is_cancelled_in_the_middle_of_them(monkeypatch):
-    cancel, asked = Cancel(), []
+def test_cancelling_ends_the_shortcuts_of_ompl(monkeypatch):
+    cancel, checked = Cancel(), []
 
     class CancelledAtOnce(og.PathSimplifier):
         def reduceVertices(self, path):
             cancel.set()
-            monkeypatch.setattr(CollisionWorld, "edge_free", lambda *ends: asked.append(ends))
+            monkeypatch.setattr(CollisionWorld, "edge_free", lambda *ends: checked.append(ends))
             return super().reduceVertices(path)
 
     monkeypatch.setattr(og, "PathSimplifier", CancelledAtOnce)
     response = PIPELINE.plan(to_joints(LEFT, RIGHT, planner="ompl"), wall(), cancel=cancel)
-    assert (response.error, asked) == ("cancelled", [])
+    assert (response.error, checked) == ("cancelled", [])
 
 
 @pytest.mark.parametrize(("late", "error"), [(525, ""), (575, "timeout")])
-def test_path_is_timed_within_a_tenth_of_the_budget_on_top_of_it(monkeypatch, late, error):
+def test_timing_has_a_tenth_of_the_budget_more(monkeypatch, late, error):
     monkeypatch.setattr(retiming, "monotonic", lambda: time.monotonic() + late)
     assert PIPELINE.plan(to_joints(LEFT, RIGHT, planner="ompl", planning_time=500.0), wall()).error == error
 
 
-@pytest.mark.parametrize("planner", ["cartesian", "ompl"])
-def test_planner_that_is_cancelled_before_it_begins_says_so(planner):
-    cancel = Cancel()
-    cancel.set()
-    response = PIPELINE.plan(to_pose(tool_down(0.5, 0.3, 0.2), RIGHT, planner=planner), wall(), cancel=cancel)
-    assert response.error == "cancelled"
+def test_lerp_path_is_a_straight_line_in_joint_space():
+    pipeline = with_planner("lerp")
+    request = to_joints(LEFT, RIGHT)
+    trajectory = assert_sound(pipeline, request, AROUND, pipeline.plan(request, AROUND))
+    span = LEFT - RIGHT
+    share = (trajectory.positions - RIGHT) @ span / (span @ span)
+    assert np.allclose(trajectory.positions, RIGHT + share[:, None] * span, atol=1e-9)
+    assert (np.diff(share) > 0).all()
+
+
+def test_line_has_the_requested_number_of_steps():
+    waypoints = line(RIGHT, LEFT, 40)
+    assert len(waypoints) == 41
+    assert np.allclose(np.diff(waypoints, axis=0), (LEFT - RIGHT) / 40)
+    assert np.array_equal(waypoints[-1], LEFT)
+
+
+@pytest.mark.parametrize("steps", [10, 40])
+def test_collision_is_reported_with_its_waypoint(steps):
+    response = with_planner("lerp", steps=steps).plan(to_joints(LEFT, RIGHT), wall())
+    waypoint = response.attempts[-1].waypoint
+    assert f"waypoint {waypoint} of {steps}: " in response.message
+    assert 0.2 < waypoint / steps < 0.6
+    assert response.fraction == pytest.approx((waypoint - 1) / steps)
+
+
+def test_another_ik_solution_is_tried_when_the_line_to_the_first_is_blocked(monkeypatch):
+    monkeypatch.setattr(lerp, "joint_goals", lambda *_, **__: [LEFT, above(0.4, -0.2, 0.3)])
+    response = with_planner("lerp").plan(to_pose(tool_down(0.4, -0.2, 0.3), RIGHT), wall())
+    assert np.allclose(last(response), above(0.4, -0.2, 0.3), atol=1e-6)
+
+
+def test_lerp_does_not_accept_straight_lines_of_the_tool():
+    response = with_planner("lerp").plan(to_pose(tool_down(0.5, 0.0, 0.3), RIGHT, straight=True), AROUND)
+    assert response.error == "no_planner"
+    assert "straight line" in response.message
+
+
+def test_invalid_number_of_steps_is_refused():
+    with pytest.raises(ConfigError, match=r"pipeline.planners.lerp.steps"):
+        with_planner("lerp", steps=0)

@@ -1,4 +1,4 @@
-"""Prisms are solid where the hull of their outline is, whatever the outline."""
+"""Prisms fill the hull of any outline."""
 
 import math
 
@@ -29,7 +29,7 @@ def touches(solid: coal.CollisionGeometry, x: float, y: float, z: float, radius:
 @settings(max_examples=60, deadline=None)
 @example([(0.0, 0.0), (0.0, 0.125), (3e-35, 0.0), (-0.125, 0.0)], 0.25)
 @given(points, st.floats(0.01, 0.3))
-def test_prism_holds_its_points_and_nothing_beyond_its_hull(outline, length):
+def test_prism_contains_its_points_and_nothing_outside_its_hull(outline, length):
     assume(not is_line([(round(x, 3), round(y, 3)) for x, y in outline]))
     solid = prism(outline, length)
     hull = convex_hull(np.array(outline))
@@ -53,7 +53,7 @@ def test_number_of_corners_does_not_matter(count):
     assert not touches(solid, 0.0505, 0.0, 0.0) and not touches(solid, 0.0, 0.0, 0.051)
 
 
-def thing(name: str, outline, position, length: float = 0.1) -> CollisionObject:
+def prism_object(name: str, outline, position, length: float = 0.1) -> CollisionObject:
     x, y, z = position
     return CollisionObject(id=name, role="target", shape="prism", dimensions=[length], outline=outline,
                            pose=Pose(position=Vector3(x=x, y=y, z=z)))
@@ -64,10 +64,10 @@ def along(*places: tuple[float, float]) -> PlanRequest:
     return PlanRequest(id="1", start=list(above(*places[0], HEIGHT)), goal=PathGoal(waypoints=poses))
 
 
-def test_prism_may_be_touched_by_those_allowed_only():
+def test_prism_may_be_touched_by_allowed_links_only():
     pipeline = PlanningPipeline(ROBOT, CELL.motion, CELL.pipeline)
-    around = PlanningScene(header=WORLD, objects=[thing("angle", ANGLE, (0.5, 0.0, 0.15))])
-    inside = along((0.5, -0.01), (0.49, -0.01))  # in the hull of the angle, not in its legs
+    around = PlanningScene(header=WORLD, objects=[prism_object("angle", ANGLE, (0.5, 0.0, 0.15))])
+    inside = along((0.5, -0.01), (0.49, -0.01))  # in the hull of the angle, outside its two sides
     response = pipeline.plan(inside, around)
     assert response.error == "start_in_collision"
     assert response.colliding[1] == "angle"
@@ -76,9 +76,9 @@ def test_prism_may_be_touched_by_those_allowed_only():
     assert pipeline.plan(along((0.5, 0.3), (0.45, 0.3)), around).ok
 
 
-def test_prism_without_area_is_refused_by_name():
+def test_prism_without_area_is_refused_with_its_name():
     pipeline = PlanningPipeline(ROBOT, CELL.motion, CELL.pipeline)
-    line = thing("line", [(0, 0), (0.01, 0.01), (0.02, 0.02)], (0.5, 0.3, 0.1))
+    line = prism_object("line", [(0, 0), (0.01, 0.01), (0.02, 0.02)], (0.5, 0.3, 0.1))
     response = pipeline.plan(along((0.5, 0.0), (0.45, 0.0)), PlanningScene(header=WORLD, objects=[line]))
     assert response.error == "bad_scene"
     assert "line: the 3 points of its outline lie on one line" in response.message

@@ -2,9 +2,10 @@ import numpy as np
 import pytest
 
 from common.planning.collision import CollisionWorld
-from common.planning.proximity import Proximity
-from tests.common.planning.planner_checks import AROUND, LEFT, RIGHT
-from tests.common.planning.planning_scenes import ROBOT, above, cache, held_scene, scene, touching
+from common.planning.joint_paths import line
+from common.planning.proximity import Proximity, SweptEdges
+from tests.common.planning.planner_checks import AROUND, LEFT, RIGHT, assert_sound, with_planner
+from tests.common.planning.planning_scenes import ROBOT, above, cache, held_scene, scene, solid, to_joints, touching
 
 LOW = above(0.5, 0.1, 0.06)
 
@@ -29,13 +30,13 @@ def test_gradient_is_that_of_the_distance():
             assert (more[pair] - less[pair]) / (2 * step) == pytest.approx(gradient, abs=0.03)
 
 
-def test_pairs_within_reach_are_found_again_wherever_the_path_moves():
+def test_cached_measurement_equals_a_fresh_one():
     measured = world()
-    remembering = Proximity(measured, 0.1)
+    caching = Proximity(measured, 0.1)
     rng = np.random.default_rng(0)
     path = np.linspace(RIGHT, LOW, 8)
     for _ in range(12):
-        near = remembering.measure(path)
+        near = caching.measure(path)
         fresh = Proximity(measured, 0.1).measure(path)
         assert np.array_equal(near.pair, fresh.pair)
         assert np.array_equal(near.position, fresh.position)
@@ -54,7 +55,7 @@ def test_distance_agrees_with_collision():
             assert measured.collides(q) == (least < 0)
 
 
-def test_nearest_pair_of_each_link_is_the_nearest():
+def test_nearest_reports_one_pair_of_each_link():
     measured = world()
     every = Proximity(measured, 0.2).measure(LOW[None])
     nearest = Proximity(measured, 0.2, nearest=True).measure(LOW[None])
@@ -64,14 +65,14 @@ def test_nearest_pair_of_each_link_is_the_nearest():
         assert distance == pytest.approx(every.distance[first[every.pair] == first[pair]].min())
 
 
-def test_links_of_the_robot_have_a_reach_of_their_own():
+def test_own_reach_applies_to_links_of_the_robot():
     measured = world(scene(box=False))
     near = Proximity(measured, 0.3, own_reach=0.01).measure(RIGHT[None])
     assert all(measured.bank.second[pair] >= measured.bank.robot_count for pair in near.pair)
     assert len(near.pair)
 
 
-def test_what_may_touch_pushes_nothing_away():
+def test_allowed_contacts_are_not_measured():
     at_ball = above(0.45, -0.1, 0.03)
     of = scene([(0.45, -0.1)])
     with_ball = by_pair(Proximity(world(of, at_ball), 0.02).measure(at_ball[None]))
@@ -82,6 +83,65 @@ def test_what_may_touch_pushes_nothing_away():
     assert Proximity(held, 0.02).measure(LEFT[None]).distance.min(initial=1.0) > 0
 
 
-def test_nothing_within_reach_is_no_pair():
+def test_no_pair_within_reach_gives_empty_arrays():
     near = Proximity(world(scene([(0.9, 0.6)], box=False)), 0.001).measure(np.array([LEFT, RIGHT]))
     assert near.gradient.shape == (0, ROBOT.dof)
+
+
+WALL = scene(box=False)
+WALL.objects.append(solid("wall", "fixture", "box", [0.4, 0.02, 0.3], (0.55, 0.0, 0.15)))
+
+
+@pytest.mark.parametrize("which", range(3))
+def test_swept_distance_bounds_all_positions_between_the_waypoints(which):
+    around = [WALL, AROUND, held_scene(scene([(0.5, 0.0)]), "ball_0")][which]
+    measured = world(around)
+    rng = np.random.default_rng(which)
+    joints = np.array([item.parentJoint for item in measured.bank.geometry.geometryObjects])
+    compared = 0
+    for _ in range(12):
+        a = np.clip(RIGHT + rng.uniform(0, 1) * (LEFT - RIGHT) + rng.normal(0, 0.2, 7), ROBOT.lower, ROBOT.upper)
+        b = np.clip(a + rng.normal(0, 0.06, 7), ROBOT.lower, ROBOT.upper)
+        swept = SweptEdges(measured, 0.2).measure(np.array([a, b]))
+        states = Proximity(measured, 0.3, nearest=True).measure(line(a, b, 20))
+        for pair, distance in zip(swept.pair, swept.distance, strict=True):
+            same = measured.bank.first[states.pair] == measured.bank.first[pair]
+            fixed = same & (joints[measured.bank.second[states.pair]] == 0)
+            if fixed.any():
+                compared += 1
+                assert distance < states.distance[fixed].min() + 2e-3  # a link that turns bulges out of its hull
+    assert compared > 10
+
+
+def test_step_along_the_swept_gradient_increases_the_distance():
+    measured = world(WALL)
+    path = np.array([above(0.5, -0.25, 0.15), above(0.5, -0.15, 0.15), above(0.5, -0.25, 0.15)])
+    pieces = SweptEdges(measured, 0.5)
+    near = pieces.measure(path)
+    tried = 0
+    for position, pair, distance, gradient in zip(near.position, near.pair, near.distance, near.gradient, strict=True):
+        if measured.pair(pair)[1] != "wall" or position != 2:  # the middle waypoint reaches farthest
+            continue
+        moved = path.copy()
+        moved[1] += 0.01 * gradient / np.linalg.norm(gradient)
+        then = pieces.measure(moved)
+        gained = then.distance[then.pair == pair].min() - distance
+        assert 0.3 < gained / (0.01 * np.linalg.norm(gradient)) < 1.5
+        tried += 1
+    assert tried
+
+
+def test_blade_between_two_states_is_measured_and_avoided():
+    around = scene(box=False)
+    around.objects.append(solid("blade", "fixture", "box", [0.4, 0.002, 0.3], (0.55, 0.0, 0.15)))
+    measured = world(around)
+    path = np.array([above(0.5, -0.15, 0.15), above(0.5, 0.16, 0.15)])
+    ends = Proximity(measured, 0.2).measure(path)
+    assert ends.distance.min() > 0
+    near = SweptEdges(measured, 0.02).measure(path)
+    assert min(near.distance) < -0.02
+    assert {measured.pair(pair)[1] for pair in near.pair[near.distance < 0]} == {"blade"}
+    pipeline = with_planner("trajopt", steps=10)
+    for height in (0.15, 0.2):
+        request = to_joints(above(0.5, 0.3, height), above(0.45, -0.3, height), planning_time=20.0)
+        assert_sound(pipeline, request, around, pipeline.plan(request, around))

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from common.control.trajectory import Trajectory
-from common.planning.path import blended_path, dense_path, distinct
+from common.planning.path import blended_path, dense_path, distinct, smoothed
 from common.planning.planners.joint_move import straight_profile
 from common.planning.retiming import limited_jerk, parametrise
 from common.planning.trajectory import TimedPath, join, sample, stretch
@@ -118,7 +118,7 @@ def test_lower_limits_take_longer():
 
 @settings(max_examples=20, deadline=None)
 @given(st.floats(0.05, 1))
-def test_stretched_trajectory_is_the_same_way_slower(scale):
+def test_stretched_trajectory_is_the_same_path_slower(scale):
     fast = parametrise(dense_path(np.array([[0, 0, 0], [0.5, 0.2, 0], [1.0, 0, 0.3]])), V, A)
     slow = stretch(fast, scale)
     assert slow.duration == pytest.approx(fast.duration / scale)
@@ -130,7 +130,7 @@ def test_stretched_trajectory_is_the_same_way_slower(scale):
 
 
 @pytest.mark.parametrize("scale", [0.0, -1.0, 1.5, float("nan")])
-def test_stretching_to_something_faster_or_nothing_is_refused(scale):
+def test_invalid_stretch_is_refused(scale):
     with pytest.raises(ValueError, match="scale"):
         stretch(parametrise(dense_path(np.array([[0, 0, 0], [1.0, 0, 0]])), V, A), scale)
 
@@ -142,8 +142,8 @@ def test_repeated_waypoints_are_one():
 
 @settings(max_examples=40, deadline=None)
 @given(waypoints, st.floats(0, 0.5), st.floats(10, 1000))
-def test_limited_jerk_keeps_all_four_limits_at_a_millisecond_and_stays_on_the_path(points, blend, quickness):
-    """Between the states as the executor has it, and as validation does."""
+def test_limited_jerk_respects_all_limits_and_stays_on_the_path(points, blend, quickness):
+    """Between the states by quintics, as in the executor, and by cubics, as in validation."""
     points, jerk = distinct(points), quickness * A
     parts = [parametrise(path, V, A) for path in blended_path(points, np.full(len(points), blend))]
     given_, limited = join(parts), limited_jerk(join(parts), jerk)
@@ -152,9 +152,9 @@ def test_limited_jerk_keeps_all_four_limits_at_a_millisecond_and_stays_on_the_pa
     assert max(hermite_peaks(limited)) <= 1.02
     longer = limited.duration - given_.duration
     assert 0 < longer <= len(parts) * 2.05 / quickness
-    longer /= len(parts)  # with a rest at each end of a part
+    longer /= len(parts)  # each part starts and ends at rest
     quintic = Trajectory(limited.times, limited.positions, limited.velocities, limited.accelerations, quintic=True)
-    step = max(1e-3, longer / 20)  # differences of finer ones are of rounded numbers
+    step = max(1e-3, longer / 20)  # finer differences would suffer from rounding
     t = np.arange(-3, limited.duration / step + 3) * step
     q = quintic.positions_at(t)
     for order, limit in ((1, V), (2, A), (3, jerk)):
@@ -165,8 +165,51 @@ def test_limited_jerk_keeps_all_four_limits_at_a_millisecond_and_stays_on_the_pa
         assert (np.abs(q - centred) <= A * longer**2 / 8 + 1e-9).all()
 
 
-def test_what_keeps_its_jerk_is_left_as_it_is():
+def test_trajectory_within_its_jerk_limit_is_not_changed():
     start, goal = np.zeros(3), np.array([1.0, -0.3, 1e-7])
     profile = straight_profile(start, goal, V, A, 100 * A)
     assert limited_jerk(profile, 100 * A) is profile
     assert limited_jerk(profile, 50 * A).duration > profile.duration
+
+
+def bending(points):
+    """Integral of the square of the curvature along a line [1/m]."""
+    edges = np.diff(points, axis=0)
+    lengths = np.linalg.norm(edges, axis=1)
+    directions = edges / lengths[:, None]
+    between = (lengths[:-1] + lengths[1:]) / 2
+    return float(((np.diff(directions, axis=0) ** 2).sum(axis=1) / between).sum())
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(3, 200), st.floats(1e-5, 1e-3), st.integers(0, 1000))
+def test_smoothed_points_stay_within_tolerances_and_ends_are_fixed(count, tolerance, seed):
+    rng = np.random.default_rng(seed)
+    points = np.cumsum(rng.uniform(-1e-3, 1e-3, (count, 3)) + np.array([1e-3, 0, 0]), axis=0)
+    tolerances = tolerance * rng.uniform(0, 1, count)
+    moved = smoothed(points, tolerances)
+    assert (np.linalg.norm(moved - points, axis=1) <= tolerances + 1e-12).all()
+    assert np.array_equal(moved[[0, -1]], points[[0, -1]])
+
+
+@pytest.mark.parametrize("radius", [0.005, 0.05])
+def test_noisy_circle_is_smoothed(radius):
+    rng = np.random.default_rng(1)
+    angles = np.cumsum(rng.uniform(4e-4, 1e-3, round(radius * 6000)) / radius)
+    points = np.column_stack([np.cos(angles), np.sin(angles)]) * radius
+    noisy = points + rng.uniform(-3e-5, 3e-5, points.shape)
+    noisy[[0, -1]] = points[[0, -1]]
+    moved = smoothed(noisy, np.full(len(points), 6e-5))
+    assert bending(moved) < 1.1 * bending(points)
+    assert np.linalg.norm(moved - points, axis=1).max() < 1.5e-4
+
+
+def test_smoothing_does_not_change_a_straight_line():
+    points = np.linspace([0, 0, 0], [0.1, 0.05, 0], 101)
+    assert np.abs(smoothed(points, np.full(101, 1e-4)) - points).max() < 1e-9
+
+
+def test_smoothing_does_not_change_fixed_or_too_few_points():
+    corner = np.array([[0, 0], [0.001, 0], [0.001, 0.001]], dtype=float)
+    assert np.array_equal(smoothed(corner, np.zeros(3)), corner)
+    assert np.array_equal(smoothed(corner[:2], np.ones(2)), corner[:2])

@@ -31,24 +31,24 @@ def tool_way(timed) -> np.ndarray:
     return np.array([ROBOT.fk(q)[:3, 3] for q in path])
 
 
-def resting(timed) -> int:
-    """Times at which the robot stands still between start and end."""
+def stops(timed) -> int:
+    """Number of stops between start and end."""
     return int((np.abs(timed.velocities[1:-1]).max(axis=1) < 1e-9).sum())
 
 
 def test_lines_without_a_blend_stop_at_their_corners():
     timed = assert_sound(PIPELINE, corners(0.0), EMPTY, PIPELINE.plan(corners(0.0), EMPTY))
-    assert resting(timed) == 2
+    assert stops(timed) == 2
     way = tool_way(timed)
     for corner in (MIDDLE, ABOVE, LEFT_ABOVE):
         assert np.linalg.norm(way - corner, axis=1).min() < 1e-4
 
 
 @pytest.mark.parametrize("radius", [0.02, 0.08])
-def test_corner_is_rounded_off_within_its_radius_without_a_stop(radius):
+def test_corner_is_blended_within_its_radius_without_a_stop(radius):
     response = PIPELINE.plan(corners(radius), EMPTY)
     timed = assert_sound(PIPELINE, corners(radius), EMPTY, response)
-    assert resting(timed) == 0
+    assert stops(timed) == 0
     way = tool_way(timed)
     for corner in (MIDDLE, ABOVE):
         assert 0.1 * radius < np.linalg.norm(way - corner, axis=1).min() < radius
@@ -63,7 +63,7 @@ def test_corner_is_rounded_off_within_its_radius_without_a_stop(radius):
     assert timed.duration < stopping.trajectory.points[-1].time_from_start
 
 
-def test_point_to_point_arc_and_line_follow_each_other():
+def test_sequence_of_point_to_point_arc_and_line():
     items = [
         SequenceItem(goal=PoseGoal(pose=matrix_to_pose(tool_down(0.5, 0.0, 0.3))), blend_radius=0.04),
         SequenceItem(
@@ -77,17 +77,17 @@ def test_point_to_point_arc_and_line_follow_each_other():
     response = PIPELINE.plan(request, EMPTY)
     timed = assert_sound(PIPELINE, request, EMPTY, response)
     assert np.allclose(last(response), HOME, atol=1e-6)
-    assert resting(timed) == 1
+    assert stops(timed) == 1
     assert np.linalg.norm(tool_way(timed) - (0.55, 0.1, 0.35), axis=1).min() < 1e-3
 
 
-def test_blend_that_is_larger_than_a_motion_is_refused():
+def test_blend_larger_than_a_motion_is_refused():
     response = PIPELINE.plan(corners(0.15), EMPTY)
     assert response.error == "bad_goal"
     assert response.message.startswith("weave: sequence: blend of items 2 and 3 of 3: blend_radius 0.15 m reaches")
 
 
-def test_motion_that_can_not_be_done_is_named_and_nothing_is_begun():
+def test_impossible_item_is_reported_and_no_trajectory_is_returned():
     items = [line_to(*MIDDLE, 0.02), line_to(1.2, 0.0, 0.2), line_to(*MIDDLE)]
     request = PlanRequest(id="1", start=list(RIGHT), goal=SequenceGoal(items=items))
     response = PIPELINE.plan(request, EMPTY)
@@ -97,7 +97,7 @@ def test_motion_that_can_not_be_done_is_named_and_nothing_is_begun():
     assert 1 / 3 < response.fraction < 2 / 3
 
 
-def test_corner_whose_blend_collides_is_named(monkeypatch):
+def test_colliding_blend_is_reported(monkeypatch):
     hit = Result(error="collision", message="waypoint 3 of 9: a collides with b", waypoint=3, colliding=("a", "b"))
     monkeypatch.setattr("common.planning.planners.sequence.blocked", lambda *_: hit)
     response = PIPELINE.plan(corners(0.05), EMPTY)
@@ -114,18 +114,18 @@ def test_straight_line_to_joint_positions_is_a_bad_goal():
     assert "item 1 of 1" in response.message
 
 
-def test_sequence_is_ended_when_it_is_cancelled():
+def test_cancelling_ends_a_sequence():
     cancel = Cancel()
     cancel.set()
     assert PIPELINE.plan(corners(0.02), EMPTY, cancel=cancel).error == "cancelled"
 
 
-def test_last_item_has_nothing_to_blend_with():
+def test_last_item_cannot_have_a_blend_radius():
     with pytest.raises(ValidationError, match="nothing follows"):
         SequenceGoal(items=[line_to(*MIDDLE, 0.1)])
 
 
-def test_blend_leaves_and_arrives_in_the_directions_of_the_motions():
+def test_blend_is_tangent_to_both_motions():
     before, after = np.linspace([0.0, 0.0], [1.0, 0.0], 51), np.linspace([1.0, 0.0], [1.0, 1.0], 51)
     rounded = blend(before, after)
     assert np.allclose(rounded[[0, -1]], [[0, 0], [1, 1]])
@@ -136,7 +136,7 @@ def test_blend_leaves_and_arrives_in_the_directions_of_the_motions():
     assert 0.1 < np.linalg.norm(rounded - [1, 0], axis=1).min() < 1
 
 
-def test_entry_is_where_the_tool_stays_within_the_radius():
+def test_blend_entry_is_where_the_tool_stays_within_the_radius():
     tool = np.linspace([0.0, 0, 0], [1.0, 0, 0], 11)
     assert blend_entry(tool, tool[-1], 0.25) == 8
     with pytest.raises(NoBlend):

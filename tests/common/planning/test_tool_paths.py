@@ -1,4 +1,4 @@
-"""Paths of several straight lines of the tool: they stay on the lines, at the speed that is asked for."""
+"""Paths of several straight lines of the tool: they stay on the lines at the requested speed."""
 
 import math
 
@@ -55,19 +55,19 @@ def off_lines(tip: np.ndarray, points) -> np.ndarray:
 
 @settings(max_examples=12, deadline=None)
 @given(st.lists(st.tuples(st.integers(-60, 60), st.integers(-60, 60)), min_size=3, max_size=8, unique=True))
-def test_tool_stays_within_a_tenth_of_a_millimetre_of_any_polyline(offsets):
+def test_tool_stays_within_0_1_mm_of_any_polyline(offsets):
     points = [(0.5 + x / 1000, y / 1000) for x, y in [*offsets, offsets[0]]]
     trajectory = traced(along(points, tool_speed=0.1))
     tip = tips(trajectory)
     assert off_lines(tip, points).max() < 1e-4
     ends = ROBOT.fk(trajectory.positions[0])[:3, 3], ROBOT.fk(trajectory.positions[-1])[:3, 3]
     assert np.linalg.norm(ends[0] - ends[1]) < 1e-4
-    for x, y in points:  # no corner is cut off
+    for x, y in points:  # no corner is skipped
         assert np.linalg.norm(tip - (x, y, HEIGHT), axis=1).min() < 4e-4  # the tips are 0.2 mm apart
 
 
 @pytest.mark.parametrize("points", [SQUARE, circle(0.05, 360), circle(0.05, 20)], ids=["square", "circle", "polygon"])
-def test_tool_keeps_its_speed_away_from_corners(points):
+def test_tool_has_constant_speed_away_from_corners(points):
     speed = 0.05
     trajectory = traced(along(points, tool_speed=speed, velocity_scaling=0.5))
     dt = 0.002
@@ -92,7 +92,7 @@ def test_without_a_speed_the_path_is_as_fast_as_limits_allow():
     assert (np.abs(fast.accelerations) <= 0.2 * ROBOT.acceleration * 1.001).all()
 
 
-def test_turns_of_the_tool_are_followed_too():
+def test_rotations_of_the_tool_are_followed():
     yaws = [0.0, 0.5, 0.5, -0.3]
     places = [(0.45, 0.0), (0.5, 0.05), (0.5, 0.05 + 1e-3), (0.5, 0.05 + 1e-3)]
     poses = [tool_down(x, y, HEIGHT, yaw) for (x, y), yaw in zip(places, yaws, strict=True)]
@@ -101,7 +101,7 @@ def test_turns_of_the_tool_are_followed_too():
     assert np.allclose(ROBOT.fk(trajectory.positions[-1]), poses[-1], atol=2e-4)
 
 
-def test_path_that_leaves_the_reach_is_refused_with_the_point_and_the_reason():
+def test_path_out_of_reach_is_refused_with_point_and_reason():
     points = [(0.6, 0.0), (0.65, 0.1), (1.2, 0.1), (0.6, 0.0)]
     response = PIPELINE.plan(along(points), EMPTY)
     assert not response.ok
@@ -120,7 +120,7 @@ def test_path_into_an_obstacle_is_refused_with_the_pair():
     assert "point 3 of 3" in response.message and "collides with wall" in response.message
 
 
-def test_fraction_that_is_asked_for_decides():
+def test_min_fraction_decides_about_a_partial_path():
     points = [(0.5, 0.0), (0.6, 0.0), (1.2, 0.0)]
     assert not PIPELINE.plan(along(points, min_fraction=0.9), EMPTY).ok
     response = PIPELINE.plan(along(points, min_fraction=0.1), EMPTY)
@@ -128,20 +128,20 @@ def test_fraction_that_is_asked_for_decides():
     assert 0.1 < response.fraction < 0.9
 
 
-def test_path_that_begins_elsewhere_is_refused():
+def test_path_that_starts_elsewhere_is_refused():
     response = PIPELINE.plan(along(SQUARE, start=HOME), EMPTY)
     assert response.error == "start_mismatch"
     assert "away from the path's first pose" in response.message
 
 
-def test_path_of_one_place_needs_no_motion():
+def test_path_of_one_position_needs_no_motion():
     for points in ([SQUARE[0]], [SQUARE[0]] * 3):
         trajectory = traced(along(points))
         assert np.abs(np.diff(trajectory.positions, axis=0)).max() < 1e-9
 
 
 @pytest.mark.parametrize("planner", ["ompl", "joint_move"])
-def test_planners_that_can_not_follow_a_path_say_so(planner):
+def test_planners_without_paths_refuse_them(planner):
     request = along(SQUARE).model_copy(update={"planner": planner})
     response = PIPELINE.plan(request, EMPTY)
     assert response.error == "no_planner"

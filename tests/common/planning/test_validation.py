@@ -49,17 +49,17 @@ def test_sound_trajectory_has_no_fault():
         (replace(GOOD, positions=GOOD.positions + np.array([0, 0, 0, 3.0, 0, 0, 0])), "start_mismatch"),
     ],
 )
-def test_what_a_controller_would_refuse_is_found(trajectory, code):
+def test_trajectory_that_a_controller_would_refuse_is_found(trajectory, code):
     assert numbers(trajectory) == code
 
 
-def test_start_elsewhere_is_found_and_the_joint_named():
+def test_wrong_start_is_found_with_the_joint():
     fault = check_numbers(GOOD, ROBOT, start=HOME + 0.01 * np.eye(7)[2], velocity=V, acceleration=A)
     assert fault.code == "start_mismatch"
     assert "panda_joint3" in fault.message
 
 
-def test_position_beyond_a_limit_is_found():
+def test_position_outside_a_limit_is_found():
     away = np.array([0, 0, 0, 0, 0, 0, 3.0])
     assert numbers(replace(GOOD, positions=GOOD.positions + away), start=HOME + away) == "position_limit"
 
@@ -77,7 +77,7 @@ def test_collision_between_states_is_found_with_waypoint_and_pair():
     assert f"waypoint {fault.waypoint} of" in fault.message
 
 
-def test_samples_are_no_farther_apart_than_the_step():
+def test_fine_samples_are_at_most_one_step_apart():
     path, owners = fine_samples(GOOD, 0.01)
     assert np.abs(np.diff(path, axis=0)).max() <= 0.01 + 1e-9
     assert np.array_equal(path[[0, -1]], GOOD.positions[[0, -1]])
@@ -85,7 +85,7 @@ def test_samples_are_no_farther_apart_than_the_step():
 
 
 @pytest.mark.skipif(library() is None, reason="the planning kernel is not built")
-def test_collision_between_the_states_that_are_looked_at_is_found():
+def test_kernel_finds_a_collision_between_checked_states():
     turned = 1.6 * np.eye(7)[0]
     positions, still = np.stack([HOME, HOME + turned]), np.zeros((2, 7))
     swing = TimedPath(np.array([0.0, 10.0]), positions, still, 0.06 * np.stack([turned, -turned]))

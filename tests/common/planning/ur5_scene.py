@@ -1,4 +1,4 @@
-"""The UR5 on its pillar beside the block on which objects stand."""
+"""The UR5 on its pillar next to the block that carries objects."""
 
 from __future__ import annotations
 

@@ -15,8 +15,8 @@ from common.clock import Clock
 from common.errors import Refused
 from common.process.in_process import running_service
 from common.process.task_runner import TaskRunner
+from common.tasks.monitoring import LivenessWatchdog
 from common.tasks.stages import Command, View
-from common.tasks.watchdogs import LivenessWatchdog
 from common.time_source import wall_ns
 from common.transport.bus import Bus
 from common.transport.local import LocalNetwork

@@ -53,7 +53,7 @@ def test_maximum_number_of_solids_fits_into_the_file() -> None:
 
 
 @pytest.mark.parametrize(("wrong", "message"), [
-    ({"shape": None}, "has a shape"), ({"shape": "mesh"}, "shape"), ({"pose": None}, "has a pose"),
+    ({"shape": None}, "needs a shape"), ({"shape": "mesh"}, "shape"), ({"pose": None}, "needs a pose"),
     ({"dimensions": [0.1]}, "3 dimensions"), ({"dimensions": [0.1, 0.1, 0.0]}, "0.001"),
     ({"dimensions": [0.1, 0.1, 11.0]}, "10"), ({"dimensions": [0.1, 0.1, float("nan")]}, "finite"),
     ({"dimensions": ["0.1", 0.1, 0.1]}, "number"), ({"pose": {"position": {"z": -10.5}}}, "position.z"),

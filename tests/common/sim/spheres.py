@@ -1,4 +1,4 @@
-"""Spheres of the simulated world, as its messages tell them."""
+"""Spheres of the simulated world as messages and images."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from common.sim.rendering import draw
 
 
 def spheres(centres: npt.ArrayLike, around: Surroundings | None = None, states: Sequence[str] = ()) -> WorldObjects:
-    """Spheres with their centres (n, 3) there [m], of the size and colour of the surroundings, on the table."""
+    """Return spheres at centers (n, 3) [m], with the size and color of the surroundings."""
     usual = around or Surroundings()
     r, g, b = usual.ball_color
     size = 2 * usual.ball_radius
@@ -33,5 +33,5 @@ def spheres(centres: npt.ArrayLike, around: Surroundings | None = None, states: 
 def draw_spheres(
     centres: npt.ArrayLike, camera: Pinhole, around: Surroundings, **options: Any
 ) -> npt.NDArray[np.uint8]:
-    """A plain picture of spheres."""
+    """Render a plain image of spheres."""
     return draw(spheres(centres, around).objects, camera, around, **options)

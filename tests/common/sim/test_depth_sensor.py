@@ -33,12 +33,12 @@ def tilted(degrees, middle=1.0):
     return np.tile(z.astype(np.float32), (240, 1))
 
 
-def test_without_a_baseline_depth_is_as_it_is():
+def test_zero_baseline_returns_the_true_depth():
     depth = step()
     assert measured(depth, baseline=0.0) is depth
 
 
-def test_steps_of_depth_grow_with_its_square():
+def test_depth_quantization_grows_with_squared_depth():
     sizes = []
     for z in (0.5, 1.0, 2.0):
         seen = np.unique(measured(tilted(5.0, z), disparity_noise=0.0, edge_noise=0.0))
@@ -48,7 +48,7 @@ def test_steps_of_depth_grow_with_its_square():
     assert sizes == sorted(sizes)
 
 
-def test_random_error_grows_with_the_square_of_depth():
+def test_depth_noise_grows_with_squared_depth():
     for z in (0.5, 1.0, 2.0):
         error = measured(plane(z), disparity_step=0.0, disparity_noise=0.1, edge_noise=0.0) - z
         assert np.nanstd(error) == pytest.approx(0.1 * z**2 / (CAMERA.fx * BASELINE), rel=0.05)
@@ -56,7 +56,7 @@ def test_random_error_grows_with_the_square_of_depth():
 
 
 @pytest.mark.parametrize("side", [1, -1])
-def test_what_stands_before_something_has_a_shadow_on_the_side_away_from_the_projector(side):
+def test_foreground_casts_a_depth_shadow_away_from_the_projector(side):
     lost = np.isnan(measured(step(), baseline=side * BASELINE, **EXACT))
     wide = CAMERA.fx * BASELINE * (1 / 0.5 - 1 / 0.8)
     columns = np.flatnonzero(lost[120])
@@ -65,14 +65,14 @@ def test_what_stands_before_something_has_a_shadow_on_the_side_away_from_the_pro
     assert not lost[:80].any() and not lost[160:].any()
 
 
-def test_what_is_thinner_than_its_shadow_is_wide_lets_light_pass_on_both_sides():
+def test_shadow_of_a_thin_object_is_as_wide_as_the_object():
     depth = plane()
     depth[:, 150:154] = 0.5
     lost = np.isnan(measured(depth, **EXACT))[120]
     assert 3 <= lost.sum() <= 6 and np.diff(np.flatnonzero(lost)).max() == 1
 
 
-def test_edges_are_where_noise_is_and_surfaces_are_smooth():
+def test_edge_noise_affects_edges_only():
     depth = step(near=0.78)
     apart = np.abs(measured(depth, disparity_noise=0.0, disparity_step=0.0) - depth) > 1e-4
     at_edge = np.zeros_like(apart)
@@ -81,7 +81,7 @@ def test_edges_are_where_noise_is_and_surfaces_are_smooth():
     assert apart[90:150, 149:151].mean() > 0.1 and not apart[~at_edge].any()
 
 
-def test_steep_surfaces_are_noisy_and_then_lost():
+def test_steep_surfaces_are_noisy_and_steeper_ones_unmeasured():
     noise = {angle: np.nanstd((measured(tilted(angle), disparity_step=0.0, edge_noise=0.0, steepest=90.0)
                                - tilted(angle))[:, 155:165]) for angle in (0, 50, 75)}
     assert noise[50] == pytest.approx(noise[0], rel=0.1) and noise[75] > 2 * noise[0]
@@ -89,7 +89,7 @@ def test_steep_surfaces_are_noisy_and_then_lost():
     assert not np.isnan(measured(tilted(60), steepest=70.0, edge_noise=0.0)[:, 155:165]).any()
 
 
-def test_where_there_is_nothing_nothing_is_measured():
+def test_background_has_no_depth():
     depth = plane()
     depth[:50] = np.inf
     depth[50:60] = np.nan

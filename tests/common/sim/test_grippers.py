@@ -23,14 +23,14 @@ BAR = ObjectConfig(id="bar", shape="box", size=(0.05, 0.20), height=0.04, x=0.5,
 
 
 class Rig:
-    """A hand in the simulated world, moved and told by hand."""
+    """A gripper in the simulated world, driven by the test."""
 
     def __init__(self, gripper: GripperConfig, thing: ObjectConfig) -> None:
         self.world = KinematicWorld(World(count=0), [thing], None, gripper)
         self.fingers, self.now = SimulatedFingers(gripper, gripper.max_width), 100.0
 
-    def be_at(self, x: float, y: float, z: float, yaw: float = 0.0, width: float | None = None) -> None:
-        """Be there and do what was told until it is done."""
+    def move(self, x: float, y: float, z: float, yaw: float = 0.0, width: float | None = None) -> None:
+        """Move there and run the command to completion."""
         hand = tool_down(x, y, z, yaw)
         if width is not None:
             self.fingers.command(width, self.now)
@@ -44,7 +44,7 @@ class Rig:
     def holding(self) -> bool:
         return self.fingers.read(self.now).holding and bool(self.world.held)
 
-    def place(self, name: str) -> np.ndarray:
+    def position(self, name: str) -> np.ndarray:
         from common.messages import Header
 
         thing = next(thing for thing in self.world.objects(Header()).objects if thing.id == name)
@@ -52,35 +52,35 @@ class Rig:
 
 
 @pytest.mark.parametrize(("thing", "top"), [(BALL, 0.06), (BAR, 0.04)])
-def test_cup_takes_what_its_lip_touches_carries_it_and_lets_it_fall(thing: ObjectConfig, top: float) -> None:
+def test_cup_picks_carries_and_releases_an_object(thing: ObjectConfig, top: float) -> None:
     rig = Rig(CUP, thing)
-    before = rig.place(thing.id)
-    rig.be_at(0.5, 0.0, top)
-    assert not rig.holding  # it does not draw yet
-    rig.be_at(0.5, 0.0, top, width=0.0)
+    before = rig.position(thing.id)
+    rig.move(0.5, 0.0, top)
+    assert not rig.holding  # suction is off
+    rig.move(0.5, 0.0, top, width=0.0)
     assert rig.holding
-    rig.be_at(0.4, 0.1, top + 0.2)
-    assert rig.place(thing.id) == pytest.approx(np.add(before, (-0.1, 0.1, 0.2)), abs=1e-6)
-    rig.be_at(0.4, 0.1, top + 0.2, width=CUP.max_width)
-    assert not rig.holding and rig.place(thing.id) == pytest.approx(np.add(before, (-0.1, 0.1, 0.0)), abs=1e-6)
+    rig.move(0.4, 0.1, top + 0.2)
+    assert rig.position(thing.id) == pytest.approx(np.add(before, (-0.1, 0.1, 0.2)), abs=1e-6)
+    rig.move(0.4, 0.1, top + 0.2, width=CUP.max_width)
+    assert not rig.holding and rig.position(thing.id) == pytest.approx(np.add(before, (-0.1, 0.1, 0.0)), abs=1e-6)
 
 
 @pytest.mark.parametrize(("x", "z"), [(0.5, 0.08), (0.53, 0.06), (0.5, 0.03)])
-def test_cup_draws_nothing_above_beside_or_within_a_ball(x: float, z: float) -> None:
+def test_cup_picks_nothing_without_full_contact(x: float, z: float) -> None:
     rig = Rig(CUP, BALL)
-    rig.be_at(x, 0.0, z, width=0.0)
+    rig.move(x, 0.0, z, width=0.0)
     assert not rig.holding and rig.fingers.read(rig.now).width == pytest.approx(0.0, abs=1e-6)
 
 
-def test_cup_that_draws_takes_what_it_comes_to() -> None:
+def test_active_cup_picks_on_contact() -> None:
     rig = Rig(CUP, BALL)
-    rig.be_at(0.5, 0.0, 0.2, width=0.0)
+    rig.move(0.5, 0.0, 0.2, width=0.0)
     assert not rig.holding
-    rig.be_at(0.5, 0.0, 0.06)
+    rig.move(0.5, 0.0, 0.06)
     assert rig.holding
 
 
-def test_lip_must_lie_on_the_object_all_round() -> None:
+def test_complete_lip_must_touch_the_object() -> None:
     solid = solid_of(BAR)
     cup = SuctionCup(lip_radius=0.012, give=0.002)
     below = np.diag([1.0, -1.0, -1.0, 1.0])  # the tool looks down; the top of the bar is at its tip
@@ -99,15 +99,15 @@ def test_lip_must_lie_on_the_object_all_round() -> None:
 
 @pytest.mark.parametrize(("axis", "yaw", "takes"), [
     ("y", 0.0, False), ("y", math.pi / 2, True), ("x", 0.0, True), ("x", math.pi / 2, False)])
-def test_fingers_close_along_the_axis_that_the_robot_file_names(axis: str, yaw: float, takes: bool) -> None:
+def test_fingers_close_along_the_configured_axis(axis: str, yaw: float, takes: bool) -> None:
     rig = Rig(GripperConfig.model_validate({**FINGERS, "closing_axis": axis}), BAR)  # 50 mm along x, 200 along y
-    rig.be_at(0.5, 0.0, 0.02, yaw, width=0.0)
+    rig.move(0.5, 0.0, 0.02, yaw, width=0.0)
     assert rig.holding is takes
 
 
 def test_gripper_has_joints_or_a_cup() -> None:
     assert finger_positions(CUP, 0.04) == []
-    with pytest.raises(ValidationError, match="needs the joints of its fingers, or a cup"):
+    with pytest.raises(ValidationError, match="needs either joints or a cup"):
         GripperConfig(links=[])
-    with pytest.raises(ValidationError, match="needs the joints of its fingers, or a cup"):
+    with pytest.raises(ValidationError, match="needs either joints or a cup"):
         GripperConfig(links=[], joints=["a"], cup=SuctionCup())

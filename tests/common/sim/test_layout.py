@@ -24,11 +24,11 @@ def places_of(world: World, seed: int, accepts: object = anywhere) -> list[tuple
     return [(thing.x, thing.y) for thing in layout(world, seed, accepts)]  # type: ignore[arg-type]
 
 
-def test_fixed_layout_is_the_first_spots(world_config: World) -> None:
+def test_fixed_layout_uses_the_first_spots(world_config: World) -> None:
     assert places_of(changed(world_config, count=3), 1) == world_config.spots[:3]
 
 
-def test_given_balls_replace_layout_and_count(world_config: World) -> None:
+def test_explicit_balls_override_layout_and_count(world_config: World) -> None:
     assert places_of(changed(world_config, balls=[(0.3, 0.0)], layout="random"), 1) == [(0.3, 0.0)]
 
 
@@ -44,7 +44,7 @@ def within_reach(x: float, y: float, z: float) -> bool:
 
 
 @given(seed=st.integers(0, 2**31 - 1), count=st.integers(1, 8))
-def test_random_layout_is_apart_seen_reachable_and_clear_of_the_box(
+def test_random_layout_is_separated_visible_reachable_and_clear_of_the_container(
     world_config: World, seed: int, count: int
 ) -> None:
     config = changed(world_config, layout="random", count=count)
@@ -58,13 +58,13 @@ def test_random_layout_is_apart_seen_reachable_and_clear_of_the_box(
     assert len(KinematicWorld(config, objects).ids) == count
 
 
-def test_other_seed_gives_another_layout(world_config: World) -> None:
+def test_layout_depends_on_the_seed(world_config: World) -> None:
     config = changed(world_config, layout="random")
     assert places_of(config, 1) != places_of(config, 2)
 
 
 @given(x=st.floats(0.0, 0.8), y=st.floats(-0.5, 0.5))
-def test_ball_in_the_picture_is_seen_with_every_point_of_its_surface(world_config: World, x: float, y: float) -> None:
+def test_sphere_in_image_means_its_complete_surface_is_visible(world_config: World, x: float, y: float) -> None:
     camera, radius = world_config.camera, 0.03
     turn = np.linspace(0, 2 * math.pi, 40)
     tilt = np.linspace(0, math.pi, 20)[:, None]
@@ -78,13 +78,13 @@ def test_ball_in_the_picture_is_seen_with_every_point_of_its_surface(world_confi
 
 
 @pytest.mark.parametrize("accepts", [lambda *at: False, lambda x, y, z: math.dist((x, y), (0.4, -0.2)) < 0.05])
-def test_layout_that_is_not_found_is_a_configuration_error(world_config: World, accepts: object) -> None:
+def test_impossible_random_layout_is_a_configuration_error(world_config: World, accepts: object) -> None:
     config = changed(world_config, layout="random")
     with pytest.raises(ConfigError, match=r"world\.objects: 7 objects fit no random layout"):
         layout(config, 1, accepts)  # type: ignore[arg-type]
 
 
-def test_camera_that_looks_up_has_no_random_layout(world_config: World) -> None:
+def test_random_layout_needs_a_camera_that_looks_down(world_config: World) -> None:
     camera = world_config.camera.model_copy(update={"rpy": (0.0, 0.0, 0.0)})
     config = changed(world_config, layout="random", camera=camera, cameras={"camera": camera})
     with pytest.raises(ConfigError, match=r"world\.camera\.rpy"):

@@ -31,7 +31,7 @@ PLACES = [(0.4, 0.0, 0.0), (0.68, 0.38, 0.0), (0.15, -0.4, 0.0)]
 
 
 @pytest.mark.parametrize("place", PLACES)
-def test_lens_shows_things_where_opencv_says(place):
+def test_lens_distortion_matches_opencv(place):
     lens = Lens(BENT, distorted=True, rectify=False)
     plain = Pinhole.from_config(BENT)
     seen = middle(lens.distort(spot(Pinhole.from_config(lens.rendered), place)))
@@ -43,27 +43,27 @@ def test_lens_shows_things_where_opencv_says(place):
 
 
 @pytest.mark.parametrize("place", PLACES)
-def test_what_is_rectified_is_where_a_pinhole_sees_it(place):
+def test_rectified_image_matches_a_pinhole(place):
     lens = Lens(BENT, distorted=True)
     picture = lens.rectify(lens.distort(spot(Pinhole.from_config(lens.rendered), place)))
     np.testing.assert_allclose(middle(picture), Pinhole.from_config(BENT).project(place), atol=0.1)
     assert lens.d == [0.0] * 5
 
 
-def test_pictures_are_drawn_as_wide_as_the_lens_sees_and_no_wider():
+def test_rendered_image_covers_the_lens_field_of_view():
     lens = Lens(BENT, distorted=True)
     assert 640 < lens.rendered.width < 1000 and 480 < lens.rendered.height < 800 and not lens.rendered.d
     white = np.full((lens.rendered.height, lens.rendered.width, 3), 200, np.uint8)
     assert lens.distort(white).min() == 200, "no black corners"
 
 
-def test_without_distortion_nothing_is_done():
+def test_lens_without_distortion_returns_the_same_image():
     picture = np.zeros((480, 640, 3), np.uint8)
     for lens in (Lens(BENT), Lens(CameraConfig(), distorted=True)):
         assert lens.distort(picture) is picture and lens.rectify(picture) is picture
 
 
-def test_a_lens_that_bends_everything_is_refused():
+def test_extreme_distortion_is_rejected():
     with pytest.raises(ConfigError, match=r"world\.camera\.d"):
         Lens(CameraConfig(d=[-1.5, 0.0]), distorted=True)
 
@@ -74,30 +74,30 @@ def sphere(x, stamp):
     return WorldObjects(header=Header(stamp=stamp), objects=[thing])
 
 
-def test_what_moves_was_elsewhere_within_the_exposure():
+def test_moving_object_is_extrapolated_back_within_the_exposure():
     movement = ObjectMotion()
     for number in range(3):
         movement.update(sphere(0.4 + 0.01 * number, 100_000_000 * number))  # 0.1 m/s, at ten pictures a second
     now = 200_000_000
     assert movement.objects(0.02, now)[0].pose.position.x == pytest.approx(0.418)
     assert movement.objects(0.0, now)[0].pose.position.x == pytest.approx(0.42)
-    assert movement.objects(0.02, now + 500_000_000)[0].pose.position.x == pytest.approx(0.42), "it stands by now"
+    assert movement.objects(0.02, now + 500_000_000)[0].pose.position.x == pytest.approx(0.42), "too old"
 
 
-def test_what_was_put_elsewhere_did_not_fly_there():
+def test_repositioned_object_has_no_velocity():
     movement = ObjectMotion()
     movement.update(sphere(0.0, 0))
     movement.update(sphere(0.6, 50_000_000))
     assert movement.objects(0.02, 50_000_000)[0].pose.position.x == pytest.approx(0.6)
 
 
-def test_joints_were_where_their_velocities_say():
+def test_joints_are_extrapolated_back_by_their_velocities():
     state = JointState(header=Header(), name=["a", "b"], position=[1.0, 2.0], velocity=[0.5, 0.0])
     assert joints_ago(state, 0.1).position == pytest.approx([0.95, 2.0])
     assert joints_ago(state, 0.0) is state
 
 
-def test_times_of_an_exposure_are_even_and_end_with_it():
+def test_sample_times_are_even_and_end_with_the_exposure():
     assert list(sample_times(0.02, 1)) == [0.0]
     assert list(sample_times(0.02, 3)) == pytest.approx([0.02, 0.01, 0.0])
 
@@ -107,7 +107,7 @@ def camera(**parameters):
     return SimulatedCamera(CELL.world, Scenery(), CELL.robot, config, np.random.default_rng(0), plain=True)
 
 
-def test_what_moves_is_blurred_along_its_way_by_as_much_as_it_moved():
+def test_motion_blur_equals_the_motion_within_the_exposure():
     still, moving = camera(), camera(sub_exposures=5)
     for one in (still, moving):
         table = one.capture(WorldObjects(), None, 0).colour.astype(int)
@@ -121,7 +121,7 @@ def test_what_moves_is_blurred_along_its_way_by_as_much_as_it_moved():
             assert rows - sharp == pytest.approx(2 * 0.01 * 520 / 0.77, abs=3)
 
 
-def test_light_that_changes_is_seen_at_once():
+def test_changed_light_affects_the_next_image():
     config = CameraParameters()
     one = SimulatedCamera(CELL.world, Scenery(), CELL.robot, config, np.random.default_rng(0), plain=True)
     bright = one.capture(WorldObjects(), None, 0).colour

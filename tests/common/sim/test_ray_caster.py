@@ -52,7 +52,7 @@ def triangles(seed, count):
 @given(seed=st.integers(0, 10**6), count=st.integers(1, 12))
 @example(seed=69, count=1)  # reaches behind the camera: what is cut is what lies nearer than NEAREST, however far aside
 @settings(max_examples=40, deadline=None)
-def test_every_pixel_of_random_triangles_is_what_its_ray_meets(seed, count):
+def test_ray_caster_matches_single_rays_for_random_triangles(seed, count):
     corners = triangles(seed, count)
     colors = np.random.default_rng(seed).integers(0, 256, (count, 3)) / 255
     meshes = [Mesh(c[None], tuple(map(float, color))) for c, color in zip(corners, colors, strict=True)]
@@ -65,7 +65,7 @@ def test_every_pixel_of_random_triangles_is_what_its_ray_meets(seed, count):
 
 
 @pytest.mark.parametrize("name", WORLDS)
-def test_pictures_of_the_worlds_are_what_single_rays_meet(name):
+def test_ray_caster_matches_single_rays_for_the_worlds(name):
     camera, picture, depth = seen_world(name)
     objects = [object_mesh(world_object(o)) for o in world(name).objects]
     meshes = [fixture_mesh(f) for f in world(name).fixtures] + objects
@@ -82,7 +82,7 @@ def test_pictures_of_the_worlds_are_what_single_rays_meet(name):
     np.testing.assert_allclose(picture[pixels[:, 1], pixels[:, 0]][flat], shown[flat], atol=0.5)
 
 
-def test_colour_at_an_edge_is_the_part_of_the_pixel_that_is_covered():
+def test_edge_pixel_color_equals_its_coverage():
     z, f = 1.0, 80.0  # a square that ends 0.3 px right of the centre of column 40 and 0.2 px below that of row 30
     x, y = (40.3 - 32) * z / f, (30.2 - 24) * z / f
     corners = np.array([[-0.1, -0.1, z], [x, -0.1, z], [x, y, z], [-0.1, y, z]])
@@ -95,7 +95,7 @@ def test_colour_at_an_edge_is_the_part_of_the_pixel_that_is_covered():
     assert view.depth[28, 40] == pytest.approx(1.0) and np.isinf(view.depth[28, 41])
 
 
-def test_two_halves_of_a_square_have_no_seam():
+def test_adjacent_triangles_have_no_seam():
     camera = Pinhole(80.0, 80.0, 32, 24, 64, 48, np.eye(4))
     for angle in np.linspace(0, 1.5, 23):
         c, s = math.cos(angle), math.sin(angle)
@@ -106,7 +106,7 @@ def test_two_halves_of_a_square_have_no_seam():
         assert (view.colour == 255).all() and (view.depth == 2).all()
 
 
-def test_what_lies_behind_something_seen_before_stays_hidden():
+def test_existing_view_occludes_and_is_not_modified():
     camera = Pinhole(80.0, 80.0, 32, 24, 64, 48, np.eye(4))
 
     def wall(z, color, width):
@@ -122,7 +122,7 @@ def test_what_lies_behind_something_seen_before_stays_hidden():
     assert near.colour[24, 5].tolist() == [0, 0, 0]  # what was seen before is not changed
 
 
-def test_triangles_that_reach_behind_the_camera_are_cut_and_not_turned_inside_out():
+def test_triangles_behind_the_camera_are_clipped():
     camera = Pinhole(80.0, 80.0, 32, 24, 64, 48, np.eye(4))
     floor = np.array([[-50, 0.5, -10], [50, 0.5, -10], [50, 0.5, 40], [-50, 0.5, 40]], float)
     view = cast([Mesh(floor[[[0, 1, 2], [0, 2, 3]]], (1, 1, 1))], camera, empty_view(camera, (0, 0, 0)))
@@ -137,7 +137,7 @@ def test_depth_outside_the_range_is_nan():
     assert (view.colour == 178).all()
 
 
-def test_view_is_the_same_however_many_triangles_are_worked_on_at_once(monkeypatch):
+def test_view_does_not_depend_on_the_batch_size(monkeypatch):
     rng = np.random.default_rng(3)
     meshes = [Mesh(triangles(seed, 20), tuple(rng.integers(0, 256, 3) / 255)) for seed in range(5)]
     meshes.append(meshes[0])  # of what is as near as something else, the first is seen
@@ -147,18 +147,18 @@ def test_view_is_the_same_however_many_triangles_are_worked_on_at_once(monkeypat
     assert np.array_equal(whole.colour, parts.colour) and np.array_equal(whole.depth, parts.depth)
 
 
-def test_work_for_a_view_is_bounded_whatever_there_is(monkeypatch, caplog):
+def test_work_and_memory_for_a_view_are_bounded(monkeypatch, caplog):
     wall = np.array([[(-9.0, -9.0, 1.0), (9.0, -9.0, 1.0), (0.0, 12.0, 1.0)]])
     meshes = [Mesh(wall - (0, 0, 1e-3 * i), (i / 999, 0.0, 0.0)) for i in range(1000)]
     pixels: list[int] = []
-    spans = ray_caster._spans
+    spans = ray_caster.pixel_spans
 
     def counted(*arguments):
         found = spans(*arguments)
         pixels.append(int((found[3] - found[2] + 1).sum()))
         return found
 
-    monkeypatch.setattr(ray_caster, "_spans", counted)
+    monkeypatch.setattr(ray_caster, "pixel_spans", counted)
     monkeypatch.setattr(ray_caster, "BATCH_PIXELS", 20_000)
     view = cast(meshes, CAMERA, empty_view(CAMERA, GREY))
     assert view.depth[24, 32] == pytest.approx(1.0, rel=1e-6), "the first of them are seen"

@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
 
-from common.sim.lighting import REFERENCE, tint
-from common.sim.sensor import EXPOSURE, Sensor, SensorParameters, grey_balance
+from common.sim.photometry import EXPOSURE, REFERENCE, Sensor, SensorParameters, grey_balance, tint
 
 DAY = np.full(3, REFERENCE)
 
@@ -15,7 +14,7 @@ def exposed(picture, level=DAY, seed=0, **parameters):
     return Sensor(SensorParameters(**parameters), np.random.default_rng(seed)).expose([picture], np.asarray(level))
 
 
-def test_pictures_come_as_they_are_drawn_until_something_else_is_asked_for():
+def test_default_sensor_returns_the_rendered_image():
     picture = flat()
     assert exposed(picture) is picture
 
@@ -28,17 +27,17 @@ def test_values_are_proportional_to_exposure_gain_and_light(times):
         assert (exposed(flat(), gain=times) == 80 * times).all()
 
 
-def test_what_is_too_bright_is_white():
+def test_overexposed_pixels_saturate():
     assert (exposed(flat(200), exposure=2 * EXPOSURE) == 255).all()
 
 
-def test_noise_grows_with_the_signal_as_that_of_light_does():
+def test_shot_noise_variance_is_proportional_to_the_signal():
     variances = [exposed(flat(value), full_well=5000, read_noise=0).astype(float).var() for value in (20, 80, 180)]
     for value, variance in zip((20, 80, 180), variances, strict=True):
         assert variance == pytest.approx(value * 255 / 5000 + 1 / 12, rel=0.05)  # and that of rounding
 
 
-def test_the_dark_has_the_noise_of_reading_and_gain_makes_it_larger():
+def test_gain_amplifies_read_noise():
     read = [exposed(flat(40), DAY / gain, full_well=5000, read_noise=30, gain=gain).astype(float).std()
             for gain in (1, 4)]
     for gain, deviation in zip((1, 4), read, strict=True):
@@ -53,11 +52,11 @@ def test_noise_is_that_of_the_seed():
 
 
 @pytest.mark.parametrize("lux", [100, 500, 3000, 10_000])
-def test_automatic_exposure_finds_the_same_brightness_in_any_light(lux):
+def test_auto_exposure_reaches_the_same_brightness_in_any_light(lux):
     assert exposed(flat(140), np.full(3, lux), auto_exposure=True).mean() == pytest.approx(110, rel=0.06)
 
 
-def test_automatic_exposure_takes_time_first_and_gain_when_there_is_no_more_of_it():
+def test_auto_exposure_uses_gain_only_at_the_longest_exposure():
     for lux, gained in ((1000, False), (20, True)):
         sensor = Sensor(SensorParameters(auto_exposure=True, longest_exposure=0.02), np.random.default_rng(0))
         sensor.expose([flat(140)], np.full(3, lux))
@@ -65,21 +64,21 @@ def test_automatic_exposure_takes_time_first_and_gain_when_there_is_no_more_of_i
     assert sensor.exposure == 0.02
 
 
-def test_automatic_exposure_follows_light_that_changes():
+def test_auto_exposure_follows_changing_light():
     sensor = Sensor(SensorParameters(auto_exposure=True), np.random.default_rng(0))
     sensor.expose([flat(140)], DAY)
     dark = [sensor.expose([flat(140)], DAY / 6).mean() for _ in range(4)]
     assert dark[0] < 25 and dark[-1] == pytest.approx(110, rel=0.06)
 
 
-def test_something_bright_is_not_lost_for_something_dark():
+def test_auto_exposure_does_not_saturate_a_small_bright_region():
     picture = flat(10)
     picture[:60, :80] = 220
     assert exposed(picture, auto_exposure=True)[10, 10].max() < 255
 
 
 @pytest.mark.parametrize("temperature", [2700, 4000, 6500, 9000])
-def test_grey_is_grey_in_any_light_and_red_is_red(temperature):
+def test_auto_white_balance_keeps_grey_grey_and_red_red(temperature):
     picture = flat(150)
     picture[80:140, 80:140] = (26, 38, 255)
     level = REFERENCE / 2 * tint(temperature)
@@ -93,14 +92,14 @@ def test_grey_is_grey_in_any_light_and_red_is_red(temperature):
         assert np.ptp(plain) > 0.3 * plain.max(), "without it grey is not grey"
 
 
-def test_what_has_no_grey_says_nothing_about_the_light():
+def test_image_without_grey_has_no_balance():
     green = np.zeros((64, 64, 3), np.float32)
     green[...] = (30, 200, 20)
     assert grey_balance(green) is None
     assert grey_balance(np.zeros((64, 64, 3), np.float32)) is None
 
 
-def test_pictures_within_an_exposure_are_added():
+def test_sub_exposures_are_averaged():
     left, right = flat(0), flat(0)
     left[:, :100], right[:, 100:200] = 200, 200
     sensor = Sensor(SensorParameters(sub_exposures=2), np.random.default_rng(0))
@@ -108,7 +107,7 @@ def test_pictures_within_an_exposure_are_added():
     assert (picture[:, :200] == 100).all() and (picture[:, 200:] == 0).all()
 
 
-def test_light_of_a_temperature_is_as_bright_as_daylight_and_warmer_or_colder():
+def test_tint_has_daylight_luminance_and_varies_with_temperature():
     weights = np.array([0.0722, 0.7152, 0.2126])  # of luminance, IEC 61966-2-1
     for temperature in (2000, 3000, 5000, 10_000):
         assert weights @ tint(temperature) == pytest.approx(1, abs=0.02)

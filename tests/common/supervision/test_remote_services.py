@@ -20,8 +20,8 @@ from common.supervision.lifecycle import publish_status
 from common.supervision.liveness_watchdog import MOST_ELSEWHERE, MOST_NOTICES, RemoteServices
 from common.transport.codec import decode, encode
 from common.transport.local import LocalNetwork
-from page.guard import close_server, make_server
-from page.health import HealthPanel
+from page.diagnostics import HealthPanel
+from page.server import close_server, make_server
 from security.certificates import Authority
 
 FAR = Notice(urgent=True, message="the certificate of panda.camera ends", host="camera")

@@ -1,4 +1,4 @@
-"""Fingers that wait for the arm: they are there when it is, and nothing is lost where it does not arrive."""
+"""Gripper commands sent before the arm arrives, also when it does not arrive."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ SEEN = 0.05  # [m] wide
 
 
 class Take(Fetch):
-    """Takes what is so wide, brings it there, and lets go."""
+    """Take an object of known width, bring it, and release it."""
 
     def __init__(self, *given: Any) -> None:
         super().__init__(*given)
@@ -96,7 +96,7 @@ class Hand(Cell):
 
 @pytest.fixture
 def closing() -> Hand:
-    """The arm is about to arrive and the fingers have begun to close."""
+    """The arm is about to arrive and the fingers have started to close."""
     hand = Hand()
     hand.until_waiting()
     hand.begin()
@@ -105,7 +105,7 @@ def closing() -> Hand:
 
 @pytest.fixture
 def releasing(closing: Hand) -> Hand:
-    """The arm is about to arrive with what it took, and the fingers have begun to open."""
+    """The arm is about to arrive with its object, and the fingers have started to open."""
     closing.arm()
     closing.step()
     closing.fingers(SEEN, holding=True)
@@ -119,7 +119,7 @@ def stage(hand: Hand) -> str:
     return hand.task.running.stage.name if hand.task.running else ""
 
 
-def test_fingers_are_asked_to_be_there_when_the_arm_is_and_to_touch_nothing_before() -> None:
+def test_early_close_starts_within_its_lead_and_touches_nothing_before() -> None:
     hand = Hand()
     command, gripper = hand.until_waiting(), hand.task.gripper
     assert command.after == hand.motion.id and stage(hand) == "reach" == hand.task.status.stage
@@ -129,16 +129,16 @@ def test_fingers_are_asked_to_be_there_when_the_arm_is_and_to_touch_nothing_befo
     hand.step()
     hand.fingers(SEEN, holding=True)
     release = hand.until_waiting()
-    assert 0.0 < release.lead < 0.06 and release.within <= 0.005, "what is let go falls where it was to"
+    assert 0.0 < release.lead < 0.06 and release.within <= 0.005, "the object falls at its destination"
 
 
-def test_fingers_that_take_very_long_are_asked_for_with_a_lead_that_a_command_may_have() -> None:
+def test_lead_of_slow_fingers_is_limited() -> None:
     hand = Hand(gripper=CELL.robot.gripper.model_copy(update={"speed": 0.001}))
     command = hand.until_waiting()
     assert decode(m.GripperCommand, encode(command)) == command
 
 
-def test_fingers_are_asked_for_late_in_a_long_motion() -> None:
+def test_early_command_is_sent_late_in_a_long_motion() -> None:
     hand = Hand()
     while not hand.motion.id:
         hand.step()
@@ -150,7 +150,7 @@ def test_fingers_are_asked_for_late_in_a_long_motion() -> None:
         assert len(hand.grips()) == asked
 
 
-def test_arm_that_arrives_has_the_fingers_followed_and_asks_them_for_nothing_twice(closing: Hand) -> None:
+def test_early_command_is_not_repeated_after_arrival(closing: Hand) -> None:
     closing.arm()
     closing.step()
     assert stage(closing) == "close" and closing.task.status.stage == "close"
@@ -167,7 +167,7 @@ def test_time_in_motion_is_counted_once(closing: Hand) -> None:
     assert closing.task.status.moving_seconds <= closing.now - 100.0 + 1e-6
 
 
-def test_what_is_let_go_a_moment_before_the_arm_stands_did_not_fall(releasing: Hand) -> None:
+def test_release_just_before_standstill_is_no_loss(releasing: Hand) -> None:
     releasing.fingers(0.0506, holding=False, state="active")
     assert releasing.step() == [] and releasing.task.status.failures == 0
     releasing.arm()
@@ -178,7 +178,7 @@ def test_what_is_let_go_a_moment_before_the_arm_stands_did_not_fall(releasing: H
     assert releasing.task.status.state == "DONE" and releasing.task.status.failures == 0
 
 
-def test_what_falls_while_the_fingers_still_wait_fell() -> None:
+def test_loss_while_the_fingers_wait_is_a_loss() -> None:
     hand = Hand()
     hand.until_waiting()
     hand.begin()
@@ -193,27 +193,27 @@ def test_what_falls_while_the_fingers_still_wait_fell() -> None:
 
 
 @pytest.mark.parametrize("end", ["aborted", "cancelled"])
-@pytest.mark.parametrize("begun", [True, False])
-def test_arm_that_does_not_arrive_has_the_fingers_end_before_anything_else_is_decided(end: str, begun: bool) -> None:
+@pytest.mark.parametrize("started", [True, False])
+def test_interrupted_motion_waits_for_the_early_fingers(end: str, started: bool) -> None:
     hand = Hand()
     hand.until_waiting()
-    if begun:
+    if started:
         hand.begin()
     hand.arm(end)
-    for _ in range(20 if begun else 1):
+    for _ in range(20 if started else 1):
         assert not [command for command in hand.step() if not isinstance(command, m.PlanRequest)]
         hand.task.status.paused = False  # resumed
-    if begun:
+    if started:
         hand.fingers(SEEN, holding=True)
     else:
         hand.call_off()
     for _ in range(3):
         hand.task.status.paused = False
         hand.step()
-    assert stage(hand) == ("bring" if begun else "reach") and hand.task.did == []
+    assert stage(hand) == ("bring" if started else "reach") and hand.task.did == []
 
 
-def test_stop_on_the_way_begins_nothing_more(closing: Hand) -> None:
+def test_stop_during_the_motion_starts_nothing(closing: Hand) -> None:
     for command in closing.task.command("stop", closing.view):
         assert isinstance(command, m.StopRequest)
     closing.arm("cancelled")
@@ -223,7 +223,7 @@ def test_stop_on_the_way_begins_nothing_more(closing: Hand) -> None:
 
 
 @pytest.mark.parametrize("holding", [True, False])
-def test_start_after_a_stop_lets_nothing_fall_that_somebody_put_in_the_hand_meanwhile(
+def test_start_after_a_stop_does_not_drop_an_object(
     closing: Hand, holding: bool
 ) -> None:
     closing.task.command("stop", closing.view)
@@ -240,12 +240,12 @@ def test_start_after_a_stop_lets_nothing_fall_that_somebody_put_in_the_hand_mean
     assert not holding or stage(closing) == "bring"
 
 
-def test_fingers_that_somebody_told_something_else_while_they_waited_are_decided_about_anew_at_once() -> None:
+def test_waiting_fingers_commanded_by_another_client_are_decided_again() -> None:
     hand = Hand()
     hand.until_waiting()
     hand.waits = None
     hand.now += 0.05
-    hand.fingers(0.07, holding=False, id="of somebody")
+    hand.fingers(0.07, holding=False, id="of another client")
     hand.now += 0.05
     hand.arm()
     before = len(hand.asked)
@@ -255,7 +255,7 @@ def test_fingers_that_somebody_told_something_else_while_they_waited_are_decided
 
 
 @pytest.mark.parametrize("error", ["stale_request", "hardware_fault", "unknown_goal"])
-def test_fingers_that_refuse_let_the_arm_arrive_and_are_asked_once_more_then(error: str) -> None:
+def test_rejected_early_command_is_repeated_after_arrival(error: str) -> None:
     hand = Hand()
     hand.answer = lambda command: None if isinstance(command, m.GripperCommand) else Cell.answer(hand, command)
     while not hand.grips():
@@ -268,7 +268,7 @@ def test_fingers_that_refuse_let_the_arm_arrive_and_are_asked_once_more_then(err
     assert len(hand.grips()) == 2 and not hand.grips()[1].after and stage(hand) == "close"
 
 
-def test_fingers_that_hold_already_are_not_asked_to_wait() -> None:
+def test_fingers_that_already_hold_are_not_sent_early() -> None:
     hand = Hand()
     hand.gripper = m.GripperState(width=SEEN, holding=True)
     hand.task.queue += [Move("reach", "REACHING", goal=THERE),
@@ -278,7 +278,7 @@ def test_fingers_that_hold_already_are_not_asked_to_wait() -> None:
     assert not hand.grips() and stage(hand) == "reach"
 
 
-def test_row_that_is_thrown_away_has_what_was_let_go_early_be_let_go_and_not_fallen(releasing: Hand) -> None:
+def test_early_release_counts_after_the_queue_is_cleared(releasing: Hand) -> None:
     releasing.task.clear()
     releasing.fingers(0.0506, holding=False, state="active")
     assert releasing.step() == [] and releasing.task.status.failures == 0
@@ -290,7 +290,7 @@ def test_row_that_is_thrown_away_has_what_was_let_go_early_be_let_go_and_not_fal
 
 
 @pytest.mark.parametrize("end", ["stop", "aborted", "cancelled"])
-def test_what_is_let_go_by_an_arm_that_does_not_arrive_is_let_go_once(releasing: Hand, end: str) -> None:
+def test_early_release_of_an_interrupted_motion_counts_once(releasing: Hand, end: str) -> None:
     if end == "stop":
         releasing.task.command("stop", releasing.view)
         end = "cancelled"
@@ -304,7 +304,7 @@ def test_what_is_let_go_by_an_arm_that_does_not_arrive_is_let_go_once(releasing:
     assert releasing.task.did[2:] == ["release"] and not releasing.task.active_stages
 
 
-def test_what_is_let_go_after_a_long_pause_by_an_arm_that_does_not_arrive_is_let_go(closing: Hand) -> None:
+def test_early_release_after_a_long_pause_counts(closing: Hand) -> None:
     closing.arm()
     closing.step()
     closing.fingers(SEEN, holding=True)
@@ -326,7 +326,7 @@ def test_what_is_let_go_after_a_long_pause_by_an_arm_that_does_not_arrive_is_let
 
 
 @pytest.mark.parametrize("end", ["forgotten", "refused", "forever"])
-def test_fingers_that_are_never_heard_of_again_keep_nothing_from_being_decided(closing: Hand, end: str) -> None:
+def test_silent_fingers_do_not_block_decisions(closing: Hand, end: str) -> None:
     closing.arm("aborted")
     closing.step()
     if end == "forgotten":
@@ -342,7 +342,7 @@ def test_fingers_that_are_never_heard_of_again_keep_nothing_from_being_decided(c
     assert stage(closing) == "reach"
 
 
-def test_arm_that_its_fingers_closed_ahead_of_is_no_failure(closing: Hand) -> None:
+def test_fingers_closed_before_arrival_are_no_failure(closing: Hand) -> None:
     closing.arm("aborted", error=m.CLOSED_BEFORE, message="held up")
     closing.step()
     closing.fingers(0.0, holding=False, state="aborted", outcome="empty")
@@ -354,7 +354,7 @@ def test_arm_that_its_fingers_closed_ahead_of_is_no_failure(closing: Hand) -> No
     assert closing.task.status.failures == 0 and stage(closing) == "reach"
 
 
-def test_arm_that_is_held_up_each_time_its_fingers_close_is_waited_for_the_next_time(closing: Hand) -> None:
+def test_next_close_waits_after_fingers_closed_before_arrival(closing: Hand) -> None:
     closing.arm("aborted", error=m.CLOSED_BEFORE, message="held up")
     closing.step()
     closing.fingers(0.08, holding=False, state="cancelled")
@@ -367,11 +367,11 @@ def test_arm_that_is_held_up_each_time_its_fingers_close_is_waited_for_the_next_
     closing.step()
     assert stage(closing) == "close" and not closing.grips()[-1].after
     closing.fingers(SEEN, holding=True)
-    assert closing.until_waiting().after, "what was taken is let go early again"
+    assert closing.until_waiting().after, "the release is early again"
     assert closing.task.status.failures == 0
 
 
-def test_report_of_before_the_arm_stood_is_not_taken_for_fingers_that_forgot() -> None:
+def test_report_from_before_standstill_is_not_a_forgotten_command() -> None:
     hand = Hand()
     hand.until_waiting()
     waiting, hand.waits = hand.waits, None
@@ -388,7 +388,7 @@ def test_report_of_before_the_arm_stood_is_not_taken_for_fingers_that_forgot() -
     assert stage(hand) == "bring" and hand.task.status.failures == 0
 
 
-def test_what_was_let_go_is_not_done_when_the_controller_has_forgotten_where_the_arm_was_going(releasing: Hand) -> None:
+def test_release_by_a_restarted_controller_does_not_count(releasing: Hand) -> None:
     releasing.motion = m.MotionStatus(header=m.Header(stamp=int((releasing.now + 1.0) * 1e9)))
     releasing.step()
     releasing.fingers(0.08, holding=False)
@@ -398,7 +398,7 @@ def test_what_was_let_go_is_not_done_when_the_controller_has_forgotten_where_the
 
 
 @pytest.mark.parametrize("later", [0, 1_000_000_000], ids=["together", "the arm again"])
-def test_executor_that_was_started_again_tells_in_its_first_reports_that_it_forgot_both(later: int) -> None:
+def test_restarted_executor_forgets_arm_and_fingers(later: int) -> None:
     hand = Hand()
     hand.until_waiting()
     stamp = int((hand.now + 1.0) * 1e9)
@@ -407,4 +407,4 @@ def test_executor_that_was_started_again_tells_in_its_first_reports_that_it_forg
     before = len(hand.asked)
     for _ in range(4):
         hand.step()
-    assert any(isinstance(one, m.PlanRequest) for one in hand.asked[before:]), "it goes on at once"
+    assert any(isinstance(one, m.PlanRequest) for one in hand.asked[before:]), "it continues at once"

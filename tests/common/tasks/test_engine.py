@@ -1,4 +1,4 @@
-"""The task engine with a task that is as small as one can be: what is no application's own."""
+"""The task engine with a minimal task."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ from common.config import load_cell
 from common.errors import ConfigError
 from common.tasks.decisions import TaskConfig
 from common.tasks.engine import Task
-from common.tasks.stages import AwaitImage, Command, Grip, Move, View
-from common.tasks.watchdogs import DwellTimer
+from common.tasks.stages import AwaitImage, Command, DwellTimer, Grip, Move, View
 
 CELL = load_cell("panda")
 THERE = m.PoseGoal(pose=m.Pose(position=m.Vector3(x=0.4, z=0.3)))
@@ -30,7 +29,7 @@ class Fetch(Task[View]):
 
 
 class Cell:
-    """A planner, an arm and fingers that do what they are told when a test says so."""
+    """A fake planner, arm and gripper controlled by the test."""
 
     def __init__(self, **robot: object) -> None:
         config = TaskConfig(robot=CELL.robot.model_copy(update=robot), run=CELL.run)
@@ -44,7 +43,7 @@ class Cell:
         return View(self.now, scene, self.gripper, self.motion, [0.0] * 7, m.Pose(position=m.Vector3(x=0.3, z=0.2)))
 
     def step(self) -> list[Command]:
-        """One step; plans are made at once, motions and grips are begun."""
+        """One step; plans are made at once, motions and grips are started."""
         self.now += 0.1
         asked = self.task.step(self.view)
         for command in asked:
@@ -95,7 +94,7 @@ def thing(name: str, x: float, y: float = 0.0) -> m.CollisionObject:
                              pose=m.Pose(position=m.Vector3(x=x, y=y, z=0.025)))
 
 
-def test_row_is_worked_off_planned_ahead_and_the_end_is_said() -> None:
+def test_queue_is_planned_ahead_executed_and_ended() -> None:
     cell = Cell()
     cell.until("reach")
     cell.step()
@@ -111,7 +110,7 @@ def test_row_is_worked_off_planned_ahead_and_the_end_is_said() -> None:
     assert (status.state, status.message, status.failures, len(status.plans)) == ("DONE", "it is in the hand", 0, 2)
 
 
-def test_what_follows_a_look_is_decided_by_a_later_picture() -> None:
+def test_decision_after_awaiting_an_image_uses_a_later_one() -> None:
     cell = Cell()
     cell.until("lift")
     cell.finish()
@@ -121,14 +120,14 @@ def test_what_follows_a_look_is_decided_by_a_later_picture() -> None:
 
 
 @pytest.mark.parametrize("where", ["during", "before"])
-def test_what_falls_out_of_the_hand_is_a_failure_and_is_taken_again(where: str) -> None:
+def test_lost_object_is_a_failure_and_is_taken_again(where: str) -> None:
     cell = Cell()
     cell.until("lift" if where == "during" else "close")
     if where == "before":
         cell.finish()
         view = cell.view
         view.trouble = "the planner is gone"
-        assert cell.task.step(view) == []  # the fingers have closed, the motion that carries has not begun
+        assert cell.task.step(view) == []  # the fingers have closed, the carrying motion has not started
     cell.gripper = cell.gripper.model_copy(update={"holding": False})
     asked = cell.step()
     assert any(isinstance(command, m.StopRequest) for command in asked) == (where == "during")
@@ -137,7 +136,7 @@ def test_what_falls_out_of_the_hand_is_a_failure_and_is_taken_again(where: str) 
     cell.until("reach")
 
 
-def test_fingers_that_close_on_nothing_open_and_go_up_and_home_before_the_next_try() -> None:
+def test_empty_grasp_opens_retreats_and_goes_home() -> None:
     cell = Cell()
     cell.until("close")
     cell.gripper = cell.gripper.model_copy(update={"state": "succeeded", "moving": False, "holding": False})
@@ -151,7 +150,7 @@ def test_fingers_that_close_on_nothing_open_and_go_up_and_home_before_the_next_t
     assert (cell.task.status.failures, cell.task.status.retries) == (1, 1)
 
 
-def test_what_appears_beside_the_way_has_the_motions_planned_anew() -> None:
+def test_new_object_near_the_path_causes_new_plans() -> None:
     cell = Cell()
     cell.until("close")
     cell.objects = [*cell.objects, thing("other", 0.5)]
@@ -159,7 +158,7 @@ def test_what_appears_beside_the_way_has_the_motions_planned_anew() -> None:
     assert [p.stage for p in cell.plans()] == ["reach", "lift", "lift"]
 
 
-def test_failure_sends_the_arm_home_and_too_many_in_a_row_are_an_error() -> None:
+def test_failure_sends_the_arm_home_and_too_many_end_in_error() -> None:
     cell = Cell()
     for _ in range(cell.task.failure_limit - 1):
         cell.until("reach")
@@ -174,7 +173,7 @@ def test_failure_sends_the_arm_home_and_too_many_in_a_row_are_an_error() -> None
     cell.until("reach")
 
 
-def test_plans_that_are_refused_for_some_seconds_do_not_use_up_all_tries_at_once() -> None:
+def test_rejected_plans_are_retried_with_a_pause() -> None:
     cell = Cell()
     answer, began = cell.answer, cell.now
 
@@ -191,7 +190,7 @@ def test_plans_that_are_refused_for_some_seconds_do_not_use_up_all_tries_at_once
 
 
 def late_answer(cell: Cell, state: str) -> None:
-    """The fingers were told something else by another; who asks for the goal again hears what became of it."""
+    """Another client commanded the fingers; a repeated request returns the result."""
     running = cell.task.running
     assert running is not None
     cell.gripper = m.GripperState(
@@ -201,7 +200,7 @@ def late_answer(cell: Cell, state: str) -> None:
         header=m.Header(stamp=int(cell.now * 1e9)), id=running.command.id, state=state, holding=True), cell.view)
 
 
-def test_motion_that_the_hardware_gave_up_is_decided_anew_once_it_works_and_no_failure() -> None:
+def test_hardware_fault_is_decided_again_without_a_failure() -> None:
     cell = Cell()
     cell.until("lift")
     cell.motion = cell.motion.model_copy(update={
@@ -215,7 +214,7 @@ def test_motion_that_the_hardware_gave_up_is_decided_anew_once_it_works_and_no_f
     assert cell.task.status.state == "DONE" and cell.task.status.failures == 0, "it sees that it has what it wanted"
 
 
-def test_grip_that_another_replaced_is_decided_anew_and_no_failure() -> None:
+def test_replaced_gripper_command_is_decided_again_without_a_failure() -> None:
     cell = Cell()
     cell.until("close")
     late_answer(cell, "cancelled")
@@ -225,7 +224,7 @@ def test_grip_that_another_replaced_is_decided_anew_and_no_failure() -> None:
     assert cell.task.status.state == "DONE" and cell.task.status.failures == 0
 
 
-def test_grip_that_succeeded_before_its_answer_came_is_followed_by_the_next_stage() -> None:
+def test_grip_that_ended_before_its_answer_continues() -> None:
     cell = Cell()
     cell.until("close")
     late_answer(cell, "succeeded")
@@ -233,7 +232,7 @@ def test_grip_that_succeeded_before_its_answer_came_is_followed_by_the_next_stag
     assert cell.task.running is not None and cell.task.running.stage.name == "lift"
 
 
-def test_answer_that_is_ahead_of_what_the_controller_tells_waits_for_it() -> None:
+def test_answer_ahead_of_the_status_waits_for_it() -> None:
     cell = Cell()
     cell.until("close")
     running = cell.task.running
@@ -249,7 +248,7 @@ def test_answer_that_is_ahead_of_what_the_controller_tells_waits_for_it() -> Non
     assert cell.task.running is not None and cell.task.running.stage.name == "lift"
 
 
-def test_failures_between_which_something_was_done_are_not_in_a_row() -> None:
+def test_progress_resets_the_failure_count() -> None:
     cell = Cell()
     for k in range(30):
         cell.until("reach")
@@ -259,7 +258,7 @@ def test_failures_between_which_something_was_done_are_not_in_a_row() -> None:
     assert cell.task.status.state == "HOMING" and cell.task.status.failures == 30
 
 
-def test_start_after_the_end_counts_the_time_anew() -> None:
+def test_start_after_the_end_restarts_the_time() -> None:
     cell = Cell()
     cell.task.status.state = "DONE"
     cell.now += 1000
@@ -269,24 +268,24 @@ def test_start_after_the_end_counts_the_time_anew() -> None:
     assert cell.task.status.task_seconds == pytest.approx(0.1)
 
 
-def test_task_that_needs_a_gripper_says_so_of_a_robot_without_one() -> None:
+def test_missing_gripper_is_reported() -> None:
     with pytest.raises(ConfigError, match=r"robot\.gripper: is missing: the task needs a robot with one"):
         _ = Cell(gripper=None).task.gripper
 
 
-def test_no_id_is_minted_twice() -> None:
+def test_ids_are_unique() -> None:
     cell = Cell()
     assert len({cell.task.new_id() for _ in range(1000)}) == 1000
 
 
-def test_patience_counts_from_when_a_reason_was_given_first() -> None:
+def test_dwell_timer_counts_from_the_first_occurrence() -> None:
     patience = DwellTimer()
     assert [patience.elapsed("a", 1.0), patience.elapsed("a", 3.0), patience.elapsed("b", 4.0)] == [0.0, 2.0, 0.0]
     patience.reset()
     assert patience.elapsed("b", 9.0) == 0.0
 
 
-def test_motions_are_planned_with_the_fingers_as_they_will_stand() -> None:
+def test_motions_are_planned_with_the_future_finger_width() -> None:
     cell = Cell()
     cell.gripper.width = 0.03
     cell.until("close")
@@ -301,7 +300,7 @@ def test_motions_are_planned_with_the_fingers_as_they_will_stand() -> None:
     assert len(cell.plans()) == 2, "about what they hold they may be closer"
 
 
-def test_motion_is_planned_anew_when_the_fingers_stand_elsewhere() -> None:
+def test_changed_finger_width_causes_a_new_plan() -> None:
     cell = Cell()
     cell.gripper.width = 0.03
     cell.step()
@@ -310,7 +309,7 @@ def test_motion_is_planned_anew_when_the_fingers_stand_elsewhere() -> None:
     assert [p.gripper_width for p in cell.plans() if p.stage == "reach"] == [0.03, 0.06]
 
 
-def test_grasp_of_something_else_is_let_go_and_what_slips_is_told() -> None:
+def test_wrong_grasp_is_released_and_slipping_reported() -> None:
     cell = Cell()
     cell.until("close")
     cell.gripper = cell.gripper.model_copy(update={
@@ -335,7 +334,7 @@ def blocked(cell: Cell, *held_by: m.Holder) -> None:
         "held": bool(held_by), "held_by": list(held_by), "interlocks": interlocks})
 
 
-def test_motion_goes_on_when_what_was_in_its_way_goes_away_and_is_planned_anew_when_it_stays() -> None:
+def test_blocked_motion_continues_or_is_planned_again() -> None:
     cell = Cell()
     cell.until("reach")
     for _ in range(3):
@@ -357,7 +356,7 @@ def test_motion_goes_on_when_what_was_in_its_way_goes_away_and_is_planned_anew_w
     assert cell.plans()[-1].stage == "home" and cell.task.status.state == "HOMING"
 
 
-def test_what_is_in_the_way_changes_nothing_while_a_person_holds_or_the_planner_is_gone() -> None:
+def test_obstacle_has_no_effect_during_a_hold_or_planner_outage() -> None:
     cell = Cell()
     cell.until("reach")
     blocked(cell, "scene_monitor", "operator")
@@ -365,34 +364,34 @@ def test_what_is_in_the_way_changes_nothing_while_a_person_holds_or_the_planner_
         assert cell.step() == []
     blocked(cell, "scene_monitor")
     for _ in range(8):
-        assert cell.step() == [], "time begins when the person has let go"
+        assert cell.step() == [], "time starts when the operator has released"
 
 
-def test_what_is_carried_is_brought_on_from_where_it_was_stopped() -> None:
+def test_held_object_is_carried_on_after_a_stop() -> None:
     cell = Cell()
     cell.until("lift")
     blocked(cell, "scene_monitor")
     for _ in range(12):
         cell.step()
-    assert not cell.task.queue, "not home: it is decided anew from here"
+    assert not cell.task.queue, "not home: it is decided again from here"
 
 
-def test_motion_is_asked_for_with_its_plan_and_the_scene_of_it() -> None:
+def test_execute_request_names_plan_and_scene() -> None:
     cell = Cell()
     cell.until("reach")
     executed = next(c for c in cell.asked if isinstance(c, m.ExecuteRequest))
     assert executed.plan == cell.plans()[0].id and executed.scene_stamp == 7
 
 
-def test_method_that_would_take_the_place_of_the_engines_own_is_refused_by_its_name() -> None:
+def test_overriding_a_private_method_of_the_engine_is_rejected() -> None:
     with pytest.raises(TypeError, match=r"Mine\._count: Task has a method of that name for itself; choose another"):
         class Mine(Task[View]):
             def _count(self, view: View) -> None:
-                """Of a person who does not know that the engine counts, too."""
+                """A user task with a name that the engine uses."""
 
 
 class Drop(Task[View]):
-    """Lets go of what is in the hand, and leaves."""
+    """Release the object and leave."""
 
     def decide(self, view: View) -> None:
         if view.holding:
@@ -417,7 +416,7 @@ def running(cell: Cell) -> str:
     return cell.task.running.stage.name if cell.task.running else ""
 
 
-def test_arm_leaves_as_soon_as_what_it_let_go_is_clear_of_the_fingers_and_not_before() -> None:
+def test_arm_leaves_once_the_released_object_is_clear() -> None:
     assert running(opening(0.0695)) == "release"
     cell = opening(0.0705)
     assert running(cell) == "leave" and cell.motion.state == "active" and cell.gripper.state == "active"
@@ -428,14 +427,14 @@ def test_arm_leaves_as_soon_as_what_it_let_go_is_clear_of_the_fingers_and_not_be
     assert cell.task.status.failures == 0 and not any(isinstance(c, m.StopRequest) for c in cell.asked)
 
 
-def test_what_still_holds_while_the_fingers_open_is_not_left() -> None:
+def test_arm_stays_while_opening_fingers_still_hold() -> None:
     cell = opening(0.0695)
     cell.gripper = cell.gripper.model_copy(update={"holding": True, "width": 0.075})
     cell.step()
     assert running(cell) == "release"
 
 
-def test_arm_waits_on_its_way_for_fingers_that_have_not_opened_by_half_of_it() -> None:
+def test_motion_stops_halfway_for_slow_fingers() -> None:
     cell = opening()
     cell.motion = cell.motion.model_copy(update={"progress": 0.49})
     assert not any(isinstance(c, m.StopRequest) for c in cell.step())
@@ -450,7 +449,7 @@ def test_arm_waits_on_its_way_for_fingers_that_have_not_opened_by_half_of_it() -
     assert running(cell) == "" and cell.task.status.failures == 0
 
 
-def test_arm_stops_for_fingers_that_stick_on_its_way() -> None:
+def test_stuck_fingers_stop_the_arm() -> None:
     cell = opening()
     cell.gripper = cell.gripper.model_copy(update={"state": "aborted", "moving": False, "message": "they stopped"})
     (stop,) = [c for c in cell.step() if isinstance(c, m.StopRequest)]
@@ -458,7 +457,7 @@ def test_arm_stops_for_fingers_that_stick_on_its_way() -> None:
     assert cell.task.status.failures == 1 and cell.task.status.message == "the fingers did not open: they stopped"
 
 
-def test_fingers_that_somebody_told_something_else_on_the_way_stop_nobody() -> None:
+def test_fingers_commanded_by_another_client_do_not_stop_the_arm() -> None:
     cell = opening()
     cell.gripper = m.GripperState(id="another's", state="active", moving=True, width=0.07)
     cell.motion = cell.motion.model_copy(update={"progress": 0.9})

@@ -71,7 +71,7 @@ def matrix(of: Move) -> np.ndarray:
 
 
 @pytest.mark.parametrize("yaw", [0.0, 0.5, -0.7, 1.4, 3.0])
-def test_fingers_close_on_two_faces_of_a_cube_however_it_is_turned(yaw: float) -> None:
+def test_fingers_close_on_two_faces_of_a_cube_at_any_yaw(yaw: float) -> None:
     stages = row(task(), view(box("a", 0.5, -0.1, yaw)))
     T_cube_tool = invert(pose_to_matrix(box("a", 0.5, -0.1, yaw).pose)) @ matrix(move(stages, "descend"))
     across = np.abs(T_cube_tool[:3, 1])  # the fingers close along y of the tool
@@ -85,7 +85,7 @@ def test_a_long_box_is_gripped_across_and_its_width_is_expected() -> None:
     assert close.expected_width == 0.03
 
 
-def test_cube_ends_where_it_is_to_be_from_wherever_it_was_gripped() -> None:
+def test_cube_ends_at_its_destination_from_any_grip() -> None:
     thing = box("a", 0.5, -0.1, 0.5)
     stages = row(task(), view(thing))
     T_tool_cube = invert(matrix(move(stages, "descend"))) @ pose_to_matrix(thing.pose)
@@ -96,28 +96,28 @@ def test_cube_ends_where_it_is_to_be_from_wherever_it_was_gripped() -> None:
     assert carried.attach == "a" and carried.attach_pose == move(stages, "lift").attach_pose
 
 
-def test_what_it_is_put_on_may_be_touched_and_nothing_else() -> None:
-    below, beside = box("below", 0.4, 0.2, z=-0.02), box("beside", 0.4, 0.23)
+def test_only_the_support_may_be_touched() -> None:
+    below, near = box("below", 0.4, 0.2, z=-0.02), box("near", 0.4, 0.23)
     of = task()
-    of.queue.extend(of._put(box("a", 0.5, 0.0), m.Pose(), Cycle("a"), view(below, beside)))
+    of.queue.extend(of._put(box("a", 0.5, 0.0), m.Pose(), Cycle("a"), view(below, near)))
     assert move(list(of.queue), "lower").touches == [("a", "below")]
 
 
-def test_with_a_thing_in_the_hand_it_is_brought_on_and_not_taken_again() -> None:
+def test_held_object_is_carried_on() -> None:
     held = box("a", 0.0, 0.0, z=0.0)
     stages = row(task(), view(holding=True, held=held, q=[0.1] * 7))
     assert [stage.name for stage in stages][:3] == ["across", "lower", "release"]  # type: ignore[attr-defined]
     assert move(stages, "across").attach_pose is None, "it is in the scene already"
 
 
-def test_with_a_thing_in_the_hand_and_nothing_seen_yet_it_goes_home_to_look() -> None:
+def test_held_object_without_a_scene_is_carried_home_first() -> None:
     held = box("a", 0.0, 0.0, z=0.0)
     stages = row(task(), view(holding=True, held=held, q=[0.1] * 7, stamp=0.0))
     assert move(stages, "home").carries and len(stages) == 2
     assert row(task(), view(holding=True, held=held, stamp=0.0)) == [], "there it waits for the picture"
 
 
-def test_what_nobody_knows_is_put_aside_clear_of_all_that_is_seen() -> None:
+def test_unknown_object_is_put_aside_in_free_space() -> None:
     held = m.CollisionObject(id="x", role="attached", shape="sphere", dimensions=[0.03], pose=m.Pose())
     standing = [box(str(k), 0.5, -0.2 + 0.1 * k) for k in range(5)]
     place = matrix(move(row(task(), view(*standing, holding=True, held=held)), "lower"))[:2, 3]
@@ -126,12 +126,12 @@ def test_what_nobody_knows_is_put_aside_clear_of_all_that_is_seen() -> None:
     assert math.dist(place, (container.x, container.y)) > container.half_side
 
 
-def test_away_from_home_with_an_empty_hand_it_goes_up_and_home_first() -> None:
+def test_empty_gripper_away_from_home_goes_home_first() -> None:
     stages = row(task(), view(box("a", 0.5, 0.0), q=[0.1] * 7))
     assert [stage.name for stage in stages] == ["retreat", "home", "look"]  # type: ignore[attr-defined]
 
 
-def test_what_does_not_work_comes_last_and_is_tried_with_the_other_faces_until_it_gives_up() -> None:
+def test_failed_object_comes_last_with_other_faces_until_given_up() -> None:
     of = task(most_tries=2)
     a, b = box("a", 0.5, 0.0), box("b", 0.5, 0.2)
     no = m.PlanResponse(id="1", ok=False, error="no_plan", message="no way")
@@ -148,7 +148,7 @@ def test_what_does_not_work_comes_last_and_is_tried_with_the_other_faces_until_i
     assert (of.status.state, of.status.message) == ("ERROR", "cube at (0.500, 0.000): no way")
 
 
-def test_done_is_said_after_a_while_of_later_pictures_and_nothing_begins_after_that() -> None:
+def test_task_is_done_after_the_settling_time_and_stays_so() -> None:
     of = task(settle=1.0)
     for now in (10.0, 10.5, 10.9):
         of.decide(view(now=now))
@@ -160,7 +160,7 @@ def test_done_is_said_after_a_while_of_later_pictures_and_nothing_begins_after_t
 
 @pytest.mark.parametrize("far", [
     box("far", 1e7, 0.0), box("far", 0.5, 0.0, z=1e7), box("far", 0.5, 0.0, size=(1e9, 1e9, 1e9))])
-def test_what_no_motion_can_be_asked_for_is_not_there(far: m.CollisionObject) -> None:
+def test_objects_out_of_range_are_ignored(far: m.CollisionObject) -> None:
     stages = row(task(), view(far, box("a", 0.5, -0.1)))
     assert move(stages, "descend").touches[0][1] == "a"
     assert row(task(), view(far)) == []

@@ -1,4 +1,4 @@
-"""What holds the arm and lets it go again, with a clock of the test's own; then with both tasks."""
+"""The liveness watchdog on a fake clock, then with both tasks."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from common import messages as m
-from common.tasks.watchdogs import LOOK_PERIOD, LivenessWatchdog
+from common.tasks.monitoring import LOOK_PERIOD, LivenessWatchdog
 from tests.applications.outlining.outline_double import OutlineDouble
 from tests.applications.pick_place.cell_double import CellDouble
 
@@ -33,16 +33,16 @@ class Setting:
         while self.now < end - 1e-9:
             self.now += step
             self.came += step * self.rate
-            self.asked += self.watchdog.look(self.now, dict(self.there), self.motion)
+            self.asked += self.watchdog.update(self.now, dict(self.there), self.motion)
         return [hold.hold for hold in self.asked[before:]]
 
 
-def test_nothing_is_held_while_all_is_well() -> None:
+def test_no_hold_without_a_fault() -> None:
     setting = Setting()
     assert setting.wait(60) == [] and setting.watchdog.trouble == ""
 
 
-def test_without_joint_states_the_arm_is_held_within_a_quarter_second_and_let_go_when_they_are_back() -> None:
+def test_missing_joint_states_hold_the_arm_until_they_return() -> None:
     setting = Setting()
     setting.wait(5)
     setting.rate = 0.0
@@ -56,7 +56,7 @@ def test_without_joint_states_the_arm_is_held_within_a_quarter_second_and_let_go
 
 
 @pytest.mark.parametrize("name", [PLANNER, EXECUTOR])
-def test_the_arm_is_held_while_a_service_is_gone(name: str) -> None:
+def test_missing_service_holds_the_arm(name: str) -> None:
     setting = Setting()
     setting.wait(1)
     setting.there[name] = False
@@ -65,7 +65,7 @@ def test_the_arm_is_held_while_a_service_is_gone(name: str) -> None:
     assert setting.wait(0.1) == [False]
 
 
-def test_the_arm_is_let_go_when_all_is_back_not_before() -> None:
+def test_hold_is_released_only_when_everything_is_back() -> None:
     setting = Setting()
     setting.wait(1)
     setting.there[PLANNER], setting.rate = False, 0.0
@@ -76,28 +76,28 @@ def test_the_arm_is_let_go_when_all_is_back_not_before() -> None:
     assert setting.wait(1) == [False]
 
 
-def test_with_no_motion_there_is_nothing_to_hold_but_trouble_is_known() -> None:
+def test_no_hold_without_motion_but_the_fault_is_known() -> None:
     setting = Setting(motion=IDLE)
     setting.wait(1)
     setting.there[PLANNER] = False
     assert setting.wait(1) == [] and setting.watchdog.trouble == "motion_planner is gone"
 
 
-def test_what_was_never_there_is_not_missing() -> None:
+def test_service_never_seen_is_not_missing() -> None:
     setting = Setting(rate=0.0)
     setting.there = {PLANNER: False, EXECUTOR: False}
     assert setting.wait(10) == [] and setting.watchdog.trouble == ""
 
 
 @pytest.mark.parametrize("late", [0.5, 2.0, 60.0])
-def test_a_task_that_was_late_itself_misses_nothing(late: float) -> None:
+def test_own_delay_is_no_fault(late: float) -> None:
     setting = Setting()
     setting.wait(5)
-    setting.now += late  # nobody ran: neither we nor the robot
+    setting.now += late  # neither the task nor the robot ran
     assert setting.wait(0.3) == []
 
 
-def test_on_a_busy_machine_a_late_joint_state_is_no_fault() -> None:
+def test_late_joint_state_on_a_busy_machine_is_no_fault() -> None:
     setting = Setting()
     setting.wait(5, step=0.3)
     setting.rate = 0.0
@@ -105,7 +105,7 @@ def test_on_a_busy_machine_a_late_joint_state_is_no_fault() -> None:
     assert setting.wait(6.0, step=0.3) == [True], "but a silence is"
 
 
-def test_joint_states_that_come_slowly_are_not_missing() -> None:
+def test_slow_joint_states_are_not_missing() -> None:
     setting = Setting(rate=2.0)
     assert setting.wait(20)[1:] in ([], [False])  # at first it is not known that they are so slow
     assert setting.wait(60) == []
@@ -113,13 +113,13 @@ def test_joint_states_that_come_slowly_are_not_missing() -> None:
     assert setting.wait(6) == [True]
 
 
-def test_a_hold_of_the_task_before_this_one_is_taken_over() -> None:
+def test_hold_of_an_earlier_process_is_adopted() -> None:
     setting = Setting(motion=m.MotionStatus(id="a", state="active", held=True, held_by=["watchdog"]))
     assert setting.wait(0.1) == [False]
 
 
 @given(st.lists(st.tuples(st.sampled_from(["joints", PLANNER, EXECUTOR]), st.floats(0.01, 3.0)), max_size=12))
-def test_holds_and_releases_alternate_and_the_last_is_a_release(events: list[tuple[str, float]]) -> None:
+def test_holds_and_releases_alternate(events: list[tuple[str, float]]) -> None:
     setting = Setting()
     setting.wait(1)
     for what, seconds in events:
@@ -143,7 +143,7 @@ TASKS: dict[str, tuple[Callable[[], Double], str]] = {
 
 
 @pytest.mark.parametrize(("make", "stage"), TASKS.values(), ids=TASKS)
-def test_no_motion_begins_while_something_is_missing_and_none_is_done_twice(
+def test_no_motion_starts_during_a_fault_and_none_is_repeated(
     make: Callable[[], Double], stage: str
 ) -> None:
     cell = make()
@@ -170,7 +170,7 @@ def test_no_motion_begins_while_something_is_missing_and_none_is_done_twice(
 
 
 @pytest.mark.parametrize(("make", "stage"), TASKS.values(), ids=TASKS)
-def test_a_task_that_finds_the_robot_held_by_a_watchdog_is_not_paused(make: Callable[[], Double], stage: str) -> None:
+def test_watchdog_hold_found_at_the_start_does_not_pause(make: Callable[[], Double], stage: str) -> None:
     cell = make()
     cell.motion = m.MotionStatus(held=True, held_by=["watchdog"])
     cell.step()

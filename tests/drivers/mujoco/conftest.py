@@ -1,4 +1,4 @@
-"""Tests of the world with physics need MuJoCo (extra `physics`); what they keep of meshes goes away with them."""
+"""Tests of the world with physics need MuJoCo (extra `physics`); cached meshes are deleted afterwards."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ except ImportError:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def kept_meshes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def mesh_cache_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("cache")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("ZENCELL_CACHE", str(folder))

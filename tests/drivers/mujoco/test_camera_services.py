@@ -35,7 +35,7 @@ def at_home(robot, stamp):
                       position=[*robot.named("home"), *locked.values()])
 
 
-async def first_pictures(service, config, cell, images, objects):
+async def first_images(service, config, cell, images, objects):
     net = LocalNetwork()
     tester = net.bus()
     robot = RobotModel.load(cell.robot)
@@ -44,35 +44,35 @@ async def first_pictures(service, config, cell, images, objects):
     joints = tester.writer(topics.JOINT_STATES)
     async with running_service(net, service.run, config):
         joints.put(at_home(robot, tester.clock.now_ns()))
-        picture = image_to_array(await asyncio.wait_for(reader.next(), 30))
-        return picture, depths.latest
+        image = image_to_array(await asyncio.wait_for(reader.next(), 30))
+        return image, depths.latest
 
 
-async def test_plain_camera_sees_arm_and_objects_of_the_world_with_physics() -> None:
+async def test_plain_camera_shows_arm_and_objects_of_the_physics_world() -> None:
     cell = load_cell("panda")
     config = camera_simulator.Config(world=small(cell), scenery=PHYSICS, robot=cell.robot, run=Run(cell="test"))
     assert (await wiring(camera_simulator.run, config)).reads == {topics.SCENE_OBJECTS, topics.JOINT_STATES}
     objects = load_world(cell.world.model_copy(update={"simulator": "kinematic"}), cell.world.objects).objects(Header())
-    picture, _ = await first_pictures(camera_simulator, config, cell, topics.CAMERA_IMAGE, objects)
+    image, _ = await first_images(camera_simulator, config, cell, topics.CAMERA_IMAGE, objects)
     camera = Pinhole.from_config(small(cell).camera)
     for thing in objects.objects:
         p = thing.pose.position
         u, v = np.rint(camera.project((p.x, p.y, p.z))).astype(int)
-        b, g, r = picture[v, u].astype(int)
-        assert r > 3 * max(b, g), f"{thing.id} is seen where it is"
-    assert picture.shape == (120, 160, 3)
-    b, g, r = picture[112:, 60:100].reshape(-1, 3).mean(axis=0)
-    assert max(b, g, r) - min(b, g, r) < 20, "the arm, which has no colour, before a brown table"
+        b, g, r = image[v, u].astype(int)
+        assert r > 3 * max(b, g), f"{thing.id} is rendered at its position"
+    assert image.shape == (120, 160, 3)
+    b, g, r = image[112:, 60:100].reshape(-1, 3).mean(axis=0)
+    assert max(b, g, r) - min(b, g, r) < 20, "the grey arm occludes the brown table"
 
 
-async def test_depth_camera_measures_an_object_where_it_is() -> None:
+async def test_depth_camera_measures_an_object_at_its_position() -> None:
     cell = load_cell("ur5")
     config = depth_camera.Config(world=small(cell), scenery=PHYSICS, robot=cell.robot, run=Run(cell="test"),
                                  farthest=5.0)
     objects = load_world(cell.world.model_copy(update={"simulator": "kinematic"}), cell.world.objects).objects(Header())
-    picture, told = await first_pictures(depth_camera, config, cell, topics.DEPTH_CAMERA_IMAGE, objects)
-    depth = image_to_array(told)
-    yellow = (picture[..., 2] > 120) & (picture[..., 1] > 120) & (picture[..., 0] < 60)
+    image, depth_message = await first_images(depth_camera, config, cell, topics.DEPTH_CAMERA_IMAGE, objects)
+    depth = image_to_array(depth_message)
+    yellow = (image[..., 2] > 120) & (image[..., 1] > 120) & (image[..., 0] < 60)
     camera = Pinhole.from_config(small(cell).camera)
     top = camera.project((0.5, 0.0, 1.1))
     np.testing.assert_allclose(np.argwhere(yellow)[:, ::-1].mean(axis=0), top, atol=0.5)
@@ -82,7 +82,7 @@ async def test_depth_camera_measures_an_object_where_it_is() -> None:
     assert side == pytest.approx(0.1, abs=0.002), "the cube"
 
 
-async def test_nothing_is_sent_before_the_arm_says_where_it_is() -> None:
+async def test_no_image_before_the_first_joint_state() -> None:
     cell = load_cell("panda")
     config = camera_simulator.Config(world=small(cell), scenery=PHYSICS, robot=cell.robot, run=Run(cell="test"))
     net = LocalNetwork()

@@ -14,12 +14,12 @@ def forgotten():
 
 def chosen(monkeypatch, *, named="", egl=False, osmesa=False):
     monkeypatch.setenv(gl.VARIABLE, named)
-    monkeypatch.setattr(gl, "_has_egl", lambda: egl)
+    monkeypatch.setattr(gl, "has_egl", lambda: egl)
     monkeypatch.setattr(gl.ctypes.util, "find_library", lambda name: "libOSMesa.so.8" if osmesa else None)
     return gl.select_gl()
 
 
-def test_egl_is_taken_before_osmesa_and_rays_where_there_is_neither(monkeypatch, caplog):
+def test_egl_precedes_osmesa_and_ray_casting(monkeypatch, caplog):
     assert chosen(monkeypatch, egl=True, osmesa=True) == "egl"
     gl.select_gl.cache_clear()
     assert chosen(monkeypatch, osmesa=True) == "osmesa"
@@ -29,26 +29,26 @@ def test_egl_is_taken_before_osmesa_and_rays_where_there_is_neither(monkeypatch,
 
 
 @pytest.mark.parametrize(("named", "found"), [("osmesa", "osmesa"), (" EGL ", "egl"), ("off", ""), ("glfw", "egl")])
-def test_variable_chooses_what_needs_no_screen(monkeypatch, named, found):
+def test_variable_selects_an_offscreen_backend(monkeypatch, named, found):
     assert chosen(monkeypatch, named=named, egl=True) == found
 
 
-def test_which_is_used_is_told_once(monkeypatch, caplog):
+def test_selected_backend_is_logged_once(monkeypatch, caplog):
     caplog.set_level("INFO")
     for _ in range(3):
         chosen(monkeypatch, egl=True)
     assert [record.message for record in caplog.records] == ["images are rendered by OpenGL (egl, detected)"]
 
 
-def test_a_machine_without_the_library_has_no_egl(monkeypatch):
+def test_missing_library_means_no_egl(monkeypatch):
     def missing(name):
         raise OSError(f"{name}: cannot open shared object file")
 
     monkeypatch.setattr(gl.ctypes, "CDLL", missing)
-    assert not gl._has_egl()
+    assert not gl.has_egl()
 
 
-def test_calls_from_any_thread_run_on_the_same_one():
+def test_single_thread_runs_all_calls_on_one_thread():
     run, found = gl.SingleThread("test"), set()
     found.add(run(threading.get_ident))
     other = threading.Thread(target=lambda: found.add(run(threading.get_ident)))

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from common.config import CameraConfig, Scenery, load_cell
-from common.config.light import Light
+from common.config.objects import Light
 from common.messages import Color, Header, JointState, Pose, Vector3, WorldObject
 from common.perception.pinhole import Pinhole
 from common.robot.model import RobotModel
@@ -60,7 +60,7 @@ def red(picture):
 
 
 @needs_gl
-def test_centres_are_seen_where_the_camera_projects_them():
+def test_sphere_centers_are_rendered_at_their_projection():
     view = camera()
     _, _, boxes, centres = cv2.connectedComponentsWithStats(red(drawn(balls(), view=view).colour).astype(np.uint8))
     assert len(boxes) == 1 + len(PLACES)
@@ -85,13 +85,13 @@ def ring(centre, axis, radius):
 
 
 @needs_gl
-def test_principal_point_off_the_middle_moves_the_picture_by_as_much():
+def test_principal_point_shifts_the_image():
     here, there = drawn(balls()).colour, drawn(balls(), view=camera(160, 120, 89.5, 52.5)).colour
     np.testing.assert_array_equal(red(here)[20:100, 20:140], red(there)[13:93, 30:150])
 
 
 @pytest.mark.parametrize("gl", [pytest.param(GL, marks=needs_gl), ""])
-def test_pixels_need_not_be_square_nor_the_axis_in_the_middle(gl):
+def test_non_square_pixels_and_off_center_axis_are_supported(gl):
     view = Pinhole.from_config(CameraConfig(width=160, height=120, fx=150, fy=110, cx=70, cy=66))
     _, _, _, middles = cv2.connectedComponentsWithStats(red(drawn(balls(), view=view, gl=gl).colour).astype(np.uint8))
     for place in view.project(PLACES):
@@ -99,7 +99,7 @@ def test_pixels_need_not_be_square_nor_the_axis_in_the_middle(gl):
 
 
 @pytest.mark.parametrize("gl", [pytest.param(GL, marks=needs_gl), ""])
-def test_depth_is_that_along_the_optical_axis(gl):
+def test_depth_is_along_the_optical_axis(gl):
     view = drawn(balls(), gl=gl)
     for (x, y, z), (u, v) in zip(PLACES, SMALL.project(PLACES), strict=True):
         pixel = np.rint((u, v))
@@ -125,7 +125,7 @@ def test_rays_and_opengl_agree_on_depth_and_colour():
 
 
 @pytest.mark.parametrize("gl", [pytest.param(GL, marks=needs_gl), ""])
-def test_arm_is_in_the_picture_where_its_joints_are(gl):
+def test_arm_is_rendered_at_its_joint_positions(gl):
     home, away = drawn([], arm(), gl=gl), drawn([], AWAY, gl=gl)
     hidden = home.depth < 0.5
     assert 0.05 < hidden.mean() < 0.6 and not (away.depth < 0.5).any()
@@ -134,7 +134,7 @@ def test_arm_is_in_the_picture_where_its_joints_are(gl):
 
 
 @needs_gl
-def test_what_stands_in_the_light_casts_a_shadow_away_from_it():
+def test_objects_cast_shadows_away_from_the_light():
     shadow = drawn(balls([(0.3, -0.2, 0.03)]), scenery=Scenery(lights={"aside": ASIDE})).colour
     none = drawn(balls([(0.3, -0.2, 0.03)]), scenery=Scenery(
         lights={"aside": ASIDE.model_copy(update={"shadow": False})})).colour
@@ -147,7 +147,7 @@ def test_what_stands_in_the_light_casts_a_shadow_away_from_it():
 
 
 @needs_gl
-def test_light_that_is_dimmed_or_warm_is_told_to_the_sensor_and_in_the_colours():
+def test_dimmed_and_warm_light_change_level_and_colors():
     bright, dim, warm = (
         PhysicsRenderer(CELL.world, Scenery(lights={"above": light}, ambient=0.2 * light.illuminance), ROBOT, SMALL,
                         depth=False, gl=GL)
@@ -160,7 +160,7 @@ def test_light_that_is_dimmed_or_warm_is_told_to_the_sensor_and_in_the_colours()
 
 
 @needs_gl
-def test_one_lamp_gets_darker_than_the_others():
+def test_one_lamp_can_be_dimmed():
     lamps = {"left": Light(position=(0.4, 0.6, 1.0), aim=(0.4, 0.2, 0.0), parallel=False, shadow=False),
              "right": Light(position=(0.4, -0.6, 1.0), aim=(0.4, -0.2, 0.0), parallel=False, shadow=False)}
     renderer = PhysicsRenderer(CELL.world, Scenery(lights=lamps), ROBOT, SMALL, depth=False, gl=GL)
@@ -173,7 +173,7 @@ def test_one_lamp_gets_darker_than_the_others():
 
 
 @pytest.mark.parametrize("gl", [pytest.param(GL, marks=needs_gl), ""])
-def test_lamp_shines_within_its_cone_only(gl):
+def test_lamp_lights_only_its_cone(gl):
     low = Light(position=(0.4, 0.0, 0.25), aim=(0.4, 0.0, 0.0), parallel=False)
     picture = drawn([], gl=gl, scenery=Scenery(lights={"low": low}, ambient=50)).colour[..., 1]
     inside, outside = ((round(float(v)), round(float(u))) for u, v in SMALL.project(np.array([
@@ -181,7 +181,7 @@ def test_lamp_shines_within_its_cone_only(gl):
     assert 0 < picture[outside] < 0.2 * picture[inside], "of light from everywhere alone"
 
 
-def test_what_is_out_of_sight_is_not_drawn_and_what_stands_still_is_not_drawn_again():
+def test_elsewhere_is_not_rendered_and_unchanged_scenes_are_cached():
     renderer = PhysicsRenderer(CELL.world, Scenery(), ROBOT, SMALL, depth=False, gl="")
     things = balls()
     first = renderer.render(things, AWAY)
@@ -191,7 +191,7 @@ def test_what_is_out_of_sight_is_not_drawn_and_what_stands_still_is_not_drawn_ag
 
 
 @pytest.mark.parametrize("error", [ImportError, RuntimeError, AttributeError, ctypes.ArgumentError])
-def test_pictures_are_drawn_by_rays_where_opengl_is_there_and_does_not_work(monkeypatch, caplog, error):
+def test_failing_opengl_falls_back_to_ray_casting(monkeypatch, caplog, error):
     def broken(kind, width, height):
         raise error("no glGetError")
 
@@ -201,7 +201,7 @@ def test_pictures_are_drawn_by_rays_where_opengl_is_there_and_does_not_work(monk
     assert "ray-cast, without shadows: OpenGL (egl) fails: no glGetError" in caplog.text
 
 
-def test_simulator_of_the_cell_says_who_draws(monkeypatch):
+def test_renderer_follows_the_simulator_of_the_cell(monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "off")
     select_gl.cache_clear()
     try:

@@ -29,122 +29,123 @@ SHAPES = [
 ]
 
 
-def thing_of_message(told: WorldObject) -> SceneObject:
-    """The object that a message tells of, which says no mass."""
-    return SceneObject(told.id, solid_of_message(told), (told.color.r, told.color.g, told.color.b))
+def object_of_message(message: WorldObject) -> SceneObject:
+    """The object of a message, with the default mass."""
+    return SceneObject(message.id, solid_of_message(message), (message.color.r, message.color.g, message.color.b))
 
 
 def model_of(cell: str, visuals: bool = False) -> tuple[RobotModel, CellModel]:
     config = load_cell(cell)
     robot = RobotModel.load(config.robot)
-    told = KinematicWorld(config.world).objects(Header()).objects
-    return robot, build_model(robot, config.world, [thing_of_message(thing) for thing in told], visuals=visuals)
+    message = KinematicWorld(config.world).objects(Header()).objects
+    return robot, build_model(robot, config.world, [object_of_message(thing) for thing in message], visuals=visuals)
 
 
 @pytest.mark.parametrize("cell", ["panda", "ur5"])
-def test_every_link_is_where_the_planner_has_it(cell: str) -> None:
-    robot, made = model_of(cell)
-    data = mujoco.MjData(made.model)
+def test_link_poses_match_the_planner(cell: str) -> None:
+    robot, cell_model = model_of(cell)
+    data = mujoco.MjData(cell_model.model)
     rng, fingers = np.random.default_rng(1), robot.config.gripper
     assert fingers is not None
     for _ in range(5):
         q = rng.uniform(robot.lower, robot.upper)
         others = dict(zip(fingers.joints, finger_positions(fingers, rng.uniform(0.0, fingers.max_width)), strict=True))
-        made.set_joints(data, [*robot.joint_names, *others], [*q, *others.values()])
-        mujoco.mj_kinematics(made.model, data)
+        cell_model.set_joints(data, [*robot.joint_names, *others], [*q, *others.values()])
+        mujoco.mj_kinematics(cell_model.model, data)
         for link, T in robot.link_poses(q, others).items():
             assert data.body(link).xpos == pytest.approx(T[:3, 3], abs=1e-9), link
             assert data.body(link).xmat == pytest.approx(T[:3, :3].ravel(), abs=1e-9), link
 
 
-def test_many_objects_do_not_touch_each_other_before_they_are_put_anywhere() -> None:
+def test_unplaced_objects_do_not_touch() -> None:
     config = load_cell("panda")
     box = solid_of(ObjectConfig.model_validate({"id": "box", "shape": "box", "size": [0.02, 0.02], "height": 0.02,
                                                 "x": 0.0, "y": 0.0}))
-    made = build_model(RobotModel.load(config.robot), config.world, [
+    cell_model = build_model(RobotModel.load(config.robot), config.world, [
         SceneObject(f"box_{k}", box, (1.0, 0.0, 0.0)) for k in range(100)])
-    data = mujoco.MjData(made.model)
-    data.qpos[:] = made.start
-    mujoco.mj_forward(made.model, data)
+    data = mujoco.MjData(cell_model.model)
+    data.qpos[:] = cell_model.start
+    mujoco.mj_forward(cell_model.model, data)
     assert data.ncon == 0
 
 
-def test_a_joint_without_any_room_between_its_limits_is_held() -> None:
+def test_joint_without_range_is_locked() -> None:
     config = load_cell("panda")
     robot = RobotModel.load(config.robot)
     robot.urdf = robot.urdf.replace("</robot>", '<link name="lid"><inertial><mass value="1"/><inertia ixx="0.01" '
                                     'iyy="0.01" izz="0.01"/></inertial></link><joint name="latch" type="revolute">'
                                     '<parent link="panda_link7"/><child link="lid"/><axis xyz="1 0 0"/><limit lower="0"'
                                     ' upper="0" effort="1" velocity="1"/></joint></robot>')
-    made = build_model(robot, config.world, [])
-    data = mujoco.MjData(made.model)
-    data.qpos[:] = made.start
-    data.qvel[made.dofs["latch"]] = 1.0
-    mujoco.mj_step(made.model, data, 100)
-    assert data.qpos[made.joints["latch"]] == pytest.approx(0.0, abs=1e-3)
+    cell_model = build_model(robot, config.world, [])
+    data = mujoco.MjData(cell_model.model)
+    data.qpos[:] = cell_model.start
+    data.qvel[cell_model.dofs["latch"]] = 1.0
+    mujoco.mj_step(cell_model.model, data, 100)
+    assert data.qpos[cell_model.joints["latch"]] == pytest.approx(0.0, abs=1e-3)
 
 
 @pytest.mark.parametrize("cell", ["panda", "ur5"])
-def test_nothing_touches_at_home_but_what_stands_on_something(cell: str) -> None:
-    _, made = model_of(cell)
-    data = mujoco.MjData(made.model)
-    data.qpos[:] = made.start
-    for number, name in enumerate(made.objects):
-        made.set_object(data, name, transform(np.eye(3), (5.0 + number, 0.0, 1.0)))
-    mujoco.mj_forward(made.model, data)
+def test_home_pose_has_no_contacts(cell: str) -> None:
+    _, cell_model = model_of(cell)
+    data = mujoco.MjData(cell_model.model)
+    data.qpos[:] = cell_model.start
+    for number, name in enumerate(cell_model.objects):
+        cell_model.set_object(data, name, transform(np.eye(3), (5.0 + number, 0.0, 1.0)))
+    mujoco.mj_forward(cell_model.model, data)
     assert data.ncon == 0
 
 
-def test_visual_shapes_are_made_once_and_change_nothing_that_moves(
-    monkeypatch: pytest.MonkeyPatch, kept_meshes: Path
+def test_visual_meshes_are_cached_and_do_not_affect_dynamics(
+    monkeypatch: pytest.MonkeyPatch, mesh_cache_folder: Path
 ) -> None:
     _, bare = model_of("panda")
     _, first = model_of("panda", visuals=True)
-    monkeypatch.setattr("common.robot.visual_meshes.visual_pieces", None)  # not asked again
+    monkeypatch.setattr("common.robot.visual_meshes.visual_pieces", None)  # must not be called again
     _, again = model_of("panda", visuals=True)
     assert first.model.nmeshvert == again.model.nmeshvert > bare.model.nmeshvert
     assert first.joints == bare.joints and first.objects == bare.objects
     assert first.model.body_mass == pytest.approx(bare.model.body_mass)
 
 
-def test_what_can_not_be_kept_is_made_anew(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_arrays_are_computed_when_the_cache_is_not_writable(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("not a folder")
     monkeypatch.setenv("ZENCELL_CACHE", str(tmp_path / "file"))
     for _ in range(2):
         assert cached_arrays("hull", [b"some"], lambda: {"points": np.ones(3)})["points"].sum() == 3
 
 
-def test_cut_short_file_of_a_mesh_is_made_anew(kept_meshes: Path) -> None:
-    made = cached_arrays("hull", [b"cut"], lambda: {"points": np.ones(3)})
-    newest = max(kept_meshes.rglob("hull-*.npz"), key=lambda path: path.stat().st_mtime_ns)
+def test_truncated_cache_file_is_recomputed(mesh_cache_folder: Path) -> None:
+    first = cached_arrays("hull", [b"cut"], lambda: {"points": np.ones(3)})
+    newest = max(mesh_cache_folder.rglob("hull-*.npz"), key=lambda path: path.stat().st_mtime_ns)
     newest.write_bytes(newest.read_bytes()[:40])
-    assert cached_arrays("hull", [b"cut"], lambda: {"points": np.ones(3)})["points"] == pytest.approx(made["points"])
+    again = cached_arrays("hull", [b"cut"], lambda: {"points": np.ones(3)})
+    assert again["points"] == pytest.approx(first["points"])
 
 
 @pytest.mark.parametrize("shape", SHAPES, ids=lambda shape: shape["id"])
-def test_every_shape_rests_as_it_was_put(shape: dict[str, object]) -> None:
+def test_every_shape_rests_as_placed(shape: dict[str, object]) -> None:
     config = load_cell("panda", ["world.count=0"])
     world = World.model_validate({"fixtures": config.world.fixtures, "objects": [shape]})
     robot = RobotModel.load(config.robot)
-    (told,) = KinematicWorld(world).objects(Header()).objects
-    made = build_model(robot, world, [thing_of_message(told)])
-    data = mujoco.MjData(made.model)
-    data.qpos[:] = made.start
-    before = pose_to_matrix(told.pose)
-    made.set_object(data, told.id, before)
+    (message,) = KinematicWorld(world).objects(Header()).objects
+    cell_model = build_model(robot, world, [object_of_message(message)])
+    data = mujoco.MjData(cell_model.model)
+    data.qpos[:] = cell_model.start
+    before = pose_to_matrix(message.pose)
+    cell_model.set_object(data, message.id, before)
     for _ in range(500):
-        mujoco.mj_step(made.model, data)
-    after = made.pose_of(data, told.id)
+        mujoco.mj_step(cell_model.model, data)
+    after = cell_model.pose_of(data, message.id)
     assert after[:3, 3] == pytest.approx(before[:3, 3], abs=1e-3)
     assert after[:3, :3] == pytest.approx(before[:3, :3], abs=0.01)
-    assert made.model.body_mass[made.objects[told.id].body] == pytest.approx(0.1)
+    assert cell_model.model.body_mass[cell_model.objects[message.id].body] == pytest.approx(0.1)
 
 
-def test_camera_looks_where_its_optical_frame_does() -> None:
+def test_camera_follows_its_optical_frame() -> None:
     config = load_cell("panda")
-    _, made = model_of("panda")
-    data = mujoco.MjData(made.model)
-    mujoco.mj_forward(made.model, data)
+    _, cell_model = model_of("panda")
+    data = mujoco.MjData(cell_model.model)
+    mujoco.mj_forward(cell_model.model, data)
     (name, camera), = config.world.cameras.items()
     found = data.camera(name)
     assert found.xpos == pytest.approx(camera.position)

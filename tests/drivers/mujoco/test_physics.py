@@ -1,4 +1,4 @@
-"""Things fall, roll, are pushed, held by friction alone, and are found again as they were."""
+"""Physics: objects fall, roll, are pushed and held by friction, and are restored after a restart."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from common.planning.ik import solve_ik
 from common.robot.finger_joints import finger_positions
 from common.robot.model import RobotModel
 from common.robot.transforms import tool_down
-from common.sim.interface import FeltWorld, PhysicalWorld, load_world
+from common.sim.interface import GripperDrivenWorld, PhysicalWorld, load_world
 from drivers.mujoco.world import PhysicsWorld
 
 BALL = {"shape": "sphere", "radius": 0.03, "mass": 0.1}
@@ -28,12 +28,12 @@ assert GRIPPER is not None
 
 
 class Rig:
-    """An arm over a table with things on it, and a clock that is moved by hand."""
+    """An arm above a table with objects, and a clock that tests drive by hand."""
 
-    def __init__(self, *things: dict[str, Any], cell: str = "panda") -> None:
+    def __init__(self, *objects: dict[str, Any], cell: str = "panda") -> None:
         config = load_cell(cell)
         self.robot = RobotModel.load(config.robot)
-        objects = [{"id": f"thing_{i + 1}", "x": 0.45, "y": 0.0, **thing} for i, thing in enumerate(things)]
+        objects = [{"id": f"object_{i + 1}", "x": 0.45, "y": 0.0, **obj} for i, obj in enumerate(objects)]
         self.config = World.model_validate({
             "fixtures": [{"id": "table", "dimensions": [1.0, 1.0, 0.05], "position": [0.5, 0.0, -0.025]}],
             "containers": {"box": {"x": 0.55, "y": 0.25}}, "objects": objects, "simulator": "mujoco"})
@@ -59,15 +59,15 @@ class Rig:
             self.arm.read(self.now)
 
     def move(self, to: Any, seconds: float = 1.0) -> None:
-        """Go there along a straight line in the joints, slowly at both ends."""
-        start, way = self.set_point.copy(), np.array(to, float) - self.set_point
+        """Move along a straight line in joint space with smooth ends."""
+        start, change = self.set_point.copy(), np.array(to, float) - self.set_point
         for step in range(1, round(seconds / PERIOD) + 1):
-            share = step * PERIOD / seconds
+            fraction = step * PERIOD / seconds
             self.now += PERIOD
             self.arm.read(self.now)
-            s, ds = 0.5 - 0.5 * math.cos(math.pi * share), 0.5 * math.pi / seconds * math.sin(math.pi * share)
-            self.set_point = start + s * way
-            self.arm.write(self.set_point, ds * way, self.now)
+            s, ds = 0.5 - 0.5 * math.cos(math.pi * fraction), 0.5 * math.pi / seconds * math.sin(math.pi * fraction)
+            self.set_point = start + s * change
+            self.arm.write(self.set_point, ds * change, self.now)
         self.wait(0.2)
 
     def above(self, x: float, y: float, z: float) -> Any:
@@ -79,57 +79,57 @@ class Rig:
         self.fingers.command(width, self.now, effort)
         self.wait(seconds)
 
-    def thing(self, name: str = "thing_1") -> WorldObject:
-        return next(thing for thing in self.world.objects(Header()).objects if thing.id == name)
+    def object(self, name: str = "object_1") -> WorldObject:
+        return next(obj for obj in self.world.objects(Header()).objects if obj.id == name)
 
-    def place(self, name: str = "thing_1") -> tuple[float, float, float]:
-        p = self.thing(name).pose.position
+    def position(self, name: str = "object_1") -> tuple[float, float, float]:
+        p = self.object(name).pose.position
         return p.x, p.y, p.z
 
     def push(self, name: str, *velocity: float) -> None:
-        cell, data = self.world._built
+        cell, data = self.world.simulation
         at = cell.objects[name].dof
         data.qvel[at: at + len(velocity)] = velocity
 
 
-def test_ball_rests_where_it_was_put_and_nothing_is_told_of_it() -> None:
+def test_resting_ball_stays_and_publishes_nothing() -> None:
     rig = Rig(BALL)
     rig.wait(0.1)
     version = rig.world.version
     rig.wait(2.0)
-    assert rig.place() == pytest.approx((0.45, 0.0, 0.03), abs=5e-4)
-    assert rig.thing().state == "table" and rig.world.version == version and rig.world.take_events() == []
+    assert rig.position() == pytest.approx((0.45, 0.0, 0.03), abs=5e-4)
+    assert rig.object().state == "table" and rig.world.version == version and rig.world.take_events() == []
 
 
-def test_pushed_ball_rolls_and_comes_to_a_stop() -> None:
+def test_pushed_ball_rolls_and_stops() -> None:
     rig = Rig(BALL)
-    rig.push("thing_1", 0.3)
+    rig.push("object_1", 0.3)
     rig.wait(0.5)
-    assert rig.place()[0] > 0.5
+    assert rig.position()[0] > 0.5
     rig.wait(3.0)
-    stopped = rig.place()
+    stopped = rig.position()
     rig.wait(1.0)
-    assert rig.place() == pytest.approx(stopped, abs=5e-4)
-    assert 0.5 < stopped[0] < 0.8 and rig.thing().state == "table"
+    assert rig.position() == pytest.approx(stopped, abs=5e-4)
+    assert 0.5 < stopped[0] < 0.8 and rig.object().state == "table"
 
 
 def test_ball_that_leaves_the_table_is_elsewhere() -> None:
     rig = Rig({**BALL, "x": 0.95})
-    rig.push("thing_1", 1.0)
+    rig.push("object_1", 1.0)
     rig.wait(0.3)
-    assert rig.thing().state == "falling"
+    assert rig.object().state == "falling"
     rig.wait(1.5)
-    assert rig.thing().state == "elsewhere" and rig.place()[2] < -0.5
+    assert rig.object().state == "elsewhere" and rig.position()[2] < -0.5
 
 
-def test_still_arm_stays_where_it_is_against_gravity() -> None:
+def test_arm_holds_its_pose_against_gravity() -> None:
     rig = Rig()
     rig.wait(1.0)
     q, dq = rig.arm.read(rig.now)
     assert q == pytest.approx(rig.robot.named("home"), abs=1e-3) and np.abs(dq).max() < 1e-3
 
 
-def test_at_rest_nothing_that_is_measured_changes() -> None:
+def test_readings_at_rest_are_constant() -> None:
     rig = Rig(BALL)
     rig.wait(0.5)
     readings = set()
@@ -140,7 +140,7 @@ def test_at_rest_nothing_that_is_measured_changes() -> None:
     assert len(readings) == 1
 
 
-def test_grasp_lifts_by_friction_and_drops_what_is_let_go() -> None:
+def test_grasped_ball_is_lifted_by_friction_and_released() -> None:
     rig = Rig(BALL)
     rig.move(rig.above(0.45, 0.0, 0.1))
     rig.move(rig.above(0.45, 0.0, 0.03))
@@ -150,25 +150,25 @@ def test_grasp_lifts_by_friction_and_drops_what_is_let_go() -> None:
     assert reading.holding and not reading.moving and reading.width == pytest.approx(0.06, abs=3e-3)
     assert reading.effort == pytest.approx(5.0, rel=0.1)
     rig.move(rig.above(0.45, 0.0, 0.2))
-    assert rig.thing().state == "held" and rig.place()[2] == pytest.approx(0.2, abs=5e-3)
+    assert rig.object().state == "held" and rig.position()[2] == pytest.approx(0.2, abs=5e-3)
     rig.wait(2.0)
-    assert rig.place()[2] == pytest.approx(0.2, abs=5e-3)
+    assert rig.position()[2] == pytest.approx(0.2, abs=5e-3)
     rig.grip(0.08)
     rig.wait(1.0)
-    assert rig.thing().state == "table" and rig.place()[2] == pytest.approx(0.03, abs=1e-3)
-    assert [update.data for update in rig.world.take_events()] == ["remove:thing_1", "add:thing_1"]
+    assert rig.object().state == "table" and rig.position()[2] == pytest.approx(0.03, abs=1e-3)
+    assert [update.data for update in rig.world.take_events()] == ["remove:object_1", "add:object_1"]
 
 
-def test_heavy_thing_slips_out_of_weak_fingers() -> None:
+def test_heavy_object_slips_out_of_weak_fingers() -> None:
     rig = Rig({**CUBE, "mass": 3.0})
     rig.move(rig.above(0.45, 0.0, 0.1))
     rig.move(rig.above(0.45, 0.0, 0.025))
     rig.grip(0.0, effort=2.0)
     rig.move(rig.above(0.45, 0.0, 0.2))
-    assert rig.place()[2] < 0.05
+    assert rig.position()[2] < 0.05
 
 
-def test_fingers_close_as_fast_as_they_are_told_to_from_the_first_time_on() -> None:
+def test_fingers_respect_their_speed_limit() -> None:
     rig = Rig()
     for _ in range(2):
         rig.wait(0.1)
@@ -181,7 +181,7 @@ def test_fingers_close_as_fast_as_they_are_told_to_from_the_first_time_on() -> N
         rig.grip(0.08)
 
 
-def test_fingers_close_on_nothing_and_say_so() -> None:
+def test_fingers_that_close_on_nothing_hold_nothing() -> None:
     rig = Rig()
     rig.grip(0.0)
     reading = rig.fingers.read(rig.now)
@@ -190,63 +190,63 @@ def test_fingers_close_on_nothing_and_say_so() -> None:
     assert rig.fingers.read(rig.now).width == pytest.approx(0.08, abs=1e-3)
 
 
-def test_fingers_that_open_against_something_do_not_push_the_arm_away() -> None:
-    rig = Rig({**CUBE, "size": [0.1, 0.1, 0.07], "y": 0.085, "mass": 80.0})  # beside the closed fingers
+def test_fingers_opening_against_an_obstacle_do_not_push_the_arm() -> None:
+    rig = Rig({**CUBE, "size": [0.1, 0.1, 0.07], "y": 0.085, "mass": 80.0})  # next to the closed fingers
     rig.grip(0.0)
     rig.move(rig.above(0.45, 0.0, 0.1))
     rig.move(rig.above(0.45, 0.0, 0.05))
     rig.grip(GRIPPER.max_width, GRIPPER.effort, 2.0)
-    assert rig.fingers.read(rig.now).width < GRIPPER.max_width - 0.01, "they are saved from opening"
+    assert rig.fingers.read(rig.now).width < GRIPPER.max_width - 0.01, "blocked from opening"
     assert np.abs(rig.arm.read(rig.now)[0] - rig.set_point).max() < 5e-3
 
 
 @pytest.mark.parametrize("cell", ["panda", "ur5"])
-def test_all_joints_of_the_gripper_follow_the_driven_one(cell: str) -> None:
+def test_gripper_joints_follow_the_driven_one(cell: str) -> None:
     rig = Rig(cell=cell)
     gripper = rig.robot.config.gripper
     assert gripper is not None
-    model, data = rig.world._built
-    for share in (0.2, 0.7):
-        rig.grip(share * gripper.max_width, gripper.max_effort, 3.0)
-        wanted = finger_positions(gripper, share * gripper.max_width)
+    model, data = rig.world.simulation
+    for fraction in (0.2, 0.7):
+        rig.grip(fraction * gripper.max_width, gripper.max_effort, 3.0)
+        wanted = finger_positions(gripper, fraction * gripper.max_width)
         found = [float(data.qpos[model.joints[name]]) for name in gripper.joints]
         assert found == pytest.approx(wanted, abs=0.01 if gripper.linkage else 1e-3)
 
 
-def test_stack_falls_when_it_is_touched() -> None:
+def test_stack_falls_when_touched() -> None:
     rig = Rig(CUBE, {**CUBE, "position": [0.45, 0.0, 0.075], "x": None, "y": None})
     rig.wait(1.0)
-    assert rig.place("thing_2")[2] == pytest.approx(0.075, abs=1e-3)
+    assert rig.position("object_2")[2] == pytest.approx(0.075, abs=1e-3)
     rig.grip(0.0)
     rig.move(rig.above(0.45, -0.12, 0.075))
     rig.move(rig.above(0.45, 0.02, 0.075))
     rig.wait(0.5)
-    assert rig.place("thing_2")[2] < 0.06 and rig.place("thing_2")[1] > 0.03
+    assert rig.position("object_2")[2] < 0.06 and rig.position("object_2")[1] > 0.03
 
 
-def test_what_is_found_again_moves_on_as_it_did() -> None:
+def test_restored_motion_continues() -> None:
     rig = Rig({**BALL, "x": 0.3}, CUBE)
-    rig.push("thing_1", 0.3, 0.1)
+    rig.push("object_1", 0.3, 0.1)
     rig.wait(0.3)
-    saved, before = rig.world.standing(), rig.place()
+    saved, before = rig.world.snapshot(), rig.position()
     saved = {name: type(each).model_validate(each.model_dump()) for name, each in saved.items()}
     rig.wait(0.3)
-    after = rig.place()
+    after = rig.position()
     rig.begin(rig.robot.named("home"))
     rig.world.restore(saved)
     rig.now += 1000.0
     rig.wait(0.01)
-    assert rig.place() == pytest.approx(before, abs=5e-3)
+    assert rig.position() == pytest.approx(before, abs=5e-3)
     rig.wait(0.3)
-    assert rig.place() == pytest.approx(after, abs=5e-3)
+    assert rig.position() == pytest.approx(after, abs=5e-3)
 
 
-def test_what_was_held_over_a_restart_is_still_held() -> None:
+def test_held_object_is_still_held_after_a_restart() -> None:
     rig = Rig(BALL)
     rig.move(rig.above(0.45, 0.0, 0.03))
     rig.grip(0.0)
     rig.move(rig.above(0.45, 0.0, 0.2))
-    saved, width = rig.world.standing(), rig.fingers.read(rig.now).width
+    saved, width = rig.world.snapshot(), rig.fingers.read(rig.now).width
     rig.begin(rig.set_point)
     rig.world.restore(saved)
     assert isinstance(rig.fingers, PlaceableGripper)
@@ -254,7 +254,7 @@ def test_what_was_held_over_a_restart_is_still_held() -> None:
     rig.fingers.command(0.0, rig.now, 5.0)
     rig.wait(1.0)
     assert rig.fingers.read(rig.now).holding
-    assert rig.thing().state == "held" and rig.place()[2] == pytest.approx(0.2, abs=8e-3)
+    assert rig.object().state == "held" and rig.position()[2] == pytest.approx(0.2, abs=8e-3)
 
 
 def test_edits_add_move_remove_and_reset() -> None:
@@ -262,24 +262,25 @@ def test_edits_add_move_remove_and_reset() -> None:
     rig.wait(0.1)
     added = rig.world.edit(WorldEdit(op="add", shape="ring", size=Vector3(x=0.06, y=0.06, z=0.03), inner_radius=0.02,
                                      position=Vector3(x=0.6, y=-0.2), mass=0.25), rig.now)
-    cell, _ = rig.world._built
+    cell, _ = rig.world.simulation
     assert cell.model.body_mass[cell.objects[added].body] == pytest.approx(0.25)
     rig.wait(0.5)
-    assert rig.place(added) == pytest.approx((0.6, -0.2, 0.015), abs=1e-3) and rig.place()[0] == pytest.approx(0.45)
-    rig.world.edit(WorldEdit(op="move", id="thing_1", position=Vector3(x=0.3, y=0.1)), rig.now)
+    assert rig.position(added) == pytest.approx((0.6, -0.2, 0.015), abs=1e-3)
+    assert rig.position()[0] == pytest.approx(0.45)
+    rig.world.edit(WorldEdit(op="move", id="object_1", position=Vector3(x=0.3, y=0.1)), rig.now)
     rig.wait(0.5)
-    assert rig.place() == pytest.approx((0.3, 0.1, 0.03), abs=1e-3)
+    assert rig.position() == pytest.approx((0.3, 0.1, 0.03), abs=1e-3)
     with pytest.raises(Refused, match=r"occupied|overlap"):
-        rig.world.edit(WorldEdit(op="move", id="thing_1", position=Vector3(x=0.45, y=-0.2)), rig.now)
-    rig.world.edit(WorldEdit(op="remove", id="thing_2"), rig.now)
-    assert rig.world.ids == ["thing_1", added]
+        rig.world.edit(WorldEdit(op="move", id="object_1", position=Vector3(x=0.45, y=-0.2)), rig.now)
+    rig.world.edit(WorldEdit(op="remove", id="object_2"), rig.now)
+    assert rig.world.ids == ["object_1", added]
     rig.wait(0.1)
     rig.world.edit(WorldEdit(op="reset"), rig.now)
     rig.wait(0.1)
-    assert rig.world.ids == ["thing_1", "thing_2"] and rig.place() == pytest.approx((0.45, 0.0, 0.03), abs=1e-3)
+    assert rig.world.ids == ["object_1", "object_2"] and rig.position() == pytest.approx((0.45, 0.0, 0.03), abs=1e-3)
 
 
-def test_what_the_simulator_does_not_take_is_refused_and_changes_nothing() -> None:
+def test_object_that_mujoco_rejects_is_refused_without_effect() -> None:
     rig = Rig(BALL)
     rig.wait(0.1)
     thin = WorldEdit(op="add", shape="prism", size=Vector3(x=0.1, y=0.1, z=1e-30), position=Vector3(x=0.6, y=-0.2),
@@ -287,120 +288,120 @@ def test_what_the_simulator_does_not_take_is_refused_and_changes_nothing() -> No
     rig.world.take_events()
     with pytest.raises(Refused, match="cannot simulate"):
         rig.world.edit(thin, rig.now)
-    assert rig.world.ids == ["thing_1"] and rig.world.take_events() == []
+    assert rig.world.ids == ["object_1"] and rig.world.take_events() == []
     added = rig.world.edit(WorldEdit(op="add", id="b", position=Vector3(x=0.6, y=-0.2)), rig.now)
     rig.wait(0.1)
-    assert rig.world.ids == ["thing_1", added] and rig.place()[0] == pytest.approx(0.45)
+    assert rig.world.ids == ["object_1", added] and rig.position()[0] == pytest.approx(0.45)
 
 
-@pytest.mark.parametrize("meanwhile", [None, WorldEdit(op="add", position=Vector3(x=0.3, y=-0.3, z=0.0))])
-def test_what_a_person_lets_slip_falls_out_of_the_fingers(meanwhile: WorldEdit | None) -> None:
+@pytest.mark.parametrize("concurrent_edit", [None, WorldEdit(op="add", position=Vector3(x=0.3, y=-0.3, z=0.0))])
+def test_dropped_object_falls_out_of_the_fingers(concurrent_edit: WorldEdit | None) -> None:
     rig = Rig(BALL)
     with pytest.raises(Refused, match="between the fingers"):
         rig.world.edit(WorldEdit(op="drop"), rig.now)
     rig.move(rig.above(0.45, 0.0, 0.03))
     rig.grip(0.0)
     rig.move(rig.above(0.45, 0.0, 0.2))
-    assert rig.world.edit(WorldEdit(op="drop"), rig.now) == "thing_1"
-    if meanwhile is not None:
-        rig.world.edit(meanwhile, rig.now)
+    assert rig.world.edit(WorldEdit(op="drop"), rig.now) == "object_1"
+    if concurrent_edit is not None:
+        rig.world.edit(concurrent_edit, rig.now)
     rig.wait(1.5)
-    assert rig.place()[2] == pytest.approx(0.03, abs=2e-3) and not rig.fingers.read(rig.now).holding
+    assert rig.position()[2] == pytest.approx(0.03, abs=2e-3) and not rig.fingers.read(rig.now).holding
 
 
-def lies_there_and_can_be_taken_again(rig: Rig) -> None:
-    assert math.dist(rig.place(), (0.45, 0.0, 0.03)) < 5e-3
-    assert np.abs(rig.arm.read(rig.now)[0] - rig.set_point).max() < 5e-3, "nor does it push the arm"
+def assert_undisturbed_and_graspable(rig: Rig) -> None:
+    assert math.dist(rig.position(), (0.45, 0.0, 0.03)) < 5e-3
+    assert np.abs(rig.arm.read(rig.now)[0] - rig.set_point).max() < 5e-3, "the arm is not pushed"
     rig.move(rig.above(0.45, 0.0, 0.2))
     rig.grip(0.08)
     rig.move(rig.above(0.45, 0.0, 0.03))
     rig.grip(0.0)
-    assert rig.fingers.read(rig.now).holding, "and it can be taken again"
+    assert rig.fingers.read(rig.now).holding, "graspable again"
 
 
-def test_what_a_person_lets_slip_on_the_table_is_not_flung_away_by_the_fingers_that_close_through_it() -> None:
+def test_object_dropped_on_the_table_is_not_flung_away_by_closing_fingers() -> None:
     rig = Rig(BALL)
     rig.move(rig.above(0.45, 0.0, 0.03))
     rig.grip(0.0)
     rig.world.edit(WorldEdit(op="drop"), rig.now)
     rig.wait(3.0)
-    lies_there_and_can_be_taken_again(rig)
+    assert_undisturbed_and_graspable(rig)
 
 
-def test_what_slips_over_a_restart_is_not_flung_away_by_the_fingers_that_are_within_it() -> None:
+def test_slipping_object_is_not_flung_away_after_a_restart() -> None:
     rig = Rig(BALL)
     rig.move(rig.above(0.45, 0.0, 0.03))
     rig.grip(0.0)
     rig.world.edit(WorldEdit(op="drop"), rig.now)
     rig.wait(0.15)
-    saved, width = rig.world.standing(), rig.fingers.read(rig.now).width
+    saved, width = rig.world.snapshot(), rig.fingers.read(rig.now).width
     assert width < 0.04, "the fingers are within the ball"
     rig.begin(rig.set_point)
     rig.world.restore({name: type(each).model_validate(each.model_dump()) for name, each in saved.items()})
     assert isinstance(rig.fingers, PlaceableGripper)
     rig.fingers.place(width)
     rig.grip(0.0, seconds=3.0)
-    lies_there_and_can_be_taken_again(rig)
+    assert_undisturbed_and_graspable(rig)
 
 
-def test_what_is_kept_of_a_world_is_of_the_moment() -> None:
+def test_snapshot_has_the_current_pose() -> None:
     rig = Rig(BALL)
     rig.wait(0.5)
-    rig.push("thing_1", 0.2)
-    for _ in range(10):  # more often than is told of anything that moves
-        before = rig.world.standing()["thing_1"].details["qpos"][0]
+    rig.push("object_1", 0.2)
+    for _ in range(10):  # shorter than the publish interval
+        before = rig.world.snapshot()["object_1"].details["qpos"][0]
         rig.wait(PERIOD)
-        assert rig.world.standing()["thing_1"].details["qpos"][0] - before > 0.1 * PERIOD
+        assert rig.world.snapshot()["object_1"].details["qpos"][0] - before > 0.1 * PERIOD
 
 
-def test_what_was_carried_over_a_restart_stands_still_with_the_arm() -> None:
+def test_held_object_is_restored_at_rest() -> None:
     rig = Rig(BALL)
     rig.move(rig.above(0.45, 0.0, 0.03))
     rig.grip(0.0)
     rig.move(rig.above(0.45, 0.0, 0.2))
-    rig.push("thing_1", 0.0, 1.0)
-    saved = rig.world.standing()
-    assert saved["thing_1"].details["qvel"][1] == 1.0
+    rig.push("object_1", 0.0, 1.0)
+    saved = rig.world.snapshot()
+    assert saved["object_1"].details["qvel"][1] == 1.0
     rig.begin(rig.set_point)
     rig.world.restore(saved)
-    cell, data = rig.world._built
-    assert not data.qvel[cell.objects["thing_1"].dof:][:6].any()
+    cell, data = rig.world.simulation
+    assert not data.qvel[cell.objects["object_1"].dof:][:6].any()
 
 
-def test_hold_up_of_the_process_is_no_leap_in_the_world() -> None:
+def test_delay_of_the_process_does_not_advance_the_world() -> None:
     rig = Rig(BALL)
-    rig.push("thing_1", 0.2)
+    rig.push("object_1", 0.2)
     rig.wait(0.1)
-    before = rig.place()
+    before = rig.position()
     rig.now += 3600.0
     rig.arm.read(rig.now)
-    assert rig.place() == pytest.approx(before, abs=5e-3)
+    assert rig.position() == pytest.approx(before, abs=5e-3)
 
 
-def test_kinds_of_worlds_are_told_apart() -> None:
+def test_kinematic_and_physics_worlds_satisfy_different_protocols() -> None:
     rig = Rig()
     kinematic = load_world(rig.config.model_copy(update={"simulator": "kinematic"}), [])
-    assert isinstance(rig.world, PhysicalWorld) and not isinstance(rig.world, FeltWorld)
-    assert isinstance(kinematic, FeltWorld) and not isinstance(kinematic, PhysicalWorld)
+    assert isinstance(rig.world, PhysicalWorld) and not isinstance(rig.world, GripperDrivenWorld)
+    assert isinstance(kinematic, GripperDrivenWorld) and not isinstance(kinematic, PhysicalWorld)
 
 
-def test_suction_cup_is_refused_and_says_what_does() -> None:
+def test_suction_cup_is_rejected_with_an_alternative() -> None:
     rig = Rig()
     cup = rig.robot.config.gripper.model_copy(update={"cup": object()})  # type: ignore[union-attr]
     with pytest.raises(ConfigError, match="kinematic"):
         load_world(rig.config, [], None, cup)
 
 
-def test_without_mujoco_one_line_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_mujoco_is_an_error_that_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     rig = Rig()
     monkeypatch.setattr("drivers.mujoco.find_spec", lambda name: None)
     with pytest.raises(ConfigError, match="zencell\\[physics\\]"):
         load_world(rig.config, [])
 
 
-def test_arm_pushes_with_no_more_than_its_motors_have() -> None:
+def test_joint_forces_respect_effort_limits() -> None:
     rig = Rig()
-    model, data = rig.world._built
+    model, data = rig.world.simulation
     limits = rig.robot.model.effortLimit
     rig.arm.write(rig.set_point + 0.5, 0 * rig.set_point, rig.now)
     rig.wait(0.05)

@@ -1,4 +1,4 @@
-"""Real cells with their page, and a real browser that opens it.
+"""Real cells with their page, and a real browser.
 
 Tests that use the browser share its event loop: `pytestmark = IN_BROWSER`.
 """
@@ -29,12 +29,12 @@ IN_BROWSER = [
     pytest.mark.browser, pytest.mark.cell, pytest.mark.slow, pytest.mark.timeout(240),
     pytest.mark.asyncio(loop_scope="session"),
 ]
-PATIENCE = 60.0  # [s] until a test gives up waiting for an event; a busy machine without a GPU is slow
+PATIENCE = 60.0  # [s] for each event; a busy machine without a GPU is slow
 NAMES = ("chromium", "chromium-browser", "google-chrome-stable", "google-chrome")
 ARGUMENTS = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 SIZE: ViewportSize = {"width": 1280, "height": 800}  # [CSS pixels]
-PIXELS = 0.5  # for each of them: the CPU draws the scene
-# A frame takes the CPU 0.1 s and more. Ten in a second are enough, and leave the cell its share.
+PIXELS = 0.5  # device pixels per CSS pixel: the CPU draws the scene
+# A frame takes the CPU 0.1 s and more; ten a second leave CPU time for the cell.
 FEW_FRAMES = """
 const draw = window.requestAnimationFrame.bind(window);
 window.requestAnimationFrame = step => setTimeout(() => draw(step), 100);
@@ -44,28 +44,28 @@ window.cancelAnimationFrame = clearTimeout;
 
 @dataclass
 class Watched:
-    """A page, and everything of it that a test should not overlook."""
+    """A page with its errors and requests."""
 
     page: Page
-    hosts: set[str] = field(default_factory=set)  # that it asked for anything
+    hosts: set[str] = field(default_factory=set)  # of its requests
     errors: list[str] = field(default_factory=list)  # of its console and its scripts
     failed: list[str] = field(default_factory=list)  # requests
 
     def __post_init__(self) -> None:
         self.page.set_default_timeout(PATIENCE * 1e3)
-        self.page.on("request", lambda request: self._asked(request.url))
-        self.page.on("websocket", lambda opened: self._asked(opened.url))
-        self.page.on("console", lambda said: self.errors.append(said.text) if said.type == "error" else None)
+        self.page.on("request", lambda request: self._requested(request.url))
+        self.page.on("websocket", lambda opened: self._requested(opened.url))
+        self.page.on("console", lambda line: self.errors.append(line.text) if line.type == "error" else None)
         self.page.on("pageerror", lambda error: self.errors.append(str(error)))
         self.page.on("requestfailed", lambda request: self.failed.append(f"{request.url}: {request.failure}"))
 
-    def _asked(self, url: str) -> None:
+    def _requested(self, url: str) -> None:
         host = urlsplit(url.removeprefix("blob:")).hostname
-        if host is not None:  # nobody is asked for data: and about:
+        if host is not None:  # data: and about: are no requests
             self.hosts.add(host)
 
     async def open(self, address: str) -> Page:
-        """The page, once it is connected and shows its scene."""
+        """Return the page once it is connected and shows its scene."""
         async with self.page.expect_event("websocket"):
             await self.page.goto(address)
         await self.page.locator("canvas").first.wait_for()
@@ -73,15 +73,15 @@ class Watched:
 
 
 class Viewed(RunningCell):
-    """A `zencell run` or `up` whose page is served."""
+    """A `zencell run` or `up` with a page."""
 
     def __init__(self, folder: Path, verb: str, cell: str, *arguments: str) -> None:
-        """Start it; `address` is there after `served`."""
+        """Start it; `address` is known after `served`."""
         super().__init__(folder, verb, cell, *arguments, "--viewer-port", str(free_port()))
         self.address = ""
 
     async def served(self) -> Viewed:
-        """Itself, once it has printed where its page is."""
+        """Return itself once it has printed the address of its page."""
         async with asyncio.timeout(PATIENCE):
             while not (found := re.search(r"^Open (http\S+)$", self.text, re.MULTILINE)):
                 if self.process.poll() is not None:
@@ -92,7 +92,7 @@ class Viewed(RunningCell):
 
 
 def free_port() -> int:
-    """A TCP port of this machine that is free."""
+    """Return a free TCP port."""
     with socket.create_server(("127.0.0.1", 0)) as probe:
         port: int = probe.getsockname()[1]
         return port
@@ -104,11 +104,10 @@ Opened = Callable[..., AbstractAsyncContextManager[Watched]]
 
 @pytest_asyncio.fixture(scope="module", loop_scope="session")
 async def bring(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[Bring]:
-    """Brings a cell up with its page: `await bring("up", "panda", "--set", "autostart=false")`.
+    """Start a cell with its page: `await bring("up", "panda", "--set", "autostart=false")`.
 
-    Who asks for the cell that is up already, in the same words, gets that one; another ends it first. So tests of a
-    file share a cell, should leave it as they found it, and are best put in an order in which few are needed. It ends
-    with the file: the tests that come after need the processor.
+    Repeated calls with the same arguments return the same running cell; other arguments end it first. So tests of a
+    file share cells and must leave them unchanged. The last cell ends with the file.
     """
     current: dict[tuple[str, ...], Viewed] = {}
 
@@ -117,12 +116,12 @@ async def bring(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[Bring
             viewed.__exit__()
         current.clear()
 
-    async def up(*words: str) -> Viewed:
-        if words not in current or current[words].process.poll() is not None:
+    async def up(*arguments: str) -> Viewed:
+        if arguments not in current or current[arguments].process.poll() is not None:
             end()
-            current[words] = Viewed(tmp_path_factory.mktemp("viewed"), *words)
-            await current[words].served()
-        return current[words]
+            current[arguments] = Viewed(tmp_path_factory.mktemp("viewed"), *arguments)
+            await current[arguments].served()
+        return current[arguments]
 
     yield up
     end()
@@ -145,7 +144,7 @@ async def browser() -> AsyncIterator[Browser]:
 
 
 def missing(what: str) -> None:
-    """Skip a test for what is missing here; where everything should be, in CI, that is a failure."""
+    """Skip a test for a missing program; in CI that is a failure."""
     if os.environ.get("CI", "").lower() in ("true", "1"):
         pytest.fail(what, pytrace=False)
     pytest.skip(what)
@@ -153,7 +152,7 @@ def missing(what: str) -> None:
 
 @pytest_asyncio.fixture(loop_scope="session")
 async def opened(browser: Browser) -> Opened:
-    """A browser of its own, without cookies, that is closed after the block: `async with opened() as watched`."""
+    """A separate browser without cookies, closed after the block: `async with opened() as watched`."""
 
     @asynccontextmanager
     async def block() -> AsyncIterator[Watched]:
@@ -169,6 +168,6 @@ async def opened(browser: Browser) -> Opened:
 
 @pytest_asyncio.fixture(loop_scope="session")
 async def watched(opened: Opened) -> AsyncIterator[Watched]:
-    """One page that is not open yet: `await watched.open(cell.address)`."""
+    """A page that is not open yet: `await watched.open(cell.address)`."""
     async with opened() as one:
         yield one

@@ -1,4 +1,4 @@
-"""A person at the page of a real cell: what is clicked there happens, and what happens is seen there."""
+"""Operating a real cell on its page."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 pytestmark = IN_BROWSER
 
 LAYOUT = ("--set", f"services.viewer.layout={Path(__file__).with_name('nothing_to_draw.yaml')}")
-# Slow, so that the task is not done before a busy browser has drawn the page.
+# Slow, so that the task lasts until a busy browser has drawn the page.
 PANDA = ("up", "panda", "--set", "autostart=false", "--set", "services.trajectory_executor.speed_scaling=0.2", *LAYOUT)
 UR5 = ("up", "ur5", "--world", "w5", "--speed", "10", "--set", "autostart=false", *LAYOUT)
 MOVING = 0.01  # [rad/s]
@@ -42,22 +42,22 @@ def is_moving(state: JointState) -> bool:
 
 
 async def after(reader: Reader[JointState], count: int) -> JointState:
-    """The joint state after so many more."""
+    """Return the joint state after a number of others."""
     for _ in range(count):
         await reader.next()
     return await reader.next()
 
 
 async def in_motion(page: Page, joints: Reader[JointState]) -> None:
-    """Have the task begin, if it does not run yet, and wait until the arm moves for it."""
+    """Start the task, if it is not running, and wait until the arm moves."""
     start = page.get_by_role("button", name="Start")
-    runs = page.locator('[data-press="start"][title="it runs already"]')
+    runs = page.locator('[data-press="start"][title="already running"]')
     try:
         await start.and_(page.locator(":not([aria-disabled])")).or_(runs).wait_for()
     except BaseException as error:
-        said = await page.locator("body").inner_text(timeout=5000)
+        text = await page.locator("body").inner_text(timeout=5000)
         presses = await page.locator("[data-press=start]").evaluate_all("found => found.map(one => one.outerHTML)")
-        error.add_note(f"Start is {presses}; the page says {said!r}")
+        error.add_note(f"Start is {presses}; the page shows {text!r}")
         raise
     if not await runs.count():
         await start.click()
@@ -74,15 +74,15 @@ async def test_pause_stops_the_arm_and_resume_starts_it(bring: Bring, watched: W
         place = await pause.bounding_box()
         await in_motion(page, joints)
         await pause.click()
-        await until(motion, lambda told: told.held, PATIENCE)
+        await until(motion, lambda status: status.held, PATIENCE)
         await until(joints, lambda state: not is_moving(state), PATIENCE)
         still = (await after(joints, 5)).position
         assert (await after(joints, 100)).position == pytest.approx(still, abs=1e-6)
         await page.locator('[data-part="task"][data-paused="True"]').get_by_text("Paused", exact=True).wait_for()
-        assert await pause.bounding_box() == place, "it moved away under the pointer"
+        assert await pause.bounding_box() == place, "it must not move under the pointer"
         await page.get_by_role("button", name="Resume").click()
         await until(joints, is_moving, PATIENCE)
-        assert not (await until(status, lambda told: not told.paused, PATIENCE)).paused
+        assert not (await until(status, lambda status: not status.paused, PATIENCE)).paused
         await page.locator('[data-part="task"][data-paused="False"][data-held="False"]').wait_for()
 
 
@@ -93,11 +93,11 @@ async def test_stop_stops_arm_and_task(bring: Bring, watched: Watched) -> None:
         joints = bus.reader(topics.JOINT_STATES)
         await in_motion(page, joints)
         stopping = asyncio.create_task(
-            until(bus.reader(PICK_PLACE_STATUS), lambda told: not told.started, PATIENCE))
+            until(bus.reader(PICK_PLACE_STATUS), lambda status: not status.started, PATIENCE))
         await page.get_by_role("button", name="STOP").click()
         stopped: PickPlaceStatus = await stopping
         ended: MotionStatus = await until(
-            bus.reader(topics.MOTION_STATUS), lambda told: told.state != "active", PATIENCE)
+            bus.reader(topics.MOTION_STATUS), lambda status: status.state != "active", PATIENCE)
         assert ended.state == "cancelled" and stopped.state != "ERROR"
         await until(joints, lambda state: not is_moving(state), PATIENCE)
         still = (await after(joints, 5)).position
@@ -105,17 +105,17 @@ async def test_stop_stops_arm_and_task(bring: Bring, watched: Watched) -> None:
         await page.locator('[data-part="notice"]').get_by_text("Stopped").wait_for()
 
 
-async def test_escape_stops_as_the_button_does(bring: Bring, watched: Watched) -> None:
+async def test_escape_key_stops_too(bring: Bring, watched: Watched) -> None:
     cell = await bring(*PANDA)
     page = await watched.open(cell.address)
     async with cell.listen() as bus:
         await in_motion(page, bus.reader(topics.JOINT_STATES))
         await page.keyboard.press("Escape")
-        await until(bus.reader(topics.MOTION_STATUS), lambda told: told.state == "cancelled", PATIENCE)
-        await until(bus.reader(PICK_PLACE_STATUS), lambda told: not told.started, PATIENCE)
+        await until(bus.reader(topics.MOTION_STATUS), lambda status: status.state == "cancelled", PATIENCE)
+        await until(bus.reader(PICK_PLACE_STATUS), lambda status: not status.started, PATIENCE)
 
 
-async def test_parameter_changed_on_the_page_changes_the_service_and_the_other_way_round(
+async def test_parameter_is_changed_on_the_page_and_shown_when_changed_elsewhere(
     bring: Bring, watched: Watched
 ) -> None:
     from playwright.async_api import expect
@@ -130,7 +130,7 @@ async def test_parameter_changed_on_the_page_changes_the_service_and_the_other_w
     async with cell.listen() as bus:
         client = bus.client(topics.parameters_of("camera_simulator"))
         await field.fill("3")
-        await page.locator('[data-part="tuning"]').get_by_text(f"{NOISE} is 3.0 now").wait_for()
+        await page.locator('[data-part="tuning"]').get_by_text(f"{NOISE} set to 3.0").wait_for()
         assert await value_of(client) == 3
         await client.call(ParameterRequest(set={NOISE: 0}, by="a test"))
         await expect(field).to_have_value("0", timeout=1e3 * PATIENCE)
@@ -150,7 +150,7 @@ async def test_killed_service_turns_red_and_comes_back(bring: Bring, watched: Wa
     await line.and_(page.locator('[data-state="ready"]')).locator(".good").wait_for()
     async with cell.listen() as bus:
         supervisor = bus.reader(topics.SUPERVISOR_STATUS)
-        status = await until(supervisor, lambda told: bool(pid_of(told)), PATIENCE)
+        status = await until(supervisor, lambda status: bool(pid_of(status)), PATIENCE)
         red = asyncio.create_task(line.locator(".bad").wait_for())
         await asyncio.sleep(0)
         os.kill(pid_of(status), signal.SIGKILL)
@@ -162,14 +162,14 @@ def pid_of(status: SupervisorStatus) -> int:
     return next((service.pid or 0 for service in status.services if service.name == "workspace_validator"), 0)
 
 
-async def test_choosing_an_object_on_the_page_traces_it(bring: Bring, watched: Watched) -> None:
+async def test_selected_object_is_traced(bring: Bring, watched: Watched) -> None:
     cell = await bring(*UR5)
     page = await watched.open(cell.address)
     async with cell.listen() as bus:
         status = bus.reader(OUTLINE_STATUS)
-        found = await until(bus.reader(CONTOURS), lambda told: len(told.contours) == 3, PATIENCE)
+        found = await until(bus.reader(CONTOURS), lambda found: len(found.contours) == 3, PATIENCE)
         other = next(contour.label for contour in found.contours if contour.index != found.selected)
         await page.get_by_role("button", name=other).click()
-        done: OutlineStatus = await until(status, lambda told: told.state in ("DONE", "ERROR"), 2 * PATIENCE)
+        done: OutlineStatus = await until(status, lambda status: status.state in ("DONE", "ERROR"), 2 * PATIENCE)
         assert (done.state, done.object, done.closed) == ("DONE", other, True), done.message
         await page.locator('[data-part="task"][data-state="DONE"]').get_by_text("Done").wait_for()

@@ -1,4 +1,4 @@
-"""The page in a real browser: it opens, asks nobody else for anything, and its comings and goings change nothing."""
+"""The page in a real browser: it loads without other hosts, and pages do not disturb the task."""
 
 import asyncio
 from collections.abc import Iterator
@@ -15,7 +15,7 @@ from websockets.asyncio.client import connect as connect_socket
 from applications.pick_place.topics import PICK_PLACE_STATUS
 from common import topics
 from common.messages import TaskCommand
-from page.guard import close_server, make_server
+from page.server import close_server, make_server
 from tests.harness import until
 from tests.page.browser.conftest import IN_BROWSER, PATIENCE, Bring, Opened, Viewed, Watched
 
@@ -23,7 +23,7 @@ pytestmark = IN_BROWSER
 
 SECRET = "correct-horse-battery"
 WAITING = ("--set", "autostart=false")
-# Where somebody looks from: the first that a browser tells, and what makes a page of its socket.
+# The first message of a browser; viser ignores clients without a camera.
 CAMERA = msgspec.msgpack.encode({
     "type": "ViewerCameraMessage", "wxyz": (1.0, 0.0, 0.0, 0.0), "position": (2.0, 0.0, 1.0), "fov": 1.0, "near": 0.1,
     "far": 100.0, "image_height": 480, "image_width": 640, "look_at": (0.0, 0.0, 0.0), "up_direction": (0.0, 0.0, 1.0),
@@ -31,7 +31,7 @@ CAMERA = msgspec.msgpack.encode({
 
 
 @pytest.mark.parametrize("cell", ["panda", "ur5"])
-async def test_page_opens_without_an_error_and_asks_no_other_host(bring: Bring, watched: Watched, cell: str) -> None:
+async def test_page_loads_without_errors_and_without_other_hosts(bring: Bring, watched: Watched, cell: str) -> None:
     up = await bring("up", cell, *WAITING)
     page = await watched.open(up.address)
     await page.wait_for_load_state("networkidle")
@@ -39,8 +39,8 @@ async def test_page_opens_without_an_error_and_asks_no_other_host(bring: Bring, 
     assert watched.errors == [] and watched.failed == []
 
 
-async def test_pages_that_come_and_go_change_nothing_for_the_task(opened: Opened, tmp_path: Path) -> None:
-    """Ten sockets as ten browsers have them, for the price of one browser: who stays, who vanishes, who never reads."""
+async def test_pages_that_connect_and_disconnect_do_not_disturb_the_task(opened: Opened, tmp_path: Path) -> None:
+    """Ten WebSockets instead of ten browsers: some stay, some vanish, one never reads."""
     with Viewed(tmp_path, "up", "panda", "--speed", "2", "--set", "world.count=3", *WAITING) as cell:
         await cell.served()
         async with cell.listen() as bus, AsyncExitStack() as stack:
@@ -51,13 +51,13 @@ async def test_pages_that_come_and_go_change_nothing_for_the_task(opened: Opened
             for socket in sockets[:9]:
                 await served(socket)
             await bus.client(topics.TASK_COMMAND).call(TaskCommand(command="start"), PATIENCE)
-            await until(status, lambda told: told.state == "PLACING", PATIENCE)
+            await until(status, lambda status: status.state == "PLACING", PATIENCE)
             for socket in sockets[:4]:
                 socket.transport.abort()
             async with opened() as watched:
                 await watched.open(cell.address)
                 errors = list(watched.errors)
-            done = await until(status, lambda told: told.state in ("DONE", "ERROR"), PATIENCE * 2)
+            done = await until(status, lambda status: status.state in ("DONE", "ERROR"), PATIENCE * 2)
             for socket in sockets[4:9]:
                 await served(socket)
         cell.interrupt()
@@ -69,7 +69,7 @@ async def test_pages_that_come_and_go_change_nothing_for_the_task(opened: Opened
 
 
 def socket_of(cell: Viewed) -> connect_socket:
-    """The socket of a page as a browser opens it."""
+    """Return the WebSocket of a page as a browser opens it."""
     return connect_socket(
         cell.address.replace("http", "ws"), origin=Origin(cell.address), max_size=None, proxy=None, close_timeout=1,
         subprotocols=[Subprotocol(f"viser-v{viser.__version__}")], open_timeout=PATIENCE,
@@ -77,25 +77,25 @@ def socket_of(cell: Viewed) -> connect_socket:
 
 
 async def served(socket: ClientConnection) -> None:
-    """Return when three more messages have come."""
+    """Receive three more messages."""
     for _ in range(3):
         assert isinstance(await socket.recv(), bytes)
 
 
 @pytest.fixture
-def wide() -> Iterator[viser.ViserServer]:
-    """A page that other machines could reach, for as long as a test takes."""
+def remote() -> Iterator[viser.ViserServer]:
+    """A page that other machines could reach."""
     server = make_server("0.0.0.0", 0, SECRET)
     server.gui.add_button("A button")
     yield server
     close_server(server)
 
 
-async def test_token_opens_the_page_once_and_is_not_in_the_address_then(
-    wide: viser.ViserServer, watched: Watched
+async def test_token_opens_the_page_and_is_removed_from_the_address(
+    remote: viser.ViserServer, watched: Watched
 ) -> None:
-    address = f"http://127.0.0.1:{wide.get_port()}/"
-    stranger = await watched.page.context.new_page()  # whose console tells of the refusal
+    address = f"http://127.0.0.1:{remote.get_port()}/"
+    stranger = await watched.page.context.new_page()  # its console shows the rejection
     refused = await stranger.goto(address)
     assert refused is not None and refused.status == 401
     await stranger.close()
@@ -107,12 +107,12 @@ async def test_token_opens_the_page_once_and_is_not_in_the_address_then(
     assert watched.errors == []
 
 
-async def test_another_web_page_in_the_same_browser_reaches_nothing(wide: viser.ViserServer, watched: Watched) -> None:
-    address = f"127.0.0.1:{wide.get_port()}"
+async def test_foreign_web_page_in_the_same_browser_has_no_access(remote: viser.ViserServer, watched: Watched) -> None:
+    address = f"127.0.0.1:{remote.get_port()}"
     page = await watched.open(f"http://{address}/?token={SECRET}")
     await page.get_by_role("button", name="A button").wait_for()
     foreign = await page.context.new_page()
-    # Of the same site, which is all that its cookie asks for.
+    # Of the same site, so that the browser sends the cookie.
     await foreign.route("http://127.0.0.1:9/", lambda route: route.fulfill(content_type="text/html", body="<p>evil"))
     await foreign.goto("http://127.0.0.1:9/")
     protocol = f"viser-v{viser.__version__}"
@@ -120,18 +120,18 @@ async def test_another_web_page_in_the_same_browser_reaches_nothing(wide: viser.
         """([address, protocol]) => new Promise(resolve => {
             const socket = new WebSocket(`ws://${address}/`, protocol);
             socket.onopen = () => resolve("opened");
-            socket.onerror = () => resolve("refused");
+            socket.onerror = () => resolve("rejected");
         })""", [address, protocol],
     )
-    assert ended == "refused"
+    assert ended == "rejected"
     framed = await foreign.evaluate(
         """address => new Promise(resolve => {
             const frame = document.createElement("iframe");
-            frame.onload = () => resolve(frame.contentDocument === null ? "not ours to read" : "read");
+            frame.onload = () => resolve(frame.contentDocument === null ? "not readable" : "read");
             frame.src = `http://${address}/`;
             document.body.append(frame);
         })""", address,
     )
-    assert framed == "not ours to read"
+    assert framed == "not readable"
     frame = foreign.frames[-1]
     assert await frame.locator("canvas").count() == 0 and "error" in frame.url

@@ -11,7 +11,7 @@ from applications.pick_place.topics import (
 )
 from common import topics
 from common.application import find_application
-from common.client.rates import MOST_SERVICES, Rates
+from common.client.statistics import MOST_SERVICES, Rates
 from common.clock import Clock
 from common.messages import (
     Header,
@@ -27,7 +27,7 @@ from common.transport.local import LocalNetwork
 from recording.report.aggregator import Collector, RunAggregator
 
 
-def test_rates_come_from_what_readers_count() -> None:
+def test_rates_come_from_reader_counts() -> None:
     rates = Rates()
     for service, key in (("left_camera", "left/image_raw"), ("trajectory_executor", "joint_states")):
         rates.update(ServiceCounters(service=service, writes=[key]), 0.0)
@@ -41,7 +41,7 @@ def test_rates_come_from_what_readers_count() -> None:
     assert rates.of_topic("left/image_raw") == 0.0  # it was started again
 
 
-def test_of_services_that_somebody_makes_up_those_are_known_that_were_heard_of_last() -> None:
+def test_of_invented_services_the_most_recent_are_remembered() -> None:
     rates = Rates()
     for second in range(3):
         for number in range(1000):
@@ -61,7 +61,7 @@ def balls(*labels: str) -> PoseArray:
     return PoseArray(poses=[Pose()] * len(labels), labels=list(labels))
 
 
-async def test_collector_hears_the_cell_and_waits_for_what_still_falls() -> None:
+async def test_collector_feeds_the_aggregator_and_waits_for_falling_objects() -> None:
     net = LocalNetwork()
     clock = Clock(2.0)
     cell = net.bus("cell", cell="test", clock=clock)

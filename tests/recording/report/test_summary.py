@@ -48,7 +48,7 @@ def test_summary_has_the_fields_that_scripts_read() -> None:
     json.dumps(summary)
 
 
-def test_a_place_is_listed_once_and_what_lies_in_the_box_never() -> None:
+def test_rejected_position_is_listed_once_and_placed_objects_never() -> None:
     rejected = Rejected()
     rejected.add([at(0.9, 0.0), at(0.9, 0.02), at(0.9, 0.1), at(0.55, 0.25, "inside the container")])
     rejected.add([at(0.905, 0.0, "partly out of view")])
@@ -57,19 +57,19 @@ def test_a_place_is_listed_once_and_what_lies_in_the_box_never() -> None:
     ]
 
 
-def test_of_what_is_made_up_the_newest_is_kept() -> None:
+def test_of_invented_rejections_the_newest_are_listed() -> None:
     summary = Summary("panda", 1, 1.0)
     for number in range(12):
         summary.on_rejections(0.0, Rejections(header=Header(), rejected=[at(i, number) for i in range(1000)]))
         for plans in ([PLAN] * 1000, []):
             summary.on_status(status("IDLE", number, plans=plans))
-    told = summary.as_dict()
-    assert len(told["rejected"]) == 1000 and {each["position"][1] for each in told["rejected"]} == {11.0}
-    assert len(told["plans"]) == 10_000
+    values = summary.as_dict()
+    assert len(values["rejected"]) == 1000 and {each["position"][1] for each in values["rejected"]} == {11.0}
+    assert len(values["plans"]) == 10_000
 
 
 @given(st.lists(st.tuples(st.floats(-1, 1), st.floats(-1, 1)), max_size=20))
-def test_listed_places_are_never_close_to_each_other(points: list[tuple[float, float]]) -> None:
+def test_listed_positions_are_never_close_to_each_other(points: list[tuple[float, float]]) -> None:
     rejected = Rejected()
     for x, y in points:
         rejected.add([at(x, y)])
@@ -98,7 +98,7 @@ def test_figures_of_a_task_that_was_restarted_add_up() -> None:
     assert figures["seconds"]["task"] == 30  # from its first start, the time in between included
 
 
-def test_only_the_first_motion_counts() -> None:
+def test_first_motion_is_reported_once() -> None:
     summary = Summary("panda", 0, 1.0)
     summary.on_motion(3.0, MotionStatus(state="none"))
     summary.on_motion(4.5, MotionStatus(state="active"))
@@ -106,26 +106,26 @@ def test_only_the_first_motion_counts() -> None:
     assert summary.as_dict()["seconds"]["first_motion"] == 4.5
 
 
-def test_truth_is_counted_by_where_things_lie() -> None:
+def test_truth_counts_objects_by_location() -> None:
     truth = Truth(("box", "tray"))
     assert truth.counted() is None and truth.settled
     truth.on_labels(balls("box", "box", "table", "held", "falling"))
     assert truth.counted() == {"in_box": 2, "on_table": 1, "elsewhere": 2, "containers": {"box": 2, "tray": 0}}
     assert not truth.settled
-    truth.on_objects(WorldObjects())  # of a recording from before balls were objects: nobody lies there
+    truth.on_objects(WorldObjects())  # of an old recording, in which balls are no objects
     assert truth.counted() == {"in_box": 2, "on_table": 1, "elsewhere": 2, "containers": {"box": 2, "tray": 0}}
     truth.on_labels(balls("box"))
     assert truth.settled
 
 
 @given(st.lists(st.floats(0, 1e6), min_size=1), st.floats(0.01, 1))
-def test_percentile_is_a_value_with_that_much_below_it(values: list[float], fraction: float) -> None:
+def test_percentile_is_a_value_with_that_share_below_it(values: list[float], fraction: float) -> None:
     found = percentile(values, fraction)
     assert found in values
     assert sum(value <= found for value in values) >= math.floor(fraction * len(values))
 
 
-def test_lines_for_people_name_what_was_left_and_what_was_restarted() -> None:
+def test_text_summary_names_left_objects_and_restarts() -> None:
     summary = Summary("panda", 0, 1.0)
     summary.on_status(status("DONE", 10, placed=6, targets=6))
     summary.rejected.add([at(0.9, 0.0)])
@@ -138,7 +138,7 @@ def test_lines_for_people_name_what_was_left_and_what_was_restarted() -> None:
     assert "router" not in text
 
 
-def test_what_the_task_believes_after_restarts_is_what_it_said_last() -> None:
+def test_placed_count_after_restarts_is_the_last_reported() -> None:
     summary = Summary("panda", 0, 1.0)
     lives = [("PLACING", 50, 5), ("IDLE", 55, 0), ("IDLE", 56, 5), ("PLACING", 60, 6), ("IDLE", 65, 0), ("DONE", 70, 7)]
     for state, seconds, done in lives:
@@ -147,7 +147,7 @@ def test_what_the_task_believes_after_restarts_is_what_it_said_last() -> None:
     assert (figures["placed"], figures["targets"], figures["state"]) == (7, 7, "DONE")
 
 
-def test_figures_of_the_task_stand_in_the_summary_as_they_are() -> None:
+def test_figures_of_the_task_are_copied_to_the_summary() -> None:
     summary = Summary("mine", 0, 1.0)
     summary.on_status(status("DONE", 10, done=1, total=1, figures={"moved_m": 0.31, "by": "edge"}))
     figures = summary.as_dict()

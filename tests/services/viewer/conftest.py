@@ -1,4 +1,4 @@
-"""The page as its browser sees it, with services that are played."""
+"""The viewer among fake services."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from common.process.in_process import running_service
 from common.transport.bus import Bus
 from common.transport.local import LocalNetwork
 from services import viewer
-from tests.page.browser_double import PATIENCE, BrowserDouble, opened
+from tests.page.fake_browser import PATIENCE, FakeBrowser, opened
 
 TOKEN = "a-token-that-is-long-enough"
 MIN_AREA = "services.vision_detector.min_area"
@@ -33,22 +33,22 @@ MIN_AREA = "services.vision_detector.min_area"
 
 async def until(condition: Callable[[], object]) -> None:
     async with asyncio.timeout(PATIENCE):
-        while not condition():  # noqa: ASYNC110  # nobody tells
+        while not condition():  # noqa: ASYNC110
             await asyncio.sleep(0.005)
 
 
-class SceneDouble:
-    """Stands for the 3D scene, whose meshes take seconds to read."""
+class FakeScene:
+    """Replaces the 3D scene, whose meshes take seconds to read."""
 
-    made: ClassVar[list[SceneDouble]] = []
+    made: ClassVar[list[FakeScene]] = []
 
     def __init__(self, *arguments: Any, shown: Mapping[str, bool]) -> None:
         self.layers, self.console, self.latest = arguments[3:6]
         self.goal_pose = m.Pose(position=m.Vector3(x=0.4, z=0.5))
         self.calls: list[tuple[str, tuple[Any, ...]]] = []
         self.visible = dict(shown)
-        self.started = False  # is fed, and heard
-        SceneDouble.made.append(self)
+        self.started = False  # connected to the page
+        FakeScene.made.append(self)
 
     def __getattr__(self, name: str) -> Callable[..., None]:
         return lambda *arguments: self.calls.append((name, arguments))
@@ -57,21 +57,21 @@ class SceneDouble:
         self.visible[layer] = on
         self.started = True
 
-    def told(self, name: str) -> list[tuple[Any, ...]]:
+    def calls_of(self, name: str) -> list[tuple[Any, ...]]:
         return [arguments for called, arguments in self.calls if called == name]
 
 
 @pytest.fixture(autouse=True)
-def scenes(monkeypatch: pytest.MonkeyPatch) -> list[SceneDouble]:
-    monkeypatch.setattr("page.scene.Scene", SceneDouble)
-    monkeypatch.setattr(viewer, "START_PATIENCE", 0.0)
-    monkeypatch.setattr(SceneDouble, "made", [])
-    return SceneDouble.made
+def scenes(monkeypatch: pytest.MonkeyPatch) -> list[FakeScene]:
+    monkeypatch.setattr("page.scene.Scene", FakeScene)
+    monkeypatch.setattr(viewer, "STARTUP_TIMEOUT", 0.0)
+    monkeypatch.setattr(FakeScene, "made", [])
+    return FakeScene.made
 
 
 @dataclass
-class Played:
-    """The services that the page asks, and what they were asked."""
+class FakeServices:
+    """Services that answer the page and record its requests."""
 
     net: LocalNetwork
     bus: Bus
@@ -129,29 +129,29 @@ def config_of(cell: Cell, **changes: object) -> viewer.Config:
 
 
 @asynccontextmanager
-async def build_report(cell: str, serve: bool = True, **changes: object) -> AsyncIterator[Played]:
-    """A viewer among played services."""
+async def serve_page(cell: str, serve: bool = True, **changes: object) -> AsyncIterator[FakeServices]:
+    """A viewer among fake services."""
     net = LocalNetwork()
-    played = Played(net, net.bus("played", cell="test", clock=Clock()))
+    services = FakeServices(net, net.bus("services", cell="test", clock=Clock()))
     if serve:
-        played.serve()
-    await played.bus.ready()
-    lines = played.bus.reader(topics.LOG)
+        services.serve()
+    await services.bus.ready()
+    lines = services.bus.reader(topics.LOG)
     async with running_service(net, viewer.run, config_of(load_cell(cell), **changes), name="viewer"):
         async with asyncio.timeout(PATIENCE):
             while (found := re.search(r"page is at http://127\.0\.0\.1:(\d+)", (await lines.next()).message)) is None:
                 pass
-        played.port = int(found[1])
-        yield played
+        services.port = int(found[1])
+        yield services
 
 
 @pytest.fixture
-async def panda() -> AsyncIterator[Played]:
-    async with build_report("panda") as played:
-        yield played
+async def panda() -> AsyncIterator[FakeServices]:
+    async with serve_page("panda") as services:
+        yield services
 
 
 @pytest.fixture
-async def page(panda: Played) -> AsyncIterator[BrowserDouble]:
+async def page(panda: FakeServices) -> AsyncIterator[FakeBrowser]:
     async with opened(panda.port) as browser:
         yield browser

@@ -1,4 +1,4 @@
-"""What the page shows of the cell, and what of it can be changed."""
+"""Content of the page: states, images, parameters, layers."""
 
 from __future__ import annotations
 
@@ -38,57 +38,57 @@ from common.application import find_application
 from common.config import Members, load_cell
 from page.layout import Layout
 from services import viewer
-from tests.page.browser_double import PATIENCE, BrowserDouble, opened
-from tests.services.viewer.conftest import MIN_AREA, TOKEN, Played, SceneDouble, build_report, until
+from tests.page.fake_browser import PATIENCE, FakeBrowser, opened
+from tests.services.viewer.conftest import MIN_AREA, TOKEN, FakeScene, FakeServices, serve_page, until
 
 
-async def test_state_and_counters_are_shown_in_words(panda: Played, page: BrowserDouble) -> None:
+async def test_state_and_counters_are_shown(panda: FakeServices, page: FakeBrowser) -> None:
     status = PickPlaceStatus(state="GRASPING", started=True, target="track_4", placed=2, targets=7, stage="pre_grasp")
     panda.bus.writer(PICK_PLACE_STATUS).put(status)
     panda.bus.writer(topics.MOTION_STATUS).put(m.MotionStatus(state="active", progress=0.5, held=True))
-    await page.until(lambda: "Taking track_4" in page.text and "pre grasp" in page.text)
-    await page.until(lambda: 'data-held="True"' in page.text and "held on its path" in page.text)
+    await page.until(lambda: "Grasping track_4" in page.text and "pre grasp" in page.text)
+    await page.until(lambda: 'data-held="True"' in page.text and "held" in page.text)
     assert '<div data-field="placed"><b>2</b>' in page.text and '<div data-field="targets"><b>7</b>' in page.text
 
 
-async def test_pictures_and_truth_are_read_only_while_a_page_that_shows_them_is_open(panda: Played) -> None:
+async def test_images_and_truth_are_read_only_while_displayed(panda: FakeServices) -> None:
     writers = {topic: panda.bus.writer(topic) for topic in (topics.CAMERA_IMAGE, DETECTION_IMAGE)}
     objects = panda.bus.writer(topics.SCENE_OBJECTS)
     assert not any(writer.matched for writer in writers.values()) and not objects.matched
     async with opened(panda.port) as page:
         await until(lambda: all(writer.matched for writer in writers.values()))
         assert not objects.matched
-        await page.set("Truth (simulated hardware)", True)
+        await page.set("Ground truth (simulation)", True)
         await until(lambda: objects.matched)
-        await page.set("With what was found", False)
+        await page.set("Detections overlay", False)
         await until(lambda: not writers[DETECTION_IMAGE].matched)
         assert writers[topics.CAMERA_IMAGE].matched
     await until(lambda: not writers[topics.CAMERA_IMAGE].matched and not objects.matched)
 
 
-async def test_parameter_changed_on_the_page_is_changed_by_the_page(panda: Played, page: BrowserDouble) -> None:
+async def test_parameter_is_changed_on_the_page(panda: FakeServices, page: FakeBrowser) -> None:
     await page.set("min area [px^2]", 300.0)
     await until(lambda: panda.sets)
     assert panda.sets == [({MIN_AREA: 300.0}, "page")]
-    await page.until(lambda: f"{MIN_AREA} is 300.0 now" in page.text)
+    await page.until(lambda: f"{MIN_AREA} set to 300.0" in page.text)
     with pytest.raises(LookupError):
         page.label("fixed")
 
 
-async def test_parameter_changed_elsewhere_is_shown(panda: Played, page: BrowserDouble) -> None:
+async def test_parameter_changed_elsewhere_is_shown(panda: FakeServices, page: FakeBrowser) -> None:
     await page.until(lambda: page.values[page.label("min area [px^2]")] == 60.0)
     panda.area = 120.0
     await page.until(lambda: page.values[page.label("min area [px^2]")] == 120.0)
 
 
-async def test_refused_parameter_is_told_and_goes_back(panda: Played, page: BrowserDouble) -> None:
+async def test_rejected_parameter_is_shown_and_reverted(panda: FakeServices, page: FakeBrowser) -> None:
     await page.set("min area [px^2]", 900.0)
     await page.until(lambda: "900.0 must be less than or equal to 500" in page.text)
     await page.until(lambda: page.values[page.label("min area [px^2]")] == 60.0)
     assert panda.area == 60.0
 
 
-async def test_dead_service_is_red_and_its_return_is_green(panda: Played, page: BrowserDouble) -> None:
+async def test_crashed_service_is_red_until_it_is_ready_again(panda: FakeServices, page: FakeBrowser) -> None:
     supervisor = panda.bus.writer(topics.SUPERVISOR_STATUS)
 
     def say(**status: object) -> None:
@@ -98,14 +98,14 @@ async def test_dead_service_is_red_and_its_return_is_green(panda: Played, page: 
     say(state="ready", pid=41)
     await page.until(lambda: 'data-service="vision_detector" data-state="ready" data-pid="41"' in page.text)
     say(state="restarting", restarts=1, message="killed by SIGKILL")
-    await page.until(lambda: 'class="bad">● died' in page.text and "killed by SIGKILL" in page.text)
+    await page.until(lambda: 'class="bad">● crashed' in page.text and "killed by SIGKILL" in page.text)
     say(state="starting", pid=42, restarts=1)
-    await page.until(lambda: 'class="bad">● starts again' in page.text)
+    await page.until(lambda: 'class="bad">● restarting' in page.text)
     say(state="ready", pid=42, restarts=1)
     await page.until(lambda: 'data-state="ready" data-pid="42" data-restarts="1"' in page.text)
 
 
-async def test_log_lines_are_text_whatever_is_in_them(panda: Played, page: BrowserDouble) -> None:
+async def test_log_lines_are_escaped_and_filtered_by_level(panda: FakeServices, page: FakeBrowser) -> None:
     odd, log = (panda.bus.writer(topics.of_service(topics.LOG, name)) for name in ("<b>x", "y"))
     await until(lambda: log.matched)
     odd.put(m.LogLine(service="<b>x", level="warning", message="<script>alert(1)</script>"))
@@ -113,46 +113,46 @@ async def test_log_lines_are_text_whatever_is_in_them(panda: Played, page: Brows
     assert "<script>" not in page.text
     log.put(m.LogLine(service="y", level="info", message="a quiet line"))
     await page.until(lambda: "a quiet line" in page.text)
-    await page.set("Show", "warning")
+    await page.set("Minimum level", "warning")
     await page.until(lambda: "a quiet line" not in page.text)
 
 
-async def test_odd_messages_leave_the_page_and_the_service_as_they_are(
-    panda: Played, page: BrowserDouble, capfd: pytest.CaptureFixture[str]
+async def test_invalid_messages_change_nothing(
+    panda: FakeServices, page: FakeBrowser, capfd: pytest.CaptureFixture[str]
 ) -> None:
     await page.until(lambda: page.label("Planner") and page.label("Speed [%]"))
     speed = page.label("Speed [%]")
     for value in ("fast", None, [1], float("nan"), 1e300):
-        await page.say({"type": "GuiUpdateMessage", "uuid": speed, "updates": {"value": value}})
-    await page.say({"type": "GuiUpdateMessage", "uuid": page.label("Planner"), "updates": {"value": "Explode"}})
-    await page.say({"type": "GuiUpdateMessage", "uuid": page.label("Show"), "updates": {"value": "nothing"}})
+        await page.send_viser({"type": "GuiUpdateMessage", "uuid": speed, "updates": {"value": value}})
+    for label, value in (("Planner", "Explode"), ("Minimum level", "nothing")):
+        await page.send_viser({"type": "GuiUpdateMessage", "uuid": page.label(label), "updates": {"value": value}})
     for updates in ({"update_cb": []}, {"removed": True}, {"value": 20.0, "label": "Speed"}):
-        await page.say({"type": "GuiUpdateMessage", "uuid": speed, "updates": updates})
+        await page.send_viser({"type": "GuiUpdateMessage", "uuid": speed, "updates": updates})
     panda.bus.writer(DETECTION_IMAGE).put(m.Image(
         header=m.Header(), height=4, width=4, encoding="bgr8", data=b"short"))
     for words in ({}, {"do": "explode"}, {"do": "press"}, {"do": "press", "what": 2000 * "x"}, {"do": "hold", "at": 1}):
-        await page.speak(**words)
-    await page.speak(do="press", what="pause")
+        await page.send(**words)
+    await page.send(do="press", what="pause")
     await until(lambda: panda.commands)
     assert panda.commands == ["pause"]
     capfd.readouterr()  # viser prints what it could not convert
 
 
-async def test_light_comes_before_what_it_falls_on() -> None:
-    """Else a browser makes the shaders of everything twice, which takes it seconds without a graphics card."""
-    async with build_report("panda") as played, opened(played.port) as page:
+async def test_lights_are_sent_before_all_meshes() -> None:
+    """Otherwise a browser compiles all shaders twice, which takes seconds without a GPU."""
+    async with serve_page("panda") as services, opened(services.port) as page:
         await page.until(lambda: page.label("Speed [%]"))
         first = next(number for number, kind in enumerate(page.kinds) if kind in ("GuiSliderMessage", "MeshMessage"))
         lights = ("EnableLightsMessage", "EnvironmentMapMessage", "HemisphereLightMessage")
         assert max(map(page.kinds.index, lights)) < first
 
 
-async def test_saved_layout_opens_with_what_was_on(tmp_path: Path) -> None:
+async def test_saved_layout_has_the_displayed_content(tmp_path: Path) -> None:
     file = tmp_path / "layout.yaml"
     file.write_text("tabs: [Log, View]\n")
-    async with build_report("panda", layout=str(file)) as played, opened(played.port) as page:
-        await page.set("Frames", True)
-        await page.set("Show", "error")
+    async with serve_page("panda", layout=str(file)) as services, opened(services.port) as page:
+        await page.set("Frames (TF)", True)
+        await page.set("Minimum level", "error")
         await page.click("Save layout")
         await page.until(lambda: f"Saved in {file}" in page.text)
         saved = Layout.model_validate(yaml.safe_load(file.read_text()))
@@ -164,98 +164,98 @@ async def test_saved_layout_opens_with_what_was_on(tmp_path: Path) -> None:
         assert [path.name for path in tmp_path.iterdir()] == [file.name]  # noqa: ASYNC240
 
 
-async def test_chosen_object_is_traced_once_its_path_is_known() -> None:
-    async with build_report("ur5") as played, opened(played.port) as page:
-        played.bus.writer(OUTLINE_STATUS).put(OutlineStatus(state="DONE", started=True))
+async def test_selected_object_is_traced_once_its_path_is_known() -> None:
+    async with serve_page("ur5") as services, opened(services.port) as page:
+        services.bus.writer(OUTLINE_STATUS).put(OutlineStatus(state="DONE", started=True))
         contours = [Contour(index=i, label=f"Object_{i}", pixels=[(1.0, 1.0), (2.0, 1.0), (2.0, 2.0)])
                     for i in range(2)]
-        played.bus.writer(CONTOURS).put(
+        services.bus.writer(CONTOURS).put(
             Contours(header=m.Header(), width=4, height=4, contours=contours, selected=0))
         await page.until(lambda: page.label("● Object_0"))
         await page.click("Object_1")
-        await until(lambda: played.selects)
-        assert played.selects == [OutlineSelect(rule="index", index=1, at=(5 / 3, 4 / 3))] and played.commands == []
-        played.bus.writer(CONTOUR_PATH).put(OutlinePoints(object="Object_1"))
-        await until(lambda: played.commands)
-        assert played.commands == ["start"]
+        await until(lambda: services.selects)
+        assert services.selects == [OutlineSelect(rule="index", index=1, at=(5 / 3, 4 / 3))] and services.commands == []
+        services.bus.writer(CONTOUR_PATH).put(OutlinePoints(object="Object_1"))
+        await until(lambda: services.commands)
+        assert services.commands == ["start"]
         await page.until(lambda: "Object_1 is chosen" in page.text)
 
 
-async def test_contour_that_is_clicked_in_the_scene_is_chosen(scenes: list[SceneDouble]) -> None:
-    async with build_report("ur5") as played:
-        await until(lambda: scenes and scenes[0].begun)
+async def test_contour_clicked_in_the_scene_is_selected(scenes: list[FakeScene]) -> None:
+    async with serve_page("ur5") as services:
+        await until(lambda: scenes and scenes[0].started)
         console, wanted = scenes[0].console, OutlineSelect(rule="index", index=1)
         await asyncio.to_thread(lambda: console.put(lambda: choose(console, wanted)))  # as viser does
-        await until(lambda: played.selects)
-        assert played.selects == [OutlineSelect(rule="index", index=1)]
+        await until(lambda: services.selects)
+        assert services.selects == [OutlineSelect(rule="index", index=1)]
 
 
-async def test_layers_are_shown_as_ticked_also_before_the_scene_is_there(
-    panda: Played, page: BrowserDouble, scenes: list[SceneDouble]
+async def test_layers_follow_their_checkboxes_also_before_the_scene_is_loaded(
+    panda: FakeServices, page: FakeBrowser, scenes: list[FakeScene]
 ) -> None:
-    await until(lambda: scenes and scenes[0].begun)
+    await until(lambda: scenes and scenes[0].started)
     assert scenes[0].visible["targets"] and not scenes[0].visible["truth"]
     await page.set("Targets", False)
     await until(lambda: not scenes[0].visible["targets"])
 
 
-async def test_scene_is_told_what_the_cell_says_while_somebody_looks(panda: Played, scenes: list[SceneDouble]) -> None:
-    told = m.MarkerArray(header=m.Header(), markers=[])
-    panda.bus.writer(WORKSPACE_MARKERS).put(told)
+async def test_scene_is_updated_while_a_page_is_open(panda: FakeServices, scenes: list[FakeScene]) -> None:
+    markers = m.MarkerArray(header=m.Header(), markers=[])
+    panda.bus.writer(WORKSPACE_MARKERS).put(markers)
     await until(lambda: scenes)
-    assert not scenes[0].told("refresh") and scenes[0].latest(WORKSPACE_MARKERS) is None
+    assert not scenes[0].calls_of("refresh") and scenes[0].latest(WORKSPACE_MARKERS) is None
     async with opened(panda.port):
-        await until(lambda: scenes[0].told("refresh") and scenes[0].latest(WORKSPACE_MARKERS) == told)
+        await until(lambda: scenes[0].calls_of("refresh") and scenes[0].latest(WORKSPACE_MARKERS) == markers)
 
 
-async def test_rejection_that_came_before_the_scene_is_shown_in_it(
-    scenes: list[SceneDouble], monkeypatch: pytest.MonkeyPatch
+async def test_rejection_before_the_scene_is_loaded_is_shown(
+    scenes: list[FakeScene], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     go = threading.Event()
 
-    def slow(*arguments: object, **options: Any) -> SceneDouble:
+    def slow(*arguments: object, **options: Any) -> FakeScene:
         assert go.wait(PATIENCE)
-        return SceneDouble(*arguments, **options)
+        return FakeScene(*arguments, **options)
 
     monkeypatch.setattr("page.scene.Scene", slow)
-    async with build_report("panda") as played, opened(played.port) as page:
+    async with serve_page("panda") as services, opened(services.port) as page:
         rejected = m.Rejections(header=m.Header(), rejected=[m.Rejection(position=m.Vector3(x=1.0), reason="too far")])
-        played.bus.writer(REJECTED_TARGETS).put(rejected)
-        await page.speak(do="press", what="pause")  # the page is there before the scene is
-        await until(lambda: played.commands)
+        services.bus.writer(REJECTED_TARGETS).put(rejected)
+        await page.send(do="press", what="pause")  # the page works before the scene is loaded
+        await until(lambda: services.commands)
         go.set()
-        await until(lambda: scenes and scenes[0].told("happened") == [(REJECTED_TARGETS, rejected)])
+        await until(lambda: scenes and scenes[0].calls_of("handle_event") == [(REJECTED_TARGETS, rejected)])
 
 
-async def test_meshes_are_read_when_the_cell_is_up_or_somebody_looks(
-    scenes: list[SceneDouble], monkeypatch: pytest.MonkeyPatch
+async def test_scene_is_loaded_when_the_cell_is_up_or_a_page_is_open(
+    scenes: list[FakeScene], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(viewer, "START_PATIENCE", 1e6)
+    monkeypatch.setattr(viewer, "STARTUP_TIMEOUT", 1e6)
     cell = load_cell("panda")
-    async with build_report("panda") as played:
-        await played.bus.alive.wait("viewer")
+    async with serve_page("panda") as services:
+        await services.bus.alive.wait("viewer")
         assert not scenes
-        async with opened(played.port):
+        async with opened(services.port):
             await until(lambda: scenes)
     scenes.clear()
-    async with build_report("panda") as played:
+    async with serve_page("panda") as services:
         for name in cell.services.keys() - {"viewer"}:  # which is there already
             assert not scenes
-            await played.net.bus(name, cell="test").ready()
+            await services.net.bus(name, cell="test").ready()
         await until(lambda: scenes)
 
 
-async def test_line_is_closed_to_other_pages_and_to_who_has_no_token() -> None:
-    async with build_report("panda", token=TOKEN) as played:
-        address = f"ws://127.0.0.1:{played.port}/line"
-        for status, headers in ((401, {}), (403, {"Cookie": f"zencell-{played.port}={TOKEN}", "Origin": "http://a.b"})):
+async def test_control_socket_rejects_foreign_origins_and_missing_tokens() -> None:
+    async with serve_page("panda", token=TOKEN) as services:
+        address = f"ws://127.0.0.1:{services.port}/control"
+        for status, headers in ((401, {}), (403, {"Cookie": f"zencell-{services.port}={TOKEN}", "Origin": "http://a.b"})):
             with pytest.raises(InvalidStatus) as refused:
                 async with connect(address, proxy=None, additional_headers=headers):
                     pass
             assert refused.value.response.status_code == status
 
 
-async def test_layer_of_a_persons_own_has_a_tick_and_reads_its_topics_while_it_is_shown(
+async def test_custom_layer_has_a_checkbox_and_reads_its_topics_while_shown(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "viewer_pkg").mkdir()
@@ -265,27 +265,27 @@ LABEL, ON, TOPICS = "My noise", False, (topics.DEPTH_CAMERA_DEPTH,)
 def show(layer, topic, message): ...
 """)
     monkeypatch.syspath_prepend(tmp_path)
-    async with build_report("ur5", layers=["viewer_pkg.noise"]) as played, opened(played.port) as page:
-        depth = played.bus.writer(topics.DEPTH_CAMERA_DEPTH)
+    async with serve_page("ur5", layers=["viewer_pkg.noise"]) as services, opened(services.port) as page:
+        depth = services.bus.writer(topics.DEPTH_CAMERA_DEPTH)
         await page.until(lambda: page.values[page.label("My noise")] is False)
         assert not depth.matched
         await page.set("My noise", True)
         await until(lambda: depth.matched)
 
 
-async def test_pictures_of_two_cameras_are_shown_beside_each_other() -> None:
+async def test_images_of_two_cameras_are_shown() -> None:
     members = Members(services=["left_camera", "right_camera"], task="", application="pick_place",
                       keys=[{"camera/*": "left_camera/*"}, {"camera/*": "right_camera/*"}])
-    async with build_report("panda", members=members) as played, opened(played.port) as page:
+    async with serve_page("panda", members=members) as services, opened(services.port) as page:
         keys = [f"{side}_camera/image_raw" for side in ("left", "right")]
-        writers = [played.bus.writer(replace(topics.CAMERA_IMAGE, key=key)) for key in keys]
+        writers = [services.bus.writer(replace(topics.CAMERA_IMAGE, key=key)) for key in keys]
         await until(lambda: all(writer.matched for writer in writers))
         for writer, grey in zip(writers, (10, 200), strict=True):
             writer.put(m.Image(header=m.Header(), height=4, width=4, encoding="mono8", data=bytes([grey] * 16)))
         await page.until(lambda: all(page.label(key) for key in keys))
 
 
-async def test_application_without_a_page_gets_the_buttons_and_words_of_every_task(
+async def test_application_without_a_page_has_the_default_buttons_and_texts(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "apps").mkdir()
@@ -300,16 +300,16 @@ APPLICATION = Application(topics=ApplicationTopics(status=STATUS))
 """)
     monkeypatch.syspath_prepend(tmp_path)
     members = Members(services=["trajectory_executor", "viewer", "mover"], task="mover", application="apps.moving")
-    async with build_report("panda", members=members) as played, opened(played.port) as page:
+    async with serve_page("panda", members=members) as services, opened(services.port) as page:
         application = find_application("apps.moving")
         status = application.status.message(state="CARRYING", started=True, subject="cube", done=1, total=2)
-        played.bus.writer(application.status).put(status)
+        services.bus.writer(application.status).put(status)
         await page.until(lambda: "Carrying cube" in page.text and '<div data-field="done"><b>1</b>' in page.text)
         with pytest.raises(LookupError):
             page.label("Targets")
 
 
-async def test_rejected_places_are_counted_once(panda: Played, page: BrowserDouble) -> None:
+async def test_rejected_positions_are_counted_once(panda: FakeServices, page: FakeBrowser) -> None:
     writer = panda.bus.writer(REJECTED_TARGETS)
     panda.bus.writer(PICK_PLACE_STATUS).put(PickPlaceStatus())
     for x, reason in ((0.9, "too far"), (0.91, "too far"), (0.2, "too near"), (0.5, "inside the container")):
@@ -318,8 +318,8 @@ async def test_rejected_places_are_counted_once(panda: Played, page: BrowserDoub
     await page.until(lambda: '<div data-field="rejected"><b>2</b>' in page.text)
 
 
-async def test_rejected_places_are_counted_no_more_when_nothing_lies_there_whoever_reset_the_world(
-    panda: Played, page: BrowserDouble
+async def test_rejected_positions_without_detections_are_not_counted(
+    panda: FakeServices, page: FakeBrowser
 ) -> None:
     panda.bus.writer(PICK_PLACE_STATUS).put(PickPlaceStatus())
     panda.bus.writer(REJECTED_TARGETS).put(m.Rejections(header=m.Header(stamp=10), rejected=[

@@ -46,11 +46,11 @@ class _More:
         await self._bus.ready()
 
     async def see(self) -> None:
-        told: list[CollisionObject] = []
+        published: list[CollisionObject] = []
         while True:
             await asyncio.sleep(1 / RATE)
-            if self._newest is not None and told != [*SEEN.values()]:
-                told = [*SEEN.values()]
+            if self._newest is not None and published != [*SEEN.values()]:
+                published = [*SEEN.values()]
                 self.put(self._newest)
 
 

@@ -19,7 +19,7 @@ def expected(lens, points, T_camera_board):
 @pytest.mark.parametrize(
     "pose", [(0.02, -0.01, 0.5, 0.4, 0.0, 0.1), (-0.08, 0.05, 0.6, -0.3, 0.4, -0.5), (0.05, 0.08, 0.75, 0.1, -0.5, 2.0)]
 )
-def test_corners_are_found_to_a_twentieth_of_a_pixel(pose):
+def test_corners_are_accurate_to_a_twentieth_of_a_pixel(pose):
     T = facing(BOARD, *pose)
     found = BOARD.find(render(BOARD, LENS, T), "a picture")
     assert isinstance(found, BoardDetection) and len(found.points) == 24
@@ -27,7 +27,7 @@ def test_corners_are_found_to_a_twentieth_of_a_pixel(pose):
     assert np.sqrt((errors**2).mean()) < 0.03 and errors.max() < 0.08
 
 
-def test_frame_of_the_board_is_lower_left_with_z_towards_the_reader():
+def test_board_frame_is_lower_left_with_z_out_of_the_paper():
     T_world_board = transform(rpy_to_matrix(0, 0, 0), (0.3, -0.1, 0.0))
     T_world_camera = transform(rpy_to_matrix(np.pi, 0, -np.pi / 2), (0.4, 0.0, 0.6))  # looks down; right is -y
     found = BOARD.find(render(BOARD, Lens(d=()), invert(T_world_camera) @ T_world_board), "a picture")
@@ -36,7 +36,7 @@ def test_frame_of_the_board_is_lower_left_with_z_towards_the_reader():
     assert right[1] < -100  # +x of world is up in that picture
 
 
-def test_page_has_the_size_that_it_says_and_shows_the_board():
+def test_page_has_the_stated_size_and_shows_the_board():
     for options in (BoardOptions(), BoardOptions(columns=11, rows=8, square=0.0215, marker=0.016, dictionary="5x5_50")):
         board = Board(options)
         page, density = board.page()
@@ -51,7 +51,7 @@ def test_page_has_the_size_that_it_says_and_shows_the_board():
 
 
 @pytest.mark.parametrize(
-    ("printed", "kind", "told"),
+    ("printed", "kind", "reason"),
     [
         (BoardOptions(columns=6, rows=5), "other board", "differs from a board of 7x5 squares"),
         (BoardOptions(columns=10, rows=7, square=0.025, marker=0.019), "other board", "is not on a board of 7x5"),
@@ -59,13 +59,13 @@ def test_page_has_the_size_that_it_says_and_shows_the_board():
         (BoardOptions(dictionary="5x5_50"), "nothing", "no marker is visible"),
     ],
 )
-def test_another_board_is_told_apart(printed, kind, told):
+def test_other_boards_are_recognized(printed, kind, reason):
     board = Board(printed)
     found = BOARD.find(render(board, LENS, facing(board, 0, 0, 0.4, 0.2, 0.2)), "a picture")
-    assert isinstance(found, NoBoard) and found.kind == kind and told in found.reason
+    assert isinstance(found, NoBoard) and found.kind == kind and reason in found.reason
 
 
-def test_a_picture_without_the_board_and_a_blurred_one_say_so():
+def test_missing_board_and_blur_are_distinguished():
     empty = np.full((480, 640, 3), 120, np.uint8)
     assert BOARD.find(empty, "x").kind == "nothing"
     blurred = BOARD.find(render(BOARD, LENS, facing(BOARD, 0, 0, 0.5), blur=3.0), "x")
@@ -78,7 +78,7 @@ def test_blur_is_measured():
         assert found.blur == pytest.approx(np.hypot(true, 0.29), rel=0.15)
 
 
-def test_covered_corners_are_left_out_and_the_others_stay_where_they_are():
+def test_covered_corners_are_omitted_without_affecting_others():
     T = facing(BOARD, 0, 0, 0.45, 0.2)
     picture = render(BOARD, LENS, T)
     whole = BOARD.find(picture, "x")
@@ -88,7 +88,7 @@ def test_covered_corners_are_left_out_and_the_others_stay_where_they_are():
     assert np.linalg.norm(found.pixels - expected(LENS, found.points, T), axis=1).max() < 0.1
 
 
-def test_light_that_falls_off_to_one_side_moves_no_corner():
+def test_uneven_light_moves_no_corner():
     T = facing(BOARD, 0.02, 0.01, 0.5, 0.3, -0.2)
     dim = render(BOARD, LENS, T) * np.linspace(1.0, 0.35, 640)[:, None]
     found = BOARD.find(np.clip(dim, 0, 255).astype(np.uint8), "x")
@@ -97,7 +97,7 @@ def test_light_that_falls_off_to_one_side_moves_no_corner():
 
 
 @pytest.mark.parametrize(
-    ("values", "told"),
+    ("values", "reason"),
     [
         ({"marker": 0.036}, "must be 0.4 to 0.95 of square"),
         ({"columns": 20, "rows": 20}, "squares need 200 markers; dictionary has 50"),
@@ -105,6 +105,6 @@ def test_light_that_falls_off_to_one_side_moves_no_corner():
         ({"square": float("nan")}, "square"),
     ],
 )
-def test_a_board_that_can_not_be_is_one_line(values, told):
-    with pytest.raises(ConfigError, match=told):
+def test_impossible_board_is_a_one_line_error(values, reason):
+    with pytest.raises(ConfigError, match=reason):
         check(BoardOptions, values)

@@ -41,7 +41,7 @@ def places():
             seen_at(lying(0.55, -0.35, 1.2), seed=9)]
 
 
-def test_one_place_gives_the_pose_within_a_millimetre_and_a_tenth_of_a_degree(places):
+def test_one_board_pose_gives_the_camera_within_a_millimeter_and_a_tenth_of_a_degree(places):
     found = calibrate_pose(places[:1], CAMERA)
     distance, angle = errors(found)
     assert distance < 1e-3 and angle < 0.1
@@ -50,7 +50,7 @@ def test_one_place_gives_the_pose_within_a_millimetre_and_a_tenth_of_a_degree(pl
     assert found.position == pytest.approx(tuple(found.T_world_camera[:3, 3]))
 
 
-def test_several_places_give_it_several_times_as_precisely_and_say_so(places):
+def test_several_board_poses_reduce_error_and_uncertainty(places):
     one, several = calibrate_pose(places[:1], CAMERA), calibrate_pose(places, CAMERA)
     distance, angle = errors(several)
     assert distance < 0.3e-3 and angle < 0.03
@@ -58,16 +58,16 @@ def test_several_places_give_it_several_times_as_precisely_and_say_so(places):
     assert several.rotation_std < one.rotation_std / 2 and several.place_std < one.place_std / 2
 
 
-def test_a_board_that_stands_upright_and_turned_serves_as_well():
+def test_upright_rotated_board_is_supported():
     looks_ahead = transform(rpy_to_matrix(-np.pi / 2, 0, -np.pi / 2), (0.0, 0.0, 0.5))  # along +x, upright
-    stands = transform(rpy_to_matrix(np.pi / 2, 0, -np.pi / 2 + 0.3), (0.7, 0.12, 0.4))
-    pictures = [("a", render(BOARD, LENS, invert(looks_ahead) @ stands))]
-    found = calibrate_pose([(stands, detect_boards(BOARD, pictures, CAMERA)[0])], CAMERA)
+    upright = transform(rpy_to_matrix(np.pi / 2, 0, -np.pi / 2 + 0.3), (0.7, 0.12, 0.4))
+    pictures = [("a", render(BOARD, LENS, invert(looks_ahead) @ upright))]
+    found = calibrate_pose([(upright, detect_boards(BOARD, pictures, CAMERA)[0])], CAMERA)
     distance, angle = errors(found, looks_ahead)
     assert distance < 2e-3 and angle < 0.1
 
 
-def test_a_picture_in_which_the_board_was_elsewhere_is_dropped_and_named(places):
+def test_image_with_a_moved_board_is_dropped_by_name(places):
     T_world_board, seen = places[0]
     moved = replace(seen[1], name="moved", pixels=seen[1].pixels + np.array([2.5, -1.0]))
     found = calibrate_pose([(T_world_board, [seen[0], moved, seen[2]]), *places[1:]], CAMERA)
@@ -75,13 +75,13 @@ def test_a_picture_in_which_the_board_was_elsewhere_is_dropped_and_named(places)
     assert errors(found)[0] < 0.5e-3
 
 
-def test_places_that_contradict_each_other_are_refused(places):
+def test_inconsistent_board_poses_are_rejected(places):
     wrong = [(lying(0.35, -0.05, 0.1), places[0][1]), *places[1:]]
     with pytest.raises(CalibrationFailed, match="are inconsistent"):
         calibrate_pose(wrong, CAMERA)
 
 
-def test_no_board_and_another_size_are_one_line():
+def test_missing_board_and_wrong_size_are_one_line_errors():
     with pytest.raises(CalibrationFailed, match="no image shows the board"):
         calibrate_pose([(np.eye(4), [])], CAMERA)
     with pytest.raises(CalibrationFailed, match="a is 320x240, but the intrinsics are for 640x480"):

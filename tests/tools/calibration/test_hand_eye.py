@@ -57,7 +57,7 @@ def off(found: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
 
 
 @pytest.mark.parametrize("mount", TRUTH)
-def test_camera_is_found_in_drawn_pictures(mount):
+def test_hand_eye_calibration_finds_the_camera_in_rendered_images(mount):
     result = calibrate_hand_eye(
         [seen(mount, T, n, drawn=True) for n, T in enumerate(hands(mount, 10))], CAMERA, mount)
     metres, radians = off(result.T_mount_camera, TRUTH[mount][0])
@@ -69,7 +69,7 @@ def test_camera_is_found_in_drawn_pictures(mount):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("mount", TRUTH)
-def test_uncertainty_that_is_told_is_that_of_the_result(mount):
+def test_reported_uncertainty_matches_the_error(mount):
     ratios = []
     for trial in range(12):
         views = [seen(mount, T, 100 * trial + n, noise=0.5) for n, T in enumerate(hands(mount, 12))]
@@ -79,7 +79,7 @@ def test_uncertainty_that_is_told_is_that_of_the_result(mount):
 
 
 @pytest.mark.parametrize("mount", TRUTH)
-def test_arm_that_is_not_where_its_joints_say_makes_the_verdict_worse(mount):
+def test_inaccurate_arm_worsens_the_verdict(mount):
     rng = np.random.default_rng(2)
     views = []
     for n, T in enumerate(hands(mount, 14)):
@@ -91,7 +91,7 @@ def test_arm_that_is_not_where_its_joints_say_makes_the_verdict_worse(mount):
 
 
 @pytest.mark.parametrize("mount", TRUTH)
-def test_view_with_the_joints_of_another_is_dropped_by_name(mount):
+def test_view_with_wrong_joints_is_dropped_by_name(mount):
     poses = hands(mount, 10)
     views = [seen(mount, T, n) for n, T in enumerate(poses)]
     views[3] = View(views[3].detection, poses[7])
@@ -100,7 +100,7 @@ def test_view_with_the_joints_of_another_is_dropped_by_name(mount):
     assert off(result.T_mount_camera, TRUTH[mount][0])[0] < 1e-3
 
 
-def test_what_cannot_be_told_is_said():
+def test_undetermined_problems_are_rejected():
     views = [seen("hand", T, n) for n, T in enumerate(hands("hand", 8))]
     with pytest.raises(CalibrationFailed, match="5 views of the board, 6 are needed"):
         calibrate_hand_eye(views[:5], CAMERA, "hand")
@@ -113,7 +113,7 @@ def test_what_cannot_be_told_is_said():
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_joints_say_where_the_hand_was(seed):
+def test_gripper_pose_follows_from_the_joints(seed):
     """The whole chain: joints, their forward kinematics, a picture, the camera."""
     rng = np.random.default_rng(seed)
     truth = transform(rpy_to_matrix(*rng.uniform(-0.1, 0.1, 3)), (0.05, 0.0, -0.1))

@@ -44,7 +44,7 @@ def off(found, lens):
     return np.linalg.norm(rays[0] - rays[1], axis=1) * lens.fx
 
 
-def test_a_lens_is_found_within_a_thousandth_and_knows_how_certain_that_is(views):
+def test_intrinsics_are_found_within_a_thousandth_with_valid_uncertainty(views):
     found = calibrate_intrinsics(views)
     truth = np.array([LENS.fx, LENS.fy, LENS.cx, LENS.cy])
     np.testing.assert_allclose(found.k, truth, rtol=1e-3)
@@ -58,7 +58,7 @@ def test_a_lens_is_found_within_a_thousandth_and_knows_how_certain_that_is(views
 
 
 @pytest.mark.slow
-def test_wide_and_rational_lenses_are_found_with_more_coefficients():
+def test_wide_and_rational_lenses_need_more_coefficients():
     lens = Lens(fx=380, fy=381, cx=321, cy=238, d=(-0.32, 0.12, 0.0005, -0.0004, -0.02))
     views = collect(many_poses(BOARD, 10, z=(0.3, 0.5)), lens).views
     found = calibrate_intrinsics(views, CollectingOptions(k_coefficients=3))
@@ -68,28 +68,28 @@ def test_wide_and_rational_lenses_are_found_with_more_coefficients():
     assert len(rational.d) == 8 and np.median(off(rational, lens)) < 0.5 and rational.rms < 0.05
 
 
-def test_without_distortion_only_the_matrix_is_sought():
+def test_zero_coefficients_fit_only_the_matrix():
     lens = Lens(d=())
     found = calibrate_intrinsics(collect(many_poses(BOARD, 10), lens).views, CollectingOptions(k_coefficients=0))
     assert found.d == [] and found.rms < 0.05
     np.testing.assert_allclose(found.k, (lens.fx, lens.fy, lens.cx, lens.cy), rtol=2e-3)
 
 
-def test_a_view_that_does_not_fit_is_dropped_and_named(views):
+def test_outlier_view_is_dropped_by_name(views):
     bent = replace(views[4], pixels=views[4].pixels + np.random.default_rng(3).normal(0, 3, views[4].pixels.shape))
     found = calibrate_intrinsics([*views[:4], bent, *views[5:]])
     assert [view.name for view in found.dropped] == [views[4].name] and found.dropped[0].rms > 1
     np.testing.assert_allclose(found.k, (LENS.fx, LENS.fy, LENS.cx, LENS.cy), rtol=1e-3)
 
 
-def test_views_that_fit_each_other_badly_are_refused(views):
+def test_inconsistent_views_are_rejected(views):
     rng = np.random.default_rng(3)
     bad = [replace(v, pixels=v.pixels + rng.normal(0, 4, v.pixels.shape)) if k % 2 else v for k, v in enumerate(views)]
     with pytest.raises(CalibrationFailed, match=r"views fit together, 8 are needed; outliers: view \d+ \d"):
         calibrate_intrinsics(bad[:11])
 
 
-def test_views_that_face_the_camera_do_not_tell_the_focal_length():
+def test_frontal_views_do_not_determine_the_focal_length():
     poses = [facing(BOARD, x, y, 0.6) for x in (-0.12, 0, 0.12) for y in (-0.07, 0, 0.07)]
     noisy = [replace(v, pixels=v.pixels + np.random.default_rng(k).normal(0, 0.3, v.pixels.shape))
              for k, v in enumerate(collect(poses).views)]
@@ -97,12 +97,12 @@ def test_views_that_face_the_camera_do_not_tell_the_focal_length():
         calibrate_intrinsics(noisy)
 
 
-def test_a_board_that_hardly_moved_is_no_new_view():
+def test_similar_view_is_not_added():
     collector = collect([facing(BOARD, 0, 0, 0.5), facing(BOARD, 0.005, 0, 0.5), facing(BOARD, 0.05, 0, 0.5)])
     assert [view.name for view in collector.views] == ["view 0", "view 2"]
 
 
-def test_too_few_views_say_what_became_of_the_pictures():
+def test_too_few_views_report_why_images_were_rejected():
     collector = collect([facing(BOARD, 0, 0, 0.5)] * 2)
     collector.add(render(BOARD, LENS, facing(BOARD, 0.1, 0, 0.5), blur=3), "smeared")
     collector.add(np.full((480, 640, 3), 90, np.uint8), "empty")
@@ -115,19 +115,19 @@ def test_too_few_views_say_what_became_of_the_pictures():
     assert "\n" not in line
 
 
-def test_pictures_of_two_sizes_are_refused():
+def test_images_of_different_sizes_are_rejected():
     collector = collect([facing(BOARD, 0, 0, 0.5)])
     other = Lens(width=800, height=600, cx=400, cy=300)
     with pytest.raises(CalibrationFailed, match="big is 800x600, but view 0 is 640x480"):
         collector.add(render(BOARD, other, facing(BOARD, 0.1, 0, 0.5)), "big")
 
 
-def test_coverage_names_the_parts_of_the_picture_that_saw_no_corner():
+def test_coverage_names_regions_without_corners():
     part, unseen = coverage(collect([facing(BOARD, -0.12, -0.08, 0.6)]).views)
     assert 0 < part < 0.5 and "lower right" in unseen and "upper left" not in unseen
     assert coverage([])[0] == 0 and len(coverage([])[1]) == 9
 
 
-def test_collecting_ends_when_there_are_enough_views():
+def test_collection_ends_with_enough_views():
     collector = collect(many_poses(BOARD, 4), most_views=3, least_views=3)
     assert collector.complete

@@ -1,4 +1,4 @@
-"""What the fingers of a model do is measured, and told where it is not what the robot file says."""
+"""Measured fingers, and deviations of robot files from them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from common.robot.finger_joints import finger_positions, width_at
 from common.robot.model import RobotModel
 from common.robot.transforms import invert
 from tests.small_arms import scara
-from tools.robot_setup.end_effector import complaints
+from tools.robot_setup.end_effector import check_gripper
 from tools.robot_setup.fingers import check_tool_frame, link_points, links_moved
 from tools.robot_setup.proposal import Proposal, draft
 
@@ -25,38 +25,38 @@ def config_of(name: str) -> RobotConfig:
 
 
 @pytest.mark.parametrize("name", names_of("robots"))
-def test_the_robots_that_come_with_the_project_say_what_is_so(name: str) -> None:
+def test_tool_frames_of_the_projects_robots_match_their_fingers(name: str) -> None:
     assert check_tool_frame(RobotModel.load(config_of(name))) == []
 
 
-def test_a_width_that_is_not_the_fingers_is_told() -> None:
+def test_wrong_gripper_width_is_reported() -> None:
     config = config_of("panda")
     assert config.gripper is not None
     wide = config.model_copy(update={"gripper": config.gripper.model_copy(update={"mimic": [1.0, 0.5]})})
-    (told,) = check_tool_frame(RobotModel.load(wide))
-    assert told == "gripper.max_width: the fingers open by 0.0600 m, not by 0.08 m"
+    (problem,) = check_tool_frame(RobotModel.load(wide))
+    assert problem == "gripper.max_width: the fingers open by 0.0600 m, not by 0.08 m"
 
 
-def test_a_gripper_that_is_mounted_gets_the_linkage_that_was_worked_out_by_hand() -> None:
+def test_mounted_gripper_gets_the_linkage_of_the_manual_robot_file() -> None:
     by_hand = config_of("ur5").gripper
-    made = draft("package://example-robot-data/robots/ur_description/urdf/ur5_robot.urdf", "arm",
+    proposal = draft("package://example-robot-data/robots/ur_description/urdf/ur5_robot.urdf", "arm",
                  gripper=str(find_file("robots", "ur5").with_name("robotiq_2f85.urdf")))
-    found = made.values["gripper"]
+    found = proposal.values["gripper"]
     assert by_hand is not None and by_hand.linkage is not None
     assert found["linkage"] == pytest.approx(by_hand.linkage.model_dump(), abs=1e-4)
     assert dict(zip(found["joints"], found["mimic"], strict=True)) == dict(
         zip(by_hand.joints, by_hand.mimic, strict=True))
     assert found["max_width"] == pytest.approx(by_hand.max_width, abs=1e-4)
     assert set(found["links"]) == set(by_hand.links)
-    assert made.values["attachments"][0]["parent_link"] == "tool0"
+    assert proposal.values["attachments"][0]["parent_link"] == "tool0"
 
 
 @pytest.mark.parametrize(("urdf", "opens", "closed"), [
     ("so_arm_description/urdf/so101.urdf", 1, -0.174533), ("z1_description/urdf/z1.urdf", -1, 0.0)])
-def test_a_jaw_that_turns_towards_a_fixed_finger_is_measured(urdf: str, opens: int, closed: float) -> None:
-    made = draft(f"package://example-robot-data/robots/{urdf}", "arm")
-    assert made.lost == [] and any("one finger is fixed" in line for line in made.check)
-    config = check(RobotConfig, made.values, "robot")
+def test_jaw_that_turns_towards_a_fixed_finger_is_measured(urdf: str, opens: int, closed: float) -> None:
+    proposal = draft(f"package://example-robot-data/robots/{urdf}", "arm")
+    assert proposal.lost == [] and any("one finger is fixed" in line for line in proposal.check)
+    config = check(RobotConfig, proposal.values, "robot")
     gripper = config.gripper
     assert gripper is not None and gripper.jaw is not None
     assert (gripper.jaw.opens, gripper.jaw.closed) == (opens, pytest.approx(closed, abs=1e-4))
@@ -70,7 +70,7 @@ def test_a_jaw_that_turns_towards_a_fixed_finger_is_measured(urdf: str, opens: i
         T = invert(poses[config.tcp_link]) @ poses[jaw]
         return np.asarray(corners @ T[:3, :3].T + T[:3, 3])
 
-    # The corner of its tip that is nearest to the fixed finger goes away from there by the width.
+    # The tip corner nearest to the fixed finger moves away from it by the width.
     shut = in_tool(0.0)
     tip = int(np.argmin(np.where(shut[:, 2] > shut[:, 2].max() - 0.02, shut[:, 1], np.inf)))
     assert shut[tip, 1] == pytest.approx(-gripper.max_width / 2, abs=2e-4)  # the tool is in the middle of the open jaws
@@ -78,65 +78,65 @@ def test_a_jaw_that_turns_towards_a_fixed_finger_is_measured(urdf: str, opens: i
         assert in_tool(width)[tip, 1] - shut[tip, 1] == pytest.approx(width, abs=5e-4)
 
 
-def test_a_jaw_file_that_is_not_so_is_told_what_is() -> None:
-    made = draft("package://example-robot-data/robots/z1_description/urdf/z1.urdf", "arm")
-    config = check(RobotConfig, made.values, "robot")
+def test_wrong_jaw_values_are_reported_with_the_measured_ones() -> None:
+    proposal = draft("package://example-robot-data/robots/z1_description/urdf/z1.urdf", "arm")
+    config = check(RobotConfig, proposal.values, "robot")
     assert config.gripper is not None and config.gripper.jaw is not None and config.tcp is not None
-    assert complaints(RobotModel.load(config)) == []
+    assert check_gripper(RobotModel.load(config)) == []
 
     def of(**changes: object) -> list[str]:
         assert config.gripper is not None
-        return complaints(RobotModel.load(config.model_copy(update={
+        return check_gripper(RobotModel.load(config.model_copy(update={
             "gripper": config.gripper.model_copy(update=changes)})))
 
     assert of(closing_axis="x") == ["gripper.closing_axis: the jaw closes along y of arm_tcp, not along x"]
-    (told,) = of(jaw=config.gripper.jaw.model_copy(update={"opens": 1}))
-    assert told.startswith("gripper.jaw: it is closed at 0 and opens by -1")
-    (told,) = of(jaw=config.gripper.jaw.model_copy(update={"radius": 0.2}))
-    assert told == "gripper.jaw.radius: its tip is 0.1000 m from its axis, not 0.2 m"
+    (problem,) = of(jaw=config.gripper.jaw.model_copy(update={"opens": 1}))
+    assert problem.startswith("gripper.jaw: it is closed at 0 and opens by -1")
+    (problem,) = of(jaw=config.gripper.jaw.model_copy(update={"radius": 0.2}))
+    assert problem == "gripper.jaw.radius: its tip is 0.1000 m from its axis, not 0.2 m"
 
 
-def test_a_jaw_that_comes_to_nothing_is_no_gripper_and_told_so() -> None:
-    made = draft("package://example-robot-data/robots/talos_data/robots/talos_left_arm.urdf", "arm")
-    assert "gripper" not in made.values
-    (lost,) = made.lost
-    assert lost.startswith("no gripper: the jaw of gripper_left_joint does not come to what is fixed")
+def test_jaw_that_does_not_reach_the_fixed_finger_is_no_gripper() -> None:
+    proposal = draft("package://example-robot-data/robots/talos_data/robots/talos_left_arm.urdf", "arm")
+    assert "gripper" not in proposal.values
+    (lost,) = proposal.lost
+    assert lost.startswith("no gripper: the jaw of gripper_left_joint does not reach the fixed finger")
 
 
-def hand_of(text: str, folder: Path) -> Proposal:
+def proposal_of(text: str, folder: Path) -> Proposal:
     (folder / "arm.urdf").write_text(text)
     return draft(str(folder / "arm.urdf"), "arm")
 
 
-def test_slides_that_are_closed_beyond_0_say_where(tmp_path: Path) -> None:
+def test_slides_closed_at_a_positive_position_report_it(tmp_path: Path) -> None:
     apart = scara().replace('lower="0" upper="0.04"', 'lower="0.03" upper="0.06"')
     for side in ("0.005", "-0.005"):
         apart = apart.replace(f'xyz="0 {side} 0.03"', f'xyz="0 {-5 * float(side)} 0.03"')
-    made = hand_of(apart, tmp_path)
-    gripper = check(RobotConfig, made.values, "robot").gripper
+    proposal = proposal_of(apart, tmp_path)
+    gripper = check(RobotConfig, proposal.values, "robot").gripper
     assert gripper is not None
     assert (gripper.closed, gripper.max_width) == (pytest.approx(0.03), pytest.approx(0.06))
     assert finger_positions(gripper, 0.02) == pytest.approx([0.04, 0.04])
     assert width_at(gripper, 0.04) == pytest.approx(0.02)
 
 
-def test_a_joint_beside_the_fingers_that_carries_none_of_them_stands_still(tmp_path: Path) -> None:
+def test_independent_joint_that_carries_no_finger_is_locked(tmp_path: Path) -> None:
     bar = ('<link name="bar"/><joint name="bar_turns" type="continuous"><parent link="palm"/><child link="bar"/>'
            '<axis xyz="0 0 1"/><limit velocity="1" effort="1"/></joint></robot>')
-    made = hand_of(scara().replace("</robot>", bar), tmp_path)
-    assert made.values["gripper"]["joints"] == ["left_finger", "right_finger"]
-    assert made.values["locked_joints"]["bar_turns"] == 0.0
-    assert "gripper: bar_turns stands still: it moves on its own beside left_finger" in made.check
+    proposal = proposal_of(scara().replace("</robot>", bar), tmp_path)
+    assert proposal.values["gripper"]["joints"] == ["left_finger", "right_finger"]
+    assert proposal.values["locked_joints"]["bar_turns"] == 0.0
+    assert "gripper: bar_turns is locked: it moves independently of left_finger" in proposal.check
 
 
-def test_fingers_about_their_own_frames_point_away_from_the_arm(tmp_path: Path) -> None:
+def test_fingers_around_their_frames_point_away_from_the_arm(tmp_path: Path) -> None:
     text = scara().replace('0.005 0.03"/><geometry>', '0.005 -0.004"/><geometry>').replace(
         'xyz="0 0 0.04"/>', 'xyz="0 0 0.1"/>')
-    made = hand_of(text, tmp_path)
-    robot = RobotModel.load(check(RobotConfig, made.values, "robot"))
-    assert robot.fk(np.zeros(4))[2, 2] == pytest.approx(-1.0)  # down, as the hand hangs
+    proposal = proposal_of(text, tmp_path)
+    robot = RobotModel.load(check(RobotConfig, proposal.values, "robot"))
+    assert robot.fk(np.zeros(4))[2, 2] == pytest.approx(-1.0)  # down, as the gripper is mounted
 
 
-def test_the_flange_whose_z_axis_points_out_is_the_tool_centre_point() -> None:
-    made = draft("package://example-robot-data/robots/ur_description/urdf/ur10_robot.urdf", "arm")
-    assert made.values["tcp_link"] == "tool0"  # and not ee_link, a third of a millimetre away, with x out
+def test_flange_whose_z_axis_points_out_is_the_tool_centre_point() -> None:
+    proposal = draft("package://example-robot-data/robots/ur_description/urdf/ur10_robot.urdf", "arm")
+    assert proposal.values["tcp_link"] == "tool0"  # and not ee_link, a third of a millimetre away, with x out

@@ -1,0 +1,212 @@
+"""Texts of the page for states and errors. A state also has a kind, which is its color: good, busy, bad, off."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+from pydantic import ValidationError
+
+from common.application import Application
+from common.client.operator_motion import AT_REST
+from common.errors import NoResponder, RemoteError, ZencellError
+from common.messages import GripperState, MotionStatus, PlanResponse, RobotStatus, TaskStatus
+from page.application import ApplicationPage, page_of
+from page.markup import BAD, BUSY, GOOD, OFF
+
+STATES = {"IDLE": "Waiting", "HOMING": "Moving to home", "DONE": "Done", "ERROR": "Failed"}
+SERVICE_STATES = {
+    "waiting": ("waiting", OFF),
+    "starting": ("starting", BUSY),
+    "ready": ("ready", GOOD),
+    "restarting": ("crashed", BAD),
+    "stopping": ("stopping", OFF),
+    "stopped": ("stopped", OFF),
+    "failed": ("failed", BAD),
+    "gone": ("not running", BAD),
+}
+CONTROLLER_MODES = {
+    "disconnected": ("Disconnected", BAD),
+    "off": ("Power off", OFF),
+    "idle": ("Not enabled", BUSY),
+    "running": ("Ready", GOOD),
+    "freedrive": ("Freedrive", BUSY),
+    "protective_stop": ("Protective stop", BAD),
+    "emergency_stop": ("Emergency stop", BAD),
+    "fault": ("Fault", BAD),
+}
+GOAL_STATES = {
+    "none": "idle",
+    "rejected": "motion rejected",
+    "active": "moving",
+    "succeeded": "idle",
+    "aborted": "motion aborted",
+    "cancelled": "motion stopped",
+}
+CLOSED_WIDTH = 0.001  # [m] below which the gripper counts as closed
+
+USER_ERRORS = (ZencellError, ValidationError)  # caused by what an operator requested, such as a value out of bounds
+
+
+# --- task ---
+
+
+def state_name(status: TaskStatus, states: Mapping[str, str]) -> str:
+    """Return the name of a task's state for the operator."""
+    return states.get(status.state, status.state.replace("_", " ").capitalize())
+
+
+def counters(status: TaskStatus, rejected: int) -> dict[str, object]:
+    """Return the figures of any task by name."""
+    figures = {name.replace("_", " "): value for name, value in status.figures.items() if value is not None}
+    seen = {"rejected": rejected} if rejected else {}
+    return {"done": status.done, "of": status.total, **figures, **seen, "retries": status.retries,
+            "failures": status.failures}
+
+
+def progress(status: TaskStatus, motion: MotionStatus | None) -> float:
+    """Return the progress of any task, 0 to 1; without a total, the progress of the current motion."""
+    return min(1.0, status.done / status.total) if status.total else motion_progress(motion)
+
+
+def motion_progress(motion: MotionStatus | None) -> float:
+    """Return the progress of the current motion, 0 to 1."""
+    return motion.progress if motion is not None and motion.state == "active" else 0.0
+
+
+@dataclass(frozen=True)
+class TaskText:
+    """Texts for a task: those of its application, or texts that fit any task."""
+
+    states: Mapping[str, str] = field(default_factory=lambda: STATES)
+    counters: Callable[[TaskStatus, int], Mapping[str, object]] = counters
+    progress: Callable[[TaskStatus, MotionStatus | None], float] = progress
+    latency: str = ApplicationPage.latency
+
+    @classmethod
+    def of(cls, application: Application | None) -> TaskText:
+        """Return the texts of an application."""
+        page = page_of(application)
+        return cls({**STATES, **page.states}, page.counters or counters, page.progress or progress, page.latency)
+
+    def state(self, status: TaskStatus | None) -> tuple[str, str]:
+        """Return the state of the task and its kind."""
+        if status is None:
+            return "Task state unknown", OFF
+        name = state_name(status, self.states)
+        if status.state == "ERROR":
+            return name, BAD
+        if status.paused:
+            return "Paused", BUSY
+        if status.state == "DONE":
+            return name, GOOD
+        if not status.started:
+            return "Stopped" if status.state != "IDLE" else "Waiting for start", OFF
+        return f"{name} {status.subject}".rstrip(), GOOD
+
+    def progress_of(self, status: TaskStatus | None, motion: MotionStatus | None) -> float:
+        """Return the progress of the task, 0 to 1."""
+        if status is None:
+            return motion_progress(motion)
+        return 1.0 if status.state == "DONE" else self.progress(status, motion)
+
+
+# --- why a button is disabled; empty texts mean that it is enabled ---
+
+
+def arm_blocked(task: TaskStatus | None, motion: MotionStatus | None) -> str:
+    """Return why no operator can move the arm now."""
+    if motion is None:
+        return "the arm's state is unknown: its controller does not respond"
+    if motion.fault:
+        return f"robot fault: {motion.fault}"
+    if task is not None and task.paused:
+        return "the paused task controls the arm: press STOP to end it"
+    if task is not None and task.started and task.state not in AT_REST:
+        return "the task controls the arm: press STOP to end it"
+    return ""
+
+
+def jog_blocked(motion: MotionStatus | None) -> str:
+    """Return why the arm cannot be jogged now, apart from `arm_blocked`."""
+    if motion is None:
+        return ""
+    if motion.held:
+        return "the arm is held: press Resume or Start to release it"
+    return "the arm is executing a motion" if motion.state == "active" else ""
+
+
+def command_blocked(task: TaskStatus | None, motion: MotionStatus | None) -> dict[str, str]:
+    """Return why each command to the task would have no effect now."""
+    if task is None:
+        return dict.fromkeys(("Start", "Pause", "Resume"), "the task's state is unknown: it does not respond")
+    stopped = motion is not None and bool(motion.stopped)
+    running = task.started and task.state not in ("DONE", "ERROR")
+    paused = task.paused or (motion is not None and motion.paused)
+    moving = motion is not None and motion.state == "active"
+    start = "" if not running or stopped else "the task is paused: press Resume" if paused else "already running"
+    pause = "already paused" if paused else "" if running or moving else "nothing is running"
+    resume = "nothing is paused" if not paused else "the arm was stopped: press Start" if stopped else ""
+    return {"Start": start, "Pause": pause, "Resume": resume}
+
+
+# --- services, arm, gripper ---
+
+
+def service_state(state: str, restarts: int) -> tuple[str, str]:
+    """Return the state of a process and its kind; a crashed one is bad until it is ready again."""
+    if state == "starting" and restarts:
+        return "restarting", BAD
+    return SERVICE_STATES[state]
+
+
+def controller_mode(robot: RobotStatus) -> tuple[str, str]:
+    """Return the mode of the robot controller and its kind."""
+    return CONTROLLER_MODES[robot.mode]
+
+
+def motion_text(status: MotionStatus | None) -> str:
+    """Return the state of the arm's motion."""
+    if status is None:
+        return "state unknown"
+    state = "held" if status.held else GOAL_STATES[status.state]
+    if status.state == "active" and not status.held:
+        state += f", {100 * status.progress:.0f} % of this motion"
+    return state
+
+
+def gripper_text(state: GripperState | None) -> str:
+    """Return the state of the gripper."""
+    if state is None:
+        return "gripper state unknown"
+    if state.holding:
+        return "gripper holds an object" + (", which is slipping" if state.outcome == "slipping" else "")
+    return f"gripper open {1e3 * state.width:.0f} mm" if state.width >= CLOSED_WIDTH else "gripper closed"
+
+
+# --- errors and plans ---
+
+
+def error_text(error: ZencellError | ValidationError) -> str:
+    """Return an error for the operator, without details for programs."""
+    if isinstance(error, ValidationError):
+        first, *more = error.errors()
+        where = ".".join(map(str, first["loc"])) or error.title
+        return f"{where}: {first['msg']}" + (f" (and {len(more)} more)" if more else "")
+    if isinstance(error, RemoteError):
+        return error.message
+    if isinstance(error, NoResponder):
+        return f"no service answers {error.key} now"
+    return str(error)
+
+
+def plan_text(response: PlanResponse) -> str:
+    """Return the result of planning in one line; after a failure with the objects that would collide."""
+    if response.ok:
+        points = response.trajectory.points if response.trajectory else []
+        motion = f"motion of {points[-1].time_from_start:.1f} s" if points else "no motion needed"
+        return f"Planned by {response.planner} in {1e3 * response.seconds:.0f} ms: {motion}"
+    line = response.message or response.error
+    if response.colliding and not all(name in line for name in response.colliding):
+        line += f"; {response.colliding[0]} would collide with {response.colliding[1]}"
+    return line

@@ -1,0 +1,88 @@
+"""Messages about control of page and arm, which every page shows."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, cast
+
+import pytest
+import viser
+
+from common.messages import MotionOwner
+from page.console import ActionQueue
+from page.main_panel import ControllerPanel, TaskPanel
+from page.permissions import CURRENT_SESSION, PageSession, Permissions
+
+FIRST, SECOND = (PageSession(n, f"10.0.0.{n}", frozenset({"look", "operate"})) for n in (1, 2))
+
+
+class FakeConsole(ActionQueue):
+    """Replies to each request for ownership with the same owner."""
+
+    acknowledged = 0
+
+    def __init__(self, permissions: Permissions, owner: MotionOwner) -> None:
+        super().__init__(permissions)
+        self._owner = owner
+
+    def latest(self, _topic: object) -> None:
+        return None
+
+    async def own(self, _act: str, _over: bool) -> MotionOwner:
+        return self._owner
+
+
+async def nothing() -> None:
+    """Do nothing."""
+
+
+def panel_of(gui: viser.GuiApi, owner: MotionOwner) -> tuple[TaskPanel, ActionQueue]:
+    permissions = Permissions()
+    permissions.enforced = True
+    console = FakeConsole(permissions, owner)
+    return TaskPanel(gui, cast(Any, console), cast(Any, None), nothing), console
+
+
+async def press(panel: TaskPanel, console: ActionQueue, session: PageSession, name: str) -> tuple[str, str]:
+    """Press a button on a page; return the message that all pages show."""
+    token = CURRENT_SESSION.set(session)
+    action, _ = console._buttons[name]
+    if (coroutine := action()) is not None:
+        await coroutine
+    CURRENT_SESSION.reset(token)
+    return panel.note[1:]
+
+
+@pytest.fixture(autouse=True)
+def session() -> Iterator[None]:
+    yield
+    CURRENT_SESSION.set(None)
+
+
+async def test_page_that_takes_control_is_named_on_every_page(gui: viser.GuiApi) -> None:
+    panel, console = panel_of(gui, MotionOwner())
+    for each in (FIRST, SECOND):
+        assert console.permissions.allow(each, "any element that moves the arm") is (each is FIRST)
+        assert await press(panel, console, each, "operate") == (f"{each} has control now", "good")
+    assert await press(panel, console, SECOND, "leave") == (f"{SECOND} has no control to release", "bad")
+
+
+@pytest.mark.parametrize(("owner", "kind"), [(f"page {FIRST.address}", "bad"), ("", "good")])
+async def test_releasing_control_of_another_operator_is_an_error(gui: viser.GuiApi, owner: str, kind: str) -> None:
+    panel, console = panel_of(
+        gui, MotionOwner(owner=owner, kind="operator" if owner else "none", asked=bool(owner)))
+    message, shown = await press(panel, console, SECOND, "give")
+    assert shown == kind and message.startswith("This page has no control to release") is bool(owner)
+
+
+async def test_controller_commands_need_the_role_operate(gui: viser.GuiApi) -> None:
+    permissions = Permissions()
+    permissions.enforced = True
+    actions = ActionQueue(permissions)
+    actions.put = lambda _action: None  # type: ignore[method-assign]
+    before = set(gui._gui_input_handle_from_uuid)
+    ControllerPanel(gui, cast(Any, actions))
+    (buttons,) = set(gui._gui_input_handle_from_uuid) - before
+    allowed = {role: permissions.allow(PageSession(n, "10.0.0.5", frozenset({"look", role})), buttons)
+               for n, role in enumerate(("look", "tune", "operate"))}
+    assert allowed == {"look": False, "tune": False, "operate": True}

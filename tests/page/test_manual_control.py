@@ -1,0 +1,74 @@
+"""Jogging: why a held button has no effect, and the names of its buttons."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+import viser
+
+from common.messages import MotionOwner, MotionStatus
+from common.time_source import use_time_source
+from page.console import ActionQueue
+from page.manual_control import Jogger, JogPanel
+from page.permissions import PAGE, Permissions
+from tests.page.test_permissions import Clock
+
+OURS, FREE = MotionOwner(owner=PAGE, kind="operator", jogging=True), MotionOwner()
+BOBS = MotionOwner(owner="bob", kind="operator", asked=True)
+
+
+class Arm:
+    """Accepts jog commands; the test sets the motion owner."""
+
+    def __init__(self, clock: Clock) -> None:
+        self.permissions, self.owner, self.clock, self.rejected = Permissions(), FREE, clock, list[str]()
+        self.jogger = Jogger(self, lambda _: {"joints": {"a": 0.1}}, lambda: (MotionStatus(), self.owner), lambda: "")
+
+    def jog(self, acknowledged: int, **velocities: Any) -> None:
+        pass
+
+    def hold(self, owner: MotionOwner, press: int = 1) -> None:
+        """Receive a hold message, 0.2 s after the last one."""
+        self.owner, self.clock.now = owner, self.clock.now + 0.2
+        self.jogger.hold("page", "joint:a:+", press, self.rejected.append)
+
+
+@pytest.fixture
+def arm() -> Iterator[Arm]:
+    clock = Clock()
+    with use_time_source(clock):
+        yield Arm(clock)
+
+
+@pytest.mark.parametrize(("before", "then", "reason"), [
+    (OURS, FREE, "press the button again"), (FREE, FREE, "its controller does not take it"),
+    (OURS, BOBS, "owned by bob"),
+])
+def test_held_button_without_effect_is_rejected_once_with_the_reason(
+    arm: Arm, before: MotionOwner, then: MotionOwner, reason: str
+) -> None:
+    for owner in [FREE, *[before] * 4, *[then] * 4]:
+        arm.hold(owner)
+    assert len(arm.rejected) == 1 and reason in arm.rejected[0]
+
+
+def test_next_press_is_judged_on_its_own(arm: Arm) -> None:
+    for owner in [FREE, *[OURS] * 4, *[FREE] * 4]:
+        arm.hold(owner)
+    for owner in [FREE] * 7:
+        arm.hold(owner, press=2)
+    assert len(arm.rejected) == 2 and "its controller does not take it" in arm.rejected[1]
+
+
+@pytest.mark.parametrize(("joints", "names"), [
+    (["panda_joint1", "panda_joint2"], ["joint1", "joint2"]),
+    (["shoulder_pan_joint", "elbow_joint"], ["joint shoulder pan", "joint elbow"]),
+    (["1", "2"], ["joint 1", "joint 2"]),
+])
+async def test_jog_buttons_have_accessible_names(gui: viser.GuiApi, joints: list[str], names: list[str]) -> None:
+    panel = JogPanel(gui, ActionQueue(), joints, [1.0, 1.0])
+    labels = re.findall(r'aria-label="([^"]*)"', panel._html.content)
+    assert labels == [f"jog {name}, {sign}" for name in names for sign in ("minus", "plus")]

@@ -1,0 +1,95 @@
+"""Planned motions of the Move tab, and sequences of saved poses."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+from typing import Any, cast
+
+import viser
+
+from common.client.operator_motion import MotionFailed
+from common.messages import Interlock, JointTrajectory, JointTrajectoryPoint, MotionStatus, PlanResponse
+from page.console import ActionQueue
+from page.move_panel import MovePanel
+from page.saved_poses import SavedPoses, poses_file, save_poses
+from tests.page.scene_cell import robot_of
+
+STOP = MotionStatus(interlocks=[Interlock(kind="stopped", by="anna", since=8)])
+
+
+class Motions:
+    """Plans when the test allows it, and moves at once; an operator presses STOP when the first motion ends."""
+
+    def __init__(self) -> None:
+        self.planning, self.may_plan = asyncio.Event(), asyncio.Event()
+        self.status, self.moves, self.follows = MotionStatus(), 0, 0
+
+    async def require_free(self) -> MotionStatus:
+        return self.status
+
+    async def plan(self, _goal: Any, *, planner: str = "") -> PlanResponse:
+        self.planning.set()
+        await self.may_plan.wait()
+        point = JointTrajectoryPoint(time_from_start=0.0, positions=[0.1], velocities=[0.0], accelerations=[0.0])
+        return PlanResponse(id="1", ok=True, trajectory=JointTrajectory(joint_names=["a"], points=[point]))
+
+    async def move(self, _goal: Any, *, planner: str = "", acknowledged: int | None = None) -> MotionStatus:
+        if acknowledged is not None and self.status.newest > acknowledged:
+            raise MotionFailed("stopped", "the motion was rejected")
+        self.moves, self.status = self.moves + 1, STOP
+        return self.status
+
+    async def follow(self, _trajectory: JointTrajectory, *, plan: PlanResponse | None = None) -> MotionStatus:
+        self.follows += 1
+        return MotionStatus()
+
+
+class EmptyScene:
+    def __getattr__(self, _name: str) -> Any:
+        return lambda *_: None
+
+
+class SilentConsole(ActionQueue):
+    """The console of a cell that publishes nothing."""
+
+    def latest(self, _topic: Any) -> None:
+        pass
+
+
+def panel_of(gui: viser.GuiApi, motions: Motions) -> tuple[MovePanel, list[tuple[str, str]]]:
+    robot, notes = robot_of("ur5"), list[tuple[str, str]]()
+    pose = dict.fromkeys(robot.joint_names, 0.1)
+    save_poses(poses_file("cell"), SavedPoses(poses={"one": pose, "two": pose}))
+    panel = MovePanel(
+        gui, cast(Any, SilentConsole()), cast(Any, motions), cast(Any, EmptyScene()), robot, [], cell="cell",
+        planner="", marker=False, notify=lambda line, kind: notes.append((line, kind)))
+    return panel, notes
+
+
+async def test_plan_is_discarded_if_another_goal_is_selected_while_planning(
+    gui: viser.GuiApi, state_folder: Path
+) -> None:
+    motions = Motions()
+    panel, notes = panel_of(gui, motions)
+    panel._goal._set_kind("one")
+    planning = asyncio.create_task(panel._plan_goal())
+    await motions.planning.wait()
+    panel._goal._set_kind("home")
+    motions.may_plan.set()
+    await planning
+    assert "Plan discarded" in notes[-1][0]
+    await panel._execute()
+    assert (motions.follows, notes[-1][0]) == (0, "Press Plan first.")
+    for operation in (panel._plan_goal, panel._execute):
+        await operation()
+    assert (motions.follows, notes[-1][0]) == (1, "Goal reached")
+
+
+async def test_stop_between_two_poses_ends_the_sequence(gui: viser.GuiApi, state_folder: Path) -> None:
+    motions = Motions()
+    panel, notes = panel_of(gui, motions)
+    panel._poses._set_sequence("one, two")
+    await panel._poses._run_sequence()
+    assert motions.moves == 1
+    assert notes[-2:] == [("Moving to two …", "busy"), ("the motion was rejected", "bad")]

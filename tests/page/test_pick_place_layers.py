@@ -1,0 +1,96 @@
+"""Targets, rejections and workspace of pick and place in the scene."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from applications.pick_place.topics import (
+    DETECTED_OBJECTS,
+    REJECTED_TARGETS,
+    VALIDATED_TARGETS,
+    WORKSPACE_MARKERS,
+)
+from common import messages as m
+from tests.page.scene_cell import WORLD, Stage, at
+
+TOO_FAR = "too far: 0.873 m from the base axis, more than 0.820 m"
+SECOND = 1_000_000_000  # [ns]
+
+
+def rejection(x: float, y: float, reason: str, stamp: int = 1) -> m.Rejections:
+    position = m.Vector3(x=x, y=y, z=0.03)
+    header = m.Header(stamp=stamp, frame_id="world")
+    return m.Rejections(header=header, rejected=[m.Rejection(position=position, reason=reason)])
+
+
+def detection(stamp: int, *positions: tuple[float, float]) -> m.MarkerArray:
+    return m.MarkerArray(header=m.Header(stamp=stamp, frame_id="world"), markers=[
+        m.Marker(ns="balls", id=i, type="sphere", pose=at(x, y, 0.03), scale=m.Vector3(x=0.06, y=0.06, z=0.06))
+        for i, (x, y) in enumerate(positions)
+    ])
+
+
+def targets(*positions: tuple[float, float]) -> m.PoseArray:
+    return m.PoseArray(header=WORLD, poses=[at(x, y, 0.03) for x, y in positions])
+
+
+def test_each_target_has_a_ring(panda: Stage) -> None:
+    for positions in ([(0.4, 0.1)], [(0.4, 0.1), (0.5, -0.1)], [(0.3, 0.2), (0.5, -0.1)]):
+        panda.say(VALIDATED_TARGETS, targets(*positions))
+        np.testing.assert_allclose([node.position[:2] for node in panda.layer("targets").nodes], positions, atol=1e-6)
+    panda.say(VALIDATED_TARGETS, targets())
+    assert panda.layer("targets").nodes == []
+    assert not [name for name in panda.server.scene._handle_from_node_name if name.startswith("/targets/")]
+
+
+def test_rejected_position_is_labeled_with_its_newest_reason(panda: Stage) -> None:
+    panda.say(REJECTED_TARGETS, rejection(0.82, 0.3, TOO_FAR))
+    assert panda.layer("rejected").labels.texts == [TOO_FAR]
+    (_, node), = panda.layer("rejected").nodes.values()
+    np.testing.assert_allclose(node.position, [0.82, 0.3, 0.03])
+    panda.say(REJECTED_TARGETS, rejection(0.1, 0.0, "too close"))
+    panda.say(REJECTED_TARGETS, rejection(0.825, 0.3, "partly out of view"))
+    assert panda.layer("rejected").reasons == ["too close", "partly out of view"]
+
+
+def test_position_of_a_target_is_no_longer_rejected(panda: Stage) -> None:
+    panda.say(REJECTED_TARGETS, rejection(0.5, 0.1, "partly out of view"))
+    panda.say(VALIDATED_TARGETS, targets((0.5, 0.11)))
+    assert panda.layer("rejected").reasons == []
+
+
+def test_rejection_is_forgotten_after_some_time_without_detections(panda: Stage) -> None:
+    panda.say(REJECTED_TARGETS, rejection(0.82, 0.3, TOO_FAR, stamp=10 * SECOND))
+    panda.say(DETECTED_OBJECTS, detection(12 * SECOND, (0.821, 0.3), (0.4, 0.1)))
+    for seconds, reasons in ((14, [TOO_FAR]), (16, [])):  # at first it may be occluded by the arm
+        panda.say(DETECTED_OBJECTS, detection(seconds * SECOND, (0.4, 0.1)))
+        assert panda.layer("rejected").reasons == reasons
+
+
+def test_number_of_displayed_rejections_is_bounded(panda: Stage) -> None:
+    for index in range(100):
+        panda.say(REJECTED_TARGETS, rejection(0.1 * index, 0.0, f"reason {index}"))
+    assert len(panda.layer("rejected").reasons) == 60 and panda.layer("rejected").reasons[-1] == "reason 99"
+
+
+def test_workspace_is_a_translucent_cylinder_that_is_sent_once(panda: Stage) -> None:
+    shell = m.Marker(
+        ns="workspace", id=0, type="cylinder", pose=at(0, 0, 0.4), scale=m.Vector3(x=1.6, y=1.6, z=1.0),
+        color=m.Color(r=0.2, g=0.8, b=0.3, a=0.15),
+    )
+    panda.say(WORKSPACE_MARKERS, m.MarkerArray(header=WORLD, markers=[shell]))
+    _, wall = panda.layer("workspace").markers.nodes
+    np.testing.assert_allclose(np.linalg.norm(wall.vertices[:, :2], axis=1), 0.8, atol=1e-6)
+    assert np.ptp(wall.vertices[:, 2]) == 1.0 and wall.opacity == 0.15 and wall.position[2] == 0.4
+    with panda.sent() as sent:
+        panda.say(WORKSPACE_MARKERS, m.MarkerArray(header=WORLD, markers=[shell]))
+    assert not sent
+
+
+def test_markers_of_every_type_are_displayed(panda: Stage) -> None:
+    types = ("sphere", "box", "text", "cylinder")
+    panda.say(WORKSPACE_MARKERS, m.MarkerArray(header=WORLD, markers=[
+        m.Marker(ns="x", id=i, type=each, pose=at(0, 0, i), scale=m.Vector3(x=1, y=1, z=1), text="a wall")
+        for i, each in enumerate(types)
+    ]))
+    assert len(panda.layer("workspace").markers.nodes) == len(types) + 1  # a cylinder has rims

@@ -1,0 +1,133 @@
+"""Ghosts of the robot for plans, and the tool path."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from common import messages as m
+from common import topics
+from tests.page.scene_cell import Stage, in_world
+
+Array = NDArray[np.float64]
+
+
+def plan(stage: Stage, q: Array, seconds: float = 2.0, count: int = 40, stamp: int = 0) -> m.JointTrajectory:
+    start = stage.robot.named("home")
+    zeros = [0.0] * len(q)
+    return m.JointTrajectory(header=m.Header(stamp=stamp), joint_names=stage.robot.joint_names, points=[
+        m.JointTrajectoryPoint(
+            time_from_start=float(s * seconds), positions=(start + s * (q - start)).tolist(), velocities=zeros,
+            accelerations=zeros,
+        ) for s in np.linspace(0, 1, count)
+    ])
+
+
+@pytest.fixture
+def home(panda: Stage) -> Array:
+    q = panda.robot.named("home")
+    panda.joints(q)
+    return q
+
+
+@pytest.fixture
+def goal(home: Array) -> Array:
+    return home + np.array([0.5, 0.2, 0, 0.1, 0, 0.1, 0])
+
+
+def assert_ghost_at(stage: Stage, q: Array, tolerance: float = 1e-6, layer: str = "plan") -> None:
+    hand = in_world(stage.server, stage.layer(layer).ghost.links["panda_hand"])
+    np.testing.assert_allclose(hand, stage.robot.link_poses(q)["panda_hand"], atol=tolerance)
+
+
+def test_ghost_is_at_the_end_of_the_plan_until_the_robot_arrives(panda: Stage, goal: Array) -> None:
+    ghost = panda.layer("plan").ghost
+    assert not ghost.visible
+    panda.say(topics.DISPLAY_TRAJECTORY, plan(panda, goal))
+    assert ghost.visible
+    assert_ghost_at(panda, goal)
+    for q, visible in ((goal - 0.05, True), (goal, False)):
+        panda.joints(q)
+        assert ghost.visible is visible
+
+
+def test_meshes_of_the_ghost_are_sent_once_with_the_first_plan(
+    panda: Stage, goal: Array, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sent: list[str] = []
+    add = panda.server.scene.add_mesh_simple
+    monkeypatch.setattr(panda.server.scene, "add_mesh_simple",
+                        lambda name, *args, **options: (sent.append(name), add(name, *args, **options))[1])
+    panda.joints(goal - 0.05)
+    assert not [name for name in sent if name.startswith("/plan/")]
+    for _ in range(2):
+        panda.say(topics.DISPLAY_TRAJECTORY, plan(panda, goal))
+    links = {name.split("/")[-2] for name in sent}
+    assert len(sent) == len(links) == len(panda.layer("plan").ghost.links)
+
+
+def test_line_is_the_path_of_the_tool(panda: Stage, goal: Array) -> None:
+    trajectory = plan(panda, goal)
+    panda.say(topics.DISPLAY_TRAJECTORY, trajectory)
+    line = panda.layer("tool_path").line
+    assert line is not None
+    expected = [panda.robot.fk(point.positions)[:3, 3] for point in trajectory.points]
+    np.testing.assert_allclose([line.points[0, 0], *line.points[:, 1]], expected, atol=1e-5)
+
+
+def test_links_that_coincide_with_the_robot_are_hidden(panda: Stage, home: Array, goal: Array) -> None:
+    panda.say(topics.DISPLAY_TRAJECTORY, plan(panda, goal))
+    panda.joints(home)
+    ghost = panda.layer("plan").ghost.links
+    assert not ghost["panda_link0"].visible and ghost["panda_hand"].visible
+
+
+def test_animation_repeats_the_plan(panda: Stage, home: Array, goal: Array) -> None:
+    panda.view.play(plan(panda, goal, seconds=2.0))
+    panda.joints(home)
+    for seconds, share in ((1.0, 0.5), (1.5, 1.0), (1.0, 0.25)):  # it starts again after 2 s and a pause of 1 s
+        panda.clock.now += seconds
+        panda.joints(home)
+        assert_ghost_at(panda, home + share * (goal - home), 1e-3)
+
+
+def test_animation_ends_when_the_robot_moves(panda: Stage, home: Array, goal: Array) -> None:
+    panda.view.play(plan(panda, goal))
+    panda.joints(home)
+    panda.clock.now += 0.5
+    panda.joints(home + 0.02 * (goal - home) / 0.5)
+    assert not panda.layer("plan").playing
+    assert_ghost_at(panda, goal)
+
+
+def test_animated_plan_is_not_restarted_when_the_planner_publishes_it(panda: Stage, goal: Array) -> None:
+    panda.view.play(plan(panda, goal, stamp=5))
+    for stamp, playing in ((5, True), (6, False)):
+        panda.say(topics.DISPLAY_TRAJECTORY, plan(panda, goal, stamp=stamp))
+        assert panda.layer("plan").playing is playing
+
+
+def test_plan_without_points_clears_the_last_and_unknown_joints_do_no_harm(panda: Stage, goal: Array) -> None:
+    panda.say(topics.DISPLAY_TRAJECTORY, plan(panda, goal))
+    panda.say(topics.DISPLAY_TRAJECTORY, m.JointTrajectory(joint_names=panda.robot.joint_names, points=[]))
+    assert not panda.layer("plan").ghost.visible and panda.layer("tool_path").line is None
+    panda.view.play(plan(panda, goal).model_copy(update={"joint_names": [f"other_{i}" for i in range(7)]}))
+    panda.joints(goal)
+
+
+def test_two_plans_are_animated_concurrently_until_the_robot_moves(panda: Stage, home: Array, goal: Array) -> None:
+    second = plan(panda, goal - 0.3, stamp=20)
+    panda.view.compare(second)
+    panda.view.play(plan(panda, goal, stamp=10))
+    panda.say(topics.DISPLAY_TRAJECTORY, second, 0.0)  # the planner publishes its newest plan
+    compared = panda.layer("compared")
+    panda.joints(home)
+    panda.clock.now += 1.999999
+    panda.joints(home + 1e-5)
+    assert_ghost_at(panda, goal, 1e-3)
+    assert_ghost_at(panda, goal - 0.3, 1e-3, "compared")
+    assert compared.line.points.shape[1:] == (2, 3) and panda.layer("tool_path").line is not None
+    np.testing.assert_allclose(panda.layer("tool_path").line.points[-1][1], panda.robot.fk(goal)[:3, 3], atol=1e-4)
+    panda.joints(home + 0.05)
+    assert not compared.ghost.visible and compared.line is None

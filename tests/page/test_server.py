@@ -1,0 +1,441 @@
+"""A real page server: which requests it admits, which it rejects, and what a client cannot make it do."""
+
+import asyncio
+import http.client
+import logging
+import re
+import socket
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import AbstractAsyncContextManager, asynccontextmanager
+from dataclasses import dataclass
+from email.message import Message
+from functools import partial
+from typing import Any
+
+import msgspec
+import pytest
+import viser
+import websockets
+from viser._messages import GuiUpdateMessage, ShareUrlRequest
+from websockets.asyncio.client import ClientConnection
+from websockets.asyncio.client import connect as connect_socket
+
+from common.config import load_cell, service_config
+from common.config.tunables import describe
+from common.errors import ConfigError
+from page import server as page_server
+from page.console import ActionQueue
+from page.permissions import Permission, Permissions
+from page.server import close_server, make_server
+from page.viser_inside import client_files, element_id
+from security.page_tokens import ROLES, TOKEN_VARIABLE
+from services.viewer import Config
+from tests.page.fake_browser import CAMERA
+
+SECRET = "correct-horse-battery"
+PATIENCE = 20.0  # [s]
+Make = Callable[..., viser.ViserServer]
+
+
+@pytest.fixture
+def make(monkeypatch: pytest.MonkeyPatch) -> Iterator[Make]:
+    """Makes servers that are closed at the end."""
+    monkeypatch.delenv(TOKEN_VARIABLE, raising=False)
+    made: list[viser.ViserServer] = []
+
+    def make_one(host: str = "127.0.0.1", port: int = 0, token: str = "", **options: Any) -> viser.ViserServer:
+        made.append(make_server(host, port, token, **options))
+        return made[-1]
+
+    yield make_one
+    for server in made:
+        close_server(server)
+
+
+@dataclass(frozen=True)
+class Answer:
+    status: int
+    text: str
+    headers: Message
+
+
+def get(server: viser.ViserServer, path: str = "/", **headers: str) -> Answer:
+    """Return the answer to a plain request."""
+    connection = http.client.HTTPConnection("127.0.0.1", server.get_port(), timeout=PATIENCE)
+    connection.request("GET", path, headers=headers)
+    answer = connection.getresponse()
+    got = Answer(answer.status, answer.read().decode(), answer.headers)
+    connection.close()
+    return got
+
+
+def open_page(
+    server: viser.ViserServer, name: str = "127.0.0.1", origin: str | None = None, path: str = "/",
+    cookie: str | None = None,
+) -> AbstractAsyncContextManager[ClientConnection]:
+    """The WebSocket of a page in a browser that resolves `name` to this server."""
+    port = server.get_port()
+
+    @asynccontextmanager
+    async def opened() -> AsyncIterator[ClientConnection]:
+        async with connect_socket(
+            f"ws://{name}:{port}{path}", host="127.0.0.1", port=port, proxy=None,
+            origin=websockets.Origin(origin) if origin else None,
+            subprotocols=[websockets.Subprotocol(f"viser-v{viser.__version__}")], max_size=None,
+            additional_headers={"Cookie": cookie} if cookie else None, open_timeout=PATIENCE,
+        ) as connection:
+            yield connection
+
+    return opened()
+
+
+async def status_of(*arguments: Any, **options: Any) -> int:
+    """Return the status of opening the WebSocket of a page, 101 if it opens."""
+    try:
+        async with open_page(*arguments, **options):
+            return 101
+    except websockets.InvalidStatus as error:
+        return error.response.status_code
+
+
+async def until(condition: Callable[[], object]) -> None:
+    async with asyncio.timeout(PATIENCE):
+        while not condition():  # noqa: ASYNC110
+            await asyncio.sleep(0.005)
+
+
+# --- admission ---
+
+
+async def test_page_and_websocket_are_served_to_this_machine(make: Make) -> None:
+    server = make()
+    answer = get(server)
+    assert answer.status == 200 and "<html" in answer.text
+    async with open_page(server, origin=f"http://127.0.0.1:{server.get_port()}") as connection:
+        assert isinstance(await connection.recv(), bytes)
+
+
+async def test_foreign_origin_is_rejected(make: Make) -> None:
+    server = make()
+    for origin in ("http://evil.example", f"http://localhost:{server.get_port()}", "null"):
+        assert await status_of(server, origin=origin) == 403
+    answer = get(server, Origin="http://evil.example")
+    assert answer.status == 403 and "other web pages must not access this page" in answer.text
+
+
+async def test_foreign_host_name_is_rejected(make: Make) -> None:
+    server = make()
+    name = f"evil.example:{server.get_port()}"
+    assert await status_of(server, name="evil.example", origin=f"http://{name}") == 403
+    assert await status_of(server, name="evil.example") == 403
+    answer = get(server, Host=name)
+    assert answer.status == 403 and f"http://127.0.0.1:{server.get_port()}" in answer.text
+
+
+async def test_remote_page_opens_with_its_token_only(make: Make) -> None:
+    server = make("0.0.0.0", token=SECRET)
+    assert get(server).status == get(server, "/?token=correct-horse-batterx").status == 401
+    assert await status_of(server) == await status_of(server, path="/?token=nonsense") == 401
+    assert {get(server, path).status for path in client_files()} == {401}
+    welcome = get(server, f"/?token={SECRET}")
+    assert welcome.status == 200 and SECRET not in welcome.text and len(welcome.text) < 500
+    cookie = welcome.headers["Set-Cookie"].partition(";")[0]
+    assert "<html" in get(server, Cookie=cookie).text
+    async with open_page(server, cookie=cookie, origin=f"http://127.0.0.1:{server.get_port()}") as connection:
+        assert isinstance(await connection.recv(), bytes)
+    assert await status_of(server, cookie=cookie, origin="http://evil.example") == 403
+
+
+def test_token_may_be_set_in_the_environment(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(TOKEN_VARIABLE, SECRET)
+    server = make()
+    assert (get(server).status, get(server, f"/?token={SECRET}").status) == (401, 200)
+
+
+def test_remote_and_secured_pages_need_a_token(make: Make) -> None:
+    with pytest.raises(ConfigError, match=f"services.viewer.token: is needed for a page at .*{TOKEN_VARIABLE}"):
+        make("0.0.0.0")
+    with pytest.raises(ConfigError, match=f"services.viewer.token: is needed in a secured cell.*{TOKEN_VARIABLE}"):
+        make(secured=True)
+    server = make(secured=True, tokens={"look": SECRET})
+    assert (get(server).status, get(server, f"/?token={SECRET}").status) == (401, 200)
+
+
+@pytest.mark.parametrize("token", ["short", "x" * 15, "spaces are not for cookies", "semi;colons;are;not;either"])
+def test_invalid_token_is_rejected_without_showing_it(make: Make, token: str) -> None:
+    with pytest.raises(ConfigError, match=r"services\.viewer\.token: must have 16 or more") as error:
+        make(token=token)
+    assert token not in str(error.value)
+
+
+def test_token_is_no_public_parameter_and_is_not_logged(make: Make, caplog: pytest.LogCaptureFixture) -> None:
+    config = service_config(load_cell("panda", [f"services.viewer.token={SECRET}"]), "viewer", Config)
+    assert config.token == SECRET
+    assert SECRET not in repr(describe(config, "viewer")) and SECRET not in repr(config)
+    with caplog.at_level(logging.DEBUG):
+        make(token=SECRET)
+        assert "ssh" not in caplog.text
+        get(make("0.0.0.0", token=SECRET), "/?token=wrong")
+    assert "without encryption" in caplog.text and "ssh -L" in caplog.text, "a remote page causes a warning"
+    assert SECRET not in caplog.text
+
+
+async def test_published_page_needs_a_token_for_other_containers_only(
+    make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    server = make("0.0.0.0", published=True)
+    assert get(server).status == get(server, Host="localhost:8080").status == 200
+    assert get(server, Host="panda-viewer:8080").status == get(server, Host="172.17.0.2:8080").status == 403
+    monkeypatch.setattr(page_server.BoundedConnection, "remote_address", ("172.18.0.7", 5555))
+    assert get(server).status == await status_of(server) == 401
+
+
+# --- responses ---
+
+
+def test_page_cannot_be_framed_and_loads_nothing_from_other_hosts(make: Make) -> None:
+    policy = get(make()).headers["Content-Security-Policy"]
+    assert "frame-ancestors 'none'" in policy and "default-src 'none'" in policy
+    assert not re.search(r"https?://|\*", policy)
+
+
+def test_rejected_request_gets_one_line(make: Make) -> None:
+    answer = get(make(token=SECRET), "/index.html")
+    assert answer.status == 401 and answer.text.count("\n") == 1 and len(answer.text) < 300
+    assert answer.headers["Cache-Control"] == "no-store"
+
+
+def test_browsers_cache_the_files_of_the_page_but_not_the_page(make: Make) -> None:
+    server = make()
+    page = get(server)
+    files = re.findall(r'"(/[0-9a-f]+\.(?:css|js))"', page.text)
+    assert page.headers["Cache-Control"] == "no-store" and len(set(files)) == 2
+    for file in files:
+        answer = get(server, file)
+        assert answer.status == 200 and "immutable" in answer.headers["Cache-Control"]
+        assert answer.headers["X-Content-Type-Options"] == "nosniff" and len(answer.text) > 50_000
+    assert get(server, "/0.js").status == 404
+
+
+def test_port_in_use_is_rejected_with_its_process_and_free_after_closing(make: Make) -> None:
+    server = make()
+    with pytest.raises(ConfigError, match=f"services.viewer.port: {server.get_port()} is in use by process .*python"):
+        make(port=server.get_port())
+    close_server(server)
+    assert get(make(port=server.get_port())).status == 200
+
+
+def test_starting_and_closing_prints_nothing(make: Make, capfd: pytest.CaptureFixture[str]) -> None:
+    close_server(make())
+    assert capfd.readouterr() == ("", "")
+
+
+def test_viser_that_starts_in_an_unknown_way_is_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
+    stopped: list[bool] = []
+
+    class OtherServer:
+        def __init__(self, **_: object) -> None:
+            pass
+
+        def stop(self) -> None:
+            stopped.append(True)
+
+    monkeypatch.setattr(viser, "ViserServer", OtherServer)
+    with pytest.raises(RuntimeError, match="starts its server in an unknown way"):
+        make_server("127.0.0.1", 0)
+    assert stopped == [True]
+
+
+async def test_share_url_cannot_be_requested(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    server = make()
+    requests: list[str] = []
+    monkeypatch.setattr(server, "request_share_url", lambda: requests.append("share"))
+    processed, loop = asyncio.Event(), asyncio.get_running_loop()
+    server._websock_server.register_handler(
+        GuiUpdateMessage, lambda *_: loop.call_soon_threadsafe(processed.set))  # type: ignore[arg-type]
+    async with open_page(server) as connection, asyncio.timeout(PATIENCE):
+        await connection.send(msgspec.msgpack.encode({"type": ShareUrlRequest.__name__}))
+        await connection.send(msgspec.msgpack.encode({"type": "GuiUpdateMessage", "uuid": "none", "updates": {}}))
+        await processed.wait()
+    server._thread_executor.shutdown()
+    assert requests == []
+
+
+# --- limits ---
+
+
+async def test_number_of_pages_is_limited_to_open_ones(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(page_server, "MAX_PAGES", 2)
+    server = make()
+    async with open_page(server) as first:
+        await first.recv()
+        async with open_page(server) as second:
+            await second.recv()
+            assert await status_of(server) == 503
+        async with open_page(server) as third:
+            await third.recv()
+
+
+async def test_flood_of_connections_is_dropped_and_the_page_recovers(
+    make: Make, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(page_server, "MAX_CONNECTIONS", 10)
+    monkeypatch.setitem(page_server.WEBSOCKET_OPTIONS, "open_timeout", 600.0)  # only the limit ends them
+    server = make()
+
+    async def end_of(reader: asyncio.StreamReader) -> None:
+        try:
+            await reader.read()
+        except OSError:
+            return
+
+    def is_down() -> bool:
+        try:
+            return get(server).status != 200
+        except OSError:
+            return True
+
+    async with asyncio.timeout(PATIENCE):
+        opened = [await asyncio.open_connection("127.0.0.1", server.get_port()) for _ in range(40)]
+        ended = [asyncio.create_task(end_of(reader)) for reader, _ in opened]
+        while sum(task.done() for task in ended) < 30:
+            await asyncio.wait([task for task in ended if not task.done()], return_when=asyncio.FIRST_COMPLETED)
+        assert sum(task.done() for task in ended) == 30
+        for _, writer in opened:
+            writer.close()
+        await asyncio.gather(*ended, *(writer.wait_closed() for _, writer in opened), return_exceptions=True)
+        while await asyncio.to_thread(is_down):
+            pass
+    assert not caplog.records
+
+
+def test_noise_does_not_stop_the_server(make: Make) -> None:
+    server = make()
+    for noise in (b"\0" * 100, b"GET /" + b"a" * 100_000, b"GET / HTTP/1.1\r\nHost: a\r\nHost: b\r\n\r\n", b""):
+        with socket.create_connection(("127.0.0.1", server.get_port()), timeout=PATIENCE) as connection:
+            try:
+                connection.sendall(noise)
+                connection.shutdown(socket.SHUT_WR)
+                while connection.recv(65536):
+                    pass
+            except OSError:  # the server may close first
+                pass
+    assert get(server).status == 200
+
+
+# --- permissions ---
+
+
+@dataclass
+class Operated:
+    """A page with buttons of different permissions; `done` are the clicked buttons and the lines of the log."""
+
+    server: viser.ViserServer
+    actions: ActionQueue
+    ids: dict[str, str]
+    done: list[str]
+
+    def cookie(self, role: str) -> str:
+        return f"zencell-{self.server.get_port()}={role}-token-of-the-page"
+
+    def open(self, role: str) -> AbstractAsyncContextManager[ClientConnection]:
+        return open_page(self.server, cookie=self.cookie(role))
+
+    async def click(self, connection: ClientConnection, name: str) -> None:
+        await connection.send(msgspec.msgpack.encode(CAMERA))  # viser ignores clients without a camera
+        update = {"type": "GuiUpdateMessage", "uuid": self.ids[name], "updates": {"value": True}}
+        await connection.send(msgspec.msgpack.encode(update))
+
+
+@pytest.fixture
+async def page(make: Make) -> AsyncIterator[Operated]:
+    done: list[str] = []
+    permissions = Permissions(done.append)
+    server = make(tokens={role: f"{role}-token-of-the-page" for role in ROLES}, permissions=permissions)
+    actions = ActionQueue(permissions)
+    running = asyncio.create_task(actions.run())
+    required: dict[str, Permission] = {"Start": "operate", "Stop": "stop", "Faster": "tune"}
+    ids = {}
+    for name, permission in required.items():
+        button = server.gui.add_button(name)
+        actions.on_click(button, partial(done.append, name), permission)
+        ids[name] = element_id(button)
+    yield Operated(server, actions, ids, done)
+    running.cancel()
+
+
+async def test_role_limits_a_raw_socket_and_every_role_may_stop(page: Operated) -> None:
+    denied: asyncio.Queue[str] = asyncio.Queue()
+    page.actions.notify = lambda line, kind="bad": denied.put_nowait(line)
+    for role, allowed in (("look", ["Stop"]), ("operate", ["Start", "Stop"]), ("tune", ["Faster", "Stop"])):
+        page.done.clear()
+        async with page.open(role) as connection, asyncio.timeout(PATIENCE):
+            for name in ("Start", "Faster", "Stop"):
+                await page.click(connection, name)
+            await until(lambda: "Stop" in page.done)
+            assert [each for each in page.done if each in page.ids] == allowed
+            for _ in range(3 - len(allowed)):
+                assert f"({role}, 127.0.0.1) has no token for the role " in await denied.get()
+
+
+async def test_second_operator_waits_until_the_first_page_is_closed(page: Operated) -> None:
+    permissions = page.actions.permissions
+    moved = {"type": "TransformControlsUpdateMessage", "name": "/goal", "wxyz": (1.0, 0.0, 0.0, 0.0),
+             "position": (0.0, 0.0, 0.0)}
+    async with page.open("operate") as second:
+        async with page.open("operate") as first:
+            await first.send(msgspec.msgpack.encode(moved))
+            await until(lambda: permissions.operating_page)
+            operating = permissions.operating_page
+            await page.click(second, "Start")
+            await page.click(second, "Stop")
+            await until(lambda: "Stop" in page.done)
+            assert "Start" not in page.done and permissions.operating_page == operating
+        await until(lambda: not permissions.operating_page)
+        await page.click(second, "Start")
+        await until(lambda: "Start" in page.done)
+        assert permissions.operating_page not in ("", operating)
+
+
+async def test_view_only_pages_leave_room_for_operators(page: Operated, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(page_server, "MAX_VIEWERS", 2)
+    look = page.cookie("look")
+    async with page.open("look"), page.open("look") as second, asyncio.timeout(PATIENCE):
+        assert await status_of(page.server, cookie=look) == 503
+        async with page.open("operate"):
+            await second.close()
+        while (status := await status_of(page.server, cookie=look)) == 503:  # noqa: ASYNC110
+            await asyncio.sleep(0.005)
+        assert status == 101
+
+
+async def test_flood_of_messages_is_slowed_and_stop_of_another_page_is_not(
+    page: Operated, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(page_server, "MAX_MESSAGE_RATE", 4)
+    denied: list[str] = []
+    page.actions.notify = lambda line, kind="bad": denied.append(line)
+    async with page.open("look") as flood, page.open("operate") as operator:
+        for _ in range(40):
+            await page.click(flood, "Start")
+        await page.click(operator, "Stop")
+        await until(lambda: "Stop" in page.done)
+        assert len(denied) < 40
+
+
+async def test_requests_carry_the_name_of_their_client(page: Operated) -> None:
+    names: asyncio.Queue[str] = asyncio.Queue()
+    permissions = page.actions.permissions
+
+    async def act() -> None:
+        await asyncio.sleep(0)
+        names.put_nowait(permissions.client_name)
+
+    button = page.server.gui.add_button("Later")
+    page.actions.on_click(button, act, "stop")
+    page.ids["Later"] = element_id(button)
+    async with page.open("look") as connection, asyncio.timeout(PATIENCE):
+        await page.click(connection, "Later")
+        assert await names.get() == "page 127.0.0.1"
+        page.actions.put(act)
+        assert await names.get() == permissions.client_name == "page"
