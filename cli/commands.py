@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from common.messages import Message, WorldEdit
     from common.topics import Request
 
-task = CommandGroup("Tell the task what to do.")
-world = CommandGroup("Change the simulated world.")
+task = CommandGroup("Start, pause, resume or stop the task.")
+world = CommandGroup("Edit the simulated world.")
 
 TIMEOUT = 5.0  # [s]
 X = Annotated[str, typer.Argument(metavar="X", help="[m] in world")]
@@ -30,14 +30,14 @@ NEGATIVE_NUMBERS = {"ignore_unknown_options": True}  # -0.2 is a coordinate, not
 
 def call(
     key: Annotated[
-        str, typer.Argument(metavar="KEY", help="of a request, as in `zencell topic list`",
+        str, typer.Argument(metavar="KEY", help="key of a request, see `zencell topic list`",
                             autocompletion=choices.requests)
     ],
-    body: Annotated[str, typer.Argument(metavar="JSON", help="its fields; `zencell topic info KEY` has an example")],
+    body: Annotated[str, typer.Argument(metavar="JSON", help="its fields; `zencell topic info KEY` shows an example")],
     at: CellTarget = RUNNING,
     timeout: Annotated[str, typer.Option("--timeout", metavar="S", help="[s]")] = f"{TIMEOUT:g}",
 ) -> None:
-    """Send a request and print the answer as JSON; exit 1 with one line if there is none."""
+    """Send a request and print the answer as JSON; exit 1 with one line without an answer."""
     from common.application import all_topics, find_topic
     from common.client.json_codec import message_from_json
     from common.topics import Request
@@ -83,36 +83,36 @@ def _task(at: CellTarget, tell: Callable[[TaskControl], Awaitable[Message]]) -> 
 
 @task.command()
 def start(override: options.Override = False, at: CellTarget = RUNNING) -> None:
-    """Start the task of a cell that waits or was stopped, or start it again; a robot that you hold is let go."""
+    """Start the task, or restart it after a stop or its end; releases your own holds of the robot."""
     _task(at, lambda task: task.start(override=override))
 
 
 @task.command()
 def pause(at: CellTarget = RUNNING) -> None:
-    """Bring the robot to rest on its path at once and hold it there."""
+    """Stop the robot on its path at once and hold it there."""
     _task(at, lambda task: task.pause())
 
 
 @task.command()
 def resume(override: options.Override = False, at: CellTarget = RUNNING) -> None:
-    """Let the robot go on along its path after a pause of yours."""
+    """Let the robot continue along its path after your pause."""
     _task(at, lambda task: task.resume(override=override))
 
 
 @task.command()
 def stop(at: CellTarget = RUNNING) -> None:
-    """Stop the robot, give up its motion, and wait for a start, also if the task does not answer."""
+    """Stop the robot, abandon its motion, and wait for a start; works also if the task does not answer."""
     _task(at, lambda task: task.stop())
 
 
 @task.command()
 def home(
     planner: Annotated[
-        str, typer.Option("--planner", metavar="NAME", help="use only this one", autocompletion=choices.planners)
+        str, typer.Option("--planner", metavar="NAME", help="use only this planner", autocompletion=choices.planners)
     ] = "",
     at: CellTarget = RUNNING,
 ) -> None:
-    """Plan a way home and go there, while no task has the robot; Ctrl-C stops the robot."""
+    """Move to the home pose while no task uses the robot; Ctrl-C stops the robot."""
     at.answer(lambda cell: cell.arm.move("home", planner=planner))
 
 
@@ -127,7 +127,7 @@ def _triple(option: str, text: str, names: str) -> dict[str, float]:
     """Three numbers that stand apart by commas, or one for all of them, by name."""
     found = options.numbers(option, text)
     if len(found) not in (1, 3):
-        raise ConfigError(option, text, "must be three numbers apart by commas, or one")
+        raise ConfigError(option, text, "must be three numbers separated by commas, or one")
     return dict(zip(names, found * (3 // len(found)), strict=True))
 
 
@@ -143,7 +143,7 @@ def _edit(at: CellTarget, values: dict[str, Any]) -> None:
 @world.command(context_settings=NEGATIVE_NUMBERS)
 def add(
     x: X, y: Y,
-    name: Annotated[str, typer.Option("--id", metavar="ID", help="chosen for you if not given")] = "",
+    name: Annotated[str, typer.Option("--id", metavar="ID", help="default: a new id")] = "",
     like: Annotated[str, typer.Option(
         "--like", metavar="ID", help="of the first layout; without it and a shape, like the first object there")] = "",
     shape: Annotated[str, typer.Option(
@@ -154,7 +154,7 @@ def add(
     yaw: Annotated[str, typer.Option("--yaw", metavar="RAD", help="[rad]")] = "",
     at: CellTarget = RUNNING,
 ) -> None:
-    """Put one more object on the table."""
+    """Add an object to the table."""
     values: dict[str, Any] = {"op": "add", "id": name, "position": _position(x, y), "like": like}
     if shape:
         values["shape"] = shape
@@ -169,17 +169,17 @@ def add(
 
 @world.command(context_settings=NEGATIVE_NUMBERS)
 def move(name: Id, x: X, y: Y, at: CellTarget = RUNNING) -> None:
-    """Put an object elsewhere."""
+    """Move an object to another position."""
     _edit(at, {"op": "move", "id": name, "position": _position(x, y)})
 
 
 @world.command()
 def remove(name: Id, at: CellTarget = RUNNING) -> None:
-    """Take an object away."""
+    """Remove an object."""
     _edit(at, {"op": "remove", "id": name})
 
 
 @world.command()
 def reset(at: CellTarget = RUNNING) -> None:
-    """Bring the first layout back."""
+    """Restore the first layout."""
     _edit(at, {"op": "reset"})

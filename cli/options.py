@@ -1,4 +1,4 @@
-"""Options that several verbs share."""
+"""Options that several commands share, and numbers in options."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ CellArgument = Annotated[
                         autocompletion=choices.cells)
 ]
 CellName = Annotated[
-    str | None, typer.Option("--cell", metavar="NAME", help="which cell; not needed while only one is up",
+    str | None, typer.Option("--cell", metavar="NAME", help="name of the cell; not needed if only one is running",
                               autocompletion=choices.cells)
 ]
 Domain = Annotated[
@@ -27,54 +27,54 @@ Domain = Annotated[
 ]
 Connect = Annotated[
     str | None,
-    typer.Option("--connect", metavar="ENDPOINT", help="use the router there, start none [ZENCELL_CONNECT]"),
+    typer.Option("--connect", metavar="ENDPOINT", help="use this router and start none [ZENCELL_CONNECT]"),
 ]
 Listen = Annotated[
     list[str] | None,
-    typer.Option("--listen", metavar="ENDPOINT", help="have the router listen there as well, as tcp/192.168.1.10:7489; "
+    typer.Option("--listen", metavar="ENDPOINT", help="another endpoint of the router, such as tcp/192.168.1.10:7489; "
                                                       "repeatable [ZENCELL_LISTEN]"),
 ]
 Link = Annotated[
     list[str] | None,
-    typer.Option("--link", metavar="ENDPOINT", help="link the router with that of another host; repeatable "
+    typer.Option("--link", metavar="ENDPOINT", help="link the router with the router of another host; repeatable "
                                                     "[ZENCELL_LINK]"),
 ]
 Only = Annotated[
     list[str] | None,
-    typer.Option("--only", metavar="SERVICE,...", help="the part of the cell that runs on this host"),
+    typer.Option("--only", metavar="SERVICE,...", help="start only these services on this host"),
 ]
 Without = Annotated[
     list[str] | None,
-    typer.Option("--without", metavar="SERVICE,...", help="all but these, which run on another host"),
+    typer.Option("--without", metavar="SERVICE,...", help="start all services but these, which run on another host"),
 ]
 Secure = Annotated[
     str | None,
-    typer.Option("--secure", metavar="DIR", help="certificates of `zencell secure init`: TLS for all [ZENCELL_SECURE]"),
+    typer.Option("--secure", metavar="DIR", help="folder of `zencell secure init`; enables TLS [ZENCELL_SECURE]"),
 ]
 PublishedKey = Annotated[
-    str, typer.Argument(metavar="KEY", help="as in `zencell topic list`, without the cell",
+    str, typer.Argument(metavar="KEY", help="a key of `zencell topic list`, without the cell",
                         autocompletion=choices.published)
 ]
-Json = Annotated[bool, typer.Option("--json", help="one JSON object a line")]
-Count = Annotated[str | None, typer.Option("--count", "-n", metavar="N", help="stop after N")]
+Json = Annotated[bool, typer.Option("--json", help="print one JSON object per line")]
+Count = Annotated[str | None, typer.Option("--count", "-n", metavar="N", help="exit after N lines or messages")]
 Override = Annotated[
-    bool, typer.Option("--override", help="although another person holds the robot; is logged with both names")
+    bool, typer.Option("--override", help="even if another operator holds the robot; logged with both names")
 ]
 Overrides = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="PATH=VALUE",
-                 help="any value of the cell, as world.count=5, or those of a YAML file, as @FILE; repeatable",
+                 help="a value of the cell, such as world.count=5, or those of a YAML file, as @FILE; repeatable",
                  autocompletion=choices.overrides),
 ]
 WorldName = Annotated[
-    str | None, typer.Option("--world", metavar="NAME", help="another world, by name or path",
+    str | None, typer.Option("--world", metavar="NAME", help="use another world, by name or path",
                              autocompletion=choices.worlds)
 ]
-Seed = Annotated[str | None, typer.Option("--seed", metavar="N", help="of everything random")]
+Seed = Annotated[str | None, typer.Option("--seed", metavar="N", help="seed of all random numbers")]
 
 
 def write_text(output: str, text: str) -> None:
-    """Write a file that --output names.
+    """Write the file of the option --output.
 
     Raises:
         ConfigError: it cannot be written.
@@ -85,14 +85,14 @@ def write_text(output: str, text: str) -> None:
         raise ConfigError("--output", output, f"cannot be written: {error.strerror or error}") from None
 
 
-# Numbers are read here and not by typer, whose errors do not show what was given.
+# Numbers are parsed here and not by typer, whose errors do not show the value.
 
 
 def number(option: str, text: str) -> float:
-    """The number that a text says.
+    """Return the number in a text.
 
     Raises:
-        ConfigError: it is none, or not finite.
+        ConfigError: it is not a finite number.
     """
     try:
         value = float(text)
@@ -104,31 +104,31 @@ def number(option: str, text: str) -> float:
 
 
 def numbers(option: str, text: str) -> list[float]:
-    """The numbers that a text says, apart by commas.
+    """Return the numbers in a text, separated by commas.
 
     Raises:
-        ConfigError: one is none, or not finite.
+        ConfigError: one is not a finite number.
     """
     return [number(option, part) for part in text.split(",")]
 
 
 def three(option: str, text: str) -> tuple[float, float, float]:
-    """The three numbers that a text says, apart by commas.
+    """Return the three numbers in a text, separated by commas.
 
     Raises:
-        ConfigError: it says others.
+        ConfigError: there are not three numbers.
     """
     if text.count(",") != 2:
-        raise ConfigError(option, text, "must be three numbers apart by commas, as 0.3,-0.1,0")
+        raise ConfigError(option, text, "must be three numbers separated by commas, such as 0.3,-0.1,0")
     x, y, z = numbers(option, text)
     return x, y, z
 
 
 def whole(option: str, text: str | None, least: int) -> int | None:
-    """The whole number that a text says; None when nothing was said.
+    """Return the whole number in a text, or None without a text.
 
     Raises:
-        ConfigError: it is none, or less than `least`.
+        ConfigError: it is not a whole number, or less than `least`.
     """
     if text is None:
         return None
@@ -142,10 +142,10 @@ def whole(option: str, text: str | None, least: int) -> int | None:
 
 
 def rate(text: str) -> float:
-    """The rate [Hz] that a text says, given to --rate.
+    """Return the rate [Hz] of the option --rate.
 
     Raises:
-        ConfigError: it is none that can be kept.
+        ConfigError: it is out of bounds.
     """
     value = number("--rate", text)
     if not 0 < value <= MOST_PER_SECOND:

@@ -10,7 +10,7 @@ from cli import choices, options
 from cli.target import RUNNING, CellTarget, CommandGroup
 from common.terminal import echo
 
-app = CommandGroup("Parameters of running services: what there is, and changing it.")
+app = CommandGroup("List, read, change and save parameters of running services.")
 
 LONGEST_VALUE = 28  # characters of a value in a table
 

@@ -12,7 +12,7 @@ from cli.target import RUNNING, CellTarget, CommandGroup
 from common.errors import ConfigError
 from common.terminal import echo
 
-app = CommandGroup("Prepare a robot, ask its controller, jog it.")
+app = CommandGroup("Prepare a robot file, command the arm's controller, jog the arm.")
 app.command()(robot_new.new)
 app.command()(robot_new.check)
 
@@ -55,7 +55,7 @@ def collisions(
 
 @app.command()
 def status(at: CellTarget = RUNNING) -> None:
-    """Print what the arm's own controller says: mode, why it cannot be moved, speed slider."""
+    """Print the state of the arm's controller: mode, why it cannot move, speed slider."""
     told = at.join(lambda cell: cell.arm.robot())
     echo(f"{told.mode}{f': {told.message}' if told.message else ''}")
     echo(f"speed slider {told.speed:.0%}, latest cycle {told.late * 1e3:.1f} ms late, "
@@ -75,7 +75,7 @@ def enable(at: CellTarget = RUNNING) -> None:
 
 @app.command()
 def recover(at: CellTarget = RUNNING) -> None:
-    """Let the arm be moved again after it has stopped to protect somebody or itself."""
+    """Recover the arm from a protective stop."""
     _order(at, "recover")
 
 
@@ -84,7 +84,7 @@ def freedrive(
     state: Annotated[str, typer.Argument(metavar="on|off", help="whether it is moved by hand")],
     at: CellTarget = RUNNING,
 ) -> None:
-    """Have the arm be moved by hand, or end that."""
+    """Switch hand guiding of the arm on or off."""
     if state not in ("on", "off"):
         raise ConfigError("freedrive", state, "must be on or off")
     _order(at, "freedrive", float(state == "on"))
@@ -97,7 +97,7 @@ def payload(
         str, typer.Option("--com", metavar="X,Y,Z", help="its centre of mass, from the flange [m]")] = "0,0,0",
     at: CellTarget = RUNNING,
 ) -> None:
-    """Tell the arm's controller what the tool carries."""
+    """Set the payload of the arm's controller."""
     x, y, z = options.three("--com", com)
     _order(at, "payload", options.number("KG", mass), com={"x": x, "y": y, "z": z})
 
@@ -128,9 +128,9 @@ def _numbers(bits: int) -> str:
 
 @app.command()
 def owner(at: CellTarget = RUNNING) -> None:
-    """Print whose the motion is: nobody else's begins. Stops and holds are everybody's."""
+    """Print which client has motion authority. Any client may stop or hold the robot."""
     told = at.join(lambda cell: cell.arm.owner_now())
-    echo(f"the motion is {told.description}{', who jogs the arm' if told.jogging else ''}")
+    echo(f"the motion is {told.description}{', jogging the arm' if told.jogging else ''}")
 
 
 def _own(at: CellTarget, act: Literal["take", "give"], *, over: bool = False) -> None:
@@ -140,17 +140,17 @@ def _own(at: CellTarget, act: Literal["take", "give"], *, over: bool = False) ->
 
 @app.command()
 def take(
-    over: Annotated[bool, typer.Option("--over", help="from whoever has it: what they move comes to rest, and a task "
+    over: Annotated[bool, typer.Option("--over", help="from its owner: their motion stops, and a task "
                                                       "waits for `zencell task start`")] = False,
     at: CellTarget = RUNNING,
 ) -> None:
-    """Have the motion until you give it back: neither a task nor anybody else moves the robot meanwhile."""
+    """Take motion authority until you give it back: no task and no other client can move the robot."""
     _own(at, "take", over=over)
 
 
 @app.command()
 def give(at: CellTarget = RUNNING) -> None:
-    """Give the motion back. Nothing moves by that."""
+    """Give motion authority back. This moves nothing."""
     _own(at, "give")
 
 
@@ -166,7 +166,7 @@ def jog(
     seconds: Annotated[str, typer.Option("--seconds", metavar="S", help="for so long, at most a minute")] = "1",
     at: CellTarget = RUNNING,
 ) -> None:
-    """Move the arm by hand for a while: at most 0.25 m/s, and it stands 0.2 s after Ctrl-C or the end of this."""
+    """Jog the arm for a while: at most 0.25 m/s; it is at standstill 0.2 s after Ctrl-C or the end."""
     from common.client.operator_motion import check_seconds
 
     duration = options.number("--seconds", seconds)

@@ -10,7 +10,7 @@ from cli import options
 from cli.target import RUNNING, CellTarget, CommandGroup
 from common.terminal import echo
 
-app = CommandGroup("Add solids that motion keeps away from though nobody perceives them.")
+app = CommandGroup("Add solids to the planning scene that no camera sees.")
 
 Name = Annotated[str, typer.Argument(metavar="NAME", help="of your own; in the scene it is added/NAME")]
 

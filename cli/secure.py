@@ -14,7 +14,7 @@ from cli.target import CommandGroup
 from common.supervision.multi_host import HostOptions
 from common.terminal import echo
 
-app = CommandGroup("Certificates for a cell's processes, and who may do what.")
+app = CommandGroup("Certificates and access rules of a cell's processes.")
 
 DAYS = 365
 SHOWN = ("writes", "reads", "answers", "asks", "passes on")
@@ -37,9 +37,9 @@ def init(
     """Make an authority, a certificate for each process, and the router's rules of who may do what."""
     from common.config import load_cell, names_of
     from common.transport.credentials import ACCESS
-    from security.folder import authority_files, make
+    from security.access import rights_in
+    from security.certificates import authority_files, make
     from security.page_tokens import VIEWER
-    from security.rights import rights_in
 
     valid = options.whole("--days", days, 1)
     assert valid is not None
@@ -65,8 +65,8 @@ def renew_(
     The router takes what is new within seconds and has everybody connect anew, each with what is new of his own.
     """
     from common.errors import ConfigError
-    from security.folder import authority_files, renew
-    from security.folder import forget as forget_others
+    from security.certificates import authority_files, renew
+    from security.certificates import forget as forget_others
 
     valid, place = options.whole("--days", days, 1), Path(folder)
     assert valid is not None
@@ -89,7 +89,7 @@ def show(folder: Folder, as_json: options.Json = False) -> None:
     """Show who may do what, as the router enforces it, and until when each certificate is valid."""
     from common.errors import ConfigError
     from common.transport.credentials import ROUTER_NAME, read_access
-    from security.checking import allowances, certificate_in
+    from security.validation import allowances, certificate_in
 
     place = Path(folder)
     allowed = allowances(read_access(place))
@@ -124,9 +124,9 @@ def check(
     from common.config import load_cell, names_of
     from common.errors import ConfigError
     from common.transport.credentials import OPERATOR, RECORDER, ROUTER_NAME, common_name, read_access
-    from security.checking import require_current, require_valid
-    from security.requiring import renewal
-    from security.rights import rights_in
+    from security.access import rights_in
+    from security.preflight import renewal
+    from security.validation import require_current, require_valid
 
     if only and len(cells or ()) != 1:
         raise ConfigError("--only", ",".join(only), "needs the one cell that they are services of: --cell CELL")
@@ -164,8 +164,8 @@ def config(
         parse_domain,
         router_settings,
     )
-    from security.checking import require_valid
-    from security.requiring import choose
+    from security.preflight import choose
+    from security.validation import require_valid
 
     choose(secure)
     given = os.environ.get(DOMAIN_VARIABLE, DEFAULT_DOMAIN) if domain is None else domain

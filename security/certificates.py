@@ -1,11 +1,12 @@
-"""A certificate authority of a cell's own, and a certificate for each of its processes."""
+"""A cell's certificate authority, and the folder of certificates, rules and tokens that it makes and renews."""
 
 from __future__ import annotations
 
 import datetime
 import ipaddress
+import json
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from cryptography import x509
@@ -13,12 +14,20 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
+from common.errors import ConfigError
+from common.transport.credentials import ACCESS, AUTHORITY, OBSERVER, OPERATOR, ROUTER_NAME, common_name
+from security.access import Rights, access_control
+from security.page_tokens import ROLES, make_token, token_file
+from security.validation import certificate_in, hosts_in
+
 CA_NAME = "zencell certificate authority"
-BACKDATED = datetime.timedelta(minutes=5)  # clocks of two hosts never agree to the second
+BACKDATED = datetime.timedelta(minutes=5)  # clocks of two hosts differ
+LOCAL = ("localhost", "127.0.0.1", "::1")
+ACCESS_HEAD = "// Access rules from the declarations of the services; all else is denied. By `zencell secure init`.\n"
 
 
 class Authority:
-    """Signs certificates. Its own key is needed for nothing else and can be kept elsewhere afterwards."""
+    """Signs certificates. Its key serves no other purpose, and can be stored elsewhere afterwards."""
 
     def __init__(self, certificate: x509.Certificate, key: ec.EllipticCurvePrivateKey) -> None:
         """Sign with this key."""
@@ -26,36 +35,36 @@ class Authority:
 
     @classmethod
     def new(cls, days: int) -> Authority:
-        """An authority that is trusted for so many days."""
+        """Return a new authority that is valid for this many days."""
         key = ec.generate_private_key(ec.SECP256R1())
-        return cls(_signed_by_itself(key, days), key)
+        return cls(_self_signed(key, days), key)
 
     @property
     def until(self) -> datetime.datetime:
-        """The end of its time."""
+        """End of its validity."""
         return self._certificate.not_valid_after_utc
 
     def prolonged(self, days: int) -> Authority:
-        """The same with a certificate for so many days from now: what it has signed is valid under both."""
-        return Authority(_signed_by_itself(self._key, days), self._key)
+        """Return the same authority valid for this many days from now; certificates it signed fit both."""
+        return Authority(_self_signed(self._key, days), self._key)
 
     @classmethod
     def load(cls, certificate: Path, key: Path) -> Authority:
-        """The authority that was written to two files."""
+        """Return the authority of two files."""
         private = serialization.load_pem_private_key(key.read_bytes(), password=None)
         if not isinstance(private, ec.EllipticCurvePrivateKey):
             raise ValueError(f"{key} is not an elliptic curve key")
         return cls(x509.load_pem_x509_certificate(certificate.read_bytes()), private)
 
-    def write(self, certificate: Path, key: Path, beside: Sequence[x509.Certificate] = ()) -> None:
-        """Write both; the key for its owner's eyes only.
+    def write(self, certificate: Path, key: Path, others: Sequence[x509.Certificate] = ()) -> None:
+        """Write both files; only their owner can read the key.
 
         Args:
-            certificate: file for it.
-            key: file for its key.
-            beside: certificates of authorities that are trusted as well, after its own.
+            certificate: its file.
+            key: file of its key.
+            others: certificates of further trusted authorities, written after its own.
         """
-        every = [self._certificate, *(each for each in beside if each != self._certificate)]
+        every = [self._certificate, *(each for each in others if each != self._certificate)]
         certificate.write_bytes(b"".join(each.public_bytes(serialization.Encoding.PEM) for each in every))
         write_secret(key, _key_bytes(self._key))
 
@@ -63,11 +72,11 @@ class Authority:
         """Write a certificate and its key.
 
         Args:
-            name: common name, by which access is controlled.
-            hosts: names and addresses at which its holder is reached; empty for one who only connects.
-            days: for which it is valid; negative for one that has run out.
-            certificate: file for it.
-            key: file for its key.
+            name: common name, which access rules refer to.
+            hosts: names and addresses at which its holder listens; empty for a client.
+            days: of validity; negative for an expired certificate.
+            certificate: its file.
+            key: file of its key.
         """
         own = ec.generate_private_key(ec.SECP256R1())
         subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
@@ -83,7 +92,7 @@ class Authority:
         write_secret(key, _key_bytes(own))
 
 
-def _signed_by_itself(key: ec.EllipticCurvePrivateKey, days: float) -> x509.Certificate:
+def _self_signed(key: ec.EllipticCurvePrivateKey, days: float) -> x509.Certificate:
     name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, CA_NAME)])
     usage = x509.KeyUsage(
         digital_signature=False, content_commitment=False, key_encipherment=False, data_encipherment=False,
@@ -122,8 +131,101 @@ def _key_bytes(key: ec.EllipticCurvePrivateKey) -> bytes:
 
 
 def write_secret(path: Path, data: bytes) -> None:
-    """Write a file that never, not even for a moment, anybody but its owner can read."""
+    """Write a file that at no moment another user can read."""
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
     with os.fdopen(descriptor, "wb") as file:
-        os.fchmod(file.fileno(), 0o600)  # one that was there before may have been open to more
+        os.fchmod(file.fileno(), 0o600)  # an existing file may have been readable by others
         file.write(data)
+
+
+def authority_files(place: Path) -> tuple[Path, Path]:
+    """Return certificate and key file of the authority."""
+    return place / f"{AUTHORITY}.pem", place / f"{AUTHORITY}.key"
+
+
+def make(
+    place: Path, rights: Mapping[str, Mapping[str, Rights]], with_page: Iterable[str], hosts: Sequence[str], days: int,
+    *, renew: bool,
+) -> int:
+    """Make an authority, a certificate for each process, tokens and rules; return the number of certificates.
+
+    Args:
+        place: the folder.
+        rights: of the processes, by cell and process.
+        with_page: cells that have an operator's page.
+        hosts: names and addresses at which clients of other hosts reach the router; by default the previous ones.
+        days: of validity.
+        renew: keep the authority, make everything else again.
+
+    Raises:
+        ConfigError: there is no authority to renew, or one already where a new one is to be made.
+    """
+    certificate, key = authority_files(place)
+    if renew and not key.is_file():
+        raise ConfigError("--renew", str(place), f"has no {key.name} to sign with")
+    if not renew and certificate.exists():
+        raise ConfigError("DIR", str(place), "has certificates already: --renew makes all but the authority anew")
+    place.mkdir(parents=True, exist_ok=True, mode=0o700)
+    authority = Authority.load(certificate, key) if renew else Authority.new(days)
+    if not renew:
+        authority.write(certificate, key)
+    elif _ends_before(authority, days):
+        authority = authority.prolonged(days)
+        authority.write(certificate, key)
+    names = [OPERATOR, OBSERVER, *(common_name(cell, process) for cell, all_ in rights.items() for process in all_)]
+    router = place / f"{ROUTER_NAME}.pem"
+    reached = hosts or (hosts_in(certificate_in(router)) if renew and router.is_file() else [])
+    authority.issue(ROUTER_NAME, list(dict.fromkeys([*LOCAL, *reached])), days, router, router.with_suffix(".key"))
+    for name in names:
+        authority.issue(name, [], days, place / f"{name}.pem", place / f"{name}.key")
+    for cell in with_page:
+        for role in ROLES:
+            write_secret(token_file(place, cell, role), f"{make_token()}\n".encode())
+    text = ACCESS_HEAD + json.dumps(access_control(rights), indent=1) + "\n"
+    (place / ACCESS).write_text(text, encoding="utf-8")
+    return len(names) + 1
+
+
+def renew(place: Path, days: int, *, new_authority: bool) -> int:
+    """Renew all certificates of the folder; return their number. A new authority is added to the previous one.
+
+    Raises:
+        ConfigError: the folder has no key to sign with.
+    """
+    certificate, key = authority_files(place)
+    signer, trusted = _signer(place)
+    if new_authority:
+        signer = Authority.new(days)
+    elif _ends_before(signer, days):
+        signer, trusted = signer.prolonged(days), trusted[1:]
+    signer.write(certificate, key, others=trusted)  # before the certificates, so that no process meets an untrusted one
+    names = [path.stem for path in sorted(place.glob("*.pem")) if path.stem != AUTHORITY]
+    for name in sorted(names, key=ROUTER_NAME.__eq__):  # the router's last: it reloads when its own changes
+        file = place / f"{name}.pem"
+        hosts = hosts_in(certificate_in(file)) if name == ROUTER_NAME else []
+        signer.issue(name, hosts, days, file, file.with_suffix(".key"))
+    return len(names)
+
+
+def forget(place: Path) -> int:
+    """Remove all previous authorities from the trusted ones; return their number.
+
+    Raises:
+        ConfigError: the folder has no key to sign with.
+    """
+    signer, trusted = _signer(place)
+    signer.write(*authority_files(place))
+    return len(trusted) - 1
+
+
+def _signer(place: Path) -> tuple[Authority, list[x509.Certificate]]:
+    certificate, key = authority_files(place)
+    if not key.is_file():
+        raise ConfigError("DIR", str(place), f"has no {key.name} to sign with")
+    certificate_in(certificate)
+    return Authority.load(certificate, key), x509.load_pem_x509_certificates(certificate.read_bytes())
+
+
+def _ends_before(authority: Authority, days: int) -> bool:
+    """Return whether an authority would expire before what it signs now."""
+    return authority.until < datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=days - 1)

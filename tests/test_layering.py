@@ -78,7 +78,7 @@ PLATFORM_SERVICES = (
 )
 APPLICATIONS = [path.parent.name for path in sorted((ROOT / "applications").glob("*/__init__.py"))]
 SHORT_FORMS = (  # short forms of world files
-    "common/config/short_forms.py",
+    "common/config/world.py",
 )
 
 

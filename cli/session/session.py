@@ -118,7 +118,7 @@ class CellSession:
         from common.transport.credentials import RECORDER
         from recording.capture import CustomTopics
         from recording.formatting import require_new
-        from security.requiring import require_recorder
+        from security.preflight import require_recorder
 
         path = Path(file).absolute()
         require_new(path, "--record")

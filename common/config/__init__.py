@@ -1,21 +1,26 @@
 """Configuration: a cell file names a robot, a world, a pipeline and its services; every value has a unit and bounds.
 
-`load_cell` resolves the names, applies `--set PATH=VALUE` overrides and checks all of it. A service declares a
-`Config` (a `Parameters`); its fields are either parameters, set under `services.<name>` of the cell, or sections of
-the cell, which are recognised by their type and filled in. Only what a service declares reaches it: `World` (where
-things really lie) is declared by the simulated hardware alone, everything else takes `Surroundings`.
+`load_cell` resolves the names, applies `--set PATH=VALUE` overrides and validates the result. A service declares a
+`Config` (a `Parameters`) with parameters, which are set under `services.<name>` of the cell, and sections of the cell,
+which are recognised by their type. A service gets only what it declares: simulated hardware declares `World`, which has
+the true poses of objects; all other services declare `Surroundings`.
 """
 
 from __future__ import annotations
 
-from common.config.basics import Coordinate, Length, Number, Parameters, Point, Rgb, Section, Tunable
+from common.config.basics import Coordinate, Length, Number, Parameters, Point, Rgb, Section, Tunable, check
 from common.config.cell import Cell, Members, Reach, ServiceEntry
-from common.config.checking import check
 from common.config.files import config_root, find_file, names_of, parse_yaml, read_robot, read_yaml
-from common.config.light import Light
-from common.config.loading import load_cell, load_robot, service_config, service_names
+from common.config.loading import (
+    expanded,
+    load_cell,
+    load_robot,
+    parse_override,
+    service_config,
+    service_names,
+    yaml_line,
+)
 from common.config.motion import Grasp, Motion, Pipeline, PlannerEntry, Run, Watchdogs
-from common.config.overrides import expanded, parse_override, yaml_line
 from common.config.robot import (
     AttachmentConfig,
     FingerShape,
@@ -26,4 +31,4 @@ from common.config.robot import (
     SuctionCup,
     TcpConfig,
 )
-from common.config.world import CameraConfig, Container, Fixture, ObjectConfig, Scenery, Surroundings, World
+from common.config.world import CameraConfig, Container, Fixture, Light, ObjectConfig, Scenery, Surroundings, World

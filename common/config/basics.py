@@ -1,11 +1,14 @@
-"""What every part of the configuration is made of."""
+"""Field types and base classes of the configuration, and validation errors in one line."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, TypeVar
+from typing import Annotated, Any, TypeVar, get_args, get_origin
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from common.errors import ConfigError
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Length = Annotated[float, Field(gt=0, le=10, allow_inf_nan=False)]
@@ -18,15 +21,15 @@ Rgb = tuple[
 
 @dataclass(frozen=True)
 class AtRunTime:
-    """Marks a field whose value may change while its service runs."""
+    """Marks a field that may change while its service runs."""
 
 
 T = TypeVar("T")
-Tunable = Annotated[T, AtRunTime()]  # as in `min_area: Tunable[float] = Field(...)`: read it where it is used
+Tunable = Annotated[T, AtRunTime()]  # as in `min_area: Tunable[float] = Field(...)`: read it at each use
 
 
 class Section(BaseModel):
-    """A part of the cell that several services may need."""
+    """A section of the cell, which any service may declare."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)  # see common/messages/basics.py
 
@@ -34,8 +37,62 @@ class Section(BaseModel):
 class Parameters(BaseModel):
     """Base of the `Config` of a service, and of the `Options` of a planner or hardware backend.
 
-    Fields that are `Tunable` are changed in place, between two turns of the service's event loop, when somebody sets
-    them; so is a section that has such fields. Nothing else ever changes.
+    `Tunable` fields, also those of sections, are changed in place between two turns of the service's event loop. No
+    other field ever changes.
     """
 
     model_config = ConfigDict(extra="forbid", defer_build=True)
+
+
+C = TypeVar("C", bound=BaseModel)
+
+
+def check(model: type[C], values: Mapping[str, Any], prefix: str = "") -> C:
+    """Return the model with these values.
+
+    Raises:
+        ConfigError: names the first invalid field, its value and what is expected.
+    """
+    try:
+        return model.model_validate(values)
+    except ValidationError as error:
+        raise _first_error(error, model, prefix) from None
+
+
+def _first_error(error: ValidationError, model: type[BaseModel], prefix: str) -> ConfigError:
+    first = error.errors(include_url=False, include_context=False)[0]
+    field = ".".join(part for part in [prefix, *(str(p) for p in first["loc"])] if part)
+    message = first["msg"].removeprefix("Value error, ").replace("Input should be", "must be").replace("Input ", "")
+    if first["type"] == "extra_forbidden":
+        names = _fields_at(model, first["loc"][:-1])
+        return ConfigError(field, first["input"], f"is not a parameter; choices: {', '.join(names)}")
+    if first["type"] == "missing":
+        return ConfigError(field, ..., "is missing")
+    if first["type"] == "value_error":
+        return ConfigError(field or "cell", ..., message)
+    return ConfigError(field, first["input"], message)
+
+
+def _fields_at(model: type[BaseModel], location: Sequence[int | str]) -> list[str]:
+    """Return the field names of the nested model at a location within `model`."""
+    current, table = model, None
+    for part in location:
+        # In a mapping of models the location has the key between the field and its fields.
+        field = current.model_fields.get(str(part))
+        annotation = table or (field.annotation if field else None)
+        table = get_args(annotation)[-1] if get_origin(annotation) is dict else None
+        if table is not None:
+            continue
+        if not (isinstance(annotation, type) and issubclass(annotation, BaseModel)):
+            break
+        current = annotation
+    # Sections of the cell are no parameters of the service itself.
+    own = current.model_fields.items() if issubclass(current, Section) else (
+        (name, field) for name, field in current.model_fields.items() if not is_section(field.annotation)
+    )
+    return sorted(name for name, _ in own)
+
+
+def is_section(annotation: object) -> bool:
+    """Return whether the type of a field is a section of the cell."""
+    return isinstance(annotation, type) and issubclass(annotation, Section)

@@ -15,39 +15,39 @@ from common.config.world import Scenery, Surroundings, World
 class ServiceEntry(Section):
     """A process of the cell: its module and its parameters, which are checked by the service itself."""
 
-    name: str = Field(description="of its own in the cell: one module may run several times")
+    name: str = Field(description="unique in the cell: one module may run several times")
     module: str
-    topics: dict[str, str] = Field({}, description="keys of the cell by its own words for them")
+    topics: dict[str, str] = Field({}, description="keys of the cell by the keys in its code")
     parameters: dict[str, Any] = {}
 
     @property
     def kind(self) -> str:
-        """What it is, whatever it is called: the last part of its module."""
+        """Last part of its module."""
         return self.module.rpartition(".")[2]
 
     @property
     def name_option(self) -> list[str]:
-        """What its command line needs beside the module to say who it is."""
+        """Command line option with its name, if that differs from its kind."""
         return [] if self.name == self.kind else ["--name", self.name]
 
 
 class Members(Section):
-    """Who is in the cell: for what looks at all of it."""
+    """All services of the cell, for services that monitor all of it."""
 
     services: list[str] = Field(description="in start order")
     task: str = Field(description="the service that runs the task")
-    application: str = Field("", description="what the cell is for: a name, or a dotted module")
-    keys: list[dict[str, str]] = Field([], description="of services with keys of their own: the cell's by theirs")
+    application: str = Field("", description="application: a name, or a dotted module")
+    keys: list[dict[str, str]] = Field([], description="remapping tables: keys of the cell by the keys in the code")
 
 
 class Reach(Section):
-    """What the services of the cell are told: some of it says where the arm can take things from."""
+    """Parameters of all services: some of them define the reachable workspace."""
 
     told: dict[str, dict[str, Any]] = Field({}, description="parameters by service")
 
 
 class Cell(Section):
-    """A resolved cell: everything that its services are configured with."""
+    """A resolved cell: the complete configuration of its services."""
 
     run: Run
     robot: RobotConfig
@@ -58,7 +58,7 @@ class Cell(Section):
     watchdogs: Watchdogs = Watchdogs()
     services: dict[str, ServiceEntry]
     task: str = Field(description="the service that runs the task and ends in DONE")
-    application: str = Field(description="what the cell is for: a name of applications, or a dotted module")
+    application: str = Field(description="application: a name, or a dotted module")
 
     @property
     def name(self) -> str:
@@ -66,11 +66,11 @@ class Cell(Section):
         return self.run.cell
 
     def section(self, kind: type[Section], camera: str | None = None) -> Section:
-        """The section of that type; surroundings are cut out of the world, without what lies in it.
+        """Return the section of a type; surroundings are the world without its objects.
 
         Args:
             kind: the type.
-            camera: which of the world's cameras the surroundings have as *the* camera; the first if not given.
+            camera: name of the camera that becomes `camera` of the surroundings; by default the first.
 
         Raises:
             UnknownName: the world has no such camera.

@@ -1,4 +1,4 @@
-"""Finding and reading the files of the configuration."""
+"""Find and read the files of the configuration."""
 
 from __future__ import annotations
 
@@ -11,55 +11,55 @@ import yaml
 
 from common.errors import ConfigError, UnknownName
 
-DEEPEST = 64  # levels of a YAML text, with those that names stand for: no file of a cell has ten
-MOST_NODES = 1_000_000  # of one, also where names stand for many of them
+MAX_LEVELS = 64  # of nesting in a YAML text, aliases expanded: no cell file has ten
+MAX_NODES = 1_000_000  # of a YAML text, aliases expanded
 
 
 def config_root() -> Path:
-    """The folder of the configuration: `ZENCELL_CONFIG`, or config/ beside the packages."""
+    """Return the folder of the configuration: `ZENCELL_CONFIG`, else config/ next to the packages."""
     given = os.environ.get("ZENCELL_CONFIG")
     return Path(given) if given else Path(__file__).resolve().parents[2] / "config"
 
 
 def names_of(kind: str) -> list[str]:
-    """Names that can be given for a kind: cells, robots, worlds or pipelines."""
+    """Return the names of a kind of files: cells, robots, worlds or pipelines."""
     return sorted(path.stem for path in (config_root() / kind).glob("*.yaml"))
 
 
 def parse_yaml(text: str, loader: type = yaml.SafeLoader) -> Any:
-    """What a YAML text says.
+    """Return the value of a YAML text.
 
     Args:
-        text: of a person or a file.
-        loader: libyaml's is faster, and does not take `{a:}` as the other does.
+        text: from a user or a file.
+        loader: libyaml's is faster, and refuses `{a:}`.
 
     Raises:
-        yaml.YAMLError: it does not parse, contains itself, is nested deeper than `DEEPEST` or stands for more than
-            `MOST_NODES`.
-        ValueError: it parses and says what there is not, such as a date.
+        yaml.YAMLError: it does not parse, contains itself, is nested deeper than `MAX_LEVELS` or expands to more than
+            `MAX_NODES`.
+        ValueError: it parses but has an impossible value, such as a date.
     """
     try:
-        _require_modest(yaml.parse(text, Loader=loader))
+        _require_bounded(yaml.parse(text, Loader=loader))
         return yaml.load(text, Loader=loader)
-    except (ArithmeticError, AttributeError, LookupError):  # PyYAML takes what has a tag for what the tag says
-        raise ValueError("a value is not of its kind, or too large") from None
+    except (ArithmeticError, AttributeError, LookupError):  # PyYAML trusts tags
+        raise ValueError("a value does not fit its tag, or is too large") from None
 
 
-def _require_modest(events: Iterable[yaml.Event]) -> None:
-    """Return when the values can be built, which libyaml does by recursion: too deep a text would end the process."""
-    named: dict[str, tuple[int, int]] = {}  # nodes and levels that a name stands for, with those of names in it
-    within: list[tuple[str | None, int, int]] = []  # name, nodes and levels so far of each collection that we are in
+def _require_bounded(events: Iterable[yaml.Event]) -> None:
+    """Return if the text is within the limits: libyaml builds values by recursion, and a deep text would crash."""
+    named: dict[str, tuple[int, int]] = {}  # nodes and levels of each anchor, aliases expanded
+    within: list[tuple[str | None, int, int]] = []  # anchor, nodes and levels so far of each open collection
 
     def refuse(problem: str, event: yaml.Event) -> NoReturn:
         error = yaml.MarkedYAMLError(problem=problem)
-        error.problem_mark = event.start_mark  # type: ignore[assignment]  # libyaml's has line and column, too
+        error.problem_mark = event.start_mark  # type: ignore[assignment]  # libyaml's mark has line and column, too
         raise error
 
     for event in events:
         if isinstance(event, yaml.CollectionStartEvent):
             within.append((event.anchor, 1, 1))
-            if len(within) > DEEPEST:
-                refuse(f"nested deeper than {DEEPEST} levels", event)
+            if len(within) > MAX_LEVELS:
+                refuse(f"nested deeper than {MAX_LEVELS} levels", event)
             continue
         if isinstance(event, yaml.CollectionEndEvent):
             name, size, levels = within.pop()
@@ -67,26 +67,26 @@ def _require_modest(events: Iterable[yaml.Event]) -> None:
             if any(name == event.anchor for name, _, _ in within):
                 refuse(f"{event.anchor!r} contains itself", event)
             name, (size, levels) = None, named.get(event.anchor or "", (1, 0))
-            if len(within) + levels > DEEPEST:
-                refuse(f"nested deeper than {DEEPEST} levels", event)
+            if len(within) + levels > MAX_LEVELS:
+                refuse(f"nested deeper than {MAX_LEVELS} levels", event)
         elif isinstance(event, yaml.ScalarEvent):
             name, size, levels = event.anchor, 1, 0
         else:
             continue
         if name is not None:
             named[name] = size, levels
-        if size > MOST_NODES:
-            refuse(f"stands for more than {MOST_NODES} values", event)
+        if size > MAX_NODES:
+            refuse(f"expands to more than {MAX_NODES} values", event)
         if within:
             above, so_far, deep = within[-1]
             within[-1] = above, so_far + size, max(deep, levels + 1)
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """A mapping from a YAML file.
+    """Return the mapping in a YAML file.
 
     Raises:
-        ConfigError: the file is not there, does not parse (with line and column), or holds no mapping.
+        ConfigError: the file is missing, does not parse (with line and column), or holds no mapping.
     """
     try:
         loaded = parse_yaml(path.read_text(encoding="utf-8"), getattr(yaml, "CSafeLoader", yaml.SafeLoader))
@@ -97,21 +97,21 @@ def read_yaml(path: Path) -> dict[str, Any]:
         where = f" at line {mark.line + 1}, column {mark.column + 1}" if mark else ""
         problem = getattr(error, "problem", None) or "not valid YAML"
         raise ConfigError("file", str(path), f"does not parse{where}: {problem}") from None
-    except ValueError as error:  # such as a date that there is not
+    except ValueError as error:  # an impossible date, for example
         raise ConfigError("file", str(path), f"does not parse: {error}") from None
     if not isinstance(loaded, dict):
         raise ConfigError("file", str(path), "must hold a mapping")
     return loaded
 
 
-def find_file(kind: str, name: str, beside: Path | None = None) -> Path:
-    """The file that a name stands for: a path (absolute, or relative to `beside`), or a name of config/<kind>.
+def find_file(kind: str, name: str, folder: Path | None = None) -> Path:
+    """Return the file of a name: a path (absolute, or relative to `folder`), or a name in config/<kind>.
 
     Raises:
-        UnknownName: with the choices.
+        UnknownName: lists the choices.
     """
     if name.endswith((".yaml", ".yml")):
-        path = (beside or Path()) / Path(name).expanduser()
+        path = (folder or Path()) / Path(name).expanduser()
         if not path.is_file():
             raise ConfigError(kind.removesuffix("s"), str(path), "is not a file")
         return path
@@ -122,16 +122,16 @@ def find_file(kind: str, name: str, beside: Path | None = None) -> Path:
 
 
 def read_robot(path: Path) -> dict[str, Any]:
-    """A robot file, with references to files and folders that lie beside it made absolute.
+    """Return a robot file with absolute paths of files and folders next to it.
 
     Raises:
         ConfigError: as `read_yaml`.
     """
-    return made_absolute(read_yaml(path), path.parent)
+    return with_absolute_paths(read_yaml(path), path.parent)
 
 
 def read_world(path: Path) -> dict[str, Any]:
-    """A world file, with the files that it names: see `with_files`.
+    """Return a world file with the files that it refers to, as in `with_files`.
 
     Raises:
         ConfigError: as `read_yaml` and `read_camera`.
@@ -140,9 +140,9 @@ def read_world(path: Path) -> dict[str, Any]:
 
 
 def with_files(world: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """The world, whose files are relative to the folder.
+    """Return the world with its files read relative to the folder.
 
-    A camera that is the path of a file of `zencell calibrate` gets the values of that file; paths of meshes are made
+    A camera that is the path of a file of `zencell calibrate` gets the values of that file; paths of meshes become
     absolute.
     """
     cameras, objects = world.get("cameras"), world.get("objects")
@@ -150,14 +150,14 @@ def with_files(world: dict[str, Any], folder: Path) -> dict[str, Any]:
         for name in names:
             if isinstance(table, dict) and isinstance(table.get(name), str):
                 table[name] = read_camera(folder / Path(table[name]).expanduser())
-    for thing in objects if isinstance(objects, list) else []:
-        if isinstance(thing, dict) and isinstance(thing.get("mesh"), str):
-            thing["mesh"] = str((folder / Path(thing["mesh"]).expanduser()).resolve())
+    for each in objects if isinstance(objects, list) else []:
+        if isinstance(each, dict) and isinstance(each.get("mesh"), str):
+            each["mesh"] = str((folder / Path(each["mesh"]).expanduser()).resolve())
     return world
 
 
 def read_camera(path: Path) -> dict[str, Any]:
-    """Intrinsics and pose from a file of `zencell calibrate`, without the record of how they came about.
+    """Return intrinsics and pose from a file of `zencell calibrate`, without the record of the calibration.
 
     Raises:
         ConfigError: as `read_yaml`, or one of them is missing in the file.
@@ -168,11 +168,11 @@ def read_camera(path: Path) -> dict[str, Any]:
         missing = [field for field in fields if field not in camera]
         if missing:
             raise ConfigError("world.camera", str(path), f"has no {missing[0]}: `zencell calibrate {verb}` writes it")
-    return {"mount": "", **camera}  # of a camera in whose place it comes, the mount is not meant
+    return {"mount": "", **camera}  # the mount of the camera it replaces does not apply
 
 
-def made_absolute(robot: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """The robot, whose descriptions and folders of descriptions are absolute where they lie in a folder."""
+def with_absolute_paths(robot: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """Return the robot with absolute paths of descriptions and package folders that exist in the folder."""
     attachments = robot.get("attachments")
     for part in [robot, *(attachments if isinstance(attachments, list) else [])]:
         for field in ("urdf", "srdf"):

@@ -1,35 +1,91 @@
-"""From files and overrides to a cell, and from a cell to the configuration of a service."""
+"""Load a cell from files and overrides, and the configuration of a service from a cell."""
 
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
+import yaml
+from pydantic_core import to_jsonable_python
+
 from common.application import application_of_task, find_application, import_from_folder_of
-from common.config.basics import Parameters
+from common.config.basics import Parameters, check, is_section
 from common.config.cell import Cell
-from common.config.checking import check, is_section
 from common.config.files import (
     find_file,
-    made_absolute,
     names_of,
+    parse_yaml,
     read_camera,
     read_robot,
     read_world,
     read_yaml,
+    with_absolute_paths,
     with_files,
 )
-from common.config.overrides import expanded, parse_override
 from common.config.robot import RobotConfig
 from common.config.world import CAMERA, Surroundings
 from common.errors import ConfigError, UnknownName
 from common.remapping import SERVICE_NAME, validate_table
 
-NOT_A_SERVICE = ("router", "supervisor", "recorder")  # processes beside the services, which have names too
-WHOLE = ("robot", "world", "pipeline", "services")  # overrides of all of these come before those of their parts
+NOT_A_SERVICE = ("router", "supervisor", "recorder")  # names of processes that are no services
+SECTIONS = ("robot", "world", "pipeline", "services")  # overrides of a complete one precede those of its parts
 P = TypeVar("P", bound=Parameters)
+
+
+def parse_override(text: str, given_as: str = "--set") -> tuple[list[str], Any]:
+    """Return the dotted path and the YAML value of `PATH=VALUE`; errors name the option `given_as`."""
+    path, found, value = text.partition("=")
+    if not found or not path.strip():
+        raise ConfigError(given_as, text, "must be PATH=VALUE, for example world.count=5, or @FILE.yaml")
+    try:
+        return path.strip().split("."), parse_yaml(value)
+    except (yaml.YAMLError, ValueError):  # an impossible date, for example
+        raise ConfigError(f"{given_as} {path}", value, "is not a YAML value") from None
+
+
+def expanded(overrides: Sequence[str]) -> list[str]:
+    """Return the overrides with `@FILE` replaced by `PATH=VALUE` for every value of the file.
+
+    Raises:
+        ConfigError: a file cannot be read, or holds no mapping.
+    """
+    found = []
+    for text in overrides:
+        if text.startswith("@"):
+            tree = read_yaml(Path(text[1:]).expanduser())
+            found += [f"{'.'.join(path)}={yaml_line(value)}" for path, value in _values(tree)]
+        else:
+            found.append(text)
+    return found
+
+
+def _values(tree: Mapping[Any, Any], above: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """Yield every value of a tree with its path, except empty ones."""
+    for key, value in tree.items():
+        name = str(key).rpartition(".")[2] if above == ("services",) else str(key)  # as `_name_of`
+        if isinstance(value, Mapping):
+            yield from _values(value, (*above, name))
+        elif value is not None:
+            yield (*above, name), value
+
+
+def yaml_line(value: Any) -> str:
+    """Return a value as one line of YAML, for `PATH=VALUE`."""
+    plain = to_jsonable_python(value)
+    text = _flow(plain)
+    # YAML spreads a text with line breaks, of which Unicode has several, over lines unless it is quoted and escaped.
+    return text if len(text.splitlines()) <= 1 else _flow(plain, quoted=True)
+
+
+def _flow(value: Any, *, quoted: bool = False) -> str:
+    text: str = yaml.safe_dump(
+        value, default_flow_style=True, default_style='"' if quoted else None, allow_unicode=not quoted, width=math.inf,
+        sort_keys=False,
+    )
+    return text.removesuffix("\n").removesuffix("\n...")
 
 
 def _override(tree: dict[str, Any], path: Sequence[str], value: Any) -> None:
@@ -45,7 +101,7 @@ def _override(tree: dict[str, Any], path: Sequence[str], value: Any) -> None:
 
 
 def _at(tree: dict[str, Any], path: Sequence[str]) -> Any:
-    """What lies at a path of the tree; None if nothing does."""
+    """Return the value at a path of the tree, or None."""
     node: Any = tree
     for part in path:
         node = node.get(part) if isinstance(node, dict) else None
@@ -59,7 +115,7 @@ def load_cell(
 
     Args:
         cell: a name, or a path that ends in .yaml.
-        overrides: `PATH=VALUE` each, or `@FILE` for those of a file, applied after all files were read.
+        overrides: `PATH=VALUE` each, or `@FILE` for those of a file, applied after all files are read.
         world: name or path of a world that replaces the cell's.
         seed: replaces the cell's seed.
 
@@ -70,18 +126,18 @@ def load_cell(
     import_from_folder_of(cell)
     tree = read_yaml(path)
     parsed = [parse_override(text) for text in expanded(overrides)]
-    given = {parts[0]: value for parts, value in parsed if len(parts) == 1}  # which file to read may be overridden
+    given = {parts[0]: value for parts, value in parsed if len(parts) == 1}  # overrides may name other files to read
     given |= {"world": world} if world is not None else {}
-    tree |= {part: given[part] for part in WHOLE if part in given}
+    tree |= {part: given[part] for part in SECTIONS if part in given}
     for part in ("robot", "world", "pipeline"):
         value = tree.get(part)
         if isinstance(value, str):
-            # A path in the cell is relative to it; one that a person gives, to where the person stands.
-            here = part in given and Path(value).expanduser().is_file()
+            # A path in the cell file is relative to it; one of an override to the working directory.
+            in_cwd = part in given and Path(value).expanduser().is_file()
             read = {"robot": read_robot, "world": read_world}.get(part, read_yaml)
-            tree[part] = read(find_file(f"{part}s", value, None if here else path.parent))
+            tree[part] = read(find_file(f"{part}s", value, None if in_cwd else path.parent))
         elif part == "robot" and isinstance(value, dict):
-            tree[part] = made_absolute(value, path.parent)
+            tree[part] = with_absolute_paths(value, path.parent)
         elif part == "world" and isinstance(value, dict):
             tree[part] = with_files(value, path.parent)
         elif not isinstance(value, dict):
@@ -96,16 +152,16 @@ def load_cell(
                 raise UnknownName("service", parts[1], by_name)
             parts[1] = by_name[parts[1]]
         if parts[0] == "world":
-            _name_one(tree["world"], parts)
+            _unify_names(tree["world"], parts)
         is_camera = parts == ["world", "camera"] or (len(parts) == 3 and parts[:2] == ["world", "cameras"])
         if is_camera and isinstance(value, str):
             before = _at(tree, parts)
             camera = {**(before if isinstance(before, dict) else {}), **read_camera(Path(value).expanduser())}
             _override(tree, parts, camera)
-        elif len(parts) > 1 or parts[0] not in WHOLE:
+        elif len(parts) > 1 or parts[0] not in SECTIONS:
             _override(tree, parts, value)
     if "run" in tree:
-        raise ConfigError("run", tree["run"], "is no section of a cell: autostart and seed stand at its top")
+        raise ConfigError("run", tree["run"], "is no section of a cell: autostart and seed are top-level fields")
     run = {"cell": tree.pop("cell", path.stem), "autostart": tree.pop("autostart", True), "seed": tree.pop("seed", 0)}
     if seed is not None:
         run["seed"] = seed
@@ -116,7 +172,7 @@ def load_cell(
 
 
 def load_robot(robot: str | Path) -> RobotConfig:
-    """The robot of a file, by its name in config/robots or its path.
+    """Return the robot of a file, by its name in config/robots or its path.
 
     Raises:
         ConfigError, UnknownName: one line naming the field, the value and the choices.
@@ -125,10 +181,10 @@ def load_robot(robot: str | Path) -> RobotConfig:
 
 
 def _name_application(tree: dict[str, Any]) -> None:
-    """Let an application name the cell's task, or the task, in older files, the application.
+    """Set the task from the application or, in older files, the application from the task.
 
     Raises:
-        UnknownName, ConfigError: there is no such application.
+        UnknownName, ConfigError: the application does not exist.
     """
     task, given = tree.get("task"), tree.get("application")
     kinds = {name: entry["module"].rpartition(".")[2] for name, entry in tree["services"].items()}
@@ -139,8 +195,8 @@ def _name_application(tree: dict[str, Any]) -> None:
         tree.setdefault("task", next((name for name in kinds if kinds[name] == kind), kind))
 
 
-def _name_one(world: dict[str, Any], path: list[str]) -> None:
-    """Have world and override speak alike of cameras and of containers: of a single one, or of several by name."""
+def _unify_names(world: dict[str, Any], path: list[str]) -> None:
+    """Make world and override use the same form for cameras and containers: a single one, or several by name."""
     for one, many in (("camera", "cameras"), ("container", "containers")):
         several = world.get(many)
         if path[1:2] == [many] and several is None:
@@ -152,20 +208,20 @@ def _name_one(world: dict[str, Any], path: list[str]) -> None:
 
 
 def _name_of(key: str) -> str:
-    """The name of a service that stands under a key of the cell file: a dotted module goes by its last part."""
+    """Return the name of a service from its key in the cell file: the last part of a dotted module."""
     return key.rpartition(".")[2]
 
 
 def _service_entries(services: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """The services by their names, in start order."""
+    """Return the services by name, in start order."""
     entries: dict[str, dict[str, Any]] = {}
     for key, given in services.items():
         entry = _service_entry(str(key), given)
         name = entry["name"]
         if name in entries:
             before = entries[name]["module"]
-            raise ConfigError(f"services.{key}", ..., f"{before} goes by the name {name} already: give this one a name "
-                              f"of its own, as in another_{name}: {{service: {key}}}")
+            raise ConfigError(f"services.{key}", ..., f"{before} has the name {name} already: give this one another "
+                              f"name, as in another_{name}: {{service: {key}}}")
         entries[name] = entry
     return entries
 
@@ -179,7 +235,7 @@ def _service_entry(key: str, given: Any) -> dict[str, Any]:
         raise ConfigError(f"services.{key}.service", kind, f"must be a service; choices: {', '.join(service_names())}")
     name = _name_of(key)
     if not SERVICE_NAME.fullmatch(name) or name in NOT_A_SERVICE:
-        raise ConfigError("services", key, "is not a name that a service can have: letters, digits and _, but not "
+        raise ConfigError("services", key, "is not a valid service name: letters, digits and _, but not "
                           + ", ".join(NOT_A_SERVICE))
     module = kind if "." in kind else f"services.{kind}"
     if "." not in kind and importlib.util.find_spec(module) is None:
@@ -189,27 +245,27 @@ def _service_entry(key: str, given: Any) -> dict[str, Any]:
 
 
 def service_names() -> list[str]:
-    """Services that come with the project: the modules in services/."""
+    """Return the services of the project: the modules in services/."""
     folder = Path(__file__).resolve().parents[2] / "services"
     return sorted(path.stem for path in folder.glob("[a-z]*.py"))
 
 
 def service_config(cell: Cell, name: str, config: type[P]) -> P:
-    """The configuration of one service: its parameters from the cell, and the sections that it declares.
+    """Return the configuration of one service: its parameters from the cell, and the sections that it declares.
 
     Raises:
         ConfigError: names `services.<name>.<parameter>`, the value and the bounds or choices.
     """
     entry = cell.services.get(name)
     given = dict(entry.parameters) if entry else {}
-    # A parameter for whoever looks through one of several cameras, unless the service has one of that name itself.
+    # A parameter of services with surroundings, which selects a camera, unless they have one of that name themselves.
     sections = [info.annotation for info in config.model_fields.values() if is_section(info.annotation)]
-    chooses = Surroundings in sections and "camera" not in config.model_fields
-    camera = given.pop("camera", None) if chooses else None
+    selects_camera = Surroundings in sections and "camera" not in config.model_fields
+    camera = given.pop("camera", None) if selects_camera else None
     if camera is not None and camera not in cell.world.cameras:
         raise ConfigError(f"services.{name}.camera", camera, f"must be one of {', '.join(cell.world.cameras)}")
     for field, info in config.model_fields.items():
         if is_section(info.annotation):
-            # A copy: what a service changes in it at run time stays with it.
+            # A copy: each service changes its own at run time.
             given[field] = cell.section(info.annotation, camera).model_copy()  # type: ignore[arg-type]
     return check(config, given, f"services.{name}")

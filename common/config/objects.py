@@ -1,4 +1,4 @@
-"""What a world is made of: fixtures, containers, cameras, and the objects that lie in it."""
+"""Parts of a world: fixtures, containers, cameras, objects and lights."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from pydantic import Field, model_validator
 
 from common.config.basics import Coordinate, Length, Number, Point, Rgb, Section
 
-CAMERA = "camera"  # the name of a single one
-TCP = "tcp"  # as a mount stands for the link of the tool centre point, whatever that is called
+CAMERA = "camera"  # name of a single camera
+TCP = "tcp"  # as a mount: the link of the tool centre point, whatever its name
 
 Shape = Literal["sphere", "box", "cylinder", "prism", "ring", "mesh"]
 NEEDS = {"sphere": ["radius"], "box": ["size", "height"], "cylinder": ["radius", "height"],
@@ -29,25 +29,25 @@ class Fixture(Section):
 
 
 class Container(Section):
-    """An open box of five panels on the table; equal spheres lie in it in a 2 x 2 grid of slots, in layers."""
+    """An open box of five panels on the table, with layers of 2 x 2 slots for equal spheres."""
 
     id: str = "box"
     x: Coordinate = Field(0.55, description="centre [m]")
     y: Coordinate = Field(0.25, description="centre [m]")
     half_side: Length = Field(0.08, description="outer half side [m]")
     floor_thickness: Length = Field(0.005, description="[m]")
-    wall_height: Length = Field(0.10, description="from the table, above the middle of a second layer [m]")
+    wall_height: Length = Field(0.10, description="from the table; higher than the centres of a second layer [m]")
     wall_thickness: Length = Field(0.008, description="[m]")
-    slot_offset: Length = Field(0.033, description="slots lie at plus and minus this from the centre [m]")
+    slot_offset: Length = Field(0.033, description="slots are at plus and minus this from the centre [m]")
     layers: int = Field(2, ge=1, le=5, description="of four slots each")
     color: Rgb = (1.0, 0.6, 0.0)
 
 
 class CameraConfig(Section):
-    """A pinhole camera. +Z looks forward, +X is to the right in the picture, +Y is down.
+    """A pinhole camera: +Z forward, +X right and +Y down in the image.
 
-    A world may name a file of `zencell calibrate` in its place. One with a `mount` sits on the robot and moves with it:
-    its pictures count while the arm is at home.
+    A world may name a file of `zencell calibrate` instead. A camera with a `mount` moves with the robot: its images are
+    used while the arm is at home.
     """
 
     frame: str = f"{CAMERA}_optical_frame"
@@ -58,9 +58,9 @@ class CameraConfig(Section):
     cx: float = Field(320.0, ge=0, le=4096, description="principal point [px]")
     cy: float = Field(240.0, ge=0, le=4096, description="principal point [px]")
     d: list[Number] = Field(
-        [], max_length=8, description="distortion of a real lens: k1, k2, p1, p2, k3, ...; camera_opencv takes it out"
+        [], max_length=8, description="distortion of a real lens: k1, k2, p1, p2, k3, ...; camera_opencv corrects it"
     )
-    mount: str = Field("", max_length=100, description="link of the robot that it sits on, or tcp; empty: fixed in "
+    mount: str = Field("", max_length=100, description="link of the robot that carries it, or tcp; empty: fixed in "
                                                        "world")
     position: Point = Field((0.40, 0.0, 0.80), description="optical centre in world, or in its mount [m]")
     rpy: tuple[Number, Number, Number] = Field(
@@ -68,19 +68,18 @@ class CameraConfig(Section):
     )
 
     @model_validator(mode="after")
-    def _is_somewhere_on_its_mount(self) -> CameraConfig:
+    def _require_pose_on_mount(self) -> CameraConfig:
         if self.mount and not {"position", "rpy"} <= self.model_fields_set:
-            raise ValueError(f"a camera with a mount needs position and rpy: where it sits on {self.mount}")
+            raise ValueError(f"a camera with a mount needs position and rpy in {self.mount}")
         return self
 
 
 class ObjectConfig(Section):
-    """A solid that can be taken and moved.
+    """A movable solid.
 
-    Its own frame lies at half its height, on the axis of a sphere, cylinder or ring, in the middle of a box, where the
-    polygon of a prism has its origin; that of a mesh is the file's. Its place is either `position` and `rpy` of that
-    frame, or, for what stands upright, `x`, `y`, the height `z` on which it stands, and `yaw`. Without any it lies at a
-    random place on the table.
+    Its frame is at half its height, on the axis of a sphere, cylinder or ring, at the centre of a box, at the origin of
+    the polygon of a prism; that of a mesh is the file's. Its pose is either `position` and `rpy` of that frame or, for
+    an upright solid, `x`, `y`, the height `z` of its base, and `yaw`. Without any of them its position is random.
     """
 
     id: str = Field(pattern=r"^[A-Za-z0-9_.-]{1,60}$")
@@ -91,7 +90,7 @@ class ObjectConfig(Section):
     )
     x: Coordinate | None = Field(None, description="of its own frame [m], world")
     y: Coordinate | None = Field(None, description="of its own frame [m], world")
-    z: Coordinate = Field(0.0, description="of what it stands on [m]")
+    z: Coordinate = Field(0.0, description="of its base [m]")
     yaw: Number = Field(0.0, description="[rad]")
     height: Length | None = Field(None, description="of all but a sphere and a mesh [m]")
     size: tuple[Length, Length] | tuple[Length, Length, Length] | None = Field(
@@ -106,7 +105,7 @@ class ObjectConfig(Section):
     mass: float = Field(0.1, gt=0, le=100, description="[kg]")
 
     @model_validator(mode="after")
-    def _has_what_its_shape_needs(self) -> ObjectConfig:
+    def _require_fields_of_shape(self) -> ObjectConfig:
         missing = [field for field in NEEDS[self.shape] if not getattr(self, field)]
         if self.shape == "box" and self.size is not None and len(self.size) == 3:
             if self.height is not None and self.height != self.size[2]:
@@ -122,7 +121,7 @@ class ObjectConfig(Section):
         return self
 
     @model_validator(mode="after")
-    def _is_in_one_place(self) -> ObjectConfig:
+    def _require_one_pose(self) -> ObjectConfig:
         if self.position is not None and (self.x is not None or self.y is not None):
             raise ValueError(f"{self.id}: either position, or x and y")
         if (self.x is None) != (self.y is None):
@@ -131,5 +130,18 @@ class ObjectConfig(Section):
 
     @property
     def placed(self) -> bool:
-        """Whether it has a place; else it is given one at random."""
+        """Whether it has a pose; else its position is random."""
         return self.position is not None or self.x is not None
+
+
+class Light(Section):
+    """A lamp, or parallel light like that of the sun. Its illuminance is that of a light meter at `aim`."""
+
+    position: Point = Field(
+        (0.5, 0.4, 1.5), description="of the lamp in world [m]; parallel light comes from its direction"
+    )
+    aim: Point = Field((0.5, 0.0, 0.0), description="point in world that it is aimed at [m]")
+    parallel: bool = Field(True, description="false: a lamp, whose light decreases with the square of the distance")
+    illuminance: float = Field(350.0, ge=0, le=100_000, description="on a surface at `aim` that faces it [lx]")
+    temperature: float = Field(6500.0, ge=1700, le=25_000, description="2700 is warm, 6500 daylight, 10000 cold [K]")
+    shadow: bool = Field(True, description="whether objects cast shadows in it")

@@ -11,7 +11,7 @@ from common.config.basics import Length, Number, Point, Section
 
 
 class ParallelLinkage(Section):
-    """Fingers on parallelograms, so that their pads stay parallel; the driven joint is an angle, 0 when open.
+    """Fingers on parallelogram linkages, which keep their pads parallel; the driven joint is an angle, 0 when open.
 
     At an angle a the pads are 2 * length * (sin(open_angle - a) - sin(open_angle - closed)) apart [m].
     """
@@ -22,15 +22,15 @@ class ParallelLinkage(Section):
 
 
 class TurningJaw(Section):
-    """A finger that turns towards a fixed one; the width [m] is that between their tips.
+    """A finger that turns towards a fixed one; the width [m] is the distance of their tips.
 
-    radius * (sin(angle + a) - sin(angle)) where it is turned by a from closed [rad].
+    It is radius * (sin(angle + a) - sin(angle)) at an angle a from closed [rad].
     """
 
     radius: Length = Field(description="of its tip from the joint's axis [m]")
     angle: float = Field(ge=-1.5, le=1.5, description="of the tip from the tool axis when closed, outwards [rad]")
     closed: Number = Field(0.0, description="driven joint when closed [rad]")
-    opens: Literal[1, -1] = Field(1, description="sense of the joint in which it opens")
+    opens: Literal[1, -1] = Field(1, description="direction of the joint in which it opens")
 
 
 class FingerShape(Section):
@@ -42,21 +42,21 @@ class FingerShape(Section):
 
 
 class SuctionCup(Section):
-    """A round cup at the tool centre point that looks along the tool's z axis."""
+    """A round suction cup at the tool centre point, along the tool's z axis."""
 
-    lip_radius: Length = Field(0.01, description="of the ring that has to lie on the object [m]")
-    give: Length = Field(0.005, description="by which the lip follows what it touches [m]")
+    lip_radius: Length = Field(0.01, description="of the ring that must be on the object [m]")
+    give: Length = Field(0.005, description="compliance of the lip [m]")
 
 
 class PayloadConfig(Section):
-    """What the arm carries where its controller wants to know; centres of mass [m] are from the flange, z out of it."""
+    """Payload for the arm's controller; centres of mass [m] from the flange, z out of it."""
 
     mass: float = Field(ge=0, le=1000, description="of the gripper [kg]")
     com: Point = Field((0.0, 0.0, 0.0), description="its centre of mass [m]")
-    held: Point | None = Field(None, description="that of what it holds [m]; else that of the gripper")
+    held: Point | None = Field(None, description="centre of mass of a held object [m]; default: com")
 
     def with_held(self, mass: float) -> tuple[float, float, float, float]:
-        """Mass [kg], and centre of mass x, y, z [m], with something so heavy [kg] in the gripper."""
+        """Return mass [kg] and centre of mass x, y, z [m] with a held object of this mass [kg]."""
         total, held = self.mass + mass, self.held or self.com
         x, y, z = ((self.mass * own + mass * other) / total if total else 0.0
                    for own, other in zip(self.com, held, strict=True))
@@ -64,7 +64,7 @@ class PayloadConfig(Section):
 
 
 class HardwareConfig(Section):
-    """A backend, of the arm or of the gripper: a module of common/hardware or drivers, or a dotted module of yours."""
+    """A backend, of the arm or of the gripper: a module of common/hardware or drivers, or a dotted module of a user."""
 
     backend: str = "mock"
     options: dict[str, Any] = {}
@@ -74,45 +74,45 @@ class GripperConfig(Section):
     """A parallel gripper: `width` is the distance between the inner faces of the fingers [m].
 
     The first of the joints is driven. Without a linkage it slides by half the width from `closed`. A suction cup has no
-    joints: its width is that of a valve, `max_width` while it does not draw, 0 while it draws nothing in, half when it
-    holds.
+    joints. Its width is `max_width` while its valve is closed, 0 while it holds nothing, half of it while it holds an
+    object.
     """
 
     closing_axis: Literal["x", "y"] = Field("y", description="axis of the tool centre point along which fingers close")
     fingers: FingerShape = FingerShape()
-    payload: PayloadConfig | None = Field(None, description="what the arm's controller is told; else nothing")
-    cup: SuctionCup | None = Field(None, description="grips what its lip touches, in the place of fingers")
-    group: str = Field("gripper", description="name of the fingers as a group")
+    payload: PayloadConfig | None = Field(None, description="payload for the arm's controller; default: not set")
+    cup: SuctionCup | None = Field(None, description="suction cup instead of fingers")
+    group: str = Field("gripper", description="group name of the fingers")
     joints: list[str] = Field([], description="finger joints, the driven one first")
     mimic: list[Number] = Field([], description="each joint per driven joint; all 1 when empty")
-    linkage: ParallelLinkage | None = Field(None, description="how the driven joint opens them; else each slides")
+    linkage: ParallelLinkage | None = Field(None, description="linkage of the driven joint; default: fingers slide")
     jaw: TurningJaw | None = Field(None, description="one finger turns and the other is fixed")
-    closed: Number = Field(0.0, description="where the driven joint is when fingers that slide are closed [m]")
-    links: list[str] = Field(description="links that may touch what is grasped")
+    closed: Number = Field(0.0, description="driven joint of closed sliding fingers [m]")
+    links: list[str] = Field(description="links that may touch a grasped object")
     max_width: Length = Field(0.08, description="fully open [m]")
     speed: Length = Field(0.2, description="closing speed of the width [m/s]")
     acceleration: Length = Field(2.0, description="of the width [m/s^2]")
     jerk: float = Field(50.0, gt=0, le=1e4, description="of the width [m/s^3]")
-    max_effort: float = Field(70.0, gt=0, le=1e4, description="grip force that it has [N]")
-    effort: float = Field(5.0, gt=0, le=1e4, description="grip force, where neither object nor command say it [N]")
-    latency: float = Field(0.2, ge=0, le=2, description="from a command until readings must show that fingers move [s]")
+    max_effort: float = Field(70.0, gt=0, le=1e4, description="largest grip force [N]")
+    effort: float = Field(5.0, gt=0, le=1e4, description="grip force, if neither object nor command set it [N]")
+    latency: float = Field(0.2, ge=0, le=2, description="from a command until readings show that the fingers move [s]")
     controller: str = Field("gripper_controller", description="name of its controller, the source of its state")
     named_widths: dict[str, Annotated[float, Field(ge=0, le=1)]] = Field({}, description="such as open, closed [m]")
-    hardware: HardwareConfig | None = Field(None, description="backend that moves it; else the arm's backend does")
+    hardware: HardwareConfig | None = Field(None, description="backend of the gripper; default: the arm's")
 
     @model_validator(mode="after")
     def _fits(self) -> GripperConfig:
         if bool(self.joints) == (self.cup is not None):
-            raise ValueError("gripper needs the joints of its fingers, or a cup, which has none")
+            raise ValueError("gripper needs either joints or a cup")
         if self.mimic and len(self.mimic) != len(self.joints):
             raise ValueError(f"gripper.mimic has {len(self.mimic)} values for {len(self.joints)} joints")
         if self.mimic and self.mimic[0] != 1:
             raise ValueError(f"gripper.mimic begins with the driven joint itself: 1, not {self.mimic[0]:g}")
         if (self.linkage is not None or self.jaw is not None) and self.closed:
-            raise ValueError("gripper.closed is of fingers that slide; a linkage and a jaw have their own closed")
+            raise ValueError("gripper.closed is for sliding fingers; a linkage and a jaw have their own closed")
         if self.jaw is not None:
             if self.linkage is not None or len(self.joints) != 1:
-                raise ValueError("gripper.jaw is of one joint, and in the place of a linkage")
+                raise ValueError("gripper.jaw needs exactly one joint and no linkage")
             most = self.jaw.radius * (1 - math.sin(self.jaw.angle))
             if self.max_width > most:
                 raise ValueError(f"gripper.jaw opens by {most:.4f} m at most, max_width is {self.max_width:g} m")
@@ -131,25 +131,25 @@ class GripperConfig(Section):
         return self
 
     def least_time(self, distance: float) -> float:
-        """Fingers at rest need at least so long [s] to come closer or further apart by a distance [m] of the width."""
-        way, ramp = max(distance, 0.0), self.speed**2 / (2 * self.acceleration)
-        ramped = math.sqrt(2 * way / self.acceleration)
-        by_speed = self.speed / self.acceleration + (way - ramp) / self.speed if way > ramp else ramped
-        return max(by_speed, math.cbrt(6 * way / self.jerk))
+        """Return the least time [s] of fingers at rest for a change of the width by a distance [m]."""
+        stroke, ramp = max(distance, 0.0), self.speed**2 / (2 * self.acceleration)
+        ramped = math.sqrt(2 * stroke / self.acceleration)
+        by_speed = self.speed / self.acceleration + (stroke - ramp) / self.speed if stroke > ramp else ramped
+        return max(by_speed, math.cbrt(6 * stroke / self.jerk))
 
     @property
     def finger_inner(self) -> float:
-        """From the tool centre point to the inner face of an open finger [m]."""
+        """Distance from the tool centre point to the inner face of an open finger [m]."""
         return self.max_width / 2 if self.fingers.inner is None else self.fingers.inner
 
     @property
     def held_width(self) -> float:
-        """Of a cup that holds something [m]."""
+        """Width of a cup that holds an object [m]."""
         return self.max_width / 2
 
 
 class AttachmentConfig(Section):
-    """Another URDF whose root is fixed to a link of the robot, such as a gripper."""
+    """Another URDF fixed by its root to a link of the robot, such as a gripper."""
 
     urdf: str = Field(description="path, or package://<package>/... from an installed description package")
     parent_link: str
@@ -158,7 +158,7 @@ class AttachmentConfig(Section):
 
 
 class TcpConfig(Section):
-    """A tool centre point that the URDF does not have, fixed to one of its links."""
+    """A tool centre point that is not in the URDF, fixed to one of its links."""
 
     link: str = Field(description="its name")
     parent: str
@@ -167,13 +167,13 @@ class TcpConfig(Section):
 
 
 class RobotConfig(Section):
-    """A robot: its descriptions, the group that is planned for, and limits that the URDF does not give."""
+    """A robot: its descriptions, its planning group, and limits that are not in the URDF."""
 
     name: str
     urdf: str = Field(description="path, or package://<package>/... from an installed description package")
-    srdf: str = Field("", description="as urdf; its disabled collision pairs are used")
-    package_dirs: list[str] = Field([], description="where package:// is looked up, before the installed packages")
-    attachments: list[AttachmentConfig] = Field([], description="descriptions that are added to the URDF")
+    srdf: str = Field("", description="as urdf, for its disabled collision pairs")
+    package_dirs: list[str] = Field([], description="folders for package://, searched before the installed packages")
+    attachments: list[AttachmentConfig] = Field([], description="descriptions added to the URDF")
     group: str = "arm"
     group_aliases: list[str] = []
     joints: list[str] = Field(min_length=1, description="joints of the group, in order")
@@ -182,19 +182,19 @@ class RobotConfig(Section):
     base_rpy: tuple[Number, Number, Number] = Field(
         (0.0, 0.0, 0.0), description="of base_link in world: roll, pitch, yaw [rad], R = Rz Ry Rx"
     )
-    tcp_link: str = Field("", description="link of the tool centre point; may be left out when `tcp` defines it")
-    tcp: TcpConfig | None = Field(None, description="the tool centre point, when the URDF has no link for it")
+    tcp_link: str = Field("", description="link of the tool centre point; not needed if `tcp` defines it")
+    tcp: TcpConfig | None = Field(None, description="tool centre point, if the URDF has no link for it")
     locked_joints: dict[str, Number] = Field(
-        {}, description="joints outside the group and where planning holds them; fingers while their width is not known"
+        {}, description="positions of joints outside the group in planning; fingers while their width is unknown"
     )
     named_poses: dict[str, list[Number]] = Field(description="joint positions [rad]; must have home")
     position_limits: list[tuple[Number, Number]] = Field(
-        [], description="lowest and highest of each joint [rad]; else the URDF's"
+        [], description="lower and upper limit of each joint [rad]; default: the URDF's"
     )
-    velocity_limits: list[Annotated[float, Field(gt=0, le=100)]] = Field([], description="[rad/s]; else the URDF's")
+    velocity_limits: list[Annotated[float, Field(gt=0, le=100)]] = Field([], description="[rad/s]; default: the URDF's")
     acceleration_limits: list[Annotated[float, Field(gt=0, le=1000)]] = Field(description="[rad/s^2]")
     deceleration_limits: list[Annotated[float, Field(gt=0, le=1000)]] = Field(
-        [], description="when braked for a hold or a stop [rad/s^2]; else acceleration_limits"
+        [], description="when braking for a hold or a stop [rad/s^2]; default: acceleration_limits"
     )
     jerk_limits: list[Annotated[float, Field(gt=0, le=1e6)]] = Field(description="[rad/s^3]")
     controller: str = Field("controller", description="name of the arm's controller, the source of its status")
@@ -203,13 +203,13 @@ class RobotConfig(Section):
 
     @model_validator(mode="before")
     @classmethod
-    def _tcp_link_is_that_of_tcp(cls, values: Any) -> Any:
+    def _set_tcp_link(cls, values: Any) -> Any:
         tcp = values.get("tcp") if isinstance(values, dict) else None
         link = tcp.get("link") if isinstance(tcp, dict) else getattr(tcp, "link", None)
         return values | {"tcp_link": link} if link and not values.get("tcp_link") else values
 
     @model_validator(mode="after")
-    def _lengths_fit(self) -> RobotConfig:
+    def _require_lengths(self) -> RobotConfig:
         if not self.tcp_link:
             raise ValueError("tcp_link must be given, or tcp")
         if self.tcp is not None and self.tcp.link != self.tcp_link:

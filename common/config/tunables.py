@@ -1,4 +1,4 @@
-"""The parameters of a service that runs: what there is, and a change of those that may change, all of them or none."""
+"""List the parameters of a running service, and change tunable ones: all of a request or none."""
 
 from __future__ import annotations
 
@@ -14,33 +14,32 @@ from pydantic import BaseModel, JsonValue
 from pydantic.fields import FieldInfo
 from pydantic_core import to_jsonable_python
 
-from common.config.basics import AtRunTime, Parameters, Section
+from common.config.basics import AtRunTime, Parameters, Section, check, is_section
 from common.config.cell import Cell
-from common.config.checking import check, is_section
-from common.config.overrides import yaml_line
+from common.config.loading import yaml_line
 from common.config.world import Surroundings
 from common.errors import ConfigError, Refused, UnknownName
 from common.messages import Parameter
 
 Kind = Literal["number", "integer", "boolean", "string", "list", "mapping"]
 
-# A bracket of a description that holds a unit, as in "[m]" or "[s, wall time]", and not "[0..255]" or "[x, y, z]".
+# A unit in brackets in a description, such as "[m]" or "[s, wall time]", but not "[0..255]" or "[x, y, z]".
 UNIT = re.compile(r"\[(%|(?![xyz]\b)[A-Za-z][\w/^*]*|1/[a-z]+)(?:, [^\[\]]*)?\]")
 
 
 @dataclass(frozen=True)
 class Leaf:
-    """One parameter: where its value is kept, and what is said of it."""
+    """One parameter: the model that holds its value, and its field."""
 
     path: str
     owner: BaseModel
     name: str
     info: FieldInfo
-    default: Any  # `...` when it must be given
+    default: Any  # `...` if required
 
     @property
     def value(self) -> Any:
-        """What it is now."""
+        """Current value."""
         return getattr(self.owner, self.name)
 
     @property
@@ -51,7 +50,7 @@ class Leaf:
 
 @dataclass(frozen=True)
 class Change:
-    """A parameter and what it changes to; nothing has changed before `apply`."""
+    """A parameter and its new value, which `apply` sets."""
 
     leaf: Leaf
     value: Any
@@ -61,12 +60,12 @@ class Change:
 
 
 def is_tunable(info: FieldInfo) -> bool:
-    """Whether a field is marked as one that may change at run time."""
+    """Return whether a field may change at run time."""
     return any(isinstance(mark, AtRunTime) for mark in info.metadata)
 
 
 def tunable_sections(config: type[BaseModel]) -> dict[str, type[Section]]:
-    """The sections of the cell that a service declares and that have fields which may change, by their path."""
+    """Return by path the sections of the cell that a service declares and that have tunable fields."""
     found = {}
     for info in config.model_fields.values():
         kind = info.annotation
@@ -76,14 +75,14 @@ def tunable_sections(config: type[BaseModel]) -> dict[str, type[Section]]:
 
 
 def section_path(kind: type[Section]) -> str:
-    """What a cell file and `--set` call a section."""
+    """Return the path of a section in cell files and `--set`."""
     if kind is Surroundings:
         return "world"
     return next(name for name, info in Cell.model_fields.items() if info.annotation is kind)
 
 
 def leaves(config: Parameters, service: str) -> dict[str, Leaf]:
-    """All parameters of a service by path: its own, nested ones too, and sections of the cell that it can change.
+    """Return all parameters of a service by path: its own, nested ones too, and those of tunable sections.
 
     A field with `repr=False`, such as a password, is left out.
     """
@@ -99,7 +98,7 @@ def leaves(config: Parameters, service: str) -> dict[str, Leaf]:
 def _leaves(model: BaseModel, prefix: str, defaults: BaseModel | None) -> Iterator[Leaf]:
     for name, info in type(model).model_fields.items():
         if (is_section(info.annotation) and not isinstance(model, Section)) or not info.repr:
-            continue  # what is not to be shown, such as a password, is nobody's business
+            continue  # a secret, such as a password
         default = getattr(defaults, name) if defaults is not None else info.get_default(call_default_factory=True)
         if info.is_required() and defaults is None:
             default = ...
@@ -110,47 +109,47 @@ def _leaves(model: BaseModel, prefix: str, defaults: BaseModel | None) -> Iterat
             yield Leaf(f"{prefix}.{name}", model, name, info, default)
 
 
-# --- saying what there is ---------------------------------------------------------------------------------------
+# --- description ---------------------------------------------------------------------------------------
 
 
 def values_of(config: Parameters, service: str) -> dict[str, JsonValue]:
-    """The values of all parameters of a service by path, as JSON has them."""
+    """Return the values of all parameters of a service by path, as JSON values."""
     return {path: to_jsonable_python(leaf.value) for path, leaf in leaves(config, service).items()}
 
 
 def describe(config: Parameters, service: str, started: Mapping[str, JsonValue] | None = None) -> list[Parameter]:
-    """Every parameter of a service as it is now, in the order in which they are declared.
+    """Return every parameter of a service with its current value, in the order of declaration.
 
     Args:
         config: of the service.
         service: its name.
-        started: values by path that the service was started with; else those of now.
+        started: values by path at the start of the service; by default the current ones.
     """
     return [_described(leaf, started or {}) for leaf in leaves(config, service).values()]
 
 
 def _described(leaf: Leaf, started: Mapping[str, JsonValue]) -> Parameter:
     value = to_jsonable_python(leaf.value)
-    begun = started.get(leaf.path, value)
+    initial = started.get(leaf.path, value)
     description = leaf.info.description or ""
     units = UNIT.findall(description)
     kind = kind_of(leaf.info.annotation)
     minimum, maximum = _limits(leaf.info, whole=kind == "integer")
     return Parameter(
-        path=leaf.path, value=value, default=begun if leaf.default is ... else to_jsonable_python(leaf.default),
+        path=leaf.path, value=value, default=initial if leaf.default is ... else to_jsonable_python(leaf.default),
         type=kind, minimum=minimum, maximum=maximum, choices=choices_of(leaf.info.annotation),
-        unit=units[-1] if units else "", description=description, runtime=leaf.runtime, changed=value != begun,
+        unit=units[-1] if units else "", description=description, runtime=leaf.runtime, changed=value != initial,
     )
 
 
 def kind_of(annotation: Any) -> Kind:
-    """What a value of a type looks like in JSON."""
+    """Return the JSON type of a Python type."""
     origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
     if origin is typing.Annotated:
         return kind_of(arguments[0])
     if origin in (typing.Union, types.UnionType):
         kinds = [kind_of(argument) for argument in arguments if argument is not types.NoneType]
-        return kinds[0] if len(set(kinds)) == 1 else "string"  # which can be read as any of them
+        return kinds[0] if len(set(kinds)) == 1 else "string"  # a string can be read as any of them
     if origin is typing.Literal:
         return kind_of(type(arguments[0]))
     simple: dict[Any, Kind] = {bool: "boolean", int: "integer", float: "number", dict: "mapping", Mapping: "mapping"}
@@ -162,12 +161,12 @@ def kind_of(annotation: Any) -> Kind:
 
 
 def choices_of(annotation: Any) -> list[str]:
-    """The values of a Literal; empty for what is none."""
+    """Return the values of a Literal; empty for other types."""
     return [str(value) for value in typing.get_args(annotation)] if typing.get_origin(annotation) is Literal else []
 
 
 def bounds_of(info: FieldInfo) -> str:
-    """Bounds of a field as people write them, such as "> 0, <= 1"; empty when there are none."""
+    """Return the bounds of a field, such as "> 0, <= 1"; empty without bounds."""
     parts = []
     for names in (("ge", "gt"), ("le", "lt")):
         signs = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<"}
@@ -176,7 +175,7 @@ def bounds_of(info: FieldInfo) -> str:
 
 
 def _limits(info: FieldInfo, *, whole: bool) -> tuple[float | None, float | None]:
-    """Least and largest value, as far as a field has bounds; open ends count as closed unless the value is whole."""
+    """Return least and largest value of a bounded field; open bounds count as closed unless it is an integer."""
     low = high = None
     for mark in info.metadata:
         low = getattr(mark, "ge", low)
@@ -188,15 +187,15 @@ def _limits(info: FieldInfo, *, whole: bool) -> tuple[float | None, float | None
     return low, high
 
 
-# --- changing it ------------------------------------------------------------------------------------------------
+# --- change ------------------------------------------------------------------------------------------------
 
 
 def checked(config: Parameters, service: str, values: Mapping[str, Any]) -> list[Change]:
-    """The change that setting values by path would be, checked as a whole by the models; nothing has changed yet.
+    """Return the changes for new values by path, validated together by the models; `apply` makes them.
 
     Raises:
-        Refused: nothing can be done: `unknown_parameter`, `needs_restart` or `bad_value`, with one line that names
-            the path, the value, and bounds or choices.
+        Refused: no value is changed: `unknown_parameter`, `needs_restart` or `bad_value`, with one line that names the
+            path, the value, and bounds or choices.
     """
     known = leaves(config, service)
     for path, value in values.items():
@@ -210,7 +209,7 @@ def checked(config: Parameters, service: str, values: Mapping[str, Any]) -> list
         raise Refused("bad_value", _with_bounds(error, known)) from None
     changes = [Change(known[path], leaf.value) for path, leaf in candidate.items() if path in values]
     for change in changes:
-        # Models read cell files, too, in which a text may be a number: here it is a slip, and true is the number 1.
+        # Models also accept text as a number, for cell files, and true as 1: here both are errors.
         number = kind_of(change.leaf.info.annotation) in ("number", "integer")
         if number and isinstance(given := values[change.leaf.path], bool | str):
             raise Refused("bad_value", _with_bounds(ConfigError(change.leaf.path, given, "must be a number"), known))
@@ -220,10 +219,10 @@ def checked(config: Parameters, service: str, values: Mapping[str, Any]) -> list
 
 
 def _candidate(config: Parameters, service: str, values: Mapping[str, Any]) -> dict[str, Leaf]:
-    """The parameters as they would be.
+    """Return the parameters with new values.
 
     Raises:
-        ConfigError: they do not fit.
+        ConfigError: they are invalid.
     """
     given = _updated(config, f"services.{service}", values)
     sections = tunable_sections(type(config))
@@ -235,7 +234,7 @@ def _candidate(config: Parameters, service: str, values: Mapping[str, Any]) -> d
 
 
 def _updated(model: BaseModel, prefix: str, values: Mapping[str, Any]) -> dict[str, Any]:
-    """The fields of a model with values by path in their places."""
+    """Return the fields of a model with new values by path."""
     given = {}
     for name in type(model).model_fields:
         path, value = f"{prefix}.{name}", getattr(model, name)
@@ -259,8 +258,8 @@ def _is_finite(value: Any) -> bool:
 
 
 def apply(changes: list[Change]) -> None:
-    """Make a change, in place: who keeps the model sees it at the next look, also on another thread all at once."""
+    """Set the new values in place; readers on any thread see all changes of a model at once."""
     for owner in {id(change.leaf.owner): change.leaf.owner for change in changes}.values():
         mine = {change.leaf.name: change.value for change in changes if change.leaf.owner is owner}
-        vars(owner).update(mine)  # sections are frozen for everybody else
+        vars(owner).update(mine)  # sections are frozen otherwise
         owner.model_fields_set.update(mine)

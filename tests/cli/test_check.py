@@ -85,7 +85,7 @@ def test_link_that_a_camera_sits_on_and_that_the_robot_has_not_is_told_with_the_
     both = str(Path(HAND).with_name("hand_and_fixed.yaml"))
     (found, *_) = check_files(load_cell(both, ["world.cameras.hand.mount=x"]))
     assert found.what.startswith("world.cameras.hand.mount: 'x' is")
-    with pytest.raises(ConfigError, match="needs position and rpy: where it sits on tcp"):
+    with pytest.raises(ConfigError, match="needs position and rpy in tcp"):
         load_cell("panda", ["world.camera={mount: tcp}"])
 
 

@@ -14,7 +14,7 @@ from common.errors import ConfigError
 from common.supervision.wiring import wiring_of
 from common.topics import Request, Topic
 from security.access import Rights, access_control, rights_of, rights_of_recorder, rights_of_supervisor
-from security.checking import allowances, require_current
+from security.validation import allowances, require_current
 
 RENEW = "zencell secure init DIR --renew"
 PLACE = Path("certs")

@@ -16,7 +16,7 @@ from common.transport.credentials import CertificateMonitor, Credentials, creden
 from common.transport.router import Router, maintain
 from security.access import Rights, access_control
 from security.certificates import Authority
-from security.checking import certificate_in, require_valid
+from security.validation import certificate_in, require_valid
 from tests.security.holders import REFUSED, Holder
 from tests.security.test_routers import free_port
 from tools.doctor.network import certificates as findings
@@ -92,14 +92,14 @@ def test_it_is_said_30_days_and_one_day_before(
 
 def test_each_end_is_logged_once_and_once_more_when_it_is_urgent(folder: Path) -> None:
     watch = CertificateMonitor(folder)
-    assert watch.look() == []
-    assert len(watch.look(now_in(11))) == len(NAMES)
-    assert watch.look(now_in(12)) == []
-    assert len(watch.look(now_in(39.5))) == len(NAMES)
-    assert [urgent for urgent, _ in watch.look(now_in(41))] == [True] * len(NAMES)
-    assert watch.look(now_in(42)) == []
+    assert watch.new_warnings() == []
+    assert len(watch.new_warnings(now_in(11))) == len(NAMES)
+    assert watch.new_warnings(now_in(12)) == []
+    assert len(watch.new_warnings(now_in(39.5))) == len(NAMES)
+    assert [urgent for urgent, _ in watch.new_warnings(now_in(41))] == [True] * len(NAMES)
+    assert watch.new_warnings(now_in(42)) == []
     own = CertificateMonitor(folder, frozenset(["panda.camera"]))
-    ((_, line),) = own.look(now_in(11))
+    ((_, line),) = own.new_warnings(now_in(11))
     assert "the certificate of panda.camera expires on" in line
     assert f"`zencell secure renew {folder}`" in line
 

@@ -10,7 +10,7 @@ import pytest
 from common.errors import ConfigError
 from common.transport.credentials import credentials_of, observer_identity, require_open_cell
 from security.certificates import Authority, write_secret
-from security.checking import require_valid
+from security.validation import require_valid
 
 RENEW = "zencell secure init DIR --renew"
 
@@ -47,7 +47,7 @@ def now_in(days: float) -> datetime.datetime:
     return datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=days)
 
 
-@pytest.mark.parametrize(("days", "reason"), [(11, "has run out"), (-1, "does this clock go right")])
+@pytest.mark.parametrize(("days", "reason"), [(11, "expired on"), (-1, "check the clock here")])
 def test_a_certificate_out_of_its_time_is_named(folder: Path, days: float, reason: str) -> None:
     with pytest.raises(ConfigError, match=reason):
         require_valid(folder, ["panda.camera"], RENEW, now_in(days))
@@ -56,7 +56,7 @@ def test_a_certificate_out_of_its_time_is_named(folder: Path, days: float, reaso
 def test_one_that_ran_out_before_its_authority_is_named_with_what_would_do(folder: Path) -> None:
     authority = Authority.load(folder / "ca.pem", folder / "ca.key")
     authority.issue("panda.camera", [], 2, folder / "panda.camera.pem", folder / "panda.camera.key")
-    with pytest.raises(ConfigError, match=r"panda\.camera\.pem.*has run out.*--renew"):
+    with pytest.raises(ConfigError, match=r"panda\.camera\.pem.*expired on.*--renew"):
         require_valid(folder, ["panda.camera"], RENEW, now_in(3))
 
 

@@ -16,7 +16,7 @@ from common.supervision.launch import Launch
 from common.supervision.multi_host import HostOptions
 from common.transport.credentials import ACCESS, ROUTER_NAME
 from security.certificates import Authority
-from security.requiring import require_secured
+from security.preflight import require_secured
 from tests.harness import free_domain
 
 CELL = load_cell("panda")
@@ -95,7 +95,7 @@ def test_a_certificate_that_has_run_out_is_named_with_its_day(
     else:
         own.issue(name, [], -1, *place)
     line = refusal("up", "panda")
-    assert line.startswith(f"--secure: '{place[0]}' has run out on 20")
+    assert line.startswith(f"--secure: '{place[0]}' expired on 20")
     assert remedy in line
 
 
@@ -159,7 +159,7 @@ def test_only_what_this_host_starts_has_to_be_there(folder: Path, monkeypatch: p
     ("override", "wanted"),
     [
         ("robot.gripper=null", "robot.gripper: is missing: scene_manager needs a robot with one"),
-        ("robot.urdf=package://example-robot-data/robots/nobody/nobody.urdf", "nobody.urdf' is not there"),
+        ("robot.urdf=package://example-robot-data/robots/nobody/nobody.urdf", "nobody.urdf' is missing"),
         ("services.scene_manager.nothing=3", "services.scene_manager.nothing: 3 is not a parameter"),
     ],
 )
@@ -186,4 +186,4 @@ def test_a_service_that_crashes_before_it_declares_anything_is_named(refusal: Re
         name, [], 10, folder / f"{name}.pem", folder / f"{name}.key"
     )
     line = refusal("run", "small.yaml", code=1)
-    assert line == "services.crashes: does not get as far as saying what it declares: KeyError('a bug')"
+    assert line == "services.crashes: failed before it declared its topics: KeyError('a bug')"

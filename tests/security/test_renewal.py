@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from cli.main import app
-from security.checking import certificate_in, hosts_in, require_valid
+from security.validation import certificate_in, hosts_in, require_valid
 
 LOCAL = {"localhost", "127.0.0.1", "::1"}
 Init = Callable[..., Path]

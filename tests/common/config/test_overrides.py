@@ -67,7 +67,7 @@ def test_a_service_goes_by_the_last_part_of_its_module(tmp_path: Path) -> None:
     ("a: " + 100_000 * "{b: ", "nested deeper than 64 levels"), ("a:\n  " + 100_000 * "- ", "nested deeper"),
     ("a: &a {b: *a}", "does not parse at line 1, column 11: 'a' contains itself"),
     ("a0: &a0 [0]\n" + "".join(f"a{n}: &a{n} [*a{n - 1}]\n" for n in range(1, 1000)), "line 64, .* than 64 levels"),
-    ("made: !!bool x", "does not parse: a value is not of its kind"),
+    ("made: !!bool x", "does not parse: a value does not fit its tag"),
     ("".join(f"a{n}: &a{n} [{','.join(10 * [f'*a{n - 1}' if n else '0'])}]\n" for n in range(9)), "more than 1000000"),
 ])
 def test_a_file_that_can_not_be_used_is_named(tmp_path: Path, text: str, said: str) -> None:

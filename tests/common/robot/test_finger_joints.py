@@ -153,8 +153,8 @@ def test_width_and_position_of_a_turning_jaw_are_inverse(opens: int, width: floa
 
 @pytest.mark.parametrize(("wrong", "message"), [
     ({"max_width": 0.2}, "gripper.jaw opens by 0.1036 m at most, max_width is 0.2 m"),
-    ({"closed": 0.1}, "gripper.closed is of fingers that slide"),
-    ({"joints": ["jaw", "other"]}, "gripper.jaw is of one joint"),
+    ({"closed": 0.1}, "gripper.closed is for sliding fingers"),
+    ({"joints": ["jaw", "other"]}, "gripper.jaw needs exactly one joint"),
 ])
 def test_impossible_turning_jaw_is_refused(wrong: dict[str, object], message: str) -> None:
     with pytest.raises(ConfigError, match=message):

@@ -1,4 +1,4 @@
-"""Whether a folder of certificates fits the cell that is to be secured with it, found before anything is started."""
+"""Validate a folder of certificates against the cell that it is to secure, before any process starts."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from common.transport.credentials import credentials_of
 from security.access import Rights, access_control
 
 FIELD = "--secure"
-AFRESH = "make it anew with `zencell secure init`"
+REMEDY = "make it anew with `zencell secure init`"
 
 
 def require_valid(folder: Path, names: Iterable[str], renew: str, now: datetime.datetime | None = None) -> None:
-    """Return when each of these common names has a certificate and the key to it, of the authority and in its time.
+    """Return if each common name has a valid certificate of the authority, and its key.
 
     Args:
         folder: of the certificates.
-        names: of the processes that are to be started.
-        renew: command line that makes them anew.
-        now: instead of the time of this machine.
+        names: of the processes to start.
+        renew: command line that renews them.
+        now: time of the check; by default the current time.
 
     Raises:
-        ConfigError: names the first that is missing, is not of this authority, or has run out.
+        ConfigError: names the first that is missing, is not of this authority, or has expired.
     """
     if not folder.is_dir():
         raise ConfigError(FIELD, str(folder), "is not a folder; make one with `zencell secure init DIR`")
@@ -42,9 +42,9 @@ def require_valid(folder: Path, names: Iterable[str], renew: str, now: datetime.
         if not authorities:
             certificate_in(own.authority)
             authorities = x509.load_pem_x509_certificates(own.authority.read_bytes())
-            _require_in_time(own.authority, authorities[0], at, f"`{renew}`")
+            _require_unexpired(own.authority, authorities[0], at, f"`{renew}`")
         certificate = certificate_in(own.certificate)
-        _require_in_time(own.certificate, certificate, at, f"`{renew}`")
+        _require_unexpired(own.certificate, certificate, at, f"`{renew}`")
         try:
             _require_issued(certificate, authorities)
             key = serialization.load_pem_private_key(own.key.read_bytes(), password=None)
@@ -65,17 +65,17 @@ def _require_issued(certificate: x509.Certificate, authorities: Iterable[x509.Ce
 def require_current(
     folder: Path, rules: Mapping[str, Any], cell: str, rights: Mapping[str, Rights], renew: str
 ) -> None:
-    """Return when the rules let each process do exactly what it declares.
+    """Return if the rules allow each process exactly what it declares.
 
     Args:
-        folder: where the rules are from.
-        rules: `access_control` as the router would be given it.
+        folder: of the rules.
+        rules: `access_control` section for the router.
         cell: name of the cell.
-        rights: of each of its processes, as they are now.
-        renew: command line that makes them anew.
+        rights: current ones of each of its processes.
+        renew: command line that renews the rules.
 
     Raises:
-        ConfigError: names the first process that has no rules or others, and what is different.
+        ConfigError: names the first process without rules or with different ones, and the difference.
     """
     wanted = allowances(access_control({cell: rights}))
     given = allowances(rules)
@@ -89,7 +89,7 @@ def require_current(
 
 
 def allowances(rules: Mapping[str, Any]) -> dict[str, dict[str, set[str]]]:
-    """What each common name is allowed: key expressions by the kind of rule, such as `reads`."""
+    """Return what each common name may do: key expressions by the kind of rule, such as `reads`."""
     by_id = {rule["id"]: rule for rule in rules["rules"]}
     found: dict[str, dict[str, set[str]]] = {}
     for policy in rules["policies"]:
@@ -101,13 +101,13 @@ def allowances(rules: Mapping[str, Any]) -> dict[str, dict[str, set[str]]]:
 
 
 def common_name_in(certificate: x509.Certificate) -> str:
-    """The common name that a certificate is for."""
+    """Return the common name of a certificate."""
     names = certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
     return str(names[0].value) if names else ""
 
 
 def hosts_in(certificate: x509.Certificate) -> list[str]:
-    """The names and addresses at which the holder of a certificate is reached."""
+    """Return the names and addresses at which the holder of a certificate listens."""
     try:
         found = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
     except x509.ExtensionNotFound:
@@ -116,23 +116,23 @@ def hosts_in(certificate: x509.Certificate) -> list[str]:
 
 
 def certificate_in(path: Path) -> x509.Certificate:
-    """The certificate that a file holds.
+    """Return the certificate of a file.
 
     Raises:
-        ConfigError: it holds none.
+        ConfigError: the file has none.
     """
     try:
         return x509.load_pem_x509_certificate(path.read_bytes())
     except ValueError:
-        raise ConfigError(FIELD, str(path), f"is not a certificate: {AFRESH}") from None
+        raise ConfigError(FIELD, str(path), f"is not a certificate: {REMEDY}") from None
 
 
-def _require_in_time(path: Path, certificate: x509.Certificate, now: datetime.datetime, remedy: str) -> None:
+def _require_unexpired(path: Path, certificate: x509.Certificate, now: datetime.datetime, remedy: str) -> None:
     until, since = certificate.not_valid_after_utc, certificate.not_valid_before_utc
     if now > until:
-        raise ConfigError(FIELD, str(path), f"has run out on {until:%Y-%m-%d}: {remedy}")
+        raise ConfigError(FIELD, str(path), f"expired on {until:%Y-%m-%d}: {remedy}")
     if now < since:
-        raise ConfigError(FIELD, str(path), f"is valid from {since:%Y-%m-%d %H:%M} UTC on: does this clock go right?")
+        raise ConfigError(FIELD, str(path), f"is valid from {since:%Y-%m-%d %H:%M} UTC on: check the clock here")
 
 
 def _differences(wanted: Mapping[str, set[str]], given: Mapping[str, set[str]]) -> Iterable[str]:

@@ -1,4 +1,4 @@
-"""What `run` and `up` do with `--secure DIR`: all of it is looked at before anything is started."""
+"""Checks of `run` and `up` with `--secure DIR`, before any process starts."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ if TYPE_CHECKING:
     from common.config import Cell
     from common.supervision.launch import Launch
 
-LOOK_TIMEOUT = 120.0  # [s] for the services to declare what they need
-SAID = "zencell: "  # before the line in which a command says what is wrong
+WIRING_TIMEOUT = 120.0  # [s] for the services to declare their keys
+PREFIX = "zencell: "  # of the error line of a command
 
 
 class NotSecured(ZencellError):
-    """The certificates do not fit the cell, or its services cannot say what they need."""
+    """The certificates do not fit the cell, or its services cannot declare their keys."""
 
     def __init__(self, message: str, exit_code: int = 2) -> None:
         super().__init__(message)
@@ -28,10 +28,10 @@ class NotSecured(ZencellError):
 
 
 def choose(folder: str | None) -> None:
-    """Have this process and all that it starts use a folder of certificates, if one was given.
+    """Use a folder of certificates, if given, in this process and its children.
 
     Raises:
-        ConfigError: it is not there.
+        ConfigError: it does not exist.
     """
     from common.transport.credentials import SECURE_VARIABLE
 
@@ -43,7 +43,7 @@ def choose(folder: str | None) -> None:
 
 
 def with_near(launch: Launch) -> Launch:
-    """The launch with a router of its own in a secured cell listening near what is started with it, too."""
+    """Return the launch; in a secured cell its own router also listens at endpoints for services of this host."""
     from common.supervision.launch import free_endpoints
     from common.transport.credentials import secure_folder
 
@@ -51,14 +51,14 @@ def with_near(launch: Launch) -> Launch:
 
 
 def require_secured(launch: Launch, cell: Cell) -> None:
-    """Return when the cell is an open one, or what this host starts of it can be: router, supervisor, its services.
+    """Return if the cell is open, or if router, supervisor and services of this host have valid certificates and rules.
 
     Args:
-        launch: how the cell was asked for.
-        cell: resolved, with the services that are to be started here.
+        launch: options of the cell.
+        cell: resolved, with the services to start here.
 
     Raises:
-        ConfigError, NotSecured: one line that names the process, what is wrong and what would do.
+        ConfigError, NotSecured: one line that names the process, the problem and the remedy.
     """
     from common.transport.credentials import ROUTER_NAME, SUPERVISOR, common_name, read_access, secure_folder
     from common.transport.endpoint import is_encrypted
@@ -68,7 +68,7 @@ def require_secured(launch: Launch, cell: Cell) -> None:
         return
     if launch.connect and not is_encrypted(launch.connect):
         raise ConfigError("--connect", launch.connect, "is an open endpoint: with --secure it must be tls/HOST:PORT")
-    from security.checking import require_valid
+    from security.validation import require_valid
 
     services = [entry.name for entry in cell.services.values()]
     names = [common_name(cell.name, process) for process in (SUPERVISOR, *services)]
@@ -79,22 +79,22 @@ def require_secured(launch: Launch, cell: Cell) -> None:
 
 
 def require_recorder(launch: Launch, cell: Cell) -> None:
-    """Return when the cell is an open one, or its recorder has a certificate.
+    """Return if the cell is open, or if its recorder has a valid certificate.
 
     Raises:
-        ConfigError: it has none that is valid.
+        ConfigError: it has none.
     """
     from common.transport.credentials import RECORDER, common_name, secure_folder
 
     folder = secure_folder()
     if folder is not None:
-        from security.checking import require_valid
+        from security.validation import require_valid
 
         require_valid(folder, [common_name(cell.name, RECORDER)], renewal(str(folder), launch.cell))
 
 
 def _require_rules(launch: Launch, services: Sequence[str], folder: Path) -> None:
-    # In a process of its own: what the services import would stay in this one for as long as the cell is up.
+    # In a child process: the imports of the services would stay in the memory of this one while the cell is up.
     from common.supervision.launch import module_command
 
     command = [*module_command("cli.main"), "secure", "check", str(folder), "--only-rules", "--cell", launch.cell,
@@ -107,18 +107,18 @@ def _require_rules(launch: Launch, services: Sequence[str], folder: Path) -> Non
         command += ["--seed", str(launch.seed)]
     try:
         done = subprocess.run(
-            command, env=launch.environment(), capture_output=True, text=True, timeout=LOOK_TIMEOUT, check=False,
+            command, env=launch.environment(), capture_output=True, text=True, timeout=WIRING_TIMEOUT, check=False,
         )
     except subprocess.TimeoutExpired:
-        raise NotSecured(f"--secure: the services did not declare what they need within {LOOK_TIMEOUT:g} s") from None
+        raise NotSecured(f"--secure: the services did not declare their keys within {WIRING_TIMEOUT:g} s") from None
     if done.returncode:
         lines = done.stderr.strip().splitlines() or [f"`secure check` ended with {done.returncode}"]
-        said = [line.removeprefix(SAID) for line in lines if line.startswith(SAID)] or lines
-        raise NotSecured(said[-1], done.returncode)
+        errors = [line.removeprefix(PREFIX) for line in lines if line.startswith(PREFIX)] or lines
+        raise NotSecured(errors[-1], done.returncode)
 
 
 def renewal(folder: str, cell: str) -> str:
-    """The command line that makes certificates and rules for a cell anew."""
+    """Return the command line that renews certificates and rules of a cell."""
     from common.config import names_of
 
     chosen = "" if cell in names_of("cells") else f" --cell {cell}"
