@@ -301,7 +301,7 @@ class Executor:
         return self._controlled.order(request.act, *request.values)
 
     def order_outcome(self, number: int) -> str | None:
-        """Return the outcome of an order to the arm's own controller, once: "" or the reason of its failure; else None."""
+        """Return the outcome of an order to the arm's controller, once: "" or the reason of its failure; else None."""
         assert self._controlled is not None
         return self._controlled.outcome(number)
 
