@@ -179,7 +179,8 @@ async def test_request_from_before_the_start_may_have_been_executed_and_is_refus
         close = GripperCommand(header=client.bus.header(), id="b", width=0.02)
     async with executor(clock=client.bus.clock) as client:
         for answer in (await client.execute.call(there), await client.command.call(close)):
-            assert (answer.state, answer.error) == ("rejected", "stale_request") and "before the executor started" in answer.message
+            assert (answer.state, answer.error) == ("rejected", "stale_request")
+            assert "before the executor started" in answer.message
         now = close.model_copy(update={"header": client.bus.header(), "id": "c"})
         assert (await client.command.call(now)).state == "active"
         assert (await client.command.call(GripperCommand(id="d", width=0.03))).state == "active", "without a stamp"
@@ -212,7 +213,8 @@ async def test_request_executed_by_an_earlier_executor_while_this_one_waited_is_
         may_continue.set()
         await waiting
         answer = await ExecutorClient(other, clock).execute.call(there)
-        assert (answer.state, answer.error) == ("rejected", "stale_request") and "before the executor started" in answer.message
+        assert (answer.state, answer.error) == ("rejected", "stale_request")
+        assert "before the executor started" in answer.message
 
 
 # --- invalid messages ---
