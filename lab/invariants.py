@@ -85,14 +85,14 @@ class WorldInvariants:
         if edited or not self._ids:
             self._ids = ids
         if checks.fails(ids == self._ids and len(set(ids)) == len(ids), OBJECTS):
-            checks.report(OBJECTS, f"{ids} instead of {self._ids}")
+            checks.add_violation(OBJECTS, f"{ids} instead of {self._ids}")
         found: dict[str, tuple[str, Position]] = {}
         for each in objects:
             position = each["pose"]["position"]
             found[each["id"]] = each["state"], (position["x"], position["y"], position["z"])
         held = [name for name, (state, _) in found.items() if state == "held"]
         if checks.fails(len(held) <= 1, OBJECTS):
-            checks.report(OBJECTS, f"{held} are held at once")
+            checks.add_violation(OBJECTS, f"{held} are held at once")
         for name, (state, position) in found.items():
             before, old_position = self._objects.get(name, (state, position))
             self._objects[name] = state, position
@@ -100,7 +100,7 @@ class WorldInvariants:
             legal = (edited or self._physics or state in CARRIED or before in CARRIED
                      or (state == before and distance < MOVED))
             if checks.fails(legal and state != LOST, OBJECTS):
-                checks.report(OBJECTS, f"{name} changed from {before} to {state} by itself, {distance:.3f} m")
+                checks.add_violation(OBJECTS, f"{name} changed from {before} to {state} by itself, {distance:.3f} m")
 
     def on_end(self, done: int, state: str) -> None:
         """Compare the final ground truth with what the task reports."""
@@ -108,11 +108,11 @@ class WorldInvariants:
         if state == "DONE" and self._fills and not self._physics:  # with physics one camera cannot count a pile
             contained = sum(label == CONTAINED for label, _ in self._objects.values())
             if checks.fails(done == contained, COUNTED):
-                checks.report(COUNTED, f"the task reports {done}, the ground truth has {contained}")
+                checks.add_violation(COUNTED, f"the task reports {done}, the ground truth has {contained}")
         if state == "DONE" and self._truth_check is not None and self._newest:
             problem = self._truth_check(decode(WorldObjects, self._newest))
             if checks.fails(not problem, ACCEPTED):
-                checks.report(ACCEPTED, problem)
+                checks.add_violation(ACCEPTED, problem)
 
 
 class Invariants:
@@ -179,13 +179,13 @@ class Invariants:
             last = self._publishing.setdefault(service, instance)
             successor = self._replaced.get(instance, "")
             if checks.fails(not successor or self._isolated & {instance, successor}, SINGLE):
-                checks.report(SINGLE, f"{instance} publishes {sample.key} after {successor} did")
+                checks.add_violation(SINGLE, f"{instance} publishes {sample.key} after {successor} did")
             if instance != last:
                 self._replaced[last], self._publishing[service] = instance, instance
         if service in self.truth_readers and service not in self._doubles:
             model = self._messages.get(sample.encoding.rpartition(";")[2], Message)
             if checks.fails(issubclass(model, PUBLISHED_BY_CAMERAS), TRUTH):
-                checks.report(TRUTH, f"{service} reads it and publishes {sample.key}")
+                checks.add_violation(TRUTH, f"{service} reads it and publishes {sample.key}")
         if sample.key == self._motion_key:
             self.motion.on_motion(instance, decode(MotionStatus, sample.payload))
         elif sample.key == self._gripper_key:
@@ -206,7 +206,7 @@ class Invariants:
         if isinstance(request, WITH_ID):
             known = self._by_id.setdefault(request.id, request)
             if self.checks.fails(known is request or known == request, ONCE):
-                self.checks.report(ONCE, f"{request.id} is the id of two different requests: "
+                self.checks.add_violation(ONCE, f"{request.id} is the id of two different requests: "
                                           f"{type(known).__name__} and {type(request).__name__}")
         self.motion.on_request(service, request)
         if isinstance(request, WorldEdit):
@@ -222,12 +222,12 @@ class Invariants:
         checks, requests, now = self.checks, self._requests, self.checks.now()
         for service, key, end in requests.open.values():
             if checks.fails(now <= end + LATE, OUTCOMES):
-                checks.report(OUTCOMES, f"{key} of {service} should have ended by {end:.1f} s")
+                checks.add_violation(OUTCOMES, f"{key} of {service} should have ended by {end:.1f} s")
         checks.checked[OUTCOMES] += requests.started
         for unexpected in requests.unexpected[self._reported:]:
-            checks.report(OUTCOMES, unexpected)
+            checks.add_violation(OUTCOMES, unexpected)
         for repeated in requests.repeated[:1]:
-            checks.report(NEWER, repeated)
+            checks.add_violation(NEWER, repeated)
         checks.checked[NEWER] = requests.read
         self._reported = len(requests.unexpected)
 

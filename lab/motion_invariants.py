@@ -63,8 +63,8 @@ class Checks:
         self.checked[invariant] += 1
         return not holds
 
-    def report(self, invariant: str, detail: str) -> None:
-        """List a violation."""
+    def add_violation(self, invariant: str, detail: str) -> None:
+        """Record a violation of an invariant."""
         if len(self.broken) < MOST_BROKEN:
             self.broken.append(f"{self.now():.3f} s: {invariant}: {detail}")
 
@@ -137,7 +137,7 @@ class MotionInvariants:
             known.instance, known.active = instance, ""
         before = self._ended.get((key, goal), "")
         if checks.fails(not before or state == before, ONCE):
-            checks.report(ONCE, f"{key}: {goal} is {state} after it was {before}")
+            checks.add_violation(ONCE, f"{key}: {goal} is {state} after it was {before}")
         if state in ENDED:
             self._ended[key, goal] = state
             if goal == known.active:
@@ -145,13 +145,13 @@ class MotionInvariants:
         elif state == "active":
             # A newer gripper goal ends the older one.
             if checks.fails(not known.active or goal == known.active or key == self._gripper, TWO):
-                checks.report(TWO, f"{key}: {goal} is active while {known.active} is")
+                checks.add_violation(TWO, f"{key}: {goal} is active while {known.active} is")
             if goal != known.active and checks.fails(goal not in self._never, NEVER):
-                checks.report(NEVER, goal)
+                checks.add_violation(NEVER, goal)
             if goal != known.active and goal in self._requested_at:
                 age = checks.now() - self._requested_at[goal]
                 if checks.fails(age <= OLDEST, FRESH):
-                    checks.report(FRESH, f"{goal} starts {age:.2f} s after its first request")
+                    checks.add_violation(FRESH, f"{goal} starts {age:.2f} s after its first request")
             known.active = goal
 
     # --- set-points ---------------------------------------------------------------------------------------------------
@@ -169,7 +169,7 @@ class MotionInvariants:
         checks, fastest = self._checks, 1.03 * limits.velocity
         fits = (q >= limits.lower - 2e-3) & (q <= limits.upper + 2e-3) & (np.abs(dq) <= fastest)
         if checks.fails(fits.all(), LIMITS):  # NaN fails too
-            checks.report(LIMITS, f"q {np.round(q, 4).tolist()}, dq {np.round(dq, 3).tolist()}")
+            checks.add_violation(LIMITS, f"q {np.round(q, 4).tolist()}, dq {np.round(dq, 3).tolist()}")
         last, self._last = self._last, (q.copy(), dq.copy(), now)
         if last is None:
             return
@@ -177,7 +177,7 @@ class MotionInvariants:
         before, self._moving = self._moving, current_incarnation()
         if passed <= 0 or passed > STALL or before is not self._moving:  # another process, or one that stalled
             if checks.fails((step <= JUMP * self._cycle / CYCLES).all(), LIMITS):
-                checks.report(LIMITS, f"a jump of {step.max():.3f} rad after {passed:.3f} s")
+                checks.add_violation(LIMITS, f"a jump of {step.max():.3f} rad after {passed:.3f} s")
             return
         self._check_step(limits, fastest, last, passed, step, dq)
         if self._cap_at is None:
@@ -194,11 +194,11 @@ class MotionInvariants:
         """Check the change of position and velocity against the set-point before."""
         checks = self._checks
         if checks.fails((step <= fastest * min(passed, self._cycle) + 1e-3).all(), LIMITS):
-            checks.report(LIMITS, f"a step of {step.max():.4f} rad in {passed * 1e3:.1f} ms")
+            checks.add_violation(LIMITS, f"a step of {step.max():.4f} rad in {passed * 1e3:.1f} ms")
         velocity = 0.0 * last[1] if passed > self._cycle else last[1]  # after a late cycle: from standstill
         change = np.abs(dq - velocity)
         if checks.fails((change <= 1.1 * limits.braking * max(passed, self._cycle / CYCLES) + 1e-3).all(), LIMITS):
-            checks.report(LIMITS, f"velocity changes by {change.max():.3f} rad/s in {passed * 1e3:.1f} ms")
+            checks.add_violation(LIMITS, f"velocity changes by {change.max():.3f} rad/s in {passed * 1e3:.1f} ms")
 
     def _check_permission(self, fastest: Vector, step: float, dq: Vector, now: float) -> None:
         """Check that the arm may move, and as fast as it does."""
@@ -206,22 +206,22 @@ class MotionInvariants:
         active = goals.active if goals is not None else ""
         self._without_goal = 0 if self.jogging or active else self._without_goal + 1
         if checks.fails(self._without_goal <= UNREPORTED, GOAL):
-            checks.report(GOAL, f"{step:.4f} rad without one")
+            checks.add_violation(GOAL, f"{step:.4f} rad without one")
         resting = self._held_since is not None and now - self._held_since >= AT_REST
         self._while_held = self._while_held + 1 if resting else 0
         if checks.fails(self._while_held <= UNREPORTED, HELD):
-            checks.report(HELD, f"it moves {step:.4f} rad")
+            checks.add_violation(HELD, f"it moves {step:.4f} rad")
         if self._cap < 1 and self._cap_at is not None and now - self._cap_at >= AT_REST:
             too_fast = np.abs(dq) > fastest * self._cap + 1e-3
             if checks.fails(not too_fast.any(), SLOW):
-                checks.report(SLOW, f"dq {np.round(dq, 3).tolist()} at {self._cap:.0%}")
+                checks.add_violation(SLOW, f"dq {np.round(dq, 3).tolist()} at {self._cap:.0%}")
         brakes = (current_incarnation() is self._stopped_by and self._stopped_at is not None
                   and now - self._stopped_at < AT_REST)
         requested = self.jogging or (goals is not None and active in self._of_operators)
         unrequested = self._stopped and not brakes and not requested
         self._unrequested = self._unrequested + 1 if unrequested else 0
         if checks.fails(self._unrequested <= UNREPORTED, UNREQUESTED):
-            checks.report(UNREQUESTED, f"it moves {step:.4f} rad for {active or 'no goal'}")
+            checks.add_violation(UNREQUESTED, f"it moves {step:.4f} rad for {active or 'no goal'}")
 
     # --- requests -----------------------------------------------------------------------------------------------------
 
@@ -262,7 +262,7 @@ class MotionInvariants:
             before = self._accepted.setdefault((instance, request.id), accepted)
             if checks.fails(before == accepted, ONCE):
                 decision = "accepted" if before else "rejected"
-                checks.report(ONCE, f"{request.id} was {decision}, then requested again and {answer.state}: "
+                checks.add_violation(ONCE, f"{request.id} was {decision}, then requested again and {answer.state}: "
                                     f"{answer.message}")
 
     def on_answer(self, service: str, request: Message, answer: Message) -> None:
@@ -272,7 +272,7 @@ class MotionInvariants:
         if getattr(request, "goal", "") not in ("", answer.id):
             return
         if self._checks.fails(answer.held, HELD):
-            self._checks.report(HELD, f"it is not held when {service} requests it")
+            self._checks.add_violation(HELD, f"it is not held when {service} requests it")
 
 
 def control_rate(cell: Cell) -> float:

@@ -91,9 +91,10 @@ def read_layout(file: BinaryIO, path: Path) -> Layout:
             described, descriptions = described + length, descriptions + 1
         if described > MOST_DESCRIBED or descriptions > MOST_DESCRIPTIONS:
             raise RecordingError(f"{path}: has {descriptions:,} descriptions in {described:,} B, "
-                                 "more than any recording")
+                                 "more than a real recording has")
         if count > MOST_SHORT and content < count * SHORT:
-            raise RecordingError(f"{path}: has {count:,} records in its first {content:,} B, more than any recording")
+            raise RecordingError(f"{path}: has {count:,} records in its first {content:,} B, "
+                                 "more than a real recording has")
         try:
             _add_record(found, opcode, content, length, file)
         except DAMAGE:

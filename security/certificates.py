@@ -164,7 +164,7 @@ def make(
     if renew and not key.is_file():
         raise ConfigError("--renew", str(place), f"has no {key.name} to sign with")
     if not renew and certificate.exists():
-        raise ConfigError("DIR", str(place), "has certificates already: --renew replaces all but the authority")
+        raise ConfigError("DIR", str(place), "has certificates already: --renew replaces all except the authority")
     place.mkdir(parents=True, exist_ok=True, mode=0o700)
     authority = Authority.load(certificate, key) if renew else Authority.new(days)
     if not renew:

@@ -194,10 +194,11 @@ def fit_world(robot: RobotModel, cell: dict[str, Any]) -> dict[str, Any]:
     """
     gripper = robot.config.gripper
     if gripper is None:
-        raise ConfigError("--cell", ..., "needs a robot with a gripper: it is to take things")
+        raise ConfigError("--cell", ..., "needs a robot with a gripper, because the task picks objects")
     radius = round(min(BALL, (gripper.max_width - ROOM) / 2), 3)
     if radius < SMALLEST:
-        raise ConfigError("gripper.max_width", gripper.max_width, f"is too narrow for a ball of {2 * SMALLEST:g} m")
+        raise ConfigError("gripper.max_width", gripper.max_width,
+                          f"is too narrow for the smallest ball, {2 * SMALLEST:g} m in diameter")
     geometry, most = RobotGeometry(robot), 0
     for heights in GRASPS:
         grasp = Grasp.model_validate(heights)

@@ -41,7 +41,7 @@ async def run(bus: Bus, config: Config) -> None:
     robot = RobotModel.load(config.robot)
     camera = MountedCamera(config.world.camera, robot).at()
     if config.robot.gripper is None:
-        raise ConfigError("robot.gripper", ..., "is missing: what takes objects needs one")
+        raise ConfigError("robot.gripper", ..., "is missing: this task picks objects and needs a gripper")
     scene = PerceivedScene(config, config.world, config.robot.gripper, config.robot.tcp_link)
     await out.begin(scene.scene())
     await bus.ready()

@@ -67,7 +67,7 @@ class Frames:
         try:
             async with asyncio.timeout(TIMEOUT):
                 while not self._known(target, source):
-                    await self._until_changed()
+                    await self._wait_for_transform()
         except TimeoutError:
             self._require_some()
             self.tree.path(target, source)
@@ -86,7 +86,7 @@ class Frames:
         try:
             async with asyncio.timeout(TIMEOUT):
                 while outdated():
-                    await self._until_changed()
+                    await self._wait_for_transform()
         except TimeoutError:
             raise self._silent(outdated()) from None
 
@@ -109,11 +109,11 @@ class Frames:
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(TIMEOUT):
                 while not self.tree.frames:
-                    await self._until_changed()
+                    await self._wait_for_transform()
         self._require_some()
         await asyncio.sleep(GATHER_TIME)
 
-    async def _until_changed(self) -> None:
+    async def _wait_for_transform(self) -> None:
         self._changed.clear()
         await self._changed.wait()
 

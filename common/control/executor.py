@@ -300,8 +300,8 @@ class Executor:
             raise Refused("busy", f"goal {self.arm.goal!r} is still being followed: stop it first")
         return self._controlled.order(request.act, *request.values)
 
-    def outcome(self, number: int) -> str | None:
-        """Return None while an order runs, then once "" for success or the reason of its failure."""
+    def order_outcome(self, number: int) -> str | None:
+        """Return the outcome of an order to the arm's controller, once: "" or the reason of its failure; else None."""
         assert self._controlled is not None
         return self._controlled.outcome(number)
 

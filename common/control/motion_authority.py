@@ -49,12 +49,13 @@ def check_age(age: float, longest: float, clock_tolerance: float, uptime: float 
     """
     if age > longest:
         what = f"is {age:.1f} s old" if age < 1e6 else "does not say when it was decided (header.stamp)"
-        return Refused(STALE, f"the request {what}: more than {longest:g} s, or the clocks differ")
+        return Refused(STALE, f"the request {what}, but at most {longest:g} s are allowed (or the clocks of the hosts "
+                              "differ)")
     if age > uptime:
-        return Refused(STALE, f"the request was decided {age - uptime:.1f} s before the executor began: it may have "
+        return Refused(STALE, f"the request was decided {age - uptime:.1f} s before the executor started: it may have "
                               "been executed already")
     if age < -clock_tolerance:
-        return Refused(AHEAD, f"the request is from {-age:.1f} s ahead: the requester's clock is wrong, or ours")
+        return Refused(AHEAD, f"the request is from {-age:.1f} s in the future: set the clocks of both hosts")
     return None
 
 

@@ -258,7 +258,7 @@ class RequestHandlers:
         if self._world is not None:
             self._world.start_step()
         for number in list(self._orders):
-            outcome = self._executor.outcome(number)
+            outcome = self._executor.order_outcome(number)
             if outcome is not None and not (order := self._orders.pop(number)).done():
                 order.set_result(outcome)
 

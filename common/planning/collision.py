@@ -116,7 +116,7 @@ class CollisionWorld:
         self._far.set(disabled, margins)
         self._kernel = self._bank.kernel()
         if self._kernel is not None:
-            self._kernel.set_rules(_least(self._far))
+            self._kernel.set_rules(_required_distances(self._far))
             (constraints or ToolConstraints.none(robot)).attach_to_kernel(self._kernel)
         self._penetrating: Rules | None = None  # pairs whose depth at the start coal measures; the kernel cannot
         self._near = self._rules_at_start(disabled, margins)
@@ -155,7 +155,8 @@ class CollisionWorld:
             return
         tool = self.robot.model.frames[self.robot.tcp_frame]
         self._kernel.set_rules(
-            _least(self._far), _least(self._near), tool.parentJoint, np.array(tool.placement.translation), self._origin,
+            _required_distances(self._far), _required_distances(self._near), tool.parentJoint,
+            np.array(tool.placement.translation), self._origin,
             self.contact_distance,
         )
 
@@ -163,7 +164,7 @@ class CollisionWorld:
         """Return pairs that are too close at the start, with the level's margin added."""
         if self._kernel is None:
             return self._far.pairs(self.start, level) if self._far.hit(self.start, level) else []
-        least = _least(self._far)
+        least = _required_distances(self._far)
         more = np.where(least > CONTACT_ALLOWED, MARGINS[level] * self._bank.shares, 0.0)
         return np.flatnonzero(self._kernel.distances(self.start)[0] <= least + more).tolist()
 
@@ -231,7 +232,7 @@ class CollisionWorld:
         if self._kernel is not None:
             hit = self._kernel.colliding(q)
             if hit >= 0:
-                close = self._kernel.distances(q)[0] <= _least(self.rules_at(q))
+                close = self._kernel.distances(q)[0] <= _required_distances(self.rules_at(q))
                 return self.pair(int(close.argmax()) if close.any() else hit)
         rules = self._coal_rules_at(q)
         if rules is None or not rules.hit(q):
@@ -407,8 +408,8 @@ def _pairs_named(bank: ObstacleBank, names: Sequence[str], allowed: Iterable[Pai
     return frozenset(found)
 
 
-def _least(rules: Rules) -> Array:
-    """Return (pairs,) [m] the required distances, CONTACT_ALLOWED for pairs that may touch or penetrate."""
+def _required_distances(rules: Rules) -> Array:
+    """Return the required distance of each pair (pairs,) [m], CONTACT_ALLOWED for pairs that may touch."""
     least = np.where(rules.margins < 0, CONTACT_ALLOWED, rules.margins)
     least[list(rules.disabled)] = CONTACT_ALLOWED
     return least

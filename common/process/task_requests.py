@@ -148,7 +148,7 @@ class TaskRequests(Generic[V]):
         return None
 
     async def _deliver(self, answer: m.MotionStatus | m.GripperState) -> None:
-        """Pass the answer of a goal to the task; after repeated refusals with a growing delay."""
+        """Pass the reply to a goal to the task; delay it more and more after repeated rejections."""
         self._refused = self._refused + 1 if answer.state == "rejected" else 0
         if self._refused > 1:
             await asyncio.sleep(min(REFUSAL_DELAY * 2 ** min(self._refused - 2, 10), LONGEST_REFUSAL_DELAY))

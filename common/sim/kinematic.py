@@ -173,7 +173,7 @@ class KinematicWorld(WorldEvents):
         self._between = {}
         self._add_event("remove", body)
         self._lower_layers(slot, now)
-        self._drop_supported(block, now)
+        self._drop_bodies_above(block, now)
 
     def _carry(self, body: Body, T_world_tcp: Array) -> None:
         assert body.grip is not None
@@ -224,13 +224,13 @@ class KinematicWorld(WorldEvents):
                     self._add_event("remove", body)
                     self._drop(body, now)
 
-    def _drop_supported(self, gone: Any, now: float) -> None:
-        """Let what lay on something fall, which is no longer there."""
+    def _drop_bodies_above(self, gone: Any, now: float) -> None:
+        """Let the bodies fall that lay on a body that is gone."""
         for body in self._ground.unsupported_by(gone, self._bodies):
             block = body.block()
             self._add_event("remove", body)
             self._release(body, now)
-            self._drop_supported(block, now)
+            self._drop_bodies_above(block, now)
 
     # --- edits ---
 
@@ -272,7 +272,7 @@ class KinematicWorld(WorldEvents):
         if body.slot_taken != slot or rest is None:
             self._lower_layers(slot, now)
         if block is not None:
-            self._drop_supported(block, now)
+            self._drop_bodies_above(block, now)
         self.version += 1
         return body.name
 

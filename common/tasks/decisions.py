@@ -63,8 +63,8 @@ class TaskDecisions(Generic[V]):
             if base.__module__.startswith(f"{__package__}."):
                 for name in vars(cls).keys() & vars(base).keys():
                     if name.startswith("_") and not name.startswith("__"):
-                        raise TypeError(f"{cls.__name__}.{name}: {base.__name__} has a method of that name for itself; "
-                                        "choose another")
+                        raise TypeError(f"{cls.__name__}.{name}: {base.__name__} already has a private method of "
+                                        "that name; rename yours")
 
     def __init__(self, config: TaskConfig, status: m.TaskStatus, prefix: str, speed: float = 1.0) -> None:
         """Start with nothing known.

@@ -59,7 +59,7 @@ class Handling(Task[View]):
     p: HandlingConfig
 
     def __init__(self, config: HandlingConfig, status: m.TaskStatus, prefix: str, speed: float = 1.0) -> None:
-        """Start with nothing known: see `Task`."""
+        """Start without an object; the arguments are those of `Task`."""
         super().__init__(config, status, prefix, speed)
         self._tries: Counter[str] = Counter()  # failed attempts by object id
         self._problem = ""  # reason of the last failed attempt

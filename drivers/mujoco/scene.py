@@ -72,7 +72,7 @@ def convex_pieces(solid: Solid) -> list[Array]:
     Concave prisms are split into triangles, rings into wedges; each connected part of a mesh becomes its convex hull.
     """
     if solid.shape == "mesh":
-        return _connected(solid.mesh)
+        return _connected_parts(solid.mesh)
     heights = np.array([solid.low[2], solid.high[2]])
     if solid.shape == "ring":
         outer, inner = float(solid.high[0]), solid.inner_radius
@@ -87,8 +87,8 @@ def convex_pieces(solid: Solid) -> list[Array]:
             for section in sections]
 
 
-def _connected(triangles: Array) -> list[Array]:
-    """Points (n, 3) of each connected part of triangles (n, 3, 3)."""
+def _connected_parts(triangles: Array) -> list[Array]:
+    """Split triangles (n, 3, 3) into connected parts; return the distinct points (m, 3) of each."""
     points, corners = np.unique(triangles.reshape(-1, 3), axis=0, return_inverse=True)
     corners = corners.reshape(-1, 3)
     lowest = np.arange(len(points))

@@ -179,7 +179,7 @@ class Chaos:
         if topic.kind == "request":
             self._record(fault)
             for _ in range(fault.count):
-                payload = nonsense(topic.message, _stateless(fault, rng), rng)
+                payload = invalid_payload(topic.message, _stateless(fault, rng), rng)
                 await self._bus.raw_get(key, 0.5, payload=payload, encoding=encoding)
             return
         real = None if fault.form in STATELESS_FORMS else await self._sample(key)
@@ -206,7 +206,7 @@ class Chaos:
         """Return a damaged payload with its attachment: of the real writer, or of a stranger."""
         attachment = decode_attachment(real.attachment) if real else None
         if real is None or attachment is None:
-            payload = nonsense(model, _stateless(fault, rng), rng)
+            payload = invalid_payload(model, _stateless(fault, rng), rng)
             own = Attachment("chaos", int(rng.integers(2**31)), checksum=checksum_of(key, payload))
             return payload, encode_attachment(own) if rng.random() < 0.5 else b""
         return next_damaged(real, attachment, fault.form, rng)
@@ -284,10 +284,10 @@ def damaged(payload: bytes, form: Form, rng: np.random.Generator) -> bytes:
     return bytes(flipped)
 
 
-def nonsense(model: type[Message], form: Form, rng: np.random.Generator) -> bytes:
-    """Return bytes of a stateless form that are no valid message of the model.
+def invalid_payload(model: type[Message], form: Form, rng: np.random.Generator) -> bytes:
+    """Return a damaged payload that no reader accepts as a message of the model.
 
-    An empty map, for example, is a valid stop request.
+    Damaged bytes may be valid by chance: an empty map, for example, is a valid stop request.
     """
     while True:
         payload = damaged(b"", form, rng)

@@ -46,7 +46,7 @@ class Truth:
     _labelled: list[TrueObject] | None = None
 
     def on_objects(self, message: m.WorldObjects) -> None:
-        """Take world objects; in old recordings they have no state."""
+        """Store the true objects of a message; old recordings lack their state and are ignored."""
         if all("state" in each.model_fields_set for each in message.objects):
             self._objects = [TrueObject(_xyz(each.pose), each.state, each.container) for each in message.objects]
 

@@ -30,12 +30,12 @@ MAX_LATENCIES = 20_000  # of frames; then the older half is dropped: at 10 Hz th
 
 @dataclass
 class Rejected:
-    """Rejected positions without duplicates."""
+    """Positions at which the task rejected an object, with the newest reason for each."""
 
     places: list[Rejection] = field(default_factory=list)
 
     def add(self, rejections: Iterable[Rejection]) -> None:
-        """Add rejections; a newer one replaces that of the same position."""
+        """Add rejected objects; a newer one replaces an older one at the same position [m]."""
         at = [_place(known.position) for known in self.places]
         for rejection in rejections:
             if NOT_LEFT_BEHIND in rejection.reason:

@@ -44,7 +44,7 @@ TOKEN = "the-token-of-this-page-0123456789"
 TRUTH = {"panda/scene_balls", "panda/scene_objects"}
 MARK = b"attack"
 SERVICES = 9
-NO_WATCHDOGS = ("--set", "watchdogs.silence=0", "--set", "watchdogs.loop=0")  # a process that dies was killed by the attack
+NO_WATCHDOGS = ("--set", "watchdogs.silence=0", "--set", "watchdogs.loop=0")  # no process is restarted
 
 
 @dataclass

@@ -60,7 +60,7 @@ def test_existing_certificates_are_not_overwritten_by_mistake(
     capsys.readouterr()
     assert app.execute(["secure", "init", "certs", "--cell", "small.yaml"]) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert line == "zencell: DIR: 'certs' has certificates already: --renew replaces all but the authority"
+    assert line == "zencell: DIR: 'certs' has certificates already: --renew replaces all except the authority"
     (folder / "ca.key").unlink()
     assert app.execute(["secure", "init", "certs", "--cell", "small.yaml", "--renew"]) == 2
     (line,) = capsys.readouterr().err.splitlines()

@@ -147,7 +147,7 @@ class KernelWorld:
         """
         given = np.ascontiguousarray(spheres, dtype=float)
         if index not in self._points:
-            raise IndexError(f"shape {index} is no set of points")
+            raise IndexError(f"shape {index} is not a point set: only add_points() creates one")
         if given.ndim != 2 or given.shape[1] != 4 or not (np.abs(given) < _LARGEST).all() or (given[:, 3] < 0).any():
             raise ValueError(f"spheres of shape {given.shape} must be (N, 4), finite and of radius 0 or more")
         with self._lock:

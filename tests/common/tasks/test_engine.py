@@ -384,7 +384,7 @@ def test_execute_request_names_plan_and_scene() -> None:
 
 
 def test_overriding_a_private_method_of_the_engine_is_rejected() -> None:
-    with pytest.raises(TypeError, match=r"Mine\._count: Task has a method of that name for itself; choose another"):
+    with pytest.raises(TypeError, match=r"Mine\._count: Task already has a private method of that name; rename yours"):
         class Mine(Task[View]):
             def _count(self, view: View) -> None:
                 """A user task with a name that the engine uses."""

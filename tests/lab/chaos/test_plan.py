@@ -26,7 +26,7 @@ from common.transport.codec import (
 from common.transport.ownership import Owner
 from common.transport.reader import SequenceFilter
 from common.transport.session import RawSample
-from lab.chaos.agent import damaged, keys_of, next_damaged, nonsense
+from lab.chaos.agent import damaged, invalid_payload, keys_of, next_damaged
 from lab.chaos.plan import CELL_SECONDS, LABELS, Fault, Form, Kind, faults, plan
 
 PROCESSES = ["router", "motion_planner", "trajectory_executor", "smart_pick_place"]
@@ -133,7 +133,7 @@ def test_image_damaged_beyond_its_checksum_costs_one_image() -> None:
 def test_nonsense_is_never_a_valid_request(form: Form) -> None:
     for seed in range(200):
         with pytest.raises(DecodeError):
-            decode(StopRequest, nonsense(StopRequest, form, np.random.default_rng(seed)))
+            decode(StopRequest, invalid_payload(StopRequest, form, np.random.default_rng(seed)))
 
 
 def test_noise_without_a_checksum_is_rejected() -> None:
