@@ -44,7 +44,8 @@ TOKEN = "the-token-of-this-page-0123456789"
 TRUTH = {"panda/scene_balls", "panda/scene_objects"}
 MARK = b"attack"
 SERVICES = 9
-NO_WATCHDOGS = ("--set", "watchdogs.silence=0", "--set", "watchdogs.loop=0")  # no process is restarted
+# A process that ends was then ended by an attack.
+NO_WATCHDOGS = ("--set", "watchdogs.silence=0", "--set", "watchdogs.loop=0")
 
 
 @dataclass
