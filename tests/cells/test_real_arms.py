@@ -16,7 +16,7 @@ from tests.doubles.franka_host import FrankaHost
 from tests.doubles.ur_host import UrHost
 from tests.harness import RunningCell, until
 
-pytestmark = [pytest.mark.cell, pytest.mark.slow, pytest.mark.alone, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.cell, pytest.mark.campaign, pytest.mark.alone, pytest.mark.timeout(300)]
 
 
 def missing(module: str) -> bool:
