@@ -23,7 +23,7 @@ from common.config import load_cell
 from common.transport.bus import Bus
 from common.transport.codec import decode
 from recording.report.aggregator import RunAggregator
-from tests.harness import RunningCell, beside, folder_for
+from tests.harness import RunningCell, folder_for, running_with
 
 CELL = "panda"
 TIMEOUT = 180.0  # [s] for one run
@@ -67,7 +67,7 @@ async def record(bus: Bus, stop: asyncio.Event) -> RecordedMotion:
         async for sample in bus.raw_reader(f"{bus.cell}/{key}"):
             raw.append((key, sample.payload))
 
-    async with beside(*(keep(topic.key) for topic in recording.listeners())):
+    async with running_with(*(keep(topic.key) for topic in recording.listeners())):
         await stop.wait()
     for key, payload in raw:
         aggregator.on(key, decode(topics_by_key[key].message, payload), 0.0, 0)

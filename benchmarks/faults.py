@@ -20,7 +20,7 @@ from common import topics
 from common.config import load_cell
 from common.messages import SupervisorStatus
 from common.transport.bus import Bus
-from tests.harness import RunningCell, beside, folder_for, until
+from tests.harness import RunningCell, folder_for, running_with, until
 
 CELL = "panda"
 SPARED = "viewer"  # nothing depends on it
@@ -98,7 +98,7 @@ async def run_once(victim: str, rng: random.Random, folder: Path, speed: float) 
     """A run in which a process is killed; none, when it has no name."""
     with RunningCell(folder, "run", CELL, "--speed", f"{speed:g}") as cell:
         assassin = Assassin(cell, victim, rng)
-        async with cell.listen() as bus, beside(*([assassin.run(bus)] if victim else [])):
+        async with cell.listen() as bus, running_with(*([assassin.run(bus)] if victim else [])):
             try:
                 code = await cell.ended(TIMEOUT)
             except TimeoutError as error:

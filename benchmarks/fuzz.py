@@ -33,7 +33,7 @@ from common.transport.bus import Bus
 from common.transport.codec import decode
 from lab.simulation import Simulation
 from tests.gaps import Gaps, Side
-from tests.harness import RunningCell, beside, until
+from tests.harness import RunningCell, running_with, until
 from tests.mutations import Mutations, models
 
 CELL = "panda"  # of real processes
@@ -153,7 +153,7 @@ async def working(folder: Path, name: str) -> AsyncIterator[tuple[RunningCell, B
     with RunningCell(folder / name, "up", CELL) as cell:
         async with cell.listen() as bus:
             await until(bus.reader(topics.MOTION_STATUS), lambda status: status.progress > 0, 120.0)
-            async with beside(keep_busy(bus, Seen())):
+            async with running_with(keep_busy(bus, Seen())):
                 yield cell, bus
         cell.interrupt()
         await cell.ended(30.0)
@@ -177,7 +177,7 @@ async def live(options: argparse.Namespace, folder: Path) -> list[str]:
             before = cell.processes()
             memory = [private(before)]
             executors = [one.processes()["trajectory_executor"].pid for one in (alone, cell)]
-            async with beside(attack(attacker, Mutations(options.seed), CELL, options.pause, acts=options.acts)):
+            async with running_with(attack(attacker, Mutations(options.seed), CELL, options.pause, acts=options.acts)):
                 for _ in range(rounds):
                     both = [Gaps(one, CELL, executor) for one, executor in zip((quiet, bus), executors, strict=True)]
                     await asyncio.sleep(options.live / rounds)

@@ -41,7 +41,7 @@ from common.robot.model import RobotModel
 from common.scene.fixtures import fixture_objects
 from common.sim.objects import world_object
 from common.transport.bus import Bus, Reader
-from tests.harness import RunningCell, beside, folder_for
+from tests.harness import RunningCell, folder_for, running_with
 
 Array = NDArray[np.float64]
 
@@ -95,7 +95,7 @@ async def watch(bus: Bus, seen: Watched) -> None:
                 seen.ended = status.header.stamp
             before = status
 
-    async with beside(
+    async with running_with(
         joints(), paths(), stamped("picture", bus.reader(topics.DEPTH_CAMERA_IMAGE)),
         stamped("contours", bus.reader(CONTOURS)), stamped("points", bus.reader(CONTOUR_POINTS)),
         stamped("scene", bus.reader(topics.PLANNING_SCENE)),

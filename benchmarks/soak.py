@@ -40,7 +40,7 @@ from common.messages import WorldEdit
 from common.transport.bus import Bus
 from tests.cells.losses import Losses
 from tests.cells.subscribers import Subscriber
-from tests.harness import LOG, RunningCell, beside, until
+from tests.harness import LOG, RunningCell, running_with, until
 
 CELL = "panda"
 PERIOD = 10.0  # [s] between looks
@@ -213,7 +213,7 @@ def _counted(seen: Seen, wrong: list[str]) -> list[str]:
 async def disturbed(endpoint: str) -> AsyncIterator[None]:
     """A slow and a stuck subscriber to everything, during the block."""
     with Subscriber(endpoint, f"{CELL}/**", 1.0), Subscriber(endpoint, f"{CELL}/**", 0) as stuck:
-        async with beside(freeze_and_wake(stuck)):
+        async with running_with(freeze_and_wake(stuck)):
             yield
 
 
@@ -253,7 +253,7 @@ async def soak(options: argparse.Namespace, folder: Path) -> int:
             watching = (watch_processes(cell, seen, options.period), keep_busy(bus, seen), count(bus, seen))
             disturbance = nullcontext() if options.alone else disturbed(cell.endpoint)
             before = descriptors_of_router(cell)
-            async with disturbance, beside(*watching):
+            async with disturbance, running_with(*watching):
                 await until_over(cell, seen, end)
                 losses.stop()
             left = await descriptors_left(cell, before)

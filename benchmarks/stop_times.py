@@ -23,7 +23,7 @@ from common.config import load_cell
 from common.messages import JointState, TaskCommand, TaskStatus, WorldEdit
 from common.robot.model import RobotModel
 from common.transport.bus import Bus, Client, Reader
-from tests.harness import RunningCell, beside, folder_for, until
+from tests.harness import RunningCell, folder_for, running_with, until
 
 FAST = 0.6  # share of the fastest that the cell's default scaling allows
 SETTLE = 0.3  # [s] between two looks
@@ -90,7 +90,7 @@ async def stops(cell: RunningCell, count: int, seed: int) -> list[Stop]:
     found: list[Stop] = []
     async with cell.listen() as bus:
         watch = Watch(bus, cell.name)
-        async with beside(watch.start_again()):
+        async with running_with(watch.start_again()):
             for command in [("pause", "resume")] * count + [("stop", "start")] * count:
                 found.append(await watch.stop(*command, rng))
     return found

@@ -14,7 +14,7 @@ if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
 
 # No deadlines: a busy machine is no failure. Speed is measured by benchmarks.
 settings.register_profile("thorough", deadline=None)
-# `make test` runs the same few examples each time, so that a failure comes from a change.
+# The same few examples each time, so that a failure comes from a change. `make campaign` searches for new ones.
 settings.register_profile("quick", deadline=None, max_examples=25, derandomize=True, database=None)
 
 
@@ -30,9 +30,11 @@ def _separate_state(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Let `make test-all` search for new examples."""
+    """Let `make campaign` search for new examples."""
     os.environ["XDG_STATE_HOME"] = str(STATE_ROOT / "shared")
-    settings.load_profile("quick" if "not slow" in config.option.markexpr else "thorough")
+    selected = config.option.markexpr
+    campaign = "campaign" in selected and "not campaign" not in selected
+    settings.load_profile("thorough" if campaign else "quick")
 
 
 def pytest_unconfigure() -> None:

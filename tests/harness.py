@@ -199,7 +199,7 @@ class RunningCell:
         """Connect a bus to the cell as soon as its router is up."""
         return connect(cell=self.name, service="watcher", endpoint=self.endpoint, timeout=PATIENCE)
 
-    def tell(self, *arguments: str) -> subprocess.CompletedProcess[str]:
+    def command(self, *arguments: str) -> subprocess.CompletedProcess[str]:
         """Run a zencell command against this cell to its end."""
         command = command_line(*arguments, "--domain", str(self.domain))
         return subprocess.run(command, env=environment(), capture_output=True, text=True, timeout=PATIENCE, check=False)
@@ -380,7 +380,7 @@ async def until(reader: Reader[M], wanted: Callable[[M], bool], timeout: float =
 
 
 @asynccontextmanager
-async def beside(*work: Any) -> AsyncIterator[None]:
+async def running_with(*work: Any) -> AsyncIterator[None]:
     """Run coroutines during the block, cancel them at its end, and raise their exceptions."""
     tasks = [asyncio.create_task(one) for one in work]
     try:

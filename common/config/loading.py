@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -30,20 +30,20 @@ from common.config.world import CAMERA, Surroundings
 from common.errors import ConfigError, UnknownName
 from common.remapping import SERVICE_NAME, validate_table
 
-NOT_A_SERVICE = ("router", "supervisor", "recorder")  # names of processes that are no services
-SECTIONS = ("robot", "world", "pipeline", "services")  # overrides of a complete one precede those of its parts
+NOT_A_SERVICE = ("router", "supervisor", "recorder")  # names of other processes
+SECTIONS = ("robot", "world", "pipeline", "services")  # an override of a complete one precedes those of its fields
 P = TypeVar("P", bound=Parameters)
 
 
-def parse_override(text: str, given_as: str = "--set") -> tuple[list[str], Any]:
-    """Return the dotted path and the YAML value of `PATH=VALUE`; errors name the option `given_as`."""
+def parse_override(text: str, option: str = "--set") -> tuple[list[str], Any]:
+    """Return the dotted path and the YAML value of `PATH=VALUE`; errors name the `option`."""
     path, found, value = text.partition("=")
     if not found or not path.strip():
-        raise ConfigError(given_as, text, "must be PATH=VALUE, for example world.count=5, or @FILE.yaml")
+        raise ConfigError(option, text, "must be PATH=VALUE, for example world.count=5, or @FILE.yaml")
     try:
         return path.strip().split("."), parse_yaml(value)
     except (yaml.YAMLError, ValueError):  # an impossible date, for example
-        raise ConfigError(f"{given_as} {path}", value, "is not a YAML value") from None
+        raise ConfigError(f"{option} {path}", value, "is not a YAML value") from None
 
 
 def expanded(overrides: Sequence[str]) -> list[str]:
@@ -126,27 +126,56 @@ def load_cell(
     import_from_folder_of(cell)
     tree = read_yaml(path)
     parsed = [parse_override(text) for text in expanded(overrides)]
-    given = {parts[0]: value for parts, value in parsed if len(parts) == 1}  # overrides may name other files to read
-    given |= {"world": world} if world is not None else {}
-    tree |= {part: given[part] for part in SECTIONS if part in given}
-    for part in ("robot", "world", "pipeline"):
-        value = tree.get(part)
-        if isinstance(value, str):
-            # A path in the cell file is relative to it; one of an override to the working directory.
-            in_cwd = part in given and Path(value).expanduser().is_file()
-            read = {"robot": read_robot, "world": read_world}.get(part, read_yaml)
-            tree[part] = read(find_file(f"{part}s", value, None if in_cwd else path.parent))
-        elif part == "robot" and isinstance(value, dict):
-            tree[part] = with_absolute_paths(value, path.parent)
-        elif part == "world" and isinstance(value, dict):
-            tree[part] = with_files(value, path.parent)
-        elif not isinstance(value, dict):
-            raise ConfigError(part, value, f"must be a name or a mapping; choices: {', '.join(names_of(part + 's'))}")
+    _read_sections(tree, parsed, world, path.parent)
     services = tree.get("services")
     if not isinstance(services, dict):
         raise ConfigError("services", services, "must be a mapping of services in start order")
+    _apply_overrides(tree, parsed)
+    if "run" in tree:
+        raise ConfigError("run", tree["run"], "is no section of a cell: autostart and seed are top-level fields")
+    run = {"cell": tree.pop("cell", path.stem), "autostart": tree.pop("autostart", True), "seed": tree.pop("seed", 0)}
+    if seed is not None:
+        run["seed"] = seed
+    tree["run"] = run
+    tree["services"] = _service_entries(services)
+    _name_application(tree)
+    return check(Cell, tree)
+
+
+def _read_sections(
+    tree: dict[str, Any], overrides: Iterable[tuple[list[str], Any]], world: str | None, folder: Path
+) -> None:
+    """Replace complete sections as overridden, and the names of robot, world and pipeline by what their files hold.
+
+    A path in the cell file is relative to its `folder`; one of an override to the working directory.
+    """
+    overridden = {parts[0]: value for parts, value in overrides if len(parts) == 1}
+    overridden |= {"world": world} if world is not None else {}
+    tree |= {section: overridden[section] for section in SECTIONS if section in overridden}
+    for section in ("robot", "world", "pipeline"):
+        value = tree.get(section)
+        if isinstance(value, str):
+            in_cwd = section in overridden and Path(value).expanduser().is_file()
+            read = {"robot": read_robot, "world": read_world}.get(section, read_yaml)
+            tree[section] = read(find_file(f"{section}s", value, None if in_cwd else folder))
+        elif section == "robot" and isinstance(value, dict):
+            tree[section] = with_absolute_paths(value, folder)
+        elif section == "world" and isinstance(value, dict):
+            tree[section] = with_files(value, folder)
+        elif not isinstance(value, dict):
+            choices = ", ".join(names_of(f"{section}s"))
+            raise ConfigError(section, value, f"must be a name or a mapping; choices: {choices}")
+
+
+def _apply_overrides(tree: dict[str, Any], overrides: Iterable[tuple[list[str], Any]]) -> None:
+    """Set the values of all overrides, except of complete sections; services may be named without their module.
+
+    Raises:
+        UnknownName, ConfigError: there is no such service, or the path leads below a value.
+    """
+    services: dict[str, Any] = tree["services"]
     by_name = {_name_of(str(key)): key for key in services}
-    for parts, value in parsed:
+    for parts, value in overrides:
         if parts[0] == "services" and len(parts) > 1 and parts[1] not in services:
             if parts[1] not in by_name:
                 raise UnknownName("service", parts[1], by_name)
@@ -160,15 +189,6 @@ def load_cell(
             _override(tree, parts, camera)
         elif len(parts) > 1 or parts[0] not in SECTIONS:
             _override(tree, parts, value)
-    if "run" in tree:
-        raise ConfigError("run", tree["run"], "is no section of a cell: autostart and seed are top-level fields")
-    run = {"cell": tree.pop("cell", path.stem), "autostart": tree.pop("autostart", True), "seed": tree.pop("seed", 0)}
-    if seed is not None:
-        run["seed"] = seed
-    tree["run"] = run
-    tree["services"] = _service_entries(services)
-    _name_application(tree)
-    return check(Cell, tree)
 
 
 def load_robot(robot: str | Path) -> RobotConfig:
@@ -186,12 +206,12 @@ def _name_application(tree: dict[str, Any]) -> None:
     Raises:
         UnknownName, ConfigError: the application does not exist.
     """
-    task, given = tree.get("task"), tree.get("application")
+    task, application = tree.get("task"), tree.get("application")
     kinds = {name: entry["module"].rpartition(".")[2] for name, entry in tree["services"].items()}
-    if given is None and isinstance(task, str):
+    if application is None and isinstance(task, str):
         tree["application"] = application_of_task(kinds.get(task, task))
-    elif isinstance(given, str):
-        kind = find_application(given).task or given.rpartition(".")[2]
+    elif isinstance(application, str):
+        kind = find_application(application).task or application.rpartition(".")[2]
         tree.setdefault("task", next((name for name in kinds if kinds[name] == kind), kind))
 
 
@@ -215,8 +235,8 @@ def _name_of(key: str) -> str:
 def _service_entries(services: dict[str, Any]) -> dict[str, dict[str, Any]]:
     """Return the services by name, in start order."""
     entries: dict[str, dict[str, Any]] = {}
-    for key, given in services.items():
-        entry = _service_entry(str(key), given)
+    for key, parameters in services.items():
+        entry = _service_entry(str(key), parameters)
         name = entry["name"]
         if name in entries:
             before = entries[name]["module"]
@@ -226,10 +246,10 @@ def _service_entries(services: dict[str, Any]) -> dict[str, dict[str, Any]]:
     return entries
 
 
-def _service_entry(key: str, given: Any) -> dict[str, Any]:
-    if given is not None and not isinstance(given, dict):
-        raise ConfigError(f"services.{key}", given, "must be a mapping of parameters")
-    parameters = dict(given or {})
+def _service_entry(key: str, values: Any) -> dict[str, Any]:
+    if values is not None and not isinstance(values, dict):
+        raise ConfigError(f"services.{key}", values, "must be a mapping of parameters")
+    parameters = dict(values or {})
     kind = parameters.pop("service", key)
     if not isinstance(kind, str) or not kind:
         raise ConfigError(f"services.{key}.service", kind, f"must be a service; choices: {', '.join(service_names())}")
@@ -257,15 +277,15 @@ def service_config(cell: Cell, name: str, config: type[P]) -> P:
         ConfigError: names `services.<name>.<parameter>`, the value and the bounds or choices.
     """
     entry = cell.services.get(name)
-    given = dict(entry.parameters) if entry else {}
-    # A parameter of services with surroundings, which selects a camera, unless they have one of that name themselves.
+    values = dict(entry.parameters) if entry else {}
+    # `camera` selects the camera of the surroundings, unless the service declares a parameter of that name.
     sections = [info.annotation for info in config.model_fields.values() if is_section(info.annotation)]
     selects_camera = Surroundings in sections and "camera" not in config.model_fields
-    camera = given.pop("camera", None) if selects_camera else None
+    camera = values.pop("camera", None) if selects_camera else None
     if camera is not None and camera not in cell.world.cameras:
         raise ConfigError(f"services.{name}.camera", camera, f"must be one of {', '.join(cell.world.cameras)}")
     for field, info in config.model_fields.items():
         if is_section(info.annotation):
-            # A copy: each service changes its own at run time.
-            given[field] = cell.section(info.annotation, camera).model_copy()  # type: ignore[arg-type]
-    return check(config, given, f"services.{name}")
+            # A copy, because each service changes its parameters at run time.
+            values[field] = cell.section(info.annotation, camera).model_copy()  # type: ignore[arg-type]
+    return check(config, values, f"services.{name}")

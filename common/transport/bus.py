@@ -10,7 +10,6 @@ from typing import Any, TypeVar
 
 from common import topics
 from common.clock import Clock
-from common.errors import ConfigError
 from common.messages import Header, Message, ServiceCounters
 from common.remapping import Remapping
 from common.topics import Request, Topic, of_service
@@ -18,6 +17,7 @@ from common.transport.codec import DEFAULT_LIMIT
 from common.transport.ownership import SHARED, Owner, Ownership
 from common.transport.reader import Reader
 from common.transport.requests import Client, Server
+from common.transport.service_run import ServiceRun
 from common.transport.session import Declaration, RawReply, Session, alive_key, call_on_loop, serves_key
 from common.transport.tokens import Alive, TokenWatch
 from common.transport.writer import RawAccess, Writer
@@ -31,7 +31,6 @@ T = TypeVar("T", bound=Topic[Any] | Request[Any, Any])
 
 REPEAT_SECONDS = 1.0  # wall time between repetitions of a state, and between counters
 _SETTLE_SECONDS = 0.05  # after which a session knows the state that it has just reported
-_END_SECONDS = 1.0  # for a cancelled service to end
 
 
 async def _save_nothing() -> None:
@@ -65,15 +64,15 @@ class Bus(RawAccess):
         self.ready_event = asyncio.Event()
         self._limit = limit
         self._remapping = Remapping(topics)
-        self._crash: asyncio.Future[BaseException] = self._loop.create_future()
+        self._service_run = ServiceRun(service, self.log, self._withdraw)
         self._readers: list[Reader[Any]] = []
         self._writers: list[Writer[Any]] = []
         self._servers: list[Server[Any, Any]] = []
         self._tokens: list[Declaration] = []
         self._ownership = Ownership(
-            session, cell, service, loop=self._loop, warn=lambda line: self.log.warning("%s", line), lose=self._lose)
+            session, cell, service, loop=self._loop, warn=lambda line: self.log.warning("%s", line),
+            lose=self._service_run.lose_keys)
         self._deferring = self._has_keys = False
-        self._lost = False  # one of our keys to another process
         self._watches: dict[str, TokenWatch] = {}
         self._subscriptions: dict[Reader[Any], Declaration] = {}
         self._on_parameters: list[Callable[[], None]] = []
@@ -82,7 +81,6 @@ class Bus(RawAccess):
         self._counters: Writer[ServiceCounters] | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._closed = False
-        self._running = False
         self._was_connected = session.connected
         session.watch_connection(lambda: call_on_loop(self._loop, self._check_connection_soon))
         self._tick()
@@ -148,7 +146,7 @@ class Bus(RawAccess):
         self._servers.append(
             Server(
                 self._session, self.cell, self.service, served, handler, loop=self._loop, log=self.log,
-                ready=self.ready_event, crash=self._on_crash, limit=self._limit, max_pending=max_pending,
+                ready=self.ready_event, crash=self._service_run.fail, limit=self._limit, max_pending=max_pending,
                 on_overload=on_overload,
             )
         )
@@ -293,33 +291,12 @@ class Bus(RawAccess):
             (self.log.info if now else self.log.warning)("the router %s", "is back" if now else "is lost")
         self._was_connected = now
 
-    def _on_crash(self, error: BaseException) -> None:
-        if not self._running:  # a tool's bus has no service to end
-            self.log.error("the handler of a request crashed", exc_info=error)
-        elif not self._crash.done():
-            self._crash.set_result(error)
-
     async def run(self, service: Coroutine[Any, Any, None]) -> None:
         """Run a service's coroutine to its end; cancel it if a handler crashes or another process has one of its keys.
 
         A service that moves hardware brings it to rest when it is cancelled; it has a second for that.
         """
-        self._running = True
-        task = asyncio.create_task(service, name=self.service)
-        both: set[asyncio.Future[Any]] = {task, self._crash}
-        try:
-            await asyncio.wait(both, return_when=asyncio.FIRST_COMPLETED)
-            if self._lost:
-                await self._withdraw()
-        finally:
-            await self._end(task)
-        if self._crash.done():
-            raise self._crash.result()
-        await task
-
-    def _lose(self, error: ConfigError) -> None:
-        self._lost = True
-        self._on_crash(error)
+        await self._service_run.run(service)
 
     async def _withdraw(self) -> None:
         """Serve and write nothing but the log: another process has the keys."""
@@ -327,16 +304,6 @@ class Bus(RawAccess):
         for writer in self._writers:
             if not writer.topic.signed:
                 writer.raw.close()
-
-    async def _end(self, task: asyncio.Task[None]) -> None:
-        if task.done():
-            return
-        task.cancel()
-        await asyncio.wait({task}, timeout=_END_SECONDS)
-        if not task.done():
-            self.log.error("the service ignores its cancellation")
-        elif not task.cancelled() and task.exception() is not None:
-            self.log.error("crashed while it ended", exc_info=task.exception())
 
     async def close(self) -> None:
         """Undeclare all tokens and cancel running requests. The owner of the session closes the session."""

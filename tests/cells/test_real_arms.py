@@ -16,7 +16,7 @@ from tests.doubles.franka_host import FrankaHost
 from tests.doubles.ur_host import UrHost
 from tests.harness import RunningCell, until
 
-pytestmark = [pytest.mark.cell, pytest.mark.slow, pytest.mark.alone, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.cell, pytest.mark.campaign, pytest.mark.alone, pytest.mark.timeout(300)]
 
 
 def missing(module: str) -> bool:
@@ -48,7 +48,7 @@ def check_traced(cell: RunningCell, host: UrHost, stops: int = 0) -> None:
     summary = cell.summary
     assert summary["state"] == "DONE" and summary["failures"] == 0, cell.text
     assert summary["outline"]["fraction"] > 0.99, summary["outline"]
-    assert host.tell()["stops"] == stops, cell.tail()
+    assert host.command()["stops"] == stops, cell.tail()
 
 
 async def check_commands(cell: RunningCell) -> None:
@@ -68,18 +68,18 @@ async def test_outline_survives_a_protective_stop_and_a_pulled_cable(tmp_path: P
         async with cell.listen() as bus:
             robot, motion = bus.reader(topics.ROBOT_STATUS), bus.reader(topics.MOTION_STATUS)
             await until(motion, lambda status: status.progress > 0.2, WHOLE)
-            host.tell("protect")
+            host.command("protect")
             reported: RobotStatus = await until(robot, lambda status: status.mode == "protective_stop", SOON)
             assert "recover" in reported.message
             failed: MotionStatus = await until(motion, lambda status: bool(status.fault), SOON)
             assert failed.state == "aborted" and failed.error == "hardware_fault"
-            before = host.tell("normal")  # the pendant alone releases nothing
+            before = host.command("normal")  # the pendant alone releases nothing
             await until(robot, lambda status: "was stopped" in status.message, SOON)
-            now = host.tell()
+            now = host.command()
             assert now["commands"] == before["commands"] and not any(now["qd"])
             await bus.client(topics.ROBOT_COMMAND).call(RobotCommand(act="recover", owner="tester"), SOON)
             await until(motion, lambda status: status.state == "active" and status.progress > 0.2, WHOLE)
-            host.tell("pull 1")
+            host.command("pull 1")
             await until(robot, lambda status: status.mode == "disconnected", SOON)
             await until(robot, lambda status: status.mode == "running", SOON)
             assert await cell.ended(WHOLE) == 0, cell.tail()
@@ -95,15 +95,15 @@ async def test_outline_survives_a_long_disconnection_and_a_controller_reboot(
         async with cell.listen() as bus:
             robot, motion = bus.reader(topics.ROBOT_STATUS), bus.reader(topics.MOTION_STATUS)
             await until(motion, lambda status: status.progress > 0.2, WHOLE)
-            host.tell(f"pull {PULLED}")
+            host.command(f"pull {PULLED}")
             await until(robot, lambda status: status.mode == "disconnected", SOON)
             await until(robot, lambda status: status.mode == "running", PULLED + SOON)
             await until(motion, lambda status: status.state == "active" and status.progress > 0.2, WHOLE)
-            host.tell("reboot 2")
+            host.command("reboot 2")
             await until(robot, lambda status: status.mode == "off", SOON)
-            before = host.tell()
+            before = host.command()
             await until(motion, lambda status: "without power" in status.fault, SOON)
-            now = host.tell()
+            now = host.command()
             assert (now["commands"], now["q"]) == (before["commands"], before["q"]) and now["mode"] == "POWER_OFF"
             await bus.client(topics.ROBOT_COMMAND).call(RobotCommand(act="enable", owner="tester"), SOON)
             assert await cell.ended(WHOLE) == 0, cell.tail()
@@ -113,7 +113,7 @@ async def test_outline_survives_a_long_disconnection_and_a_controller_reboot(
 @on_ur
 async def test_outline_is_traced_at_thirty_percent_of_the_speed_slider(tmp_path: Path) -> None:
     with UrHost("127.0.0.53", q=HOME) as host, outliner(tmp_path, host) as cell:
-        host.tell("slider 0.3")
+        host.command("slider 0.3")
         async with cell.listen() as bus:
             motion = bus.reader(topics.MOTION_STATUS)
             await until(motion, lambda status: status.state == "active" and status.progress > 0.2, WHOLE)
@@ -121,7 +121,7 @@ async def test_outline_is_traced_at_thirty_percent_of_the_speed_slider(tmp_path:
             await check_commands(cell)
             assert await cell.ended(WHOLE + SOON) == 0, cell.tail()
         check_traced(cell, host)
-        assert host.tell()["fastest"] <= 0.3 * 3.14159 * 1.05
+        assert host.command()["fastest"] <= 0.3 * 3.14159 * 1.05
 
 
 def picker(folder: Path) -> RunningCell:

@@ -41,6 +41,6 @@ def test_running_cell_lists_several_services_of_a_kind_by_name(tmp_path: Path) -
         info = json.loads(place.ask("topic", "echo", "left/camera/camera_info", "-n", "1", "--json").stdout)
         assert info["header"]["frame_id"] == "left_optical_frame"
         # A second instance is refused, also when a user starts it.
-        twice = cell.tell("service", "left_camera", "--cell", CELL)
+        twice = cell.command("service", "left_camera", "--cell", CELL)
         assert twice.returncode == 2
         assert "another left_camera is up, which has left/camera/camera_info already" in twice.stderr.splitlines()[-1]

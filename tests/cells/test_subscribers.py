@@ -14,7 +14,7 @@ from common.messages import ServiceCounters, TaskCommand
 from common.transport.bus import Bus
 from tests.cells.losses import Losses
 from tests.cells.subscribers import Subscriber
-from tests.harness import RunningCell, beside, until
+from tests.harness import RunningCell, running_with, until
 
 pytestmark = [pytest.mark.cell, pytest.mark.slow]
 
@@ -36,7 +36,7 @@ async def test_slow_and_frozen_subscribers_block_no_service(tmp_path: Path) -> N
             )
             with slow, stuck:
                 stuck.freeze()
-                async with beside(newest_counters(bus, newest)):
+                async with running_with(newest_counters(bus, newest)):
                     await task.call(TaskCommand(command="start"), 10.0)
                     await until(status, lambda one: one.state in ("DONE", "ERROR"), 90.0)
                     losses.stop()

@@ -48,7 +48,7 @@ def up(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningCell]:
 
 
 def test_snapshot_of_a_running_cell_can_be_planned_from_its_files(up: RunningCell, tmp_path: Path) -> None:
-    stored = up.tell("snapshot", "ur5", str(tmp_path), "--select", "green")
+    stored = up.command("snapshot", "ur5", str(tmp_path), "--select", "green")
     assert stored.returncode == 0, stored.stderr
     names = {"camera_image.png", "depth_camera_image.png", "depth_camera_image_normalized.png", "depth_data.npy",
              "relevant_contours_pixels.json", "relevant_contours_coordinates.json",
@@ -66,19 +66,19 @@ def test_snapshot_of_a_running_cell_can_be_planned_from_its_files(up: RunningCel
 
 
 def test_missing_object_is_rejected_with_choices_and_another_is_selected(up: RunningCell) -> None:
-    refused = up.tell("task", "select", "7")
+    refused = up.command("task", "select", "7")
     assert refused.returncode == 1
     assert "there is no contour 7; choices: 0 (Object_0, " in refused.stderr
-    nonsense = up.tell("task", "select", "purple")
+    nonsense = up.command("task", "select", "purple")
     assert nonsense.returncode == 2 and "choices:" in nonsense.stderr
-    chosen = up.tell("task", "select", "red")
+    chosen = up.command("task", "select", "red")
     assert chosen.returncode == 0, chosen.stderr
     label = json.loads(chosen.stdout)["label"]
 
     async def begin() -> None:
         async with up.listen() as bus:
             await until(bus.reader(CONTOUR_PATH), lambda path: path.object == label)
-            started = up.tell("task", "start")
+            started = up.command("task", "start")
             assert started.returncode == 0, started.stderr
             status = bus.reader(OUTLINE_STATUS)
             await until(status, lambda s: s.object == label and s.stage == "approach", 60)

@@ -88,7 +88,7 @@ def test_printed_zenoh_cli_command_decodes_the_topics(up: RunningCell) -> None:
 
 @pytest.mark.slow
 def test_camera_publishes_at_most_about_ten_images_a_second(up: RunningCell) -> None:
-    answer = up.tell("topic", "hz", "camera/image_raw", "--count", "3", "--json")
+    answer = up.command("topic", "hz", "camera/image_raw", "--count", "3", "--json")
     assert answer.returncode == 0, answer.stderr
     last = json.loads(answer.stdout.splitlines()[-1])
     assert 1 < last["hz"] < 13  # fewer on a machine that is busy
@@ -129,7 +129,7 @@ async def test_terminal_jogs_the_arm_and_releases_it_when_killed(up: RunningCell
      "zencell: --seconds: 99.0 must be more than 0 and at most 60 s\n"),
 ])
 def test_taking_releasing_and_jogging_print_one_line(up: RunningCell, arguments: list[str], wanted: str) -> None:
-    said = up.tell("robot", *arguments)
+    said = up.command("robot", *arguments)
     assert re.fullmatch(wanted, said.stdout + said.stderr)
 
 

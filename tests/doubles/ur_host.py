@@ -27,7 +27,7 @@ class UrHost:
         self._orders = socket.create_connection((host, ORDERS))
         self._file = self._orders.makefile("rw")
 
-    def tell(self, order: str = "state") -> dict[str, Any]:
+    def command(self, order: str = "state") -> dict[str, Any]:
         """Give an order; how the arm is."""
         self._file.write(order + "\n")
         self._file.flush()

@@ -47,11 +47,11 @@ def rig(host: UrHost) -> Iterator[Rig]:
 
 def test_arm_is_read_where_it_is_and_follows_from_there(host: UrHost, rig: Rig) -> None:
     rig.until("")
-    assert np.allclose(rig.arm.read(0.0)[0], host.tell()["q"], atol=1e-3)
+    assert np.allclose(rig.arm.read(0.0)[0], host.command()["q"], atol=1e-3)
     assert np.allclose(rig.arm.read(0.0)[0], [0, -1.57, 0.5, -1.57, 0, 0], atol=1e-6), "it has not moved"
     assert rig.swing(SWING) == ""
     rig.until("")
-    state = host.tell()
+    state = host.command()
     assert state["commands"] > 100 and state["stops"] == 0 and state["fastest"] < 1.0
 
 
@@ -59,7 +59,7 @@ def test_ceasing_set_points_bring_the_arm_to_rest(host: UrHost, rig: Rig) -> Non
     rig.until("")
     assert rig.swing(SWING / 4) == ""
     end = time.monotonic() + TIMEOUT
-    while max(map(abs, host.tell()["qd"])) > 1e-3:  # without set-points
+    while max(map(abs, host.command()["qd"])) > 1e-3:  # without set-points
         assert time.monotonic() < end
         time.sleep(PERIOD)
     assert "ceased to come" in rig.until("ceased to come")
@@ -69,7 +69,8 @@ def test_ceasing_set_points_bring_the_arm_to_rest(host: UrHost, rig: Rig) -> Non
 def test_short_hold_up_of_the_driver_does_not_stop_the_arm(host: UrHost, rig: Rig) -> None:
     rig.until_it_moves()
     rig.until("")
-    stops, (driver,) = host.tell()["stops"], [child for child in multiprocessing.active_children() if child.is_alive()]
+    stops = host.command()["stops"]
+    (driver,) = [child for child in multiprocessing.active_children() if child.is_alive()]
     assert rig.target is not None
     q0, began, gaps = rig.target, time.monotonic(), [0.4, 0.8, 1.2]
     while (t := time.monotonic() - began) < np.pi and not rig.cycle(
@@ -82,7 +83,7 @@ def test_short_hold_up_of_the_driver_does_not_stop_the_arm(host: UrHost, rig: Ri
             rig.arm.read(0.0)
             assert rig.arm.delay > rig.arm.ahead + 0.03 + 0.03, "readings are that old"
             os.kill(driver.pid or 0, signal.SIGCONT)
-    assert host.tell()["stops"] == stops and rig.arm.late > 0.03, rig.problems[-3:]
+    assert host.command()["stops"] == stops and rig.arm.late > 0.03, rig.problems[-3:]
     rig.until_it_moves()
 
 
@@ -120,7 +121,7 @@ def test_ended_program_is_reported_at_once_and_restarted(
     messages, receive = list[str](), rig.arm._process.on_message
     monkeypatch.setattr(rig.arm._process, "on_message",
                         lambda message: (messages.append(message.state.message), receive(message)))
-    host.tell("end")
+    host.command("end")
     assert rig.wave(2.0) != "", "it comes to rest"
     rig.until_it_moves()
     assert any("its program has ended" in message for message in messages)
@@ -142,30 +143,30 @@ def test_arm_that_brakes_by_itself_reports_it_before_it_is_at_rest(
     assert max(map(abs, next(each for each in messages if each.ceased).state.dq)) > 0.05, "while it moves"
     while problem := rig.cycle(None, 0 * SIX):
         assert "ceased to come" in problem, "no other problem until it is at rest"
-    assert max(map(abs, host.tell()["qd"])) < FASTEST / 2, "half of what was, for servoJ smooths: what it is sent rests"
+    assert max(map(abs, host.command()["qd"])) < FASTEST / 2, "servoJ smooths, but the set-points have stopped"
 
 
 def test_protective_stop_is_reported_and_ends_only_on_request(host: UrHost, rig: Rig) -> None:
     rig.until("")
-    host.tell("protect")
+    host.command("protect")
     assert rig.wave(2.0) != ""
     rig.until("protective stop")
     assert rig.arm.state.mode == "protective_stop"
-    host.tell("normal")  # at the pendant: that alone moves nothing
+    host.command("normal")  # at the pendant: that alone moves nothing
     rig.until("was stopped for safety")
-    where = host.tell()["q"]
+    where = host.command()["q"]
     assert rig.done(rig.arm.order("recover")) == ""
     rig.until("")
-    assert np.allclose(host.tell()["q"], where) and rig.swing(0.3) == "", rig.problems[-6:]
+    assert np.allclose(host.command()["q"], where) and rig.swing(0.3) == "", rig.problems[-6:]
 
 
 def test_protective_stop_persists_over_a_lost_link(host: UrHost, rig: Rig) -> None:
     rig.until("")
-    host.tell("protect")
+    host.command("protect")
     rig.until("protective stop")
-    host.tell("pull 1")
+    host.command("pull 1")
     rig.until("no message")
-    host.tell("normal")
+    host.command("normal")
     rig.until("was stopped for safety")
     assert rig.done(rig.arm.order("recover")) == ""
     rig.until_it_moves()
@@ -181,10 +182,10 @@ def test_stop_before_a_restart_of_this_process_blocks_motions(host: UrHost, rig:
 
 def test_request_does_not_end_an_emergency_stop(host: UrHost, rig: Rig) -> None:
     rig.until("")
-    host.tell("emergency")
+    host.command("emergency")
     rig.until("emergency stop")
     assert "pressed" in rig.done(rig.arm.order("recover"))
-    host.tell("normal")
+    host.command("normal")
     rig.until("was stopped for safety")
     assert rig.done(rig.arm.order("recover")) == ""
     rig.until("")
@@ -192,17 +193,17 @@ def test_request_does_not_end_an_emergency_stop(host: UrHost, rig: Rig) -> None:
 
 def test_pulled_cable_is_reported_and_the_arm_found_where_it_stopped(host: UrHost, rig: Rig) -> None:
     rig.until("")
-    host.tell("pull 1")
+    host.command("pull 1")
     problem = rig.wave(3.0)
     assert "no message" in problem or "does not take" in problem
     rig.until("")
-    assert np.allclose(rig.arm.read(0.0)[0], host.tell()["q"], atol=1e-3)
+    assert np.allclose(rig.arm.read(0.0)[0], host.command()["q"], atol=1e-3)
     rig.until_it_moves()
 
 
 def test_restarted_controller_waits_for_power(host: UrHost, rig: Rig) -> None:
     rig.until("")
-    host.tell("reboot 1")
+    host.command("reboot 1")
     assert rig.wave(3.0) != ""
     rig.until("without power")
     assert rig.arm.state.mode == "off"
@@ -213,34 +214,34 @@ def test_restarted_controller_waits_for_power(host: UrHost, rig: Rig) -> None:
 def test_jump_is_not_played(host: UrHost, rig: Rig) -> None:
     rig.until("")
     end = time.monotonic() + TIMEOUT
-    while rig.target is None or np.abs(np.array((before := host.tell())["q"]) - rig.target).max() > 1e-3 or max(
+    while rig.target is None or np.abs(np.array((before := host.command())["q"]) - rig.target).max() > 1e-3 or max(
         map(abs, before["qd"])
     ) > 1e-3:
         rig.cycle(None, 0 * SIX)  # earlier set-points are still played
         assert time.monotonic() < end
     rig.cycle(rig.target + 0.5, 0 * SIX)
     assert "would jump" in rig.until("would jump")
-    after = host.tell()
+    after = host.command()
     assert after["stops"] == before["stops"] and np.allclose(after["q"], before["q"], atol=2e-3)
 
 
 def test_freedrive_releases_the_arm_until_it_is_ended(host: UrHost, rig: Rig) -> None:
     rig.until("")
-    assert rig.done(rig.arm.order("freedrive", 1.0)) == "" and host.tell()["freedrive"]
+    assert rig.done(rig.arm.order("freedrive", 1.0)) == "" and host.command()["freedrive"]
     assert "moved by hand" in rig.until("moved by hand")
-    assert rig.done(rig.arm.order("freedrive", 0.0)) == "" and not host.tell()["freedrive"]
+    assert rig.done(rig.arm.order("freedrive", 0.0)) == "" and not host.command()["freedrive"]
     rig.until("")
 
 
 def test_payload_is_set_and_the_slider_reported(host: UrHost, rig: Rig) -> None:
     rig.until("")
-    assert rig.done(rig.arm.order("payload", 1.25)) == "" and host.tell()["payload"][0] == 1.25
-    host.tell("slider 0.3")
+    assert rig.done(rig.arm.order("payload", 1.25)) == "" and host.command()["payload"][0] == 1.25
+    host.command("slider 0.3")
     end = time.monotonic() + TIMEOUT
     while rig.arm.state.speed != 0.3:
         rig.cycle(None, 0 * SIX)
         assert time.monotonic() < end
-    host.tell("slider 1")
+    host.command("slider 1")
     assert "cannot dance" in rig.done(rig.arm.order("dance"))
 
 
@@ -258,14 +259,14 @@ def test_payload_is_set_only_between_motions(host: UrHost, rig: Rig) -> None:
             orders.append(rig.arm.order("payload", 0.6 + 0.01 * tries))
 
     assert rig.swing(SWING, ask) == ""
-    before = host.tell()["payload"][0]
+    before = host.command()["payload"][0]
     assert "while the arm moves" in rig.done(orders[0]) and before != 0.6 + 0.01 * tries
     rig.until("")
     number = rig.arm.order("payload", 0.5, 0.0, 0.0, 0.1)
     end = time.monotonic() + TIMEOUT
     while (outcome := rig.arm.outcome(number)) is None:
         assert rig.cycle(None, 0 * SIX) == "" and time.monotonic() < end
-    assert outcome == "" and host.tell()["payload"] == [0.5, 0.0, 0.0, 0.1]
+    assert outcome == "" and host.command()["payload"] == [0.5, 0.0, 0.0, 0.1]
     assert rig.swing(SWING / 4) == "", "motions continue"
 
 
@@ -286,7 +287,7 @@ def test_cb3_controller_is_served_at_its_rate() -> None:
             rig.until("")
             assert not any("was connected" in problem for problem in rig.problems), "no fault"
             assert rig.swing(1.0) == ""
-            assert 50 < host.tell()["commands"] < 1000
+            assert 50 < host.command()["commands"] < 1000
         finally:
             rig.arm.close()
 

@@ -68,6 +68,7 @@ def poses(count: int) -> list[np.ndarray]:
     return [q for q in found if q is not None][:count]
 
 
+@pytest.mark.slow
 def test_camera_pose_is_found_from_collected_views() -> None:
     session = start()
     arm, reasons = Arm(session), []

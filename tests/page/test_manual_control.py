@@ -44,7 +44,7 @@ def arm() -> Iterator[Arm]:
 
 
 @pytest.mark.parametrize(("before", "then", "reason"), [
-    (OURS, FREE, "press the button again"), (FREE, FREE, "its controller does not take it"),
+    (OURS, FREE, "press the button again"), (FREE, FREE, "its controller does not accept it"),
     (OURS, BOBS, "owned by bob"),
 ])
 def test_held_button_without_effect_is_rejected_once_with_the_reason(
@@ -60,7 +60,7 @@ def test_next_press_is_judged_on_its_own(arm: Arm) -> None:
         arm.hold(owner)
     for owner in [FREE] * 7:
         arm.hold(owner, press=2)
-    assert len(arm.rejected) == 2 and "its controller does not take it" in arm.rejected[1]
+    assert len(arm.rejected) == 2 and "its controller does not accept it" in arm.rejected[1]
 
 
 @pytest.mark.parametrize(("joints", "names"), [

@@ -41,7 +41,7 @@ def allowed(**declared: Declared) -> dict[str, dict[str, set[str]]]:
     return allowances(access_control({"panda": cell(**declared)}))
 
 
-def test_a_service_may_do_exactly_what_it_declares() -> None:
+def test_service_may_do_exactly_what_it_declares() -> None:
     camera = allowed(camera=CAMERA)["panda.camera"]
     assert camera["writes"] == {"panda/camera/image_raw", "panda/camera/camera_info", "panda/log/camera",
                                 "panda/counters/camera"}
@@ -52,7 +52,7 @@ def test_a_service_may_do_exactly_what_it_declares() -> None:
                                   *(f"panda/owns/{key}/*/camera/*" for key in owned)}
 
 
-def test_who_calls_may_ask_and_who_serves_may_answer() -> None:
+def test_client_may_query_and_server_may_reply() -> None:
     both = allowed(task=TASK, executor=EXECUTOR)
     assert both["panda.task"]["asks"] == {"panda/gripper/command", "panda/gripper/state", "panda/param/*"}
     assert both["panda.task"]["answers"] == {"panda/param/task", "panda/counters/task"}
@@ -61,38 +61,39 @@ def test_who_calls_may_ask_and_who_serves_may_answer() -> None:
     assert "asks" not in both["panda.executor"]
 
 
-def test_everything_else_is_denied_and_every_rule_names_its_cell_but_to_hear_of_readers() -> None:
+def test_all_else_is_denied_and_only_the_rule_for_subscriptions_names_no_cell() -> None:
     control = access_control({"panda": {**cell(camera=CAMERA), "supervisor": rights_of_supervisor()}})
     assert control["enabled"] and control["default_permission"] == "deny"
     for rule in control["rules"]:
         assert rule["permission"] == "allow"
-        if rule["id"].endswith(" hears of readers"):  # in whatever expression they read
+        if rule["id"].endswith(" hears of readers"):  # readers may subscribe with any expression
             assert (rule["flows"], rule["messages"], rule["key_exprs"]) == (["egress"], ["declare_subscriber"], ["**"])
         elif rule["id"].startswith("panda."):
             assert all(key.startswith("panda/") for key in rule["key_exprs"])
 
 
 @pytest.mark.parametrize("name", ["observer", "panda.recorder"])
-def test_who_only_listens_can_ask_for_states_and_for_no_request(name: str) -> None:
+def test_observer_and_recorder_may_query_states_and_no_request(name: str) -> None:
     asks = allowances(access_control({"panda": {"recorder": rights_of_recorder()}}))[name]["asks"]
     keys = {key.partition("/")[2] for key in asks}
     assert keys == {topic.expression for topic in all_topics().values() if topic.kind == "state"}
 
 
 @pytest.mark.parametrize("name", ["panda", "ur5"])
-async def test_the_arm_is_had_recover_by_operators_and_by_the_page_and_by_nobody_else(name: str) -> None:
+async def test_only_operators_and_the_page_may_recover_the_arm(name: str) -> None:
     loaded = load_cell(name)
     rights = {entry.name: rights_of(entry.name, await wiring_of(loaded, entry)) for entry in loaded.services.values()}
     may = allowances(access_control({name: {**rights, "recorder": rights_of_recorder()}}))
-    asking = {who for who, rights in may.items() if {f"{name}/robot/command", "*/**"} & rights.get("asks", set())}
-    assert asking == {f"{name}.viewer", "operator"}
+    recover = {f"{name}/robot/command", "*/**"}
+    callers = {caller for caller, rights in may.items() if recover & rights.get("asks", set())}
+    assert callers == {f"{name}.viewer", "operator"}
 
 
-def test_rules_that_are_those_of_the_services_are_current() -> None:
+def test_rules_that_match_the_services_are_current() -> None:
     rights = cell(camera=CAMERA, task=TASK)
     rules = access_control({"panda": rights, "ur5": cell(other=EXECUTOR)})
     require_current(PLACE, rules, "panda", rights, RENEW)
-    require_current(PLACE, rules, "panda", cell(camera=CAMERA), RENEW)  # fewer are started
+    require_current(PLACE, rules, "panda", cell(camera=CAMERA), RENEW)  # a host may start only some of the services
 
 
 @pytest.mark.parametrize(
@@ -103,7 +104,7 @@ def test_rules_that_are_those_of_the_services_are_current() -> None:
         ({"task": TASK}, {"task": Declared()}, r"panda\.task than it declares now.*is allowed and not needed"),
     ],
 )
-def test_a_service_that_is_missing_or_different_is_named(
+def test_missing_or_different_rules_of_a_service_are_rejected_by_name(
     before: dict[str, Declared], now: dict[str, Declared], reason: str
 ) -> None:
     with pytest.raises(ConfigError, match=reason) as caught:
@@ -111,6 +112,6 @@ def test_a_service_that_is_missing_or_different_is_named(
     assert RENEW in str(caught.value)
 
 
-def test_operators_jog_and_observers_do_not() -> None:
+def test_operator_may_jog_and_observer_may_not() -> None:
     both = allowed(task=TASK)
     assert both["operator"]["writes"] == {"*/motion/jog"} and "writes" not in both["observer"]

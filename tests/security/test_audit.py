@@ -1,4 +1,4 @@
-"""`make audit`: what it says of a database that has findings, that has none, and that is not there."""
+"""`make audit` with a database that has findings, that has none, and that cannot be reached."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ pytestmark = pytest.mark.skipif(not (BIN / "pip-audit").exists(), reason="pip-au
 
 PINNED = dict(re.findall(r"^([\w.-]+)==(\S+)$", (ROOT / "constraints.txt").read_text(), re.M))
 FINDING = {
-    "id": "PYSEC-0000-1", "details": "made up", "summary": None, "aliases": [], "fixed_in": ["999"], "link": "",
+    "id": "PYSEC-0000-1", "details": "invented", "summary": None, "aliases": [], "fixed_in": ["999"], "link": "",
     "source": "osv", "withdrawn": None,
 }
 
@@ -33,7 +33,7 @@ def plain(name: str) -> str:
 
 
 class Database(socketserver.ThreadingTCPServer):
-    """Stands in for the package index, as a proxy that answers in its place."""
+    """A fake package index, reached as a proxy."""
 
     daemon_threads = True
 
@@ -43,17 +43,17 @@ class Database(socketserver.ThreadingTCPServer):
         authority.issue("index", ["pypi.org"], 1, folder / "index.pem", folder / "index.key")
         self.tls = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
         self.tls.load_cert_chain(folder / "index.pem", folder / "index.key")
-        self.there = True
+        self.reachable = True
         self.vulnerable: str | None = None
-        self.asked: dict[str, str] = {}
+        self.requested: dict[str, str] = {}
         super().__init__(("127.0.0.1", 0), _Connection)
 
     def answer(self, path: str) -> bytes:
         match = re.fullmatch(r"/pypi/([^/]+)/([^/]+)/json", path)
-        if match is None or not self.there:
+        if match is None or not self.reachable:
             return b"HTTP/1.1 404 Not Found\r\nContent-Length: 0\r\nConnection: close\r\n\r\n"
         name, version = plain(match[1]), match[2]
-        self.asked[name] = version
+        self.requested[name] = version
         body = json.dumps({"info": {}, "vulnerabilities": [FINDING] if name == self.vulnerable else []}).encode()
         head = f"HTTP/1.1 200 OK\r\nContent-Type: application/json\r\nContent-Length: {len(body)}\r\n"
         return f"{head}Connection: close\r\n\r\n".encode() + body
@@ -85,11 +85,11 @@ def database(tmp_path: Path) -> Iterator[Database]:
 
 @pytest.fixture
 def audit(database: Database, tmp_path: Path) -> Callable[[], subprocess.CompletedProcess[str]]:
-    """Runs what `make audit` runs, for which the stand-in is the package index."""
+    """Runs the command of `make audit` against the fake package index."""
     authority = str(tmp_path / "ca.pem")
-    kept = {name: value for name, value in os.environ.items() if not name.lower().endswith(("_proxy", "_bundle"))}
+    inherited = {name: value for name, value in os.environ.items() if not name.lower().endswith(("_proxy", "_bundle"))}
     environment = {
-        **kept, "HTTPS_PROXY": f"http://127.0.0.1:{database.server_address[1]}", "SSL_CERT_FILE": authority,
+        **inherited, "HTTPS_PROXY": f"http://127.0.0.1:{database.server_address[1]}", "SSL_CERT_FILE": authority,
         "REQUESTS_CA_BUNDLE": authority, "PIP_CACHE_DIR": str(tmp_path / "cache"), "HOME": str(tmp_path),
         "XDG_CACHE_HOME": str(tmp_path / "cache"),
     }
@@ -102,15 +102,15 @@ Audit = Callable[[], subprocess.CompletedProcess[str]]
 
 
 @pytest.mark.slow
-def test_every_version_that_is_tested_is_looked_up(database: Database, audit: Audit) -> None:
+def test_every_pinned_version_is_looked_up(database: Database, audit: Audit) -> None:
     done = audit()
     assert done.returncode == 0, done.stderr
     assert "No known vulnerabilities found" in done.stdout + done.stderr
-    assert {plain(name): version for name, version in PINNED.items()}.items() <= database.asked.items()
+    assert {plain(name): version for name, version in PINNED.items()}.items() <= database.requested.items()
 
 
 @pytest.mark.slow
-def test_a_finding_fails_and_is_named(database: Database, audit: Audit) -> None:
+def test_finding_fails_and_is_named(database: Database, audit: Audit) -> None:
     database.vulnerable = "cryptography"
     done = audit()
     assert done.returncode == 1
@@ -118,8 +118,8 @@ def test_a_finding_fails_and_is_named(database: Database, audit: Audit) -> None:
     assert found.split()[:2] == ["cryptography", PINNED["cryptography"]]
 
 
-def test_without_the_database_one_line_says_so(database: Database, audit: Audit) -> None:
-    database.there = False
+def test_unreachable_database_is_reported_in_one_line(database: Database, audit: Audit) -> None:
+    database.reachable = False
     done = audit()
     assert (done.returncode, done.stdout) == (0, "")
     (line,) = done.stderr.splitlines()

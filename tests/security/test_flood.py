@@ -1,4 +1,4 @@
-"""Connections that say nothing keep nobody out who holds a certificate."""
+"""Silent connections keep no client with a valid certificate out."""
 
 import socket
 import time
@@ -6,10 +6,10 @@ from pathlib import Path
 
 from common.transport.credentials import credentials_of
 from common.transport.router import Router
-from tests.security.holders import Holder
+from tests.security.raw_client import RawClient
 from tests.security.test_routers import free_port
 
-SILENT = 150  # Zenoh itself accepts nobody for 100 ms after each
+SILENT = 150  # Zenoh without the gate accepts no client for 100 ms after each
 WITHIN = 3.0  # [s]
 
 
@@ -17,15 +17,15 @@ def test_silent_connections_keep_no_valid_certificate_out(certificates: Path) ->
     port = free_port()
     with Router([f"tls/127.0.0.1:{port}"], certificates):
 
-        def lets_in() -> float:
+        def seconds_to_connect() -> float:
             began = time.monotonic()
-            holder = credentials_of("operator", certificates)
-            with Holder(f"tls/127.0.0.1:{port}", holder, connect_ms=int(1000 * WITHIN)) as one:
-                assert one.connected
+            operator = credentials_of("operator", certificates)
+            with RawClient(f"tls/127.0.0.1:{port}", operator, connect_ms=int(1000 * WITHIN)) as client:
+                assert client.connected
             return time.monotonic() - began
 
         silent = [socket.create_connection(("127.0.0.1", port)) for _ in range(SILENT)]
-        assert lets_in() < WITHIN, "while they are there"
+        assert seconds_to_connect() < WITHIN, "while the silent ones are open"
         for each in silent:
             each.close()
-        assert lets_in() < WITHIN, "after they went"
+        assert seconds_to_connect() < WITHIN, "after the silent ones have closed"

@@ -1,4 +1,4 @@
-"""`--secure` refuses what cannot be secured before anything is started: one line that says what would do."""
+"""`--secure` refuses incomplete or invalid files before any process starts, in one line with the remedy."""
 
 from __future__ import annotations
 
@@ -27,21 +27,21 @@ Refusal = Callable[..., str]
 
 @pytest.fixture
 def folder(certificates: Path, tmp_path: Path) -> Path:
-    """A copy of the certificates, to be spoiled."""
+    """A copy of the certificates, to be damaged."""
     return Path(shutil.copytree(certificates, tmp_path / "certs"))
 
 
 @pytest.fixture
 def refusal(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: Shown) -> Refusal:
-    """Runs a command in this process, which must end with exit code 2; the one line that it writes."""
+    """Runs a command that must be refused in one line; returns that line without the program's name."""
     for variable in ("ZENCELL_SECURE", "ZENCELL_LISTEN", "ZENCELL_LINK", "ZENCELL_CONNECT"):
-        monkeypatch.setenv(variable, "")  # and taken back afterwards, whatever the command makes of it
+        monkeypatch.setenv(variable, "")  # restored afterwards, whatever the command sets
     monkeypatch.chdir(folder.parent)
-    monkeypatch.setattr(sys, "path", list(sys.path))  # services of one's own are looked for
+    monkeypatch.setattr(sys, "path", list(sys.path))  # the command adds the folder of custom services
 
     def run(*arguments: str, secure: str | None = "certs", code: int = 2) -> str:
-        given = [] if secure is None else ["--secure", secure]
-        ended = app.execute([*arguments, *given, "--domain", str(free_domain())])
+        options = [] if secure is None else ["--secure", secure]
+        ended = app.execute([*arguments, *options, "--domain", str(free_domain())])
         shown = capsys.readouterr()
         assert shown.out == ""
         (line,) = shown.err.splitlines() or ["nothing"]
@@ -53,13 +53,15 @@ def refusal(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: Shown) -> Ref
 
 
 @pytest.mark.parametrize("verb", ["run", "up"])
-@pytest.mark.parametrize("given", ["nowhere", "certs/ca.pem", ""])
-def test_a_folder_that_is_none_is_named_with_what_makes_one(refusal: Refusal, verb: str, given: str) -> None:
-    line = refusal(verb, "panda", secure=given)
-    assert line == f"--secure: {given!r} is not a folder; make one with `zencell secure init DIR`"
+@pytest.mark.parametrize("folder_name", ["nowhere", "certs/ca.pem", ""])
+def test_missing_folder_is_named_with_the_command_that_creates_one(
+    refusal: Refusal, verb: str, folder_name: str
+) -> None:
+    line = refusal(verb, "panda", secure=folder_name)
+    assert line == f"--secure: {folder_name!r} is not a folder; make one with `zencell secure init DIR`"
 
 
-def test_a_folder_that_the_environment_names_is_looked_at_too(
+def test_missing_folder_in_the_environment_variable_is_named(
     refusal: Refusal, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("ZENCELL_SECURE", "nowhere")
@@ -71,13 +73,13 @@ def test_a_folder_that_the_environment_names_is_looked_at_too(
     ["ca.pem", "router.pem", "router.key", "panda.supervisor.pem", "panda.vision_detector.pem", "panda.viewer.key",
      ACCESS],
 )
-def test_what_the_folder_lacks_is_named(refusal: Refusal, folder: Path, missing: str) -> None:
+def test_missing_file_is_named(refusal: Refusal, folder: Path, missing: str) -> None:
     (folder / missing).unlink()
     line = refusal("run", "panda")
     assert line == f"--secure: '{folder}' has no {missing}: make it with `zencell secure init`"
 
 
-def test_a_recorder_needs_a_certificate_of_its_own_where_one_is_started(refusal: Refusal, folder: Path) -> None:
+def test_recorder_that_is_started_needs_its_own_certificate(refusal: Refusal, folder: Path) -> None:
     (folder / "panda.recorder.key").unlink()
     line = refusal("run", "panda", "--only", "robot_state_publisher", "--record", "all.mcap")
     assert line == f"--secure: '{folder}' has no panda.recorder.key: make it with `zencell secure init`"
@@ -85,7 +87,7 @@ def test_a_recorder_needs_a_certificate_of_its_own_where_one_is_started(refusal:
 
 @pytest.mark.parametrize(("name", "remedy"), [(ROUTER_NAME, "--renew"), ("panda.smart_pick_place", "--renew"),
                                               ("ca", "--renew")])
-def test_a_certificate_that_has_run_out_is_named_with_its_day(
+def test_expired_certificate_is_named_with_its_date(
     refusal: Refusal, folder: Path, name: str, remedy: str
 ) -> None:
     own = Authority.new(-1) if name == "ca" else Authority.load(folder / "ca.pem", folder / "ca.key")
@@ -99,7 +101,7 @@ def test_a_certificate_that_has_run_out_is_named_with_its_day(
     assert remedy in line
 
 
-def test_a_certificate_of_another_authority_is_named(refusal: Refusal, folder: Path) -> None:
+def test_certificate_of_another_authority_is_named(refusal: Refusal, folder: Path) -> None:
     name = "panda.motion_planner"
     Authority.new(10).issue(name, [], 10, folder / f"{name}.pem", folder / f"{name}.key")
     assert f"{name}.pem' is not of ca.pem: `zencell secure init" in refusal("up", "panda")
@@ -107,7 +109,7 @@ def test_a_certificate_of_another_authority_is_named(refusal: Refusal, folder: P
 
 @pytest.mark.parametrize("mode", [0o640, 0o604, 0o660])
 @pytest.mark.parametrize("name", [ROUTER_NAME, "panda.trajectory_executor"])
-def test_a_key_that_others_can_read_is_named_with_the_command_that_closes_it(
+def test_key_that_others_can_read_is_named_with_the_remedy(
     refusal: Refusal, folder: Path, name: str, mode: int
 ) -> None:
     key = folder / f"{name}.key"
@@ -116,20 +118,20 @@ def test_a_key_that_others_can_read_is_named_with_the_command_that_closes_it(
 
 
 @pytest.mark.parametrize("option", ["--listen", "--link", "--connect"])
-def test_an_open_endpoint_beside_certificates_is_named(refusal: Refusal, option: str) -> None:
+def test_unencrypted_endpoint_with_certificates_is_named(refusal: Refusal, option: str) -> None:
     line = refusal("up", "panda", option, "tcp/192.168.1.10:7489")
     assert line.startswith(f"{option}: 'tcp/192.168.1.10:7489' is an open endpoint: ")
     assert line.endswith("it must be tls/HOST:PORT")
 
 
-def test_an_open_endpoint_of_the_environment_is_named_by_its_variable(
+def test_unencrypted_endpoint_of_the_environment_is_named_with_its_variable(
     refusal: Refusal, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("ZENCELL_LINK", "tls/192.168.1.10:7489, tcp/192.168.1.11:7489")
     assert refusal("up", "panda").startswith("ZENCELL_LINK: 'tcp/192.168.1.11:7489' is an open endpoint")
 
 
-def test_rules_of_other_services_are_refused_with_what_is_different(refusal: Refusal, folder: Path) -> None:
+def test_outdated_rules_are_refused_with_the_difference(refusal: Refusal, folder: Path) -> None:
     rules = (folder / ACCESS).read_text()
     (folder / ACCESS).write_text(rules.replace('"panda/detected_objects"', '"panda/something_else"'))
     line = refusal("run", "panda", "--only", "vision_detector")
@@ -137,7 +139,7 @@ def test_rules_of_other_services_are_refused_with_what_is_different(refusal: Ref
     assert line.endswith(f"`zencell secure init {folder} --renew`")
 
 
-def test_only_what_this_host_starts_has_to_be_there(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_host_needs_only_the_files_of_what_it_starts(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     part = HostOptions(only=["viewer,vision_detector"]).part_of(CELL)  # the viewer's topics depend on the complete cell
     eye = folder.parent / "eye"
     eye.mkdir()
@@ -156,22 +158,22 @@ def test_only_what_this_host_starts_has_to_be_there(folder: Path, monkeypatch: p
 
 
 @pytest.mark.parametrize(
-    ("override", "wanted"),
+    ("override", "reason"),
     [
         ("robot.gripper=null", "robot.gripper: is missing: scene_manager needs a robot with one"),
-        ("robot.urdf=package://example-robot-data/robots/nobody/nobody.urdf", "nobody.urdf' is missing"),
+        ("robot.urdf=package://example-robot-data/robots/unknown/unknown.urdf", "unknown.urdf' is missing"),
         ("services.scene_manager.nothing=3", "services.scene_manager.nothing: 3 is not a parameter"),
     ],
 )
-def test_an_override_that_a_service_can_not_run_with_is_the_line_of_the_service(
-    refusal: Refusal, override: str, wanted: str
+def test_override_that_a_service_rejects_is_reported_in_its_words(
+    refusal: Refusal, override: str, reason: str
 ) -> None:
     line = refusal("run", "panda", "--only", "scene_manager", "--set", override)
-    assert wanted in line
+    assert reason in line
     assert "Error" not in line
 
 
-def test_a_service_that_crashes_before_it_declares_anything_is_named(refusal: Refusal, folder: Path) -> None:
+def test_service_that_crashes_before_it_declares_anything_is_named(refusal: Refusal, folder: Path) -> None:
     package = folder.parent / "extra"
     package.mkdir()
     (package / "crashes.py").write_text(

@@ -1,4 +1,4 @@
-"""`zencell secure init` and `--renew`: what is made anew and what stays."""
+"""`zencell secure init --renew` replaces all certificates and leaves the authority and the router's host names."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Init = Callable[..., Path]
 
 @pytest.fixture
 def init(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Init:
-    """Makes the certificates of a small cell, or makes them anew."""
+    """Creates or renews the certificates of a small cell."""
     (tmp_path / "extra").mkdir()
     (tmp_path / "extra" / "quiet.py").write_text(
         "from common.config import Parameters as Config\nasync def run(bus, config):\n    await bus.ready()\n"
@@ -39,7 +39,7 @@ def hosts(folder: Path) -> set[str]:
     return set(hosts_in(certificate_in(folder / "router.pem")))
 
 
-def test_a_router_is_still_reached_by_its_names_when_all_but_the_authority_was_made_anew(init: Init) -> None:
+def test_renewal_leaves_the_authority_and_the_host_names_of_the_router(init: Init) -> None:
     folder = init("--host", "arm.example.org", "--host", "192.168.1.11")
     assert hosts(folder) == {*LOCAL, "arm.example.org", "192.168.1.11"}
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
@@ -52,7 +52,7 @@ def test_a_router_is_still_reached_by_its_names_when_all_but_the_authority_was_m
     assert hosts(folder) == {*LOCAL, "eye.example.org"}
 
 
-def test_certificates_that_are_there_are_not_overwritten_by_mistake(
+def test_existing_certificates_are_not_overwritten_by_mistake(
     init: Init, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = init()

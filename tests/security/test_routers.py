@@ -1,4 +1,4 @@
-"""Secured routers without a cell: two that are linked, endpoints that are not encrypted, and one made of a file."""
+"""Secured routers without a cell: linked routers, unencrypted endpoints, and a router configured by a file."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from common.transport.router import open_router
 from security.access import Rights, access_control
 from security.certificates import Authority
 from tests.harness import ROOT, environment, free_domain
-from tests.security.holders import REFUSED, Holder
+from tests.security.raw_client import REFUSAL_MS, RawClient
 
 
 def free_port() -> int:
@@ -42,42 +42,42 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_what_is_too_large_for_a_key_under_another_name_goes_no_farther_than_the_router() -> None:
+def test_size_limit_of_a_remapped_key_is_enforced_by_the_router() -> None:
     here, key = f"tcp/127.0.0.1:{free_port()}", "cell/left/camera/camera_info"
     with ExitStack() as stack:
         stack.enter_context(open_router([here], small=["left/camera/camera_info"]))
-        writer, reader = (stack.enter_context(Holder(here, None)) for _ in range(2))
-        heard = reader.hear(key)
+        writer, reader = (stack.enter_context(RawClient(here, None)) for _ in range(2))
+        received = reader.subscribe(key)
         for _ in range(100):
             writer.put(key, bytes(MAX_OTHER_BYTES + 1))
             writer.put(key, b"small")
-            if heard.samples:
+            if received.samples:
                 break
-            heard.soon(0.1)
-        assert {len(payload) for _, payload in heard.samples} == {len(b"small")}
+            received.wait_briefly(0.1)
+        assert {len(payload) for _, payload in received.samples} == {len(b"small")}
 
 
-def test_linked_routers_pass_on_what_each_lets_through_and_no_more(folder: Path) -> None:
+def test_linked_routers_forward_only_what_each_admits(folder: Path) -> None:
     here, there = (f"tls/127.0.0.1:{free_port()}" for _ in range(2))
     with ExitStack() as stack:
         stack.enter_context(open_router([here], folder))
         stack.enter_context(open_router([there], folder, [here]))
-        writer = stack.enter_context(Holder(here, credentials_of("cell.writer", folder)))
-        reader = stack.enter_context(Holder(there, credentials_of("cell.reader", folder)))
-        other = stack.enter_context(Holder(there, credentials_of("cell.reader", folder)))
-        heard = reader.hear("cell/**", "cell/seen", "cell/secret")
+        writer = stack.enter_context(RawClient(here, credentials_of("cell.writer", folder)))
+        reader = stack.enter_context(RawClient(there, credentials_of("cell.reader", folder)))
+        other = stack.enter_context(RawClient(there, credentials_of("cell.reader", folder)))
+        received = reader.subscribe("cell/**", "cell/seen", "cell/secret")
         for _ in range(100):
             writer.put("cell/secret", b"not for all")
             writer.put("cell/seen", b"for all")
             other.put("cell/seen", b"by a reader")
-            if heard.samples:
+            if received.samples:
                 break
-            heard.soon(0.1)
-        assert set(heard.samples) == {("cell/seen", b"for all")}
+            received.wait_briefly(0.1)
+        assert set(received.samples) == {("cell/seen", b"for all")}
 
 
 @pytest.mark.parametrize("option", ["--listen", "--link"])
-def test_an_open_endpoint_is_refused_beside_certificates(folder: Path, option: str) -> None:
+def test_unencrypted_endpoint_is_refused_with_certificates(folder: Path, option: str) -> None:
     open_one, tls = f"tcp/127.0.0.1:{free_port()}", f"tls/127.0.0.1:{free_port()}"
     listen, link = ([open_one], []) if option == "--listen" else ([tls], [open_one])
     with pytest.raises(ConfigError, match=f"^{option}: .*must be tls/"):
@@ -85,7 +85,7 @@ def test_an_open_endpoint_is_refused_beside_certificates(folder: Path, option: s
 
 
 @pytest.mark.parametrize("secured", [False, True])
-def test_a_router_that_is_reached_from_elsewhere_names_the_remedy_unless_it_is_secured(
+def test_router_reachable_from_other_hosts_warns_unless_it_is_secured(
     folder: Path, secured: bool
 ) -> None:
     protocol, extra = ("tls", {"ZENCELL_SECURE": str(folder)}) if secured else ("tcp", {})
@@ -98,79 +98,79 @@ def test_a_router_that_is_reached_from_elsewhere_names_the_remedy_unless_it_is_s
         assert router.stderr is not None
         router.stdin.write("go\n")
         router.stdin.flush()
-        said = [router.stderr.readline()]
-        router.stdin.close()  # its supervisor is gone: it ends
-        said += router.stderr.readlines()
-    warnings = [line for line in said if "WARNING" in line]
+        output = [router.stderr.readline()]
+        router.stdin.close()  # the router ends without its supervisor
+        output += router.stderr.readlines()
+    warnings = [line for line in output if "WARNING" in line]
     assert len(warnings) == (0 if secured else 1)
     assert all("zencell secure init DIR" in line for line in warnings)
 
 
-# --- the router's configuration as a file, for a router that is not ours ----------------------------------------------
+# --- the router's configuration as a file, for zenohd and other routers ----------------------------------------------
 
 
-def written(capsys: pytest.CaptureFixture[str], place: Path, *arguments: str) -> Path:
-    """What `zencell router config` prints, as a file."""
+def write_config(capsys: pytest.CaptureFixture[str], place: Path, *arguments: str) -> Path:
+    """Write the output of `zencell router config` to a file; return its path."""
     assert app.execute(["router", "config", *arguments]) == 0
     place.write_text(capsys.readouterr().out)
     return place
 
 
 @pytest.fixture
-def nothing_handed_down(monkeypatch: pytest.MonkeyPatch) -> None:
+def no_variables(monkeypatch: pytest.MonkeyPatch) -> None:
     for variable in ("ZENCELL_SECURE", "ZENCELL_LISTEN", "ZENCELL_LINK", "ZENCELL_DOMAIN"):
         monkeypatch.setenv(variable, "42" if variable == "ZENCELL_DOMAIN" else "")
 
 
-@pytest.mark.usefixtures("nothing_handed_down")
-def test_the_file_says_what_our_own_router_is_told(
+@pytest.mark.usefixtures("no_variables")
+def test_config_file_equals_the_configuration_of_our_router(
     capsys: pytest.CaptureFixture[str], folder: Path, tmp_path: Path
 ) -> None:
-    file = written(capsys, tmp_path / "open.json5", "--link", "tcp/192.168.1.10:7489")
-    told = router_config(["tcp/127.0.0.1:7489"], links=["tcp/192.168.1.10:7489"])
-    assert str(zenoh.Config.from_file(file)) == str(told)
-    file = written(capsys, tmp_path / "secured.json5", "--secure", str(folder), "--listen", "tls/0.0.0.0:7449",
+    file = write_config(capsys, tmp_path / "open.json5", "--link", "tcp/192.168.1.10:7489")
+    expected = router_config(["tcp/127.0.0.1:7489"], links=["tcp/192.168.1.10:7489"])
+    assert str(zenoh.Config.from_file(file)) == str(expected)
+    file = write_config(capsys, tmp_path / "secured.json5", "--secure", str(folder), "--listen", "tls/0.0.0.0:7449",
                    "--domain", "2")
-    told = router_config(["tls/0.0.0.0:7449"], credentials_of(ROUTER_NAME, folder), read_access(folder))
-    assert str(zenoh.Config.from_file(file)) == str(told)
+    expected = router_config(["tls/0.0.0.0:7449"], credentials_of(ROUTER_NAME, folder), read_access(folder))
+    assert str(zenoh.Config.from_file(file)) == str(expected)
 
 
-@pytest.mark.usefixtures("nothing_handed_down")
-def test_a_router_that_was_given_the_file_lets_in_and_passes_on_what_ours_does(
+@pytest.mark.usefixtures("no_variables")
+def test_router_with_the_config_file_enforces_the_same_rules(
     capsys: pytest.CaptureFixture[str], folder: Path, tmp_path: Path
 ) -> None:
     domain = free_domain()
-    file = written(capsys, tmp_path / "router.json5", "--secure", str(folder), "--domain", str(domain))
+    file = write_config(capsys, tmp_path / "router.json5", "--secure", str(folder), "--domain", str(domain))
     endpoint = f"tls/127.0.0.1:{port_of(domain)}"
     with zenoh.open(zenoh.Config.from_file(file)):
         with pytest.raises(zenoh.ZError):
-            Holder(endpoint, None, connect_ms=REFUSED)
-        with (Holder(endpoint, credentials_of("cell.writer", folder)) as writer,
-              Holder(endpoint, credentials_of("cell.reader", folder)) as reader):
-            heard = reader.hear("cell/**", "cell/seen", "cell/secret")
+            RawClient(endpoint, None, connect_ms=REFUSAL_MS)
+        with (RawClient(endpoint, credentials_of("cell.writer", folder)) as writer,
+              RawClient(endpoint, credentials_of("cell.reader", folder)) as reader):
+            received = reader.subscribe("cell/**", "cell/seen", "cell/secret")
             for _ in range(100):
                 writer.put("cell/secret", b"not for all")
                 writer.put("cell/seen", b"for all")
-                if heard.samples:
+                if received.samples:
                     break
-                heard.soon(0.1)
-            assert set(heard.samples) == {("cell/seen", b"for all")}
+                received.wait_briefly(0.1)
+            assert set(received.samples) == {("cell/seen", b"for all")}
 
 
-@pytest.mark.usefixtures("nothing_handed_down")
+@pytest.mark.usefixtures("no_variables")
 @pytest.mark.parametrize(
-    ("arguments", "wanted"),
+    ("arguments", "reason"),
     [
         (["--domain", "233"], "--domain: '233'"),
         (["--secure", "nowhere"], "'nowhere' is not a folder"),
         (["--listen", "here"], "--listen: 'here' must be an endpoint"),
     ],
 )
-def test_a_file_that_no_router_could_use_is_not_written(
-    capsys: pytest.CaptureFixture[str], arguments: list[str], wanted: str
+def test_invalid_options_write_no_config_file(
+    capsys: pytest.CaptureFixture[str], arguments: list[str], reason: str
 ) -> None:
     assert app.execute(["router", "config", *arguments]) == 2
     shown = capsys.readouterr()
     (line,) = shown.err.splitlines()
     assert shown.out == ""
-    assert wanted in line
+    assert reason in line

@@ -1,4 +1,4 @@
-"""A secured cell on two hosts, each with a router and no more certificates than it needs; the routers are linked."""
+"""A secured cell on two hosts with linked routers; each host has only the certificates that it needs."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from common.config import load_cell
 from common.transport.credentials import credentials_of
 from common.transport.endpoint import port_of
 from tests.harness import RunningCell
-from tests.security.holders import PATIENCE, Heard, Holder
+from tests.security.raw_client import TIMEOUT, RawClient, Received
 
 pytestmark = [pytest.mark.cell, pytest.mark.slow, pytest.mark.timeout(300)]
 
@@ -22,8 +22,8 @@ EYE = ["camera_simulator", "vision_detector", "workspace_validator"]
 ARM = [entry.name for entry in load_cell("panda").services.values() if entry.name not in (*EYE, "viewer")]
 
 
-def given_to(host: Path, certificates: Path, services: Iterable[str]) -> Path:
-    """The certificates of one host."""
+def install(host: Path, certificates: Path, services: Iterable[str]) -> Path:
+    """Copy the certificates of one host; return its folder."""
     host.mkdir()
     for name in ("router", *(f"panda.{process}" for process in ("supervisor", *services))):
         for kind in ("pem", "key"):
@@ -33,20 +33,20 @@ def given_to(host: Path, certificates: Path, services: Iterable[str]) -> Path:
     return host
 
 
-def answered(holder: Holder, key: str, heard: Heard) -> None:
-    """Return when somebody answers a key; until then ask again whenever something more was heard."""
-    while not holder.ask(key, timeout=PATIENCE):
-        before = len(heard.samples)
-        heard.wait(lambda samples, seen=before: len(samples) > seen)  # type: ignore[misc]
+def wait_answered(client: RawClient, key: str, received: Received) -> None:
+    """Query a key until there is a reply, again after each received sample."""
+    while not client.query(key, timeout=TIMEOUT):
+        before = len(received.samples)
+        received.wait(lambda samples, seen=before: len(samples) > seen)  # type: ignore[misc]
 
 
-def test_a_run_completes_with_perception_behind_one_router_and_the_arm_behind_another(
+def test_run_completes_with_perception_and_arm_behind_different_routers(
     certificates: Path, tmp_path: Path
 ) -> None:
     folders = [tmp_path / "eye", tmp_path / "arm"]
     for folder in folders:
         folder.mkdir()
-    secured = [given_to(folder / "certs", certificates, part) for folder, part in zip(folders, (EYE, ARM), strict=True)]
+    secured = [install(folder / "certs", certificates, part) for folder, part in zip(folders, (EYE, ARM), strict=True)]
     same = ("--speed", "5", "--set", "world.count=1")
     epoch = {"ZENCELL_EPOCH": str(time.time_ns())}
     with RunningCell(
@@ -54,19 +54,19 @@ def test_a_run_completes_with_perception_behind_one_router_and_the_arm_behind_an
     ) as eye:
         reached = f"tls/127.0.0.1:{port_of(eye.domain)}"
         with (
-            Holder(reached, credentials_of("operator", certificates)) as operator,
-            Holder(reached, credentials_of("panda.camera_simulator", certificates)) as camera,
+            RawClient(reached, credentials_of("operator", certificates)) as operator,
+            RawClient(reached, credentials_of("panda.camera_simulator", certificates)) as camera,
         ):
-            heard = operator.hear("panda/joint_states", "panda/detected_objects")
+            received = operator.subscribe("panda/joint_states", "panda/detected_objects")
             with RunningCell(
                 folders[1], "run", "panda", "--without", ",".join(EYE), "--secure", str(secured[1]), "--link", reached,
                 *same, secrets=epoch,
             ) as arm:
-                answered(operator, "panda/motion/status", heard)  # by the arm, over the link
-                assert camera.ask("panda/motion/status", timeout=1.0) == []
+                wait_answered(operator, "panda/motion/status", received)  # by the arm, over the link
+                assert camera.query("panda/motion/status", timeout=1.0) == []
                 assert asyncio.run(arm.ended(240)) == 0, f"{arm.tail()}\nand the eye:\n{eye.tail()}"
         assert arm.summary["state"] == "DONE"
         assert arm.summary["truth"] == {"in_box": 1, "on_table": 0, "elsewhere": 0, "containers": {"box": 1}}
         eye.interrupt()
         assert asyncio.run(eye.ended(60)) == 0
-    assert "panda/detected_objects" in heard.keys
+    assert "panda/detected_objects" in received.keys

@@ -12,7 +12,7 @@ from common.process.in_process import running_service
 from common.transport.bus import Bus
 from common.transport.local import LocalNetwork
 from services import contour_tracer
-from tests.harness import PATIENCE, beside
+from tests.harness import PATIENCE, running_with
 
 CELL = load_cell("ur5")
 CONFIG = service_config(CELL, "contour_tracer", contour_tracer.Config)
@@ -64,7 +64,7 @@ async def test_selected_contour_causes_plan_requests() -> None:
     status = bus.reader(OUTLINE_STATUS)
     await bus.ready()
     running = running_service(net, contour_tracer.run, CONFIG, name="contour_tracer")
-    async with running, beside(keep_showing(bus)):
+    async with running, running_with(keep_showing(bus)):
         async with asyncio.timeout(PATIENCE):
             stages = [(await asked.get()).stage for _ in range(5)]
             assert stages == ["approach", "descend", "trace", "retreat", "home"]
@@ -87,7 +87,7 @@ async def test_planner_without_a_scene_is_asked_again() -> None:
     bus.serve(topics.MOTION_PLAN, plan)
     await bus.ready()
     running = running_service(net, contour_tracer.run, CONFIG, name="contour_tracer")
-    async with running, beside(keep_showing(bus)):
+    async with running, running_with(keep_showing(bus)):
         async with asyncio.timeout(PATIENCE):
             assert await asked.get() == await asked.get() == await asked.get()
 

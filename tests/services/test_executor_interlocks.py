@@ -170,7 +170,7 @@ async def test_safety_stop_of_the_arm_persists_until_an_operator_has_it_recover(
         arm, states = stopping_arm.created[-1], client.bus.reader(topics.ROBOT_STATUS)
         assert (await client.wait_for(states)).mode == "protective_stop" and arm.stopped
         order = client.bus.client(topics.ROBOT_COMMAND)
-        with pytest.raises(RemoteError, match="before the executor began"):
+        with pytest.raises(RemoteError, match="before the executor started"):
             await order.call(RobotCommand(header=before, act="recover", owner="tester"))
         assert arm.stopped
         answer = await order.call(RobotCommand(header=client.bus.header(), act="recover", owner="tester"))

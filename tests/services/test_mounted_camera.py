@@ -22,7 +22,7 @@ from common.supervision.wiring import wiring
 from common.transport.local import LocalNetwork
 from services import depth_camera, robot_state_publisher, vision_detector
 from tests.common.sim.spheres import spheres
-from tests.harness import beside
+from tests.harness import running_with
 
 SMALL = {"width": 64, "height": 48, "fx": 34, "fy": 34, "cx": 32, "cy": 24}
 CELL = load_cell(str(Path(__file__).parents[1] / "data" / "hand_camera.yaml"),
@@ -58,7 +58,7 @@ async def test_depth_of_a_mounted_camera_lies_on_the_table_at_any_pose() -> None
             await asyncio.sleep(0.01)
 
     async with (
-        beside(move()), beside(camera.follow()),
+        running_with(move()), running_with(camera.follow()),
         running_service(net, depth_camera.run, config, name="depth_camera"),
         running_service(net, robot_state_publisher.run, publisher, name="robot_state_publisher"), asyncio.timeout(60),
     ):
@@ -90,7 +90,7 @@ async def test_image_waits_for_its_transform_and_is_skipped_without_one() -> Non
     publisher = service_config(CELL, "robot_state_publisher", robot_state_publisher.Config)
     picture = Header(stamp=1030 * MS, frame_id="camera_optical_frame")
     async with (
-        beside(camera.follow()),
+        running_with(camera.follow()),
         running_service(net, robot_state_publisher.run, publisher, name="robot_state_publisher"), asyncio.timeout(60),
     ):
         moving = bus.reader(topics.TF)

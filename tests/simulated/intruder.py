@@ -21,7 +21,7 @@ from common.planning.trajectory import sample, timed_path
 from common.robot.finger_joints import measured_width
 from common.robot.model import RobotModel
 from common.transport.bus import Bus
-from tests.harness import beside, until
+from tests.harness import running_with, until
 from tests.simulated.sees_more import SAID, SEEN
 from tests.simulated.visited import SimulatedCell
 
@@ -77,7 +77,7 @@ class Intruder:
         self._joints = bus.reader(topics.JOINT_STATES)
         self._edit, self._followed = bus.client(topics.WORLD_EDIT), bus.client(topics.MOTION_FOLLOWED)
         self._pillar: tuple[coal.Box, coal.Transform3s, Intrusion] | None = None
-        async with beside(self._check()):
+        async with running_with(self._check()):
             while len(self.found) < self.most and not simulated.ended.is_set():
                 await asyncio.sleep(float(self._rng.uniform(0.3, 3.0)))
                 status = self._motion.latest

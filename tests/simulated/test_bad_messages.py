@@ -12,7 +12,7 @@ from common.supervision.wiring import owned_in, wiring_of
 from common.transport.bus import Bus
 from lab.chaos.agent import Chaos
 from lab.chaos.plan import Fault, Form
-from tests.harness import beside
+from tests.harness import running_with
 from tests.simulated.visited import SimulatedCell
 
 pytestmark = pytest.mark.timeout(600)  # some seconds of work, on a machine that may be busy
@@ -36,7 +36,7 @@ def test_bad_messages_stop_no_service_and_a_slipped_ball_is_grasped_again() -> N
         bad += [Fault(0.0, "corrupt", key, form="huge") for key in (topics.GRIPPER_STATE.key, topics.JOINT_STATES.key)]
         old = [Fault(0.0, "replay", key, 0.5, count=3) for key in keys]
         chaos = Chaos(bus, [Fault(0.0, "drop"), *bad, *old], dict, cell.cell.world, slip_timeout=60)
-        async with beside(chaos.run()):
+        async with running_with(chaos.run()):
             await cell.ended.wait()
         happened.update((one.what, one.target) for one in chaos.injected)
 

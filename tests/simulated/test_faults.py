@@ -24,12 +24,13 @@ def outcome_of(name: str, seed: int) -> Outcome:
     return Simulation(PANDA if name == "panda" else load_cell(name), seed, faults=True, digest=True).run()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("cell", "seed"), [
     ("panda", 1),
-    pytest.param("panda", 2, marks=pytest.mark.slow),  # the answer to who is there comes late, to a second instance
-    pytest.param("ur5", 2, marks=pytest.mark.slow),
-    pytest.param("ur5", 22, marks=pytest.mark.slow),  # stopped where it cannot go up any further
-    pytest.param("ur5", 45, marks=pytest.mark.slow),  # jogged towards the pedestal of the object, in a fast cell
+    pytest.param("panda", 2, marks=pytest.mark.campaign),  # the answer to who is there comes late, to a second instance
+    ("ur5", 2),
+    pytest.param("ur5", 22, marks=pytest.mark.campaign),  # stopped where it cannot go up any further
+    pytest.param("ur5", 45, marks=pytest.mark.campaign),  # jogged towards the pedestal of the object, in a fast cell
 ])
 def test_cell_succeeds_under_all_faults(cell, seed):
     outcome = outcome_of(cell, seed)

@@ -19,6 +19,7 @@ DATA = Path(__file__).parents[1] / "data"
 HAND, BOTH = str(DATA / "hand_camera.yaml"), str(DATA / "hand_and_fixed.yaml")
 
 
+@pytest.mark.slow
 def test_camera_on_the_arm_clears_the_table_with_images_taken_in_motion() -> None:
     off: list[float] = []  # of detections in pictures that were taken while the arm moved [m]
 

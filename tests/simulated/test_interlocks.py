@@ -49,6 +49,7 @@ async def assert_standstill(cell: SimulatedCell, bus: Bus) -> None:
     assert await assert_still(cell, joints, bus.clock.now_ns()) == first
 
 
+@pytest.mark.slow
 def test_stopped_robot_stays_stopped_over_restarts_until_an_operator_starts_it() -> None:
     async def visit(cell: SimulatedCell, bus: Bus) -> None:
         motion, status = bus.reader(topics.MOTION_STATUS), bus.reader(PICK_PLACE_STATUS)

@@ -9,6 +9,7 @@ SIDE = ["world.camera.position=[1.15,0,0.85]", "world.camera.rpy=[-2.4,0,1.5708]
 COVERED = "services.camera_simulator.brightness=-255"
 
 
+@pytest.mark.slow
 def test_balls_occluded_by_the_arm_are_found_by_moving_it() -> None:
     cell = SimulatedCell("panda", [ARM, "world.balls=[[0.3,0.0]]", "services.camera_simulator.rate=5"])
     assert (cell.outcome.state, cell.outcome.done) == ("DONE", 1), cell.outcome

@@ -87,6 +87,7 @@ def test_ur5_paused_while_tracing_resumes_the_same_trace() -> None:
     assert summary["seconds"]["moving"] < summary["seconds"]["task"]
 
 
+@pytest.mark.slow
 def test_robot_stays_held_when_a_paused_task_dies_until_resume() -> None:
     async def visit(cell: SimulatedCell, bus: Bus) -> None:
         joints, motion = bus.reader(topics.JOINT_STATES), bus.reader(topics.MOTION_STATUS)

@@ -13,6 +13,7 @@ pytestmark = pytest.mark.timeout(600)
 PHYSICS = "world.simulator=mujoco"
 
 
+@pytest.mark.slow
 def test_table_is_cleared_by_friction_alone() -> None:
     summary = SimulatedCell("panda", [PHYSICS, "world.count=1"]).summary
     assert (summary["state"], summary["placed"]) == ("DONE", 1)

@@ -44,6 +44,7 @@ def test_single_camera_leaves_objects_out_of_its_view() -> None:
     assert (outcome.state, outcome.done) == ("DONE", 2), outcome  # the third lies where only the right one looks
 
 
+@pytest.mark.slow
 def test_task_is_not_done_while_one_of_two_cameras_is_silent() -> None:
     lost = "services.right_detector.topics={camera/*: nowhere/camera/*, detect*: right/detect*}"
     outcome = Simulation(load_cell(CELL, [lost]), 1).run()

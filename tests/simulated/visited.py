@@ -25,7 +25,7 @@ from lab.simulation import Outcome, Simulation
 from recording.capture import CustomTopics
 from recording.report.aggregator import Collector, RunAggregator
 from recording.report.summary import describe
-from tests.harness import beside
+from tests.harness import running_with
 
 Visit = Callable[["SimulatedCell", Bus], Coroutine[Any, Any, None]]
 
@@ -67,7 +67,7 @@ class SimulatedCell:
     async def _observe(self, bus: Bus) -> None:
         collector = Collector(bus, self._aggregator, 0.0, lambda line: None)
         self.ended = collector.ended
-        async with beside(collector.run()):
+        async with running_with(collector.run()):
             if self._visit is not None:
                 await self._visit(self, bus)
             await collector.ended.wait()
@@ -103,7 +103,7 @@ def no_processes() -> Iterator[None]:
 def _run_to_end(operation: CellSession) -> int:
     async def work(bus: Bus) -> None:
         collector = Collector(bus, operation.aggregator, 0.0, lambda line: None)
-        async with beside(collector.run()):
+        async with running_with(collector.run()):
             if not operation.cell.run.autostart:
                 await bus.client(topics.TASK_COMMAND).call(TaskCommand(command="start"))
             await collector.ended.wait()

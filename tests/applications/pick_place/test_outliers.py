@@ -71,6 +71,7 @@ def test_cable_is_detected_by_its_outline(place: tuple[float, float]) -> None:
     assert {one.reason for one in odd} == {NOT_ROUND}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("eye", [AROUND.camera, SIDE])
 def test_thin_cable_is_reported_next_to_balls(eye: CameraConfig) -> None:
     camera, around = Pinhole.from_config(eye), AROUND.model_copy(update={"camera": eye})
@@ -138,6 +139,7 @@ def test_no_ball_of_a_stack_is_offered_to_a_side_camera(
     assert any(math.dist(one.position[:2], place) < 0.01 for one in detector.outliers), "the lower one is where it is"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gap", [0.0, 0.006])
 def test_three_balls_are_offered_only_without_one_on_top(gap: float) -> None:
     draw, away = Renderer(AROUND, camera=CAMERA), (0.06 + gap) / math.sqrt(3)
@@ -164,6 +166,7 @@ def test_three_touching_balls_are_offered_in_a_blurred_image(blur: float) -> Non
     assert len(detector.detect(cv2.GaussianBlur(picture, (0, 0), blur), CAMERA)) == len(places), detector.outliers
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("eye", [AROUND.camera, SIDE])
 @pytest.mark.parametrize("others", [True, False])
 def test_touching_balls_are_no_stack(eye: CameraConfig, others: bool) -> None:

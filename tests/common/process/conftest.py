@@ -1,4 +1,4 @@
-"""The network, processes and routers that the tests of the transport have."""
+"""The network, process and router fixtures of the transport tests."""
 
 from tests.common.transport.conftest import (  # noqa: F401
     domain,

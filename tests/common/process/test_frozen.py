@@ -1,4 +1,4 @@
-"""What the health check of a container does about a service that is stopped, shown on children of this process."""
+"""The health check of a container kills a service that stays stopped (SIGSTOP)."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ import pytest
 from common.process.health import end_if_frozen, stopped_service
 from tests.harness import freeze
 
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc, as in a container")
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc, as in a container")
 
 
 @pytest.fixture
 def service() -> Iterator[subprocess.Popen[bytes]]:
-    """A process that was started as services are, up."""
+    """A running child process with a module name, like a service."""
     started = subprocess.Popen([sys.executable, "-m", "http.server", "--bind", "127.0.0.1", "0"],
                                stdout=subprocess.PIPE, env={**os.environ, "PYTHONUNBUFFERED": "1"})
     assert started.stdout is not None
@@ -29,7 +29,7 @@ def service() -> Iterator[subprocess.Popen[bytes]]:
     started.stdout.close()
 
 
-def test_service_that_runs_is_left_alone(service: subprocess.Popen[bytes]) -> None:
+def test_running_service_is_not_killed(service: subprocess.Popen[bytes]) -> None:
     assert stopped_service(os.getpid()) is None
     assert not end_if_frozen(os.getpid())
     assert service.poll() is None
@@ -43,7 +43,7 @@ def test_stopped_service_is_killed(service: subprocess.Popen[bytes]) -> None:
     assert sum(waited) == pytest.approx(3.0)
 
 
-def test_service_that_goes_on_in_time_is_left_alone(service: subprocess.Popen[bytes]) -> None:
+def test_service_that_resumes_in_time_is_not_killed(service: subprocess.Popen[bytes]) -> None:
     freeze(service)
     waited: list[float] = []
 
@@ -58,13 +58,13 @@ def test_service_that_goes_on_in_time_is_left_alone(service: subprocess.Popen[by
     assert service.poll() is None
 
 
-def test_stopped_process_that_somebody_else_started_is_left_alone(service: subprocess.Popen[bytes]) -> None:
+def test_stopped_process_of_another_parent_is_not_killed(service: subprocess.Popen[bytes]) -> None:
     freeze(service)
     assert stopped_service(parent=service.pid) is None
     assert stopped_service(os.getpid()) == service.pid
 
 
-def test_stopped_program_that_is_no_service_is_left_alone() -> None:
+def test_stopped_program_that_is_no_service_is_not_killed() -> None:
     program = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
     try:
         freeze(program)

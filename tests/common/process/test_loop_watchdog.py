@@ -1,4 +1,4 @@
-"""A stuck event loop ends its process: the timer on a clock of the test, the end with real processes."""
+"""A stuck event loop ends its process: the timer with a simulated clock, the exit with real processes."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from common.process.lifeline import PERIOD, STUCK_EXIT, StallTimer
 from common.transport.endpoint import endpoint_of
 from tests.harness import wait_router
 
-PATIENCE = 20.0
+TIMEOUT = 20.0
 CELL = str(Path(__file__).with_name("toy_cell.yaml"))
 
 
-def test_timer_loop_is_never_stuck() -> None:
+def test_turning_loop_is_never_stuck() -> None:
     timer = StallTimer()
     for k in range(100):
         assert timer.still_for(k * PERIOD) <= PERIOD
         timer.turned()
 
 
-def test_stall_lasts_until_the_next_turn() -> None:
+def test_stall_ends_with_the_next_turn() -> None:
     timer = StallTimer()
     assert [timer.still_for(k * PERIOD) for k in range(9)][-1] == 8 * PERIOD
     timer.turned()
@@ -37,7 +37,7 @@ def test_suspended_process_is_not_stuck() -> None:
 @pytest.fixture
 async def toy(processes, domain: int):
     processes.start("services.router", "--domain", str(domain))
-    await wait_router(endpoint_of(domain), PATIENCE)
+    await wait_router(endpoint_of(domain), TIMEOUT)
 
     def start(mode: str):
         return processes.start("tests.common.process.toy", "--cell", CELL, "--domain", str(domain),

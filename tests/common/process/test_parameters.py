@@ -1,4 +1,4 @@
-"""Every service answers for its parameters, without doing anything for it."""
+"""Every service serves its parameters, without code of its own."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from common.topics import parameters_of
 from common.transport.bus import Bus, Client
 from common.transport.local import LocalNetwork
 
-PATIENCE = 20.0
+TIMEOUT = 20.0
 CELLS = {name: load_cell(name) for name in ("panda", "ur5")}
 
 
 class Config(Parameters):
     motion: Motion
-    rate: Tunable[float] = Field(10.0, gt=0, le=1000, description="turns [Hz]")
+    rate: Tunable[float] = Field(10.0, gt=0, le=1000, description="cycles [Hz]")
     size: Tunable[int] = Field(3, ge=1, le=5)
     file: str = ""
 
@@ -45,39 +45,39 @@ class Rig:
         self.log = self.bus.reader(topics.LOG)
         self.client: Client[ParameterRequest, ParameterReply] = self.bus.client(parameters_of("toy"))
 
-    async def ask(self, *, dry_run: bool = False, by: str = "", **values: object) -> dict[str, object]:
+    async def request(self, *, dry_run: bool = False, by: str = "", **values: object) -> dict[str, object]:
         full = {path.replace("__", "."): value for path, value in values.items()}
         reply = await self.client.call(ParameterRequest.model_validate({"set": full, "dry_run": dry_run, "by": by}))
         assert reply.service == "toy"
         return {p.path: p.value for p in reply.parameters}
 
     async def refusal(self, **values: object) -> RemoteError:
-        before = await self.ask()
+        before = await self.request()
         with pytest.raises(RemoteError) as caught:
-            await self.ask(**values)
-        assert await self.ask() == before
+            await self.request(**values)
+        assert await self.request() == before
         return caught.value
 
     async def lines(self, count: int) -> list[str]:
-        async with asyncio.timeout(PATIENCE):
+        async with asyncio.timeout(TIMEOUT):
             return [(await self.log.next()).message for _ in range(count)]
 
 
 @pytest.fixture
 async def rig() -> AsyncIterator[Rig]:
-    made = Rig()
-    async with running_service(made.net, service, made.config, name="toy"):
-        yield made
+    rig = Rig()
+    async with running_service(rig.net, service, rig.config, name="toy"):
+        yield rig
 
 
-async def test_nothing_to_set_asks_what_there_is(rig: Rig) -> None:
-    values = await rig.ask()
+async def test_empty_request_recycles_all_values(rig: Rig) -> None:
+    values = await rig.request()
     assert values["services.toy.rate"] == 10.0 and values["motion.velocity_scaling"] == 0.2
     assert values["services.toy.file"] == ""
 
 
-async def test_a_change_is_made_logged_with_who_made_it_and_told_to_the_service(rig: Rig) -> None:
-    values = await rig.ask(services__toy__rate=20, motion__velocity_scaling=0.5, by="ann@desk/7")
+async def test_change_is_applied_logged_with_its_operator_and_reported_to_the_service(rig: Rig) -> None:
+    values = await rig.request(services__toy__rate=20, motion__velocity_scaling=0.5, by="ann@desk/7")
     assert (values["services.toy.rate"], values["motion.velocity_scaling"]) == (20.0, 0.5)
     assert (rig.config.rate, rig.config.motion.velocity_scaling) == (20.0, 0.5)
     lines = await rig.lines(3)
@@ -86,83 +86,85 @@ async def test_a_change_is_made_logged_with_who_made_it_and_told_to_the_service(
     assert lines[2] == "now at 20 Hz"
 
 
-async def test_a_dry_run_and_what_is_so_already_change_and_log_nothing(rig: Rig) -> None:
-    assert (await rig.ask(services__toy__rate=20, dry_run=True))["services.toy.rate"] == 10.0
-    await rig.ask(services__toy__rate=10)
-    await rig.ask(services__toy__size=4)
+async def test_dry_run_and_unchanged_value_change_and_log_nothing(rig: Rig) -> None:
+    assert (await rig.request(services__toy__rate=20, dry_run=True))["services.toy.rate"] == 10.0
+    await rig.request(services__toy__rate=10)
+    await rig.request(services__toy__size=4)
     assert await rig.lines(2) == ["services.toy.size: 3 -> 4 (by unknown operator)", "now at 10 Hz"]
 
 
-async def test_a_dry_run_is_refused_as_the_change_would_be(rig: Rig) -> None:
+async def test_invalid_dry_run_is_refused(rig: Rig) -> None:
     with pytest.raises(RemoteError, match="size: 6"):
-        await rig.ask(services__toy__size=6, dry_run=True)
+        await rig.request(services__toy__size=6, dry_run=True)
 
 
-@pytest.mark.parametrize(("values", "code", "said"), [
+@pytest.mark.parametrize(("values", "code", "text"), [
     ({"services__toy__rate": 20, "services__toy__size": 9}, "bad_value", "services.toy.size: 9 must be"),
     ({"services__toy__rate": 20, "services__toy__fiel": ""}, "unknown_parameter", "did you mean 'services.toy.file'"),
     ({"services__toy__rate": 20, "services__toy__file": "x"}, "needs_restart", "--set services.toy.file=x"),
     ({"services__toy__rate": float("inf")}, "bad_value", "services.toy.rate: inf"),
 ])
-async def test_all_or_nothing(rig: Rig, values: dict[str, object], code: str, said: str) -> None:
+async def test_invalid_value_leaves_all_values_unchanged(
+    rig: Rig, values: dict[str, object], code: str, text: str
+) -> None:
     refusal = await rig.refusal(**values)
-    assert refusal.code == code and said in refusal.message
+    assert refusal.code == code and text in refusal.message
 
 
-async def test_a_bad_request_leaves_the_service_running(rig: Rig) -> None:
+async def test_bad_request_leaves_the_service_running(rig: Rig) -> None:
     for values in ({"services__toy__rate": None}, {"services__toy__rate": [1]}, {"services__toy__rate": {"a": 1}}):
         assert (await rig.refusal(**values)).code == "bad_value"
-    assert (await rig.ask())["services.toy.rate"] == 10.0
+    assert (await rig.request())["services.toy.rate"] == 10.0
 
 
-async def test_a_service_that_is_gone_does_not_answer() -> None:
+async def test_ended_service_does_not_reply() -> None:
     rig = Rig()
     async with running_service(rig.net, service, rig.config, name="toy"):
-        await rig.bus.alive.wait("toy", PATIENCE)
-        await rig.ask()
-    await rig.bus.alive.wait("toy", PATIENCE, there=False)
+        await rig.bus.alive.wait("toy", TIMEOUT)
+        await rig.request()
+    await rig.bus.alive.wait("toy", TIMEOUT, there=False)
     with pytest.raises(NoResponder):
-        await rig.ask()
+        await rig.request()
 
 
 @pytest.mark.parametrize(("cell", "name"), [(cell, name) for cell in CELLS for name in CELLS[cell].services])
-async def test_the_wiring_of_a_service_does_not_tell_of_what_everybody_serves(cell: str, name: str) -> None:
+async def test_wiring_of_a_service_omits_its_parameter_request(cell: str, name: str) -> None:
     module = importlib.import_module(f"services.{name}")
     found = await wiring(module.run, service_config(CELLS[cell], name, module.Config))
     assert parameters_of(name) not in found.serves
 
 
-def test_the_request_of_any_service_is_found_by_its_key() -> None:
+def test_topics_and_parameter_requests_are_found_by_key() -> None:
     assert find_topic("param/vision_detector") == parameters_of("vision_detector")
     assert find_topic("camera/image_raw") is topics.CAMERA_IMAGE
     assert find_topic("param/<service>") is topics.PARAMETERS
     assert find_topic("param/") is find_topic("param/a/b") is find_topic("nothing") is None
 
 
-async def test_a_pace_that_waits_for_long_goes_on_when_its_rate_is_raised() -> None:
+async def test_waiting_rate_wakes_when_it_is_raised() -> None:
     rate = 1e-6
     bus = LocalNetwork().bus("toy")
-    pace = LoopRate(bus, lambda: rate)
-    waiting = asyncio.create_task(pace.wait())
+    loop_rate = LoopRate(bus, lambda: rate)
+    waiting = asyncio.create_task(loop_rate.wait())
     await asyncio.sleep(0)
-    bus.parameters_changed()  # of something else
+    bus.parameters_changed()  # of another parameter
     await asyncio.sleep(0)
     assert not waiting.done()
     rate = 1000.0
     bus.parameters_changed()
-    async with asyncio.timeout(PATIENCE):
+    async with asyncio.timeout(TIMEOUT):
         await waiting
 
 
-async def test_turns_of_a_pace_lie_on_a_grid_and_those_that_were_missed_are_left_out() -> None:
+async def test_cycles_lie_on_a_grid_and_missed_ones_are_skipped() -> None:
     loop = asyncio.get_running_loop()
-    pace = LoopRate(LocalNetwork().bus("toy"), lambda: 1000.0)
-    await pace.wait()
-    first = pace.due
+    loop_rate = LoopRate(LocalNetwork().bus("toy"), lambda: 1000.0)
+    await loop_rate.wait()
+    first = loop_rate.due
     for _ in range(5):
-        await asyncio.sleep(0.0035)  # more than three turns
-        await pace.wait()
-        assert pace.due <= loop.time()
-        turns = (pace.due - first) * 1000.0
-        assert turns == pytest.approx(round(turns), abs=1e-3) and turns > 3
-        first = pace.due
+        await asyncio.sleep(0.0035)  # more than three cycles
+        await loop_rate.wait()
+        assert loop_rate.due <= loop.time()
+        cycles = (loop_rate.due - first) * 1000.0
+        assert cycles == pytest.approx(round(cycles), abs=1e-3) and cycles > 3
+        first = loop_rate.due

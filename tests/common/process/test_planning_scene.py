@@ -23,8 +23,8 @@ POLE = SceneEdit(op="add", id="pole", shape="cylinder", dimensions=[0.02, 1.0], 
 
 async def writer(bus: Bus, config: None) -> None:
     """Publish a scene with one ball."""
-    out = SceneWriter(bus)
-    await out.begin(PlanningScene(header=Header(stamp=1), objects=[SEEN]))
+    scene_writer = SceneWriter(bus)
+    await scene_writer.begin(PlanningScene(header=Header(stamp=1), objects=[SEEN]))
     await bus.ready()
     await asyncio.Event().wait()
 

@@ -1,4 +1,4 @@
-"""Planning workers, forked by programs of their own, in which nothing else runs yet."""
+"""Planning workers, each forked by a fresh program without other threads."""
 
 import contextlib
 import json
@@ -10,7 +10,7 @@ import psutil
 
 ROOT = Path(__file__).resolve().parents[3]
 
-BEGIN = """
+SETUP = """
 import asyncio, json, os, signal, sys, time
 from common.config import load_cell
 from common.messages import CollisionObject, Header, JointGoal, PlanningScene, PlanRequest, Pose, Vector3
@@ -50,22 +50,22 @@ def cancelled(after):
 
 def run_script(script: str, *arguments: str) -> list[object]:
     """Return the JSON lines that a program printed."""
-    done = subprocess.run([sys.executable, "-c", BEGIN + script, *arguments], cwd=ROOT, capture_output=True, text=True,
+    done = subprocess.run([sys.executable, "-c", SETUP + script, *arguments], cwd=ROOT, capture_output=True, text=True,
                           check=False, timeout=60)
     assert (done.returncode, done.stderr) == (0, "")
     return [json.loads(line) for line in done.stdout.splitlines()]
 
 
 def test_worker_plans_like_the_pipeline_also_with_a_new_scene() -> None:
-    answers, own = run_script("""
+    by_worker, by_pipeline = run_script("""
 own = PlanningPipeline(RobotModel.load(cell.robot), *setup[1:], seed=3)
 empty = PlanningScene(header=Header(frame_id="world"))
-for asks in (plan, own.plan):
-    answers = [asks(request(name), where, None) for name, where in (("a", scene), ("b", scene), ("c", empty))]
+for planner in (plan, own.plan):
+    answers = [planner(request(name), where, None) for name, where in (("a", scene), ("b", scene), ("c", empty))]
     print(json.dumps([[p.positions for p in each.trajectory.points] for each in answers]))
 """)
-    assert answers == own
-    assert isinstance(answers, list) and answers[0] != answers[2]
+    assert by_worker == by_pipeline
+    assert isinstance(by_worker, list) and by_worker[0] != by_worker[2]
 
 
 def test_cancelled_worker_plans_the_next_request() -> None:

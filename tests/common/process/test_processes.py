@@ -1,4 +1,4 @@
-"""What only real processes show: every way to end, and what the others see of it."""
+"""Real processes: every way in which a service or router ends, and what other processes observe."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from common.transport.zenoh_session import connect
 from tests.common.process.toy import Config
 from tests.harness import freeze, wait_router
 
-PATIENCE = 20.0  # only ever waited for by a test that fails
+TIMEOUT = 20.0  # only a failing test waits that long
 CELL = str(Path(__file__).with_name("toy_cell.yaml"))
 START, HOLD = TaskCommand(command="start"), TaskCommand(command="pause")
 
@@ -41,7 +41,7 @@ class Stage:
 
     async def router(self) -> subprocess.Popen[bytes]:
         process = self.processes.start("services.router", "--domain", str(self.domain))
-        await wait_router(self.endpoint, PATIENCE)
+        await wait_router(self.endpoint, TIMEOUT)
         return process
 
     def toy(self, *arguments: str, mode: str = "serve") -> subprocess.Popen[bytes]:
@@ -51,7 +51,7 @@ class Stage:
         )
 
     async def ended(self, process: subprocess.Popen[bytes]) -> int:
-        return await asyncio.to_thread(process.wait, PATIENCE)
+        return await asyncio.to_thread(process.wait, TIMEOUT)
 
     def output(self, process: subprocess.Popen[bytes]) -> str:
         return self.processes.output(process)
@@ -60,7 +60,7 @@ class Stage:
         await self.processes.said(process, text)
 
     async def connected(self, process: subprocess.Popen[bytes]) -> None:
-        """Return when a process has a link to the router, though it has not said anything."""
+        """Return when a process has a link to the router, before it logs anything."""
 
         def linked() -> bool:
             links = psutil.Process(process.pid).net_connections("tcp")
@@ -70,7 +70,7 @@ class Stage:
         await self.until(linked)
 
     def bus(self):
-        return connect(cell="toy_cell", service="tester", endpoint=self.endpoint, timeout=PATIENCE)
+        return connect(cell="toy_cell", service="tester", endpoint=self.endpoint, timeout=TIMEOUT)
 
 
 @pytest.fixture
@@ -80,21 +80,21 @@ def stage(processes, domain: int, until) -> Stage:
 
 @pytest.fixture
 async def bus(stage: Stage) -> AsyncIterator[Bus]:
-    stage.the_router = await stage.router()
+    stage.running_router = await stage.router()
     async with stage.bus() as bus:
         yield bus
 
 
 async def available(bus: Bus) -> Client:
     client = bus.client(topics.TASK_COMMAND)
-    await client.wait_available(PATIENCE)
+    await client.wait_available(TIMEOUT)
     return client
 
 
-# --- the ends of a request ----------------------------------------------------------------------------------------
+# --- results of a request -----------------------------------------------------------------------------------------
 
 
-async def test_request_is_answered_or_refused_and_a_handler_with_a_bug_ends_the_process(
+async def test_request_is_answered_or_refused_and_a_bug_in_a_handler_ends_the_process(
     stage: Stage, bus: Bus
 ) -> None:
     toy = stage.toy("--set", "services.toy.placed=5")
@@ -109,10 +109,10 @@ async def test_request_is_answered_or_refused_and_a_handler_with_a_bug_ends_the_
     assert "Traceback" in stage.output(toy)
 
 
-async def test_responder_killed_in_the_middle_loses_the_request_and_is_none_then(stage: Stage, bus: Bus) -> None:
+async def test_killed_server_loses_the_request_and_is_then_unavailable(stage: Stage, bus: Bus) -> None:
     toy = stage.toy()
     client = await available(bus)
-    waiting = asyncio.create_task(client.call(HOLD, timeout=PATIENCE))
+    waiting = asyncio.create_task(client.call(HOLD, timeout=TIMEOUT))
     await stage.said(toy, "holding")
     toy.kill()
     with pytest.raises(RequestLost):
@@ -122,7 +122,7 @@ async def test_responder_killed_in_the_middle_loses_the_request_and_is_none_then
         await client.call(START)
 
 
-async def test_frozen_responder_is_a_time_out_then_lost_then_gone_and_serves_again_when_it_thaws(
+async def test_frozen_server_times_out_then_loses_requests_and_serves_again_when_resumed(
     stage: Stage, bus: Bus
 ) -> None:
     toy = stage.toy()
@@ -130,22 +130,22 @@ async def test_frozen_responder_is_a_time_out_then_lost_then_gone_and_serves_aga
     freeze(toy)
     with pytest.raises(RequestTimeout):
         await client.call(START, timeout=0.2)
-    with pytest.raises(RequestLost):  # its lease runs out while we wait
-        await client.call(START, timeout=PATIENCE)
+    with pytest.raises(RequestLost):  # its lease expires during the call
+        await client.call(START, timeout=TIMEOUT)
     await stage.until(lambda: not client.available)
     with pytest.raises(NoResponder):
-        await client.call(START, timeout=PATIENCE)
+        await client.call(START, timeout=TIMEOUT)
     toy.send_signal(signal.SIGCONT)
-    await client.wait_available(PATIENCE)
+    await client.wait_available(TIMEOUT)
     assert (await client.call(START)).stage == "7"
 
 
-async def test_router_killed_in_the_middle_loses_the_request_and_then_nobody_is_there(stage: Stage, bus: Bus) -> None:
+async def test_killed_router_loses_the_request_and_then_no_server_is_available(stage: Stage, bus: Bus) -> None:
     toy = stage.toy()
     client = await available(bus)
-    waiting = asyncio.create_task(client.call(HOLD, timeout=PATIENCE))
+    waiting = asyncio.create_task(client.call(HOLD, timeout=TIMEOUT))
     await stage.said(toy, "holding")
-    stage.the_router.kill()
+    stage.running_router.kill()
     with pytest.raises(RequestLost):
         await waiting
     await stage.until(lambda: not client.available)
@@ -154,47 +154,47 @@ async def test_router_killed_in_the_middle_loses_the_request_and_then_nobody_is_
 
 
 @pytest.mark.slow
-async def test_router_frozen_in_the_middle_loses_the_request(stage: Stage, bus: Bus) -> None:
+async def test_frozen_router_loses_the_request(stage: Stage, bus: Bus) -> None:
     toy = stage.toy()
     client = await available(bus)
-    waiting = asyncio.create_task(client.call(HOLD, timeout=PATIENCE))
+    waiting = asyncio.create_task(client.call(HOLD, timeout=TIMEOUT))
     await stage.said(toy, "holding")
-    freeze(stage.the_router)
+    freeze(stage.running_router)
     with pytest.raises(RequestTimeout):
         await client.call(START, timeout=0.1)
     with pytest.raises(RequestLost):
         await waiting
 
 
-async def test_all_heals_when_the_router_is_restarted(stage: Stage, bus: Bus) -> None:
+async def test_topics_tokens_and_requests_recover_when_the_router_restarts(stage: Stage, bus: Bus) -> None:
     toy = stage.toy()
     client = await available(bus)
     reader = bus.reader(PICK_PLACE_STATUS)
-    await asyncio.wait_for(reader.next(), PATIENCE)
-    await bus.alive.wait("toy", PATIENCE)
-    stage.the_router.kill()
-    await stage.ended(stage.the_router)
-    await bus.alive.wait("toy", PATIENCE, there=False)
+    await asyncio.wait_for(reader.next(), TIMEOUT)
+    await bus.alive.wait("toy", TIMEOUT)
+    stage.running_router.kill()
+    await stage.ended(stage.running_router)
+    await bus.alive.wait("toy", TIMEOUT, there=False)
     await stage.said(toy, "the router is lost")
     await stage.router()
-    await bus.alive.wait("toy", PATIENCE)
-    await client.wait_available(PATIENCE)
-    async with asyncio.timeout(PATIENCE):
-        async for sample in bus.raw_reader("toy_cell/pick_place_status"):  # it is put again by itself
+    await bus.alive.wait("toy", TIMEOUT)
+    await client.wait_available(TIMEOUT)
+    async with asyncio.timeout(TIMEOUT):
+        async for sample in bus.raw_reader("toy_cell/pick_place_status"):  # the state is repeated
             assert sample.payload
             break
     assert reader.received == 1
-    assert [s.key for s in await bus.raw_get("toy_cell/pick_place_status", PATIENCE)] == ["toy_cell/pick_place_status"]
+    assert [s.key for s in await bus.raw_get("toy_cell/pick_place_status", TIMEOUT)] == ["toy_cell/pick_place_status"]
     assert (await client.call(START)).stage == "7"
     toy.send_signal(signal.SIGTERM)
     assert await stage.ended(toy) == 0
 
 
-# --- gone after a signal, whatever goes on ------------------------------------------------------------------------
+# --- a signal ends a service in every state -----------------------------------------------------------------------
 
 
 async def reach(stage: Stage, state: str) -> list[subprocess.Popen[bytes]]:
-    """Two toys in a state: one for each signal."""
+    """Return two toys in that state, one for each signal."""
     if state == "connecting":
         toys = [stage.toy() for _ in range(2)]
         for toy in toys:
@@ -207,7 +207,7 @@ async def reach(stage: Stage, state: str) -> list[subprocess.Popen[bytes]]:
             await stage.connected(toy)
         return toys
     mode = state if state in ("busy", "stubborn") else "serve"
-    toys = [stage.toy(mode=mode), stage.toy("--set", "cell=another", mode=mode)]  # one cell has only one of it
+    toys = [stage.toy(mode=mode), stage.toy("--set", "cell=another", mode=mode)]  # a cell admits only one of a name
     for toy in toys:
         await stage.said(toy, "is ready")
     if state == "router dead":
@@ -226,34 +226,34 @@ STATES = ["connecting", "gated", "running", "busy", "stubborn", "router dead", "
     state if state in ("running", "connecting", "stubborn") else pytest.param(state, marks=pytest.mark.slow)
     for state in STATES
 ])
-async def test_gone_with_exit_code_0_after_sigint_or_sigterm(stage: Stage, state: str) -> None:
+async def test_sigint_and_sigterm_end_a_service_with_exit_code_0_in_every_state(stage: Stage, state: str) -> None:
     interrupted, terminated = await reach(stage, state)
     interrupted.send_signal(signal.SIGINT)
-    interrupted.send_signal(signal.SIGINT)  # an impatient second one changes nothing
+    interrupted.send_signal(signal.SIGINT)  # a second one changes nothing
     terminated.send_signal(signal.SIGTERM)
     assert [await stage.ended(interrupted), await stage.ended(terminated)] == [0, 0]
     for toy in (interrupted, terminated):
         assert "Traceback" not in stage.output(toy)
 
 
-async def test_gate_lets_run_begin_and_its_end_ends_the_process(stage: Stage, bus: Bus) -> None:
+async def test_service_starts_when_its_gate_opens_and_ends_when_it_closes(stage: Stage, bus: Bus) -> None:
     toy = stage.toy("--gate")
     await stage.connected(toy)
     assert "toy" not in await bus.alive.known()
     toy.stdin.write(b"go\n")
     toy.stdin.flush()
-    await bus.alive.wait("toy", PATIENCE)
+    await bus.alive.wait("toy", TIMEOUT)
     toy.stdin.close()
     assert await stage.ended(toy) == 0
-    await bus.alive.wait("toy", PATIENCE, there=False)
+    await bus.alive.wait("toy", TIMEOUT, there=False)
     assert "the supervisor is gone" in stage.output(toy)
 
 
-async def test_token_vanishes_at_once_when_a_service_is_terminated(stage: Stage, bus: Bus) -> None:
+async def test_token_vanishes_when_a_service_is_terminated(stage: Stage, bus: Bus) -> None:
     toy = stage.toy()
-    await bus.alive.wait("toy", PATIENCE)
+    await bus.alive.wait("toy", TIMEOUT)
     os.kill(toy.pid, signal.SIGTERM)
-    await bus.alive.wait("toy", PATIENCE, there=False)
+    await bus.alive.wait("toy", TIMEOUT, there=False)
     assert await stage.ended(toy) == 0
     assert "stopped: SIGTERM" in stage.output(toy)
 
@@ -269,7 +269,7 @@ async def test_router_ends_on_signals_and_with_its_supervisor(processes, domain:
             router.stdin.close()
         else:
             router.send_signal(end)
-        assert await asyncio.to_thread(router.wait, PATIENCE) == 0
+        assert await asyncio.to_thread(router.wait, TIMEOUT) == 0
 
 
 # --- bad starts ---------------------------------------------------------------------------------------------------
@@ -283,7 +283,9 @@ async def test_router_ends_on_signals_and_with_its_supervisor(processes, domain:
         (["--sped", "5"], "unrecognized arguments: --sped 5"),
     ],
 )
-async def test_bad_start_is_one_line_and_exit_code_2(stage: Stage, arguments: list[str], reason: str) -> None:
+async def test_invalid_option_is_reported_in_one_line_with_exit_code_2(
+    stage: Stage, arguments: list[str], reason: str
+) -> None:
     toy = stage.toy(*arguments)
     assert await stage.ended(toy) == 2
     output = stage.output(toy)
@@ -300,7 +302,7 @@ async def test_bad_start_is_one_line_and_exit_code_2(stage: Stage, arguments: li
         (["--connect", "nowhere"], "--connect: 'nowhere' must be an endpoint"),
     ],
 )
-def test_what_a_service_can_not_start_with_is_one_line(arguments: list[str], reason: str) -> None:
+def test_invalid_configuration_is_reported_in_one_line(arguments: list[str], reason: str) -> None:
     parser = argparse.ArgumentParser()
     add_options(parser)
     options = parser.parse_args(["--cell", CELL, "--domain", "1", *arguments])
@@ -309,7 +311,7 @@ def test_what_a_service_can_not_start_with_is_one_line(arguments: list[str], rea
     assert reason in str(caught.value) and "\n" not in str(caught.value)
 
 
-async def test_exit_code_tells_how_run_ended(stage: Stage, bus: Bus) -> None:
+async def test_exit_code_shows_how_a_service_ended(stage: Stage, bus: Bus) -> None:
     for mode, code in (("crash", 1), ("bad_config", 2), ("end", 0)):
         toy = stage.toy("--log-json", mode=mode)
         assert await stage.ended(toy) == code
@@ -328,7 +330,7 @@ async def test_second_router_names_the_process_that_holds_the_port(stage: Stage)
     assert f"port {port_of(stage.domain)} (domain {stage.domain}) is in use by process {router.pid}" in line
 
 
-async def test_tool_without_a_router_is_told_so(domain: int) -> None:
+async def test_tool_reports_a_missing_router(domain: int) -> None:
     with pytest.raises(NoRouter, match=f"no router at {endpoint_of(domain)}"):
         async with connect(cell="toy_cell", service="tester", endpoint=endpoint_of(domain), timeout=0.1):
             pass

@@ -1,4 +1,4 @@
-"""Who comes after all others."""
+"""Thread priorities."""
 
 import os
 import sys
@@ -9,7 +9,7 @@ import pytest
 
 from common.process.environment import NICENESS, lower_thread_priority
 
-linux = pytest.mark.skipif(sys.platform != "linux", reason="elsewhere only processes have a priority")
+linux = pytest.mark.skipif(sys.platform != "linux", reason="only Linux has priorities of threads")
 
 
 def priority() -> int:
@@ -17,9 +17,9 @@ def priority() -> int:
 
 
 @linux
-def test_only_the_thread_that_computes_comes_last() -> None:
+def test_only_the_computing_thread_gets_a_lower_priority() -> None:
     before = priority()
     with ThreadPoolExecutor(1) as pool:
         assert pool.submit(lambda: (lower_thread_priority(), priority())[1]).result() == NICENESS
-    lower_thread_priority()  # the main one is everybody's
+    lower_thread_priority()  # without effect on the main thread
     assert priority() == before

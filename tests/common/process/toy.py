@@ -1,4 +1,4 @@
-"""A service for tests of the transport, run as a process: its answers show every end of a request."""
+"""A service that tests run as a process: it shows every result of a request and every way to end."""
 
 import asyncio
 import time
@@ -51,7 +51,7 @@ async def run(bus: Bus, config: Config) -> None:
             try:
                 await asyncio.sleep(1000)
             except asyncio.CancelledError:
-                bus.log.info("does not care")
+                bus.log.info("ignores the cancellation")
     if config.mode == "crash":
         raise RuntimeError("the service has a bug")
     if config.mode == "bad_config":

@@ -19,18 +19,18 @@ from common.transport.local import LocalNetwork
 from common.transport.zenoh_session import connect
 from tests.harness import ROOT, environment, free_domain, wait_router
 
-PATIENCE = 20.0  # only ever waited for by a test that fails
+TIMEOUT = 20.0  # only a failing test waits that long
 
 
 async def until(condition: Callable[[], bool]) -> None:
-    """Return as soon as something holds that nobody tells us about."""
-    async with asyncio.timeout(PATIENCE):
+    """Poll until the condition holds."""
+    async with asyncio.timeout(TIMEOUT):
         while not condition():  # noqa: ASYNC110
             await asyncio.sleep(0.005)
 
 
 class Processes:
-    """Starts modules of the project as processes and leaves none behind."""
+    """Starts modules of the project as processes, and kills them at the end."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -78,13 +78,13 @@ def processes(tmp_path: Path) -> Iterator[Processes]:
 
 @pytest.fixture(scope="session")
 def shared_router(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """Endpoint of a router for all tests that leave it alone; they keep apart by the names of their cells."""
+    """Endpoint of a router that tests share; each test uses a cell name of its own."""
     processes = Processes(tmp_path_factory.mktemp("router"))
     domain = free_domain()
     processes.start("services.router", "--domain", str(domain))
     try:
         with ThreadPoolExecutor(1) as thread:  # this thread may already run a loop
-            thread.submit(lambda: asyncio.run(wait_router(endpoint_of(domain), PATIENCE))).result()
+            thread.submit(lambda: asyncio.run(wait_router(endpoint_of(domain), TIMEOUT))).result()
         yield endpoint_of(domain)
     finally:
         processes.end()
@@ -101,7 +101,7 @@ def until_fixture() -> Until:
 
 @pytest.fixture(params=["local", "zenoh"])
 async def new_bus(request: pytest.FixtureRequest) -> AsyncIterator[NewBus]:
-    """Makes buses that meet on one network: in process, and over a real router."""
+    """Creates buses on one network: in process, and over a real router."""
     cell = f"test_{uuid.uuid4().hex[:8]}"
     async with AsyncExitStack() as stack:
         if request.param == "local":

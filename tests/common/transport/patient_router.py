@@ -1,4 +1,4 @@
-"""A router that waits for a minute and a half until it drops a part of a picture that a reader does not take."""
+"""A router that waits 90 s for a slow reader before it drops a fragment of an image."""
 
 from common.transport import endpoint
 from services.router import main

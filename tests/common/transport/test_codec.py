@@ -28,11 +28,11 @@ images = st.builds(
 
 
 @given(st.one_of(vectors, images))
-def test_message_comes_back_as_it_was(message: m.Message) -> None:
+def test_message_survives_encoding(message: m.Message) -> None:
     assert decode(type(message), encode(message)) == message
 
 
-def test_goal_comes_back_as_the_kind_it_was() -> None:
+def test_kind_of_a_goal_survives_encoding() -> None:
     for goal in (m.JointGoal(positions=[0.1]), m.PoseGoal(pose=m.Pose())):
         request = m.PlanRequest(id="a", goal=goal, allowed_collisions=[("a", "b")])
         assert decode(m.PlanRequest, encode(request)) == request
@@ -88,7 +88,7 @@ def test_error_names_the_field_within_the_message() -> None:
 
 
 @given(names, st.integers(0, 2**60), names, st.none() | st.integers(0, 2**32 - 1))
-def test_attachment_comes_back_as_it_was(writer: str, sequence: int, trace: str, checksum: int | None) -> None:
+def test_attachment_survives_encoding(writer: str, sequence: int, trace: str, checksum: int | None) -> None:
     attachment = Attachment(writer, sequence, trace=trace, checksum=checksum)
     assert decode_attachment(encode_attachment(attachment)) == attachment
 
@@ -108,7 +108,7 @@ def test_foreign_attachment_is_refused(data: bytes) -> None:
         decode_attachment(data)
 
 
-def test_error_reply_comes_back_and_zenohs_own_is_told_apart() -> None:
+def test_error_reply_survives_encoding_and_differs_from_one_of_zenoh() -> None:
     assert decode_error(encode_error("code", "what went wrong")) == ("code", "what went wrong")
     assert decode_error(b"Timeout") is None
 

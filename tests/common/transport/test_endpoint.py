@@ -43,19 +43,19 @@ def test_error_names_the_variable_that_the_value_came_from() -> None:
 
 
 @pytest.mark.parametrize("connect", ["router", "tcp/router", "router:7447", "tcp/:7447", "tcp/router:99999", "x/y:1"])
-def test_what_is_no_endpoint_is_refused(connect: str) -> None:
+def test_invalid_endpoint_is_refused(connect: str) -> None:
     with pytest.raises(ConfigError, match="--connect"):
         endpoint_of(None, connect)
 
 
-def test_client_file_points_at_the_default_router_and_searches_for_nothing() -> None:
+def test_client_file_names_the_default_router_and_disables_scouting() -> None:
     config = zenoh.Config.from_file(Path(__file__).parents[3] / "config" / "zenoh-client.json5")
     assert json.loads(config.get_json("mode")) == "client"
     assert json.loads(config.get_json("connect/endpoints")) == [endpoint_of(environ={})]
     assert json.loads(config.get_json("scouting/multicast/enabled")) is False
 
 
-def test_the_router_takes_nothing_larger_than_readers_do() -> None:
+def test_size_limits_of_the_router_are_those_of_readers() -> None:
     limits = {key: entry["size_limit"] for entry in size_limits() for key in entry["key_exprs"]}
     for topic in all_topics().values():
         most = max(topic.message.max_bytes, getattr(topic, "answer", topic.message).max_bytes)

@@ -1,4 +1,4 @@
-"""Large requests are read beside the loop, in pieces and in order; what takes long to read is refused early."""
+"""Large requests are decoded outside the loop, in pieces and in order; costly payloads are refused early."""
 
 import asyncio
 import contextlib
@@ -36,7 +36,7 @@ def execute(points: int, name: str = "a") -> m.ExecuteRequest:
 
 
 def seconds_to_decode(model: type[Message], payload: bytes) -> float:
-    """Least CPU time of three tries."""
+    """Return the least processor time of three attempts [s]."""
     times = []
     for _ in range(3):
         began = process_time()
@@ -48,14 +48,14 @@ def seconds_to_decode(model: type[Message], payload: bytes) -> float:
 
 @pytest.mark.parametrize("model", [model for model in MESSAGES if model.max_bytes <= 4 * SMALL_BYTES])
 @pytest.mark.slow
-def test_nothing_that_is_small_takes_long_to_refuse(model: type[Message]) -> None:
+def test_small_payloads_are_refused_fast(model: type[Message]) -> None:
     worst = 0.0
     for field in model.model_fields:
         for value in VALUES:
             count = (model.max_bytes - 64) // len(msgpack.packb(value))
             worst = max(worst, seconds_to_decode(model, msgpack.packb({field: [value] * count})))
     worst = max(worst, seconds_to_decode(model, msgpack.packb({f"{i:x}": 0 for i in range(1500)})))
-    assert worst < 0.02  # measured: 1.5 ms; a machine that is busy counts the work of others' caches too
+    assert worst < 0.02  # measured: 1.5 ms; more on a busy machine, whose caches others fill
 
 
 @pytest.mark.parametrize(("model", "payload"), [
@@ -65,13 +65,13 @@ def test_nothing_that_is_small_takes_long_to_refuse(model: type[Message]) -> Non
     (m.PlanRequest, msgpack.packb({"goal": [[0]] * 1_000_000})),
     (m.ServiceCounters, msgpack.packb({"service": "a", "received": {f"{i:x}": "" for i in range(2000)}})),
 ], ids=lambda value: getattr(value, "__name__", ""))
-def test_what_cost_seconds_costs_milliseconds(model: type[Message], payload: bytes) -> None:
+def test_costly_payloads_are_refused_within_milliseconds(model: type[Message], payload: bytes) -> None:
     with pytest.raises(DecodeError):
         decode(model, payload)
     assert seconds_to_decode(model, payload) < 0.15
 
 
-def test_the_longest_trajectory_fits_and_reads_the_same_in_pieces() -> None:
+def test_longest_trajectory_fits_and_decodes_the_same_in_pieces() -> None:
     request = execute(MAX_POINTS)
     payload = encode(request)
     assert len(payload) <= m.ExecuteRequest.max_bytes
@@ -88,26 +88,26 @@ def test_the_longest_trajectory_fits_and_reads_the_same_in_pieces() -> None:
     (msgpack.packb({"id": msgpack.ExtType(5, b"0" * SMALL_BYTES)}), "exceeds max_ext_len"),
     (msgpack.packb({"id": b"a" * SMALL_BYTES})[:-9] + b"\xc1" * 9, r"id: must be a valid string"),
 ], ids=["more", "less", "key", "lists", "list", "extension", "bytes"])
-def test_large_payloads_are_refused_alike(payload: bytes, reason: str, in_pieces: bool) -> None:
+def test_large_invalid_payloads_are_refused_the_same_in_pieces(payload: bytes, reason: str, in_pieces: bool) -> None:
     with pytest.raises(DecodeError, match=reason):
         decode(m.ExecuteRequest, payload, in_pieces=in_pieces)
 
 
-async def test_large_requests_are_read_beside_the_loop_and_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
-    beside: list[bool] = []
+async def test_large_requests_are_decoded_outside_the_loop_and_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
+    in_thread: list[bool] = []
 
-    def noted(model: Any, payload: bytes, *rest: Any, **more: Any) -> Message:
+    def recording_decode(model: Any, payload: bytes, *rest: Any, **more: Any) -> Message:
         if model is m.ExecuteRequest:
-            beside.append(threading.current_thread() is not threading.main_thread())
+            in_thread.append(threading.current_thread() is not threading.main_thread())
         return decode(model, payload, *rest, **more)
 
-    monkeypatch.setattr("common.transport.codec.decode", noted)
+    monkeypatch.setattr("common.transport.codec.decode", recording_decode)
     network = LocalNetwork()
     server, client = network.bus("server"), network.bus("client")
-    heard: list[str] = []
+    received: list[str] = []
 
     async def handle(request: m.ExecuteRequest) -> m.MotionStatus:
-        heard.append(request.id)
+        received.append(request.id)
         return m.MotionStatus(id=request.id)
 
     server.serve(MOTION_EXECUTE, handle)
@@ -116,26 +116,26 @@ async def test_large_requests_are_read_beside_the_loop_and_in_order(monkeypatch:
     sizes = {"large": 4000, "small": 2, "middle": 200, "last": 1}
     asked = [asyncio.create_task(calls.call(execute(points, name), timeout=30.0)) for name, points in sizes.items()]
     answers = await asyncio.gather(*asked)
-    assert beside == [True, False, True, False]
-    assert heard == [answer.id for answer in answers] == list(sizes)
+    assert in_thread == [True, False, True, False]
+    assert received == [answer.id for answer in answers] == list(sizes)
     await client.close()
     await server.close()
 
 
-def test_garbage_collector_does_not_look_at_all_that_was_read_in_one_go() -> None:
+def test_garbage_collector_does_not_scan_a_large_message() -> None:
     payload = encode(execute(10_000))
-    looked: list[int] = []
+    scanned: list[int] = []
 
     def note(phase: str, _: dict[str, int]) -> None:
         if phase == "start":
-            looked.append(len(gc.get_objects(0)))
+            scanned.append(len(gc.get_objects(0)))
 
     gc.callbacks.append(note)
     try:
         request = decode(m.ExecuteRequest, payload)
-        kept = [[] for _ in range(2000)]  # what makes it look
+        new_objects = [[] for _ in range(2000)]  # trigger a collection
     finally:
         gc.callbacks.remove(note)
         gc.unfreeze()
-    assert len(request.trajectory.points) == 10_000 and kept
-    assert looked and max(looked) < 20_000, "and not at the lists of all points"
+    assert len(request.trajectory.points) == 10_000 and new_objects
+    assert scanned and max(scanned) < 20_000, "the lists of the points are excluded"

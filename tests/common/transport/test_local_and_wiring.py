@@ -15,7 +15,7 @@ from common.topics import Request, Topic
 from common.transport.bus import Bus
 from common.transport.local import LocalNetwork
 
-PATIENCE = 20.0
+TIMEOUT = 20.0
 
 
 class Config:
@@ -52,11 +52,11 @@ async def test_service_runs_in_process_from_its_ready_to_the_end_of_the_block() 
     async with running_service(net, service, Config(), name="toy"):
         assert await tester.alive.known() == {"toy"}
         tester.writer(topics.CAMERA_IMAGE).put(image(4))
-        assert (await asyncio.wait_for(status.next(), PATIENCE)).placed == 4
-        assert await asyncio.wait_for(log.next(), PATIENCE) == LogLine(
+        assert (await asyncio.wait_for(status.next(), TIMEOUT)).placed == 4
+        assert await asyncio.wait_for(log.next(), TIMEOUT) == LogLine(
             header=log.latest.header, service="toy", level="info", message="saw 4"
         )
-    await tester.alive.wait("toy", PATIENCE, there=False)
+    await tester.alive.wait("toy", TIMEOUT, there=False)
     with pytest.raises(NoResponder):
         await tester.client(topics.TASK_COMMAND).call(TaskCommand(command="start"))
 
@@ -80,7 +80,7 @@ async def test_crash_in_the_middle_ends_the_block_and_is_raised() -> None:
             await asyncio.Event().wait()
 
     with pytest.raises(RuntimeError, match="the handler has a bug"):
-        await asyncio.wait_for(block(), PATIENCE)
+        await asyncio.wait_for(block(), TIMEOUT)
 
 
 async def test_failure_of_the_block_is_raised_as_it_is() -> None:
@@ -112,7 +112,7 @@ async def test_service_that_ends_before_it_is_ready_is_reported() -> None:
         await wiring(short, Config())
 
 
-async def test_wiring_lists_what_a_service_has_to_do_with() -> None:
+async def test_wiring_lists_topics_and_requests_of_a_service() -> None:
     found = await wiring(service, Config())
     assert found.reads == {topics.CAMERA_IMAGE}
     assert found.writes == {PICK_PLACE_STATUS}
@@ -127,7 +127,7 @@ async def test_wiring_raises_what_the_service_raises() -> None:
         await wiring(service, config)
 
 
-async def test_buses_of_two_networks_or_cells_do_not_meet() -> None:
+async def test_buses_of_different_networks_or_cells_are_separate() -> None:
     net = LocalNetwork()
     net.bus("sender", cell="a").writer(PICK_PLACE_STATUS).put(PickPlaceStatus())
     assert net.bus("other", cell="b").reader(PICK_PLACE_STATUS).latest is None
@@ -135,11 +135,11 @@ async def test_buses_of_two_networks_or_cells_do_not_meet() -> None:
     assert net.bus("same", cell="a").reader(PICK_PLACE_STATUS).latest == PickPlaceStatus()
 
 
-def test_topic_and_request_of_before_named_a_writer_and_are_still_taken_with_a_warning() -> None:
+def test_former_writer_argument_of_topic_and_request_is_accepted_with_a_warning() -> None:
     with pytest.warns(DeprecationWarning, match="mine: leave 'my_service' out"):
-        topic = Topic("mine", LogLine, "state", "my_service", "what it is")
-    assert topic == Topic("mine", LogLine, "state", "what it is") and topic.doc == "what it is"
+        topic = Topic("mine", LogLine, "state", "my_service", "the doc")
+    assert topic == Topic("mine", LogLine, "state", "the doc") and topic.doc == "the doc"
     with pytest.warns(DeprecationWarning, match="ask: leave 'my_service' out"):
-        request = Request("ask", TaskCommand, TaskStatus, "my_service", "asks for it")
-    assert (request.doc, request.kind) == ("asks for it", "request")
-    assert replace(topic, key="other") == Topic("other", LogLine, "state", "what it is")
+        request = Request("ask", TaskCommand, TaskStatus, "my_service", "the doc")
+    assert (request.doc, request.kind) == ("the doc", "request")
+    assert replace(topic, key="other") == Topic("other", LogLine, "state", "the doc")

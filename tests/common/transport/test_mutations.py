@@ -9,7 +9,7 @@ from tests.mutations import Mutations, models, real
 PAYLOADS = 150  # of each message, and of each side
 
 
-def test_what_mutations_begin_with_are_messages() -> None:
+def test_mutations_start_from_valid_messages() -> None:
     for model in models():
         for value in real(model):
             assert model.model_validate(value).model_dump() == value

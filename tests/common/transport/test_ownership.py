@@ -1,4 +1,4 @@
-"""A key is written or served by one service: the second finds out when it becomes ready, over Zenoh and in process."""
+"""A key is written or served by one service: a second one is refused when it becomes ready."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ async def obey(_: TaskCommand) -> TaskStatus:
 
 
 @pytest.fixture(autouse=True)
-def _hurry(monkeypatch: pytest.MonkeyPatch) -> None:
+def _claim_without_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ownership, "CLAIM_SECONDS", 0.0)
 
 
@@ -54,32 +54,32 @@ async def test_second_server_is_refused_and_so_is_a_second_process_of_one_name(n
         await second.ready()
 
 
-async def test_what_is_put_before_a_key_is_ours_reaches_nobody_who_listens_or_asks(
+async def test_deferred_messages_are_published_once_the_key_is_acquired(
     new_bus: NewBus, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     first, second, listener = await new_bus("scene"), await new_bus("scene"), await new_bus("listener")
-    heard = listener.reader(topics.PLANNING_SCENE)
+    received = listener.reader(topics.PLANNING_SCENE)
     await listener.ready()
     key = f"{first.cell}/{topics.PLANNING_SCENE.key}"
     for number, bus in enumerate((first, second), 1):
         bus.defer_writes()
         writer = bus.writer(topics.PLANNING_SCENE)
-        for stamp in (1, 10 * number):  # of a state the newest counts
+        for stamp in (1, 10 * number):  # only the newest of a state is published
             writer.put(PlanningScene(header=Header(stamp=stamp)))
     await first.ready()
-    assert (await heard.next()).header.stamp == 10
+    assert (await received.next()).header.stamp == 10
     with pytest.raises(ConfigError):
         await second.ready()
-    asked = [decode(PlanningScene, sample.payload) for sample in await listener.raw_get(key, 1.0)]
-    assert [scene.header.stamp for scene in asked] == [10]
-    assert heard.latest is not None and heard.latest.header.stamp == 10
-    monkeypatch.setattr(ownership, "CLAIM_SECONDS", 10.0)  # the tokens of who ends take their time
+    replies = [decode(PlanningScene, sample.payload) for sample in await listener.raw_get(key, 1.0)]
+    assert [scene.header.stamp for scene in replies] == [10]
+    assert received.latest is not None and received.latest.header.stamp == 10
+    monkeypatch.setattr(ownership, "CLAIM_SECONDS", 10.0)  # tokens of a closed bus vanish late
     await first.close()
     await second.acquire_keys()
-    assert (await heard.next()).header.stamp == 20
+    assert (await received.next()).header.stamp == 20
 
 
-async def test_what_all_services_write_each_owns_for_itself_and_readers_own_nothing(new_bus: NewBus) -> None:
+async def test_each_service_owns_its_log_and_counters_and_readers_own_nothing(new_bus: NewBus) -> None:
     writer, reader = await new_bus("writer"), await new_bus("reader")
     for bus in (writer, reader):
         for each in (topics.LOG, topics.SUPERVISOR_STATUS):
@@ -95,7 +95,7 @@ async def test_what_all_services_write_each_owns_for_itself_and_readers_own_noth
         ("log/writer", "log/writer", "writer")]
 
 
-async def test_what_a_service_owns_itself_needs_no_answer_of_the_network(new_bus: NewBus, monkeypatch) -> None:
+async def test_own_keys_are_known_without_a_reply_of_the_network(new_bus: NewBus, monkeypatch) -> None:
     bus = await new_bus("writer")
     bus.writer(topics.CAMERA_IMAGE)
     monkeypatch.setattr(ownership, "tokens_now", AsyncMock(return_value=[]))
@@ -104,37 +104,37 @@ async def test_what_a_service_owns_itself_needs_no_answer_of_the_network(new_bus
     assert [owner.key for owner in await bus.owners()] == ["camera/image_raw", "counters/writer"]
 
 
-def test_who_just_became_ready_owns_a_key_once_while_both_its_tokens_are_seen() -> None:
-    asks = Owner("joint_states", "joint_states", "executor", process_name("abc"))
-    ready = replace(asks, process=process_name("abc", since=7))
-    other = replace(asks, process=process_name("def"))
-    for seen in itertools.permutations((asks, ready, other)):
+def test_process_with_a_claiming_and_a_ready_token_is_one_owner() -> None:
+    claiming = Owner("joint_states", "joint_states", "executor", process_name("abc"))
+    ready = replace(claiming, process=process_name("abc", since=7))
+    other = replace(claiming, process=process_name("def"))
+    for seen in itertools.permutations((claiming, ready, other)):
         assert sorted(unique_owners(seen), key=lambda owner: owner.instance)[:1] == [ready]
         assert {owner.instance for owner in unique_owners(seen)} == {"abc", "def"}
 
 
-async def test_second_writer_waits_for_the_first_to_go(new_bus: NewBus, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_second_writer_waits_until_the_first_has_closed(new_bus: NewBus, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ownership, "CLAIM_SECONDS", 20.0)
     before, after = await new_bus("camera"), await new_bus("camera")
     for bus in (before, after):
         bus.writer(topics.CAMERA_IMAGE)
     await before.ready()
-    looked, look = asyncio.Event(), Ownership.owners
+    checked, original = asyncio.Event(), Ownership.owners
 
     async def owners(ownership: Ownership, *keys: str) -> list[Owner]:
-        found = await look(ownership, *keys)
-        looked.set()
+        found = await original(ownership, *keys)
+        checked.set()
         return found
 
     monkeypatch.setattr(Ownership, "owners", owners)
     becoming = asyncio.create_task(after.ready())
-    await looked.wait()
+    await checked.wait()
     assert not becoming.done()
     await before.close()
     await asyncio.wait_for(becoming, 20)
 
 
-async def test_of_two_that_start_at_once_never_are_both_ready(new_bus: NewBus) -> None:
+async def test_two_services_that_start_at_once_are_never_both_ready(new_bus: NewBus) -> None:
     buses = [await new_bus(f"camera_{number}") for number in range(2)]
     for bus in buses:
         bus.writer(topics.CAMERA_IMAGE)
@@ -142,24 +142,24 @@ async def test_of_two_that_start_at_once_never_are_both_ready(new_bus: NewBus) -
     assert any(isinstance(each, ConfigError) for each in ended)
 
 
-async def test_keys_are_told_under_the_name_in_the_cell_with_the_own_word() -> None:
+async def test_owners_have_the_remapped_key_and_that_of_the_code() -> None:
     net = LocalNetwork()
     camera = net.bus("left", topics={"camera/*": "left/camera/*"})
     camera.writer(topics.CAMERA_IMAGE)
     await camera.ready()
-    camera.writer(topics.CAMERA_INFO)  # later, as few do
+    camera.writer(topics.CAMERA_INFO)  # after it became ready
     assert {(owner.key, owner.own) for owner in await net.bus("tool").owners()} == {
         ("left/camera/image_raw", "camera/image_raw"), ("left/camera/camera_info", "camera/camera_info"),
         ("counters/left", "counters/left")}
 
 
-def test_token_says_who_holds_it() -> None:
+def test_token_names_its_owner() -> None:
     owner = Owner("left/image_raw", "camera/image_raw", "left", process_name("a1", 7))
     assert Owner.of(f"panda{owner.token}") == owner
     assert owner.instance == "a1" and not owner.claiming and replace(owner, process=process_name("a2")).claiming
 
 
-def test_who_was_ready_first_stays_and_who_asks_never_displaces_anybody() -> None:
+def test_earliest_ready_process_precedes_and_a_claiming_one_never_does() -> None:
     names = [process_name(*each) for each in (("b", 5), ("a", 6), ("c", 6), ("a0", None))]
     owners = [Owner("tf", "tf", "camera", name) for name in names]
     for earlier, later in itertools.combinations(owners, 2):
@@ -167,12 +167,12 @@ def test_who_was_ready_first_stays_and_who_asks_never_displaces_anybody() -> Non
 
 
 class Split:
-    """Two networks of one cell, each with a service of the same name, that are joined."""
+    """Two networks of one cell that can be joined, each with a service of the same name."""
 
     def __init__(self) -> None:
         self.nets = LocalNetwork(), LocalNetwork()
         self.buses: list[Bus] = []
-        self.stood: list[asyncio.Task[None]] = []
+        self.running: list[asyncio.Task[None]] = []
 
     async def start(self, side: int, service: str = "arm") -> None:
         bus = self.nets[side].bus(service)
@@ -184,21 +184,21 @@ class Split:
             await asyncio.Event().wait()
 
         self.buses.append(bus)
-        self.stood.append(asyncio.create_task(bus.run(run())))
+        self.running.append(asyncio.create_task(bus.run(run())))
         await bus.ready_event.wait()
 
     def join(self) -> list[Declaration]:
-        """Show to each side the tokens of the other; returns what the first side is shown."""
+        """Declare the tokens of each side on the other; return those declared on the first side."""
         tokens = [list(net.tokens) for net in self.nets]
-        shown: list[list[Declaration]] = []
+        declared: list[list[Declaration]] = []
         for net, theirs in zip(self.nets, reversed(tokens), strict=True):
             session = net.session()
-            shown.append([session.token(entry.key) for entry in theirs])
-        return shown[0]
+            declared.append([session.token(entry.key) for entry in theirs])
+        return declared[0]
 
 
 @pytest.mark.parametrize("first", [0, 1])
-async def test_split_network_that_is_whole_again_leaves_the_one_that_was_there_first(
+async def test_service_that_was_ready_first_survives_when_a_split_network_heals(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, first: int
 ) -> None:
     monkeypatch.setattr("common.transport.ownership.CONFLICT_SECONDS", 0.0)
@@ -207,12 +207,12 @@ async def test_split_network_that_is_whole_again_leaves_the_one_that_was_there_f
         await split.start(side)
     split.join()
     with pytest.raises(ConfigError, match=r"services\.arm: another arm .* was there first: this one ends"):
-        await asyncio.wait_for(split.stood[1], 20)
-    assert not split.stood[0].done() and caplog.text.count("gives way: this one was there first") == 1
-    split.stood[0].cancel()
+        await asyncio.wait_for(split.running[1], 20)
+    assert not split.running[0].done() and caplog.text.count("gives way: this one was there first") == 1
+    split.running[0].cancel()
 
 
-async def test_first_tells_of_a_second_that_ended_before_the_first_had_met_it_for_long_enough(
+async def test_first_service_reports_a_second_one_that_has_ended_already(
     caplog: pytest.LogCaptureFixture
 ) -> None:
     split = Split()
@@ -223,23 +223,23 @@ async def test_first_tells_of_a_second_that_ended_before_the_first_had_met_it_fo
     for _ in range(4):
         await asyncio.sleep(0)
     assert caplog.text.count("gives way: this one was there first") == 1
-    for stood in split.stood:
-        stood.cancel()
+    for task in split.running:
+        task.cancel()
 
 
-async def test_who_asks_and_goes_soon_is_told_of_by_nobody(caplog: pytest.LogCaptureFixture) -> None:
+async def test_short_claim_is_not_reported(caplog: pytest.LogCaptureFixture) -> None:
     split = Split()
     await split.start(0)
     session = split.nets[0].session()
-    for process in (process_name("asks"), process_name("before", since=7)):
+    for process in (process_name("claims"), process_name("before", since=7)):
         session.token(owns_key("test", topics.JOINT_STATES.key, topics.JOINT_STATES.key, "arm", process)).undeclare()
     for _ in range(4):
         await asyncio.sleep(0)
-    assert "first" not in caplog.text and not split.stood[0].done()
-    split.stood[0].cancel()
+    assert "first" not in caplog.text and not split.running[0].done()
+    split.running[0].cancel()
 
 
-async def test_second_service_that_is_started_while_one_is_up_is_told_of_by_both(
+async def test_second_service_is_refused_and_reported_by_the_first(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr("common.transport.ownership.CONFLICT_SECONDS", 0.0)
@@ -250,24 +250,24 @@ async def test_second_service_that_is_started_while_one_is_up_is_told_of_by_both
     second.serve(topics.TASK_COMMAND, obey)
     with pytest.raises(ConfigError, match="another arm is up"):
         await second.ready()
-    assert "another arm (process" in caplog.text and not split.stood[0].done()
-    split.stood[0].cancel()
+    assert "another arm (process" in caplog.text and not split.running[0].done()
+    split.running[0].cancel()
 
 
-async def test_who_asks_for_a_key_that_is_alive_takes_no_request_away(new_bus: NewBus, monkeypatch) -> None:
+async def test_claiming_server_receives_no_requests_of_the_ready_one(new_bus: NewBus, monkeypatch) -> None:
     monkeypatch.setattr(ownership, "CLAIM_SECONDS", 20.0)
     first, second, tool = await new_bus("task"), await new_bus("task"), await new_bus("tool")
 
-    async def steal(_: TaskCommand) -> TaskStatus:
-        raise AssertionError("asked the one that is not there yet")
+    async def must_not_be_called(_: TaskCommand) -> TaskStatus:
+        raise AssertionError("a server that is not ready was called")
 
     first.serve(topics.TASK_COMMAND, obey)
-    second.serve(topics.TASK_COMMAND, steal)
+    second.serve(topics.TASK_COMMAND, must_not_be_called)
     await first.ready()
-    asking = asyncio.create_task(second.ready())
+    claiming = asyncio.create_task(second.ready())
     client = tool.client(topics.TASK_COMMAND)
     await client.wait_available(20)
     for _ in range(5):
         assert await client.call(TaskCommand(command="start"), 20) == TaskStatus()
-    assert not asking.done()
-    asking.cancel()
+    assert not claiming.done()
+    claiming.cancel()

@@ -1,4 +1,4 @@
-"""What every service says of itself goes under a key of its own: nobody says it for another."""
+"""Log and counters of a service have a key of its own; no other service can publish in its name."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from common.transport.codec import Attachment, encode, encode_attachment
 from common.transport.local import LocalNetwork
 
 NewBus = Callable[..., Awaitable[Bus]]
-PATIENCE = 20.0
+TIMEOUT = 20.0
 
 
 def line(service: str, message: str = "") -> m.LogLine:
@@ -32,10 +32,10 @@ def put(bus: Bus, key: str, message: m.Message, writer: str = "", sequence: int 
 
 
 async def next_of(reader):
-    return await asyncio.wait_for(reader.next(), PATIENCE)
+    return await asyncio.wait_for(reader.next(), TIMEOUT)
 
 
-async def test_each_writes_under_its_own_name_and_a_reader_hears_all(new_bus: NewBus, until) -> None:
+async def test_each_service_writes_under_its_name_and_one_reader_receives_all(new_bus: NewBus, until) -> None:
     camera, arm, tool = await new_bus("camera"), await new_bus("arm"), await new_bus("tool")
     reader, writers = tool.reader(topics.LOG), [bus.writer(topics.LOG) for bus in (camera, arm)]
     assert [writer.topic.key for writer in writers] == ["log/camera", "log/arm"]
@@ -45,31 +45,33 @@ async def test_each_writes_under_its_own_name_and_a_reader_hears_all(new_bus: Ne
     assert {(await next_of(reader)).service for _ in writers} == {"camera", "arm"}
 
 
-@pytest.mark.parametrize(("topic", "made"), [(topics.LOG, line), (topics.COUNTERS, counted)])
-async def test_who_says_that_he_is_another_is_refused_and_counted(new_bus: NewBus, until, caplog, topic, made) -> None:
+@pytest.mark.parametrize(("topic", "message_of"), [(topics.LOG, line), (topics.COUNTERS, counted)])
+async def test_message_in_the_name_of_another_service_is_refused_and_counted(
+    new_bus: NewBus, until, caplog, topic, message_of
+) -> None:
     camera, tool = await new_bus("camera"), await new_bus("tool")
     reader = tool.reader(topic)
     plain = topic.key.partition("/")[0]
     await until(lambda: camera.writer(topic).matched)
-    put(camera, f"{plain}/camera", made("arm"), "arm.1")
-    put(camera, f"{plain}/camera/arm", made("arm"))
-    put(camera, f"{plain}/arm", made("arm"), "arm.1")
-    assert await next_of(reader) == made("arm")
+    put(camera, f"{plain}/camera", message_of("arm"), "arm.1")
+    put(camera, f"{plain}/camera/arm", message_of("arm"))
+    put(camera, f"{plain}/arm", message_of("arm"), "arm.1")
+    assert await next_of(reader) == message_of("arm")
     assert reader.invalid == 2 and tool.counters().invalid == {topic.key: 2}
     await until(lambda: "service: must be 'camera' under" in caplog.text)
     assert f"/{plain}/camera, not 'arm'" in caplog.text
 
 
-async def test_nobody_uses_up_the_numbers_of_another(new_bus: NewBus, until) -> None:
+async def test_forged_sequence_numbers_do_not_hide_messages_of_the_real_writer(new_bus: NewBus, until) -> None:
     camera, tool = await new_bus("camera"), await new_bus("tool")
     reader = tool.reader(topics.LOG)
     await until(lambda: camera.writer(topics.LOG).matched)
-    put(camera, "log/camera", line("camera"), "arm.1", 1000)  # which is what the arm's own writer calls itself
+    put(camera, "log/camera", line("camera"), "arm.1", 1000)  # the writer id of the real arm
     put(camera, "log/arm", line("arm"), "arm.1", 1)
     assert [(await next_of(reader)).service for _ in range(2)] == ["camera", "arm"]
 
 
-async def test_a_flood_of_one_displaces_no_counters_of_another() -> None:
+async def test_flood_of_one_service_displaces_no_counters_of_another() -> None:
     net = LocalNetwork()
     reader, bus = net.bus("tool").reader(topics.COUNTERS), net.bus("camera")
     put(bus, "counters/arm", counted("arm", 7))
@@ -79,7 +81,7 @@ async def test_a_flood_of_one_displaces_no_counters_of_another() -> None:
     assert reader.latest == counted("camera", 4999) and reader.dropped == 4999
 
 
-async def test_counters_of_all_are_there_at_once_for_who_comes_late(new_bus: NewBus, until) -> None:
+async def test_late_reader_gets_the_counters_of_all_at_once(new_bus: NewBus, until) -> None:
     services = [await new_bus(name) for name in ("camera", "arm")]
     for bus in services:
         await bus.ready()
@@ -88,7 +90,7 @@ async def test_counters_of_all_are_there_at_once_for_who_comes_late(new_bus: New
     assert {(await next_of(reader)).service for _ in services} == {"camera", "arm"}
 
 
-async def test_plain_key_of_before_is_still_read_with_one_warning(new_bus: NewBus, until, caplog) -> None:
+async def test_former_plain_key_is_still_read_with_one_warning(new_bus: NewBus, until, caplog) -> None:
     old, tool = await new_bus("old"), await new_bus("tool")
     reader = tool.reader(topics.LOG)
     await until(lambda: old.writer(topics.LOG).matched)
@@ -98,7 +100,7 @@ async def test_plain_key_of_before_is_still_read_with_one_warning(new_bus: NewBu
     assert caplog.text.count("a client publishes under log; the next version no longer reads that key") == 1
 
 
-def test_plain_word_stands_for_all_and_a_name_for_one() -> None:
+def test_topic_is_found_by_its_plain_key_and_by_that_of_one_service() -> None:
     assert find_topic("log") is topics.LOG is find_topic("log/<service>")
     assert find_topic("counters/arm") == topics.of_service(topics.COUNTERS, "arm")
     assert find_topic("param/arm") == topics.parameters_of("arm") and find_topic("param") is None

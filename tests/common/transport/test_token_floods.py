@@ -1,4 +1,4 @@
-"""However many liveliness tokens somebody declares, and however odd: nobody has much to do with them on the loop."""
+"""A flood of liveliness tokens, also malformed ones, costs a bounded time of each event loop."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from common.transport.session import alive_key, owns_key
 from common.transport.tokens import MAX_NAMES, MAX_PER_TURN, TokenWatch
 
 NewBus = Callable[..., Awaitable[Bus]]
-FLOOD = 3000  # counts, not seconds: as many more would be the same
-LATER = 2**63  # [ns] than every real one
-ODD = ("0", "-", "zz", "-1--1", "|", "%s", "[bold]", "\x1b[31m", "\u202e", "a" * 1000)
+FLOOD = 3000  # enough to exceed all limits
+LATE = 2**63  # [ns] later than all real ones
+UNUSUAL = ("0", "-", "zz", "-1--1", "|", "%s", "[bold]", "\x1b[31m", "\u202e", "a" * 1000)
 
 
 async def obey(_: TaskCommand) -> TaskStatus:
@@ -28,21 +28,21 @@ async def obey(_: TaskCommand) -> TaskStatus:
 
 
 def forged(number: int, key: str = "camera/image_raw", service: str = "camera", *, cell: str = "test") -> str:
-    """A token that a camera's certificate lets it declare, with a word and a process of its own choice."""
-    return owns_key(cell, key, f"k{number}", service, f"{LATER + number:016x}-{number:08x}")
+    """Return a token that a camera's certificate permits, with a freely chosen own key and process."""
+    return owns_key(cell, key, f"k{number}", service, f"{LATE + number:016x}-{number:08x}")
 
 
-class Watched:
-    """The changes that a watch of the services that are ready tells of, in which turn of the loop."""
+class Watch:
+    """The changes that a watch of ready services reports, and the most of them in one turn of the loop."""
 
     def __init__(self, session: LocalSession) -> None:
         self.changes: list[tuple[str, bool]] = []
         self.most_at_once = 0
         self._at_once = 0
         self.watch = TokenWatch(session, alive_key("test"), asyncio.get_running_loop())
-        self.watch.on_change(self._take)
+        self.watch.on_change(self._note)
 
-    def _take(self, name: str, there: bool) -> None:
+    def _note(self, name: str, there: bool) -> None:
         self.changes.append((name, there))
         self._at_once += 1
         if self._at_once == 1:
@@ -52,57 +52,57 @@ class Watched:
         self.most_at_once, self._at_once = max(self.most_at_once, self._at_once), 0
 
     async def settled(self) -> None:
-        """Return when all that came before was told."""
+        """Return when all earlier changes have been reported."""
         for _ in range(2 + MAX_NAMES // MAX_PER_TURN):
             await asyncio.sleep(0)
 
 
-async def test_watch_tells_of_a_few_names_in_a_turn_and_of_some_in_all(caplog: pytest.LogCaptureFixture) -> None:
+async def test_watch_limits_names_per_turn_and_in_all(caplog: pytest.LogCaptureFixture) -> None:
     net = LocalNetwork()
-    watched, flooder = Watched(net.session()), net.session()
+    observed, flooder = Watch(net.session()), net.session()
     for number in range(FLOOD):
         flooder.token(alive_key("test", f"n{number}"))
-    await watched.settled()
-    assert 0 < watched.most_at_once <= MAX_PER_TURN
-    assert len(watched.changes) == len(watched.watch.names) == MAX_NAMES
-    assert watched.watch.left_out == FLOOD - MAX_NAMES and caplog.text.count("further ones are left out") == 1
+    await observed.settled()
+    assert 0 < observed.most_at_once <= MAX_PER_TURN
+    assert len(observed.changes) == len(observed.watch.names) == MAX_NAMES
+    assert observed.watch.left_out == FLOOD - MAX_NAMES and caplog.text.count("further ones are left out") == 1
     flooder.close()
-    await watched.settled()
+    await observed.settled()
     token = net.session().token(alive_key("test", "camera"))
-    await watched.settled()
-    assert watched.watch.names == {"camera"}
+    await observed.settled()
+    assert observed.watch.names == {"camera"}
     token.undeclare()
-    await watched.settled()
-    assert not watched.watch.names
+    await observed.settled()
+    assert not observed.watch.names
 
 
 @pytest.mark.parametrize("extra", [0, 1])
-async def test_name_that_comes_and_goes_all_the_time_is_told_of_once(extra: int) -> None:
+async def test_name_that_appears_and_vanishes_repeatedly_is_reported_once(extra: int) -> None:
     net = LocalNetwork()
-    watched, flooder = Watched(net.session()), net.session()
+    observed, flooder = Watch(net.session()), net.session()
     stays = net.session().token(alive_key("test", "task"))
-    await watched.settled()
+    await observed.settled()
     stays.undeclare()
     net.session().token(alive_key("test", "task"))
     for _ in range(FLOOD // 10):
         flooder.token(alive_key("test", "camera")).undeclare()
     if extra:
         flooder.token(alive_key("test", "camera"))
-    await watched.settled()
-    assert watched.changes[:3] == [("task", True), ("task", False), ("task", True)]  # who came back had been gone
-    assert watched.changes[3:] == ([("camera", True)] if extra else [("camera", True), ("camera", False)])
-    assert watched.watch.names == {"task", *["camera"] * extra}
+    await observed.settled()
+    assert observed.changes[:3] == [("task", True), ("task", False), ("task", True)]  # it restarted
+    assert observed.changes[3:] == ([("camera", True)] if extra else [("camera", True), ("camera", False)])
+    assert observed.watch.names == {"task", *["camera"] * extra}
 
 
-async def test_tokens_of_a_key_never_come_to_who_has_other_keys(
+async def test_process_receives_only_tokens_of_its_own_keys(
     new_bus: NewBus, monkeypatch: pytest.MonkeyPatch, until
 ) -> None:
-    heard: list[str] = []
-    hear = Ownership._receive
+    received: list[str] = []
+    receive = Ownership._receive
 
     def note(self: Ownership, token: str, there: bool) -> None:
-        heard.append(token)
-        hear(self, token, there)
+        received.append(token)
+        receive(self, token, there)
 
     monkeypatch.setattr(Ownership, "_receive", note)
     executor, flooder = await new_bus("executor"), await new_bus("camera")
@@ -113,24 +113,24 @@ async def test_tokens_of_a_key_never_come_to_who_has_other_keys(
     (await new_bus("tool")).raw_watch_tokens(owns_key(executor.cell), seen.add)
     for number in range(FLOOD):
         flooder._declare_token(forged(number, cell=executor.cell))
-    # Comes after all of these to who hears it.
+    # Arrives after all of these.
     flooder._declare_token(forged(0, "joint_states", "executor", cell=executor.cell))
-    await until(lambda: forged(0, "joint_states", "executor", cell=executor.cell) in heard)
+    await until(lambda: forged(0, "joint_states", "executor", cell=executor.cell) in received)
     await until(lambda: len(seen) >= FLOOD)
-    assert len([token for token in heard if "camera" in token]) == 0
+    assert len([token for token in received if "camera" in token]) == 0
 
 
 class Flooded:
-    """A camera whose key thousands of forged tokens claim, all of them later than it."""
+    """A camera whose key is claimed by thousands of forged tokens with later times."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.net = LocalNetwork()
-        self.judged: list[Owner] = []
-        judge = Ownership._resolve
+        self.resolved: list[Owner] = []
+        resolve = Ownership._resolve
 
         def note(owners: Ownership, other: Owner, now: float) -> None:
-            self.judged.append(other)
-            judge(owners, other, now)
+            self.resolved.append(other)
+            resolve(owners, other, now)
 
         monkeypatch.setattr(Ownership, "_resolve", note)
         self.bus = self.net.bus("camera")
@@ -146,30 +146,30 @@ class Flooded:
         await self.bus.ready_event.wait()
         for number in range(FLOOD):
             self._session.token(forged(number))
-        for word in (*ODD, "*"):
-            for process in ODD:
-                self._session.token(owns_key("test", "camera/image_raw", word, "camera", f"x{process}"))
+        for own_key in (*UNUSUAL, "*"):
+            for process in UNUSUAL:
+                self._session.token(owns_key("test", "camera/image_raw", own_key, "camera", f"x{process}"))
         self._session.token("test/owns/**")
-        await self.look()
+        await self.settle()
 
-    async def look(self) -> None:
-        """Have all that was there for long enough judged."""
+    async def settle(self) -> None:
+        """Return when all owners that lasted long enough have been resolved."""
         for _ in range(4):
             await asyncio.sleep(0)
 
 
-async def test_few_of_those_who_claim_a_key_are_looked_at_and_told_of(
+async def test_only_few_claimants_of_a_key_are_resolved_and_reported(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(ownership, "CONFLICT_SECONDS", 0.0)
     flooded = Flooded(monkeypatch)
     await flooded.flood()
-    assert len(flooded.judged) <= 2 * MAX_OTHERS
+    assert len(flooded.resolved) <= 2 * MAX_OTHERS
     assert 0 < caplog.text.count("gives way") <= MAX_WARNINGS and not flooded.ran.done()
     flooded.ran.cancel()
 
 
-async def test_other_that_was_there_first_is_met_amid_a_flood(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_earlier_owner_is_detected_amid_a_flood(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ownership, "CONFLICT_SECONDS", 0.0)
     flooded = Flooded(monkeypatch)
     await flooded.flood()
@@ -178,7 +178,7 @@ async def test_other_that_was_there_first_is_met_amid_a_flood(monkeypatch: pytes
         await asyncio.wait_for(flooded.ran, 20)
 
 
-async def test_lines_about_who_claims_a_key_go_on_after_a_while_and_say_how_many_there_were() -> None:
+async def test_claim_warnings_resume_later_with_the_number_of_omitted_ones() -> None:
     net, lines = LocalNetwork(), []
     loop = asyncio.get_running_loop()
     owners = Ownership(net.session(), "test", "camera", loop=loop, warn=lines.append, lose=pytest.fail)

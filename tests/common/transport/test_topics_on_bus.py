@@ -18,7 +18,7 @@ from common.process.log import BusLog
 from common.transport.bus import Bus, Reader, Writer
 from common.transport.codec import Attachment, checksum_of, encode, encode_attachment
 
-PATIENCE = 20.0
+TIMEOUT = 20.0
 LINES = topics.Topic("lines", LogLine, "event", "lines")
 
 
@@ -39,7 +39,7 @@ async def matched(writer: Writer, until) -> None:
 
 
 async def next_of(reader: Reader):
-    return await asyncio.wait_for(reader.next(), PATIENCE)
+    return await asyncio.wait_for(reader.next(), TIMEOUT)
 
 
 def put_raw(bus: Bus, topic, payload: bytes, attachment: bytes = b"") -> None:
@@ -70,30 +70,30 @@ async def test_latest_does_not_consume(new_bus, until) -> None:
     assert reader.dropped == 0
 
 
-async def test_loop_is_woken_for_who_waits_and_not_for_who_looks_at_the_newest_at_times(new_bus, until) -> None:
+async def test_loop_is_woken_for_a_waiting_reader_only(new_bus, until) -> None:
     sender, receiver = await new_bus("sender"), await new_bus("receiver")
     reader, writer = receiver.reader(topics.CAMERA_IMAGE), sender.writer(topics.CAMERA_IMAGE)
     await matched(writer, until)
-    rings, ring = [], reader._notifier.notify
+    wakeups, notify = [], reader._notifier.notify
 
-    def rung() -> None:
-        rings.append(1)
-        ring()
+    def counting() -> None:
+        wakeups.append(1)
+        notify()
 
-    reader._notifier.notify = rung  # type: ignore[method-assign]
+    reader._notifier.notify = counting  # type: ignore[method-assign]
     for number in (1, 2, 3):
         writer.put(image(number))
     await until(lambda: reader.received == 3)
-    assert not rings and reader.latest is not None and reader.latest.header.stamp == 3
+    assert not wakeups and reader.latest is not None and reader.latest.header.stamp == 3
     assert (await next_of(reader)).header.stamp == 3
     both = [asyncio.create_task(next_of(reader)) for _ in range(2)]
-    await asyncio.sleep(0)  # they wait
+    await asyncio.sleep(0)  # both wait now
     for number in (4, 5):
         writer.put(image(number))
-        done, _ = await asyncio.wait(both, timeout=PATIENCE, return_when=asyncio.FIRST_COMPLETED)
+        done, _ = await asyncio.wait(both, timeout=TIMEOUT, return_when=asyncio.FIRST_COMPLETED)
         both = [task for task in both if task not in done]
         assert [task.result().header.stamp for task in done] == [number]
-    assert not both and rings
+    assert not both and wakeups
 
 
 async def test_stream_message_is_returned_once(new_bus, until) -> None:
@@ -104,10 +104,10 @@ async def test_stream_message_is_returned_once(new_bus, until) -> None:
     await next_of(reader)
     waiting = asyncio.create_task(reader.next())
     writer.put(image(2))
-    assert (await asyncio.wait_for(waiting, PATIENCE)).header.stamp == 2
+    assert (await asyncio.wait_for(waiting, TIMEOUT)).header.stamp == 2
 
 
-async def test_events_come_all_and_in_order(new_bus, until) -> None:
+async def test_all_events_arrive_in_order(new_bus, until) -> None:
     sender, receiver = await new_bus("sender"), await new_bus("receiver")
     reader, writer = receiver.reader(LINES), sender.writer(LINES)
     await matched(writer, until)
@@ -161,11 +161,11 @@ async def test_late_reader_gets_the_state_at_once(new_bus) -> None:
 
 
 @pytest.mark.parametrize("pattern", ["pick_place_status", "**", "*"])
-async def test_state_can_be_asked_for_also_with_wildcards(new_bus, pattern: str) -> None:
+async def test_state_can_be_queried_also_with_wildcards(new_bus, pattern: str) -> None:
     sender, plain = await new_bus("sender"), await new_bus("plain")
     sender.writer(PICK_PLACE_STATUS).put(status(3))
     samples = []
-    async with asyncio.timeout(PATIENCE):
+    async with asyncio.timeout(TIMEOUT):
         while not samples:
             samples = await plain.raw_get(f"{plain.cell}/{pattern}", 2.0)
     assert [sample.key for sample in samples] == [f"{plain.cell}/pick_place_status"]
@@ -173,7 +173,7 @@ async def test_state_can_be_asked_for_also_with_wildcards(new_bus, pattern: str)
     assert msgpack.unpackb(samples[0].payload)["placed"] == 3
 
 
-async def test_state_that_was_never_put_has_no_value_to_ask_for(new_bus) -> None:
+async def test_unpublished_state_has_no_value(new_bus) -> None:
     bus = await new_bus()
     bus.writer(PICK_PLACE_STATUS)
     assert await bus.raw_get(f"{bus.cell}/**", 2.0) == []
@@ -184,7 +184,7 @@ async def test_plain_late_subscriber_sees_the_state_repeated_and_readers_do_not(
     reader = receiver.reader(PICK_PLACE_STATUS)
     sender.writer(PICK_PLACE_STATUS).put(status(3))
     await next_of(reader)
-    async with asyncio.timeout(PATIENCE):
+    async with asyncio.timeout(TIMEOUT):
         seen = []
         async for sample in receiver.raw_reader(f"{receiver.cell}/**"):
             seen.append(sample)
@@ -195,7 +195,7 @@ async def test_plain_late_subscriber_sees_the_state_repeated_and_readers_do_not(
     assert reader.dropped == 0
 
 
-async def test_restarted_writer_is_heard_though_it_counts_from_the_start(new_bus, until) -> None:
+async def test_restarted_writer_is_received_though_its_sequence_starts_again(new_bus, until) -> None:
     sender, receiver = await new_bus("sender"), await new_bus("receiver")
     reader = receiver.reader(PICK_PLACE_STATUS)
     first = sender.writer(PICK_PLACE_STATUS)
@@ -235,61 +235,61 @@ async def test_bad_payloads_are_dropped_counted_and_reported_once(new_bus, until
     await matched(writer, until)
     for payload in BAD:
         put_raw(bus, LINES, payload)
-    put_raw(bus, LINES, encode(event(1)), b"no attachment of ours")
+    put_raw(bus, LINES, encode(event(1)), b"invalid attachment")
     for sequence in (1, 2):
-        put_raw(bus, LINES, b"garbage", encode_attachment(Attachment("somebody", sequence)))
+        put_raw(bus, LINES, b"garbage", encode_attachment(Attachment("other", sequence)))
     writer.put(event(7))
     assert (await next_of(reader)).message == "7"
     assert reader.invalid == len(BAD) + 3
-    await until(lambda: "somebody" in caplog.text)
+    await until(lambda: "other" in caplog.text)
     assert len([r for r in caplog.records if r.levelno == logging.WARNING]) == 2
     assert bus.counters().invalid == {"lines": len(BAD) + 3}
 
 
-async def test_a_message_that_was_damaged_on_its_way_is_refused_and_the_next_real_one_is_not(new_bus, until) -> None:
+async def test_damaged_message_is_refused_and_the_next_intact_one_is_accepted(new_bus, until) -> None:
     bus = await new_bus()
     reader, writer = bus.reader(PICK_PLACE_STATUS), bus.writer(PICK_PLACE_STATUS)
     await matched(writer, until)
     sent, key = encode(status(3)), f"{bus.cell}/{PICK_PLACE_STATUS.key}"
     for damaged in (sent[:-1], encode(status(4)), b"x" + sent[1:]):
         put_raw(bus, PICK_PLACE_STATUS, damaged,
-                encode_attachment(Attachment("somebody", 9, checksum=checksum_of(key, sent))))
+                encode_attachment(Attachment("other", 9, checksum=checksum_of(key, sent))))
     await until(lambda: reader.invalid == 3)
     put_raw(bus, PICK_PLACE_STATUS, sent,
-            encode_attachment(Attachment("somebody", 5, checksum=checksum_of(key, sent))))
+            encode_attachment(Attachment("other", 5, checksum=checksum_of(key, sent))))
     assert (await next_of(reader)).placed == 3
     assert reader.invalid == 3
 
 
-async def test_a_message_that_was_sent_under_another_key_is_refused(new_bus, until) -> None:
+async def test_message_sent_under_another_key_is_refused(new_bus, until) -> None:
     bus = await new_bus()
     reader, writer = bus.reader(topics.TF_STATIC), bus.writer(topics.TF_STATIC)
     await matched(writer, until)
     sent = encode(TFMessage(transforms=[]))
     put_raw(bus, topics.TF_STATIC, sent,
-            encode_attachment(Attachment("somebody", 1, checksum=checksum_of(f"{bus.cell}/{topics.TF.key}", sent))))
+            encode_attachment(Attachment("other", 1, checksum=checksum_of(f"{bus.cell}/{topics.TF.key}", sent))))
     await until(lambda: reader.invalid == 1)
     assert reader.latest is None
 
 
-async def test_rubbish_does_not_displace_a_state_that_was_not_read_yet(new_bus, until) -> None:
+async def test_invalid_payload_does_not_displace_an_unread_state(new_bus, until) -> None:
     bus = await new_bus()
     reader, writer = bus.reader(PICK_PLACE_STATUS), bus.writer(PICK_PLACE_STATUS)
     await matched(writer, until)
     writer.put(status(3))
     put_raw(bus, PICK_PLACE_STATUS, b"garbage")
-    put_raw(bus, PICK_PLACE_STATUS, b"garbage", encode_attachment(Attachment("somebody", 1)))
+    put_raw(bus, PICK_PLACE_STATUS, b"garbage", encode_attachment(Attachment("other", 1)))
     await until(lambda: reader.received == 3)
     assert (await next_of(reader)).placed == 3
 
 
-async def test_put_of_another_message_is_a_bug_that_shows(new_bus) -> None:
+async def test_put_of_another_message_class_raises(new_bus) -> None:
     bus = await new_bus()
     with pytest.raises(TypeError, match="carries Image, not LogLine"):
         bus.writer(topics.CAMERA_IMAGE).put(event(1))
 
 
-async def test_trace_rides_from_what_was_read_to_what_is_put(new_bus, until) -> None:
+async def test_trace_passes_from_the_read_message_to_the_published_one(new_bus, until) -> None:
     sender, middle, end = await new_bus("sender"), await new_bus("middle"), await new_bus("end")
     images, log = sender.writer(topics.CAMERA_IMAGE), middle.writer(LINES)
     reader = middle.reader(topics.CAMERA_IMAGE)
@@ -313,7 +313,7 @@ async def test_trace_rides_from_what_was_read_to_what_is_put(new_bus, until) -> 
     await forwarding
 
 
-async def test_counters_are_published_while_somebody_reads_them(new_bus, until) -> None:
+async def test_counters_are_published_while_they_have_a_reader(new_bus, until) -> None:
     service, tool = await new_bus("service"), await new_bus("tool")
     reader, writer = service.reader(REJECTED_TARGETS), service.writer(REJECTED_TARGETS)
     await matched(writer, until)
@@ -335,13 +335,13 @@ async def test_log_lines_are_put_on_the_log_topic(new_bus, until) -> None:
     service.log.setLevel(logging.INFO)
     try:
         service.log.debug("hidden")
-        service.log.info("said on the loop")
-        await asyncio.to_thread(service.log.warning, "said in a thread")
+        service.log.info("logged on the loop")
+        await asyncio.to_thread(service.log.warning, "logged in a thread")
     finally:
         service.log.removeHandler(handler)
     lines = [await next_of(reader), await next_of(reader)]
     assert [(line.service, line.level, line.message) for line in lines] == [
-        ("talker", "info", "said on the loop"), ("talker", "warning", "said in a thread")
+        ("talker", "info", "logged on the loop"), ("talker", "warning", "logged in a thread")
     ]
 
 
@@ -352,7 +352,7 @@ async def test_header_has_cell_time(new_bus) -> None:
     assert bus.header("world").frame_id == "world"
 
 
-async def test_reader_listens_only_while_it_is_told_to(new_bus, until) -> None:
+async def test_reader_subscribes_only_while_it_listens(new_bus, until) -> None:
     sender, receiver = await new_bus("sender"), await new_bus("receiver")
     reader, writer = receiver.reader(topics.CAMERA_IMAGE, listening=False), sender.writer(topics.CAMERA_IMAGE)
     assert not writer.matched
@@ -366,7 +366,7 @@ async def test_reader_listens_only_while_it_is_told_to(new_bus, until) -> None:
     assert (await next_of(reader)).header.stamp == 7
 
 
-async def test_state_reader_that_begins_to_listen_gets_the_last_value(new_bus, until) -> None:
+async def test_state_reader_that_starts_to_listen_gets_the_last_value(new_bus, until) -> None:
     sender, receiver = await new_bus("sender"), await new_bus("receiver")
     reader = receiver.reader(PICK_PLACE_STATUS, listening=False)
     sender.writer(PICK_PLACE_STATUS).put(status(4))

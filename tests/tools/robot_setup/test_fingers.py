@@ -51,6 +51,7 @@ def test_mounted_gripper_gets_the_linkage_of_the_manual_robot_file() -> None:
     assert proposal.values["attachments"][0]["parent_link"] == "tool0"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("urdf", "opens", "closed"), [
     ("so_arm_description/urdf/so101.urdf", 1, -0.174533), ("z1_description/urdf/z1.urdf", -1, 0.0)])
 def test_jaw_that_turns_towards_a_fixed_finger_is_measured(urdf: str, opens: int, closed: float) -> None:

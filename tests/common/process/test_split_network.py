@@ -1,4 +1,4 @@
-"""Two hosts that run the same service, whose routers are linked later: one of the two is left, and both say so."""
+"""Two hosts run the same service and link their routers later: one service survives, and both report it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tests.harness import free_domain
 
 
 @pytest.mark.slow
-async def test_of_two_hosts_that_are_linked_later_the_first_keeps_the_service(processes: Processes) -> None:
+async def test_first_of_two_hosts_keeps_the_service_when_they_are_linked_later(processes: Processes) -> None:
     domains = free_domain(), free_domain()
     routers = [processes.start("services.router", "--domain", str(domain)) for domain in domains]
     toys = []

@@ -1,4 +1,4 @@
-"""Somebody who holds a certificate, or claims to, with nothing of the project between him and the network."""
+"""A plain Zenoh client with any certificate, or none: what an attacker has, without the project's own transport."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ import zenoh
 from common.transport.credentials import Credentials
 from common.transport.endpoint import client_config
 
-PATIENCE = 30.0  # [s] only ever waited for by a test that fails
-NOBODY = b"Timeout"  # what Zenoh itself says when there was no answer
-REFUSED = 1500  # [ms] in which a connection that is refused is tried
+TIMEOUT = 30.0  # [s] only a failing test waits that long
+TIMEOUT_REPLY = b"Timeout"  # of Zenoh itself, when no queryable has replied
+REFUSAL_MS = 1500  # [ms] for which a connection is tried that must be refused
 
 
 def direct(callback: Callable[[Any], None]) -> Any:
-    # The default, an indirect callback, makes a thread that keeps the interpreter from ending.
+    # The default, an indirect callback, starts a thread that keeps the interpreter from exiting.
     return zenoh.handlers.Callback(callback, indirect=False)
 
 
-class Holder:
-    """A connection with somebody's certificate; a `with` block."""
+class RawClient:
+    """A session with the given certificate; a `with` block."""
 
-    def __init__(self, endpoint: str, credentials: Credentials | None, *, connect_ms: int = int(PATIENCE * 1000)):
+    def __init__(self, endpoint: str, credentials: Credentials | None, *, connect_ms: int = int(TIMEOUT * 1000)):
         self._session = zenoh.open(client_config(endpoint, connect_ms=connect_ms, credentials=credentials))
-        self._kept: list[Any] = []  # what nobody holds is taken back
+        self._declarations: list[Any] = []  # Zenoh undeclares one that is no longer referenced
 
-    def __enter__(self) -> Holder:
+    def __enter__(self) -> RawClient:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -44,46 +44,47 @@ class Holder:
     def delete(self, key: str) -> None:
         self._session.delete(key, congestion_control=zenoh.CongestionControl.BLOCK)
 
-    def hear(self, *keys: str) -> Heard:
-        heard = Heard()
+    def subscribe(self, *keys: str) -> Received:
+        received = Received()
         for key in keys:
-            self._kept.append(self._session.declare_subscriber(key, direct(heard.add)))
-        return heard
+            self._declarations.append(self._session.declare_subscriber(key, direct(received.add)))
+        return received
 
-    def answer(self, key: str, payload: bytes) -> Heard:
-        """Answer everybody who asks for a key; what was asked."""
-        heard = Heard()
+    def serve(self, key: str, payload: bytes) -> Received:
+        """Reply `payload` to every query for a key; return the queries."""
+        received = Received()
 
         def reply(query: zenoh.Query) -> None:
             with query:
-                heard.add(query)
+                received.add(query)
                 query.reply(key, payload)
 
-        self._kept.append(self._session.declare_queryable(key, direct(reply)))
-        return heard
+        self._declarations.append(self._session.declare_queryable(key, direct(reply)))
+        return received
 
-    def ask(self, key: str, payload: bytes | None = None, *, timeout: float = 2.0) -> list[bytes]:
-        """The answers, errors too; all who answer the key are asked."""
+    def query(self, key: str, payload: bytes | None = None, *, timeout: float = 2.0) -> list[bytes]:
+        """Return the replies, error replies included, of all queryables of the key."""
         replies = self._session.get(key, payload=payload, timeout=timeout, target=zenoh.QueryTarget.ALL,
                                     consolidation=zenoh.ConsolidationMode.NONE)
         results = [reply.ok or reply.err for reply in replies]
         answers = [result.payload.to_bytes() for result in results if result is not None]
-        return [answer for answer in answers if answer != NOBODY]
+        return [answer for answer in answers if answer != TIMEOUT_REPLY]
 
-    def claim(self, token: str) -> None:
-        self._kept.append(self._session.liveliness().declare_token(token))
+    def declare_token(self, token: str) -> None:
+        self._declarations.append(self._session.liveliness().declare_token(token))
 
     def tokens(self, key: str) -> list[str]:
         return [str(reply.ok.key_expr) for reply in self._session.liveliness().get(key, timeout=2.0) if reply.ok]
 
-    def watch(self, key: str) -> Heard:
-        heard = Heard()
-        self._kept.append(self._session.liveliness().declare_subscriber(key, direct(heard.add), history=True))
-        return heard
+    def watch_tokens(self, key: str) -> Received:
+        received = Received()
+        subscriber = self._session.liveliness().declare_subscriber(key, direct(received.add), history=True)
+        self._declarations.append(subscriber)
+        return received
 
 
-class Heard:
-    """What has come, from any thread."""
+class Received:
+    """Received samples or queries; filled by any thread."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
@@ -102,12 +103,12 @@ class Heard:
 
     def wait(self, condition: Callable[[list[tuple[str, bytes]]], bool]) -> None:
         with self._changed:
-            assert self._changed.wait_for(lambda: condition(self.samples), PATIENCE), self.samples[-5:]
+            assert self._changed.wait_for(lambda: condition(self.samples), TIMEOUT), self.samples[-5:]
 
-    def soon(self, seconds: float) -> None:
-        """Return when something has come, or after so long."""
+    def wait_briefly(self, seconds: float) -> bool:
+        """Return as soon as there is a sample, at the latest after `seconds`; return whether there is one."""
         with self._changed:
-            self._changed.wait_for(lambda: bool(self.samples), seconds)
+            return self._changed.wait_for(lambda: bool(self.samples), seconds)
 
     def wait_for(self, key: str, payload: bytes | None = None) -> None:
         self.wait(lambda samples: any(k == key and payload in (None, p) for k, p in samples))

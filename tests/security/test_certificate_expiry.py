@@ -1,4 +1,4 @@
-"""Certificates end: it is said before, they are made anew while all runs, and an authority is replaced with overlap."""
+"""Certificates expire with a warning, are renewed in a running cell, and an authority is replaced with overlap."""
 
 import datetime
 import json
@@ -17,12 +17,12 @@ from common.transport.router import Router, maintain
 from security.access import Rights, access_control
 from security.certificates import Authority
 from security.validation import certificate_in, require_valid
-from tests.security.holders import REFUSED, Holder
+from tests.security.raw_client import REFUSAL_MS, RawClient
 from tests.security.test_routers import free_port
 from tools.doctor.network import certificates as findings
 
 NAMES = ("router", "operator", "panda.camera")
-PATIENCE = 20.0  # [s] only ever waited for by a test that fails
+TIMEOUT = 20.0  # [s] only a failing test waits that long
 RENEW = "zencell secure renew DIR"
 
 
@@ -40,18 +40,18 @@ def folder(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def endpoint(folder: Path) -> Iterator[str]:
-    """A router that is tended, as its process does it."""
-    found, stop = f"tls/127.0.0.1:{free_port()}", threading.Event()
-    with Router([found], folder) as router:
-        tending = threading.Thread(target=maintain, args=[router, stop])
-        tending.start()
-        yield found
+    """A router that adopts new certificates, as in its process."""
+    endpoint, stop = f"tls/127.0.0.1:{free_port()}", threading.Event()
+    with Router([endpoint], folder) as router:
+        maintaining = threading.Thread(target=maintain, args=[router, stop])
+        maintaining.start()
+        yield endpoint
         stop.set()
-        tending.join()
+        maintaining.join()
 
 
 def until(what: str, reached: Callable[[], object]) -> None:
-    end = time.monotonic() + PATIENCE
+    end = time.monotonic() + TIMEOUT
     while not reached():
         assert time.monotonic() < end, what
         time.sleep(0.05)
@@ -61,36 +61,36 @@ def now_in(days: float) -> datetime.datetime:
     return datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=days)
 
 
-# --- when it is said ---------------------------------------------------------------------------------------------
+# --- warnings ----------------------------------------------------------------------------------------------------
 
 
-def test_the_end_is_that_of_the_certificate(folder: Path) -> None:
+def test_expiry_is_that_of_the_certificate(folder: Path) -> None:
     for name in ("ca", *NAMES):
         assert expiry_of(folder / f"{name}.pem") == certificate_in(folder / f"{name}.pem").not_valid_after_utc
-    Authority.new(365 * 40).write(folder / "late.pem", folder / "late.key")  # told in another form from 2050 on
+    Authority.new(365 * 40).write(folder / "late.pem", folder / "late.key")  # encoded in another form from 2050 on
     assert expiry_of(folder / "late.pem") == certificate_in(folder / "late.pem").not_valid_after_utc
     assert expiry_of(folder / "ca.key") is None
     assert expiry_of(folder / "none.pem") is None
 
 
-@pytest.mark.parametrize(("days", "urgent", "said"), [
+@pytest.mark.parametrize(("days", "urgent", "text"), [
     (9, None, ""), (11, False, "in 29 days"), (38, False, "in 2 days"), (39.5, True, "in 12 hours"),
     (41, True, "expired on"),
 ])
-def test_it_is_said_30_days_and_one_day_before(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, days: float, urgent: bool | None, said: str
+def test_warnings_start_30_days_and_one_day_before(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, days: float, urgent: bool | None, text: str
 ) -> None:
     monkeypatch.setenv("ZENCELL_SECURE", str(folder))
     at = now_in(days) + datetime.timedelta(minutes=-1)
     found = expiry_warning("router", certificate_in(folder / "router.pem").not_valid_after_utc, at)
     assert (found[0] if found else None) is urgent
-    told = [*findings(at)]
-    assert {finding.level for finding in told} == {{None: "ok", False: "warn", True: "fail"}[urgent]}
-    assert all(said in finding.what for finding in told)
-    assert len(told) == (1 if urgent is None else len(NAMES))
+    reported = [*findings(at)]
+    assert {finding.level for finding in reported} == {{None: "ok", False: "warn", True: "fail"}[urgent]}
+    assert all(text in finding.what for finding in reported)
+    assert len(reported) == (1 if urgent is None else len(NAMES))
 
 
-def test_each_end_is_logged_once_and_once_more_when_it_is_urgent(folder: Path) -> None:
+def test_each_expiry_is_logged_once_and_again_when_urgent(folder: Path) -> None:
     watch = CertificateMonitor(folder)
     assert watch.new_warnings() == []
     assert len(watch.new_warnings(now_in(11))) == len(NAMES)
@@ -104,10 +104,10 @@ def test_each_end_is_logged_once_and_once_more_when_it_is_urgent(folder: Path) -
     assert f"`zencell secure renew {folder}`" in line
 
 
-# --- made anew while all runs ---------------------------------------------------------------------------------------
+# --- renewal of a running cell --------------------------------------------------------------------------------------
 
 
-def test_all_is_made_anew_also_an_authority_that_would_end_before(folder: Path) -> None:
+def test_renewal_includes_an_authority_that_would_expire_earlier(folder: Path) -> None:
     before = {name: (folder / f"{name}.pem").read_bytes() for name in (*NAMES, "ca")}
     assert app.execute(["secure", "renew", str(folder)]) == 0
     assert all((folder / f"{name}.pem").read_bytes() != text for name, text in before.items())
@@ -116,32 +116,32 @@ def test_all_is_made_anew_also_an_authority_that_would_end_before(folder: Path) 
     certificate_in(folder / "camera.pem").verify_directly_issued_by(certificate_in(folder / "ca.pem"))
 
 
-def test_whoever_is_connected_shows_his_new_certificate_without_a_restart(folder: Path, endpoint: str) -> None:
-    with Holder(endpoint, credentials_of("panda.camera", folder)) as camera:
+def test_connected_client_presents_its_new_certificate_without_a_restart(folder: Path, endpoint: str) -> None:
+    with RawClient(endpoint, credentials_of("panda.camera", folder)) as camera:
         assert camera.connected
         assert app.execute(["secure", "renew", str(folder), "--authority"]) == 0
         with_both = (folder / "ca.pem").read_bytes()
         assert with_both.count(b"BEGIN") == 2
         assert app.execute(["secure", "renew", str(folder), "--forget"]) == 0
-        # The router takes what is new and ends all links: who is back has shown what is new, and trusts what is new.
-        until("a certificate of the new authority is not let in",
-              lambda: is_let_in(endpoint, credentials_of("operator", folder)))
-        until("who was connected is not back", lambda: camera.connected)
+        # The router adopts the new files and closes all links: a client that reconnects uses the new ones, too.
+        until("a client of the new authority cannot connect",
+              lambda: can_connect(endpoint, credentials_of("operator", folder)))
+        until("the connected client does not reconnect", lambda: camera.connected)
 
 
-def is_let_in(endpoint: str, credentials: Credentials) -> bool:
+def can_connect(endpoint: str, credentials: Credentials) -> bool:
     try:
-        with Holder(endpoint, credentials, connect_ms=REFUSED) as one:
+        with RawClient(endpoint, credentials, connect_ms=REFUSAL_MS) as one:
             return one.connected
     except zenoh.ZError:
         return False
 
 
 @pytest.mark.slow
-def test_an_authority_is_replaced_with_overlap_and_then_trusted_no_more(
+def test_authority_is_replaced_with_overlap_and_then_no_longer_trusted(
     folder: Path, endpoint: str, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
-    elsewhere = tmp_path_factory.mktemp("another_host")  # which gets its new files later
+    elsewhere = tmp_path_factory.mktemp("another_host")  # gets its new files later
     for name in ("ca.pem", "operator.pem", "operator.key"):
         (elsewhere / name).write_bytes((folder / name).read_bytes())
     (elsewhere / "operator.key").chmod(0o600)
@@ -149,33 +149,33 @@ def test_an_authority_is_replaced_with_overlap_and_then_trusted_no_more(
     assert app.execute(["secure", "renew", str(folder), "--authority"]) == 0
     (elsewhere / "ca.pem").write_bytes((folder / "ca.pem").read_bytes())
     new = credentials_of("operator", folder)
-    until("the new one is not let in", lambda: is_let_in(endpoint, new))
-    assert is_let_in(endpoint, old), "both authorities are trusted"
+    until("the new certificate cannot connect", lambda: can_connect(endpoint, new))
+    assert can_connect(endpoint, old), "both authorities are trusted"
     assert app.execute(["secure", "renew", str(folder), "--forget"]) == 0
     (elsewhere / "ca.pem").write_bytes((folder / "ca.pem").read_bytes())
-    until("the old one is still let in", lambda: not is_let_in(endpoint, old))
-    until("the new one is not let in", lambda: is_let_in(endpoint, new))
+    until("the old certificate can still connect", lambda: not can_connect(endpoint, old))
+    until("the new certificate cannot connect", lambda: can_connect(endpoint, new))
 
 
-def test_what_cannot_be_used_leaves_in_force_what_was_there(
+def test_unusable_files_leave_the_previous_ones_in_force(
     folder: Path, endpoint: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     with caplog.at_level(logging.ERROR, "router"):
         (folder / "router.key").write_bytes((folder / "operator.key").read_bytes())
-        until("nothing was said", lambda: caplog.records)
+        until("nothing was logged", lambda: caplog.records)
     assert "the previous ones stay in force" in caplog.text
-    assert is_let_in(endpoint, credentials_of("operator", folder))
+    assert can_connect(endpoint, credentials_of("operator", folder))
 
 
 @pytest.mark.slow
-def test_a_certificate_that_ends_opens_nothing_new_and_ends_nothing_that_runs(folder: Path, endpoint: str) -> None:
-    lasts = 3.0  # [s]
+def test_expired_certificate_opens_no_new_link_and_closes_none(folder: Path, endpoint: str) -> None:
+    validity = 3.0  # [s]
     Authority.load(folder / "ca.pem", folder / "ca.key").issue(
-        "operator", [], lasts / 86400, folder / "operator.pem", folder / "operator.key")
+        "operator", [], validity / 86400, folder / "operator.pem", folder / "operator.key")
     own = credentials_of("operator", folder)
-    with Holder(endpoint, own) as running:
-        heard = running.hear("panda/x")
-        until("it is still let in", lambda: not is_let_in(endpoint, own))
-        with Holder(endpoint, credentials_of("panda.camera", folder)) as camera:
-            until("what runs has ended", lambda: (camera.put("panda/x", b"a"), heard.samples)[1])
+    with RawClient(endpoint, own) as running:
+        received = running.subscribe("panda/x")
+        until("the expired certificate can still connect", lambda: not can_connect(endpoint, own))
+        with RawClient(endpoint, credentials_of("panda.camera", folder)) as camera:
+            until("the established link received nothing", lambda: (camera.put("panda/x", b"a"), received.samples)[1])
         assert running.connected

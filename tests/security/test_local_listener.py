@@ -1,0 +1,173 @@
+"""Services of the router's host connect at a listener of their own; a flood at one listener leaves the other open."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import shutil
+import socket
+import time
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+
+from common.supervision.launch import Launch, free_endpoints
+from common.transport.credentials import credentials_of
+from common.transport.endpoint import LINKS, NEAR_MS, nearby_endpoints
+from common.transport.router import Router
+from common.transport.zenoh_session import ZenohSession, open_zenoh
+from security.certificates import Authority
+from tests.common.transport.conftest import until
+from tests.security.raw_client import REFUSAL_MS, RawClient
+from tests.security.test_routers import free_port
+
+SILENT = 150  # Zenoh without the gate accepts no client for 100 ms after each
+WITHIN = 3.0  # [s]
+
+
+class SecuredRouter:
+    """A router with its TLS gate and its listeners for services of this host."""
+
+    def __init__(self, certificates: Path) -> None:
+        self.certificates = certificates
+        self.endpoint, self.near = f"tls/127.0.0.1:{free_port()}", free_endpoints(2)
+        self.process = Router([self.endpoint], certificates, near=self.near)
+
+    @property
+    def uses_gate(self) -> bool:
+        return bool(self.process._gate._sockets)
+
+    async def connect(self, *, near: bool) -> tuple[ZenohSession, float]:
+        began = time.monotonic()
+        camera = credentials_of("panda.camera_simulator", self.certificates)
+        session = await open_zenoh(self.endpoint, camera, self.near if near else ())
+        return session, time.monotonic() - began
+
+
+@pytest.fixture
+def router(certificates: Path, tmp_path: Path):
+    folder = tmp_path / "certificates"
+    shutil.copytree(certificates, folder)
+    router = SecuredRouter(folder)
+    with router.process:
+        yield router
+
+
+def connections(ports: list[str]) -> list[socket.socket]:
+    return [socket.create_connection(("127.0.0.1", int(each.rpartition(":")[2]))) for each in ports]
+
+
+async def test_local_client_bypasses_the_gate_and_has_the_rights_of_its_certificate(router: SecuredRouter) -> None:
+    session, _ = await router.connect(near=True)
+    assert session.connected and not router.uses_gate and len(session._session.info.links()) == len(LINKS)
+    far, _ = await router.connect(near=False)
+    assert far.connected and router.uses_gate
+    with RawClient(router.endpoint, credentials_of("operator", router.certificates)) as operator:
+        received = operator.subscribe("panda/**")
+        for _ in range(100):
+            for key in ("panda/joint_states", "panda/camera/camera_info"):
+                session.publisher(key, "", reliable=True).put(b"by the camera", b"")
+            if received.samples:
+                break
+            received.wait_briefly(0.1)
+        assert received.keys == {"panda/camera/camera_info"}
+    for each in (session, far):
+        each.close()
+
+
+@pytest.mark.parametrize("expression", ["panda/camera/camera_info", "panda/camera/*", "panda/**", "*/camera/**"])
+async def test_late_subscriber_receives_from_a_local_writer_with_any_expression(
+    router: SecuredRouter, expression: str
+) -> None:
+    writer, _ = await router.connect(near=True)
+    answered = asyncio.get_running_loop().create_future()
+    publisher = writer.publisher("panda/camera/camera_info", "", reliable=True)
+    # The reply comes after all earlier declarations: the router knows by then that there is no subscriber.
+    writer.get_tokens("panda/alive/*", lambda _: None, lambda: answered.get_loop().call_soon_threadsafe(
+        answered.set_result, None), timeout=WITHIN)
+    await answered
+    assert not publisher.matched
+    with RawClient(router.endpoint, credentials_of("operator", router.certificates)) as operator:
+        received = operator.subscribe(expression)
+        for _ in range(100):
+            publisher.put(b"by the camera", b"")
+            if received.samples:
+                break
+            received.wait_briefly(0.1)
+        assert received.keys == {"panda/camera/camera_info"}
+    writer.close()
+
+
+@pytest.mark.parametrize("flooded", [pytest.param("near", marks=pytest.mark.slow), "gate"])
+async def test_silent_connections_at_one_listener_keep_no_client_out_at_the_other(
+    router: SecuredRouter, flooded: str
+) -> None:
+    listening = [each for each in router.near if _listens(each)]
+    assert len(listening) == 1
+    at = listening if flooded == "near" else [router.endpoint]
+    silent = connections(at * SILENT)
+    for state in ("while the silent ones are open", "after the silent ones have closed"):
+        for near in (True, False):
+            session, took = await router.connect(near=near)
+            assert took < WITHIN + (NEAR_MS / 1000 if near else 0), (state, near)
+            session.close()
+        for each in silent:
+            each.close()
+
+
+def _listens(endpoint: str) -> bool:
+    try:
+        connections([endpoint])[0].close()
+    except ConnectionRefusedError:
+        return False
+    return True
+
+
+@pytest.mark.slow
+async def test_local_listener_refuses_clients_without_a_certificate_of_the_authority(
+    router: SecuredRouter, tmp_path: Path
+) -> None:
+    authority = Authority.new(10)
+    foreign = tmp_path / "foreign"
+    foreign.mkdir()
+    authority.write(foreign / "ca.pem", foreign / "ca.key")
+    authority.issue("operator", [], 10, foreign / "operator.pem", foreign / "operator.key")
+    shutil.copy(router.certificates / "ca.pem", foreign / "ca.pem")
+    (near,) = [each for each in router.near if _listens(each)]
+    for credentials in (None, credentials_of("operator", foreign)):
+        with pytest.raises(Exception, match="Unable to connect"):
+            RawClient(near, credentials, connect_ms=REFUSAL_MS)
+
+
+async def test_local_client_reconnects_locally_after_a_renewal(router: SecuredRouter) -> None:
+    session, _ = await router.connect(near=True)
+    authority = Authority.load(router.certificates / "ca.pem", router.certificates / "ca.key")
+    authority.issue("router", ["127.0.0.1"], 30, router.certificates / "router.pem", router.certificates / "router.key")
+    renewed = [router.process.renew() for _ in range(2)]
+    assert renewed == [False, True]
+    before = router.near[1]
+    await until(lambda: not _listens(before) and _listens(router.near[0]))
+    await until(lambda: session.connected and not router.uses_gate)
+    session.close()
+
+
+def test_router_starts_without_its_local_listener_if_the_port_is_taken(
+    certificates: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    endpoint, near = f"tls/127.0.0.1:{free_port()}", free_endpoints(1)
+    with ExitStack() as stack:
+        stack.enter_context(socket.create_server(("127.0.0.1", int(near[0].rpartition(":")[2]))))
+        with caplog.at_level(logging.WARNING):
+            stack.enter_context(Router([endpoint], certificates, near=near))
+        assert "services of this host connect through the gate" in caplog.text
+        assert stack.enter_context(RawClient(endpoint, credentials_of("operator", certificates))).connected
+
+
+def test_supervisor_passes_the_local_listeners_of_its_router_to_services(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ZENCELL_SECURE", "somewhere")
+    launch = Launch("panda", domain=3, near=("tls/127.0.0.1:1", "tls/127.0.0.1:2"))
+    environment = launch.environment({})
+    assert nearby_endpoints("tls/127.0.0.1:7450", environment) == ["tls/127.0.0.1:1", "tls/127.0.0.1:2"]
+    assert nearby_endpoints("tls/192.168.1.10:7450", environment) == [] == nearby_endpoints("tls/127.0.0.1:7450", {})
+    assert launch.router_command()[-5:] == ["--near", "tls/127.0.0.1:1", "--near", "tls/127.0.0.1:2", "--gate"]
