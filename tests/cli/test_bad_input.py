@@ -60,7 +60,7 @@ CASES: dict[str, tuple[list[str], list[str]]] = {
     "unknown topic": (["topic", "info", "joint_state"], ["unknown key", "did you mean 'joint_states'?"]),
     "cell file whose name begins no key": (["check", "a cell.yaml"], ["'a cell' is no name of a cell", "letters"]),
     "cell that stands for several": (["task", "stop", "--cell", "*"], ["cell: '*'", "is not a valid name of a cell"]),
-    "cell of two parts": (["play", RECORDING, "--cell", "a/b"], ["--cell: 'a/b'", "is no name"]),
+    "cell of two parts": (["play", RECORDING, "--cell", "a/b"], ["--cell: 'a/b'", "is not a valid name"]),
     "key of a part without a name": (["topic", "pub", "my//key", "{}"], ["unknown key 'my//key'", "choices:"]),
     "key that stands for several": (["topic", "pub", "my/*", "{}"], ["unknown key 'my/*'", "choices:"]),
     "service of no name": (["service", "nobody"], ["unknown service 'nobody'", "motion_planner"]),

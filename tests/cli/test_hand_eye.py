@@ -98,7 +98,7 @@ def test_camera_on_the_hand_is_found_from_a_folder_and_written(
         assert wanted in capsys.readouterr().err
     (tmp_path / "views" / "view_004.png").unlink()
     assert app.execute([*asked, "--camera", "hand"]) == 2
-    assert "view_004.png' is no picture in that folder" in capsys.readouterr().err
+    assert "view_004.png' is not an image in that folder" in capsys.readouterr().err
 
 
 ARM = '''"""An arm that somebody brings from pose to pose, and its camera."""

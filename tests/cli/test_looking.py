@@ -173,7 +173,7 @@ def test_graph_shows_who_is_alive(place: Place) -> None:
 
 @pytest.mark.parametrize(("arguments", "code", "message"), [
     (["tf", "echo", "world", "hnad", "--once"], 2, "unknown frame 'hnad' (did you mean 'hand'?); choices: base, cart"),
-    (["tf", "echo", "world", "cart", "--once"], 2, "one hangs on 'world', the other on 'map'"),
+    (["tf", "echo", "world", "cart", "--once"], 2, "the root of one is 'world', of the other 'map'"),
     (["tf", "frames", "--cell", "other"], 1, "nothing came on other/tf and other/tf_static"),
     (["topic", "delay", "camera/image_rwa", "-n", "1"], 2, "did you mean 'camera/image_raw'?"),
 ])
@@ -189,6 +189,6 @@ def test_doctor_finds_the_cell_and_its_version(place: Place) -> None:
     findings = [json.loads(line) for line in done.stdout.splitlines()]
     said = [finding["what"] for finding in findings]
     endpoint = f"tcp/127.0.0.1:{7447 + place.domain}"
-    assert f"cell look at {endpoint} speaks the version of this tool" in said
+    assert f"cell look at {endpoint} has the message version of this tool" in said
     assert any(what.startswith("a cell is up, or comes up: zencell up look.yaml (") for what in said)
     assert all(finding["remedy"] for finding in findings if finding["level"] != "ok")

@@ -256,7 +256,7 @@ async def test_a_service_that_does_not_answer_hides_nothing_of_the_others(monkey
     bus.serve(parameters_of("tuned"), answer)
     await bus.ready()
     # The token of what is served is named by who serves it; here one bus stands for two services.
-    monkeypatch.setattr(parameters, "serving", lambda _: asyncio.sleep(0, ["frozen", "tuned"]))
+    monkeypatch.setattr(parameters, "tunable_services", lambda _: asyncio.sleep(0, ["frozen", "tuned"]))
     found = await parameters.listing(bus, None)
     assert [p.path for p in found.parameters["tuned"]] == ["services.tuned.x"]
     with pytest.raises(RequestTimeout, match="param/frozen"):
@@ -279,11 +279,11 @@ async def test_answers_that_make_no_sense_are_told_in_one_line(monkeypatch: pyte
 
     bus.serve(parameters_of("tuned"), answer)
     await bus.ready()
-    monkeypatch.setattr(parameters, "serving", lambda _: asyncio.sleep(0, ["tuned"]))
-    with pytest.raises(RequestFailed, match=r"tuned does not say what became of services\.tuned\.x"):
+    monkeypatch.setattr(parameters, "tunable_services", lambda _: asyncio.sleep(0, ["tuned"]))
+    with pytest.raises(RequestFailed, match=r"tuned did not report services\.tuned\.x after the change"):
         await parameters.change(bus, {"tuned.x": 2})
     assert asked == 3
-    with pytest.raises(RequestFailed, match=r"services\.tuned\.x\.y is told of as a part of another parameter"):
+    with pytest.raises(RequestFailed, match=r"services\.tuned\.x\.y lies inside the value of another parameter"):
         await parameters.dumped(bus, None)
     await bus.close()
 

@@ -51,7 +51,7 @@ async def test_repetition_of_an_old_state_says_nothing_of_its_age() -> None:
     gripper = network.bus("executor").writer(topics.GRIPPER_STATE)
     gripper.put(GripperState(header=Header(stamp=5), width=0.0))
     async with CellMonitor(network.bus("top"), CLOCK) as watch:
-        gripper.repeat()
+        gripper.raw.repeat()
         (row,) = watch.view().topics
         assert (row.messages, row.p50) == (1, None)
         gripper.put(GripperState(header=Header(stamp=CLOCK.now_ns()), width=0.0))
@@ -156,7 +156,7 @@ async def test_keys_that_somebody_makes_up_are_listened_to_up_to_a_number() -> N
     async with CellMonitor(network.bus("top"), CLOCK) as watch:
         for number in range(10):
             watch.count(counted(f"liar_{number}", {f"mine/{number}/{i}": 1 for i in range(200)}), 1.0)
-        assert len(watch._hearing) == MAX_KEYS
+        assert len(watch._statistics) == MAX_KEYS
         assert len(watch.view().topics) == 0
 
 
