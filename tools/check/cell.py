@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-import os
 import pickle
-import sys
 from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING
 
@@ -133,8 +131,8 @@ async def warnings_in_subprocess(cell: Cell, environ: Mapping[str, str]) -> list
         QuickCheckFailed: the subprocess failed; stderr has its output.
     """
     process = await asyncio.create_subprocess_exec(
-        *module_command(__name__), stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE, env=environ,
-        start_new_session=True,  # so that it does not get Ctrl-C
+        *module_command("tools.check.quick"), stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE,
+        env=environ, start_new_session=True,  # so that it does not get Ctrl-C
     )
     try:
         output, _ = await process.communicate(pickle.dumps(cell))
@@ -146,20 +144,3 @@ async def warnings_in_subprocess(cell: Cell, environ: Mapping[str, str]) -> list
         raise QuickCheckFailed(f"the quick check failed (exit code {process.returncode}); see `zencell check`")
     found: list[Finding] = pickle.loads(output)
     return found
-
-
-def main() -> None:
-    """Check the pickled cell from stdin and write the pickled findings to stdout."""
-    from common.process.lifeline import die_when_orphaned
-
-    die_when_orphaned()
-    os.nice(NICE)
-    with os.fdopen(os.dup(1), "wb") as answer:
-        os.dup2(2, 1)  # so that prints of the user's modules do not mix with the answer
-        from tools.check.cell import quick_warnings  # not of __main__: the parent unpickles by this name
-
-        answer.write(pickle.dumps(quick_warnings(pickle.load(sys.stdin.buffer))))
-
-
-if __name__ == "__main__":
-    main()
