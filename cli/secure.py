@@ -1,4 +1,4 @@
-"""Certificates for a cell's processes, and who may do what."""
+"""`zencell secure`: certificates of a cell and its access rules."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ def init(
     cells: Annotated[list[str] | None, typer.Option("--cell", metavar="CELL", help="all of config/cells if not given; "
                                                     "repeatable")] = None,
     hosts: Annotated[list[str] | None, typer.Option("--host", metavar="NAME", help="name or address at which the "
-                                                    "router is reached from elsewhere; repeatable; with --renew those "
-                                                    "of before if not given")] = None,
+                                                    "router is reached from elsewhere; repeatable; with --renew the "
+                                                    "previous ones if not given")] = None,
     days: Annotated[str, typer.Option("--days", metavar="N", help="for which the certificates are valid")] = str(DAYS),
     overrides: options.Overrides = None,
-    renew: Annotated[bool, typer.Option("--renew", help="keep the authority, make the rest anew")] = False,
+    renew: Annotated[bool, typer.Option("--renew", help="replace all except the authority")] = False,
 ) -> None:
-    """Make an authority, a certificate for each process, and the router's rules of who may do what."""
+    """Create an authority, a certificate for each process, and the access rules of the router."""
     from common.config import load_cell, names_of
     from common.transport.credentials import ACCESS
     from security.access import rights_in
@@ -48,7 +48,7 @@ def init(
     place = Path(folder)
     made = make(place, {cell.name: rights_in(cell) for cell in loaded}, with_page, hosts or (), valid, renew=renew)
     echo(f"{made} certificates, valid for {valid} days, and {ACCESS} in {folder}")
-    echo(f"keep {authority_files(place)[1]} elsewhere: nothing but another `secure init --renew` needs it")
+    echo(f"keep {authority_files(place)[1]} elsewhere: only `secure init --renew` and `secure renew` need it")
     echo(f"next: zencell up {(cells or names_of('cells'))[0]} --secure {folder}")
 
 
@@ -56,13 +56,13 @@ def init(
 def renew_(
     folder: Folder,
     days: Annotated[str, typer.Option("--days", metavar="N", help="for which the certificates are valid")] = str(DAYS),
-    authority: Annotated[bool, typer.Option("--authority", help="with a new authority beside the one of before, which "
-                                                                "is trusted until --forget")] = False,
-    forget: Annotated[bool, typer.Option("--forget", help="trust no authority of before any more")] = False,
+    authority: Annotated[bool, typer.Option("--authority", help="create a new authority; the previous one is trusted, "
+                                                                "too, until --forget")] = False,
+    forget: Annotated[bool, typer.Option("--forget", help="trust only the newest authority")] = False,
 ) -> None:
-    """Make the certificates that are there anew, while the cell runs; rules and names stay.
+    """Renew all certificates while the cell runs; rules and names stay.
 
-    The router takes what is new within seconds and has everybody connect anew, each with what is new of his own.
+    The router adopts the new files within seconds and closes all links: clients reconnect with their new certificates.
     """
     from common.errors import ConfigError
     from security.certificates import authority_files, renew
@@ -71,22 +71,22 @@ def renew_(
     valid, place = options.whole("--days", days, 1), Path(folder)
     assert valid is not None
     if authority and forget:
-        raise ConfigError("--forget", ..., "comes when everybody has a certificate of the new authority: apart from "
+        raise ConfigError("--forget", ..., "comes once every host has certificates of the new authority: not with "
                                            "--authority")
     certificate = authority_files(place)[0]
     if forget:
-        echo(f"{certificate}: {forget_others(place)} authorities of before are trusted no more")
+        echo(f"{certificate}: {forget_others(place)} previous authorities are no longer trusted")
         return
     echo(f"{renew(place, valid, new_authority=authority)} certificates, valid for {valid} days, in {folder}; a router "
-         "that uses them shows them within seconds, and has everybody connect anew")
+         "that uses them adopts them within seconds, and all clients reconnect")
     if authority:
-        echo(f"the authority of before is trusted too: when every host has its new files, `zencell secure renew "
-             f"{folder} --forget`, and {certificate.name} to every host once more")
+        echo(f"the previous authority is still trusted: once every host has its new files, `zencell secure renew "
+             f"{folder} --forget`, then copy {certificate.name} to every host again")
 
 
 @app.command()
 def show(folder: Folder, as_json: options.Json = False) -> None:
-    """Show who may do what, as the router enforces it, and until when each certificate is valid."""
+    """Show what each certificate permits, as the router enforces it, and until when it is valid."""
     from common.errors import ConfigError
     from common.transport.credentials import ROUTER_NAME, read_access
     from security.validation import allowances, certificate_in
@@ -120,7 +120,7 @@ def check(
     only: options.Only = None,
     only_rules: Annotated[bool, typer.Option("--only-rules", hidden=True)] = False,
 ) -> None:
-    """Say whether the certificates are valid, and the rules those that the cells' services need now."""
+    """Check that the certificates are valid and that the rules match what the services declare now."""
     from common.config import load_cell, names_of
     from common.errors import ConfigError
     from common.transport.credentials import OPERATOR, RECORDER, ROUTER_NAME, common_name, read_access
