@@ -168,10 +168,10 @@ class CellSession:
             code = asyncio.run(self._run(self._until_ended))
         except StartFailed:
             self.summary.failed = True
-            self._write_summary()
+            self.write_summary()
             raise
         try:
-            self._write_summary()
+            self.write_summary()
         finally:  # also when the file cannot be written
             out = DroppingWriter(sys.stdout)
             for line in describe(self.summary.as_dict(), self.aggregator.figures):
@@ -182,10 +182,11 @@ class CellSession:
     def stay(self) -> int:
         """Stay up until a signal, and return the exit code: 0 if the cell was up."""
         code = asyncio.run(self._run(self._until_interrupted))
-        self._write_summary()
+        self.write_summary()
         return 0 if self.summary.ready is not None else code
 
-    def _write_summary(self) -> None:
+    def write_summary(self) -> None:
+        """Write the figures of the run to its summary file, if there is one."""
         if self.file is not None:
             self.summary.write(self.file)
 
