@@ -1,4 +1,4 @@
-"""Certificates for a cell's processes, and who may do what."""
+"""Certificates and access rules of a cell's processes."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ app = CommandGroup("Certificates and access rules of a cell's processes.")
 DAYS = 365
 SHOWN = ("writes", "reads", "answers", "asks", "passes on")
 
-Folder = Annotated[str, typer.Argument(metavar="DIR", help="of the certificates")]
+Folder = Annotated[str, typer.Argument(metavar="DIR", help="folder of the certificates")]
 
 
 @app.command()
 def init(
     folder: Folder,
-    cells: Annotated[list[str] | None, typer.Option("--cell", metavar="CELL", help="all of config/cells if not given; "
-                                                    "repeatable")] = None,
-    hosts: Annotated[list[str] | None, typer.Option("--host", metavar="NAME", help="name or address at which the "
-                                                    "router is reached from elsewhere; repeatable; with --renew those "
-                                                    "of before if not given")] = None,
-    days: Annotated[str, typer.Option("--days", metavar="N", help="for which the certificates are valid")] = str(DAYS),
+    cells: Annotated[list[str] | None, typer.Option("--cell", metavar="CELL", help="[all of config/cells]; "
+                                                                                   "repeatable")] = None,
+    hosts: Annotated[list[str] | None, typer.Option("--host", metavar="NAME", help="name or address of the router for "
+                                                    "other hosts; repeatable; --renew keeps the present ones if "
+                                                    "none is given")] = None,
+    days: Annotated[str, typer.Option("--days", metavar="N", help="validity of the certificates [days]")] = str(DAYS),
     overrides: options.Overrides = None,
-    renew: Annotated[bool, typer.Option("--renew", help="keep the authority, make the rest anew")] = False,
+    renew: Annotated[bool, typer.Option("--renew", help="keep the authority, create everything else again")] = False,
 ) -> None:
-    """Make an authority, a certificate for each process, and the router's rules of who may do what."""
+    """Create a certificate authority, a certificate for each process, and the router's access rules."""
     from common.config import load_cell, names_of
     from common.transport.credentials import ACCESS
     from security.access import rights_in
@@ -45,24 +45,25 @@ def init(
     assert valid is not None
     loaded = [load_cell(name, overrides or ()) for name in cells or names_of("cells")]
     with_page = [cell.name for cell in loaded if any(entry.kind == VIEWER for entry in cell.services.values())]
-    place = Path(folder)
-    made = make(place, {cell.name: rights_in(cell) for cell in loaded}, with_page, hosts or (), valid, renew=renew)
-    echo(f"{made} certificates, valid for {valid} days, and {ACCESS} in {folder}")
-    echo(f"keep {authority_files(place)[1]} elsewhere: nothing but another `secure init --renew` needs it")
+    folder_path = Path(folder)
+    rights = {cell.name: rights_in(cell) for cell in loaded}
+    count = make(folder_path, rights, with_page, hosts or (), valid, renew=renew)
+    echo(f"{count} certificates, valid for {valid} days, and {ACCESS} in {folder}")
+    echo(f"keep {authority_files(folder_path)[1]} off this host: only `secure init --renew` and `secure renew` need it")
     echo(f"next: zencell up {(cells or names_of('cells'))[0]} --secure {folder}")
 
 
 @app.command("renew")
 def renew_(
     folder: Folder,
-    days: Annotated[str, typer.Option("--days", metavar="N", help="for which the certificates are valid")] = str(DAYS),
-    authority: Annotated[bool, typer.Option("--authority", help="with a new authority beside the one of before, which "
-                                                                "is trusted until --forget")] = False,
-    forget: Annotated[bool, typer.Option("--forget", help="trust no authority of before any more")] = False,
+    days: Annotated[str, typer.Option("--days", metavar="N", help="validity of the certificates [days]")] = str(DAYS),
+    authority: Annotated[bool, typer.Option("--authority", help="create a new authority too; the old one stays "
+                                                                "trusted until --forget")] = False,
+    forget: Annotated[bool, typer.Option("--forget", help="stop trusting old authorities")] = False,
 ) -> None:
-    """Make the certificates that are there anew, while the cell runs; rules and names stay.
+    """Renew the existing certificates while the cell runs; rules and names stay.
 
-    The router takes what is new within seconds and has everybody connect anew, each with what is new of his own.
+    The router loads the new files within seconds and makes every client reconnect with its new certificate.
     """
     from common.errors import ConfigError
     from security.certificates import authority_files, renew
@@ -71,22 +72,22 @@ def renew_(
     valid, place = options.whole("--days", days, 1), Path(folder)
     assert valid is not None
     if authority and forget:
-        raise ConfigError("--forget", ..., "comes when everybody has a certificate of the new authority: apart from "
-                                           "--authority")
+        raise ConfigError("--forget", ..., "cannot be combined with --authority: use it once every process has a "
+                                           "certificate of the new authority")
     certificate = authority_files(place)[0]
     if forget:
-        echo(f"{certificate}: {forget_others(place)} authorities of before are trusted no more")
+        echo(f"{certificate}: {forget_others(place)} old authorities are no longer trusted")
         return
     echo(f"{renew(place, valid, new_authority=authority)} certificates, valid for {valid} days, in {folder}; a router "
-         "that uses them shows them within seconds, and has everybody connect anew")
+         "that uses them loads them within seconds and makes every client reconnect")
     if authority:
-        echo(f"the authority of before is trusted too: when every host has its new files, `zencell secure renew "
-             f"{folder} --forget`, and {certificate.name} to every host once more")
+        echo(f"the old authority is still trusted; when every host has its new files, run `zencell secure renew "
+             f"{folder} --forget`, and {certificate.name} to every host again")
 
 
 @app.command()
 def show(folder: Folder, as_json: options.Json = False) -> None:
-    """Show who may do what, as the router enforces it, and until when each certificate is valid."""
+    """Show the access rights that the router enforces, and the expiry date of each certificate."""
     from common.errors import ConfigError
     from common.transport.credentials import ROUTER_NAME, read_access
     from security.validation import allowances, certificate_in
@@ -103,7 +104,7 @@ def show(folder: Folder, as_json: options.Json = False) -> None:
         if as_json:
             echo(json.dumps({"name": name, "valid_until": until, **rights}))
             continue
-        echo(f"{name}: {f'valid until {until}' if until else 'its certificate is not here'}")
+        echo(f"{name}: {f'valid until {until}' if until else 'no certificate in this folder'}")
         for kind, keys in rights.items():
             cell = name.partition(".")[0]
             echo(f"  {kind:<8} {', '.join(key.removeprefix(f'{cell}/') for key in keys)}")
@@ -112,15 +113,15 @@ def show(folder: Folder, as_json: options.Json = False) -> None:
 @app.command()
 def check(
     folder: Folder,
-    cells: Annotated[list[str] | None, typer.Option("--cell", metavar="CELL", help="all of config/cells if not given; "
-                                                    "repeatable")] = None,
+    cells: Annotated[list[str] | None, typer.Option("--cell", metavar="CELL", help="[all of config/cells]; "
+                                                                                   "repeatable")] = None,
     overrides: options.Overrides = None,
     world: options.WorldName = None,
     seed: options.Seed = None,
     only: options.Only = None,
     only_rules: Annotated[bool, typer.Option("--only-rules", hidden=True)] = False,
 ) -> None:
-    """Say whether the certificates are valid, and the rules those that the cells' services need now."""
+    """Check that the certificates are valid and that the rules match the current services of the cells."""
     from common.config import load_cell, names_of
     from common.errors import ConfigError
     from common.transport.credentials import OPERATOR, RECORDER, ROUTER_NAME, common_name, read_access
@@ -129,18 +130,18 @@ def check(
     from security.validation import require_current, require_valid
 
     if only and len(cells or ()) != 1:
-        raise ConfigError("--only", ",".join(only), "needs the one cell that they are services of: --cell CELL")
+        raise ConfigError("--only", ",".join(only), "needs the one cell of these services: --cell CELL")
     place, number = Path(folder), options.whole("--seed", seed, 0)
-    for given in cells or names_of("cells"):
-        cell = load_cell(given, overrides or (), world=world, seed=number)
-        again = renewal(folder, given)
+    for cell_name in cells or names_of("cells"):
+        cell = load_cell(cell_name, overrides or (), world=world, seed=number)
+        again = renewal(folder, cell_name)
         rights = rights_in(cell, [entry.name for entry in HostOptions(only=only).part_of(cell).services.values()])
         if not only_rules:
             processes = [process for process in rights if not only or process != RECORDER]
             names = [ROUTER_NAME, *([] if only else [OPERATOR]), *(common_name(cell.name, one) for one in processes)]
             require_valid(place, names, again)
         require_current(place, read_access(place), cell.name, rights, again)
-        echo(f"{cell.name}: {len(rights)} processes, certificates and rules are as they need them")
+        echo(f"{cell.name}: {len(rights)} processes, certificates and rules are valid")
 
 
 router = CommandGroup("Configuration of a cell's router.")
@@ -168,8 +169,8 @@ def config(
     from security.validation import require_valid
 
     choose(secure)
-    given = os.environ.get(DOMAIN_VARIABLE, DEFAULT_DOMAIN) if domain is None else domain
-    number = parse_domain(given, DOMAIN_VARIABLE if domain is None else "--domain")
+    text = os.environ.get(DOMAIN_VARIABLE, DEFAULT_DOMAIN) if domain is None else domain
+    number = parse_domain(text, DOMAIN_VARIABLE if domain is None else "--domain")
     launch = HostOptions(listen, link).linked(Launch(cell="", domain=number))
     endpoints = launch.listen or (endpoint_of(number),)
     folder = secure_folder()

@@ -73,7 +73,7 @@ def test_it_tells_residuals_uncertainty_and_what_comes_next(calibrated, tmp_path
     assert f"--set world.camera={calibrated}" in told
     path = shutil.copy(calibrated, tmp_path / "camera.yaml")
     assert app.execute(["calibrate", "intrinsics", "views", "-o", str(path)]) == 0
-    assert "had a pose, which was found with other intrinsics and is gone" in capsys.readouterr().out
+    assert "had a pose, which is removed because it belongs to other intrinsics" in capsys.readouterr().out
     assert "position" not in yaml.safe_load(Path(path).read_text())
 
 
