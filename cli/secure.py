@@ -1,4 +1,4 @@
-"""Certificates and access rules of a cell's processes."""
+"""`zencell secure`: certificates of a cell and its access rules."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ app = CommandGroup("Certificates and access rules of a cell's processes.")
 DAYS = 365
 SHOWN = ("writes", "reads", "answers", "asks", "passes on")
 
-Folder = Annotated[str, typer.Argument(metavar="DIR", help="folder of the certificates")]
+Folder = Annotated[str, typer.Argument(metavar="DIR", help="of the certificates")]
 
 
 @app.command()
 def init(
     folder: Folder,
-    cells: Annotated[list[str] | None, typer.Option("--cell", metavar="CELL", help="[all of config/cells]; "
-                                                                                   "repeatable")] = None,
-    hosts: Annotated[list[str] | None, typer.Option("--host", metavar="NAME", help="name or address of the router for "
-                                                    "other hosts; repeatable; --renew keeps the present ones if "
-                                                    "none is given")] = None,
-    days: Annotated[str, typer.Option("--days", metavar="N", help="validity of the certificates [days]")] = str(DAYS),
+    cells: Annotated[list[str] | None, typer.Option("--cell", metavar="CELL", help="all of config/cells if not given; "
+                                                    "repeatable")] = None,
+    hosts: Annotated[list[str] | None, typer.Option("--host", metavar="NAME", help="name or address at which the "
+                                                    "router is reached from elsewhere; repeatable; with --renew the "
+                                                    "previous ones if not given")] = None,
+    days: Annotated[str, typer.Option("--days", metavar="N", help="for which the certificates are valid")] = str(DAYS),
     overrides: options.Overrides = None,
-    renew: Annotated[bool, typer.Option("--renew", help="keep the authority, create everything else again")] = False,
+    renew: Annotated[bool, typer.Option("--renew", help="replace all except the authority")] = False,
 ) -> None:
-    """Create a certificate authority, a certificate for each process, and the router's access rules."""
+    """Create an authority, a certificate for each process, and the access rules of the router."""
     from common.config import load_cell, names_of
     from common.transport.credentials import ACCESS
     from security.access import rights_in
@@ -45,25 +45,24 @@ def init(
     assert valid is not None
     loaded = [load_cell(name, overrides or ()) for name in cells or names_of("cells")]
     with_page = [cell.name for cell in loaded if any(entry.kind == VIEWER for entry in cell.services.values())]
-    folder_path = Path(folder)
-    rights = {cell.name: rights_in(cell) for cell in loaded}
-    count = make(folder_path, rights, with_page, hosts or (), valid, renew=renew)
-    echo(f"{count} certificates, valid for {valid} days, and {ACCESS} in {folder}")
-    echo(f"keep {authority_files(folder_path)[1]} off this host: only `secure init --renew` and `secure renew` need it")
+    place = Path(folder)
+    made = make(place, {cell.name: rights_in(cell) for cell in loaded}, with_page, hosts or (), valid, renew=renew)
+    echo(f"{made} certificates, valid for {valid} days, and {ACCESS} in {folder}")
+    echo(f"keep {authority_files(place)[1]} elsewhere: only `secure init --renew` and `secure renew` need it")
     echo(f"next: zencell up {(cells or names_of('cells'))[0]} --secure {folder}")
 
 
 @app.command("renew")
 def renew_(
     folder: Folder,
-    days: Annotated[str, typer.Option("--days", metavar="N", help="validity of the certificates [days]")] = str(DAYS),
-    authority: Annotated[bool, typer.Option("--authority", help="create a new authority too; the old one stays "
-                                                                "trusted until --forget")] = False,
-    forget: Annotated[bool, typer.Option("--forget", help="stop trusting old authorities")] = False,
+    days: Annotated[str, typer.Option("--days", metavar="N", help="for which the certificates are valid")] = str(DAYS),
+    authority: Annotated[bool, typer.Option("--authority", help="create a new authority; the previous one is trusted, "
+                                                                "too, until --forget")] = False,
+    forget: Annotated[bool, typer.Option("--forget", help="trust only the newest authority")] = False,
 ) -> None:
-    """Renew the existing certificates while the cell runs; rules and names stay.
+    """Renew all certificates while the cell runs; rules and names stay.
 
-    The router loads the new files within seconds and makes every client reconnect with its new certificate.
+    The router adopts the new files within seconds and closes all links: clients reconnect with their new certificates.
     """
     from common.errors import ConfigError
     from security.certificates import authority_files, renew
@@ -72,22 +71,22 @@ def renew_(
     valid, place = options.whole("--days", days, 1), Path(folder)
     assert valid is not None
     if authority and forget:
-        raise ConfigError("--forget", ..., "cannot be combined with --authority: use it once every process has a "
-                                           "certificate of the new authority")
+        raise ConfigError("--forget", ..., "comes once every host has certificates of the new authority: not with "
+                                           "--authority")
     certificate = authority_files(place)[0]
     if forget:
-        echo(f"{certificate}: {forget_others(place)} old authorities are no longer trusted")
+        echo(f"{certificate}: {forget_others(place)} previous authorities are no longer trusted")
         return
     echo(f"{renew(place, valid, new_authority=authority)} certificates, valid for {valid} days, in {folder}; a router "
-         "that uses them loads them within seconds and makes every client reconnect")
+         "that uses them adopts them within seconds, and all clients reconnect")
     if authority:
-        echo(f"the old authority is still trusted; when every host has its new files, run `zencell secure renew "
-             f"{folder} --forget`, and {certificate.name} to every host again")
+        echo(f"the previous authority is still trusted: once every host has its new files, `zencell secure renew "
+             f"{folder} --forget`, then copy {certificate.name} to every host again")
 
 
 @app.command()
 def show(folder: Folder, as_json: options.Json = False) -> None:
-    """Show the access rights that the router enforces, and the expiry date of each certificate."""
+    """Show what each certificate permits, as the router enforces it, and until when it is valid."""
     from common.errors import ConfigError
     from common.transport.credentials import ROUTER_NAME, read_access
     from security.validation import allowances, certificate_in
@@ -104,7 +103,7 @@ def show(folder: Folder, as_json: options.Json = False) -> None:
         if as_json:
             echo(json.dumps({"name": name, "valid_until": until, **rights}))
             continue
-        echo(f"{name}: {f'valid until {until}' if until else 'no certificate in this folder'}")
+        echo(f"{name}: {f'valid until {until}' if until else 'its certificate is not here'}")
         for kind, keys in rights.items():
             cell = name.partition(".")[0]
             echo(f"  {kind:<8} {', '.join(key.removeprefix(f'{cell}/') for key in keys)}")
@@ -113,15 +112,15 @@ def show(folder: Folder, as_json: options.Json = False) -> None:
 @app.command()
 def check(
     folder: Folder,
-    cells: Annotated[list[str] | None, typer.Option("--cell", metavar="CELL", help="[all of config/cells]; "
-                                                                                   "repeatable")] = None,
+    cells: Annotated[list[str] | None, typer.Option("--cell", metavar="CELL", help="all of config/cells if not given; "
+                                                    "repeatable")] = None,
     overrides: options.Overrides = None,
     world: options.WorldName = None,
     seed: options.Seed = None,
     only: options.Only = None,
     only_rules: Annotated[bool, typer.Option("--only-rules", hidden=True)] = False,
 ) -> None:
-    """Check that the certificates are valid and that the rules match the current services of the cells."""
+    """Check that the certificates are valid and that the rules match what the services declare now."""
     from common.config import load_cell, names_of
     from common.errors import ConfigError
     from common.transport.credentials import OPERATOR, RECORDER, ROUTER_NAME, common_name, read_access
@@ -130,18 +129,18 @@ def check(
     from security.validation import require_current, require_valid
 
     if only and len(cells or ()) != 1:
-        raise ConfigError("--only", ",".join(only), "needs the one cell of these services: --cell CELL")
+        raise ConfigError("--only", ",".join(only), "needs the one cell that they are services of: --cell CELL")
     place, number = Path(folder), options.whole("--seed", seed, 0)
-    for cell_name in cells or names_of("cells"):
-        cell = load_cell(cell_name, overrides or (), world=world, seed=number)
-        again = renewal(folder, cell_name)
+    for given in cells or names_of("cells"):
+        cell = load_cell(given, overrides or (), world=world, seed=number)
+        again = renewal(folder, given)
         rights = rights_in(cell, [entry.name for entry in HostOptions(only=only).part_of(cell).services.values()])
         if not only_rules:
             processes = [process for process in rights if not only or process != RECORDER]
             names = [ROUTER_NAME, *([] if only else [OPERATOR]), *(common_name(cell.name, one) for one in processes)]
             require_valid(place, names, again)
         require_current(place, read_access(place), cell.name, rights, again)
-        echo(f"{cell.name}: {len(rights)} processes, certificates and rules are valid")
+        echo(f"{cell.name}: {len(rights)} processes, certificates and rules are as they need them")
 
 
 router = CommandGroup("Configuration of a cell's router.")
@@ -169,8 +168,8 @@ def config(
     from security.validation import require_valid
 
     choose(secure)
-    text = os.environ.get(DOMAIN_VARIABLE, DEFAULT_DOMAIN) if domain is None else domain
-    number = parse_domain(text, DOMAIN_VARIABLE if domain is None else "--domain")
+    given = os.environ.get(DOMAIN_VARIABLE, DEFAULT_DOMAIN) if domain is None else domain
+    number = parse_domain(given, DOMAIN_VARIABLE if domain is None else "--domain")
     launch = HostOptions(listen, link).linked(Launch(cell="", domain=number))
     endpoints = launch.listen or (endpoint_of(number),)
     folder = secure_folder()

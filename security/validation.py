@@ -18,7 +18,7 @@ from common.transport.credentials import credentials_of
 from security.access import Rights, access_control
 
 FIELD = "--secure"
-REMEDY = "make it anew with `zencell secure init`"
+REMEDY = "create it again with `zencell secure init`"
 
 
 def require_valid(folder: Path, names: Iterable[str], renew: str, now: datetime.datetime | None = None) -> None:

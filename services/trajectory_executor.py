@@ -118,8 +118,9 @@ def create_executor(
     )
     start, world, persisted, saver = robot.named("home"), None, None, None
     if simulated:
-        world = create_world(config.world, config.run.seed, robot, config.grasp, configured_bounds(config.reach.told),
-                             config.grasp_tolerances, config.robot.gripper)
+        bounds = configured_bounds(config.reach.parameters)
+        world = create_world(config.world, config.run.seed, robot, config.grasp, bounds, config.grasp_tolerances,
+                             config.robot.gripper)
         if file := state_file(bus.cell):
             persisted = matching_state(file.load(), config.world.simulator, world, robot.dof)
             saver = saver_for(file)

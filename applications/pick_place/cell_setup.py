@@ -127,7 +127,7 @@ def reach(cell: Cell, arm: Arm) -> Iterator[Finding]:
     Raises:
         ConfigError: inconsistent bounds, or no random layout within reach.
     """
-    bounds = configured_bounds(cell.section(Reach).told)  # type: ignore[attr-defined]
+    bounds = configured_bounds(cell.section(Reach).parameters)  # type: ignore[attr-defined]
     cache = ReachCache(arm.robot, cell.grasp, bounds)
     gripper = cell.robot.gripper
     width = gripper.max_width if gripper is not None and gripper.joints else None

@@ -43,7 +43,7 @@ class Members(Section):
 class Reach(Section):
     """Parameters of all services: some of them define the reachable workspace."""
 
-    told: dict[str, dict[str, Any]] = Field({}, description="parameters by service")
+    parameters: dict[str, dict[str, Any]] = Field({}, description="parameters by service")
 
 
 class Cell(Section):
@@ -85,7 +85,7 @@ class Cell(Section):
             keys = [entry.topics for entry in self.services.values() if entry.topics]
             return Members(services=names, task=self.task, application=self.application, keys=keys)
         if kind is Reach:
-            return Reach(told={name: entry.parameters for name, entry in self.services.items()})
+            return Reach(parameters={name: entry.parameters for name, entry in self.services.items()})
         for value in (self.run, self.robot, self.world, self.motion, self.grasp, self.pipeline, self.watchdogs):
             if type(value) is kind:
                 return value

@@ -18,7 +18,7 @@ from common.topics import MOTION_JOG, general_key
 from common.transport.session import Declaration, LoopNotifier, Session, owns_key
 from common.transport.tokens import tokens_now
 
-# Keys with many writers: the supervisors of linked hosts, and every client that jogs. Readers tell them apart.
+# Keys with many writers: the supervisors of linked hosts, and every client that jogs. Readers distinguish them.
 SHARED = ("log/supervisor", "counters/supervisor", "supervisor/status", MOTION_JOG.key)
 CLAIM_SECONDS = 3.0  # longer than a dead link lives: tokens of the previous process may outlive it that long
 CLAIM_PERIOD = 0.2  # [s] between two queries for other owners

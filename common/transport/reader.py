@@ -27,7 +27,7 @@ M = TypeVar("M", bound=Message)
 V = TypeVar("V")
 
 _MAX_SENDERS = 1024  # remembered by their writer id
-_MAX_UNREAD = 8  # senders whose newest unread message is kept
+_MAX_UNREAD = 8  # senders whose newest unread message is queued
 NO_SENDER = ""  # a sender without an attachment
 
 
@@ -60,7 +60,7 @@ def _remember(table: OrderedDict[str, V], key: str, value: V) -> None:
 
 
 class SequenceFilter:
-    """Tells which messages are newer than earlier ones of the same writer."""
+    """Checks which messages are newer than earlier ones of the same writer."""
 
     def __init__(self) -> None:
         self._last: OrderedDict[str, int] = OrderedDict()

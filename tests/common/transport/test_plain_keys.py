@@ -73,7 +73,7 @@ async def test_plain_subscriber_and_reader_receive_each_line_once(
     await until(lambda: counted.received)
     listening.cancel()
     assert not {f"{tool.cell}/log", f"{tool.cell}/counters"} & set(raw)
-    assert "nobody reads any more" not in caplog.text
+    assert "no longer reads that key" not in caplog.text
 
 
 async def test_two_supervisors_copy_each_line_once_and_no_forged_one(
