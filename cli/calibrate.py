@@ -1,4 +1,4 @@
-"""Calibrate a real camera: print a board, find the lens from views of it, and the pose from where it lies."""
+"""Calibrate a real camera: print a board, estimate the intrinsics from views of it, and the pose from its position."""
 
 from __future__ import annotations
 
@@ -21,12 +21,13 @@ app = CommandGroup("Calibrate a real camera with a ChArUco board.")
 BOARD_FORMATS = (".png", ".pdf")
 SOURCE_HELP = "device number or path, video file, or folder of images"
 
-Squares = Annotated[str, typer.Option("--squares", metavar="COLUMNSxROWS", help="of the board")]
-Square = Annotated[str, typer.Option("--square", metavar="M", help="measured length of a square [m]")]
-Marker = Annotated[str, typer.Option("--marker", metavar="M", help="length of a marker [m]; 0: 3/4 of a square")]
-Dictionary = Annotated[str, typer.Option("--dictionary", metavar="NAME", help="of markers: 4x4_50, 5x5_50, ...")]
-Size = Annotated[str, typer.Option("--size", metavar="WxH", help="size that a device is asked for [px]")]
-Seconds = Annotated[str, typer.Option("--seconds", metavar="S", help="how long a device is looked at")]
+Squares = Annotated[str, typer.Option("--squares", metavar="COLUMNSxROWS", help="number of squares of the board")]
+Square = Annotated[str, typer.Option("--square", metavar="M", help="measured side length of a square [m]")]
+Marker = Annotated[str, typer.Option("--marker", metavar="M", help="side length of a marker [m]; 0: 3/4 of a square")]
+Dictionary = Annotated[str, typer.Option("--dictionary", metavar="NAME", help="dictionary of the markers: "
+                                                                              "4x4_50, 5x5_50, ...")]
+Size = Annotated[str, typer.Option("--size", metavar="WxH", help="image size to request from a device [px]")]
+Seconds = Annotated[str, typer.Option("--seconds", metavar="S", help="how long to read images from a device [s]")]
 
 
 @app.command(name="board")
@@ -34,7 +35,7 @@ def board_command(
     output: Annotated[str, typer.Option("-o", "--output", metavar="FILE", help="a .png or .pdf file")],
     squares: Squares = "7x5", square: Square = "0.036", marker: Marker = "0", dictionary: Dictionary = "4x4_50",
 ) -> None:
-    """Write a board to print at 100 %; a line on it tells whether the printer did."""
+    """Write a board to print at 100 %; a line on it of known length shows whether the print has the right scale."""
     suffix = Path(output).suffix.lower()
     if suffix not in BOARD_FORMATS:
         raise ConfigError("--output", output, f"must end in {' or '.join(BOARD_FORMATS)}")
@@ -57,13 +58,14 @@ def intrinsics(
     source: Annotated[str, typer.Argument(metavar="SOURCE", help=SOURCE_HELP)],
     output: Annotated[str, typer.Option("-o", "--output", metavar="FILE", help="YAML file to write")] = "camera.yaml",
     squares: Squares = "7x5", square: Square = "0.036", marker: Marker = "0", dictionary: Dictionary = "4x4_50",
-    views: Annotated[str, typer.Option("--views", metavar="N", help="distinct views that are needed")] = "8",
+    views: Annotated[str, typer.Option("--views", metavar="N", help="number of distinct views to collect")] = "8",
     k_coefficients: Annotated[
-        str, typer.Option("--k-coefficients", metavar="N", help="radial ones: 0 no lens, 3 wide, above 3 rational")
+        str, typer.Option("--k-coefficients", metavar="N", help="number of radial coefficients: 0 no "
+                                                                "distortion, 3 wide angle, above 3 rational model")
     ] = "2",
     size: Size = "", seconds: Seconds = "60",
 ) -> None:
-    """Find focal lengths, centre and distortion from views of the board all over the picture, tilted to each side."""
+    """Estimate focal lengths, centre and distortion from tilted views of the board all over the image."""
     from common.config import check
     from common.perception.image_sources import read_images
     from tools.calibration.intrinsics import CollectingOptions, ViewSelector, calibrate_intrinsics
@@ -74,11 +76,11 @@ def intrinsics(
                                          "k_coefficients": options.whole("--k-coefficients", k_coefficients, 0)})
     collector = ViewSelector(board_of(squares, square, marker, dictionary), settings)
     terminal = sys.stderr.isatty()
-    for name, picture in read_images(source, parse_size(size), options.number("--seconds", seconds)):
-        reason = collector.add(picture, name)
+    for name, image in read_images(source, parse_size(size), options.number("--seconds", seconds)):
+        reason = collector.add(image, name)
         if terminal:
             part, unseen = collector.coverage()
-            echo(f"{name}: {reason or f'view {len(collector.views)}'}; {100 * part:.0f} % of the picture covered"
+            echo(f"{name}: {reason or f'view {len(collector.views)}'}; {100 * part:.0f} % of the image covered"
                  + (f", nothing {unseen[0]}" if unseen else ""), err=True)
         if collector.complete:
             break
@@ -87,7 +89,7 @@ def intrinsics(
     camera = camera_from_intrinsics(found, source, str(collector.board.options))
     old = Path(output).expanduser()
     if old.is_file() and "position:" in old.read_text(encoding="utf-8", errors="replace"):
-        echo(f"{output} had a pose, which was found with other intrinsics and is gone: calibrate it again")
+        echo(f"{output} had a pose, which is removed because it belongs to other intrinsics: calibrate the pose again")
     camera.save(output)
     echo(format_intrinsics(found))
     echo(f"{output} holds the intrinsics; next: zencell calibrate pose SOURCE --intrinsics {output} ...")
@@ -95,7 +97,8 @@ def intrinsics(
 
 @app.command()
 def pose(
-    sources: Annotated[list[str], typer.Argument(metavar="SOURCE...", help=f"{SOURCE_HELP}; one for each place")],
+    sources: Annotated[list[str], typer.Argument(metavar="SOURCE...", help=f"{SOURCE_HELP}; one for each board "
+                                                                           f"position")],
     intrinsics_file: Annotated[
         str, typer.Option("--intrinsics", metavar="FILE", help="YAML file of `zencell calibrate intrinsics`")
     ],
@@ -104,21 +107,22 @@ def pose(
                                                                           "[m]; once for each SOURCE")
     ],
     board_rpy: Annotated[
-        list[str] | None, typer.Option("--board-rpy", metavar="R,P,Y", help="of the board in world [rad]; 0,0,0: face "
+        list[str] | None, typer.Option("--board-rpy", metavar="R,P,Y", help="rotation of the board in world "
+                                                                            "[rad]; 0,0,0: face "
                                                                             "up, x along x; once, or for each SOURCE")
     ] = None,
     output: Annotated[
-        str, typer.Option("-o", "--output", metavar="FILE", help="YAML file to write; left out: that of --intrinsics")
+        str, typer.Option("-o", "--output", metavar="FILE", help="YAML file to write [the file of --intrinsics]")
     ] = "",
     squares: Squares = "7x5", square: Square = "0.036", marker: Marker = "0", dictionary: Dictionary = "4x4_50",
-    pictures_of_each: Annotated[
-        str, typer.Option("--pictures", metavar="N", help="of each place, at most")
+    images_of_each: Annotated[
+        str, typer.Option("--pictures", metavar="N", help="images of each board position, at most")
     ] = "20",
     seconds: Seconds = "10",
 ) -> None:
-    """Find where the camera is, from pictures of a board that lies where it was measured; the camera stays still.
+    """Estimate the pose of a fixed camera from images of a board at a measured position.
 
-    Several places, far apart in the picture, make it much more precise: give a SOURCE and a --board-position for each.
+    Several board positions, far apart in the image, are much more accurate: pass SOURCE and --board-position for each.
     """
     from common.perception.camera_file import CameraFile
     from common.robot.transforms import rpy_to_matrix, transform
@@ -127,14 +131,15 @@ def pose(
 
     rotations = board_rpy or ["0,0,0"]
     if len(board_position) != len(sources):
-        raise ConfigError("--board-position", len(board_position), f"times for {len(sources)} places")
+        raise ConfigError("--board-position", len(board_position), f"times for {len(sources)} sources")
     if len(rotations) not in (1, len(sources)):
-        raise ConfigError("--board-rpy", len(rotations), f"times for {len(sources)} places; once does for all of them")
+        raise ConfigError("--board-rpy", len(rotations), f"times for {len(sources)} sources; pass it once for "
+                                                         f"all, or once for each")
     rotations = rotations * len(sources) if len(rotations) == 1 else rotations
     positions = [options.three("--board-position", text) for text in board_position]
     angles = [options.three("--board-rpy", text) for text in rotations]
     camera, board = CameraFile.load(intrinsics_file), board_of(squares, square, marker, dictionary)
-    most, limit = options.whole("--pictures", pictures_of_each, 1) or 1, options.number("--seconds", seconds)
+    most, limit = options.whole("--pictures", images_of_each, 1) or 1, options.number("--seconds", seconds)
     places = [(transform(rpy_to_matrix(*rpy), position), detect_boards_in(source, board, camera, most, limit))
               for source, position, rpy in zip(sources, positions, angles, strict=True)]
     result = calibrate_pose(places, camera)
@@ -150,13 +155,14 @@ def hand_eye(
     intrinsics_file: Annotated[
         str, typer.Option("--intrinsics", metavar="FILE", help="YAML file of `zencell calibrate intrinsics`")
     ],
-    mount: Annotated[str, typer.Option("--camera", metavar="hand|beside", help="where the camera is")],
+    mount: Annotated[str, typer.Option("--camera", metavar="hand|beside", help="on the hand, or beside an arm "
+                                                                               "that holds the board")],
     output: Annotated[
-        str, typer.Option("-o", "--output", metavar="FILE", help="YAML file to write; left out: that of --intrinsics")
+        str, typer.Option("-o", "--output", metavar="FILE", help="YAML file to write [the file of --intrinsics]")
     ] = "",
     squares: Squares = "7x5", square: Square = "0.036", marker: Marker = "0", dictionary: Dictionary = "4x4_50",
 ) -> None:
-    """Find where a camera is that sits on the hand, or beside an arm that holds the board."""
+    """Estimate the pose of a camera on the hand, or beside an arm that holds the board."""
     from typing import get_args
 
     from common.perception.camera_file import CameraFile
@@ -168,48 +174,48 @@ def hand_eye(
     if mount not in get_args(Mount):
         raise UnknownName("--camera", mount, get_args(Mount))
     camera, board = CameraFile.load(intrinsics_file), board_of(squares, square, marker, dictionary)
-    views, why, said = load_views(Path(folder).expanduser(), board, camera)
-    if len(views) < MIN_VIEWS and why:
-        raise CalibrationFailed(f"{len(views)} views of the board, {MIN_VIEWS} are needed; {why[0]}")
+    views, problems, header = load_views(Path(folder).expanduser(), board, camera)
+    if len(views) < MIN_VIEWS and problems:
+        raise CalibrationFailed(f"{len(views)} views of the board, {MIN_VIEWS} are needed; {problems[0]}")
     result = calibrate_hand_eye(views, camera, "hand" if mount == "hand" else "beside")
     file = output or intrinsics_file
-    with_hand_eye(camera, result, folder, said.robot, mount).save(file)
+    with_hand_eye(camera, result, folder, header.robot, mount).save(file)
     echo(format_hand_eye(result))
-    place = "the place on the hand" if mount == "hand" else "pose"
+    place = "the pose on the hand" if mount == "hand" else "pose"
     echo(f"{file} holds intrinsics and {place}; a cell takes both with --set world.camera={file}")
     echo(result.verdict)
 
 
 @app.command()
 def collect(
-    folder: Annotated[str, typer.Argument(metavar="FOLDER", help="where views are kept, with the joints of each")],
-    robot: Annotated[str, typer.Option("--robot", metavar="NAME", help="robot file of the arm that is up")],
-    key: Annotated[str, typer.Option("--key", metavar="KEY", help="of the camera's pictures")] = "camera/image_raw",
-    views: Annotated[str, typer.Option("--views", metavar="N", help="that are wanted")] = "15",
+    folder: Annotated[str, typer.Argument(metavar="FOLDER", help="folder for the images and joint positions")],
+    robot: Annotated[str, typer.Option("--robot", metavar="NAME", help="robot file of the arm in the running cell")],
+    key: Annotated[str, typer.Option("--key", metavar="KEY", help="topic of the camera's images")] = "camera/image_raw",
+    views: Annotated[str, typer.Option("--views", metavar="N", help="number of views to collect")] = "15",
     squares: Squares = "7x5", square: Square = "0.036", marker: Marker = "0", dictionary: Dictionary = "4x4_50",
     at: CellTarget = RUNNING,
 ) -> None:
-    """Keep pictures of the board, with the joints, of a cell that is up: whenever the arm rests in a new pose.
+    """Save board images and joint positions of a running cell each time the arm is at standstill in a new pose.
 
-    Bring it there by hand, by jogging or by a script of yours; nothing is moved from here.
+    Move the arm by hand, by jogging or with your own script; this command moves nothing.
     """
     from common.config import load_robot
     from common.robot.model import RobotModel
     from tools.calibration.views import HandEyeCollector, collect_views
 
     model = RobotModel.load(load_robot(robot))
-    board, wanted = board_of(squares, square, marker, dictionary), options.whole("--views", views, 1) or 1
+    board, needed = board_of(squares, square, marker, dictionary), options.whole("--views", views, 1) or 1
     collector = HandEyeCollector(Path(folder).expanduser(), model, robot, board)
-    at.visit(lambda bus: collect_views(bus, key, collector, wanted, echo))
+    at.visit(lambda bus: collect_views(bus, key, collector, needed, echo))
     echo(f"{folder} holds {collector.count} views; next: zencell calibrate hand-eye {folder} --intrinsics FILE "
          "--camera hand|beside")
 
 
 def board_of(squares: str, square: str, marker: str, dictionary: str) -> Board:
-    """The board that options describe.
+    """Return the board that the options describe.
 
     Raises:
-        ConfigError: one of them does not fit.
+        ConfigError: an option is not valid.
     """
     from typing import get_args
 
@@ -226,10 +232,10 @@ def board_of(squares: str, square: str, marker: str, dictionary: str) -> Board:
 
 
 def parse_size(text: str) -> tuple[int, int] | None:
-    """Width and height of `WxH` [px]; None for nothing.
+    """Parse `WxH` to width and height [px]; empty text gives None.
 
     Raises:
-        ConfigError: it is not of that form.
+        ConfigError: the text has another form.
     """
     return _two("--size", text, "640x480") if text else None
 

@@ -1,4 +1,4 @@
-"""What there is to run: cells, services; and one service in the foreground."""
+"""List cells and services, run one service in the foreground, create a new project."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ DEFAULT = "sort_cubes"
 
 
 def cells() -> None:
-    """List the cells that can be run by name."""
+    """List the cells by name."""
     from common.config import config_root, names_of
 
     for name in names_of("cells"):
@@ -31,7 +31,7 @@ def cells() -> None:
 
 
 def services() -> None:
-    """List the services that a cell can be made of."""
+    """List the built-in services."""
     import services as package
     from common.config import service_names
 
@@ -41,18 +41,18 @@ def services() -> None:
 
 
 def _first_line(path: Path) -> str:
-    """First line of a module's docstring, without running the module."""
+    """Return the first line of a module's docstring without importing the module."""
     doc = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
     return doc.partition("\n")[0]
 
 
 def service(
     name: Annotated[
-        str, typer.Argument(metavar="NAME", help="of `zencell services`, of the cell, or a module",
+        str, typer.Argument(metavar="NAME", help="a service of `zencell services` or of the cell, or a module",
                             autocompletion=choices.services)
     ],
     cell: Annotated[
-        str, typer.Option("--cell", metavar="CELL", help="the cell that it belongs to", autocompletion=choices.cells)
+        str, typer.Option("--cell", metavar="CELL", help="the cell of the service", autocompletion=choices.cells)
     ] = choices.default_cell(),
     overrides: options.Overrides = None,
     world: options.WorldName = None,
@@ -60,7 +60,7 @@ def service(
     domain: options.Domain = None,
     connect: options.Connect = None,
 ) -> None:
-    """Run one service of a cell in the foreground, beside a cell that is up or its own router."""
+    """Run one service of a cell in the foreground; connects to a running cell or router."""
     from common.config import ServiceEntry, load_cell, service_names
     from common.supervision.launch import (
         ROUTER_MODULE,
@@ -91,12 +91,12 @@ def service(
 
 
 def new(
-    folder: Annotated[str, typer.Argument(metavar="DIR", help="is made; its name is that of cell and task")],
+    folder: Annotated[str, typer.Argument(metavar="DIR", help="folder to create; names the cell and the task")],
     task: Annotated[
-        str, typer.Option("--task", metavar="KIND", help="what it begins as", autocompletion=choices.tasks)
+        str, typer.Option("--task", metavar="KIND", help="template", autocompletion=choices.tasks)
     ] = DEFAULT,
 ) -> None:
-    """Write a cell, a task in one file and their test into a new folder: they run at once."""
+    """Create a folder with a cell, a task in one file and their test, ready to run."""
     kinds = choices.task_kinds()
     if task not in kinds:
         raise UnknownName("task", task, kinds)
@@ -117,10 +117,10 @@ def new(
 
 
 def _require_name(folder: str, to: Path) -> None:
-    """Return when the task can be imported as a module of that folder.
+    """Check that the task can be imported as a module of that folder.
 
     Raises:
-        ConfigError: it cannot, and why.
+        ConfigError: it cannot; with the reason.
     """
     name = to.name
     if not re.fullmatch(r"[A-Za-z_]\w*", name, re.ASCII) or keyword.iskeyword(name):

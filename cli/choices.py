@@ -1,4 +1,6 @@
-"""What there is to offer: cells, robots, services, keys, parameters, each word with what it is."""
+"""Completions of cells, robots, services, keys and parameters, each with a description.
+
+They are read from syntax trees, so that a completion does not import pydantic: it must answer while a user types."""
 
 from __future__ import annotations
 
@@ -11,71 +13,71 @@ from cli.model_sources import ROOT, Model, ModelField, fields_of, find_model, is
 
 LONGEST_DOC = 60  # [characters]
 
-Offer = tuple[str, str]  # a word, and what it is
+Offer = tuple[str, str]  # a completion and its description
 
 
 def cells(incomplete: str) -> list[Offer]:
-    """Cells by name, with the first comment of their files."""
+    """Return cells by name, with the first comment of their files."""
     return _starting(incomplete, ((path.stem, _first_comment(path)) for path in _config_files("cells")))
 
 
 def default_cell() -> str:
-    """The first cell that there is by name."""
+    """Return the first cell in alphabetical order."""
     return min((path.stem for path in _config_files("cells")), default="")
 
 
 def worlds(incomplete: str) -> list[Offer]:
-    """Worlds by name."""
+    """Return worlds by name."""
     return _starting(incomplete, ((path.stem, _first_comment(path)) for path in _config_files("worlds")))
 
 
 def robots(incomplete: str) -> list[Offer]:
-    """Robots by name."""
+    """Return robots by name."""
     return _starting(incomplete, ((path.stem, _first_comment(path)) for path in _config_files("robots")))
 
 
 def services(incomplete: str) -> list[Offer]:
-    """Services that come with the project, with the first line of what they say of themselves."""
+    """Return the built-in services, with the first line of their docstrings."""
     return _starting(incomplete, ((path.stem, _doc(path)) for path in _modules("services")))
 
 
 def tasks(incomplete: str) -> list[Offer]:
-    """Kinds of tasks that a project may begin as."""
+    """Return the templates of new projects."""
     return _starting(incomplete, ((kind, _doc(ROOT / "examples" / kind / "task.py")) for kind in task_kinds()))
 
 
 def task_kinds() -> list[str]:
-    """Examples with a cell of their own: each is what a new project may begin as."""
+    """Return the examples with a cell file: each is a template of `zencell new`."""
     return sorted(path.parent.name for path in (ROOT / "examples").glob("*/cell.yaml"))
 
 
 def planners(incomplete: str) -> list[Offer]:
-    """Planners by name."""
+    """Return planners by name."""
     return _starting(incomplete, ((path.stem, _doc(path)) for path in _modules("common/planning/planners")))
 
 
 def keys(incomplete: str) -> list[Offer]:
-    """All keys: topics and requests."""
+    """Return all keys: topics and requests."""
     return _starting(incomplete, ((key, doc) for key, _, doc in _topics()))
 
 
 def published(incomplete: str) -> list[Offer]:
-    """Keys that are published."""
+    """Return the keys of topics."""
     return _starting(incomplete, ((key, doc) for key, kind, doc in _topics() if kind == "Topic"))
 
 
 def requests(incomplete: str) -> list[Offer]:
-    """Keys that answer."""
+    """Return the keys of requests."""
     return _starting(incomplete, ((key, doc) for key, kind, doc in _topics() if kind == "Request"))
 
 
 def parameters(incomplete: str) -> list[Offer]:
-    """Dotted paths of all parameters, as `--set` and `param` take them."""
+    """Return dotted paths of all parameters, as for `--set` and `param`."""
     return _starting(incomplete, _parameters(incomplete))
 
 
 def overrides(incomplete: str) -> list[Offer]:
-    """The same with the sign that the value comes after."""
+    """Return the same paths, each followed by `=`."""
     return [(f"{path}=", doc) for path, doc in parameters(incomplete)]
 
 
@@ -84,7 +86,7 @@ def _starting(incomplete: str, offers: Iterator[Offer]) -> list[Offer]:
 
 
 def _short(doc: str) -> str:
-    """A description that fits on a line beside its word; brackets would be taken for markup on the way."""
+    """Shorten a description to one line; brackets would be parsed as markup."""
     text = doc.replace("[", "(").replace("]", ")")
     return text if len(text) <= LONGEST_DOC else f"{text[: LONGEST_DOC - 3].rstrip()}..."
 
@@ -93,7 +95,7 @@ def _short(doc: str) -> str:
 
 
 def _config_files(kind: str) -> list[Path]:
-    # As common.config.config_root has it, which takes pydantic to import.
+    # Same rule as common.config.config_root, whose import loads pydantic.
     root = Path(os.environ.get("ZENCELL_CONFIG") or ROOT / "config")
     return sorted((root / kind).glob("*.yaml"))
 
@@ -116,7 +118,7 @@ def _doc(path: Path) -> str:
 
 
 def _topics() -> Iterator[tuple[str, str, str]]:
-    """Key, Topic or Request, and description, as common/topics.py and the applications have them."""
+    """Yield key, Topic or Request, and description from common/topics.py and the applications."""
     files = [ROOT / "common" / "topics.py", *sorted((ROOT / "applications").glob("*/topics.py"))]
     for node in (node for file in files for node in tree_of(file).body):
         match node:
@@ -127,7 +129,7 @@ def _topics() -> Iterator[tuple[str, str, str]]:
 
 
 def _parameters(incomplete: str) -> Iterator[Offer]:
-    """All parameters, without those whose files need not be read for what was typed so far."""
+    """Yield the parameters; files that cannot match the typed text are not read."""
 
     def may_follow(prefix: str) -> bool:
         return f"{prefix}.".startswith(incomplete) or incomplete.startswith(f"{prefix}.")

@@ -1,4 +1,4 @@
-"""Shell completion: installs or shows what a shell needs to ask us what may come next."""
+"""Shell completion: install or show the completion script of a shell."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ import typer
 from common.errors import UnknownName
 
 SHELLS = ("bash", "zsh", "fish")
-COMPLETE_VARIABLE = "_ZENCELL_COMPLETE"  # with which a shell asks
+COMPLETE_VARIABLE = "_ZENCELL_COMPLETE"  # set by a shell that requests completions
 
 
 def prepare(environ: Mapping[str, str] = os.environ) -> None:
-    """Make ready to answer a shell, when it is one that asks."""
+    """Register the shells if a shell requests completions."""
     if COMPLETE_VARIABLE in environ:
         _register_shells()
 
 
 def _register_shells() -> None:
-    # Typer does this only for its own options, which would not take the name of a shell.
+    # Typer does this only for its built-in options, which do not accept the name of a shell.
     from typer._completion_classes import completion_init
 
     completion_init()
@@ -56,12 +56,12 @@ def _shells(incomplete: str) -> list[str]:
 def root(
     install_completion: Annotated[
         str | None,
-        typer.Option("--install-completion", metavar="SHELL", help="complete words of zencell in bash, zsh or fish",
+        typer.Option("--install-completion", metavar="SHELL", help="install completion for bash, zsh or fish",
                      callback=_install, is_eager=True, expose_value=False, autocompletion=_shells),
     ] = None,
     show_completion: Annotated[
         str | None,
-        typer.Option("--show-completion", metavar="SHELL", help="show what that would install", callback=_show,
+        typer.Option("--show-completion", metavar="SHELL", help="show the completion script", callback=_show,
                      is_eager=True, expose_value=False, autocompletion=_shells),
     ] = None,
 ) -> None:

@@ -1,4 +1,4 @@
-"""Export a recording to what other programs read."""
+"""Export a recording for other programs."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from recording.sample import Decoder
     from recording.selection import Selection
 
-CANNOT_BE_SHOWN = (ArithmeticError, ValueError, LookupError, TypeError)  # what numbers that no run has lead to
+PLOT_ERRORS = (ArithmeticError, ValueError, LookupError, TypeError)  # errors from values that no real run contains
 
 
 def export(
@@ -28,14 +28,14 @@ def export(
         str | None, typer.Option("--foxglove", metavar="OUT.mcap", help="for Foxglove: JSON with its own schemas")
     ] = None,
     csv: Annotated[str | None, typer.Option("--csv", metavar="DIR", help="a table for each topic")] = None,
-    images: Annotated[str | None, typer.Option("--images", metavar="DIR", help="a PNG for each picture")] = None,
+    images: Annotated[str | None, typer.Option("--images", metavar="DIR", help="a PNG for each image")] = None,
     video: Annotated[
-        str | None, typer.Option("--video", metavar="OUT.mp4", help="of one topic: name it with --topics")
+        str | None, typer.Option("--video", metavar="OUT.mp4", help="video of one topic, named with --topics")
     ] = None,
     topics: Annotated[list[str] | None, typer.Option("--topics", metavar="KEY", help="only these; repeatable")] = None,
     exclude: Exclude = None,
 ) -> None:
-    """Write a recording as what other programs read: Foxglove, tables, pictures, a video."""
+    """Export a recording for other programs: Foxglove, tables, images, a video."""
     from recording.reader import Recording
     from recording.sample import Decoder
     from recording.selection import Selection
@@ -63,7 +63,7 @@ def export(
         if video:
             _video(recording, Path(video), selection, decoder)
     for topic, count in sorted(decoder.skipped.items()):
-        echo(f"{printable(topic)}: {count} messages left out, which are none that this version knows", err=True)
+        echo(f"{printable(topic)}: {count} messages left out: this version does not know their type", err=True)
 
 
 def _foxglove(recording: Recording, target: Path, selection: Selection, decoder: Decoder) -> None:
@@ -84,10 +84,10 @@ def _images(recording: Recording, folder: Path, selection: Selection, decoder: D
     from recording.export import export_images, file_names, image_topics
 
     if not image_topics(recording, selection.wants):
-        raise ConfigError("--images", str(recording.path), "has no pictures among what is to be exported")
+        raise ConfigError("--images", str(recording.path), "has no images among the selected topics")
     names = file_names(image_topics(recording, selection.wants))
     for topic, count in export_images(recording, folder, selection.wants, decoder).items():
-        echo(f"{folder / names[topic]}: {count:,} pictures")
+        echo(f"{folder / names[topic]}: {count:,} images")
 
 
 def _video(recording: Recording, target: Path, selection: Selection, decoder: Decoder) -> None:
@@ -96,19 +96,19 @@ def _video(recording: Recording, target: Path, selection: Selection, decoder: De
     choices = image_topics(recording, selection.wants)
     if len(choices) != 1:
         named = ", ".join(choices) or "none"
-        raise ConfigError("--video", str(target), f"needs one topic with pictures, by --topics KEY; choices: {named}")
+        raise ConfigError("--video", str(target), f"needs one topic with images, by --topics KEY; choices: {named}")
     count, rate = export_video(recording, target, choices[0], decoder)
-    echo(f"{target}: {count:,} pictures of {choices[0]} at {rate:g} Hz")
+    echo(f"{target}: {count:,} images of {choices[0]} at {rate:g} Hz")
 
 
 def report(
     file: File,
-    output: Annotated[str, typer.Option("-o", "--output", metavar="FILE.html", help="[beside the recording]")] = "",
+    output: Annotated[str, typer.Option("-o", "--output", metavar="FILE.html", help="[next to the recording]")] = "",
     cell: Annotated[
-        str | None, typer.Option("--cell", metavar="CELL", help="whose robot it was, if the recording's is not here")
+        str | None, typer.Option("--cell", metavar="CELL", help="cell with the robot [the cell of the recording]")
     ] = None,
 ) -> None:
-    """Write one page about a recorded run: timeline, plans, latency, joints, what was seen, and what went wrong."""
+    """Write an HTML report of a recorded run: timeline, plans, latency, joints, detections and failures."""
     from recording.reader import Recording
     from recording.report.build import build_report, truncated_note
     from recording.sample import RecordingError
@@ -121,9 +121,9 @@ def report(
         raise ConfigError("--output", output, "cannot be written: the folder does not exist")
     with Recording(path) as recording:
         try:
-            with warnings.catch_warnings(action="ignore"):  # of numbers that no picture can show
+            with warnings.catch_warnings(action="ignore"):  # about values that a plot cannot show
                 text = build_report(recording, cell)
-        except CANNOT_BE_SHOWN as error:
+        except PLOT_ERRORS as error:
             raise RecordingError(f"{path}: has values that cannot be shown: {type(error).__name__}: {error}") from error
         if not recording.finished:
             echo(f"zencell: {truncated_note(recording)}", err=True)

@@ -1,4 +1,4 @@
-"""Services and topics of a cell as a picture: DOT and Mermaid as text, SVG drawn here."""
+"""Graph of the services and topics of a cell as SVG, DOT or Mermaid."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ def graph(
         str, typer.Argument(metavar="[CELL]", help="name or path of the cell file", autocompletion=choices.cells)
     ] = choices.default_cell(),
     output: Annotated[
-        str, typer.Option("-o", "--output", metavar="FILE", help="*.svg, *.dot or *.mmd; without it Mermaid on stdout")
+        str, typer.Option("-o", "--output", metavar="FILE", help="*.svg, *.dot or *.mmd [Mermaid on stdout]")
     ] = "",
     overrides: options.Overrides = None,
     no_viewer: Annotated[
-        bool, typer.Option("--no-viewer", help="without the operator's page, which reads nearly everything")
+        bool, typer.Option("--no-viewer", help="leave out the operator's page, which reads nearly every topic")
     ] = False,
     domain: options.Domain = None,
     connect: options.Connect = None,
 ) -> None:
-    """Draw services and topics of a cell, up or not; while it is up, what is not alive is dashed."""
+    """Draw the services and topics of a cell; if the cell is running, services that are not alive are dashed."""
     from common.config import load_cell
     from security.page_tokens import VIEWER
     from tools.graph import graph_of, names
@@ -67,7 +67,7 @@ def _writer_of(path: Path | None) -> Callable[[Graph], str]:
 
 
 def _wired_services(cell: Cell) -> list[ServiceWiring]:
-    """The services of a cell in start order; one that cannot be wire_service is drawn without its keys."""
+    """Return the services in start order; a service whose wiring fails is drawn without its keys."""
     from common.supervision.wiring import ServiceWiring, WiringFailed, wire_service
 
     found = []

@@ -1,6 +1,6 @@
 """The `zencell` command: runs, inspects and commands work cells.
 
-The verbs live beside this file, one file for each group of them, and import what is heavy when they are called.
+Each group of verbs is one file in this folder; heavy modules are imported when a verb is called.
 """
 
 from __future__ import annotations
@@ -40,20 +40,20 @@ from cli.target import CommandGroup
 from common.errors import RequestFailed, ZencellError
 from common.terminal import echo, printable
 
-NO_HOME = "Could not determine home directory."  # what pathlib says of ~NAME/...
+NO_HOME = "Could not determine home directory."  # pathlib's error for ~NAME/...
 EXIT_FAILED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 1, 2, 130
 
 
 class CommandLine(CommandGroup):
-    """CommandGroup whose errors come out as one line: exit code 1 for what failed, 2 for bad input, 130 for Ctrl-C."""
+    """CommandGroup that prints errors as one line: exit code 1 for failures, 2 for bad input, 130 for Ctrl-C."""
 
     def __call__(self, *args: Any, **kwargs: Any) -> None:
-        """Run the verb that the process's arguments name and end the process with its code."""
+        """Run the verb in the process's arguments and end the process with its exit code."""
         signal.signal(signal.SIGINT, signal.default_int_handler)
         _leave(self.execute(sys.argv[1:]))
 
     def execute(self, arguments: Sequence[str]) -> int:
-        """Exit code of a verb, which is run; an error is shown."""
+        """Run a verb, print its error if it fails, and return the exit code."""
         completion.prepare()
         try:
             of_applications.take_own(arguments)
@@ -62,26 +62,26 @@ class CommandLine(CommandGroup):
         except typer.TyperException as error:
             code = _fail(_with_choices(error), error.exit_code)
         except RequestFailed as error:
-            code = _fail(printable(error), EXIT_FAILED)  # in words of somebody else
+            code = _fail(printable(error), EXIT_FAILED)  # the text comes from another process
         except ZencellError as error:
             code = _fail(str(error), getattr(error, "exit_code", EXIT_BAD_INPUT))
         except (KeyboardInterrupt, typer.Abort):
             code = EXIT_INTERRUPTED
         except BrokenPipeError:  # as in `zencell topic echo ... | head`
             code = EXIT_FAILED
-        except OSError as error:  # what the system does not let us do, such as reading a file of somebody else's
-            if error.strerror is None:  # none of the system's
+        except OSError as error:  # for example a file of another user
+            if error.strerror is None:  # not from the operating system
                 raise
             code = _fail(f"{error.filename}: {error.strerror}" if error.filename else error.strerror, EXIT_FAILED)
         except RuntimeError as error:
             if str(error) != NO_HOME:
                 raise
-            code = _fail("a path begins with ~ and the name of somebody who has no home here", EXIT_BAD_INPUT)
+            code = _fail("a path begins with ~ and a user name without a home folder", EXIT_BAD_INPUT)
         return code if isinstance(code, int) else 0
 
 
 def _with_choices(error: typer.TyperException) -> str:
-    """What is wrong with the arguments; a verb that does not exist is told with those that do."""
+    """Return the error text; for an unknown verb with the choices."""
     message = error.format_message()
     verbs_there = getattr(getattr(getattr(error, "ctx", None), "command", None), "commands", {})
     return f"{message} choices: {', '.join(verbs_there)}" if message.startswith("No such command") else message
@@ -95,14 +95,14 @@ def _fail(message: str, code: int) -> int:
 def _leave(code: int) -> NoReturn:
     """End the process without waiting for threads that are still in foreign code, such as one that connects."""
     for stream in (sys.stdout, sys.stderr):
-        with contextlib.suppress(OSError, ValueError):  # nobody reads any more
+        with contextlib.suppress(OSError, ValueError):  # the reader has closed the pipe
             stream.flush()
     os._exit(code)
 
 
 app = CommandLine(
     "Robot work cells as a mesh of processes over Zenoh.",
-    add_completion=False,  # our own options below take the name of the shell
+    add_completion=False,  # the options below take the name of the shell
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )

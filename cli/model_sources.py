@@ -1,4 +1,4 @@
-"""Fields of the models of the configuration, read from their sources without importing anything."""
+"""Fields of the models of the configuration, read from their sources without imports."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ ROOT = Path(__file__).resolve().parent.parent
 
 @dataclass(frozen=True)
 class Model:
-    """A class, and the file in which the names that it uses mean something."""
+    """A class, and the file that defines the scope of its names."""
 
     path: Path
     node: ast.ClassDef
@@ -21,7 +21,7 @@ class Model:
 
 @dataclass(frozen=True)
 class ModelField:
-    """A field of a model; `model` is its type where that is a model too; `empty`: there is none unless it is given."""
+    """A field; `model` is its type if that is a model too; `empty` says that the default is None."""
 
     name: str
     description: str
@@ -31,13 +31,13 @@ class ModelField:
 
 @cache
 def tree_of(path: Path) -> ast.Module:
-    """The syntax tree of a file."""
+    """Return the syntax tree of a file."""
     return ast.parse(path.read_text(encoding="utf-8"), str(path))
 
 
 @cache
 def find_model(path: Path, name: str) -> Model | None:
-    """The class that a name means in a file of the project, also where it was imported from; None for another's."""
+    """Return the class of a name in a file, following imports; None if it is not part of the project."""
     for node in tree_of(path).body:
         if isinstance(node, ast.ClassDef) and node.name == name:
             return Model(path, node)
@@ -56,7 +56,7 @@ def _file_of(module: str) -> Path | None:
 
 
 def fields_of(model: Model) -> Iterator[ModelField]:
-    """The fields of a model, inherited ones first, without those that are shown nowhere."""
+    """Yield the fields of a model, inherited ones first, without secrets."""
     for base in model.node.bases:
         inherited = find_model(model.path, base.id) if isinstance(base, ast.Name) else None
         if inherited is not None:
@@ -72,7 +72,7 @@ def fields_of(model: Model) -> Iterator[ModelField]:
 
 
 def is_section(model: Model) -> bool:
-    """Whether a model is a part of the cell that services share."""
+    """Return whether a model is a shared section of the cell."""
     bases = [base.id for base in model.node.bases if isinstance(base, ast.Name)]
     return "Section" in bases or any(
         is_section(inherited) for base in bases if (inherited := find_model(model.path, base))
@@ -80,7 +80,7 @@ def is_section(model: Model) -> bool:
 
 
 def _type_name(annotation: ast.expr) -> str:
-    """The name of a field's type, without `| None` and `Tunable`; empty for what has none."""
+    """Return the name of a field's type without `| None` and `Tunable`; empty if it has none."""
     match annotation:
         case ast.BinOp(left=left, right=ast.Constant(value=None)):
             return _type_name(left)
@@ -95,7 +95,7 @@ def _default_is_none(value: ast.expr | None) -> bool:
 
 
 def _is_secret(value: ast.expr | None) -> bool:
-    """Whether a field is kept out of its model's repr, as passwords and tokens are."""
+    """Return whether a field is excluded from its model's repr, as passwords and tokens are."""
     return isinstance(value, ast.Call) and any(
         keyword.arg == "repr" and isinstance(keyword.value, ast.Constant) and keyword.value.value is False
         for keyword in value.keywords

@@ -1,4 +1,4 @@
-"""Play a recording: what was recorded travels again, with or without the cell that it came from."""
+"""Play a recording: publish its messages again, with or without a running cell."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from common.terminal import echo, rewrite
 if TYPE_CHECKING:
     from recording.player import Player
 
-MOST_RATE = 1000.0
+MAX_RATE = 1000.0
 
 
 def play_(
@@ -30,23 +30,24 @@ def play_(
     remap: Annotated[
         list[str] | None, typer.Option("--remap", metavar="FROM:=TO", help="publish under another key; repeatable")
     ] = None,
-    rate: Annotated[str, typer.Option("--rate", metavar="X", help="times as fast")] = "1",
-    loop: Annotated[bool, typer.Option("--loop", help="begin again at the end, until Ctrl-C")] = False,
-    start_offset: Annotated[str, typer.Option("--start-offset", metavar="S", help="begin there [s]")] = "0",
+    rate: Annotated[str, typer.Option("--rate", metavar="X", help="speed factor")] = "1",
+    loop: Annotated[bool, typer.Option("--loop", help="repeat until Ctrl-C")] = False,
+    start_offset: Annotated[str, typer.Option("--start-offset", metavar="S", help="start at this time of the "
+                                                                                  "recording [s]")] = "0",
     start_paused: Annotated[bool, typer.Option("--start-paused", help="wait for space at the start")] = False,
     stamp_now: Annotated[
-        bool, typer.Option("--stamp-now", help="move stamps to the present; else they stay as recorded")
+        bool, typer.Option("--stamp-now", help="shift stamps to the present [stamps as recorded]")
     ] = False,
     wait: Annotated[
-        list[str] | None, typer.Option("--wait", metavar="SERVICE", help="begin when it is ready; repeatable")
+        list[str] | None, typer.Option("--wait", metavar="SERVICE", help="start once this service is ready; repeatable")
     ] = None,
     cell: Annotated[str | None, typer.Option("--cell", metavar="NAME", help="play as this cell")] = None,
     domain: options.Domain = None,
     connect: options.Connect = None,
 ) -> None:
-    """Publish what was recorded, in its own time; starts a router if none is there.
+    """Publish the messages of a recording with their timing; start a router if none is running.
 
-    On a terminal space pauses, right steps one message, down one picture, left goes back 5 s, q quits.
+    On a terminal space pauses, right steps one message, down one image, left goes back 5 s, q quits.
     """
     from common.remapping import is_cell
     from common.transport.credentials import require_open_cell
@@ -58,17 +59,17 @@ def play_(
     selection = Selection.of([*(keys or ()), *(topics or ())], None, exclude)
     renamed = renaming(remap or [])
     speed, offset = options.number("--rate", rate), options.number("--start-offset", start_offset)
-    if not 0 < speed <= MOST_RATE:
-        raise ConfigError("--rate", rate, f"must be more than 0 and at most {MOST_RATE:g}")
+    if not 0 < speed <= MAX_RATE:
+        raise ConfigError("--rate", rate, f"must be more than 0 and at most {MAX_RATE:g}")
     on_terminal = sys.stdin.isatty() and sys.stderr.isatty()
     if start_paused and not on_terminal:
-        raise ConfigError("--start-paused", ..., "needs a terminal, where space goes on; --wait SERVICE needs none")
+        raise ConfigError("--start-paused", ..., "needs a terminal, where space continues; --wait SERVICE needs none")
     with Recording(Path(file)) as recording:
         if not 0 <= offset <= recording.seconds:
             raise ConfigError("--start-offset", start_offset, f"must be 0 to {recording.seconds:.1f}, its length [s]")
         played = played_topics(recording, selection)
         if loop and recording.seconds == 0:
-            raise ConfigError("--loop", ..., f"needs a recording with a length, which {file} has not")
+            raise ConfigError("--loop", ..., f"needs a recording with a length, but {file} has none")
 
         def create() -> Player:
             from recording.player import Player
@@ -78,7 +79,7 @@ def play_(
 
         name = cell or recording.cell
         if not name:
-            raise ConfigError("--cell", ..., f"{file} does not say of which cell it is: name one")
+            raise ConfigError("--cell", ..., f"{file} does not name its cell: name one")
         if not is_cell(name):
             raise ConfigError("--cell", name, "is not a valid name of a cell")
         show = rewrite if on_terminal else None

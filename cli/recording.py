@@ -1,4 +1,4 @@
-"""Recordings: make one, look what is in it, repair one that was cut."""
+"""Recordings: record, show the contents, recover a truncated file."""
 
 from __future__ import annotations
 
@@ -17,56 +17,57 @@ from common.errors import ConfigError
 from common.terminal import echo, rewrite
 from recording.formatting import format_bytes, format_contents, require_new
 
-LEAST_FILE = 1.0  # [MB] of a recording that is split
+MIN_FILE_SIZE = 1.0  # [MB] of a recording that is split
 
 File = Annotated[str, typer.Argument(metavar="FILE.mcap", help="a recording")]
 Keys = Annotated[
     list[str] | None, typer.Argument(metavar="KEY", help="without the cell; * and ** as wildcards",
                                      autocompletion=choices.published)
 ]
-Exclude = Annotated[str | None, typer.Option("--exclude", metavar="RE", help="leave out keys in which RE is found")]
+Exclude = Annotated[str | None, typer.Option("--exclude", metavar="RE", help="leave out keys that match RE")]
 
 
 def record_(
     keys: Keys = None,
-    regex: Annotated[str | None, typer.Option("--regex", metavar="RE", help="keys in which RE is found")] = None,
+    regex: Annotated[str | None, typer.Option("--regex", metavar="RE", help="only keys that match RE")] = None,
     exclude: Exclude = None,
     output: Annotated[str | None, typer.Option("-o", "--output", metavar="FILE.mcap", help="[CELL_TIME.mcap]")] = None,
-    duration: Annotated[str | None, typer.Option("--duration", metavar="S", help="end after so long [s]")] = None,
+    duration: Annotated[str | None, typer.Option("--duration", metavar="S", help="stop after this duration "
+                                                                                 "[s]")] = None,
     max_size: Annotated[
-        str | None, typer.Option("--max-size", metavar="MB", help="begin another file, FILE_1.mcap, after so much")
+        str | None, typer.Option("--max-size", metavar="MB", help="split into FILE_1.mcap, ... at this size")
     ] = None,
     at: CellTarget = RUNNING,
     gate: Annotated[bool, typer.Option("--gate", hidden=True, help="under a supervisor: wait for a line")] = False,
-    own: Annotated[str, typer.Option("--own", hidden=True, help="under a supervisor: what is in the cell's file")] = "",
+    own: Annotated[str, typer.Option("--own", hidden=True, help="under a supervisor: custom topics of the cell")] = "",
 ) -> None:
-    """Record what travels in a cell, all keys if none are given, until Ctrl-C."""
+    """Record the messages of a cell until Ctrl-C: the given keys, or all."""
     from common.config import load_cell
     from common.transport.credentials import observer_identity
     from recording.capture import CustomTopics
     from recording.recorder import RecordRequest, record, record_gated, require_published
     from recording.selection import Selection
 
-    beside, cell = CustomTopics.read(own) if own else CustomTopics(), at.cell
+    custom, cell = CustomTopics.read(own) if own else CustomTopics(), at.cell
     if cell is not None and cell.endswith((".yaml", ".yml")):
         loaded = load_cell(cell)
-        cell, beside = loaded.name, CustomTopics.of(loaded)
+        cell, custom = loaded.name, CustomTopics.of(loaded)
     selection = Selection.of(keys or (), regex, exclude)
     require_published(selection)
     seconds = _positive("--duration", duration)
     megabytes = _positive("--max-size", max_size)
-    if megabytes is not None and megabytes < LEAST_FILE:
-        raise ConfigError("--max-size", max_size, f"must be {LEAST_FILE:g} or more")
+    if megabytes is not None and megabytes < MIN_FILE_SIZE:
+        raise ConfigError("--max-size", max_size, f"must be {MIN_FILE_SIZE:g} or more")
     if output:
         require_new(Path(output))
-    asked = RecordRequest(
+    request = RecordRequest(
         selection, Path(output) if output else None, None if megabytes is None else round(megabytes * 1e6), seconds,
-        gate, beside)
+        gate, custom)
     show = rewrite if sys.stderr.isatty() else None
     if gate:
-        asyncio.run(record_gated(asked, cell, at.domain, at.connect, echo, show))
+        asyncio.run(record_gated(request, cell, at.domain, at.connect, echo, show))
     else:
-        replace(at, cell=cell).visit(lambda bus: record(bus, asked, echo, show), identity=observer_identity())
+        replace(at, cell=cell).visit(lambda bus: record(bus, request, echo, show), identity=observer_identity())
 
 
 def _positive(option: str, text: str | None) -> float | None:
@@ -79,7 +80,7 @@ def _positive(option: str, text: str | None) -> float | None:
 
 
 def info(file: File, as_json: options.Json = False) -> None:
-    """Show what is in a recording: each topic with its type, count, rate and size, how long it is, what was lost."""
+    """Show the contents of a recording: type, count, rate and size of each topic, duration, lost messages."""
     from recording.reader import Recording
     from recording.summary import summarise
 
@@ -98,7 +99,7 @@ def recover(
         str | None, typer.Option("-o", "--output", metavar="FILE.mcap", help="[FILE_recovered.mcap]")
     ] = None,
 ) -> None:
-    """Make a whole file of a recording that was cut by a kill or a full disk."""
+    """Write a complete file from a recording that was truncated by a kill or a full disk."""
     from recording.reader import recover as recover_file
 
     source = Path(file)

@@ -1,4 +1,4 @@
-"""Robot files: which of their links need no collision check. Robots that are up: what their controllers say and do."""
+"""Disabled collision pairs of robot files; commands to the controllers of running robots."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ def collisions(
         str, typer.Argument(metavar="ROBOT", help="a name of config/robots, or the path of a YAML file",
                             autocompletion=choices.robots)
     ],
-    samples: Annotated[str, typer.Option("--samples", metavar="N", help="random configurations")] = "10000",
-    margin: Annotated[str, typer.Option("--margin", metavar="M", help="pairs that come this close are checked [m]")]
+    samples: Annotated[str, typer.Option("--samples", metavar="N", help="number of random configurations")] = "10000",
+    margin: Annotated[str, typer.Option("--margin", metavar="M", help="check pairs that come this close [m]")]
     = "0.005",
-    seed: Annotated[str, typer.Option("--seed", metavar="N", help="of the configurations")] = "0",
-    output: Annotated[str, typer.Option("-o", "--output", metavar="FILE", help="write there, not here")] = "",
+    seed: Annotated[str, typer.Option("--seed", metavar="N", help="seed of the configurations")] = "0",
+    output: Annotated[str, typer.Option("-o", "--output", metavar="FILE", help="file to write [stdout]")] = "",
 ) -> None:
     """Compute an SRDF: groups, named poses, and the pairs of links that need no collision check."""
     import numpy as np
@@ -40,7 +40,7 @@ def collisions(
     distance = options.number("--margin", margin)
     if distance < 0:
         raise ConfigError("--margin", margin, "must be 0 or more")
-    # The SRDF that the robot file names may be the one that is still to be made.
+    # The SRDF that the robot file names may not exist yet: this command creates it.
     model = RobotModel.load(load_robot(name).model_copy(update={"srdf": ""}))
     pairs = disabled_pairs(model, samples=count or 1, margin=distance, rng=np.random.default_rng(number))
     text = srdf(model, pairs)
@@ -56,15 +56,15 @@ def collisions(
 @app.command()
 def status(at: CellTarget = RUNNING) -> None:
     """Print the state of the arm's controller: mode, why it cannot move, speed slider."""
-    told = at.join(lambda cell: cell.arm.robot())
-    echo(f"{told.mode}{f': {told.message}' if told.message else ''}")
-    echo(f"speed slider {told.speed:.0%}, latest cycle {told.late * 1e3:.1f} ms late, "
-         f"inputs {told.inputs:#b}, outputs {told.outputs:#b}")
+    state = at.join(lambda cell: cell.arm.robot())
+    echo(f"{state.mode}{f': {state.message}' if state.message else ''}")
+    echo(f"speed slider {state.speed:.0%}, latest cycle {state.late * 1e3:.1f} ms late, "
+         f"inputs {state.inputs:#b}, outputs {state.outputs:#b}")
 
 
 def _order(at: CellTarget, act: str, value: float = 0.0, **more: Any) -> None:
-    told = at.join(lambda cell: cell.arm.order(act, value, **more))
-    echo(f"{told.mode}{f': {told.message}' if told.message else ''}")
+    state = at.join(lambda cell: cell.arm.order(act, value, **more))
+    echo(f"{state.mode}{f': {state.message}' if state.message else ''}")
 
 
 @app.command()
@@ -81,7 +81,7 @@ def recover(at: CellTarget = RUNNING) -> None:
 
 @app.command()
 def freedrive(
-    state: Annotated[str, typer.Argument(metavar="on|off", help="whether it is moved by hand")],
+    state: Annotated[str, typer.Argument(metavar="on|off", help="whether the arm can be guided by hand")],
     at: CellTarget = RUNNING,
 ) -> None:
     """Switch hand guiding of the arm on or off."""
@@ -92,9 +92,9 @@ def freedrive(
 
 @app.command()
 def payload(
-    mass: Annotated[str, typer.Argument(metavar="KG", help="mass of what the tool carries, with its fingers")],
+    mass: Annotated[str, typer.Argument(metavar="KG", help="mass on the flange: gripper and object")],
     com: Annotated[
-        str, typer.Option("--com", metavar="X,Y,Z", help="its centre of mass, from the flange [m]")] = "0,0,0",
+        str, typer.Option("--com", metavar="X,Y,Z", help="centre of mass in the flange frame [m]")] = "0,0,0",
     at: CellTarget = RUNNING,
 ) -> None:
     """Set the payload of the arm's controller."""
@@ -105,13 +105,13 @@ def payload(
 @app.command()
 def io(
     output: Annotated[str | None, typer.Argument(metavar="OUTPUT", help="number of a digital output")] = None,
-    state: Annotated[str | None, typer.Argument(metavar="on|off", help="what it becomes")] = None,
+    state: Annotated[str | None, typer.Argument(metavar="on|off", help="new state of the output")] = None,
     at: CellTarget = RUNNING,
 ) -> None:
     """Print the digital inputs and outputs of the arm's controller, or set an output."""
     if output is None:
-        told = at.join(lambda cell: cell.arm.robot())
-        echo(f"inputs on: {_numbers(told.inputs)}\noutputs on: {_numbers(told.outputs)}")
+        controller = at.join(lambda cell: cell.arm.robot())
+        echo(f"inputs on: {_numbers(controller.inputs)}\noutputs on: {_numbers(controller.outputs)}")
         return
     if state not in ("on", "off"):
         raise ConfigError("io", state or "", "must be on or off")
@@ -119,28 +119,28 @@ def io(
 
 
 def _numbers(bits: int) -> str:
-    """The numbers of the bits that are set."""
+    """Return the numbers of the bits that are set."""
     return ", ".join(str(n) for n in range(32) if bits >> n & 1) or "none"
 
 
-# --- whose the motion is -------------------------------------------------------------------------------------------
+# --- motion authority ----------------------------------------------------------------------------------------------
 
 
 @app.command()
 def owner(at: CellTarget = RUNNING) -> None:
     """Print which client has motion authority. Any client may stop or hold the robot."""
-    told = at.join(lambda cell: cell.arm.owner_now())
-    echo(f"the motion is {told.description}{', jogging the arm' if told.jogging else ''}")
+    current = at.join(lambda cell: cell.arm.owner_now())
+    echo(f"the motion is {current.description}{', jogging the arm' if current.jogging else ''}")
 
 
 def _own(at: CellTarget, act: Literal["take", "give"], *, over: bool = False) -> None:
-    told = at.join(lambda cell: cell.arm.own(act, over=over, kind="operator"))
-    echo(f"the motion is {told.description}")
+    current = at.join(lambda cell: cell.arm.own(act, over=over, kind="operator"))
+    echo(f"the motion is {current.description}")
 
 
 @app.command()
 def take(
-    over: Annotated[bool, typer.Option("--over", help="from its owner: their motion stops, and a task "
+    over: Annotated[bool, typer.Option("--over", help="take it from its owner: their motion stops, and a task "
                                                       "waits for `zencell task start`")] = False,
     at: CellTarget = RUNNING,
 ) -> None:
@@ -162,11 +162,12 @@ def jog(
     angular: Annotated[
         str | None, typer.Option("--angular", metavar="X,Y,Z", help="rotation of the tool about the TCP [rad/s]")
     ] = None,
-    frame: Annotated[str, typer.Option("--frame", metavar="base|tool|world", help="whose axes those are")] = "base",
-    seconds: Annotated[str, typer.Option("--seconds", metavar="S", help="for so long, at most a minute")] = "1",
+    frame: Annotated[str, typer.Option("--frame", metavar="base|tool|world", help="frame of --linear and "
+                                                                                  "--angular")] = "base",
+    seconds: Annotated[str, typer.Option("--seconds", metavar="S", help="duration [s], at most 60")] = "1",
     at: CellTarget = RUNNING,
 ) -> None:
-    """Jog the arm for a while: at most 0.25 m/s; it is at standstill 0.2 s after Ctrl-C or the end."""
+    """Jog the arm for a while: at most 0.25 m/s; the arm is at standstill 0.2 s after Ctrl-C or the end."""
     from common.client.operator_motion import check_seconds
 
     duration = options.number("--seconds", seconds)
@@ -177,8 +178,8 @@ def jog(
     for each in joint or []:
         name, _, value = each.partition("=")
         joints[name] = options.number("--joint", value)
-    asked: dict[str, Any] = {
+    request: dict[str, Any] = {
         "joints": joints, "linear": options.three("--linear", linear or "0,0,0"),
         "angular": options.three("--angular", angular or "0,0,0"), "frame": frame,
         "seconds": duration}
-    at.join(lambda cell: cell.arm.jog(**asked))
+    at.join(lambda cell: cell.arm.jog(**request))

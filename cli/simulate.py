@@ -1,4 +1,4 @@
-"""`simulate`: whole cells on a virtual clock, one run for each seed."""
+"""`simulate`: complete cells on a virtual clock, one run for each seed."""
 
 from __future__ import annotations
 
@@ -19,26 +19,28 @@ if TYPE_CHECKING:
 
 def simulate(
     cell: options.CellArgument,
-    seeds: Annotated[str | None, typer.Option("--seeds", metavar="A-B", help="a run for each of them [1-20]")] = None,
-    seed: Annotated[str | None, typer.Option("--seed", metavar="N", help="just this one, told in full")] = None,
-    faults: Annotated[bool, typer.Option("--faults", help="crashes, cut links, messages that go astray")] = False,
+    seeds: Annotated[str | None, typer.Option("--seeds", metavar="A-B", help="seeds to run [1-20]")] = None,
+    seed: Annotated[str | None, typer.Option("--seed", metavar="N", help="run only this seed and print all "
+                                                                         "events")] = None,
+    faults: Annotated[bool, typer.Option("--faults", help="inject crashes, cut links and lost messages")] = False,
     doubles: Annotated[
-        bool, typer.Option("--doubles", help="of perception and planner: task, executor and supervisor as they are, in "
-                                             "many more seeds")
+        bool, typer.Option("--doubles", help="replace perception and planner by fast fakes, for many more "
+                                             "seeds of task, executor and supervisor")
     ] = False,
     trace: Annotated[
-        str | None, typer.Option("--trace", metavar="FILE.mcap", help="of --seed: a recording of all that travelled")
+        str | None, typer.Option("--trace", metavar="FILE.mcap", help="record all messages of the run of --seed")
     ] = None,
-    jobs: Annotated[str | None, typer.Option("--jobs", metavar="N", help="so many at a time [one a core]")] = None,
+    jobs: Annotated[str | None, typer.Option("--jobs", metavar="N", help="number of parallel runs [one for each "
+                                                                         "core]")] = None,
     limit: Annotated[
-        str, typer.Option("--limit", metavar="S", help="of virtual time, in which the task must end [s]")
+        str, typer.Option("--limit", metavar="S", help="virtual time limit of the task [s]")
     ] = "300",
     overrides: options.Overrides = None,
     world: options.WorldName = None,
 ) -> None:
-    """Run a whole cell in this process on a virtual clock, once for each seed, and check what must hold at every step.
+    """Run a complete cell in one process on a virtual clock, once for each seed; check the invariants at every step.
 
-    Exit code 0 only when nothing broke and 99 % of the seeds ended DONE.
+    Exit code 0 only if no invariant is violated and 99 % of the seeds end DONE.
     """
     from common.config import load_cell
     from common.errors import ConfigError
@@ -52,23 +54,23 @@ def simulate(
     if trace is not None and seed is None:
         raise ConfigError("--trace", trace, "needs --seed N")
     one = options.whole("--seed", seed, 0)
-    several = seeds_of(seeds or "1-20")
+    all_seeds = seeds_of(seeds or "1-20")
     at_a_time = options.whole("--jobs", jobs, 1) or max(1, int(usable_cores()))
     longest = options.number("--limit", limit)
     if longest <= 0:
         raise ConfigError("--limit", limit, "must be more than 0 [s]")
     loaded = load_cell(cell, overrides or (), world=world)
     if doubles:
-        given = (*settings_of(loaded.application), *(overrides or ()))
-        loaded = with_doubles(load_cell(cell, given, world=world))
-    with_observed_arm(loaded)  # says in one line what cannot be simulated
+        settings = (*settings_of(loaded.application), *(overrides or ()))
+        loaded = with_doubles(load_cell(cell, settings, world=world))
+    with_observed_arm(loaded)  # raises an error if the cell cannot be simulated
     if one is None:
-        raise typer.Exit(_campaign(loaded, several, faults, at_a_time, longest))
+        raise typer.Exit(_campaign(loaded, all_seeds, faults, at_a_time, longest))
     raise typer.Exit(_single(loaded, one, faults, trace, longest))
 
 
 def _single(cell: Cell, seed: int, faults: bool, file: str | None, limit: float) -> int:
-    """Run one seed and tell of all that happened; the exit code."""
+    """Run one seed, print all events, and return the exit code."""
     from lab.campaign import format_outcome
     from lab.observers import Trace
     from lab.simulation import Simulation
@@ -93,7 +95,7 @@ def _single(cell: Cell, seed: int, faults: bool, file: str | None, limit: float)
 
 
 def _campaign(cell: Cell, seeds: Sequence[int], faults: bool, jobs: int, limit: float) -> int:
-    """Run all seeds with a bar that tells how far it is, then the table; the exit code."""
+    """Run all seeds with a progress bar, print the table, and return the exit code."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 

@@ -1,4 +1,4 @@
-"""Verbs and options that applications bring: of those that come with the project, and of a cell's own."""
+"""Verbs and options of applications: built-in ones, and the custom application of a cell file."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class CommandShell:
         self, visit: Callable[[Bus], Awaitable[T]], cell: str, overrides: list[str] | None, world: str | None,
         seed: str | None, domain: str | None, connect: str | None,
     ) -> T:
-        """What a visit to a cell returns: to one that is up, or one that is brought up for it without its task."""
+        """Call `visit` in the running cell, or bring the cell up without its task for it; return the result."""
         from cli.session.session import CellSession
         from common.config import load_cell
         from common.supervision.launch import require_free_port, router_location
@@ -58,7 +58,7 @@ class CommandShell:
             if endpoint is None:
                 require_free_port(endpoint_of(number))
             is_up = endpoint is not None
-        except PortInUse:  # somebody has the port: a router, if it is zencell's
+        except PortInUse:  # a router of zencell may have the port
             is_up = True
         if is_up:
             name = load_cell(cell, tuple(overrides or ()), world=world).name
@@ -69,7 +69,7 @@ class CommandShell:
         return operation.visit(visit)
 
     def parameters(self, cell: Cell, service: str) -> Any:
-        """The checked parameters of a service of a cell."""
+        """Return the validated parameters of a service of a cell."""
         from common.config import service_config
 
         found = (entry.module for entry in cell.services.values() if entry.name == service)
@@ -77,33 +77,33 @@ class CommandShell:
 
 
 class ApplicationVerbs:
-    """Takes up what applications bring."""
+    """Adds the verbs and options of applications to the command line."""
 
     def __init__(self, app: typer.Typer, groups: dict[str, typer.Typer], run: Callable[..., None], last: str) -> None:
-        """Begin without any.
+        """Start without applications.
 
         Args:
-            app: gets the verbs.
-            groups: get those of theirs.
-            run: the verb that gets options; takes `befores` and what they ask for as keywords.
-            last: the parameter of `run` before which they stand in its help.
+            app: the command that gets the verbs.
+            groups: command groups by name, which get verbs such as `task select`.
+            run: the verb that gets additional options; receives them as keywords.
+            last: the parameter of `run` before which the help lists these options.
         """
         self._app, self._groups, self._run, self._last = app, groups, run, last
         self._known: set[str] = set()
 
     def take_all(self) -> None:
-        """Those of the applications that come with the project."""
+        """Add the verbs and options of the built-in applications."""
         for found in applications():
             self.take(found)
 
     def take_own(self, arguments: Sequence[str]) -> None:
-        """Those of the application of a cell file that is named on the command line, if it is a module of its own."""
+        """Add those of custom applications of cell files on the command line."""
         for name in own_applications(arguments):
-            with contextlib.suppress(ConfigError):  # whoever loads the cell says it
+            with contextlib.suppress(ConfigError):  # loading the cell reports the error
                 self.take(find_application(name))
 
     def take(self, application: Application) -> None:
-        """Those of one application."""
+        """Add the verbs and options of one application once."""
         if application.name in self._known:
             return
         self._known.add(application.name)
@@ -122,13 +122,13 @@ BEFORE_RUN: list[Callable[..., BeforeRun]] = []
 
 
 def before_run(cell: str, overrides: list[str] | None, world: str | None, given: dict[str, Any]) -> BeforeRun:
-    """What a run starts with, as all applications have it.
+    """Return overrides and first action of a run, after the hooks of all applications.
 
     Args:
-        cell: as it was given.
-        overrides: as they were given.
-        world: as it was given.
-        given: options that applications have added to `run`, by their parameters.
+        cell: name or path.
+        overrides: values of `--set`.
+        world: name or path of another world.
+        given: values of options that applications added to `run`, by parameter name.
     """
     so_far = BeforeRun(list(overrides or ()))
     for before in BEFORE_RUN:
@@ -139,7 +139,7 @@ def before_run(cell: str, overrides: list[str] | None, world: str | None, given:
 
 
 def with_shared_options(verb: Callable[..., None]) -> Callable[..., None]:
-    """The verb, with the options that others have where it names them and says nothing of its own."""
+    """Annotate a verb's bare parameters with the shared options of the same names."""
     hints = get_type_hints(verb, include_extras=True)
     for name, parameter in inspect.signature(verb).parameters.items():
         if hasattr(hints[name], "__metadata__"):
@@ -153,7 +153,7 @@ def with_shared_options(verb: Callable[..., None]) -> Callable[..., None]:
 
 
 def add_options(run: Callable[..., None], before: Callable[..., BeforeRun], last: str) -> None:
-    """Let a verb have the keyword-only parameters of `before` as options of its own, before its parameter `last`."""
+    """Add the keyword-only parameters of `before` to a verb as options, before its parameter `last`."""
     signature = inspect.signature(run, eval_str=True)
     parameters = [p for p in signature.parameters.values() if p.kind is not p.VAR_KEYWORD]
     more = [p for p in inspect.signature(before, eval_str=True).parameters.values() if p.kind is p.KEYWORD_ONLY]
@@ -163,11 +163,11 @@ def add_options(run: Callable[..., None], before: Callable[..., BeforeRun], last
 
 
 def own_applications(arguments: Sequence[str]) -> Iterator[str]:
-    """Dotted modules that cell files on the command line name as their applications."""
+    """Yield the application modules (dotted names) of the cell files on the command line."""
     for argument in arguments:
         path = Path(argument.rpartition("=")[2])
         if path.suffix == ".yaml" and path.is_file():
-            from common.config import read_yaml  # completion is to be quick
+            from common.config import read_yaml  # imported late: completion must be fast
 
             with contextlib.suppress(ConfigError):
                 name = read_yaml(path).get("application")

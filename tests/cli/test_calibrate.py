@@ -73,7 +73,7 @@ def test_it_tells_residuals_uncertainty_and_what_comes_next(calibrated, tmp_path
     assert f"--set world.camera={calibrated}" in told
     path = shutil.copy(calibrated, tmp_path / "camera.yaml")
     assert app.execute(["calibrate", "intrinsics", "views", "-o", str(path)]) == 0
-    assert "had a pose, which was found with other intrinsics and is gone" in capsys.readouterr().out
+    assert "had a pose, which is removed because it belongs to other intrinsics" in capsys.readouterr().out
     assert "position" not in yaml.safe_load(Path(path).read_text())
 
 
@@ -127,7 +127,7 @@ def test_a_board_is_written_with_its_true_size(tmp_path, capsys):
         (["board", "-o", "board.png", "--squares", "40x40"], 2, ["800 markers", "50"]),
         (["pose", "a", "--intrinsics", "none.yaml", "--board-position", "0,0,0"], 2, ["none.yaml", "cannot be read"]),
         (["pose", "a", "--intrinsics", "FILE", "--board-position", "0,0"], 2, ["--board-position", "'0,0'", "three"]),
-        (["pose", "a", "b", "--intrinsics", "FILE", "--board-position", "0,0,0"], 2, ["1 times for 2 places"]),
+        (["pose", "a", "b", "--intrinsics", "FILE", "--board-position", "0,0,0"], 2, ["1 times for 2 sources"]),
         (["pose", "empty", "--intrinsics", "FILE", "--board-position", "0,0,0"], 1, ["none of 2", "no marker"]),
         (["pose", "blurred", "--intrinsics", "FILE", "--board-position", "0,0,0"], 1, ["none of 3", "blurred"]),
         (["pose", "views", "--intrinsics", "FILE", "--board-position", "0,0,0"], 1, ["are inconsistent"]),

@@ -321,7 +321,7 @@ BAD = [
     (("play", "there.mcap", "--exclude", "."), "has no message of the selected topics"),
     (("play", "there.mcap", "--start-paused"), "--start-paused: needs a terminal"),
     (("export", "there.mcap"), "needs one or more of --foxglove"),
-    (("export", "there.mcap", "--video", "v.mp4"), "needs one topic with pictures"),
+    (("export", "there.mcap", "--video", "v.mp4"), "needs one topic with images"),
     (("export", "there.mcap", "--csv", "there.mcap"), "--csv: 'there.mcap' must be a folder"),
     (("export", "there.mcap", "--csv", "d", "--topics", "tf"), "--topics: 'tf' is not in there.mcap; choices: joint"),
     (("run", "tiny.yaml", "--record", "there.mcap"), "--record: "),
