@@ -58,7 +58,7 @@ async def check_commands(cell: RunningCell) -> None:
         (("io", "3", "up"), "zencell: io: 'up' must be on or off"),
         (("io", "99", "on"), "zencell: output.output: 99 must be less than 32"),
     ):
-        done = await asyncio.to_thread(cell.tell, "robot", *words)
+        done = await asyncio.to_thread(cell.command, "robot", *words)
         assert (done.stdout + done.stderr).strip() == said
 
 

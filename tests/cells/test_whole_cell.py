@@ -114,7 +114,7 @@ async def test_terminal_jogs_the_arm_and_releases_it_when_killed(up: RunningCell
     finally:
         jogging.kill()
         jogging.wait()
-    assert (await asyncio.to_thread(up.tell, "robot", "owner")).stdout == "the motion is free\n"
+    assert (await asyncio.to_thread(up.command, "robot", "owner")).stdout == "the motion is free\n"
 
 
 @pytest.mark.parametrize(("arguments", "wanted"), [

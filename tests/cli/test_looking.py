@@ -190,5 +190,5 @@ def test_doctor_finds_the_cell_and_its_version(place: Place) -> None:
     said = [finding["what"] for finding in findings]
     endpoint = f"tcp/127.0.0.1:{7447 + place.domain}"
     assert f"cell look at {endpoint} has the message version of this tool" in said
-    assert any(what.startswith("a cell is up, or comes up: zencell up look.yaml (") for what in said)
+    assert any(what.startswith("a cell runs or starts: zencell up look.yaml (") for what in said)
     assert all(finding["remedy"] for finding in findings if finding["level"] != "ok")
