@@ -74,7 +74,7 @@ class RobotiqHost:
 
         self._server = Server(("127.0.0.1", port), Lines)
         self.port = self._server.server_address[1]
-        self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
+        self._thread = threading.Thread(target=self._server.serve_forever, args=(0.02,), daemon=True)
         self._thread.start()
 
     def __enter__(self) -> RobotiqHost:

@@ -35,6 +35,11 @@ class Rig:
         self.velocities.append(velocity)
         return self.controller.status
 
+    def run(self, cycles):
+        for _ in range(cycles):
+            self.step()
+        return self.controller.status
+
     def until_over(self, most=20.0):
         end = self.now + most
         while self.controller.status.state == "active":

@@ -43,13 +43,12 @@ def mock(start=START, width=0.08):
 class ExecutorRig:
     """An executor, and all that it has published."""
 
-    def __init__(self, limits, hardware=None, balls=((0.5, 0.0),), world=None, persisted=None, **changes):
-        self.hardware = hardware or mock()
+    def __init__(self, limits, hardware=None, balls=((0.5, 0.0),), world=None, persisted=None):
+        self.hardware, self.saver = hardware or mock(), Saver()
         self.world = world or KinematicWorld(World(fixtures=[TABLE], balls=list(balls)))
-        self.saver = Saver()
         self.cell = SimulatedCell(self.world, self.hardware, Gantry(), persisted=persisted, saver=self.saver)
-        args = {"gripper": GRIPPER, "kinematics": Gantry(), "world": self.cell, **changes}
-        self.executor = Executor(self.hardware, limits, START, **args)
+        self.executor = Executor(
+            self.hardware, limits, START, gripper=GRIPPER, kinematics=Gantry(), world=self.cell)
         self.stamp = int(1.7e18)
         self.motions, self.grippers, self.updates, self.balls, self.joints = [], [], [], [], []
 
@@ -81,9 +80,9 @@ class ExecutorRig:
     def grip(self, goal, width, **more):
         return self.executor.command_gripper(GripperCommand(id=goal, width=width, **more), self.now)
 
-    def restarted(self, limits, stop=None):
+    def restarted(self, limits, stop=None, hardware=None):
         """An executor after this one, in the same world."""
-        again = ExecutorRig(limits, persisted=self.saved)
+        again = ExecutorRig(limits, hardware, persisted=self.saved)
         again.stamp = self.stamp
         if stop is not None:
             again.executor.authority.stop(stop, again.now)

@@ -21,11 +21,10 @@ CONFIG = GripperConfig(joints=["left", "right"], links=[], max_effort=235.0)
 class LateFingers:
     """Fingers that start to move after a delay, and whose readings are old [s]."""
 
-    def __init__(self, begin: float, age: float, width: float = 0.08) -> None:
-        self.fingers, self.begin, self.age = SimulatedFingers(CONFIG, width), begin, age
+    def __init__(self, begin: float, age: float, width: float) -> None:
+        self.fingers, self.begin, self.age, self.effort = SimulatedFingers(CONFIG, width), begin, age, 0.0
         self.pending: deque[tuple[float, float, float]] = deque()
         self.past: deque[tuple[float, GripperReading]] = deque()
-        self.effort = 0.0
 
     def command(self, width: float, now: float, effort: float) -> None:
         self.pending.append((now + self.begin, width, effort))
@@ -41,10 +40,16 @@ class LateFingers:
 
 
 class Rig:
-    def __init__(self, begin: float = 0.0, age: float = 0.0, width: float = 0.08) -> None:
+    """A gripper with an object of some width [m] between its fingers."""
+
+    def __init__(self, between: float = 0.06, begin: float = 0.0, age: float = 0.0, width: float = 0.08) -> None:
         self.hand = LateFingers(begin, age, width)
         self.controller, self.now = GripperController(self.hand, CONFIG), 10.0
         self.run(0.2)
+        self.between(between)
+
+    def between(self, width: float) -> None:
+        self.hand.fingers.obstruct(width)
 
     def run(self, seconds: float) -> GripperState:
         for _ in range(round(seconds / 0.01)):
@@ -53,84 +58,56 @@ class Rig:
         return self.controller.state
 
     def grip(self, width: float = 0.0, **more: float) -> GripperState:
-        """The state when the goal is over."""
+        """Return the state at the end of the goal."""
         self.controller.command(GripperCommand(id=f"goal {self.now:.2f}", width=width, **more), self.now)
         until = self.now + 5.0
         while self.run(0.01).state == "active":
             assert self.controller.state.moving and self.now < until
         return self.controller.state
 
-    def between(self, width: float) -> None:
-        self.hand.fingers.obstruct(width)
 
-
-DELAYS = [(0.0, 0.0), (0.0, 0.1), (0.1, 0.0), (0.08, 0.1)]
-
-
-@pytest.mark.parametrize(("begin", "age"), DELAYS)
-@pytest.mark.parametrize(("width", "state", "outcome", "says"), [
+@pytest.mark.parametrize(("begin", "age"), [(0.0, 0.0), (0.0, 0.1), (0.1, 0.0), (0.08, 0.1)])
+@pytest.mark.parametrize(("width", "state", "outcome", "message"), [
     (0.060, "succeeded", "grasped", ""),
     (0.055, "succeeded", "grasped", ""),
     (0.066, "aborted", "too_wide", "the fingers closed on something too wide (0.0660 m, not 0.0600 m)"),
     (0.030, "aborted", "too_narrow", "the fingers closed on something too narrow (0.0300 m, not 0.0600 m)"),
     (0.0, "aborted", "empty", "the fingers closed on nothing"),
 ])
-def test_grasp_is_checked_by_the_width_of_the_held_object(begin, age, width, state, outcome, says):
-    rig = Rig(begin, age)
-    rig.between(width)
+def test_grasp_is_checked_by_the_width_of_the_held_object(begin, age, width, state, outcome, message):
+    rig = Rig(width, begin, age)
     found = rig.grip(expected_width=0.06, width_tolerance=0.0051)
-    assert (found.state, found.outcome, found.message) == (state, outcome, says)
+    assert (found.state, found.outcome, found.message) == (state, outcome, message)
     assert found.holding == (width > 0) and found.width == pytest.approx(width) and not found.moving
     assert rig.run(1.0) == found, "the result stays"
     opened = rig.grip(0.08)
     assert (opened.state, opened.outcome, opened.holding) == ("succeeded", "", False)
-
-
-@pytest.mark.parametrize(("begin", "age"), DELAYS)
-def test_late_fingers_have_not_missed_the_object(begin, age):
-    rig = Rig(begin, age)
-    rig.between(0.06)
-    assert rig.grip().outcome == "grasped"
-
-
-class Script:
-    """Scripted readings."""
-
-    def __init__(self, *readings: GripperReading) -> None:
-        self.readings = deque(readings)
-
-    def command(self, width: float, now: float, effort: float) -> None:
-        pass
-
-    def read(self, now: float) -> GripperReading:
-        return self.readings.popleft() if len(self.readings) > 1 else self.readings[0]
+    assert width == 0.0 or rig.grip().outcome == "grasped", "any width will do if none is expected"
 
 
 def test_fingers_that_report_late_that_they_hold_have_not_missed_the_object():
-    still = GripperReading(0.06, 0.0, False, False)
-    script = Script(*[GripperReading(0.07, -0.1, True, False)] * 30, *[still] * 10, still._replace(holding=True))
-    controller = GripperController(script, CONFIG)
-    controller.command(GripperCommand(id="close", width=0.0, expected_width=0.06), 0.0)
-    states = [controller.update(script.read(0.01 * k), 0.01 * k).state for k in range(1, 60)]
-    assert set(states) == {"active", "succeeded"} and controller.state.outcome == "grasped"
-    script = Script(GripperReading(0.07, -0.1, True, False), still)
-    controller = GripperController(script, CONFIG)
-    controller.command(GripperCommand(id="close", width=0.0), 0.0)
-    states = [controller.update(script.read(0.01 * k), 0.01 * k).state for k in range(1, 60)]
-    assert states.count("active") == pytest.approx(CONFIG.latency / 0.01, abs=2) and states[-1] == "aborted"
+    def states(readings: list[GripperReading], **command: float) -> list[GripperState]:
+        """Return the states of a command while the fingers report these, the last one for good."""
+        controller, left = GripperController(SimulatedFingers(CONFIG), CONFIG), deque(readings)
+        controller.command(GripperCommand(id="close", width=0.0, **command), 0.0)
+        return [controller.update(left.popleft() if len(left) > 1 else left[0], 0.01 * k) for k in range(1, 60)]
+
+    moving, still = GripperReading(0.07, -0.1, True, False), GripperReading(0.06, 0.0, False, False)
+    held = states([moving] * 30 + [still] * 10 + [still._replace(holding=True)], expected_width=0.06)
+    assert {one.state for one in held} == {"active", "succeeded"} and held[-1].outcome == "grasped"
+    missed = [one.state for one in states([moving, still])]
+    assert missed.count("active") == pytest.approx(CONFIG.latency / 0.01, abs=2) and missed[-1] == "aborted"
 
 
 @pytest.mark.parametrize("expected", [{}, {"expected_width": 0.06}])
 def test_slipping_object_is_reported_until_the_next_command(expected):
     rig = Rig()
-    rig.between(0.06)
     goal = rig.grip(**expected)
     rig.between(0.059)
     assert rig.run(0.5).outcome == "grasped", "a soft object gives way a little"
     rig.between(0.055)
     slipping = rig.run(0.5)
-    assert (slipping.id, slipping.state, slipping.outcome, slipping.holding) == (
-        goal.id, "succeeded", "slipping", True)
+    assert (slipping.id, slipping.state, slipping.outcome, slipping.holding) == (goal.id, "succeeded", "slipping", True)
     assert slipping.message == "the held object slips: it was 0.0600 m wide, the fingers are 0.0550 m apart"
     rig.between(0.0)
     lost = rig.run(0.5)
@@ -141,7 +118,6 @@ def test_slipping_object_is_reported_until_the_next_command(expected):
 
 def test_release_is_no_slipping():
     rig = Rig()
-    rig.between(0.06)
     rig.grip()
     rig.controller.command(GripperCommand(id="open", width=0.08), rig.now)
     assert {rig.run(0.01).outcome for _ in range(100)} == {""}
@@ -149,7 +125,6 @@ def test_release_is_no_slipping():
 
 def test_fingers_press_with_the_commanded_effort_or_the_default():
     rig = Rig()
-    rig.between(0.06)
     assert rig.grip().effort == CONFIG.effort == 5.0
     assert rig.grip(effort=40.0).effort == 40.0
     refused = rig.grip(effort=300.0)
@@ -169,29 +144,19 @@ def test_robot_file_sets_the_default_effort():
 def test_fields_of_grasps_are_sent_only_when_they_are_set():
     ball = {"id": "ball", "role": "target", "shape": "sphere", "dimensions": [0.03], "pose": Pose()}
     plain = [GripperCommand(id="a", width=0.0), GripperState(), CollisionObject.model_validate(ball)]
-    new = {"expected_width", "width_tolerance", "outcome", "grip_effort"}
+    heavy = CollisionObject.model_validate({**ball, "grip_effort": 2.0})
+    full = [GripperCommand(id="a", width=0.0, expected_width=0.05, width_tolerance=0.01), GripperState(outcome="empty"),
+            heavy, PlanningScene(header=Header(), objects=[heavy])]
     for message in plain:
-        assert not new & set(msgpack.unpackb(encode(message)))
-    says = [GripperCommand(id="a", width=0.0, expected_width=0.05, width_tolerance=0.01),
-            GripperState(outcome="empty"), CollisionObject.model_validate({**ball, "grip_effort": 2.0})]
-    for message in plain + says:
+        assert not {"expected_width", "width_tolerance", "outcome", "grip_effort"} & set(
+            msgpack.unpackb(encode(message)))
+    for message in plain + full:
         assert decode(type(message), encode(message)) == message
-    scene = PlanningScene(header=Header(), objects=[says[2]])
-    assert decode(PlanningScene, encode(scene)) == scene
 
 
-def test_grasp_succeeds_as_soon_as_fingers_seen_moving_press_on_an_object() -> None:
-    rig = Rig()
-    rig.between(0.06)
+@pytest.mark.parametrize(("width", "at_once"), [(0.08, True), (0.06, False)], ids=["moving", "touching already"])
+def test_only_fingers_that_press_without_having_moved_are_given_their_latency(width, at_once):
+    rig = Rig(width=width)
     began = rig.now
-    assert rig.grip(expected_width=0.06).outcome == "grasped"
-    there = rig.hand.read(rig.now)
-    assert not there.moving and rig.now - began < CONFIG.latency, "as the readings show"
-
-
-def test_fingers_that_press_without_moving_are_given_their_latency() -> None:
-    rig = Rig(width=0.06)
-    rig.between(0.06)
-    began = rig.now
-    assert rig.grip(expected_width=0.06).outcome == "grasped"
-    assert rig.now - began >= CONFIG.latency - 1e-6, "readings may be older than the command"
+    assert rig.grip(expected_width=0.06).outcome == "grasped" and not rig.hand.read(rig.now).moving
+    assert (rig.now - began < CONFIG.latency - 1e-6) == at_once, "readings may be older than the command"

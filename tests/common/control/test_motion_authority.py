@@ -1,14 +1,31 @@
-"""The owner of the motion: who may move the arm, and what a hand-over, a start, a stop and a hold do."""
+"""The owner of the motion: which client may move the arm, and the effect of a hand-over, a start, a stop and a hold."""
 
 import pytest
 
 from common.errors import Refused
-from tests.common.control.jogged_arm import arm
+from tests.common.control.jogged_arm import ur5
 
-__all__ = ["arm"]
+__all__ = ["ur5"]
 
 NO_OWNER = ("", "none")
 OWNED_BY_ANN = r"the motion is owned by ann \(operator\)"
+
+
+@pytest.fixture
+def arm(ur5):
+    return ur5
+
+
+@pytest.fixture
+def owned(ur5):
+    """The arm, of which ann owns the motion."""
+    ur5.own()
+    return ur5
+
+
+def start_of_a_task(arm):
+    """Give the motion to a task, as its start does."""
+    return arm.own(owner="sorting", kind="task").owner == "sorting"
 
 
 def test_requester_of_a_motion_owns_it_until_it_ends(arm):
@@ -19,7 +36,7 @@ def test_requester_of_a_motion_owns_it_until_it_ends(arm):
     assert arm.owner == NO_OWNER and arm.execute("three").state == "active" and arm.owner == ("", "task")
 
 
-def test_requested_ownership_lasts_until_it_is_returned(arm):
+def test_requested_ownership_continues_until_its_owner_returns_it(arm):
     arm.own(kind="script")
     arm.run(10.0)
     assert arm.owner == ("ann", "script") and arm.execute("one", "bob").error == "not_owner"
@@ -29,23 +46,22 @@ def test_requested_ownership_lasts_until_it_is_returned(arm):
     assert arm.owner == NO_OWNER and arm.execute("two", "bob").state == "active"
 
 
-def test_ownership_returned_during_a_motion_ends_with_that_motion(arm):
-    arm.own()
-    assert arm.execute("one", "ann").state == "active"
-    arm.run(0.3)
-    arm.own("give")
-    arm.step()
-    assert arm.executor.arm.goal == "one" and arm.owner == ("ann", "operator")
+def test_ownership_returned_during_a_motion_ends_with_that_motion(owned):
+    assert owned.execute("one", "ann").state == "active"
+    owned.run(0.3)
+    owned.own("give")
+    owned.step()
+    assert owned.executor.arm.goal == "one" and owned.owner == ("ann", "operator")
     with pytest.raises(Refused, match=OWNED_BY_ANN):
-        arm.own(owner="bob")
-    arm.run(3.0)
-    assert arm.owner == NO_OWNER
-    arm.own(owner="bob")
-    arm.jog_joint(0.3, owner="bob")
-    arm.own("give", "bob")
-    assert arm.owner == ("bob", "operator"), "the arm is not at rest yet"
-    arm.run(0.5)
-    assert arm.owner == NO_OWNER
+        owned.own(owner="bob")
+    owned.run(3.0)
+    assert owned.owner == NO_OWNER
+    owned.own(owner="bob")
+    owned.jog_joint(0.3, owner="bob")
+    owned.own("give", "bob")
+    assert owned.owner == ("bob", "operator"), "the arm is not at rest yet"
+    owned.run(0.5)
+    assert owned.owner == NO_OWNER
 
 
 def test_lease_ends_without_a_renewal_but_not_during_a_motion(arm):
@@ -72,18 +88,16 @@ def test_each_change_of_the_owner_is_reported_once(arm):
 # --- taking it over ---
 
 
-def test_ownership_is_taken_over_only_explicitly_and_stops_the_owner_before(arm):
-    arm.own()
+def test_ownership_is_taken_over_only_explicitly_and_stops_the_owner_before(owned):
     with pytest.raises(Refused, match=OWNED_BY_ANN + " since .*: take it over, if it must be"):
-        arm.own(owner="bob")
-    arm.own(owner="bob", over=True)
-    assert arm.owner == ("bob", "operator")
-    assert arm.execute("one", "ann").error == "stopped"
+        owned.own(owner="bob")
+    owned.own(owner="bob", over=True)
+    assert owned.owner == ("bob", "operator") and owned.execute("one", "ann").error == "stopped"
 
 
 @pytest.mark.parametrize("task_alive", [True, False])
 def test_operator_who_takes_over_from_a_task_stops_it_until_a_start(arm, task_alive):
-    arm.own(owner="sorting", kind="task")
+    assert start_of_a_task(arm)
     arm.execute("one")
     arm.run(0.5)
     if not task_alive:  # its motion continues
@@ -98,8 +112,7 @@ def test_operator_who_takes_over_from_a_task_stops_it_until_a_start(arm, task_al
     assert arm.execute("three", "ann", acknowledged=arm.stamp + 1).state == "active"
     arm.run(3.0)
     arm.start_task("ann")
-    assert arm.owner == NO_OWNER and arm.own(owner="sorting", kind="task").owner == "sorting"
-    assert arm.execute("four").state == "active"
+    assert arm.owner == NO_OWNER and start_of_a_task(arm) and arm.execute("four").state == "active"
 
 
 def test_operator_who_takes_over_while_a_task_restarts_stops_it(arm):
@@ -108,30 +121,28 @@ def test_operator_who_takes_over_while_a_task_restarts_stops_it(arm):
     assert arm.execute("one").error == "stopped"
 
 
-def test_task_that_was_refused_stays_stopped_when_the_ownership_is_returned(arm):
-    arm.own()
-    assert arm.execute("one").error == "not_owner"
-    arm.own("give")
-    assert arm.execute("two").error == arm.execute("three", "bob").error == "stopped"
-    arm.start_task("bob")
-    assert arm.execute("four").state == "active"
+def test_refused_task_stays_stopped_when_the_ownership_is_returned(owned):
+    assert owned.execute("one").error == "not_owner"
+    owned.own("give")
+    assert owned.execute("two").error == owned.execute("three", "bob").error == "stopped"
+    owned.start_task("bob")
+    assert owned.execute("four").state == "active"
 
 
-def test_repeated_goal_that_was_refused_does_not_stop_a_task_started_since(arm):
-    arm.own()
-    assert arm.execute("one").error == "not_owner"
-    arm.start_task("ann")
-    assert arm.own(owner="sorting", kind="task").owner == "sorting"
-    assert arm.execute("one").error == "not_owner", "an id has one answer"
-    assert arm.execute("two").state == "active"
-    arm.run(3.0)
-    arm.own("give", "sorting")
-    arm.own(owner="bob")
-    assert arm.execute("one").error == "not_owner" and not arm.authority.interlocks.all
+def test_repeated_goal_that_was_refused_does_not_stop_a_task_started_since(owned):
+    assert owned.execute("one").error == "not_owner"
+    owned.start_task("ann")
+    assert start_of_a_task(owned)
+    assert owned.execute("one").error == "not_owner", "an id has one answer"
+    assert owned.execute("two").state == "active"
+    owned.run(3.0)
+    owned.own("give", "sorting")
+    owned.own(owner="bob")
+    assert owned.execute("one").error == "not_owner" and not owned.authority.interlocks.all
 
 
 def test_ownership_of_a_task_ends_with_its_process_and_that_of_an_operator_does_not(arm):
-    arm.own(owner="sorting", kind="task")
+    assert start_of_a_task(arm)
     arm.authority.disown_task()
     arm.step()
     assert arm.owner == NO_OWNER
@@ -143,33 +154,28 @@ def test_ownership_of_a_task_ends_with_its_process_and_that_of_an_operator_does_
 # --- starts, stops and holds ---
 
 
-def test_start_by_another_operator_ends_an_ownership_only_with_override(arm):
-    arm.own()
-    arm.start_task("bob")
-    assert arm.owner == ("ann", "operator") and arm.execute("one").error == "not_owner"
-    arm.start_task("bob", override=True)
-    assert arm.owner == NO_OWNER
+def test_start_by_another_operator_ends_an_ownership_only_with_override_or_of_an_unknown_operator(owned):
+    owned.start_task("bob")
+    assert owned.owner == ("ann", "operator") and owned.execute("one").error == "not_owner"
+    owned.start_task("bob", override=True)
+    assert owned.owner == NO_OWNER
+    owned.own(owner="operator")
+    owned.start_task("bob")
+    assert owned.owner == NO_OWNER and owned.execute("two").state == "active"
 
 
-def test_every_start_ends_the_ownership_of_an_unknown_operator(arm):
-    arm.own(owner="operator")
-    arm.start_task("bob")
-    assert arm.owner == NO_OWNER and arm.execute("one").state == "active"
-
-
-def test_start_with_override_ends_the_motion_of_the_owner_for_good(arm):
-    arm.own()
-    arm.execute("one", "ann")
-    arm.run(0.5)
-    arm.start_task("bob", override=True)
-    assert arm.own(owner="sorting", kind="task").owner == "sorting"
-    arm.run(0.5)
-    assert arm.at_rest() and arm.executor.arm.goal == "" and arm.reports[-1].owner is None
-    assert arm.execute("one", "ann").state == "cancelled" and "one" in arm.authority.interlocks.record.goals
-    assert arm.execute("two").state == "active"
-    arm.start_task("bob", override=True)
-    arm.run(0.5)
-    assert arm.executor.arm.goal == "two", "a second start does not end the motion of the task"
+def test_start_with_override_ends_the_motion_of_the_owner_for_good(owned):
+    owned.execute("one", "ann")
+    owned.run(0.5)
+    owned.start_task("bob", override=True)
+    assert start_of_a_task(owned)
+    owned.run(0.5)
+    assert owned.at_rest() and owned.executor.arm.goal == "" and owned.reports[-1].owner is None
+    assert owned.execute("one", "ann").state == "cancelled" and "one" in owned.authority.interlocks.record.goals
+    assert owned.execute("two").state == "active"
+    owned.start_task("bob", override=True)
+    owned.run(0.5)
+    assert owned.executor.arm.goal == "two", "a second start does not end the motion of the task"
 
 
 def test_start_decided_before_a_later_stop_has_no_effect(arm):
@@ -184,27 +190,22 @@ def test_start_decided_before_a_later_stop_has_no_effect(arm):
     assert arm.execute("two").error == "stopped"
 
 
-def test_operator_who_turns_a_hold_into_a_stop_gets_the_motion_of_a_task_and_of_no_operator(arm):
-    def into_stop():
-        arm.hold("bob", hold=False, into_stop=True, acknowledged=arm.stamp + 1)
+def test_operator_who_turns_a_hold_into_a_stop_gets_the_motion_of_a_task_and_of_no_operator(owned):
+    def into_stop(goal):
+        owned.hold("bob", hold=False, into_stop=True, acknowledged=owned.stamp + 1)
+        return owned.execute(goal, "bob", acknowledged=owned.stamp + 1)
 
-    arm.own()
-    arm.hold("bob")
-    into_stop()
-    assert arm.owner == ("ann", "operator")
-    assert arm.execute("one", "bob", acknowledged=arm.stamp + 1).error == "not_owner"
-    arm.own("give")
-    arm.own(owner="sorting", kind="task")
-    into_stop()
-    assert arm.execute("two", "bob", acknowledged=arm.stamp + 1).state == "active"
+    owned.hold("bob")
+    assert into_stop("one").error == "not_owner" and owned.owner == ("ann", "operator")
+    owned.own("give")
+    assert start_of_a_task(owned) and into_stop("two").state == "active"
 
 
-def test_stop_and_hold_need_no_ownership_and_a_stop_ends_it(arm):
-    arm.own()
-    arm.execute("one", "ann")
-    arm.run(0.5)
-    assert arm.hold("bob").held
-    arm.run(0.5)
-    assert arm.at_rest()
-    arm.stop("bob")
-    assert arm.owner == NO_OWNER
+def test_stop_and_hold_need_no_ownership_and_a_stop_ends_it(owned):
+    owned.execute("one", "ann")
+    owned.run(0.5)
+    assert owned.hold("bob").held
+    owned.run(0.5)
+    assert owned.at_rest()
+    owned.stop("bob")
+    assert owned.owner == NO_OWNER

@@ -5,27 +5,24 @@ import pytest
 
 from common.config import GripperConfig
 from common.control.executor import Executor
-from common.hardware.interface import Limits
 from common.hardware.mock import SimulatedFingers
-from common.messages import ExecuteRequest, GripperCommand, Header, JointTrajectory
+from common.messages import ExecuteRequest, GripperCommand, Header
 from tests.doubles.stopping_arm import StoppingArm
 
 PAYLOAD = {"mass": 0.9, "com": [0, 0, 0.06], "held": [0, 0, 0.16]}
-TWO = np.ones(2)
-LIMITS = Limits(("shoulder", "elbow"), -3 * TWO, 3 * TWO, 2 * TWO, 10 * TWO)
 EMPTY = ("payload", 0.9, 0.0, 0.0, 0.06)
 GRASP = {"width": 0.0, "expected_width": 0.05, "mass": 0.3}
 
 
 class PayloadRig:
-    def __init__(self, **gripper: object) -> None:
+    def __init__(self, limits, **gripper):
         config = GripperConfig.model_validate({"joints": ["left", "right"], "links": [], **gripper})
         self.fingers = SimulatedFingers(config)
-        self.arm = StoppingArm(0 * TWO, self.fingers)
-        self.executor, self.now, self.notes = Executor(self.arm, LIMITS, 0 * TWO, gripper=config), 10.0, list[str]()
+        self.arm = StoppingArm(np.zeros(2), self.fingers)
+        self.executor, self.now, self.notes = Executor(self.arm, limits, np.zeros(2), gripper=config), 10.0, []
         self.run()
 
-    def run(self, seconds: float = 0.5) -> list[tuple[object, ...]]:
+    def run(self, seconds=0.5):
         """Run cycles; return the orders that the arm got."""
         before = len(self.arm.orders)
         for _ in range(round(seconds / 0.01)):
@@ -33,19 +30,19 @@ class PayloadRig:
             self.notes += self.executor.cycle(Header(stamp=round(self.now * 1e9))).notes
         return self.arm.orders[before:]
 
-    def move(self, trajectory: JointTrajectory) -> None:
+    def move(self, trajectory):
         answer = self.executor.execute(ExecuteRequest(id=f"{self.now:.2f}", trajectory=trajectory), self.now)
         assert answer.state == "active", answer
 
-    def grip(self, seconds: float = 1.5, **command: float) -> list[tuple[object, ...]]:
+    def grip(self, seconds=1.5, **command):
         self.executor.command_gripper(GripperCommand(id=f"{self.now:.2f}", **command), self.now)
         return self.run(seconds)
 
 
 @pytest.fixture
-def rig() -> PayloadRig:
+def rig(limits):
     """The gripper, with an object between its fingers."""
-    rig = PayloadRig(payload=PAYLOAD)
+    rig = PayloadRig(limits, payload=PAYLOAD)
     assert rig.arm.orders == [EMPTY]
     rig.fingers.obstruct(0.05)
     return rig
@@ -90,5 +87,5 @@ def test_change_during_a_motion_is_sent_at_rest(rig, rest_to_rest):
     assert rig.grip(0.1, width=0.08) == [] and rig.run(3.0) == [EMPTY]
 
 
-def test_nothing_is_sent_without_a_payload_in_the_robot_file():
-    assert PayloadRig().arm.orders == []
+def test_nothing_is_sent_without_a_payload_in_the_robot_file(limits):
+    assert PayloadRig(limits).arm.orders == []

@@ -6,7 +6,7 @@ import types
 import numpy as np
 import pytest
 
-from common.config import HardwareConfig, Parameters, RobotConfig
+from common.config import HardwareConfig, Parameters, RobotConfig, load_cell
 from common.errors import ConfigError, UnknownName
 from common.hardware.driven_gripper import DrivenGripper
 from common.hardware.driver_process import DriverProcess
@@ -24,36 +24,41 @@ from common.hardware.mock import SimulatedFingers
 START = np.array([0.1, -0.2])
 
 
-def robot(backend: str, gripper: dict[str, object] | None = None, **options: object) -> RobotConfig:
+def robot(backend, gripper=None, **options):
     return RobotConfig(
         name="two", urdf="two.urdf", joints=["shoulder", "elbow"], base_link="base", tcp_link="tip",
         named_poses={"home": [0, 0]}, acceleration_limits=[1, 1], jerk_limits=[1, 1],
-        gripper={"joints": ["finger"], "links": [], "hardware": gripper},  # type: ignore[arg-type]
-        hardware=HardwareConfig(backend=backend, options=options),
-    )
+        gripper={"joints": ["finger"], "links": [], "hardware": gripper},
+        hardware=HardwareConfig(backend=backend, options=options))
 
 
 @pytest.fixture
-def own_arm(monkeypatch: pytest.MonkeyPatch) -> str:
-    """The name of a backend of the user, which brings a gripper if its robot has one."""
-    module = types.ModuleType("mine.arm")
-
+def own(monkeypatch):
+    """Backends of the user: an arm, which brings a gripper if its robot has one, and a gripper."""
     class Options(Parameters):
         port: int = 1
 
-    module.Options, module.simulated = Options, False  # type: ignore[attr-defined]
-    module.create = lambda robot, limits, start, options: types.SimpleNamespace(  # type: ignore[attr-defined]
+    arm, gripper = types.ModuleType("mine.arm"), types.ModuleType("mine.gripper")
+    arm.Options, arm.simulated = Options, False
+    arm.create = lambda robot, limits, start, options: types.SimpleNamespace(
         names=limits.names, port=options.port, gripper="its own" if robot.gripper else None)
-    monkeypatch.setitem(sys.modules, "mine", types.ModuleType("mine"))
-    monkeypatch.setitem(sys.modules, "mine.arm", module)
-    return "mine.arm"
+    gripper.GripperOptions, gripper.create_gripper = Parameters, None
+    for name, module in (("mine", types.ModuleType("mine")), ("mine.arm", arm), ("mine.gripper", gripper)):
+        monkeypatch.setitem(sys.modules, name, module)
+    return types.SimpleNamespace(arm=arm, gripper=gripper)
+
+
+@pytest.fixture
+def no_driver(monkeypatch):
+    """Start no process of a driver."""
+    monkeypatch.setattr(DriverProcess, "keep_running", lambda process: None)
 
 
 # --- arms ---
 
 
 @pytest.mark.parametrize("name", ["mock", "lag"])
-def test_simulated_arm_starts_at_rest_and_moves_where_it_is_sent(limits: Limits, name: str) -> None:
+def test_simulated_arm_starts_at_rest_and_moves_where_it_is_sent(limits, name):
     hardware = load_hardware(robot(name), limits, START)
     q, dq = hardware.read(5.0)
     assert np.array_equal(q, START) and not dq.any() and isinstance(hardware.gripper, SimulatedGripper)
@@ -62,16 +67,17 @@ def test_simulated_arm_starts_at_rest_and_moves_where_it_is_sent(limits: Limits,
     hardware.close()
 
 
-def test_backends_are_found_by_name() -> None:
+def test_backends_are_found_by_name():
     assert backend_names() == ["franka", "lag", "mock", "ur"]
     assert gripper_backend_names() == ["franka_hand", "mock", "robotiq"]
     assert all(is_simulated(robot(name)) for name in ("lag", "mock"))
 
 
-def test_user_backend_is_a_dotted_module(limits: Limits, own_arm: str) -> None:
-    assert not find_backend(robot(own_arm)).simulated
-    arm = load_hardware(robot(own_arm, port=7), limits, START)
-    assert (arm.names, arm.port, arm.gripper) == (("shoulder", "elbow"), 7, "its own")  # type: ignore[attr-defined]
+def test_user_backend_is_a_dotted_module(limits, own):
+    assert not find_backend(robot("mine.arm")).simulated
+    arm = load_hardware(robot("mine.arm", port=7), limits, START)
+    assert (arm.names, arm.port, arm.gripper) == (("shoulder", "elbow"), 7, "its own")
+    assert find_gripper_backend(HardwareConfig(backend="mine.gripper")) is own.gripper
 
 
 @pytest.mark.parametrize(("name", "error"), [
@@ -79,48 +85,40 @@ def test_user_backend_is_a_dotted_module(limits: Limits, own_arm: str) -> None:
     ("no.such.module", r"robot\.hardware\.backend: "), ("common.control.executor", r"robot\.hardware\.backend: "),
     ("mujoco", r"leave the backend at mock and set world\.simulator: mujoco in the cell"),
 ])
-def test_unsuitable_backend_is_refused_with_the_choices(name: str, error: str) -> None:
+def test_unsuitable_backend_is_refused_with_the_choices(name, error):
     with pytest.raises((ConfigError, UnknownName), match=error):
         find_backend(robot(name))
 
 
 @pytest.mark.parametrize(("options", "field"), [({"time_constant": -1}, "time_constant"), ({"lag": 1}, "lag")])
-def test_invalid_option_is_refused_by_name(limits: Limits, options: dict[str, object], field: str) -> None:
+def test_invalid_option_is_refused_by_name(limits, options, field):
     with pytest.raises(ConfigError, match=rf"robot\.hardware\.options\.{field}"):
         load_hardware(robot("lag", **options), limits, START)
 
 
-def test_lag_is_first_order_at_any_step(limits: Limits) -> None:
-    for steps in (1, 7, 100):
-        hardware = load_hardware(robot("lag", time_constant=0.1), limits, START)
-        hardware.write(START + 1, START, 0.0)
-        for t in np.linspace(0.0, 0.1, steps + 1):
-            q, dq = hardware.read(float(t))
-        assert np.allclose(q, START + 1 - np.exp(-1)) and np.allclose(dq, np.exp(-1) / 0.1)
+@pytest.mark.parametrize("steps", [1, 7, 100])
+def test_lag_is_first_order_at_any_step(limits, steps):
+    hardware = load_hardware(robot("lag", time_constant=0.1), limits, START)
+    hardware.write(START + 1, START, 0.0)
+    for t in np.linspace(0.0, 0.1, steps + 1):
+        q, dq = hardware.read(float(t))
+    assert np.allclose(q, START + 1 - np.exp(-1)) and np.allclose(dq, np.exp(-1) / 0.1)
 
 
 # --- grippers ---
 
-GRIPPERS = [
-    ({"backend": "mock"}, SimulatedFingers), ({"backend": "franka_hand", "options": {"host": "h"}}, DrivenGripper),
-    ({"backend": "robotiq", "options": {"host": "h", "model": "2f85"}}, DrivenGripper),
-]
-
 
 @pytest.mark.parametrize("arm", ["mock", "lag", "mine.arm"])
-@pytest.mark.parametrize(("gripper", "kind"), GRIPPERS)
-def test_any_gripper_goes_with_any_arm(
-    limits: Limits, monkeypatch: pytest.MonkeyPatch, own_arm: str, arm: str, gripper: dict[str, object], kind: type
-) -> None:
-    monkeypatch.setattr(DriverProcess, "keep_running", lambda process: None)
+@pytest.mark.parametrize(("gripper", "kind"), [
+    ({"backend": "mock"}, SimulatedFingers), ({"backend": "franka_hand", "options": {"host": "h"}}, DrivenGripper),
+    ({"backend": "robotiq", "options": {"host": "h", "model": "2f85"}}, DrivenGripper),
+])
+def test_any_gripper_goes_with_any_arm(limits, no_driver, own, arm, gripper, kind):
     assert isinstance(load_hardware(robot(arm, gripper), limits, START).gripper, kind)
 
 
-def test_arm_is_created_without_its_own_gripper_if_another_one_is_named(
-    limits: Limits, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    seen = []
-    lag = find_backend(robot("lag"))
+def test_arm_is_created_without_its_own_gripper_if_another_one_is_named(limits, monkeypatch):
+    seen, lag = [], find_backend(robot("lag"))
     create = lag.create
     monkeypatch.setattr(lag, "create", lambda robot, *args: (seen.append(robot.gripper), create(robot, *args))[1])
     load_hardware(robot("lag"), limits, START)
@@ -132,36 +130,41 @@ def test_arm_is_created_without_its_own_gripper_if_another_one_is_named(
     ({"backend": "robotik"}, r"'robotik' \(did you mean 'robotiq'\?\); choices: franka_hand, mock, robotiq"),
     ({"backend": "no.such.module"}, r"robot\.gripper\.hardware\.backend: "),
     ({"backend": "common.hardware.pace"}, r"robot\.gripper\.hardware\.backend: .*it has no GripperOptions"),
-    ({"backend": "robotiq", "options": {"host": "h", "model": "3f"}},
-     r"robot\.gripper\.hardware\.options\.model: '3f'"),
+    ({"backend": "robotiq", "options": {"host": "h", "model": "3f"}}, r"gripper\.hardware\.options\.model: '3f'"),
     ({"backend": "robotiq", "options": {"model": "2f85"}}, r"robot\.gripper\.hardware\.options\.host"),
 ])
-def test_unsuitable_gripper_backend_is_refused_with_the_choices(
-    limits: Limits, gripper: dict[str, object], error: str
-) -> None:
+def test_unsuitable_gripper_backend_is_refused_with_the_choices(limits, gripper, error):
     config = robot("mock", gripper)
     for refuse in (is_simulated, lambda config: load_hardware(config, limits, START)):
         with pytest.raises((ConfigError, UnknownName), match=error):
             refuse(config)
 
 
-def test_gripper_backend_of_the_user_is_a_dotted_module(monkeypatch: pytest.MonkeyPatch) -> None:
-    module = types.ModuleType("mine.gripper")
-    module.GripperOptions, module.create_gripper = Parameters, None  # type: ignore[attr-defined]
-    monkeypatch.setitem(sys.modules, "mine", types.ModuleType("mine"))
-    monkeypatch.setitem(sys.modules, "mine.gripper", module)
-    assert find_gripper_backend(HardwareConfig(backend="mine.gripper")) is module
+def test_ur_arm_brings_the_gripper_of_its_option(no_driver):
+    pytest.importorskip("rtde_control", reason="make setup EXTRAS=ur")
+    six = np.ones(6)
+    limits = Limits(tuple("abcdef"), -6 * six, 6 * six, 3 * six, 5 * six, 10 * six, 500 * six)
+
+    def load(gripper):
+        options = (f"{name}={value}" for name, value in {
+            "backend": "ur", "options.host": "127.0.0.9", "options.model": "ur5e", "options.gripper": gripper}.items())
+        return load_hardware(
+            load_cell("ur5", [f"robot.hardware.{option}" for option in options]).robot, limits, limits.lower)
+
+    assert isinstance(load("2f85").gripper, DrivenGripper)
+    with pytest.raises(ConfigError, match=r"robot\.hardware\.options\.gripper: '3f'"):
+        load("3f")
 
 
 # --- the arm of a simulated world ---
 
 
-def test_arm_of_a_world_replaces_only_mock(limits: Limits) -> None:
-    arm: object = object()
-    assert load_hardware(robot("mock"), limits, START, lambda: arm) is arm  # type: ignore[arg-type,return-value]
+def test_arm_of_a_world_replaces_only_mock(limits):
+    arm = object()
+    assert load_hardware(robot("mock"), limits, START, lambda: arm) is arm
     for config, error in (
         (robot("lag"), r"'lag' moves the joints itself.*set mock here, or kinematic there"),
         (robot("mock", {"backend": "mock"}), r"robot\.gripper\.hardware\.backend: 'mock' moves the gripper, and so"),
     ):
         with pytest.raises(ConfigError, match=error):
-            load_hardware(config, limits, START, lambda: arm)  # type: ignore[arg-type,return-value]
+            load_hardware(config, limits, START, lambda: arm)

@@ -1,4 +1,4 @@
-"""Messages of a driver process, for an arm that does what the test wants."""
+"""Messages of a driver process, for an arm controlled by the test."""
 
 import multiprocessing
 import time
@@ -35,17 +35,11 @@ class EndingArm:
     def wait(self) -> None:
         """Return at once."""
 
-    def do(self, act: str, *values: float) -> None:
-        """Ignore orders."""
-
-    def close(self) -> None:
-        """Do nothing."""
-
 
 def test_change_right_after_a_reading_is_reported_before_the_arm_falls_silent(limits: Limits) -> None:
     ours, theirs = multiprocessing.Pipe()
     with ours, theirs:
-        player = Player(EndingArm(), SetPointStream(limits, 0.05, 0.002), theirs)
+        player = Player(EndingArm(), SetPointStream(limits, 0.05, 0.002), theirs)  # type: ignore[arg-type]
         with pytest.raises(EOFError):
             while True:
                 player.cycle()

@@ -1,3 +1,5 @@
+"""Simulated fingers."""
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -10,14 +12,25 @@ CONFIG = GripperConfig(joints=["left", "right"], links=[])
 WIDTHS = st.floats(0.0, 0.08)
 
 
-def read(fingers: SimulatedFingers, start: float, end: float, step: float = 0.005) -> list[float]:
-    return [fingers.read(float(t)).width for t in np.arange(start, end, step)]
+@pytest.fixture
+def fingers() -> SimulatedFingers:
+    return SimulatedFingers(CONFIG, 0.08)
 
 
-def test_fingers_close_smoothly_and_stop_at_the_width() -> None:
-    fingers = SimulatedFingers(CONFIG, 0.08)
+@pytest.fixture
+def holding(fingers: SimulatedFingers) -> SimulatedFingers:
+    """Fingers that hold an object of 6 cm at 2 s."""
+    fingers.command(0.0, 0.0)
+    fingers.obstruct(0.06)
+    assert fingers.read(2.0).holding
+    return fingers
+
+
+def test_fingers_close_smoothly_and_stop_at_the_width(fingers: SimulatedFingers) -> None:
+    fingers.command(0.08, 9.0)
+    assert not fingers.read(9.0).moving, "they are there already"
     fingers.command(0.02, 10.0)
-    widths = read(fingers, 10.0, 12.0)
+    widths = [fingers.read(float(t)).width for t in np.arange(10.0, 12.0, 0.005)]
     assert widths == sorted(widths, reverse=True) and widths[-1] == 0.02
     assert np.max(np.abs(np.diff(widths))) <= CONFIG.speed * 0.005 + 1e-9
     reading = fingers.read(12.0)
@@ -43,52 +56,27 @@ def test_fingers_stop_at_an_object_and_hold_it(obstruction: float, step: float) 
     fingers = SimulatedFingers(CONFIG, 0.08)
     fingers.command(0.0, 0.0)
     fingers.obstruct(obstruction)
-    assert min(read(fingers, 0.0, 2.0, step)) >= obstruction
+    assert min(fingers.read(float(t)).width for t in np.arange(0.0, 2.0, step)) >= obstruction
     reading = fingers.read(2.5)
     assert reading.width == obstruction and reading.holding and not reading.moving
 
 
-def test_fingers_that_lose_their_object_continue_to_close() -> None:
-    fingers = SimulatedFingers(CONFIG, 0.08)
-    fingers.command(0.0, 0.0)
-    fingers.obstruct(0.06)
-    fingers.read(2.0)
-    fingers.obstruct(0.0)
-    assert fingers.read(2.01).moving and not fingers.read(2.01).holding
-    assert fingers.read(4.0).width == 0.0
+def test_fingers_that_lose_their_object_continue_to_close(holding: SimulatedFingers) -> None:
+    holding.obstruct(0.0)
+    assert holding.read(2.01).moving and not holding.read(2.01).holding and holding.read(4.0).width == 0.0
 
 
-def test_opening_releases_the_object() -> None:
-    fingers = SimulatedFingers(CONFIG, 0.08)
-    fingers.command(0.0, 0.0)
-    fingers.obstruct(0.06)
-    fingers.read(2.0)
-    fingers.command(0.08, 2.0)
-    assert not fingers.read(2.0).holding
-    assert fingers.read(4.0).width == 0.08
-
-
-def test_second_close_command_keeps_the_hold() -> None:
-    fingers = SimulatedFingers(CONFIG, 0.08)
-    fingers.command(0.0, 0.0)
-    fingers.obstruct(0.06)
-    fingers.read(2.0)
-    fingers.command(0.01, 2.0)
-    assert fingers.read(2.0).holding and fingers.read(2.0).width == 0.06
-
-
-def test_command_of_the_present_width_moves_nothing() -> None:
-    fingers = SimulatedFingers(CONFIG, 0.08)
-    fingers.command(0.08, 0.0)
-    assert not fingers.read(0.0).moving
+def test_second_close_command_continues_the_hold_and_opening_releases(holding: SimulatedFingers) -> None:
+    holding.command(0.01, 2.0)
+    assert holding.read(2.0).holding and holding.read(2.0).width == 0.06
+    holding.command(0.08, 2.0)
+    assert not holding.read(2.0).holding and holding.read(4.0).width == 0.08
 
 
 @given(WIDTHS, WIDTHS)
 def test_fingers_are_never_faster_than_their_least_time(start: float, end: float) -> None:
-    fingers, least = SimulatedFingers(CONFIG, start), CONFIG.least_time(abs(end - start))
+    fingers, way = SimulatedFingers(CONFIG, start), abs(end - start)
     fingers.command(end, 0.0)
-    for share in (0.25, 0.5, 0.75):
-        moved = abs(fingers.read(CONFIG.least_time(share * abs(end - start))).width - start)
-        assert moved <= share * abs(end - start) + 1e-9
-    assert abs(fingers.read(least).width - start) <= abs(end - start) + 1e-9
-    assert abs(fingers.read(least + 0.2).width - end) < 1e-9, "and not much slower"
+    for share in (0.25, 0.5, 0.75, 1.0):
+        assert abs(fingers.read(CONFIG.least_time(share * way)).width - start) <= share * way + 1e-9
+    assert abs(fingers.read(CONFIG.least_time(way) + 0.2).width - end) < 1e-9, "and not much slower"
