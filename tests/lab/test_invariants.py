@@ -3,25 +3,9 @@
 import numpy as np
 import pytest
 
+from common import messages as m
 from common.config import load_cell
 from common.hardware.interface import Limits
-from common.messages import (
-    ExecuteRequest,
-    GripperCommand,
-    GripperState,
-    HoldRequest,
-    JointGoal,
-    JointTrajectory,
-    MotionStatus,
-    PlanRequest,
-    Pose,
-    StopRequest,
-    Vector3,
-    WorldEdit,
-    WorldEditReply,
-    WorldObject,
-    WorldObjects,
-)
 from common.transport.codec import encode, encoding_of
 from common.transport.session import RawSample
 from lab.invariants import ACCEPTED, OBJECTS, Invariants
@@ -29,9 +13,10 @@ from lab.loop import Incarnation, context_of
 from lab.motion_invariants import NEVER, UNREQUESTED
 from lab.processes import RequestLog
 
-MOTION = ExecuteRequest(id="a-1", trajectory=JointTrajectory(joint_names=["j"], points=[]))
-FINGERS = GripperCommand(id="a-1", width=0.04)
-EDIT = WorldEdit(op="move", id="ball_1", position=Vector3(x=0.5))
+PANDA = load_cell("panda")
+MOTION = m.ExecuteRequest(id="a-1", trajectory=m.JointTrajectory(joint_names=["j"], points=[]))
+FINGERS = m.GripperCommand(id="a-1", width=0.04)
+EDIT = m.WorldEdit(op="move", id="ball_1", position=m.Vector3(x=0.5))
 
 
 @pytest.fixture
@@ -41,7 +26,7 @@ def requests():
 
 @pytest.fixture
 def invariants(requests):
-    return Invariants(load_cell("panda"), requests, lambda: 1.0)
+    return Invariants(PANDA, requests, lambda: 1.0)
 
 
 def put(invariants, topic, message):
@@ -50,14 +35,11 @@ def put(invariants, topic, message):
 
 
 def put_objects(invariants, **positions):
-    """Publish objects at x [m]; return the violations so far."""
-    objects = [WorldObject(id=name, shape="sphere", pose=Pose(position=Vector3(x=x)), state="table")
+    """Publish objects at x [m]; return whether a violation was found so far."""
+    objects = [m.WorldObject(id=name, shape="sphere", pose=m.Pose(position=m.Vector3(x=x)), state="table")
                for name, x in positions.items()]
-    put(invariants, "scene_objects", WorldObjects(objects=objects))
-    return invariants.broken
-
-
-# --- goals ------------------------------------------------------------------------------------------------------------
+    put(invariants, "scene_objects", m.WorldObjects(objects=objects))
+    return any(OBJECTS in line for line in invariants.broken)
 
 
 @pytest.mark.parametrize(("instance", "first", "again", "holds"), [
@@ -69,15 +51,15 @@ def put_objects(invariants, **positions):
 def test_repeated_goal_request_gets_the_same_decision(invariants, requests, instance, first, again, holds):
     fingers = FINGERS.model_copy(update={"id": "b-1"})
     for process, state in (("executor 1", first), (instance, again)):
-        requests.on_serve(process, MOTION, MotionStatus(id="a-1", state=state))
-        requests.on_serve(process, fingers, GripperState(id="b-1", state=state))
+        requests.on_serve(process, MOTION, m.MotionStatus(id="a-1", state=state))
+        requests.on_serve(process, fingers, m.GripperState(id="b-1", state=state))
     assert (invariants.broken == []) == holds
 
 
 @pytest.mark.parametrize(("other", "holds"), [
     (MOTION, True), (MOTION.model_copy(), True), (FINGERS, False), (FINGERS.model_copy(update={"id": "a-2"}), True),
-    (MOTION.model_copy(update={"trajectory": JointTrajectory(joint_names=["k"], points=[])}), False),
-    (PlanRequest(id="a-1", goal=JointGoal(named="home")), False),
+    (MOTION.model_copy(update={"trajectory": m.JointTrajectory(joint_names=["k"], points=[])}), False),
+    (m.PlanRequest(id="a-1", goal=m.JointGoal(named="home")), False),
 ])
 def test_id_belongs_to_one_request(invariants, requests, other, holds):
     requests.on_request("task", MOTION)
@@ -87,9 +69,9 @@ def test_id_belongs_to_one_request(invariants, requests, other, holds):
 
 @pytest.mark.parametrize("known", [False, True])
 def test_goal_stopped_before_it_arrived_never_moves(invariants, requests, known):
-    answer = MotionStatus(id="a-1", state="active") if known else MotionStatus(id="a-1", error="unknown_goal")
-    requests.on_serve("executor 1", StopRequest(id="a-1", by="requester"), answer)
-    put(invariants, "motion/status", MotionStatus(id="a-1", state="active"))
+    answer = m.MotionStatus(id="a-1", state="active") if known else m.MotionStatus(id="a-1", error="unknown_goal")
+    requests.on_serve("executor 1", m.StopRequest(id="a-1", by="requester"), answer)
+    put(invariants, "motion/status", m.MotionStatus(id="a-1", state="active"))
     assert invariants.broken == ([] if known else [f"1.000 s: {NEVER}: a-1"])
 
 
@@ -97,12 +79,9 @@ def test_goal_stopped_before_it_arrived_never_moves(invariants, requests, known)
     ("", True, True), ("", False, False), ("a-1", False, False), ("a-0", False, True),
 ])
 def test_requested_hold_takes_effect_unless_its_goal_is_over(invariants, requests, goal, held, holds):
-    request = HoldRequest(hold=True, reason="a mug blocks the path", by="scene_monitor", goal=goal)
-    requests.on_answer("motion_planner", request, MotionStatus(id="a-1", state="active", held=held))
+    request = m.HoldRequest(hold=True, reason="a mug blocks the path", by="scene_monitor", goal=goal)
+    requests.on_answer("motion_planner", request, m.MotionStatus(id="a-1", state="active", held=held))
     assert (invariants.broken == []) == holds
-
-
-# --- motion after a stop ----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("restarted", "seconds", "holds"), [
@@ -110,7 +89,7 @@ def test_requested_hold_takes_effect_unless_its_goal_is_over(invariants, request
 ])
 def test_after_a_stop_only_the_process_that_served_it_may_brake(invariants, requests, restarted, seconds, holds):
     limits = Limits(("j",), np.array([-3.0]), np.array([3.0]), np.array([1.0]), np.array([1.0]))
-    stop = StopRequest(owner="anna")
+    stop = m.StopRequest(owner="anna")
     first = context_of(Incarnation("executor"))
     then = context_of(Incarnation("executor")) if restarted else first
 
@@ -120,20 +99,16 @@ def test_after_a_stop_only_the_process_that_served_it_may_brake(invariants, requ
             invariants.on_set_point(limits, q, q, np.array([0.01]), start + 0.01 * cycle)
 
     requests.on_request("operator", stop)
-    first.run(requests.on_serve, "executor 1", stop, MotionStatus(id="a-1", state="active"))
-    put(invariants, "motion/status", MotionStatus(id="a-1", state="active"))
+    first.run(requests.on_serve, "executor 1", stop, m.MotionStatus(id="a-1", state="active"))
+    put(invariants, "motion/status", m.MotionStatus(id="a-1", state="active"))
     first.run(move, 0.0, 10, 0.5)
     then.run(move, seconds, 20, 0.501)
     assert any(UNREQUESTED in line for line in invariants.broken) != holds
 
 
-# --- objects ----------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("later", [{}, {"ball_1": 0.4}, {"ball_1": 0.3, "ball_2": 0.5}])
 def test_object_that_vanishes_moves_or_appears_by_itself_is_reported(invariants, later):
-    assert put_objects(invariants, ball_1=0.3) == []
-    assert any(OBJECTS in line for line in put_objects(invariants, **later))
+    assert not put_objects(invariants, ball_1=0.3) and put_objects(invariants, **later)
 
 
 @pytest.mark.parametrize("answered", [True, False])
@@ -141,10 +116,9 @@ def test_edit_of_the_world_may_be_published_before_or_after_its_answer(invariant
     put_objects(invariants, ball_1=0.3)
     requests.on_request("visitor", EDIT)
     if answered:
-        requests.on_answer("visitor", EDIT, WorldEditReply(id="ball_1", ids=["ball_1"]))
-    assert put_objects(invariants, ball_1=0.5) == []
-    if answered:
-        assert any(OBJECTS in line for line in put_objects(invariants, ball_1=0.3)), "the edit allows one change"
+        requests.on_answer("visitor", EDIT, m.WorldEditReply(id="ball_1", ids=["ball_1"]))
+    assert not put_objects(invariants, ball_1=0.5)
+    assert not answered or put_objects(invariants, ball_1=0.3), "the edit allows one change"
 
 
 def test_application_checks_the_ground_truth_once_its_task_is_done(tmp_path, monkeypatch):
@@ -156,10 +130,10 @@ def test_application_checks_the_ground_truth_once_its_task_is_done(tmp_path, mon
         "def misplaced(truth):\n    return ', '.join(each.id for each in truth.objects)\n"
         "APPLICATION = Application(topics=ApplicationTopics(status=STATUS), truth_check=misplaced)\n")
     monkeypatch.syspath_prepend(tmp_path)
-    cell = load_cell("panda").model_copy(update={"application": "checking.task"})
+    cell = PANDA.model_copy(update={"application": "checking.task"})
     for state, broken in (("ERROR", False), ("DONE", True)):
         invariants = Invariants(cell, RequestLog(), lambda: 1.0)
-        put(invariants, "scene_objects", WorldObjects(objects=[WorldObject(id="cube", shape="box")]))
+        put(invariants, "scene_objects", m.WorldObjects(objects=[m.WorldObject(id="cube", shape="box")]))
         invariants.on_end(0, state)
         assert [line.endswith(f"{ACCEPTED}: cube") for line in invariants.broken] == [True] * broken
-    assert ACCEPTED not in Invariants(load_cell("panda"), RequestLog(), lambda: 1.0).checked
+    assert ACCEPTED not in Invariants(PANDA, RequestLog(), lambda: 1.0).checked

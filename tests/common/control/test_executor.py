@@ -51,82 +51,28 @@ def test_ball_is_grasped_lifted_carried_and_released(limits, rest_to_rest, make)
     assert rig.updates == ["remove:ball_1", "add:ball_1"]
 
 
-def test_fingers_that_close_on_nothing_succeed_without_holding(limits):
-    rig = ExecutorRig(limits, balls=[(0.8, 0.0)])
-    rig.grip("close", 0.0)
-    rig.run(1.0)
-    state = rig.grippers[-1]
-    assert (state.id, state.state, state.holding, state.width) == ("close", "succeeded", False, 0.0)
 
 
-@pytest.mark.parametrize(("expected", "state", "outcome"), [
-    (0.058, "succeeded", "grasped"), (0.04, "aborted", "too_wide"), (0.075, "aborted", "too_narrow")])
-@pytest.mark.parametrize("edit", [
-    m.WorldEdit(op="drop", id="ball_1"), m.WorldEdit(op="move", id="ball_1", position=m.Vector3(x=0.3))])
-def test_grasp_is_checked_by_the_width_of_the_object_and_its_loss_reported(rig, expected, state, outcome, edit):
-    rig.grip("close", 0.0, expected_width=expected)
-    rig.run(1.0)
-    found = rig.grippers[-1]
-    assert (found.state, found.outcome, found.holding, found.effort) == (state, outcome, True, GRIPPER.effort)
-    rig.cell.edit(edit, rig.now)
-    rig.run(1.0)
-    found = rig.grippers[-1]
-    assert not found.holding and found.width == 0.0
-    assert found.outcome == ("slipping" if state == "succeeded" else outcome)
 
 
-def test_repeated_gripper_id_moves_nothing_and_a_new_command_replaces_the_running_one(rig):
-    rig.grip("close", 0.0)
-    rig.run(0.1)
-    rig.grip("open", 0.08)
-    replaced = rig.grip("close", 0.0)
-    assert replaced.state == "cancelled" and "open" in replaced.message
-    rig.run(1.0)
-    assert (rig.grippers[-1].id, rig.grippers[-1].state) == ("open", "succeeded")
-    rig.grip("half", 0.07)
-    rig.run(1.0)
-    again = rig.grip("open", 0.08)
-    assert (again.id, again.state) == ("open", "succeeded")
-    rig.run(0.5)
-    assert (rig.grippers[-1].id, rig.grippers[-1].width) == ("half", pytest.approx(0.07))
-
-
-def test_width_beyond_the_fingers_is_rejected(rig):
-    answer = rig.grip("wide", 0.1)
-    assert answer.state == "rejected" and "0.08" in answer.message
-    rig.run(0.5)
-    assert rig.grippers[-1].id == "" and rig.grippers[-1].width == 0.08
-
-
-def test_arm_without_gripper_refuses_gripper_commands(limits):
+def test_executor_works_without_a_world_and_without_a_gripper(limits):
+    close = m.GripperCommand(id="close", width=0.0)
     executor = Executor(MockHardware(START, None), limits, START)
     with pytest.raises(Refused, match="no gripper"):
-        executor.command_gripper(m.GripperCommand(id="close", width=0.0), 1.0)
+        executor.command_gripper(close, 1.0)
     report = executor.cycle(m.Header(stamp=1))
     assert report.gripper is None and report.joints is not None and len(report.joints.name) == 2
-
-
-def test_executor_works_without_a_world(limits):
     executor = Executor(mock(), limits, START, gripper=GRIPPER)
     executor.restore(1.0)
-    executor.command_gripper(m.GripperCommand(id="close", width=0.0), 1.0)
-    for tick in range(200):
+    executor.command_gripper(close, 1.0)
+    for tick in range(100):
         report = executor.cycle(m.Header(stamp=int(1e9 + tick * 1e7)))
         assert report.objects is None and not report.updates
     assert report.joints is not None and report.joints.position[2:] == [0, 0]
 
 
-class NumbFingers:
-    """Simulated fingers that objects cannot block."""
 
-    def command(self, width, now, effort):
-        pass
-
-    def read(self, now):
-        raise AssertionError
-
-
-@pytest.mark.parametrize("fingers", [None, NumbFingers()])
+@pytest.mark.parametrize("fingers", [None, "fingers that objects cannot block"])
 def test_backend_with_an_unsuitable_gripper_is_a_configuration_error(limits, fingers):
     with pytest.raises(ConfigError, match=r"robot\.hardware\.backend"):
         ExecutorRig(limits, MockHardware(START, fingers))
@@ -158,14 +104,6 @@ def test_long_step_of_the_world_is_deferred_and_the_arm_continues(limits, monkey
 
 # --- restarts of simulated hardware ---
 
-
-def test_unchanged_objects_are_not_saved_again_while_the_arm_moves(rig, rest_to_rest):
-    rig.execute("a", rest_to_rest([0, 0], [0, 0.1]))
-    rig.run(0.2)
-    first = rig.saved
-    rig.step()
-    second = rig.saved
-    assert first.q != second.q and first.objects is second.objects and first.layout is second.layout
 
 
 def test_objects_of_physics_are_saved_as_of_the_same_moment_as_the_arm(limits, rest_to_rest):
@@ -230,22 +168,6 @@ def test_fingers_without_a_command_stay_where_they_were_before_a_restart(limits,
 # --- goals ---
 
 
-def test_progress_is_reported_about_ten_times_a_second(rig, rest_to_rest):
-    rig.execute("a", rest_to_rest([0, 0], [0.5, 0.5], 2.0))
-    rig.run(2.5)
-    reports = [report for report in rig.motions if report.id == "a"]
-    assert reports[0].state == "active" and reports[-1].state == "succeeded" and 19 <= len(reports) <= 24
-    assert [report.progress for report in reports] == sorted(report.progress for report in reports)
-
-
-def test_stop_reports_cancelled(rig, rest_to_rest):
-    rig.execute("a", rest_to_rest([0, 0], [0.5, 0.5], 2.0))
-    rig.run(1.0)
-    assert rig.executor.authority.stop(m.StopRequest(id="a", reason="enough"), rig.now).state == "active"
-    rig.run(0.5)
-    assert (rig.motions[-1].state, rig.motions[-1].message) == ("cancelled", "enough")
-    assert not any(rig.joints[-1].velocity)
-
 
 def test_nothing_moves_before_the_first_joint_reading(limits, rest_to_rest):
     rig = ExecutorRig(limits, mock(np.array([0.5, 0.0])))
@@ -268,25 +190,16 @@ def test_hold_for_a_goal_holds_only_that_goal_and_ends_with_it(rig, rest_to_rest
     status = rig.motions[-1]
     assert status.state == "active" and not status.paused and "held: mug obstructs hand" in status.message
     assert [(one.by, one.reason) for one in status.interlocks] == [("scene_monitor", "mug obstructs hand")]
+    authority.hold(m.HoldRequest(hold=True, owner="anna"))
+    assert authority.hold(obstructed(hold=False))[0].held_by == ["operator"], "each releases only its own hold"
+    authority.hold(obstructed())
+    assert authority.hold(m.HoldRequest(hold=False, owner="anna"))[0].held_by == ["scene_monitor"]
     authority.stop(m.StopRequest(id="a", by="requester"), rig.now)
     rig.run(0.5)
     assert (rig.motions[-1].state, rig.motions[-1].held) == ("cancelled", False)
     assert rig.execute("b", trajectory).state == "rejected", "the arm is not at its start any more"
     assert not authority.hold(obstructed())[0].held, "that goal is over"
 
-
-def test_scene_monitor_and_operator_release_only_their_own_holds(rig, rest_to_rest):
-    authority = rig.executor.authority
-    rig.execute("a", rest_to_rest([0, 0], [0.3, 0.3]))
-    authority.hold(m.HoldRequest(hold=True, owner="anna"))
-    authority.hold(obstructed())
-    authority.hold(obstructed(hold=False))
-    rig.run(1.0)
-    assert rig.motions[-1].held_by == ["operator"] and rig.motions[-1].progress < 0.1
-    authority.hold(obstructed())
-    authority.hold(m.HoldRequest(hold=False, owner="anna"))
-    rig.run(1.0)
-    assert rig.motions[-1].held_by == ["scene_monitor"]
 
 
 def test_goal_reports_its_plan_and_its_request_can_be_read_while_it_is_followed(rig, rest_to_rest):
@@ -298,6 +211,7 @@ def test_goal_reports_its_plan_and_its_request_can_be_read_while_it_is_followed(
     for goal in ("b", ""):
         with pytest.raises(Refused, match=f"goal '{goal}' is not followed now"):
             rig.executor.followed(goal)
-    rig.run(5.0)
+    rig.run(2.0)
+    assert rig.motions[-1].state == "succeeded" and 9 <= len(rig.motions) <= 16, "progress is reported each 0.1 s"
     with pytest.raises(Refused):
         rig.executor.followed("a")

@@ -103,16 +103,6 @@ def test_requested_set_points_are_reached_again_and_then_followed_exactly(limite
     assert_within(sent)
 
 
-def test_after_a_reset_set_points_start_from_rest(limiter):
-    for k in range(1, 30):
-        limiter.step(STILL + 0.5 * 5 * (k * PERIOD) ** 2, STILL + 5 * k * PERIOD, PERIOD)
-    limiter.rest()
-    assert limiter.at_rest
-    after = [limiter.position] * 3
-    for k in range(30, 100):
-        after.append(limiter.step(STILL + 5 * 0.29 ** 2 / 2 + 1.45 * (k - 29) * PERIOD, STILL + 1.45, PERIOD)[0])
-    assert_within(after)
-
 
 @pytest.mark.parametrize("beyond", [0.0, 0.0005, 0.03])
 @pytest.mark.parametrize("speed", [0.001, 0.02])

@@ -127,11 +127,6 @@ def test_arm_pushed_off_its_path_is_held_there_within_limits():
     rig.assert_accepts_and_reaches_a_goal_here()
 
 
-def test_set_points_start_where_the_arm_is():
-    rig = Sampled(LIMITS, MockHardware(np.array([0.7, -0.4]), None))
-    rig.run(5)
-    assert np.array_equal(rig.positions[1:], [[0.7, -0.4]] * 5)
-
 
 EVENTS = st.one_of(
     st.tuples(st.just("hold"), st.booleans()),

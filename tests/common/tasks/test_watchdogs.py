@@ -13,15 +13,14 @@ from common.tasks.monitoring import LOOK_PERIOD, LivenessWatchdog
 from tests.applications.outlining.outline_double import OutlineDouble
 from tests.applications.pick_place.cell_double import CellDouble
 
-ACTIVE, IDLE = m.MotionStatus(id="a", state="active"), m.MotionStatus()
 PLANNER, EXECUTOR = "motion_planner", "trajectory_executor"
 
 
 class Setting:
-    """Joint states at a rate, a planner and an executor, seen by a task that looks 20 times a second."""
+    """Joint states at a rate, a planner and an executor, watched by a task 20 times a second."""
 
-    def __init__(self, rate: float = 100.0, motion: m.MotionStatus = ACTIVE) -> None:
-        self.rate, self.motion, self.now = rate, motion, 100.0
+    def __init__(self, rate: float = 100.0, **motion: object) -> None:
+        self.rate, self.motion, self.now = rate, m.MotionStatus(**{"id": "a", "state": "active", **motion}), 100.0
         self.there = {PLANNER: True, EXECUTOR: True}
         self.came = 0.0
         self.asked: list[m.HoldRequest] = []
@@ -37,14 +36,14 @@ class Setting:
         return [hold.hold for hold in self.asked[before:]]
 
 
-def test_no_hold_without_a_fault() -> None:
+@pytest.fixture
+def setting() -> Setting:
     setting = Setting()
-    assert setting.wait(60) == [] and setting.watchdog.trouble == ""
+    assert setting.wait(5) == [] and setting.watchdog.trouble == ""
+    return setting
 
 
-def test_missing_joint_states_hold_the_arm_until_they_return() -> None:
-    setting = Setting()
-    setting.wait(5)
+def test_missing_joint_states_hold_the_arm_until_they_return(setting: Setting) -> None:
     setting.rate = 0.0
     assert setting.wait(0.2) == []
     assert setting.wait(0.1) == [True]
@@ -56,28 +55,19 @@ def test_missing_joint_states_hold_the_arm_until_they_return() -> None:
 
 
 @pytest.mark.parametrize("name", [PLANNER, EXECUTOR])
-def test_missing_service_holds_the_arm(name: str) -> None:
-    setting = Setting()
-    setting.wait(1)
+def test_missing_service_holds_the_arm_until_everything_is_back(setting: Setting, name: str) -> None:
     setting.there[name] = False
     assert setting.wait(0.1) == [True] and setting.asked[-1].reason == f"{name} is gone"
-    setting.there[name] = True
-    assert setting.wait(0.1) == [False]
-
-
-def test_hold_is_released_only_when_everything_is_back() -> None:
-    setting = Setting()
-    setting.wait(1)
-    setting.there[PLANNER], setting.rate = False, 0.0
-    assert setting.wait(1) == [True]
+    setting.rate = 0.0
+    assert setting.wait(1) == []
     setting.rate = 100.0
     assert setting.wait(1) == []
-    setting.there[PLANNER] = True
+    setting.there[name] = True
     assert setting.wait(1) == [False]
 
 
 def test_no_hold_without_motion_but_the_fault_is_known() -> None:
-    setting = Setting(motion=IDLE)
+    setting = Setting(state="none")
     setting.wait(1)
     setting.there[PLANNER] = False
     assert setting.wait(1) == [] and setting.watchdog.trouble == "motion_planner is gone"
@@ -90,9 +80,7 @@ def test_service_never_seen_is_not_missing() -> None:
 
 
 @pytest.mark.parametrize("late", [0.5, 2.0, 60.0])
-def test_own_delay_is_no_fault(late: float) -> None:
-    setting = Setting()
-    setting.wait(5)
+def test_own_delay_is_no_fault(setting: Setting, late: float) -> None:
     setting.now += late  # neither the task nor the robot ran
     assert setting.wait(0.3) == []
 
@@ -114,8 +102,7 @@ def test_slow_joint_states_are_not_missing() -> None:
 
 
 def test_hold_of_an_earlier_process_is_adopted() -> None:
-    setting = Setting(motion=m.MotionStatus(id="a", state="active", held=True, held_by=["watchdog"]))
-    assert setting.wait(0.1) == [False]
+    assert Setting(held=True, held_by=["watchdog"]).wait(0.1) == [False]
 
 
 @given(st.lists(st.tuples(st.sampled_from(["joints", PLANNER, EXECUTOR]), st.floats(0.01, 3.0)), max_size=12))
@@ -134,42 +121,39 @@ def test_holds_and_releases_alternate(events: list[tuple[str, float]]) -> None:
     assert holds == [True, False] * (len(holds) // 2)
 
 
-# --- with the tasks -----------------------------------------------------------------------------------------------
+# --- with the tasks ---
 
 Double = CellDouble | OutlineDouble
-TASKS: dict[str, tuple[Callable[[], Double], str]] = {
-    "pick_place": (lambda: CellDouble([(0.40, -0.30)]), "pre-grasp"), "outline": (OutlineDouble, "trace"),
-}
+BOTH = pytest.mark.parametrize(("make", "stage"), [
+    (lambda: CellDouble([(0.40, -0.30)]), "pre-grasp"), (OutlineDouble, "trace")], ids=["pick_place", "outline"])
 
 
-@pytest.mark.parametrize(("make", "stage"), TASKS.values(), ids=TASKS)
-def test_no_motion_starts_during_a_fault_and_none_is_repeated(
-    make: Callable[[], Double], stage: str
-) -> None:
-    cell = make()
+@BOTH
+def test_no_motion_starts_during_a_fault_and_none_is_repeated(make: Callable[[], Double], stage: str) -> None:
+    cell, trouble = make(), ""
     view = cell.view
-    trouble = ""
 
     def troubled() -> object:
         seen = view()
         seen.trouble = trouble
         return seen
 
+    def executed() -> list[str]:
+        return [request.id for request in cell.requests if isinstance(request, m.ExecuteRequest)]
+
     cell.view = troubled  # type: ignore[assignment,method-assign]
     cell.until(stage)
     trouble = "motion_planner is gone"
-    before = sum(isinstance(r, m.ExecuteRequest) for r in cell.requests)
+    before = executed()
     for _ in range(100):
         cell.step()
-    assert sum(isinstance(r, m.ExecuteRequest) for r in cell.requests) == before
-    assert cell.motion.state == "succeeded", "what was under way may end"
+    assert executed() == before and cell.motion.state == "succeeded", "the active motion may end"
     trouble = ""
     cell.until("DONE")
-    executed = [r.id for r in cell.requests if isinstance(r, m.ExecuteRequest)]
-    assert len(executed) == len(set(executed)) and cell.task.status.failures == 0
+    assert len(executed()) == len(set(executed())) and cell.task.status.failures == 0
 
 
-@pytest.mark.parametrize(("make", "stage"), TASKS.values(), ids=TASKS)
+@BOTH
 def test_watchdog_hold_found_at_the_start_does_not_pause(make: Callable[[], Double], stage: str) -> None:
     cell = make()
     cell.motion = m.MotionStatus(held=True, held_by=["watchdog"])
