@@ -64,13 +64,6 @@ def test_clock_reads_count_as_work_of_a_thread_call():
     assert reads == pytest.approx(1e9 / CLOCK_READ_NS, abs=2) and took >= 1.0
 
 
-def test_error_of_a_thread_call_is_raised_in_its_caller():
-    async def main(loop):
-        with pytest.raises(ValueError, match="broken"):
-            await asyncio.to_thread(int, "broken")
-
-    run(main)
-
 
 class Victim:
     """Task of its own incarnation that lists what it has done."""

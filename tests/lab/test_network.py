@@ -13,7 +13,7 @@ from common.time_source import use_time_source
 from common.topics import MOTION_HOLD, MOTION_STATUS, SCENE_OBJECT_UPDATES
 from common.transport.bus import Bus
 from lab.loop import VirtualTimeLoop
-from lab.network import GOOD_LINKS, POOR_LINKS, LinkQuality, SimulatedNetwork
+from lab.network import GOOD_LINKS, POOR_LINKS, SimulatedNetwork
 
 HOLD = HoldRequest(hold=True)
 
@@ -179,11 +179,3 @@ async def assert_delayed_is_served_twice(net, ends, times):
         await client.call(HOLD, timeout=1.0)
     await client.call(HOLD, timeout=4.0)
     assert served == sorted(served) and [at - began for at in served] == pytest.approx(times, abs=0.1)
-
-
-@on_links(LinkQuality(late=0.1))
-async def test_share_of_requests_is_late(net):
-    client, _ = await net.hold_client()
-    for _ in range(100):
-        await client.call(HOLD, timeout=10.0)
-    assert 5 <= net.network.counted["late"] <= 50

@@ -7,7 +7,6 @@ from common import messages as m
 from common.config import World
 from common.control.executor import Executor
 from common.errors import ConfigError, Refused
-from common.hardware.lag import LagHardware
 from common.hardware.mock import MockHardware, SimulatedFingers
 from common.sim.interface import ObjectSnapshot
 from common.sim.kinematic import KinematicWorld
@@ -30,28 +29,6 @@ def test_first_cycle_reports_everything_and_later_ones_only_the_joints(rig):
 
 
 # --- gripper and world ---
-
-
-@pytest.mark.parametrize("make", [MockHardware, lambda start, fingers: LagHardware(start, 0.03, fingers)])
-def test_ball_is_grasped_lifted_carried_and_released(limits, rest_to_rest, make):
-    rig = ExecutorRig(limits, make(START, SimulatedFingers(GRIPPER)))
-    rig.step()
-    assert rig.grip("close", 0.0).state == "active"
-    rig.run(1.0)
-    assert rig.grippers[-1].holding and rig.grippers[-1].state == "succeeded"
-    assert rig.grippers[-1].width == pytest.approx(0.06) and rig.updates == ["remove:ball_1"]
-    rig.execute("lift", rest_to_rest([0, 0], [-0.2, 0.2]))
-    rig.run(1.5)
-    assert rig.motions[-1].state == "succeeded" and rig.balls[-1].labels == ["held"]
-    assert rig.balls[-1].poses[0].position.z == pytest.approx(0.23, abs=2e-3)
-    rig.grip("open", 0.08)
-    rig.run(1.0)
-    assert not rig.grippers[-1].holding and rig.balls[-1].labels == ["table"]
-    assert rig.balls[-1].poses[0].position.x == pytest.approx(0.3, abs=2e-3)
-    assert rig.updates == ["remove:ball_1", "add:ball_1"]
-
-
-
 
 
 

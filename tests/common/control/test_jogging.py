@@ -153,8 +153,10 @@ def test_invalid_command_is_refused(ur5):
     ur5.command(joints={}, linear=Vector3(x=0.1))
 
 
-def test_goal_and_jogging_exclude_each_other(ur5):
+def test_neither_a_goal_nor_another_operator_moves_a_jogged_arm_and_a_goal_excludes_jogging(ur5):
     ur5.jog_joint(0.3)
+    with pytest.raises(Refused, match=r"the motion is owned by ann \(operator\)"):
+        ur5.command(owner="bob", joints={ur5.joint: -0.2})
     assert ur5.execute("one", "ann").error == "busy"
     ur5.run(0.5)
     assert ur5.execute("two", "ann").state == "active"
@@ -214,9 +216,3 @@ def test_only_the_operator_who_stopped_the_arm_may_jog_it(ur5):
     ur5.run(0.3)
     ur5.jog_joint(0.3, acknowledged=acknowledged)
     assert not ur5.at_rest()
-
-
-def test_second_operator_cannot_jog_meanwhile(ur5):
-    ur5.jog_joint(0.2)
-    with pytest.raises(Refused, match=r"the motion is owned by ann \(operator\)"):
-        ur5.command(owner="bob", joints={ur5.joint: -0.2})

@@ -28,22 +28,21 @@ def start_of_a_task(arm):
     return arm.own(owner="sorting", kind="task").owner == "sorting"
 
 
-def test_requester_of_a_motion_owns_it_until_it_ends(arm):
+def test_motion_is_owned_by_its_requester_until_its_end_or_by_an_owner_until_it_is_returned(arm):
     assert arm.owner == NO_OWNER
     assert arm.execute("one", "ann").state == "active" and arm.owner == ("ann", "operator")
     assert arm.execute("two").error == "not_owner"
     arm.run(3.0)
     assert arm.owner == NO_OWNER and arm.execute("three").state == "active" and arm.owner == ("", "task")
-
-
-def test_requested_ownership_continues_until_its_owner_returns_it(arm):
+    arm.run(3.0)
     arm.own(kind="script")
     arm.run(10.0)
-    assert arm.owner == ("ann", "script") and arm.execute("one", "bob").error == "not_owner"
+    assert arm.owner == ("ann", "script") and arm.execute("four", "bob").error == "not_owner"
     arm.own("give", "bob")
     assert arm.owner == ("ann", "script")
     arm.own("give")
-    assert arm.owner == NO_OWNER and arm.execute("two", "bob").state == "active"
+    assert arm.owner == NO_OWNER and arm.execute("five", "bob").state == "active"
+
 
 
 def test_ownership_returned_during_a_motion_ends_with_that_motion(owned):

@@ -61,16 +61,6 @@ def test_faults_are_in_order_and_as_frequent_as_requested(per_minute: float) -> 
     assert times == sorted(times) and 0.8 * per_minute < 60 * len(times) / times[-1] < 1.3 * per_minute
 
 
-@pytest.mark.parametrize(("fault", "text"), [
-    (Fault(1.0, "kill", "vision_detector"), "kill -9 vision_detector"),
-    (Fault(1.0, "freeze", "router", 2.14, holding=True), "SIGSTOP router: 2.1 s, while holding an object"),
-    (Fault(1.0, "freeze", "tf", math.inf), "SIGSTOP tf: until a watchdog acts"),
-    (Fault(1.0, "corrupt", "tf", form="truncated", count=12), "damaged messages on tf: 12 truncated"),
-    (Fault(1.0, "drop"), "held object slips"),
-])
-def test_fault_is_formatted_in_one_line(fault: Fault, text: str) -> None:
-    assert str(fault) == text
-
 
 def test_keys_are_those_that_services_write_or_serve_with_the_topics_of_their_own_keys() -> None:
     owned = {"trajectory_executor": ["motion/execute", "joint_states", "param/trajectory_executor"],
