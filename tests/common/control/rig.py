@@ -1,5 +1,7 @@
 """An executor with simulated hardware on a table, driven cycle by cycle by a test."""
 
+import math
+
 import numpy as np
 
 from applications.pick_place.topics import scene_balls
@@ -38,6 +40,25 @@ class Saver:
 
 def mock(start=START, width=0.08):
     return MockHardware(start, SimulatedFingers(GRIPPER, width))
+
+
+class LateArm(MockHardware):
+    """An arm that reaches its set-points so much later [s], and stays where it is when it is stopped."""
+
+    def __init__(self, start, gripper, delay):
+        super().__init__(start, gripper)
+        self._delay, self._sent = delay, [(-math.inf, start, 0.0 * start)]
+
+    def read(self, now):
+        while len(self._sent) > 1 and self._sent[1][0] <= now - self._delay + 1e-6:
+            self._sent.pop(0)
+        return self._sent[0][1].copy(), self._sent[0][2].copy()
+
+    def write(self, positions, velocities, now):
+        self._sent.append((now, positions.copy(), velocities.copy()))
+
+    def stop(self):
+        self._sent = [(-math.inf, self._sent[0][1], 0.0 * self._sent[0][2])]
 
 
 class ExecutorRig:

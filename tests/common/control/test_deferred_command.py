@@ -11,10 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from common import messages as m
-from common.hardware.interface import HardwareFault, Vector
-from common.hardware.mock import MockHardware, SimulatedFingers
+from common.hardware.interface import HardwareFault
+from common.hardware.mock import SimulatedFingers
 from common.messages import GripperCommand, HoldRequest, StopRequest
-from tests.common.control.rig import GRIPPER, START, ExecutorRig
+from tests.common.control.rig import GRIPPER, START, ExecutorRig, LateArm
 from tests.common.control.test_holding import FEW
 from tests.common.control.trajectories import LIMITS, rest_to_rest
 
@@ -24,29 +24,12 @@ OPEN = GRIPPER.least_time(0.5e-3)
 WITHIN = 0.005  # [m]
 
 
-class LateArm(MockHardware):
-    """At each set-point so much later [s]."""
-
-    def __init__(self, start: Vector, delay: float, gripper: SimulatedFingers) -> None:
-        super().__init__(start, gripper)
-        self._delay = delay
-        self._sent = [(-math.inf, start, 0.0 * start)]
-
-    def read(self, now: float) -> tuple[Vector, Vector]:
-        while len(self._sent) > 1 and self._sent[1][0] <= now - self._delay + 1e-6:
-            self._sent.pop(0)
-        return self._sent[0][1].copy(), self._sent[0][2].copy()
-
-    def write(self, positions: Vector, velocities: Vector, now: float) -> None:
-        self._sent.append((now, positions.copy(), velocities.copy()))
-
-
 class Hand(ExecutorRig):
     """A hand that goes down to a ball to take it, or goes away with the ball to release it there."""
 
     def __init__(self, holding: bool, delay: float = 0.0) -> None:
         start = START if holding else np.array([0.0, DOWN])
-        super().__init__(LIMITS, LateArm(start, delay, SimulatedFingers(GRIPPER)))
+        super().__init__(LIMITS, LateArm(start, SimulatedFingers(GRIPPER), delay))
         self.executor.arm.history.delay = delay
         self.step()
         if holding:

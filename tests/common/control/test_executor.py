@@ -169,7 +169,8 @@ def test_hold_for_a_goal_holds_only_that_goal_and_ends_with_it(rig, rest_to_rest
     assert [(one.by, one.reason) for one in status.interlocks] == [("scene_monitor", "mug obstructs hand")]
     authority.hold(m.HoldRequest(hold=True, owner="anna"))
     assert authority.hold(obstructed(hold=False))[0].held_by == ["operator"], "each releases only its own hold"
-    authority.hold(obstructed())
+    both = authority.hold(obstructed())[0]
+    assert both.held_by == ["operator", "scene_monitor"] and "mug obstructs hand" in both.message and both.paused
     assert authority.hold(m.HoldRequest(hold=False, owner="anna"))[0].held_by == ["scene_monitor"]
     authority.stop(m.StopRequest(id="a", by="requester"), rig.now)
     rig.run(0.5)

@@ -89,18 +89,6 @@ def test_arm_stays_on_its_path_and_within_limits_for_any_holds_and_speeds(swings
     rig.assert_on_path_within(LIMITS, swings)
 
 
-def test_arm_moves_only_when_neither_an_operator_nor_a_watchdog_holds_it():
-    rig = Timed(LIMITS)
-    rig.accept("a", winding(2, 0.5))
-    rig.controller.hold(True, "paused")
-    both = rig.controller.hold(True, "no joint states", "watchdog")
-    assert both.held and both.held_by == ["operator", "watchdog"] and "paused; no joint states" in both.message
-    alone = rig.controller.hold(False, "")
-    assert alone.held and alone.held_by == ["watchdog"] and not alone.paused
-    assert not rig.controller.hold(False, "", "watchdog").held
-    assert rig.until_over().state == "succeeded"
-    rig.assert_on_path_within(LIMITS, 2)
-
 
 @FEW
 @given(swings=st.integers(0, 6), share=st.sampled_from([0.5, 0.9]), when=st.floats(0.02, 0.98), stop=st.booleans())
@@ -198,15 +186,6 @@ def test_release_during_a_stop_does_not_end_the_stop(rig, rest_to_rest):
     assert answer.state == "active" and "stopping" in answer.message
     assert rig.until_over().state == "cancelled"
 
-
-def test_duration_scales_with_the_speed(limits, rest_to_rest):
-    for scaling in (1.0, 0.5, 0.05):
-        rig = Rig(limits)
-        rig.controller.reports.speed_scaling = scaling
-        rig.accept("a", rest_to_rest([0, 0], [1, 1]))
-        status = rig.until_over(30)
-        assert status.state == "succeeded" and status.speed_scaling == scaling
-        assert rig.now - T0 == pytest.approx(1 / scaling, abs=0.05)
 
 
 def test_fault_while_held_ends_the_goal_and_the_robot_stays_held(rig, rest_to_rest):

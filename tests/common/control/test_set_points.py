@@ -85,12 +85,6 @@ def test_goals_of_a_microsecond_off_by_their_tolerance_keep_limits_and_speed_sca
     assert rig.now - begin > count * 0.05 / share
 
 
-def test_points_too_close_in_time_are_followed_slowly():
-    rig = Sampled(LIMITS)
-    assert rig.accept("a", trajectory((k * 1e-6, [k * 1e-6, 0]) for k in range(5_000))).state == "active"
-    rig.until_over()
-    rig.assert_within(LIMITS)
-
 
 def test_sharp_points_within_the_slack_are_followed_slower_to_their_end():
     rig = Sampled(LIMITS)

@@ -2,7 +2,6 @@
 
 import re
 import tracemalloc
-from collections import deque
 
 import numpy as np
 import pytest
@@ -14,6 +13,7 @@ from common.control.trajectory import Trajectory
 from common.hardware.lag import LagHardware
 from common.hardware.mock import MockHardware
 from common.messages import Header, Interlock, MotionStatus
+from tests.common.control.rig import LateArm
 from tests.drivers.rig import START, STEP, T0, Rig
 from tests.harness import ROOT
 
@@ -160,28 +160,11 @@ def test_arm_that_does_not_arrive_ends_the_goal_after_the_goal_time(limits, rest
 # --- arms with a delay of 0.1 s, according to their driver ---
 
 
-class Behind(MockHardware):
-    """An arm that reaches its set-points some cycles later, and stays where it is when it is stopped."""
-
-    def __init__(self, cycles: int) -> None:
-        super().__init__(START, None)
-        self._coming = deque([(START, START)] * cycles)
-
-    def write(self, positions, velocities, now):
-        self._coming.append((positions, velocities))
-        super().write(*self._coming.popleft(), now)
-
-    def stop(self):
-        here = self.read(0.0)[0]
-        super().write(here, 0 * here, 0.0)
-        self._coming = deque([(here, 0 * here)] * len(self._coming))
-
-
 @pytest.fixture
 def delayed(limits, rest_to_rest):
-    """Return a rig whose arm is some cycles behind and has started a goal."""
-    def make(cycles=10, path=0.02):
-        rig = Rig(limits, Behind(cycles), path=path)
+    """Return a rig whose arm is late by some seconds and has started a goal."""
+    def make(seconds=0.11, path=0.02):
+        rig = Rig(limits, LateArm(START, None, seconds), path=path)
         rig.controller.history.delay = 0.1
         rig.accept("a", rest_to_rest([0, 0], [1, 1]))
         return rig
@@ -223,5 +206,5 @@ def test_delayed_readings_are_compared_with_the_set_points_of_their_time(delayed
 
 
 def test_arm_later_than_usual_is_on_its_path_and_one_that_stays_behind_is_not(delayed):
-    assert delayed(18).until_over().state == "succeeded"
-    assert delayed(25).until_over().error == "path_tolerance"
+    assert delayed(0.19).until_over().state == "succeeded"
+    assert delayed(0.26).until_over().error == "path_tolerance"

@@ -8,17 +8,10 @@ import pytest
 
 from common.config import HardwareConfig, Parameters, RobotConfig, load_cell
 from common.errors import ConfigError, UnknownName
+from common.hardware import loading
 from common.hardware.driven_gripper import DrivenGripper
 from common.hardware.driver_process import DriverProcess
-from common.hardware.interface import Limits, SimulatedGripper
-from common.hardware.loading import (
-    backend_names,
-    find_backend,
-    find_gripper_backend,
-    gripper_backend_names,
-    is_simulated,
-    load_hardware,
-)
+from common.hardware.interface import Limits
 from common.hardware.mock import SimulatedFingers
 
 START = np.array([0.1, -0.2])
@@ -57,27 +50,18 @@ def no_driver(monkeypatch):
 # --- arms ---
 
 
-@pytest.mark.parametrize("name", ["mock", "lag"])
-def test_simulated_arm_starts_at_rest_and_moves_where_it_is_sent(limits, name):
-    hardware = load_hardware(robot(name), limits, START)
-    q, dq = hardware.read(5.0)
-    assert np.array_equal(q, START) and not dq.any() and isinstance(hardware.gripper, SimulatedGripper)
-    hardware.write(START + 1, np.ones(2), 5.0)
-    assert np.allclose(hardware.read(6.0)[0], START + 1)
-    hardware.close()
-
 
 def test_backends_are_found_by_name():
-    assert backend_names() == ["franka", "lag", "mock", "ur"]
-    assert gripper_backend_names() == ["franka_hand", "mock", "robotiq"]
-    assert all(is_simulated(robot(name)) for name in ("lag", "mock"))
+    assert loading.backend_names() == ["franka", "lag", "mock", "ur"]
+    assert loading.gripper_backend_names() == ["franka_hand", "mock", "robotiq"]
+    assert all(loading.is_simulated(robot(name)) for name in ("lag", "mock"))
 
 
 def test_user_backend_is_a_dotted_module(limits, own):
-    assert not find_backend(robot("mine.arm")).simulated
-    arm = load_hardware(robot("mine.arm", port=7), limits, START)
+    assert not loading.find_backend(robot("mine.arm")).simulated
+    arm = loading.load_hardware(robot("mine.arm", port=7), limits, START)
     assert (arm.names, arm.port, arm.gripper) == (("shoulder", "elbow"), 7, "its own")
-    assert find_gripper_backend(HardwareConfig(backend="mine.gripper")) is own.gripper
+    assert loading.find_gripper_backend(HardwareConfig(backend="mine.gripper")) is own.gripper
 
 
 @pytest.mark.parametrize(("name", "error"), [
@@ -87,18 +71,18 @@ def test_user_backend_is_a_dotted_module(limits, own):
 ])
 def test_unsuitable_backend_is_refused_with_the_choices(name, error):
     with pytest.raises((ConfigError, UnknownName), match=error):
-        find_backend(robot(name))
+        loading.find_backend(robot(name))
 
 
 @pytest.mark.parametrize(("options", "field"), [({"time_constant": -1}, "time_constant"), ({"lag": 1}, "lag")])
 def test_invalid_option_is_refused_by_name(limits, options, field):
     with pytest.raises(ConfigError, match=rf"robot\.hardware\.options\.{field}"):
-        load_hardware(robot("lag", **options), limits, START)
+        loading.load_hardware(robot("lag", **options), limits, START)
 
 
 @pytest.mark.parametrize("steps", [1, 7, 100])
 def test_lag_is_first_order_at_any_step(limits, steps):
-    hardware = load_hardware(robot("lag", time_constant=0.1), limits, START)
+    hardware = loading.load_hardware(robot("lag", time_constant=0.1), limits, START)
     hardware.write(START + 1, START, 0.0)
     for t in np.linspace(0.0, 0.1, steps + 1):
         q, dq = hardware.read(float(t))
@@ -114,15 +98,15 @@ def test_lag_is_first_order_at_any_step(limits, steps):
     ({"backend": "robotiq", "options": {"host": "h", "model": "2f85"}}, DrivenGripper),
 ])
 def test_any_gripper_goes_with_any_arm(limits, no_driver, own, arm, gripper, kind):
-    assert isinstance(load_hardware(robot(arm, gripper), limits, START).gripper, kind)
+    assert isinstance(loading.load_hardware(robot(arm, gripper), limits, START).gripper, kind)
 
 
 def test_arm_is_created_without_its_own_gripper_if_another_one_is_named(limits, monkeypatch):
-    seen, lag = [], find_backend(robot("lag"))
+    seen, lag = [], loading.find_backend(robot("lag"))
     create = lag.create
     monkeypatch.setattr(lag, "create", lambda robot, *args: (seen.append(robot.gripper), create(robot, *args))[1])
-    load_hardware(robot("lag"), limits, START)
-    load_hardware(robot("lag", {"backend": "mock"}), limits, START)
+    loading.load_hardware(robot("lag"), limits, START)
+    loading.load_hardware(robot("lag", {"backend": "mock"}), limits, START)
     assert [gripper is None for gripper in seen] == [False, True]
 
 
@@ -135,7 +119,7 @@ def test_arm_is_created_without_its_own_gripper_if_another_one_is_named(limits, 
 ])
 def test_unsuitable_gripper_backend_is_refused_with_the_choices(limits, gripper, error):
     config = robot("mock", gripper)
-    for refuse in (is_simulated, lambda config: load_hardware(config, limits, START)):
+    for refuse in (loading.is_simulated, lambda config: loading.load_hardware(config, limits, START)):
         with pytest.raises((ConfigError, UnknownName), match=error):
             refuse(config)
 
@@ -148,7 +132,7 @@ def test_ur_arm_brings_the_gripper_of_its_option(no_driver):
     def load(gripper):
         options = (f"{name}={value}" for name, value in {
             "backend": "ur", "options.host": "127.0.0.9", "options.model": "ur5e", "options.gripper": gripper}.items())
-        return load_hardware(
+        return loading.load_hardware(
             load_cell("ur5", [f"robot.hardware.{option}" for option in options]).robot, limits, limits.lower)
 
     assert isinstance(load("2f85").gripper, DrivenGripper)
@@ -161,10 +145,10 @@ def test_ur_arm_brings_the_gripper_of_its_option(no_driver):
 
 def test_arm_of_a_world_replaces_only_mock(limits):
     arm = object()
-    assert load_hardware(robot("mock"), limits, START, lambda: arm) is arm
+    assert loading.load_hardware(robot("mock"), limits, START, lambda: arm) is arm
     for config, error in (
         (robot("lag"), r"'lag' moves the joints itself.*set mock here, or kinematic there"),
         (robot("mock", {"backend": "mock"}), r"robot\.gripper\.hardware\.backend: 'mock' moves the gripper, and so"),
     ):
         with pytest.raises(ConfigError, match=error):
-            load_hardware(config, limits, START, lambda: arm)
+            loading.load_hardware(config, limits, START, lambda: arm)

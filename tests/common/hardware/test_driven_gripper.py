@@ -116,18 +116,15 @@ def test_fingers_open_and_close_to_a_width(host: RobotiqHost, answers: bytes) ->
             assert state.width == pytest.approx(width, abs=3e-4) and not state.holding  # a count
 
 
-def test_fault_of_the_gripper_ends_the_driver(host: RobotiqHost) -> None:
-    with closing(connected(host)) as gripper:
-        host.gripper.registers["FLT"] = 14
-        with pytest.raises(RuntimeError, match="has fault 14"):
-            gripper.read()
 
-
-@pytest.mark.parametrize("answer", [b"POS\n", b"POS x\n", b"?\n", b"y" * 600])
-def test_invalid_answer_ends_the_driver_with_one_line(
-    host: RobotiqHost, answer: bytes, monkeypatch: pytest.MonkeyPatch,
+@pytest.mark.parametrize(("answer", "problem"), [
+    (b"FLT 14\n", "the gripper has fault 14"), (b"FLT\n", "the gripper answers 'FLT'"),
+    (b"FLT x\n", "the gripper answers 'FLT x'"), (b"?\n", "the gripper answers"), (b"y" * 600, "the gripper"),
+])
+def test_fault_or_invalid_answer_ends_the_driver_with_one_line(
+    host: RobotiqHost, answer: bytes, problem: str, monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     with closing(connected(host)) as gripper:
         monkeypatch.setattr(host.gripper, "answer", lambda line: answer)
-        with pytest.raises((RuntimeError, ConnectionError), match="the gripper"):
+        with pytest.raises((RuntimeError, ConnectionError), match=problem):
             gripper.read()

@@ -287,36 +287,21 @@ def test_silent_fingers_do_not_block_decisions(closing: Hand, end: str) -> None:
     assert closing.stage == "reach"
 
 
-@pytest.fixture
-def closed_before(closing: Hand) -> Hand:
-    """The arm was held up, and so the executor aborted its motion with closing fingers."""
+def test_fingers_closed_before_arrival_are_no_failure_and_the_next_close_is_not_early(closing: Hand) -> None:
     closing.arm("aborted", error=m.CLOSED_BEFORE, message="held up")
     closing.step()
-    return closing
-
-
-def test_fingers_closed_before_arrival_are_no_failure(closed_before: Hand) -> None:
-    closed_before.fingers(0.0, "aborted", holding=False, outcome="empty")
-    closed_before.step()
-    assert closed_before.status.failures == 0
-    assert closed_before.stage == "open", "it does not go down with closed fingers"
-    closed_before.fingers(0.08, holding=False)
-    closed_before.steps(3)
-    assert closed_before.status.failures == 0 and closed_before.stage == "reach"
-
-
-def test_next_close_waits_after_fingers_closed_before_arrival(closed_before: Hand) -> None:
-    closed_before.fingers(0.08, "cancelled", holding=False)
-    while closed_before.stage != "reach":
-        closed_before.step()
-    closed_before.steps(5)
-    assert len(closed_before.grips) == 1
-    closed_before.arm()
-    closed_before.step()
-    assert closed_before.stage == "close" and not closed_before.grips[-1].after
-    closed_before.fingers(SEEN, holding=True)
-    assert closed_before.until_waiting().after, "the release is early again"
-    assert closed_before.status.failures == 0
+    closing.fingers(0.0, "aborted", holding=False, outcome="empty")
+    closing.step()
+    assert closing.status.failures == 0 and closing.stage == "open", "it does not go down with closed fingers"
+    closing.fingers(0.08, holding=False)
+    closing.steps(8)
+    assert closing.stage == "reach" and [grip.width for grip in closing.grips] == [0.0, 0.08]
+    closing.arm()
+    closing.step()
+    assert closing.stage == "close" and not closing.grips[-1].after
+    closing.fingers(SEEN, holding=True)
+    assert closing.until_waiting().after, "the release is early again"
+    assert closing.status.failures == 0
 
 
 def test_report_from_before_standstill_is_not_a_forgotten_command(waiting: Hand) -> None:

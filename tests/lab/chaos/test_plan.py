@@ -12,16 +12,7 @@ import pytest
 from applications.pick_place.topics import PickPlaceStatus
 from common.errors import DecodeError
 from common.messages import Image, StopRequest
-from common.transport.codec import (
-    CHECKED_BYTES,
-    Attachment,
-    checksum_of,
-    decode,
-    decode_attachment,
-    encode,
-    encode_attachment,
-    require_intact,
-)
+from common.transport import codec
 from common.transport.ownership import Owner
 from common.transport.reader import SequenceFilter
 from common.transport.session import RawSample
@@ -77,35 +68,36 @@ def test_keys_are_those_that_services_write_or_serve_with_the_topics_of_their_ow
 
 @pytest.mark.parametrize("form", [form for form in get_args(Form) if form])
 def test_damaged_message_is_rejected(form: Form) -> None:
-    payload = encode(PickPlaceStatus(placed=3))
-    attachment = Attachment("smart_pick_place.1", 7, checksum=checksum_of("panda/pick_place_status", payload))
-    require_intact(attachment, "panda/pick_place_status", payload)
+    key, payload = "panda/pick_place_status", codec.encode(PickPlaceStatus(placed=3))
+    attachment = codec.Attachment("smart_pick_place.1", 7, checksum=codec.checksum_of(key, payload))
+    codec.require_intact(attachment, key, payload)
     for seed in range(1 if form == "huge" else 50):
         bad = damaged(payload, form, np.random.default_rng(seed))
         with pytest.raises(DecodeError):
-            require_intact(attachment, "panda/pick_place_status", bad)
-            decode(PickPlaceStatus, bad)
+            codec.require_intact(attachment, key, bad)
+            codec.decode(PickPlaceStatus, bad)
 
 
 def test_noise_and_wrong_types_are_rejected_without_a_checksum() -> None:
     for seed in range(50):
         for form in ("wrong type", "noise"):
             with pytest.raises(DecodeError):
-                decode(StopRequest, invalid_payload(StopRequest, form, np.random.default_rng(seed)))
+                codec.decode(StopRequest, invalid_payload(StopRequest, form, np.random.default_rng(seed)))
         with pytest.raises(DecodeError):
-            decode(PickPlaceStatus, damaged(b"", "noise", np.random.default_rng(seed)))
+            codec.decode(PickPlaceStatus, damaged(b"", "noise", np.random.default_rng(seed)))
 
 
 def test_image_damaged_beyond_its_checksum_costs_one_image() -> None:
-    key, payload, rng = "ur5/depth_camera/image_raw", bytes(2 * CHECKED_BYTES), np.random.default_rng(0)
+    key, payload, rng = "ur5/depth_camera/image_raw", bytes(2 * codec.CHECKED_BYTES), np.random.default_rng(0)
     seventh, eighth, ninth = (
-        Attachment("depth_camera.1", number, checksum=checksum_of(key, payload)) for number in (7, 8, 9))
+        codec.Attachment("depth_camera.1", number, checksum=codec.checksum_of(key, payload)) for number in (7, 8, 9))
     newness = SequenceFilter()
     assert newness.is_new(seventh)
-    real = RawSample(key, payload, "", encode_attachment(seventh))
+    real = RawSample(key, payload, "", codec.encode_attachment(seventh))
     bad = (next_damaged(real, seventh, "flipped", rng) for _ in range(100))
-    body, encoded = next((body, encoded) for body, encoded in bad if body[:CHECKED_BYTES] == payload[:CHECKED_BYTES])
-    attachment = decode_attachment(encoded)
+    checked = slice(codec.CHECKED_BYTES)
+    body, encoded = next((body, encoded) for body, encoded in bad if body[checked] == payload[checked])
+    attachment = codec.decode_attachment(encoded)
     assert attachment is not None and body != payload
-    require_intact(attachment, key, body)
+    codec.require_intact(attachment, key, body)
     assert newness.is_new(attachment) and not newness.is_new(eighth) and newness.is_new(ninth)
