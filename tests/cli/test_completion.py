@@ -1,5 +1,4 @@
 import importlib
-import os
 import subprocess
 from pathlib import Path
 
@@ -8,17 +7,18 @@ import pytest
 from cli import choices, completion
 from common.application import all_topics
 from common.config import load_cell, service_config, service_names
+from common.config.tunables import leaves
 from common.planning.planners import planner_names
 from common.topics import Topic
 from tests.harness import PATIENCE, ask, command_line, environment
 
 
-def offered(line: str, folder: Path, shell: str = "bash", **more: str) -> list[str]:
-    """What the shell's own protocol answers for the last word of a line."""
+def offered(line: str, folder: Path, shell: str = "bash", **variables: str) -> list[str]:
+    """Return what the shell's own protocol answers for the last word of a line."""
     words = line.split(" ")
-    asked = {"COMP_WORDS": line, "COMP_CWORD": str(len(words) - 1)} if shell == "bash" else {
+    request = {"COMP_WORDS": line, "COMP_CWORD": str(len(words) - 1)} if shell == "bash" else {
         "_TYPER_COMPLETE_ARGS": line, "_TYPER_COMPLETE_FISH_ACTION": "get-args"}
-    done = ask(folder, environment={"_ZENCELL_COMPLETE": f"complete_{shell}"} | asked | more)
+    done = ask(folder, environment={"_ZENCELL_COMPLETE": f"complete_{shell}"} | request | variables)
     assert done.stderr == ""
     return done.stdout.split("\n")[:-1]
 
@@ -34,96 +34,68 @@ def offered(line: str, folder: Path, shell: str = "bash", **more: str) -> list[s
     ("zencell gra", ["graph"]),
     ("zencell --install-completion z", ["zsh"]),
 ])
-def test_a_word_is_completed(line: str, wanted: list[str], tmp_path: Path) -> None:
+def test_word_is_completed(line: str, wanted: list[str], tmp_path: Path) -> None:
     assert offered(line, tmp_path) == wanted
 
 
-def test_fish_and_zsh_are_told_what_each_word_is(tmp_path: Path) -> None:
+def test_words_of_fish_and_zsh_have_a_description(tmp_path: Path) -> None:
     (line,) = offered("zencell run u", tmp_path, "fish")
-    word, _, about = line.partition("\t")
-    assert word == "ur5"
-    assert about.startswith("A UR5 ")
+    assert line.startswith("ur5\tA UR5 ")
     assert '"ur5":' in "".join(offered("zencell run u", tmp_path, "zsh"))
 
 
-def test_cells_of_a_configuration_of_ones_own_are_completed(tmp_path: Path) -> None:
+def test_cells_of_another_configuration_are_completed(tmp_path: Path) -> None:
     (tmp_path / "cells").mkdir()
     (tmp_path / "cells" / "mine.yaml").write_text("# A cell of mine.\ncell: mine\n")
     assert offered("zencell run m", tmp_path, ZENCELL_CONFIG=str(tmp_path)) == ["mine"]
 
 
 @pytest.mark.parametrize("shell", completion.SHELLS)
-def test_what_a_shell_needs_is_shown_and_asks_us(shell: str, tmp_path: Path) -> None:
+def test_script_of_a_shell_calls_the_command(shell: str, tmp_path: Path) -> None:
     done = ask(tmp_path, "--show-completion", shell)
     assert (done.returncode, done.stderr) == (0, "")
     assert f"_ZENCELL_COMPLETE=complete_{shell}" in done.stdout
 
 
-def test_bash_itself_completes_after_installing(tmp_path: Path) -> None:
+def test_bash_completes_after_installing(tmp_path: Path) -> None:
     home = {"HOME": str(tmp_path)}
-    done = subprocess.run(command_line("--install-completion", "bash"), env=environment() | home, capture_output=True,
-                          text=True, timeout=PATIENCE, check=True)
+    done = ask(tmp_path, "--install-completion", "bash", environment=home)
     assert "bash completion installed" in done.stdout
-    # The name of the command, as it would be on the PATH.
-    program = tmp_path / "zencell"
+    program = tmp_path / "zencell"  # the name of the command, as it would be on the PATH
     program.write_text('#!/bin/sh\nexec ' + " ".join(command_line()) + ' "$@"\n')
     program.chmod(0o755)
     script = (
         f'source "{tmp_path}/.bash_completions/zencell.sh"; COMP_WORDS=(zencell run p); COMP_CWORD=2; '
         f'_zencell_completion "{program}"; echo "${{COMPREPLY[@]}}"'
     )
-    done = subprocess.run(["bash", "--norc", "-c", script], env=environment() | home, capture_output=True, text=True,
+    bash = subprocess.run(["bash", "--norc", "-c", script], env=environment() | home, capture_output=True, text=True,
                           timeout=PATIENCE, check=True)
-    assert done.stdout.strip() == "panda"
-
-
-def test_unknown_shell_is_one_line(tmp_path: Path) -> None:
-    done = ask(tmp_path, "--install-completion", "tcsh")
-    assert done.returncode == 2
-    assert done.stderr.splitlines() == ["zencell: unknown shell 'tcsh'; choices: bash, fish, zsh"]
-    assert not os.listdir(tmp_path)
-
-
-# What is read from the sources is what the code itself says.
+    assert bash.stdout.strip() == "panda"
 
 
 def words(offered: list[tuple[str, str]]) -> set[str]:
     return {word for word, _ in offered}
 
 
-def test_keys_are_those_of_the_topic_table() -> None:
+def test_completed_names_are_those_of_the_code() -> None:
     topics = all_topics()
     assert words(choices.keys("")) == set(topics)
     assert words(choices.published("")) == {key for key, topic in topics.items() if isinstance(topic, Topic)}
     assert dict(choices.keys("tf")) == {key: topics[key].doc for key in ("tf", "tf_static")}
     for _, about in (*choices.parameters(""), *choices.keys(""), *choices.services("")):
         assert len(about) <= choices.LONGEST_DOC and "[" not in about
-
-
-def test_services_and_planners_are_those_that_there_are() -> None:
     assert words(choices.services("")) == set(service_names()) - {"router"}
     assert words(choices.planners("")) == set(planner_names())
-
-
-def test_parameters_are_those_of_the_models() -> None:
-    from common.config.tunables import leaves
-
-    cell = load_cell("panda")
-    found = words(choices.parameters("services."))
-    names = [name for name in service_names() if name != "router"]
-    wanted: set[str] = set()
-    for name in names:
+    cell, wanted = load_cell("panda"), set[str]()
+    for name in set(service_names()) - {"router"}:
         config = service_config(cell, name, importlib.import_module(f"services.{name}").Config)
         wanted |= {path for path in leaves(config, name) if path.startswith("services.")}
-    assert found == wanted
+    assert words(choices.parameters("services.")) == wanted
     assert {"motion.velocity_scaling", "world.count", "robot.hardware.backend"} <= words(choices.parameters(""))
+    assert all(word.endswith("=") for word in words(choices.overrides("world.")))
 
 
 @pytest.mark.parametrize("typed", ["", "s", "services", "services.v", "services.viewer.po", "motion", "motion.", "x"])
-def test_what_was_typed_leaves_out_nothing_that_begins_so(typed: str) -> None:
+def test_every_parameter_with_the_typed_start_is_offered(typed: str) -> None:
     wanted = {word for word in words(choices.parameters("")) if word.startswith(typed)}
     assert words(choices.parameters(typed)) == wanted
-
-
-def test_every_override_can_be_completed_further() -> None:
-    assert all(word.endswith("=") for word in words(choices.overrides("world.")))

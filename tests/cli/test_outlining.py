@@ -1,95 +1,44 @@
-"""Bad input to the verbs of outlining gets one line that names what is wrong, and no traceback."""
+"""Files of outlining that cannot be used are rejected in one line."""
 
-import io
+from collections.abc import Callable
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
 from applications.outlining import stage_files
-from cli.main import app
+
+SIZE = (768, 1024)  # of the images of the UR5's camera
+BLACK, FAR = np.zeros((*SIZE, 3), np.uint8), np.full(SIZE, 1.75, np.float32)
+AT_THE_BORDER = BLACK.copy()
+AT_THE_BORDER[300:400, :100] = (0, 255, 255)
 
 
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    """A picture and its depth of the size that the UR5's camera has, with nothing in them."""
-    picture = np.zeros((768, 1024, 3), np.uint8)
-    stage_files.write_pictures(tmp_path, picture, np.full((768, 1024), 1.75, np.float32))
-    return tmp_path
+@pytest.mark.parametrize(("image", "depth", "arguments", "code", "wanted"), [
+    (BLACK, np.ones((10, 20), np.float32), [], 2, "20x10, but camera_image.png is 1024x768"),
+    (BLACK[:48, :64], FAR[:48, :64], [], 2, "'64x48' must be as large as the camera's: 1024x768"),
+    (BLACK, FAR * np.nan, [], 2, "no valid depth at all"),
+    (BLACK, None, [], 2, "depth_data.npy: "),
+    (BLACK, FAR, [], 1, "no contour"),
+    (BLACK, FAR, ["--select", "purple"], 2, "choices: "),
+    (BLACK, FAR, ["--select", "none"], 2, "chooses nothing"),
+    (AT_THE_BORDER, FAR, [], 1, "every contour touches the border"),
+], ids=lambda value: value if isinstance(value, str) else "")
+def test_unusable_images_are_rejected(
+    image: np.ndarray, depth: np.ndarray | None, arguments: list[str], code: int, wanted: str, tmp_path: Path,
+    rejection: Callable[..., str],
+) -> None:
+    stage_files.write_pictures(tmp_path, image, FAR if depth is None else depth)
+    if depth is None:
+        (tmp_path / stage_files.DEPTH).write_bytes(b"no array")
+    assert wanted in rejection("outline", str(tmp_path), *arguments, code=code)
 
 
-def one_line(capsys: pytest.CaptureFixture[str], code: int, *arguments: str) -> str:
-    assert app.execute(arguments) == code
-    said = capsys.readouterr().err
-    assert said.startswith("zencell: ") and said.count("\n") == 1
-    return said
-
-
-def test_folder_without_a_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert "camera_image.png: is missing" in one_line(capsys, 2, "outline", str(tmp_path))
-
-
-def test_depth_that_is_no_array(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (folder / stage_files.DEPTH).write_bytes(b"nothing of that kind")
-    assert "depth_data.npy: " in one_line(capsys, 2, "outline", str(folder))
-
-
-def test_depth_of_another_size_than_the_picture(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    np.save(folder / stage_files.DEPTH, np.ones((10, 20), np.float32))
-    assert "20x10, but camera_image.png is 1024x768" in one_line(capsys, 2, "outline", str(folder))
-
-
-def test_picture_of_another_size_than_the_camera_has(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    stage_files.write_pictures(tmp_path, np.zeros((48, 64, 3), np.uint8), np.ones((48, 64), np.float32))
-    assert "'64x48' must be as large as the camera's: 1024x768" in one_line(capsys, 2, "outline", str(tmp_path))
-
-
-def test_depth_without_any_depth(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    np.save(folder / stage_files.DEPTH, np.full((768, 1024), np.nan, np.float32))
-    assert "no valid depth at all" in one_line(capsys, 2, "outline", str(folder))
-
-
-def test_picture_without_a_contour(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert "no contour" in one_line(capsys, 1, "outline", str(folder))
-
-
-def test_choice_that_is_none(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert "choices: " in one_line(capsys, 2, "outline", str(folder), "--select", "purple")
-    assert "chooses nothing" in one_line(capsys, 2, "outline", str(folder), "--select", "none")
-    assert "choices: " in one_line(capsys, 2, "task", "select", "purple")
-
-
-def test_object_at_the_border_only(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    picture = np.zeros((768, 1024, 3), np.uint8)
-    picture[300:400, :100] = (0, 255, 255)
-    cv2.imwrite(str(folder / stage_files.PICTURE), picture)
-    assert "every contour touches the border" in one_line(capsys, 1, "outline", str(folder))
-
-
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [("", "is not valid JSON"), ("[[1, 2, 3]]", "at least 3 points"), ("[[0, 0, 1], [0, 1, 1], [1, 1]]", "entry 2")],
-)
-def test_coordinates_that_can_not_be_used(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, said: str
+@pytest.mark.parametrize(("text", "wanted"), [
+    ("", "is not valid JSON"), ("[[1, 2, 3]]", "at least 3 points"), ("[[0, 0, 1], [0, 1, 1], [1, 1]]", "entry 2")])
+def test_unusable_coordinates_are_rejected(
+    text: str, wanted: str, tmp_path: Path, rejection: Callable[..., str]
 ) -> None:
     (tmp_path / stage_files.CLEARED).write_text(text)
-    told = one_line(capsys, 2, "run", "ur5", "--from", str(tmp_path))
-    assert f"{stage_files.CLEARED}: " in told and said in told
-
-
-def test_coordinates_that_are_missing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert "is missing" in one_line(capsys, 2, "run", "ur5", "--from", str(tmp_path))
-
-
-def test_cell_that_outlines_nothing_has_no_object_to_choose(capsys: pytest.CaptureFixture[str]) -> None:
-    assert "'panda' needs a cell that outlines objects" in one_line(capsys, 2, "run", "panda", "--ask")
-    assert "'panda' needs a cell that outlines objects" in one_line(capsys, 2, "run", "panda", "--from", ".")
-
-
-def test_nobody_can_be_asked_without_a_terminal(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("sys.stdin", io.StringIO())
-    assert "--ask: needs a terminal" in one_line(capsys, 2, "run", "ur5", "--ask")
+    line = rejection("run", "ur5", "--from", str(tmp_path))
+    assert f"{stage_files.CLEARED}: " in line and wanted in line

@@ -1,0 +1,202 @@
+"""`zencell robot`: a robot file from a URDF alone and a cell that picks with it, its check, and its collision pairs."""
+
+from __future__ import annotations
+
+import io
+import shlex
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from common.config import RobotConfig, check, config_root, load_cell, read_robot
+from common.robot.model import RobotModel
+from lab.simulation import Simulation
+from tests.harness import ROOT, ask
+from tests.small_arms import nodding, scara
+from tools.robot_setup.fingers import check_tool_frame
+
+URDF = ROOT / "tests" / "data" / "side_arm.urdf"
+TEXT = URDF.read_text()
+NO_ARM = '<robot name="post"><link name="a"/><link name="b"/><joint name="j" type="fixed">' \
+         '<parent link="a"/><child link="b"/></joint></robot>'
+NO_MESH = NO_ARM.replace('<link name="b"/>', '<link name="b"><collision><geometry><mesh filename="package://gone/b.stl"/>'
+                                             '</geometry></collision></link>')
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the files of a new robot."""
+    folder = tmp_path_factory.mktemp("new")
+    (folder / "side_arm.urdf").write_text(TEXT)
+    done = ask(folder, "robot", "new", "side_arm.urdf", "--yes", "--name", "side", "--cell", "side_cell.yaml")
+    assert done.returncode == 0, done.stderr
+    (folder / "output.txt").write_text(done.stdout)
+    return folder
+
+
+def test_tool_frame_and_home_pose_suit_the_hand(folder: Path) -> None:
+    robot = RobotModel.load(check(RobotConfig, read_robot(folder / "side.yaml"), "robot"))
+    assert robot.config.base_link == "foot"
+    assert robot.config.joints == ["turn", "lift", "bend", "roll", "pitch", "spin"]
+    assert robot.config.tcp is not None and robot.config.gripper is not None
+    assert robot.config.gripper.closing_axis == "y"
+    assert robot.config.gripper.max_width == pytest.approx(0.08)
+    assert check_tool_frame(robot) == []
+    home = robot.named("home")
+    poses = robot.link_poses(home)
+    T_flange_tcp = np.linalg.inv(poses["flange"]) @ poses[robot.config.tcp_link]
+    assert T_flange_tcp[:3, 2] == pytest.approx([1, 0, 0], abs=1e-5)  # no link of the URDF points that way
+    assert T_flange_tcp[:3, 3] == pytest.approx([0.10, 0, 0], abs=1e-4)  # a centimetre behind the tips
+    T_world_tcp = robot.fk(home)
+    assert T_world_tcp[2, 2] == pytest.approx(-1, abs=1e-3), "the tool points down"
+    assert T_world_tcp[0, 3] > 0.15 and abs(T_world_tcp[1, 3]) < 0.02, "in front of the base"
+    assert np.all(np.minimum(home - robot.lower, robot.upper - home) > 0.1)
+
+
+def test_guessed_limits_are_marked(folder: Path) -> None:
+    text, values = (folder / "side.yaml").read_text(), yaml.safe_load((folder / "side.yaml").read_text())
+    assert values["position_limits"][0] == pytest.approx([-np.pi, np.pi])
+    assert values["velocity_limits"] == [2, 2, 2, 3, 3, 1]
+    assert values["acceleration_limits"] == [4, 4, 4, 6, 6, 2]
+    assert values["jerk_limits"] == [80, 80, 80, 120, 120, 40]
+    for field in ("velocity_limits", "acceleration_limits", "jerk_limits"):
+        before = text[: text.index(f"\n{field}:")].rsplit("\n", 1)[-1]
+        assert before.startswith("# GUESSED"), field
+    output = (folder / "output.txt").read_text()
+    assert "guessed: velocity_limits of spin" in output
+    assert "next: zencell robot check side.yaml" in output and "zencell run side_cell.yaml" in output
+    assert "zencell up side_cell.yaml --set autostart=false" in output
+
+
+def test_check_compares_the_tool_with_the_fingers(folder: Path) -> None:
+    done = ask(folder, "robot", "check", "side.yaml")
+    assert (done.returncode, done.stderr) == (0, "") and "fingers close along its y" in done.stdout
+    (folder / "wrong.yaml").write_text((folder / "side.yaml").read_text().replace("closing_axis: y", "closing_axis: x"))
+    done = ask(folder, "robot", "check", "wrong.yaml")
+    assert done.returncode == 1
+    assert done.stdout.splitlines() == ["gripper.closing_axis: the fingers close along y of side_tcp, not along x"]
+    values = yaml.safe_load((folder / "side.yaml").read_text())
+    del values["tcp"]
+    (folder / "bare.yaml").write_text(yaml.safe_dump(values | {"tcp_link": "flange"}))
+    done = ask(folder, "robot", "check", "bare.yaml")
+    assert done.returncode == 1
+    assert "z of flange must point from the palm to the tips of the fingers, which is x" in done.stdout
+
+
+def test_files_are_overwritten_only_on_request(folder: Path) -> None:
+    before = (folder / "side.yaml").read_text()
+    done = ask(folder, "robot", "new", "side_arm.urdf", "--yes", "--name", "side")
+    assert done.returncode == 2
+    assert done.stderr.splitlines() == ["zencell: --out: 'side.yaml' is there already; --force overwrites it"]
+    assert (folder / "side.yaml").read_text() == before
+
+
+def test_name_is_asked_for_with_a_guess(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.stdin", io.StringIO("\n"))
+    done = ask(folder, "robot", "new", "side_arm.urdf")
+    assert done.returncode == 0, done.stderr
+    assert "name of the robot [side_arm]" in done.stdout
+    assert yaml.safe_load((folder / "side_arm.yaml").read_text())["name"] == "side_arm"
+    monkeypatch.setattr("sys.stdin", io.StringIO(""))
+    done = ask(folder, "robot", "new", "side_arm.urdf", "--force")
+    assert done.returncode == 2
+    assert done.stderr.splitlines()[-1] == "zencell: --yes: is needed where nobody answers: it takes the best guesses"
+
+
+def test_xacro_file_is_read_and_overwrites_no_urdf(tmp_path: Path) -> None:
+    pytest.importorskip("xacro")
+    head = '<robot name="x" xmlns:xacro="http://www.ros.org/wiki/xacro"><xacro:property name="speed" value="2.5"/>'
+    text = TEXT.replace('<robot name="side arm">', head).replace('velocity="3"', 'velocity="${speed}"')
+    (tmp_path / "arm.urdf.xacro").write_text(text)
+    done = ask(tmp_path, "robot", "new", "arm.urdf.xacro", "--yes")
+    assert done.returncode == 0, done.stderr
+    assert yaml.safe_load((tmp_path / "x.yaml").read_text())["velocity_limits"] == [2, 2, 2, 2.5, 2.5, 1]
+    done = ask(tmp_path, "robot", "new", "arm.urdf.xacro", "--yes", "--name", "y")
+    assert done.returncode == 2 and "arm.urdf, which is there already" in done.stderr
+
+
+@pytest.mark.parametrize(("text", "options", "wanted"), [
+    (None, "", ["bad.urdf", "is missing"]),
+    ("joint: 1", "", ["bad.urdf", "does not parse"]),
+    ("<sdf/>", "", ["its root is <sdf>"]),
+    (NO_ARM, "", ["bad.urdf", "no joint that moves"]),
+    (NO_MESH, "", ["package://gone/b.stl", "--package-dir"]),
+    (TEXT.replace('<box size="0.04 0.05 0.11"/>', '<mesh filename="bad.urdf"/>'), "", ["a mesh that cannot be loaded"]),
+    (TEXT.replace('lower="-1.5"', 'lower="3"'), "", ["'lift'", "needs limits"]),
+    (TEXT.replace('upper="2.6"', 'upper="${wide}"'), "", ["'bend'", "'${wide}'"]),
+    (TEXT.replace(' velocity="0"', ""), "", ["'spin'", "no velocity"]),
+    (TEXT, "--tip flnge", ["'flnge'", "did you mean 'flange'?"]),
+    (TEXT, "--tip foot", ["'foot'", "flange"]),
+    (TEXT, "--name 'my arm'", ["--name", "'my arm'"]),
+    (TEXT, "--out no/a.yaml", ["--out", "does not exist"]),
+    (TEXT, "--out a.srdf", ["--out", "'a.srdf'", ".yaml"]),
+    (TEXT, "--out a.yaml --cell ./a.yaml", ["--cell", "'./a.yaml'", "another"]),
+    (TEXT, f"--gripper {URDF}", ["--gripper", "upper_slide moves there already"]),
+    (TEXT, "--cell a.yaml --like ur5", ["outlining", "lays out no world"]),
+], ids=lambda value: ", ".join(value)[:40] if isinstance(value, list) else "")
+def test_unusable_description_or_option_is_one_line(
+    text: str | None, options: str, wanted: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    rejection: Callable[..., str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    if text is not None:
+        (tmp_path / "bad.urdf").write_text(text)
+    line = rejection("robot", "new", "bad.urdf", *shlex.split(options), "--yes")
+    assert not [word for word in wanted if word not in line], line
+
+
+def test_collision_pairs_are_written_or_shown_and_depend_on_the_seed(tmp_path: Path) -> None:
+    def collisions(robot: str, *options: str) -> str:
+        done = ask(tmp_path, "robot", "collisions", robot, *options)
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    written = collisions("panda", "--samples", "50", "-o", "panda.srdf")
+    assert written.startswith("panda.srdf: ") and "adjacent" in written and "never" in written
+    shown = collisions("panda", "--samples", "50")
+    assert shown == (tmp_path / "panda.srdf").read_text()
+    assert shown.startswith('<?xml version="1.0"?>\n<robot name="panda">')
+    texts = [collisions("ur5", "--samples", "3", "--seed", seed) for seed in ("0", "1", "0")]
+    assert texts[0] == texts[2] != texts[1]
+    text = (config_root() / "robots" / "panda.yaml").read_text()
+    line = next(line for line in text.splitlines() if line.startswith("srdf:"))
+    (tmp_path / "mine.yaml").write_text(text.replace(line, "srdf: mine.srdf"))  # which does not exist yet
+    collisions("mine.yaml", "--samples", "10", "-o", "mine.srdf")
+    assert (tmp_path / "mine.srdf").is_file()
+
+
+def clear_table(cell: Path, seed: int | None = None) -> None:
+    outcome = Simulation(load_cell(str(cell), seed=seed), 1).run()
+    assert (outcome.state, outcome.done, outcome.total) == ("DONE", 7, 7), outcome.message
+    assert (outcome.broken, outcome.crashes) == ([], [])
+
+
+@pytest.mark.slow
+def test_new_arm_clears_its_table(folder: Path) -> None:
+    clear_table(folder / "side_cell.yaml")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("arm", [scara, nodding, "package://example-robot-data/robots/z1_description/urdf/z1.urdf"])
+def test_arm_of_four_joints_or_with_one_jaw_clears_its_table(arm: Callable[[], str] | str, tmp_path: Path) -> None:
+    if not isinstance(arm, str):
+        (tmp_path / "arm.urdf").write_text(arm())
+    done = ask(tmp_path, "robot", "new", arm if isinstance(arm, str) else "arm.urdf", "--yes", "--name", "few",
+               "--cell", "few_cell.yaml")
+    assert done.returncode == 0, done.stderr
+    clear_table(tmp_path / "few_cell.yaml", seed=1)
+
+
+@pytest.mark.slow
+def test_commands_of_the_docs_set_up_an_arm_that_clears_its_table(tmp_path: Path) -> None:
+    page = (ROOT / "docs" / "robots.md").read_text()
+    block = page.split("```sh\n")[1].split("```")[0].replace("\\\n", " ")
+    commands = [shlex.split(line) for line in block.strip().splitlines()]
+    assert [command[:3] for command in commands[:2]] == [["zencell", "robot", "new"], ["zencell", "robot", "check"]]
+    for command in commands:
+        done = ask(tmp_path, *command[1:])
+        assert done.returncode == 0, done.stdout + done.stderr
+    assert "seed 1: DONE" in done.stdout
