@@ -32,8 +32,7 @@ def poses(count: int) -> list[np.ndarray]:
     while len(found) < count:
         q = HOME + rng.uniform(-0.3, 0.3, 7)
         board = invert(ROBOT.fk(q) @ T_TCP_CAMERA) @ T_WORLD_BOARD
-        corners = cv2.projectPoints(BOARD.corners, cv2.Rodrigues(board[:3, :3])[0], board[:3, 3], LENS.k,
-                                    np.array(LENS.d))[0][:, 0]
+        corners = LENS.project(board, BOARD.corners)
         if np.all((corners > 30) & (corners < (610, 450))):
             found.append(q)
     return found
@@ -76,10 +75,8 @@ def test_camera_at_the_hand_is_calibrated_from_a_folder(
     for n, q in enumerate(POSES):
         rest_at(collector, q, float(n))
         assert collector.add_image(n + 0.59, image(n)) == ""
-    camera = CameraFile(width=LENS.width, height=LENS.height, fx=LENS.fx, fy=LENS.fy, cx=LENS.cx, cy=LENS.cy,
-                        d=[*LENS.d])
     file, fixed = str(tmp_path / "camera.yaml"), str(tmp_path / "fixed.yaml")
-    camera.save(file)
+    LENS.camera().save(file)
     command = ["calibrate", "hand-eye", str(tmp_path / "views"), "--intrinsics", file]
     code, (output, error) = app.execute([*command, "--camera", "hand"]), capsys.readouterr()
     assert (code, error) == (0, "")

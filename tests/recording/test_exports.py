@@ -1,10 +1,12 @@
-"""What other programs get: Foxglove's schemas held, tables, pictures, a video."""
+"""Exports for other programs: Foxglove files, tables, images and a video."""
 
 import base64
 import csv
 import json
 import os
 from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -87,13 +89,13 @@ def test_messages_are_converted_to_foxglove_schemas(message: Message, schema: st
         assert value["timestamp"] == TIME
 
 
-def test_exported_image_has_the_recorded_pixels() -> None:
-    for encoding in ("bgr8", "rgb8"):
-        smooth = np.zeros((16, 16, 3), np.uint8)
-        smooth[..., 0] = 200
-        _, value = convert(array_to_image(smooth, encoding, HEADER))
-        pixels = cv2.imdecode(np.frombuffer(base64.b64decode(value["data"]), np.uint8), cv2.IMREAD_COLOR)
-        assert abs(int(pixels[8, 8, 0 if encoding == "bgr8" else 2]) - 200) < 5
+@pytest.mark.parametrize(("encoding", "blue"), [("bgr8", 0), ("rgb8", 2)])
+def test_exported_image_has_the_recorded_pixels(encoding: str, blue: int) -> None:
+    smooth = np.zeros((16, 16, 3), np.uint8)
+    smooth[..., 0] = 200
+    _, value = convert(array_to_image(smooth, encoding, HEADER))
+    pixels = cv2.imdecode(np.frombuffer(base64.b64decode(value["data"]), np.uint8), cv2.IMREAD_COLOR)
+    assert abs(int(pixels[8, 8, blue]) - 200) < 5
 
 
 def test_scene_replaces_the_one_before_and_attached_objects_move_with_their_link() -> None:
@@ -111,53 +113,24 @@ def image(number: int, pixels: np.ndarray, encoding: str = "bgr8", key: str = "p
     return Sample(key, packed(message), log_time, message="Image", writer="camera.1", sequence=number + 1)
 
 
-def foreign() -> Sample:
-    return Sample("panda/mine", b"\x81\xa1a\x01", START, message="Somebodys", kind="event")
-
-
-def test_foxglove_file_is_complete_and_skipped_messages_are_counted(tmp_path: Path) -> None:
-    source = write(tmp_path / "a.mcap", [joints(0), joints(1), status(2), image(3, PICTURE), foreign()])
-    decoder = Decoder()
-    with Recording(source) as recording:
-        count = foxglove.export_foxglove(recording, tmp_path / "f.mcap", lambda topic: True, decoder)
-    assert (count, decoder.skipped) == (4, Counter({"mine": 1}))
-    with (tmp_path / "f.mcap").open("rb") as file:
-        found = [(s.name, c.topic, c.message_encoding, msg.log_time) for s, c, msg in make_reader(file).iter_messages()]
-    assert found[0] == ("foxglove.JointStates", "panda/joint_states", "json", START)
-    assert [name for name, *_ in found] == [
-        "foxglove.JointStates", "foxglove.JointStates", "PickPlaceStatus", "foxglove.CompressedImage"]
-
-
-def test_foxglove_file_that_does_not_fit_on_the_disk_is_removed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    source = write(tmp_path / "a.mcap", [joints(n) for n in range(100)])
-    fill_disk(monkeypatch, 600)
-    with Recording(source) as recording, pytest.raises(RecordingError, match=r"f.mcap: cannot be written, the disk is"):
-        foxglove.export_foxglove(recording, tmp_path / "f.mcap", lambda topic: True, Decoder())
-    assert list(tmp_path.iterdir()) == [source]
-
-
-def custom_message(number: int) -> Sample:
-    """A message whose class is not here, with the schema that was recorded."""
+def custom(number: int) -> Sample:
+    """Return a message of an unknown class, with its recorded schema."""
     values = {"header": {"stamp": START + number, "frame_id": "w"}, "gloss": number / 4, "raw": b"\xff\x00"}
     return Sample("panda/gloss", msgpack.packb(values), START + number * STEP, message="Gloss", writer="polisher.1",
                   sequence=number + 1, schema=json.dumps({"title": "Gloss", "type": "object"}).encode())
 
 
-def test_messages_of_unknown_classes_are_exported_by_their_recorded_schema(tmp_path: Path) -> None:
-    cut = write(tmp_path / "a.mcap", [custom_message(0), custom_message(1), foreign()])
-    recover(cut, tmp_path / "b.mcap")
-    decoder = Decoder()
-    with Recording(tmp_path / "b.mcap") as recording:
-        assert export.export_tables(recording, tmp_path / "csv", lambda topic: True, decoder) == {"gloss.csv": 2}
-        assert foxglove.export_foxglove(recording, tmp_path / "f.mcap", lambda topic: True, decoder) == 2
-    assert set(decoder.skipped) == {"mine"}
-    assert [row["gloss"] for row in table(tmp_path / "csv" / "gloss.csv")] == ["0.0", "0.25"]
-    with (tmp_path / "f.mcap").open("rb") as file:
-        schema, _, message = next(iter(make_reader(file).iter_messages()))
-    assert (schema.name, json.loads(schema.data)["title"]) == ("Gloss", "Gloss")
-    assert base64.urlsafe_b64decode(json.loads(message.data)["raw"]) == b"\xff\x00"
+FOREIGN = Sample("panda/mine", b"\x81\xa1a\x01", START, message="Foreign", kind="event")
+
+
+@pytest.fixture
+def recorded(tmp_path: Path) -> Iterator[Callable[..., Recording]]:
+    with ExitStack() as stack:
+        yield lambda *samples: stack.enter_context(Recording(write(tmp_path / "a.mcap", list(samples))))
+
+
+def every(topic: str) -> bool:
+    return True
 
 
 def table(path: Path) -> list[dict[str, str]]:
@@ -165,10 +138,37 @@ def table(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def test_tables_have_a_row_for_each_message_and_a_column_for_each_joint(tmp_path: Path) -> None:
-    source = write(tmp_path / "a.mcap", [f(n) for n in range(5) for f in (joints, status)] + [image(9, PICTURE)])
-    with Recording(source) as recording:
-        counts = export.export_tables(recording, tmp_path / "csv", lambda topic: True, Decoder())
+def messages_of(path: Path) -> list[tuple[Any, Any, Any]]:
+    with path.open("rb") as file:
+        return list(make_reader(file).iter_messages())
+
+
+def test_foxglove_file_is_complete_and_skipped_messages_are_counted(tmp_path: Path, recorded) -> None:
+    recording, decoder = recorded(joints(0), joints(1), status(2), image(3, PICTURE), FOREIGN), Decoder()
+    assert foxglove.export_foxglove(recording, tmp_path / "f.mcap", every, decoder) == 4
+    assert decoder.skipped == Counter({"mine": 1})
+    found = [(s.name, c.topic, c.message_encoding, m.log_time) for s, c, m in messages_of(tmp_path / "f.mcap")]
+    assert found[0] == ("foxglove.JointStates", "panda/joint_states", "json", START)
+    assert [name for name, *_ in found] == [
+        "foxglove.JointStates", "foxglove.JointStates", "PickPlaceStatus", "foxglove.CompressedImage"]
+
+
+def test_messages_of_unknown_classes_are_exported_by_their_recorded_schema(tmp_path: Path) -> None:
+    recover(write(tmp_path / "a.mcap", [custom(0), custom(1), FOREIGN]), tmp_path / "b.mcap")
+    decoder = Decoder()
+    with Recording(tmp_path / "b.mcap") as recording:
+        assert export.export_tables(recording, tmp_path / "csv", every, decoder) == {"gloss.csv": 2}
+        assert foxglove.export_foxglove(recording, tmp_path / "f.mcap", every, decoder) == 2
+    assert set(decoder.skipped) == {"mine"}
+    assert [row["gloss"] for row in table(tmp_path / "csv" / "gloss.csv")] == ["0.0", "0.25"]
+    schema, _, message = messages_of(tmp_path / "f.mcap")[0]
+    assert (schema.name, json.loads(schema.data)["title"]) == ("Gloss", "Gloss")
+    assert base64.urlsafe_b64decode(json.loads(message.data)["raw"]) == b"\xff\x00"
+
+
+def test_tables_have_a_row_for_each_message_and_a_column_for_each_joint(tmp_path: Path, recorded) -> None:
+    recording = recorded(*(f(n) for n in range(5) for f in (joints, status)), image(9, PICTURE))
+    counts = export.export_tables(recording, tmp_path / "csv", every, Decoder())
     assert counts == {"joint_states.csv": 5, "pick_place_status.csv": 5}
     rows = table(tmp_path / "csv" / "joint_states.csv")
     assert list(rows[0]) == ["time", "stamp", "a.position", "b.position", "a.velocity", "b.velocity"]
@@ -178,11 +178,10 @@ def test_tables_have_a_row_for_each_message_and_a_column_for_each_joint(tmp_path
     assert [row["placed"] for row in states] == list("01234") and states[0]["plans"] == "[]"
 
 
-def test_png_files_have_the_recorded_pixels(tmp_path: Path) -> None:
+def test_png_files_have_the_recorded_pixels(tmp_path: Path, recorded) -> None:
     depth = image(1, DEPTH, "32FC1", "panda/depth_camera/depth/image_raw")
-    source = write(tmp_path / "a.mcap", [image(0, PICTURE), depth, image(2, PICTURE[..., ::-1].copy(), "rgb8")])
-    with Recording(source) as recording:
-        counts = export.export_images(recording, tmp_path / "png", lambda topic: True, Decoder())
+    recording = recorded(image(0, PICTURE), depth, image(2, PICTURE[..., ::-1].copy(), "rgb8"))
+    counts = export.export_images(recording, tmp_path / "png", every, Decoder())
     assert counts == {"camera/image_raw": 2, "depth_camera/depth/image_raw": 1}
     for path in sorted((tmp_path / "png" / "camera_image_raw").iterdir()):
         assert np.array_equal(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), PICTURE)
@@ -191,25 +190,25 @@ def test_png_files_have_the_recorded_pixels(tmp_path: Path) -> None:
     assert np.array_equal(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), np.full((6, 8), 1250, np.uint16))
 
 
-def test_video_has_every_image_at_the_recorded_rate(tmp_path: Path) -> None:
+def test_video_has_every_image_at_the_recorded_rate(tmp_path: Path, recorded) -> None:
     pixels = np.zeros((64, 80, 3), np.uint8)
-    source = write(tmp_path / "a.mcap", [image(n, pixels + np.uint8(20 * n)) for n in range(10)])
-    with Recording(source) as recording:
-        count, rate = export.export_video(recording, tmp_path / "v.mp4", "camera/image_raw", Decoder())
+    recording = recorded(*(image(n, pixels + np.uint8(20 * n)) for n in range(10)))
+    assert export.export_video(recording, tmp_path / "v.mp4", "camera/image_raw", Decoder()) == (10, 10.0)
     video = cv2.VideoCapture(str(tmp_path / "v.mp4"))
-    assert (count, rate) == (10, 10.0)
     assert (video.get(cv2.CAP_PROP_FRAME_COUNT), video.get(cv2.CAP_PROP_FPS)) == (10, 10)
     frames = [video.read()[1] for _ in range(10)]
     assert abs(int(frames[9][32, 40, 1]) - 180) < 6
     video.release()
 
 
-def test_video_that_does_not_fit_on_the_disk_is_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    source, target = write(tmp_path / "a.mcap", [image(n, PICTURE) for n in range(10)]), tmp_path / "v.mp4"
-    open_writer = cv2.VideoWriter
+def test_file_that_does_not_fit_on_the_disk_is_removed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, recorded
+) -> None:
+    recording = recorded(*(image(n, PICTURE) for n in range(10)))
+    open_writer, target = cv2.VideoWriter, tmp_path / "v.mp4"
 
-    class Cut:
-        """Writes to a disk that takes the first 40 bytes, of which OpenCV says nothing."""
+    class Truncated:
+        """Write to a disk that takes the first 40 bytes, which OpenCV does not report."""
 
         fourcc = open_writer.fourcc
 
@@ -221,29 +220,27 @@ def test_video_that_does_not_fit_on_the_disk_is_removed(tmp_path: Path, monkeypa
             self.inner.release()
             os.truncate(target, 40)
 
-    monkeypatch.setattr(export.cv2, "VideoWriter", Cut)
-    with Recording(source) as recording, pytest.raises(RecordingError, match=r"v.mp4: cannot be written"):
+    monkeypatch.setattr(export.cv2, "VideoWriter", Truncated)
+    with pytest.raises(RecordingError, match=r"v.mp4: cannot be written"):
         export.export_video(recording, target, "camera/image_raw", Decoder())
-    assert list(tmp_path.iterdir()) == [source]
+    fill_disk(monkeypatch, 600)
+    with pytest.raises(RecordingError, match=r"f.mcap: cannot be written, the disk is"):
+        foxglove.export_foxglove(recording, tmp_path / "f.mcap", every, Decoder())
+    assert [path.name for path in tmp_path.iterdir()] == ["a.mcap"]
 
 
-def test_video_of_a_depth_topic_is_rejected(tmp_path: Path) -> None:
-    source = write(tmp_path / "a.mcap", [image(0, DEPTH, "32FC1")])
-    with Recording(source) as recording, pytest.raises(RecordingError, match="has no color image"):
-        export.export_video(recording, tmp_path / "v.mp4", "camera/image_raw", Decoder())
+def test_video_of_a_depth_topic_is_rejected(tmp_path: Path, recorded) -> None:
+    with pytest.raises(RecordingError, match="has no color image"):
+        export.export_video(
+            recorded(image(0, DEPTH, "32FC1")), tmp_path / "v.mp4", "camera/image_raw", Decoder())
 
 
-def test_field_that_a_class_no_longer_has_is_ignored() -> None:
+def test_removed_field_is_ignored_and_an_invalid_payload_is_counted() -> None:
     decoder = Decoder()
     values = {**msgpack.unpackb(joints(0).payload), "torque_of_old": 1}
     values["header"]["sequence_of_old"] = 7
     message = decoder.message(joints(0, payload=msgpack.packb(values)))
-    assert message == decoder.message(joints(0)) and not decoder.skipped
-
-
-def test_invalid_payload_is_counted_and_left_out() -> None:
-    decoder = Decoder()
-    assert decoder.message(joints(0)) is not None
+    assert message is not None and message == decoder.message(joints(0)) and not decoder.skipped
     assert decoder.message(joints(0, payload=b"\xc1")) is None
     other = packed(Image(header=HEADER, height=1, width=1, encoding="x", data=b""))
     assert decoder.message(joints(0, payload=other)) is None

@@ -1,4 +1,4 @@
-"""What is written is what is read: by us and by the library's own reader."""
+"""Recordings are read as they were written, by zencell and by the reader of the mcap library."""
 
 import json
 from dataclasses import replace
@@ -20,11 +20,15 @@ from tests.recording.samples import START, STEP, joints, status, write
 texts = st.text(st.characters(codec="utf-8", exclude_characters="/"), min_size=1, max_size=8)
 anything = st.builds(
     Sample, key=texts.map(lambda text: f"panda/{text}"), payload=st.binary(max_size=200),
-    log_time=st.integers(1, 2**62), publish_time=st.integers(1, 2**62),
-    message=st.sampled_from(["", "Image", "Somebodys"]),
+    log_time=st.integers(1, 2**62), publish_time=st.integers(1, 2**62), message=st.sampled_from(["", "Image", "Mine"]),
     kind=st.sampled_from(["stream", "event", "state"]), writer=texts, sequence=st.integers(0, 2**32 - 1),
     trace=st.sampled_from(["", "abc"]),
 )
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "a.mcap"
 
 
 @given(st.lists(anything, max_size=30, unique_by=lambda s: (s.key, s.writer, s.sequence)), st.integers(1, 7))
@@ -33,14 +37,12 @@ def test_samples_are_read_as_they_were_written(
 ) -> None:
     path = write(tmp_path_factory.mktemp("files") / "a.mcap", samples, every=every)
     with Recording(path) as recording:
-        assert recording.finished
-        assert recording.cell == "panda"
+        assert recording.finished and recording.cell == "panda"
         assert list(recording.samples()) == samples
 
 
-def test_payloads_are_plain_msgpack_with_the_schema_of_their_class(tmp_path: Path) -> None:
-    path = write(tmp_path / "a.mcap", [joints(0), status(1)])
-    with path.open("rb") as file:
+def test_payloads_are_plain_msgpack_with_the_schema_of_their_class(path: Path) -> None:
+    with write(path, [joints(0), status(1)]).open("rb") as file:
         reader = make_reader(file)
         found = {channel.topic: (schema, channel, message) for schema, channel, message in reader.iter_messages()}
         summary = reader.get_summary()
@@ -51,111 +53,96 @@ def test_payloads_are_plain_msgpack_with_the_schema_of_their_class(tmp_path: Pat
     assert (message.log_time, message.publish_time, message.sequence) == (START, START - 1_000_000, 1)
     assert channel.metadata == {"kind": "stream", "writer": "executor.1"}
     assert summary.statistics.message_count == 3  # with the one that holds the traces
+    assert message_of("application/msgpack;Image") == "Image" and message_of("zenoh/bytes") == ""
+    assert (encoding_of("Image"), encoding_of("")) == ("application/msgpack;Image", "application/msgpack")
 
 
-def test_each_writer_of_a_key_has_a_channel(tmp_path: Path) -> None:
-    second = joints(1, writer="executor.2", sequence=1)
-    path = write(tmp_path / "a.mcap", [joints(0), second])
-    with Recording(path) as recording:
-        assert [sample.writer for sample in recording.samples()] == ["executor.1", "executor.2"]
-
-
-def test_flushed_messages_can_be_read_while_the_file_is_written(tmp_path: Path) -> None:
-    writer = RecordingWriter(tmp_path / "a.mcap", {"cell": "panda"})
+def test_flushed_messages_can_be_read_while_the_file_is_written(path: Path) -> None:
+    writer = RecordingWriter(path, {"cell": "panda"})
     for number in range(5):
         writer.add(joints(number))
     writer.flush()
     writer.add(joints(5))
-    with Recording(tmp_path / "a.mcap") as recording:
+    with Recording(path) as recording:
         assert not recording.finished
         assert list(recording.samples()) == [
-            replace(joints(n), publish_time=START + n * STEP - 1_000_000) for n in range(5)
-        ]
+            replace(joints(n), publish_time=START + n * STEP - 1_000_000) for n in range(5)]
         assert recording.topics() == {"joint_states": ("JointState", "stream")}
     writer.close()
 
 
-def test_samples_are_selected_by_topic_and_time(tmp_path: Path) -> None:
-    path = write(tmp_path / "a.mcap", [f(n) for n in range(30) for f in (joints, status)], every=6)
-    with Recording(path) as recording:
+def test_samples_are_selected_by_topic_and_time(path: Path) -> None:
+    with Recording(write(path, [f(n) for n in range(30) for f in (joints, status)], every=6)) as recording:
         found = list(recording.samples(lambda topic: topic == "joint_states", START + 20 * STEP))
         assert [sample.sequence for sample in found] == list(range(21, 31))
         assert recording.seconds == pytest.approx(0.29)
 
 
 def test_truncated_file_is_read_selectively_once_its_channels_are_known(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    writer = RecordingWriter(tmp_path / "a.mcap", {"cell": "panda"})
+    writer = RecordingWriter(path, {"cell": "panda"})
     for number in range(20):
         writer.add(joints(number))
         writer.flush()
     writer.abandon()
     read = []
-    with Recording(tmp_path / "a.mcap") as recording:
+    with Recording(path) as recording:
         records = recording._records
         monkeypatch.setattr(recording, "_records", lambda place: read.append(place) or records(place))
-        for asked, most in (("first", 20), ("again", 4)):
+        for attempt, most in (("first", 20), ("again", 4)):
             read.clear()
             found = recording.samples(since=START + 8 * STEP, until=START + 11 * STEP)
-            assert [sample.sequence for sample in found] == [9, 10, 11, 12], asked
+            assert [sample.sequence for sample in found] == [9, 10, 11, 12], attempt
             assert len(read) == most
 
 
-def test_states_before_a_time_are_the_newest_of_each_key(tmp_path: Path) -> None:
+def test_states_before_a_time_are_the_newest_of_each_key_and_its_writers(path: Path) -> None:
     restarted = status(3, writer="task.2", sequence=1)
     other = status(1, key="panda/gripper/state", message="GripperState")
-    path = write(tmp_path / "a.mcap", [status(0), other, joints(2), restarted, status(4)], every=1)
-    with Recording(path) as recording:
+    with Recording(write(path, [status(0), other, joints(2), restarted, status(4)], every=1)) as recording:
+        assert [sample.writer for sample in recording.samples()] == [
+            "task.1", "task.1", "executor.1", "task.2", "task.1"]
         found = recording.states_before(START + 4 * STEP)
         assert [(sample.key, sample.writer) for sample in found] == [
             ("panda/gripper/state", "task.1"), ("panda/pick_place_status", "task.2")]
         assert recording.states_before(START) == []
 
 
-def test_each_file_of_a_split_recording_is_usable_alone(tmp_path: Path) -> None:
-    writer = SplitWriter(tmp_path / "a.mcap", {"cell": "panda"}, max_bytes=6000)
+def test_each_file_of_a_split_recording_is_usable_alone(path: Path) -> None:
+    writer = SplitWriter(path, {"cell": "panda"}, max_bytes=6000)
     writer.describe("run", {"seed": 3})
     writer.add(status(0, "GRASPING"))
     for number in range(1, 40):
         writer.add(joints(number))
         writer.flush()
     writer.close({"reason": "test"})
-    assert len(writer.files) > 2
-    assert writer.files[0].name == "a_0.mcap"
-    came: list[int] = []
+    assert len(writer.files) > 2 and writer.files[0].name == "a_0.mcap"
+    sequences: list[int] = []
     for file in writer.files:
         with Recording(file) as recording:
             first, *rest = recording.samples()
             assert recording.finished and recording.metadata("run") == {"seed": 3}
             assert first.payload == status(0, "GRASPING").payload
             assert all(START <= first.log_time <= sample.log_time for sample in rest)
-            came += [sample.sequence for sample in rest]
-    assert came == list(range(2, 41))
+            sequences += [sample.sequence for sample in rest]
+    assert sequences == list(range(2, 41))
     assert writer.size == sum(file.stat().st_size for file in writer.files)
 
 
-def test_existing_file_is_not_overwritten(tmp_path: Path) -> None:
-    path = write(tmp_path / "a.mcap", [joints(0)])
+def test_existing_file_is_not_overwritten_and_other_files_are_rejected(path: Path) -> None:
+    with pytest.raises(RecordingError, match="no such file"):
+        Recording(path)
     with pytest.raises(RecordingError, match="exists already"):
-        RecordingWriter(path, {})
-
-
-@pytest.mark.parametrize(("content", "why"), [(None, "no such file"), (b"hello world", "is no MCAP file")])
-def test_file_that_is_no_recording_is_rejected(tmp_path: Path, content: bytes | None, why: str) -> None:
-    path = tmp_path / "a.mcap"
-    if content is not None:
-        path.write_bytes(content)
-    with pytest.raises(RecordingError, match=why):
+        RecordingWriter(write(path, [joints(0)]), {})
+    path.write_bytes(b"hello world")
+    with pytest.raises(RecordingError, match="is no MCAP file"):
         Recording(path)
 
 
-def test_summary_counts_messages_and_losses_by_topic(tmp_path: Path) -> None:
-    writer = RecordingWriter(tmp_path / "a.mcap", {"cell": "panda"})
-    for number in range(11):
-        writer.add(joints(number))
-    writer.close({"dropped": {"panda/joint_states": 2}, "missed": {"panda/camera/image_raw": 3}})
-    with Recording(tmp_path / "a.mcap") as recording:
+def test_summary_counts_messages_and_losses_by_topic(path: Path) -> None:
+    lost = {"dropped": {"panda/joint_states": 2}, "missed": {"panda/camera/image_raw": 3}}
+    with Recording(write(path, [joints(number) for number in range(11)], ended=lost)) as recording:
         summary = summarise(recording)
     topic = summary.topics["joint_states"]
     assert (topic.messages, topic.type, topic.kind, topic.dropped) == (11, "JointState", "stream", 2)
@@ -167,18 +154,11 @@ def test_summary_counts_messages_and_losses_by_topic(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("cell", ["panda", "1", "true", "null", "k\u00fcche", "a.b-c_2"])
-def test_cell_name_is_read_as_text(tmp_path: Path, cell: str) -> None:
+def test_cell_name_is_read_as_text(path: Path, cell: str) -> None:
     assert is_cell(cell)
-    RecordingWriter(tmp_path / "a.mcap", {"cell": cell}).close()
-    with Recording(tmp_path / "a.mcap") as recording:
+    RecordingWriter(path, {"cell": cell}).close()
+    with Recording(path) as recording:
         assert recording.cell == cell
-
-
-def test_encoding_names_the_message_class() -> None:
-    assert message_of("application/msgpack;Image") == "Image"
-    assert message_of("zenoh/bytes") == ""
-    assert encoding_of("Image") == "application/msgpack;Image"
-    assert encoding_of("") == "application/msgpack"
 
 
 def test_repetitions_are_dropped_and_gaps_counted() -> None:
@@ -188,19 +168,19 @@ def test_repetitions_are_dropped_and_gaps_counted() -> None:
     assert sequences.is_new("k", "restarted", 1)
 
 
-def test_many_tiny_messages_can_be_read(tmp_path: Path) -> None:
-    samples = [joints(number, payload=b"\x80") for number in range(60_000)]
-    with Recording(write(tmp_path / "a.mcap", samples, every=len(samples))) as recording:
+def test_many_tiny_messages_can_be_read(path: Path) -> None:
+    tiny = joints(0, payload=b"\x80")
+    with Recording(write(path, [tiny] * 60_000, every=60_000)) as recording:
         assert sum(1 for _ in recording.samples()) == 60_000
 
 
-def test_tiny_messages_under_many_and_long_keys_can_be_read(tmp_path: Path) -> None:
-    writer = RecordingWriter(tmp_path / "a.mcap", {"cell": "panda"})
-    for turn in range(12):
-        for number in range(2000):
-            assert writer.add(joints(2000 * turn + number, key=f"panda/made/up/{number}", payload=b"\x80"))
+def test_tiny_messages_under_many_and_long_keys_can_be_read(path: Path) -> None:
+    writer, samples = RecordingWriter(path, {"cell": "panda"}), [
+        joints(number, key=f"panda/made/up/{number}", payload=b"\x80") for number in range(2000)]
+    for _ in range(12):
+        assert all(map(writer.add, samples))
         writer.flush()
     assert not writer.add(joints(0, key="panda/made/up/0" + 500 * "p"))
     writer.close()
-    with Recording(tmp_path / "a.mcap") as recording:
+    with Recording(path) as recording:
         assert sum(1 for _ in recording.samples()) == 24_000
