@@ -9,6 +9,7 @@ import subprocess
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +37,12 @@ def run(
     )
     assert done.returncode == 0 or not check, f"{' '.join(command)}:\n{done.stdout[-2000:]}\n{done.stderr[-2000:]}"
     return done.stdout
+
+
+@cache
+def build_image() -> None:
+    """Build the image of all services, once."""
+    run("docker", "compose", "-p", "zencell-test", "build", "router", timeout=800)
 
 
 @dataclass
@@ -71,10 +78,14 @@ class Containers:
         assert done.returncode, f"{' '.join(arguments)} did not fail: {done.stdout[-2000:]}"
         return done.stderr
 
+    def inspect_all(self, *services: str) -> dict[str, dict[str, Any]]:
+        """Return what the engine knows about the containers, by service."""
+        containers = self.compose("ps", "-a", "-q", *services).split()
+        found: list[dict[str, Any]] = json.loads(run("docker", "inspect", *containers))
+        return {each["Config"]["Labels"]["com.docker.compose.service"]: each for each in found}
+
     def inspect(self, service: str) -> dict[str, Any]:
-        container = self.compose("ps", "-a", "-q", service).strip()
-        found: list[dict[str, Any]] = json.loads(run("docker", "inspect", container))
-        return found[0]
+        return self.inspect_all(service)[service]
 
     def health(self, service: str) -> str:
         """Return the engine's health status: starting, healthy or unhealthy."""

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from common.config import load_cell
-from tests.deploy.engine import Containers, require_engine, run
+from tests.deploy.engine import Containers, build_image, require_engine, run
 
 pytestmark = [pytest.mark.container, pytest.mark.timeout(900)]
 
@@ -26,7 +26,7 @@ SERVICES = ["router", *(f"panda-{entry.name}" for entry in load_cell("panda").se
 def cell() -> Iterator[Containers]:
     require_engine()
     with Containers("zencell-test", environment={"ZENCELL_PAGE": PAGE_PORT}) as containers:
-        containers.compose("build", timeout=800)
+        build_image()
         containers.compose("up", "-d", "--no-build", timeout=180)
         yield containers
 
@@ -46,44 +46,40 @@ def test_compose_up_clears_the_table(cell: Containers) -> None:
     assert status_on_host(cell)["placed"] == 7
 
 
-@pytest.mark.parametrize("service", SERVICES)
-def test_every_container_is_healthy_and_unprivileged(cell: Containers, service: str) -> None:
-    cell.wait_for(f"{service} is healthy", lambda: cell.health(service) == "healthy", 60)
-    found = cell.inspect(service)
-    assert found["HostConfig"]["ReadonlyRootfs"]
-    assert cell.compose("exec", "-T", service, "id", "-u").strip() != "0"
+def test_every_container_is_healthy_and_unprivileged_and_only_the_page_is_published(cell: Containers) -> None:
+    def unhealthy() -> list[str]:
+        found = cell.inspect_all()
+        return [service for service in SERVICES if found[service]["State"]["Health"]["Status"] != "healthy"]
 
-
-def test_only_the_page_is_published_and_only_to_this_machine(cell: Containers) -> None:
+    cell.wait_for("every service is healthy", lambda: not unhealthy(), 60)
+    found = cell.inspect_all()
+    assert set(found) == set(SERVICES)
+    assert all(each["HostConfig"]["ReadonlyRootfs"] for each in found.values())
+    assert not {each["Config"]["User"].partition(":")[0] for each in found.values()} & {"", "0", "root"}
+    assert cell.compose("exec", "-T", "router", "id", "-u").strip() != "0"
     published = {
-        (service, port["HostIp"], port["HostPort"])
-        for service in SERVICES
-        for ports in cell.inspect(service)["NetworkSettings"]["Ports"].values() for port in ports or ()
+        (service, port["HostIp"], port["HostPort"]) for service, each in found.items()
+        for ports in each["NetworkSettings"]["Ports"].values() for port in ports or ()
     }
     assert published == {("panda-viewer", "127.0.0.1", PAGE_PORT)}
 
 
-def test_image_is_small_and_contains_no_build_tools(cell: Containers) -> None:
+def test_image_is_small_and_contains_the_planning_kernel_but_no_build_tools(cell: Containers) -> None:
+    def shell(script: str) -> str:
+        return cell.compose("exec", "-T", "router", "sh", "-c", script).strip()
+
     size = int(run("docker", "image", "inspect", "-f", "{{.Size}}", "zencell"))
     assert size < MOST_MEGABYTES * 1e6
-    missing = cell.compose("exec", "-T", "router", "sh", "-c", "command -v gcc cc make pip zig; true").strip()
-    assert missing.replace("/usr/local/bin/pip", "") == ""
-    robots = cell.compose(
-        "exec", "-T", "router", "sh", "-c", "ls $(python -c 'import pathlib, cmeel; print(pathlib.Path("
-        "cmeel.__file__).parents[1])')/cmeel.prefix/share/example-robot-data/robots",
-    ).split()
-    assert sorted(robots) == ["panda_description", "ur_description"]
-
-
-def test_image_contains_the_planning_kernel_but_no_compiler(cell: Containers) -> None:
-    assert "ok    planning kernel: planning_kernel" in cell.compose("exec", "-T", "router", "zencell", "doctor")
-    packages = cell.compose("exec", "-T", "router", "sh", "-c", "ls /opt/zencell/lib/python3*/site-packages")
+    tools = shell("command -v gcc cc make pip zig; true")
+    assert tools.replace("/usr/local/bin/pip", "") == ""
+    robots = shell("ls $(python -c 'import pathlib, cmeel; print(pathlib.Path("
+                   "cmeel.__file__).parents[1])')/cmeel.prefix/share/example-robot-data/robots")
+    assert sorted(robots.split()) == ["panda_description", "ur_description"]
+    packages = shell("ls /opt/zencell/lib/python3*/site-packages")
     assert "pydantic" in packages and "ziglang" not in packages
-
-
-def test_configuration_is_read_only_in_containers(cell: Containers) -> None:
-    output = cell.compose("exec", "-T", "router", "sh", "-c", "(echo x >> /app/config/cells/panda.yaml) 2>&1; true")
-    assert "Read-only" in output or "denied" in output
+    assert "ok    planning kernel: planning_kernel" in shell("zencell doctor")
+    output = shell("(echo x >> /app/config/cells/panda.yaml) 2>&1; true")
+    assert "Read-only" in output or "denied" in output, "the configuration is read-only"
 
 
 def test_killed_service_is_restarted(cell: Containers) -> None:

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from tests.deploy.engine import Containers, require_engine
+from tests.deploy.engine import Containers, build_image, require_engine
 
 pytestmark = [pytest.mark.container, pytest.mark.timeout(900)]
 
@@ -21,7 +21,7 @@ def cell() -> Iterator[Containers]:
     """The router and one service, ready."""
     require_engine()
     with Containers("zencell-test-frozen") as containers:
-        containers.compose("build", "router", timeout=800)
+        build_image()
         containers.compose("up", "-d", "--no-build", "router", SERVICE, timeout=180)
         containers.wait_for("it is ready", lambda: containers.is_ready(SERVICE), PATIENCE)
         yield containers

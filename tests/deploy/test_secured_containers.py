@@ -1,4 +1,4 @@
-"""compose.secure.yaml for real: who shows the operator's certificate is let in, who shows none is not."""
+"""compose.secure.yaml in an engine: the operator's certificate gives access, and no certificate gives none."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 
 from deploy.containers import USER
 from deploy.generate import ROOT
-from tests.deploy.engine import Containers, require_engine, run
+from tests.deploy.engine import Containers, build_image, require_engine, run
 
 pytestmark = [pytest.mark.container, pytest.mark.timeout(900)]
 
@@ -27,7 +27,7 @@ def cell(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Containers]:
     folder = tmp_path_factory.mktemp("certificates")
     files = ("compose.yaml", "compose.secure.yaml")
     with Containers(PROJECT, files, ROOT, {"ZENCELL_CERTS": str(folder / "certs")}) as containers:
-        containers.compose("build", "router", timeout=800)
+        build_image()
         own(folder, USER)
         run("docker", "run", "--rm", "-v", f"{folder}:/made", "zencell", "zencell", "secure", "init", "/made/certs",
             "--host", "router", timeout=200)

@@ -1,4 +1,4 @@
-"""compose.dev.yaml for real: a service starts again when its source changes, and waits where that does not parse."""
+"""compose.dev.yaml in an engine: a service restarts when its source changes, and waits while that does not parse."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pictures of a board, rendered with a camera that is known exactly, lens and all."""
+"""Images of a board, rendered with a known camera and lens."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -6,6 +6,7 @@ from functools import cache
 import cv2
 import numpy as np
 
+from common.perception.camera_file import CameraFile
 from common.perception.pinhole import Pinhole
 from common.robot.transforms import invert, rpy_to_matrix, transform
 from common.sim.rendering import RIM_WIDTH
@@ -17,7 +18,7 @@ FINER = 2  # rays along each side of a pixel
 
 @dataclass(frozen=True)
 class Lens:
-    """The truth."""
+    """The true intrinsics."""
 
     fx: float = 533.0
     fy: float = 529.0
@@ -31,8 +32,17 @@ class Lens:
     def k(self):
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1.0]])
 
+    def camera(self):
+        return CameraFile(width=self.width, height=self.height, fx=self.fx, fy=self.fy, cx=self.cx, cy=self.cy,
+                          d=list(self.d))
+
+    def project(self, T_camera_board, points):
+        """Return the pixels of points (n, 3) on a board."""
+        rotation = cv2.Rodrigues(T_camera_board[:3, :3])[0]
+        return cv2.projectPoints(points, rotation, T_camera_board[:3, 3], self.k, np.array(self.d))[0][:, 0]
+
     def pixels(self):
-        """(height * FINER, width * FINER, 2): each pixel in FINER x FINER parts."""
+        """Return each pixel in FINER x FINER parts: (height * FINER, width * FINER, 2)."""
         part = (np.arange(FINER) + 0.5) / FINER - 0.5
         u = (np.arange(self.width)[:, None] + part).ravel()
         v = (np.arange(self.height)[:, None] + part).ravel()
@@ -40,7 +50,7 @@ class Lens:
 
     @cache  # noqa: B019 -- a few lenses, and they live as long as the tests
     def rays(self):
-        """(height * FINER, width * FINER, 2): x and y of the ray of each part of a pixel, at z = 1."""
+        """Return x and y of the ray of each part of a pixel, at z = 1: (height * FINER, width * FINER, 2)."""
         pixels = self.pixels()
         criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-10)
         rays = cv2.undistortPoints(pixels.reshape(-1, 1, 2), self.k, np.array(self.d), criteria=criteria)
@@ -48,17 +58,16 @@ class Lens:
 
 
 def render(board: Board, lens: Lens, T_camera_board, *, blur=0.5, noise=2.0, seed=0, background=110):
-    """The bgr8 picture of a board at that pose in the optical frame."""
+    """Return the bgr8 image of a board at a pose in the optical frame."""
     page, density, margin = printed(board)
     parts = np.full((lens.height * FINER, lens.width * FINER), background, np.float32)
     w, h = board.size
     corners = np.array([[-margin, -margin, 0], [w + margin, -margin, 0], [w + margin, h + margin, 0],
                         [-margin, h + margin, 0]])
-    outline, _ = cv2.projectPoints(corners, cv2.Rodrigues(T_camera_board[:3, :3])[0], T_camera_board[:3, 3], lens.k,
-                                   np.array(lens.d))
+    outline = lens.project(T_camera_board, corners)
     limit = np.array([lens.width, lens.height])
-    low = (np.clip(outline[:, 0].min(axis=0) - 12, 0, limit) * FINER).astype(int)
-    high = (np.clip(outline[:, 0].max(axis=0) + 12, 0, limit) * FINER).astype(int)
+    low = (np.clip(outline.min(axis=0) - 12, 0, limit) * FINER).astype(int)
+    high = (np.clip(outline.max(axis=0) + 12, 0, limit) * FINER).astype(int)
     where = slice(low[1], high[1]), slice(low[0], high[0])
     rays = lens.rays()[where]
     T = invert(T_camera_board)
@@ -76,7 +85,7 @@ def render(board: Board, lens: Lens, T_camera_board, *, blur=0.5, noise=2.0, see
 
 @cache
 def printed(board: Board):
-    """The page of a board, its density [px/m] and its upper left margin [m]; coarser than a printer's."""
+    """Return the page of a board, coarser than a printer's, its density [px/m] and its upper left margin [m]."""
     page, density = board.page()
     margin = (page.shape[1] / density - board.size[0]) / 2
     height, width = page.shape
@@ -86,7 +95,7 @@ def printed(board: Board):
 
 
 def develop(parts, blur, noise, seed, lens):
-    """From parts of pixels to a picture, with blur [px] and noise."""
+    """Return an image from parts of pixels, with blur [px] and noise."""
     picture = cv2.resize(parts, (lens.width, lens.height), interpolation=cv2.INTER_AREA)
     picture = cv2.GaussianBlur(picture, (0, 0), blur) if blur else picture
     picture = 20 + 0.8 * picture  # neither black nor white is ever quite so
@@ -96,14 +105,14 @@ def develop(parts, blur, noise, seed, lens):
 
 
 def facing(board: Board, x, y, z, tilt_x=0.0, tilt_y=0.0, turn=0.0):
-    """T_camera_board with the board's centre at (x, y, z) [m] of the optical frame, tilted and turned [rad]."""
+    """Return T_camera_board with the board's center at (x, y, z) [m] of the optical frame, tilted and turned [rad]."""
     R = rpy_to_matrix(np.pi, 0, 0) @ rpy_to_matrix(tilt_x, tilt_y, turn)
     middle = np.array([board.size[0] / 2, board.size[1] / 2, 0])
     return transform(R, np.array([x, y, z]) - R @ middle)
 
 
 def many_poses(board: Board, count, seed=1, z=(0.45, 0.75)):
-    """Places all over the picture, with tilts to every side."""
+    """Return poses all over the image, with tilts to every side."""
     rng = np.random.default_rng(seed)
     poses = []
     for k in range(count):
@@ -116,8 +125,8 @@ def many_poses(board: Board, count, seed=1, z=(0.45, 0.75)):
 
 
 def through(lens: Lens, T_world_camera, surroundings, balls, *, noise=2.0, seed=0):
-    """The bgr8 picture of balls (n, 3) in world on the table through the lens."""
-    finer, border = 3, 200  # [px] beyond the picture, which the lens may pull in
+    """Return the bgr8 image of balls (n, 3) in world on the table through the lens."""
+    finer, border = 3, 200  # [px] beyond the image, which the lens may pull in
     k = finer * lens.k
     pinhole = Pinhole(k[0, 0], k[1, 1], finer * (lens.cx + border + 0.5) - 0.5, finer * (lens.cy + border + 0.5) - 0.5,
                       finer * (lens.width + 2 * border), finer * (lens.height + 2 * border), T_world_camera)

@@ -4,54 +4,46 @@ import cv2
 import numpy as np
 import pytest
 
-from common.perception.camera_file import CameraFile
 from common.robot.transforms import invert, rpy_to_matrix, transform
 from tests.tools.calibration.rendered_boards import BOARD, Lens, render
 from tools.calibration.camera_pose import calibrate_pose, detect_boards
 from tools.calibration.intrinsics import CalibrationFailed
 
 LENS = Lens()
-CAMERA = CameraFile(width=640, height=480, fx=LENS.fx, fy=LENS.fy, cx=LENS.cx, cy=LENS.cy, d=list(LENS.d))
+CAMERA = LENS.camera()
 T_WORLD_CAMERA = transform(rpy_to_matrix(np.pi - 0.06, 0.04, -np.pi / 2 + 0.1), (0.42, -0.01, 0.80))
 
 
-def lying(x, y, yaw, z=0.0):
-    return transform(rpy_to_matrix(0, 0, yaw), (x, y, z))
+def on_table(x, y, yaw):
+    return transform(rpy_to_matrix(0, 0, yaw), (x, y, 0.0))
 
 
-def seen_at(T_world_board, count=3, seed=0):
-    pictures = [(f"picture {seed + k}", render(BOARD, LENS, invert(T_WORLD_CAMERA) @ T_world_board, seed=seed + k))
-                for k in range(count)]
-    found, reasons = detect_boards(BOARD, pictures, CAMERA)
+def seen(T_world_board, seed, T_world_camera=T_WORLD_CAMERA, count=3):
+    images = [(f"image {k}", render(BOARD, LENS, invert(T_world_camera) @ T_world_board, seed=k))
+              for k in range(seed, seed + count)]
+    found, reasons = detect_boards(BOARD, images, CAMERA)
     assert not reasons
     return T_world_board, found
 
 
 def errors(found, truth=T_WORLD_CAMERA):
-    """Distance [m] and angle [deg] from the truth."""
+    """Return distance [m] and angle [deg] from the truth."""
     T = invert(truth) @ found.T_world_camera
-    return np.linalg.norm(found.T_world_camera[:3, 3] - truth[:3, 3]), np.degrees(
-        np.linalg.norm(cv2.Rodrigues(T[:3, :3])[0])
-    )
+    return np.linalg.norm(T[:3, 3]), np.degrees(np.linalg.norm(cv2.Rodrigues(T[:3, :3])[0]))
 
 
 @pytest.fixture(scope="module")
 def places():
-    return [seen_at(lying(0.35, -0.15, 0.1)), seen_at(lying(0.3, 0.15, 1.7), seed=5),
-            seen_at(lying(0.55, -0.35, 1.2), seed=9)]
+    return [seen(on_table(0.35, -0.15, 0.1), 0), seen(on_table(0.3, 0.15, 1.7), 5), seen(on_table(0.55, -0.35, 1.2), 9)]
 
 
-def test_one_board_pose_gives_the_camera_within_a_millimeter_and_a_tenth_of_a_degree(places):
-    found = calibrate_pose(places[:1], CAMERA)
-    distance, angle = errors(found)
-    assert distance < 1e-3 and angle < 0.1
-    assert found.rms < 0.05 and found.rms_on_board < 1e-4 and len(found.pictures) == 3 and not found.dropped
-    np.testing.assert_allclose(rpy_to_matrix(*found.rpy), found.T_world_camera[:3, :3], atol=1e-9)
-    assert found.position == pytest.approx(tuple(found.T_world_camera[:3, 3]))
-
-
-def test_several_board_poses_reduce_error_and_uncertainty(places):
+def test_several_board_poses_reduce_error_and_uncertainty_of_one(places):
     one, several = calibrate_pose(places[:1], CAMERA), calibrate_pose(places, CAMERA)
+    distance, angle = errors(one)
+    assert distance < 1e-3 and angle < 0.1
+    assert one.rms < 0.05 and one.rms_on_board < 1e-4 and len(one.pictures) == 3 and not one.dropped
+    np.testing.assert_allclose(rpy_to_matrix(*one.rpy), one.T_world_camera[:3, :3], atol=1e-9)
+    assert one.position == pytest.approx(tuple(one.T_world_camera[:3, 3]))
     distance, angle = errors(several)
     assert distance < 0.3e-3 and angle < 0.03
     assert max(several.position_std) < max(one.position_std) / 2
@@ -61,22 +53,17 @@ def test_several_board_poses_reduce_error_and_uncertainty(places):
 def test_upright_rotated_board_is_supported():
     looks_ahead = transform(rpy_to_matrix(-np.pi / 2, 0, -np.pi / 2), (0.0, 0.0, 0.5))  # along +x, upright
     upright = transform(rpy_to_matrix(np.pi / 2, 0, -np.pi / 2 + 0.3), (0.7, 0.12, 0.4))
-    pictures = [("a", render(BOARD, LENS, invert(looks_ahead) @ upright))]
-    found = calibrate_pose([(upright, detect_boards(BOARD, pictures, CAMERA)[0])], CAMERA)
-    distance, angle = errors(found, looks_ahead)
+    distance, angle = errors(calibrate_pose([seen(upright, 0, looks_ahead, 1)], CAMERA), looks_ahead)
     assert distance < 2e-3 and angle < 0.1
 
 
-def test_image_with_a_moved_board_is_dropped_by_name(places):
-    T_world_board, seen = places[0]
-    moved = replace(seen[1], name="moved", pixels=seen[1].pixels + np.array([2.5, -1.0]))
-    found = calibrate_pose([(T_world_board, [seen[0], moved, seen[2]]), *places[1:]], CAMERA)
+def test_moved_board_is_dropped_in_one_image_and_rejected_in_all(places):
+    T_world_board, (first, second, third) = places[0]
+    moved = replace(second, name="moved", pixels=second.pixels + np.array([2.5, -1.0]))
+    found = calibrate_pose([(T_world_board, [first, moved, third]), *places[1:]], CAMERA)
     assert [view.name for view in found.dropped] == ["moved"]
     assert errors(found)[0] < 0.5e-3
-
-
-def test_inconsistent_board_poses_are_rejected(places):
-    wrong = [(lying(0.35, -0.05, 0.1), places[0][1]), *places[1:]]
+    wrong = [(on_table(0.35, -0.05, 0.1), places[0][1]), *places[1:]]
     with pytest.raises(CalibrationFailed, match="are inconsistent"):
         calibrate_pose(wrong, CAMERA)
 

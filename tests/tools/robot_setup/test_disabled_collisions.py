@@ -19,10 +19,8 @@ def named(pairs, *reasons):
 
 def test_srdf_of_the_ur5_is_up_to_date():
     assert ROBOT.srdf is not None
-    written = {
-        (item.get("link1"), item.get("link2"), item.get("reason"))
-        for item in ET.parse(ROBOT.srdf).iter("disable_collisions")
-    }
+    written = {(item.get("link1"), item.get("link2"), item.get("reason"))
+               for item in ET.parse(ROBOT.srdf).iter("disable_collisions")}
     assert written == {(p.one, p.other, p.reason) for p in disabled_pairs(ROBOT)}
 
 
@@ -49,9 +47,7 @@ def test_never_colliding_pairs_do_not_collide_at_other_samples(robot):
 
 def test_links_that_can_collide_stay_checked():
     checked = RobotGeometry(ROBOT)
-    pairs = {
-        frozenset((checked.links[p.first], checked.links[p.second])) for p in checked.geometry.collisionPairs
-    }
+    pairs = {frozenset((checked.links[p.first], checked.links[p.second])) for p in checked.geometry.collisionPairs}
     for one, other in [("base_link", "forearm_link"), ("shoulder_link", "robotiq_85_base_link"),
                        ("upper_arm_link", "robotiq_85_left_finger_tip_link"), ("base_link", "wrist_3_link")]:
         assert frozenset((one, other)) in pairs
@@ -61,34 +57,12 @@ def test_links_that_can_collide_stay_checked():
 
 def test_panda_pairs_are_almost_those_of_its_manufacturer():
     assert PANDA.srdf is not None
-    manufacturer = {
-        frozenset((item.get("link1"), item.get("link2"))) for item in ET.parse(PANDA.srdf).iter("disable_collisions")
-    }
+    manufacturer = {frozenset((item.get("link1"), item.get("link2")))
+                    for item in ET.parse(PANDA.srdf).iter("disable_collisions")}
     with_shapes = {link for pair in named(disabled_pairs(PANDA, samples=1)) for link in pair}
     missed = {pair for pair in manufacturer if pair <= with_shapes} - named(disabled_pairs(PANDA))
     # The manufacturer disables two pairs whose shapes collide at about one sample in twelve.
     assert missed == {frozenset(("panda_link5", "panda_link7")), frozenset(("panda_link5", "panda_hand"))}
-
-
-def test_links_that_always_touch_are_reported_as_always(tmp_path):
-    shapes = {"base": ("0.2 0.2 0.2", "0 0 0"), "arm": ("0.02 0.02 0.02", "0 0 0"), "tip": ("0.3 0.3 0.3", "0 0 0")}
-    links = "".join(
-        f'<link name="{name}"><collision><origin xyz="{at}"/><geometry><box size="{size}"/></geometry></collision>'
-        "</link>" for name, (size, at) in shapes.items()
-    )
-    joints = "".join(
-        f'<joint name="{child}_joint" type="revolute"><parent link="{parent}"/><child link="{child}"/>'
-        '<axis xyz="0 0 1"/><limit lower="-1" upper="1" velocity="1" effort="1"/></joint>'
-        for parent, child in [("base", "arm"), ("arm", "tip")]
-    )
-    path = tmp_path / "folded.urdf"
-    path.write_text(f'<robot name="folded">{links}{joints}</robot>')
-    robot = RobotModel.load(RobotConfig(
-        name="folded", urdf=str(path), joints=["arm_joint", "tip_joint"], base_link="base", tcp_link="tip",
-        named_poses={"home": [0, 0]}, acceleration_limits=[1, 1], jerk_limits=[1, 1],
-    ))
-    found = {(p.one, p.other): p.reason for p in disabled_pairs(robot, samples=20)}
-    assert found == {("base", "arm"): "Adjacent", ("arm", "tip"): "Adjacent", ("base", "tip"): "Always"}
 
 
 def test_srdf_contains_groups_and_poses_and_is_loaded_by_the_planner(tmp_path):
@@ -109,27 +83,38 @@ def test_srdf_contains_groups_and_poses_and_is_loaded_by_the_planner(tmp_path):
     assert counts[0] < counts[1]
 
 
-def _wrist(gap: float) -> str:
-    """A box before a joint and a wall behind it, a gap [m] apart at position 0: they touch when the joint turns."""
-    def link(name: str, at: str, size: str) -> str:
-        shape = f'<origin xyz="{at}"/><geometry><box size="{size}"/></geometry>'
-        return f'<link name="{name}"><collision>{shape}</collision></link>'
+def robot_of(tmp_path, *parts):
+    """Load a robot of links (`name`, position and size of a box) and revolute or fixed joints (`parent`, `child`)."""
+    text = ""
+    for part in parts:
+        if len(part) == 3:
+            name, at, size = part
+            shape = f'<origin xyz="{at}"/><geometry><box size="{size}"/></geometry>'
+            text += f'<link name="{name}"><collision>{shape}</collision></link>'
+        else:
+            parent, child = part
+            kind = "fixed" if child == "wall" else "revolute"
+            text += (f'<joint name="to_{child}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
+                     '<axis xyz="0 0 1"/><limit lower="-1.5" upper="1.5" velocity="1" effort="1"/></joint>')
+    (tmp_path / "r.urdf").write_text(f'<robot name="r">{text}</robot>')
+    tip = parts[-1][1] if parts[-1][1] != "wall" else parts[-1][0]
+    return RobotModel.load(RobotConfig(
+        name="r", urdf=str(tmp_path / "r.urdf"), joints=["to_arm", f"to_{tip}"], base_link="base", tcp_link=tip,
+        named_poses={"home": [0, 0]}, acceleration_limits=[1, 1], jerk_limits=[1, 1]))
 
-    def joint(name: str, parent: str, child: str, kind: str = "revolute") -> str:
-        return (f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
-                '<axis xyz="0 0 1"/><limit lower="-1.5" upper="1.5" velocity="1" effort="1"/></joint>')
 
-    return "".join([
-        '<robot name="r"><link name="base"/>', joint("a", "base", "arm"), link("arm", "0 0 0", "0.1 0.02 0.02"),
-        joint("b", "arm", "hand"), link("hand", "0 0 0.03", "0.02 0.02 0.01"),
-        joint("on", "hand", "wall", "fixed"), link("wall", f"0 {0.011 + gap} 0", "0.1 0.002 0.08"), "</robot>"])
+def test_links_that_always_touch_are_reported_as_always(tmp_path):
+    robot = robot_of(tmp_path, ("base", "0 0 0", "0.2 0.2 0.2"), ("arm", "0 0 0", "0.02 0.02 0.02"),
+                     ("tip", "0 0 0", "0.3 0.3 0.3"), ("base", "arm"), ("arm", "tip"))
+    found = {(p.one, p.other): p.reason for p in disabled_pairs(robot, samples=20)}
+    assert found == {("base", "arm"): "Adjacent", ("arm", "tip"): "Adjacent", ("base", "tip"): "Always"}
 
 
 @pytest.mark.parametrize(("gap", "reason"), [(0.0002, "Always"), (0.02, None)])
-def test_neighbours_that_almost_always_touch_are_disabled(gap, reason, tmp_path):
-    (tmp_path / "r.urdf").write_text(_wrist(gap))
-    robot = RobotModel.load(RobotConfig.model_validate({
-        "name": "r", "urdf": str(tmp_path / "r.urdf"), "joints": ["a", "b"], "base_link": "base", "tcp_link": "hand",
-        "acceleration_limits": [1, 1], "jerk_limits": [1, 1], "named_poses": {"home": [0, 0]}}))
+def test_neighbors_that_almost_always_touch_are_disabled(gap, reason, tmp_path):
+    """A box before a joint and a wall behind it, a gap [m] apart at position 0, touch when the joint turns."""
+    robot = robot_of(tmp_path, ("base", "0 0 -1", "0.1 0.1 0.1"), ("arm", "0 0 0", "0.1 0.02 0.02"),
+                     ("hand", "0 0 0.03", "0.02 0.02 0.01"), ("wall", f"0 {0.011 + gap} 0", "0.1 0.002 0.08"),
+                     ("base", "arm"), ("arm", "hand"), ("hand", "wall"))
     found = {frozenset((p.one, p.other)): p.reason for p in disabled_pairs(robot, samples=400)}
     assert found.get(frozenset(("arm", "wall"))) == reason

@@ -17,11 +17,25 @@ from tools.robot_setup.end_effector import check_gripper
 from tools.robot_setup.fingers import check_tool_frame, link_points, links_moved
 from tools.robot_setup.proposal import Proposal, draft
 
-Array = NDArray[np.float64]
+ROBOTS = "package://example-robot-data/robots"
 
 
 def config_of(name: str) -> RobotConfig:
     return check(RobotConfig, read_robot(find_file("robots", name)), "robot")
+
+
+@pytest.fixture
+def scara_with(tmp_path: Path):
+    """Return the proposal for a SCARA whose description was changed."""
+    def proposal(*changes: tuple[str, str]) -> Proposal:
+        text = scara()
+        for old, new in changes:
+            assert old in text
+            text = text.replace(old, new)
+        (tmp_path / "arm.urdf").write_text(text)
+        return draft(str(tmp_path / "arm.urdf"), "arm")
+
+    return proposal
 
 
 @pytest.mark.parametrize("name", names_of("robots"))
@@ -29,18 +43,10 @@ def test_tool_frames_of_the_projects_robots_match_their_fingers(name: str) -> No
     assert check_tool_frame(RobotModel.load(config_of(name))) == []
 
 
-def test_wrong_gripper_width_is_reported() -> None:
-    config = config_of("panda")
-    assert config.gripper is not None
-    wide = config.model_copy(update={"gripper": config.gripper.model_copy(update={"mimic": [1.0, 0.5]})})
-    (problem,) = check_tool_frame(RobotModel.load(wide))
-    assert problem == "gripper.max_width: the fingers open by 0.0600 m, not by 0.08 m"
-
-
 def test_mounted_gripper_gets_the_linkage_of_the_manual_robot_file() -> None:
     by_hand = config_of("ur5").gripper
-    proposal = draft("package://example-robot-data/robots/ur_description/urdf/ur5_robot.urdf", "arm",
-                 gripper=str(find_file("robots", "ur5").with_name("robotiq_2f85.urdf")))
+    proposal = draft(f"{ROBOTS}/ur_description/urdf/ur5_robot.urdf", "arm",
+                     gripper=str(find_file("robots", "ur5").with_name("robotiq_2f85.urdf")))
     found = proposal.values["gripper"]
     assert by_hand is not None and by_hand.linkage is not None
     assert found["linkage"] == pytest.approx(by_hand.linkage.model_dump(), abs=1e-4)
@@ -55,7 +61,7 @@ def test_mounted_gripper_gets_the_linkage_of_the_manual_robot_file() -> None:
 @pytest.mark.parametrize(("urdf", "opens", "closed"), [
     ("so_arm_description/urdf/so101.urdf", 1, -0.174533), ("z1_description/urdf/z1.urdf", -1, 0.0)])
 def test_jaw_that_turns_towards_a_fixed_finger_is_measured(urdf: str, opens: int, closed: float) -> None:
-    proposal = draft(f"package://example-robot-data/robots/{urdf}", "arm")
+    proposal = draft(f"{ROBOTS}/{urdf}", "arm")
     assert proposal.lost == [] and any("one finger is fixed" in line for line in proposal.check)
     config = check(RobotConfig, proposal.values, "robot")
     gripper = config.gripper
@@ -66,7 +72,7 @@ def test_jaw_that_turns_towards_a_fixed_finger_is_measured(urdf: str, opens: int
     jaw = next(link for link in gripper.links if link in links_moved(robot, gripper.joints))
     q, corners = np.clip(np.zeros(robot.dof), robot.lower, robot.upper), link_points(robot)[jaw]
 
-    def in_tool(width: float) -> Array:
+    def in_tool(width: float) -> NDArray[np.float64]:
         poses = robot.link_poses(q, {gripper.joints[0]: finger_positions(gripper, width)[0]})
         T = invert(poses[config.tcp_link]) @ poses[jaw]
         return np.asarray(corners @ T[:3, :3].T + T[:3, 3])
@@ -79,41 +85,38 @@ def test_jaw_that_turns_towards_a_fixed_finger_is_measured(urdf: str, opens: int
         assert in_tool(width)[tip, 1] - shut[tip, 1] == pytest.approx(width, abs=5e-4)
 
 
-def test_wrong_jaw_values_are_reported_with_the_measured_ones() -> None:
-    proposal = draft("package://example-robot-data/robots/z1_description/urdf/z1.urdf", "arm")
-    config = check(RobotConfig, proposal.values, "robot")
+def test_wrong_values_of_a_gripper_are_reported_with_the_measured_ones() -> None:
+    config = check(RobotConfig, draft(f"{ROBOTS}/z1_description/urdf/z1.urdf", "arm").values, "robot")
     assert config.gripper is not None and config.gripper.jaw is not None and config.tcp is not None
-    assert check_gripper(RobotModel.load(config)) == []
+    jaw = config.gripper.jaw
 
-    def of(**changes: object) -> list[str]:
+    def problems(config: RobotConfig, **changes: object) -> list[str]:
         assert config.gripper is not None
-        return check_gripper(RobotModel.load(config.model_copy(update={
-            "gripper": config.gripper.model_copy(update=changes)})))
+        gripper = config.gripper.model_copy(update=changes)
+        robot = RobotModel.load(config.model_copy(update={"gripper": gripper}))
+        return check_gripper(robot) if gripper.jaw else check_tool_frame(robot)
 
-    assert of(closing_axis="x") == ["gripper.closing_axis: the jaw closes along y of arm_tcp, not along x"]
-    (problem,) = of(jaw=config.gripper.jaw.model_copy(update={"opens": 1}))
+    assert problems(config) == []
+    assert problems(config, closing_axis="x") == [
+        "gripper.closing_axis: the jaw closes along y of arm_tcp, not along x"]
+    (problem,) = problems(config, jaw=jaw.model_copy(update={"opens": 1}))
     assert problem.startswith("gripper.jaw: it is closed at 0 and opens by -1")
-    (problem,) = of(jaw=config.gripper.jaw.model_copy(update={"radius": 0.2}))
-    assert problem == "gripper.jaw.radius: its tip is 0.1000 m from its axis, not 0.2 m"
+    assert problems(config, jaw=jaw.model_copy(update={"radius": 0.2})) == [
+        "gripper.jaw.radius: its tip is 0.1000 m from its axis, not 0.2 m"]
+    assert problems(config_of("panda"), mimic=[1.0, 0.5]) == [
+        "gripper.max_width: the fingers open by 0.0600 m, not by 0.08 m"]
 
 
 def test_jaw_that_does_not_reach_the_fixed_finger_is_no_gripper() -> None:
-    proposal = draft("package://example-robot-data/robots/talos_data/robots/talos_left_arm.urdf", "arm")
+    proposal = draft(f"{ROBOTS}/talos_data/robots/talos_left_arm.urdf", "arm")
     assert "gripper" not in proposal.values
     (lost,) = proposal.lost
     assert lost.startswith("no gripper: the jaw of gripper_left_joint does not reach the fixed finger")
 
 
-def proposal_of(text: str, folder: Path) -> Proposal:
-    (folder / "arm.urdf").write_text(text)
-    return draft(str(folder / "arm.urdf"), "arm")
-
-
-def test_slides_closed_at_a_positive_position_report_it(tmp_path: Path) -> None:
-    apart = scara().replace('lower="0" upper="0.04"', 'lower="0.03" upper="0.06"')
-    for side in ("0.005", "-0.005"):
-        apart = apart.replace(f'xyz="0 {side} 0.03"', f'xyz="0 {-5 * float(side)} 0.03"')
-    proposal = proposal_of(apart, tmp_path)
+def test_slides_closed_at_a_positive_position_report_it(scara_with) -> None:
+    apart = [(f'xyz="0 {side} 0.03"', f'xyz="0 {-5 * float(side)} 0.03"') for side in ("0.005", "-0.005")]
+    proposal = scara_with(('lower="0" upper="0.04"', 'lower="0.03" upper="0.06"'), *apart)
     gripper = check(RobotConfig, proposal.values, "robot").gripper
     assert gripper is not None
     assert (gripper.closed, gripper.max_width) == (pytest.approx(0.03), pytest.approx(0.06))
@@ -121,23 +124,19 @@ def test_slides_closed_at_a_positive_position_report_it(tmp_path: Path) -> None:
     assert width_at(gripper, 0.04) == pytest.approx(0.02)
 
 
-def test_independent_joint_that_carries_no_finger_is_locked(tmp_path: Path) -> None:
-    bar = ('<link name="bar"/><joint name="bar_turns" type="continuous"><parent link="palm"/><child link="bar"/>'
-           '<axis xyz="0 0 1"/><limit velocity="1" effort="1"/></joint></robot>')
-    proposal = proposal_of(scara().replace("</robot>", bar), tmp_path)
+def test_independent_joint_that_carries_no_finger_is_locked(scara_with) -> None:
+    proposal = scara_with((
+        "</robot>", '<link name="bar"/><joint name="bar_turns" type="continuous"><parent link="palm"/>'
+                    '<child link="bar"/><axis xyz="0 0 1"/><limit velocity="1" effort="1"/></joint></robot>'))
     assert proposal.values["gripper"]["joints"] == ["left_finger", "right_finger"]
     assert proposal.values["locked_joints"]["bar_turns"] == 0.0
     assert "gripper: bar_turns is locked: it moves independently of left_finger" in proposal.check
 
 
-def test_fingers_around_their_frames_point_away_from_the_arm(tmp_path: Path) -> None:
-    text = scara().replace('0.005 0.03"/><geometry>', '0.005 -0.004"/><geometry>').replace(
-        'xyz="0 0 0.04"/>', 'xyz="0 0 0.1"/>')
-    proposal = proposal_of(text, tmp_path)
-    robot = RobotModel.load(check(RobotConfig, proposal.values, "robot"))
+def test_tool_points_away_from_the_arm(scara_with) -> None:
+    around = scara_with(('0.005 0.03"/><geometry>', '0.005 -0.004"/><geometry>'),
+                        ('xyz="0 0 0.04"/>', 'xyz="0 0 0.1"/>'))  # the fingers are around their frames
+    robot = RobotModel.load(check(RobotConfig, around.values, "robot"))
     assert robot.fk(np.zeros(4))[2, 2] == pytest.approx(-1.0)  # down, as the gripper is mounted
-
-
-def test_flange_whose_z_axis_points_out_is_the_tool_centre_point() -> None:
-    proposal = draft("package://example-robot-data/robots/ur_description/urdf/ur10_robot.urdf", "arm")
+    proposal = draft(f"{ROBOTS}/ur_description/urdf/ur10_robot.urdf", "arm")
     assert proposal.values["tcp_link"] == "tool0"  # and not ee_link, a third of a millimetre away, with x out
