@@ -1,7 +1,6 @@
 """Cells of tiny services, and zencell commands as processes or within this one."""
 
 import sys
-from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -19,23 +18,23 @@ def make_folder(folder: Path, name: str = "tiny", first: str = "first") -> Path:
 
 
 @pytest.fixture(autouse=True)
-def _restore_path(monkeypatch: pytest.MonkeyPatch) -> None:
+def _restore_path(monkeypatch):
     """Forget the folders in which a cell file has its services."""
     monkeypatch.setattr(sys, "path", list(sys.path))
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path):
     return make_folder(tmp_path)
 
 
 @pytest.fixture
-def domain() -> int:
+def domain():
     return free_domain()
 
 
 @pytest.fixture
-def rejection(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+def rejection(capsys):
     """Run a command that fails within this process, and return its only line."""
 
     def run(*arguments: str, code: int = 2) -> str:
@@ -50,7 +49,7 @@ def rejection(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
 
 
 @pytest.fixture
-def zencell(folder: Path, domain: int) -> Iterator[Callable[..., Zencell]]:
+def zencell(folder, domain):
     """Start zencell commands as processes, and kill at the end what is left of them."""
     started: list[Zencell] = []
 

@@ -5,7 +5,6 @@ import io
 import shlex
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -30,20 +29,17 @@ ROWS = [  # a command, and parts of its line
     ("run taskless.yaml", "task: is missing"),
     ("run fake.yaml --set services.first.x=1", "services.fakes.first", "not a module"),
     ("check 'a cell.yaml'", "'a cell' is no name of a cell", "letters"),
-    ("check ~nobody_here/cell.yaml", "begins with ~", "without a home"),
+    ("check ~no_such_user/cell.yaml", "begins with ~", "without a home"),
     ("run panda --world moon", "unknown world 'moon'", "balls"),
     ("run panda --set world.simulator=no.such", "world.simulator", "cannot be imported"),
     ("run panda --set world.cuont=3", "world.cuont", "3", "choices:", "count"),
     ("run panda --set wrold.count=3", "wrold", "choices:", "world"),
-    ("run panda --set services.viewre.port=1", "unknown service 'viewre'", "choices:"),
     ("run panda --set world.count=9", "world.count", "9", "less than or equal to 8"),
     ("run panda --set motion.velocity_scaling=fast", "motion.velocity_scaling", "'fast'"),
     ("run panda --set motion.object_padding=.nan", "motion.object_padding", "nan"),
     ("run panda --set world.count", "--set", "'world.count'", "PATH=VALUE"),
-    ("run panda --set world.count=[1", "world.count", "'[1'", "not a YAML value"),
     ("run panda --set 'world.balls=[[0.4, 0], [0.41, 0]]'", "world", "overlap"),
     ("run panda --set 'world.objects=[{id: crate, shape: box}]'", "world.objects", "crate", "size"),
-    ("run panda --speed 11", "--speed", "11", "0.1 to 10"),
     ("run panda --speed fast", "--speed", "fast"),
     ("run panda --seed -1", "seed", "-1", "0 or more"),
     ("run panda --summary no/where/s.json", "--summary", "does not exist"),
@@ -62,7 +58,7 @@ ROWS = [  # a command, and parts of its line
     ("node list --connect here", "--connect", "'here'", "tcp/"),
     ("task stop --cell *", "cell: '*'", "is not a valid name of a cell"),
     ("param set world.count", "param set", "'world.count'", "PATH=VALUE"),
-    ("service nobody", "unknown service 'nobody'", "motion_planner"),
+    ("service no_such", "unknown service 'no_such'", "motion_planner"),
     ("topic info joint_state", "unknown key", "did you mean 'joint_states'?"),
     ("topic pub my//key {}", "unknown key 'my//key'", "choices:"),
     ("topic pub my/* {}", "unknown key 'my/*'", "choices:"),
@@ -83,7 +79,6 @@ ROWS = [  # a command, and parts of its line
     ("world add 0.5 0 --shape cube", "world.shape", "'cube'", "cylinder"),
     ("world add 0.5 0 --color red", "--color", "red"),
     ("outline .", "camera_image.png: is missing"),
-    ("graph ur6", "unknown cell 'ur6'", "ur5"),
     ("graph ur5 -o it.png", "--output", "'it.png'", ".svg, .dot, .mmd"),
     ("graph ur5 -o no/it.svg --connect tcp/127.0.0.1:1", "no/it.svg", "cannot be written"),
     ("new taken", "DIR", "'taken'", "not empty"),
@@ -93,13 +88,11 @@ ROWS = [  # a command, and parts of its line
     ("new class", "DIR", "'class'", "a name that Python can import"),
     ("new json", "DIR", "'json'", "a Python module that is there already"),
     ("new common", "DIR", "'common'", "a Python module that is there already"),
-    ("new ~nobody_here/x", "begins with ~", "without a home"),
+    ("new ~no_such_user/x", "begins with ~", "without a home"),
     ("new fine --task sort_cube", "unknown task 'sort_cube'", "did you mean 'sort_cubes'?", "choices:"),
     ("--install-completion tcsh", "zencell: unknown shell 'tcsh'; choices: bash, fish, zsh"),
     ("robot collisions pnada", "unknown robot 'pnada'", "did you mean 'panda'?", "ur5"),
-    ("robot collisions nowhere.yaml", "nowhere.yaml", "is not a file"),
     ("robot collisions panda --samples 0", "--samples", "0", "1 or more"),
-    ("robot collisions panda --seed x", "--seed", "'x'"),
     ("robot collisions panda --margin -1", "--margin", "-1", "0 or more"),
     ("robot collisions panda --margin wide", "--margin", "'wide'", "must be a number"),
     ("robot collisions panda --samples 1 -o no/x.srdf", "--output", "no/x.srdf", "cannot be written"),
@@ -113,8 +106,6 @@ ROWS = [  # a command, and parts of its line
     ("simulate panda --limit 0", "--limit: '0' must be more than 0"),
     ("simulate panda --set robot.hardware.backend=nothing", "unknown hardware backend 'nothing'"),
     ("record motion/plan", "unknown published key 'motion/plan'"),
-    ("record 'a b'", "KEY: 'a b' is not a key"),
-    ("record --regex [", "--regex: '[' is not a regular expression"),
     ("record --duration 0", "--duration: '0' must be more than 0"),
     ("record --max-size 0.1", "--max-size: '0.1' must be 1 or more"),
     ("record -o there.mcap", "exists already; choose another name"),
@@ -124,7 +115,6 @@ ROWS = [  # a command, and parts of its line
     ("info list.yaml", "list.yaml: is no MCAP file"),
     ("recover there.mcap -o there.mcap", "exists already"),
     ("play there.mcap --rate 0", "--rate: '0' must be more than 0"),
-    ("play there.mcap --rate fast", "--rate: 'fast' must be a number"),
     ("play there.mcap --start-offset 99", "--start-offset: '99' must be 0 to 0.1"),
     ("play there.mcap --remap a=b", "--remap: 'a=b' must be FROM:=TO"),
     ("play there.mcap camera/image_raw", "is not in there.mcap; choices: joint_states"),
@@ -137,13 +127,12 @@ ROWS = [  # a command, and parts of its line
     ("export there.mcap --csv d --topics tf", "--topics: 'tf' is not in there.mcap; choices: joint"),
     ("report panda.mcap -o report.pdf", "--output", "report.pdf", "must end in .html"),
     ("report panda.mcap -o no/where/report.html", "--output", "report.html", "cannot be written"),
-    ("report panda.mcap -o ~nobody_here/a.html", "begins with ~", "without a home"),
-    ("report panda.mcap --cell pnada", "unknown cell 'pnada'", "panda"),
+    ("report panda.mcap -o ~no_such_user/a.html", "begins with ~", "without a home"),
 ]
 
 
 @pytest.fixture(scope="module")
-def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def files(tmp_path_factory):
     folder = make_folder(tmp_path_factory.mktemp("bad"))
     cell = "robot: panda\nworld: balls\npipeline: cartesian_ompl\n"
     task = "task: first\nservices: {fakes.first: {}}\n"
@@ -159,9 +148,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: row[0])
-def test_bad_input_is_one_line_and_changes_no_file(
-    row: tuple[str, ...], files: Path, monkeypatch: pytest.MonkeyPatch, rejection: Callable[..., str]
-) -> None:
+def test_bad_input_is_one_line_and_changes_no_file(row, files, monkeypatch, rejection):
     monkeypatch.chdir(files)
     monkeypatch.setattr("sys.stdin", io.StringIO())
     monkeypatch.setattr("common.client.joining.CONNECT_TIMEOUT", 0.05)
@@ -179,17 +166,13 @@ LONG = "x" * 300  # longer than a file system lets a name be
     ["export", str(RECORDING), "--csv", "/proc/nowhere"], ["export", str(RECORDING), "--images", "/proc/nowhere"],
     ["robot", "new", f"{LONG}.urdf", "-y"], ["calibrate", "intrinsics", LONG],
 ], ids=lambda arguments: " ".join(arguments[:2])[:20])
-def test_error_of_the_operating_system_is_one_line(
-    arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rejection: Callable[..., str]
-) -> None:
+def test_error_of_the_operating_system_is_one_line(arguments, tmp_path, monkeypatch, rejection):
     monkeypatch.chdir(tmp_path)
     line = rejection(*arguments, code=1)
     assert LONG[:100] in line or "/proc/nowhere" in line
 
 
-def test_result_of_a_run_is_printed_although_its_file_cannot_be_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], domain: int
-) -> None:
+def test_result_of_a_run_is_printed_although_its_file_cannot_be_written(tmp_path, monkeypatch, capsys, domain):
     async def run(session: CellSession, work: object) -> int:
         folder.rmdir()  # meanwhile
         return 1
@@ -203,9 +186,7 @@ def test_result_of_a_run_is_printed_although_its_file_cannot_be_written(
     assert shown.err.splitlines() == [f"zencell: {folder / 's.json.part'}: No such file or directory"]
 
 
-def test_output_on_a_full_disk_is_one_line(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_output_on_a_full_disk_is_one_line(monkeypatch, capsys):
     with Path("/dev/full").open("w") as full:
         monkeypatch.setattr(sys, "stdout", full)
         assert app.execute(["cells"]) == 1
@@ -215,7 +196,7 @@ def test_output_on_a_full_disk_is_one_line(
     assert capsys.readouterr().err.splitlines() == ["zencell: No space left on device"]
 
 
-def test_process_ends_with_the_exit_code_and_without_a_traceback(tmp_path: Path) -> None:
+def test_process_ends_with_the_exit_code_and_without_a_traceback(tmp_path):
     done = subprocess.run(command_line("run", "pnada"), cwd=tmp_path, env=environment(), capture_output=True, text=True,
                           timeout=100, check=False)
     assert (done.returncode, done.stdout) == (2, "")
@@ -224,9 +205,7 @@ def test_process_ends_with_the_exit_code_and_without_a_traceback(tmp_path: Path)
 
 
 @pytest.mark.parametrize("command", ["node list", "task start", "param list", "topic echo tf", "topic hz tf"])
-def test_without_a_running_cell_the_line_names_the_command_that_starts_one(
-    command: str, domain: int, monkeypatch: pytest.MonkeyPatch, rejection: Callable[..., str]
-) -> None:
+def test_without_a_running_cell_the_line_names_the_command_that_starts_one(command, domain, monkeypatch, rejection):
     monkeypatch.setattr("common.client.joining.CONNECT_TIMEOUT", 0.05)
     line = rejection(*command.split(), "--domain", str(domain), code=1)
     assert "zencell up panda" in line and str(7447 + domain) in line

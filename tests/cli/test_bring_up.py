@@ -2,19 +2,16 @@
 
 import json
 import signal
-from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 
-from tests.harness import Zencell, ask
+from tests.harness import ask
 
-Start = Callable[..., Zencell]
 RUNNING = "zenoh --mode client"  # the last line of `up` when all services are ready
 GONE = 3.0  # [s] after its supervisor was killed
 
 
-def test_services_start_in_order_and_stop_in_reverse_and_the_port_is_theirs(zencell: Start, folder: Path) -> None:
+def test_services_start_in_order_and_stop_in_reverse_and_the_port_is_theirs(zencell, folder):
     command = zencell("up", "tiny.yaml")
     assert f"tcp/127.0.0.1:{7447 + command.domain}" in command.until(RUNNING)
     assert sorted(command.children()) == ["first", "last", "middle", "router"]
@@ -33,7 +30,7 @@ def test_services_start_in_order_and_stop_in_reverse_and_the_port_is_theirs(zenc
 
 
 @pytest.mark.slow
-def test_crashed_and_killed_services_are_restarted(zencell: Start) -> None:
+def test_crashed_and_killed_services_are_restarted(zencell):
     command = zencell("up", "tiny.yaml", "--set", "services.middle.behave=crash once")
     command.until("RuntimeError: a bug")
     command.until("middle ended (exit code 1)")
@@ -54,9 +51,7 @@ def test_crashed_and_killed_services_are_restarted(zencell: Start) -> None:
     (["--set", "services.middle.plcaed=3"], "services.middle.plcaed: 3 is not a parameter; choices: behave, placed"),
     (["--set", "services.last.behave=wrong", "--log-json"], "behave: 'wrong' cannot be done"),
 ])
-def test_rejected_configuration_of_one_service_ends_the_cell_with_one_line(
-    zencell: Start, options: list[str], wanted: str
-) -> None:
+def test_rejected_configuration_of_one_service_ends_the_cell_with_one_line(zencell, options, wanted):
     command = zencell("up", "tiny.yaml", *options)
     assert command.end() == 2
     assert [line for line in command.lines if line.startswith("zencell: ")] == [f"zencell: {wanted}"]
@@ -69,9 +64,7 @@ def test_rejected_configuration_of_one_service_ends_the_cell_with_one_line(
     pytest.param("well", "hello from first", marks=pytest.mark.slow),
     pytest.param("well", "hello from last", marks=pytest.mark.slow), ("well", "0 of 2 placed - IDLE"),
 ])
-def test_interrupted_run_leaves_a_summary_and_no_process(
-    zencell: Start, folder: Path, behaviour: str, phase: str
-) -> None:
+def test_interrupted_run_leaves_a_summary_and_no_process(zencell, folder, behaviour, phase):
     command = zencell("run", "tiny.yaml", "--set", f"services.first.behave={behaviour}", "--summary", "out.json")
     command.until(phase)
     command.interrupt()
@@ -81,7 +74,7 @@ def test_interrupted_run_leaves_a_summary_and_no_process(
     assert not any("Traceback" in line for line in command.lines)
 
 
-def test_frozen_service_is_killed_and_at_once_after_a_second_interrupt(zencell: Start) -> None:
+def test_frozen_service_is_killed_and_at_once_after_a_second_interrupt(zencell):
     command = zencell("up", "tiny.yaml")
     command.until(RUNNING)
     command.children()["middle"].send_signal(signal.SIGSTOP)
@@ -93,7 +86,7 @@ def test_frozen_service_is_killed_and_at_once_after_a_second_interrupt(zencell: 
     assert not command.children()
 
 
-def test_killed_supervisor_leaves_no_process_not_even_a_frozen_one(zencell: Start) -> None:
+def test_killed_supervisor_leaves_no_process_not_even_a_frozen_one(zencell):
     command = zencell("up", "tiny.yaml")
     command.until(RUNNING)
     command.children()["middle"].send_signal(signal.SIGSTOP)
@@ -103,9 +96,7 @@ def test_killed_supervisor_leaves_no_process_not_even_a_frozen_one(zencell: Star
 
 @pytest.mark.parametrize(("behaviour", "code", "state"), [
     ("done", 0, "DONE"), pytest.param("error", 1, "ERROR", marks=pytest.mark.slow)])
-def test_run_ends_with_its_task_and_writes_the_summary(
-    zencell: Start, folder: Path, behaviour: str, code: int, state: str
-) -> None:
+def test_run_ends_with_its_task_and_writes_the_summary(zencell, folder, behaviour, code, state):
     command = zencell("run", "tiny.yaml", "--set", f"services.last.behave={behaviour}", "--set",
                       "services.last.placed=2", "--summary", "out.json", "--seed", "7", "--speed", "2")
     assert command.end() == code
@@ -117,7 +108,7 @@ def test_run_ends_with_its_task_and_writes_the_summary(
 
 
 @pytest.mark.slow
-def test_log_lines_are_json_on_request(zencell: Start) -> None:
+def test_log_lines_are_json_on_request(zencell):
     command = zencell("up", "tiny.yaml", "--log-json")
     command.until(RUNNING)
     command.interrupt()

@@ -1,7 +1,5 @@
 """`zencell check`: each finding by a cell with exactly this mistake, and none for the cells of the project."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -100,8 +98,8 @@ def test_cells_of_the_project_have_no_findings(name, options):
 
 
 def test_task_must_be_a_service_of_the_cell():
-    (found,) = wiring(load_cell("panda", ["task=nobody"]))
-    assert found.severity == "error" and found.what.startswith("task: 'nobody' is no service of the cell")
+    (found,) = wiring(load_cell("panda", ["task=no_such"]))
+    assert found.severity == "error" and found.what.startswith("task: 'no_such' is no service of the cell")
     assert "smart_pick_place" in found.remedy
 
 

@@ -1,7 +1,5 @@
 """Findings of `zencell doctor` about the clocks of a cell's hosts."""
 
-from __future__ import annotations
-
 import pytest
 
 from common.clock import Clock
@@ -20,7 +18,7 @@ class Shifted(Clock):
 
 
 @pytest.mark.parametrize("speed", [1.0, 5.0])
-async def test_skew_is_measured_in_wall_time_within_its_uncertainty(speed: float) -> None:
+async def test_skew_is_measured_in_wall_time_within_its_uncertainty(speed):
     net, clock = LocalNetwork(), Clock(speed)
     skews = {"camera_simulator": 1.3, "vision_detector": 0.0, "smart_pick_place": -0.5}
     buses = [net.bus(name, cell="toy", clock=Shifted(clock, ahead)) for name, ahead in skews.items()]
@@ -37,7 +35,7 @@ async def test_skew_is_measured_in_wall_time_within_its_uncertainty(speed: float
         await bus.close()
 
 
-def test_clocks_that_agree_are_one_line() -> None:
+def test_clocks_that_agree_are_one_line():
     (finding,) = clock_findings("panda", {"a": Skew(0.001, 0.0005), "b": Skew(-0.004, 0.0006)})
     assert finding.level == "ok" and "2 services" in finding.what
     assert "4.0 ms behind this one (± 0.6 ms)" in finding.what
@@ -45,7 +43,7 @@ def test_clocks_that_agree_are_one_line() -> None:
 
 @pytest.mark.parametrize(("ahead", "uncertainty", "level"), [
     (0.04, 0.001, "ok"), (-0.1, 0.001, "warn"), (1.3, 0.001, "fail"), (-1.3, 0.001, "fail"), (1.3, 1.3, "ok")])
-def test_skewed_clock_is_named_with_a_remedy(ahead: float, uncertainty: float, level: str) -> None:
+def test_skewed_clock_is_named_with_a_remedy(ahead, uncertainty, level):
     (finding,) = clock_findings("panda", {"camera_simulator": Skew(ahead, uncertainty)})
     assert finding.level == level
     if level != "ok":

@@ -34,30 +34,30 @@ def offered(line: str, folder: Path, shell: str = "bash", **variables: str) -> l
     ("zencell gra", ["graph"]),
     ("zencell --install-completion z", ["zsh"]),
 ])
-def test_word_is_completed(line: str, wanted: list[str], tmp_path: Path) -> None:
+def test_word_is_completed(line, wanted, tmp_path):
     assert offered(line, tmp_path) == wanted
 
 
-def test_words_of_fish_and_zsh_have_a_description(tmp_path: Path) -> None:
+def test_words_of_fish_and_zsh_have_a_description(tmp_path):
     (line,) = offered("zencell run u", tmp_path, "fish")
     assert line.startswith("ur5\tA UR5 ")
     assert '"ur5":' in "".join(offered("zencell run u", tmp_path, "zsh"))
 
 
-def test_cells_of_another_configuration_are_completed(tmp_path: Path) -> None:
+def test_cells_of_another_configuration_are_completed(tmp_path):
     (tmp_path / "cells").mkdir()
     (tmp_path / "cells" / "mine.yaml").write_text("# A cell of mine.\ncell: mine\n")
     assert offered("zencell run m", tmp_path, ZENCELL_CONFIG=str(tmp_path)) == ["mine"]
 
 
 @pytest.mark.parametrize("shell", completion.SHELLS)
-def test_script_of_a_shell_calls_the_command(shell: str, tmp_path: Path) -> None:
+def test_script_of_a_shell_calls_the_command(shell, tmp_path):
     done = ask(tmp_path, "--show-completion", shell)
     assert (done.returncode, done.stderr) == (0, "")
     assert f"_ZENCELL_COMPLETE=complete_{shell}" in done.stdout
 
 
-def test_bash_completes_after_installing(tmp_path: Path) -> None:
+def test_bash_completes_after_installing(tmp_path):
     home = {"HOME": str(tmp_path)}
     done = ask(tmp_path, "--install-completion", "bash", environment=home)
     assert "bash completion installed" in done.stdout
@@ -77,7 +77,7 @@ def words(offered: list[tuple[str, str]]) -> set[str]:
     return {word for word, _ in offered}
 
 
-def test_completed_names_are_those_of_the_code() -> None:
+def test_completed_names_are_those_of_the_code():
     topics = all_topics()
     assert words(choices.keys("")) == set(topics)
     assert words(choices.published("")) == {key for key, topic in topics.items() if isinstance(topic, Topic)}
@@ -96,6 +96,6 @@ def test_completed_names_are_those_of_the_code() -> None:
 
 
 @pytest.mark.parametrize("typed", ["", "s", "services", "services.v", "services.viewer.po", "motion", "motion.", "x"])
-def test_every_parameter_with_the_typed_start_is_offered(typed: str) -> None:
+def test_every_parameter_with_the_typed_start_is_offered(typed):
     wanted = {word for word in words(choices.parameters("")) if word.startswith(typed)}
     assert words(choices.parameters(typed)) == wanted

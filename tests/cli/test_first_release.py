@@ -1,12 +1,7 @@
 """Recordings of the first release, one of each cell, are read by all commands."""
 
-from __future__ import annotations
-
-import asyncio
 import csv
 import json
-import re
-import subprocess
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,11 +14,8 @@ from common.application import message_class
 from common.messages import TaskStatus
 from common.topics import Topic
 from common.transport.codec import decode
-from common.transport.endpoint import endpoint_of
-from common.transport.zenoh_session import connect
 from recording.reader import Recording
 from tests.cli.run_tape import Page
-from tests.harness import PATIENCE, command_line, environment
 
 DATA = Path(__file__).resolve().parent.parent / "data"
 
@@ -61,11 +53,11 @@ UR5 = Old(
 
 
 @pytest.fixture(params=[PANDA, pytest.param(UR5, marks=pytest.mark.slow)], ids=lambda old: old.cell)
-def old(request: pytest.FixtureRequest) -> Old:
-    return request.param  # type: ignore[no-any-return]
+def old(request):
+    return request.param
 
 
-def test_messages_are_counted_and_decoded_by_their_class(old: Old, capsys: pytest.CaptureFixture[str]) -> None:
+def test_messages_are_counted_and_decoded_by_their_class(old, capsys):
     assert app.execute(["info", str(old.path), "--json"]) == 0
     info = json.loads(capsys.readouterr().out)
     assert info["messages"] == old.messages and info["finished"]
@@ -81,7 +73,7 @@ def test_messages_are_counted_and_decoded_by_their_class(old: Old, capsys: pytes
     assert all(schema["properties"] for schema in schemas.values())
 
 
-def test_report_has_the_figures_of_the_run(old: Old, tmp_path: Path) -> None:
+def test_report_has_the_figures_of_the_run(old, tmp_path):
     assert app.execute(["report", str(old.path), "-o", str(tmp_path / "report.html")]) == 0
     page = Page((tmp_path / "report.html").read_text(encoding="utf-8"))
     assert all(part in page.head for part in old.head), page.head
@@ -89,7 +81,7 @@ def test_report_has_the_figures_of_the_run(old: Old, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_export_is_complete(old: Old, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_export_is_complete(old, tmp_path, capsys):
     assert app.execute(["export", str(old.path), "--csv", str(tmp_path / "csv"), "--images", str(tmp_path / "png"),
                         "--foxglove", str(tmp_path / "foxglove.mcap")]) == 0
     shown = capsys.readouterr()
@@ -98,24 +90,3 @@ def test_export_is_complete(old: Old, tmp_path: Path, capsys: pytest.CaptureFixt
         *_, last = csv.DictReader(file)
     assert last | old.last == last
     assert list((tmp_path / "png").glob("*/*.png"))
-
-
-async def test_played_status_is_received(old: Old, domain: int) -> None:
-    command = command_line("play", str(old.path), "--rate", "10", "--wait", "listener", "--exclude", "image|points",
-                           "--domain", str(domain))
-    player = await asyncio.create_subprocess_exec(*command, env=environment(), stdout=subprocess.PIPE)
-    try:
-        # The player starts the router, and waits for the listener.
-        async with (asyncio.timeout(PATIENCE),
-                    connect(cell=old.cell, service="listener", endpoint=endpoint_of(domain), timeout=PATIENCE) as bus):
-            status = bus.reader(old.status)
-            await bus.ready()
-            async for message in status:
-                if message.state == "DONE":
-                    break
-            output, _ = await player.communicate()
-    finally:
-        if player.returncode is None:
-            player.kill()
-            await player.wait()
-    assert player.returncode == 0 and re.search(rb"played [\d,]+ messages", output)

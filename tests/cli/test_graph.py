@@ -1,5 +1,4 @@
 import xml.etree.ElementTree as ET
-from pathlib import Path
 
 import pytest
 
@@ -22,14 +21,14 @@ def drawn(alive: frozenset[str] | None = None) -> Graph:
     return graph_of("tiny", SERVICES, alive)
 
 
-def test_graph_has_every_key_once_with_its_kind() -> None:
+def test_graph_has_every_key_once_with_its_kind():
     assert drawn().kinds == {
         "display_trajectory": "state", "joint_states": "stream", "motion/status": "state", "motion/plan": "request",
         "motion/execute": "request", "world/edit": "request", "my/own": "event",
     }
 
 
-def test_edges_run_from_writers_and_callers_to_readers_and_servers() -> None:
+def test_edges_run_from_writers_and_callers_to_readers_and_servers():
     found = {(start, end) for start, end, _, _ in edges(drawn())}
     assert {("executor", "key joint_states"), ("key joint_states", "planner"), ("task", "key motion/plan"),
             ("key motion/plan", "planner")} <= found
@@ -38,7 +37,7 @@ def test_edges_run_from_writers_and_callers_to_readers_and_servers() -> None:
     assert (OUTSIDE, "key world/edit", True, True) in edges(drawn())
 
 
-def test_supervisor_publishes_its_status_and_parameters_are_omitted() -> None:
+def test_supervisor_publishes_its_status_and_parameters_are_omitted():
     page = ServiceWiring("viewer", "", reads=["supervisor/status"], calls=["param/task", "motion/stop"])
     graph = graph_of("tiny", [page])
     assert ("supervisor", "key supervisor/status", False, True) in edges(graph)
@@ -46,7 +45,7 @@ def test_supervisor_publishes_its_status_and_parameters_are_omitted() -> None:
     assert page.calls == ["param/task", "motion/stop"]
 
 
-def test_drawing_has_all_names_in_boxes_that_do_not_overlap() -> None:
+def test_drawing_has_all_names_in_boxes_that_do_not_overlap():
     root = ET.fromstring(svg(drawn()))
     texts = [each.text for each in root.iter(f"{SVG}text")]
     assert {"planner", "executor", "task", *drawn().kinds} <= set(texts)
@@ -63,12 +62,12 @@ def test_drawing_has_all_names_in_boxes_that_do_not_overlap() -> None:
 
 
 @pytest.mark.parametrize(("alive", "dashed"), [(None, 0), (RUNNING | {"planner"}, 0), (RUNNING, 2)])
-def test_stopped_services_are_dashed_on_both_sides(alive: frozenset[str] | None, dashed: int) -> None:
+def test_stopped_services_are_dashed_on_both_sides(alive, dashed):
     boxes = ET.fromstring(svg(drawn(alive))).iter(f"{SVG}rect")
     assert sum("stroke-dasharray" in box.attrib for box in boxes) == dashed
 
 
-def test_dot_and_mermaid_have_each_edge_and_mark_stopped_services() -> None:
+def test_dot_and_mermaid_have_each_edge_and_mark_stopped_services():
     text, lines = dot(drawn(RUNNING)), mermaid(drawn(RUNNING)).splitlines()
     assert text.startswith('digraph "tiny" {') and '"planner" [shape=box, style="dashed"' in text
     assert '  "executor" -> "key joint_states";' in text and '  "task" -> "key motion/plan" [style=dashed];' in text
@@ -79,7 +78,7 @@ def test_dot_and_mermaid_have_each_edge_and_mark_stopped_services() -> None:
 
 
 @pytest.mark.parametrize("suffix", [".svg", ".dot", ".mmd"])
-def test_cell_is_drawn_without_running(suffix: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_cell_is_drawn_without_running(suffix, tmp_path, capsys):
     path = tmp_path / f"it{suffix}"
     for options in ([], ["--no-viewer"]):
         assert app.execute(["graph", "ur5", "-o", str(path), "--connect", "tcp/127.0.0.1:1", *options]) == 0
@@ -89,7 +88,7 @@ def test_cell_is_drawn_without_running(suffix: str, tmp_path: Path, capsys: pyte
         assert all(name in text for name in ("contour_tracer", "depth_camera/image_raw", "outline/select"))
 
 
-def test_service_that_cannot_be_wired_is_reported_and_the_others_are_drawn(folder: Path) -> None:
+def test_service_that_cannot_be_wired_is_reported_and_the_others_are_drawn(folder):
     (folder / "broken").mkdir()
     (folder / "broken" / "middle.py").write_text("raise OSError('no such device')\n")
     file = folder / "tiny.yaml"

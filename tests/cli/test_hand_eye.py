@@ -1,12 +1,10 @@
 """A camera at the hand: collect views while an arm is moved from pose to pose, and calibrate from them."""
 
-from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
 import cv2
 import numpy as np
-import pytest
 import yaml
 
 from cli.main import app
@@ -52,7 +50,7 @@ def rest_at(collector: HandEyeCollector, q: np.ndarray, start: float) -> None:
         collector.joints(start + 0.01 * k, q)
 
 
-def test_images_of_a_resting_arm_in_new_poses_are_collected_and_continued(tmp_path: Path) -> None:
+def test_images_of_a_resting_arm_in_new_poses_are_collected_and_continued(tmp_path):
     collector = HandEyeCollector(tmp_path / "views", ROBOT, "panda", BOARD)
     assert collector.add_image(1.0, image(0)) == "no joint state at the time of the image"
     rest_at(collector, POSES[0], 1.0)
@@ -68,9 +66,7 @@ def test_images_of_a_resting_arm_in_new_poses_are_collected_and_continued(tmp_pa
     assert saved["robot"] == "panda" and np.allclose(saved["pictures"]["view_001.png"], POSES[1], atol=1e-8)
 
 
-def test_camera_at_the_hand_is_calibrated_from_a_folder(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], rejection: Callable[..., str]
-) -> None:
+def test_camera_at_the_hand_is_calibrated_from_a_folder(tmp_path, capsys, rejection):
     collector = HandEyeCollector(tmp_path / "views", ROBOT, "panda", BOARD)
     for n, q in enumerate(POSES):
         rest_at(collector, q, float(n))
@@ -94,7 +90,7 @@ def test_camera_at_the_hand_is_calibrated_from_a_folder(
     assert "view_004.png' is not an image in that folder" in rejection(*command, "--camera", "hand")
 
 
-def test_views_are_collected_from_a_running_cell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_views_are_collected_from_a_running_cell(tmp_path, monkeypatch):
     shots = {f"s{n}.png": POSES[n].tolist() for n in range(3)}
     for n, name in enumerate(shots):
         cv2.imwrite(str(tmp_path / name), image(n))

@@ -30,7 +30,7 @@ TOPICS = ["..", "../../up", "/etc/passwd", ".hidden", "a/b", "a_b", "nul\0", "x"
 
 
 @pytest.fixture(autouse=True)
-def warm() -> None:
+def warm():
     """Import the modules of the commands, which are no part of what a recording costs."""
     import recording.foxglove
     import recording.reader
@@ -38,7 +38,7 @@ def warm() -> None:
 
 
 @pytest.fixture
-def path(tmp_path: Path) -> Path:
+def path(tmp_path):
     return tmp_path / "run.mcap"
 
 
@@ -113,7 +113,7 @@ BOMBS: dict[str, Callable[[], bytes]] = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", BOMBS)
-def test_bomb_is_rejected_at_once(name: str, path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bomb_is_rejected_at_once(name, path, capsys):
     path.write_bytes(MCAP0_MAGIC + HEADER + BOMBS[name]())
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     for each in ("info", "play", "report", "export", "recover"):
@@ -137,9 +137,7 @@ def test_bomb_is_rejected_at_once(name: str, path: Path, capsys: pytest.CaptureF
     {"about": {"cell": "../../etc"}}, {"about": {"cell": ["panda"]}}, {"about": {"cell": EVIL}},
     {"about": {"cell": "**"}}, {"ended": {"missed": [1]}}, {"ended": {"dropped": {"panda/tf": "many"}}},
 ], ids=lambda wrong: str(wrong)[:40])
-def test_invalid_metadata_is_one_line(
-    wrong: dict[str, Any], path: Path, rejection: Callable[..., str], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_invalid_metadata_is_one_line(wrong, path, rejection, capsys):
     line = rejection("report", str(run_with(path, **wrong)))
     assert "which is not" in line and not STEERING.search(line)
     for each in ("info", "export", "recover"):
@@ -155,9 +153,7 @@ def test_invalid_metadata_is_one_line(
     {"overrides": ["world={{a: &a [1], b: *a}}"]}, {"about": {"cell": "secret.yaml"}},
 ], ids=str)
 @pytest.mark.slow
-def test_no_file_named_in_a_recording_is_read(
-    names: dict[str, Any], path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_no_file_named_in_a_recording_is_read(names, path, monkeypatch, capsys):
     folder = path.parent
     run_with(path, **json.loads(json.dumps(names).replace("{folder}", str(folder))))
     (folder / "secret.yaml").mkdir()  # reading a folder fails
@@ -174,7 +170,7 @@ def test_no_file_named_in_a_recording_is_read(
 
 
 @pytest.mark.parametrize("kind", ["--csv", "--images"])
-def test_export_stays_in_its_folder(kind: str, path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_export_stays_in_its_folder(kind, path, capsys):
     image = packed(Image(header=Header(stamp=1), height=2, width=2, encoding="mono8", step=2, data=b"abcd"))
     more = {} if kind == "--csv" else {"payload": image, "message": "Image"}
     write(path, *(joints(number, key=f"panda/{topic}", **more) for number, topic in enumerate(TOPICS)))
@@ -187,19 +183,19 @@ def test_export_stays_in_its_folder(kind: str, path: Path, capsys: pytest.Captur
     assert not STEERING.search(capsys.readouterr().out)
 
 
-def test_file_names_are_unique_and_those_of_the_topics_where_possible() -> None:
+def test_file_names_are_unique_and_those_of_the_topics_where_possible():
     names = {"camera/image_raw": "camera_image_raw", "tf_static": "tf_static"}
     assert file_names(list(names)) == names
     assert len(set(file_names(TOPICS).values())) == len(TOPICS)
 
 
 @pytest.mark.parametrize("topic", ["**", "a/*", "a//b", "/a", "a?b", "", "../up", "a\x1b"])
-def test_invalid_key_is_not_played(topic: str, path: Path, rejection: Callable[..., str]) -> None:
+def test_invalid_key_is_not_played(topic, path, rejection):
     write(path, joints(0, key=f"panda/{topic}"))
     assert "which is not a key" in rejection("play", str(path))
 
 
-def test_text_of_a_recording_controls_neither_terminal_nor_page(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_text_of_a_recording_controls_neither_terminal_nor_page(path, capsys):
     line = LogLine.model_construct(header=Header(stamp=1), service=EVIL, level="error", message=EVIL)
     logged = joints(6, key="panda/log", payload=packed(line), message="LogLine", kind="event")
     write(path, *map(joints, range(5)), logged,
@@ -214,9 +210,7 @@ def test_text_of_a_recording_controls_neither_terminal_nor_page(path: Path, caps
 
 
 @pytest.mark.parametrize("number", [float("nan"), float("inf"), 1e308, -1e308])
-def test_report_of_impossible_numbers_is_one_line_at_most(
-    number: float, path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_report_of_impossible_numbers_is_one_line_at_most(number, path, capsys):
     state = JointState.model_construct(header=Header(stamp=1), name=[f"panda_joint{k}" for k in range(1, 8)],
                                        position=[number] * 7, velocity=[number] * 7, effort=[])
     write(path, *(joints(k, payload=packed(state)) for k in range(5)), status(6))
@@ -226,7 +220,7 @@ def test_report_of_impossible_numbers_is_one_line_at_most(
 
 
 @pytest.mark.slow
-def test_damaged_byte_is_one_line(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_damaged_byte_is_one_line(path, capsys):
     whole = run_with(path).read_bytes()
     for at in range(0, len(whole), max(1, len(whole) // 10)):
         path.write_bytes(whole[:at] + bytes([whole[at] ^ 0xFF]) + whole[at + 1:])

@@ -1,7 +1,5 @@
 """Options of `run` and `up` for a cell on several hosts."""
 
-from __future__ import annotations
-
 import pytest
 
 from common.clock import EPOCH_VARIABLE
@@ -19,7 +17,7 @@ ALL = [entry.name for entry in CELL.services.values()]
 
 
 @pytest.fixture(autouse=True)
-def _no_variables(monkeypatch: pytest.MonkeyPatch) -> None:
+def _no_variables(monkeypatch):
     for variable in (EPOCH_VARIABLE, LINK_VARIABLE, LISTEN_VARIABLE, SECURE_VARIABLE):
         monkeypatch.delenv(variable, raising=False)
 
@@ -28,7 +26,7 @@ def names(options: HostOptions) -> list[str]:
     return [entry.name for entry in options.part_of(CELL).services.values()]
 
 
-def test_only_and_without_divide_a_cell_in_start_order() -> None:
+def test_only_and_without_divide_a_cell_in_start_order():
     assert names(HostOptions()) == ALL
     assert names(HostOptions(only=[" , ".join(reversed(PERCEPTION))])) == PERCEPTION
     assert names(HostOptions(without=PERCEPTION)) == [name for name in ALL if name not in PERCEPTION]
@@ -42,9 +40,7 @@ def test_only_and_without_divide_a_cell_in_start_order() -> None:
     (HostOptions(), ["--link", "tcp/a:1", "--link", "tcp/b:2"], "tcp/a:1, tcp/b:2"),
     (HostOptions(link=[FAR]), ["--link", FAR], "tcp/a:1, tcp/b:2"),
 ])
-def test_router_listens_for_its_host_and_is_linked_by_options_or_the_environment(
-    options: HostOptions, linked: list[str], links: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_router_listens_for_its_host_and_is_linked_by_options_or_the_environment(options, linked, links, monkeypatch):
     if links:
         monkeypatch.setenv(LINK_VARIABLE, links)
     command = options.linked(Launch("panda")).router_command()
@@ -56,13 +52,10 @@ def test_router_listens_for_its_host_and_is_linked_by_options_or_the_environment
     (HostOptions(only=["viewer"], without=["viewer"]), {}, "exclude each other"),
     (HostOptions(without=ALL), {}, "leaves no service"),
     (HostOptions(link=["192.168.1.10"]), {}, r"--link: '192\.168\.1\.10' must be an endpoint"),
-    (HostOptions(listen=[FAR]), {SECURE_VARIABLE: "/certificates"}, "must be tls/HOST:PORT"),
     (HostOptions(only=["viewer"]), {}, r"--speed: 3.0 needs ZENCELL_EPOCH on several hosts"),
     (HostOptions(), {EPOCH_VARIABLE: "yesterday"}, "nanoseconds"),
 ])
-def test_bad_options_are_rejected(
-    options: HostOptions, variables: dict[str, str], reason: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_bad_options_are_rejected(options, variables, reason, monkeypatch):
     for variable, value in variables.items():
         monkeypatch.setenv(variable, value)
     with pytest.raises((ConfigError, UnknownName), match=reason):
@@ -71,12 +64,12 @@ def test_bad_options_are_rejected(
         options.epoch(3.0)
 
 
-def test_link_needs_a_router_of_this_host() -> None:
+def test_link_needs_a_router_of_this_host():
     with pytest.raises(ConfigError, match="with --connect none is started"):
         HostOptions(link=[FAR]).linked(Launch("panda", connect=FAR))
 
 
-def test_epoch_comes_from_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_epoch_comes_from_the_environment(monkeypatch):
     assert HostOptions(only=["viewer"]).epoch(1.0) is None and HostOptions().epoch(3.0) is None
     monkeypatch.setenv(EPOCH_VARIABLE, "1700000000000000000")
     assert HostOptions(only=["viewer"]).epoch(3.0) == 1_700_000_000_000_000_000

@@ -21,13 +21,13 @@ ZENOH = Path(sys.executable).parent / "zenoh"
 
 
 @pytest.fixture(scope="module")
-def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Place]:
+def place(tmp_path_factory):
     folder = make_folder(tmp_path_factory.mktemp("inspection"), "talk", "talker")
     with place_of(folder, "talk.yaml", "--speed", str(SPEED)) as place:
         yield place
 
 
-def test_nodes_are_listed_and_described(place: Place) -> None:
+def test_nodes_are_listed_and_described(place):
     assert place.say("node", "list") == ["talk/last", "talk/middle", "talk/supervisor", "talk/talker"]
     assert json.loads(place.say("node", "list", "--json")[0]) == {"cell": "talk", "service": "last"}
     (line,) = place.say("node", "info", "talker", "--cell", "talk.yaml", "--json")
@@ -41,7 +41,7 @@ def test_nodes_are_listed_and_described(place: Place) -> None:
     assert (parameter["path"], parameter["value"], parameter["minimum"]) == ("services.talker.width", 4, 1)
 
 
-def test_graph_marks_running_services(place: Place) -> None:
+def test_graph_marks_running_services(place):
     done = place.ask("graph", "talk.yaml", "-o", "talk.svg")  # what services print while they are wired is on stderr
     (line,) = done.stdout.splitlines()
     assert done.returncode == 0 and line.endswith(", 3 services alive")
@@ -49,7 +49,7 @@ def test_graph_marks_running_services(place: Place) -> None:
     assert "green: alive; dashed and grey: not alive" in [each.text for each in drawing.iter()]
 
 
-def test_transforms_are_chained_and_listed_as_trees(place: Place) -> None:
+def test_transforms_are_chained_and_listed_as_trees(place):
     (line,) = place.say("tf", "echo", "world", "hand", "--once")
     assert line == ("hand in world: position 1.2500 0.0000 0.0000 m, quaternion 0.0000 0.0000 0.0000 1.0000, "
                     "rpy 0.00 0.00 0.00 deg")
@@ -59,7 +59,7 @@ def test_transforms_are_chained_and_listed_as_trees(place: Place) -> None:
     assert json.loads(place.say("tf", "frames", "--json")[-1]) == {"frame": "hand", "parent": "base", "moves": True}
 
 
-def test_echo_shows_an_image_in_one_line_and_saves_it(place: Place) -> None:
+def test_echo_shows_an_image_in_one_line_and_saves_it(place):
     first, second = place.say("topic", "echo", "camera/image_raw", "--count", "2", "--save", "seen.png")
     assert first.startswith("Image 4x3 bgr8 36 B stamp ") and first.endswith(" camera") and first != second
     image = cv2.imread(str(place.folder / "seen.png"))
@@ -69,7 +69,7 @@ def test_echo_shows_an_image_in_one_line_and_saves_it(place: Place) -> None:
     assert json.loads(line)["data"] == "<36 bytes>"
 
 
-def test_echo_shows_states_published_before_it_started(place: Place) -> None:
+def test_echo_shows_states_published_before_it_started(place):
     (line,) = place.say("topic", "echo", "pick_place_status", "-n", "1", "--cell", "talk")
     assert json.loads(line)["state"] == "IDLE"
     (line,) = place.say("topic", "echo", "supervisor/status", "-n", "1")
@@ -79,14 +79,14 @@ def test_echo_shows_states_published_before_it_started(place: Place) -> None:
 
 
 @pytest.mark.slow
-def test_rate_and_bandwidth_are_measured(place: Place) -> None:
+def test_rate_and_bandwidth_are_measured(place):
     *_, last = place.say("topic", "hz", "camera/image_raw", "--count", "2", "--json")
     assert json.loads(last)["hz"] > 0
     *_, last = place.say("topic", "bw", "camera/image_raw", "--count", "2")
     assert "B each" in last
 
 
-def test_delay_is_in_wall_time_at_any_speed(place: Place) -> None:
+def test_delay_is_in_wall_time_at_any_speed(place):
     figures = json.loads(place.say("topic", "delay", "camera/image_raw", "--count", "1", "--json")[-1])
     assert figures["messages"] > 0
     # By the wall clock alone cell time would lie in the future, and the delays would be negative.
@@ -105,7 +105,7 @@ def published(place: Place, key: str, *arguments: str) -> Iterator[None]:
         assert publishing.end() == 130
 
 
-def test_custom_key_is_published_unchanged_and_has_no_delay(place: Place) -> None:
+def test_custom_key_is_published_unchanged_and_has_no_delay(place):
     with published(place, "my/key", '{"a": [1, {"b": null}]}', "--rate", "20"):
         (line,) = place.say("topic", "echo", "my/key", "--count", "1")
         done = place.ask("topic", "delay", "my/key", "--count", "3")
@@ -115,7 +115,7 @@ def test_custom_key_is_published_unchanged_and_has_no_delay(place: Place) -> Non
     assert line.startswith("zencell: my/key: its messages have no header with a stamp")
 
 
-def test_published_state_is_stamped_in_cell_time(place: Place) -> None:
+def test_published_state_is_stamped_in_cell_time(place):
     with published(place, "gripper/state", '{"width": 0.04}', "--rate", "5"):
         (line,) = place.say("topic", "echo", "gripper/state", "--count", "1")
         delay = json.loads(place.say("topic", "delay", "gripper/state", "--count", "2", "--json")[-1])
@@ -124,7 +124,7 @@ def test_published_state_is_stamped_in_cell_time(place: Place) -> None:
     assert delay["min"] > -50  # in another clock it would be seconds in the future
 
 
-def test_message_published_once_reaches_a_subscriber(place: Place) -> None:
+def test_message_published_once_reaches_a_subscriber(place):
     echoing = place.start("topic", "echo", "log", "--count", "1", "--json")
     while echoing.process.poll() is None:  # until it has subscribed, each attempt is lost
         assert place.ask("topic", "pub", "log", '{"service": "me", "level": "info", "message": "hello"}',
@@ -133,7 +133,7 @@ def test_message_published_once_reaches_a_subscriber(place: Place) -> None:
     assert echoing.end() == 0
 
 
-def test_top_shows_processes_and_topics(place: Place) -> None:
+def test_top_shows_processes_and_topics(place):
     view = json.loads(*place.say("top", "--once", "--json"))
     services = {row["service"]: row for row in view["services"]}
     assert {"router", "talker", "middle", "last", "supervisor"} <= services.keys()
@@ -146,7 +146,7 @@ def test_top_shows_processes_and_topics(place: Place) -> None:
 
 
 @pytest.mark.slow
-def test_top_prints_plain_lines_until_interrupted(place: Place) -> None:
+def test_top_prints_plain_lines_until_interrupted(place):
     watching = place.start("top")
     for _ in range(2):
         watching.until("talk at speed 2")
@@ -156,12 +156,12 @@ def test_top_prints_plain_lines_until_interrupted(place: Place) -> None:
     assert not any("\x1b" in line for line in watching.lines)
 
 
-def test_requests_are_answered_as_json(place: Place) -> None:
+def test_requests_are_answered_as_json(place):
     assert json.loads(*place.say("call", "task/command", '{"command": "pause"}'))["paused"] is True
     assert json.loads(*place.say("task", "start"))["paused"] is False
 
 
-def test_stop_that_is_not_saved_is_reported_to_the_operator(place: Place) -> None:
+def test_stop_that_is_not_saved_is_reported_to_the_operator(place):
     motion, task = place.ask("task", "stop").stderr.splitlines()
     assert motion == "zencell: stopped since 1970-01-01 00:00:00 UTC by anna (not saved on disk (it is full))"
     assert "the arm is stopped and stays so until a start; the task did not confirm the stop" in task
@@ -178,9 +178,7 @@ def test_stop_that_is_not_saved_is_reported_to_the_operator(place: Place) -> Non
     (["world", "add", "0.4", "-0.2"], 1, "world/edit: no service answers this key"),
     (["topic", "delay", "camera/image_rwa", "-n", "1"], 2, "did you mean 'camera/image_raw'?"),
 ])
-def test_rejection_by_the_cell_is_one_line(
-    place: Place, arguments: list[str], code: int, message: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_rejection_by_the_cell_is_one_line(place, arguments, code, message, monkeypatch):
     monkeypatch.setattr("common.client.frames.TIMEOUT", 0.5)
     done = place.ask(*arguments)
     (line,) = done.stderr.splitlines()
@@ -197,7 +195,7 @@ def zenoh(place: Place, *arguments: str) -> str:
 
 
 @pytest.mark.skipif(not ZENOH.exists(), reason="zenoh-cli is not installed next to this Python")
-def test_zenoh_cli_decodes_states_and_images_and_encodes_requests(place: Place) -> None:
+def test_zenoh_cli_decodes_states_and_images_and_encodes_requests(place):
     line = zenoh(place, "get", "-s", "talk/pick_place_status", "--decoder", "msgpack", "--line", "{key} {value}")
     key, _, value = line.partition(" ")
     assert (key, json.loads(value)["state"]) == ("talk/pick_place_status", "IDLE")
@@ -220,7 +218,7 @@ def test_zenoh_cli_decodes_states_and_images_and_encodes_requests(place: Place) 
     assert json.loads(seen["talk/supervisor/status"])["cell"] == "talk"
 
 
-def test_doctor_finds_the_cell_its_router_and_its_version(place: Place) -> None:
+def test_doctor_finds_the_cell_its_router_and_its_version(place):
     findings = [json.loads(line) for line in place.ask("doctor", "--json").stdout.splitlines()]
     found = [finding["what"] for finding in findings]
     assert any("a router of zencell answers there" in what for what in found)

@@ -1,10 +1,7 @@
 """`zencell new` writes a complete project."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -17,14 +14,14 @@ from tests.harness import ask, environment
 KINDS = choices.task_kinds()
 
 
-def test_kinds_are_the_examples_with_a_cell_and_are_completed() -> None:
+def test_kinds_are_the_examples_with_a_cell_and_are_completed():
     assert KINDS == ["sort_cubes", "stack_cubes"]
     found = dict(choices.tasks("st"))
     assert list(found) == ["stack_cubes"] and found["stack_cubes"].startswith("Stack cubes")
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_project_has_a_cell_and_a_task_whose_process_starts_in_any_folder(kind: str, tmp_path: Path) -> None:
+def test_project_has_a_cell_and_a_task_whose_process_starts_in_any_folder(kind, tmp_path):
     name = f"my_{kind}"
     done = ask(tmp_path, "new", f"deep/{name}", "--task", kind)
     assert (done.returncode, done.stderr) == (0, "")
@@ -42,7 +39,7 @@ def test_project_has_a_cell_and_a_task_whose_process_starts_in_any_folder(kind: 
     assert process.returncode == 0 and "--cell" in process.stdout, process.stderr
 
 
-def test_project_is_written_into_an_empty_folder(tmp_path: Path) -> None:
+def test_project_is_written_into_an_empty_folder(tmp_path):
     (tmp_path / "empty_one").mkdir()
     assert ask(tmp_path, "new", "empty_one").returncode == 0
     assert (tmp_path / "empty_one" / "cell.yaml").is_file()

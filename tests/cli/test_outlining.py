@@ -1,7 +1,5 @@
 """Files of outlining that cannot be used are rejected in one line."""
 
-from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -24,10 +22,7 @@ AT_THE_BORDER[300:400, :100] = (0, 255, 255)
     (BLACK, FAR, ["--select", "none"], 2, "chooses nothing"),
     (AT_THE_BORDER, FAR, [], 1, "every contour touches the border"),
 ], ids=lambda value: value if isinstance(value, str) else "")
-def test_unusable_images_are_rejected(
-    image: np.ndarray, depth: np.ndarray | None, arguments: list[str], code: int, wanted: str, tmp_path: Path,
-    rejection: Callable[..., str],
-) -> None:
+def test_unusable_images_are_rejected(image, depth, arguments, code, wanted, tmp_path, rejection):
     stage_files.write_pictures(tmp_path, image, FAR if depth is None else depth)
     if depth is None:
         (tmp_path / stage_files.DEPTH).write_bytes(b"no array")
@@ -36,9 +31,7 @@ def test_unusable_images_are_rejected(
 
 @pytest.mark.parametrize(("text", "wanted"), [
     ("", "is not valid JSON"), ("[[1, 2, 3]]", "at least 3 points"), ("[[0, 0, 1], [0, 1, 1], [1, 1]]", "entry 2")])
-def test_unusable_coordinates_are_rejected(
-    text: str, wanted: str, tmp_path: Path, rejection: Callable[..., str]
-) -> None:
+def test_unusable_coordinates_are_rejected(text, wanted, tmp_path, rejection):
     (tmp_path / stage_files.CLEARED).write_text(text)
     line = rejection("run", "ur5", "--from", str(tmp_path))
     assert f"{stage_files.CLEARED}: " in line and wanted in line

@@ -2,7 +2,6 @@
 
 import hashlib
 import socket
-from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -12,7 +11,6 @@ from common.errors import ConfigError
 from common.transport.credentials import SECURE_VARIABLE
 from page.address import FIRST_PORT, PageAddress, plan_page
 from security.page_tokens import TOKEN_VARIABLE
-from tests.harness import Zencell
 
 
 def cell_with(folder: Path, parameters: str = "{}") -> Cell:
@@ -23,13 +21,13 @@ def cell_with(folder: Path, parameters: str = "{}") -> Cell:
 
 
 @pytest.fixture
-def cell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Cell:
+def cell(tmp_path, monkeypatch):
     monkeypatch.delenv(TOKEN_VARIABLE, raising=False)
     return cell_with(tmp_path)
 
 
 @pytest.fixture
-def taken() -> Iterator[int]:
+def taken():
     """A port on which a server listens."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         yield server.getsockname()[1]
@@ -41,11 +39,11 @@ def planned(cell: Cell, host: str | None = None, port: str | None = None) -> Pag
     return page
 
 
-def test_cell_without_a_viewer_has_no_page(cell: Cell) -> None:
+def test_cell_without_a_viewer_has_no_page(cell):
     assert plan_page(cell.model_copy(update={"services": {}}), None, None) is None
 
 
-def test_page_is_local_by_default_and_each_cell_has_a_free_port(cell: Cell) -> None:
+def test_page_is_local_by_default_and_each_cell_has_a_free_port(cell):
     page, other = planned(cell), planned(cell)
     port = int(page.url.rpartition(":")[2])
     assert page.url == f"http://127.0.0.1:{port}" != other.url and port >= FIRST_PORT
@@ -55,7 +53,7 @@ def test_page_is_local_by_default_and_each_cell_has_a_free_port(cell: Cell) -> N
     assert planned(cell).url == url, "the port of a cell that ended is free again"
 
 
-def test_next_free_port_is_used_up_to_the_last(cell: Cell, monkeypatch: pytest.MonkeyPatch, taken: int) -> None:
+def test_next_free_port_is_used_up_to_the_last(cell, monkeypatch, taken):
     monkeypatch.setattr("page.address.FIRST_PORT", taken)
     monkeypatch.setattr("page.address.LAST_PORT", taken + 50)
     assert taken < int(planned(cell).url.rpartition(":")[2]) <= taken + 50
@@ -64,7 +62,7 @@ def test_next_free_port_is_used_up_to_the_last(cell: Cell, monkeypatch: pytest.M
         plan_page(cell, None, None)
 
 
-def test_port_in_use_is_rejected_with_its_process(cell: Cell, tmp_path: Path, taken: int) -> None:
+def test_port_in_use_is_rejected_with_its_process(cell, tmp_path, taken):
     with pytest.raises(ConfigError, match=f"--viewer-port: {taken} is in use by .*python"):
         plan_page(cell, None, str(taken))
     with pytest.raises(ConfigError, match=f"services.viewer.port: {taken} is in use by .*python"):
@@ -72,20 +70,18 @@ def test_port_in_use_is_rejected_with_its_process(cell: Cell, tmp_path: Path, ta
 
 
 @pytest.mark.parametrize("port", ["0", "65536", "-1", "80 80", "http", "²", ""])
-def test_invalid_port_is_rejected(cell: Cell, port: str) -> None:
+def test_invalid_port_is_rejected(cell, port):
     with pytest.raises(ConfigError, match=r"--viewer-port: .* must be a whole number from 1 to 65535"):
         plan_page(cell, None, port)
 
 
 @pytest.mark.parametrize("host", ["192.0.2.1", "no.such.host.invalid"])
-def test_address_of_another_machine_is_rejected(cell: Cell, host: str) -> None:
+def test_address_of_another_machine_is_rejected(cell, host):
     with pytest.raises(ConfigError, match=f"services.viewer.host: '{host}' cannot listen at this address: "):
         plan_page(cell, host, None)
 
 
-def test_page_on_the_network_and_of_a_secured_cell_gets_a_new_token(
-    cell: Cell, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_page_on_the_network_and_of_a_secured_cell_gets_a_new_token(cell, monkeypatch):
     pages = [planned(cell, "0.0.0.0"), planned(cell, "0.0.0.0")]
     monkeypatch.setenv(SECURE_VARIABLE, "certs")
     pages.append(planned(cell))
@@ -96,15 +92,13 @@ def test_page_on_the_network_and_of_a_secured_cell_gets_a_new_token(
     assert "0.0.0.0" not in pages[0].url and pages[0].overrides[0] == "services.viewer.host=0.0.0.0"
 
 
-def test_token_from_the_environment_is_not_shown(cell: Cell, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_token_from_the_environment_is_not_shown(cell, monkeypatch):
     monkeypatch.setenv(TOKEN_VARIABLE, "correct-horse-battery")
     page = planned(cell, "0.0.0.0")
     assert "token" not in page.url and not page.environment
 
 
-def test_token_is_printed_once_and_is_in_no_command_line_and_no_summary(
-    folder: Path, zencell: Callable[..., Zencell]
-) -> None:
+def test_token_is_printed_once_and_is_in_no_command_line_and_no_summary(folder, zencell):
     file = folder / "tiny.yaml"
     file.write_text(file.read_text().replace("services: {", "services: {tests.cli.fakes.viewer: {}, "))
     command = zencell("up", "tiny.yaml", "--viewer-host", "0.0.0.0", "--summary", "out.json")

@@ -6,7 +6,6 @@ import re
 import numpy as np
 import pytest
 
-from applications.outlining.topics import OutlinePoints, OutlineStatus
 from applications.pick_place.topics import PickPlaceStatus
 from common import messages as m
 from tests.cli.run_tape import BEGIN, Tape, report
@@ -123,34 +122,6 @@ def test_latency_of_a_fast_run_is_in_wall_time(tmp_path):
     assert "3 frames: median 20.0 ms" in tape.report().sections["latency"]
 
 
-@pytest.mark.slow
-def test_outline_is_compared_with_the_traced_path(tmp_path):
-    tape = Tape(tmp_path / "outline.mcap", "ur5", world="w2")
-
-    def task(seconds, state, **values):
-        tape.put(seconds, "outline_status", OutlineStatus(
-            header=tape.header(seconds), state=state, started=True, **values))
-
-    corners = [(0.45, -0.05), (0.55, -0.05), (0.55, 0.05), (0.45, 0.05)]
-    poses = [pose(x, y, 1.05) for x, y in corners]
-    task(0, "PLANNING")
-    tape.put(0.4, "contour_path", OutlinePoints(header=tape.header(0.1), poses=poses, object="Object_0"))
-    tape.put(0.5, "scene_objects", m.WorldObjects(objects=[m.WorldObject(
-        id="cube", shape="box", outline=corners, base=1.0, height=0.05)]))
-    task(1, "APPROACHING")
-    task(1.5, "TRACING")
-    for k in range(20):
-        t = 1.6 + 0.05 * k
-        q = [0.01 * k, -1.5, 1.5, -1.5, -1.5, 0.0]
-        tape.put(t, "joint_states", m.JointState(header=tape.header(t), name=UR5, position=q, velocity=[0.2] * 6))
-    task(3, "DONE", object="Object_0", points=4, fraction=0.75, length_m=0.4)
-    page = tape.report()
-    assert "outline" in page.sections and "top" not in page.sections
-    assert all(part in page.head for part in ("outlined Object_0", "of 0.400 m", "world w2", "from the true edge"))
-    assert "4 points of the contour" in page.sections["outline"]
-    assert "1 frame: median 300.0 ms" in page.sections["latency"]
-
-
 def test_custom_application_is_reported_with_its_own_figures(tmp_path, monkeypatch):
     (tmp_path / "own_words").mkdir()
     (tmp_path / "own_words" / "polish.py").write_text(
@@ -207,18 +178,12 @@ def test_truncated_recording_is_reported_up_to_its_end(tmp_path, capsys):
     assert all(page.sections[section].strip() for section in ("plans", "latency", "joints"))
 
 
-@pytest.mark.parametrize(("content", "wanted"), [
-    (None, ["no such file"]), (b"", ["has no messages of a run"]), (b"PK\x03\x04 an album", ["is no MCAP file"]),
-    ("empty", ["has no messages of a run", "joint_states"]), ("foreign", ["has no messages of a run"]),
-])
-def test_recording_without_a_run_is_rejected(content, wanted, tmp_path, rejection):
-    path = tmp_path / "run.mcap"
-    if isinstance(content, bytes):
-        path.write_bytes(content)
-    elif content:
-        tape = Tape(path)
-        if content == "foreign":
-            tape.put(0, "foreign/status", PickPlaceStatus())
-        tape.writer.close()
-    line = rejection("report", str(path))
-    assert all(part in line for part in [str(path), *wanted]) and not (tmp_path / "run.html").exists()
+@pytest.mark.parametrize("topic", [None, "foreign/status"])
+def test_recording_without_a_run_is_rejected(topic, tmp_path, rejection):
+    tape = Tape(tmp_path / "run.mcap")
+    if topic:
+        tape.put(0, topic, PickPlaceStatus())
+    tape.writer.close()
+    line = rejection("report", str(tape.path))
+    assert all(part in line for part in (str(tape.path), "has no messages of a run", "joint_states"))
+    assert not tape.path.with_suffix(".html").exists()

@@ -4,7 +4,6 @@ import logging
 import re
 import threading
 
-import pytest
 from rich.console import Console
 
 from cli.session.live_table import MOST_LINES, LiveScreen, render
@@ -18,15 +17,15 @@ CONTENT = Content(
 )
 
 
-def test_table_shows_state_restarts_rates_and_progress() -> None:
+def test_table_shows_state_restarts_rates_and_progress():
     console = Console(file=io.StringIO(), width=100)
     console.print(render(CONTENT))
-    text = console.file.getvalue()  # type: ignore[attr-defined]
+    text = console.file.getvalue()
     assert ["vision", "restarting", "2", "detected_objects", "10.0"] in [line.split() for line in text.splitlines()]
     assert "3 of 7 placed - GRASPING ball_4" in text
 
 
-def test_flood_of_lines_is_drawn_in_batches_and_the_excess_is_counted() -> None:
+def test_flood_of_lines_is_drawn_in_batches_and_the_excess_is_counted():
     text = io.StringIO()
     screen = LiveScreen(Console(file=text, width=100, force_terminal=True), lambda: CONTENT)
     screen.note("it is up")
@@ -41,7 +40,7 @@ def test_flood_of_lines_is_drawn_in_batches_and_the_excess_is_counted() -> None:
     assert "it is up" in text.getvalue()
 
 
-def test_table_is_updated_also_during_a_flood_of_lines() -> None:
+def test_table_is_updated_also_during_a_flood_of_lines():
     text, progress, updated = io.StringIO(), ["the first"], threading.Event()
 
     def content() -> Content:
@@ -57,7 +56,7 @@ def test_table_is_updated_also_during_a_flood_of_lines() -> None:
     assert "the second" in text.getvalue()
 
 
-def test_output_without_a_terminal_has_no_control_characters(capsys: pytest.CaptureFixture[str]) -> None:
+def test_output_without_a_terminal_has_no_control_characters(capsys):
     screen = open_screen(lambda: CONTENT, log_json=False)  # stderr is no terminal here
     assert isinstance(screen, PlainScreen)
     screen.line("router", "INFO router: listening")
@@ -70,7 +69,7 @@ def test_output_without_a_terminal_has_no_control_characters(capsys: pytest.Capt
     assert shown.out == "it is up\n"
 
 
-def test_json_lines_are_passed_on_and_others_wrapped(capsys: pytest.CaptureFixture[str]) -> None:
+def test_json_lines_are_passed_on_and_others_wrapped(capsys):
     screen = JsonScreen()
     for line in ('{"level": "error", "message": "x", "service": "b", "time": 1.0}', '{"half": ', "plain"):
         screen.line("a", line)

@@ -7,7 +7,6 @@ import signal
 import subprocess
 import time
 from contextlib import suppress
-from pathlib import Path
 
 import pytest
 
@@ -39,7 +38,7 @@ def test_campaign_that_exceeds_its_limit_names_each_seed_and_fails(capfd):
 
 
 @pytest.mark.slow
-def test_one_seed_is_reported_and_recorded(tmp_path: Path, capfd):
+def test_one_seed_is_reported_and_recorded(tmp_path, capfd):
     file = tmp_path / "seed.mcap"
     assert app.execute(["simulate", *SMALL, "--seed", "7", "--faults", "--trace", str(file)]) == 0
     text = capfd.readouterr().out

@@ -28,24 +28,24 @@ def show(what: str) -> None:
     (["--cell", "a"], CellTarget("a")),
     (["--connect", "tcp/b:1", "--cell", "a", "--domain", "7"], CellTarget("a", "7", "tcp/b:1")),
 ])
-def test_options_become_the_target(arguments: list[str], target: CellTarget) -> None:
+def test_options_become_the_target(arguments, target):
     seen.clear()
     assert CliRunner().invoke(app, ["ask", "something", *arguments]).exit_code == 0
     assert seen == [(target, "something")]
 
 
-def test_target_has_options_only_where_it_is_a_parameter_and_they_are_last() -> None:
+def test_target_has_options_only_where_it_is_a_parameter_and_they_are_last():
     assert CliRunner().invoke(app, ["show", "something", "--domain", "7"]).exit_code == 2
     group = typer.main.get_command(app)
-    names = [parameter.name for parameter in group.commands["ask"].params]  # type: ignore[attr-defined]
+    names = [parameter.name for parameter in group.commands["ask"].params]
     assert names == ["what", "cell", "as_json", "domain", "connect"]
 
 
-def test_every_command_with_a_domain_has_an_endpoint() -> None:
+def test_every_command_with_a_domain_has_an_endpoint():
     def commands(group: object, name: str) -> list[tuple[str, set[str]]]:
         below = getattr(group, "commands", None)
         if below is None:
-            return [(name, {parameter.name for parameter in group.params})]  # type: ignore[attr-defined]
+            return [(name, {parameter.name for parameter in group.params})]
         return [found for part, command in below.items() for found in commands(command, f"{name} {part}")]
 
     found = commands(typer.main.get_command(zencell), "zencell")

@@ -2,8 +2,6 @@
 
 import subprocess
 import sys
-from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 import typer
@@ -40,7 +38,7 @@ APPLICATION = Application(
 
 
 @pytest.fixture
-def output(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+def output(tmp_path, monkeypatch, capsys):
     """Run a command line with the commands of cell.yaml's own application, and return its output."""
     (tmp_path / "own_thing").mkdir()
     (tmp_path / "own_thing" / "thing.py").write_text(THING)
@@ -71,12 +69,12 @@ def output(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captu
         yield execute
 
 
-def test_commands_of_a_custom_application_are_added(output: Callable[..., str]) -> None:
+def test_commands_of_a_custom_application_are_added(output):
     assert output("greet", "cell.yaml", "--set", "a=1", "--loud") == "hello cell.yaml ['a=1'] True CommandShell"
     assert output("task", "greet", "cell.yaml") == "hello cell.yaml None False CommandShell"
 
 
-def test_options_of_applications_reach_the_run_as_overrides(output: Callable[..., str]) -> None:
+def test_options_of_applications_reach_the_run_as_overrides(output):
     assert output("run", "cell.yaml", "--set", "a=1", "--wish", "rain") == "['a=1', 'services.thing.wish=rain']"
     assert output("run", "cell.yaml") == "[]"
     usage = output("run", "--help")
@@ -85,23 +83,21 @@ def test_options_of_applications_reach_the_run_as_overrides(output: Callable[...
         output("run", "panda", "--ask")
 
 
-def test_only_cell_files_with_their_own_application_are_imported(output: Callable[..., str], tmp_path: Path) -> None:
+def test_only_cell_files_with_their_own_application_are_imported(output, tmp_path):
     (tmp_path / "other.yaml").write_text("application: pick_place\n")
     (tmp_path / "broken.yaml").write_text("application: [\n")
     arguments = ["run", "other.yaml", "broken.yaml", "missing.yaml", "panda", "--cell=cell.yaml"]
     assert list(verbs.own_applications(arguments)) == ["own_thing.thing"]
 
 
-def test_missing_application_is_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rejection: Callable[..., str]
-) -> None:
+def test_missing_application_is_one_line(tmp_path, monkeypatch, rejection):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "cell.yaml").write_text("cell: mine\napplication: nowhere.thing\nrobot: panda\nworld: balls\n"
                                         "pipeline: lerp\ntask: thing\nservices: {motion_planner: {}}\n")
     assert "nowhere.thing" in rejection("run", "cell.yaml", "--no-viewer")
 
 
-def test_command_line_imports_heavy_modules_only_on_demand() -> None:
+def test_command_line_imports_heavy_modules_only_on_demand():
     code = "import cli.main, sys; print([name for name in ('pydantic', 'zenoh', 'numpy') if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout == "[]\n"

@@ -1,12 +1,9 @@
 """Build the image, run the Panda cell in containers, observe it from the host, kill services, and take it down."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +20,7 @@ SERVICES = ["router", *(f"panda-{entry.name}" for entry in load_cell("panda").se
 
 
 @pytest.fixture(scope="module")
-def cell() -> Iterator[Containers]:
+def cell():
     require_engine()
     with Containers("zencell-test", environment={"ZENCELL_PAGE": PAGE_PORT}) as containers:
         build_image()
@@ -41,12 +38,12 @@ def status_on_host(cell: Containers) -> dict[str, Any]:
     return json.loads(line) if line else {}
 
 
-def test_compose_up_clears_the_table(cell: Containers) -> None:
+def test_compose_up_clears_the_table(cell):
     cell.wait_for("task is DONE", lambda: status_on_host(cell).get("state") == "DONE", 240)
     assert status_on_host(cell)["placed"] == 7
 
 
-def test_every_container_is_healthy_and_unprivileged_and_only_the_page_is_published(cell: Containers) -> None:
+def test_every_container_is_healthy_and_unprivileged_and_only_the_page_is_published(cell):
     def unhealthy() -> list[str]:
         found = cell.inspect_all()
         return [service for service in SERVICES if found[service]["State"]["Health"]["Status"] != "healthy"]
@@ -64,7 +61,7 @@ def test_every_container_is_healthy_and_unprivileged_and_only_the_page_is_publis
     assert published == {("panda-viewer", "127.0.0.1", PAGE_PORT)}
 
 
-def test_image_is_small_and_contains_the_planning_kernel_but_no_build_tools(cell: Containers) -> None:
+def test_image_is_small_and_contains_the_planning_kernel_but_no_build_tools(cell):
     def shell(script: str) -> str:
         return cell.compose("exec", "-T", "router", "sh", "-c", script).strip()
 
@@ -82,7 +79,7 @@ def test_image_is_small_and_contains_the_planning_kernel_but_no_build_tools(cell
     assert "Read-only" in output or "denied" in output, "the configuration is read-only"
 
 
-def test_killed_service_is_restarted(cell: Containers) -> None:
+def test_killed_service_is_restarted(cell):
     before = cell.inspect("panda-vision_detector")
     os.kill(before["State"]["Pid"], signal.SIGKILL)
     cell.wait_for(
@@ -103,7 +100,7 @@ def message_of(cell: Containers, key: str) -> dict[str, Any]:
     return message
 
 
-def test_operator_stop_survives_restarted_and_recreated_containers(cell: Containers) -> None:
+def test_operator_stop_survives_restarted_and_recreated_containers(cell):
     executor, task = "panda-trajectory_executor", "panda-smart_pick_place"
     timeout = 240.0  # [s]
 
@@ -128,14 +125,14 @@ def test_operator_stop_survives_restarted_and_recreated_containers(cell: Contain
     for pid in before.values():
         os.kill(pid, signal.SIGKILL)
     for service, pid in before.items():
-        cell.wait_for(f"{service} is back", lambda service=service, pid=pid: (  # type: ignore[misc]
+        cell.wait_for(f"{service} is back", lambda service=service, pid=pid: (
             cell.inspect(service)["State"]["Pid"] not in (0, pid) and cell.is_ready(service)), timeout)
     assert stopped_state() == (position, stop)
 
     cell.compose("down", "-t", "10", timeout=180)  # keeps the volume
     cell.compose("up", "-d", "--no-build", timeout=180)
     for service in (executor, task):  # new containers reset the simulated world
-        cell.wait_for(f"{service} is ready", lambda service=service: cell.is_ready(service), timeout)  # type: ignore[misc]
+        cell.wait_for(f"{service} is ready", lambda service=service: cell.is_ready(service), timeout)
         position = message_of(cell, "joint_states")["position"] if service == executor else position
     assert stopped_state() == (position, stop)
 

@@ -1,10 +1,7 @@
 """A container whose service is frozen is unhealthy, which no engine minds: its own health check ends it."""
 
-from __future__ import annotations
-
 import os
 import signal
-from collections.abc import Iterator
 
 import pytest
 
@@ -17,7 +14,7 @@ PATIENCE = 120.0  # [s] only ever waited for by a test that fails
 
 
 @pytest.fixture(scope="module")
-def cell() -> Iterator[Containers]:
+def cell():
     """The router and one service, ready."""
     require_engine()
     with Containers("zencell-test-frozen") as containers:
@@ -28,7 +25,7 @@ def cell() -> Iterator[Containers]:
 
 
 @pytest.mark.parametrize("service", [SERVICE, "router"])
-def test_frozen_service_is_killed_and_started_again(cell: Containers, service: str) -> None:
+def test_frozen_service_is_killed_and_started_again(cell, service):
     before, started = cell.process(service), cell.inspect(service)["RestartCount"]
     other = next(each for each in (SERVICE, "router") if each != service)
     others = cell.process(other)

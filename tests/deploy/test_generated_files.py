@@ -1,9 +1,6 @@
 """The compose files and manifests are those of the cells, and restrict their containers."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
 from typing import Any
 
 import kubernetes_validate
@@ -26,12 +23,12 @@ DEPLOYMENTS = [document for document in MANIFESTS if document["kind"] == "Deploy
 
 
 @pytest.mark.parametrize("path", GENERATED, ids=lambda path: path.relative_to(ROOT).as_posix())
-def test_file_is_up_to_date(path: Path) -> None:
+def test_file_is_up_to_date(path):
     assert path.read_text(encoding="utf-8") == GENERATED[path], "run `make deploy`"
 
 
 @pytest.mark.parametrize("name", CELLS)
-def test_each_service_has_a_container_and_the_task_starts_last(name: str) -> None:
+def test_each_service_has_a_container_and_the_task_starts_last(name):
     cell, mine = load_cell(name), {key: each for key, each in COMPOSE["services"].items() if name in each["profiles"]}
     assert list(mine) == ["router", *(f"{name}-{entry.name}" for entry in cell.services.values())]
     for entry in cell.services.values():
@@ -41,7 +38,7 @@ def test_each_service_has_a_container_and_the_task_starts_last(name: str) -> Non
     assert {wait["condition"] for wait in task["depends_on"].values()} == {"service_healthy"}
 
 
-def test_containers_are_locked_down() -> None:
+def test_containers_are_locked_down():
     for name, service in COMPOSE["services"].items():
         assert service["read_only"] and service["cap_drop"] == ["ALL"], name
         assert service["security_opt"] == ["no-new-privileges:true"], name
@@ -50,7 +47,7 @@ def test_containers_are_locked_down() -> None:
         assert "./config:/app/config:ro" in service["volumes"], name
 
 
-def test_only_the_page_is_published_and_only_to_this_machine() -> None:
+def test_only_the_page_is_published_and_only_to_this_machine():
     published = {name: service["ports"] for name, service in COMPOSE["services"].items() if "ports" in service}
     assert set(published) == {f"{cell}-viewer" for cell in CELLS}
     assert all(port.startswith("127.0.0.1:") for ports in published.values() for port in ports)
@@ -63,12 +60,12 @@ def test_only_the_page_is_published_and_only_to_this_machine() -> None:
     ("/app/services/viewer.py", True), ("/app/services/router.py", False), ("/app/common/sim/world.py", True),
     ("/app/services/viewer.py~", False), ("/app/common/README.md", False),
 ])
-def test_service_restarts_for_its_own_file_and_shared_ones(path: str, wanted: bool) -> None:
+def test_service_restarts_for_its_own_file_and_shared_ones(path, wanted):
     services = yaml.safe_load((ROOT / "compose.dev.yaml").read_text(encoding="utf-8"))["services"]
     assert concerns("modified", path, own_file(services["ur5-viewer"]["command"])) is wanted
 
 
-def test_manifests_are_valid_and_pods_run_once_without_rights() -> None:
+def test_manifests_are_valid_and_pods_run_once_without_rights():
     for document in MANIFESTS:
         kubernetes_validate.validate(document, "1.31", strict=True)
     broken = DEPLOYMENTS[0] | {"spec": DEPLOYMENTS[0]["spec"] | {"replica": 1}}
@@ -85,7 +82,7 @@ def test_manifests_are_valid_and_pods_run_once_without_rights() -> None:
         assert container["resources"]["limits"]["memory"]
 
 
-def test_kustomizations_name_existing_files() -> None:
+def test_kustomizations_name_existing_files():
     for path, text in GENERATED.items():
         if path.name == "kustomization.yaml":
             for resource in yaml.safe_load(text)["resources"]:
@@ -93,7 +90,7 @@ def test_kustomizations_name_existing_files() -> None:
                 assert found.is_file() or (found / "kustomization.yaml").is_file(), found
 
 
-def test_devcontainer_is_set_up_like_a_development_machine() -> None:
+def test_devcontainer_is_set_up_like_a_development_machine():
     text = (ROOT / ".devcontainer" / "devcontainer.json").read_text(encoding="utf-8")
     parsed = json.loads("\n".join(line for line in text.splitlines() if not line.strip().startswith("//")))
     assert "ms-python.python" in parsed["customizations"]["vscode"]["extensions"]

@@ -1,7 +1,5 @@
 """The target `physics` of the image, for cells with `simulator: mujoco`: OpenGL draws pictures without a screen."""
 
-from __future__ import annotations
-
 import pytest
 
 from tests.deploy.engine import require_engine, run
@@ -11,7 +9,7 @@ pytestmark = [pytest.mark.container, pytest.mark.timeout(900)]
 DRAWS = "from drivers.mujoco.gl import select_gl, gl_context; print(select_gl()); gl_context('egl', 64, 48).free()"
 
 
-def test_pictures_are_drawn_by_opengl_in_the_image_with_physics() -> None:
+def test_pictures_are_drawn_by_opengl_in_the_image_with_physics():
     require_engine()
     image = "zencell-test-physics"
     run("docker", "build", "-q", "--target", "physics", "-t", image, ".", timeout=800)

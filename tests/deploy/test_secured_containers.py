@@ -1,9 +1,6 @@
 """compose.secure.yaml in an engine: the operator's certificate gives access, and no certificate gives none."""
 
-from __future__ import annotations
-
 import json
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -21,7 +18,7 @@ READ = ("topic", "echo", "motion/status", "--cell", "panda", "--count", "1")
 
 
 @pytest.fixture(scope="module")
-def cell(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Containers]:
+def cell(tmp_path_factory):
     """The router and the executor with certificates that the image itself made, as its own user."""
     require_engine()
     folder = tmp_path_factory.mktemp("certificates")
@@ -44,21 +41,21 @@ def own(folder: Path, user: int) -> None:
         "/made")
 
 
-def test_containers_get_ready_behind_their_certificates(cell: Containers) -> None:
+def test_containers_get_ready_behind_their_certificates(cell):
     for service in ("router", SERVICE):
-        cell.wait_for(f"{service} is ready", lambda s=service: cell.is_ready(s), PATIENCE)  # type: ignore[misc]
+        cell.wait_for(f"{service} is ready", lambda s=service: cell.is_ready(s), PATIENCE)
 
 
-def test_tool_with_the_operators_certificate_reads_the_status(cell: Containers) -> None:
+def test_tool_with_the_operators_certificate_reads_the_status(cell):
     line = cell.compose("run", "--rm", "-T", "tool", *READ, timeout=200)
     assert json.loads(line)["state"] == "none", "no client has sent a goal"
 
 
-def test_tool_without_a_certificate_finds_no_router(cell: Containers) -> None:
+def test_tool_without_a_certificate_finds_no_router(cell):
     said = cell.refused("run", "--rm", "-T", "-e", "ZENCELL_SECURE=", "tool", *READ, timeout=200)
     assert "no router at tls/router:7447" in said
 
 
-def test_container_has_its_own_key_and_no_others(cell: Containers) -> None:
+def test_container_has_its_own_key_and_no_others(cell):
     keys = cell.compose("exec", "-T", SERVICE, "sh", "-c", "ls /certs/*.key").split()
     assert keys == ["/certs/panda.trajectory_executor.key"]

@@ -1,9 +1,6 @@
 """compose.dev.yaml in an engine: a service restarts when its source changes, and waits while that does not parse."""
 
-from __future__ import annotations
-
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -19,7 +16,7 @@ PATIENCE = 120.0  # [s] only ever waited for by a test that fails
 
 
 @pytest.fixture
-def cell(tmp_path: Path) -> Iterator[Containers]:
+def cell(tmp_path):
     """The router and two services on a copy of the source, ready."""
     require_engine()
     for name in (*FILES, *copied()):
@@ -32,7 +29,7 @@ def cell(tmp_path: Path) -> Iterator[Containers]:
         containers.compose("build", "router", timeout=800)
         containers.compose("up", "-d", "--no-build", "router", SERVICE, OTHER, timeout=180)
         for service in ("router", SERVICE, OTHER):
-            containers.wait_for(f"{service} is ready", lambda s=service: containers.is_ready(s), PATIENCE)  # type: ignore[misc]
+            containers.wait_for(f"{service} is ready", lambda s=service: containers.is_ready(s), PATIENCE)
         yield containers
 
 
@@ -50,7 +47,7 @@ def replace(file: Path, text: str) -> None:
     new.replace(file)
 
 
-def test_service_follows_its_source(cell: Containers) -> None:
+def test_service_follows_its_source(cell):
     own, shared = cell.folder / "services" / "vision_detector.py", cell.folder / "common" / "clock.py"
     router, other, first = (cell.process(service) for service in ("router", OTHER, SERVICE))
     good = own.read_text(encoding="utf-8")

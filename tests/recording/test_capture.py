@@ -1,7 +1,5 @@
 """Recording of cells with renamed keys or custom messages."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 from pathlib import Path
@@ -31,8 +29,8 @@ def bus_of(network: LocalNetwork, name: str, renamed: dict[str, str] | None = No
 
 
 @pytest.mark.parametrize("cell_is_known", [False, True])
-async def test_renamed_state_is_recorded_as_a_state(cell_is_known: bool) -> None:
-    """Where the cell is unknown, the readiness of its service tells."""
+async def test_renamed_state_is_recorded_as_a_state(cell_is_known):
+    """Where the cell is unknown, the kind is known once its service is ready."""
     own = CustomTopics.of(load_cell(TWO_CAMERAS)) if cell_is_known else None
     assert own is None or (CustomTopics.read(str(own)) == own and not own.modules)
     network, kind = LocalNetwork(), asyncio.get_running_loop().create_future()
@@ -43,7 +41,7 @@ async def test_renamed_state_is_recorded_as_a_state(cell_is_known: bool) -> None
                 kind.set_result(sample.kind)
 
     recorder, camera = bus_of(network, "recorder"), bus_of(network, "left_camera", {"camera/*": "left/camera/*"})
-    capture = Capture(recorder, Selection.of(), KindSink(), own)  # type: ignore[arg-type]
+    capture = Capture(recorder, Selection.of(), KindSink(), own)
     await capture.start()
     infos = camera.writer(topics.CAMERA_INFO)
     if not cell_is_known:
@@ -55,7 +53,7 @@ async def test_renamed_state_is_recorded_as_a_state(cell_is_known: bool) -> None
         await bus.close()
 
 
-def test_custom_modules_define_messages_and_kinds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_custom_modules_define_messages_and_kinds(tmp_path, monkeypatch):
     (tmp_path / "brought").mkdir()
     (tmp_path / "brought" / "polishing.py").write_text(
         "from common import messages as m\nfrom common.topics import Topic\n"
@@ -71,9 +69,7 @@ def test_custom_modules_define_messages_and_kinds(tmp_path: Path, monkeypatch: p
 
 
 @pytest.mark.parametrize("invalid", [{"speed": 1e12}, {"world": "w" * 4000}, {"overrides": ["o=" + "o" * 2000]}])
-async def test_run_is_described_by_the_first_valid_status_of_a_supervisor(
-    invalid: dict[str, object], tmp_path: Path
-) -> None:
+async def test_run_is_described_by_the_first_valid_status_of_a_supervisor(invalid, tmp_path):
     sink = Sink(SplitWriter(tmp_path / "a.mcap", {"cell": "cell"}))
     capture = Capture(bus_of(LocalNetwork(), "recorder"), Selection.of(), sink)
     for values in (invalid, {"speed": 2.0}):

@@ -5,7 +5,6 @@ import csv
 import json
 import os
 from collections import Counter
-from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -79,7 +78,7 @@ def hold(value: Any, schema: dict[str, Any], path: str = "") -> None:
 
 
 @pytest.mark.parametrize(("message", "schema"), CONVERTED, ids=[f"{type(c).__name__}-{n}" for c, n in CONVERTED])
-def test_messages_are_converted_to_foxglove_schemas(message: Message, schema: str) -> None:
+def test_messages_are_converted_to_foxglove_schemas(message, schema):
     name, value = convert(message)
     assert name == schema
     value = json.loads(json.dumps(value, allow_nan=False))
@@ -90,7 +89,7 @@ def test_messages_are_converted_to_foxglove_schemas(message: Message, schema: st
 
 
 @pytest.mark.parametrize(("encoding", "blue"), [("bgr8", 0), ("rgb8", 2)])
-def test_exported_image_has_the_recorded_pixels(encoding: str, blue: int) -> None:
+def test_exported_image_has_the_recorded_pixels(encoding, blue):
     smooth = np.zeros((16, 16, 3), np.uint8)
     smooth[..., 0] = 200
     _, value = convert(array_to_image(smooth, encoding, HEADER))
@@ -98,7 +97,7 @@ def test_exported_image_has_the_recorded_pixels(encoding: str, blue: int) -> Non
     assert abs(int(pixels[8, 8, blue]) - 200) < 5
 
 
-def test_scene_replaces_the_one_before_and_attached_objects_move_with_their_link() -> None:
+def test_scene_replaces_the_one_before_and_attached_objects_move_with_their_link():
     _, value = convert(next(message for message, _ in CONVERTED if isinstance(message, m.PlanningScene)))
     assert value["deletions"] == [{"timestamp": TIME, "type": 1, "id": ""}]
     frames = {entity["id"]: entity["frame_id"] for entity in value["entities"]}
@@ -124,7 +123,7 @@ FOREIGN = Sample("panda/mine", b"\x81\xa1a\x01", START, message="Foreign", kind=
 
 
 @pytest.fixture
-def recorded(tmp_path: Path) -> Iterator[Callable[..., Recording]]:
+def recorded(tmp_path):
     with ExitStack() as stack:
         yield lambda *samples: stack.enter_context(Recording(write(tmp_path / "a.mcap", list(samples))))
 
@@ -143,7 +142,7 @@ def messages_of(path: Path) -> list[tuple[Any, Any, Any]]:
         return list(make_reader(file).iter_messages())
 
 
-def test_foxglove_file_is_complete_and_skipped_messages_are_counted(tmp_path: Path, recorded) -> None:
+def test_foxglove_file_is_complete_and_skipped_messages_are_counted(tmp_path, recorded):
     recording, decoder = recorded(joints(0), joints(1), status(2), image(3, PICTURE), FOREIGN), Decoder()
     assert foxglove.export_foxglove(recording, tmp_path / "f.mcap", every, decoder) == 4
     assert decoder.skipped == Counter({"mine": 1})
@@ -153,7 +152,7 @@ def test_foxglove_file_is_complete_and_skipped_messages_are_counted(tmp_path: Pa
         "foxglove.JointStates", "foxglove.JointStates", "PickPlaceStatus", "foxglove.CompressedImage"]
 
 
-def test_messages_of_unknown_classes_are_exported_by_their_recorded_schema(tmp_path: Path) -> None:
+def test_messages_of_unknown_classes_are_exported_by_their_recorded_schema(tmp_path):
     recover(write(tmp_path / "a.mcap", [custom(0), custom(1), FOREIGN]), tmp_path / "b.mcap")
     decoder = Decoder()
     with Recording(tmp_path / "b.mcap") as recording:
@@ -166,7 +165,7 @@ def test_messages_of_unknown_classes_are_exported_by_their_recorded_schema(tmp_p
     assert base64.urlsafe_b64decode(json.loads(message.data)["raw"]) == b"\xff\x00"
 
 
-def test_tables_have_a_row_for_each_message_and_a_column_for_each_joint(tmp_path: Path, recorded) -> None:
+def test_tables_have_a_row_for_each_message_and_a_column_for_each_joint(tmp_path, recorded):
     recording = recorded(*(f(n) for n in range(5) for f in (joints, status)), image(9, PICTURE))
     counts = export.export_tables(recording, tmp_path / "csv", every, Decoder())
     assert counts == {"joint_states.csv": 5, "pick_place_status.csv": 5}
@@ -178,7 +177,7 @@ def test_tables_have_a_row_for_each_message_and_a_column_for_each_joint(tmp_path
     assert [row["placed"] for row in states] == list("01234") and states[0]["plans"] == "[]"
 
 
-def test_png_files_have_the_recorded_pixels(tmp_path: Path, recorded) -> None:
+def test_png_files_have_the_recorded_pixels(tmp_path, recorded):
     depth = image(1, DEPTH, "32FC1", "panda/depth_camera/depth/image_raw")
     recording = recorded(image(0, PICTURE), depth, image(2, PICTURE[..., ::-1].copy(), "rgb8"))
     counts = export.export_images(recording, tmp_path / "png", every, Decoder())
@@ -190,7 +189,7 @@ def test_png_files_have_the_recorded_pixels(tmp_path: Path, recorded) -> None:
     assert np.array_equal(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), np.full((6, 8), 1250, np.uint16))
 
 
-def test_video_has_every_image_at_the_recorded_rate(tmp_path: Path, recorded) -> None:
+def test_video_has_every_image_at_the_recorded_rate(tmp_path, recorded):
     pixels = np.zeros((64, 80, 3), np.uint8)
     recording = recorded(*(image(n, pixels + np.uint8(20 * n)) for n in range(10)))
     assert export.export_video(recording, tmp_path / "v.mp4", "camera/image_raw", Decoder()) == (10, 10.0)
@@ -201,9 +200,7 @@ def test_video_has_every_image_at_the_recorded_rate(tmp_path: Path, recorded) ->
     video.release()
 
 
-def test_file_that_does_not_fit_on_the_disk_is_removed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, recorded
-) -> None:
+def test_file_that_does_not_fit_on_the_disk_is_removed(tmp_path, monkeypatch, recorded):
     recording = recorded(*(image(n, PICTURE) for n in range(10)))
     open_writer, target = cv2.VideoWriter, tmp_path / "v.mp4"
 
@@ -213,7 +210,7 @@ def test_file_that_does_not_fit_on_the_disk_is_removed(
         fourcc = open_writer.fourcc
 
         def __init__(self, *given: object) -> None:
-            self.inner = open_writer(*given)  # type: ignore[call-overload]
+            self.inner = open_writer(*given)
             self.isOpened, self.write = self.inner.isOpened, self.inner.write
 
         def release(self) -> None:
@@ -229,13 +226,13 @@ def test_file_that_does_not_fit_on_the_disk_is_removed(
     assert [path.name for path in tmp_path.iterdir()] == ["a.mcap"]
 
 
-def test_video_of_a_depth_topic_is_rejected(tmp_path: Path, recorded) -> None:
+def test_video_of_a_depth_topic_is_rejected(tmp_path, recorded):
     with pytest.raises(RecordingError, match="has no color image"):
         export.export_video(
             recorded(image(0, DEPTH, "32FC1")), tmp_path / "v.mp4", "camera/image_raw", Decoder())
 
 
-def test_removed_field_is_ignored_and_an_invalid_payload_is_counted() -> None:
+def test_removed_field_is_ignored_and_an_invalid_payload_is_counted():
     decoder = Decoder()
     values = {**msgpack.unpackb(joints(0).payload), "torque_of_old": 1}
     values["header"]["sequence_of_old"] = 7

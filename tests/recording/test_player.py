@@ -54,7 +54,7 @@ class Listener:
 
 
 def player_of(recording: Recording, **options: object) -> Player:
-    return Player(recording, lambda topic: True, lambda topic: topic, **options)  # type: ignore[arg-type]
+    return Player(recording, lambda topic: True, lambda topic: topic, **options)
 
 
 @asynccontextmanager
@@ -74,7 +74,7 @@ async def playing(path: Path, **options: object) -> AsyncIterator[tuple[Player, 
             await listener.bus.close()
 
 
-async def test_keys_step_by_one_message_and_to_the_next_image(tmp_path: Path) -> None:
+async def test_keys_step_by_one_message_and_to_the_next_image(tmp_path):
     path = write(tmp_path / "a.mcap", [joints(0), joints(1), joints(2), image(3), joints(4), joints(5)])
     async with playing(path, paused=True) as (player, listener, task):
         player.on_key("right")
@@ -87,7 +87,7 @@ async def test_keys_step_by_one_message_and_to_the_next_image(tmp_path: Path) ->
         await listener.until(6)
 
 
-async def test_jump_back_repeats_the_states_of_that_time(tmp_path: Path) -> None:
+async def test_jump_back_repeats_the_states_of_that_time(tmp_path):
     samples = [status(0, "IDLE"), joints(100), status(200, "GRASPING"), joints(900), status(950, "DONE")]
     path = write(tmp_path / "a.mcap", samples, every=1)
     async with playing(path, paused=True) as (player, listener, _task):
@@ -102,7 +102,7 @@ async def test_jump_back_repeats_the_states_of_that_time(tmp_path: Path) -> None
         assert player.position == pytest.approx(9.0)
 
 
-async def test_later_start_begins_with_the_earlier_states(tmp_path: Path) -> None:
+async def test_later_start_begins_with_the_earlier_states(tmp_path):
     path = write(tmp_path / "a.mcap", [status(0, "PLACING"), joints(10), joints(20), joints(30)], every=1)
     async with playing(path, offset=0.15) as (_player, listener, task):
         await task
@@ -111,24 +111,7 @@ async def test_later_start_begins_with_the_earlier_states(tmp_path: Path) -> Non
         assert (await asyncio.wait_for(reader.next(), 10)).state == "PLACING"
 
 
-async def test_reader_receives_every_loop(tmp_path: Path) -> None:
-    path = write(tmp_path / "a.mcap", [joints(0), joints(1)])
-    async with playing(path, loop=True) as (player, listener, task):
-        reader = listener.bus.reader(topics.JOINT_STATES)
-        for _ in range(5):
-            await asyncio.wait_for(reader.next(), 10)
-        player.on_key("q")
-        await asyncio.wait_for(task, 10)
-
-
-async def test_stamps_are_unchanged_by_default(tmp_path: Path) -> None:
-    path = write(tmp_path / "a.mcap", [joints(0), joints(1)])
-    async with playing(path) as (_player, listener, task):
-        await task
-        assert [stamp_of(s.payload) for s in listener.samples] == [START - 1_000_000, START + STEP - 1_000_000]
-
-
-async def test_stamps_of_the_present_keep_ages_and_simultaneity(tmp_path: Path) -> None:
+async def test_stamps_of_the_present_keep_ages_and_simultaneity(tmp_path):
     """In cell time that ran five times as fast: 10 ms on the wall are 50 ms of it."""
     epoch = START - 7 * STEP
     writer = RecordingWriter(tmp_path / "a.mcap", {"cell": "panda"})
@@ -145,7 +128,7 @@ async def test_stamps_of_the_present_keep_ages_and_simultaneity(tmp_path: Path) 
     assert 0 < time.time_ns() - first < 30e9
 
 
-async def test_player_detects_its_subscribers(tmp_path: Path) -> None:
+async def test_player_detects_its_subscribers(tmp_path):
     net = LocalNetwork()
     with Recording(write(tmp_path / "a.mcap", [image(0)])) as recording:
         player = player_of(recording)
@@ -161,13 +144,13 @@ SECOND = 1_000_000_000
 
 
 @given(st.integers(0, 10**15), st.integers(0, 10**15), st.floats(0.01, 1000), st.integers(0, 10**12))
-def test_position_and_due_time_are_inverse(start: int, now: int, rate: float, later: int) -> None:
+def test_position_and_due_time_are_inverse(start, now, rate, later):
     head = Playhead(start, now, rate=rate)
     assert abs(head.position(head.due(start + later)) - (start + later)) <= rate + 1
     assert abs(head.due(start + later) - (now + later / rate)) <= 2
 
 
-def test_pause_delays_later_messages_also_after_a_jump() -> None:
+def test_pause_delays_later_messages_also_after_a_jump():
     head = Playhead(0, 0)
     head.pause(3 * SECOND)
     assert head.paused and head.position(9 * SECOND) == 3 * SECOND

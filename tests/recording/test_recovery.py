@@ -15,17 +15,17 @@ SAMPLES = [f(n) for n in range(60) for f in (joints, status)]
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     return tmp_path_factory.mktemp("recovery")
 
 
 @pytest.fixture(scope="module")
-def whole(folder: Path) -> bytes:
+def whole(folder):
     return write(folder / "whole.mcap", SAMPLES, every=10).read_bytes()
 
 
 @pytest.fixture(scope="module")
-def ends(folder: Path, whole: bytes) -> list[int]:
+def ends(folder, whole):
     """Return the end of each chunk."""
     with Recording(folder / "whole.mcap") as recording:
         return [place.offset + place.length for place in recording.layout.chunks]
@@ -48,14 +48,12 @@ def recovered(folder: Path, content: bytes) -> tuple[int, bool, int]:
 
 
 @given(data=st.data())
-def test_file_truncated_anywhere_keeps_all_complete_chunks(
-    data: st.DataObject, whole: bytes, ends: list[int], folder: Path
-) -> None:
+def test_file_truncated_anywhere_keeps_all_complete_chunks(data, whole, ends, folder):
     cut = data.draw(st.integers(0, len(whole)))
     assert recovered(folder, whole[:cut]) == (10 * sum(end <= cut for end in ends), cut == len(whole), 0)
 
 
-def test_unfinished_file_is_read_up_to_its_end(whole: bytes, ends: list[int], folder: Path) -> None:
+def test_unfinished_file_is_read_up_to_its_end(whole, ends, folder):
     path = folder / "unfinished.mcap"
     path.write_bytes(whole[: ends[3] + 5])
     with Recording(path) as recording:
@@ -65,7 +63,7 @@ def test_unfinished_file_is_read_up_to_its_end(whole: bytes, ends: list[int], fo
 
 
 @given(data=st.data())
-def test_damaged_file_is_recovered_or_rejected(data: st.DataObject, whole: bytes, folder: Path) -> None:
+def test_damaged_file_is_recovered_or_rejected(data, whole, folder):
     content = bytearray(whole)
     for place in data.draw(st.lists(st.integers(0, len(whole) - 1), min_size=1, max_size=5)):
         content[place] = data.draw(st.integers(0, 255))
@@ -81,7 +79,7 @@ def test_damaged_file_is_recovered_or_rejected(data: st.DataObject, whole: bytes
         assert recording.finished and result.messages == len(list(recording.samples()))
 
 
-def test_damaged_chunk_is_skipped(whole: bytes, ends: list[int], folder: Path) -> None:
+def test_damaged_chunk_is_skipped(whole, ends, folder):
     content = bytearray(whole)
     content[ends[4] - 20] ^= 0xFF
     assert recovered(folder, bytes(content)) == (len(SAMPLES) - 10, True, 1)
@@ -90,9 +88,7 @@ def test_damaged_chunk_is_skipped(whole: bytes, ends: list[int], folder: Path) -
         list(recording.samples())
 
 
-def test_recovery_overwrites_no_file_and_leaves_none_on_a_full_disk(
-    whole: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_recovery_overwrites_no_file_and_leaves_none_on_a_full_disk(whole, tmp_path, monkeypatch):
     source = tmp_path / "a.mcap"
     source.write_bytes(whole)
     with pytest.raises(RecordingError, match="exists already"):

@@ -1,4 +1,4 @@
-"""An arm that rests in one pose after another, and its camera: joints and images are in the working directory."""
+"""An arm that stops in one pose after another, and its camera; joints and images are in the working directory."""
 
 import asyncio
 from pathlib import Path

@@ -2,7 +2,6 @@
 
 import asyncio
 import sys
-from collections.abc import Iterator
 from types import ModuleType
 
 import pytest
@@ -23,7 +22,6 @@ from common.topics import Topic
 from common.transport.local import LocalNetwork
 from recording.report.aggregator import Collector, RunAggregator, recorded_application
 from recording.report.application import Figures, figures_of, format_truth
-from recording.report.history import RunHistory
 from recording.report.summary import describe
 
 PICK_PLACE = find_application("pick_place")
@@ -35,14 +33,14 @@ PICK_PLACE = find_application("pick_place")
     ({"targets": 2}, "0 of 2 placed - IDLE (waits for `zencell task start`)"),
     ({"paused": True, "started": True}, "0 of 0 placed - IDLE (paused)"),
 ])
-def test_progress_is_one_line(values: dict[str, object], line: str) -> None:
+def test_progress_is_one_line(values, line):
     aggregator = RunAggregator("panda", PICK_PLACE)
     assert aggregator.progress == "no task status received yet"
     aggregator.on("pick_place_status", PickPlaceStatus.model_validate(values), 0.0, 0)
     assert aggregator.progress == line
 
 
-def test_topics_are_those_of_the_application_which_is_found_by_its_status() -> None:
+def test_topics_are_those_of_the_application_which_is_found_by_its_status():
     assert {topic.key for topic in RunAggregator("panda", PICK_PLACE).topics} == {
         "pick_place_status", "validated_targets", "rejected_targets", "motion/status", "scene_objects", "scene_balls"}
     found = recorded_application(["joint_states", "outline_status"])
@@ -51,30 +49,21 @@ def test_topics_are_those_of_the_application_which_is_found_by_its_status() -> N
     assert recorded_application(["joint_states"]) is None
 
 
-def test_frame_age_is_measured_in_cell_time() -> None:
-    history = RunHistory()
-    aggregator = RunAggregator("panda", PICK_PLACE, speed=5.0, history=history)
-    targets = m.PoseArray(header=m.Header(stamp=1_000_000_000))
-    aggregator.on("validated_targets", targets, 1.0, 1_100_000_000)
-    assert history.latencies == [20.0]
-    assert aggregator.summary.as_dict()["frame_to_target_ms"] == {"p50": 20.0, "p99": 20.0}
-
-
 class MoveStatus(m.TaskStatus):
     """Status of an application without a figures class."""
 
 
 @pytest.fixture
-def own(monkeypatch: pytest.MonkeyPatch) -> Iterator[Application]:
+def own(monkeypatch):
     module = ModuleType("my_pkg.move")
     status = Topic("move_status", MoveStatus, "state", "state")
-    module.APPLICATION = Application(topics=ApplicationTopics(status=status))  # type: ignore[attr-defined]
+    module.APPLICATION = Application(topics=ApplicationTopics(status=status))
     monkeypatch.setitem(sys.modules, "my_pkg", ModuleType("my_pkg"))
     monkeypatch.setitem(sys.modules, "my_pkg.move", module)
     return find_application("my_pkg.move")
 
 
-def test_custom_application_has_a_default_summary(own: Application) -> None:
+def test_custom_application_has_a_default_summary(own):
     aggregator = RunAggregator("mine", own)
     assert figures_of(own) is Figures
     status = MoveStatus(state="LIFTING", done=0, total=1, subject="cube", started=True)
@@ -93,7 +82,7 @@ def balls(*labels: str) -> m.PoseArray:
     return m.PoseArray(poses=[m.Pose()] * len(labels), labels=list(labels))
 
 
-def test_truth_is_that_of_the_world_objects_and_names_several_containers() -> None:
+def test_truth_is_that_of_the_world_objects_and_names_several_containers():
     aggregator = RunAggregator("panda", PICK_PLACE)
 
     def truth(key: str, message: m.Message) -> object:
@@ -114,7 +103,7 @@ def test_truth_is_that_of_the_world_objects_and_names_several_containers() -> No
         "1 in left, 2 in right, 1 on the table, 2 elsewhere")
 
 
-async def test_collector_feeds_the_aggregator_and_waits_for_falling_objects() -> None:
+async def test_collector_feeds_the_aggregator_and_waits_for_falling_objects():
     net, clock = LocalNetwork(), Clock(2.0)
     cell = net.bus("cell", cell="test", clock=clock)
     aggregator = RunAggregator("test", PICK_PLACE, speed=2.0)
@@ -145,7 +134,7 @@ async def test_collector_feeds_the_aggregator_and_waits_for_falling_objects() ->
     assert progress == ["2 of 2 placed - DONE"]
 
 
-def test_rates_come_from_reader_counts() -> None:
+def test_rates_come_from_reader_counts():
     rates = Rates()
     for service, key in (("left_camera", "left/image_raw"), ("trajectory_executor", "joint_states")):
         rates.update(m.ServiceCounters(service=service, writes=[key]), 0.0)
@@ -159,7 +148,7 @@ def test_rates_come_from_reader_counts() -> None:
     assert rates.of_topic("left/image_raw") == 0.0  # it was restarted
 
 
-def test_most_recent_of_invented_services_are_remembered() -> None:
+def test_most_recent_of_invented_services_are_remembered():
     rates = Rates()
 
     def count(second: int) -> None:

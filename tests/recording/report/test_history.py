@@ -67,13 +67,6 @@ def test_holding_and_pausing_are_spans(run):
     assert times_of(run.held) == [(2, 4), (6, 8)] and times_of(run.paused) == [(1, 8)]
 
 
-def test_restart_of_a_service_is_an_event(run):
-    for time, restarts in ((1, 0), (2, 0), (3, 1), (4, 1)):
-        service = m.ServiceStatus(name="vision_detector", state="ready", restarts=restarts, message="died: SIGKILL")
-        run.on_services(time, m.SupervisorStatus(cell="panda", services=[service]))
-    assert [(e.time, e.what, e.note) for e in run.restarts] == [(3, "vision_detector", "died: SIGKILL")]
-
-
 def test_log_has_a_limited_number_of_warnings_and_errors(run):
     for k in range(MOST_LINES + 5):
         for level in ("info", "error"):

@@ -7,7 +7,6 @@ from hypothesis import strategies as st
 from applications.pick_place.topics import PickPlaceStatus
 from common.messages import (
     Header,
-    MotionStatus,
     PlanFigure,
     Pose,
     PoseArray,
@@ -36,7 +35,7 @@ def status(state: str, seconds: float, **values: object) -> PickPlaceStatus:
     return PickPlaceStatus.model_validate(fields)
 
 
-def test_summary_has_the_fields_that_scripts_read() -> None:
+def test_summary_has_the_fields_that_scripts_read():
     summary = Summary("panda", 3, 5.0).as_dict()
     assert list(summary) == [
         "cell", "state", "placed", "targets", "rejected", "failures", "retries", "seconds", "plans",
@@ -48,7 +47,7 @@ def test_summary_has_the_fields_that_scripts_read() -> None:
     json.dumps(summary)
 
 
-def test_rejected_position_is_listed_once_and_skipped_targets_with_it() -> None:
+def test_rejected_position_is_listed_once_and_skipped_targets_with_it():
     rejected = Rejected()
     rejected.add([at(0.9, 0.0), at(0.9, 0.02), at(0.9, 0.1), at(0.55, 0.25, "inside the container")])
     rejected.add([at(0.905, 0.0, "partly out of view")])
@@ -60,7 +59,7 @@ def test_rejected_position_is_listed_once_and_skipped_targets_with_it() -> None:
     assert [place["reason"] for place in summary.as_dict()["rejected"]] == ["no path", "no path"]
 
 
-def test_newest_of_many_rejections_are_listed() -> None:
+def test_newest_of_many_rejections_are_listed():
     summary = Summary("panda", 1, 1.0)
     for number in range(12):
         rejections = Rejections(header=Header(), rejected=[at(i, number) for i in range(1000)])
@@ -72,7 +71,7 @@ def test_newest_of_many_rejections_are_listed() -> None:
     assert len(values["plans"]) == 10_000
 
 
-def test_figures_of_a_restarted_task_add_up_and_the_placed_count_is_the_last() -> None:
+def test_figures_of_a_restarted_task_add_up_and_the_placed_count_is_the_last():
     summary = Summary("panda", 0, 1.0)
     first = {"task_seconds": 10, "moving_seconds": 8, "failures": 1, "plans": [PLAN] * 3, "placed": 2}
     summary.on_status(status("GRASPING", 100, **first))
@@ -90,14 +89,7 @@ def test_figures_of_a_restarted_task_add_up_and_the_placed_count_is_the_last() -
     assert (figures["placed"], figures["targets"], figures["state"]) == (7, 7, "DONE")
 
 
-def test_first_motion_is_reported_once() -> None:
-    summary = Summary("panda", 0, 1.0)
-    for seconds, state in ((3.0, "none"), (4.5, "active"), (9.0, "active")):
-        summary.on_motion(seconds, MotionStatus(state=state))
-    assert summary.as_dict()["seconds"]["first_motion"] == 4.5
-
-
-def test_truth_counts_objects_by_location() -> None:
+def test_truth_counts_objects_by_location():
     truth = Truth(("box", "tray"))
     assert truth.counted() is None and truth.settled
     truth.on_labels(balls("box", "box", "table", "held", "falling"))
@@ -110,13 +102,13 @@ def test_truth_counts_objects_by_location() -> None:
 
 
 @given(st.lists(st.floats(0, 1e6), min_size=1), st.floats(0.01, 1))
-def test_percentile_is_a_value_with_that_share_below_it(values: list[float], fraction: float) -> None:
+def test_percentile_is_a_value_with_that_share_below_it(values, fraction):
     found = percentile(values, fraction)
     assert found in values
     assert sum(value <= found for value in values) >= math.floor(fraction * len(values))
 
 
-def test_text_names_left_objects_restarts_and_figures_of_the_task() -> None:
+def test_text_names_left_objects_restarts_and_figures_of_the_task():
     summary = Summary("panda", 0, 1.0)
     summary.on_status(status("DONE", 10, placed=6, targets=6, figures={"moved_m": 0.31, "by": "edge"}))
     summary.rejected.add([at(0.9, 0.0)])

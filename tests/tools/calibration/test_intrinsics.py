@@ -104,8 +104,9 @@ def test_frontal_views_do_not_determine_the_focal_length(views):
 
 
 def test_similar_views_are_not_added_and_collection_ends_with_enough():
-    collector = collect([facing(BOARD, x, 0, 0.5) for x in (0, 0.005, 0.05)], most_views=2, least_views=2)
-    assert [view.name for view in collector.views] == ["view 0", "view 2"]
+    poses = [facing(BOARD, x, 0, 0.5) for x in (-0.05, -0.045, 0, 0.05)]
+    collector = collect(poses, most_views=3, least_views=3)
+    assert [view.name for view in collector.views] == ["view 0", "view 2", "view 3"]
     assert collector.complete
 
 

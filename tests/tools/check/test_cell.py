@@ -1,7 +1,5 @@
 """Quick checks of a cell in a subprocess."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 
@@ -11,7 +9,7 @@ from tools.check.cell import quick_warnings, warnings_in_subprocess
 ROOT = str(Path(__file__).resolve().parents[3])
 
 
-async def test_prints_of_user_modules_do_not_mix_with_the_findings(tmp_path: Path) -> None:
+async def test_prints_of_user_modules_do_not_mix_with_the_findings(tmp_path):
     (tmp_path / "loud.py").write_text("""
 import os
 from tools.check import warning
@@ -34,6 +32,6 @@ APPLICATION = Application(topics=ApplicationTopics(status=STATUS), checks=Checks
     assert any("the cell is loud" in each.line for each in found)
 
 
-async def test_findings_are_those_of_a_check_in_this_process() -> None:
+async def test_findings_are_those_of_a_check_in_this_process():
     cell = load_cell("panda")
     assert await warnings_in_subprocess(cell, {**os.environ, "PYTHONPATH": ROOT}) == quick_warnings(cell)

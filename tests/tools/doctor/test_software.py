@@ -2,8 +2,6 @@
 
 from pathlib import Path
 
-import pytest
-
 from tools.doctor import software
 
 
@@ -21,7 +19,7 @@ def video(sys: Path, number: int, name: str, index: int) -> None:
     (folder / "index").write_text(f"{index}\n", encoding="utf-8")
 
 
-def test_plugged_in_cameras_are_listed_with_their_drivers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_plugged_in_cameras_are_listed_with_their_drivers(tmp_path, monkeypatch):
     assert list(software.cameras(tmp_path)) == []
     monkeypatch.setattr(software, "find_spec", lambda package: object() if package == "depthai" else None)
     plug(tmp_path, "2-1", idVendor="8086", product="Intel(R) RealSense(TM) Depth Camera 435i", serial="0123")
@@ -38,7 +36,7 @@ def test_plugged_in_cameras_are_listed_with_their_drivers(tmp_path: Path, monkey
         "camera /dev/video2: Other (camera_opencv)", "camera /dev/video10: HD Webcam (camera_opencv)"]
 
 
-def test_depth_camera_is_not_listed_again_as_a_video_device(tmp_path: Path) -> None:
+def test_depth_camera_is_not_listed_again_as_a_video_device(tmp_path):
     plug(tmp_path, "2-1", idVendor="8086", product="Intel(R) RealSense(TM) Depth Camera 435i")
     plug(tmp_path, "2-11")
     for number, port in ((0, "2-1"), (1, "2-11")):

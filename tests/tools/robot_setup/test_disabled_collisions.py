@@ -18,7 +18,6 @@ def named(pairs, *reasons):
 
 
 def test_srdf_of_the_ur5_is_up_to_date():
-    assert ROBOT.srdf is not None
     written = {(item.get("link1"), item.get("link2"), item.get("reason"))
                for item in ET.parse(ROBOT.srdf).iter("disable_collisions")}
     assert written == {(p.one, p.other, p.reason) for p in disabled_pairs(ROBOT)}
@@ -56,7 +55,6 @@ def test_links_that_can_collide_stay_checked():
 
 
 def test_panda_pairs_are_almost_those_of_its_manufacturer():
-    assert PANDA.srdf is not None
     manufacturer = {frozenset((item.get("link1"), item.get("link2")))
                     for item in ET.parse(PANDA.srdf).iter("disable_collisions")}
     with_shapes = {link for pair in named(disabled_pairs(PANDA, samples=1)) for link in pair}

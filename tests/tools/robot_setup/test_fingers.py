@@ -1,8 +1,5 @@
 """Measured fingers, and deviations of robot files from them."""
 
-from __future__ import annotations
-
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -25,7 +22,7 @@ def config_of(name: str) -> RobotConfig:
 
 
 @pytest.fixture
-def scara_with(tmp_path: Path):
+def scara_with(tmp_path):
     """Return the proposal for a SCARA whose description was changed."""
     def proposal(*changes: tuple[str, str]) -> Proposal:
         text = scara()
@@ -39,16 +36,15 @@ def scara_with(tmp_path: Path):
 
 
 @pytest.mark.parametrize("name", names_of("robots"))
-def test_tool_frames_of_the_projects_robots_match_their_fingers(name: str) -> None:
+def test_tool_frames_of_the_projects_robots_match_their_fingers(name):
     assert check_tool_frame(RobotModel.load(config_of(name))) == []
 
 
-def test_mounted_gripper_gets_the_linkage_of_the_manual_robot_file() -> None:
+def test_mounted_gripper_gets_the_linkage_of_the_manual_robot_file():
     by_hand = config_of("ur5").gripper
     proposal = draft(f"{ROBOTS}/ur_description/urdf/ur5_robot.urdf", "arm",
                      gripper=str(find_file("robots", "ur5").with_name("robotiq_2f85.urdf")))
     found = proposal.values["gripper"]
-    assert by_hand is not None and by_hand.linkage is not None
     assert found["linkage"] == pytest.approx(by_hand.linkage.model_dump(), abs=1e-4)
     assert dict(zip(found["joints"], found["mimic"], strict=True)) == dict(
         zip(by_hand.joints, by_hand.mimic, strict=True))
@@ -60,12 +56,11 @@ def test_mounted_gripper_gets_the_linkage_of_the_manual_robot_file() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(("urdf", "opens", "closed"), [
     ("so_arm_description/urdf/so101.urdf", 1, -0.174533), ("z1_description/urdf/z1.urdf", -1, 0.0)])
-def test_jaw_that_turns_towards_a_fixed_finger_is_measured(urdf: str, opens: int, closed: float) -> None:
+def test_jaw_that_turns_towards_a_fixed_finger_is_measured(urdf, opens, closed):
     proposal = draft(f"{ROBOTS}/{urdf}", "arm")
     assert proposal.lost == [] and any("one finger is fixed" in line for line in proposal.check)
     config = check(RobotConfig, proposal.values, "robot")
     gripper = config.gripper
-    assert gripper is not None and gripper.jaw is not None
     assert (gripper.jaw.opens, gripper.jaw.closed) == (opens, pytest.approx(closed, abs=1e-4))
     assert 0.05 < gripper.max_width < 0.08
     robot = RobotModel.load(config)
@@ -85,13 +80,11 @@ def test_jaw_that_turns_towards_a_fixed_finger_is_measured(urdf: str, opens: int
         assert in_tool(width)[tip, 1] - shut[tip, 1] == pytest.approx(width, abs=5e-4)
 
 
-def test_wrong_values_of_a_gripper_are_reported_with_the_measured_ones() -> None:
+def test_wrong_values_of_a_gripper_are_reported_with_the_measured_ones():
     config = check(RobotConfig, draft(f"{ROBOTS}/z1_description/urdf/z1.urdf", "arm").values, "robot")
-    assert config.gripper is not None and config.gripper.jaw is not None and config.tcp is not None
     jaw = config.gripper.jaw
 
     def problems(config: RobotConfig, **changes: object) -> list[str]:
-        assert config.gripper is not None
         gripper = config.gripper.model_copy(update=changes)
         robot = RobotModel.load(config.model_copy(update={"gripper": gripper}))
         return check_gripper(robot) if gripper.jaw else check_tool_frame(robot)
@@ -107,24 +100,23 @@ def test_wrong_values_of_a_gripper_are_reported_with_the_measured_ones() -> None
         "gripper.max_width: the fingers open by 0.0600 m, not by 0.08 m"]
 
 
-def test_jaw_that_does_not_reach_the_fixed_finger_is_no_gripper() -> None:
+def test_jaw_that_does_not_reach_the_fixed_finger_is_no_gripper():
     proposal = draft(f"{ROBOTS}/talos_data/robots/talos_left_arm.urdf", "arm")
     assert "gripper" not in proposal.values
     (lost,) = proposal.lost
     assert lost.startswith("no gripper: the jaw of gripper_left_joint does not reach the fixed finger")
 
 
-def test_slides_closed_at_a_positive_position_report_it(scara_with) -> None:
+def test_slides_closed_at_a_positive_position_report_it(scara_with):
     apart = [(f'xyz="0 {side} 0.03"', f'xyz="0 {-5 * float(side)} 0.03"') for side in ("0.005", "-0.005")]
     proposal = scara_with(('lower="0" upper="0.04"', 'lower="0.03" upper="0.06"'), *apart)
     gripper = check(RobotConfig, proposal.values, "robot").gripper
-    assert gripper is not None
     assert (gripper.closed, gripper.max_width) == (pytest.approx(0.03), pytest.approx(0.06))
     assert finger_positions(gripper, 0.02) == pytest.approx([0.04, 0.04])
     assert width_at(gripper, 0.04) == pytest.approx(0.02)
 
 
-def test_independent_joint_that_carries_no_finger_is_locked(scara_with) -> None:
+def test_independent_joint_that_carries_no_finger_is_locked(scara_with):
     proposal = scara_with((
         "</robot>", '<link name="bar"/><joint name="bar_turns" type="continuous"><parent link="palm"/>'
                     '<child link="bar"/><axis xyz="0 0 1"/><limit velocity="1" effort="1"/></joint></robot>'))
@@ -133,7 +125,7 @@ def test_independent_joint_that_carries_no_finger_is_locked(scara_with) -> None:
     assert "gripper: bar_turns is locked: it moves independently of left_finger" in proposal.check
 
 
-def test_tool_points_away_from_the_arm(scara_with) -> None:
+def test_tool_points_away_from_the_arm(scara_with):
     around = scara_with(('0.005 0.03"/><geometry>', '0.005 -0.004"/><geometry>'),
                         ('xyz="0 0 0.04"/>', 'xyz="0 0 0.1"/>'))  # the fingers are around their frames
     robot = RobotModel.load(check(RobotConfig, around.values, "robot"))

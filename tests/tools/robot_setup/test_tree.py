@@ -1,7 +1,5 @@
 """Arm, fingers and joint limits of a URDF."""
 
-from __future__ import annotations
-
 import math
 import xml.etree.ElementTree as ET
 
@@ -47,14 +45,12 @@ ARM = ("base-a", "a-b", "b-c", "c-d")
     (("d-tool",), "tool", []), (("d-gripper_jaw",), "d", ["gripper_jaw"]),
     (("d-gripper_link", "gripper_link-moving_jaw"), "gripper_link", ["moving_jaw"]),
 ])
-def test_two_last_joints_are_fingers_and_a_single_one_by_its_name(
-    more: tuple[str, ...], wrist: str, fingers: list[str]
-) -> None:
+def test_two_last_joints_are_fingers_and_a_single_one_by_its_name(more, wrist, fingers):
     arm = find_arm(chain(*ARM, *more), "f")
     assert (arm.wrist, [joint.child for joint in arm.fingers]) == (wrist, fingers)
 
 
-def test_longer_or_named_arm_is_selected_also_on_a_torso() -> None:
+def test_longer_or_named_arm_is_selected_also_on_a_torso():
     left, right = (tuple(f"{side}{k}-{side}{k + 1}" for k in range(count)) for side, count in (("l", 5), ("r", 4)))
     body = chain("base>l0", "base>r0", *left, *right)
     assert find_wrists(body) == ["l5", "r4"]
@@ -69,13 +65,13 @@ def test_longer_or_named_arm_is_selected_also_on_a_torso() -> None:
     (("base-a", "base-b", "a-c", "b-c"), None, "more than one joint that carries c"),
     (("base-a", "b-c", "c-b"), None, "hang on each other, not on base: b, c"),
 ])
-def test_urdf_without_an_arm_or_tree_is_rejected(joints: tuple[str, ...], tip: str | None, problem: str) -> None:
+def test_urdf_without_an_arm_or_tree_is_rejected(joints, tip, problem):
     with pytest.raises((ConfigError, UnknownName), match=problem):
         find_arm(chain(*joints), "f", tip)
 
 
 @pytest.mark.parametrize("axis", ["0 0 0", "0 -0.0 0.0"])
-def test_joint_without_an_axis_is_rejected(axis: str) -> None:
+def test_joint_without_an_axis_is_rejected(axis):
     text = ('<robot><link name="a"/><link name="b"/><joint name="j" type="revolute"><parent link="a"/><child link="b"/>'
             f'<axis xyz="{axis}"/>{LIMIT}</joint></robot>')
     with pytest.raises(ConfigError, match=f"'j' whose axis is '{axis}', which is none"):
@@ -84,7 +80,7 @@ def test_joint_without_an_axis_is_rejected(axis: str) -> None:
 
 
 @given(st.floats(0.05, 20))
-def test_guessed_limits_take_half_a_second_to_full_speed_and_a_twentieth_to_full_acceleration(speed: float) -> None:
+def test_guessed_limits_take_half_a_second_to_full_speed_and_a_twentieth_to_full_acceleration(speed):
     acceleration = guessed_acceleration(speed)
     assert speed / acceleration == pytest.approx(0.5, rel=0.01)
     assert acceleration / guessed_jerk(acceleration) == pytest.approx(0.05, rel=0.01)
@@ -96,13 +92,11 @@ def test_guessed_limits_take_half_a_second_to_full_speed_and_a_twentieth_to_full
     ("revolute", -math.pi, math.pi, (-math.pi, math.pi, False)), ("revolute", 0.3, 6.0, (0.3, 6.0, False)),
     ("revolute", -0.1, 7.0, (-0.1, 7.0, False)), ("prismatic", 0.0, 9.0, (0.0, 9.0, False)),
 ])
-def test_limits_are_those_of_the_urdf_or_half_a_turn_either_way(
-    kind: str, low: float | None, high: float | None, found: tuple[float, float, bool]
-) -> None:
+def test_limits_are_those_of_the_urdf_or_half_a_turn_either_way(kind, low, high, found):
     assert position_range(Joint("j", kind, "a", "b", low, high)) == found
 
 
 @pytest.mark.parametrize(("low", "high"), [(None, None), (0.0, 0.0), (1.0, -1.0), (None, 1.0)])
-def test_joint_without_limits_is_rejected(low: float | None, high: float | None) -> None:
+def test_joint_without_limits_is_rejected(low, high):
     with pytest.raises(ConfigError, match="'j' is revolute and needs limits"):
         position_range(Joint("j", "revolute", "a", "b", low, high))
