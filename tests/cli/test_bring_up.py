@@ -105,13 +105,3 @@ def test_run_ends_with_its_task_and_writes_the_summary(zencell, folder, behaviou
     assert summary["restarts"] == {"router": 0, "first": 0, "middle": 0, "last": 0}
     assert summary["seconds"]["ready"] > 0
     assert f"tiny: {state}, 2 of 2 placed" in command.lines
-
-
-@pytest.mark.slow
-def test_log_lines_are_json_on_request(zencell):
-    command = zencell("up", "tiny.yaml", "--log-json")
-    command.until(RUNNING)
-    command.interrupt()
-    assert command.end() == 0
-    for line in filter(None, command.lines):
-        assert {"time", "service", "level", "message"} <= json.loads(line).keys()

@@ -91,7 +91,8 @@ def test_unknown_link_of_a_camera_is_rejected_with_the_choices():
 
 @pytest.mark.parametrize(("name", "options"), [
     (HAND, {}), ("panda", {"seed": 1}), ("panda", {"overrides": ["world.layout=random", "world.count=8"], "seed": 7}),
-    *(("ur5", {"world": world}) for world in names_of("worlds") if world != "balls")])
+    *(pytest.param("ur5", {"world": world}, marks=[pytest.mark.slow] if world > "w2" else [])
+      for world in names_of("worlds") if world != "balls")])
 def test_cells_of_the_project_have_no_findings(name, options):
     cell = load_cell(name, **options)
     assert [*check_files(cell), *check_model(cell), *wiring(cell)] == []

@@ -247,22 +247,6 @@ def test_running_cell_and_other_programs_are_no_leftovers():
     assert list(process_findings(others)) == [Finding("ok", "no process is left from an earlier run")]
 
 
-@pytest.mark.slow
-def test_stopped_service_of_a_cell_is_found_until_the_cell_is_gone(zencell):
-    command = zencell("up", "tiny.yaml")
-    command.until("zenoh --mode client")
-    middle = command.children()["middle"]
-    middle.suspend()
-    while middle.status() != psutil.STATUS_STOPPED:  # up to 5 ms later
-        time.sleep(0.001)
-    (found,) = (f for f in machine.processes() if f"middle ({middle.pid})" in f.what)
-    check(found, "stopped (SIGSTOP)", "kill -CONT", str(middle.pid))
-    command.process.kill()
-    command.end()
-    command.until_childless()  # the system wakes it when its supervisor dies
-    assert not [f for f in machine.processes() if f"({middle.pid})" in f.what]
-
-
 def test_service_that_outlived_its_supervisor_is_found():
     waits = "import os, time; print(os.getpid(), flush=True); time.sleep(60)"
     deaf = [sys.executable, "-c", waits, "-m", "services.deaf", "--gate"]

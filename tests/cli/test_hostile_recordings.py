@@ -140,7 +140,7 @@ def test_bomb_is_rejected_at_once(name, path, capsys):
 def test_invalid_metadata_is_one_line(wrong, path, rejection, capsys):
     line = rejection("report", str(run_with(path, **wrong)))
     assert "which is not" in line and not STEERING.search(line)
-    for each in ("info", "export", "recover"):
+    for each in ("info", "recover"):
         app.execute(command(each, path))
         shown = capsys.readouterr()
         assert len(shown.err.splitlines()) <= 1 and not STEERING.search(shown.err + shown.out)

@@ -163,7 +163,7 @@ def clear_table(cell: Path, seed: int | None = None) -> None:
     assert (outcome.broken, outcome.crashes) == ([], [])
 
 
-@pytest.mark.slow
+@pytest.mark.campaign  # that of the docs does it among the slow tests
 def test_new_arm_clears_its_table(folder):
     clear_table(folder / "side_cell.yaml")
 
