@@ -1,7 +1,7 @@
-"""Problems with constrained paths, and checks that are independent of the code that satisfies the constraints.
+"""Problems with constrained paths, and checks with pinocchio's kinematics at every millisecond.
 
 Both ends of a problem have a solution near the home pose: between other postures of the arm there may be no path with
-an upright tool. The checks use pinocchio's kinematics at every millisecond.
+an upright tool.
 """
 
 from __future__ import annotations
@@ -11,21 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from common.messages import (
-    Box,
-    CollisionObject,
-    Header,
-    PathConstraints,
-    PlanningScene,
-    PlanResponse,
-    Pose,
-    Vector3,
-)
+from common.messages import Box, CollisionObject, PathConstraints, PlanningScene, PlanResponse, Pose, Vector3
 from common.planning.collision import CollisionWorld
 from common.planning.ik import solve_ik
 from common.planning.trajectory import sample, timed_path
 from common.robot.model import RobotModel
 from common.robot.transforms import tool_down, transform
+from tests.common.planning.scenes import only, solid
 
 FLOOR = {"panda": 0.0, "ur5": 1.0}  # [m] height of the wall's foot
 _WALL = 0.25  # [m] high
@@ -42,11 +34,11 @@ class ToolMotion:
     speeds: np.ndarray
 
     def tilt(self, axis=(0.0, 0.0, -1.0)) -> float:
-        """The most [rad] by which the tool's z axis leans from an axis."""
+        """The largest angle [rad] of the tool's z axis from an axis."""
         return float(np.arccos(np.clip(self.axes @ np.array(axis), -1, 1)).max())
 
     def outside(self, box: Box) -> float:
-        """The most [m] by which the tool is outside a box along the axes of world."""
+        """The largest distance [m] of the tool outside a box along the axes of world."""
         middle, size = box.pose.position, box.size
         away = np.abs(self.places - (middle.x, middle.y, middle.z))
         return float((away - np.array([size.x, size.y, size.z]) / 2).max())
@@ -79,16 +71,11 @@ class Carry:
 def walled(robot: str) -> PlanningScene:
     """A wall between the two sides."""
     floor = FLOOR[robot]
-    objects = [
-        _box("floor", [0.6, 1.0, 0.05], floor - 0.025),
-        _box("wall", [0.5, 0.02, _WALL], floor + _WALL / 2),
-    ]
-    return PlanningScene(header=Header(frame_id="world"), objects=objects)
+    return only(_box("floor", [0.6, 1.0, 0.05], floor - 0.025), _box("wall", [0.5, 0.02, _WALL], floor + _WALL / 2))
 
 
 def _box(name: str, sides: list[float], z: float) -> CollisionObject:
-    pose = Pose(position=Vector3(x=0.55, z=z))
-    return CollisionObject(id=name, role="fixture", shape="box", dimensions=sides, pose=pose)
+    return solid(name, "fixture", "box", sides, (0.55, 0.0, z))
 
 
 def constraints_of(name: str, robot: str) -> PathConstraints:

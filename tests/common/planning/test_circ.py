@@ -1,3 +1,5 @@
+"""Arcs of the tool."""
+
 import numpy as np
 import pytest
 from hypothesis import assume, given
@@ -6,21 +8,19 @@ from pydantic import ValidationError
 
 from common.messages import ArcGoal, PlanRequest, Pose, Vector3
 from common.planning.planners.circ import NoArc, circle_about, circle_through
-from common.planning.validation import fine_samples
 from common.robot.transforms import matrix_to_pose, tool_down
-from tests.common.planning.planner_checks import RIGHT, assert_sound, with_planner
-from tests.common.planning.planning_scenes import ROBOT, last, scene, solid
+from tests.common.planning.checks import planned, tool_places, with_planner
+from tests.common.planning.requests import RIGHT, to
+from tests.common.planning.scenes import EMPTY, ROBOT, scene, solid
 
-EMPTY = scene(box=False)
 DX, DY = np.array([0.1, 0, 0]), np.array([0, 0.1, 0])
 START = ROBOT.fk(RIGHT)[:3, 3]
 POINTS = st.tuples(*[st.floats(-1, 1)] * 3).map(np.array)
-SHARES = np.linspace(0, 1, 101)
 
 
 def to_arc(T, **circle) -> PlanRequest:
     points = {name: Vector3(x=p[0], y=p[1], z=p[2]) for name, p in circle.items()}
-    return PlanRequest(id="1", start=list(RIGHT), goal=ArcGoal(pose=matrix_to_pose(T), **points))
+    return to(ArcGoal(pose=matrix_to_pose(T), **points), RIGHT)
 
 
 @given(start=POINTS, via=POINTS, goal=POINTS)
@@ -31,8 +31,7 @@ def test_circle_passes_its_three_points_in_order(start, via, goal):
         return
     assume(circle.radius < 10)
     arc = circle.points(np.linspace(0, 1, 2001))
-    assert np.allclose(arc[0], start, atol=1e-6)
-    assert np.allclose(arc[-1], goal, atol=1e-6)
+    assert np.allclose(arc[[0, -1]], [start, goal], atol=1e-6)
     assert np.linalg.norm(arc - via, axis=1).min() < 2 * circle.length / 2000 + 1e-6
     assert np.allclose(np.linalg.norm(arc - circle.centre, axis=1), circle.radius, atol=1e-6)
 
@@ -46,48 +45,37 @@ def test_circle_about_a_centre_takes_the_shorter_arc(centre, one, other):
     except NoArc:
         return
     assert circle.angle <= np.pi
-    assert np.allclose(circle.points(SHARES)[-1], centre + other, atol=1e-6)
+    assert np.allclose(circle.points(np.linspace(0, 1, 101))[-1], centre + other, atol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("make", "text"),
-    [
-        (lambda: circle_through(START, START + DY, START + 2 * DY), "straight line"),
-        (lambda: circle_through(START, START, START + DY), "three different points"),
-        (lambda: circle_about(START, START + DY, START + 2 * DY), "plane of the circle"),
-        (lambda: circle_about(START, START + DY, START + 2 * DX), "0.1000 m from the start and 0.2236"),
-    ],
-)
-def test_points_that_define_no_circle_are_refused(make, text):
+@pytest.mark.parametrize(("make", "points", "text"), [
+    (circle_through, (START, START + DY, START + 2 * DY), "straight line"),
+    (circle_through, (START, START, START + DY), "three different points"),
+    (circle_about, (START, START + DY, START + 2 * DY), "plane of the circle"),
+    (circle_about, (START, START + DY, START + 2 * DX), "0.1000 m from the start and 0.2236"),
+])
+def test_points_that_define_no_circle_are_refused(make, points, text):
     with pytest.raises(NoArc, match=text):
-        make()
+        make(*points)
 
 
-@pytest.mark.parametrize("how", ["via", "center"])
-def test_tool_follows_the_arc_at_its_speed(how):
-    pipeline = with_planner("circ", speed=0.5)
+@pytest.mark.parametrize(("how", "point", "circle_of"), [
+    ("via", (0.5, 0.0, 0.5), circle_through), ("center", (0.3, 0, 0.2), circle_about)])
+def test_tool_follows_the_arc_at_its_speed(how, point, circle_of):
     T = tool_down(0.5, 0.3, 0.2, 0.3)
-    point = (0.3, 0, 0.2) if how == "center" else (0.5, 0.0, 0.5)
-    request = to_arc(T, **{how: point})
-    response = pipeline.plan(request, EMPTY)
-    timed = assert_sound(pipeline, request, EMPTY, response)
-    assert np.allclose(ROBOT.fk(last(response)), T, atol=2e-4)
-    circle = (circle_about if how == "center" else circle_through)(START, np.array(point), T[:3, 3])
-    path, _ = fine_samples(timed, 0.01)
-    way = np.array([ROBOT.fk(q)[:3, 3] for q in path])
-    normal = np.cross(circle.x, circle.y)
-    assert np.abs((way - circle.centre) @ normal).max() < 5e-4
-    assert np.abs(np.linalg.norm(way - circle.centre, axis=1) - circle.radius).max() < 5e-4
-    assert timed.duration > circle.length / 0.1
-    assert timed.duration < circle.length / 0.1 + 1
+    timed = planned(with_planner("circ", speed=0.5), to_arc(T, **{how: point}), EMPTY)
+    assert np.allclose(ROBOT.fk(timed.positions[-1]), T, atol=2e-4)
+    circle = circle_of(START, np.array(point), T[:3, 3])
+    away = tool_places(timed, 0.01) - circle.centre
+    assert np.abs(away @ np.cross(circle.x, circle.y)).max() < 5e-4
+    assert np.abs(np.linalg.norm(away, axis=1) - circle.radius).max() < 5e-4
+    assert circle.length / 0.1 < timed.duration < circle.length / 0.1 + 1
 
 
 def test_colliding_arc_is_reported_with_waypoint_and_pair():
-    beam = solid("beam", "fixture", "box", [0.1, 0.02, 0.1], (0.5, 0.0, 0.5))
-    blocked = EMPTY.model_copy(update={"objects": [*EMPTY.objects, beam]})
-    response = with_planner("circ").plan(to_arc(tool_down(0.5, 0.3, 0.2), via=(0.5, 0.0, 0.5)), blocked)
-    assert response.error == "collision"
-    assert response.colliding[1] == "beam"
+    beam = scene((), solid("beam", "fixture", "box", [0.1, 0.02, 0.1], (0.5, 0.0, 0.5)), box=False)
+    response = with_planner("circ").plan(to_arc(tool_down(0.5, 0.3, 0.2), via=(0.5, 0.0, 0.5)), beam)
+    assert (response.error, response.colliding[1]) == ("collision", "beam")
     assert f"point {response.attempts[-1].waypoint + 1} of " in response.message
     assert 0.1 < response.fraction < 0.5
 
@@ -99,10 +87,8 @@ def test_colliding_arc_is_reported_with_waypoint_and_pair():
 ])
 def test_impossible_arc_is_refused(planner, via, error, text):
     response = with_planner(planner).plan(to_arc(tool_down(0.5, 0.3, 0.2), via=via), EMPTY)
-    assert response.error == error
-    assert text in response.message
-    if error == "no_ik":
-        assert 0 < response.fraction < 0.5
+    assert response.error == error and text in response.message
+    assert error != "no_ik" or 0 < response.fraction < 0.5
 
 
 @pytest.mark.parametrize("points", [{}, {"via": Vector3(), "center": Vector3()}])

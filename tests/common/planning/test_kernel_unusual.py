@@ -8,21 +8,20 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from common.messages import PlanningScene
-from common.planning.collision import CollisionWorld
 from common.planning.kernel import library
 from common.planning.kernel.solvers import find_path
 from common.planning.kernel.world import KernelUnavailable, KernelWorld
-from tests.common.planning.planning_scenes import HOME, ROBOT, SPREAD, WORLD, cache, scene, solid
-from tests.common.planning.test_kernel import robot_with
+from tests.common.planning.scenes import GEOMETRY, HOME, ROBOT, TABLE, only, scene, solid, world
+from tests.common.planning.test_kernel import at, robot_with, slider
 
 pytestmark = pytest.mark.skipif(library.library() is None, reason="the planning kernel is not built here")
 
 ONE = np.ones(1)
+BALL, ORIGIN = coal.Sphere(0.1), (0, 0, 0)
 
 
 def far_from_everything() -> KernelWorld:
-    return KernelWorld(*robot_with((coal.Sphere(0.1), (0, 0, 0)), (coal.Box(0.2, 0.2, 0.2), (5, 0, 0))))
+    return slider((BALL, ORIGIN), (coal.Box(0.2, 0.2, 0.2), (5, 0, 0)))
 
 
 def reaching_arm(limit: float) -> KernelWorld:
@@ -39,12 +38,9 @@ def reaching_arm(limit: float) -> KernelWorld:
 
 @pytest.mark.parametrize("number", [np.nan, np.inf, -np.inf])
 def test_nan_and_infinity_are_not_free(number):
-    free, none = np.zeros(1), np.array([number])
-    for kernel in (far_from_everything(), CollisionWorld(ROBOT, scene(), start=HOME, cache=cache()).kernel):
-        if kernel.dof > 1:
-            free = HOME
-            none = HOME.copy()
-            none[0] = number
+    for kernel, free in ((far_from_everything(), at(0.0)), (world(scene()).kernel, HOME)):
+        none = free.copy()
+        none[0] = number
         assert kernel.colliding(none) >= 0
         assert not kernel.edge_free(free, none) and not kernel.edge_free(none, free)
         assert kernel.first_collision(np.array([free, none, free, free]))[0] == 1
@@ -54,9 +50,7 @@ def test_nan_and_infinity_are_not_free(number):
 
 
 def test_extremely_long_edge_is_not_free():
-    far = HOME.copy()
-    far[0] = 1e7
-    assert not CollisionWorld(ROBOT, scene(), start=HOME, cache=cache()).edge_free(HOME, far)
+    assert not world(scene()).edge_free(HOME, np.array([1e7, *HOME[1:]]))
 
 
 @pytest.mark.parametrize("limit", [0.1, 3.0, 1e308, np.inf])
@@ -73,72 +67,84 @@ def test_edge_outside_the_limits_of_a_sliding_joint_is_checked(limit):
     assert not kernel.edge_free(np.array([1.0, 0.0]), np.array([1.0, 3.0]))
 
 
-@pytest.mark.parametrize("kind", ["HX", "Composite"])
-def test_unsupported_joint_kind_is_refused(kind):
-    model, geometry = pin.Model(), pin.GeometryModel()
-    joint = pin.JointModelHX(0.5) if kind == "HX" else pin.JointModelComposite()
-    if kind == "Composite":
-        joint.addJoint(pin.JointModelRZ(), pin.SE3(np.eye(3), np.array([1.0, 0, 0])))
-    model.addJoint(0, joint, pin.SE3.Identity(), "joint", ONE, ONE, -ONE, ONE)
-    with pytest.raises(KernelUnavailable, match=kind):
-        KernelWorld(model, geometry)
+def swept(shape: coal.CollisionGeometry) -> coal.CollisionGeometry:
+    shape.setSweptSphereRadius(0.1)
+    return shape
 
 
-@pytest.mark.parametrize("size", [1e8, 1e155, 1e308])
-def test_extremely_large_shape_is_refused(size):
-    with pytest.raises(KernelUnavailable, match="larger than"):
-        KernelWorld(*robot_with((coal.Box(0.2, 0.2, 0.2), (0, 0, 0)), (coal.Sphere(size), (0.05 + size, 0, 0))))
+def shapes(*given):
+    return robot_with((BALL, ORIGIN), *given)
+
+
+def with_joint(joint) -> tuple[pin.Model, pin.GeometryModel]:
+    model = pin.Model()
+    model.addJoint(0, joint, pin.SE3.Identity(), "joint")
+    return model, pin.GeometryModel()
+
+
+def composite() -> pin.JointModelComposite:
+    joint = pin.JointModelComposite()
+    joint.addJoint(pin.JointModelRZ(), pin.SE3(np.eye(3), np.array([1.0, 0, 0])))
+    return joint
+
+
+@pytest.mark.parametrize(("arguments", "text"), [
+    (with_joint(pin.JointModelHX(0.5)), "HX"),
+    (with_joint(composite()), "Composite"),
+    (with_joint(pin.JointModelFreeFlyer()), "one degree of freedom"),
+    (shapes((coal.Cone(0.1, 0.2), (5, 0, 0))), "Cone"),
+    (shapes((swept(coal.Box(0.2, 0.2, 0.2)), (0.25, 0, 0))), "swept"),
+    *((shapes((coal.Sphere(size), (0.05 + size, 0, 0))), "larger than") for size in (1e8, 1e155, 1e308)),
+])
+def test_unsupported_joint_or_shape_is_refused(arguments, text):
+    with pytest.raises(KernelUnavailable, match=text):
+        KernelWorld(*arguments)
 
 
 def test_scene_with_an_extremely_large_shape_uses_coal():
-    ground = solid("ground", "fixture", "box", [1e8, 1e8, 1.0], (0, 0, -0.6))
-    huge = CollisionWorld(ROBOT, PlanningScene(header=WORLD, objects=[ground]), start=HOME, cache=cache())
+    huge = world(only(solid("ground", "fixture", "box", [1e8, 1e8, 1.0], (0, 0, -0.6))))
     assert huge.kernel is None and not huge.collides(HOME)
 
 
-def test_shape_with_a_swept_sphere_is_refused():
-    wall = coal.Box(0.2, 0.2, 0.2)
-    wall.setSweptSphereRadius(0.1)
-    with pytest.raises(KernelUnavailable, match="swept"):
-        KernelWorld(*robot_with((coal.Sphere(0.1), (0, 0, 0)), (wall, (0.25, 0, 0))))
-
-
 def test_pair_of_two_fixed_shapes_is_checked():
-    ball = coal.Sphere(0.1)
     for gap, free in ((0.3, True), (0.1, False)):
-        model, geometry = robot_with((ball, (0, 0, 0)), (ball, (3, 0, 0)), (ball, (3 + gap, 0, 0)))
+        model, geometry = shapes((BALL, (3, 0, 0)), (BALL, (3 + gap, 0, 0)))
         geometry.removeAllCollisionPairs()
         geometry.addCollisionPair(pin.CollisionPair(1, 2))
         kernel = KernelWorld(model, geometry)
-        assert (kernel.colliding(np.zeros(1)) < 0) == free
-        assert kernel.edge_free(np.zeros(1), ONE) == free
+        assert (kernel.colliding(at(0.0)) < 0) == free
+        assert kernel.edge_free(at(0.0), ONE) == free
 
 
-def test_search_without_goals_is_refused_and_tiny_steps_respect_limits():
-    kernel, ends = far_from_everything(), (np.array([-0.9]), np.array([[0.9]]))
-    with pytest.raises(ValueError, match="goals"):
-        find_path(kernel, ends[0], np.zeros((0, 1)))
+def test_tiny_steps_of_a_search_respect_limits():
+    kernel, ends = far_from_everything(), (at(-0.9), np.array([[0.9]]))
     found = find_path(kernel, *ends, reach=1e-5, nodes=1000)
     assert found.error == "no_path" and found.nodes <= 1000
     found = find_path(kernel, *ends, reach=1e-8, nodes=10**9, seconds=0.05)
     assert found.error == "timeout" and found.search_seconds < 1
 
 
-def test_unknown_shape_index_is_refused():
+def test_wrong_arguments_are_refused():
+    kernel = KernelWorld(ROBOT.model, GEOMETRY.geometry)
+    with pytest.raises(ValueError, match="shape"):
+        kernel.colliding(np.zeros(6))
+    with pytest.raises(ValueError, match="margins"):
+        kernel.set_rules(np.zeros(3))
+    with pytest.raises(ValueError, match="goals"):
+        find_path(far_from_everything(), at(-0.9), np.zeros((0, 1)))
     with pytest.raises(IndexError):
         far_from_everything().set_pose(2, np.eye(4))
 
 
 def test_threads_sharing_a_world_get_the_same_answers():
-    world = CollisionWorld(ROBOT, scene(SPREAD), start=HOME, cache=cache())
-    states = np.random.default_rng(0).uniform(ROBOT.lower, ROBOT.upper, (100, ROBOT.dof))
-    edges = [*pairwise(states)]
-    expected = [world.edge_free(a, b) for a, b in edges]
+    shared = world(TABLE)
+    edges = [*pairwise(np.random.default_rng(0).uniform(ROBOT.lower, ROBOT.upper, (100, ROBOT.dof)))]
+    expected = [shared.edge_free(a, b) for a, b in edges]
     wrong: list[int] = []
 
     def ask() -> None:
-        for _ in range(30):
-            wrong.extend(i for i, (a, b) in enumerate(edges) if world.edge_free(a, b) != expected[i])
+        for _ in range(10):
+            wrong.extend(i for i, (a, b) in enumerate(edges) if shared.edge_free(a, b) != expected[i])
 
     threads = [threading.Thread(target=ask) for _ in range(2)]
     for thread in threads:

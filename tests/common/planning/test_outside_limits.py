@@ -7,16 +7,16 @@ from common.control.limiter import Limiter
 from common.control.trajectory import Tolerances, checked_trajectory
 from common.errors import Refused
 from common.hardware.interface import Limits
-from common.planning.pipeline import PlanningPipeline
 from common.planning.planners import planner_names
 from common.planning.trajectory import timed_path
 from common.planning.validation import validate
 from common.robot.transforms import tool_down
-from tests.common.planning.planning_scenes import CELL, HOME, ROBOT, SPREAD, above, scene, to_joints, to_pose
+from tests.common.planning.checks import PIPELINE
+from tests.common.planning.requests import above, to_joints, to_pose
+from tests.common.planning.scenes import HOME, ROBOT, TABLE
 
-PIPELINE = PlanningPipeline(ROBOT, CELL.motion, CELL.pipeline)
-TABLE = scene(SPREAD)
-ELBOW, SHOULDER = 3, 1
+ELBOW, SHOULDER, LAST = 3, 1, 6
+STILL = np.zeros(ROBOT.dof)
 LIMITS = Limits(ROBOT.joint_names, ROBOT.lower, ROBOT.upper, ROBOT.velocity, ROBOT.acceleration, ROBOT.acceleration,
                 ROBOT.jerk)
 
@@ -50,30 +50,24 @@ def test_plan_of_any_planner_leads_inwards_first(planner, by):
     limiter, t, q = Limiter(LIMITS, start, 0.01), 0.0, [start]
     while t < trajectory.duration:
         t += 0.01
-        target, velocity = accepted.at(t)
-        q.append(limiter.step(target, velocity, 0.01)[0])
+        q.append(limiter.step(*accepted.at(t), 0.01)[0])
     assert (np.diff(excess(np.array(q)), axis=0) <= 1e-9).all()
     assert np.abs(q[-1] - trajectory.positions[-1]).max() < 1e-3
 
 
-def test_start_outside_the_limits_by_more_than_the_tolerance_is_refused():
-    response = PIPELINE.plan(to_joints(HOME, outside(0.06)), TABLE)
-    assert (response.ok, response.error) == (False, "start_out_of_limits")
-
-
-def test_goal_slightly_outside_a_limit_is_refused():
-    response = PIPELINE.plan(to_joints(outside(0.001), HOME), TABLE)
-    assert (response.ok, response.error) == (False, "goal_out_of_limits")
+@pytest.mark.parametrize(("goal", "start", "code"), [
+    (HOME, outside(0.06), "start_out_of_limits"), (outside(0.001), HOME, "goal_out_of_limits")])
+def test_start_beyond_the_tolerance_or_goal_outside_the_limits_is_refused(goal, start, code):
+    response = PIPELINE.plan(to_joints(goal, start), TABLE)
+    assert (response.ok, response.error) == (False, code)
 
 
 def test_obstacle_on_the_path_back_inside_is_named():
-    start = above(0.5, 0.0, 0.15)
-    start[ROBOT.dof - 1] = ROBOT.upper[-1] + 0.04
-    free = PIPELINE.plan(to_pose(tool_down(0.5, 0, 0.3, 0.0), start), TABLE)
-    assert free.error != "start_in_collision"
-    low = above(0.5, 0.0, -0.05)
-    low[ROBOT.dof - 1] = ROBOT.upper[-1] + 0.04
-    response = PIPELINE.plan(to_pose(tool_down(0.5, 0, 0.3, 0.0), low), TABLE)
+    free, low = above(0.5, 0.0, 0.15), above(0.5, 0.0, -0.05)
+    free[LAST] = low[LAST] = ROBOT.upper[LAST] + 0.04
+    up = tool_down(0.5, 0, 0.3, 0.0)
+    assert PIPELINE.plan(to_pose(up, free), TABLE).error != "start_in_collision"
+    response = PIPELINE.plan(to_pose(up, low), TABLE)
     assert response.error == "start_in_collision" and response.colliding
 
 
@@ -81,17 +75,15 @@ def test_limiter_holds_an_arm_outside_its_limits_where_it_is():
     start = outside(0.03)
     limiter = Limiter(LIMITS, start, 0.01)
     for _ in range(50):
-        position, velocity = limiter.step(start, np.zeros(ROBOT.dof), 0.01)
+        position, velocity = limiter.step(start, STILL, 0.01)
         assert (position == start).all() and not velocity.any()
-
-
-def test_no_motion_leads_farther_outside_than_the_arm_is():
-    start = outside(0.03)
-    limiter = Limiter(LIMITS, start, 0.01)
     for _ in range(300):
-        position, _ = limiter.step(outside(0.1), np.zeros(ROBOT.dof), 0.01)
+        position, _ = limiter.step(outside(0.1), STILL, 0.01)
         assert (excess(position) <= excess(start) + 1e-9).all()
-    response = PIPELINE.plan(to_joints(HOME, start), TABLE)
+
+
+def test_trajectory_that_leads_outside_is_refused():
+    response = PIPELINE.plan(to_joints(HOME, outside(0.03)), TABLE)
     message = response.trajectory.model_copy(deep=True)
     message.points.reverse()
     for point, other in zip(message.points, response.trajectory.points, strict=True):
@@ -99,8 +91,7 @@ def test_no_motion_leads_farther_outside_than_the_arm_is():
         point.velocities = [-v for v in point.velocities]
     with pytest.raises(Refused, match="exceeds the limit of panda_joint"):
         checked_trajectory(message, LIMITS, HOME, Tolerances())
-    fault = validate(
-        timed_path(message), ROBOT, PIPELINE.world(to_joints(HOME, HOME), TABLE, HOME), start=HOME,
-        velocity=ROBOT.velocity, acceleration=ROBOT.acceleration, step=0.01,
-    )
+    world = PIPELINE.world(to_joints(HOME, HOME), TABLE, HOME)
+    limits = {"velocity": ROBOT.velocity, "acceleration": ROBOT.acceleration}
+    fault = validate(timed_path(message), ROBOT, world, start=HOME, step=0.01, **limits)
     assert fault is not None and fault.code == "position_limit"

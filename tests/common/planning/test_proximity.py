@@ -1,17 +1,15 @@
 import numpy as np
 import pytest
 
-from common.planning.collision import CollisionWorld
 from common.planning.joint_paths import line
 from common.planning.proximity import Proximity, SweptEdges
-from tests.common.planning.planner_checks import AROUND, LEFT, RIGHT, assert_sound, with_planner
-from tests.common.planning.planning_scenes import ROBOT, above, cache, held_scene, scene, solid, to_joints, touching
+from tests.common.planning.checks import planned, with_planner
+from tests.common.planning.requests import LEFT, RIGHT, above, to_joints, touching
+from tests.common.planning.scenes import EMPTY, ROBOT, TABLE, held_scene, scene, wall, world
 
 LOW = above(0.5, 0.1, 0.06)
-
-
-def world(of=AROUND, start=RIGHT, **more) -> CollisionWorld:
-    return CollisionWorld(ROBOT, of, start=start, cache=cache(), **more)
+MEASURED = world(TABLE, RIGHT)
+WALL = wall(height=0.3, depth=0.4)
 
 
 def by_pair(near):
@@ -19,25 +17,23 @@ def by_pair(near):
 
 
 def test_gradient_is_that_of_the_distance():
-    measured = world()
-    near = Proximity(measured, 0.15).measure(LOW[None])
+    near = Proximity(MEASURED, 0.15).measure(LOW[None])
     assert len(near.pair) > 5
     step = 1e-4
     for joint in range(ROBOT.dof):
         away = step * np.eye(ROBOT.dof)[joint]
-        more, less = (by_pair(Proximity(measured, 0.2).measure((LOW + s * away)[None])) for s in (1, -1))
+        more, less = (by_pair(Proximity(MEASURED, 0.2).measure((LOW + s * away)[None])) for s in (1, -1))
         for pair, gradient in zip(near.pair.tolist(), near.gradient[:, joint], strict=True):
             assert (more[pair] - less[pair]) / (2 * step) == pytest.approx(gradient, abs=0.03)
 
 
 def test_cached_measurement_equals_a_fresh_one():
-    measured = world()
-    caching = Proximity(measured, 0.1)
+    caching = Proximity(MEASURED, 0.1)
     rng = np.random.default_rng(0)
     path = np.linspace(RIGHT, LOW, 8)
     for _ in range(12):
         near = caching.measure(path)
-        fresh = Proximity(measured, 0.1).measure(path)
+        fresh = Proximity(MEASURED, 0.1).measure(path)
         assert np.array_equal(near.pair, fresh.pair)
         assert np.array_equal(near.position, fresh.position)
         assert np.allclose(near.distance, fresh.distance, atol=1e-5)
@@ -45,61 +41,47 @@ def test_cached_measurement_equals_a_fresh_one():
 
 
 def test_distance_agrees_with_collision():
-    measured = world(padding=0.003)
-    rng = np.random.default_rng(1)
-    for _ in range(60):
-        q = rng.uniform(ROBOT.lower, ROBOT.upper)
-        near = Proximity(measured, 0.05).measure(q[None])
-        least = near.distance.min(initial=1.0)
+    measured = world(TABLE, RIGHT, padding=0.003)
+    for q in np.random.default_rng(1).uniform(ROBOT.lower, ROBOT.upper, (60, ROBOT.dof)):
+        least = Proximity(measured, 0.05).measure(q[None]).distance.min(initial=1.0)
         if abs(least) > 1e-4:
             assert measured.collides(q) == (least < 0)
 
 
 def test_nearest_reports_one_pair_of_each_link():
-    measured = world()
-    every = Proximity(measured, 0.2).measure(LOW[None])
-    nearest = Proximity(measured, 0.2, nearest=True).measure(LOW[None])
-    first = measured.bank.first
+    every = Proximity(MEASURED, 0.2).measure(LOW[None])
+    nearest = Proximity(MEASURED, 0.2, nearest=True).measure(LOW[None])
+    first = MEASURED.bank.first
     assert len(set(first[nearest.pair])) == len(nearest.pair) < len(every.pair)
     for pair, distance in by_pair(nearest).items():
         assert distance == pytest.approx(every.distance[first[every.pair] == first[pair]].min())
 
 
-def test_own_reach_applies_to_links_of_the_robot():
-    measured = world(scene(box=False))
+def test_own_reach_applies_to_links_of_the_robot_and_nothing_near_gives_empty_arrays():
+    measured = world(EMPTY, RIGHT)
     near = Proximity(measured, 0.3, own_reach=0.01).measure(RIGHT[None])
-    assert all(measured.bank.second[pair] >= measured.bank.robot_count for pair in near.pair)
-    assert len(near.pair)
+    assert len(near.pair) and all(measured.bank.second[pair] >= measured.bank.robot_count for pair in near.pair)
+    near = Proximity(world(scene([(0.9, 0.6)], box=False), RIGHT), 0.001).measure(np.array([LEFT, RIGHT]))
+    assert near.gradient.shape == (0, ROBOT.dof)
 
 
 def test_allowed_contacts_are_not_measured():
     at_ball = above(0.45, -0.1, 0.03)
     of = scene([(0.45, -0.1)])
-    with_ball = by_pair(Proximity(world(of, at_ball), 0.02).measure(at_ball[None]))
-    allowed = world(of, at_ball, allowed=touching("ball_0"))
-    without = by_pair(Proximity(allowed, 0.02).measure(at_ball[None]))
-    assert set(without) < set(with_ball)
+    every = by_pair(Proximity(world(of, at_ball), 0.02).measure(at_ball[None]))
+    others = by_pair(Proximity(world(of, at_ball, allowed=touching("ball_0")), 0.02).measure(at_ball[None]))
+    assert set(others) < set(every)
     held = world(held_scene(of, "ball_0"), at_ball)
     assert Proximity(held, 0.02).measure(LEFT[None]).distance.min(initial=1.0) > 0
 
 
-def test_no_pair_within_reach_gives_empty_arrays():
-    near = Proximity(world(scene([(0.9, 0.6)], box=False)), 0.001).measure(np.array([LEFT, RIGHT]))
-    assert near.gradient.shape == (0, ROBOT.dof)
-
-
-WALL = scene(box=False)
-WALL.objects.append(solid("wall", "fixture", "box", [0.4, 0.02, 0.3], (0.55, 0.0, 0.15)))
-
-
-@pytest.mark.parametrize("which", range(3))
-def test_swept_distance_bounds_all_positions_between_the_waypoints(which):
-    around = [WALL, AROUND, held_scene(scene([(0.5, 0.0)]), "ball_0")][which]
-    measured = world(around)
-    rng = np.random.default_rng(which)
+@pytest.mark.parametrize("around", [WALL, TABLE, held_scene(scene([(0.5, 0.0)]), "ball_0")], ids=["wall", "", "held"])
+def test_swept_distance_bounds_all_positions_between_the_waypoints(around):
+    measured = world(around, RIGHT)
+    rng = np.random.default_rng(1)
     joints = np.array([item.parentJoint for item in measured.bank.geometry.geometryObjects])
     compared = 0
-    for _ in range(12):
+    for _ in range(8):
         a = np.clip(RIGHT + rng.uniform(0, 1) * (LEFT - RIGHT) + rng.normal(0, 0.2, 7), ROBOT.lower, ROBOT.upper)
         b = np.clip(a + rng.normal(0, 0.06, 7), ROBOT.lower, ROBOT.upper)
         swept = SweptEdges(measured, 0.2).measure(np.array([a, b]))
@@ -110,38 +92,34 @@ def test_swept_distance_bounds_all_positions_between_the_waypoints(which):
             if fixed.any():
                 compared += 1
                 assert distance < states.distance[fixed].min() + 2e-3  # a link that turns bulges out of its hull
-    assert compared > 10
+    assert compared > 7
 
 
 def test_step_along_the_swept_gradient_increases_the_distance():
-    measured = world(WALL)
+    measured = world(WALL, RIGHT)
     path = np.array([above(0.5, -0.25, 0.15), above(0.5, -0.15, 0.15), above(0.5, -0.25, 0.15)])
     pieces = SweptEdges(measured, 0.5)
     near = pieces.measure(path)
     tried = 0
     for position, pair, distance, gradient in zip(near.position, near.pair, near.distance, near.gradient, strict=True):
-        if measured.pair(pair)[1] != "wall" or position != 2:  # the middle waypoint reaches farthest
-            continue
-        moved = path.copy()
-        moved[1] += 0.01 * gradient / np.linalg.norm(gradient)
-        then = pieces.measure(moved)
-        gained = then.distance[then.pair == pair].min() - distance
-        assert 0.3 < gained / (0.01 * np.linalg.norm(gradient)) < 1.5
-        tried += 1
+        if measured.pair(pair)[1] == "wall" and position == 2:  # the middle waypoint reaches farthest
+            moved = path.copy()
+            moved[1] += 0.01 * gradient / np.linalg.norm(gradient)
+            then = pieces.measure(moved)
+            gained = then.distance[then.pair == pair].min() - distance
+            assert 0.3 < gained / (0.01 * np.linalg.norm(gradient)) < 1.5
+            tried += 1
     assert tried
 
 
 def test_blade_between_two_states_is_measured_and_avoided():
-    around = scene(box=False)
-    around.objects.append(solid("blade", "fixture", "box", [0.4, 0.002, 0.3], (0.55, 0.0, 0.15)))
-    measured = world(around)
+    around = wall(height=0.3, depth=0.4, width=0.002)
+    measured = world(around, RIGHT)
     path = np.array([above(0.5, -0.15, 0.15), above(0.5, 0.16, 0.15)])
-    ends = Proximity(measured, 0.2).measure(path)
-    assert ends.distance.min() > 0
+    assert Proximity(measured, 0.2).measure(path).distance.min() > 0
     near = SweptEdges(measured, 0.02).measure(path)
     assert min(near.distance) < -0.02
-    assert {measured.pair(pair)[1] for pair in near.pair[near.distance < 0]} == {"blade"}
-    pipeline = with_planner("trajopt", steps=10)
+    assert {measured.pair(pair)[1] for pair in near.pair[near.distance < 0]} == {"wall"}
     for height in (0.15, 0.2):
         request = to_joints(above(0.5, 0.3, height), above(0.45, -0.3, height), planning_time=20.0)
-        assert_sound(pipeline, request, around, pipeline.plan(request, around))
+        planned(with_planner("trajopt", steps=10), request, around)

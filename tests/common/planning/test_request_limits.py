@@ -6,29 +6,32 @@ from typing import Any
 import numpy as np
 import pytest
 
-from common.messages import ArcGoal, PathGoal, Pose, PoseGoal, SequenceGoal, SequenceItem, Vector3
-from common.messages.planning import PlanRequest, PlanResponse
+from common.messages import ArcGoal, PathGoal, PlanResponse, Pose, PoseGoal, SequenceGoal, SequenceItem, Vector3
 from common.messages.robot import MAX_POINTS
 from common.planning.path import dense_path
-from common.planning.pipeline import PlanningPipeline
 from common.planning.retiming import parametrise
 from common.planning.trajectory import TimedPath, TooLong, require_sendable
 from common.robot.transforms import matrix_to_pose
-from tests.common.planning.planning_scenes import CELL, HOME, ROBOT, scene
+from tests.common.planning.checks import PIPELINE
+from tests.common.planning.requests import to
+from tests.common.planning.scenes import HOME, ROBOT, scene
 
-PIPELINE = PlanningPipeline(ROBOT, CELL.motion, CELL.pipeline)
 HERE = matrix_to_pose(ROBOT.fk(HOME))
+PLACE = HERE.position
 
 
 def at(x: float, y: float = 0.0, z: float = 0.3) -> Pose:
     return Pose(position=Vector3(x=x, y=y, z=z), orientation=HERE.orientation)
 
 
+def behind(by: float) -> Pose:
+    return at(PLACE.x - by, PLACE.y, PLACE.z)
+
+
 def answer(goal: Any, **more: Any) -> PlanResponse:
     """Return the response, which took little CPU time whatever the planning time of the request."""
     began = process_time()
-    request = PlanRequest(id="a", start=HOME.tolist(), goal=goal, planning_time=60.0, **more)
-    response = PIPELINE.plan(request, scene())
+    response = PIPELINE.plan(to(goal, planning_time=60.0, **more), scene())
     assert process_time() - began < 4.0
     return response
 
@@ -41,16 +44,22 @@ def test_extremely_distant_goal_is_refused_by_the_checks(far: float, straight: b
     assert f"goal at ({far:g}, 0, 0.3)" in refused.message and "which reaches 1." in refused.message
 
 
-@pytest.mark.parametrize("goal", [
-    PathGoal(waypoints=[HERE, at(1e5)]), ArcGoal(pose=at(1e5), via=Vector3(x=0.5)),
-    ArcGoal(pose=at(0.5), via=Vector3(x=1e5)), SequenceGoal(items=[SequenceItem(goal=PoseGoal(pose=at(1e5)))]),
-], ids=["path", "arc", "via", "sequence"])
-def test_extremely_distant_part_of_a_goal_is_refused(goal: Any) -> None:
-    assert answer(goal).error == "out_of_reach"
+BEYOND = Vector3(x=PLACE.x - 1.0, y=PLACE.y + 2e-3, z=PLACE.z)  # almost on the line, behind the goal
 
 
-def test_goal_slightly_out_of_reach_is_tried() -> None:
-    assert answer(PoseGoal(pose=at(ROBOT.reach + 0.1))).error == "no_ik"
+@pytest.mark.parametrize(("goal", "error", "text"), [
+    (PathGoal(waypoints=[HERE, at(1e5)]), "out_of_reach", ""),
+    (ArcGoal(pose=at(1e5), via=Vector3(x=0.5)), "out_of_reach", ""),
+    (ArcGoal(pose=at(0.5), via=Vector3(x=1e5)), "out_of_reach", ""),
+    (SequenceGoal(items=[SequenceItem(goal=PoseGoal(pose=at(1e5)))]), "out_of_reach", ""),
+    (PoseGoal(pose=at(ROBOT.reach + 0.1)), "no_ik", ""),
+    (PathGoal(waypoints=[HERE, behind(0.1)], step=1e-7), "too_long", "1e+06 steps of the tool; the limit is 25000"),
+    (PathGoal(waypoints=[HERE, behind(0.005)], step=5e-6), "retiming_failed", "finer than IK resolves joint positions"),
+    (ArcGoal(pose=behind(0.2), via=BEYOND), "too_long", ""),
+], ids=["path", "arc", "via", "sequence", "slightly out of reach", "steps", "fine steps", "radius"])
+def test_goal_with_an_extreme_part_is_refused(goal: Any, error: str, text: str) -> None:
+    refused = answer(goal, planner="circ" if isinstance(goal, ArcGoal) else "")
+    assert refused.error == error and text in refused.message
 
 
 def test_reach_is_an_upper_bound() -> None:
@@ -60,36 +69,15 @@ def test_reach_is_an_upper_bound() -> None:
     assert 0.5 * ROBOT.reach < farthest < ROBOT.reach
 
 
-def test_path_of_too_many_steps_is_refused_before_planning() -> None:
-    place = HERE.position
-    there = Pose(position=Vector3(x=place.x - 0.1, y=place.y, z=place.z), orientation=HERE.orientation)
-    refused = answer(PathGoal(waypoints=[HERE, there], step=1e-7))
-    assert refused.error == "too_long" and "1e+06 steps of the tool; the limit is 25000" in refused.message
-
-
-def test_steps_finer_than_ik_resolves_are_refused() -> None:
-    place = HERE.position
-    there = Pose(position=Vector3(x=place.x - 0.005, y=place.y, z=place.z), orientation=HERE.orientation)
-    refused = answer(PathGoal(waypoints=[HERE, there], step=5e-6))
-    assert refused.error == "retiming_failed" and "finer than IK resolves joint positions" in refused.message
-
-
-def test_arc_with_a_huge_radius_is_refused() -> None:
-    place = HERE.position
-    along = Vector3(x=place.x - 0.2, y=place.y, z=place.z)
-    beyond = Vector3(x=place.x - 1.0, y=place.y + 2e-3, z=place.z)  # almost on the line, behind the goal
-    refused = answer(ArcGoal(pose=Pose(position=along, orientation=HERE.orientation), via=beyond), planner="circ")
-    assert refused.error == "too_long"
-
-
-def test_timing_respects_deadline_and_number_of_states() -> None:
+@pytest.mark.parametrize(("limit", "code", "text"), [
+    ({"deadline": 0.0}, "timeout", "planning ended while the path was timed"),
+    ({"step": 1e-6}, "too_long", f"a trajectory has {MAX_POINTS} at most"),
+])
+def test_timing_respects_deadline_and_number_of_states(limit: dict[str, float], code: str, text: str) -> None:
     path = dense_path(np.linspace(0, 1, 100)[:, None] * np.ones((1, 3)))
-    with pytest.raises(TooLong, match="planning ended while the path was timed") as late:
-        parametrise(path, np.ones(3), np.ones(3), deadline=0.0)
-    assert late.value.code == "timeout"
-    with pytest.raises(TooLong, match=f"a trajectory has {MAX_POINTS} at most") as long:
-        parametrise(path, np.ones(3), np.ones(3), step=1e-6)
-    assert long.value.code == "too_long"
+    with pytest.raises(TooLong, match=text) as refusal:
+        parametrise(path, np.ones(3), np.ones(3), **limit)
+    assert refusal.value.code == code
 
 
 @pytest.mark.parametrize(("states", "duration"), [(MAX_POINTS + 1, 1.0), (10, 1e7)])

@@ -1,30 +1,18 @@
-"""Scenes and requests that the planning tests share."""
+"""Robots, scenes and collision worlds of the planning tests."""
 
 from __future__ import annotations
 
-import numpy as np
-
 from common.config import load_cell
-from common.messages import (
-    AttachedObject,
-    CollisionObject,
-    Header,
-    JointGoal,
-    PlanningScene,
-    PlanRequest,
-    Pose,
-    PoseGoal,
-    Vector3,
-)
-from common.planning.ik import solve_ik
+from common.messages import AttachedObject, CollisionObject, Header, PlanningScene, Pose, Vector3
+from common.planning.collision import CollisionWorld
 from common.planning.obstacles import ObstacleCache
 from common.planning.robot_geometry import RobotGeometry
 from common.robot.model import RobotModel
-from common.robot.transforms import matrix_to_pose, tool_down
 
 WORLD = Header(frame_id="world")
 CELL = load_cell("panda")
 ROBOT = RobotModel.load(CELL.robot)
+UR5 = RobotModel.load(load_cell("ur5").robot)
 GEOMETRY = RobotGeometry(ROBOT)
 HOME = ROBOT.named("home")
 FINGERS = ("panda_hand", "panda_leftfinger", "panda_rightfinger")
@@ -39,17 +27,26 @@ def cache() -> ObstacleCache:
     return ObstacleCache(GEOMETRY)
 
 
-def solid(name, role, shape, dimensions, position) -> CollisionObject:
+def world(of: PlanningScene, start=HOME, **more) -> CollisionWorld:
+    return CollisionWorld(ROBOT, of, start=start, cache=more.pop("cache", None) or cache(), **more)
+
+
+def solid(name, role, shape, dimensions, position, **more) -> CollisionObject:
     x, y, z = position
     pose = Pose(position=Vector3(x=x, y=y, z=z))
-    return CollisionObject(id=name, role=role, shape=shape, dimensions=dimensions, pose=pose)
+    return CollisionObject(id=name, role=role, shape=shape, dimensions=dimensions, pose=pose, **more)
 
 
 def ball(number, x, y, z=0.03, role="target") -> CollisionObject:
     return solid(f"ball_{number}", role, "sphere", [0.03], (x, y, z))
 
 
-def scene(balls=(), *, box=True) -> PlanningScene:
+def only(*objects: CollisionObject) -> PlanningScene:
+    return PlanningScene(header=WORLD, objects=list(objects))
+
+
+def scene(balls=(), *more: CollisionObject, box=True) -> PlanningScene:
+    """A table with balls, further objects, and a box as the container."""
     objects = [solid("table", "fixture", "box", [1.2, 1.6, 0.05], (0.4, 0, -0.025))]
     if box:
         objects.append(solid("box_floor", "container", "box", [0.16, 0.16, 0.005], (0.55, 0.25, 0.0025)))
@@ -58,7 +55,15 @@ def scene(balls=(), *, box=True) -> PlanningScene:
             ("box_west", 0, 0.076, [0.16, 0.008, 0.07]), ("box_east", 0, -0.076, [0.16, 0.008, 0.07]),
         ):
             objects.append(solid(name, "container", "box", sides, (0.55 + dx, 0.25 + dy, 0.035)))
-    return PlanningScene(header=WORLD, objects=objects + [ball(i, x, y) for i, (x, y) in enumerate(balls)])
+    return only(*objects, *more, *[ball(i, x, y) for i, (x, y) in enumerate(balls)])
+
+
+EMPTY, TABLE = scene(box=False), scene(SPREAD)
+
+
+def wall(height: float = 0.4, depth: float = 0.5, width: float = 0.02) -> PlanningScene:
+    """A wall across the table that blocks the straight edge from one side to the other."""
+    return scene((), solid("wall", "fixture", "box", [depth, width, height], (0.55, 0.0, height / 2)), box=False)
 
 
 def held_scene(base: PlanningScene, name: str) -> PlanningScene:
@@ -67,27 +72,3 @@ def held_scene(base: PlanningScene, name: str) -> PlanningScene:
     held = taken.model_copy(update={"role": "attached", "pose": Pose()})
     rest = [o for o in base.objects if o.id != name]
     return PlanningScene(header=WORLD, objects=rest, attached=[AttachedObject(link="panda_hand_tcp", object=held)])
-
-
-def touching(name: str) -> list[tuple[str, str]]:
-    return [(finger, name) for finger in FINGERS]
-
-
-def above(x, y, z, yaw=0.0) -> np.ndarray:
-    q = solve_ik(ROBOT, tool_down(x, y, z, yaw), HOME)
-    assert q is not None
-    return q
-
-
-def to_pose(T, start, **more) -> PlanRequest:
-    goal = {k: more.pop(k) for k in ("position_tolerance", "tilt_tolerance", "yaw_tolerance") if k in more}
-    return PlanRequest(id="1", start=list(start), goal=PoseGoal(pose=matrix_to_pose(T), **goal), **more)
-
-
-def to_joints(goal, start, **more) -> PlanRequest:
-    return PlanRequest(id="1", start=list(start), goal=JointGoal(positions=list(goal)), **more)
-
-
-def last(response) -> np.ndarray:
-    assert response.ok, response.message
-    return np.array(response.trajectory.points[-1].positions)
