@@ -1,9 +1,8 @@
-"""Boxes of two colours in pictures of the simulated world, against where they really are."""
+"""Boxes of two colors in pictures of the simulated world, against their true poses."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -34,11 +33,15 @@ def cube(name: str, x: float, y: float, z: float = SIDE / 2, yaw: float = 0.0, s
     )
 
 
-def seen(*cubes: WorldObject, **options: object) -> list[DetectedBox]:
+def view_of(*cubes: WorldObject) -> tuple[Any, Any, Pinhole]:
+    """Picture, depth and camera."""
     view = Renderer(AROUND)
     shown = view.render(list(cubes))
-    detector = BoxDetector(BoxOptions.model_validate({"kinds": KINDS, **options}))
-    return detector.detect(shown.colour, np.asarray(shown.depth, np.float32), view.camera)
+    return shown.colour, np.asarray(shown.depth, np.float32), view.camera
+
+
+def seen(*cubes: WorldObject, **options: object) -> list[DetectedBox]:
+    return BoxDetector(BoxOptions.model_validate({"kinds": KINDS, **options})).detect(*view_of(*cubes))
 
 
 def quarter(angle: float) -> float:
@@ -81,35 +84,23 @@ def test_partly_occluded_cube_is_not_detected() -> None:
 
 def test_other_colors_and_missing_depth_give_no_detection() -> None:
     assert seen(cube("red", 0.5, 0.0), kinds={"green": KINDS["green"]}) == []
-    view = Renderer(AROUND)
-    shown = view.render([cube("red", 0.5, 0.0)])
-    nothing = np.full(np.shape(shown.depth), np.nan, np.float32)
-    assert BoxDetector(BoxOptions(kinds=KINDS)).detect(shown.colour, nothing, view.camera) == []
+    picture, depth, camera = view_of(cube("red", 0.5, 0.0))
+    assert BoxDetector(BoxOptions(kinds=KINDS)).detect(picture, np.full_like(depth, np.nan), camera) == []
 
 
-def test_noise_specks_are_skipped_and_a_cube_is_found(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    looked_into = 0
-
-    def counted(*given: Any) -> Iterator[Any]:
-        nonlocal looked_into
-        looked_into += 1
-        return faces(*given)
-
+def test_noise_specks_are_skipped_and_a_cube_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    searched: list[Any] = []
     faces = boxes._faces
-    monkeypatch.setattr(boxes, "_faces", counted)
-    view = Renderer(AROUND)
-    shown = view.render([cube("red", 0.45, -0.15)])
-    picture = shown.colour.copy()
-    picture[::3, ::3][(shown.colour[::3, ::3, 2] < 150)] = (25, 25, 230)
-    found = BoxDetector(BoxOptions(kinds=KINDS)).detect(picture, np.asarray(shown.depth, np.float32), view.camera)
-    assert len(found) == 1 and looked_into < 10
+    monkeypatch.setattr(boxes, "_faces", lambda *given: searched.append(given) or faces(*given))
+    picture, depth, camera = view_of(cube("red", 0.45, -0.15))
+    specks = picture[::3, ::3]
+    specks[specks[..., 2] < 150] = (25, 25, 230)
+    found = BoxDetector(BoxOptions(kinds=KINDS)).detect(picture, depth, camera)
+    assert len(found) == 1 and len(searched) < 10
 
 
 def test_invalid_camera_is_rejected() -> None:
     camera = Pinhole(1e-300, 50.0, 1e5, 24.0, 64, 48, np.eye(4))
     picture, depth = np.full((48, 64, 3), (25, 25, 230), np.uint8), np.full((48, 64), 1.0, np.float32)
     with pytest.raises(FrameError, match=r"more than 1e\+07 m away"):
-        BoxDetector(BoxOptions(kinds={"red": BoxKind(color=(0.9, 0.1, 0.1), size=(0.04, 0.04, 0.04))})).detect(
-            picture, depth, camera)
+        BoxDetector(BoxOptions(kinds=KINDS)).detect(picture, depth, camera)

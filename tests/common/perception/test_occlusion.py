@@ -1,4 +1,4 @@
-"""What a robot hides of a picture: all of it that a renderer draws of it, and little more."""
+"""The part of a picture that the robot occludes: all rendered pixels of it, and few more."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def robot() -> RobotModel:
 def test_occlusion_covers_the_rendered_arm_tightly(robot: RobotModel, camera: Pinhole) -> None:
     silhouettes, rng = RobotSilhouettes(robot), np.random.default_rng(1)
     renderer, empty = (Renderer(AROUND, one, plain=True, camera=camera) for one in (robot, None))
-    for _ in range(4):
+    for _ in range(2):
         q = robot.named("home") + rng.uniform(-0.6, 0.6, 7)
         state = JointState(header=Header(), name=list(robot.joint_names), position=q.tolist(), velocity=[], effort=[])
         arm = (renderer.render([], state).colour != empty.render([]).colour).any(axis=2)
@@ -58,8 +58,9 @@ def test_arm_behind_the_camera_occludes_nothing(robot: RobotModel) -> None:
 
 
 def test_unusable_image_occludes_everything() -> None:
-    blind = Occlusion(ABOVE, "the lens is covered")
-    assert blind.everything and blind.occludes([(0.4, 0.0, 0.03)])[0] and blind.touches([(0.4, 0.0, 0.03)])[0]
+    unusable = Occlusion(ABOVE, "the lens is covered")
+    assert unusable.everything
+    assert unusable.occludes([(0.4, 0.0, 0.03)])[0] and unusable.touches([(0.4, 0.0, 0.03)])[0]
 
 
 def test_swept_region_is_occluded_until_an_image_is_taken_at_standstill(robot: RobotModel) -> None:

@@ -1,3 +1,5 @@
+"""Projection of points and of spheres."""
+
 import math
 
 import numpy as np
@@ -8,35 +10,20 @@ from hypothesis import strategies as st
 from common.config import CameraConfig
 from common.messages import CameraInfo, Header
 from common.perception.pinhole import CameraError, Pinhole
+from common.perception.sphere import ray_distances, silhouette
 from common.robot.transforms import rpy_to_matrix, transform
 
 angle = st.floats(-math.pi, math.pi)
+places = st.tuples(st.floats(-0.2, 0.9), st.floats(-0.6, 0.6), st.floats(-0.2, 0.5))
 default = Pinhole.from_config(CameraConfig())
-
-
-def test_default_camera_is_a_rotation_and_not_a_mirror():
-    R = default.T_world_optical[:3, :3]
-    assert np.linalg.det(R) == pytest.approx(1.0)
-    np.testing.assert_allclose(R, np.array([(0, -1, 0), (-1, 0, 0), (0, 0, -1)]).T, atol=1e-12)
 
 
 @given(st.floats(0, 639), st.floats(0, 479), st.floats(0, 0.3))
 def test_default_camera_maps_right_to_minus_y_and_down_to_minus_x(u, v, z):
-    x, y = default.on_plane((u, v), z)
     h = 0.80 - z
-    assert y == pytest.approx(0.0 - (u - 320) * h / 520, abs=1e-9)
-    assert x == pytest.approx(0.40 - (v - 240) * h / 520, abs=1e-9)
-
-
-def test_default_camera_shows_robot_left_as_left_and_far_as_up():
-    middle, left, far = default.project([(0.4, 0, 0), (0.4, 0.2, 0), (0.6, 0, 0)])
-    assert left[0] < middle[0] and left[1] == pytest.approx(middle[1])
-    assert far[1] < middle[1] and far[0] == pytest.approx(middle[0])
-
-
-def test_default_camera_sees_the_expected_area():
-    corners = default.on_plane([(-0.5, -0.5), (639.5, 479.5)], 0.0)
-    np.testing.assert_allclose(corners, [(0.769, 0.492), (0.031, -0.492)], atol=1.5e-3)
+    x, y = 0.40 - (v - 240) * h / 520, 0.0 - (u - 320) * h / 520
+    np.testing.assert_allclose(default.on_plane((u, v), z), (x, y), atol=1e-9)
+    np.testing.assert_allclose(default.project((x, y, z)), (u, v), atol=1e-6)
 
 
 @given(st.tuples(angle, angle, angle), st.floats(1, 639), st.floats(1, 479), st.floats(0.1, 5))
@@ -46,11 +33,6 @@ def test_projection_inverts_rays_for_any_pose(rpy, u, v, distance):
     assert np.linalg.norm(direction) == pytest.approx(1)
     np.testing.assert_allclose(camera.project(origin + distance * direction), (u, v), atol=1e-6)
     assert np.linalg.det(camera.T_world_optical[:3, :3]) == pytest.approx(1)
-
-
-@given(st.floats(0.1, 0.7), st.floats(-0.4, 0.4), st.floats(0, 0.2))
-def test_on_plane_inverts_projection(x, y, z):
-    np.testing.assert_allclose(default.on_plane(default.project((x, y, z)), z), (x, y), atol=1e-9)
 
 
 def test_camera_info_and_its_pose_describe_the_same_camera():
@@ -65,26 +47,58 @@ def test_points_behind_the_camera_and_missed_planes_are_nan():
     assert np.isnan(default.on_plane((320, 240), 0.9)).all()
 
 
-def test_mirrored_or_non_rigid_pose_is_rejected():
-    mirror = default.T_world_optical.copy()
-    mirror[:3, 0] *= -1
-    stretched = default.T_world_optical.copy()
-    stretched[:3, :3] *= 1.1
-    for T in (mirror, stretched):
-        with pytest.raises(CameraError, match=r"determinant \+1"):
-            Pinhole(520, 520, 320, 240, 640, 480, T)
+@pytest.mark.parametrize("change", [np.diag([-1, 1, 1, 1]), np.diag([1.1, 1.1, 1.1, 1])], ids=["mirror", "stretch"])
+def test_mirrored_or_non_rigid_pose_is_rejected(change):
+    with pytest.raises(CameraError, match=r"determinant \+1"):
+        Pinhole(520, 520, 320, 240, 640, 480, default.T_world_optical @ change)
 
 
-def test_distortion_and_skew_are_rejected():
-    k = [520.0, 0, 320, 0, 520, 240, 0, 0, 1]
-    with pytest.raises(CameraError, match="distortion"):
-        Pinhole.from_info(CameraInfo(header=Header(), height=480, width=640, d=[0.1, 0, 0, 0, 0], k=k), np.eye(4))
-    k[1] = 3.0
-    with pytest.raises(CameraError, match="intrinsic matrix"):
-        Pinhole.from_info(CameraInfo(header=Header(), height=480, width=640, k=k), np.eye(4))
+@pytest.mark.parametrize(("d", "skew", "text"), [([0.1, 0, 0, 0, 0], 0.0, "distortion"), ([], 3.0, "intrinsic matrix")])
+def test_distortion_and_skew_are_rejected(d, skew, text):
+    k = [520.0, skew, 320, 0, 520, 240, 0, 0, 1]
+    with pytest.raises(CameraError, match=text):
+        Pinhole.from_info(CameraInfo(header=Header(), height=480, width=640, d=d, k=k), np.eye(4))
 
 
 def test_image_border_is_half_a_pixel_beyond_the_outer_pixel_centers():
     inside = default.in_image([(-0.4, 10), (-0.6, 10), (639.4, 479.4), (100, 479.6)])
     assert inside.tolist() == [True, False, True, False]
     assert not default.in_image((3.0, 100.0), margin=5)
+
+
+# --- spheres ---
+
+
+@given(places, st.floats(0.005, 0.1))
+def test_rays_through_the_silhouette_touch_the_sphere(center, radius):
+    rays = default.directions(silhouette(default, center, radius))
+    distance, _ = ray_distances(rays, np.array([center]) - default.position)
+    np.testing.assert_allclose(distance, radius, rtol=1e-9)
+
+
+@given(places)
+def test_gradient_of_ray_distance_is_the_unit_vector_to_the_center(center):
+    rays = default.directions(np.random.default_rng(1).uniform((0, 0), (640, 480), (20, 2)))
+    c = np.array([center]) - default.position
+    distance, along = ray_distances(rays, c)
+    gradient = (c - along * rays) / distance
+    far = distance[:, 0] > 1e-3
+    for axis, step in enumerate(1e-7 * np.eye(3)):
+        change = (ray_distances(rays, c + step)[0] - ray_distances(rays, c - step)[0])[:, 0] / 2e-7
+        np.testing.assert_allclose(change[far], gradient[far, axis], atol=1e-4)
+
+
+def test_silhouette_is_round_on_the_axis_and_elongated_and_shifted_off_it():
+    below = silhouette(default, (0.4, 0.0, 0.03), 0.03)
+    np.testing.assert_allclose(np.linalg.norm(below - (320, 240), axis=1), 520 * 0.03 / np.sqrt(0.77**2 - 0.03**2))
+    outline = silhouette(default, (0.4, 0.4, 0.03), 0.03, 720)
+    width, height = np.ptp(outline, axis=0)
+    assert width > 1.1 * height
+    u = (outline[:, 0].min() + outline[:, 0].max()) / 2
+    assert u - 320 == pytest.approx(-520 * 0.4 * 0.77 / (0.77**2 - 0.03**2), abs=0.01)
+    assert u - default.project((0.4, 0.4, 0.03))[0] < -0.3
+
+
+@pytest.mark.parametrize("center", [(0.4, 0.0, 0.81), (0.4, 0.0, 1.0), (0.4, 0.0, 0.78)])
+def test_sphere_at_or_behind_the_camera_has_no_silhouette(center):
+    assert silhouette(default, center, 0.03).shape == (0, 2)

@@ -5,7 +5,6 @@ from hypothesis import strategies as st
 
 from common.errors import UnknownName
 from common.planning.collision import interpolate
-from common.planning.robot_geometry import RobotGeometry
 from tests.common.planning.requests import above, touching
 from tests.common.planning.scenes import BLOCK, HOME, ROBOT, TABLE, ball, cache, held_scene, only, scene, solid, world
 
@@ -50,17 +49,6 @@ def test_free_edge_is_free_at_every_small_step(seed):
     assert (hit is not None) == any(colliding)
     if hit is not None:
         assert hit.index == colliding.index(True)
-
-
-def test_levers_bound_the_motion_of_link_origins():
-    rng, geometry = np.random.default_rng(0), RobotGeometry(ROBOT)
-    for _ in range(50):
-        a = rng.uniform(ROBOT.lower, ROBOT.upper)
-        b = np.clip(a + rng.normal(0, 0.3, 7), ROBOT.lower, ROBOT.upper)
-        one, other = ROBOT.link_poses(a), ROBOT.link_poses(b)
-        for link, lever in zip(geometry.links, geometry.levers, strict=True):
-            moved = np.linalg.norm(one[link][:3, 3] - other[link][:3, 3])
-            assert moved <= np.abs(b - a) @ lever + 1e-9
 
 
 def test_padding_applies_to_perceived_objects_only():

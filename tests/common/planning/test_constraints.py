@@ -82,12 +82,6 @@ def test_violating_start_or_goal_is_refused_with_value_and_limit(goal, start, co
     assert response.attempts == []
 
 
-def test_region_of_tilted_goals_is_reached_with_an_upright_tool():
-    goal = transform(rpy_to_matrix(np.pi - 0.35, 0.0, 0.0), (0.5, 0.3, 0.25))
-    request = to_pose(goal, RIGHT, tilt_tolerance=0.3, constraints=upright(0.2), planner="rrt_connect")
-    assert driven(ROBOT, PIPELINE.plan(request, EMPTY)).tilt() < 0.201
-
-
 @pytest.mark.parametrize("planner", ["rrt_connect", *(pytest.param(name, marks=pytest.mark.slow) for name in OTHERS)])
 def test_no_planner_returns_a_violating_trajectory(planner):
     satisfied = refused = 0
@@ -218,15 +212,6 @@ def test_glass_is_carried_upright_over_a_wall(name, what, count):
         assert way.tilt() < constraints.tilt + 1e-3
         assert constraints.region is None or way.outside(constraints.region) < 1e-4
         assert is_free(pipeline, request, around, response)
-
-
-def test_seed_decides_the_constrained_path():
-    carry = carries(ROBOT, "panda", 1, 0.05)[0]
-    paths = []
-    for seed in (3, 3, 4):
-        request = to_pose(carry.T_world_goal, carry.start, constraints=upright(0.1), planner="rrt_connect", seed=seed)
-        paths.append(PIPELINE.plan(request, walled("panda")).trajectory)
-    assert paths[0] == paths[1] != paths[2]
 
 
 def test_impossible_constrained_search_ends_within_the_planning_time():

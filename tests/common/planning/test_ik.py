@@ -87,13 +87,6 @@ def test_kernel_and_pinocchio_agree_from_a_close_seed(robot):
     assert len(apart) >= 45 and max(apart) < 0.02
 
 
-@pytest.mark.parametrize("yaw", [-1.0, 0.0, 1.0])
-def test_grasps_on_the_complete_table_are_solved_from_home(yaw):
-    for x in (0.35, 0.5, 0.62):
-        for y in (-0.3, 0.0, 0.3):
-            assert solve_ik(ROBOT, tool_down(x, y, 0.03, yaw), HOME, restarts=3) is not None
-
-
 @kernel
 @each_robot
 @pytest.mark.parametrize("place", [(1.5, 0, 0.3), (0, 0, 0.1), (1e6, 0, 0), (np.nan, 0, 0)])

@@ -18,7 +18,7 @@ from common.planning.problem import Cancel
 from common.planning.retiming import parametrise
 from common.planning.robot_geometry import RobotGeometry
 from tests.common.planning.requests import above
-from tests.common.planning.scenes import BLOCK, GEOMETRY, HOME, ROBOT, TABLE, UR5, held_scene, scene, world
+from tests.common.planning.scenes import GEOMETRY, ROBOT, TABLE, UR5, world
 
 pytestmark = pytest.mark.skipif(library.library() is None, reason="the planning kernel is not built here")
 
@@ -107,14 +107,6 @@ def test_largest_proved_margin_is_the_least_distance_along_an_edge(bent, robot):
         compared += 1
 
 
-def test_joint_poses_agree_with_pinocchio():
-    kernel, data = KernelWorld(ROBOT.model, GEOMETRY.geometry), ROBOT.model.createData()
-    for q in np.random.default_rng(0).uniform(ROBOT.lower, ROBOT.upper, (20, ROBOT.dof)):
-        pin.forwardKinematics(ROBOT.model, data, q)
-        placed = np.array([placement.homogeneous[:3] for placement in list(data.oMi)[1:]])
-        np.testing.assert_allclose(kernel.joint_poses(q), placed, atol=1e-12)
-
-
 @pytest.mark.parametrize("gap", [1e-7, 1e-5, 1e-3])
 def test_close_edge_is_free_and_grazing_edge_is_not(gap):
     for sign, free in ((1, True), (-1, False)):
@@ -154,28 +146,6 @@ def test_contact_is_allowed_within_the_contact_distance():
     assert not kernel.edge_free(at(0.0), at(0.03))
     kernel.set_rules(np.zeros(1), np.full(1, CONTACT_ALLOWED), 1, np.zeros(3), np.zeros(3), 0.005)
     assert not kernel.edge_free(at(0.0), at(-0.5))
-
-
-def test_first_colliding_position_of_a_path_is_found():
-    kernel = world(scene(BLOCK)).kernel
-    path = interpolate([HOME, above(0.5, -0.1, 0.2), above(0.5, -0.1, 0.01)], 0.01)
-    colliding = [kernel.colliding(q) >= 0 for q in path]
-    assert any(colliding)
-    assert kernel.first_collision(path)[0] == colliding.index(True)
-    assert kernel.first_collision(path[: colliding.index(True)])[0] == -1
-
-
-def test_world_with_an_attached_object_agrees_with_coal():
-    held = held_scene(TABLE, "ball_3")
-    fast = world(held)
-    with library.without_kernel():
-        plain = world(held)
-    assert fast.kernel is not None and plain.kernel is None
-    for q in np.random.default_rng(3).uniform(ROBOT.lower, ROBOT.upper, (100, ROBOT.dof)):
-        assert fast.collides(q) == plain.collides(q)
-        edge = (HOME, HOME + 0.3 * (q - HOME))
-        if fast.edge_free(*edge):
-            assert all(not plain.collides(x) for x in interpolate(edge, 0.02))
 
 
 def test_paths_are_free_reach_their_ends_and_depend_on_the_seed():

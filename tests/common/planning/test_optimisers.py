@@ -1,37 +1,19 @@
-"""Planners that optimise a whole path."""
+"""Planners that optimise a complete path, and the distances and gradients that they use."""
+
+from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from common.planning.joint_paths import evenly_spaced, quintic
+from common.planning.joint_paths import line
 from common.planning.problem import Cancel
-from common.planning.proximity import Proximity
+from common.planning.proximity import Proximity, SweptEdges
 from tests.common.planning.checks import assert_refused, planned, with_planner
-from tests.common.planning.requests import LEFT, RIGHT, to_joints
-from tests.common.planning.scenes import wall, world
+from tests.common.planning.requests import LEFT, RIGHT, above, to_joints, touching
+from tests.common.planning.scenes import EMPTY, ROBOT, TABLE, held_scene, scene, wall, world
 
 LOW_WALL = wall(height=0.3, depth=0.3)
 either = pytest.mark.parametrize("planner", ["chomp", "trajopt"])
-
-
-def test_quintic_is_at_rest_at_its_ends():
-    path = quintic(RIGHT, LEFT, 101)
-    assert np.array_equal(path[[0, -1]], [RIGHT, LEFT])
-    speed, bend = np.diff(path, axis=0) * 100, np.diff(path, 2, axis=0) * 100**2
-    span = np.abs(LEFT - RIGHT)
-    assert (np.abs(speed[[0, -1]]) < 0.01 * span + 1e-9).all()
-    assert (np.abs(bend[[0, -1]]) < 0.8 * span + 1e-9).all()
-    assert np.allclose(speed.max(axis=0)[LEFT > RIGHT], 1.875 * span[LEFT > RIGHT], rtol=0.01)
-
-
-def test_even_spacing_preserves_the_ends():
-    path = quintic(RIGHT, LEFT, 30)
-    even = evenly_spaced(path, 0.05)
-    steps = np.linalg.norm(np.diff(even, axis=0), axis=1)
-    assert np.allclose(steps, steps[0])
-    assert steps[0] == pytest.approx(0.05, rel=0.1)
-    assert np.allclose(even[[0, -1]], path[[0, -1]])
-    assert len(evenly_spaced(np.array([RIGHT, RIGHT, RIGHT]))) == 2
 
 
 @either
@@ -65,3 +47,121 @@ def test_optimisation_ends_when_it_is_cancelled(planner):
 
     endless = with_planner(planner, iterations=10000)
     assert endless.plan(to_joints(LEFT, RIGHT), wall(height=2.0), cancel=AfterAWhile()).error == "cancelled"
+
+
+LOW = above(0.5, 0.1, 0.06)
+MEASURED = world(TABLE, RIGHT)
+WALL = wall(height=0.3, depth=0.4)
+
+
+def by_pair(near):
+    return dict(zip(near.pair.tolist(), near.distance.tolist(), strict=True))
+
+
+def test_gradient_is_that_of_the_distance():
+    near = Proximity(MEASURED, 0.15).measure(LOW[None])
+    assert len(near.pair) > 5
+    step = 1e-4
+    for joint in range(ROBOT.dof):
+        away = step * np.eye(ROBOT.dof)[joint]
+        more, less = (by_pair(Proximity(MEASURED, 0.2).measure((LOW + s * away)[None])) for s in (1, -1))
+        for pair, gradient in zip(near.pair.tolist(), near.gradient[:, joint], strict=True):
+            assert (more[pair] - less[pair]) / (2 * step) == pytest.approx(gradient, abs=0.03)
+
+
+def test_cached_measurement_equals_a_fresh_one():
+    caching = Proximity(MEASURED, 0.1)
+    rng = np.random.default_rng(0)
+    path = np.linspace(RIGHT, LOW, 8)
+    for _ in range(12):
+        near = caching.measure(path)
+        fresh = Proximity(MEASURED, 0.1).measure(path)
+        assert np.array_equal(near.pair, fresh.pair)
+        assert np.array_equal(near.position, fresh.position)
+        assert np.allclose(near.distance, fresh.distance, atol=1e-5)
+        path = path + rng.normal(0, 0.05, path.shape)
+
+
+def test_distance_agrees_with_collision():
+    measured = world(TABLE, RIGHT, padding=0.003)
+    for q in np.random.default_rng(1).uniform(ROBOT.lower, ROBOT.upper, (60, ROBOT.dof)):
+        least = Proximity(measured, 0.05).measure(q[None]).distance.min(initial=1.0)
+        if abs(least) > 1e-4:
+            assert measured.collides(q) == (least < 0)
+
+
+def test_nearest_reports_one_pair_of_each_link():
+    every = Proximity(MEASURED, 0.2).measure(LOW[None])
+    nearest = Proximity(MEASURED, 0.2, nearest=True).measure(LOW[None])
+    first = MEASURED.bank.first
+    assert len(set(first[nearest.pair])) == len(nearest.pair) < len(every.pair)
+    for pair, distance in by_pair(nearest).items():
+        assert distance == pytest.approx(every.distance[first[every.pair] == first[pair]].min())
+
+
+def test_own_reach_applies_to_links_of_the_robot_and_nothing_near_gives_empty_arrays():
+    measured = world(EMPTY, RIGHT)
+    near = Proximity(measured, 0.3, own_reach=0.01).measure(RIGHT[None])
+    assert len(near.pair) and all(measured.bank.second[pair] >= measured.bank.robot_count for pair in near.pair)
+    near = Proximity(world(scene([(0.9, 0.6)], box=False), RIGHT), 0.001).measure(np.array([LEFT, RIGHT]))
+    assert near.gradient.shape == (0, ROBOT.dof)
+
+
+def test_allowed_contacts_are_not_measured():
+    at_ball = above(0.45, -0.1, 0.03)
+    of = scene([(0.45, -0.1)])
+    every = by_pair(Proximity(world(of, at_ball), 0.02).measure(at_ball[None]))
+    others = by_pair(Proximity(world(of, at_ball, allowed=touching("ball_0")), 0.02).measure(at_ball[None]))
+    assert set(others) < set(every)
+    held = world(held_scene(of, "ball_0"), at_ball)
+    assert Proximity(held, 0.02).measure(LEFT[None]).distance.min(initial=1.0) > 0
+
+
+@pytest.mark.parametrize("around", [WALL, TABLE, held_scene(scene([(0.5, 0.0)]), "ball_0")], ids=["wall", "", "held"])
+def test_swept_distance_bounds_all_positions_between_the_waypoints(around):
+    measured = world(around, RIGHT)
+    rng = np.random.default_rng(1)
+    joints = np.array([item.parentJoint for item in measured.bank.geometry.geometryObjects])
+    compared = 0
+    for _ in range(8):
+        a = np.clip(RIGHT + rng.uniform(0, 1) * (LEFT - RIGHT) + rng.normal(0, 0.2, 7), ROBOT.lower, ROBOT.upper)
+        b = np.clip(a + rng.normal(0, 0.06, 7), ROBOT.lower, ROBOT.upper)
+        swept = SweptEdges(measured, 0.2).measure(np.array([a, b]))
+        states = Proximity(measured, 0.3, nearest=True).measure(line(a, b, 20))
+        for pair, distance in zip(swept.pair, swept.distance, strict=True):
+            same = measured.bank.first[states.pair] == measured.bank.first[pair]
+            fixed = same & (joints[measured.bank.second[states.pair]] == 0)
+            if fixed.any():
+                compared += 1
+                assert distance < states.distance[fixed].min() + 2e-3  # a link that turns bulges out of its hull
+    assert compared > 7
+
+
+def test_step_along_the_swept_gradient_increases_the_distance():
+    measured = world(WALL, RIGHT)
+    path = np.array([above(0.5, -0.25, 0.15), above(0.5, -0.15, 0.15), above(0.5, -0.25, 0.15)])
+    pieces = SweptEdges(measured, 0.5)
+    near = pieces.measure(path)
+    tried = 0
+    for position, pair, distance, gradient in zip(near.position, near.pair, near.distance, near.gradient, strict=True):
+        if measured.pair(pair)[1] == "wall" and position == 2:  # the middle waypoint reaches farthest
+            moved = path.copy()
+            moved[1] += 0.01 * gradient / np.linalg.norm(gradient)
+            then = pieces.measure(moved)
+            gained = then.distance[then.pair == pair].min() - distance
+            assert 0.3 < gained / (0.01 * np.linalg.norm(gradient)) < 1.5
+            tried += 1
+    assert tried
+
+
+def test_blade_between_two_states_is_measured_and_avoided():
+    around = wall(height=0.3, depth=0.4, width=0.002)
+    measured = world(around, RIGHT)
+    path = np.array([above(0.5, -0.15, 0.15), above(0.5, 0.16, 0.15)])
+    assert Proximity(measured, 0.2).measure(path).distance.min() > 0
+    near = SweptEdges(measured, 0.02).measure(path)
+    assert min(near.distance) < -0.02
+    assert {measured.pair(pair)[1] for pair in near.pair[near.distance < 0]} == {"wall"}
+    for height in (0.15, 0.2):
+        request = to_joints(above(0.5, 0.3, height), above(0.45, -0.3, height), planning_time=20.0)
+        planned(with_planner("trajopt", steps=10), request, around)

@@ -71,17 +71,6 @@ def test_obstacle_on_the_path_back_inside_is_named():
     assert response.error == "start_in_collision" and response.colliding
 
 
-def test_limiter_holds_an_arm_outside_its_limits_where_it_is():
-    start = outside(0.03)
-    limiter = Limiter(LIMITS, start, 0.01)
-    for _ in range(50):
-        position, velocity = limiter.step(start, STILL, 0.01)
-        assert (position == start).all() and not velocity.any()
-    for _ in range(300):
-        position, _ = limiter.step(outside(0.1), STILL, 0.01)
-        assert (excess(position) <= excess(start) + 1e-9).all()
-
-
 def test_trajectory_that_leads_outside_is_refused():
     response = PIPELINE.plan(to_joints(HOME, outside(0.03)), TABLE)
     message = response.trajectory.model_copy(deep=True)

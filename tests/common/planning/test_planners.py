@@ -89,13 +89,6 @@ def test_sampled_path_ends_in_the_region_of_the_goal():
     assert distance_outside(Region(T, np.full(3, 0.02), 0.25, 3.14), end) < 1e-3
 
 
-def test_distance_outside_a_region():
-    region = Region(tool_down(0.5, 0.0, 0.2, 0.0), np.full(3, 0.02), 0.2, 0.5)
-    assert distance_outside(region, tool_down(0.515, 0.0, 0.2, 0.4)) < 0
-    assert distance_outside(region, tool_down(0.53, 0.0, 0.2, 0.0)) == pytest.approx(0.01)
-    assert distance_outside(region, tool_down(0.5, 0.0, 0.2, 0.6)) == pytest.approx(0.1)
-
-
 def test_tool_follows_a_straight_line_and_turns_evenly():
     T_goal, start = tool_down(0.55, 0.1, 0.3, 0.8), above(0.4, -0.2, 0.2)
     T_start = ROBOT.fk(start)

@@ -116,11 +116,6 @@ def test_invalid_stretch_is_refused(scale):
         stretch(parametrise(STRAIGHT, V, A), scale)
 
 
-def test_repeated_waypoints_are_one():
-    points = np.array([[0, 0, 0], [0, 0, 0], [1, 0, 0], [1, 0, 0.0]])
-    assert np.array_equal(distinct(points), [[0, 0, 0], [1, 0, 0]])
-
-
 @settings(max_examples=25, deadline=None)
 @given(waypoints, st.floats(0, 0.5), st.floats(10, 1000))
 def test_limited_jerk_respects_all_limits_and_stays_on_the_path(points, blend, quickness):
@@ -151,14 +146,6 @@ def test_trajectory_within_its_jerk_limit_is_not_changed():
     assert limited_jerk(profile, 50 * A).duration > profile.duration
 
 
-def bending(points) -> float:
-    """Integral of the square of the curvature along a line [1/m]."""
-    edges = np.diff(points, axis=0)
-    lengths = np.linalg.norm(edges, axis=1)
-    between = (lengths[:-1] + lengths[1:]) / 2
-    return float(((np.diff(edges / lengths[:, None], axis=0) ** 2).sum(axis=1) / between).sum())
-
-
 @settings(max_examples=20, deadline=None)
 @given(st.integers(3, 200), st.floats(1e-5, 1e-3), st.integers(0, 1000))
 def test_smoothed_points_stay_within_tolerances_and_ends_are_fixed(count, tolerance, seed):
@@ -168,18 +155,6 @@ def test_smoothed_points_stay_within_tolerances_and_ends_are_fixed(count, tolera
     moved = smoothed(points, tolerances)
     assert (np.linalg.norm(moved - points, axis=1) <= tolerances + 1e-12).all()
     assert np.array_equal(moved[[0, -1]], points[[0, -1]])
-
-
-@pytest.mark.parametrize("radius", [0.005, 0.05])
-def test_noisy_circle_is_smoothed(radius):
-    rng = np.random.default_rng(1)
-    angles = np.cumsum(rng.uniform(4e-4, 1e-3, round(radius * 6000)) / radius)
-    points = np.column_stack([np.cos(angles), np.sin(angles)]) * radius
-    noisy = points + rng.uniform(-3e-5, 3e-5, points.shape)
-    noisy[[0, -1]] = points[[0, -1]]
-    moved = smoothed(noisy, np.full(len(points), 6e-5))
-    assert bending(moved) < 1.1 * bending(points)
-    assert np.linalg.norm(moved - points, axis=1).max() < 1.5e-4
 
 
 def test_smoothing_does_not_change_straight_fixed_or_too_few_points():

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from unittest.mock import patch
-
 import numpy as np
 import pytest
 
@@ -140,14 +138,6 @@ def test_trajectory_without_points_or_with_too_many_states_is_not_monitored(moni
     monitor.follow("g", "", JointTrajectory(joint_names=ROBOT.joint_names, points=points))
     with pytest.raises(NotMonitored, match="more than 25000 states"):
         monitor.find_obstruction(scene(item("ball", (0.5, 0.0, 0.5))), 0.0)
-
-
-def test_unchanged_scene_is_checked_once(monitor):
-    start_motion(monitor, scene())
-    problem = monitor.find_obstruction(MUG, 0.0)
-    with patch.object(monitor, "_hit", side_effect=AssertionError):
-        again = MUG.model_copy(update={"header": Header(stamp=9, frame_id="world")})
-        assert monitor.find_obstruction(again, 0.1) == problem
 
 
 def test_obstruction_has_to_leave_by_a_clear_distance_and_other_objects_do_not(monitor):

@@ -7,7 +7,7 @@ from common.planning.kernel.library import library
 from common.planning.path import blended_path
 from common.planning.retiming import parametrise
 from common.planning.trajectory import TimedPath
-from common.planning.validation import check_numbers, fine_samples, validate
+from common.planning.validation import check_numbers, validate
 from tests.common.planning.requests import above
 from tests.common.planning.scenes import HOME, ROBOT, ball, only, scene, world
 
@@ -67,13 +67,6 @@ def test_collision_between_states_is_found_with_waypoint_and_pair():
     fault = fault_of(direct(start, goal, step=0.5), only(ball(0, *ROBOT.fk((start + goal) / 2)[:3, 3])))
     assert (fault.code, fault.colliding[1]) == ("collision", "ball_0")
     assert f"waypoint {fault.waypoint} of" in fault.message
-
-
-def test_fine_samples_are_at_most_one_step_apart():
-    path, owners = fine_samples(GOOD, 0.01)
-    assert np.abs(np.diff(path, axis=0)).max() <= 0.01 + 1e-9
-    assert np.array_equal(path[[0, -1]], GOOD.positions[[0, -1]])
-    assert (np.diff(owners) >= 0).all()
 
 
 @pytest.mark.skipif(library() is None, reason="the planning kernel is not built")

@@ -1,4 +1,4 @@
-"""Mesh files of every format: what is damaged is told in a line that names the field and the file."""
+"""Mesh files of every format: the error for a damaged file is one line that names the field and the file."""
 
 from __future__ import annotations
 
@@ -40,5 +40,5 @@ def test_damaged_mesh_is_named_in_a_line(tmp_path: Path, name: str, read) -> Non
         path.write_bytes(DAMAGED[name])
     with pytest.raises(ConfigError) as refused:
         read("robot.urdf", path)
-    told = str(refused.value)
-    assert told.startswith(f"robot.urdf: {str(path)!r} is a mesh that cannot be read: ") and "\n" not in told
+    message = str(refused.value)
+    assert message.startswith(f"robot.urdf: {str(path)!r} is a mesh that cannot be read: ") and "\n" not in message

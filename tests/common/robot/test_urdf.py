@@ -1,10 +1,13 @@
+"""Robots of several descriptions: base pose, attachments, TCP, limits."""
+
 from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
 import pytest
+import trimesh
 
-from common.config import RobotConfig, check, find_file, load_cell, read_robot
+from common.config import RobotConfig, check, find_file, read_robot
 from common.errors import ConfigError
 from common.planning.ik import solve_ik
 from common.robot.model import RobotModel
@@ -47,20 +50,19 @@ def mounted(folder: Path, **changes: object) -> list[dict[str, object]]:
     return [{"urdf": str(folder / "hand.urdf"), "parent_link": "arm", "position": [0, 0, 0.2], **changes}]
 
 
+def shapes(robot: RobotModel) -> list[pin.GeometryObject]:
+    return list(robot.full_geometry(pin.GeometryType.COLLISION).geometryObjects)
+
+
 def test_base_pose_of_the_robot_file_moves_the_complete_robot(make):
     at_origin, moved = make(), make(base_position=[1.0, -0.5, 0.75], base_rpy=[0.1, -0.2, 0.7])
     T_world_base = transform(rpy_to_matrix(0.1, -0.2, 0.7), (1.0, -0.5, 0.75))
     for name, T in at_origin.link_poses([0.3]).items():
         assert np.allclose(moved.link_poses([0.3])[name], T_world_base @ T, atol=1e-9)
     assert np.allclose(moved.fk([0.3]), T_world_base @ at_origin.fk([0.3]))
-    first = moved.full_geometry(pin.GeometryType.COLLISION).geometryObjects[0]
-    assert np.allclose(first.placement.homogeneous, T_world_base, atol=1e-9)
+    assert np.allclose(shapes(moved)[0].placement.homogeneous, T_world_base, atol=1e-9)
     assert (at_origin.world_frames, moved.world_frames) == (["", "world", "base"], ["", "world"])
-
-
-def test_world_is_not_a_link_of_the_robot(make):
-    robot = make(base_position=[0, 0, 1])
-    assert set(robot.link_names) == {"base", "arm"} and robot.link_parents == {"arm": "base"}
+    assert set(moved.link_names) == {"base", "arm"} and moved.link_parents == {"arm": "base"}
 
 
 def test_base_pose_of_the_description_is_ignored(make):
@@ -70,15 +72,13 @@ def test_base_pose_of_the_description_is_ignored(make):
 
 def test_continuous_joint_gets_limits_of_a_full_turn_or_of_the_robot_file(make):
     turning = ARM.replace('type="revolute"', 'type="continuous"').replace('lower="-2" upper="2" ', "")
-    robot = make(turning)
-    assert (robot.dof, robot.lower.tolist(), robot.upper.tolist()) == (1, [-2 * np.pi], [2 * np.pi])
-    narrow = make(turning, position_limits=[(-1.0, 3.0)])
-    assert (narrow.lower.tolist(), narrow.upper.tolist()) == ([-1.0], [3.0])
+    for changes, low, high in (({}, -2 * np.pi, 2 * np.pi), ({"position_limits": [(-1.0, 3.0)]}, -1.0, 3.0)):
+        robot = make(turning, **changes)
+        assert (robot.dof, robot.lower.tolist(), robot.upper.tolist()) == (1, [low], [high])
 
 
 def test_fixed_joint_may_have_the_name_of_a_link(make):
     robot = make(ARM + link("stand") + joint("arm", "stand", "fixed").replace('"arm_stand"', '"stand"'))
-    assert "stand" in robot.link_names
     assert robot.link_poses([0.3])["stand"][2, 3] == pytest.approx(1.0)
 
 
@@ -88,55 +88,42 @@ def test_attachment_is_fixed_to_its_link_and_the_tcp_to_the_attachment(make, tmp
     assert robot.link_parents == {"arm": "base", "palm": "arm", "thumb": "palm", "tip": "thumb"}
     assert np.allclose(robot.fk([0.0])[:3, 3], (0, 0.1, 0.75))
     assert np.allclose(robot.fk([0.0])[:3, 2], (0, 1, 0))
-    assert len(robot.full_geometry(pin.GeometryType.COLLISION).geometryObjects) == 3
+    assert len(shapes(robot)) == 3
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"base_link": "nowhere"}, "robot.base_link.*nowhere.*choices: base, arm"),
-        ({"base_link": "arm"}, "robot.base_link.*its parent is base and joint base_arm moves"),
-        ({"tcp": {"link": "tip", "parent": "elbow"}, "tcp_link": ""}, "robot.tcp.parent.*elbow.*choices: base, arm"),
-        ({"tcp": {"link": "arm", "parent": "base"}}, "robot.tcp.link.*is a link of the URDF already"),
-        ({"tcp": {"link": "tip", "parent": "arm"}}, "tcp_link is arm, but tcp defines tip"),
-        ({"tcp_link": ""}, "tcp_link must be given, or tcp"),
-        ({"velocity_limits": [1, 1]}, "velocity_limits has 2 values for 1 joints"),
-        ({"position_limits": [[0, 1], [0, 1]]}, "position_limits has 2 values for 1 joints"),
-        ({"position_limits": [[1, 0]]}, "robot.position_limits.*has no usable limits for joint"),
-        ({"position_limits": [[0.5, 1]]}, "robot.named_poses.home.*must be within 0.5 to 1"),
-    ],
-)
-def test_parts_that_do_not_fit_are_refused_with_field_and_choices(make, changes, message):
+@pytest.mark.parametrize(("changes", "message"), [
+    ({"base_link": "nowhere"}, "robot.base_link.*nowhere.*choices: base, arm"),
+    ({"base_link": "arm"}, "robot.base_link.*its parent is base and joint base_arm moves"),
+    ({"tcp": {"link": "tip", "parent": "elbow"}, "tcp_link": ""}, "robot.tcp.parent.*elbow.*choices: base, arm"),
+    ({"tcp": {"link": "arm", "parent": "base"}}, "robot.tcp.link.*is a link of the URDF already"),
+    ({"tcp": {"link": "tip", "parent": "arm"}}, "tcp_link is arm, but tcp defines tip"),
+    ({"tcp_link": ""}, "tcp_link must be given, or tcp"),
+    ({"velocity_limits": [1, 1]}, "velocity_limits has 2 values for 1 joints"),
+    ({"position_limits": [[0, 1], [0, 1]]}, "position_limits has 2 values for 1 joints"),
+    ({"position_limits": [[1, 0]]}, "robot.position_limits.*has no usable limits for joint"),
+    ({"position_limits": [[0.5, 1]]}, "robot.named_poses.home.*must be within 0.5 to 1"),
+])
+def test_invalid_part_is_refused_with_field_and_choices(make, changes, message):
     with pytest.raises(ConfigError, match=message):
         make(**changes)
 
 
-@pytest.mark.parametrize(
-    ("hand", "changes", "message"),
-    [
-        (HAND, {"parent_link": "elbow"}, r"robot.attachments.0.parent_link.*elbow.*choices: base, arm"),
-        (HAND, {"urdf": "gone.urdf"}, r"robot.attachments.0.urdf.*gone.urdf.*is missing"),
-        (link("arm"), {}, r"robot.attachments.0.urdf.*has a link arm, which the robot already has"),
-        (link("one") + link("two"), {}, r"robot.attachments.0.urdf.*must have one root, not one, two"),
-        ("<link", {}, r"robot.attachments.0.urdf.*does not parse"),
-    ],
-)
-def test_attachments_that_do_not_fit_are_refused(make, tmp_path, hand, changes, message):
+@pytest.mark.parametrize(("hand", "changes", "message"), [
+    (HAND, {"parent_link": "elbow"}, r"robot.attachments.0.parent_link.*elbow.*choices: base, arm"),
+    (HAND, {"urdf": "gone.urdf"}, r"robot.attachments.0.urdf.*gone.urdf.*is missing"),
+    (link("arm"), {}, r"robot.attachments.0.urdf.*has a link arm, which the robot already has"),
+    (link("one") + link("two"), {}, r"robot.attachments.0.urdf.*must have one root, not one, two"),
+    ("<link", {}, r"robot.attachments.0.urdf.*does not parse"),
+])
+def test_invalid_attachment_is_refused(make, tmp_path, hand, changes, message):
     with pytest.raises(ConfigError, match=message):
         make(hand=hand, attachments=mounted(tmp_path, **changes))
 
 
 def test_mesh_next_to_an_attachment_is_found_from_any_folder(make, tmp_path):
-    corners = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)]
-    faces = [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)]
-    text = "".join(
-        "facet normal 0 0 0\nouter loop\n" + "".join(f"vertex {x} {y} {z}\n" for x, y, z in (corners[i] for i in face))
-        + "endloop\nendfacet\n" for face in faces
-    )
-    (tmp_path / "palm.stl").write_text(f"solid palm\n{text}endsolid palm\n")
+    trimesh.creation.box().export(tmp_path / "palm.stl")
     hand = link("palm", '<collision><geometry><mesh filename="palm.stl"/></geometry></collision>')
-    robot = make(hand=hand, attachments=mounted(tmp_path))
-    assert len(robot.full_geometry(pin.GeometryType.COLLISION).geometryObjects) == 3
+    assert len(shapes(make(hand=hand, attachments=mounted(tmp_path)))) == 3
 
 
 def test_files_next_to_a_robot_file_are_found_from_any_folder(tmp_path):
@@ -146,21 +133,6 @@ def test_files_next_to_a_robot_file_are_found_from_any_folder(tmp_path):
     read = read_robot(tmp_path / "mine.yaml")
     assert read["urdf"] == read["attachments"][0]["urdf"] == str(tmp_path / "mine.urdf")
     assert read["srdf"] == "package://a/b.srdf"
-
-
-def test_merged_panda_equals_its_description():
-    robot = RobotModel.load(load_cell("panda").robot)
-    share = next(folder for folder in robot.package_folders if (folder / "example-robot-data").is_dir())
-    alone = pin.buildModelFromUrdf(str(share / robot.config.urdf.removeprefix("package://")))
-    assert list(alone.names) == list(robot.full_model.names)
-    q = pin.randomConfiguration(alone)
-    frames = {}
-    for model in (alone, robot.full_model):
-        data = model.createData()
-        pin.framesForwardKinematics(model, data, q)
-        frames[model] = {f.name: data.oMf[i].homogeneous for i, f in enumerate(model.frames)}
-    assert all(np.allclose(T, frames[robot.full_model][name]) for name, T in frames[alone].items())
-    assert robot.world_frames == ["", "world", "panda_link0"]
 
 
 def test_ur5_is_on_its_pillar_and_reaches_the_block():

@@ -43,8 +43,7 @@ def test_maximum_number_of_solids_fits_into_the_file() -> None:
     solids = AddedSolids()
     for number in range(MAX_ADDED):
         at, color = dict.fromkeys("xyz", -1 / 3), dict.fromkeys("rgba", 1 / 3)
-        solids = solids.apply(
-            edit(name=f"{number:ä>100}", dimensions=[1 / 3] * 3, pose={"position": at}, color=color))
+        solids = solids.apply(edit(name=f"{number:ä>100}", dimensions=[1 / 3] * 3, pose={"position": at}, color=color))
     assert len(solids.model_dump_json(indent=1).encode()) < ROOM / 2
     with pytest.raises(Refused, match=f"{MAX_ADDED} solids") as refusal:
         solids.apply(edit())

@@ -18,6 +18,14 @@ OPEN, GRIP = 0.08, 2 * R
 TABLE = Fixture(id="table", dimensions=[1.0, 1.0, 0.05], position=(0.5, 0.0, -0.025))
 BOX = (0.55, 0.25)  # center of the container of a world with balls
 CUBE = {"shape": "box", "size": [0.04, 0.04, 0.04]}
+L_SHAPE = [(-0.02, -0.02), (0.03, -0.02), (0.03, 0.0), (0.0, 0.0), (0.0, 0.03), (-0.02, 0.03)]
+SHAPES: dict[str, dict[str, Any]] = {
+    "sphere": {"shape": "sphere", "radius": 0.02},
+    "box": {"shape": "box", "size": [0.03, 0.05, 0.04]},
+    "cylinder": {"shape": "cylinder", "radius": 0.025, "height": 0.06},
+    "prism": {"shape": "prism", "polygon": L_SHAPE, "height": 0.04},
+    "ring": {"shape": "ring", "radius": 0.03, "inner_radius": 0.02, "height": 0.03},
+}
 
 
 class Rig:
@@ -35,6 +43,20 @@ class Rig:
     def with_balls(cls, *spots: tuple[float, float]) -> Rig:
         """Balls `ball_N` on the table, by default one at (0.5, 0), and the container `box`."""
         return cls(config=World(fixtures=[TABLE], balls=list(spots) or [(0.5, 0.0)]))
+
+    @classmethod
+    def holding_ball(cls, *spots: tuple[float, float]) -> Rig:
+        """With balls, the first of them in the gripper."""
+        rig = cls.with_balls(*spots)
+        rig.grasp(*(spots[0] if spots else (0.5, 0.0)))
+        return rig
+
+    @classmethod
+    def holding_cube(cls, *others: dict[str, Any]) -> Rig:
+        """With a cube in the gripper and further objects."""
+        rig = cls(CUBE, *others)
+        rig.grasp(0.4, 0.0, 0.02)
+        return rig
 
     def tick(self, tool: Any = None, width: float | None = None) -> None:
         """Run one control cycle with simulated fingers."""
@@ -72,11 +94,18 @@ class Rig:
     def events(self) -> list[str]:
         return [update.data for update in self.world.take_events()]
 
+    def objects(self) -> dict[str, WorldObject]:
+        return {obj.id: obj for obj in self.world.objects(Header()).objects}
+
     def object(self, name: str = "object_1") -> WorldObject:
-        return next(obj for obj in self.world.objects(Header()).objects if obj.id == name)
+        return self.objects()[name]
 
     def pose(self, name: str = "object_1") -> Any:
         return pose_to_matrix(self.object(name).pose)
+
+    def place(self, name: str = "object_1") -> Any:
+        """Position (3,) [m] of an object."""
+        return self.pose(name)[:3, 3]
 
     def balls(self) -> dict[str, tuple[str, Any]]:
         """State and position of each ball."""

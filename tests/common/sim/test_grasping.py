@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,20 +13,13 @@ from hypothesis import strategies as st
 
 from common.config import load_cell
 from common.errors import ConfigError, UnknownName
-from common.messages import Header, Vector3, WorldEdit
+from common.messages import Header, Vector3
 from common.robot.transforms import invert, tool_down
 from common.sim.interface import load_world
 from common.sim.kinematic import KinematicWorld
-from tests.common.sim.rig import CUBE, GRIP, R, Rig
+from tests.common.sim.rig import CUBE, GRIP, SHAPES, R, Rig
 
-L_SHAPE = [(-0.02, -0.02), (0.03, -0.02), (0.03, 0.0), (0.0, 0.0), (0.0, 0.03), (-0.02, 0.03)]
-SHAPES: dict[str, tuple[dict[str, Any], float]] = {  # and the width between the fingers
-    "sphere": ({"shape": "sphere", "radius": 0.02}, 0.04),
-    "box": ({"shape": "box", "size": [0.03, 0.05], "height": 0.04}, 0.05),
-    "cylinder": ({"shape": "cylinder", "radius": 0.025, "height": 0.06}, 0.05),
-    "prism": ({"shape": "prism", "polygon": L_SHAPE, "height": 0.04}, 0.05),
-    "ring": ({"shape": "ring", "radius": 0.03, "inner_radius": 0.02, "height": 0.03}, 0.06),
-}
+BOX_4_CM = {"shape": "box", "size": [0.04, 0.04], "height": 0.04}
 
 
 @given(
@@ -44,18 +36,21 @@ def test_ball_between_the_fingers_is_grasped_and_centered(yaw, across, sideways,
     assert offset[1] == pytest.approx(0.0, abs=1e-9)
 
 
-@pytest.mark.parametrize("shape", SHAPES)
-def test_fingers_close_to_the_width_of_the_object(shape: str) -> None:
-    values, width = SHAPES[shape]
-    rig = Rig(values)
-    assert rig.grasp(0.4, 0.0, 0.02) == "object_1"
-    assert rig.width == pytest.approx(width, abs=1e-4)
+@pytest.mark.parametrize(("thing", "y", "width"), [
+    (SHAPES["sphere"], 0.0, 0.04), (SHAPES["box"], 0.0, 0.05), (SHAPES["cylinder"], 0.0, 0.05),
+    (SHAPES["prism"], 0.0, 0.05), (SHAPES["ring"], 0.0, 0.06),
+    ({"shape": "ring", "radius": 0.1, "inner_radius": 0.085, "height": 0.03}, 0.0925, 0.015),  # by its wall
+])
+def test_fingers_close_to_the_width_of_the_object(thing, y: float, width: float) -> None:
+    rig = Rig(thing)
+    assert rig.grasp(0.4, y, 0.02) == "object_1"
+    assert rig.width == pytest.approx(width, abs=1e-3)
     assert rig.object().state == "held"
 
 
 @given(yaw=st.floats(-math.pi, math.pi))
 def test_width_of_a_rotated_box_is_its_extent_between_the_pads(yaw: float) -> None:
-    rig = Rig({"shape": "box", "size": [0.03, 0.05], "height": 0.04})
+    rig = Rig(SHAPES["box"])
     assert rig.grasp(0.4, 0.0, 0.02, yaw) == "object_1"
     # The pads are 20 mm wide: the part between them is no wider than the outline.
     c, s = abs(math.cos(yaw)), abs(math.sin(yaw))
@@ -63,53 +58,29 @@ def test_width_of_a_rotated_box_is_its_extent_between_the_pads(yaw: float) -> No
     assert across - 1e-6 <= rig.width <= 0.03 * s + 0.05 * c + 1e-6
 
 
-@pytest.mark.parametrize("off", [(0.011, 0, 0), (0, 0.013, 0), (0, 0, 0.011), (0, 0.05, 0), (0.2, 0, 0)])
-def test_fingers_next_to_a_ball_close_on_nothing(off) -> None:
-    rig = Rig.with_balls()
-    assert rig.grasp(0.5 + off[0], 0.0 + off[1], R + off[2]) == ""
-    assert rig.width == 0.0 and rig.ball()[0] == "table" and rig.events() == []
-
-
-@pytest.mark.parametrize(("size", "off"), [
-    ([0.04, 0.04], (0.021, 0, 0)), ([0.04, 0.04], (0, 0.024, 0)), ([0.04, 0.04], (0, 0, 0.021)),
-    ([0.1, 0.1], (0, 0, 0)),  # wider than the opening
+@pytest.mark.parametrize(("thing", "off"), [
+    *(({"shape": "sphere", "radius": R}, off) for off in (
+        (0.011, 0, 0), (0, 0.013, 0), (0, 0, 0.011), (0, 0.05, 0), (0.2, 0, 0))),
+    *((BOX_4_CM, off) for off in ((0.021, 0, -0.01), (0, 0.024, -0.01), (0, 0, 0.011))),
+    ({**BOX_4_CM, "size": [0.1, 0.1]}, (0, 0, -0.01)),  # wider than the opening
 ])
-def test_fingers_next_to_a_box_or_too_narrow_close_on_nothing(size: list[float], off: tuple[float, ...]) -> None:
-    rig = Rig({"shape": "box", "size": size, "height": 0.04})
-    assert rig.grasp(0.4 + off[0], off[1], 0.02 + off[2]) == ""
-    assert rig.width == 0.0 and rig.object().state == "table"
+def test_fingers_next_to_an_object_or_too_narrow_close_on_nothing(thing, off) -> None:
+    rig = Rig(thing)
+    assert rig.grasp(0.4 + off[0], off[1], R + off[2]) == ""
+    assert rig.width == 0.0 and rig.object().state == "table" and rig.events() == []
 
 
-def test_closed_fingers_grasp_nothing() -> None:
-    rig = Rig.with_balls()
+def test_closed_fingers_grasp_nothing_and_open_ones_only_one_ball() -> None:
+    rig = Rig.with_balls((0.5, 0.0), (0.56, 0.0))
     rig.tick(width=0.03)
     rig.tick(tool_down(0.5, 0.0, R))
     rig.tick(width=0.0)
     assert rig.world.held == "" and rig.width == 0.0
-
-
-def test_only_one_ball_is_grasped() -> None:
-    rig = Rig.with_balls((0.5, 0.0), (0.56, 0.0))
     assert rig.grasp(0.5, 0.0) == "ball_1"
     assert [label for label, _ in rig.balls().values()] == ["held", "table"]
 
 
-def test_wall_of_a_large_ring_is_grasped() -> None:
-    rig = Rig({"shape": "ring", "radius": 0.1, "inner_radius": 0.085, "height": 0.03})
-    assert rig.grasp(0.4, 0.0925, 0.02) == "object_1"
-    assert rig.width == pytest.approx(0.015, abs=1e-3)
-
-
-def test_held_ball_moves_rigidly_with_the_gripper() -> None:
-    rig = Rig.with_balls()
-    rig.grasp(0.502, 0.0, 0.035)
-    grip = rig.tool[:3, :3].T @ (rig.ball()[1] - rig.tool[:3, 3])
-    turned = tool_down(0.3, 0.2, 0.4, 1.0)
-    rig.tick(turned)
-    assert np.allclose(rig.ball()[1], turned[:3, :3] @ grip + turned[:3, 3])
-
-
-def test_held_object_keeps_its_pose_in_the_gripper() -> None:
+def test_held_object_moves_rigidly_with_the_gripper() -> None:
     rig = Rig({**CUBE, "yaw": 0.3})
     rig.grasp(0.403, 0.0, 0.025, 0.3)
     T_tcp_cube = invert(rig.tool) @ rig.pose()
@@ -120,8 +91,7 @@ def test_held_object_keeps_its_pose_in_the_gripper() -> None:
 
 
 def test_grasp_and_rest_are_published_as_remove_and_add() -> None:
-    rig = Rig.with_balls()
-    rig.grasp(0.5, 0.0)
+    rig = Rig.holding_ball()
     assert rig.events() == ["remove:ball_1"]
     rig.release(0.3, 0.0)
     assert rig.events() == []
@@ -132,8 +102,7 @@ def test_grasp_and_rest_are_published_as_remove_and_add() -> None:
 
 
 def test_release_needs_an_opening_beyond_the_tolerance() -> None:
-    rig = Rig.with_balls()
-    rig.grasp(0.5, 0.0)
+    rig = Rig.holding_ball()
     rig.tick(width=GRIP + 0.001)
     assert rig.world.held == "ball_1"
     rig.tick(width=GRIP + 0.003)
@@ -157,7 +126,7 @@ def wedge(tmp_path: Path) -> Path:
     return world
 
 
-def test_mesh_from_a_file_is_grasped_and_placed(wedge: Path) -> None:
+def test_mesh_from_a_file_is_grasped_placed_and_restored(wedge: Path) -> None:
     rig = Rig(config=load_cell("panda", world=str(wedge)).world)
     assert rig.object("wedge").size == Vector3(x=0.04, y=0.04, z=0.03)
     assert rig.grasp(0.4, 0.0, 0.005) == "wedge"
@@ -165,21 +134,16 @@ def test_mesh_from_a_file_is_grasped_and_placed(wedge: Path) -> None:
     rig.put_down(0.6, 0.3)
     obj = rig.object("wedge")
     assert (obj.state, obj.container) == ("contained", "tray") and len(obj.triangles) == 8
+    rig.edit("add", at=(0.3, 0.2), like="wedge")
+    again = KinematicWorld(rig.config)
+    again.restore(rig.world.snapshot())
+    assert again.objects(Header()) == rig.world.objects(Header()) and again.ids == ["wedge", "wedge_1"]
 
 
 def test_missing_mesh_file_is_named(wedge: Path) -> None:
     (wedge.parent / "wedge.stl").unlink()
     with pytest.raises(ConfigError, match=r"world\.objects\.wedge\.mesh: .*wedge\.stl' is a mesh that cannot be read"):
         KinematicWorld(load_cell("panda", world=str(wedge)).world)
-
-
-def test_added_mesh_is_restored(wedge: Path) -> None:
-    config = load_cell("panda", world=str(wedge)).world
-    world = KinematicWorld(config)
-    world.edit(WorldEdit(op="add", like="wedge", position=Vector3(x=0.3, y=0.2)), 0.0)
-    again = KinematicWorld(config)
-    again.restore(world.snapshot())
-    assert again.objects(Header()) == world.objects(Header()) and again.ids == ["wedge", "wedge_1"]
 
 
 def test_unknown_simulator_lists_the_choices() -> None:

@@ -1,3 +1,5 @@
+"""Initial positions of the objects of a world."""
+
 import math
 
 import numpy as np
@@ -7,40 +9,35 @@ from hypothesis import strategies as st
 
 from common.config import World
 from common.errors import ConfigError
+from common.messages import Header
 from common.robot.transforms import rpy_to_matrix
 from common.sim.kinematic import KinematicWorld
 from common.sim.layout import layout, sphere_in_image
+from tests.common.sim.rig import SHAPES, TABLE
 
 
 def anywhere(x: float, y: float, z: float) -> bool:
     return True
 
 
+def within_reach(x: float, y: float, z: float) -> bool:
+    return 0.28 <= math.hypot(x, y) <= 0.78
+
+
 def changed(world: World, **values: object) -> World:
     return World.model_validate(world.model_dump(exclude={"objects"}) | values)
 
 
-def places_of(world: World, seed: int, accepts: object = anywhere) -> list[tuple[float | None, float | None]]:
+def places_of(world: World, seed: int = 1, accepts: object = anywhere) -> list[tuple[float | None, float | None]]:
     return [(thing.x, thing.y) for thing in layout(world, seed, accepts)]  # type: ignore[arg-type]
 
 
-def test_fixed_layout_uses_the_first_spots(world_config: World) -> None:
-    assert places_of(changed(world_config, count=3), 1) == world_config.spots[:3]
-
-
-def test_explicit_balls_override_layout_and_count(world_config: World) -> None:
-    assert places_of(changed(world_config, balls=[(0.3, 0.0)], layout="random"), 1) == [(0.3, 0.0)]
-
-
-@pytest.mark.parametrize("how", ["fixed", "random"])
-def test_world_without_balls_has_an_empty_layout(world_config: World, how: str) -> None:
-    empty = changed(world_config, count=0, spots=[], layout=how)
-    assert layout(empty, 1, anywhere) == []
-    assert KinematicWorld(empty).ids == []
-
-
-def within_reach(x: float, y: float, z: float) -> bool:
-    return 0.28 <= math.hypot(x, y) <= 0.78
+def test_layout_uses_explicit_balls_or_the_first_spots_or_none(world_config: World) -> None:
+    assert places_of(changed(world_config, count=3)) == world_config.spots[:3]
+    assert places_of(changed(world_config, balls=[(0.3, 0.0)], layout="random")) == [(0.3, 0.0)]
+    for how in ("fixed", "random"):
+        empty = changed(world_config, count=0, spots=[], layout=how)
+        assert layout(empty, 1, anywhere) == [] and KinematicWorld(empty).ids == []
 
 
 @given(seed=st.integers(0, 2**31 - 1), count=st.integers(1, 8))
@@ -50,7 +47,7 @@ def test_random_layout_is_separated_visible_reachable_and_clear_of_the_container
     config = changed(world_config, layout="random", count=count)
     objects = layout(config, seed, within_reach)
     assert len(objects) == count and layout(config, seed, within_reach) == objects
-    places = [(x, y) for x, y in places_of(config, seed, within_reach) if x is not None and y is not None]
+    places = [(thing.x, thing.y) for thing in objects if thing.x is not None and thing.y is not None]
     for i, (x, y) in enumerate(places):
         assert within_reach(x, y, 0.03) and all(math.dist((x, y), other) >= 0.07 for other in places[:i])
         off_box = math.hypot(max(abs(x - 0.55) - 0.08, 0.0), max(abs(y - 0.25) - 0.08, 0.0))
@@ -58,9 +55,14 @@ def test_random_layout_is_separated_visible_reachable_and_clear_of_the_container
     assert len(KinematicWorld(config, objects).ids) == count
 
 
-def test_layout_depends_on_the_seed(world_config: World) -> None:
-    config = changed(world_config, layout="random")
-    assert places_of(config, 1) != places_of(config, 2)
+def test_objects_without_a_position_are_placed_by_the_seed() -> None:
+    described = [{"id": f"{shape}_{i}", **SHAPES[shape]} for shape in SHAPES for i in range(2)]
+    config = World.model_validate({"fixtures": [TABLE], "containers": {"tray": {}}, "objects": described})
+    found = layout(config, 3, within_reach)
+    assert found == layout(config, 3, within_reach) != layout(config, 4, within_reach)
+    assert [one.id for one in found] == [one["id"] for one in described]
+    for one in KinematicWorld(config, found).objects(Header()).objects:
+        assert one.state == "table" and math.hypot(one.pose.position.x, one.pose.position.y) < 0.83
 
 
 @given(x=st.floats(0.0, 0.8), y=st.floats(-0.5, 0.5))
@@ -77,11 +79,10 @@ def test_sphere_in_image_means_its_complete_surface_is_visible(world_config: Wor
     assert not (inside or outside) or sphere_in_image(camera, (x, y), radius, radius) == inside
 
 
-@pytest.mark.parametrize("accepts", [lambda *at: False, lambda x, y, z: math.dist((x, y), (0.4, -0.2)) < 0.05])
-def test_impossible_random_layout_is_a_configuration_error(world_config: World, accepts: object) -> None:
+def test_impossible_random_layout_is_a_configuration_error(world_config: World) -> None:
     config = changed(world_config, layout="random")
     with pytest.raises(ConfigError, match=r"world\.objects: 7 objects fit no random layout"):
-        layout(config, 1, accepts)  # type: ignore[arg-type]
+        layout(config, 1, lambda x, y, z: math.dist((x, y), (0.4, -0.2)) < 0.05)
 
 
 def test_random_layout_needs_a_camera_that_looks_down(world_config: World) -> None:

@@ -15,6 +15,12 @@ from tests.applications.outlining.outline_scenes import WORLDS, seen_world, worl
 
 GREY = (178 / 255,) * 3
 CAMERA = Pinhole(80.0, 80.0, 32.0, 24.0, 64, 48, transform(rpy_to_matrix(-math.pi, 0, math.pi / 2), (0.5, 0, 2.0)))
+AT_ORIGIN = Pinhole(80.0, 80.0, 32, 24, 64, 48, np.eye(4))
+BLACK = empty_view(AT_ORIGIN, (0, 0, 0))
+
+
+def rectangle(corners, color=(1.0, 1.0, 1.0)) -> Mesh:
+    return Mesh(np.array(corners, float)[[[0, 1, 2], [0, 2, 3]]], color)
 
 
 def ray_by_ray(meshes, camera, pixels):
@@ -50,8 +56,8 @@ def triangles(seed, count):
 
 
 @given(seed=st.integers(0, 10**6), count=st.integers(1, 12))
-@example(seed=69, count=1)  # reaches behind the camera: what is cut is what lies nearer than NEAREST, however far aside
-@settings(max_examples=40, deadline=None)
+@example(seed=69, count=1)  # reaches behind the camera: NEAREST cuts it, however far aside
+@settings(max_examples=30, deadline=None)
 def test_ray_caster_matches_single_rays_for_random_triangles(seed, count):
     corners = triangles(seed, count)
     colors = np.random.default_rng(seed).integers(0, 256, (count, 3)) / 255
@@ -64,7 +70,8 @@ def test_ray_caster_matches_single_rays_for_random_triangles(seed, count):
     assert (~same).mean() < 0.002  # rays through an edge
 
 
-@pytest.mark.parametrize("name", WORLDS)
+@pytest.mark.parametrize("name", [name if name in ("w2", "w6") else pytest.param(name, marks=pytest.mark.campaign)
+                                  for name in WORLDS])
 def test_ray_caster_matches_single_rays_for_the_worlds(name):
     camera, picture, depth = seen_world(name)
     objects = [object_mesh(world_object(o)) for o in world(name).objects]
@@ -72,22 +79,20 @@ def test_ray_caster_matches_single_rays_for_the_worlds(name):
     rng = np.random.default_rng(3)
     around = np.rint(camera.project(np.concatenate([m.corners for m in objects]).reshape(-1, 3))).astype(int)
     pixels = np.vstack([rng.choice(around, 60) + rng.integers(-3, 4, (60, 2)), rng.integers(0, (1024, 768), (60, 2))])
+    u, v = pixels.T
     expected, color = ray_by_ray(meshes, camera, pixels.astype(float))
-    got = depth[pixels[:, 1], pixels[:, 0]]
     expected[expected > 2.25] = np.nan
-    np.testing.assert_allclose(got, expected, atol=2e-6)
-    flat = np.array([np.ptp(picture[v - 1 : v + 2, u - 1 : u + 2].reshape(-1, 3), axis=0).max() == 0
-                     for u, v in pixels])
+    np.testing.assert_allclose(depth[v, u], expected, atol=2e-6)
+    around = [picture[y - 1 : y + 2, x - 1 : x + 2].reshape(-1, 3) for x, y in pixels]
+    flat = np.array([np.ptp(colors, axis=0).max() == 0 for colors in around])
     shown = np.where(np.isnan(color), GREY, color)[:, ::-1] * 255
-    np.testing.assert_allclose(picture[pixels[:, 1], pixels[:, 0]][flat], shown[flat], atol=0.5)
+    np.testing.assert_allclose(picture[v, u][flat], shown[flat], atol=0.5)
 
 
 def test_edge_pixel_color_equals_its_coverage():
-    z, f = 1.0, 80.0  # a square that ends 0.3 px right of the centre of column 40 and 0.2 px below that of row 30
-    x, y = (40.3 - 32) * z / f, (30.2 - 24) * z / f
-    corners = np.array([[-0.1, -0.1, z], [x, -0.1, z], [x, y, z], [-0.1, y, z]])
-    camera = Pinhole(f, f, 32, 24, 64, 48, np.eye(4))
-    view = cast([Mesh(corners[[[0, 1, 2], [0, 2, 3]]], (1.0, 1.0, 1.0))], camera, empty_view(camera, (0, 0, 0)))
+    # a square that ends 0.3 px right of the centre of column 40 and 0.2 px below that of row 30
+    x, y = (40.3 - 32) / 80, (30.2 - 24) / 80
+    view = cast([rectangle([[-0.1, -0.1, 1], [x, -0.1, 1], [x, y, 1], [-0.1, y, 1]])], AT_ORIGIN, BLACK)
     covered = view.colour[..., 0] / 255
     assert covered[28, 40] == pytest.approx(0.8, abs=0.04) and covered[30, 38] == pytest.approx(0.7, abs=0.04)
     assert covered[30, 40] == pytest.approx(0.56, abs=0.1)
@@ -96,55 +101,46 @@ def test_edge_pixel_color_equals_its_coverage():
 
 
 def test_adjacent_triangles_have_no_seam():
-    camera = Pinhole(80.0, 80.0, 32, 24, 64, 48, np.eye(4))
-    for angle in np.linspace(0, 1.5, 23):
+    for angle in np.linspace(0, 1.5, 12):
         c, s = math.cos(angle), math.sin(angle)
         corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) @ np.array([[c, s], [-s, c]]) * 3
-        square = np.column_stack([corners, np.full(4, 2.0)])
-        meshes = [Mesh(square[[[0, 1, 2], [0, 2, 3]]], (1.0, 1.0, 1.0))]
-        view = cast(meshes, camera, empty_view(camera, (0, 0, 0)))
+        view = cast([rectangle(np.column_stack([corners, np.full(4, 2.0)]))], AT_ORIGIN, BLACK)
         assert (view.colour == 255).all() and (view.depth == 2).all()
 
 
 def test_existing_view_occludes_and_is_not_modified():
-    camera = Pinhole(80.0, 80.0, 32, 24, 64, 48, np.eye(4))
-
     def wall(z, color, width):
-        corners = np.array([[-width, -9, z], [width, -9, z], [width, 9, z], [-width, 9, z]], float)
-        return Mesh(corners[[[0, 1, 2], [0, 2, 3]]], color)
+        return rectangle([[-width, -9, z], [width, -9, z], [width, 9, z], [-width, 9, z]], color)
 
-    near = cast([wall(1.0, (1, 0, 0), 0.1)], camera, empty_view(camera, (0, 0, 0)))
-    both = cast([wall(2.0, (0, 1, 0), 9)], camera, near)
-    together = cast([wall(1.0, (1, 0, 0), 0.1), wall(2.0, (0, 1, 0), 9)], camera, empty_view(camera, (0, 0, 0)))
+    near = cast([wall(1.0, (1, 0, 0), 0.1)], AT_ORIGIN, BLACK)
+    both = cast([wall(2.0, (0, 1, 0), 9)], AT_ORIGIN, near)
+    together = cast([wall(1.0, (1, 0, 0), 0.1), wall(2.0, (0, 1, 0), 9)], AT_ORIGIN, BLACK)
     np.testing.assert_array_equal(both.depth, together.depth)
     assert np.abs(both.colour.astype(int) - together.colour)[:, 20].max() == 0
     assert both.colour[24, 32].tolist() == [0, 0, 255] and both.colour[24, 5].tolist() == [0, 255, 0]
-    assert near.colour[24, 5].tolist() == [0, 0, 0]  # what was seen before is not changed
+    assert near.colour[24, 5].tolist() == [0, 0, 0]
 
 
 def test_triangles_behind_the_camera_are_clipped():
-    camera = Pinhole(80.0, 80.0, 32, 24, 64, 48, np.eye(4))
-    floor = np.array([[-50, 0.5, -10], [50, 0.5, -10], [50, 0.5, 40], [-50, 0.5, 40]], float)
-    view = cast([Mesh(floor[[[0, 1, 2], [0, 2, 3]]], (1, 1, 1))], camera, empty_view(camera, (0, 0, 0)))
+    floor = rectangle([[-50, 0.5, -10], [50, 0.5, -10], [50, 0.5, 40], [-50, 0.5, 40]])
+    view = cast([floor], AT_ORIGIN, BLACK)
     assert np.isinf(view.depth[:25]).all()
     np.testing.assert_allclose(view.depth[30:, 3], 0.5 * 80 / (np.arange(30, 48) - 24), rtol=1e-5)
 
 
-def test_depth_outside_the_range_is_nan():
-    camera = Pinhole(80.0, 80.0, 32, 24, 64, 48, np.eye(4))
-    assert np.isnan(empty_view(camera, GREY).depth_within(0.1, 2.25)).all()
-    view = cast([], camera, empty_view(camera, GREY))
-    assert (view.colour == 178).all()
+def test_empty_view_has_its_color_and_no_depth():
+    view = cast([], AT_ORIGIN, empty_view(AT_ORIGIN, GREY))
+    assert (view.colour == 178).all() and np.isnan(view.depth_within(0.1, 2.25)).all()
 
 
 def test_view_does_not_depend_on_the_batch_size(monkeypatch):
     rng = np.random.default_rng(3)
     meshes = [Mesh(triangles(seed, 20), tuple(rng.integers(0, 256, 3) / 255)) for seed in range(5)]
-    meshes.append(meshes[0])  # of what is as near as something else, the first is seen
-    whole = cast(meshes, CAMERA, empty_view(CAMERA, GREY))
+    meshes.append(meshes[0])  # of two at the same depth the first is seen
+    one = cast(meshes, CAMERA, empty_view(CAMERA, GREY))
     monkeypatch.setattr(ray_caster, "BATCH_PIXELS", 100)
-    parts = cast(meshes, CAMERA, empty_view(CAMERA, GREY))
-    assert np.array_equal(whole.colour, parts.colour) and np.array_equal(whole.depth, parts.depth)
+    other = cast(meshes, CAMERA, empty_view(CAMERA, GREY))
+    assert np.array_equal(one.colour, other.colour) and np.array_equal(one.depth, other.depth)
 
 
 def test_work_and_memory_for_a_view_are_bounded(monkeypatch, caplog):

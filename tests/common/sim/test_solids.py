@@ -1,16 +1,21 @@
+"""Triangles of solids, and outlines of objects."""
+
+from __future__ import annotations
+
 import math
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pydantic import ValidationError
 
 from common.config import Fixture, ObjectConfig
 from common.sim import solids
 from common.sim.objects import object_mesh, world_object
 from common.sim.solids import band_triangles, circle, extrude, fixture_mesh, primitive, triangulate
 
-original_is_ear = solids.is_ear
+LETTER = np.array([(-4, -3), (4, -3), (4, -1), (1, -1), (1, 4), (-1, 4), (-1, -1), (-4, -1)], float)
 
 
 def area(triangles):
@@ -19,8 +24,9 @@ def area(triangles):
 
 
 def shoelace(outline):
+    """Area of an outline, positive if it is counterclockwise."""
     x, y = np.asarray(outline).T
-    return abs(float(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y))) / 2
+    return float(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y)) / 2
 
 
 def volume(corners):
@@ -35,30 +41,16 @@ def test_triangles_of_a_polygon_have_its_area_and_do_not_overlap(seed, count, tu
     radii = np.random.default_rng(seed).uniform(0.2, 1.0, count)
     angles = turn + np.linspace(0, 2 * math.pi, count, endpoint=False)
     star = radii[:, None] * np.column_stack([np.cos(angles), np.sin(angles)])
-    for outline in (star, star[::-1]):
-        assert area(triangulate(outline)) == pytest.approx(shoelace(outline), rel=1e-9)
-
-
-@given(turn=st.floats(0, 7))
-def test_ears_contain_no_other_corner(turn):
     c, s = math.cos(turn), math.sin(turn)
-    letter = [(-4, -3), (4, -3), (4, -1), (1, -1), (1, 4), (-1, 4), (-1, -1), (-4, -1)]
-    outline = np.array(letter, float) @ np.array([[c, s], [-s, c]])
-    assert area(triangulate(outline)) == pytest.approx(shoelace(outline), rel=1e-9)
+    for outline in (star, star[::-1], LETTER @ np.array([[c, s], [-s, c]])):  # ears of the letter contain corners
+        assert area(triangulate(outline)) == pytest.approx(abs(shoelace(outline)), rel=1e-9)
 
 
-def test_self_intersecting_polygon_takes_bounded_time():
-    looked_at = 0
-
-    def counted(*given):
-        nonlocal looked_at
-        looked_at += 1
-        return original_is_ear(*given)
-
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(solids, "is_ear", counted)
-        triangles = triangulate(np.random.default_rng(1).uniform(-0.1, 0.1, (200, 2)))
-    assert triangles.shape == (198, 3, 2) and looked_at < 2000
+def test_self_intersecting_polygon_takes_bounded_time(monkeypatch):
+    calls, is_ear = [], solids.is_ear
+    monkeypatch.setattr(solids, "is_ear", lambda *given: calls.append(given) or is_ear(*given))
+    triangles = triangulate(np.random.default_rng(1).uniform(-0.1, 0.1, (200, 2)))
+    assert triangles.shape == (198, 3, 2) and len(calls) < 2000
 
 
 def test_band_between_two_circles_has_the_difference_of_their_areas():
@@ -66,17 +58,15 @@ def test_band_between_two_circles_has_the_difference_of_their_areas():
     assert area(band_triangles(outer, inner)) == pytest.approx(shoelace(outer) - shoelace(inner), rel=2e-3)
 
 
-@pytest.mark.parametrize("shape, size, expected", [
+@pytest.mark.parametrize(("shape", "size", "expected"), [
     ("box", [0.2, 0.3, 0.4], 0.024), ("cylinder", [0.1, 0.5], math.pi * 0.01 * 0.5),
     ("sphere", [0.1], 4 / 3 * math.pi * 0.001)])
 def test_primitives_are_closed_and_have_their_volume(shape, size, expected):
     corners = primitive(shape, size)
     assert volume(corners) == pytest.approx(expected, rel=0.02)
-    edges = np.sort(np.rint(np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]) * 1e6), axis=1)
-    solid = edges[(np.abs(edges[:, 0] - edges[:, 1]) > 0).any(axis=1)]
-    _, counts = np.unique(np.sort(solid.reshape(-1, 6).view([("", float)] * 3).reshape(-1, 2), axis=1), axis=0,
-                          return_counts=True)
-    assert (counts % 2 == 0).all()
+    edges = np.rint(np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]) * 1e6)
+    pairs = [frozenset(map(tuple, edge.tolist())) for edge in edges if (edge[0] != edge[1]).any()]
+    assert all(pairs.count(pair) % 2 == 0 for pair in set(pairs))
 
 
 def test_fixture_mesh_is_at_its_pose():
@@ -87,10 +77,32 @@ def test_fixture_mesh_is_at_its_pose():
         primitive("cone", [1])
 
 
-def test_object_mesh_extends_from_its_support_to_its_top():
-    ring = ObjectConfig(id="r", shape="ring", x=0.5, y=0, z=1.0, radius=0.06, inner_radius=0.04, height=0.03)
-    corners = object_mesh(world_object(ring)).corners
+def test_object_mesh_extends_from_its_support_to_its_top_around_its_hole():
+    size = {"radius": 0.06, "inner_radius": 0.04, "height": 0.03}
+    ring = world_object(ObjectConfig(id="r", shape="ring", x=0.5, y=0, z=1.0, **size))
+    corners = object_mesh(ring).corners
     assert (corners[..., 2].min(), corners[..., 2].max()) == pytest.approx((1.0, 1.03))
     radii = np.linalg.norm(corners[..., :2] - (0.5, 0), axis=-1)
-    assert radii.min() == pytest.approx(0.04) and radii.max() == pytest.approx(0.06)
+    assert (radii.min(), radii.max()) == pytest.approx((0.04, 0.06))
+    assert np.hypot(*(np.array(ring.hole) - (0.5, 0)).T) == pytest.approx(0.04)
     assert len(extrude(circle(1.0)[::90], np.empty((0, 2)), 0, 1)) == 4 + 4 + 8
+
+
+@pytest.mark.parametrize(("options", "expected"), [
+    ({"shape": "box", "size": (0.1, 0.2)}, 0.02),
+    ({"shape": "cylinder", "radius": 0.05}, math.pi * 0.0025),
+    ({"shape": "prism", "polygon": [(0, 0), (0, 0.1), (0.1, 0)]}, 0.005),
+])
+def test_outline_is_counterclockwise_with_the_area_of_the_shape(options, expected):
+    thing = ObjectConfig.model_validate({"id": "thing", "x": 0.5, "y": 0.1, "yaw": 0.4, "height": 0.1, **options})
+    assert shoelace(world_object(thing).outline) == pytest.approx(expected, rel=1e-3)
+
+
+def test_yaw_rotates_counterclockwise_about_the_position():
+    thing = ObjectConfig(id="box", shape="box", size=(0.2, 0.1), x=0.5, y=0.1, yaw=math.pi / 2, height=0.1)
+    assert np.array(world_object(thing).outline)[1] == pytest.approx([0.55, 0.2])
+
+
+def test_shape_without_its_dimensions_is_rejected():
+    with pytest.raises(ValidationError, match="ring needs radius and inner_radius"):
+        ObjectConfig(id="ring", shape="ring", x=0, y=0, height=0.03)
