@@ -18,8 +18,7 @@ def path(tmp_path):
 
 
 def test_saved_camera_file_loads_equal_and_a_cell_uses_it(path):
-    assert CameraFile.load(str(path)) == FULL
-    assert "world.camera=camera.yaml" in path.read_text()
+    assert CameraFile.load(str(path)) == FULL and "world.camera=camera.yaml" in path.read_text()
     camera = load_cell("panda", [f"world.camera={path}"]).world.camera
     assert (camera.width, camera.fx, camera.position, camera.rpy) == (800, 701.5, FULL.position, FULL.rpy)
     assert camera.d == FULL.d and camera.frame == "camera_optical_frame"

@@ -55,8 +55,7 @@ def test_padding_applies_to_perceived_objects_only():
     place = next_to_finger(GRASP, 0.001)
     for role, expected in (("target", True), ("contained", True), ("fixture", False)):
         nearby = only(solid("ball", role, "sphere", [0.03], place))
-        assert not world(nearby).collides(GRASP)
-        assert not world(nearby, padding=0.0005).collides(GRASP)
+        assert not world(nearby).collides(GRASP) and not world(nearby, padding=0.0005).collides(GRASP)
         assert world(nearby, padding=0.003).collides(GRASP) is expected
 
 
@@ -76,8 +75,7 @@ def test_allowed_pairs_may_touch_in_either_order():
 
 def test_attached_object_moves_with_the_tool():
     lone = world(scene(BLOCK[:1]), GRASP, attach="ball_0")
-    assert lone.attached == ["ball_0"]
-    assert not lone.collides(GRASP)
+    assert lone.attached == ["ball_0"] and not lone.collides(GRASP)
     assert lone.colliding_pair(above(0.55, 0.174, 0.09)) == ("ball_0", "box_east")
     for z in (0.02, 0.025):
         assert lone.colliding_pair(above(0.45, 0.1, z))[0] == "ball_0"
@@ -90,8 +88,7 @@ def test_contact_at_the_start_ends_after_the_contact_distance():
     close = scene([(0.50, -0.10), (0.561, -0.10)])
     rules = {"padding": 0.003, "contact_distance": 0.02, "allowed": touching("ball_1")}
     lifted = world(close, GRASP, attach="ball_0", **rules)
-    assert not lifted.collides(GRASP)
-    assert not lifted.collides(above(0.50, -0.10, 0.045))
+    assert not lifted.collides(GRASP) and not lifted.collides(above(0.50, -0.10, 0.045))
     assert lifted.collides(above(0.50, -0.10, 0.0505))  # 64.4 mm between the centres, padded radii 66 mm
     assert not lifted.collides(above(0.50, -0.10, 0.06))
     assert lifted.colliding_pair(above(0.50, -0.075, 0.03)) == ("ball_0", "table")
@@ -109,8 +106,7 @@ def blocked(of, *ends):
 @pytest.mark.parametrize("overlap", [0.002, 0.0, -0.0005])
 def test_attached_object_penetrates_no_deeper_than_at_the_start(overlap):
     held = world(scene([(0.50, -0.10), (0.56 - overlap, -0.10)]), GRASP, attach="ball_0", padding=0.003)
-    assert not held.collides(GRASP)
-    assert blocked(held, GRASP, above(0.50, -0.10, 0.045)) is None
+    assert not held.collides(GRASP) and blocked(held, GRASP, above(0.50, -0.10, 0.045)) is None
     assert blocked(held, GRASP, above(0.50, -0.11, 0.035)) is None
     assert blocked(held, GRASP, above(0.504, -0.10, 0.0301)) == ("ball_0", "ball_1")
     assert blocked(held, GRASP, above(0.515, -0.10, 0.031)) == ("ball_0", "ball_1")

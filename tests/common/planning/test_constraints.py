@@ -94,8 +94,7 @@ def test_no_planner_returns_a_violating_trajectory(planner):
         if response.ok:
             satisfied += 1
             way = driven(ROBOT, response)
-            assert way.tilt() < tilt + 1e-3
-            assert way.outside(region) < 1e-4
+            assert way.tilt() < tilt + 1e-3 and way.outside(region) < 1e-4
         else:
             refused += 1
             assert response.error in ("constraint", "timeout", "no_path"), response.message
@@ -155,18 +154,15 @@ def test_proved_curve_satisfies_constraints_at_every_sample(name, compiled):
 def test_upright_may_be_defined_by_the_start():
     on_its_side = transform(rpy_to_matrix(np.pi / 2, 0.0, 0.0), (0.5, -0.1, 0.4))
     constraints = ToolConstraints(ROBOT, upright(0.1, upright_at_start=True), HOME)
-    assert constraints.state_violation(HOME) == ""
-    assert constraints.pose_violation(on_its_side)
+    assert constraints.state_violation(HOME) == "" and constraints.pose_violation(on_its_side)
     leaning = ToolConstraints(ROBOT, upright(0.1, tool_axis=Vector3(y=-2.0), axis=Vector3(z=-5.0)), HOME)
-    assert leaning.pose_violation(on_its_side) == ""
-    assert "tilted by 1.57" in leaning.state_violation(HOME)
+    assert leaning.pose_violation(on_its_side) == "" and "tilted by 1.57" in leaning.state_violation(HOME)
 
 
 def test_upright_goal_of_a_set_is_chosen_or_each_failure_is_reported():
     request = to(GoalSet(goals=[LEANING, down(0.5, 0.2, 0.25)]), RIGHT, constraints=upright(0.2))
     response = PIPELINE.plan(request, EMPTY)
-    assert response.goal_index == 1
-    assert driven(ROBOT, response).tilt() < 0.201
+    assert response.goal_index == 1 and driven(ROBOT, response).tilt() < 0.201
     request.goal = GoalSet(goals=[LEANING, down(2.0, 0.0, 0.2)])
     message = PIPELINE.plan(request, EMPTY).message
     assert "goal 1: " in message and "tilted by 0.5 rad, 0.2 allowed" in message
@@ -219,11 +215,9 @@ def test_impossible_constrained_search_ends_within_the_planning_time():
     constraints = upright(0.3, region=CORRIDOR)
     request = to_joints(LEFT, RIGHT, constraints=constraints, planning_time=0.2, planner="rrt_connect")
     response = PIPELINE.plan(request, over)
-    assert response.error in ("timeout", "no_path")
-    assert response.seconds < 0.5
+    assert response.error in ("timeout", "no_path") and response.seconds < 0.5
     why = "found no path that satisfies the constraints; on the straight edge, panda_link5 collides with wall"
-    assert response.message == f"rrt_connect: RRT-Connect {why}"
-    assert response.attempts[-1].message == why
+    assert response.message == f"rrt_connect: RRT-Connect {why}" and response.attempts[-1].message == why
     cancel = Cancel()
     cancel.set()
     assert PIPELINE.plan(request, over, cancel=cancel).error == "cancelled"
@@ -242,8 +236,7 @@ def test_fixed_tool_point_allows_only_a_turn_about_its_axis():
     fixed = world(EMPTY, RIGHT, constraints=ToolConstraints(ROBOT, held, RIGHT))
     assert fixed.edge_free(RIGHT, RIGHT + 0.5 * TURN[6])  # it turns about the tool axis
     found = find_path(fixed.kernel, RIGHT, np.array([LEFT]), seconds=0.05)
-    assert found.waypoints is None
-    assert 1 <= found.from_start <= found.nodes - 1
+    assert found.waypoints is None and 1 <= found.from_start <= found.nodes - 1
 
 
 def test_path_back_inside_the_limits_satisfies_constraints():
@@ -252,8 +245,7 @@ def test_path_back_inside_the_limits_satisfies_constraints():
     out = inside + 0.03 * TURN[0]
     slow = to_joints(inside - 0.3 * TURN[0], out, constraints=PathConstraints(tool_speed=0.01))
     way = driven(ROBOT, PIPELINE.plan(slow, EMPTY))
-    assert np.linalg.norm(way.places[0] - ROBOT.fk(out)[:3, 3]) < 1e-6
-    assert 0.009 < way.speeds.max() < 0.0101
+    assert np.linalg.norm(way.places[0] - ROBOT.fk(out)[:3, 3]) < 1e-6 and 0.009 < way.speeds.max() < 0.0101
     middle = ROBOT.fk(inside - 0.15 * TURN[0])[:3, 3]
     side = 2 * float(np.abs(ROBOT.fk(inside)[:3, 3] - middle).max()) + 0.002
     region = box(*middle.tolist(), side, side, side)

@@ -57,12 +57,6 @@ def test_failure_of_each_goal_is_reported(planner):
     assert "; goal 2: all " in response.message and "collides with" in response.message
 
 
-def test_failure_of_each_line_is_reported():
-    response = PIPELINE.plan(to_any([UNREACHABLE, BURIED], straight=True), TABLE)
-    assert not response.ok
-    assert "none of 2 goals; goal 1: waypoint" in response.message and "; goal 2: waypoint" in response.message
-
-
 @pytest.mark.parametrize("planner", LINES)
 def test_line_that_fails_validation_is_replaced_by_the_next(planner):
     lower, lowest = down(0.31, 0.0, 0.42), down(0.31, 0.0, 0.37)

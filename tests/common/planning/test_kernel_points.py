@@ -90,8 +90,7 @@ def test_kernel_agrees_with_coal_on_spheres(robot, seed):
 def test_tiny_sphere_on_an_edge_is_found():
     model, geometry = robot_with((coal.Box(0.002, 0.02, 0.02), (0, 0, 0)))
     kernel, _, _ = worlds(model, geometry, np.array([[0.123, 0.0, 0.0, 1e-5]]), held=False)
-    assert kernel.colliding(at(-0.5)) < 0
-    assert not kernel.edge_free(at(-0.5), at(0.5))
+    assert kernel.colliding(at(-0.5)) < 0 and not kernel.edge_free(at(-0.5), at(0.5))
     assert kernel.edge_free(at(-0.5), at(0.12198))
     kernel.set_points(1, np.zeros((0, 4)))
     kernel.refresh()

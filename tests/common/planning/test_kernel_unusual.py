@@ -60,8 +60,7 @@ def test_edge_outside_the_limits_of_a_sliding_joint_is_checked(limit):
         a, b = np.array([1 - rng.uniform(0.2, 1), 2.0]), np.array([1 + rng.uniform(0.2, 1), 2.0])
         assert not kernel.edge_free(a, b)
         cubic = np.array([a, b - a, [0.0, 0.0], [0.0, 0.0]])
-        assert kernel.cubics_collision(cubic[None])[0] == 0
-        assert kernel.edge_free(a - (0, 0.2), b - (0, 0.2))
+        assert kernel.cubics_collision(cubic[None])[0] == 0 and kernel.edge_free(a - (0, 0.2), b - (0, 0.2))
     along = np.stack([np.linspace(0, 2, 401), np.full(401, 2.0)], axis=1)
     assert kernel.first_collision(along)[0] == 190
     assert not kernel.edge_free(np.array([1.0, 0.0]), np.array([1.0, 3.0]))
@@ -112,8 +111,7 @@ def test_pair_of_two_fixed_shapes_is_checked():
         geometry.removeAllCollisionPairs()
         geometry.addCollisionPair(pin.CollisionPair(1, 2))
         kernel = KernelWorld(model, geometry)
-        assert (kernel.colliding(at(0.0)) < 0) == free
-        assert kernel.edge_free(at(0.0), ONE) == free
+        assert (kernel.colliding(at(0.0)) < 0) == free and kernel.edge_free(at(0.0), ONE) == free
 
 
 def test_tiny_steps_of_a_search_respect_limits():

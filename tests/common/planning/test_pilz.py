@@ -13,7 +13,7 @@ from pydantic import ValidationError
 
 from common.messages import ArcGoal, PlanRequest, Pose, Vector3
 from common.planning.planners.circ import NoArc, circle_about, circle_through
-from common.planning.planners.ptp import synchronised, trapezoid
+from common.planning.planners.ptp import trapezoid
 from common.planning.trajectory import TimedPath, end_accelerations, sample
 from common.robot.transforms import matrix_to_pose, rpy_to_matrix, tool_down, transform
 from tests.common.planning.checks import planned, tool_places, with_planner
@@ -27,8 +27,7 @@ def test_point_to_point_has_three_phases_shared_by_all_joints():
     timed = planned(with_planner("ptp", deceleration=0.5), to_joints(LEFT, RIGHT), TABLE)
     assert len(timed.times) == 8  # two for each change of acceleration, within the jerk limit
     begin, end = (values[1::2] for values in end_accelerations(timed))
-    assert np.allclose(begin, end, atol=1e-6)
-    assert np.allclose(begin[1], 0, atol=1e-6)
+    assert np.allclose(begin, end, atol=1e-6) and np.allclose(begin[1], 0, atol=1e-6)
     assert np.allclose(np.abs(begin[2]), 0.5 * np.abs(begin[0]), rtol=1e-3, atol=1e-6)
     assert 0.97 < (np.abs(timed.velocities) / LIMIT).max() <= 1
 
@@ -59,15 +58,13 @@ def test_turn_in_place_respects_the_rotation_speed():
     goal = ROBOT.fk(RIGHT) @ transform(rpy_to_matrix(0.0, 0.0, 1.2), (0, 0, 0))
     times, poses, speeds = tool_along(planned(with_planner("lin"), to_pose(goal, RIGHT), TABLE))
     turns = [np.linalg.norm(pin.log3(a.T @ b)) for a, b in pairwise(poses[:, :3, :3])]
-    assert max(turns) / times[1] == pytest.approx(0.2 * 1.57, rel=0.02)
-    assert speeds.max() < 0.01
+    assert max(turns) / times[1] == pytest.approx(0.2 * 1.57, rel=0.02) and speeds.max() < 0.01
 
 
 def test_line_is_slower_where_a_joint_is_at_its_limit():
     fast = with_planner("lin", speed=3.0, acceleration=50, deceleration=50)
     timed = planned(fast, to_pose(tool_down(0.5, 0.3, 0.2), RIGHT), EMPTY)
-    assert (np.abs(timed.velocities) / LIMIT).max() > 0.97
-    assert tool_along(timed)[2].max() < 0.6
+    assert (np.abs(timed.velocities) / LIMIT).max() > 0.97 and tool_along(timed)[2].max() < 0.6
 
 
 values = st.floats(0.01, 10)
@@ -78,33 +75,13 @@ def test_trapezoid_covers_the_length_within_its_limits(length, speed, accelerati
     profile = trapezoid(length, speed, acceleration, deceleration)
     times = np.linspace(0, profile.duration, 200)
     s, ds, dds = np.array([profile.at(t) for t in times]).T
-    assert s[0] == 0
-    assert s[-1] == pytest.approx(length)
-    assert ds[-1] == pytest.approx(0, abs=1e-9)
-    assert ds.max() <= speed * (1 + 1e-9)
-    assert dds.max() <= acceleration * (1 + 1e-9)
-    assert dds.min() >= -deceleration * (1 + 1e-9)
+    assert s[0] == 0 and s[-1] == pytest.approx(length)
+    assert ds[-1] == pytest.approx(0, abs=1e-9) and ds.max() <= speed * (1 + 1e-9)
+    assert dds.max() <= acceleration * (1 + 1e-9) and dds.min() >= -deceleration * (1 + 1e-9)
     assert (np.diff(s) >= -1e-9).all()
     step = times[1]
     assert np.allclose(np.diff(s), 0.5 * step * (ds[1:] + ds[:-1]), atol=(acceleration + deceleration) * step**2)
 
-
-joints = st.lists(st.floats(-3, 3), min_size=3, max_size=3).map(np.array)
-
-
-@given(start=joints, goal=joints, braking=st.floats(0.1, 1))
-def test_synchronised_joints_have_one_joint_at_its_limit(start, goal, braking):
-    velocity, acceleration = np.array([1.0, 2.0, 0.5]), np.array([3.0, 1.0, 2.0])
-    timed = synchronised(start, goal, velocity, acceleration, braking * acceleration)
-    assert np.allclose(timed.positions[[0, -1]], [start, goal])
-    begin, end = end_accelerations(timed)
-    for found in (begin, end):
-        assert (np.abs(found) <= acceleration * (1 + 1e-6) + 1e-6).all()
-    assert (np.abs(timed.velocities) <= velocity * (1 + 1e-9)).all()
-    if np.abs(goal - start).max() > 1e-3:
-        used = (np.abs(timed.velocities) / velocity, np.abs(begin[0]) / acceleration,
-                np.abs(end[-1]) / (braking * acceleration))
-        assert max(share.max() for share in used) == pytest.approx(1, abs=1e-3)
 
 
 DX, DY = np.array([0.1, 0, 0]), np.array([0, 0.1, 0])

@@ -67,8 +67,7 @@ def test_start_in_collision_is_refused_with_the_pair():
     response = PIPELINE.plan(to_pose(tool_down(0.35, -0.09, 0.2), stuck, stage="lift"), TABLE)
     message = "lift: request_checks: start is in collision: panda_rightfinger with ball_1"
     assert_refused(response, "start_in_collision", message)
-    assert response.colliding == ("panda_rightfinger", "ball_1")
-    assert response.attempts == []
+    assert response.colliding == ("panda_rightfinger", "ball_1") and response.attempts == []
 
 
 FAR = Pose(position=Vector3(z=1e7))
@@ -147,8 +146,7 @@ def test_validation_applies_the_contact_rule_of_planning():
     response = PIPELINE.plan(request, close)
     strict = world(close, start, padding=0.003, attach="ball_0", allowed=touching("ball_1"), contact_distance=0.0)
     path, _ = fine_samples(timed_path(response.trajectory), 0.005)
-    assert strict.first_collision(path) is not None
-    assert is_free(PIPELINE, request, close, response)
+    assert strict.first_collision(path) is not None and is_free(PIPELINE, request, close, response)
 
 
 def test_colliding_blend_is_replaced_by_a_stop():

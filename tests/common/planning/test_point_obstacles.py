@@ -9,7 +9,6 @@ from common.messages import AttachedObject
 from common.perception.pinhole import Pinhole
 from common.planning import point_obstacles
 from common.planning.collision import interpolate
-from common.planning.kernel import library
 from common.planning.obstacles import ObstacleCache
 from common.planning.pipeline import PlanningPipeline
 from common.planning.point_obstacles import CameraView, KnownShapeFilter, PointObstacle, downsampled
@@ -17,7 +16,6 @@ from common.robot.transforms import transform
 from tests.common.planning.requests import to_joints
 from tests.common.planning.scenes import CELL, EMPTY, GEOMETRY, HOME, ROBOT, SPREAD, ball, held_scene, scene, world
 
-needs_kernel = pytest.mark.skipif(library.library() is None, reason="the planning kernel is not built here")
 TIP = ROBOT.fk(HOME)[:3, 3]
 ASIDE = HOME + 0.6 * np.eye(7)[0]
 
@@ -46,24 +44,6 @@ def test_every_point_is_inside_a_sphere(backend, side):
     assert len(spheres) == len(np.unique(np.floor(left / side), axis=0))
 
 
-@needs_kernel
-def test_spheres_and_mask_are_the_same_without_the_kernel():
-    rng, q = np.random.default_rng(1), HOME + 0.2
-    seen = ROBOT.fk(q)[:3, 3] + rng.normal(size=(300, 3)) * 0.15
-
-    def computed():
-        spheres = downsampled(seen, 0.02)
-        mask = KnownShapeFilter(GEOMETRY).mask(scene(SPREAD), q, seen, margin=0.02, object_margin=0.01)
-        return spheres[np.lexsort(spheres.T)], mask
-
-    one = computed()
-    with library.without_kernel():
-        other = computed()
-    np.testing.assert_allclose(one[0], other[0], atol=1e-9)
-    assert one[1].any() and not one[1].all()
-    assert (one[1] == other[1]).all()
-
-
 def post() -> np.ndarray:
     """Points (N, 3) of a post on the table that obstructs motions from one side to the other."""
     y, z = np.meshgrid(np.arange(-0.02, 0.02, 0.004), np.arange(0.01, 0.3, 0.004))
@@ -79,11 +59,9 @@ def test_world_names_points_and_the_newest_count(backend):
     def collides(obstacle, **more) -> bool:
         return world(scene(), cache=shared, points=[obstacle], **more).collides(HOME)
 
-    assert "points of camera" in world(scene(), points=[deep]).colliding_pair(HOME)
-    assert collides(deep)
+    assert "points of camera" in world(scene(), points=[deep]).colliding_pair(HOME) and collides(deep)
     assert not collides(deep, allowed=[(link, "points of camera") for link in ROBOT.link_names])
-    assert not collides(POST)
-    assert collides(deep)
+    assert not collides(POST) and collides(deep)
 
 
 def test_points_are_padded_except_where_the_start_is_within_the_padding(backend):

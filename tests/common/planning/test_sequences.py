@@ -68,8 +68,7 @@ def test_sequence_of_point_to_point_arc_and_line():
     timed = planned(BLENDING, sequence(
         SequenceItem(goal=down(0.5, 0.0, 0.3), blend_radius=0.04), SequenceItem(goal=arc, blend_radius=0.03),
         line_to(0.4, 0.2, 0.3), SequenceItem(goal=JointGoal(named="home"))), EMPTY)
-    assert np.allclose(timed.positions[-1], HOME, atol=1e-6)
-    assert stops(timed) == 1
+    assert np.allclose(timed.positions[-1], HOME, atol=1e-6) and stops(timed) == 1
     assert np.linalg.norm(tool_places(timed) - (0.55, 0.1, 0.35), axis=1).min() < 1e-3
 
 
@@ -128,8 +127,7 @@ def distance_from_via(timed) -> float:
 
 def test_intermediate_region_is_passed_within_the_radius_without_a_stop():
     timed = planned(PIPELINE, through(VIA, GRASP), TABLE)
-    assert np.abs(timed.velocities[1:-1]).max(axis=1).min() > 1e-3
-    assert distance_from_via(timed) < RADIUS
+    assert np.abs(timed.velocities[1:-1]).max(axis=1).min() > 1e-3 and distance_from_via(timed) < RADIUS
     assert distance_outside(Region(tool_down(*BALL), np.zeros(3), 0.0, math.pi), ROBOT.fk(timed.positions[-1])) < 2e-4
     tool = tool_places(timed)
     low = tool[tool[:, 2] < BALL[2] + 0.04]

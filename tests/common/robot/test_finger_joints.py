@@ -86,8 +86,7 @@ def test_joints_and_mimics_of_the_robot_file_match_the_description():
     joints = {joint.get("name"): joint for joint in ET.fromstring(ROBOT.urdf).iter("joint")}
     driven, *others = GRIPPER.joints
     mimics = {name: joint.find("mimic") for name, joint in joints.items() if joint.find("mimic") is not None}
-    assert set(mimics) == set(others)
-    assert {mimic.get("joint") for mimic in mimics.values()} == {driven}
+    assert set(mimics) == set(others) and {mimic.get("joint") for mimic in mimics.values()} == {driven}
     assert [float(mimics[name].get("multiplier", "nan")) for name in others] == GRIPPER.mimic[1:]
     closed = dict(zip(GRIPPER.joints, finger_positions(GRIPPER, 0.0), strict=True))
     assert {name: pytest.approx(value, abs=1e-6) for name, value in closed.items()} == CONFIG.locked_joints

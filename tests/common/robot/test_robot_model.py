@@ -18,8 +18,7 @@ def test_panda_has_the_joints_limits_and_frames_of_its_description(robot):
     assert robot.joint_names == [f"panda_joint{i}" for i in range(1, 8)] and robot.dof == 7
     assert np.allclose(robot.velocity, [2.175] * 4 + [2.61] * 3)
     assert np.allclose(robot.lower[[0, 3]], [-2.8973, -3.0718])
-    assert (robot.acceleration[1], robot.jerk[6]) == (7.5, 10000)
-    assert robot.groups == ["arm", "panda_arm"]
+    assert (robot.acceleration[1], robot.jerk[6]) == (7.5, 10000) and robot.groups == ["arm", "panda_arm"]
     assert robot.world_frames == ["", "world", "panda_link0"]
     share = next(folder for folder in robot.package_folders if (folder / "example-robot-data").is_dir())
     alone = pin.buildModelFromUrdf(str(share / CONFIG.urdf.removeprefix("package://")))

@@ -15,15 +15,13 @@ lengths = st.floats(-2, 2)
 def test_pose_message_round_trip_and_inverse_preserve_the_matrix(roll, pitch, yaw, x, y, z):
     T = t.transform(t.rpy_to_matrix(roll, pitch, yaw), (x, y, z))
     assert np.allclose(t.pose_to_matrix(t.matrix_to_pose(T)), T, atol=1e-9)
-    assert np.allclose(t.invert(T) @ T, np.eye(4))
-    assert t.matrix_to_pose(np.eye(4)) == Pose()
+    assert np.allclose(t.invert(T) @ T, np.eye(4)) and t.matrix_to_pose(np.eye(4)) == Pose()
 
 
 @given(angles, angles, angles)
 def test_rotations_are_proper(roll, pitch, yaw):
     R = t.rpy_to_matrix(roll, pitch, yaw)
-    assert np.allclose(R @ R.T, np.eye(3), atol=1e-12)
-    assert math.isclose(np.linalg.det(R), 1.0)
+    assert np.allclose(R @ R.T, np.eye(3), atol=1e-12) and math.isclose(np.linalg.det(R), 1.0)
     assert np.allclose(t.quaternion_to_matrix(*t.matrix_to_quaternion(R)), R, atol=1e-9)
 
 

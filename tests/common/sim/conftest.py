@@ -1,8 +1,8 @@
 import pytest
 
-from common.config import Fixture, World
+from common.config import World
+from tests.common.sim.rig import TABLE
 
-TABLE = Fixture(id="table", dimensions=[1.0, 1.0, 0.05], position=(0.5, 0.0, -0.025))
 SPOTS = [(0.40, -0.30), (0.52, -0.30), (0.64, -0.25), (0.40, -0.17), (0.52, -0.17), (0.64, -0.13), (0.40, -0.04)]
 
 

@@ -30,8 +30,7 @@ def test_ball_between_the_fingers_is_grasped_and_centered(yaw, across, sideways,
     rig = Rig.with_balls()
     tool = tool_down(0.5, 0.0, R + above, yaw)
     x, y, z = tool[:3, 3] + tool[:3, :3] @ [across, sideways, 0.0]
-    assert rig.grasp(x, y, z, yaw) == "ball_1"
-    assert rig.width == GRIP
+    assert rig.grasp(x, y, z, yaw) == "ball_1" and rig.width == GRIP
     offset = rig.tool[:3, :3].T @ (rig.ball()[1] - rig.tool[:3, 3])
     assert offset[1] == pytest.approx(0.0, abs=1e-9)
 
@@ -43,8 +42,7 @@ def test_ball_between_the_fingers_is_grasped_and_centered(yaw, across, sideways,
 ])
 def test_fingers_close_to_the_width_of_the_object(thing, y: float, width: float) -> None:
     rig = Rig(thing)
-    assert rig.grasp(0.4, y, 0.02) == "object_1"
-    assert rig.width == pytest.approx(width, abs=1e-3)
+    assert rig.grasp(0.4, y, 0.02) == "object_1" and rig.width == pytest.approx(width, abs=1e-3)
     assert rig.object().state == "held"
 
 

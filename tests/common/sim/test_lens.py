@@ -6,7 +6,7 @@ from common.config import CameraConfig, Scenery, load_cell
 from common.errors import ConfigError
 from common.messages import Header, JointState, WorldObjects
 from common.perception.pinhole import Pinhole
-from common.sim.camera import CameraParameters, Lens, ObjectMotion, SimulatedCamera, joints_ago, sample_times
+from common.sim.camera import CameraParameters, Lens, ObjectMotion, SimulatedCamera, joints_ago
 from tests.common.sim.spheres import spheres
 
 BARREL = [-0.25, 0.08, 0.001, -0.0005, 0.0]
@@ -83,13 +83,7 @@ def test_repositioned_object_has_no_velocity():
 
 def test_joints_are_extrapolated_back_by_their_velocities():
     state = JointState(header=Header(), name=["a", "b"], position=[1.0, 2.0], velocity=[0.5, 0.0])
-    assert joints_ago(state, 0.1).position == pytest.approx([0.95, 2.0])
-    assert joints_ago(state, 0.0) is state
-
-
-def test_sample_times_are_even_and_end_with_the_exposure():
-    assert list(sample_times(0.02, 1)) == [0.0]
-    assert list(sample_times(0.02, 3)) == pytest.approx([0.02, 0.01, 0.0])
+    assert joints_ago(state, 0.1).position == pytest.approx([0.95, 2.0]) and joints_ago(state, 0.0) is state
 
 
 def camera(config: CameraParameters):

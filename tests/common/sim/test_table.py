@@ -85,16 +85,14 @@ def test_squares_overlap_iff_they_share_a_point(x: float, y: float, yaw: float, 
 
 
 def test_touching_is_no_overlap_but_containment_is() -> None:
-    assert not overlap(SQUARE, SQUARE + np.array([1.0, 0.0]))
-    assert overlap(SQUARE, SQUARE)
+    assert not overlap(SQUARE, SQUARE + np.array([1.0, 0.0])) and overlap(SQUARE, SQUARE)
     assert overlap(SQUARE, 0.2 * SQUARE + 0.4) and overlap(0.2 * SQUARE + 0.4, SQUARE)
     assert within(SQUARE, SQUARE) and within(0.2 * SQUARE, SQUARE) and not within(SQUARE + 0.01, SQUARE)
 
 
 def test_square_fits_into_a_concave_corner() -> None:
     corner = np.array([(0, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 2)], dtype=float)
-    assert not overlap(corner, 0.9 * SQUARE + 1.05)
-    assert overlap(corner, SQUARE + 0.95)
+    assert not overlap(corner, 0.9 * SQUARE + 1.05) and overlap(corner, SQUARE + 0.95)
 
 
 def test_overlap_of_large_outlines_takes_bounded_work(monkeypatch) -> None:

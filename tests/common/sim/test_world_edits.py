@@ -35,8 +35,7 @@ def centers(rig: Rig) -> dict[str, tuple[float, ...]]:
 def test_added_ball_gets_the_next_free_id() -> None:
     rig = Rig.with_balls((0.5, 0.0), (0.6, 0.0))
     rig.edit("remove", "ball_1")
-    assert rig.edit("add", at=(0.4, 0.2)) == "ball_1"
-    assert rig.edit("add", at=(0.4, -0.2)) == "ball_3"
+    assert rig.edit("add", at=(0.4, 0.2)) == "ball_1" and rig.edit("add", at=(0.4, -0.2)) == "ball_3"
     assert np.allclose(rig.ball(3)[1], [0.4, -0.2, R])
     assert rig.events() == ["remove:ball_1", "add:ball_1", "add:ball_3"]
     assert rig.edit("move", "ball_1", (0.401, 0.2)) == "ball_1", "overlapping its own position"
@@ -116,8 +115,7 @@ def test_reset_and_restore_recover_positions() -> None:
     stranger = ObjectSnapshot(pose=(0, 0, 0, 0, 0, 0, 1))
     again.world.restore(rig.world.snapshot() | {"stranger": stranger})
     assert centers(again) == centers(rig) and centers(again)["red_cylinder"][:2] == pytest.approx((0.5, 0.05))
-    assert rig.world.layout == rig_of("w5").world.layout
-    assert rig.edit("reset") == ""
+    assert rig.world.layout == rig_of("w5").world.layout and rig.edit("reset") == ""
     assert centers(rig) == first
     balls = Rig.holding_ball((0.5, 0.0), (0.6, 0.0))
     balls.edit("remove", "ball_2")
