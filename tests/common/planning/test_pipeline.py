@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from common.config import Motion, Pipeline
-from common.messages import Header, JointGoal, PlanRequest, Pose, Vector3
+from common.messages import JointGoal, PlanRequest, Pose, Vector3
 from common.planning.pipeline import PlanningPipeline
 from common.planning.trajectory import timed_path
 from common.planning.validation import Fault, fine_samples
@@ -97,11 +97,6 @@ FAR = Pose(position=Vector3(z=1e7))
 def test_bad_request_is_refused_with_code_and_choices_and_the_next_is_served(request_, code, text):
     assert_refused(PIPELINE.plan(request_, TABLE), code, text)
     assert PIPELINE.plan(to_joints(HOME, START), TABLE).ok
-
-
-def test_scene_in_another_frame_is_refused():
-    elsewhere = scene().model_copy(update={"header": Header(frame_id="camera")})
-    assert PIPELINE.plan(to_joints(HOME, START), elsewhere).error == "bad_scene"
 
 
 def test_current_state_is_the_default_start():

@@ -9,9 +9,8 @@ import trimesh
 
 from common.config import RobotConfig, check, find_file, read_robot
 from common.errors import ConfigError
-from common.planning.ik import solve_ik
 from common.robot.model import RobotModel
-from common.robot.transforms import rpy_to_matrix, tool_down, transform
+from common.robot.transforms import rpy_to_matrix, transform
 
 BOX = '<collision><geometry><box size="0.1 0.1 0.1"/></geometry></collision>'
 
@@ -132,11 +131,3 @@ def test_files_next_to_a_robot_file_are_found_from_any_folder(tmp_path):
     read = read_robot(tmp_path / "mine.yaml")
     assert read["urdf"] == read["attachments"][0]["urdf"] == str(tmp_path / "mine.urdf")
     assert read["srdf"] == "package://a/b.srdf"
-
-
-def test_ur5_is_on_its_pillar_and_reaches_the_block():
-    robot = RobotModel.load(check(RobotConfig, read_robot(find_file("robots", "ur5"))))
-    assert np.allclose(robot.link_poses(robot.named("home"))["base_link"][:3, 3], (0, 0, 0.75))
-    assert np.allclose(robot.velocity, np.pi, atol=1e-5) and robot.groups == ["ur_manipulator"]
-    q = solve_ik(robot, tool_down(0.5, 0.1, 1.05), robot.named("home"))
-    assert q is not None and np.allclose(robot.fk(q)[:3, 3], (0.5, 0.1, 1.05), atol=1e-4)

@@ -7,9 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from common.messages import Header, Vector3
-from common.robot.transforms import matrix_to_rpy, pose_to_matrix, tool_down
-from common.sim.kinematic import KinematicWorld
+from common.robot.transforms import matrix_to_rpy, tool_down
 from tests.common.sim.rig import BOX, CUBE, OPEN, SHAPES, R, Rig
 
 
@@ -169,21 +167,3 @@ def test_sphere_and_cube_in_one_container_do_not_overlap() -> None:
     on_top = ball[2] >= cube[2] + 0.02 + 0.03 - 1e-6
     off = np.maximum(np.abs(ball[:2] - cube[:2]) - 0.02, 0.0)
     assert on_top or float(np.hypot(*off)) >= 0.03 - 1e-6
-
-
-def test_added_and_falling_objects_are_restored() -> None:
-    rig = Rig(CUBE)
-    rig.edit("add", at=(0.3, 0.2), shape="cylinder", size=Vector3(x=0.04, z=0.05))
-    rig.grasp(0.4, 0.0, 0.02)
-    rig.release(0.6, 0.3, 0.3, 0.4)
-    rig.tick()
-    again = KinematicWorld(rig.config)
-    again.restore(rig.world.snapshot())
-    for _ in range(60):
-        rig.now += 0.01
-        for world in (rig.world, again):
-            world.tick(rig.now, rig.tool, OPEN, False)
-        for one, other in zip(again.objects(Header()).objects, rig.world.objects(Header()).objects, strict=True):
-            assert (one.id, one.state, one.size) == (other.id, other.state, other.size)
-            np.testing.assert_allclose(pose_to_matrix(one.pose), pose_to_matrix(other.pose), atol=1e-9)
-    assert rig.object().container == "left"

@@ -38,8 +38,9 @@ def test_added_ball_gets_the_next_free_id() -> None:
     assert rig.edit("add", at=(0.4, 0.2)) == "ball_1" and rig.edit("add", at=(0.4, -0.2)) == "ball_3"
     assert np.allclose(rig.ball(3)[1], [0.4, -0.2, R])
     assert rig.events() == ["remove:ball_1", "add:ball_1", "add:ball_3"]
+    version = rig.world.version
     assert rig.edit("move", "ball_1", (0.401, 0.2)) == "ball_1", "overlapping its own position"
-    assert rig.events() == ["remove:ball_1", "add:ball_1"]
+    assert rig.world.version > version and rig.events() == ["remove:ball_1", "add:ball_1"]
 
 
 def test_balls_added_above_the_container_fill_its_slots() -> None:
@@ -90,13 +91,6 @@ def test_every_object_can_be_moved_and_keeps_its_shape(name: str) -> None:
             np.testing.assert_allclose(np.reshape(new, (-1, 2)) - (0.002, -0.003), np.reshape(old, (-1, 2)), atol=1e-12)
         pose = {"outline": before.outline, "hole": before.hole, "pose": before.pose}
         assert after.model_copy(update=pose) == before
-
-
-def test_only_successful_moves_are_published() -> None:
-    rig = rig_of("w5")
-    version = rig.world.version
-    rig.edit("move", "red_cylinder", (0.5, 0.05))
-    assert rig.world.version > version and rig.events() == ["remove:red_cylinder", "add:red_cylinder"]
 
 
 def test_object_on_the_ground_may_be_anywhere_outside_fixtures() -> None:
