@@ -1,7 +1,5 @@
 """Boxes of two colors in pictures of the simulated world, against their true poses."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

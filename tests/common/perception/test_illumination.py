@@ -1,7 +1,5 @@
 """Blank images are recognised, and the red cast of warm light is compensated."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """The part of a picture that the robot occludes: all rendered pixels of it, and few more."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

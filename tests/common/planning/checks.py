@@ -1,18 +1,19 @@
 """Pipelines of the tests, and checks of their responses."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from common.config import Pipeline
 from common.messages import PlanningScene, PlanRequest, PlanResponse
 from common.planning.pipeline import PlanningPipeline
+from common.planning.problem import Cancel
 from common.planning.trajectory import TimedPath, timed_path
 from common.planning.validation import fine_samples
 from tests.common.planning.scenes import CELL, ROBOT, UR5
 
 PIPELINE = PlanningPipeline(ROBOT, CELL.motion, CELL.pipeline)
 UR5_PIPELINE = PlanningPipeline(UR5, CELL.motion, CELL.pipeline)
+CANCELLED = Cancel()
+CANCELLED.set()
 
 
 def with_planner(name: str, **options: object) -> PlanningPipeline:

@@ -4,8 +4,6 @@ Both ends of a problem have a solution near the home pose: between other posture
 an upright tool.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Goals and requests of the planning tests."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from common.messages import JointGoal, PlanRequest, PoseGoal

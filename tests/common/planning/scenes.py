@@ -1,7 +1,5 @@
 """Robots, scenes and collision worlds of the planning tests."""
 
-from __future__ import annotations
-
 from common.config import load_cell
 from common.messages import AttachedObject, CollisionObject, Header, PlanningScene, Pose, Vector3
 from common.planning.collision import CollisionWorld

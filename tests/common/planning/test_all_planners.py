@@ -5,9 +5,8 @@ import re
 import numpy as np
 import pytest
 
-from common.planning.problem import Cancel
 from common.robot.transforms import tool_down
-from tests.common.planning.checks import assert_refused, last, planned, with_planner
+from tests.common.planning.checks import CANCELLED, assert_refused, last, planned, with_planner
 from tests.common.planning.requests import LEFT, RIGHT, above, to_joints, to_pose
 from tests.common.planning.scenes import ROBOT, TABLE, scene, solid, wall
 
@@ -91,9 +90,7 @@ def test_path_around_a_wall_is_found(planner):
 
 @pytest.mark.parametrize("planner", ALL)
 def test_cancelled_planner_reports_it_or_has_finished(planner):
-    cancel = Cancel()
-    cancel.set()
-    response = PIPELINES[planner].plan(request_for(planner, tool_down(0.5, 0.3, 0.2), RIGHT), wall(), cancel=cancel)
+    response = PIPELINES[planner].plan(request_for(planner, tool_down(0.5, 0.3, 0.2), RIGHT), wall(), cancel=CANCELLED)
     assert not response.ok
     assert response.error == "cancelled" or planner == "joint_move"
 

@@ -1,7 +1,5 @@
 """Motions are planned for the gripper's width: closed fingers fit into a gap, open ones around a wall."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import coal

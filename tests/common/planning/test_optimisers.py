@@ -1,7 +1,5 @@
 """Planners that optimise a complete path, and the distances and gradients that they use."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

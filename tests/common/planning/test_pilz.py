@@ -1,7 +1,5 @@
 """Point to point, straight lines and arcs with trapezoidal profiles."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

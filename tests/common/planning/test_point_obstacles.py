@@ -1,7 +1,5 @@
 """Obstacles from camera points: no point is lost, known shapes are removed; the kernel agrees with coal."""
 
-from __future__ import annotations
-
 import coal
 import numpy as np
 import pinocchio as pin

@@ -1,7 +1,5 @@
 """Obstructions of the running motion are reported, and nothing else is."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Sequences: of single motions with blends, and of regions passed without a stop."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -12,13 +10,13 @@ from common.config import load_cell
 from common.messages import ArcGoal, GoalSet, JointGoal, PlanRequest, PoseGoal, SequenceGoal, SequenceItem, Vector3
 from common.planning.goal_sampling import distance_outside, nearest_pose_in, sample_pose
 from common.planning.pipeline import PlanningPipeline
-from common.planning.problem import Cancel, Region, Result
+from common.planning.problem import Region, Result
 from common.robot.transforms import tool_down
-from tests.common.planning.checks import PIPELINE, assert_refused, assert_sound, planned, tool_places, with_planner
+from tests.common.planning.checks import CANCELLED, PIPELINE, assert_refused, assert_sound, planned, tool_places
 from tests.common.planning.requests import RIGHT, down, to
 from tests.common.planning.scenes import EMPTY, HOME, ROBOT, TABLE, wall
 
-BLENDING = with_planner("sequence")
+ARC = ArcGoal(pose=down(0.5, 0.2, 0.3).pose, via=Vector3(x=0.55, y=0.1, z=0.35))
 MIDDLE, ABOVE, LEFT_ABOVE = (0.5, 0.0, 0.2), (0.5, 0.0, 0.4), (0.5, 0.3, 0.4)
 
 
@@ -27,7 +25,7 @@ def line_to(x, y, z, blend_radius=0.0) -> SequenceItem:
 
 
 def sequence(*items: SequenceItem) -> PlanRequest:
-    return to(SequenceGoal(items=list(items)), RIGHT, stage="weave")
+    return to(SequenceGoal(items=list(items)), RIGHT, stage="weave", planner="sequence")
 
 
 def corners(radius: float) -> PlanRequest:
@@ -40,7 +38,7 @@ def stops(timed) -> int:
 
 
 def test_lines_without_a_blend_stop_at_their_corners():
-    timed = planned(BLENDING, corners(0.0), EMPTY)
+    timed = planned(PIPELINE, corners(0.0), EMPTY)
     assert stops(timed) == 2
     for corner in (MIDDLE, ABOVE, LEFT_ABOVE):
         assert np.linalg.norm(tool_places(timed) - corner, axis=1).min() < 1e-4
@@ -48,7 +46,7 @@ def test_lines_without_a_blend_stop_at_their_corners():
 
 @pytest.mark.parametrize("radius", [0.02, 0.08])
 def test_corner_is_blended_within_its_radius_without_a_stop(radius):
-    timed = planned(BLENDING, corners(radius), EMPTY)
+    timed = planned(PIPELINE, corners(radius), EMPTY)
     assert stops(timed) == 0
     way = tool_places(timed)
     for corner in (MIDDLE, ABOVE):
@@ -60,41 +58,23 @@ def test_corner_is_blended_within_its_radius_without_a_stop(radius):
     ]).min(axis=0)
     assert on_lines[outside].max() < 3e-4
     assert np.allclose(ROBOT.fk(timed.positions[-1])[:3, 3], LEFT_ABOVE, atol=1e-4)
-    assert timed.duration < planned(BLENDING, corners(0.0), EMPTY).duration
+    assert timed.duration < planned(PIPELINE, corners(0.0), EMPTY).duration
 
 
 def test_sequence_of_point_to_point_arc_and_line():
-    arc = ArcGoal(pose=down(0.5, 0.2, 0.3).pose, via=Vector3(x=0.55, y=0.1, z=0.35))
-    timed = planned(BLENDING, sequence(
-        SequenceItem(goal=down(0.5, 0.0, 0.3), blend_radius=0.04), SequenceItem(goal=arc, blend_radius=0.03),
+    timed = planned(PIPELINE, sequence(
+        SequenceItem(goal=down(0.5, 0.0, 0.3), blend_radius=0.04), SequenceItem(goal=ARC, blend_radius=0.03),
         line_to(0.4, 0.2, 0.3), SequenceItem(goal=JointGoal(named="home"))), EMPTY)
     assert np.allclose(timed.positions[-1], HOME, atol=1e-6) and stops(timed) == 1
     assert np.linalg.norm(tool_places(timed) - (0.55, 0.1, 0.35), axis=1).min() < 1e-3
 
 
-@pytest.mark.parametrize(("request_", "code", "text"), [
-    (corners(0.15), "bad_goal", "weave: sequence: blend of items 2 and 3 of 3: blend_radius 0.15 m reaches"),
-    (sequence(line_to(*MIDDLE, 0.02), line_to(1.2, 0.0, 0.2), line_to(*MIDDLE)), "no_ik", "item 2 of 3: waypoint "),
-    (sequence(SequenceItem(goal=JointGoal(named="home"), straight=True)), "bad_goal", "item 1 of 1"),
-])
-def test_impossible_item_or_blend_is_refused_with_its_number(request_, code, text):
-    response = BLENDING.plan(request_, EMPTY)
-    assert_refused(response, code, text)
-    assert code != "no_ik" or 1 / 3 < response.fraction < 2 / 3
-
-
 def test_colliding_blend_is_reported(monkeypatch):
     hit = Result(error="collision", message="waypoint 3 of 9: a collides with b", waypoint=3, colliding=("a", "b"))
     monkeypatch.setattr("common.planning.planners.sequence.blocked", lambda *_: hit)
-    response = BLENDING.plan(corners(0.05), EMPTY)
+    response = PIPELINE.plan(corners(0.05), EMPTY)
     text = "weave: sequence: blend of items 1 and 2 of 3: waypoint 3 of 9: a collides with b"
     assert (response.error, response.colliding, response.message) == ("collision", ("a", "b"), text)
-
-
-def test_cancelling_ends_a_sequence():
-    cancel = Cancel()
-    cancel.set()
-    assert BLENDING.plan(corners(0.02), EMPTY, cancel=cancel).error == "cancelled"
 
 
 def test_last_item_cannot_have_a_blend_radius():
@@ -154,7 +134,8 @@ def test_every_pipeline_passes_regions(name):
 def test_blocked_segment_is_planned_by_the_planners():
     request = through(about(0.5, -0.1, 0.3), about(0.5, 0.3, 0.15))
     planned(PIPELINE, request, wall(0.35))
-    assert_refused(with_planner("lerp").plan(request, wall(0.35)), "collision", "legs: item ")
+    lerp = request.model_copy(update={"planner": "lerp"})
+    assert_refused(PIPELINE.plan(lerp, wall(0.35)), "collision", "legs: item ")
 
 
 def test_reached_goal_of_a_final_set_is_reported():
@@ -164,13 +145,18 @@ def test_reached_goal_of_a_final_set_is_reported():
         assert (response.ok, response.goal_index) == (True, 1), response.message
 
 
-@pytest.mark.parametrize(("goals", "error", "text"), [
-    ((VIA, about(0.9, 0.0, 0.9, side=0.0, yaw=0.0)), "no_ik", "legs: item 2 of 2: "),
-    ((about(0.5, 0.0, -0.1), about(0.5, 0.3, 0.2)), "goal_in_collision", "legs: item 1 of 2: "),
-    ((VIA, ArcGoal(pose=down(0.5, 0.2, 0.3).pose, via=Vector3(x=0.55, y=0.1, z=0.35))), "no_planner", ""),
+@pytest.mark.parametrize(("request_", "code", "text"), [
+    (corners(0.15), "bad_goal", "weave: sequence: blend of items 2 and 3 of 3: blend_radius 0.15 m reaches"),
+    (sequence(line_to(*MIDDLE), line_to(1.2, 0.0, 0.2), line_to(*MIDDLE)), "no_ik", "item 2 of 3: waypoint "),
+    (sequence(SequenceItem(goal=JointGoal(named="home"), straight=True)), "bad_goal", "item 1 of 1"),
+    (through(VIA, about(0.9, 0.0, 0.9, side=0.0, yaw=0.0)), "no_ik", "legs: item 2 of 2: "),
+    (through(about(0.5, 0.0, -0.1), about(0.5, 0.3, 0.2)), "goal_in_collision", "legs: item 1 of 2: "),
+    (through(VIA, ARC), "no_planner", ""),
 ])
-def test_impossible_item_is_refused_with_its_number(goals, error, text):
-    assert_refused(PIPELINE.plan(through(*goals), TABLE), error, text)
+def test_impossible_item_or_blend_is_refused_with_its_number(request_, code, text):
+    response = PIPELINE.plan(request_, TABLE)
+    assert_refused(response, code, text)
+    assert "waypoint" not in text or 1 / 3 < response.fraction < 2 / 3
 
 
 def test_intermediate_joint_goal_is_passed_and_the_start_needs_no_motion():
@@ -180,10 +166,9 @@ def test_intermediate_joint_goal_is_passed_and_the_start_needs_no_motion():
     assert np.allclose(planned(PIPELINE, through(home, home), TABLE).positions, HOME, atol=1e-6)
 
 
-def test_search_ends_when_it_is_cancelled():
-    cancel = Cancel()
-    cancel.set()
-    assert PIPELINE.plan(through(VIA, GRASP), TABLE, cancel=cancel).error == "cancelled"
+def test_cancelling_ends_a_sequence():
+    for request in (corners(0.02), through(VIA, GRASP)):
+        assert PIPELINE.plan(request, TABLE, cancel=CANCELLED).error == "cancelled"
 
 
 def test_nearest_pose_is_inside_the_region_and_inner_poses_are_unchanged():

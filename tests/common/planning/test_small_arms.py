@@ -1,7 +1,5 @@
 """Arms of fewer than six joints: yaw and tilt that they cannot choose stay free, or the failure is explained."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

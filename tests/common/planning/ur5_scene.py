@@ -1,7 +1,5 @@
 """The UR5 on its pillar next to the block that carries objects."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Mesh files of every format: the error for a damaged file is one line that names the field and the file."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

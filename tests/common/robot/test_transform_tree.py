@@ -1,7 +1,5 @@
 """Poses between frames of a tree, and of a camera on a moving link at the time of an image."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

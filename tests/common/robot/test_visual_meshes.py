@@ -1,7 +1,5 @@
 """Meshes of the robot for viewers: positions, colors, and number of triangles."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

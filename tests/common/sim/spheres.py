@@ -1,7 +1,5 @@
 """Spheres of the simulated world as messages and images."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

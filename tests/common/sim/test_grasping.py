@@ -1,7 +1,5 @@
 """Grasping in the kinematic world: what the fingers hold, how wide it is, and how it moves with the gripper."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

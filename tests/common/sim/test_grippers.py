@@ -1,7 +1,5 @@
 """The gripper of the robot file decides what it can hold: its closing axis, a suction cup."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

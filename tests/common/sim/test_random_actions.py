@@ -1,7 +1,5 @@
 """Invariants of the kinematic world over random action sequences."""
 
-from __future__ import annotations
-
 from itertools import combinations
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Rendered images of the simulated world, plain and full: objects, fixtures, the arm, noise and caching."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Where released objects come to rest in the kinematic world."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

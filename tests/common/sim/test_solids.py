@@ -1,7 +1,5 @@
 """Triangles of solids, and outlines of objects."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The simulated state survives a restart, also when its process was killed while writing it."""
 
-from __future__ import annotations
-
 import math
 import os
 import socket

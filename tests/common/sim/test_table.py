@@ -1,7 +1,5 @@
 """Free positions on the table, and overlap of outlines seen from above."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 

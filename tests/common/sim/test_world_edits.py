@@ -1,7 +1,5 @@
 """Operator edits of the kinematic world: valid ones take effect exactly, all others are refused without effect."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 
