@@ -158,12 +158,16 @@ def test_primitive_shapes_are_created_from_their_dimensions(tmp_path: Path) -> N
     np.testing.assert_allclose([arm.min(axis=0)[2], *arm.max(axis=0)[[0, 2]]], [-0.3, 1.25, 0.3], atol=1e-6)
 
 
-def test_file_without_colors_gets_color_and_scale_of_the_urdf(tmp_path: Path) -> None:
-    trimesh.creation.box(extents=(1, 2, 3)).export(tmp_path / "box.stl")
-    visual = """<visual><geometry><mesh filename="box.stl" scale="0.1 0.1 0.1"/></geometry>
+@pytest.mark.parametrize(("mesh", "corners"), [
+    (trimesh.creation.box(extents=(1, 2, 3)), 24), (trimesh.creation.icosphere(0), 60),  # split at sharp edges
+    (trimesh.creation.icosphere(2), 162)])
+def test_file_without_colors_gets_color_and_scale_of_the_urdf(tmp_path: Path, mesh, corners: int) -> None:
+    mesh.export(tmp_path / "mesh.stl")
+    visual = """<visual><geometry><mesh filename="mesh.stl" scale="0.1 0.1 0.1"/></geometry>
       <material name="red"><color rgba="1 0 0 1"/></material></visual>"""
     red = next(piece for piece in visual_pieces(post(tmp_path, visual)) if piece.color == (255, 0, 0))
-    np.testing.assert_allclose(red.vertices.max(axis=0), [0.05, 0.1, 0.15])
+    np.testing.assert_allclose(red.vertices.max(axis=0), 0.1 * mesh.vertices.max(axis=0), atol=1e-6)
+    assert len(red.vertices) == corners
 
 
 @pytest.mark.parametrize(("shape", "message"), [
