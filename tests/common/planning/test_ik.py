@@ -45,7 +45,7 @@ def check(model: pin.Model, frame: int, q, T) -> None:
 
 @kernel
 @each_robot
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(seed=st.integers(0, 2**31))
 def test_ik_solves_any_reachable_pose(robot, seed):
     rng = np.random.default_rng(seed)

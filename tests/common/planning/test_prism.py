@@ -26,7 +26,7 @@ def touches(body: coal.CollisionGeometry, x: float, y: float, z: float) -> bool:
     return bool(result.isCollision())
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @example([(0.0, 0.0), (0.0, 0.125), (3e-35, 0.0), (-0.125, 0.0)], 0.25)
 @given(points, st.floats(0.01, 0.3))
 def test_prism_contains_its_points_and_nothing_outside_its_hull(outline, length):

@@ -61,7 +61,7 @@ def away_from(points, q) -> float:
     return min(found)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(waypoints, st.floats(0, 0.5))
 def test_blended_paths_are_timed_within_limits_and_cut_corners_by_less_than_half_their_length(points, blend):
     paths = blended(points, blend)
@@ -73,7 +73,7 @@ def test_blended_paths_are_timed_within_limits_and_cut_corners_by_less_than_half
     assert np.linalg.norm(states[:, None, :] - fine[None, :, :], axis=2).min(axis=1).max() < 0.004
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(arrays(np.float64, (4, 3), elements=st.floats(-1, 1).map(lambda x: round(x, 3))), st.integers(2, 40))
 def test_dense_paths_are_timed_within_limits_from_rest_to_rest(c, count):
     s = np.linspace(0, 1, count + 1)[:, None]
@@ -116,7 +116,7 @@ def test_invalid_stretch_is_refused(scale):
         stretch(parametrise(STRAIGHT, V, A), scale)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(waypoints, st.floats(0, 0.5), st.floats(10, 1000))
 def test_limited_jerk_respects_all_limits_and_stays_on_the_path(points, blend, quickness):
     """Between the states by quintics, as in the executor, and by cubics, as in validation."""

@@ -51,13 +51,13 @@ def robot(arms) -> RobotModel:
 def test_region_about_a_reached_pose_is_reached_again(arms, name: str, bounds: tuple[float, float]) -> None:
     robot, rng = arms[name], np.random.default_rng(3)
     found = 0
-    for _ in range(15):
+    for _ in range(8):
         region = Region(robot.fk(rng.uniform(robot.lower, robot.upper)), np.zeros(3), *bounds)
         q = solve_region_ik(robot, region, robot.named("home"), rng=rng, restarts=30)
         if q is not None:
             found += 1
             assert distance_outside(region, robot.fk(q)) < 2e-4 and robot.within_limits(q)
-    assert found >= 14
+    assert found >= 7
 
 
 def test_tool_is_tilted_only_where_necessary(robot: RobotModel) -> None:

@@ -106,7 +106,7 @@ def padded(path: Path) -> bytes:
     return path.read_bytes().ljust(2 * SLOT, b"\0")
 
 
-@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(before=st.integers(1, 4), cut=st.integers(0, 400), rubbish=st.booleans())
 def test_partly_written_state_falls_back_to_the_previous_one(path: Path, before: int, cut: int, rubbish: bool) -> None:
     path.unlink(missing_ok=True)
