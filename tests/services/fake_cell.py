@@ -44,6 +44,12 @@ async def latest(reader: Reader[Any], wanted: Callable[[Any], object] = lambda _
     return reader.latest if reader.latest is not None and wanted(reader.latest) else await until(reader, wanted)
 
 
+async def settle() -> None:
+    """Let services take the messages that were just published."""
+    for _ in range(20):
+        await asyncio.sleep(0)
+
+
 def camera_transform(camera: Pinhole, frame: str) -> m.TFMessage:
     """Return the pose of a camera in world."""
     header, pose = m.Header(frame_id="world"), matrix_to_pose(camera.T_world_optical)

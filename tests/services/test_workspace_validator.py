@@ -1,5 +1,3 @@
-import asyncio
-
 import numpy as np
 import pytest
 
@@ -14,7 +12,7 @@ from common.config import Grasp, Surroundings, load_cell
 from common.messages import Header, Marker, MarkerArray, Vector3
 from common.perception.pinhole import Pinhole
 from services import workspace_validator
-from tests.services.fake_cell import FakeCell, at, until
+from tests.services.fake_cell import FakeCell, at, settle, until
 
 AROUND = Surroundings()
 CAMERA = Pinhole.from_config(AROUND.camera)
@@ -105,8 +103,7 @@ async def test_detections_before_camera_info_are_dropped():
     cell = Cell()
     async with cell.running(workspace_validator, CONFIG):
         cell.put(DETECTED_OBJECTS, detections(GOOD, stamp=1))
-        for _ in range(20):
-            await asyncio.sleep(0)
+        await settle()
         cell.calibrate(CAMERA, AROUND.camera.frame)
         await cell.answer(detections(GOOD, stamp=2), 1)
         assert cell.targets.received == 1
