@@ -11,83 +11,88 @@ from applications.pick_place.topics import SCENE_BALLS
 from common import topics
 from common.clock import Clock
 from common.config import load_cell, service_config
-from common.messages import ExecuteRequest, GripperCommand, HoldRequest, JointTrajectory, JointTrajectoryPoint
-from common.process.in_process import running_service
+from common.messages import (
+    ExecuteRequest,
+    GripperCommand,
+    Header,
+    HoldRequest,
+    JointTrajectory,
+    JointTrajectoryPoint,
+    WorldEdit,
+)
 from common.robot.model import RobotModel
-from common.transport.local import LocalNetwork
 from services import trajectory_executor
 from services.trajectory_executor import Config
+from tests.services.fake_cell import PATIENCE, FakeCell, latest
 
-CELL, NAME = "test", "trajectory_executor"
+NAME = "trajectory_executor"
 SPEED = 10.0
 NOT_TOO_LATE = "services.trajectory_executor.request_timeout=60"  # for a busy machine
 SLOW = 0.02  # share of the limits of a motion that a test interrupts
+PANDA = load_cell("panda")
+HOME = RobotModel.load(PANDA.robot).named("home")
 
 
-def config(*overrides: str) -> Config:
-    return service_config(load_cell("panda", [NOT_TOO_LATE, *overrides]), NAME, Config)
+def config(*overrides: str, **cell) -> Config:
+    return service_config(load_cell("panda", [NOT_TOO_LATE, *overrides], **cell), NAME, Config)
 
 
-class ExecutorClient:
+class ExecutorClient(FakeCell):
     """A client of the executor."""
 
-    def __init__(self, net: LocalNetwork, clock: Clock, config: Config | None = None) -> None:
-        self.net, self.config = net, config
-        self.bus = net.bus("tester", cell=CELL, clock=clock)
-        self.joints = self.bus.reader(topics.JOINT_STATES)
-        self.motion = self.bus.reader(topics.MOTION_STATUS)
-        self.gripper = self.bus.reader(topics.GRIPPER_STATE)
-        self.balls = self.bus.reader(SCENE_BALLS)
-        self.updates = self.bus.reader(topics.SCENE_OBJECT_UPDATES)
-        self.execute = self.bus.client(topics.MOTION_EXECUTE)
-        self.stop = self.bus.client(topics.MOTION_STOP)
-        self.hold = self.bus.client(topics.MOTION_HOLD)
-        self.own = self.bus.client(topics.MOTION_OWN)
-        self.command = self.bus.client(topics.GRIPPER_COMMAND)
-        self.edit = self.bus.client(topics.WORLD_EDIT)
+    def __init__(self, clock: Clock, net=None, config: Config | None = None) -> None:
+        super().__init__(clock, net)
+        self.config = config
+        self.joints, self.objects = self.reader(topics.JOINT_STATES), self.reader(topics.SCENE_OBJECTS)
+        self.motion, self.gripper = self.reader(topics.MOTION_STATUS), self.reader(topics.GRIPPER_STATE)
+        self.balls, self.updates = self.reader(SCENE_BALLS), self.reader(topics.SCENE_OBJECT_UPDATES)
+        self.execute, self.own = self.client(topics.MOTION_EXECUTE), self.client(topics.MOTION_OWN)
+        self.stop, self.hold = self.client(topics.MOTION_STOP), self.client(topics.MOTION_HOLD)
+        self.command, self.world = self.client(topics.GRIPPER_COMMAND), self.client(topics.WORLD_EDIT)
 
-    async def wait_for(self, reader, test=lambda message: True):
-        """Return the first message that passes the test."""
-        async with asyncio.timeout(20):
-            message = reader.latest
-            while message is None or not test(message):
-                message = await reader.next()
-            return message
+    def request(self, goal, trajectory, stamp=None):
+        header = self.bus.header() if stamp is None else Header(stamp=stamp)
+        return ExecuteRequest(header=header, id=goal, trajectory=trajectory)
 
-    def request(self, goal, trajectory):
-        return ExecuteRequest(header=self.bus.header(), id=goal, trajectory=trajectory)
-
-    async def start(self, goal, trajectory):
-        return await self.execute.call(self.request(goal, trajectory))
+    async def start(self, goal, trajectory, stamp=None):
+        return await self.execute.call(self.request(goal, trajectory, stamp))
 
     async def ended(self, goal):
-        return await self.wait_for(self.motion, lambda m: m.id == goal and m.state not in ("active", "rejected"))
+        return await latest(self.motion, lambda m: m.id == goal and m.state not in ("active", "rejected"))
 
     async def follow(self, goal, trajectory):
-        """Follow a trajectory to its end and return the status."""
+        """Follow a trajectory to its successful end and return the status."""
         answer = await self.start(goal, trajectory)
         assert answer.state == "active", answer.message
-        return await self.ended(goal)
+        status = await self.ended(goal)
+        assert status.state == "succeeded", status.message
+        return status
 
-    async def move_slowly(self, robot, goal="a", until=0.2, distance=0.5):
+    async def joints_after(self, stamp):
+        return await latest(self.joints, lambda state: state.header.stamp > stamp)
+
+    async def move_slowly(self, goal="a", until=0.1, distance=0.25):
         """Start a long motion from home; return when it is under way."""
-        home = robot.named("home")
-        await self.start(goal, move(robot, home, home + distance, SLOW))
-        await self.wait_for(self.motion, lambda m: m.progress > until)
+        await self.start(goal, to_home_plus(distance, scaling=SLOW))
+        await latest(self.motion, lambda m: m.progress > until)
 
     async def grip(self, goal, width):
         await self.command.call(GripperCommand(id=goal, width=width))
-        return await self.wait_for(self.gripper, lambda g: g.id == goal and g.state != "active" and not g.moving)
+        return await latest(self.gripper, lambda g: g.id == goal and g.state != "active" and not g.moving)
 
     async def release(self, owner, **more):
         return await self.hold.call(HoldRequest(hold=False, owner=owner, **more))
 
+    async def edit(self, timeout=20.0, **edit):
+        return await self.world.call(WorldEdit(**edit), timeout=timeout)
+
 
 @asynccontextmanager
-async def executor(*overrides: str, speed: float = SPEED, clock: Clock | None = None):
-    net, clock, args = LocalNetwork(), clock or Clock(speed), config(*overrides)
-    async with running_service(net, trajectory_executor.run, args, name=NAME, cell=CELL, clock=clock):
-        yield ExecutorClient(net, clock, args)
+async def executor(*overrides: str, speed: float = SPEED, clock: Clock | None = None, net=None, **cell):
+    args = config(*overrides, **cell)
+    client = ExecutorClient(clock or Clock(speed), net, args)
+    async with client.running(trajectory_executor, args):
+        yield client
 
 
 def move(robot: RobotModel, start, end, scaling=0.5) -> JointTrajectory:
@@ -106,6 +111,11 @@ def move(robot: RobotModel, start, end, scaling=0.5) -> JointTrajectory:
     return JointTrajectory(joint_names=robot.joint_names, points=points)
 
 
+def to_home_plus(distance: float, start: float = 0.0, scaling: float = 0.5) -> JointTrajectory:
+    """Return a motion of all Panda joints between offsets [rad] from home."""
+    return move(RobotModel.load(PANDA.robot), HOME + start, HOME + distance, scaling)
+
+
 @asynccontextmanager
 async def blocked(monkeypatch, where, name: str):
     """Let a method block until the end of the block; yield an event that is set once it was called."""
@@ -114,7 +124,7 @@ async def blocked(monkeypatch, where, name: str):
 
     def wait(*args, **kwargs):
         loop.call_soon_threadsafe(entered.set)
-        assert resume.wait(20)
+        assert resume.wait(PATIENCE)
         return method(*args, **kwargs)
 
     monkeypatch.setattr(where, name, wait)
@@ -126,6 +136,6 @@ async def blocked(monkeypatch, where, name: str):
 
 async def cycles_continue(client: ExecutorClient, cycles: int = 20) -> None:
     """Return when so many more joint states have arrived."""
-    async with asyncio.timeout(20):
+    async with asyncio.timeout(PATIENCE):
         stamps = {(await client.joints.next()).header.stamp for _ in range(cycles)}
     assert len(stamps) == cycles

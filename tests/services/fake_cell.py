@@ -76,8 +76,8 @@ def trajectory(joints: Sequence[str], *times: float) -> m.JointTrajectory:
 class FakeCell:
     """The neighbours of a service: publishes what they publish, and answers what they serve."""
 
-    def __init__(self, clock: Clock | None = None) -> None:
-        self.net, self.clock = LocalNetwork(), clock or Clock()
+    def __init__(self, clock: Clock | None = None, net: LocalNetwork | None = None) -> None:
+        self.net, self.clock = net or LocalNetwork(), clock or Clock()
         self.bus = self.net.bus("tester", clock=self.clock)
         self.reader = self.bus.reader
         self.client = self.bus.client
@@ -113,13 +113,16 @@ class FakeCell:
         header = self.bus.header() if stamp is None else m.Header(stamp=stamp)
         self.put(topics.JOINT_STATES, m.JointState(header=header, name=list(names), position=list(q)))
 
-    def put_robot(self, robot: RobotConfig, *objects: m.CollisionObject, width: float = 0.0, age: float = 0.0) -> None:
-        """Publish an arm at home with an open gripper in a planning scene of some age [s, cell time]."""
+    def put_robot(
+        self, robot: RobotConfig, *objects: m.CollisionObject, width: float = 0.0, age: float = 0.0
+    ) -> m.Header:
+        """Publish an arm at home with its gripper and planning scene, and return their header, of some age [s]."""
         header = m.Header(stamp=self.clock.now_ns() - int(age * 1e9), frame_id="world")
         self.put(topics.GRIPPER_STATE, m.GripperState(header=header, width=width))
         self.put(topics.MOTION_STATUS, m.MotionStatus(header=header))
         self.put_joints(robot.joints, robot.named_poses["home"], header.stamp)
         self.put(topics.PLANNING_SCENE, m.PlanningScene(header=header, objects=list(objects)))
+        return header
 
     def serve_planner(
         self, found: m.JointTrajectory | None = None, error: str = "no_ik"

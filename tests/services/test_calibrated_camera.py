@@ -1,8 +1,5 @@
 """From a calibration to positions in the world: the cell uses the lens and pose found with the board."""
 
-import asyncio
-from contextlib import AsyncExitStack
-
 import cv2
 import numpy as np
 import pytest
@@ -12,10 +9,9 @@ from cli.main import app
 from common import topics
 from common.config import load_cell, service_config
 from common.perception.image import image_to_array
-from common.process.in_process import running_service
 from common.robot.transforms import invert, rpy_to_matrix, transform
-from common.transport.local import LocalNetwork
 from services import camera_opencv, robot_state_publisher, vision_detector
+from tests.services.fake_cell import FakeCell, name_of, until
 from tests.tools.calibration.rendered_boards import BOARD, Lens, many_poses, render, through
 
 LENS = Lens()
@@ -61,15 +57,12 @@ def cell(tmp_path_factory):
 
 @pytest.mark.slow
 async def test_detection_through_a_distorted_lens_is_accurate_to_two_millimeters(cell):
-    loaded, net = load_cell(cell), LocalNetwork()
-    bus = net.bus()
-    found, infos, images = (bus.reader(t) for t in (DETECTED_OBJECTS, topics.CAMERA_INFO, topics.CAMERA_IMAGE))
-    async with AsyncExitStack() as stack, asyncio.timeout(60):
-        for module in (robot_state_publisher, vision_detector, camera_opencv):
-            name = module.__name__.rpartition(".")[2]
-            config = service_config(loaded, name, module.Config)
-            await stack.enter_async_context(running_service(net, module.run, config, name=name))
-        message, info, image = await found.next(), await infos.next(), await images.next()
+    fake, loaded = FakeCell(), load_cell(cell)
+    readers = [fake.reader(t) for t in (DETECTED_OBJECTS, topics.CAMERA_INFO, topics.CAMERA_IMAGE)]
+    publisher, detector, camera = [fake.running(module, service_config(loaded, name_of(module), module.Config))
+                                   for module in (robot_state_publisher, vision_detector, camera_opencv)]
+    async with publisher, detector, camera:
+        message, info, image = [await until(reader) for reader in readers]
     places = np.array([(m.pose.position.x, m.pose.position.y) for m in message.markers])
     assert len(places) == len(BALLS)
     off = [np.linalg.norm(places - ball[:2], axis=1).min() for ball in BALLS]
@@ -79,12 +72,11 @@ async def test_detection_through_a_distorted_lens_is_accurate_to_two_millimeters
 
 
 async def test_unrectified_images_are_published_with_their_distortion(cell):
-    loaded, net = load_cell(cell, ["services.camera_opencv.rectify=false"]), LocalNetwork()
-    bus = net.bus()
-    infos, images = bus.reader(topics.CAMERA_INFO), bus.reader(topics.CAMERA_IMAGE)
+    fake, loaded = FakeCell(), load_cell(cell, ["services.camera_opencv.rectify=false"])
+    infos, images = fake.reader(topics.CAMERA_INFO), fake.reader(topics.CAMERA_IMAGE)
     config = service_config(loaded, "camera_opencv", camera_opencv.Config)
-    async with running_service(net, camera_opencv.run, config, name="camera_opencv"), asyncio.timeout(30):
-        info, image = await infos.next(), await images.next()
+    async with fake.running(camera_opencv, config):
+        info, image = await until(infos), await until(images)
     assert info.distortion_model == "plumb_bob" and info.d == pytest.approx(LENS.d, abs=0.02)
     sent = cv2.imread(str(config.source) + "/0.png")
     assert np.array_equal(image_to_array(image), sent)

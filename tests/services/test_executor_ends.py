@@ -1,4 +1,4 @@
-"""Whatever ends the executor during a motion, the arm comes to rest on its path first."""
+"""An executor that ends during a motion brings the arm to standstill on its path first."""
 
 from __future__ import annotations
 

@@ -2,83 +2,143 @@
 
 from __future__ import annotations
 
+import asyncio
 import importlib
+from functools import cache
+from pathlib import Path
+from typing import Any
 
 import pytest
 
-from applications.pick_place.topics import SCENE_BALLS
+from applications.outlining.topics import CONTOUR_PATH, CONTOUR_POINTS, OUTLINE_SELECT
+from applications.pick_place.topics import (
+    DETECTED_OBJECTS,
+    DETECTION_IMAGE,
+    DETECTION_MASK,
+    REJECTED_TARGETS,
+    SCENE_BALLS,
+    VALIDATED_TARGETS,
+    WORKSPACE_MARKERS,
+)
 from common import topics
 from common.application import all_topics
 from common.config import Surroundings, World, load_cell, service_config
 from common.errors import ConfigError
+from common.planning.camera_obstacles import PointsOptions
 from common.supervision.wiring import Wiring, owned_in, require_one_owner, wiring
+from services import camera_opencv, motion_planner, real_depth_camera, vision_detector
 
 CELLS = {name: load_cell(name, ["services.viewer.port=0"]) for name in ("panda", "ur5")}
 SERVICES = [(cell, name) for cell, loaded in CELLS.items() for name in loaded.services]
-CAMERAS = ("camera_simulator", "depth_camera")
-SHOWING = "viewer"  # shows the truth on a tick, and decides nothing
-DECIDING = [(cell, name) for cell, name in SERVICES if name not in (*CAMERAS, SHOWING, "trajectory_executor")]
+CAMERAS = {"panda": "camera_simulator", "ur5": "depth_camera"}
+VIEWER = "viewer"  # shows the truth on demand, and decides nothing
+DECIDING = [(cell, name) for cell, name in SERVICES if name not in (*CAMERAS.values(), VIEWER, "trajectory_executor")]
 TRUTH = {SCENE_BALLS, topics.SCENE_OBJECTS}
+DEPTH_TOPICS = {topics.DEPTH_CAMERA_IMAGE, topics.DEPTH_CAMERA_DEPTH, topics.DEPTH_CAMERA_POINTS,
+                topics.DEPTH_CAMERA_INFO}
 
 
-async def wired(cell: str, name: str) -> Wiring:
-    module = importlib.import_module(CELLS[cell].services[name].module)
-    return await wiring(module.run, service_config(CELLS[cell], name, module.Config))
+def config_class(cell: str, name: str) -> Any:
+    return importlib.import_module(CELLS[cell].services[name].module).Config
+
+
+def wiring_of(module: Any, config: Any) -> Wiring:
+    return asyncio.run(wiring(module.run, config))
+
+
+@cache
+def wired(cell: str) -> dict[str, Wiring]:
+    """Return the wiring of each service of a cell."""
+    return {name: wiring_of(importlib.import_module(CELLS[cell].services[name].module),
+                            service_config(CELLS[cell], name, config_class(cell, name)))
+            for name in CELLS[cell].services}
+
+
+@pytest.mark.parametrize(("cell", "name", "reads", "owns"), [
+    ("panda", "trajectory_executor", {topics.MOTION_JOG},
+     {topics.JOINT_STATES, topics.MOTION_STATUS, topics.MOTION_OWNER, topics.ROBOT_STATUS, topics.GRIPPER_STATE,
+      SCENE_BALLS, topics.SCENE_OBJECTS, topics.SCENE_OBJECT_UPDATES, topics.MOTION_EXECUTE, topics.MOTION_FOLLOWED,
+      topics.MOTION_STOP, topics.MOTION_HOLD, topics.MOTION_OWN, topics.ROBOT_COMMAND, topics.GRIPPER_COMMAND,
+      topics.WORLD_EDIT}),
+    ("panda", "motion_planner", {topics.PLANNING_SCENE, topics.JOINT_STATES, topics.MOTION_STATUS},
+     {topics.MOTION_PLAN, topics.DISPLAY_TRAJECTORY}),
+    ("panda", "camera_simulator", {topics.SCENE_OBJECTS}, {topics.CAMERA_IMAGE, topics.CAMERA_INFO}),
+    ("panda", "vision_detector", {topics.CAMERA_IMAGE, topics.CAMERA_INFO, topics.TF_STATIC},
+     {DETECTED_OBJECTS, DETECTION_IMAGE, DETECTION_MASK}),
+    ("panda", "workspace_validator", {DETECTED_OBJECTS, topics.CAMERA_INFO, topics.TF_STATIC, topics.JOINT_STATES},
+     {VALIDATED_TARGETS, REJECTED_TARGETS, WORKSPACE_MARKERS}),
+    ("panda", "robot_state_publisher", {topics.JOINT_STATES},
+     {topics.TF, topics.TF_STATIC, topics.ROBOT_DESCRIPTION}),
+    ("ur5", "depth_camera", None, DEPTH_TOPICS),
+    ("ur5", "contour_detector", None, {all_topics()[key] for key in ("contours", "contour_image")} | {OUTLINE_SELECT}),
+    ("ur5", "pixel_to_world", None, {CONTOUR_POINTS}),
+    ("ur5", "duplicate_remover", None, {CONTOUR_PATH}),
+])
+def test_service_reads_and_owns_exactly_its_topics(
+    cell: str, name: str, reads: set[Any] | None, owns: set[Any]
+) -> None:
+    found = wired(cell)[name]
+    assert found.owns == owns and reads in (None, found.reads)
+    assert found.calls <= {topics.MOTION_FOLLOWED, topics.MOTION_HOLD}
 
 
 @pytest.mark.parametrize(("cell", "name"), DECIDING)
-async def test_no_deciding_service_reads_the_ground_truth(cell: str, name: str) -> None:
-    assert not (await wired(cell, name)).reads & TRUTH
-    config = importlib.import_module(CELLS[cell].services[name].module).Config
-    assert not [f for f, info in config.model_fields.items() if info.annotation is World]
+def test_no_deciding_service_reads_the_ground_truth(cell: str, name: str) -> None:
+    assert not wired(cell)[name].reads & TRUTH
+    assert not [f for f, info in config_class(cell, name).model_fields.items() if info.annotation is World]
 
 
-@pytest.mark.parametrize(("cell", "camera"), list(zip(CELLS, CAMERAS, strict=True)))
-async def test_only_camera_and_page_read_the_ground_truth(cell: str, camera: str) -> None:
-    readers = [name for name in CELLS[cell].services if (await wired(cell, name)).reads & TRUTH]
-    assert set(readers) == {camera, SHOWING}
+@pytest.mark.parametrize("cell", CELLS)
+def test_only_camera_and_viewer_read_the_ground_truth_and_only_from_topics(cell: str) -> None:
+    assert {name for name, found in wired(cell).items() if found.reads & TRUTH} == {CAMERAS[cell], VIEWER}
+    assert World not in [info.annotation for info in config_class(cell, CAMERAS[cell]).model_fields.values()]
 
 
-@pytest.mark.parametrize("camera", CAMERAS)
-async def test_camera_gets_the_ground_truth_from_the_topic(camera: str) -> None:
-    config = importlib.import_module(f"services.{camera}").Config
-    assert World not in [info.annotation for info in config.model_fields.values()]
-
-
-async def test_every_known_topic_has_an_owner() -> None:
-    owned = {topic for cell, name in SERVICES for topic in (await wired(cell, name)).owns}
+def test_every_known_topic_has_an_owner() -> None:
+    owned = {topic for cell, name in SERVICES for topic in wired(cell)[name].owns}
     of_no_service = {topics.SUPERVISOR_STATUS, topics.LOG, topics.COUNTERS, topics.PARAMETERS, topics.MOTION_JOG}
     assert owned == set(all_topics().values()) - of_no_service
 
 
 @pytest.mark.parametrize("cell", CELLS)
-async def test_no_two_services_of_a_cell_own_one_key(cell: str) -> None:
-    wirings = {name: await wired(cell, name) for name in CELLS[cell].services}
-    require_one_owner(wirings)
-    assert {key: services for key, (_, services) in owned_in(wirings).items() if len(services) != 1} == {}
-    twice = {**wirings, "another": next(found for found in wirings.values() if found.serves)}
+def test_no_two_services_of_a_cell_own_one_key(cell: str) -> None:
+    require_one_owner(wired(cell))
+    assert {key: services for key, (_, services) in owned_in(wired(cell)).items() if len(services) != 1} == {}
+    twice = {**wired(cell), "another": next(found for found in wired(cell).values() if found.serves)}
     with pytest.raises(ConfigError, match=r"services\.another: motion_planner has .* already.*as in topics: "):
         require_one_owner(twice)
 
 
 @pytest.mark.parametrize("cell", CELLS)
-async def test_every_input_has_exactly_one_source(cell: str) -> None:
-    all_wired = [await wired(cell, name) for name in CELLS[cell].services]
-    written = [topic for found in all_wired for topic in found.writes]
-    served = [topic for found in all_wired for topic in found.serves]
-    by_others = {topics.SUPERVISOR_STATUS, topics.LOG, topics.COUNTERS, topics.MOTION_JOG}  # and by everybody
-    parameters = {topics.parameters_of(name) for name in CELLS[cell].services}  # not served by the services themselves
+def test_every_input_has_exactly_one_source(cell: str) -> None:
+    written = [topic for found in wired(cell).values() for topic in found.writes]
+    served = [topic for found in wired(cell).values() for topic in found.serves]
+    by_others = {topics.SUPERVISOR_STATUS, topics.LOG, topics.COUNTERS, topics.MOTION_JOG}  # and by every service
+    parameters = {topics.parameters_of(name) for name in CELLS[cell].services}  # served by the platform
     assert len(written) == len(set(written)) and len(served) == len(set(served))
-    for name, found in zip(CELLS[cell].services, all_wired, strict=True):
-        if name != SHOWING:  # which shows whatever there is
-            assert found.reads <= set(written) | by_others
+    for name, found in wired(cell).items():
+        assert name == VIEWER or found.reads <= set(written) | by_others
         assert found.calls <= set(served) | parameters
 
 
-async def test_device_camera_is_wired_like_the_simulated_one() -> None:
-    simulated = await wired("panda", "camera_simulator")
-    module = importlib.import_module("services.camera_opencv")
-    section = CELLS["panda"].section(Surroundings)
-    device = await wiring(module.run, module.Config(world=section, source="0"))
-    assert device.writes == simulated.writes
-    assert not device.reads
+def test_real_cameras_are_wired_like_the_simulated_ones() -> None:
+    color = camera_opencv.Config(world=CELLS["panda"].section(Surroundings), source="0")
+    depth = real_depth_camera.Config(world=CELLS["ur5"].section(Surroundings), driver="realsense")
+    for module, config, cell in ((camera_opencv, color, "panda"), (real_depth_camera, depth, "ur5")):
+        found = wiring_of(module, config)
+        assert found.writes == wired(cell)[CAMERAS[cell]].writes and not found.reads
+
+
+def test_planner_with_points_reads_its_cameras() -> None:
+    depth = {"depth": topics.DEPTH_CAMERA_DEPTH.key, "info": topics.DEPTH_CAMERA_INFO.key}
+    cameras = [depth, {"points": "left/points"}]
+    config = service_config(CELLS["ur5"], "motion_planner", motion_planner.Config)
+    config = config.model_copy(update={"points": PointsOptions.model_validate({"cameras": cameras})})
+    added = wiring_of(motion_planner, config).reads - wired("ur5")["motion_planner"].reads
+    assert {topic.key for topic in added} == {topics.TF_STATIC.key, "left/points", *depth.values()}
+
+
+def test_only_cells_with_a_camera_on_the_robot_read_tf() -> None:
+    mounted = load_cell(str(Path(__file__).parents[1] / "data" / "hand_camera.yaml"))
+    found = wiring_of(vision_detector, service_config(mounted, "vision_detector", vision_detector.Config))
+    assert topics.TF in found.reads and topics.TF not in wired("panda")["vision_detector"].reads
