@@ -125,16 +125,16 @@ class FakeCell:
         return header
 
     def serve_planner(
-        self, found: m.JointTrajectory | None = None, error: str = "no_ik"
+        self, found: m.JointTrajectory | None = None, error: str = "no_ik", unreachable: str = ""
     ) -> asyncio.Queue[m.PlanRequest]:
-        """Answer plan requests with a trajectory or an error, and return the queue of requests."""
+        """Answer plan requests with a trajectory, or with an error in one stage; return the queue of requests."""
         asked: asyncio.Queue[m.PlanRequest] = asyncio.Queue()
 
         async def plan(request: m.PlanRequest) -> m.PlanResponse:
             asked.put_nowait(request)
             if error == "no_scene":
                 raise Refused(error, "no planning scene received yet")
-            if found is None:
+            if found is None or (unreachable and request.stage == unreachable):
                 return m.PlanResponse(id=request.id, ok=False, error=error, message="not today")
             return m.PlanResponse(id=request.id, ok=True, trajectory=found, fraction=1.0)
 

@@ -1,4 +1,4 @@
-"""Repeated work for each service."""
+"""Repeatable input for each service: each turn gives a service something to do and yields its result."""
 
 from __future__ import annotations
 
@@ -27,314 +27,218 @@ from common import topics
 from common.clock import Clock
 from common.config import Parameters, load_cell, service_config
 from common.config.tunables import tunable_sections
-from common.perception.image import array_to_image, image_to_array
+from common.perception.image import image_to_array
 from common.perception.pinhole import Pinhole
-from common.process.in_process import running_service
 from common.robot.model import RobotModel
 from common.robot.transforms import matrix_to_pose
 from common.sim.objects import world_object
-from common.transport.bus import Bus
-from common.transport.local import LocalNetwork
 from tests.common.sim.spheres import draw_spheres
+from tests.services.executor_rig import HOME, to_home_plus
+from tests.services.fake_cell import PATIENCE, FakeCell, at, ball, trajectory, until
 
 PANDA, UR5 = load_cell("panda"), load_cell("ur5")
 CELLS = {"panda": PANDA, "ur5": UR5}
 CAMERA, DEPTH_CAMERA = Pinhole.from_config(PANDA.world.camera), Pinhole.from_config(UR5.world.camera)
-HOME = PANDA.robot.named_poses["home"]
+FRAME, DEPTH_FRAME = PANDA.world.camera.frame, UR5.world.camera.frame
 BALLS = [(0.40, -0.30, 0.03), (0.52, -0.30, 0.03), (0.56, -0.25, 0.03)]
-PATIENCE = 20.0  # [s]
-Scenario = Callable[[Bus], AsyncIterator[Any]]
+CORNERS = [(0.45, -0.05), (0.55, -0.05), (0.55, 0.05), (0.45, 0.05)]
+SQUARE = np.zeros((DEPTH_CAMERA.height, DEPTH_CAMERA.width, 3), np.uint8)  # a yellow one below the depth camera
+SQUARE[300:400, 400:500] = (0, 200, 200)
+Turns = Callable[[FakeCell], AsyncIterator[Any]]
 
 
 def config_of(service: str) -> Parameters:
-    """The configuration in the first cell that has the service; its own copy of everything."""
+    """Return the configuration in the first cell that has the service; its own copy of everything."""
     module = importlib.import_module(f"services.{service}")
     cell = next((c for c in CELLS.values() if service in c.services), PANDA)
     return service_config(cell, service, module.Config)
 
 
-async def tune(bus: Bus, service: str, values: dict[str, Any]) -> list[m.Parameter]:
-    """Change parameters as an operator does; paths without `services.<name>.` are its own."""
-    sections = tunable_sections(importlib.import_module(f"services.{service}").Config)
-    full = {path if path.split(".")[0] in sections else f"services.{service}.{path}": v for path, v in values.items()}
-    client = bus.client(topics.parameters_of(service))
-    return (await client.call(m.ParameterRequest(set=full, by="a test"), PATIENCE)).parameters
+async def later(cell: FakeCell, reader: Any) -> Any:
+    """Return the first message that was stamped after now."""
+    now = cell.clock.now_ns()
+    return await until(reader, lambda message: message.header.stamp > now)
 
 
-async def later(bus: Bus, reader: Any) -> Any:
-    """The first message that was stamped after now."""
-    now = bus.clock.now_ns()
-    return await receive(reader, lambda message: message.header.stamp > now)
+async def answer(reader: Any, header: m.Header) -> Any:
+    """Return the message with the stamp of a header."""
+    return await until(reader, lambda message: message.header.stamp == header.stamp)
 
 
-async def receive(reader: Any, wanted: Callable[[Any], bool] = lambda _: True) -> Any:
-    async with asyncio.timeout(PATIENCE):
-        while not wanted(message := await reader.next()):
-            pass
-        return message
+def detections(cell: FakeCell, x: float, y: float) -> m.MarkerArray:
+    marker = m.Marker(ns="ball", id=0, type="sphere", scale=m.Vector3(x=0.06, y=0.06, z=0.06),
+                      pixel=CAMERA.project((x, y, 0.03)), pose=at(x, y, 0.03))
+    return m.MarkerArray(header=cell.bus.header("world"), markers=[marker])
 
 
-# --- what each service is given to do, over and over: each turn yields what came of it ----------------------------
-
-
-def calibrate(bus: Bus, camera: Pinhole, frame: str) -> None:
-    bus.writer(topics.TF_STATIC).put(m.TFMessage(transforms=[m.TransformStamped(
-        header=bus.header("world"), child_frame_id=frame, transform=matrix_to_pose(camera.T_world_optical))]))
-    info = topics.CAMERA_INFO if camera is CAMERA else topics.DEPTH_CAMERA_INFO
-    bus.writer(info).put(camera.info(bus.header(frame)))
-
-
-async def simulate_camera(bus: Bus) -> AsyncIterator[m.Image]:
-    images = bus.reader(topics.CAMERA_IMAGE)
-    bus.writer(topics.SCENE_OBJECTS).put(m.WorldObjects())
+async def simulate_camera(cell: FakeCell) -> AsyncIterator[m.Image]:
+    images = cell.reader(topics.CAMERA_IMAGE)
+    cell.put(topics.SCENE_OBJECTS, m.WorldObjects())
     while True:
-        yield await later(bus, images)
+        yield await later(cell, images)
 
 
-async def detect(bus: Bus) -> AsyncIterator[list[m.Marker]]:
-    frame = PANDA.world.camera.frame
-    images, found = bus.writer(topics.CAMERA_IMAGE), bus.reader(DETECTED_OBJECTS)
-    calibrate(bus, CAMERA, frame)
-    pictures = [draw_spheres(balls, CAMERA, PANDA.world) for balls in (BALLS, BALLS[:2])]
+async def detect(cell: FakeCell) -> AsyncIterator[list[m.Marker]]:
+    found = cell.reader(DETECTED_OBJECTS)
+    cell.calibrate(CAMERA, FRAME)
+    images = [draw_spheres(balls, CAMERA, PANDA.world) for balls in (BALLS, BALLS[:2])]
+    for turn in itertools.count():  # each image twice: an unchanged one is processed again only after a change
+        cell.put_image(topics.CAMERA_IMAGE, images[turn // 2 % 2], "bgr8", cell.clock.now_ns(), FRAME)
+        yield (await until(found)).markers
+
+
+async def validate(cell: FakeCell) -> AsyncIterator[m.PoseArray]:
+    targets = cell.reader(VALIDATED_TARGETS)
+    cell.calibrate(CAMERA, FRAME)
     for turn in itertools.count():
-        picture = pictures[turn // 2 % 2]  # the same twice: it would not be looked at again without a change
-        images.put(array_to_image(picture, "bgr8", bus.header(frame)))
-        yield (await receive(found)).markers
+        frame = detections(cell, 0.50 + 0.01 * turn, -0.20)  # elsewhere: inverse kinematics is solved
+        cell.put(DETECTED_OBJECTS, frame)
+        while len((found := await answer(targets, frame.header)).poses) != 1:
+            pass
+        yield found
 
 
-async def validate(bus: Bus) -> AsyncIterator[m.PoseArray]:
-    detected, targets = bus.writer(DETECTED_OBJECTS), bus.reader(VALIDATED_TARGETS)
-    calibrate(bus, CAMERA, PANDA.world.camera.frame)
-    turn = 0
+async def update_scene(cell: FakeCell) -> AsyncIterator[list[m.CollisionObject]]:
+    scenes = cell.reader(topics.PLANNING_SCENE)
+    cell.calibrate(CAMERA, FRAME)
     while True:
-        place = (0.50 + 0.01 * turn, -0.20, 0.03)  # elsewhere: inverse kinematics is asked
-        turn += 1
-        frame = markers(bus, place)
-        detected.put(frame)
-        yield await receive(targets, lambda t, stamp=frame.header.stamp: t.header.stamp == stamp and len(t.poses) == 1)
+        frame = detections(cell, 0.40, 0.0)
+        cell.put(DETECTED_OBJECTS, frame)
+        yield [o for o in (await answer(scenes, frame.header)).objects if o.role == "target"]
 
 
-def markers(bus: Bus, *places: tuple[float, float, float]) -> m.MarkerArray:
-    made = []
-    for number, place in enumerate(places):
-        u, v = CAMERA.project(place)
-        made.append(m.Marker(ns="ball", id=number, type="sphere", scale=m.Vector3(x=0.06, y=0.06, z=0.06), pixel=(u, v),
-                             pose=m.Pose(position=m.Vector3(x=place[0], y=place[1], z=place[2]))))
-    return m.MarkerArray(header=bus.header("world"), markers=made)
+async def publish_state(cell: FakeCell) -> AsyncIterator[m.TFMessage]:
+    tf, start = cell.reader(topics.TF), cell.clock.now_ns()
+    for turn in itertools.count(1):
+        stamp = start + turn * 10**9
+        cell.put_joints(PANDA.robot.joints, HOME, stamp)
+        yield await until(tf, lambda t, stamp=stamp: t.transforms[0].header.stamp == stamp)
 
 
-async def keep_scene(bus: Bus) -> AsyncIterator[list[m.CollisionObject]]:
-    detected, scenes = bus.writer(DETECTED_OBJECTS), bus.reader(topics.PLANNING_SCENE)
-    calibrate(bus, CAMERA, PANDA.world.camera.frame)
-    while True:
-        frame = markers(bus, (0.40, 0.0, 0.03))
-        detected.put(frame)
-        scene = await receive(scenes, lambda s, stamp=frame.header.stamp: s.header.stamp == stamp)
-        yield [o for o in scene.objects if o.role == "target"]
-
-
-async def publish_state(bus: Bus) -> AsyncIterator[m.TFMessage]:
-    joints, tf = bus.writer(topics.JOINT_STATES), bus.reader(topics.TF)
-    stamp = bus.clock.now_ns()
-    while True:
-        stamp += 10**9
-        joints.put(m.JointState(header=m.Header(stamp=stamp), name=PANDA.robot.joints, position=HOME))
-        yield await receive(tf, lambda t, stamp=stamp: t.transforms[0].header.stamp == stamp)
-
-
-async def pick_and_place(bus: Bus) -> AsyncIterator[m.PlanRequest]:
-    asked: asyncio.Queue[m.PlanRequest] = asyncio.Queue()
-
-    async def plan(request: m.PlanRequest) -> m.PlanResponse:
-        asked.put_nowait(request)
-        return m.PlanResponse(id=request.id, ok=False, error="no_ik", message="not today")
-
-    bus.serve(topics.MOTION_PLAN, plan)
-    gripper, motion = bus.writer(topics.GRIPPER_STATE), bus.writer(topics.MOTION_STATUS)
-    joints, scene = bus.writer(topics.JOINT_STATES), bus.writer(topics.PLANNING_SCENE)
-    targets = bus.writer(VALIDATED_TARGETS)
-    turn = 0
-    while True:
-        x, y = 0.40 + 0.08 * (turn % 3), -0.17  # another place, for this one is given up in the end
-        turn += 1
-        header = bus.header("world")
-        ball = m.CollisionObject(id=f"track_{turn}", role="target", shape="sphere", dimensions=[0.03],
-                                 pose=m.Pose(position=m.Vector3(x=x, y=y, z=0.03)))
-        gripper.put(m.GripperState(header=header, width=0.08))
-        motion.put(m.MotionStatus(header=header))
-        joints.put(m.JointState(header=header, name=PANDA.robot.joints, position=HOME))
-        scene.put(m.PlanningScene(header=header, objects=[ball]))
-        targets.put(m.PoseArray(header=header, poses=[ball.pose]))
-        async with asyncio.timeout(PATIENCE):
-            while not isinstance((request := await asked.get()).goal, m.PoseGoal) or (
-                abs(request.goal.pose.position.x - x) > 1e-6
-            ):
-                pass
+async def pick_and_place(cell: FakeCell) -> AsyncIterator[m.PlanRequest]:
+    planned = cell.serve_planner()
+    for turn in itertools.count(1):
+        x = 0.40 + 0.08 * (turn % 3)  # another position, for each is abandoned in the end
+        target = ball(f"track_{turn}", x, -0.17)
+        header = cell.put_robot(PANDA.robot, target, width=0.08)
+        cell.put(VALIDATED_TARGETS, m.PoseArray(header=header, poses=[target.pose]))
+        while not isinstance((request := await planned.get()).goal, m.PoseGoal) or (
+            abs(request.goal.pose.position.x - x) > 1e-6
+        ):
+            pass
         yield request
 
 
-async def plan_motion(bus: Bus) -> AsyncIterator[m.PlanResponse]:
-    robot = RobotModel.load(PANDA.robot)
-    below = robot.fk(robot.named("home"))
+async def plan_motion(cell: FakeCell) -> AsyncIterator[m.PlanResponse]:
+    below = RobotModel.load(PANDA.robot).fk(HOME)
     below[2, 3] -= 0.10
-    bus.writer(topics.PLANNING_SCENE).put(m.PlanningScene(header=bus.header("world")))
-    plan = bus.client(topics.MOTION_PLAN)
-    goal = m.PoseGoal(pose=matrix_to_pose(below))
+    cell.put(topics.PLANNING_SCENE, m.PlanningScene(header=cell.bus.header("world")))
+    plan, goal = cell.client(topics.MOTION_PLAN), m.PoseGoal(pose=matrix_to_pose(below))
     while True:
-        answer = await plan.call(m.PlanRequest(id="1", start=HOME, goal=goal, straight=True), PATIENCE)
-        assert answer.ok, answer.message
-        yield answer
+        found = await plan.call(m.PlanRequest(id="1", start=HOME.tolist(), goal=goal, straight=True), PATIENCE)
+        assert found.ok, found.message
+        yield found
 
 
-async def execute(bus: Bus) -> AsyncIterator[m.MotionStatus]:
-    """A quintic in time for one joint, there and back."""
-    call, status = bus.client(topics.MOTION_EXECUTE), bus.reader(topics.MOTION_STATUS)
-    turn, seconds, distance = 0, 0.5, 0.05
+async def execute(cell: FakeCell) -> AsyncIterator[m.MotionStatus]:
+    """Move there and back; each motion starts slightly off the end of the one before."""
+    call, status = cell.client(topics.MOTION_EXECUTE), cell.reader(topics.MOTION_STATUS)
+    for turn in itertools.count():
+        way = to_home_plus(0.05, start=1e-3) if turn % 2 == 0 else to_home_plus(1e-3, start=0.051)
+        request = m.ExecuteRequest(header=cell.bus.header(), id=f"goal-{turn}", trajectory=way)
+        started = await call.call(request, PATIENCE)
+        yield started if started.state != "active" else await until(
+            status, lambda s, turn=turn: s.id == f"goal-{turn}" and s.state != "active")
+
+
+async def see_depth(cell: FakeCell) -> AsyncIterator[np.ndarray]:
+    depths = cell.reader(topics.DEPTH_CAMERA_DEPTH)
+    cell.put_joints(UR5.robot.joints, UR5.robot.named_poses["home"])
+    cell.put(topics.SCENE_OBJECTS, m.WorldObjects(objects=[world_object(o) for o in UR5.world.objects]))
     while True:
-        points = []
-        off = 1e-3 * (turn % 2 == 0)  # each starts slightly off the end of the one before
-        for u in np.linspace(0.0, 1.0, 26):
-            s = u**3 * (10 - 15 * u + 6 * u * u)
-            ds, dds = 30 * u**2 * (1 - u) ** 2 / seconds, 60 * u * (1 - u) * (1 - 2 * u) / seconds**2
-            sign, begin = (1, 0.0) if turn % 2 == 0 else (-1, distance)
-            points.append(m.JointTrajectoryPoint(
-                time_from_start=u * seconds, positions=[HOME[0] + off + begin + sign * distance * s, *HOME[1:]],
-                velocities=[sign * distance * ds, *[0.0] * 6], accelerations=[sign * distance * dds, *[0.0] * 6]))
-        trajectory = m.JointTrajectory(joint_names=PANDA.robot.joints, points=points)
-        turn += 1
-        request = m.ExecuteRequest(header=bus.header(), id=f"goal-{turn}", trajectory=trajectory)
-        answer = await call.call(request, PATIENCE)
-        if answer.state == "active":
-            answer = await receive(status, lambda s, turn=turn: s.id == f"goal-{turn}" and s.state != "active")
-        yield answer
+        yield image_to_array(await later(cell, depths))
 
 
-async def see_depth(bus: Bus) -> AsyncIterator[np.ndarray]:
-    depths = bus.reader(topics.DEPTH_CAMERA_DEPTH)
-    bus.writer(topics.JOINT_STATES).put(m.JointState(
-        header=bus.header(), name=UR5.robot.joints, position=UR5.robot.named_poses["home"]))
-    bus.writer(topics.SCENE_OBJECTS).put(m.WorldObjects(objects=[world_object(o) for o in UR5.world.objects]))
+async def find_contour(cell: FakeCell) -> AsyncIterator[Contours]:
+    contours = cell.reader(CONTOURS)
     while True:
-        yield image_to_array(await later(bus, depths))
+        header = cell.bus.header()
+        cell.put_image(topics.DEPTH_CAMERA_IMAGE, SQUARE, "bgr8", header.stamp, DEPTH_FRAME)
+        yield await answer(contours, header)
 
 
-def square() -> np.ndarray:
-    """A yellow square, to be seen by the depth camera."""
-    picture = np.zeros((DEPTH_CAMERA.height, DEPTH_CAMERA.width, 3), np.uint8)
-    picture[300:400, 400:500] = (0, 200, 200)
-    return picture
-
-
-async def contour(bus: Bus) -> AsyncIterator[Contours]:
-    images, contours = bus.writer(topics.DEPTH_CAMERA_IMAGE), bus.reader(CONTOURS)
-    while True:
-        header = bus.header(UR5.world.camera.frame)
-        images.put(array_to_image(square(), "bgr8", header))
-        yield await receive(contours, lambda c, stamp=header.stamp: c.header.stamp == stamp)
-
-
-async def to_world(bus: Bus) -> AsyncIterator[OutlinePoints]:
-    frame = UR5.world.camera.frame
-    calibrate(bus, DEPTH_CAMERA, frame)
-    depths, contours = bus.writer(topics.DEPTH_CAMERA_DEPTH), bus.writer(CONTOURS)
-    points = bus.reader(CONTOUR_POINTS)
+async def to_world(cell: FakeCell) -> AsyncIterator[OutlinePoints]:
+    points = cell.reader(CONTOUR_POINTS)
+    cell.calibrate(DEPTH_CAMERA, DEPTH_FRAME, topics.DEPTH_CAMERA_INFO)
     depth = np.full((DEPTH_CAMERA.height, DEPTH_CAMERA.width), 1.75, np.float32)
     depth[300:400, 400:500] = 1.65
-    found = find_contours(square(), ContourOptions())
+    found = find_contours(SQUARE, ContourOptions())
     while True:
-        header = bus.header(frame)
-        depths.put(array_to_image(depth, "32FC1", header))
-        contours.put(Contours(header=header, width=DEPTH_CAMERA.width, height=DEPTH_CAMERA.height, contours=found,
-                                selected=0))
-        yield await receive(points, lambda p, stamp=header.stamp: p.header.stamp == stamp)
+        header = cell.bus.header(DEPTH_FRAME)
+        cell.put_image(topics.DEPTH_CAMERA_DEPTH, depth, "32FC1", header.stamp, DEPTH_FRAME)
+        cell.put(CONTOURS, Contours(
+            header=header, width=DEPTH_CAMERA.width, height=DEPTH_CAMERA.height, contours=found, selected=0))
+        yield await answer(points, header)
 
 
-async def clear(bus: Bus) -> AsyncIterator[OutlinePoints]:
-    outlines, paths = bus.writer(CONTOUR_POINTS), bus.reader(CONTOUR_PATH)
-    round_ = [m.Pose(position=m.Vector3(x=0.5 + 0.05 * np.cos(a), y=0.05 * np.sin(a), z=1.1))
+async def simplify(cell: FakeCell) -> AsyncIterator[OutlinePoints]:
+    paths = cell.reader(CONTOUR_PATH)
+    circle = [at(0.5 + 0.05 * np.cos(a), 0.05 * np.sin(a), 1.1)
               for a in np.linspace(0, 2 * np.pi, 90, endpoint=False)]
     while True:
-        header = bus.header("world")
-        outlines.put(OutlinePoints(header=header, poses=round_, object="Object_0"))
-        yield await receive(paths, lambda p, stamp=header.stamp: p.header.stamp == stamp)
+        header = cell.bus.header("world")
+        cell.put(CONTOUR_POINTS, OutlinePoints(header=header, poses=circle, object="Object_0"))
+        yield await answer(paths, header)
 
 
-async def trace(bus: Bus) -> AsyncIterator[m.PlanRequest]:
-    asked: asyncio.Queue[m.PlanRequest] = asyncio.Queue()
-
-    async def plan(request: m.PlanRequest) -> m.PlanResponse:
-        asked.put_nowait(request)
-        done = request.stage != "trace"
-        point = m.JointTrajectoryPoint(time_from_start=0.0, positions=[0.0] * 6, velocities=[0.0] * 6,
-                                       accelerations=[0.0] * 6)
-        trajectory = m.JointTrajectory(joint_names=UR5.robot.joints, points=[point])
-        return m.PlanResponse(id=request.id, ok=done, trajectory=trajectory if done else None, fraction=1.0,
-                              error="" if done else "no_ik", message="" if done else "not today")
-
-    bus.serve(topics.MOTION_PLAN, plan)
-    command, status = bus.client(topics.TASK_COMMAND), bus.reader(OUTLINE_STATUS)
-    writers = {topic.key: bus.writer(topic) for topic in (
-        topics.GRIPPER_STATE, topics.MOTION_STATUS, topics.JOINT_STATES, topics.PLANNING_SCENE, CONTOUR_PATH)}
-    corners = [(0.45, -0.05), (0.55, -0.05), (0.55, 0.05), (0.45, 0.05)]
-    cube = m.CollisionObject(
-        id="Object_3", role="target", shape="prism", dimensions=[0.1], outline=[(x - 0.5, y) for x, y in corners],
-        pose=m.Pose(position=m.Vector3(x=0.5, z=1.05)))
-    poses = [m.Pose(position=m.Vector3(x=x, y=y, z=1.1)) for x, y in corners]
-    home = UR5.robot.named_poses["home"]
+async def trace(cell: FakeCell) -> AsyncIterator[m.PlanRequest]:
+    planned = cell.serve_planner(trajectory(UR5.robot.joints, 0.0), unreachable="trace")
+    command, status = cell.client(topics.TASK_COMMAND), cell.reader(OUTLINE_STATUS)
+    cube = m.CollisionObject(id="Object_3", role="target", shape="prism", dimensions=[0.1],
+                             outline=[(x - 0.5, y) for x, y in CORNERS], pose=at(0.5, 0.0, 1.05))
     while True:
-        header = bus.header("world")
-        writers["gripper/state"].put(m.GripperState(header=header, width=0.0))
-        writers["motion/status"].put(m.MotionStatus(header=header))
-        writers["joint_states"].put(m.JointState(header=header, name=UR5.robot.joints, position=home))
-        writers["planning_scene"].put(m.PlanningScene(header=header, objects=[cube]))
-        writers["contour_path"].put(OutlinePoints(header=header, poses=poses, object="Object_3"))
-        async with asyncio.timeout(PATIENCE):
-            while (request := await asked.get()).stage != "trace":
-                pass
+        header = cell.put_robot(UR5.robot, cube)
+        poses = [at(x, y, 1.1) for x, y in CORNERS]
+        cell.put(CONTOUR_PATH, OutlinePoints(header=header, poses=poses, object="Object_3"))
+        while (request := await planned.get()).stage != "trace":
+            pass
         yield request
-        await receive(status, lambda s: s.state == "ERROR")
+        await until(status, lambda s: s.state == "ERROR")
         await command.call(m.TaskCommand(command="start"), PATIENCE)
 
 
-async def film(bus: Bus) -> AsyncIterator[m.Image]:
-    images = bus.reader(topics.CAMERA_IMAGE)
+async def film(cell: FakeCell) -> AsyncIterator[m.Image]:
+    images = cell.reader(topics.CAMERA_IMAGE)
     while True:
-        yield await later(bus, images)
+        yield await later(cell, images)
 
 
-SCENARIOS: dict[str, Scenario] = {
+TURNS: dict[str, Turns] = {
     "camera_simulator": simulate_camera, "camera_opencv": film, "vision_detector": detect,
-    "workspace_validator": validate, "scene_manager": keep_scene, "smart_pick_place": pick_and_place,
+    "workspace_validator": validate, "scene_manager": update_scene, "smart_pick_place": pick_and_place,
     "motion_planner": plan_motion, "trajectory_executor": execute, "robot_state_publisher": publish_state,
-    "depth_camera": see_depth, "contour_detector": contour, "pixel_to_world": to_world, "duplicate_remover": clear,
-    "contour_tracer": trace,
+    "depth_camera": see_depth, "contour_detector": find_contour, "pixel_to_world": to_world,
+    "duplicate_remover": simplify, "contour_tracer": trace,
 }
 
 
-def prepared(service: str, folder: Path) -> Parameters:
-    """The configuration of a service that is made to do something."""
-    config = config_of(service)
-    quick = {"camera_simulator": {"rate": 50.0}, "depth_camera": {"rate": 30.0, "max_rate": 30.0}}
-    if service == "camera_opencv":
-        width, height = PANDA.world.camera.width, PANDA.world.camera.height
-        assert cv2.imwrite(str(folder / "1.png"), np.zeros((height, width, 3), np.uint8))
-        return config.model_copy(update={"source": str(folder), "rate": 50.0})
-    return config.model_copy(update=quick.get(service, {}))
+class Running(FakeCell):
+    """A service at work: each `turn` gives it something to do and returns the result."""
 
-
-class Running:
-    """A service at work: each `turn` gives it the same to do and returns what came of it."""
-
-    def __init__(self, service: str, folder: Path, *, speed: float = 1.0) -> None:
-        self.service, self.config = service, prepared(service, folder)
-        self.module = importlib.import_module(f"services.{service}")
-        self.net, self.clock = LocalNetwork(), Clock(speed)
+    def __init__(self, service: str, folder: Path, *, speed: float = 1.0, **config: Any) -> None:
+        super().__init__(Clock(speed))
+        if service == "camera_opencv":
+            image = np.zeros((PANDA.world.camera.height, PANDA.world.camera.width, 3), np.uint8)
+            assert cv2.imwrite(str(folder / "1.png"), image)
+            config = {"source": str(folder), "rate": 50.0, **config}
+        quick = {"camera_simulator": {"rate": 50.0}, "depth_camera": {"rate": 30.0, "max_rate": 30.0}}
+        self.service, self.module = service, importlib.import_module(f"services.{service}")
+        self.config = config_of(service).model_copy(update={**quick.get(service, {}), **config})
 
     async def __aenter__(self) -> Running:
-        self.bus = self.net.bus("tester", cell="test", clock=self.clock)
-        self._life = running_service(self.net, self.module.run, self.config, name=self.service, clock=self.clock)
+        self._life = self.running(self.module, self.config)
         await self._life.__aenter__()
-        self._turns = SCENARIOS[self.service](self.bus)
+        self._turns = TURNS[self.service](self)
         await self.bus.ready()
         return self
 
@@ -347,4 +251,9 @@ class Running:
             return await anext(self._turns)
 
     async def tune(self, **values: Any) -> None:
-        await tune(self.bus, self.service, values)
+        """Change parameters as an operator does; paths without `services.<name>.` are of the service."""
+        sections = tunable_sections(self.module.Config)
+        paths = {path if path.split(".")[0] in sections else f"services.{self.service}.{path}": value
+                 for path, value in values.items()}
+        client = self.client(topics.parameters_of(self.service))
+        await client.call(m.ParameterRequest(set=paths, by="a test"), PATIENCE)
