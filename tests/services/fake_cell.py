@@ -125,9 +125,17 @@ class FakeCell:
         return header
 
     def serve_planner(
-        self, found: m.JointTrajectory | None = None, error: str = "no_ik", unreachable: str = ""
+        self, found: Callable[[m.PlanRequest], m.JointTrajectory] | m.JointTrajectory | None = None,
+        error: str = "no_ik", unreachable: str = "", **fields: Any,
     ) -> asyncio.Queue[m.PlanRequest]:
-        """Answer plan requests with a trajectory, or with an error in one stage; return the queue of requests."""
+        """Answer plan requests with a trajectory, or with an error in one stage; return the queue of requests.
+
+        Args:
+            found: the trajectory, or a function of the request; None: the error.
+            error: code of the error; no_scene: the request is refused.
+            unreachable: stage whose requests fail.
+            fields: of the response.
+        """
         asked: asyncio.Queue[m.PlanRequest] = asyncio.Queue()
 
         async def plan(request: m.PlanRequest) -> m.PlanResponse:
@@ -135,19 +143,21 @@ class FakeCell:
             if error == "no_scene":
                 raise Refused(error, "no planning scene received yet")
             if found is None or (unreachable and request.stage == unreachable):
-                return m.PlanResponse(id=request.id, ok=False, error=error, message="not today")
-            return m.PlanResponse(id=request.id, ok=True, trajectory=found, fraction=1.0)
+                failed = {"id": request.id, "ok": False, "error": error, "message": "not today", **fields}
+                return m.PlanResponse.model_validate(failed)
+            way = found(request) if callable(found) else found
+            return m.PlanResponse(id=request.id, ok=True, trajectory=way, fraction=1.0, **fields)
 
         self.bus.serve(topics.MOTION_PLAN, plan)
         return asked
 
-    def serve_executor(self, error: str = "") -> asyncio.Queue[m.ExecuteRequest]:
-        """Reject every trajectory, and return the queue of requests."""
+    def serve_executor(self, state: str = "rejected") -> asyncio.Queue[m.ExecuteRequest]:
+        """Answer every trajectory with a state, and return the queue of requests."""
         asked: asyncio.Queue[m.ExecuteRequest] = asyncio.Queue()
 
         async def execute(request: m.ExecuteRequest) -> m.MotionStatus:
             asked.put_nowait(request)
-            return m.MotionStatus(id=request.id, state="rejected", error=error, message="not today")
+            return m.MotionStatus.model_validate({"id": request.id, "state": state, "message": "not today"})
 
         self.bus.serve(topics.MOTION_EXECUTE, execute)
         return asked

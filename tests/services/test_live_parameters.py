@@ -28,6 +28,8 @@ from tests.services.watched_reading import Watch
 SERVICES = sorted({name for cell in CELLS.values() for name in cell.services} - {"viewer"} | {"camera_opencv"})
 TUNABLE = [name for name in SERVICES if any(leaf.runtime for leaf in leaves(config_of(name), name).values())]
 
+SPEEDS = {"trajectory_executor": 10.0}  # of the clock
+
 
 def change(parameters: Parameters, **values: Any) -> None:
     apply(checked(parameters, "it", {f"services.it.{name}": value for name, value in values.items()}))
@@ -183,7 +185,7 @@ RARE_PATHS = {f"{service}.{name}" for service, names in RARE.items() for name in
 async def test_every_tunable_parameter_is_read_when_it_is_used(
     service: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    running = Running(service, tmp_path)
+    running = Running(service, tmp_path, speed=SPEEDS.get(service, 1.0))
     watch = Watch(monkeypatch, running.config, service)
     async with running:
         await running.turn()
@@ -238,7 +240,7 @@ def duration(answer: Any) -> float:
 async def test_changed_parameter_affects_the_next_result(
     service: str, result: Callable[[Any], Any], changes: list[tuple[dict[str, Any], Any]], tmp_path: Path
 ) -> None:
-    async with Running(service, tmp_path, speed=10.0 if service == "trajectory_executor" else 1.0) as running:
+    async with Running(service, tmp_path, speed=SPEEDS.get(service, 1.0)) as running:
         for values, expected in changes:
             await running.tune(**values)
             assert result(await running.turn()) == expected, values

@@ -6,26 +6,19 @@ import asyncio
 import re
 from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
-from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import pytest
 
-from applications.outlining.topics import (
-    OUTLINE_SELECT,
-    OutlineSelect,
-    OutlineSelection,
-)
+from applications.outlining.topics import OUTLINE_SELECT, OutlineSelect, OutlineSelection
+from applications.pick_place.topics import PICK_PLACE_STATUS, PickPlaceStatus
 from common import messages as m
 from common import topics
-from common.clock import Clock
-from common.config import Cell, load_cell, service_config
+from common.config import load_cell, service_config
 from common.errors import Refused
-from common.process.in_process import running_service
-from common.transport.bus import Bus
-from common.transport.local import LocalNetwork
 from services import viewer
 from tests.page.fake_browser import PATIENCE, FakeBrowser, opened
+from tests.services.fake_cell import FakeCell
 
 TOKEN = "a-token-that-is-long-enough"
 MIN_AREA = "services.vision_detector.min_area"
@@ -69,20 +62,17 @@ def scenes(monkeypatch: pytest.MonkeyPatch) -> list[FakeScene]:
     return FakeScene.made
 
 
-@dataclass
-class FakeServices:
+class FakeServices(FakeCell):
     """Services that answer the page and record its requests."""
 
-    net: LocalNetwork
-    bus: Bus
-    port: int = 0
-    commands: list[str] = field(default_factory=list)
-    holder: str = ""
-    stops: list[str] = field(default_factory=list)
-    orders: list[tuple[str, str]] = field(default_factory=list)
-    sets: list[tuple[dict[str, object], str]] = field(default_factory=list)
-    selects: list[OutlineSelect] = field(default_factory=list)
-    area: float = 60.0
+    def __init__(self) -> None:
+        super().__init__()
+        self.port, self.holder, self.area = 0, "", 60.0
+        self.commands: list[str] = []
+        self.stops: list[str] = []
+        self.orders: list[tuple[str, str]] = []
+        self.sets: list[tuple[dict[str, object], str]] = []
+        self.selects: list[OutlineSelect] = []
 
     async def command(self, request: m.TaskCommand) -> m.TaskStatus:
         self.commands.append(request.command)
@@ -123,26 +113,35 @@ class FakeServices:
         self.bus.serve(OUTLINE_SELECT, self.select)
         self.bus.serve(topics.parameters_of("vision_detector"), self.parameters)
 
+    def put_motion(self, *interlocks: m.Interlock, **status: Any) -> None:
+        self.put(topics.MOTION_STATUS, m.MotionStatus(interlocks=list(interlocks), **status))
 
-def config_of(cell: Cell, **changes: object) -> viewer.Config:
-    return service_config(cell, "viewer", viewer.Config).model_copy(update={"port": 0, **changes})
+    def put_task(self, **status: Any) -> None:
+        self.put(PICK_PLACE_STATUS, PickPlaceStatus(**status))
 
 
 @asynccontextmanager
 async def serve_page(cell: str, serve: bool = True, **changes: object) -> AsyncIterator[FakeServices]:
-    """A viewer among fake services."""
-    net = LocalNetwork()
-    services = FakeServices(net, net.bus("services", cell="test", clock=Clock()))
+    """Run a viewer among fake services."""
+    services = FakeServices()
     if serve:
         services.serve()
     await services.bus.ready()
-    lines = services.bus.reader(topics.LOG)
-    async with running_service(net, viewer.run, config_of(load_cell(cell), **changes), name="viewer"):
+    lines = services.reader(topics.LOG)
+    config = service_config(load_cell(cell), "viewer", viewer.Config).model_copy(update={"port": 0, **changes})
+    async with services.running(viewer, config):
         async with asyncio.timeout(PATIENCE):
             while (found := re.search(r"page is at http://127\.0\.0\.1:(\d+)", (await lines.next()).message)) is None:
                 pass
         services.port = int(found[1])
         yield services
+
+
+@asynccontextmanager
+async def page_of(cell: str, **changes: object) -> AsyncIterator[tuple[FakeServices, FakeBrowser]]:
+    """Run a viewer among fake services, with an open page."""
+    async with serve_page(cell, **changes) as services, opened(services.port) as browser:  # type: ignore[arg-type]
+        yield services, browser
 
 
 @pytest.fixture
