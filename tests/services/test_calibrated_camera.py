@@ -69,14 +69,3 @@ async def test_detection_through_a_distorted_lens_is_accurate_to_two_millimeters
     assert max(off) < 2e-3, off
     assert not any(info.d) and info.k[0] == pytest.approx(LENS.fx, rel=2e-3)
     assert image_to_array(image).shape == (480, 640, 3)
-
-
-async def test_unrectified_images_are_published_with_their_distortion(cell):
-    fake, loaded = FakeCell(), load_cell(cell, ["services.camera_opencv.rectify=false"])
-    infos, images = fake.reader(topics.CAMERA_INFO), fake.reader(topics.CAMERA_IMAGE)
-    config = service_config(loaded, "camera_opencv", camera_opencv.Config)
-    async with fake.running(camera_opencv, config):
-        info, image = await until(infos), await until(images)
-    assert info.distortion_model == "plumb_bob" and info.d == pytest.approx(LENS.d, abs=0.02)
-    sent = cv2.imread(str(config.source) + "/0.png")
-    assert np.array_equal(image_to_array(image), sent)

@@ -81,6 +81,15 @@ async def test_images_of_a_folder_or_video_are_published_in_order_and_repeated(k
     assert info.k == [50, 0, 32, 0, 51, 24, 0, 0, 1] and not any(info.d)
 
 
+async def test_unrectified_images_are_published_with_their_distortion(folder, tmp_path):
+    (path := tmp_path / "distorted.yaml").write_text(yaml.safe_dump(SMALL | {"d": [0.1, -0.02, 0.0, 0.0]}))
+    cell = Cell()
+    async with cell.running(camera_opencv, config(source=folder, intrinsics=str(path), rectify=False)):
+        info, image = await until(cell.infos), await until(cell.images)
+    assert info.distortion_model == "plumb_bob" and info.d[:4] == [0.1, -0.02, 0.0, 0.0]
+    assert (image_to_array(image) == plain(image_to_array(image)[0, 0, 0])).all(), "as it was read"
+
+
 async def test_service_stays_after_a_folder_without_loop_ends(folder, intrinsics):
     cell = Cell()
     log = cell.reader(topics.LOG)
@@ -100,7 +109,7 @@ async def test_image_of_another_size_is_a_one_line_error(folder):
 class Flaky:
     """A device that is absent at first and gives two images each time it is opened."""
 
-    live, opened, value, left = True, 0, 0, 0
+    live, opened, value, left = True, 0, 0, 1
 
     def open(self, *_args, **_kwargs):
         self.opened += 1
@@ -143,24 +152,26 @@ def test_unknown_source_is_named_with_the_choices_and_a_missing_device_is_none(t
             source_of(tmp_path).read()
 
 
-@pytest.mark.parametrize(("content", "message"), [
-    ("width: 64", "height"),
-    ("{width: 64, height: 48, fx: -1, fy: 50, cx: 32, cy: 24}", "fx"),
-    ("{width: 64, height: 48, fx: .nan, fy: 50, cx: 32, cy: 24}", "fx"),
-    ("{width: 64, height: 48, fx: 50, fy: 50, cx: 32, cy: 24, skew: 1}", "skew"),
-    ("width: [", "does not parse"),
-])
-def test_invalid_intrinsics_are_named(tmp_path, content, message):
-    path = tmp_path / "camera.yaml"
-    path.write_text(content)
-    with pytest.raises(ConfigError, match=message):
-        CameraFile.load(str(path))
+@pytest.mark.parametrize(("device", "parameter"), [(lambda: None, "reopen_at_most"), (Flaky, "reopen_after")])
+async def test_lost_camera_uses_the_timeout_set_live(monkeypatch, intrinsics, device, parameter):
+    monkeypatch.setattr(camera_opencv, "open_source", lambda *_, **__: device())
+    cell, tuned = Cell(), config(source=0, intrinsics=intrinsics, reopen_after=1e-3, reopen_at_most=1e-2)
+    log = cell.reader(topics.LOG)
+    async with cell.running(camera_opencv, tuned):
+        for seconds in ("0.001", "0.002"):
+            setattr(tuned, parameter, float(seconds))
+            await until(log, lambda line, s=seconds: line.message.endswith(f"opening it again in {s} s"))
 
 
 def test_intrinsics_are_those_of_the_worlds_camera_or_of_a_file_with_its_pose(tmp_path):
     i = calibrated(config(source=0))
     assert (i.width, i.height, i.fx, i.fy, i.cx, i.cy, i.d) == (640, 480, 520, 520, 320, 240, [])
     path = tmp_path / "camera.yaml"
+    for content, message in (("{width: 64, height: 48, fx: .nan, fy: 50, cx: 32, cy: 24}", "fx"),
+                             ("width: [", "does not parse")):
+        path.write_text(content)
+        with pytest.raises(ConfigError, match=message):
+            calibrated(config(source=0, intrinsics=str(path)))
     path.write_text(yaml.safe_dump(SMALL | {"position": [0.1, 0.2, 0.9], "rpy": [3.1, 0.0, 0.0]}))
     with pytest.raises(ConfigError, match=r"another pose than the world's camera: .*--set world\.camera="):
         calibrated(config(source=0, intrinsics=str(path)))

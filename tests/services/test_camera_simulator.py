@@ -84,6 +84,25 @@ async def test_noise_depends_on_the_seed_of_the_run():
     assert one[300:, 300:].mean() == pytest.approx(128 - 20 - 1, abs=1)
 
 
+async def test_noise_brightness_and_rate_take_effect_in_a_static_world():
+    cell, config = Cell(), CONFIG.model_copy(update={"rate": 50.0})
+
+    async def pixels():
+        now = cell.clock.now_ns()
+        image = await until(cell.images, lambda image: image.header.stamp > now)
+        return np.frombuffer(image.data, np.uint8).astype(int)
+
+    async with cell.running(camera_simulator, config):
+        cell.place()
+        before = await pixels()
+        config.brightness = 20.0
+        assert (await pixels() == np.minimum(before + 20, 255)).all()
+        config.brightness, config.noise_std = 0.0, 10.0
+        assert 5 < np.std(await pixels() - before) < 15
+        config.noise_std = 0.0
+        assert (await pixels() == before).all()
+
+
 async def test_slow_rendering_does_not_block_the_event_loop(monkeypatch):
     cell, loop = Cell(), asyncio.get_running_loop()
     entered, resume, render = asyncio.Event(), threading.Event(), Renderer.render

@@ -2,33 +2,37 @@
 
 from __future__ import annotations
 
-import asyncio
+import importlib
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from applications.outlining.topics import OutlinePoints
-from applications.pick_place.topics import REJECTED_TARGETS, WORKSPACE_MARKERS
 from common import topics
-from common.config import Parameters, World
-from common.config.tunables import apply, checked, leaves, tunable_sections
-from common.messages import Interlock, StopRequest
-from common.robot.transforms import tool_down
+from common.config import Cell, Parameters, World, load_cell, service_config
+from common.config.tunables import Leaf, apply, checked, leaves, tunable_sections
+from common.messages import Interlock, PlanRequest, PoseGoal, StopRequest
+from common.robot.model import RobotModel
+from common.robot.transforms import matrix_to_pose, tool_down
 from common.sim.interface import GraspTolerances
 from common.sim.kinematic import KinematicWorld
+from common.transport.bus import Bus
 from tests.applications.outlining.outline_double import OutlineDouble
 from tests.applications.pick_place.cell_double import CellDouble
-from tests.services.fake_cell import until
-from tests.services.service_turns import CELLS, TURNS, Running, config_of
 from tests.services.watched_reading import Watch
+from tests.simulated.visited import SimulatedCell
 
-SERVICES = sorted({name for cell in CELLS.values() for name in cell.services} - {"viewer"} | {"camera_opencv"})
-TUNABLE = [name for name in SERVICES if any(leaf.runtime for leaf in leaves(config_of(name), name).values())]
+CELLS = {name: load_cell(name) for name in ("panda", "ur5")}
 
-SPEEDS = {"trajectory_executor": 10.0}  # of the clock
+
+def config_of(service: str) -> Parameters:
+    cell = next(cell for cell in CELLS.values() if service in cell.services)
+    return service_config(cell, service, importlib.import_module(cell.services[service].module).Config)
+
+
+def tunable_leaves(service: str) -> dict[str, Leaf]:
+    return {path: leaf for path, leaf in leaves(config_of(service), service).items() if leaf.runtime}
 
 
 def change(parameters: Parameters, **values: Any) -> None:
@@ -140,164 +144,48 @@ def test_simulated_grasps_use_current_tolerances() -> None:
         assert bool(world.held) == (release == 0.02)
 
 
-class Flickering:
-    """A device that is gone after each image."""
-
-    live = True
-
-    def __init__(self) -> None:
-        self.images = [np.zeros((480, 640, 3), np.uint8)]
-
-    def read(self) -> np.ndarray | None:
-        return self.images.pop() if self.images else None
-
-    def close(self) -> None:
-        self.images.clear()
-
-
-@pytest.mark.parametrize(("device", "parameter"), [(lambda: None, "reopen_at_most"), (Flickering, "reopen_after")])
-async def test_lost_camera_uses_the_current_timeout(
-    device: Callable[[], Any], parameter: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("services.camera_opencv.open_source", lambda *_, **__: device())
-    longest = {"reopen_at_most": 1e-3} if parameter == "reopen_at_most" else {}
-    async with Running("camera_opencv", tmp_path, reopen_after=1e-3, **longest) as running:
-        log = running.reader(topics.LOG)
-        for seconds in ("0.001", "0.002"):
-            await running.tune(**{parameter: float(seconds)})
-            await until(log, lambda line, s=seconds: line.message.endswith(f"opening it again in {s} s"))
-
-
-RARE = {  # parameters with a test above
-    "services.camera_opencv": ("reopen_after", "reopen_at_most"),
-    "services.smart_pick_place": ("max_retries", "grace", "empty", "goal_timeout", "max_failures",
-                                  "obstacle_patience"),
-    "services.contour_tracer": ("obstacle_patience", "overtime", "picture_timeout", "selection_timeout"),
-    "services.trajectory_executor": ("grasp_tolerances.sideways", "grasp_tolerances.release"),
-}
-RARE_PATHS = {f"{service}.{name}" for service, names in RARE.items() for name in names}
+RARE = {f"services.{service}.{name}" for service, names in {  # those with a test above, or of faults
+    "smart_pick_place": ("max_retries", "grace", "empty", "goal_timeout", "max_failures", "obstacle_patience"),
+    "contour_tracer": ("obstacle_patience", "overtime", "picture_timeout", "selection_timeout"),
+    "trajectory_executor": ("grasp_tolerances.sideways", "grasp_tolerances.release"),
+}.items() for name in names}
 
 
 # --- every parameter of every service ---
 
 
-@pytest.mark.parametrize("service", TUNABLE)
-async def test_every_tunable_parameter_is_read_when_it_is_used(
-    service: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.slow
+@pytest.mark.parametrize(("cell", "overrides"), [("panda", ["world.count=1"]), ("ur5", [])])
+def test_every_tunable_parameter_is_read_while_the_cell_works(
+    cell: str, overrides: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    running = Running(service, tmp_path, speed=SPEEDS.get(service, 1.0))
-    watch = Watch(monkeypatch, running.config, service)
-    async with running:
-        await running.turn()
-        await running.turn()
+    watch = Watch(monkeypatch)
+
+    def watched(loaded: Cell, service: str, kind: type[Parameters]) -> Parameters:
+        config = service_config(loaded, service, kind)
+        watch.add(config, service)
+        return config
+
+    async def begin(_: SimulatedCell, bus: Bus) -> None:
         watch.begin()
-        await running.turn()
-        await running.turn()
-    assert sorted(watch.tunable - watch.read - RARE_PATHS) == []
+        home = CELLS[cell].robot.named_poses["home"]
+        goal = PoseGoal(pose=matrix_to_pose(RobotModel.load(CELLS[cell].robot).fk(home)))
+        request = PlanRequest(id="usual", start=home, goal=goal, straight=True)  # unlike tasks, without a planning time
+        await bus.client(topics.MOTION_PLAN).call(request, 60.0)
+
+    monkeypatch.setattr("lab.processes.service_config", watched)
+    SimulatedCell(cell, overrides, visit=begin)
+    assert sorted(watch.tunable - watch.read - RARE) == []
 
 
-def test_rarely_read_parameters_share_a_model_with_frequent_ones() -> None:
+@pytest.mark.parametrize("path", sorted(RARE))
+def test_rarely_read_parameter_shares_a_model_with_frequent_ones(path: str) -> None:
     """So the test above shows that the service works with that model itself, and not with a copy."""
-    for path in RARE_PATHS:
-        service = path.split(".")[1]
-        owners = {p: leaf.owner for p, leaf in leaves(config_of(service), service).items() if leaf.runtime}
-        assert [p for p, owner in owners.items() if owner is owners[path] and p not in RARE_PATHS], path
-    assert set(TUNABLE) <= set(TURNS)
+    owners = {p: leaf.owner for p, leaf in tunable_leaves(path.split(".")[1]).items()}
+    assert [p for p, owner in owners.items() if owner is owners[path] and p not in RARE]
 
 
 @pytest.mark.parametrize("cell", CELLS)
 def test_section_with_tunable_parameters_belongs_to_one_service_of_the_cell(cell: str) -> None:
     sections = [path for name in CELLS[cell].services for path in tunable_sections(type(config_of(name)))]
     assert sorted(sections) == sorted(set(sections)) == ["motion", "pipeline"]
-
-
-# --- the next result after a change ---
-
-ALL_BRIGHT = {"hsv_red_lo1": [0, 120, 255], "hsv_red_lo2": [170, 120, 255], "hsv_red_hi1": [1, 121, 255]}
-
-
-def duration(answer: Any) -> float:
-    return float(answer.trajectory.points[-1].time_from_start)
-
-
-@pytest.mark.parametrize(("service", "result", "changes"), [
-    ("vision_detector", len, [({}, 3), ({"min_contour_area_px": 9000.0}, 0), ({"min_contour_area_px": 400.0}, 2),
-                              (ALL_BRIGHT, 0)]),
-    ("contour_detector", lambda found: len(found.contours), [
-        ({}, 1), ({"threshold": 220}, 0), ({"threshold": 127, "min_area": 1e5}, 0)]),
-    ("smart_pick_place", lambda request: (request.goal.position_tolerance.x, request.planning_time), [
-        ({}, (0.04, 2.0)), ({"grasp_pos_tol": 0.02, "planning_time": 3.0}, (0.02, 3.0))]),
-    ("contour_tracer", lambda request: (request.goal.waypoints[0].position.z, request.goal.tool_speed), [
-        ({}, (1.102, 0.05)), ({"standoff": 0.02, "tool_speed": 0.1}, (1.12, 0.1))]),
-    ("contour_tracer", lambda request: request.goal.step, [({"step": 0.002}, 0.002)]),
-    ("trajectory_executor", lambda status: status.error, [({}, ""), ({"tolerances.start": 1e-4}, "start_mismatch")]),
-    ("scene_manager", len, [({"confirm_frames": 100, "forget_after": 60.0}, 0), ({}, 0), ({}, 0),
-                            ({"confirm_frames": 3}, 1)]),
-    ("depth_camera", lambda depth: bool(np.isnan(depth).all()), [({}, False), ({"depth_dropout": 1.0}, True)]),
-    ("depth_camera", lambda depth: bool(np.nanmax(depth) > 1.74), [({}, True), ({"farthest": 1.70}, False)]),
-    ("duplicate_remover", lambda path: len(path.poses) > 22, [({}, True), ({"tolerance": 0.005}, False)]),
-])
-async def test_changed_parameter_affects_the_next_result(
-    service: str, result: Callable[[Any], Any], changes: list[tuple[dict[str, Any], Any]], tmp_path: Path
-) -> None:
-    async with Running(service, tmp_path, speed=SPEEDS.get(service, 1.0)) as running:
-        for values, expected in changes:
-            await running.tune(**values)
-            assert result(await running.turn()) == expected, values
-
-
-async def test_noise_and_brightness_take_effect_in_a_static_world(tmp_path: Path) -> None:
-    def pixels(image: Any) -> Any:
-        return np.frombuffer(image.data, np.uint8).astype(int)
-
-    async with Running("camera_simulator", tmp_path) as service:
-        before = pixels(await service.turn())
-        await service.tune(brightness=20.0)
-        assert (pixels(await service.turn()) == np.minimum(before + 20, 255)).all()
-        await service.tune(brightness=0.0, noise_std=10.0)
-        assert 5 < np.std(pixels(await service.turn()) - before) < 15
-        await service.tune(noise_std=0.0)
-        assert (pixels(await service.turn()) == before).all()
-        await service.tune(rate=1e-4)
-        waiting = asyncio.create_task(service.turn())
-        await asyncio.sleep(0)
-        await service.tune(rate=50.0)
-        await waiting
-
-
-async def test_velocity_scaling_takes_effect_in_the_next_plan(tmp_path: Path) -> None:
-    async with Running("motion_planner", tmp_path) as service:
-        fast = duration(await service.turn())
-        await service.tune(**{"motion.velocity_scaling": 0.05, "motion.acceleration_scaling": 0.05})
-        slow = duration(await service.turn())
-        await service.tune(**{"motion.cartesian_speed_scale": 0.5})
-        assert slow > 1.9 * fast
-        assert duration(await service.turn()) == pytest.approx(2 * slow, rel=1e-6)
-
-
-async def test_workspace_bounds_take_effect_on_markers_and_targets(tmp_path: Path) -> None:
-    async with Running("workspace_validator", tmp_path) as service:
-        shells, rejected = service.reader(WORKSPACE_MARKERS), service.reader(REJECTED_TARGETS)
-        await service.turn()
-        await service.tune(max_radius=0.5)
-        await until(shells, lambda found: found.markers[0].scale.x == 1.0)
-        turn = asyncio.create_task(service.turn())
-        assert "too far" in (await until(rejected)).rejected[0].reason
-        turn.cancel()
-        await asyncio.wait({turn})
-
-
-async def test_contours_rounding_and_rate_of_the_stages_take_effect(tmp_path: Path) -> None:
-    async with Running("contour_detector", tmp_path) as service:
-        await service.tune(subpixel=False)
-        (found,) = (await service.turn()).contours
-        assert all(u == round(u) for u, _ in found.pixels)
-    async with Running("pixel_to_world", tmp_path) as service:
-        await service.turn()
-        await service.tune(rounding=0.05)
-        for pose in (await service.turn()).poses:
-            assert pose.position.x / 0.05 == pytest.approx(round(pose.position.x / 0.05))
-    async with Running("robot_state_publisher", tmp_path) as service:
-        await service.tune(rate=1.0)
-        first = (await service.turn()).transforms[0].header.stamp
-        assert (await service.turn()).transforms[0].header.stamp - first == 10**9

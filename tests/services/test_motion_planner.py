@@ -15,6 +15,7 @@ from common.messages import (
     Header,
     JointGoal,
     MotionStatus,
+    ParameterRequest,
     PlanningScene,
     PlanRequest,
     PoseGoal,
@@ -127,6 +128,21 @@ async def test_failed_request_names_the_colliding_pair_and_the_next_is_served(pl
     assert (response.ok, response.error, response.colliding[1]) == (False, "start_in_collision", "ball_1")
     planner.put_scene()
     assert (await planner.plan.call(PlanRequest(id="3", goal=goal), timeout=30)).ok
+
+
+async def test_velocity_scaling_changed_live_affects_the_next_plan(planner):
+    planner.put_scene()
+    below = ROBOT.fk(HOME)
+    below[2, 3] -= 0.10
+    request = PlanRequest(id="1", start=list(HOME), goal=PoseGoal(pose=matrix_to_pose(below)), straight=True)
+    durations = []
+    for values in ({}, {"motion.velocity_scaling": 0.05, "motion.acceleration_scaling": 0.05},
+                   {"motion.cartesian_speed_scale": 0.5}):
+        await planner.client(topics.parameters_of("motion_planner")).call(ParameterRequest(set=values, by="a test"))
+        answer = await planner.plan.call(request, timeout=30)
+        durations.append(answer.trajectory.points[-1].time_from_start)
+    fast, slow, slower = durations
+    assert slow > 1.9 * fast and slower == pytest.approx(2 * slow, rel=1e-6)
 
 
 class FakeWorker:

@@ -22,13 +22,15 @@ FINGERS = ["panda_finger_joint1", "panda_finger_joint2"]
 class Cell(FakeCell):
     def __init__(self) -> None:
         super().__init__()
+        self.config: robot_state_publisher.Config
         self.tf, self.static = self.reader(topics.TF), self.reader(topics.TF_STATIC)
 
 
 @pytest.fixture
 async def cell() -> AsyncIterator[Cell]:
     made = Cell()
-    async with made.running(robot_state_publisher, CONFIG):
+    made.config = CONFIG.model_copy()
+    async with made.running(robot_state_publisher, made.config):
         yield made
 
 
@@ -57,7 +59,7 @@ async def test_frames_agree_with_forward_kinematics_and_each_has_one_parent(cell
     assert np.allclose(T[:3, 3], (0.40, 0.0, 0.80)) and np.linalg.det(T[:3, :3]) == pytest.approx(1.0)
 
 
-async def test_tf_has_half_the_rate_of_joint_states(cell: Cell) -> None:
+async def test_tf_has_half_the_rate_of_joint_states_or_the_rate_set_live(cell: Cell) -> None:
     stamps, start = [], cell.bus.header().stamp
     for number in range(20):
         cell.put_joints(ARM, HOME, start + number * 10_000_000)
@@ -65,6 +67,11 @@ async def test_tf_has_half_the_rate_of_joint_states(cell: Cell) -> None:
         if number % 2 == 0:
             stamps.append((await until(cell.tf)).transforms[0].header.stamp)
     assert stamps == [start + n * 10_000_000 for n in range(0, 20, 2)] and cell.tf.received == 10
+    cell.config.rate = 1.0
+    for stamp in (start + 10**9, start + 10**9 + 500_000_000, start + 2 * 10**9):
+        cell.put_joints(ARM, HOME, stamp)
+        await settle()
+    assert cell.tf.received == 12, "once a second"
 
 
 async def test_state_of_another_robot_is_skipped_with_one_warning(cell: Cell) -> None:

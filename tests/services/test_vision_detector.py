@@ -134,7 +134,7 @@ async def test_detections_out_of_message_range_do_not_end_the_service(cell):
     await cell.detected(2)
 
 
-async def test_mask_follows_the_color_windows_and_needs_a_subscriber(monkeypatch):
+async def test_mask_and_detections_follow_live_parameters_and_the_mask_needs_a_subscriber(monkeypatch):
     cell, calls, masks_of, tuned = Cell(), [], Detector.masks, CONFIG.model_copy()
     cell.calibrate(CAMERA, FRAME)
     monkeypatch.setattr(Detector, "masks", lambda self, *given: calls.append(1) or masks_of(self, *given))
@@ -151,9 +151,13 @@ async def test_mask_follows_the_color_windows_and_needs_a_subscriber(monkeypatch
         for u, v in (np.rint(CAMERA.project(place)).astype(int) for place in PLACES):
             assert mask[v, u] == 255
         assert set(np.unique(mask)) == {0, 255} and (mask == 255).mean() < 0.1
-        tuned.hsv_red_hi1 = tuned.hsv_red_hi2 = (0, 0, 0)  # excludes every color
+        tuned.min_contour_area_px = 9000.0
         cell.expose(3)
-        assert not image_to_array(await until(masks, lambda found: found.header.stamp == 3)).any()
+        await cell.detected(2)
+        await cell.detected(3, 0)  # although the image is unchanged
+        tuned.hsv_red_hi1 = tuned.hsv_red_hi2 = (0, 0, 0)  # excludes every color
+        cell.expose(4)
+        assert not image_to_array(await until(masks, lambda found: found.header.stamp == 4)).any()
 
 
 @pytest.mark.parametrize(("values", "problem"), [

@@ -9,7 +9,7 @@ from applications.pick_place.topics import (
 )
 from common import topics
 from common.config import Grasp, Surroundings, load_cell
-from common.messages import Header, Marker, MarkerArray, Vector3
+from common.messages import Header, Marker, MarkerArray, ParameterRequest, Vector3
 from common.perception.pinhole import Pinhole
 from services import workspace_validator
 from tests.services.fake_cell import FakeCell, at, settle, until
@@ -54,7 +54,8 @@ class Cell(FakeCell):
 async def cell():
     made = Cell()
     made.calibrate(CAMERA, AROUND.camera.frame)
-    async with made.running(workspace_validator, CONFIG):
+    made.config = CONFIG.model_copy()
+    async with made.running(workspace_validator, made.config):
         yield made
 
 
@@ -107,6 +108,16 @@ async def test_detections_before_camera_info_are_dropped():
         cell.calibrate(CAMERA, AROUND.camera.frame)
         await cell.answer(detections(GOOD, stamp=2), 1)
         assert cell.targets.received == 1
+
+
+async def test_bounds_changed_live_affect_targets_and_markers(cell):
+    shells = cell.reader(WORKSPACE_MARKERS)
+    await cell.answer(detections((0.55, 0.0, 0.03)), 1)
+    parameters = cell.client(topics.parameters_of("workspace_validator"))
+    await parameters.call(ParameterRequest(set={"services.workspace_validator.max_radius": 0.5}, by="a test"))
+    await until(shells, lambda message: message.markers[0].scale.x == 1.0)
+    await cell.answer(detections((0.55, 0.0, 0.03), stamp=2_000), 0)
+    assert "too far" in (await cell.reasons(1))[0]
 
 
 async def test_late_subscriber_gets_shell_and_column(cell):

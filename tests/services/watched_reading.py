@@ -1,4 +1,4 @@
-"""Records which fields of a configuration are read, in the original and in copies made after `begin`."""
+"""Records which tunable parameters services read, in their configuration and in copies made after `begin`."""
 
 from __future__ import annotations
 
@@ -11,30 +11,35 @@ from common.config.tunables import leaves
 
 
 class Watch:
-    """What is read of a configuration. A copy that was taken before `begin` counts as copied away."""
+    """The read parameters of configurations. Reading a copy made before `begin` does not count."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, config: Parameters, service: str) -> None:
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.read: set[str] = set()
-        self.tunable = {path for path, leaf in leaves(config, service).items() if leaf.runtime}
+        self.tunable: set[str] = set()
         self._models: dict[int, tuple[Any, str]] = {}  # references, so that no other model gets the same id
         self._copies: list[int] = []
+        for kind in (Parameters, Section):
+            monkeypatch.setattr(kind, "__getattribute__", self._recording(object.__getattribute__), raising=False)
+            monkeypatch.setattr(kind, "__copy__", self._following(kind.__copy__))
+
+    def add(self, config: Parameters, service: str) -> None:
+        """Watch the configuration of a service."""
         for path, leaf in leaves(config, service).items():
             self._models[id(leaf.owner)] = (leaf.owner, path.rpartition(".")[0])
-        for kind in (Parameters, Section):
-            monkeypatch.setattr(kind, "__getattribute__", self._getting(object.__getattribute__), raising=False)
-            monkeypatch.setattr(kind, "__copy__", self._copying(kind.__copy__))
+            if leaf.runtime:
+                self.tunable.add(path)
 
-    def _getting(self, get: Any) -> Any:
-        def getting(model: Any, name: str) -> Any:
+    def _recording(self, get: Any) -> Any:
+        def recorded(model: Any, name: str) -> Any:
             known = self._models.get(id(model))
             if known is not None:
                 self.read.add(f"{known[1]}.{name}")
             return get(model, name)
 
-        return getting
+        return recorded
 
-    def _copying(self, copy: Any) -> Any:
-        def copying(model: Any) -> Any:
+    def _following(self, copy: Any) -> Any:
+        def followed(model: Any) -> Any:
             made = copy(model)
             known = self._models.get(id(model))
             if known is not None:
@@ -42,10 +47,10 @@ class Watch:
                 self._copies.append(id(made))
             return made
 
-        return copying
+        return followed
 
     def begin(self) -> None:
-        """Forget what was read so far; copies that exist now do not count from here on."""
+        """Forget what was read so far."""
         for copied in self._copies:
             self._models[copied] = (self._models[copied][0], "an old copy of ")
         self._copies.clear()

@@ -137,18 +137,21 @@ async def test_dragged_object_is_moved_and_a_rejection_is_shown(
 
 
 async def test_page_shows_the_past_until_the_arm_is_operated(
-    panda: FakeServices, page: FakeBrowser, scenes: list[FakeScene]
+    panda: FakeServices, page: FakeBrowser, scenes: list[FakeScene], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    for name in ("SLOW_PERIOD", "FAST_PERIOD", "_PRESENT_TOLERANCE"):
+        monkeypatch.setattr(f"page.history.{name}", 0.01)
+
     def shown() -> float | None:
         state = scenes[0].latest(topics.JOINT_STATES) if scenes else None
         return state.position[0] if state is not None else None
 
-    for state, value, text in (("GRASPING", 1.0, "Grasping ball_1"), ("PLACING", 2.0, "Placing ball_1")):
+    for number, state in enumerate(("GRASPING", "PLACING")):
+        panda.put_joints(["panda_joint1"], [1.0 + number], 1 + number)
+        await until(lambda number=number: shown() == 1.0 + number)
         panda.put_task(state=state, started=True, subject="ball_1")
-        panda.put_joints(["panda_joint1"], [value], round(1 + value))
-        await until(lambda value=value: shown() == value)
-        await page.until(lambda text=text: text in page.text)
-    await page.until(lambda: "Placing ball_1" in page.text and "Grasping ball_1" in page.text)
+        await page.until(lambda number=number: f"time:event{number}" in page.text)
+    assert "Placing ball_1" in page.text and "Grasping ball_1" in page.text
     await page.press("‹ Event")
     await page.press("‹ Event")
     await until(lambda: shown() == 1.0)
