@@ -17,6 +17,29 @@ from common.transport.local import LocalNetwork
 UNSAVED = m.Interlock(kind="stopped", by="ann", reason=f"{NOT_PERSISTED}: the disk is full", since=1)
 
 
+async def task_control(arm: bool, task: bool) -> tuple[TaskControl, dict[str, asyncio.Event]]:
+    """Return the client of an arm and a task that confirm a stop or not, and events of their requests."""
+    network, stopped = LocalNetwork(), {"arm": asyncio.Event(), "task": asyncio.Event()}
+    cell = network.bus("cell")
+
+    async def stop_arm(_: m.StopRequest) -> m.MotionStatus:
+        stopped["arm"].set()
+        if not arm:
+            raise Refused("busy", "from the arm")
+        return m.MotionStatus(interlocks=[UNSAVED])
+
+    async def stop_task(_: m.TaskCommand) -> m.TaskStatus:
+        stopped["task"].set()
+        if not task:
+            raise Refused("busy", "from the task")
+        return m.TaskStatus(state="READY")
+
+    cell.serve(topics.MOTION_STOP, stop_arm)
+    cell.serve(topics.TASK_COMMAND, stop_task)
+    await cell.ready()
+    return TaskControl(Subscriptions(network.bus("operator")), "ann"), stopped
+
+
 @pytest.mark.parametrize(("arm", "task", "raised", "message"), [
     (True, True, None, ""),
     (True, False, TaskStopFailed,
@@ -27,55 +50,23 @@ UNSAVED = m.Interlock(kind="stopped", by="ann", reason=f"{NOT_PERSISTED}: the di
 async def test_stop_reports_which_of_arm_and_task_did_not_confirm_it(
     arm: bool, task: bool, raised: type[ZencellError] | None, message: str,
 ) -> None:
-    network, received = LocalNetwork(), list[str]()
-    cell, operator = network.bus("cell"), network.bus("operator")
-
-    async def stop_arm(_: m.StopRequest) -> m.MotionStatus:
-        received.append("arm")
-        if not arm:
-            raise Refused("busy", "from the arm")
-        return m.MotionStatus(interlocks=[UNSAVED])
-
-    async def stop_task(_: m.TaskCommand) -> m.TaskStatus:
-        received.append("task")
-        if not task:
-            raise Refused("busy", "from the task")
-        return m.TaskStatus(state="READY")
-
-    cell.serve(topics.MOTION_STOP, stop_arm)
-    cell.serve(topics.TASK_COMMAND, stop_task)
-    await cell.ready()
-    control = TaskControl(Subscriptions(operator), "ann")
+    control, stopped = await task_control(arm, task)
     if raised is None:
         assert (await control.stop()).state == "READY"
     else:
         with pytest.raises(raised, match=message):
             await control.stop()
-    assert sorted(received) == ["arm", "task"], "both, whatever the other answers"
+    assert stopped["arm"].is_set() and stopped["task"].is_set(), "both, whatever the other answers"
     assert ("disk is full" in control.unsaved) == arm
 
 
 @pytest.mark.parametrize("turns", range(1, 6))
 async def test_cancelled_stop_still_reaches_both(turns: int) -> None:
-    network, arm, task = LocalNetwork(), asyncio.Event(), asyncio.Event()
-    cell, operator = network.bus("cell"), network.bus("operator")
-
-    async def stop_arm(_: m.StopRequest) -> m.MotionStatus:
-        arm.set()
-        return m.MotionStatus()
-
-    async def stop_task(_: m.TaskCommand) -> m.TaskStatus:
-        task.set()
-        return m.TaskStatus()
-
-    cell.serve(topics.MOTION_STOP, stop_arm)
-    cell.serve(topics.TASK_COMMAND, stop_task)
-    await cell.ready()
-    control = TaskControl(Subscriptions(operator), "ann")
+    control, stopped = await task_control(arm=True, task=True)
     stopping = asyncio.create_task(control.stop())
     for _ in range(turns):
         await asyncio.sleep(0)
     stopping.cancel()
     async with asyncio.timeout(10):
-        await arm.wait()
-        await task.wait()
+        await stopped["arm"].wait()
+        await stopped["task"].wait()
