@@ -59,11 +59,17 @@ class LoopThread:
             tasks.append(task := asyncio.ensure_future(begin()))
             task.add_done_callback(settle)
 
-        self._loop.call_soon_threadsafe(start)
+        def cancel() -> None:
+            if tasks:
+                tasks[0].cancel()
+            else:  # interrupted before it was scheduled
+                done.set_exception(ZencellError("the call was interrupted"))
+
         try:
+            self._loop.call_soon_threadsafe(start)
             return done.result()
         except KeyboardInterrupt:
-            self._loop.call_soon_threadsafe(lambda: [task.cancel() for task in tasks])
+            self._loop.call_soon_threadsafe(cancel)
             concurrent.futures.wait([done])
             raise
 

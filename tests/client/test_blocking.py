@@ -30,6 +30,11 @@ def loop() -> Iterator[LoopThread]:
 class Fake:
     """Fake."""
 
+    entered = left = ended = False
+
+    def __init__(self) -> None:
+        self.waiting = threading.Event()
+
     async def twice(self, value: int) -> int:
         """Return the double."""
         return 2 * value
@@ -54,10 +59,21 @@ class Fake:
 
     async def forever(self) -> None:
         try:
+            self.waiting.set()
             await asyncio.Event().wait()
         finally:
-            await asyncio.sleep(0.05)  # cleaning up takes time
+            await asyncio.sleep(0.02)  # cleaning up takes time
             self.ended = True
+
+
+def press_ctrl_c(when: threading.Event) -> None:
+    """Interrupt the main thread a little after an event: there is none for its wait."""
+    def interrupt() -> None:
+        assert when.wait(10)
+        time.sleep(0.05)
+        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
+
+    threading.Thread(target=interrupt).start()
 
 
 def test_coroutine_methods_block_and_raise_their_errors(loop: LoopThread) -> None:
@@ -79,6 +95,19 @@ def test_async_for_becomes_for_and_is_closed_when_it_is_left(loop: LoopThread) -
     assert fake.left
 
 
+def test_iterator_collected_on_the_loops_own_thread_does_not_block_it(loop: LoopThread) -> None:
+    fake = Fake()
+    held = {"numbers": Blocking(loop, fake).count(100)}
+    next(held["numbers"])
+
+    async def drop() -> None:
+        held.clear()
+
+    call(loop, drop)
+    call(loop, asyncio.sleep, 0.01)
+    assert fake.left
+
+
 def test_async_with_becomes_with_also_with_an_error(loop: LoopThread) -> None:
     fake = Fake()
     with Blocking(loop, fake).block() as value:
@@ -92,14 +121,10 @@ def test_async_with_becomes_with_also_with_an_error(loop: LoopThread) -> None:
 @pytest.mark.parametrize("when", ["before", "as it is entered"])
 def test_ctrl_c_while_a_block_is_entered_leaves_it(loop: LoopThread, monkeypatch, when: str) -> None:
     fake, wait = Fake(), loop.wait
-    fake.entered = False
 
     def interrupted(begin: Callable[[], Awaitable[object]]) -> None:
         monkeypatch.undo()
-        if when != "before":
-            wait(begin)
-        else:
-            wait(functools.partial(cancelled, begin))
+        wait(begin if when != "before" else functools.partial(cancelled, begin))
         raise KeyboardInterrupt
 
     async def cancelled(begin: Callable[[], Awaitable[object]]) -> None:
@@ -115,54 +140,57 @@ def test_ctrl_c_while_a_block_is_entered_leaves_it(loop: LoopThread, monkeypatch
     assert call(loop, fake.twice, 4) == 8, "the loop still works"
 
 
-def test_ctrl_c_cancels_the_call_and_waits_for_its_end(loop: LoopThread) -> None:
-    fake = Fake()
-    threading.Timer(0.2, lambda: signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)).start()
+@pytest.mark.parametrize("busy", [False, True])
+def test_ctrl_c_cancels_the_call_and_waits_for_its_end(loop: LoopThread, busy: bool) -> None:
+    fake, started = Fake(), threading.Event()
+
+    def block_loop() -> None:
+        started.set()
+        time.sleep(0.2)
+
+    if busy:
+        loop._loop.call_soon_threadsafe(block_loop)
+    press_ctrl_c(started if busy else fake.waiting)
     with pytest.raises(KeyboardInterrupt):
         call(loop, fake.forever)
-    assert fake.ended
+    assert fake.ended == fake.waiting.is_set() and (busy or fake.ended)
     assert call(loop, fake.twice, 4) == 8, "the loop still works"
 
 
-def test_ctrl_c_works_while_the_loop_is_busy(loop: LoopThread) -> None:
-    fake = Fake()
-    loop._loop.call_soon_threadsafe(time.sleep, 0.5)
-    threading.Timer(0.1, lambda: signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)).start()
+@pytest.mark.parametrize("scheduled", [False, True])
+def test_ctrl_c_as_a_call_is_scheduled_leaves_it_not_running(loop: LoopThread, monkeypatch, scheduled: bool) -> None:
+    fake, schedule = Fake(), loop._loop.call_soon_threadsafe
+
+    def interrupted(callback: Callable[[], object]) -> None:
+        monkeypatch.undo()
+        if scheduled:
+            schedule(callback)
+            assert fake.waiting.wait(10)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(loop._loop, "call_soon_threadsafe", interrupted)
     with pytest.raises(KeyboardInterrupt):
         call(loop, fake.forever)
-    assert call(loop, fake.twice, 4) == 8
+    assert fake.ended == scheduled == fake.waiting.is_set()
 
 
 def test_call_in_another_thread_raises_when_the_cell_is_closed() -> None:
-    loop, errors = LoopThread(), list[str]()
+    loop, fake, errors = LoopThread(), Fake(), list[str]()
 
     def wait() -> None:
         try:
-            call(loop, Fake().forever)
+            call(loop, fake.forever)
         except ZencellError as error:
             errors.append(str(error))
 
     waiting = threading.Thread(target=wait)
     waiting.start()
-    call(loop, asyncio.sleep, 0.05)
+    assert fake.waiting.wait(10)
     loop.end()
     waiting.join(10.0)
     assert errors == ["the cell was closed meanwhile"]
     with pytest.raises(ZencellError, match="was closed"):
-        call(loop, Fake().twice, 1)
-
-
-def test_iterator_collected_on_the_loops_own_thread_does_not_block_it(loop: LoopThread) -> None:
-    fake = Fake()
-    held = {"numbers": Blocking(loop, fake).count(100)}
-    next(held["numbers"])
-
-    async def drop() -> None:
-        held.clear()
-
-    call(loop, drop)
-    call(loop, asyncio.sleep, 0.01)
-    assert fake.left
+        call(loop, fake.twice, 1)
 
 
 def test_cell_that_is_not_open_says_so_and_can_be_inspected() -> None:
