@@ -133,8 +133,8 @@ def test_any_key_can_be_called_or_listened_to() -> None:
         assert answer.held and again.held and [each.by for each in again.interlocks] == ["program"]
         await cell.arm.release()
         for request, error, words in (
-            (cell.call(None), ConfigError, ""), (cell.call("motion/hold", 3), ConfigError, ""),  # type: ignore[arg-type]
-            (anext(cell.listen(None)), ConfigError, ""),  # type: ignore[arg-type]
+            (cell.call(None), ConfigError, "."), (cell.call("motion/hold", 3), ConfigError, "."),  # type: ignore[arg-type]
+            (anext(cell.listen(None)), ConfigError, "."),  # type: ignore[arg-type]
             (cell.call("motion/hodl"), UnknownName, "motion/hold"),
             (cell.call("motion/hold", hodl=True), ConfigError, "hold"),
             (cell.call("motion/hold", hold=True, timeout=-1), ConfigError, "timeout"),

@@ -1,4 +1,4 @@
-"""The scripts and the notebook of examples/, as a person runs them."""
+"""The scripts, the notebook and the page of the Python client, run as a user runs them."""
 
 from __future__ import annotations
 
@@ -9,10 +9,14 @@ import re
 import signal
 import subprocess
 import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import psutil
 import pytest
+
+from common.client.blocking import Cell
+from common.errors import ZencellError
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 SAYS = {  # what a script prints among other lines
@@ -30,24 +34,16 @@ SAYS = {  # what a script prints among other lines
 pytestmark = [pytest.mark.slow, pytest.mark.alone, pytest.mark.timeout(240)]  # jogging is a matter of 0.1 s
 
 
-def test_every_script_is_run_here_and_listed_for_people() -> None:
-    scripts = [path for path in EXAMPLES.glob("*.py") if path.stem != "conftest"]
-    assert {path.stem for path in scripts} == set(SAYS)
-    table = (EXAMPLES / "README.md").read_text(encoding="utf-8")
-    assert all(f"({path.name})" in table for path in [*scripts, *EXAMPLES.glob("*.ipynb")])
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A working directory in which no process is left at the end."""
+    monkeypatch.chdir(tmp_path)
+    yield tmp_path
+    assert not processes_in(tmp_path)
 
 
-@pytest.mark.parametrize("name", sorted(SAYS))
-def test_script_prints_what_it_found_and_leaves_nothing_behind(name: str, tmp_path: Path) -> None:
-    command = [sys.executable, EXAMPLES / f"{name}.py"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=200, check=False)
-    assert done.returncode == 0 and not done.stderr, done.stderr
-    assert re.search(SAYS[name], done.stdout), done.stdout
-    assert not left(tmp_path)
-
-
-def left(folder: Path) -> list[psutil.Process]:
-    """Processes that were begun in a folder, but for this one."""
+def processes_in(folder: Path) -> list[psutil.Process]:
+    """Return the processes with a working directory, except this one."""
     found = []
     for process in psutil.process_iter():
         try:
@@ -58,10 +54,27 @@ def left(folder: Path) -> list[psutil.Process]:
     return found
 
 
-def test_notebook_runs_from_top_to_bottom_inside_a_loop_that_runs(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def run(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, *arguments], capture_output=True, text=True, timeout=200, check=False)
+
+
+def test_every_script_is_run_here_and_listed_in_the_readme() -> None:
+    scripts = [path for path in EXAMPLES.glob("*.py") if path.stem != "conftest"]
+    assert {path.stem for path in scripts} == set(SAYS)
+    table = (EXAMPLES / "README.md").read_text(encoding="utf-8")
+    assert all(f"({path.name})" in table for path in [*scripts, *EXAMPLES.glob("*.ipynb")])
+
+
+@pytest.mark.parametrize("name", sorted(SAYS))
+def test_script_prints_its_result_and_ends_its_cell(name: str, folder: Path) -> None:
+    done = run(EXAMPLES / f"{name}.py")
+    assert done.returncode == 0 and not done.stderr, done.stderr
+    assert re.search(SAYS[name], done.stdout), done.stdout
+
+
+def test_notebook_runs_from_top_to_bottom_inside_a_running_loop(
+    folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.chdir(tmp_path)
     steps = json.loads((EXAMPLES / "tutorial.ipynb").read_text(encoding="utf-8"))["cells"]
     names: dict[str, object] = {}
 
@@ -73,26 +86,21 @@ def test_notebook_runs_from_top_to_bottom_inside_a_loop_that_runs(
 
     asyncio.run(kernel())
     assert "out_of_reach" in capsys.readouterr().out
-    assert names["held"].outcome == "grasped" and not left(tmp_path)  # type: ignore[attr-defined]
+    assert names["held"].outcome == "grasped"  # type: ignore[attr-defined]
 
 
-@pytest.mark.parametrize(("page", "says"), [("docs/client.md", "out_of_reach")])
-def test_what_a_page_says_works_from_top_to_bottom(
-    page: str, says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    blocks = re.findall(r"```python\n(.*?)```", (EXAMPLES.parent / page).read_text(encoding="utf-8"), re.DOTALL)
+def test_code_of_the_page_runs_from_top_to_bottom(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    page = (EXAMPLES.parent / "docs" / "client.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     assert blocks
     names: dict[str, object] = {}
     for block in blocks:
         exec(block, names)
-    assert says in capsys.readouterr().out and not left(tmp_path)
+    assert "out_of_reach" in capsys.readouterr().out
     assert names["status"].state in ("DONE", "ERROR"), "the task was not stopped on its way"  # type: ignore[attr-defined]
 
 
 SLOWLY = """
-import time
-
 from zencell import pose
 from zencell.blocking import Cell
 
@@ -101,54 +109,51 @@ with Cell.start("panda") as cell:
     try:
         cell.arm.move(pose(0.3, 0.5, 0.3), speed=0.02)
     except KeyboardInterrupt:
-        time.sleep(0.5)  # in which it comes to rest
-        status = cell.arm.status()
-        print(status.state, abs(cell.arm.velocities()).max() < 0.01, flush=True)
+        while abs(cell.arm.velocities()).max() > 0.01:
+            pass
+        print(cell.arm.status().state, flush=True)
         raise
 """
 
 
-def test_ctrl_c_stops_the_arm_and_ends_the_cell(tmp_path: Path) -> None:
-    with subprocess.Popen(
-        [sys.executable, "-c", SLOWLY], cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        env={**os.environ, "PYTHONUNBUFFERED": "1"},
-    ) as script:
-        assert script.stdout is not None and script.stdout.readline() == "ready\n"
+def start_slow_motion() -> subprocess.Popen[str]:
+    script = subprocess.Popen([sys.executable, "-u", "-c", SLOWLY], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+                              text=True)
+    assert script.stdout is not None and script.stdout.readline() == "ready\n"
+    return script
+
+
+def test_ctrl_c_stops_the_arm_and_ends_the_cell(folder: Path) -> None:
+    with start_slow_motion() as script:
         with pytest.raises(subprocess.TimeoutExpired):
-            script.wait(3.0)  # it moves for longer
+            script.wait(2.0)  # it moves for longer
         script.send_signal(signal.SIGINT)
-        out, told = script.communicate(timeout=60)
-    assert out == "cancelled True\n", (out, told)
-    assert told.rstrip().endswith("KeyboardInterrupt") and script.returncode != 0 and not left(tmp_path)
+        out, err = script.communicate(timeout=60)
+    assert out == "cancelled\n", (out, err)
+    assert err.rstrip().endswith("KeyboardInterrupt") and script.returncode != 0
 
 
-def test_a_script_that_is_killed_takes_its_cell_with_it(tmp_path: Path) -> None:
-    with subprocess.Popen(
-        [sys.executable, "-c", SLOWLY], cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
-    ) as script:
-        assert script.stdout is not None and script.stdout.readline() == "ready\n" and left(tmp_path)
+def test_killed_script_takes_its_cell_with_it(folder: Path) -> None:
+    with start_slow_motion() as script:
+        assert processes_in(folder)
         script.kill()
-    _, alive = psutil.wait_procs(left(tmp_path), timeout=60)
+    _, alive = psutil.wait_procs(processes_in(folder), timeout=60)
     assert not alive
 
 
-def test_a_script_that_forgets_its_cell_ends_it_all_the_same(tmp_path: Path) -> None:
-    script = "from zencell.blocking import Cell\ncell = Cell.start('panda').open()\nprint(cell.arm.joints().shape)"
-    done = subprocess.run(
-        [sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, timeout=100, check=False)
-    assert (done.returncode, done.stdout, done.stderr) == (0, "(7,)\n", "") and not left(tmp_path)
+def test_script_that_does_not_close_its_cell_ends_it_all_the_same(folder: Path) -> None:
+    open_cell = "from zencell.blocking import Cell\ncell = Cell.start('panda').open()\n"
+    done = run("-c", open_cell + "print(cell.arm.joints().shape)")
+    assert (done.returncode, done.stdout, done.stderr) == (0, "(7,)\n", "")
 
 
-def test_a_cell_that_does_not_come_up_says_why(tmp_path: Path) -> None:
-    for asked, words in (
-        ('Cell.start("nobody")', "unknown cell 'nobody'"),
-        ('Cell.start("panda", overrides=["world.cuont=1"])', "world.cuont"),
-        ('Cell.start("panda", speed=99)', "--speed"),
-        ('Cell("panda", domain=231)', "zencell up"),
-        ('Cell("panda", domain=9999)', "0 to 232"),
-    ):
-        script = f"from zencell.blocking import Cell\nwith {asked} as cell: pass"
-        done = subprocess.run(
-            [sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, timeout=100, check=False)
-        assert done.returncode == 1 and words in done.stderr.splitlines()[-1], (asked, done.stderr)
-        assert not left(tmp_path)
+@pytest.mark.parametrize(("make", "message"), [
+    (lambda: Cell.start("unknown"), "unknown cell 'unknown'"),
+    (lambda: Cell.start("panda", overrides=["world.cuont=1"]), "world.cuont"),
+    (lambda: Cell.start("panda", speed=99), "--speed"),
+    (lambda: Cell("panda", domain=231), "zencell up"),
+    (lambda: Cell("panda", domain=9999), "0 to 232"),
+])
+def test_cell_that_cannot_be_joined_has_a_reason(make: Callable[[], Cell], message: str, folder: Path) -> None:
+    with pytest.raises(ZencellError, match=message), make():
+        pass

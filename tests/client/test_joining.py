@@ -57,17 +57,22 @@ def net(monkeypatch: pytest.MonkeyPatch) -> LocalNetwork:
     return network
 
 
-async def stays(bus: Bus, config: None) -> None:
-    """Be ready and publish nothing."""
-    await bus.ready()
-    await asyncio.Event().wait()
+def publishing(net: LocalNetwork, topic: Topic[Any] | None, message: Any = None, **where: Any) -> Any:
+    """Run a service that publishes one message, or none."""
+    async def run(bus: Bus, config: None) -> None:
+        if topic is not None:
+            bus.writer(topic).put(message)
+        await bus.ready()
+        await asyncio.Event().wait()
+
+    return running_service(net, run, None, **where)
 
 
 async def test_only_running_cell_is_joined_and_one_of_several_must_be_named(net: LocalNetwork) -> None:
-    async with running_service(net, stays, None, cell="anna"):
+    async with publishing(net, None, cell="anna"):
         async with Cell() as cell:
             assert cell.name == "anna"
-        async with running_service(net, stays, None, cell="bert"):
+        async with publishing(net, None, cell="bert"):
             with pytest.raises(SeveralCellsRunning) as caught:
                 async with Cell():
                     pass
@@ -102,39 +107,30 @@ async def test_arm_is_stopped_and_task_started_under_remapped_keys(net: LocalNet
                 await request
 
 
-async def test_camera_has_the_name_that_the_program_uses(net: LocalNetwork) -> None:
-    async def films(bus: Bus, config: None) -> None:
-        bus.writer(CAMERA_INFO).put(CameraInfo(
-            header=Header(frame_id=bus.service), width=2, height=1, k=[1.0, 0.0, 1.0, 0.0, 1.0, 0.5, 0.0, 0.0, 1.0]))
-        await bus.ready()
-        await asyncio.Event().wait()
+RIGHT = {"*": "right/*"}
 
-    async with (
-        running_service(net, films, None, name="one", topics=LEFT),
-        running_service(net, films, None, name="two", topics={"camera/*": "right/camera/*"}),
-    ):
-        for remapped, name, others in ((LEFT, "camera", ["right/camera"]), (None, "right/camera", ["left/camera"])):
+
+def camera_info(frame: str) -> CameraInfo:
+    return CameraInfo(header=Header(frame_id=frame), width=2, height=1, k=[1.0, 0.0, 1.0, 0.0, 1.0, 0.5, 0.0, 0.0, 1.0])
+
+
+async def test_camera_has_the_name_that_the_program_uses(net: LocalNetwork) -> None:
+    async with (publishing(net, CAMERA_INFO, camera_info("one"), name="one", topics=LEFT),
+                publishing(net, CAMERA_INFO, camera_info("two"), name="two", topics={"camera/*": "right/camera/*"})):
+        for remapped, name, others, frame in ((LEFT, "camera", ["right/camera"], "one"),
+                                              (None, "right/camera", ["left/camera"], "two")):
             async with Cell("test", remapped=remapped) as cell:
                 assert sorted(await cell.cameras()) == sorted([name, *others])
-                info = await (await cell.camera(name)).info()
-                assert info.header.frame_id == ("one" if remapped else "two")
+                assert (await (await cell.camera(name)).info()).header.frame_id == frame
 
 
 async def test_of_several_tasks_the_one_under_remapped_keys_is_used(net: LocalNetwork) -> None:
-    async def publishes(bus: Bus, config: None) -> None:
-        out = bus.writer(PICK_PLACE_STATUS)
-        out.put(PickPlaceStatus(header=Header(stamp=1), message=bus.service))
-        await bus.ready()
-        await asyncio.Event().wait()
-
-    async with (
-        running_service(net, publishes, None, name="one", topics=LEFT),
-        running_service(net, publishes, None, name="two", topics={"*": "right/*"}),
-    ):
-        async with Cell("test", remapped=LEFT) as cell:
-            assert (await cell.task.status()).message == "one"
-        async with Cell("test", remapped={"*": "right/*"}) as cell:
-            assert (await cell.task.status()).message == "two"
+    one, two = (PickPlaceStatus(header=Header(stamp=1), message=name) for name in ("one", "two"))
+    async with (publishing(net, PICK_PLACE_STATUS, one, name="one", topics=LEFT),
+                publishing(net, PICK_PLACE_STATUS, two, name="two", topics=RIGHT)):
+        for remapped, message in ((LEFT, "one"), (RIGHT, "two")):
+            async with Cell("test", remapped=remapped) as cell:
+                assert (await cell.task.status()).message == message
         async with Cell("test") as cell:
             with pytest.raises(UnknownName, match="choices: left/pick_place_status, right/pick_place_status"):
                 await cell.task.status()
@@ -156,13 +152,7 @@ async def test_task_of_a_custom_application_needs_its_module(
         f"from common.application import Application, ApplicationTopics\nfrom {__name__} import OWN\n"
         "APPLICATION = Application(topics=ApplicationTopics(status=OWN))\n")
 
-    async def publishes(bus: Bus, config: None) -> None:
-        out = bus.writer(OWN)
-        out.put(OwnStatus(header=Header(stamp=1), message="it runs"))
-        await bus.ready()
-        await asyncio.Event().wait()
-
-    async with running_service(net, publishes, None, name="own"):
+    async with publishing(net, OWN, OwnStatus(header=Header(stamp=1), message="it runs"), name="own"):
         async with Cell("test", application="own.application") as cell:
             assert (await cell.task.status()).message == "it runs"
         async with Cell("test") as cell:
