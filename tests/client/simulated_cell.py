@@ -6,38 +6,43 @@ import asyncio
 from collections.abc import Awaitable, Callable
 
 import numpy as np
+import pytest
 
 from common.client.cell import Cell
+from common.config import load_cell
 from common.transport.bus import Bus
-from tests.simulated.visited import SimulatedCell
-
-Program = Callable[[Cell], Awaitable[None]]
+from lab.simulation import Simulation
 
 
 class Ended(Exception):
     """The program has ended; the rest of the run does not matter."""
 
 
-def run(program: Program, cell: str = "panda", *overrides: str) -> None:
+def run(program: Callable[[Cell], Awaitable[None]], cell: str = "panda", *overrides: str) -> None:
     """Run a program of the operator `program` in a cell to its end."""
     run_with_processes(lambda _, joined: program(joined), cell, *overrides)
 
 
 def run_with_processes(
-    program: Callable[[SimulatedCell, Cell], Awaitable[None]], cell: str = "panda", *overrides: str
+    program: Callable[[Simulation, Cell], Awaitable[None]], cell: str = "panda", *overrides: str
 ) -> None:
     """Run a program that may also kill processes of the cell."""
+    raised: list[BaseException] = []
 
-    async def visit(simulated: SimulatedCell, bus: Bus) -> None:
-        async with Cell.on(bus, owner="program") as joined:
-            await program(simulated, joined)
+    async def visit(bus: Bus) -> None:
+        try:
+            async with Cell.on(bus, owner="program") as joined:
+                await program(simulation, joined)
+        except BaseException as error:
+            raised.append(error)
         raise Ended
 
-    try:
-        SimulatedCell(cell, ["autostart=false", *overrides], visit=visit)
-    except Ended:
-        return
-    raise AssertionError("the run ended before the program")
+    simulation = Simulation(load_cell(cell, ["autostart=false", *overrides]), 1, visit=visit)
+    with pytest.raises(Ended):
+        simulation.run()
+    if raised:
+        raise raised[0]
+    assert not simulation.outcome.broken and not simulation.outcome.crashes, simulation.outcome
 
 
 async def moving(cell: Cell) -> None:

@@ -100,7 +100,7 @@ async def cancelled(cell: Cell) -> None:
 
 def test_motion_pauses_while_held_and_stops_when_it_is_cancelled_or_the_cell_is_left() -> None:
     async def program(cell: Cell) -> None:
-        there = asyncio.create_task(cell.arm.move(pose(0.4, 0.4, 0.3), speed=0.2))
+        there = asyncio.create_task(cell.arm.move(pose(0.4, 0.3, 0.3), speed=0.5))
         await moving(cell)
         await cell.arm.hold("a visitor comes")
         await standstill(cell)
@@ -110,7 +110,7 @@ def test_motion_pauses_while_held_and_stops_when_it_is_cancelled_or_the_cell_is_
         await cell.arm.release()
         assert (await there).state == "succeeded"
 
-        back = asyncio.create_task(cell.arm.move("home", speed=0.1))
+        back = asyncio.create_task(cell.arm.move("home", speed=0.3))
         await moving(cell)
         back.cancel()
         with pytest.raises(asyncio.CancelledError):
@@ -145,24 +145,6 @@ def test_motion_releases_the_stop_of_its_own_operator_but_not_that_of_another() 
         assert caught.value.code == "stopped"
         with pytest.raises(MotionFailed, match="another"):
             await cell.gripper.open()
-
-    run(program)
-
-
-def test_own_stop_during_planning_blocks_the_motion() -> None:
-    async def program(cell: Cell) -> None:
-        before, plan = await cell.arm.joints(), cell.arm._motion.plan
-
-        async def stopped_meanwhile(*goal: Any, **more: Any) -> Any:
-            found = await plan(*goal, **more)
-            await Cell.on(cell.bus, owner="program").arm.stop("wait")  # the same operator, in another terminal
-            return found
-
-        cell.arm._motion.plan = stopped_meanwhile  # type: ignore[method-assign]
-        with pytest.raises(MotionFailed, match="wait") as caught:
-            await cell.arm.move(pose(0.45, 0.1, 0.4))
-        assert caught.value.code == "stopped" and "wait" in (await cell.arm.status()).stopped
-        assert np.allclose(await cell.arm.joints(), before, atol=1e-6)
 
     run(program)
 

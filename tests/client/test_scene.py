@@ -12,10 +12,10 @@ from common.client.cell import Cell
 from common.client.goals import pose
 from common.client.operator_motion import MotionFailed
 from common.errors import ConfigError, RemoteError
+from lab.simulation import Simulation
 from tests.client.simulated_cell import run, run_with_processes
 from tests.harness import until
 from tests.simulated.test_interlocks import again
-from tests.simulated.visited import SimulatedCell
 
 pytestmark = pytest.mark.timeout(600)
 
@@ -24,7 +24,7 @@ WALL = ("box", (0.3, 0.02, 0.7))  # between them
 
 
 def test_added_solid_is_avoided_also_after_a_restart_until_it_is_removed() -> None:
-    async def program(simulated: SimulatedCell, cell: Cell) -> None:
+    async def program(simulated: Simulation, cell: Cell) -> None:
         await cell.arm.move(LEFT)
         free = await cell.arm.plan(RIGHT, straight=True)
         for _ in range(2):  # also if it is added again

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from datetime import timedelta
-from types import MappingProxyType, ModuleType, SimpleNamespace
-from typing import Any
+from types import ModuleType
+from typing import Any, cast
+from unittest.mock import MagicMock
 
 import numpy as np
 
@@ -18,12 +18,6 @@ STEPS = 4000
 LENS = (40.0, 40.0, 31.5, 23.5)  # fx, fy, cx, cy of the OAK [px]
 
 
-def module_of(name: str, **members: Any) -> ModuleType:
-    module = ModuleType(name)
-    vars(module).update(members)
-    return module
-
-
 class FakeRealSense:
     """A RealSense, which may be unplugged; its color lens is not its depth lens.
 
@@ -31,84 +25,74 @@ class FakeRealSense:
     """
 
     def __init__(self) -> None:
-        self.plugged, self.coeffs, self.opened, self.stopped = True, [0.0] * 5, 0, 0
+        self.plugged, self.coeffs, self.opened, self.stopped, self.count = True, [0.0] * 5, 0, 0, 0
         self.streams: dict[str, tuple[Any, ...]] = {}
         self.shot: RgbdFrame | None = None
         self.lenses = {"color": (40.0, 41.0, 31.0, 23.0), "depth": (35.0, 35.0, 30.0, 22.0)}
+
+    def start(self, config: Any) -> Any:
+        self.streams = {call.args[0]: call.args[1:] for call in config.enable_stream.call_args_list[-2:]}
+        self.streams["device"] = config.enable_device.call_args.args
+        if self.streams["color"][0] != WIDTH:
+            raise RuntimeError("Couldn't resolve requests")
+        self.opened, self.count = self.opened + 1, 0
+        profile = MagicMock()
+        profile.get_device().is_playback.return_value = False
+        profile.get_device().first_depth_sensor().get_depth_scale.return_value = SCALE
+        profile.get_stream.side_effect = self.stream
+        return profile
+
+    def stream(self, name: str) -> Any:
+        fx, fy, ppx, ppy = self.lenses[name]
+        stream = MagicMock()
+        stream.format.return_value = "bgr8"
+        stream.as_video_stream_profile().get_intrinsics.return_value = MagicMock(
+            width=WIDTH, height=HEIGHT, fx=fx, fy=fy, ppx=ppx, ppy=ppy,
+            coeffs=self.coeffs if name == "color" else [0.0] * 5)
+        return stream
 
     def require_plugged(self) -> None:
         if not self.plugged:
             raise RuntimeError("Frame didn't arrive within 1000")
 
-    def depth(self, aligned: bool) -> np.ndarray:
-        if self.shot is not None and aligned:
-            return np.rint(np.nan_to_num(self.shot.depth) / SCALE).astype(np.uint16)
-        steps = np.full((HEIGHT, WIDTH), STEPS if aligned else 1, np.uint16)
+    def wait_for_frames(self, timeout: int) -> None:
+        self.require_plugged()
+        time.sleep(0.002)
+        self.count += 1
+
+    def stop(self) -> None:
+        self.stopped += 1
+        self.require_plugged()
+
+    def aligned(self, _: Any) -> Any:
+        """Return depth and color; only this depth, which is aligned, has the right values."""
+        steps = np.full((HEIGHT, WIDTH), STEPS, np.uint16)
         steps[:, 5] = 0
-        return steps
-
-    def color(self) -> np.ndarray:
-        return np.full((HEIGHT, WIDTH, 3), (10, 20, 200), np.uint8) if self.shot is None else self.shot.colour
-
-    def frames(self, number: int, aligned: bool = False) -> Any:
-        def frame(pixels: np.ndarray) -> Any:
-            return SimpleNamespace(get_data=lambda: pixels, get_timestamp=lambda: 1e3 * (time.time() - 0.2),
-                                   get_frame_timestamp_domain=lambda: "global")
-
-        return SimpleNamespace(number=number, get_depth_frame=lambda: frame(self.depth(aligned)),
-                               get_color_frame=lambda: frame(self.color()) if number > 1 else None)
-
-    def profile(self) -> Any:
-        def stream(name: str) -> Any:
-            fx, fy, ppx, ppy = self.lenses[name]
-            intrinsics = SimpleNamespace(width=WIDTH, height=HEIGHT, fx=fx, fy=fy, ppx=ppx, ppy=ppy,
-                                         coeffs=self.coeffs if name == "color" else [0.0] * 5)
-            video = SimpleNamespace(get_intrinsics=lambda: intrinsics)
-            return SimpleNamespace(as_video_stream_profile=lambda: video, format=lambda: "bgr8")
-
-        sensor = SimpleNamespace(get_depth_scale=lambda: SCALE)
-        device = SimpleNamespace(first_depth_sensor=lambda: sensor, is_playback=lambda: False)
-        return SimpleNamespace(get_device=lambda: device, get_stream=stream)
+        color = np.full((HEIGHT, WIDTH, 3), (10, 20, 200), np.uint8)
+        if self.shot is not None:
+            steps, color = np.rint(np.nan_to_num(self.shot.depth) / SCALE).astype(np.uint16), self.shot.colour
+        frames = MagicMock()
+        frames.get_depth_frame().get_data.return_value = steps
+        frames.get_color_frame().get_data.return_value = color
+        frames.get_color_frame().get_timestamp.return_value = 1e3 * (time.time() - 0.2)
+        frames.get_color_frame().get_frame_timestamp_domain.return_value = "global"
+        if self.count == 1:
+            frames.get_color_frame.return_value = None
+        return frames
 
     def module(self) -> ModuleType:
         """Return pyrealsense2."""
-        fake = self
-
-        class Config(dict[str, tuple[Any, ...]]):
-            def enable_device(self, serial: str) -> None:
-                self["device"] = (serial,)
-
-            def enable_stream(self, stream: str, *mode: Any) -> None:
-                self[stream] = mode
-
-        class Pipeline:
-            count = 0
-
-            def start(self, config: Config) -> Any:
-                if config["color"][0] != WIDTH:
-                    raise RuntimeError("Couldn't resolve requests")
-                fake.opened, fake.streams = fake.opened + 1, config
-                return fake.profile()
-
-            def wait_for_frames(self, timeout: int) -> Any:
-                fake.require_plugged()
-                time.sleep(0.002)
-                self.count += 1
-                return fake.frames(self.count)
-
-            def stop(self) -> None:
-                fake.stopped += 1
-                fake.require_plugged()
-
-        device = SimpleNamespace(get_info={"serial": "0123"}.get)
-        return module_of(
-            "pyrealsense2", config=Config, pipeline=Pipeline,
-            align=lambda stream: SimpleNamespace(process=lambda frames: fake.frames(frames.number, aligned=True)),
-            stream=SimpleNamespace(color="color", depth="depth"),
-            format=SimpleNamespace(z16="z16", bgr8="bgr8", rgb8="rgb8"),
-            camera_info=SimpleNamespace(serial_number="serial"),
-            timestamp_domain=SimpleNamespace(global_time="global"),
-            context=lambda: SimpleNamespace(query_devices=lambda: [device] if fake.plugged else []))
+        rs, device = MagicMock(), MagicMock()
+        rs.stream.color, rs.stream.depth = "color", "depth"
+        rs.format.z16, rs.format.bgr8, rs.format.rgb8 = "z16", "bgr8", "rgb8"
+        rs.timestamp_domain.global_time, rs.camera_info.serial_number = "global", "serial"
+        device.get_info.side_effect = {"serial": "0123"}.get
+        rs.context().query_devices.side_effect = lambda: [device] if self.plugged else []
+        pipeline = rs.pipeline.return_value
+        pipeline.start.side_effect, pipeline.stop.side_effect = self.start, self.stop
+        pipeline.wait_for_frames.side_effect = self.wait_for_frames
+        rs.align.return_value.process.side_effect = self.aligned
+        return cast(ModuleType, rs)
 
 
 class FakeOak:
@@ -120,68 +104,60 @@ class FakeOak:
 
     def output(self, name: str) -> Any:
         def link(to: Any) -> None:
-            if to in ("stereo.align", "align.align"):
-                self.aligned_by = to.partition(".")[0]
+            if to in ("stereo", "align"):
+                self.aligned_by = to
 
-        return SimpleNamespace(link=link, name=name)
+        return MagicMock(socket=name, link=link)
+
+    def request_output(self, socket: str, *size: Any, **how: Any) -> Any:
+        self.outputs[socket] = (*size, how)
+        return self.output(socket)
 
     def camera(self) -> Any:
-        def build(socket: str) -> Any:
-            def request(size: tuple[int, int], **how: Any) -> Any:
-                self.outputs[socket] = (size, how)
-                return self.output(socket)
-
-            return SimpleNamespace(requestOutput=request)
-
-        return SimpleNamespace(build=build)
+        camera = MagicMock()
+        camera.build.side_effect = lambda socket: MagicMock(
+            requestOutput=lambda *size, **how: self.request_output(socket, *size, **how))
+        return camera
 
     def stereo(self) -> Any:
         def build(left: Any, right: Any, presetMode: str) -> Any:  # noqa: N803
-            assert (left.name, right.name) == ("left", "right")
-            return SimpleNamespace(setLeftRightCheck=lambda on: None, setSubpixel=lambda on: None,
-                                   inputAlignTo="stereo.align", depth=self.output("depth"))
+            assert (left.socket, right.socket) == ("left", "right")
+            return MagicMock(inputAlignTo="stereo", depth=self.output("depth"))
 
-        return SimpleNamespace(build=build)
+        return MagicMock(build=build)
 
     def device(self, *which: Any) -> Any:
         if not self.plugged:
             raise RuntimeError("No available devices")
-        return SimpleNamespace(getPlatform=lambda: self.platform, close=lambda: None)
+        return MagicMock(getPlatform=lambda: self.platform)
 
     def get(self, timeout: timedelta) -> Any:
         if not self.plugged:
             raise RuntimeError("queue was closed")
         time.sleep(0.002)
+        group = {"rgb": MagicMock(), "depth": MagicMock()}
         k = [[LENS[0], 0, LENS[2]], [0, LENS[1], LENS[3]], [0, 0, 1]]
-        transformation = SimpleNamespace(getIntrinsicMatrix=lambda: k)
-        color = SimpleNamespace(getTransformation=lambda: transformation, getWidth=lambda: WIDTH,
-                                getHeight=lambda: HEIGHT, getCvFrame=lambda: self.shot.colour,
-                                getTimestamp=lambda: timedelta(seconds=10.0))
+        group["rgb"].getTransformation().getIntrinsicMatrix.return_value = k
+        group["rgb"].getWidth.return_value, group["rgb"].getHeight.return_value = WIDTH, HEIGHT
+        group["rgb"].getCvFrame.return_value = self.shot.colour
+        group["rgb"].getTimestamp.return_value = timedelta(seconds=10.0)
         steps = np.rint(np.nan_to_num(self.shot.depth) * 1000).astype(np.uint16)
-        return {"rgb": color, "depth": SimpleNamespace(getFrame=lambda: steps)}
+        group["depth"].getFrame.return_value = steps
+        return group
 
     def stop(self) -> None:
         self.closed += 1
 
     def module(self) -> ModuleType:
         """Return depthai."""
-        def stereo() -> Any:
-            return self.stereo()
-
-        stereo.PresetMode = SimpleNamespace(DEFAULT="default")  # type: ignore[attr-defined]
-        sync = SimpleNamespace(
-            inputs=MappingProxyType({"rgb": "sync.rgb", "depth": "sync.depth"}),
-            setSyncThreshold=lambda threshold: None,
-            out=SimpleNamespace(createOutputQueue=lambda maxSize, blocking: SimpleNamespace(get=self.get)))
-        align = SimpleNamespace(input="align.in", inputAlignTo="align.align", outputAligned=self.output("aligned"))
-
-        def create(node: Callable[[], Any]) -> Any:
-            return node()
-
-        return module_of(
-            "depthai", Device=self.device, DeviceInfo=lambda name: name,
-            Pipeline=lambda device: SimpleNamespace(create=create, start=lambda: None, stop=self.stop),
-            CameraBoardSocket=SimpleNamespace(CAM_A="color", CAM_B="left", CAM_C="right"),
-            Platform=SimpleNamespace(RVC4="RVC4"), Clock=SimpleNamespace(now=lambda: timedelta(seconds=10.1)),
-            ImgFrame=SimpleNamespace(Type=SimpleNamespace(BGR888i="bgr")),
-            node=SimpleNamespace(Camera=self.camera, StereoDepth=stereo, ImageAlign=lambda: align, Sync=lambda: sync))
+        dai = MagicMock(Device=self.device)
+        socket = dai.CameraBoardSocket
+        socket.CAM_A, socket.CAM_B, socket.CAM_C = "color", "left", "right"
+        dai.Platform.RVC4, dai.ImgFrame.Type.BGR888i = "RVC4", "bgr"
+        dai.Clock.now.return_value = timedelta(seconds=10.1)
+        dai.node.Camera, dai.node.StereoDepth.side_effect = self.camera, self.stereo
+        dai.node.ImageAlign.return_value = MagicMock(inputAlignTo="align", outputAligned=self.output("aligned"))
+        dai.node.Sync.return_value.out.createOutputQueue.return_value.get = self.get
+        pipeline = dai.Pipeline.return_value
+        pipeline.create, pipeline.stop = lambda node: node(), self.stop
+        return cast(ModuleType, dai)

@@ -7,7 +7,7 @@ import os
 import pytest
 
 from common import topics
-from common.atomic_file import RUNTIME_VARIABLE, STATE_VARIABLE
+from common.atomic_file import STATE_VARIABLE
 from common.control import interlocks
 from common.control.interlocks import InterlockFile
 from common.errors import ConfigError, RemoteError
@@ -90,17 +90,6 @@ async def test_stop_blocks_arm_and_gripper_over_restarts_until_a_start() -> None
         assert (await client.grip("h", 0.02)).state == "succeeded"
 
 
-async def test_task_refused_because_an_operator_owns_the_motion_is_stopped_also_after_a_restart() -> None:
-    async with executor() as client:
-        await client.own.call(OwnRequest(act="take", owner="ann"))
-        refused = await client.command.call(GripperCommand(header=client.bus.header(), id="a", width=0.02))
-        assert refused.error == "not_owner"
-        await client.own.call(OwnRequest(act="give", owner="ann"))
-    async with executor() as client:
-        refused = await client.command.call(GripperCommand(header=client.bus.header(), id="b", width=0.02))
-        assert refused.error == "stopped" and "by ann (the motion is owned by ann" in refused.message
-
-
 async def test_more_requests_to_stop_than_can_be_read_stop_the_robot() -> None:
     async with executor() as client:
         await client.move_slowly()
@@ -164,15 +153,6 @@ async def test_safety_stop_of_the_arm_persists_until_an_operator_has_it_recover(
 
 
 # --- the file ---
-
-
-async def test_executor_that_cannot_write_its_file_does_not_start(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "file").write_text("")
-    monkeypatch.setenv(STATE_VARIABLE, str(tmp_path / "file"))
-    monkeypatch.setenv(RUNTIME_VARIABLE, str(tmp_path))
-    with pytest.raises(ConfigError, match=r"ZENCELL_STATE: .* cannot be written"):
-        async with executor():
-            pass
 
 
 async def test_second_executor_of_the_same_cell_name_in_the_same_folder_is_refused(

@@ -10,7 +10,7 @@ import pytest
 from common.atomic_file import STATE_VARIABLE
 from common.clock import Clock
 from common.control.executor import Executor
-from common.errors import ConfigError, RemoteError, UnknownName
+from common.errors import ConfigError, UnknownName
 from common.messages import GripperCommand, JointTrajectoryPoint, StopRequest, Vector3
 from common.planning.ik import solve_ik
 from common.robot.model import RobotModel
@@ -248,18 +248,6 @@ async def test_ball_is_picked_up_and_dropped_into_the_box(robot: RobotModel) -> 
         dropped = await latest(client.balls, lambda b: b.labels == ["box"])
         assert dropped.poses[0].position.z == pytest.approx(0.035)
         assert [(await client.updates.next()).data for _ in range(2)] == ["remove:ball_1", "add:ball_1"]
-
-
-async def test_world_edits_change_the_truth_and_invalid_ones_are_rejected() -> None:
-    async with executor("world.count=2") as client:
-        reply = await client.edit(op="add", position=Vector3(x=0.4, y=0.2))
-        assert reply.id == "ball_3" and reply.ids == ["ball_1", "ball_2", "ball_3"]
-        await latest(client.balls, lambda b: len(b.ids) == 3)
-        with pytest.raises(RemoteError) as refusal:
-            await client.edit(op="remove", id="ball_9")
-        assert refusal.value.code == "unknown_id" and "ball_3" in refusal.value.message
-        await client.edit(op="remove", id="ball_3")
-        await latest(client.balls, lambda b: len(b.ids) == 2)
 
 
 async def random_balls(*overrides: str):
