@@ -8,18 +8,10 @@ import numpy as np
 import ruckig
 
 from applications.pick_place.topics import SCENE_BALLS
+from common import messages as m
 from common import topics
 from common.clock import Clock
 from common.config import load_cell, service_config
-from common.messages import (
-    ExecuteRequest,
-    GripperCommand,
-    Header,
-    HoldRequest,
-    JointTrajectory,
-    JointTrajectoryPoint,
-    WorldEdit,
-)
 from common.robot.model import RobotModel
 from services import trajectory_executor
 from services.trajectory_executor import Config
@@ -51,8 +43,8 @@ class ExecutorClient(FakeCell):
         self.command, self.world = self.client(topics.GRIPPER_COMMAND), self.client(topics.WORLD_EDIT)
 
     def request(self, goal, trajectory, stamp=None):
-        header = self.bus.header() if stamp is None else Header(stamp=stamp)
-        return ExecuteRequest(header=header, id=goal, trajectory=trajectory)
+        header = self.bus.header() if stamp is None else m.Header(stamp=stamp)
+        return m.ExecuteRequest(header=header, id=goal, trajectory=trajectory)
 
     async def start(self, goal, trajectory, stamp=None):
         return await self.execute.call(self.request(goal, trajectory, stamp))
@@ -77,14 +69,14 @@ class ExecutorClient(FakeCell):
         await latest(self.motion, lambda m: m.progress > until)
 
     async def grip(self, goal, width):
-        await self.command.call(GripperCommand(id=goal, width=width))
+        await self.command.call(m.GripperCommand(id=goal, width=width))
         return await latest(self.gripper, lambda g: g.id == goal and g.state != "active" and not g.moving)
 
     async def release(self, owner, **more):
-        return await self.hold.call(HoldRequest(hold=False, owner=owner, **more))
+        return await self.hold.call(m.HoldRequest(hold=False, owner=owner, **more))
 
     async def edit(self, timeout=20.0, **edit):
-        return await self.world.call(WorldEdit(**edit), timeout=timeout)
+        return await self.world.call(m.WorldEdit(**edit), timeout=timeout)
 
 
 @asynccontextmanager
@@ -95,7 +87,7 @@ async def executor(*overrides: str, speed: float = SPEED, clock: Clock | None = 
         yield client
 
 
-def move(robot: RobotModel, start, end, scaling=0.5) -> JointTrajectory:
+def move(robot: RobotModel, start, end, scaling=0.5) -> m.JointTrajectory:
     """Return a point-to-point motion at a share of the robot's limits."""
     problem = ruckig.InputParameter(robot.dof)
     problem.current_position, problem.target_position = list(start), list(end)
@@ -107,11 +99,11 @@ def move(robot: RobotModel, start, end, scaling=0.5) -> JointTrajectory:
     points = []
     for t in np.linspace(0.0, found.duration, max(2, round(found.duration / 0.02))):
         q, dq, ddq = found.at_time(float(t))
-        points.append(JointTrajectoryPoint(time_from_start=float(t), positions=q, velocities=dq, accelerations=ddq))
-    return JointTrajectory(joint_names=robot.joint_names, points=points)
+        points.append(m.JointTrajectoryPoint(time_from_start=float(t), positions=q, velocities=dq, accelerations=ddq))
+    return m.JointTrajectory(joint_names=robot.joint_names, points=points)
 
 
-def to_home_plus(distance: float, start: float = 0.0, scaling: float = 0.5) -> JointTrajectory:
+def to_home_plus(distance: float, start: float = 0.0, scaling: float = 0.5) -> m.JointTrajectory:
     """Return a motion of all Panda joints between offsets [rad] from home."""
     return move(RobotModel.load(PANDA.robot), HOME + start, HOME + distance, scaling)
 

@@ -61,9 +61,9 @@ def at(x: float, y: float, z: float) -> m.Pose:
     return m.Pose(position=m.Vector3(x=x, y=y, z=z))
 
 
-def ball(name: str, x: float, y: float) -> m.CollisionObject:
-    """Return a target on the table."""
-    return m.CollisionObject(id=name, role="target", shape="sphere", dimensions=[0.03], pose=at(x, y, 0.03))
+def ball(name: str, x: float, y: float, z: float = 0.03) -> m.CollisionObject:
+    """Return a target, by default on the table."""
+    return m.CollisionObject(id=name, role="target", shape="sphere", dimensions=[0.03], pose=at(x, y, z))
 
 
 def trajectory(joints: Sequence[str], *times: float) -> m.JointTrajectory:

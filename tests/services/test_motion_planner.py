@@ -5,27 +5,16 @@ from functools import partial
 
 import pytest
 
+from common import messages as m
 from common import topics
 from common.config import load_cell, service_config
 from common.errors import Refused, RemoteError
-from common.messages import (
-    CollisionObject,
-    ExecuteRequest,
-    FollowedRequest,
-    Header,
-    JointGoal,
-    MotionStatus,
-    ParameterRequest,
-    PlanningScene,
-    PlanRequest,
-    PoseGoal,
-)
 from common.planning.pipeline import PlanningPipeline
 from common.process.planning_worker import WorkerDied
 from common.robot.model import RobotModel
 from common.robot.transforms import matrix_to_pose, tool_down
 from services import motion_planner
-from tests.services.fake_cell import FakeCell, at, until
+from tests.services.fake_cell import FakeCell, at, ball, until
 
 CELL = load_cell("panda")
 CONFIG = service_config(CELL, "motion_planner", motion_planner.Config)
@@ -34,8 +23,8 @@ HOME = ROBOT.named("home")
 FINGERS = ["panda_finger_joint1", "panda_finger_joint2"]
 
 
-def box(name: str, size: list[float], x: float, z: float) -> CollisionObject:
-    return CollisionObject(id=name, role="fixture", shape="box", dimensions=size, pose=at(x, 0.0, z))
+def box(name: str, size: list[float], x: float, z: float) -> m.CollisionObject:
+    return m.CollisionObject(id=name, role="fixture", shape="box", dimensions=size, pose=at(x, 0.0, z))
 
 
 class User(FakeCell):
@@ -47,7 +36,7 @@ class User(FakeCell):
 
     def put_scene(self, *objects):
         table = box("table", [1.0, 1.0, 0.05], 0.5, -0.025)
-        self.put(topics.PLANNING_SCENE, PlanningScene(header=Header(frame_id="world"), objects=[table, *objects]))
+        self.put(topics.PLANNING_SCENE, m.PlanningScene(header=m.Header(frame_id="world"), objects=[table, *objects]))
 
     def put_state(self, q, width=0.08):
         self.put_joints([*ROBOT.joint_names, *FINGERS], [*q, width / 2, width / 2])
@@ -80,8 +69,8 @@ async def planner():
         yield user
 
 
-def to_home(id="1", **more) -> PlanRequest:
-    return PlanRequest(id=id, goal=JointGoal(named="home"), **more)
+def to_home(id="1", **more) -> m.PlanRequest:
+    return m.PlanRequest(id=id, goal=m.JointGoal(named="home"), **more)
 
 
 async def test_request_is_answered_with_a_trajectory_that_is_also_displayed(planner):
@@ -98,7 +87,7 @@ async def test_request_is_answered_with_a_trajectory_that_is_also_displayed(plan
 
 async def test_plan_uses_the_gripper_width_of_the_joint_states(planner):
     planner.put_scene(box("wall", [0.1, 0.04, 0.04], 0.5, 0.02))
-    around_wall = PlanRequest(id="1", goal=PoseGoal(pose=matrix_to_pose(tool_down(0.5, 0.0, 0.02))))
+    around_wall = m.PlanRequest(id="1", goal=m.PoseGoal(pose=matrix_to_pose(tool_down(0.5, 0.0, 0.02))))
     planner.put_state(HOME, width=0.08)
     assert (await planner.plan.call(around_wall, timeout=30)).ok
     planner.put_state(HOME, width=0.0)
@@ -120,25 +109,24 @@ async def test_request_without_a_scene_or_a_complete_joint_state_is_refused(plan
 
 async def test_failed_request_names_the_colliding_pair_and_the_next_is_served(planner):
     x, y, z = ROBOT.fk(HOME)[:3, 3]
-    in_gripper = CollisionObject(id="ball_1", role="target", shape="sphere", dimensions=[0.03], pose=at(x, y, z + 0.06))
-    planner.put_scene(in_gripper)
+    planner.put_scene(ball("ball_1", x, y, z + 0.06))  # within the gripper
     planner.put_state(HOME)
-    goal = PoseGoal(pose=matrix_to_pose(tool_down(0.4, 0.1, 0.3)))
-    response = await planner.plan.call(PlanRequest(id="2", stage="lift", goal=goal), timeout=30)
+    goal = m.PoseGoal(pose=matrix_to_pose(tool_down(0.4, 0.1, 0.3)))
+    response = await planner.plan.call(m.PlanRequest(id="2", stage="lift", goal=goal), timeout=30)
     assert (response.ok, response.error, response.colliding[1]) == (False, "start_in_collision", "ball_1")
     planner.put_scene()
-    assert (await planner.plan.call(PlanRequest(id="3", goal=goal), timeout=30)).ok
+    assert (await planner.plan.call(m.PlanRequest(id="3", goal=goal), timeout=30)).ok
 
 
 async def test_velocity_scaling_changed_live_affects_the_next_plan(planner):
     planner.put_scene()
     below = ROBOT.fk(HOME)
     below[2, 3] -= 0.10
-    request = PlanRequest(id="1", start=list(HOME), goal=PoseGoal(pose=matrix_to_pose(below)), straight=True)
+    request = m.PlanRequest(id="1", start=list(HOME), goal=m.PoseGoal(pose=matrix_to_pose(below)), straight=True)
     durations = []
     for values in ({}, {"motion.velocity_scaling": 0.05, "motion.acceleration_scaling": 0.05},
                    {"motion.cartesian_speed_scale": 0.5}):
-        await planner.client(topics.parameters_of("motion_planner")).call(ParameterRequest(set=values, by="a test"))
+        await planner.client(topics.parameters_of("motion_planner")).call(m.ParameterRequest(set=values, by="a test"))
         answer = await planner.plan.call(request, timeout=30)
         durations.append(answer.trajectory.points[-1].time_from_start)
     fast, slow, slower = durations
@@ -207,7 +195,7 @@ async def test_stopping_the_service_ends_a_running_plan(monkeypatch):
     async with asyncio.timeout(30):
         async with serving(pipeline=options) as user:
             user.put_scene(box("wall", [0.3, 0.02, 0.4], 0.55, 0.2))
-            request = PlanRequest(id="1", start=start, goal=JointGoal(positions=goal), planning_time=300)
+            request = m.PlanRequest(id="1", start=start, goal=m.JointGoal(positions=goal), planning_time=300)
             call = asyncio.create_task(user.plan.call(request, timeout=300))
             await planning.wait()
             assert not call.done()
@@ -218,7 +206,7 @@ async def test_stopping_the_service_ends_a_running_plan(monkeypatch):
 async def test_motion_status_without_an_id_is_ignored_and_the_next_motion_is_checked(planner) -> None:
     requested: asyncio.Queue[str] = asyncio.Queue()
 
-    async def followed(request: FollowedRequest) -> ExecuteRequest:
+    async def followed(request: m.FollowedRequest) -> m.ExecuteRequest:
         await requested.put(request.id)
         raise Refused("unknown_goal", "not followed here")
 
@@ -226,7 +214,7 @@ async def test_motion_status_without_an_id_is_ignored_and_the_next_motion_is_che
     await planner.bus.ready()
     planner.put_scene()
     for name in ("x", "", "y"):  # no executor sends an empty id, but a faulty client could
-        planner.put(topics.MOTION_STATUS, MotionStatus(id=name, state="active"))
+        planner.put(topics.MOTION_STATUS, m.MotionStatus(id=name, state="active"))
         if name:
             assert await asyncio.wait_for(requested.get(), 10) == name
         answer = await planner.plan.call(to_home(name or "none", start=[0.0]), timeout=30)

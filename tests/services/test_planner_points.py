@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from common import messages as m
 from common import topics
 from common.config import (
     ObjectConfig,
@@ -22,16 +23,6 @@ from common.config import (
     service_config,
 )
 from common.errors import RemoteError
-from common.messages import (
-    CollisionObject,
-    Header,
-    JointGoal,
-    JointState,
-    PlanRequest,
-    PointCloud2,
-    TFMessage,
-    WorldObjects,
-)
 from common.perception.camera_input import FrameError
 from common.perception.pinhole import Pinhole
 from common.planning.camera_obstacles import JointHistory, PointsOptions, cloud_points, frame_pose
@@ -62,7 +53,7 @@ def joints_at(y: float) -> np.ndarray:
 
 
 START, GOAL = joints_at(-0.3), joints_at(0.3)
-ACROSS = PlanRequest(id="1", stage="reach", start=START.tolist(), goal=JointGoal(positions=GOAL.tolist()))
+ACROSS = m.PlanRequest(id="1", stage="reach", start=START.tolist(), goal=m.JointGoal(positions=GOAL.tolist()))
 
 
 def with_points(**options: Any) -> motion_planner.Config:
@@ -80,10 +71,10 @@ class Cell(FakeCell):
     def show(self, *objects: ObjectConfig, stamp: int | None = None) -> None:
         """Publish scene, truth, camera pose, and joint positions of now or of a time [ns]."""
         T = Pinhole.from_config(AROUND.camera).T_world_optical
-        self.put(topics.TF_STATIC, TFMessage(transforms=[stamped("world", AROUND.camera.frame, T, 0)]))
+        self.put(topics.TF_STATIC, m.TFMessage(transforms=[stamped("world", AROUND.camera.frame, T, 0)]))
         self.put(topics.PLANNING_SCENE, SCENE)
         self.put_joints(ROBOT.joint_names, START, stamp)
-        self.put(topics.SCENE_OBJECTS, WorldObjects(objects=[world_object(item) for item in objects]))
+        self.put(topics.SCENE_OBJECTS, m.WorldObjects(objects=[world_object(item) for item in objects]))
 
     async def new_image(self, reader: Any) -> None:
         """Wait for an image taken from now on, and publish a joint state at its time."""
@@ -101,7 +92,7 @@ class Cell(FakeCell):
 @pytest.mark.parametrize("camera", [DEPTH, {"points": topics.DEPTH_CAMERA_POINTS.key}], ids=["depth", "cloud"])
 async def test_obstacle_that_only_the_camera_sees_is_avoided(camera: dict[str, str]) -> None:
     cell, collides = Cell(), []
-    post = CollisionObject(id="post", role="fixture", shape="box", dimensions=[0.08, 0.08, 0.25],
+    post = m.CollisionObject(id="post", role="fixture", shape="box", dimensions=[0.08, 0.08, 0.25],
                            pose=at(0.5, 0, 1.125))
     world = CollisionWorld(ROBOT, SCENE.model_copy(update={"objects": [*SCENE.objects, post]}), start=START)
     async with cell.running(depth_camera, CAMERA):
@@ -134,7 +125,7 @@ async def test_request_without_a_usable_image_is_refused_with_the_reason(planner
         await until(planner.depths)
         refusal = await planner.refusal()
         assert refusal.code == "no_state" and "no joint state at the time" in refusal.message
-        planner.put(topics.TF_STATIC, TFMessage(transforms=[stamped("world", "elsewhere", np.eye(4), 0)]))
+        planner.put(topics.TF_STATIC, m.TFMessage(transforms=[stamped("world", "elsewhere", np.eye(4), 0)]))
         await planner.new_image(planner.depths)
         refusal = await planner.refusal()
         assert refusal.code == "bad_points" and "depth_camera_optical_frame" in refusal.message
@@ -155,7 +146,7 @@ async def test_client_retries_a_request_that_came_before_the_first_image() -> No
     reports: list[str] = []
 
     class Client:
-        async def call(self, request: PlanRequest, timeout: float) -> str:
+        async def call(self, request: m.PlanRequest, timeout: float) -> str:
             if not reports:
                 raise RemoteError("motion/plan", "no_points", "no image received yet")
             return "a plan"
@@ -180,12 +171,12 @@ def test_invalid_options_are_refused(options: dict[str, Any], message: str) -> N
 def test_mounted_camera_has_the_pose_of_its_link() -> None:
     on_tool = transform(np.eye(3), (0.0, 0.05, 0.1))
     link = ROBOT.link_names[-1]
-    poses = TFMessage(transforms=[stamped("mount", "lens", on_tool, 0), stamped(link, "mount", on_tool, 0)])
+    poses = m.TFMessage(transforms=[stamped("mount", "lens", on_tool, 0), stamped(link, "mount", on_tool, 0)])
     expected = ROBOT.link_poses(START)[link] @ on_tool @ on_tool
     np.testing.assert_allclose(frame_pose("lens", poses, ROBOT, START), expected, atol=1e-12)
     with pytest.raises(FrameError, match="'nowhere'; its frames: lens, mount"):
         frame_pose("nowhere", poses, ROBOT, START)
-    cycle = TFMessage(transforms=[stamped("a", "b", on_tool, 0), stamped("b", "a", on_tool, 0)])
+    cycle = m.TFMessage(transforms=[stamped("a", "b", on_tool, 0), stamped("b", "a", on_tool, 0)])
     with pytest.raises(FrameError, match="frame 'a'; its"):
         frame_pose("a", cycle, ROBOT, START)
 
@@ -193,8 +184,8 @@ def test_mounted_camera_has_the_pose_of_its_link() -> None:
 def test_joint_history_interpolates_between_close_states() -> None:
     history = JointHistory(ROBOT)
     for stamp, q in ((1.0, START), (1.02, START + 0.02), (1.01, START - 1), (3.0, GOAL)):
-        header = Header(stamp=int(stamp * 1e9))
-        history.add(JointState(header=header, name=ROBOT.joint_names, position=list(q)))
+        header = m.Header(stamp=int(stamp * 1e9))
+        history.add(m.JointState(header=header, name=ROBOT.joint_names, position=list(q)))
     np.testing.assert_allclose(history.at(int(1.005e9)), START + 0.005, atol=1e-9)
     np.testing.assert_allclose(history.at(int(1.1e9)), START + 0.02)
     np.testing.assert_allclose(history.at(int(3.05e9)), GOAL)
@@ -204,8 +195,8 @@ def test_joint_history_interpolates_between_close_states() -> None:
 def test_cloud_points_are_read_by_field_names() -> None:
     values = np.array([[[1, 2], [3, 4]], [[5, 6], [np.nan, 8]]], "<f4")
     data = np.ascontiguousarray(values.repeat(2, axis=2)[..., :3]).tobytes()  # x, x, y
-    cloud = PointCloud2(
-        header=Header(), height=2, width=2, fields=["z", "x", "y"], point_step=12, row_step=24, data=data)
+    cloud = m.PointCloud2(
+        header=m.Header(), height=2, width=2, fields=["z", "x", "y"], point_step=12, row_step=24, data=data)
     np.testing.assert_allclose(cloud_points(cloud), [[1, 2, 1], [3, 4, 3], [5, 6, 5]])
     padded = b"".join(data[row:row + 24] + b"pads" for row in (0, 24))
     np.testing.assert_allclose(cloud_points(cloud.model_copy(update={"row_step": 28, "data": padded})),
