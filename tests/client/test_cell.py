@@ -121,7 +121,7 @@ def test_task_is_started_observed_and_stopped() -> None:
         await cell.task.start()
         assert (await cell.task.ended()).state == "DONE"
 
-    run(program, "panda", "world.count=2")
+    run(program, "panda", "world.count=1")
 
 
 def test_any_key_can_be_called_or_listened_to() -> None:

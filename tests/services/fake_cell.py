@@ -95,9 +95,7 @@ class FakeCell:
             self._writers[topic.key] = self.bus.writer(topic)
         self._writers[topic.key].put(message)
 
-    def calibrate(
-        self, camera: Pinhole, frame: str, info: topics.Topic[m.CameraInfo] = topics.CAMERA_INFO
-    ) -> None:
+    def calibrate(self, camera: Pinhole, frame: str, info: topics.Topic[m.CameraInfo] = topics.CAMERA_INFO) -> None:
         """Publish intrinsics and pose of a camera."""
         self.put(topics.TF_STATIC, camera_transform(camera, frame))
         self.put(info, camera.info(self.bus.header(frame)))
