@@ -22,7 +22,8 @@ SPEED = 10.0
 NOT_TOO_LATE = "services.trajectory_executor.request_timeout=60"  # for a busy machine
 SLOW = 0.02  # share of the limits of a motion that a test interrupts
 PANDA = load_cell("panda")
-HOME = RobotModel.load(PANDA.robot).named("home")
+ROBOT = RobotModel.load(PANDA.robot)
+HOME = ROBOT.named("home")
 
 
 def config(*overrides: str, **cell) -> Config:
@@ -105,7 +106,7 @@ def move(robot: RobotModel, start, end, scaling=0.5) -> m.JointTrajectory:
 
 def to_home_plus(distance: float, start: float = 0.0, scaling: float = 0.5) -> m.JointTrajectory:
     """Return a motion of all Panda joints between offsets [rad] from home."""
-    return move(RobotModel.load(PANDA.robot), HOME + start, HOME + distance, scaling)
+    return move(ROBOT, HOME + start, HOME + distance, scaling)
 
 
 @asynccontextmanager

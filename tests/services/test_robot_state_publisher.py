@@ -3,20 +3,20 @@ from collections.abc import AsyncIterator
 import numpy as np
 import pytest
 
+from common import messages as m
 from common import topics
+from common.config import Cell as LoadedCell
 from common.config import load_cell, service_config
-from common.messages import TFMessage
+from common.robot.finger_joints import finger_positions
 from common.robot.model import RobotModel
 from common.robot.transforms import pose_to_matrix
 from services import robot_state_publisher
 from tests.services.fake_cell import FakeCell, settle, until
 
-CELL = load_cell("panda")
+CELL, UR5 = load_cell("panda"), load_cell("panda", ["robot=ur5"], world="w2")
 CONFIG = service_config(CELL, "robot_state_publisher", robot_state_publisher.Config)
-ROBOT = RobotModel.load(CELL.robot)
-HOME = ROBOT.named("home").tolist()
+HOME = CELL.robot.named_poses["home"]
 ARM = [f"panda_joint{i}" for i in range(1, 8)]
-FINGERS = ["panda_finger_joint1", "panda_finger_joint2"]
 
 
 class Cell(FakeCell):
@@ -34,9 +34,8 @@ async def cell() -> AsyncIterator[Cell]:
         yield made
 
 
-def chain(messages: list[TFMessage], frame: str) -> np.ndarray:
+def pose_in_world(tree: dict[str, m.TransformStamped], frame: str) -> np.ndarray:
     """Return the (4, 4) pose of a frame in world, following the tree."""
-    tree = {t.child_frame_id: t for message in messages for t in message.transforms}
     T = np.eye(4)
     while frame != "world":
         T = pose_to_matrix(tree[frame].transform) @ T
@@ -44,19 +43,27 @@ def chain(messages: list[TFMessage], frame: str) -> np.ndarray:
     return T
 
 
-async def test_frames_agree_with_forward_kinematics_and_each_has_one_parent(cell: Cell) -> None:
-    q = ROBOT.named("home") + 0.1
-    cell.put_joints(ARM + FINGERS, [*q, 0.01, 0.01], 7 * 10**9)
-    moving, fixed = await until(cell.tf), await until(cell.static)
-    children = [t.child_frame_id for t in moving.transforms + fixed.transforms]
-    assert len(children) == len(set(children)) and set(children) == {*ROBOT.link_names, "camera_optical_frame"}
+@pytest.mark.parametrize(("loaded", "camera"), [(CELL, "camera_optical_frame"), (UR5, "depth_camera_optical_frame")])
+async def test_frames_agree_with_forward_kinematics_and_each_has_one_parent(loaded: LoadedCell, camera: str) -> None:
+    cell, robot, gripper = Cell(), RobotModel.load(loaded.robot), loaded.robot.gripper
+    assert gripper is not None
+    q, fingers = robot.named("home") + 0.1, finger_positions(gripper, 0.02)
+    config = service_config(loaded, "robot_state_publisher", robot_state_publisher.Config)
+    async with cell.running(robot_state_publisher, config):
+        cell.put_joints([*robot.joint_names, *gripper.joints], [*q, *fingers], 7 * 10**9)
+        moving, fixed = await until(cell.tf), await until(cell.static)
+    tree = {t.child_frame_id: t for t in moving.transforms + fixed.transforms}
+    assert len(tree) == len(moving.transforms + fixed.transforms) and set(tree) == {*robot.link_names, camera}
     assert all(t.header.stamp == 7 * 10**9 for t in moving.transforms)
-    for link, T in ROBOT.link_poses(q, dict.fromkeys(FINGERS, 0.01)).items():
-        assert np.allclose(chain([moving, fixed], link), T, atol=1e-6), link
-    assert np.allclose(chain([moving, fixed], "panda_hand_tcp"), ROBOT.fk(q), atol=1e-6)
-    T = chain([fixed], "camera_optical_frame")  # looks straight down
-    assert np.allclose(T[:3, :3], np.column_stack([(0, -1, 0), (-1, 0, 0), (0, 0, -1)]))
-    assert np.allclose(T[:3, 3], (0.40, 0.0, 0.80)) and np.linalg.det(T[:3, :3]) == pytest.approx(1.0)
+    for link, T in robot.link_poses(q, dict(zip(gripper.joints, fingers, strict=True))).items():
+        assert np.allclose(pose_in_world(tree, link), T, atol=1e-6), link
+    T = pose_in_world(tree, camera)
+    assert np.allclose(T[:3, 2], (0, 0, -1)) and np.linalg.det(T[:3, :3]) == pytest.approx(1.0), "looks down"
+    if loaded is UR5:
+        assert tree["base_link"].header.frame_id == "world" and tree["base_link"].transform.position.z == 0.75
+    else:
+        assert np.allclose(pose_in_world(tree, "panda_hand_tcp"), robot.fk(q), atol=1e-6)
+        assert np.allclose(T[:3, :2], [(0, -1), (-1, 0), (0, 0)]) and np.allclose(T[:3, 3], (0.40, 0.0, 0.80))
 
 
 async def test_tf_has_half_the_rate_of_joint_states_or_the_rate_set_live(cell: Cell) -> None:

@@ -1,32 +1,24 @@
-"""Executor and frames of a UR5 that does not stand at the origin, with a gripper of six joints."""
+"""Executor of a UR5 that does not stand at the origin, with a gripper of six joints."""
 
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from common import topics
 from common.atomic_file import STATE_VARIABLE
-from common.config import load_cell, service_config
+from common.config import load_cell
 from common.errors import RemoteError
 from common.messages import GripperCommand, JointState, Vector3
 from common.robot.finger_joints import finger_positions
 from common.robot.model import RobotModel
-from common.robot.transforms import pose_to_matrix
 from common.sim.objects import centre_of
-from services import robot_state_publisher
 from tests.services.executor_rig import executor, move
-from tests.services.fake_cell import FakeCell, latest, until
+from tests.services.fake_cell import latest, until
 
 OVERRIDES = ("robot=ur5", "services.trajectory_executor.tolerances={path: 0.2, goal: 0.1, stopped_velocity: 0.2}")
 CELL = load_cell("panda", OVERRIDES, world="w2")
 GRIPPER = CELL.robot.gripper
 assert GRIPPER is not None
-
-
-@pytest.fixture(scope="module")
-def robot() -> RobotModel:
-    return RobotModel.load(CELL.robot)
 
 
 def ur5():
@@ -51,7 +43,8 @@ async def test_fingers_close_together_within_the_speed_of_their_knuckle() -> Non
         assert state.position[6:] == pytest.approx([f * state.position[6] for f in GRIPPER.mimic], abs=1e-12)
 
 
-async def test_trajectory_is_followed_and_status_names_its_controller(robot: RobotModel) -> None:
+async def test_trajectory_is_followed_and_status_names_its_controller() -> None:
+    robot = RobotModel.load(CELL.robot)
     home, there = robot.named("home"), robot.named("default")
     async with ur5() as client:
         done = await client.follow("up", move(robot, home, there))
@@ -81,22 +74,3 @@ async def test_edited_objects_are_like_the_first_of_the_world_and_persist_over_a
     async with ur5() as client:
         again = await latest(client.objects)
     np.testing.assert_allclose(again.objects[0].outline, moved.objects[0].outline, atol=1e-12)
-
-
-async def test_frames_agree_with_forward_kinematics_from_world_to_the_finger_tips(robot: RobotModel) -> None:
-    cell = FakeCell()
-    config = service_config(CELL, "robot_state_publisher", robot_state_publisher.Config)
-    q, fingers = robot.named("home") + 0.1, finger_positions(GRIPPER, 0.03)
-    readers = cell.reader(topics.TF), cell.reader(topics.TF_STATIC)
-    async with cell.running(robot_state_publisher, config):
-        cell.put_joints([*robot.joint_names, *GRIPPER.joints], [*q, *fingers])
-        transforms = [t for reader in readers for t in (await until(reader)).transforms]
-    tree = {t.child_frame_id: (t.header.frame_id, pose_to_matrix(t.transform)) for t in transforms}
-    assert len(tree) == len(transforms) and set(tree) == {*robot.link_names, "depth_camera_optical_frame"}
-    assert tree["base_link"][0] == "world" and tree["base_link"][1][2, 3] == pytest.approx(0.75)
-    for link, T in robot.link_poses(q, dict(zip(GRIPPER.joints, fingers, strict=True))).items():
-        T_world_link, frame = np.eye(4), link
-        while frame != "world":
-            frame, T_parent_frame = tree[frame]
-            T_world_link = T_parent_frame @ T_world_link
-        assert np.allclose(T_world_link, T, atol=1e-6), link

@@ -13,7 +13,6 @@ from common.control.executor import Executor
 from common.errors import ConfigError, UnknownName
 from common.messages import GripperCommand, JointTrajectoryPoint, StopRequest, Vector3
 from common.planning.ik import solve_ik
-from common.robot.model import RobotModel
 from common.robot.transforms import tool_down
 from common.scene.workspace import unreachable_reason
 from common.sim.interface import ObjectSnapshot
@@ -24,6 +23,7 @@ from common.transport.local import LocalNetwork
 from tests.services.executor_rig import (
     HOME,
     PANDA,
+    ROBOT,
     SPEED,
     ExecutorClient,
     blocked,
@@ -38,10 +38,10 @@ NEAR = to_home_plus(0.2)
 SCALING = "services.trajectory_executor.speed_scaling"
 
 
-async def test_arm_starts_at_home_with_open_fingers_and_the_balls_of_the_world(robot: RobotModel) -> None:
+async def test_arm_starts_at_home_with_open_fingers_and_the_balls_of_the_world() -> None:
     async with executor("world.count=3") as client:
         state = await client.joints.next()
-        assert state.name == [*robot.joint_names, "panda_finger_joint1", "panda_finger_joint2"]
+        assert state.name == [*ROBOT.joint_names, "panda_finger_joint1", "panda_finger_joint2"]
         assert np.allclose(state.position, [*HOME, 0.04, 0.04])
         balls = await latest(client.balls)
         assert balls.ids == ["ball_1", "ball_2", "ball_3"] and set(balls.labels) == {"table"}
@@ -60,7 +60,7 @@ async def test_stop_brings_the_arm_to_standstill() -> None:
 
 async def test_speed_scaling_set_during_a_motion_slows_the_arm_down() -> None:
     async with executor() as client:
-        trajectory, began = to_home_plus(0.3, scaling=0.05), client.clock.now()
+        trajectory, began = to_home_plus(0.15, scaling=0.05), client.clock.now()
         await client.start("a", trajectory)
         await latest(client.motion, lambda m: m.progress > 0.1)
         client.config.speed_scaling = 0.2
@@ -227,22 +227,22 @@ async def test_cycles_continue_while_the_disk_for_the_simulated_world_hangs(monk
 # --- the simulated world ---
 
 
-def above_and_at(robot: RobotModel, x: float, y: float) -> tuple[np.ndarray, np.ndarray]:
+def above_and_at(x: float, y: float) -> tuple[np.ndarray, np.ndarray]:
     """Return joint positions above a ball and with the fingers around it."""
-    above = solve_ik(robot, tool_down(x, y, 0.2), HOME)
-    return above, solve_ik(robot, tool_down(x, y, 0.03), above)
+    above = solve_ik(ROBOT, tool_down(x, y, 0.2), HOME)
+    return above, solve_ik(ROBOT, tool_down(x, y, 0.03), above)
 
 
-async def test_ball_is_picked_up_and_dropped_into_the_box(robot: RobotModel) -> None:
-    above, at_ball = above_and_at(robot, 0.5, 0.0)
-    over_box = solve_ik(robot, tool_down(0.55, 0.25, 0.25), HOME)
+async def test_ball_is_picked_up_and_dropped_into_the_box() -> None:
+    above, at_ball = above_and_at(0.5, 0.0)
+    over_box = solve_ik(ROBOT, tool_down(0.55, 0.25, 0.25), HOME)
     async with executor("robot.hardware.backend=lag", "world.balls=[[0.5, 0.0]]") as client:
-        await client.follow("1", move(robot, HOME, above))
-        await client.follow("2", move(robot, above, at_ball))
+        await client.follow("1", move(ROBOT, HOME, above))
+        await client.follow("2", move(ROBOT, above, at_ball))
         closed = await client.grip("3", 0.0)
         assert closed.holding and closed.width == pytest.approx(0.06)
-        await client.follow("4", move(robot, at_ball, above))
-        await client.follow("5", move(robot, above, over_box))
+        await client.follow("4", move(ROBOT, at_ball, above))
+        await client.follow("5", move(ROBOT, above, over_box))
         assert (await latest(client.balls, lambda b: b.labels == ["held"])).poses[0].position.z > 0.1
         assert not (await client.grip("6", 0.08)).holding
         dropped = await latest(client.balls, lambda b: b.labels == ["box"])
@@ -255,12 +255,12 @@ async def random_balls(*overrides: str):
         return await latest(client.balls)
 
 
-async def test_random_layout_follows_the_seed_and_the_reach_of_robot_and_validator(robot: RobotModel) -> None:
+async def test_random_layout_follows_the_seed_and_the_reach_of_robot_and_validator() -> None:
     one, two = await random_balls("seed=20"), await random_balls("seed=20")
     assert one.poses == two.poses and len(one.ids) == 7
     for p in (pose.position for pose in one.poses):
         for scale in (1 + off / float(np.hypot(p.x, p.y)) for off in (-0.005, 0.0, 0.005)):  # detected a little off
-            assert not unreachable_reason(robot, (p.x * scale, p.y * scale, p.z), PANDA.grasp)
+            assert not unreachable_reason(ROBOT, (p.x * scale, p.y * scale, p.z), PANDA.grasp)
     limits = (f"services.workspace_validator.{name}" for name in ("max_radius=0.52", "min_radius=0.3"))
     near = await random_balls("world.count=4", *limits)
     assert all(0.3 <= np.hypot(p.position.x, p.position.y) <= 0.52 for p in near.poses) and len(near.poses) == 4
@@ -275,14 +275,14 @@ def persistent(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 async def test_arm_gripper_and_held_ball_are_found_as_they_were_before_a_restart(
-    robot: RobotModel, persistent: None
+    persistent: None
 ) -> None:
-    above, at_ball = above_and_at(robot, *PANDA.world.spots[3])
+    above, at_ball = above_and_at(*PANDA.world.spots[3])
     async with executor() as client:
-        await client.follow("a", move(robot, HOME, above))
-        await client.follow("b", move(robot, above, at_ball))
+        await client.follow("a", move(ROBOT, HOME, above))
+        await client.follow("b", move(ROBOT, above, at_ball))
         assert (await client.grip("close", 0.0)).holding
-        await client.follow("c", move(robot, at_ball, above))
+        await client.follow("c", move(ROBOT, at_ball, above))
         before = await latest(client.balls, lambda b: "held" in b.labels)
         joints, gripper = client.joints.latest, client.gripper.latest
     async with executor() as client:
@@ -292,14 +292,14 @@ async def test_arm_gripper_and_held_ball_are_found_as_they_were_before_a_restart
         balls = await latest(client.balls)
         assert dict(zip(balls.ids, balls.labels, strict=True)) == dict(zip(before.ids, before.labels, strict=True))
         held = balls.ids[balls.labels.index("held")]
-        await client.follow("d", move(robot, above, HOME))
+        await client.follow("d", move(ROBOT, above, HOME))
         await client.grip("open", 0.08)
         balls = await latest(client.balls, lambda b: b.labels[b.ids.index(held)] == "table")
         assert len(balls.ids) == len(before.ids)
 
 
 async def test_saved_state_of_another_layout_or_simulator_is_not_used(
-    robot: RobotModel, persistent: None, caplog: pytest.LogCaptureFixture
+    persistent: None, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level("INFO")
     async with executor() as client:
