@@ -147,7 +147,7 @@ async def test_image_depth_and_points_share_a_stamp():
 
 
 @pytest.mark.parametrize(("points", "problem"), [
-    (TRIANGLE * 7000, "at most 20000"), ([*TRIANGLE, (5e8, 0.0, 0.0)], "10000000")], ids=["too many", "too far"])
+    (TRIANGLE * 6667, "at most 20000"), ([*TRIANGLE, (5e8, 0.0, 0.0)], "10000000")], ids=["too many", "too far"])
 def test_unusable_coordinates_of_a_file_are_rejected_at_the_start(tmp_path, points, problem):
     write_points(file := tmp_path / "a.json", points)
     with pytest.raises(ConfigError, match=problem):

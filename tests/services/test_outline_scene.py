@@ -41,11 +41,11 @@ def cube_contours(stamp: int = 0) -> Contours:
 
 
 def noise_contours() -> Contours:
-    """Return thousands of small contours."""
+    """Return hundreds of small contours."""
     image = np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8)
     for row in range(5):
         for column in range(5):
-            image[20 + row:-20:33, 20 + column:-20:33] = (0, 0, 255)
+            image[20 + row:-20:45, 20 + column:-20:45] = (0, 0, 255)
     return contours(find_contours(image, ContourOptions()))
 
 
