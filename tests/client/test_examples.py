@@ -72,9 +72,7 @@ def test_script_prints_its_result_and_ends_its_cell(name: str, folder: Path) -> 
     assert re.search(SAYS[name], done.stdout), done.stdout
 
 
-def test_notebook_runs_from_top_to_bottom_inside_a_running_loop(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_notebook_runs_from_top_to_bottom_inside_a_running_loop(folder, capsys):
     steps = json.loads((EXAMPLES / "tutorial.ipynb").read_text(encoding="utf-8"))["cells"]
     names: dict[str, object] = {}
 

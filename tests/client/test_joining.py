@@ -143,9 +143,7 @@ class OwnStatus(TaskStatus):
 OWN = Topic("own_status", OwnStatus, "state", "progress")
 
 
-async def test_task_of_a_custom_application_needs_its_module(
-    net: LocalNetwork, tmp_path: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_task_of_a_custom_application_needs_its_module(net, tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     (tmp_path / "own").mkdir()
     (tmp_path / "own" / "application.py").write_text(

@@ -130,9 +130,7 @@ async def test_plan_alone_and_failed_plan_move_nothing(cell: Cell, operator: Ope
     ({"started": True, "state": "DONE"}, ""), ({"started": True, "state": "IDLE"}, ""),
     ({"started": False, "state": "GRASPING"}, ""), ({"started": True, "state": "ERROR"}, ""),
 ])
-async def test_motion_is_refused_only_while_a_task_has_the_robot(
-    cell: Cell, operator: OperatorMotion, status: dict[str, object], message: str
-) -> None:
+async def test_motion_is_refused_only_while_a_task_has_the_robot(cell, operator, status, message):
     cell.put_task(**status)
     if not message:
         assert (await operator.move(HOME)).state == "succeeded"
@@ -156,9 +154,7 @@ async def test_motion_is_refused_while_another_operator_stops_or_holds_the_robot
     assert cell.requests == []
 
 
-async def test_interlock_set_during_planning_or_between_motions_is_not_acknowledged(
-    cell: Cell, operator: OperatorMotion
-) -> None:
+async def test_interlock_set_during_planning_or_between_motions_is_not_acknowledged(cell, operator):
     cell.publish(("held", "anna", 7), held=True)
     cell.during_planning = lambda: cell.publish(("held", "anna", 7), ("stopped", "anna", 8), held=True)
     await operator.move(HOME)
@@ -177,9 +173,7 @@ async def test_own_stop_during_planning_blocks_the_robot(cell: Cell) -> None:
     assert isinstance(execute, m.ExecuteRequest) and execute.acknowledged is not None and execute.acknowledged < since
 
 
-async def test_motion_of_another_client_is_not_stopped(
-    cell: Cell, operator: OperatorMotion, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_motion_of_another_client_is_not_stopped(cell, operator, monkeypatch):
     monkeypatch.setattr("common.client.operator_motion.BRAKING_TIMEOUT", 0.05)
     cell.publish(id="other", state="active", held=True)
     with pytest.raises(MotionFailed, match="follows goal 'other'") as caught:
@@ -228,17 +222,13 @@ async def test_cancelled_motion_stops_the_robot(cell: Cell, operator: OperatorMo
 
 
 @pytest.mark.parametrize("timeout", ["5", 0, -1.0, float("nan"), None])
-async def test_invalid_timeout_is_refused_before_anything_moves(
-    cell: Cell, operator: OperatorMotion, timeout: Any
-) -> None:
+async def test_invalid_timeout_is_refused_before_anything_moves(cell, operator, timeout):
     with pytest.raises(ConfigError, match="timeout: "):
         await operator.move(HOME, timeout=timeout)
     assert cell.kinds == ["Plan"]
 
 
-async def test_any_error_while_waiting_stops_the_robot(
-    cell: Cell, operator: OperatorMotion, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_any_error_while_waiting_stops_the_robot(cell, operator, monkeypatch):
     async def breaks(*_: object) -> m.MotionStatus:
         raise RuntimeError("a bug")
 
@@ -264,9 +254,7 @@ async def test_motion_without_progress_is_stopped_but_not_while_held(cell: Cell,
     ({"state": "cancelled", "error": "cancelled", "message": "requested"}, "the motion was cancelled: requested"),
     ({"id": "", "state": "none"}, "was restarted and has forgotten"),
 ])
-async def test_unsuccessful_motion_raises_one_line(
-    cell: Cell, operator: OperatorMotion, status: dict[str, object], message: str
-) -> None:
+async def test_unsuccessful_motion_raises_one_line(cell, operator, status, message):
     moving = await cell.motion_of(operator)
     cell.publish(**status)
     with pytest.raises(MotionFailed, match=message):

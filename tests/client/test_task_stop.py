@@ -10,7 +10,7 @@ from common import messages as m
 from common import topics
 from common.client.subscriptions import Subscriptions
 from common.client.task import ArmStopFailed, TaskControl, TaskStopFailed
-from common.errors import Refused, RemoteError, ZencellError
+from common.errors import Refused, RemoteError
 from common.messages.execution import NOT_PERSISTED
 from common.transport.local import LocalNetwork
 
@@ -47,9 +47,7 @@ async def task_control(arm: bool, task: bool) -> tuple[TaskControl, dict[str, as
     (False, True, ArmStopFailed, "the task has stopped; the executor of the arm did not confirm.*from the arm"),
     (False, False, RemoteError, "from the task"),
 ])
-async def test_stop_reports_which_of_arm_and_task_did_not_confirm_it(
-    arm: bool, task: bool, raised: type[ZencellError] | None, message: str,
-) -> None:
+async def test_stop_reports_which_of_arm_and_task_did_not_confirm_it(arm, task, raised, message):
     control, stopped = await task_control(arm, task)
     if raised is None:
         assert (await control.stop()).state == "READY"

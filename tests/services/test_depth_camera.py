@@ -217,9 +217,7 @@ async def test_unknown_driver_or_option_or_missing_package_is_a_one_line_error(
     assert message in await Camera(**config).error()
 
 
-async def test_frame_of_unexpected_shape_is_a_one_line_error(
-    realsense: FakeRealSense, monkeypatch: pytest.MonkeyPatch,
-) -> None:
+async def test_frame_of_unexpected_shape_is_a_one_line_error(realsense, monkeypatch):
     monkeypatch.setattr(importlib.import_module("drivers.realsense"), "RgbdFrame",
                         lambda colour, depth, age: RgbdFrame(colour, depth.astype(np.float64), age))
     assert "'realsense' gives depth of shape (48, 64) and type float64" in await Camera().error()

@@ -118,9 +118,7 @@ def test_executor_whose_arm_is_at_standstill_ends_at_once() -> None:
     assert len(arm.positions) <= cycles[0] + 2 and not arm.speed
 
 
-def test_executor_that_was_not_first_brakes_within_limits_and_leaves_the_keys_to_the_other(
-    monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_executor_that_was_not_first_brakes_within_limits_and_leaves_the_keys_to_the_other(monkeypatch):
     monkeypatch.setattr(ownership, "CONFLICT_SECONDS", 0.05)  # while the arm still moves
     found = []
 

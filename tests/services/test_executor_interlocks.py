@@ -155,9 +155,7 @@ async def test_safety_stop_of_the_arm_persists_until_an_operator_has_it_recover(
 # --- the file ---
 
 
-async def test_second_executor_of_the_same_cell_name_in_the_same_folder_is_refused(
-    monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_second_executor_of_the_same_cell_name_in_the_same_folder_is_refused(monkeypatch):
     monkeypatch.setattr(interlocks, "LOCK_TIMEOUT", 0.1)
     async with executor() as client:
         await client.stop.call(StopRequest(owner="anna"))

@@ -156,9 +156,7 @@ RARE = {f"services.{service}.{name}" for service, names in {  # those with a tes
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("cell", "overrides"), [("panda", ["world.count=1"]), ("ur5", [])])
-def test_every_tunable_parameter_is_read_while_the_cell_works(
-    cell: str, overrides: list[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_every_tunable_parameter_is_read_while_the_cell_works(cell, overrides, monkeypatch):
     watch = Watch(monkeypatch)
 
     def watched(loaded: Cell, service: str, kind: type[Parameters]) -> Parameters:

@@ -1,6 +1,5 @@
 """Executor of a UR5 that does not stand at the origin, with a gripper of six joints."""
 
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -54,9 +53,7 @@ async def test_trajectory_is_followed_and_status_names_its_controller() -> None:
     assert (again.state, again.error, again.source) == ("rejected", "start_mismatch", "joint_trajectory_controller")
 
 
-async def test_edited_objects_are_like_the_first_of_the_world_and_persist_over_a_restart(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+async def test_edited_objects_are_like_the_first_of_the_world_and_persist_over_a_restart(monkeypatch, tmp_path):
     monkeypatch.setenv(STATE_VARIABLE, str(tmp_path))
     async with ur5() as client:
         with pytest.raises(RemoteError, match="would overlap cube"):

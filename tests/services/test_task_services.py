@@ -34,9 +34,7 @@ SQUARE = [(0.45, -0.05), (0.55, -0.05), (0.55, 0.05), (0.45, 0.05)]
 
 @pytest.mark.parametrize(("service", "config", "topic"), [
     (smart_pick_place, PICK_PLACE, PICK_PLACE_STATUS), (contour_tracer, TRACER, OUTLINE_STATUS)])
-async def test_late_reader_gets_the_status_and_pause_is_answered_with_it(
-    service: Any, config: Any, topic: topics.Topic[Any]
-) -> None:
+async def test_late_reader_gets_the_status_and_pause_is_answered_with_it(service, config, topic):
     cell = FakeCell()
     async with cell.running(service, config):
         first, late = await until(cell.reader(topic)), await until(cell.reader(topic))
@@ -173,9 +171,7 @@ async def test_release_positions_survive_a_restart_and_a_damaged_file_is_reporte
     assert f"the memory of the task is lost: {saved} cannot be read: it is damaged" in caplog.text
 
 
-async def test_memory_that_cannot_be_saved_is_saved_as_soon_as_possible(
-    tasks: list[PickPlace], monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+async def test_memory_that_cannot_be_saved_is_saved_as_soon_as_possible(tasks, monkeypatch, tmp_path, caplog):
     blocker = tmp_path / "no_folder"
     blocker.write_text("")
     monkeypatch.setenv(RUNTIME_VARIABLE, str(blocker / "cell"))

@@ -138,9 +138,7 @@ async def test_request_from_before_the_start_may_have_been_executed_and_is_rejec
         assert (await client.command.call(GripperCommand(id="d", width=0.03))).state == "active", "without a stamp"
 
 
-async def test_request_executed_by_an_earlier_executor_while_this_one_waited_is_rejected(
-    monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_request_executed_by_an_earlier_executor_while_this_one_waited_is_rejected(monkeypatch):
     clock, other = Clock(SPEED), LocalNetwork()
     waits, may_continue, acquire = asyncio.Event(), asyncio.Event(), Bus.acquire_keys
 
@@ -274,9 +272,7 @@ def persistent(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(STATE_VARIABLE, str(tmp_path))
 
 
-async def test_arm_gripper_and_held_ball_are_found_as_they_were_before_a_restart(
-    persistent: None
-) -> None:
+async def test_arm_gripper_and_held_ball_are_found_as_they_were_before_a_restart(persistent):
     above, at_ball = above_and_at(*PANDA.world.spots[3])
     async with executor() as client:
         await client.follow("a", move(ROBOT, HOME, above))
@@ -298,9 +294,7 @@ async def test_arm_gripper_and_held_ball_are_found_as_they_were_before_a_restart
         assert len(balls.ids) == len(before.ids)
 
 
-async def test_saved_state_of_another_layout_or_simulator_is_not_used(
-    persistent: None, caplog: pytest.LogCaptureFixture
-) -> None:
+async def test_saved_state_of_another_layout_or_simulator_is_not_used(persistent, caplog):
     caplog.set_level("INFO")
     async with executor() as client:
         await client.follow("a", NEAR)

@@ -10,16 +10,7 @@ from typing import Any
 
 import pytest
 
-from applications.outlining.topics import CONTOUR_PATH, CONTOUR_POINTS, OUTLINE_SELECT
-from applications.pick_place.topics import (
-    DETECTED_OBJECTS,
-    DETECTION_IMAGE,
-    DETECTION_MASK,
-    REJECTED_TARGETS,
-    SCENE_BALLS,
-    VALIDATED_TARGETS,
-    WORKSPACE_MARKERS,
-)
+from applications.pick_place.topics import SCENE_BALLS
 from common import topics
 from common.application import all_topics
 from common.config import Surroundings, World, load_cell, service_config
@@ -34,8 +25,6 @@ CAMERAS = {"panda": "camera_simulator", "ur5": "depth_camera"}
 VIEWER = "viewer"  # shows the truth on demand, and decides nothing
 DECIDING = [(cell, name) for cell, name in SERVICES if name not in (*CAMERAS.values(), VIEWER, "trajectory_executor")]
 TRUTH = {SCENE_BALLS, topics.SCENE_OBJECTS}
-DEPTH_TOPICS = {topics.DEPTH_CAMERA_IMAGE, topics.DEPTH_CAMERA_DEPTH, topics.DEPTH_CAMERA_POINTS,
-                topics.DEPTH_CAMERA_INFO}
 
 
 def config_class(cell: str, name: str) -> Any:
@@ -52,34 +41,6 @@ def wired(cell: str) -> dict[str, Wiring]:
     return {name: wiring_of(importlib.import_module(CELLS[cell].services[name].module),
                             service_config(CELLS[cell], name, config_class(cell, name)))
             for name in CELLS[cell].services}
-
-
-@pytest.mark.parametrize(("cell", "name", "reads", "owns"), [
-    ("panda", "trajectory_executor", {topics.MOTION_JOG},
-     {topics.JOINT_STATES, topics.MOTION_STATUS, topics.MOTION_OWNER, topics.ROBOT_STATUS, topics.GRIPPER_STATE,
-      SCENE_BALLS, topics.SCENE_OBJECTS, topics.SCENE_OBJECT_UPDATES, topics.MOTION_EXECUTE, topics.MOTION_FOLLOWED,
-      topics.MOTION_STOP, topics.MOTION_HOLD, topics.MOTION_OWN, topics.ROBOT_COMMAND, topics.GRIPPER_COMMAND,
-      topics.WORLD_EDIT}),
-    ("panda", "motion_planner", {topics.PLANNING_SCENE, topics.JOINT_STATES, topics.MOTION_STATUS},
-     {topics.MOTION_PLAN, topics.DISPLAY_TRAJECTORY}),
-    ("panda", "camera_simulator", {topics.SCENE_OBJECTS}, {topics.CAMERA_IMAGE, topics.CAMERA_INFO}),
-    ("panda", "vision_detector", {topics.CAMERA_IMAGE, topics.CAMERA_INFO, topics.TF_STATIC},
-     {DETECTED_OBJECTS, DETECTION_IMAGE, DETECTION_MASK}),
-    ("panda", "workspace_validator", {DETECTED_OBJECTS, topics.CAMERA_INFO, topics.TF_STATIC, topics.JOINT_STATES},
-     {VALIDATED_TARGETS, REJECTED_TARGETS, WORKSPACE_MARKERS}),
-    ("panda", "robot_state_publisher", {topics.JOINT_STATES},
-     {topics.TF, topics.TF_STATIC, topics.ROBOT_DESCRIPTION}),
-    ("ur5", "depth_camera", None, DEPTH_TOPICS),
-    ("ur5", "contour_detector", None, {all_topics()[key] for key in ("contours", "contour_image")} | {OUTLINE_SELECT}),
-    ("ur5", "pixel_to_world", None, {CONTOUR_POINTS}),
-    ("ur5", "duplicate_remover", None, {CONTOUR_PATH}),
-])
-def test_service_reads_and_owns_exactly_its_topics(
-    cell: str, name: str, reads: set[Any] | None, owns: set[Any]
-) -> None:
-    found = wired(cell)[name]
-    assert found.owns == owns and reads in (None, found.reads)
-    assert found.calls <= {topics.MOTION_FOLLOWED, topics.MOTION_HOLD}
 
 
 @pytest.mark.parametrize(("cell", "name"), DECIDING)

@@ -103,9 +103,7 @@ async def test_second_operator_sees_the_page_with_control_and_takes_control() ->
         assert all(not jog.joints or jog.joints["panda_joint1"] > 0 for jog in [reader.latest] if jog)
 
 
-async def test_control_is_taken_from_another_operator_by_pressing_twice(
-    panda: FakeServices, page: FakeBrowser
-) -> None:
+async def test_control_is_taken_from_another_operator_by_pressing_twice(panda, page):
     requests: list[m.OwnRequest] = []
     anna = m.MotionOwner(owner="anna", kind="operator", asked=True, since=1)
 

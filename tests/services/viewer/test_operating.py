@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-from typing import Any
 
 import pytest
 
@@ -11,7 +10,7 @@ from common import messages as m
 from common import topics
 from common.errors import Refused
 from tests.page.fake_browser import PATIENCE, FakeBrowser
-from tests.services.viewer.conftest import FakeScene, FakeServices, page_of, until
+from tests.services.viewer.conftest import FakeServices, page_of, until
 
 
 async def test_stop_stops_the_arm_and_the_task(panda: FakeServices, page: FakeBrowser) -> None:
@@ -42,9 +41,7 @@ async def test_missing_answer_to_a_stop_is_shown(arm: bool, line: str, kind: str
      {"Start": "the task is paused: press Resume", "Pause": "already paused"}),
     ("Start", {"state": "DONE", "started": True}, {"Pause": "nothing is running", "Resume": "nothing is paused"}),
 ])
-async def test_command_is_sent_and_commands_without_effect_are_disabled(
-    panda: FakeServices, page: FakeBrowser, command: str, state: dict[str, Any], others: dict[str, str]
-) -> None:
+async def test_command_is_sent_and_commands_without_effect_are_disabled(panda, page, command, state, others):
     await page.until(lambda: "does not respond" in page.button("Start")[1])
     assert "the arm's state is unknown" in page.button("Go home")[1]
     panda.put_motion()
@@ -68,9 +65,7 @@ async def test_hold_of_another_operator_is_overridden_by_pressing_twice(panda: F
     assert panda.commands == ["resume", "start", "start"]
 
 
-async def test_new_hold_after_a_rejection_is_shown_before_it_is_overridden(
-    panda: FakeServices, page: FakeBrowser
-) -> None:
+async def test_new_hold_after_a_rejection_is_shown_before_it_is_overridden(panda, page):
     panda.put_task()
     for since, panda.holder in ((5, "anna"), (9, "bob")):
         panda.put_motion(m.Interlock(kind="held", by=panda.holder, since=since), held=True)
@@ -118,9 +113,7 @@ async def test_gripper_buttons_send_commands(panda: FakeServices, page: FakeBrow
         assert command.header.stamp, "a late command is rejected by its stamp"
 
 
-async def test_dragged_object_is_moved_and_a_rejection_is_shown(
-    panda: FakeServices, page: FakeBrowser, scenes: list[FakeScene]
-) -> None:
+async def test_dragged_object_is_moved_and_a_rejection_is_shown(panda, page, scenes):
     moved: list[m.WorldEdit] = []
 
     async def edit(request: m.WorldEdit) -> m.WorldEditReply:
@@ -136,9 +129,7 @@ async def test_dragged_object_is_moved_and_a_rejection_is_shown(
     assert moved == [m.WorldEdit(op="move", id="ball_2", position=m.Vector3(x=0.5, y=0.1))]
 
 
-async def test_page_shows_the_past_until_the_arm_is_operated(
-    panda: FakeServices, page: FakeBrowser, scenes: list[FakeScene], monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_page_shows_the_past_until_the_arm_is_operated(panda, page, scenes, monkeypatch):
     for name in ("SLOW_PERIOD", "FAST_PERIOD", "_PRESENT_TOLERANCE"):
         monkeypatch.setattr(f"page.history.{name}", 0.01)
 

@@ -8,7 +8,7 @@ from common import messages as m
 from common import topics
 from tests.page.fake_browser import PATIENCE, FakeBrowser
 from tests.services.fake_cell import trajectory
-from tests.services.viewer.conftest import FakeScene, FakeServices, page_of, until
+from tests.services.viewer.conftest import FakeServices, page_of, until
 
 JOINTS = [f"panda_joint{k}" for k in range(1, 8)]
 
@@ -29,9 +29,7 @@ async def test_invalid_goal_is_shown_and_the_service_continues(panda: FakeServic
             await asyncio.sleep(0.01)
 
 
-async def test_failed_plan_to_the_marker_names_the_collision(
-    panda: FakeServices, page: FakeBrowser, scenes: list[FakeScene]
-) -> None:
+async def test_failed_plan_to_the_marker_names_the_collision(panda, page, scenes):
     planned = panda.serve_planner(
         error="collision", message="operator: the goal collides", colliding=("panda_hand", "table"))
     await until(lambda: scenes)
@@ -45,9 +43,7 @@ async def test_failed_plan_to_the_marker_names_the_collision(
     assert (request.planner, request.goal) == ("chomp", m.PoseGoal(pose=scenes[0].goal_pose))
 
 
-async def test_plan_is_discarded_when_the_goal_marker_is_moved(
-    panda: FakeServices, page: FakeBrowser, scenes: list[FakeScene]
-) -> None:
+async def test_plan_is_discarded_when_the_goal_marker_is_moved(panda, page, scenes):
     panda.serve_planner(trajectory(JOINTS, 1.0))
     panda.put_motion()
     await until(lambda: scenes)
@@ -76,9 +72,7 @@ async def test_plan_is_executed_once(panda: FakeServices, page: FakeBrowser) -> 
     assert executed.empty()
 
 
-async def test_two_plans_are_animated_and_compared_and_the_second_one_is_executed(
-    panda: FakeServices, page: FakeBrowser, scenes: list[FakeScene]
-) -> None:
+async def test_two_plans_are_animated_and_compared_and_the_second_one_is_executed(panda, page, scenes):
     first, second = (trajectory(["panda_joint1"], 0.0, seconds) for seconds in (1.0, 2.0))
     panda.serve_planner(lambda request: second if request.planner == "ptp" else first, planner="ptp", seconds=0.1)
     executed = panda.serve_executor("active")

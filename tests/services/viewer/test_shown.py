@@ -61,9 +61,7 @@ async def test_images_and_truth_are_read_only_while_displayed(panda: FakeService
     await until(lambda: not image.matched and not objects.matched)
 
 
-async def test_parameter_is_changed_on_the_page_and_a_rejected_value_is_reverted(
-    panda: FakeServices, page: FakeBrowser
-) -> None:
+async def test_parameter_is_changed_on_the_page_and_a_rejected_value_is_reverted(panda, page):
     def value() -> Any:
         return page.values[page.label(AREA)]
 
@@ -108,9 +106,7 @@ async def test_log_lines_are_escaped_and_filtered_by_level(panda: FakeServices, 
     await page.until(lambda: "a quiet line" not in page.text)
 
 
-async def test_invalid_messages_change_nothing(
-    panda: FakeServices, page: FakeBrowser, capfd: pytest.CaptureFixture[str]
-) -> None:
+async def test_invalid_messages_change_nothing(panda, page, capfd):
     await page.until(lambda: page.label("Planner") and page.label("Speed [%]"))
     speed = page.label("Speed [%]")
     changes = [(speed, {"value": value}) for value in ("fast", None, [1], float("nan"), 1e300)]
@@ -177,9 +173,7 @@ async def test_object_selected_in_the_list_or_scene_is_traced_once_its_path_is_k
 # --- the scene ---
 
 
-async def test_layers_follow_their_checkboxes_also_before_the_scene_is_loaded(
-    panda: FakeServices, page: FakeBrowser, scenes: list[FakeScene]
-) -> None:
+async def test_layers_follow_their_checkboxes_also_before_the_scene_is_loaded(panda, page, scenes):
     await until(lambda: scenes and scenes[0].started)
     assert scenes[0].visible["targets"] and not scenes[0].visible["truth"]
     await page.set("Targets", False)
@@ -200,9 +194,7 @@ def rejections(*positions: tuple[float, float], reason: str = "too far", stamp: 
         m.Rejection(position=m.Vector3(x=x, y=y), reason=reason) for x, y in positions])
 
 
-async def test_rejection_before_the_scene_is_loaded_is_shown(
-    scenes: list[FakeScene], monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_rejection_before_the_scene_is_loaded_is_shown(scenes, monkeypatch):
     resume = threading.Event()
 
     def slow(*arguments: object, **options: Any) -> FakeScene:
@@ -219,9 +211,7 @@ async def test_rejection_before_the_scene_is_loaded_is_shown(
         await until(lambda: scenes and scenes[0].calls_of("handle_event") == [(REJECTED_TARGETS, rejected)])
 
 
-async def test_rejected_positions_are_counted_once_while_they_are_detected(
-    panda: FakeServices, page: FakeBrowser
-) -> None:
+async def test_rejected_positions_are_counted_once_while_they_are_detected(panda, page):
     panda.put_task()
     for x, reason in ((1.1, "too far"), (1.11, "too far"), (0.2, "too near"), (0.5, "inside the container")):
         panda.put(REJECTED_TARGETS, rejections((x, 0.8), reason=reason, stamp=10))
@@ -232,9 +222,7 @@ async def test_rejected_positions_are_counted_once_while_they_are_detected(
     await page.until(lambda: '<div data-field="rejected"><b>1</b>' in page.text)
 
 
-async def test_scene_is_loaded_when_the_cell_is_up_or_a_page_is_open(
-    scenes: list[FakeScene], monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_scene_is_loaded_when_the_cell_is_up_or_a_page_is_open(scenes, monkeypatch):
     monkeypatch.setattr(viewer, "STARTUP_TIMEOUT", 1e6)
     async with serve_page("panda") as services:
         await services.bus.alive.wait("viewer")
@@ -262,9 +250,7 @@ async def test_control_socket_rejects_foreign_origins_and_missing_tokens() -> No
             assert caught.value.response.status_code == status
 
 
-async def test_custom_layer_has_a_checkbox_and_reads_its_topics_while_shown(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_custom_layer_has_a_checkbox_and_reads_its_topics_while_shown(tmp_path, monkeypatch):
     (tmp_path / "viewer_pkg").mkdir()
     (tmp_path / "viewer_pkg" / "noise.py").write_text("""
 from common import topics
@@ -292,9 +278,7 @@ async def test_images_of_two_cameras_are_shown() -> None:
         await page.until(lambda: all(page.label(key) for key in keys))
 
 
-async def test_application_without_a_page_has_the_default_buttons_and_texts(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_application_without_a_page_has_the_default_buttons_and_texts(tmp_path, monkeypatch):
     (tmp_path / "apps").mkdir()
     (tmp_path / "apps" / "moving.py").write_text("""
 from common.application import Application, ApplicationTopics
