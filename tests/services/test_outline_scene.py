@@ -45,7 +45,7 @@ def noise_contours() -> Contours:
     image = np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8)
     for row in range(5):
         for column in range(5):
-            image[20 + row:-20:45, 20 + column:-20:45] = (0, 0, 255)
+            image[20 + row:-20:36, 20 + column:-20:36] = (0, 0, 255)
     return contours(find_contours(image, ContourOptions()))
 
 
