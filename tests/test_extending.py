@@ -287,9 +287,7 @@ def test_single_file_task_moves_a_cube_as_processes(folder: Path, tmp_path: Path
 
 
 @pytest.mark.slow
-def test_single_file_task_moves_a_cube_with_its_own_status_and_figures(
-    folder: Path, tmp_path: Path
-) -> None:
+def test_single_file_task_moves_a_cube_with_its_own_status_and_figures(folder: Path, tmp_path: Path) -> None:
     assert len(FILES["my_pkg/move_cube.py"].splitlines()) < 120
     file, recording = tmp_path / "summary.json", tmp_path / "run.mcap"
     with no_processes():
@@ -324,9 +322,7 @@ def test_single_file_task_continues_with_a_held_object(folder: Path) -> None:
     assert (plan.goal.pose.position.x, plan.goal.pose.position.y) == config.to
 
 
-def test_invalid_application_module_is_rejected_by_name(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_invalid_application_module_is_rejected_by_name(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(folder)
     with pytest.raises(ConfigError, match=r"application: 'my_pkg\.move_ball' cannot be imported"):
         load_cell("cube.yaml", ["application=my_pkg.move_ball"])

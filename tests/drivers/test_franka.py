@@ -148,9 +148,7 @@ def test_reflex_reports_its_reason_and_ends_only_on_request() -> None:
         rig.until("")
 
 
-def test_nothing_moves_without_a_request_and_motions_start_where_the_arm_is(
-    host: FrankaHost, rig: Rig,
-) -> None:
+def test_nothing_moves_without_a_request_and_motions_start_where_the_arm_is(host: FrankaHost, rig: Rig) -> None:
     rig.until("")
     assert rig.arm.state.mode == "running"
     assert np.allclose(rig.arm.read(0.0)[0], [0, 0, 0, -1.57, 0, 1.57, 0.785], atol=1e-3)
@@ -182,9 +180,7 @@ def test_payload_is_set_at_rest(rig: Rig) -> None:
     rig.until_it_moves()
 
 
-def test_frozen_or_restarted_controller_is_connected_again_without_motion(
-    host: FrankaHost, rig: Rig,
-) -> None:
+def test_frozen_or_restarted_controller_is_connected_again_without_motion(host: FrankaHost, rig: Rig) -> None:
     rig.until("")
     host.freeze(1.0)
     rig.until_it_moves()

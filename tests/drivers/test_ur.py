@@ -99,9 +99,7 @@ def test_held_up_driver_does_not_consider_the_arm_disconnected(host: UrHost, rig
     assert multiprocessing.active_children() == driver, "in the same process"
 
 
-def test_set_points_have_the_time_of_their_computation(
-    rig: Rig, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_set_points_have_the_time_of_their_computation(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     rig.until("")
     sent: list[tuple[object, ...]] = []
     monkeypatch.setattr(rig.arm._process, "send", lambda message: sent.append(message) or True)

@@ -63,9 +63,7 @@ def arm(controller: Controller) -> UrArm:
     return arm
 
 
-def test_refused_freedrive_is_not_reported_after_power_on(
-    controller: Controller, arm: UrArm
-) -> None:
+def test_refused_freedrive_is_not_reported_after_power_on(controller: Controller, arm: UrArm) -> None:
     controller.mode = OFF
     assert arm.read().mode == "off"
     with pytest.raises(ValueError, match="cannot freedrive: the joints are without power"):
@@ -74,9 +72,7 @@ def test_refused_freedrive_is_not_reported_after_power_on(
     assert arm.read().mode == "running" and not controller.by_hand
 
 
-def test_protective_stop_ends_freedrive(
-    controller: Controller, arm: UrArm
-) -> None:
+def test_protective_stop_ends_freedrive(controller: Controller, arm: UrArm) -> None:
     arm.do("freedrive", 1.0)
     assert arm.read().mode == "freedrive" and controller.by_hand
     controller.safety = PROTECTIVE_STOP

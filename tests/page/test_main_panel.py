@@ -69,8 +69,7 @@ async def test_page_that_takes_control_is_named_on_every_page(gui: viser.GuiApi)
 
 @pytest.mark.parametrize(("owner", "kind"), [(f"page {FIRST.address}", "bad"), ("", "good")])
 async def test_releasing_control_of_another_operator_is_an_error(gui: viser.GuiApi, owner: str, kind: str) -> None:
-    panel, console = panel_of(
-        gui, MotionOwner(owner=owner, kind="operator" if owner else "none", asked=bool(owner)))
+    panel, console = panel_of(gui, MotionOwner(owner=owner, kind="operator" if owner else "none", asked=bool(owner)))
     message, shown = await press(panel, console, SECOND, "give")
     assert shown == kind and message.startswith("This page has no control to release") is bool(owner)
 

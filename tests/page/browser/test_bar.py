@@ -163,9 +163,7 @@ async def test_of_two_pages_that_jog_one_moves_the_arm_and_the_other_shows_why_n
         await release()
 
 
-async def test_stuck_server_is_shown_in_a_banner_and_by_stop_until_it_recovers(
-    bring: Bring, watched: Watched
-) -> None:
+async def test_stuck_server_is_shown_in_a_banner_and_by_stop_until_it_recovers(bring: Bring, watched: Watched) -> None:
     cell = await bring(*PANDA)
     page = await watched.open(cell.address)
     await page.get_by_role("button", name="Start").wait_for()
