@@ -1,7 +1,4 @@
-"""franka-sim as a test host: the maker's protocol with an arm of MuJoCo behind it, in an environment of its own.
-
-`make franka-sim` makes that environment.
-"""
+"""franka-sim as a test host: the vendor's protocol with a MuJoCo arm, in the environment of `make franka-sim`."""
 
 from __future__ import annotations
 
@@ -17,35 +14,32 @@ import numpy as np
 
 ROOT = Path(__file__).resolve().parents[2]
 PYTHON = ROOT / ".venv-franka-sim" / "bin" / "python"
-PORTS = (1337, 1338)  # of arm and hand; they are part of the protocol: one such host at a time
-READY = 60.0  # [s]
+HAND_PORT = 1338  # part of the protocol: one host at a time
+TIMEOUT = 60.0  # [s]
 
 
 class FrankaHost:
-    """A controller that answers at 127.0.0.1; options are those of franka-sim's server."""
+    """A controller at 127.0.0.1 with options of franka-sim's server."""
 
     def __init__(self, *options: str) -> None:
-        self._folder = tempfile.TemporaryDirectory()
-        self._options = options
+        self._folder, self._options = tempfile.TemporaryDirectory(), options
         folder = Path(self._folder.name)
         subprocess.run([PYTHON, ROOT / "tests" / "doubles" / "franka_model.py", folder], check=True)
         self._models = {"FR3_MJCF": str(folder / "fr3.xml"), "FRANKA_HAND_MJCF": str(folder / "hand.xml")}
         self.log = folder / "log"
-        self._process: subprocess.Popen[bytes]
         self.boot()
 
     def boot(self) -> None:
-        """Start the controller, with the arm where it stood; returns when it listens."""
+        """Start the controller with the arm at its last position; return when it listens."""
         folder = Path(self._folder.name)
         with self.log.open("ab") as log:
             self._process = subprocess.Popen(
                 [PYTHON, ROOT / "tests" / "doubles" / "franka_server.py", folder / "stands", *self._options],
                 stdout=log, stderr=log, env={**os.environ, **self._models})
-        end = time.monotonic() + READY
+        end = time.monotonic() + TIMEOUT
         while True:
             try:
-                # Not the arm's own port: that is for one client at a time.
-                socket.create_connection(("127.0.0.1", PORTS[1]), 1.0).close()
+                socket.create_connection(("127.0.0.1", HAND_PORT), 1.0).close()  # the arm's port serves one client
                 return
             except OSError:
                 if self._process.poll() is not None or time.monotonic() > end:
@@ -53,21 +47,21 @@ class FrankaHost:
                 time.sleep(0.1)
 
     def crash(self) -> None:
-        """Have the controller be gone at once."""
+        """Kill the controller."""
         self._process.kill()
         self._process.wait()
 
     def hit(self) -> None:
-        """Have the arm stop with a reflex."""
+        """Stop the arm with a reflex."""
         self._process.send_signal(signal.SIGUSR1)
 
     @property
     def stands(self) -> list[float]:
-        """Where its joints are [rad]."""
+        """Joint positions [rad]."""
         return list(np.fromfile(Path(self._folder.name) / "stands"))
 
     def freeze(self, seconds: float) -> None:
-        """Have it do and say nothing for a while [s]."""
+        """Suspend the controller for a while [s]."""
         self._process.send_signal(signal.SIGSTOP)
         try:
             time.sleep(seconds)
@@ -76,7 +70,7 @@ class FrankaHost:
 
     @property
     def text(self) -> str:
-        """What it said."""
+        """The log so far."""
         return self.log.read_text(errors="replace")
 
     def __enter__(self) -> FrankaHost:

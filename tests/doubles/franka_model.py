@@ -1,4 +1,4 @@
-"""Writes models of the FR3 and its hand, without meshes, for franka-sim: run where that is."""
+"""Write models of the FR3 and its hand without meshes; runs in the environment of franka-sim."""
 
 import sys
 import xml.etree.ElementTree as ET
@@ -7,9 +7,7 @@ from pathlib import Path
 import franka_sim
 import mujoco
 
-ARMATURE = [0.2, 0.2, 0.2, 0.2, 0.1, 0.1, 0.1]  # [kg m^2] of the motors, as the joints feel them
-
-
+ARMATURE = [0.2, 0.2, 0.2, 0.2, 0.1, 0.1, 0.1]  # [kg m^2] of the motors, at the joints
 FINGER = """<body name="{name}" pos="0 0 0.058" {turned}>
   <inertial pos="0 0 0.03" mass="0.015" diaginertia="2e-6 2e-6 1e-6"/>
   <joint name="{joint}" type="slide" axis="0 1 0" range="0 0.04" armature="0.1"/>
@@ -22,7 +20,7 @@ HAND = f"""<mujoco model="hand"><worldbody><body name="hand">
 
 
 def main() -> None:
-    """Write fr3.xml and hand.xml into the folder that is named."""
+    """Write fr3.xml and hand.xml into the folder given as argument."""
     robot = ET.parse(Path(franka_sim.__file__).parent / "models" / "fr3.urdf").getroot()
     for link in robot.iter("link"):
         for shape in [part for part in link if part.tag in ("visual", "collision")]:

@@ -1,12 +1,12 @@
-"""franka-sim's server whose arm moves in its own time: run where that is.
+"""franka-sim's server with an arm whose clock advances with its state messages; runs in franka-sim's environment.
 
     python franka_server.py FILE [options of franka_sim.run_server]
 
-FILE keeps where the arm stands, for the next one. At a SIGUSR1 the arm stops with a reflex, as if it had hit something.
+FILE stores the joint positions for the next start. SIGUSR1 stops the arm with a reflex, like a collision.
 
-As it comes the arm moves in the host's time and is told where to be in its own, which on a busy host is slower: then it
-is far behind what it was told. Here it moves by a millisecond for each state that it tells, its servo is stiffer, and
-its time stands still until that state was answered: for `PATIENCE` at most, and not where it is to judge that.
+The original arm moves in the host's time but is commanded in its own time, which is slower on a busy host: it falls far
+behind its set-points. Here each state message advances the arm by a millisecond, its servo is stiffer, and its clock
+waits up to `PATIENCE` for the reply to that message, except with `--enforce-comm-constraints`.
 """
 
 import signal
@@ -21,59 +21,58 @@ from franka_sim import mujoco_franka_sim, run_server
 from franka_sim.server.motion_session import MotionSessionMixin
 
 STIFFNESS = [20e3, 20e3, 20e3, 20e3, 10e3, 10e3, 10e3]  # [Nm/rad]
-DAMPING = [200.0, 200.0, 200.0, 200.0, 100.0, 100.0, 100.0]  # [Nm s/rad]: twice the armature in 1 ms would swing
+DAMPING = [200.0, 200.0, 200.0, 200.0, 100.0, 100.0, 100.0]  # [Nm s/rad]: twice the armature in 1 ms would oscillate
 IDLE = 0.1  # [s]
-PATIENCE = 0.2  # [s] without an answer, after which the arm does without, as a real one after a millisecond
+PATIENCE = 0.2  # [s]; a real arm waits a millisecond
+CARTESIAN_REFLEX = 7  # error number of the protocol
 
-CARTESIAN_REFLEX = 7  # among the errors of the protocol
-
-answered = MotionSessionMixin._drain_gate
-watched = MotionSessionMixin._run_safety_velocity_check
-free_running = mujoco_franka_sim.MujocoFrankaSim.run_simulation
+drain_gate = MotionSessionMixin._drain_gate
+check_velocity = MotionSessionMixin._run_safety_velocity_check
+run_freely = mujoco_franka_sim.MujocoFrankaSim.run_simulation
 moving, hit = threading.Lock(), threading.Event()
-stands: Any = None
+positions: Any = None
 
 
 def run_simulation(self: Any) -> None:
-    """Leave the arm to who reads its state; with fingers of its own it goes on as it was made."""
+    """Simulate the hand in the host's time; the arm advances in `get_robot_state`."""
     if self.enable_hand:
-        free_running(self)
+        run_freely(self)
     while self.running:
         time.sleep(IDLE)
 
 
 def get_robot_state(self: Any) -> Any:
-    """The state a millisecond later."""
+    """Return the state a millisecond later."""
     if not self.enable_hand:
         with moving:
             self.step()
-            stands[:] = self._state_snapshot["q"]
+            positions[:] = self._state_snapshot["q"]
     return self._state_snapshot
 
 
-def wait_for_the_answer(self: Any, answer_deadline: float) -> float:
-    """Return when the state before was answered; the time [s] that this took."""
-    return answered(self, answer_deadline + PATIENCE)
+def wait_for_reply(self: Any, deadline: float) -> float:
+    """Wait for the reply to the last state; return the waiting time [s]."""
+    return drain_gate(self, deadline + PATIENCE)
 
 
-def watch(self: Any, sim_state: Any) -> None:
-    """Stop with a reflex when something was hit."""
+def stop_if_hit(self: Any, sim_state: Any) -> None:
+    """Stop with a reflex after SIGUSR1."""
     if hit.is_set():
         hit.clear()
-        self._abort_with_error(CARTESIAN_REFLEX, "something was hit")
-    watched(self, sim_state)
+        self._abort_with_error(CARTESIAN_REFLEX, "collision")
+    check_velocity(self, sim_state)
 
 
 if __name__ == "__main__":
     mujoco_franka_sim.ARM_POSITION_KP, mujoco_franka_sim.ARM_POSITION_KD = np.array(STIFFNESS), np.array(DAMPING)
     mujoco_franka_sim.MujocoFrankaSim.run_simulation = run_simulation
     mujoco_franka_sim.MujocoFrankaSim.get_robot_state = get_robot_state
-    MotionSessionMixin._run_safety_velocity_check = watch
+    MotionSessionMixin._run_safety_velocity_check = stop_if_hit
     file = Path(sys.argv.pop(1))
-    stands = np.memmap(file, float, "r+" if file.exists() else "w+", shape=(7,))
-    if stands.any():
-        mujoco_franka_sim.ARM_INITIAL_Q = np.array(stands)
+    positions = np.memmap(file, float, "r+" if file.exists() else "w+", shape=(7,))
+    if positions.any():
+        mujoco_franka_sim.ARM_INITIAL_Q = np.array(positions)
     if "--enforce-comm-constraints" not in sys.argv:
-        MotionSessionMixin._drain_gate = wait_for_the_answer
+        MotionSessionMixin._drain_gate = wait_for_reply
     signal.signal(signal.SIGUSR1, lambda *_: hit.set())
     run_server.main()

@@ -1,4 +1,4 @@
-"""A double of Robotiq's program on an arm's controller: registers, and fingers that move and meet things."""
+"""Double of Robotiq's program on an arm's controller: registers, and fingers that move and meet objects."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ SPEED = 400.0  # counts a second at SPE 255, and 50 at 0
 
 
 class Gripper:
-    """Fingers as counts; `thing` is the count at which they meet what is between them."""
+    """Fingers in counts; `thing` is the count at which they meet an object."""
 
     def __init__(self) -> None:
         self.registers = {"ACT": 1, "STA": 3, "GTO": 0, "POS": OPEN, "SPE": 255, "FOR": 255, "FLT": 0}
         self.thing: int | None = None
-        self.answers = b"ack"  # some versions end it with a line, some do not
+        self.answers = b"ack"  # some versions append a line end
         self._began, self._from, self._to = 0.0, OPEN, OPEN
         self._reached, self._met = OPEN, False
         self._lock = threading.Lock()
 
     def answer(self, line: str) -> bytes:
-        """What a line is answered with."""
+        """Return the reply to a line."""
         words = line.split()
         with self._lock:
             self._move()
@@ -55,7 +55,7 @@ class Gripper:
 
 
 class RobotiqHost:
-    """The port, at a free number of this host."""
+    """The port of the gripper."""
 
     def __init__(self, port: int = 0) -> None:
         self.gripper = gripper = Gripper()
@@ -84,6 +84,6 @@ class RobotiqHost:
         self._server.shutdown()
         self._thread.join()
         for connection in self._connections:
-            with contextlib.suppress(OSError):  # closed before
+            with contextlib.suppress(OSError):  # already closed
                 connection.shutdown(socket.SHUT_RDWR)
         self._server.server_close()

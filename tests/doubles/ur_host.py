@@ -1,4 +1,4 @@
-"""A test host that runs the controller of an arm, and tells it how to misbehave."""
+"""A process with the controller of an arm of Universal Robots, and commands that inject faults."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tests.doubles.ur_controller import ORDERS
 
 
 class UrHost:
-    """A process of its own at an address of its own; `q` where the arm stands [rad]."""
+    """A controller at its own loopback address, with the arm at `q` [rad]."""
 
     def __init__(self, host: str, *options: str, q: str = "0,-1.57,0.5,-1.57,0,0") -> None:
         self.host = host
@@ -21,14 +21,13 @@ class UrHost:
             stdout=subprocess.PIPE, text=True,
         )
         assert self._process.stdout is not None
-        said = self._process.stdout.readline()
-        if said != "listening\n":
-            raise RuntimeError(f"{host}: {said}: see above")
+        if (line := self._process.stdout.readline()) != "listening\n":
+            raise RuntimeError(f"{host} does not start: {line}")
         self._orders = socket.create_connection((host, ORDERS))
         self._file = self._orders.makefile("rw")
 
     def command(self, order: str = "state") -> dict[str, Any]:
-        """Give an order; how the arm is."""
+        """Execute a command; return the state of the arm."""
         self._file.write(order + "\n")
         self._file.flush()
         answer: dict[str, Any] = json.loads(self._file.readline())

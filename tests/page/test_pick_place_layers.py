@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from applications.pick_place.topics import (DETECTED_OBJECTS, REJECTED_TARGETS, VALIDATED_TARGETS, WORKSPACE_MARKERS)
+from applications.pick_place.topics import DETECTED_OBJECTS, REJECTED_TARGETS, VALIDATED_TARGETS, WORKSPACE_MARKERS
 from common import messages as m
 from tests.page.scene_cell import WORLD, Stage, at
 

@@ -23,70 +23,52 @@ from tests.page.scene_cell import WORLD, Stage, around_of, at, ball, in_world, i
 GOAL = matrix_to_pose(transform(rpy_to_matrix(3.0, 0.2, 0.5), (0.5, 0.1, 0.4)))
 
 
-def fingers(stage: Stage, width: float) -> dict[str, float]:
-    gripper = stage.robot.config.gripper
-    assert gripper is not None
-    return dict(zip(gripper.joints, finger_positions(gripper, width), strict=True))
-
-
 def link_pose(stage: Stage, link: str) -> Any:
     return in_world(stage.server, stage.layer("robot").figure.links[link])
-
-
-@pytest.mark.parametrize("cell", ["panda", "ur5"])
-def test_links_have_the_poses_of_forward_kinematics(server: viser.ViserServer, cell: str) -> None:
-    stage = Stage(server, cell)
-    for share, width in ((0.0, 0.02), (0.4, 0.07)):
-        q = stage.robot.named("home") + share * (stage.robot.lower - stage.robot.named("home"))
-        stage.joints(q, fingers(stage, width))
-        links = stage.robot.link_poses(q, fingers(stage, width))
-        for link in stage.layer("robot").figure.links:
-            np.testing.assert_allclose(link_pose(stage, link), links[link], atol=1e-6, err_msg=link)
-
-
-def test_fingers_move_apart(panda: Stage) -> None:
-    gaps = []
-    for width in (0.0, 0.08):
-        panda.joints(panda.robot.named("home"), fingers(panda, width))
-        left, right = (link_pose(panda, f"panda_{side}finger") for side in ("left", "right"))
-        gaps.append(float(np.linalg.norm(left[:3, 3] - right[:3, 3])))
-    assert gaps == pytest.approx([0.0, 0.08], abs=1e-6)
-
-
-def test_unknown_joints_are_ignored(panda: Stage) -> None:
-    q = panda.robot.named("home") + 0.1
-    panda.joints(q, {"turntable_joint": 1.0})
-    tcp = panda.view.stage.poses.pose("panda_hand_tcp")[0]
-    np.testing.assert_allclose(tcp, panda.robot.fk(q)[:3, 3], atol=1e-6)
-    panda.say(topics.JOINT_STATES, m.JointState(header=WORLD, name=["other"], position=[1.0]))
-    np.testing.assert_allclose(panda.view.stage.poses.pose("panda_hand_tcp")[0], tcp)
-
-
-def sphere(name: str, pose: m.Pose) -> m.WorldObjects:
-    size = m.Vector3(x=0.06, y=0.06, z=0.06)
-    return m.WorldObjects(header=WORLD, objects=[m.WorldObject(id=name, shape="sphere", size=size, pose=pose)])
 
 
 def targets(x: float, y: float) -> m.PoseArray:
     return m.PoseArray(header=WORLD, poses=[at(x, y, 0.03)])
 
 
+@pytest.mark.parametrize("cell", ["panda", "ur5"])
+def test_links_and_fingers_have_the_poses_of_forward_kinematics(server: viser.ViserServer, cell: str) -> None:
+    stage = Stage(server, cell)
+    gripper = stage.robot.config.gripper
+    assert gripper is not None
+    for share, width in ((0.0, 0.02), (0.4, 0.07)):
+        q = stage.robot.named("home") + share * (stage.robot.lower - stage.robot.named("home"))
+        fingers = dict(zip(gripper.joints, finger_positions(gripper, width), strict=True))
+        stage.joints(q, fingers)
+        links = stage.robot.link_poses(q, fingers)
+        for link in stage.layer("robot").figure.links:
+            np.testing.assert_allclose(link_pose(stage, link), links[link], atol=1e-6, err_msg=link)
+
+
+def test_unknown_joints_are_ignored(panda: Stage) -> None:
+    q = panda.robot.named("home") + 0.1
+    panda.joints(q, {"turntable_joint": 1.0})
+    panda.say(topics.JOINT_STATES, m.JointState(header=WORLD, name=["other"], position=[1.0]))
+    np.testing.assert_allclose(panda.view.stage.poses.pose("panda_hand_tcp")[0], panda.robot.fk(q)[:3, 3], atol=1e-6)
+
+
 def test_nothing_is_sent_without_a_change(panda: Stage) -> None:
-    pose = m.JointState(header=WORLD, name=panda.robot.joint_names, position=[0.1] * 3 + [-1.0] + [0.1] * 3)
-    scene = scene_of(*fixed_objects(around_of("panda")), ball("a", at(0.4, 0.1, 0.03)))
+    thing = m.WorldObject(id="ball_1", shape="sphere", size=m.Vector3(x=0.06, y=0.06, z=0.06), pose=at(0.4, 0.1, 0.03))
+    messages = {
+        topics.JOINT_STATES: panda.joint_state([0.1] * 3 + [-1.0] + [0.1] * 3), VALIDATED_TARGETS: targets(0.4, 0.1),
+        topics.PLANNING_SCENE: scene_of(*fixed_objects(around_of("panda")), ball("a", at(0.4, 0.1, 0.03))),
+        topics.SCENE_OBJECTS: m.WorldObjects(header=WORLD, objects=[thing]),
+    }
+
+    def publish_all(stamp: int) -> None:
+        for topic, message in messages.items():
+            panda.say(topic, message.model_copy(update={"header": m.Header(stamp=stamp, frame_id="world")}))
+
     panda.show("truth", True)
-
-    def show_all(stamp: int) -> None:
-        later = {"header": m.Header(stamp=stamp, frame_id="world")}
-        for topic, message in ((topics.JOINT_STATES, pose), (topics.PLANNING_SCENE, scene),
-                               (VALIDATED_TARGETS, targets(0.4, 0.1)),
-                               (topics.SCENE_OBJECTS, sphere("ball_1", at(0.4, 0.1, 0.03)))):
-            panda.say(topic, message.model_copy(update=later))
-
     with panda.sent() as first:
-        show_all(1)
+        publish_all(1)
     with panda.sent() as again:
-        show_all(2)
+        publish_all(2)
         panda.say(VALIDATED_TARGETS, targets(0.4003, 0.0996))  # noise of detections
     assert first and not again
 
@@ -95,8 +77,8 @@ def test_without_a_page_nothing_is_sent_and_then_the_newest_of_all(panda: Stage)
     panda.watched = False
     q = panda.robot.named("home") + 0.2
     with panda.sent() as sent:
-        for share in (0.5, 1.0):
-            panda.joints(panda.robot.named("home") + 0.2 * share)
+        for joints in (q - 0.1, q):
+            panda.joints(joints)
         panda.say(topics.PLANNING_SCENE, scene_of(ball("a", at(0.4, 0.1, 0.03))))
         panda.say(VALIDATED_TARGETS, targets(0.4, 0.1))
     assert not sent
@@ -124,13 +106,6 @@ def test_layers_start_as_configured_and_unknown_ones_are_rejected(server: viser.
         Stage(server, "panda", shown={"roboter": True})
 
 
-def test_hidden_layer_displays_the_newest_message_when_shown(panda: Stage) -> None:
-    panda.say(topics.SCENE_OBJECTS, sphere("ball_1", at(0.4, 0.1, 0.03)))
-    assert panda.layer("truth").node("ball_1") is None
-    panda.show("truth", True)
-    assert is_shown(panda.server, panda.layer("truth").node("ball_1"))
-
-
 # --- planning scene ---
 
 
@@ -139,21 +114,20 @@ def test_objects_are_added_moved_changed_and_removed(panda: Stage) -> None:
     node, table = panda.layer("objects").node("a"), panda.layer("fixtures").node("table")
     assert isinstance(node, viser.IcosphereHandle) and node.radius == 0.03 and node.color == (255, 36, 36)
     assert isinstance(table, viser.BoxHandle) and table.dimensions == (1.0, 1.0, 0.05)
-    assert node.name.startswith("/objects/") and table.name.startswith("/fixtures/")
     panda.say(topics.PLANNING_SCENE, scene_of(ball("a", at(0.5, 0.2, 0.03))))
     assert panda.layer("objects").node("a") is node and panda.layer("fixtures").node("table") is None
     np.testing.assert_allclose(in_world(panda.server, node)[:3, 3], [0.5, 0.2, 0.03])
     larger = ball("a", at(0.5, 0.2, 0.03)).model_copy(update={"dimensions": [0.05]})
     panda.say(topics.PLANNING_SCENE, scene_of(larger))
-    changed = panda.layer("objects").node("a")
-    assert isinstance(changed, viser.IcosphereHandle) and changed.radius == 0.05
+    assert panda.layer("objects").node("a").radius == 0.05
     panda.say(topics.PLANNING_SCENE, scene_of())
     assert panda.layer("objects").node("a") is None
 
 
-def test_attached_object_moves_with_its_link(panda: Stage) -> None:
+def test_attached_object_moves_with_its_link_and_one_of_an_unknown_link_is_left_out(panda: Stage) -> None:
     held = ball("held", at(0.01, 0.0, 0.02), role="attached")
-    panda.say(topics.PLANNING_SCENE, scene_of(held={"panda_hand_tcp": held}))
+    panda.say(topics.PLANNING_SCENE, scene_of(held={"panda_hand_tcp": held, "third_hand": ball("b", at(0, 0, 0))}))
+    assert panda.layer("objects").node("b", "third_hand") is None
     for offset in (0.0, 0.3):
         q = panda.robot.named("home") + offset
         panda.joints(q)
@@ -167,24 +141,17 @@ def test_attached_object_moves_with_its_link(panda: Stage) -> None:
     np.testing.assert_allclose(in_world(panda.server, panda.layer("objects").node("held"))[:3, 3], [0.5, 0.2, 0.03])
 
 
-def test_object_attached_to_an_unknown_link_is_left_out(panda: Stage) -> None:
-    panda.say(topics.PLANNING_SCENE, scene_of(ball("a", at(0.4, 0, 0.03)), held={"third_hand": ball("b", at(0, 0, 0))}))
-    assert panda.layer("objects").node("a") is not None
-    assert panda.layer("objects").node("b", "third_hand") is None
-
-
-def test_prism_has_its_size_and_a_degenerate_one_is_left_out(ur5: Stage) -> None:
-    def show(*outline: tuple[float, float]) -> Any:
+@pytest.mark.parametrize("degenerate", [[(0.1, 0.1)] * 3, [(0.0, 0.0), (0.1, 0.0), (0.2, 0.0)]])
+def test_prism_has_its_size_and_a_degenerate_one_is_left_out(ur5: Stage, degenerate: list[tuple[float, float]]) -> None:
+    def show(outline: list[tuple[float, float]]) -> Any:
         ur5.say(topics.PLANNING_SCENE, scene_of(m.CollisionObject(
-            id="a", role="target", shape="prism", dimensions=[0.06], pose=at(0.5, 0, 1.03), outline=list(outline))))
+            id="a", role="target", shape="prism", dimensions=[0.06], pose=at(0.5, 0, 1.03), outline=outline)))
         return ur5.layer("objects").node("a")
 
-    for degenerate in ([(0.1, 0.1)] * 3, [(0.0, 0.0), (0.1, 0.0), (0.2, 0.0)]):
-        node = show((-0.02, -0.01), (0.04, -0.01), (0.04, 0.03), (-0.02, 0.03))
-        np.testing.assert_allclose(node.vertices.min(axis=0), [-0.02, -0.01, -0.03], atol=1e-6)
-        np.testing.assert_allclose(node.vertices.max(axis=0), [0.04, 0.03, 0.03], atol=1e-6)
-        assert show(*degenerate) is None
-    ur5.say(topics.PLANNING_SCENE, scene_of())
+    node = show([(-0.02, -0.01), (0.04, -0.01), (0.04, 0.03), (-0.02, 0.03)])
+    np.testing.assert_allclose(node.vertices.min(axis=0), [-0.02, -0.01, -0.03], atol=1e-6)
+    np.testing.assert_allclose(node.vertices.max(axis=0), [0.04, 0.03, 0.03], atol=1e-6)
+    assert show(degenerate) is None
 
 
 @pytest.mark.parametrize("cell", ["panda", "ur5"])
@@ -205,7 +172,10 @@ def test_empty_messages_do_no_harm(server: viser.ViserServer, cell: str) -> None
             stage.say(topic, empty[topic.message])
     stage.view.show_image(topics.CAMERA_IMAGE, np.zeros((48, 64, 3), np.uint8))
     stage.view.play(m.JointTrajectory(joint_names=["a"], points=[]))
-    stage.joints(stage.robot.named("home"))
+    q = stage.robot.named("home")
+    stage.joints(q)
+    last = list(stage.layer("robot").figure.links)[-1]
+    np.testing.assert_allclose(link_pose(stage, last), stage.robot.link_poses(q)[last], atol=1e-6)
 
 
 def test_scene_does_not_change_the_initial_camera(server: viser.ViserServer) -> None:
@@ -218,37 +188,29 @@ def test_scene_does_not_change_the_initial_camera(server: viser.ViserServer) -> 
 # --- goal marker ---
 
 
-def test_goal_marker_appears_at_the_tool_and_stays_where_it_was_put(panda: Stage) -> None:
+def test_goal_marker_appears_at_the_tool_with_its_gripper_and_stays_where_it_was_put(panda: Stage) -> None:
     q = panda.robot.named("home") + 0.2
     panda.joints(q)
     assert not panda.view.goal.visible
     panda.view.show_goal_marker(True)
     assert panda.view.goal.visible
     np.testing.assert_allclose(pose_to_matrix(panda.view.goal_pose), panda.robot.fk(q), atol=1e-6)
+    shown = [node for name, node in panda.server.scene._handle_from_node_name.items() if name.startswith("/goal/")]
+    poses, links = [in_world(panda.server, node) for node in shown], panda.robot.link_poses(q)
+    assert any(np.allclose(pose, links["panda_hand"], atol=1e-5) for pose in poses)
+    assert not any(np.allclose(pose, links["panda_link5"], atol=1e-5) for pose in poses)
     panda.view.goal.pose = GOAL
     panda.view.show_goal_marker(True)
     np.testing.assert_allclose(pose_to_matrix(panda.view.goal_pose), pose_to_matrix(GOAL), atol=1e-9)
 
 
-def test_goal_marker_shows_the_links_of_the_gripper(panda: Stage) -> None:
-    panda.view.show_goal_marker(True)
-    panda.view.goal.pose = matrix_to_pose(panda.robot.fk(panda.robot.named("home")))
-    links = panda.robot.link_poses(panda.robot.named("home"))
-    shown = [node for name, node in panda.server.scene._handle_from_node_name.items() if name.startswith("/goal/")]
-    poses = [in_world(panda.server, node) for node in shown]
-    assert any(np.allclose(pose, links["panda_hand"], atol=1e-5) for pose in poses)
-    assert not any(np.allclose(pose, links["panda_link5"], atol=1e-5) for pose in poses)
-
-
-@pytest.mark.parametrize(("position", "wxyz"), [
-    ((1e9, 0, 0), (1, 0, 0, 0)), ((0, 0, 0.5), (0, 0, 0, 0)), ((np.nan, 0, 0), (1, 0, 0, 0))])
-def test_invalid_pose_of_the_goal_marker_is_reverted(
-    panda: Stage, position: tuple[float, ...], wxyz: tuple[float, ...]
-) -> None:
+def test_invalid_pose_of_the_goal_marker_is_reverted(panda: Stage) -> None:
     panda.view.show_goal_marker(True)
     panda.view.goal.pose = GOAL
-    before = panda.view.goal_pose
-    node = panda.view.goal._node
-    node._impl.position[:], node._impl.wxyz[:] = position, wxyz  # as a message of a browser does
-    assert panda.view.goal_pose == before
-    np.testing.assert_allclose(node.position, (0.5, 0.1, 0.4))
+    before, node = panda.view.goal_pose, panda.view.goal._node
+    for position, wxyz in (
+        ((1e9, 0, 0), (1, 0, 0, 0)), ((0, 0, 0.5), (0, 0, 0, 0)), ((np.nan, 0, 0), (1, 0, 0, 0)),
+    ):
+        node._impl.position[:], node._impl.wxyz[:] = position, wxyz  # like a message of a browser
+        assert panda.view.goal_pose == before
+        np.testing.assert_allclose(node.position, (0.5, 0.1, 0.4))

@@ -22,31 +22,30 @@ ABOVE = Light(position=(0.4, 0.0, 2.0), aim=(0.4, 0.0, 0.0))
 ASIDE = Light(position=(0.4, 1.0, 1.0), aim=(0.4, 0.0, 0.0))
 
 needs_gl = pytest.mark.skipif(not GL, reason="no OpenGL here: apt-get install libegl1 libgl1-mesa-dri libopengl0")
+with_and_without_gl = pytest.mark.parametrize("gl", [pytest.param(GL, marks=needs_gl), ""])
 
 
-def balls(places=PLACES):
-    return [WorldObject(id=f"ball_{number}", shape="sphere", size=Vector3(x=0.06, y=0.06, z=0.06),
-                        pose=Pose(position=Vector3(x=x, y=y, z=z)), color=Color(r=1.0, g=0.15, b=0.1))
-            for number, (x, y, z) in enumerate(places)]
+def balls(places=PLACES, radius=0.03):
+    size = Vector3(x=2 * radius, y=2 * radius, z=2 * radius)
+    return [WorldObject(id=f"ball_{number}", shape="sphere", size=size, color=Color(r=1.0, g=0.15, b=0.1),
+                        pose=Pose(position=Vector3(x=x, y=y, z=z))) for number, (x, y, z) in enumerate(places)]
 
 
 def arm(**moved):
-    """At home, with joints moved by so much [rad]."""
+    """Return the home pose with joints moved by these angles [rad]."""
     position = ROBOT.named("home") + [moved.get(name, 0.0) for name in ROBOT.joint_names]
     locked = ROBOT.config.locked_joints
     return JointState(header=Header(), name=[*ROBOT.joint_names, *locked], position=[*position, *locked.values()])
 
 
-AWAY = arm(panda_joint1=2.8)  # turned back, out of the picture
+AWAY = arm(panda_joint1=2.8)  # turned back, out of view
 
 
-def camera(width=640, height=480, cx=319.5, cy=239.5, **changed):
-    scale = width / 640
-    return Pinhole.from_config(CameraConfig(width=width, height=height, fx=520 * scale, fy=520 * scale, cx=cx, cy=cy,
-                                            **changed))
+def camera(width=640, height=480, fx=520, fy=520, cx=319.5, cy=239.5):
+    return Pinhole.from_config(CameraConfig(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy))
 
 
-SMALL = camera(160, 120, 79.5, 59.5)
+SMALL = camera(160, 120, 130, 130, 79.5, 59.5)
 
 
 def drawn(objects, joints=AWAY, *, scenery=None, view=SMALL, gl=GL, world=CELL.world):
@@ -60,45 +59,24 @@ def red(picture):
 
 
 @needs_gl
-def test_sphere_centers_are_rendered_at_their_projection():
+def test_small_spheres_are_rendered_at_their_projection():
     view = camera()
-    _, _, boxes, centres = cv2.connectedComponentsWithStats(red(drawn(balls(), view=view).colour).astype(np.uint8))
+    mask = red(drawn(balls(radius=0.01), view=view).colour)
+    _, _, boxes, centres = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
     assert len(boxes) == 1 + len(PLACES)
-    for place in PLACES:
-        # The outline of a sphere off the axis is an ellipse whose middle lies beyond its centre: seen from the middle
-        # of the circle in which the rays touch it.
-        to_center = np.array(place) - view.position
-        square = to_center @ to_center
-        touch = view.position + to_center * (1 - 0.03**2 / square)
-        outline = ring(touch, to_center / np.sqrt(square), 0.03 * np.sqrt(1 - 0.03**2 / square))
-        area = cv2.moments(view.project(outline).astype(np.float32))
-        middle = np.array((area["m10"], area["m01"])) / area["m00"]
-        nearest = centres[1:][np.argmin(np.linalg.norm(centres[1:] - middle, axis=1))]
-        np.testing.assert_allclose(nearest, middle, atol=0.15)
-        assert np.linalg.norm(nearest - view.project(place)) < 0.8
+    for place in view.project(PLACES):
+        assert np.linalg.norm(centres[1:] - place, axis=1).min() < 0.25
 
 
-def ring(centre, axis, radius):
-    across = np.linalg.svd(axis[None])[2][1:]
-    angles = np.linspace(0, 2 * np.pi, 720, endpoint=False)
-    return centre + radius * (np.cos(angles)[:, None] * across[0] + np.sin(angles)[:, None] * across[1])
-
-
-@needs_gl
-def test_principal_point_shifts_the_image():
-    here, there = drawn(balls()).colour, drawn(balls(), view=camera(160, 120, 89.5, 52.5)).colour
-    np.testing.assert_array_equal(red(here)[20:100, 20:140], red(there)[13:93, 30:150])
-
-
-@pytest.mark.parametrize("gl", [pytest.param(GL, marks=needs_gl), ""])
+@with_and_without_gl
 def test_non_square_pixels_and_off_center_axis_are_supported(gl):
-    view = Pinhole.from_config(CameraConfig(width=160, height=120, fx=150, fy=110, cx=70, cy=66))
+    view = camera(160, 120, fx=150, fy=110, cx=70, cy=66)
     _, _, _, middles = cv2.connectedComponentsWithStats(red(drawn(balls(), view=view, gl=gl).colour).astype(np.uint8))
     for place in view.project(PLACES):
         assert np.linalg.norm(middles[1:] - place, axis=1).min() < 0.6
 
 
-@pytest.mark.parametrize("gl", [pytest.param(GL, marks=needs_gl), ""])
+@with_and_without_gl
 def test_depth_is_along_the_optical_axis(gl):
     view = drawn(balls(), gl=gl)
     for (x, y, z), (u, v) in zip(PLACES, SMALL.project(PLACES), strict=True):
@@ -116,15 +94,15 @@ def test_rays_and_opengl_agree_on_depth_and_colour():
     shown = Scenery(lights={"above": ABOVE.model_copy(update={"shadow": False})})
     one, other = (drawn(balls(), arm(), scenery=shown, gl=gl) for gl in (GL, ""))
     square = np.ones((3, 3), np.uint8)
-    whole = cv2.dilate(other.depth, square) - cv2.erode(other.depth, square) < 0.01  # nothing ends there
-    assert whole.mean() > 0.7
-    apart = np.abs(one.depth - other.depth)[whole]
-    assert np.mean(apart > 1e-3) < 0.01
-    different = np.abs(one.colour.astype(int) - other.colour).max(axis=2)[whole]
-    assert np.mean(different > 40) < 0.05, "rays see no highlights, and faces instead of what is round"
+    inner = cv2.dilate(other.depth, square) - cv2.erode(other.depth, square) < 0.01  # no edges
+    assert inner.mean() > 0.7
+    error = np.abs(one.depth - other.depth)[inner]
+    assert np.mean(error > 1e-3) < 0.01
+    different = np.abs(one.colour.astype(int) - other.colour).max(axis=2)[inner]
+    assert np.mean(different > 40) < 0.05, "rays show no highlights, and facets instead of curved surfaces"
 
 
-@pytest.mark.parametrize("gl", [pytest.param(GL, marks=needs_gl), ""])
+@with_and_without_gl
 def test_arm_is_rendered_at_its_joint_positions(gl):
     home, away = drawn([], arm(), gl=gl), drawn([], AWAY, gl=gl)
     hidden = home.depth < 0.5
@@ -172,13 +150,13 @@ def test_one_lamp_can_be_dimmed():
     assert one[:, right].mean() < 0.6 * both[:, right].mean() < one[:, left].mean()
 
 
-@pytest.mark.parametrize("gl", [pytest.param(GL, marks=needs_gl), ""])
+@with_and_without_gl
 def test_lamp_lights_only_its_cone(gl):
     low = Light(position=(0.4, 0.0, 0.25), aim=(0.4, 0.0, 0.0), parallel=False)
     picture = drawn([], gl=gl, scenery=Scenery(lights={"low": low}, ambient=50)).colour[..., 1]
     inside, outside = ((round(float(v)), round(float(u))) for u, v in SMALL.project(np.array([
         (0.4, -0.1, 0.0), (0.4, -0.35, 0.0)])))
-    assert 0 < picture[outside] < 0.2 * picture[inside], "of light from everywhere alone"
+    assert 0 < picture[outside] < 0.2 * picture[inside], "only ambient light"
 
 
 def test_elsewhere_is_not_rendered_and_unchanged_scenes_are_cached():

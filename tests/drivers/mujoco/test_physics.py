@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import mujoco
 import numpy as np
 import pytest
 
@@ -17,7 +16,7 @@ from common.planning.ik import solve_ik
 from common.robot.finger_joints import finger_positions
 from common.robot.model import RobotModel
 from common.robot.transforms import tool_down
-from common.sim.interface import GripperDrivenWorld, PhysicalWorld, load_world
+from common.sim.interface import load_world
 from drivers.mujoco.world import PhysicsWorld
 
 BALL = {"shape": "sphere", "radius": 0.03, "mass": 0.1}
@@ -47,6 +46,13 @@ class Rig:
         limits = Limits(tuple(robot.joint_names), robot.lower, robot.upper, robot.velocity, robot.acceleration)
         self.world, self.arm = world, world.hardware(robot, limits, np.array(q, float))
         self.set_point = np.array(q, float)
+
+    def restart(self, q: Any) -> float:
+        """Restore the world in a new process, from a snapshot through its wire format; return the finger width."""
+        saved, width = self.world.snapshot(), self.fingers.read(self.now).width
+        self.begin(q)
+        self.world.restore({name: type(each).model_validate(each.model_dump()) for name, each in saved.items()})
+        return width
 
     @property
     def fingers(self) -> Gripper:
@@ -79,6 +85,18 @@ class Rig:
         self.fingers.command(width, self.now, effort)
         self.wait(seconds)
 
+    def grasp(self, z: float = 0.03, effort: float = 5.0, lift: float | None = 0.2) -> None:
+        """Grasp the object at (0.45, 0, z) from above, and lift it."""
+        self.move(self.above(0.45, 0.0, z + 0.07))
+        self.move(self.above(0.45, 0.0, z))
+        self.grip(0.0, effort)
+        if lift is not None:
+            self.move(self.above(0.45, 0.0, lift))
+
+    def place_fingers(self, width: float) -> None:
+        assert isinstance(self.fingers, PlaceableGripper)
+        self.fingers.place(width)
+
     def object(self, name: str = "object_1") -> WorldObject:
         return next(obj for obj in self.world.objects(Header()).objects if obj.id == name)
 
@@ -92,11 +110,16 @@ class Rig:
         data.qvel[at: at + len(velocity)] = velocity
 
 
-def test_resting_ball_stays_and_publishes_nothing() -> None:
+def test_cell_at_rest_does_not_change() -> None:
     rig = Rig(BALL)
-    rig.wait(0.1)
-    version = rig.world.version
-    rig.wait(2.0)
+    rig.wait(0.5)
+    version, readings = rig.world.version, set()
+    for _ in range(150):
+        rig.now += PERIOD
+        q, dq = rig.arm.read(rig.now)
+        readings.add((q.tobytes(), dq.tobytes(), rig.fingers.read(rig.now)))
+    assert len(readings) == 1, "noise of readings would be published"
+    assert q == pytest.approx(rig.robot.named("home"), abs=1e-3) and np.abs(dq).max() < 1e-3
     assert rig.position() == pytest.approx((0.45, 0.0, 0.03), abs=5e-4)
     assert rig.object().state == "table" and rig.world.version == version and rig.world.take_events() == []
 
@@ -122,37 +145,16 @@ def test_ball_that_leaves_the_table_is_elsewhere() -> None:
     assert rig.object().state == "elsewhere" and rig.position()[2] < -0.5
 
 
-def test_arm_holds_its_pose_against_gravity() -> None:
-    rig = Rig()
-    rig.wait(1.0)
-    q, dq = rig.arm.read(rig.now)
-    assert q == pytest.approx(rig.robot.named("home"), abs=1e-3) and np.abs(dq).max() < 1e-3
-
-
-def test_readings_at_rest_are_constant() -> None:
-    rig = Rig(BALL)
-    rig.wait(0.5)
-    readings = set()
-    for _ in range(50):
-        rig.now += PERIOD
-        q, dq = rig.arm.read(rig.now)
-        readings.add((q.tobytes(), dq.tobytes(), rig.fingers.read(rig.now)))
-    assert len(readings) == 1
-
-
 def test_grasped_ball_is_lifted_by_friction_and_released() -> None:
     rig = Rig(BALL)
-    rig.move(rig.above(0.45, 0.0, 0.1))
-    rig.move(rig.above(0.45, 0.0, 0.03))
     assert not rig.fingers.read(rig.now).holding
-    rig.grip(0.0)
+    rig.grasp(lift=None)
     reading = rig.fingers.read(rig.now)
     assert reading.holding and not reading.moving and reading.width == pytest.approx(0.06, abs=3e-3)
     assert reading.effort == pytest.approx(5.0, rel=0.1)
     rig.move(rig.above(0.45, 0.0, 0.2))
-    assert rig.object().state == "held" and rig.position()[2] == pytest.approx(0.2, abs=5e-3)
     rig.wait(2.0)
-    assert rig.position()[2] == pytest.approx(0.2, abs=5e-3)
+    assert rig.object().state == "held" and rig.position()[2] == pytest.approx(0.2, abs=5e-3)
     rig.grip(0.08)
     rig.wait(1.0)
     assert rig.object().state == "table" and rig.position()[2] == pytest.approx(0.03, abs=1e-3)
@@ -161,40 +163,29 @@ def test_grasped_ball_is_lifted_by_friction_and_released() -> None:
 
 def test_heavy_object_slips_out_of_weak_fingers() -> None:
     rig = Rig({**CUBE, "mass": 3.0})
-    rig.move(rig.above(0.45, 0.0, 0.1))
-    rig.move(rig.above(0.45, 0.0, 0.025))
-    rig.grip(0.0, effort=2.0)
-    rig.move(rig.above(0.45, 0.0, 0.2))
+    rig.grasp(0.025, effort=2.0)
     assert rig.position()[2] < 0.05
 
 
-def test_fingers_respect_their_speed_limit() -> None:
+def test_fingers_respect_their_speed_limit_and_hold_nothing_without_an_object() -> None:
     rig = Rig()
     for _ in range(2):
         rig.wait(0.1)
         rig.fingers.command(0.0, rig.now, 5.0)
         widths = []
-        while rig.fingers.read(rig.now).moving:
+        while (reading := rig.fingers.read(rig.now)).moving:
             rig.wait(PERIOD)
-            widths.append(rig.fingers.read(rig.now).width)
+            widths.append(reading.width)
         assert np.abs(np.diff(widths)).max() <= 1.05 * GRIPPER.speed * PERIOD
+        assert reading.width == pytest.approx(0.0, abs=1e-3) and not reading.holding
         rig.grip(0.08)
-
-
-def test_fingers_that_close_on_nothing_hold_nothing() -> None:
-    rig = Rig()
-    rig.grip(0.0)
-    reading = rig.fingers.read(rig.now)
-    assert reading.width == pytest.approx(0.0, abs=1e-3) and not reading.holding and not reading.moving
-    rig.grip(0.08)
-    assert rig.fingers.read(rig.now).width == pytest.approx(0.08, abs=1e-3)
+        assert rig.fingers.read(rig.now).width == pytest.approx(0.08, abs=1e-3)
 
 
 def test_fingers_opening_against_an_obstacle_do_not_push_the_arm() -> None:
     rig = Rig({**CUBE, "size": [0.1, 0.1, 0.07], "y": 0.085, "mass": 80.0})  # next to the closed fingers
     rig.grip(0.0)
-    rig.move(rig.above(0.45, 0.0, 0.1))
-    rig.move(rig.above(0.45, 0.0, 0.05))
+    rig.grasp(0.05, lift=None)
     rig.grip(GRIPPER.max_width, GRIPPER.effort, 2.0)
     assert rig.fingers.read(rig.now).width < GRIPPER.max_width - 0.01, "blocked from opening"
     assert np.abs(rig.arm.read(rig.now)[0] - rig.set_point).max() < 5e-3
@@ -213,27 +204,37 @@ def test_gripper_joints_follow_the_driven_one(cell: str) -> None:
         assert found == pytest.approx(wanted, abs=0.01 if gripper.linkage else 1e-3)
 
 
-def test_stack_falls_when_touched() -> None:
-    rig = Rig(CUBE, {**CUBE, "position": [0.45, 0.0, 0.075], "x": None, "y": None})
-    rig.wait(1.0)
-    assert rig.position("object_2")[2] == pytest.approx(0.075, abs=1e-3)
-    rig.grip(0.0)
-    rig.move(rig.above(0.45, -0.12, 0.075))
-    rig.move(rig.above(0.45, 0.02, 0.075))
-    rig.wait(0.5)
-    assert rig.position("object_2")[2] < 0.06 and rig.position("object_2")[1] > 0.03
+def test_joint_forces_respect_effort_limits() -> None:
+    rig = Rig()
+    model, data = rig.world.simulation
+    rig.arm.write(rig.set_point + 0.5, 0 * rig.set_point, rig.now)
+    rig.wait(0.05)
+    forces = np.abs([float(data.actuator_force[model.actuators[name]]) for name in rig.robot.joint_names])
+    assert (forces <= rig.robot.model.effortLimit + 1e-9).all() and forces.max() > 1.0
+
+
+def test_delay_of_the_process_does_not_advance_the_world() -> None:
+    rig = Rig(BALL)
+    rig.push("object_1", 0.2)
+    rig.wait(0.1)
+    before = rig.position()
+    rig.now += 3600.0
+    rig.arm.read(rig.now)
+    assert rig.position() == pytest.approx(before, abs=5e-3)
+
+
+# --- restarts ---
 
 
 def test_restored_motion_continues() -> None:
     rig = Rig({**BALL, "x": 0.3}, CUBE)
     rig.push("object_1", 0.3, 0.1)
     rig.wait(0.3)
-    saved, before = rig.world.snapshot(), rig.position()
-    saved = {name: type(each).model_validate(each.model_dump()) for name, each in saved.items()}
+    before, saved = rig.position(), rig.world.snapshot()
     rig.wait(0.3)
     after = rig.position()
     rig.begin(rig.robot.named("home"))
-    rig.world.restore(saved)
+    rig.world.restore({name: type(each).model_validate(each.model_dump()) for name, each in saved.items()})
     rig.now += 1000.0
     rig.wait(0.01)
     assert rig.position() == pytest.approx(before, abs=5e-3)
@@ -241,20 +242,30 @@ def test_restored_motion_continues() -> None:
     assert rig.position() == pytest.approx(after, abs=5e-3)
 
 
-def test_held_object_is_still_held_after_a_restart() -> None:
+def test_held_object_is_restored_at_rest_and_still_held() -> None:
     rig = Rig(BALL)
-    rig.move(rig.above(0.45, 0.0, 0.03))
-    rig.grip(0.0)
-    rig.move(rig.above(0.45, 0.0, 0.2))
-    saved, width = rig.world.snapshot(), rig.fingers.read(rig.now).width
-    rig.begin(rig.set_point)
-    rig.world.restore(saved)
-    assert isinstance(rig.fingers, PlaceableGripper)
-    rig.fingers.place(width)
-    rig.fingers.command(0.0, rig.now, 5.0)
-    rig.wait(1.0)
+    rig.grasp()
+    rig.push("object_1", 0.0, 1.0)
+    width = rig.restart(rig.set_point)
+    cell, data = rig.world.simulation
+    assert not data.qvel[cell.objects["object_1"].dof:][:6].any()
+    rig.place_fingers(width)
+    rig.grip(0.0, seconds=1.0)
     assert rig.fingers.read(rig.now).holding
     assert rig.object().state == "held" and rig.position()[2] == pytest.approx(0.2, abs=8e-3)
+
+
+def test_snapshot_has_the_current_pose() -> None:
+    rig = Rig(BALL)
+    rig.wait(0.5)
+    rig.push("object_1", 0.2)
+    for _ in range(10):  # shorter than the publish interval
+        before = rig.world.snapshot()["object_1"].details["qpos"][0]
+        rig.wait(PERIOD)
+        assert rig.world.snapshot()["object_1"].details["qpos"][0] - before > 0.1 * PERIOD
+
+
+# --- edits ---
 
 
 def test_edits_add_move_remove_and_reset() -> None:
@@ -280,7 +291,7 @@ def test_edits_add_move_remove_and_reset() -> None:
     assert rig.world.ids == ["object_1", "object_2"] and rig.position() == pytest.approx((0.45, 0.0, 0.03), abs=1e-3)
 
 
-def test_object_that_mujoco_rejects_is_refused_without_effect() -> None:
+def test_object_that_mujoco_rejects_is_rejected_without_effect() -> None:
     rig = Rig(BALL)
     rig.wait(0.1)
     thin = WorldEdit(op="add", shape="prism", size=Vector3(x=0.1, y=0.1, z=1e-30), position=Vector3(x=0.6, y=-0.2),
@@ -299,9 +310,7 @@ def test_dropped_object_falls_out_of_the_fingers(concurrent_edit: WorldEdit | No
     rig = Rig(BALL)
     with pytest.raises(Refused, match="between the fingers"):
         rig.world.edit(WorldEdit(op="drop"), rig.now)
-    rig.move(rig.above(0.45, 0.0, 0.03))
-    rig.grip(0.0)
-    rig.move(rig.above(0.45, 0.0, 0.2))
+    rig.grasp()
     assert rig.world.edit(WorldEdit(op="drop"), rig.now) == "object_1"
     if concurrent_edit is not None:
         rig.world.edit(concurrent_edit, rig.now)
@@ -309,102 +318,38 @@ def test_dropped_object_falls_out_of_the_fingers(concurrent_edit: WorldEdit | No
     assert rig.position()[2] == pytest.approx(0.03, abs=2e-3) and not rig.fingers.read(rig.now).holding
 
 
-def assert_undisturbed_and_graspable(rig: Rig) -> None:
+@pytest.mark.parametrize("restart", [False, True])
+def test_object_dropped_on_the_table_is_not_flung_away_by_closing_fingers(restart: bool) -> None:
+    rig = Rig(BALL)
+    rig.grasp(lift=None)
+    rig.world.edit(WorldEdit(op="drop"), rig.now)
+    if restart:
+        rig.wait(0.15)
+        width = rig.restart(rig.set_point)
+        assert width < 0.04, "the fingers are within the ball"
+        rig.place_fingers(width)
+        rig.grip(0.0, seconds=3.0)
+    else:
+        rig.wait(3.0)
     assert math.dist(rig.position(), (0.45, 0.0, 0.03)) < 5e-3
     assert np.abs(rig.arm.read(rig.now)[0] - rig.set_point).max() < 5e-3, "the arm is not pushed"
     rig.move(rig.above(0.45, 0.0, 0.2))
     rig.grip(0.08)
-    rig.move(rig.above(0.45, 0.0, 0.03))
-    rig.grip(0.0)
+    rig.grasp(lift=None)
     assert rig.fingers.read(rig.now).holding, "graspable again"
 
 
-def test_object_dropped_on_the_table_is_not_flung_away_by_closing_fingers() -> None:
-    rig = Rig(BALL)
-    rig.move(rig.above(0.45, 0.0, 0.03))
-    rig.grip(0.0)
-    rig.world.edit(WorldEdit(op="drop"), rig.now)
-    rig.wait(3.0)
-    assert_undisturbed_and_graspable(rig)
-
-
-def test_slipping_object_is_not_flung_away_after_a_restart() -> None:
-    rig = Rig(BALL)
-    rig.move(rig.above(0.45, 0.0, 0.03))
-    rig.grip(0.0)
-    rig.world.edit(WorldEdit(op="drop"), rig.now)
-    rig.wait(0.15)
-    saved, width = rig.world.snapshot(), rig.fingers.read(rig.now).width
-    assert width < 0.04, "the fingers are within the ball"
-    rig.begin(rig.set_point)
-    rig.world.restore({name: type(each).model_validate(each.model_dump()) for name, each in saved.items()})
-    assert isinstance(rig.fingers, PlaceableGripper)
-    rig.fingers.place(width)
-    rig.grip(0.0, seconds=3.0)
-    assert_undisturbed_and_graspable(rig)
-
-
-def test_snapshot_has_the_current_pose() -> None:
-    rig = Rig(BALL)
-    rig.wait(0.5)
-    rig.push("object_1", 0.2)
-    for _ in range(10):  # shorter than the publish interval
-        before = rig.world.snapshot()["object_1"].details["qpos"][0]
-        rig.wait(PERIOD)
-        assert rig.world.snapshot()["object_1"].details["qpos"][0] - before > 0.1 * PERIOD
-
-
-def test_held_object_is_restored_at_rest() -> None:
-    rig = Rig(BALL)
-    rig.move(rig.above(0.45, 0.0, 0.03))
-    rig.grip(0.0)
-    rig.move(rig.above(0.45, 0.0, 0.2))
-    rig.push("object_1", 0.0, 1.0)
-    saved = rig.world.snapshot()
-    assert saved["object_1"].details["qvel"][1] == 1.0
-    rig.begin(rig.set_point)
-    rig.world.restore(saved)
-    cell, data = rig.world.simulation
-    assert not data.qvel[cell.objects["object_1"].dof:][:6].any()
-
-
-def test_delay_of_the_process_does_not_advance_the_world() -> None:
-    rig = Rig(BALL)
-    rig.push("object_1", 0.2)
-    rig.wait(0.1)
-    before = rig.position()
-    rig.now += 3600.0
-    rig.arm.read(rig.now)
-    assert rig.position() == pytest.approx(before, abs=5e-3)
-
-
-def test_kinematic_and_physics_worlds_satisfy_different_protocols() -> None:
-    rig = Rig()
-    kinematic = load_world(rig.config.model_copy(update={"simulator": "kinematic"}), [])
-    assert isinstance(rig.world, PhysicalWorld) and not isinstance(rig.world, GripperDrivenWorld)
-    assert isinstance(kinematic, GripperDrivenWorld) and not isinstance(kinematic, PhysicalWorld)
+# --- configuration ---
 
 
 def test_suction_cup_is_rejected_with_an_alternative() -> None:
-    rig = Rig()
-    cup = rig.robot.config.gripper.model_copy(update={"cup": object()})  # type: ignore[union-attr]
+    cup = GRIPPER.model_copy(update={"cup": object()})
     with pytest.raises(ConfigError, match="kinematic"):
-        load_world(rig.config, [], None, cup)
+        load_world(Rig().config, [], None, cup)
 
 
 def test_missing_mujoco_is_an_error_that_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
-    rig = Rig()
+    config = Rig().config
     monkeypatch.setattr("drivers.mujoco.find_spec", lambda name: None)
     with pytest.raises(ConfigError, match="zencell\\[physics\\]"):
-        load_world(rig.config, [])
-
-
-def test_joint_forces_respect_effort_limits() -> None:
-    rig = Rig()
-    model, data = rig.world.simulation
-    limits = rig.robot.model.effortLimit
-    rig.arm.write(rig.set_point + 0.5, 0 * rig.set_point, rig.now)
-    rig.wait(0.05)
-    forces = [abs(float(data.actuator_force[model.actuators[name]])) for name in rig.robot.joint_names]
-    assert (np.array(forces) <= limits + 1e-9).all() and max(forces) > 1.0
-    assert mujoco.mj_versionString()
+        load_world(config, [])

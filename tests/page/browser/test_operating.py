@@ -13,7 +13,7 @@ import pytest
 from applications.outlining.topics import CONTOURS, OUTLINE_STATUS, OutlineStatus
 from applications.pick_place.topics import PICK_PLACE_STATUS, PickPlaceStatus
 from common import topics
-from common.messages import (JointState, MotionStatus, ParameterReply, ParameterRequest, SupervisorStatus)
+from common.messages import JointState, MotionStatus, ParameterReply, ParameterRequest, SupervisorStatus
 from common.transport.bus import Client, Reader
 from tests.harness import until
 from tests.page.browser.conftest import IN_BROWSER, PATIENCE, Bring, Watched
