@@ -50,9 +50,9 @@ def get_robot_state(self: Any) -> Any:
     return self._state_snapshot
 
 
-def wait_for_reply(self: Any, deadline: float) -> float:
+def wait_for_reply(self: Any, answer_deadline: float) -> float:
     """Wait for the reply to the last state; return the waiting time [s]."""
-    return drain_gate(self, deadline + PATIENCE)
+    return drain_gate(self, answer_deadline + PATIENCE)
 
 
 def stop_if_hit(self: Any, sim_state: Any) -> None:

@@ -26,12 +26,14 @@ AVAILABLE = {"arm": ("no arm", True), "task": ("no task", True)}
 UNAVAILABLE = {"arm": ("no arm", False), "task": ("no task", False)}
 
 
-class Connection:
-    """A fake WebSocket: `incoming` are the messages of the page, `results` the replies to it."""
+class Page(HoldHandler):
+    """A page with its WebSocket: `incoming` are its messages, `results` the replies, `presses` the effective ones."""
 
     def __init__(self) -> None:
+        self.permissions = Permissions()
         self.incoming: asyncio.Queue[str] = asyncio.Queue()
-        self.results: asyncio.Queue[dict[str, Any]] = asyncio.Queue()
+        self.results: asyncio.Queue[str] = asyncio.Queue()
+        self.presses: asyncio.Queue[int] = asyncio.Queue()
 
     async def __aiter__(self) -> AsyncIterator[str]:
         while True:
@@ -40,63 +42,51 @@ class Connection:
     async def send(self, data: str) -> None:
         message = json.loads(data)
         if "result" in message:
-            self.results.put_nowait(message)
+            self.results.put_nowait(message["result"])
 
     def receive(self, **message: Any) -> None:
         self.incoming.put_nowait(json.dumps(message))
 
-    def hold(self, press: int, seen: float, at: float = 0.0) -> None:
+    def hold_down(self, press: int, seen: float, at: float = 0.0) -> None:
         self.receive(do="hold", what="joint:1:+", n=press, at=at, seen=seen)
 
-
-class Presses(HoldHandler):
-    def __init__(self) -> None:
-        self.numbers: asyncio.Queue[int] = asyncio.Queue()
-
     def hold(self, client: object, button: str, press: int, reject: Callable[[str], None]) -> None:
-        self.numbers.put_nowait(press)
-
-
-Served = tuple[Presses, Connection, Permissions]
+        self.presses.put_nowait(press)
 
 
 @pytest.fixture
-async def served() -> AsyncIterator[Served]:
-    """A socket of an open page."""
-    permissions = Permissions()
-    actions, connection = ActionQueue(permissions), Connection()
+async def page() -> AsyncIterator[Page]:
+    page = Page()
+    actions = ActionQueue(page.permissions)
     control = ControlSocket(actions)
-    control.hold_handler = presses = Presses()
-    permissions.enforced = True
+    control.hold_handler = page
+    page.permissions.enforced = True
     running = [asyncio.create_task(actions.run()),
-               asyncio.create_task(control.serve(connection))]  # type: ignore[arg-type]
-    connection.receive(do="page", what=permissions.issue_key(SESSION))
-    yield presses, connection, permissions
+               asyncio.create_task(control.serve(page))]  # type: ignore[arg-type]
+    page.receive(do="page", what=page.permissions.issue_key(SESSION))
+    async with asyncio.timeout(10):
+        yield page
     for task in running:
         task.cancel()
     await asyncio.gather(*running, return_exceptions=True)
     CURRENT_SESSION.set(None)
 
 
-async def test_press_whose_messages_are_all_late_has_no_effect(served: Served) -> None:
-    presses, connection, _ = served
+async def test_press_whose_messages_are_all_late_has_no_effect(page: Page) -> None:
     now = time.monotonic()
     for press, seen in ((1, now - MAX_STATUS_AGE - 1), (2, 0.0), (3, now)):
         for number in range(3):
-            connection.hold(press, seen, at=number * 40.0)
-    async with asyncio.timeout(10):
-        assert await presses.numbers.get() == 3, "only this press had a recent status"
+            page.hold_down(press, seen, at=number * 40.0)
+    assert await page.presses.get() == 3, "only this press had a recent status"
 
 
-async def test_closed_page_cannot_act_over_its_open_control_socket(served: Served) -> None:
-    presses, connection, permissions = served
-    async with asyncio.timeout(10):
-        connection.hold(1, time.monotonic())
-        await presses.numbers.get()
-        permissions.remove(SESSION)
-        connection.hold(2, time.monotonic())
-        assert "nothing was done" in (await connection.results.get())["result"]
-    assert presses.numbers.empty()
+async def test_closed_page_cannot_act_over_its_open_control_socket(page: Page) -> None:
+    page.hold_down(1, time.monotonic())
+    await page.presses.get()
+    page.permissions.remove(SESSION)
+    page.hold_down(2, time.monotonic())
+    assert "nothing was done" in await page.results.get()
+    assert page.presses.empty()
 
 
 def test_delayed_message_is_detected_whatever_the_clocks_show() -> None:
@@ -116,10 +106,6 @@ def detector_of(*services: str) -> LossDetector:
     return losses
 
 
-def test_peer_that_was_never_seen_is_not_lost() -> None:
-    assert LossDetector().update(True, [], {"arm": ("no arm", False)}, 100.0) == []
-
-
 def test_lost_service_is_reported_after_a_grace_time_until_it_returns() -> None:
     losses = detector_of("camera", "viewer")
     assert losses.update(True, ["viewer"], AVAILABLE, 5.0) == []
@@ -128,8 +114,10 @@ def test_lost_service_is_reported_after_a_grace_time_until_it_returns() -> None:
     assert losses.update(True, ["viewer"], AVAILABLE, 9.0) == [], "the grace time starts again"
 
 
-def test_part_of_the_page_without_a_responder_is_stale() -> None:
-    losses, lost = detector_of("executor"), {"arm": ("no arm", False), "task": ("no task", True)}
+def test_part_of_the_page_whose_responder_was_lost_is_stale() -> None:
+    lost = {"arm": ("no arm", False), "task": ("no task", True)}
+    assert LossDetector().update(True, [], lost, 100.0) == [], "it was never seen"
+    losses = detector_of("executor")
     losses.update(True, [], lost, 1.0)
     assert losses.update(True, [], lost, 3.0) == [
         Loss("no arm", 1.0, frozenset({"arm"})), Loss("executor does not respond", 1.0)]

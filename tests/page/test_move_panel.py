@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import asyncio
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
+from unittest.mock import MagicMock
 
+import pytest
 import viser
 
 from common.client.operator_motion import MotionFailed
@@ -16,6 +18,7 @@ from page.saved_poses import SavedPoses, poses_file, save_poses
 from tests.page.scene_cell import robot_of
 
 STOP = MotionStatus(interlocks=[Interlock(kind="stopped", by="anna", since=8)])
+POINT = JointTrajectoryPoint(time_from_start=0.0, positions=[0.1], velocities=[0.0], accelerations=[0.0])
 
 
 class Motions:
@@ -31,8 +34,7 @@ class Motions:
     async def plan(self, _goal: Any, *, planner: str = "") -> PlanResponse:
         self.planning.set()
         await self.may_plan.wait()
-        point = JointTrajectoryPoint(time_from_start=0.0, positions=[0.1], velocities=[0.0], accelerations=[0.0])
-        return PlanResponse(id="1", ok=True, trajectory=JointTrajectory(joint_names=["a"], points=[point]))
+        return PlanResponse(id="1", ok=True, trajectory=JointTrajectory(joint_names=["a"], points=[POINT]))
 
     async def move(self, _goal: Any, *, planner: str = "", acknowledged: int | None = None) -> MotionStatus:
         if acknowledged is not None and self.status.newest > acknowledged:
@@ -45,33 +47,27 @@ class Motions:
         return MotionStatus()
 
 
-class EmptyScene:
-    def __getattr__(self, _name: str) -> Any:
-        return lambda *_: None
+class Panel:
+    """The Move tab of a cell that publishes nothing, with two saved poses."""
+
+    def __init__(self, gui: viser.GuiApi) -> None:
+        robot, console = robot_of("ur5"), ActionQueue()
+        console.latest = lambda _topic: None  # type: ignore[attr-defined]
+        pose = dict.fromkeys(robot.joint_names, 0.1)
+        save_poses(poses_file("cell"), SavedPoses(poses={"one": pose, "two": pose}))
+        self.motions, self.notes = Motions(), list[tuple[str, str]]()
+        self.panel: Any = MovePanel(
+            gui, console, self.motions, MagicMock(), robot, [], cell="cell", planner="", marker=False,  # type: ignore[arg-type]
+            notify=lambda line, kind: self.notes.append((line, kind)))
 
 
-class SilentConsole(ActionQueue):
-    """The console of a cell that publishes nothing."""
-
-    def latest(self, _topic: Any) -> None:
-        pass
+@pytest.fixture
+async def move(gui: viser.GuiApi, state_folder: Path) -> Panel:
+    return Panel(gui)
 
 
-def panel_of(gui: viser.GuiApi, motions: Motions) -> tuple[MovePanel, list[tuple[str, str]]]:
-    robot, notes = robot_of("ur5"), list[tuple[str, str]]()
-    pose = dict.fromkeys(robot.joint_names, 0.1)
-    save_poses(poses_file("cell"), SavedPoses(poses={"one": pose, "two": pose}))
-    panel = MovePanel(
-        gui, cast(Any, SilentConsole()), cast(Any, motions), cast(Any, EmptyScene()), robot, [], cell="cell",
-        planner="", marker=False, notify=lambda line, kind: notes.append((line, kind)))
-    return panel, notes
-
-
-async def test_plan_is_discarded_if_another_goal_is_selected_while_planning(
-    gui: viser.GuiApi, state_folder: Path
-) -> None:
-    motions = Motions()
-    panel, notes = panel_of(gui, motions)
+async def test_plan_is_discarded_if_another_goal_is_selected_while_planning(move: Panel) -> None:
+    panel, motions, notes = move.panel, move.motions, move.notes
     panel._goal._set_kind("one")
     planning = asyncio.create_task(panel._plan_goal())
     await motions.planning.wait()
@@ -86,10 +82,8 @@ async def test_plan_is_discarded_if_another_goal_is_selected_while_planning(
     assert (motions.follows, notes[-1][0]) == (1, "Goal reached")
 
 
-async def test_stop_between_two_poses_ends_the_sequence(gui: viser.GuiApi, state_folder: Path) -> None:
-    motions = Motions()
-    panel, notes = panel_of(gui, motions)
-    panel._poses._set_sequence("one, two")
-    await panel._poses._run_sequence()
-    assert motions.moves == 1
-    assert notes[-2:] == [("Moving to two …", "busy"), ("the motion was rejected", "bad")]
+async def test_stop_between_two_poses_ends_the_sequence(move: Panel) -> None:
+    move.panel._poses._set_sequence("one, two")
+    await move.panel._poses._run_sequence()
+    assert move.motions.moves == 1
+    assert move.notes[-2:] == [("Moving to two …", "busy"), ("the motion was rejected", "bad")]

@@ -13,15 +13,12 @@ from tests.page.scene_cell import Stage, in_world
 Array = NDArray[np.float64]
 
 
-def plan(stage: Stage, q: Array, seconds: float = 2.0, count: int = 40, stamp: int = 0) -> m.JointTrajectory:
-    start = stage.robot.named("home")
-    zeros = [0.0] * len(q)
+def plan(stage: Stage, q: Array, stamp: int = 0) -> m.JointTrajectory:
+    """Return a straight motion of 2 s in joint space from home."""
+    start, zeros = stage.robot.named("home"), [0.0] * len(q)
     return m.JointTrajectory(header=m.Header(stamp=stamp), joint_names=stage.robot.joint_names, points=[
-        m.JointTrajectoryPoint(
-            time_from_start=float(s * seconds), positions=(start + s * (q - start)).tolist(), velocities=zeros,
-            accelerations=zeros,
-        ) for s in np.linspace(0, 1, count)
-    ])
+        m.JointTrajectoryPoint(time_from_start=float(2.0 * s), positions=(start + s * (q - start)).tolist(),
+                               velocities=zeros, accelerations=zeros) for s in np.linspace(0, 1, 40)])
 
 
 @pytest.fixture
@@ -41,11 +38,13 @@ def assert_ghost_at(stage: Stage, q: Array, tolerance: float = 1e-6, layer: str 
     np.testing.assert_allclose(hand, stage.robot.link_poses(q)["panda_hand"], atol=tolerance)
 
 
-def test_ghost_is_at_the_end_of_the_plan_until_the_robot_arrives(panda: Stage, goal: Array) -> None:
+def test_ghost_is_at_the_end_of_the_plan_until_the_robot_arrives(panda: Stage, home: Array, goal: Array) -> None:
     ghost = panda.layer("plan").ghost
     assert not ghost.visible
     panda.say(topics.DISPLAY_TRAJECTORY, plan(panda, goal))
-    assert ghost.visible
+    panda.joints(home)
+    assert ghost.visible and ghost.links["panda_hand"].visible
+    assert not ghost.links["panda_link0"].visible, "it coincides with the robot"
     assert_ghost_at(panda, goal)
     for q, visible in ((goal - 0.05, True), (goal, False)):
         panda.joints(q)
@@ -63,40 +62,36 @@ def test_meshes_of_the_ghost_are_sent_once_with_the_first_plan(
     assert not [name for name in sent if name.startswith("/plan/")]
     for _ in range(2):
         panda.say(topics.DISPLAY_TRAJECTORY, plan(panda, goal))
-    links = {name.split("/")[-2] for name in sent}
-    assert len(sent) == len(links) == len(panda.layer("plan").ghost.links)
+    assert len(sent) == len({name.split("/")[-2] for name in sent}) == len(panda.layer("plan").ghost.links)
 
 
-def test_line_is_the_path_of_the_tool(panda: Stage, goal: Array) -> None:
+def test_tool_path_is_a_line_until_a_plan_without_points(panda: Stage, goal: Array) -> None:
     trajectory = plan(panda, goal)
     panda.say(topics.DISPLAY_TRAJECTORY, trajectory)
     line = panda.layer("tool_path").line
     assert line is not None
     expected = [panda.robot.fk(point.positions)[:3, 3] for point in trajectory.points]
     np.testing.assert_allclose([line.points[0, 0], *line.points[:, 1]], expected, atol=1e-5)
+    panda.say(topics.DISPLAY_TRAJECTORY, m.JointTrajectory(joint_names=panda.robot.joint_names, points=[]))
+    assert not panda.layer("plan").ghost.visible and panda.layer("tool_path").line is None
 
 
-def test_links_that_coincide_with_the_robot_are_hidden(panda: Stage, home: Array, goal: Array) -> None:
-    panda.say(topics.DISPLAY_TRAJECTORY, plan(panda, goal))
-    panda.joints(home)
-    ghost = panda.layer("plan").ghost.links
-    assert not ghost["panda_link0"].visible and ghost["panda_hand"].visible
+def test_plan_of_unknown_joints_does_no_harm(panda: Stage, goal: Array) -> None:
+    panda.view.play(plan(panda, goal).model_copy(update={"joint_names": [f"other_{i}" for i in range(7)]}))
+    panda.joints(goal)
+    panda.say(topics.DISPLAY_TRAJECTORY, plan(panda, goal - 0.3))
+    assert_ghost_at(panda, goal - 0.3)
 
 
-def test_animation_repeats_the_plan(panda: Stage, home: Array, goal: Array) -> None:
-    panda.view.play(plan(panda, goal, seconds=2.0))
+def test_animation_repeats_the_plan_until_the_robot_moves(panda: Stage, home: Array, goal: Array) -> None:
+    panda.view.play(plan(panda, goal))
     panda.joints(home)
     for seconds, share in ((1.0, 0.5), (1.5, 1.0), (1.0, 0.25)):  # it starts again after 2 s and a pause of 1 s
         panda.clock.now += seconds
         panda.joints(home)
         assert_ghost_at(panda, home + share * (goal - home), 1e-3)
-
-
-def test_animation_ends_when_the_robot_moves(panda: Stage, home: Array, goal: Array) -> None:
-    panda.view.play(plan(panda, goal))
-    panda.joints(home)
     panda.clock.now += 0.5
-    panda.joints(home + 0.02 * (goal - home) / 0.5)
+    panda.joints(home + 0.04 * (goal - home))
     assert not panda.layer("plan").playing
     assert_ghost_at(panda, goal)
 
@@ -106,14 +101,6 @@ def test_animated_plan_is_not_restarted_when_the_planner_publishes_it(panda: Sta
     for stamp, playing in ((5, True), (6, False)):
         panda.say(topics.DISPLAY_TRAJECTORY, plan(panda, goal, stamp=stamp))
         assert panda.layer("plan").playing is playing
-
-
-def test_plan_without_points_clears_the_last_and_unknown_joints_do_no_harm(panda: Stage, goal: Array) -> None:
-    panda.say(topics.DISPLAY_TRAJECTORY, plan(panda, goal))
-    panda.say(topics.DISPLAY_TRAJECTORY, m.JointTrajectory(joint_names=panda.robot.joint_names, points=[]))
-    assert not panda.layer("plan").ghost.visible and panda.layer("tool_path").line is None
-    panda.view.play(plan(panda, goal).model_copy(update={"joint_names": [f"other_{i}" for i in range(7)]}))
-    panda.joints(goal)
 
 
 def test_two_plans_are_animated_concurrently_until_the_robot_moves(panda: Stage, home: Array, goal: Array) -> None:

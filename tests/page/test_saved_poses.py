@@ -15,16 +15,11 @@ from page.saved_poses import HEADER, SavedPoses, SavedPosesPanel, load_poses, po
 
 POSES = {"bin": {"a": 0.25, "b": -1.0}, "über der Kiste": {"b": 0.5, "a": 0.0}}
 JOINTS = ["a", "b"]
-RESERVED = ["goal marker", "home"]
 
 
 @pytest.fixture(autouse=True)
 def folder(state_folder: Path) -> Path:
     return state_folder
-
-
-def saved() -> set[str]:
-    return set(load_poses(poses_file("cell")).poses)
 
 
 def test_saved_poses_are_read_again_in_the_order_of_the_joints() -> None:
@@ -35,13 +30,9 @@ def test_saved_poses_are_read_again_in_the_order_of_the_joints() -> None:
     assert again.poses == POSES and path.read_text(encoding="utf-8").startswith(HEADER)
     assert again.named("über der Kiste", JOINTS) == [0.0, 0.5]
     assert [each.name for each in path.parent.iterdir()] == [path.name]
-
-
-@pytest.mark.parametrize(("name", "joints", "reason"), [
-    ("box", JOINTS, "choices: bin"), ("bin", ["a"], "a robot with other joints")])
-def test_unknown_pose_or_other_joints_are_rejected(name: str, joints: list[str], reason: str) -> None:
-    with pytest.raises(ConfigError, match=reason):
-        SavedPoses(poses=POSES).named(name, joints)
+    for name, joints, reason in (("box", JOINTS, "choices: bin"), ("bin", ["a"], "a robot with other joints")):
+        with pytest.raises(ConfigError, match=reason):
+            again.named(name, joints)
 
 
 @pytest.mark.parametrize("name", ["", " a", "a, b", "x" * 41, "a\nb"])
@@ -58,44 +49,52 @@ def test_invalid_file_is_rejected_by_its_name(tmp_path: Path, text: str) -> None
         load_poses(path)
 
 
-def panel_of(gui: viser.GuiApi) -> SavedPosesPanel:
-    async def move(_names: list[str]) -> None:
-        pass
+class Panel:
+    """The panel of a page at the joint positions 1, 2; `goal marker` and `home` are reserved names."""
 
-    return SavedPosesPanel(
-        gui, ActionQueue(), "cell", JOINTS, lambda: np.array([1.0, 2.0]), lambda: None, move, RESERVED)
+    def __init__(self, gui: viser.GuiApi) -> None:
+        async def move(_names: list[str]) -> None:
+            pass
+
+        self.panel = SavedPosesPanel(gui, ActionQueue(), "cell", JOINTS, lambda: np.array([1.0, 2.0]), lambda: None,
+                                     move, ["goal marker", "home"])
+
+    def save(self, name: str) -> None:
+        self.panel._set_name(name)
+        self.panel._save()
+
+    def delete(self, name: str) -> None:
+        self.panel._set_name(name)
+        self.panel._delete()
+
+    @property
+    def text(self) -> str:
+        self.panel.show("")
+        return self.panel._html.content
 
 
-def save(panel: SavedPosesPanel, name: str) -> None:
-    panel._set_name(name)
-    panel._save()
-
-
-def delete(panel: SavedPosesPanel, name: str) -> None:
-    panel._set_name(name)
-    panel._delete()
+def saved() -> set[str]:
+    return set(load_poses(poses_file("cell")).poses)
 
 
 async def test_pose_with_a_reserved_name_is_hidden_and_can_be_deleted(gui: viser.GuiApi) -> None:
     save_poses(poses_file("cell"), SavedPoses(poses={name: {"a": 0.0, "b": 0.0} for name in ("bin", "home")}))
-    panel = panel_of(gui)
-    assert panel.names == ["bin"]  # a dropdown with a duplicate choice makes viser's page blank
+    page = Panel(gui)
+    assert page.panel.names == ["bin"], "viser's page is blank with a duplicate choice"
     with pytest.raises(ConfigError, match="reserved"):
-        panel.positions("home")
-    panel.show("")
-    assert "hidden, because the name is reserved: home" in panel._html.content
-    delete(panel, "home")
-    panel.show("")
-    assert "hidden" not in panel._html.content and saved() == {"bin"}
+        page.panel.positions("home")
+    assert "hidden, because the name is reserved: home" in page.text
+    page.delete("home")
+    assert "hidden" not in page.text and saved() == {"bin"}
 
 
 async def test_poses_that_another_page_saved_meanwhile_remain(gui: viser.GuiApi) -> None:
-    one, other = panel_of(gui), panel_of(gui)
-    save(one, "bin")
-    save(other, "box")
-    assert saved() == set(other.names) == {"bin", "box"}
-    delete(one, "bin")
+    one, other = Panel(gui), Panel(gui)
+    one.save("bin")
+    other.save("box")
+    assert saved() == set(other.panel.names) == {"bin", "box"}
+    one.delete("bin")
     assert saved() == {"box"}
     poses_file("cell").write_text("[")
     with pytest.raises(ConfigError, match="does not parse"):
-        save(one, "more")
+        one.save("more")

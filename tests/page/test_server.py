@@ -365,15 +365,15 @@ async def test_view_only_pages_leave_room_for_operators(page: Operated, monkeypa
 async def test_flood_of_messages_is_slowed_and_stop_of_another_page_is_not(
     page: Operated, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(page_server, "MAX_MESSAGE_RATE", 4)
+    monkeypatch.setattr(page_server, "MAX_MESSAGE_RATE", 40)
     denied: list[str] = []
     page.actions.notify = lambda line, kind="bad": denied.append(line)
     async with page.open("look") as flood, page.open("operate") as operator:
-        for _ in range(40):
+        for _ in range(200):
             await page.click(flood, "Start")
         await page.click(operator, "Stop")
         await until(lambda: "Stop" in page.done)
-        assert len(denied) < 40
+        assert len(denied) < 200
         flood.transport.abort()  # the server would read the rest of the flood before it closes
 
 

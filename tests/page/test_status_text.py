@@ -1,3 +1,5 @@
+"""Texts of the page for states, plans and errors."""
+
 from __future__ import annotations
 
 from typing import get_args
@@ -6,18 +8,9 @@ import pytest
 
 from applications.outlining.topics import OutlineState, OutlineStatus
 from applications.pick_place.topics import PickPlaceStatus, TaskState
+from common import messages as m
 from common.application import find_application
 from common.errors import ConfigError, NoResponder, RemoteError, ZencellError
-from common.messages import (
-    GoalState,
-    GripperState,
-    JointTrajectory,
-    JointTrajectoryPoint,
-    MotionStatus,
-    PlanResponse,
-    ServiceStatus,
-    TaskStatus,
-)
 from page import status_text as texts
 from page.markup import block, row, span
 from page.status_text import TaskText
@@ -26,9 +19,8 @@ from page.status_text import TaskText
 def test_every_state_has_a_text() -> None:
     for application, states in (("pick_place", TaskState), ("outlining", OutlineState)):
         assert set(get_args(states)) <= set(TaskText.of(find_application(application)).states)
-    assert set(texts.GOAL_STATES) == set(get_args(GoalState))
-    states = get_args(ServiceStatus.model_fields["state"].annotation)
-    assert set(texts.SERVICE_STATES) == {*states, "gone"}
+    assert set(texts.GOAL_STATES) == set(get_args(m.GoalState))
+    assert set(texts.SERVICE_STATES) == {*get_args(m.ServiceStatus.model_fields["state"].annotation), "gone"}
 
 
 @pytest.mark.parametrize(("status", "text"), [
@@ -49,35 +41,32 @@ def test_text_of_a_task_state(status: PickPlaceStatus | OutlineStatus | None, te
 
 
 def test_texts_of_an_application_without_a_page() -> None:
-    status = TaskStatus(state="MOVING_IT", started=True, subject="cube", done=1, total=4, figures={"mean_mm": 0.2})
+    status = m.TaskStatus(state="MOVING_IT", started=True, subject="cube", done=1, total=4, figures={"mean_mm": 0.2})
     text = TaskText.of(None)
     assert text.state(status)[0] == "Moving it cube" and text.progress_of(status, None) == 0.25
     assert text.counters(status, 0) == {"done": 1, "of": 4, "mean mm": 0.2, "retries": 0, "failures": 0}
 
 
 def test_texts_of_arm_and_gripper() -> None:
-    assert texts.motion_text(MotionStatus(state="active", progress=0.25)) == "moving, 25 % of this motion"
-    assert texts.motion_text(MotionStatus(state="active", progress=0.25, held=True)) == "held"
-    assert texts.gripper_text(GripperState(width=0.08)) == "gripper open 80 mm"
-    assert texts.gripper_text(GripperState(width=0.06, holding=True)) == "gripper holds an object"
-    assert texts.gripper_text(GripperState(width=0.06, holding=True, outcome="slipping")).endswith(" is slipping")
-    assert texts.gripper_text(GripperState(width=0.0)) == "gripper closed"
+    assert texts.motion_text(m.MotionStatus(state="active", progress=0.25)) == "moving, 25 % of this motion"
+    assert texts.motion_text(m.MotionStatus(state="active", progress=0.25, held=True)) == "held"
+    assert texts.gripper_text(m.GripperState(width=0.08)) == "gripper open 80 mm"
+    assert texts.gripper_text(m.GripperState(width=0.06, holding=True)) == "gripper holds an object"
+    assert texts.gripper_text(m.GripperState(width=0.06, holding=True, outcome="slipping")).endswith(" is slipping")
+    assert texts.gripper_text(m.GripperState(width=0.0)) == "gripper closed"
 
 
-def test_text_of_a_failed_plan_names_the_colliding_objects_once() -> None:
-    failed = PlanResponse(id="a", ok=False, error="collision", message="operator: waypoint 3",
-                          colliding=("panda_hand", "table"))
+def test_text_of_a_plan_has_planner_and_duration_or_the_colliding_objects_once() -> None:
+    points = [m.JointTrajectoryPoint(time_from_start=t, positions=[0.0], velocities=[0.0], accelerations=[0.0])
+              for t in (0.0, 2.5)]
+    trajectory = m.JointTrajectory(joint_names=["a"], points=points)
+    found = m.PlanResponse(id="a", ok=True, planner="ompl", seconds=0.12, trajectory=trajectory)
+    assert texts.plan_text(found) == "Planned by ompl in 120 ms: motion of 2.5 s"
+    failed = m.PlanResponse(id="a", ok=False, error="collision", message="operator: waypoint 3",
+                            colliding=("panda_hand", "table"))
     assert texts.plan_text(failed) == "operator: waypoint 3; panda_hand would collide with table"
     named = failed.model_copy(update={"message": "panda_hand touches table"})
     assert texts.plan_text(named) == "panda_hand touches table"
-
-
-def test_text_of_a_plan_names_planner_and_duration() -> None:
-    points = [JointTrajectoryPoint(time_from_start=t, positions=[0.0], velocities=[0.0], accelerations=[0.0])
-              for t in (0.0, 2.5)]
-    found = PlanResponse(id="a", ok=True, planner="ompl", seconds=0.12,
-                         trajectory=JointTrajectory(joint_names=["a"], points=points))
-    assert texts.plan_text(found) == "Planned by ompl in 120 ms: motion of 2.5 s"
 
 
 @pytest.mark.parametrize(("error", "text"), [
