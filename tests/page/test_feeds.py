@@ -1,13 +1,14 @@
+"""Topics that the page reads, always or on demand."""
+
 from __future__ import annotations
 
-from typing import Any
+from types import SimpleNamespace
 
 from applications.outlining.topics import CONTOURS, OUTLINE_SELECT
 from applications.pick_place.topics import VALIDATED_TARGETS
 from common import messages as m
 from common import topics
 from common.application import find_application
-from common.topics import Topic
 from common.transport.local import LocalNetwork
 from page.feeds import Feeds, Topics, Updater
 from page.layers import find_layers
@@ -26,20 +27,18 @@ def test_page_reads_topics_of_the_platform_and_of_its_application_only() -> None
 
 async def test_message_is_taken_once_and_remains_the_latest() -> None:
     net = LocalNetwork()
-    feeds = Feeds(net.bus("viewer"), ALWAYS, ON_DEMAND)
-    writer = net.bus("trajectory_executor").writer(topics.GRIPPER_STATE)
+    feeds, writer = Feeds(net.bus("viewer"), ALWAYS, ON_DEMAND), net.bus("executor").writer(topics.GRIPPER_STATE)
     assert feeds.latest(topics.GRIPPER_STATE) is None is feeds.take(topics.GRIPPER_STATE)
-    writer.put(m.GripperState(width=0.01))
-    first = feeds.take(topics.GRIPPER_STATE)
-    assert first == m.GripperState(width=0.01)
-    assert feeds.take(topics.GRIPPER_STATE) is None and feeds.latest(topics.GRIPPER_STATE) is first
-    writer.put(m.GripperState(width=0.02))
-    assert feeds.take(topics.GRIPPER_STATE) == m.GripperState(width=0.02)
+    for width in (0.01, 0.02):
+        writer.put(m.GripperState(width=width))
+        first = feeds.take(topics.GRIPPER_STATE)
+        assert first == m.GripperState(width=width)
+        assert feeds.take(topics.GRIPPER_STATE) is None and feeds.latest(topics.GRIPPER_STATE) is first
 
 
 async def test_on_demand_topics_are_read_while_selected_and_events_always() -> None:
     net = LocalNetwork()
-    feeds, publisher = Feeds(net.bus("viewer"), ALWAYS, ON_DEMAND), net.bus("trajectory_executor")
+    feeds, publisher = Feeds(net.bus("viewer"), ALWAYS, ON_DEMAND), net.bus("executor")
     objects, events = publisher.writer(topics.SCENE_OBJECTS), publisher.writer(topics.SCENE_OBJECT_UPDATES)
     for selected in (False, True, False):
         feeds.select([topics.SCENE_OBJECTS] if selected else [])
@@ -49,24 +48,15 @@ async def test_on_demand_topics_are_read_while_selected_and_events_always() -> N
     assert feeds.latest(VALIDATED_TARGETS) is None
 
 
-def test_part_of_the_page_receives_new_messages_once_per_period() -> None:
-    messages: dict[str, m.Message] = {}
-    shown: list[tuple[str, m.Message]] = []
-
-    class Part:
-        TOPICS = (topics.GRIPPER_STATE, topics.SCENE_OBJECT_UPDATES)
-        PERIOD = 0.5
-
-        def show(self, topic: Topic[Any], message: Any) -> None:
-            shown.append((topic.key, message))
-
-    updater = Updater(Part(), lambda topic: messages.get(topic.key))  # type: ignore[arg-type, return-value]
-    messages["scene_object_updates"] = m.SceneUpdate(data="add:a")  # an event, which is not passed on by an updater
-    updater.update(1.0)
-    assert shown == []
+def test_part_of_the_page_receives_new_messages_once_per_period_but_no_events() -> None:
+    messages: dict[str, m.Message] = {topics.SCENE_OBJECT_UPDATES.key: m.SceneUpdate(data="add:a")}
+    shown: list[m.Message] = []
+    part = SimpleNamespace(TOPICS=(topics.GRIPPER_STATE, topics.SCENE_OBJECT_UPDATES), PERIOD=0.5,
+                           show=lambda _topic, message: shown.append(message))
+    updater = Updater(part, lambda topic: messages.get(topic.key))  # type: ignore[arg-type, return-value]
     states = [m.GripperState(width=width) for width in (0.01, 0.02, 0.03)]
     for state, now in zip(states, (1.0, 1.2, 1.6), strict=True):
-        messages["gripper/state"] = state
+        messages[topics.GRIPPER_STATE.key] = state
         updater.update(now)
         updater.update(now)
-    assert shown == [("gripper/state", states[0]), ("gripper/state", states[2])]
+    assert shown == [states[0], states[2]]

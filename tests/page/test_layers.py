@@ -5,85 +5,55 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-import viser
 
-from common import messages as m
 from common.application import find_application, find_topic
 from common.errors import ConfigError, UnknownName
 from page.layers import find_layers, has_data, shown_layers
-from page.scene import Scene
-from tests.page.scene_cell import Clock, FakeConsole, around_of, robot_of
 
-PANDA = find_application("pick_place")
-CUSTOM = '''
-from common import topics
-LABEL = "Gripper width"
-ON = False
-TOPICS = (topics.GRIPPER_STATE,)
-def show(layer, topic, message):
-    layer.scene.add_label(f"{layer.root}/width", f"{1000 * message.width:.0f} mm")
-'''
-CLASSES = '''
-from page.layers import Layer
-class Floor(Layer):
-    LABEL = "Floor"
-    def build(self):
-        self.scene.add_frame(f"{self.root}/floor")
-class HighWall(Layer):
-    LABEL = "Wall"
-'''
+PANDA, UR5 = find_application("pick_place"), find_application("outlining")
+MODULES = {
+    "single": 'LABEL = "Gripper width"\nON = False\nTOPICS = ()\ndef show(layer, topic, message): pass\n',
+    "house": 'from page.layers import Layer\nclass Floor(Layer):\n    LABEL = "Floor"\n'
+             'class HighWall(Layer):\n    LABEL = "Wall"\n',
+    "broken": "import no_such_thing", "empty": "TOPICS = ()",
+}
 
 
-@pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    folder = tmp_path / "page_pkg"
-    folder.mkdir()
+@pytest.fixture(autouse=True)
+def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "page_pkg").mkdir()
+    for name, text in MODULES.items():
+        (tmp_path / "page_pkg" / f"{name}.py").write_text(text)
     monkeypatch.syspath_prepend(tmp_path)
-    return folder
 
 
 def test_cell_has_the_layers_of_the_platform_and_of_its_application() -> None:
-    panda, ur5 = find_layers(PANDA), find_layers(find_application("outlining"))
+    panda, ur5 = find_layers(PANDA), find_layers(UR5)
     everywhere = {"robot", "fixtures", "objects", "plan", "tool_path", "camera", "frames", "truth", "grid",
                   "collision_shapes", "reach", "points", "compared"}
     assert {*panda} & {*ur5} == everywhere
     assert {*panda} - {*ur5} == {"targets", "rejected", "workspace"}
     assert {*ur5} - {*panda} == {"outline", "contours"}
     assert (next(iter(panda)), list(panda)[-1]) == ("robot", "grid")  # in the order of their checkboxes
-    assert all(kind.LABEL for kind in (*panda.values(), *ur5.values()))
+    for kind in (*panda.values(), *ur5.values()):
+        assert kind.LABEL and all(topic == find_topic(topic.key) for topic in kind.TOPICS)
 
 
-def test_module_with_topics_and_show_is_a_layer(folder: Path, server: viser.ViserServer) -> None:
-    (folder / "hand_width.py").write_text(CUSTOM)
-    layers = find_layers(PANDA, ["page_pkg.hand_width"])
-    name = "page_pkg.hand_width"
-    assert (layers[name].LABEL, shown_layers({}, layers)[name]) == ("Gripper width", False)
-    server.scene.reset()
-    messages = {"gripper/state": m.GripperState(width=0.04)}
-    scene = Scene(
-        server, robot_of("panda"), around_of("panda"), {name: layers[name]}, FakeConsole(),  # type: ignore[arg-type]
-        lambda topic: messages.get(topic.key), shown={name: True}, clock=Clock(),  # type: ignore[arg-type, return-value]
-    )
-    scene.refresh(1.0)
-    label = server.scene.get_handle_by_name(f"/{name}/width")
-    assert isinstance(label, viser.LabelHandle) and label.text == "40 mm"
+def test_custom_module_is_a_layer_or_has_several_as_classes() -> None:
+    layers = find_layers(PANDA, ["page_pkg.single", "page_pkg.house"])
+    names = [name for name in layers if "." in name]
+    assert names == ["page_pkg.single", "page_pkg.house.floor", "page_pkg.house.high_wall"]
+    assert [layers[name].LABEL for name in names] == ["Gripper width", "Floor", "Wall"]
+    assert not shown_layers({}, layers)["page_pkg.single"]
 
 
-def test_module_may_have_several_layers_as_classes(folder: Path) -> None:
-    (folder / "house.py").write_text(CLASSES)
-    layers = find_layers(None, ["page_pkg.house"])
-    assert [name for name in layers if "." in name] == ["page_pkg.house.floor", "page_pkg.house.high_wall"]
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [("import no_such_thing", "cannot be imported: No module named 'no_such_thing'"),
-     ("TOPICS = ()", "has no layer: neither a class derived from Layer, nor LABEL"), ],
-)
-def test_module_without_a_layer_is_rejected_by_name(folder: Path, text: str, message: str) -> None:
-    (folder / f"wrong_{len(text)}.py").write_text(text)
-    with pytest.raises(ConfigError, match=f"services.viewer.layers: 'page_pkg.wrong_{len(text)}' {message}"):
-        find_layers(PANDA, [f"page_pkg.wrong_{len(text)}"])
+@pytest.mark.parametrize(("module", "message"), [
+    ("broken", "cannot be imported: No module named 'no_such_thing'"),
+    ("empty", "has no layer: neither a class derived from Layer, nor LABEL"),
+])
+def test_module_without_a_layer_is_rejected_by_name(module: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=f"services.viewer.layers: 'page_pkg.{module}' {message}"):
+        find_layers(PANDA, [f"page_pkg.{module}"])
 
 
 def test_layout_may_name_layers_of_other_cells() -> None:
@@ -93,20 +63,10 @@ def test_layout_may_name_layers_of_other_cells() -> None:
         shown_layers({"outlien": False}, find_layers(PANDA))
 
 
-def test_layer_is_offered_if_one_of_its_topics_is_published() -> None:
-    layers = find_layers(PANDA)
-    def offered(*keys: str) -> set[str]:
-        return {name for name, kind in layers.items() if has_data(kind, keys)}
-    assert offered() == {"grid"}
-    assert offered("tf", "tf_static", "joint_states") == {
-        "grid", "robot", "collision_shapes", "reach", "frames", "compared"}
-    assert offered("depth_camera/points") - offered() == {"points"}
-    assert offered("camera/camera_info") - offered() == {"camera"}
-    assert offered("scene_objects") - offered() == {"truth"}
-
-
-def test_topics_of_all_layers_are_known() -> None:
-    for name in ("pick_place", "outlining"):
-        for layer in find_layers(find_application(name)).values():
-            for topic in layer.TOPICS:
-                assert topic == find_topic(topic.key)
+@pytest.mark.parametrize(("keys", "offered"), [
+    ([], set()), (["depth_camera/points"], {"points"}), (["camera/camera_info"], {"camera"}),
+    (["scene_objects"], {"truth"}),
+    (["tf", "tf_static", "joint_states"], {"robot", "collision_shapes", "reach", "frames", "compared"}),
+])
+def test_layer_is_offered_if_one_of_its_topics_is_published(keys: list[str], offered: set[str]) -> None:
+    assert {name for name, kind in find_layers(PANDA).items() if has_data(kind, keys)} == {"grid", *offered}

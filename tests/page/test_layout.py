@@ -1,6 +1,9 @@
+"""The layout of the page: default, saved by the user, and invalid."""
+
 from __future__ import annotations
 
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -27,25 +30,30 @@ def test_layout_is_saved_for_the_user_and_the_default_is_unchanged() -> None:
     assert (config_root() / "viewer.yaml").read_text() == before
 
 
-def test_user_without_a_home_gets_the_default_layout(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_default_layout_without_a_home_or_a_layout_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("XDG_STATE_HOME")
-    monkeypatch.setattr(Path, "home", lambda: (_ for _ in ()).throw(RuntimeError("none")))
+    monkeypatch.setattr(Path, "home", Mock(side_effect=RuntimeError("none")))
     assert set(load_layout("", print).viewpoints) == CELLS
     with pytest.raises(ConfigError, match="home"):
         save_layout("", Layout())
-
-
-def test_project_without_a_layout_file_has_default_values(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ZENCELL_CONFIG", str(tmp_path))
     assert config_root() == tmp_path and load_layout("", print) == Layout()
 
 
-def test_saved_layout_is_read_again(tmp_path: Path) -> None:
+def test_saved_layout_is_read_again_and_a_failed_save_leaves_it_unchanged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     file = tmp_path / "mine.yaml"
     layout = Layout(tabs=["Log"], layers={"grid": False}, viewpoints={"panda": Viewpoint(position=(1, 2, 3))})
     assert save_layout(str(file), layout) == file
-    assert load_layout(str(file), print) == layout
-    assert list(tmp_path.iterdir()) == [file]
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "replace", Mock(side_effect=OSError(28, "No space left on device")))
+        with pytest.raises(OSError, match="No space"):
+            save_layout(str(file), Layout(dark=False))
+    file.chmod(0o444)
+    with pytest.raises(PermissionError, match="read-only"):
+        save_layout(str(file), Layout(dark=False))
+    assert load_layout(str(file), print) == layout and list(tmp_path.iterdir()) == [file]
 
 
 def test_tab_newer_than_a_saved_layout_is_added_unless_it_was_removed_on_purpose(tmp_path: Path) -> None:
@@ -57,23 +65,6 @@ def test_tab_newer_than_a_saved_layout_is_added_unless_it_was_removed_on_purpose
     for tabs in (["Log", "Move"], list(reversed(TABS))):
         file.write_text(f"tabs: {tabs}\n")
         assert load_layout(str(file), print).tabs == tabs
-
-
-def test_failed_save_leaves_the_file_unchanged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    file = tmp_path / "mine.yaml"
-    save_layout(str(file), Layout())
-    before = file.read_text()
-    with monkeypatch.context() as patch:
-        def fail(*_: object) -> None:
-            raise OSError(28, "No space left on device")
-
-        patch.setattr(Path, "replace", fail)
-        with pytest.raises(OSError, match="No space"):
-            save_layout(str(file), Layout(dark=False))
-    file.chmod(0o444)
-    with pytest.raises(PermissionError, match="read-only"):
-        save_layout(str(file), Layout(dark=False))
-    assert file.read_text() == before and list(tmp_path.iterdir()) == [file]
 
 
 @pytest.mark.parametrize(("text", "message"), [

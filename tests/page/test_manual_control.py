@@ -1,4 +1,4 @@
-"""Jogging: why a held button has no effect, and the names of its buttons."""
+"""Jogging: why a held button has no effect, one page at a time, and the names of the buttons."""
 
 from __future__ import annotations
 
@@ -25,15 +25,17 @@ class Arm:
 
     def __init__(self, clock: Clock) -> None:
         self.permissions, self.owner, self.clock, self.rejected = Permissions(), FREE, clock, list[str]()
+        self.jogs = 0
         self.jogger = Jogger(self, lambda _: {"joints": {"a": 0.1}}, lambda: (MotionStatus(), self.owner), lambda: "")
 
     def jog(self, acknowledged: int, **velocities: Any) -> None:
-        pass
+        self.jogs += bool(velocities)
 
-    def hold(self, owner: MotionOwner, press: int = 1) -> None:
-        """Receive a hold message, 0.2 s after the last one."""
-        self.owner, self.clock.now = owner, self.clock.now + 0.2
-        self.jogger.hold("page", "joint:a:+", press, self.rejected.append)
+    def hold(self, *owners: MotionOwner, press: int = 1, page: str = "one") -> None:
+        """Receive a hold message with each motion owner, 0.2 s after the last one."""
+        for self.owner in owners:
+            self.clock.now += 0.2
+            self.jogger.hold(page, "joint:a:+", press, self.rejected.append)
 
 
 @pytest.fixture
@@ -47,20 +49,25 @@ def arm() -> Iterator[Arm]:
     (OURS, FREE, "press the button again"), (FREE, FREE, "its controller does not accept it"),
     (OURS, BOBS, "owned by bob"),
 ])
-def test_held_button_without_effect_is_rejected_once_with_the_reason(
+def test_held_button_without_effect_is_rejected_once_a_press_with_the_reason(
     arm: Arm, before: MotionOwner, then: MotionOwner, reason: str
 ) -> None:
-    for owner in [FREE, *[before] * 4, *[then] * 4]:
-        arm.hold(owner)
+    arm.hold(FREE, *[before] * 4, *[then] * 4)
     assert len(arm.rejected) == 1 and reason in arm.rejected[0]
-
-
-def test_next_press_is_judged_on_its_own(arm: Arm) -> None:
-    for owner in [FREE, *[OURS] * 4, *[FREE] * 4]:
-        arm.hold(owner)
-    for owner in [FREE] * 7:
-        arm.hold(owner, press=2)
+    arm.hold(*[FREE] * 7, press=2)
     assert len(arm.rejected) == 2 and "its controller does not accept it" in arm.rejected[1]
+
+
+def test_one_page_jogs_at_a_time(arm: Arm) -> None:
+    arm.hold(OURS, OURS)
+    jogs = arm.jogs
+    arm.hold(OURS, page="two")
+    assert (arm.rejected, arm.jogs) == (["Another page is jogging the arm"], jogs)
+    arm.hold(OURS)
+    assert arm.jogs > jogs
+    arm.clock.now += 1.0  # the earlier press has ended
+    arm.hold(OURS, page="two", press=2)
+    assert len(arm.rejected) == 1 and arm.jogs > jogs + 1
 
 
 @pytest.mark.parametrize(("joints", "names"), [

@@ -1,3 +1,5 @@
+"""Fields of the Tuning tab for parameters."""
+
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
@@ -22,14 +24,9 @@ def parameter(**fields: Any) -> Parameter:
 
 @pytest.fixture
 def make(gui: viser.GuiApi) -> Iterator[Make]:
-    """Makes a field for a parameter; all fields are removed at the end."""
+    """Make a field for a parameter; all fields are removed at the end."""
     made: list[ParameterField] = []
-
-    def make_field(found: Parameter | None = None, **fields: Any) -> ParameterField:
-        made.append(ParameterField(gui, found or parameter(**fields), ["a"]))
-        return made[-1]
-
-    yield make_field
+    yield lambda found=None, **fields: made.append(ParameterField(gui, found or parameter(**fields), ["a"])) or made[-1]
     for field in made:
         field.handle.remove()
 
@@ -71,18 +68,13 @@ def test_label_has_the_unit_and_a_mark_for_a_changed_value(make: Make) -> None:
         assert field.handle.label == label
 
 
-def test_new_value_is_shown_unless_the_operator_is_changing_it(make: Make) -> None:
+def test_new_value_is_shown_if_it_fits_and_the_operator_is_not_changing_it(make: Make) -> None:
     field = make(value=0.5, minimum=0, maximum=1)
     for field.pending, value in ((True, 0.5), (False, 0.7)):
         field.show(parameter(value=0.7, minimum=0, maximum=1))
         assert field.handle.value == value
-
-
-def test_field_that_cannot_show_a_value_does_not_fit(make: Make) -> None:
-    field = make(value=0.5, minimum=0, maximum=1)
     assert field.fits(parameter(value=1, minimum=0, maximum=1))
-    for other in ("high", None, [1.0], True):
-        assert not field.fits(parameter(value=other, minimum=0, maximum=1))
+    assert not any(field.fits(parameter(value=other, minimum=0, maximum=1)) for other in ("high", None, [1.0], True))
     chosen = make(value="red", type="string", choices=["red", "green"])
     assert not chosen.fits(parameter(value="blue", type="string", choices=["red", "green"]))
 

@@ -1,4 +1,4 @@
-"""The files of viser's client, unpacked so that a browser can cache them; and messages from any thread."""
+"""The files of viser's client, unpacked so that a browser can cache them, and messages from any thread."""
 
 from __future__ import annotations
 
@@ -67,19 +67,18 @@ def test_page_with_an_unknown_packing_is_sent_unchanged(page: str) -> None:
 
 async def test_message_from_another_thread_wakes_waiting_tasks_on_their_loop() -> None:
     buffer = AsyncMessageBuffer(asyncio.get_running_loop(), persistent_messages=False)
-    for number in range(100):
+
+    def push(number: int, woken: list[asyncio.Future[bool]]) -> list[bool]:
+        """Return whether this thread woke the waiting tasks instead of the loop."""
+        buffer.message_event.set()
+        found = [future.done() for future in woken]
+        buffer.push(RunJavascriptMessage(f"{number}"))
+        return found
+
+    for number in range(20):
         waiting = asyncio.create_task(buffer.message_event.wait())
         await asyncio.sleep(0)
         woken = list(buffer.message_event._waiters)  # type: ignore[attr-defined]
-        seen = await asyncio.to_thread(_pushed, buffer, number, woken)
+        assert await asyncio.to_thread(push, number, woken) == [False]
         await asyncio.wait_for(waiting, 10.0)
-        assert seen == [False]
         buffer.message_event.clear()
-
-
-def _pushed(buffer: AsyncMessageBuffer, number: int, woken: list[asyncio.Future[bool]]) -> list[bool]:
-    """Return whether each waiting task was woken by this thread instead of by the loop."""
-    buffer.message_event.set()
-    found = [future.done() for future in woken]
-    buffer.push(RunJavascriptMessage(f"{number}"))
-    return found

@@ -61,32 +61,25 @@ async def test_edits_are_undone_in_reverse_order(world: World) -> None:
     first = next(iter(before))
     x, y, _ = before[first]
     states: list[Positions] = []
-
-    async def edit(edit: WorldEdit) -> None:
+    for edit in (WorldEdit(op="move", id=first, position=Vector3(x=x - 0.05, y=y - 0.12)), None,
+                 WorldEdit(op="remove", id=first), WorldEdit(op="reset")):
         states.append(world.positions)
-        await world.editor.edit(edit)
+        if edit is None:
+            await world.editor.add_like(world.named(first), x - 0.05, y - 0.12)
+            assert len(world.positions) == len(before) + 1
+        else:
+            await world.editor.edit(edit)
         assert world.positions != states[-1]
-
-    await edit(WorldEdit(op="move", id=first, position=Vector3(x=x - 0.05, y=y - 0.12)))
-    states.append(world.positions)
-    await world.editor.add_like(world.named(first), x - 0.05, y - 0.12)
-    assert len(world.positions) == len(before) + 1
-    await edit(WorldEdit(op="remove", id=first))
-    await edit(WorldEdit(op="reset"))
     assert world.positions == before
     while states:
         assert world.editor.last
         await world.editor.undo()
         assert world.positions == states.pop()
+    with pytest.raises(RemoteError):
+        await world.editor.edit(WorldEdit(op="remove", id="unknown"))
     assert world.positions == before and not world.editor.last
     with pytest.raises(NothingToUndo, match="no edit"):
         await world.editor.undo()
-
-
-async def test_rejected_edit_cannot_be_undone(world: World) -> None:
-    with pytest.raises(RemoteError):
-        await world.editor.edit(WorldEdit(op="remove", id="unknown"))
-    assert not world.editor.last
 
 
 async def test_removed_custom_object_is_restored_and_can_be_copied(world: World) -> None:

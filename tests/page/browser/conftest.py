@@ -10,7 +10,7 @@ import os
 import re
 import shutil
 import socket
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Callable
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -40,6 +40,9 @@ const draw = window.requestAnimationFrame.bind(window);
 window.requestAnimationFrame = step => setTimeout(() => draw(step), 100);
 window.cancelAnimationFrame = clearTimeout;
 """
+# Slow motions, so that the task is still running when a busy browser has drawn the page; an empty scene.
+PANDA = ("up", "panda", "--set", "autostart=false", "--set", "services.trajectory_executor.speed_scaling=0.2",
+         "--set", f"services.viewer.layout={Path(__file__).with_name('nothing_to_draw.yaml')}")
 
 
 @dataclass
@@ -48,8 +51,7 @@ class Watched:
 
     page: Page
     hosts: set[str] = field(default_factory=set)  # of its requests
-    errors: list[str] = field(default_factory=list)  # of its console and its scripts
-    failed: list[str] = field(default_factory=list)  # requests
+    errors: list[str] = field(default_factory=list)  # of its console, its scripts, and requests
 
     def __post_init__(self) -> None:
         self.page.set_default_timeout(PATIENCE * 1e3)
@@ -57,7 +59,7 @@ class Watched:
         self.page.on("websocket", lambda opened: self._requested(opened.url))
         self.page.on("console", lambda line: self.errors.append(line.text) if line.type == "error" else None)
         self.page.on("pageerror", lambda error: self.errors.append(str(error)))
-        self.page.on("requestfailed", lambda request: self.failed.append(f"{request.url}: {request.failure}"))
+        self.page.on("requestfailed", lambda request: self.errors.append(f"{request.url}: {request.failure}"))
 
     def _requested(self, url: str) -> None:
         host = urlsplit(url.removeprefix("blob:")).hostname
@@ -73,11 +75,12 @@ class Watched:
 
 
 class Viewed(RunningCell):
-    """A `zencell run` or `up` with a page."""
+    """A `zencell run` or `up` with a page; `address` is known after `served`."""
 
-    def __init__(self, folder: Path, verb: str, cell: str, *arguments: str) -> None:
-        """Start it; `address` is known after `served`."""
-        super().__init__(folder, verb, cell, *arguments, "--viewer-port", str(free_port()))
+    def __init__(self, folder: Path, *arguments: str) -> None:
+        with socket.create_server(("127.0.0.1", 0)) as probe:
+            port: int = probe.getsockname()[1]
+        super().__init__(folder, *arguments, "--viewer-port", str(port))
         self.address = ""
 
     async def served(self) -> Viewed:
@@ -91,40 +94,14 @@ class Viewed(RunningCell):
         return self
 
 
-def free_port() -> int:
-    """Return a free TCP port."""
-    with socket.create_server(("127.0.0.1", 0)) as probe:
-        port: int = probe.getsockname()[1]
-        return port
+Opened = Callable[[], AbstractAsyncContextManager[Watched]]
 
 
-Bring = Callable[..., Awaitable[Viewed]]
-Opened = Callable[..., AbstractAsyncContextManager[Watched]]
-
-
-@pytest_asyncio.fixture(scope="module", loop_scope="session")
-async def bring(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[Bring]:
-    """Start a cell with its page: `await bring("up", "panda", "--set", "autostart=false")`.
-
-    Repeated calls with the same arguments return the same running cell; other arguments end it first. So tests of a
-    file share cells and must leave them unchanged. The last cell ends with the file.
-    """
-    current: dict[tuple[str, ...], Viewed] = {}
-
-    def end() -> None:
-        for viewed in current.values():
-            viewed.__exit__()
-        current.clear()
-
-    async def up(*arguments: str) -> Viewed:
-        if arguments not in current or current[arguments].process.poll() is not None:
-            end()
-            current[arguments] = Viewed(tmp_path_factory.mktemp("viewed"), *arguments)
-            await current[arguments].served()
-        return current[arguments]
-
-    yield up
-    end()
+@pytest_asyncio.fixture(scope="session", loop_scope="session")
+async def cell(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[Viewed]:
+    """A panda cell that all tests share: each leaves the arm and the task stopped."""
+    with Viewed(tmp_path_factory.mktemp("viewed"), *PANDA) as cell:
+        yield await cell.served()
 
 
 @pytest_asyncio.fixture(scope="session", loop_scope="session")
@@ -171,3 +148,12 @@ async def watched(opened: Opened) -> AsyncIterator[Watched]:
     """A page that is not open yet: `await watched.open(cell.address)`."""
     async with opened() as one:
         yield one
+
+
+@pytest_asyncio.fixture(loop_scope="session")
+async def page(cell: Viewed, watched: Watched) -> AsyncIterator[Page]:
+    """The page of the shared cell; it must have no errors at the end."""
+    page = await watched.open(cell.address)
+    await page.get_by_role("button", name="Start").wait_for()
+    yield page
+    assert not watched.errors

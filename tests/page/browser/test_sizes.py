@@ -1,69 +1,123 @@
-"""Every tab at four sizes: the same elements, none overflows, and STOP stays visible."""
+"""The page at three sizes: STOP stays visible, every tab has the same elements with names, and none overflows."""
 
 from __future__ import annotations
 
 import re
-from contextlib import suppress
 from typing import TYPE_CHECKING
 
 import pytest
 
 from page.layout import TABS
-from tests.page.browser.conftest import IN_BROWSER, Bring, Watched
-from tests.page.browser.test_bar import PANDA, SIZES, check_stop
-from tests.page.browser.test_panels import NAMELESS, tab
+from tests.page.browser.conftest import IN_BROWSER
 
 if TYPE_CHECKING:
     from playwright.async_api import Page
 
 pytestmark = IN_BROWSER
 
-# Labels of all buttons and fields, except events (labeled with their time), and elements that overflow sideways.
-CONTROLS = r"""() => {
+SIZES = {"usual": (1280, 800), "small": (800, 600), "phone": (390, 844)}
+
+# What is at the center and the corners of STOP, its size, and whether the bar covers any part of the page; the layout
+# follows a taller bar in the next frame.
+STOP = """async () => {
+  await new Promise(drawn => requestAnimationFrame(() => requestAnimationFrame(drawn)));
+  const stop = document.querySelector("#zc-stop"), at = stop.getBoundingClientRect();
+  const inside = [[0.5, 0.5], [0.05, 0.1], [0.95, 0.9]].every(([x, y]) =>
+    document.elementFromPoint(at.x + x * at.width, at.y + y * at.height) === stop);
+  const bar = document.querySelector("#zc-bar").getBoundingClientRect();
+  const root = document.querySelector("#root").getBoundingClientRect();
+  const wide = [...document.querySelectorAll(".zc button")].filter(each => each.offsetParent).map(each =>
+    each.getBoundingClientRect()).filter(each => each.right > innerWidth + 1 || each.left < -1);
+  return {inside, width: at.width, height: at.height, apart: root.top >= bar.bottom - 1, sideways:
+    document.documentElement.scrollWidth > innerWidth, wide: wide.length, red: getComputedStyle(stop).backgroundColor};
+}"""
+
+# Labels of all buttons and fields except events (labeled with their time), elements that overflow sideways, and those
+# without an accessible name.
+ELEMENTS = r"""() => {
   const seen = [...document.querySelectorAll("#root button, #root input, #root label, #root [role=tab]")]
     .filter(each => each.offsetParent);
   const words = each => (each.getAttribute("aria-label") || each.textContent || "").trim();
+  const html = each => each.outerHTML.slice(0, 120);
   const out = seen.filter(each => { const at = each.getBoundingClientRect();
     return at.width > 0 && (at.right > innerWidth + 1 || at.left < -1); });
+  const nameless = [...document.querySelectorAll("#zc-bar button, .zc button, #root input, #root select")]
+    .filter(each => each.offsetParent && !words(each) && !each.getAttribute("aria-labelledby")
+      && !(each.labels && each.labels.length) && each.type !== "hidden");
   return {labels: [...new Set(seen.map(words).filter(each => each && !/\d\d:\d\d:\d\d$/.test(each)))].sort(),
-    out: out.map(each => each.outerHTML.slice(0, 120))};
+    out: out.map(html), nameless: nameless.map(html)};
 }"""
 
 
-async def controls(page: Page, expected: list[str] | None = None) -> list[str]:
-    """Return the labels of the panel; check that nothing overflows and that everything has a name.
-
-    A page that was just loaded shows other elements until the server's messages arrive: wait for `expected`.
-    """
-    if expected is not None:
-        from playwright.async_api import TimeoutError as NotInTime
-
-        with suppress(NotInTime):  # the comparison of the caller shows the difference
-            await page.wait_for_function(f"wanted => ({CONTROLS})().labels.join() === wanted", arg=",".join(expected))
-    seen = await page.evaluate(CONTROLS)
-    assert not seen["out"], seen["out"]
-    await page.wait_for_function(f"() => ({NAMELESS})().length === 0")
-    return list(seen["labels"])
+async def check_stop(page: Page) -> None:
+    """Check that STOP is completely visible, large and red, and that nothing overflows."""
+    seen = await page.evaluate(STOP)
+    assert seen["inside"] and seen["apart"] and not seen["sideways"] and not seen["wide"], seen
+    assert seen["width"] >= 100 and seen["height"] >= 44, seen
+    red, green, blue = (int(part) for part in seen["red"].strip("rgb()").split(","))
+    assert red > 180 and green < 80 and blue < 80
 
 
-@pytest.mark.timeout(480)  # 32 checks of a page without a GPU
-async def test_every_tab_has_the_same_elements_at_every_size_without_overflow(bring: Bring, watched: Watched) -> None:
-    cell = await bring(*PANDA)
+async def tab(page: Page, name: str) -> None:
+    """Open a tab by its name."""
+    await page.get_by_role("tab", name=name).or_(page.get_by_text(name, exact=True)).first.click()
+
+
+async def load(page: Page, size: str) -> None:
+    """Load the page at a size."""
+    width, height = SIZES[size]
+    await page.set_viewport_size({"width": width, "height": height})
+    await page.reload()
+    await page.get_by_role("button", name="Start").wait_for()
+
+
+@pytest.mark.parametrize("size", SIZES)
+async def test_stop_is_visible_and_clickable_whatever_is_open(page: Page, size: str) -> None:
+    await load(page, size)
+    await check_stop(page)
+    for icon in await page.locator("#root .mantine-ActionIcon-root").all():  # settings and commands of the panel
+        if await icon.is_visible():
+            await icon.click(force=True)
+            await check_stop(page)
+            break
+    await load(page, size)
+    if size == "phone":
+        await page.get_by_text("zencell · panda").click()  # collapses the panel
+        await check_stop(page)
+        await page.get_by_text("zencell · panda").click()
+    await page.mouse.move(SIZES[size][0] - 60, SIZES[size][1] - 60)
+    await page.mouse.wheel(0, 2000)
+    await check_stop(page)
+    await page.get_by_role("button", name="STOP: stop arm and task").click()
+    await page.get_by_role("status").get_by_text("Stopped by page").wait_for()
+    await tab(page, "Time")
+    await page.get_by_role("button", name="− 1 s").dispatch_event("click")
+    await page.get_by_role("status").get_by_text("Not live: the scene shows").wait_for()
+    await check_stop(page)
+    await page.get_by_role("button", name="Live", exact=True).dispatch_event("click")
+    await page.locator("#zc-past:empty").wait_for(state="attached")
+
+
+@pytest.mark.timeout(480)  # 24 checks of a page without a GPU
+async def test_every_tab_has_the_same_elements_at_every_size_without_overflow(page: Page) -> None:
     offered: dict[str, list[str]] = {}
-    page = await watched.open(cell.address)
-    for size, (width, height) in SIZES.items():
-        await page.set_viewport_size({"width": width, "height": height})
-        await page.reload()
-        await page.get_by_role("button", name="Start").wait_for()
+    for size in SIZES:
+        await load(page, size)
         if size == "phone":
             await page.get_by_text(re.compile("Health · ")).click()  # expands the tabs
         for name in TABS:
             await tab(page, name)
-            if name == "Cameras":
+            if name == "Cameras":  # only images and layers with data
                 await page.get_by_text("Color mask", exact=True).wait_for()
-                await page.get_by_text("Depth image", exact=True).wait_for(state="hidden")  # not in this cell
+                await page.get_by_text("Depth image", exact=True).wait_for(state="hidden")
+            if name == "View":
+                await page.get_by_text("Targets", exact=True).wait_for()
+                await page.get_by_text("Point cloud", exact=True).wait_for(state="hidden")
             await check_stop(page)
-            labels = await controls(page, offered.get(name))
-            assert labels, (size, name)
-            assert set(labels) ^ set(offered.setdefault(name, labels)) == set(), (size, name)
-    assert not watched.errors
+            if name in offered:  # a page that was just loaded shows other elements until all messages have arrived
+                await page.wait_for_function(
+                    f"wanted => ({ELEMENTS})().labels.join() === wanted", arg=",".join(offered[name]))
+            await page.wait_for_function(f"() => ({ELEMENTS})().nameless.length === 0")
+            seen = await page.evaluate(ELEMENTS)
+            assert not seen["out"] and seen["labels"], (size, name, seen["out"])
+            offered.setdefault(name, seen["labels"])
