@@ -26,19 +26,19 @@ STRANGE: Strange = [
 
 
 def models() -> list[type[Message]]:
-    """Every message of the platform and its applications, requests and answers too."""
+    """Return all messages of the platform and its applications, with requests and answers."""
     found = [model for topic in all_topics().values() for model in (topic.message, getattr(topic, "answer", None))]
     return sorted({model for model in found if model is not None}, key=lambda model: model.__name__)
 
 
 def real(model: type[Message]) -> list[dict[str, Any]]:
-    """What is in messages that are sent, as maps."""
+    """Return realistic content of a message as maps."""
     return [message.model_dump() for message in _more() if type(message) is model] or [
         model.model_validate(example_of(model)).model_dump()]
 
 
 def _more() -> Iterator[Message]:
-    """Messages with more in them than has to be."""
+    """Yield messages with many optional fields."""
     header = m.Header(stamp=1_763_737_000_123_456_789, frame_id="world")
     pose = m.Pose(position=m.Vector3(x=0.4, y=0.1, z=0.3))
     rest = [0.0] * 7
@@ -78,7 +78,7 @@ def _more() -> Iterator[Message]:
 
 
 class Mutations:
-    """Changed payloads of messages; the same seed makes the same ones."""
+    """Changed payloads of messages, reproducible by their seed."""
 
     def __init__(self, seed: int) -> None:
         self.random = random.Random(seed)
@@ -86,7 +86,7 @@ class Mutations:
         self._packed = {model: [msgpack.packb(each) for each in values] for model, values in self._real.items()}
 
     def payload(self, model: type[Message]) -> bytes:
-        """A payload that began as one of the message's."""
+        """Return a changed payload of a message."""
         if self.random.random() < 0.5:
             return self._bytes(bytearray(self.random.choice(self._packed[model])))
         value = msgpack.unpackb(self.random.choice(self._packed[model]))
@@ -115,7 +115,7 @@ class Mutations:
         return bytes(payload)
 
     def _structure(self, value: Any) -> Any:
-        """The value with one part of it changed, on any level."""
+        """Return the value with one change at any level."""
         draw = self.random
         if isinstance(value, dict) and value and draw.random() < 0.9:
             name = draw.choice(list(value))

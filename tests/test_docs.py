@@ -1,4 +1,4 @@
-"""The documents say what the code says."""
+"""The documents match the code."""
 
 from __future__ import annotations
 
@@ -16,8 +16,6 @@ from docs.seed_parameters import CONTROLLER
 from tests import pages
 
 ROOT = Path(__file__).resolve().parent.parent
-
-
 PAGES = sorted(path.relative_to(ROOT).as_posix() for path in [*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"),
                                                               *ROOT.glob("examples/*.md")])
 

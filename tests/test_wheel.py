@@ -8,7 +8,7 @@ import shutil
 import subprocess
 import sys
 import sysconfig
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
@@ -85,6 +85,12 @@ request = PlanRequest(id="1", start=left, goal=JointGoal(positions=right), plann
 scene = PlanningScene(header=Header(frame_id="world"), objects=[wall])
 print(kernel().level, kernel().what, PlanningPipeline(robot, cell.motion, cell.pipeline).plan(request, scene).planner)
 """
+CODECS = """
+from importlib.metadata import entry_points
+for kind in ("decoders", "encoders"):
+    found, = entry_points(group=f"zenoh_cli.codecs.{kind}", name="msgpack")
+    print(found.load().__name__)
+"""
 
 
 @dataclass(frozen=True)
@@ -96,18 +102,17 @@ class Installation:
     site: Path | None = None  # site-packages of a wheel
     file: str = ""  # name of the wheel
 
-    def run(self, folder: Path, *arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
-        """Run a command in a folder."""
+    def run(self, folder: Path, *arguments: str, **environment: str) -> str:
+        """Run a command in a folder; return its output."""
         inherited = {k: v for k, v in os.environ.items() if not k.startswith(("ZENCELL_", "PYTHON", "VIRTUAL_ENV"))}
         done = subprocess.run([*self.command, *arguments], cwd=folder, env=inherited | environment, text=True,
                               timeout=100, capture_output=True, check=False)
         assert done.returncode == 0, done.stdout + done.stderr
-        return done
+        return done.stdout
 
     def python(self, folder: Path, *arguments: str) -> str:
         """Return the output of its Python, run in a folder."""
-        own = str(Path(self.command[0]).with_name("python"))
-        return Installation([own], self.modules).run(folder, *arguments).stdout
+        return replace(self, command=[str(Path(self.command[0]).with_name("python"))]).run(folder, *arguments)
 
 
 CLONE = Installation([sys.executable, "-m", "zencell"], ROOT)
@@ -196,10 +201,10 @@ def test_cell_runs_from_an_empty_folder_without_loading_a_module_twice(
     if kind == "clone":
         environment["PYTHONPATH"] += f":{ROOT}"
     else:
-        assert "panda" in installation.run(empty, "cells").stdout
-    done = installation.run(empty, "run", "panda", "--no-viewer", "--speed", "10", "--set", "world.count=1",
-                            "--domain", str(DOMAIN), "--record", str(tmp_path / "run.mcap"), **environment)
-    assert "DONE, 1 of 1 placed" in done.stdout, done.stdout + done.stderr
+        assert "panda" in installation.run(empty, "cells")
+    output = installation.run(empty, "run", "panda", "--no-viewer", "--speed", "10", "--set", "world.count=1",
+                              "--domain", str(DOMAIN), "--record", str(tmp_path / "run.mcap"), **environment)
+    assert "DONE, 1 of 1 placed" in output
     assert list(empty.iterdir()) == []
     programs = mains(tmp_path, installation)
     assert {"services.router", "services.motion_planner", "services.trajectory_executor", "cli.main"} <= programs
@@ -211,36 +216,21 @@ def test_user_modules_import_the_project_from_a_wheel(wheel: Installation, tmp_p
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "task.py").write_text(SERVICE, encoding="utf-8")
     (tmp_path / "mine.yaml").write_text(CELL, encoding="utf-8")
-    done = wheel.run(tmp_path, "run", "mine.yaml", "--no-viewer", "--domain", str(DOMAIN + 1), **watched(tmp_path))
-    assert "DONE" in done.stdout and "mine.task" in mains(tmp_path, wheel)
+    output = wheel.run(tmp_path, "run", "mine.yaml", "--no-viewer", "--domain", str(DOMAIN + 1), **watched(tmp_path))
+    assert "DONE" in output and "mine.task" in mains(tmp_path, wheel)
     script = "import zencell\nfrom common.config import load_cell\nprint(load_cell('ur5').name)\n"
-    (tmp_path / "script.py").write_text(script, encoding="utf-8")
-    assert wheel.python(tmp_path, "script.py") == "ur5\n"
-
-
-@pytest.mark.slow
-def test_new_project_from_a_wheel_runs(wheel: Installation, tmp_path: Path) -> None:
+    assert wheel.python(tmp_path, "-c", script) == "ur5\n"
     wheel.run(tmp_path, "new", "fresh_task", "--task", "stack_cubes")
-    assert "DONE" in wheel.run(tmp_path, "simulate", "fresh_task/cell.yaml", "--seed", "1").stdout
+    assert "DONE" in wheel.run(tmp_path, "simulate", "fresh_task/cell.yaml", "--seed", "1")
 
 
 @pytest.mark.slow
-def test_zenoh_cli_finds_the_codec_of_a_wheel(wheel: Installation, tmp_path: Path) -> None:
-    script = """
-from importlib.metadata import entry_points
-for kind in ("decoders", "encoders"):
-    found, = entry_points(group=f"zenoh_cli.codecs.{kind}", name="msgpack")
-    print(found.load().__name__)
-"""
-    assert wheel.python(tmp_path, "-c", script).split() == ["decode", "encode"]
-
-
-@pytest.mark.slow
-def test_wheel_contains_the_kernel_and_has_a_platform_tag(wheel: Installation, tmp_path: Path) -> None:
+def test_wheel_contains_the_kernel_and_the_codec_of_zenoh_cli(wheel: Installation, tmp_path: Path) -> None:
     assert wheel.file.endswith(f"-py3-none-{sysconfig.get_platform().replace('-', '_')}.whl")
     assert list((wheel.modules / KERNEL).glob("*.so"))
     output = wheel.python(tmp_path, "-c", PLAN)
     assert output.startswith("ok planning kernel: planning_kernel") and output.endswith(" rrt_connect\n")
+    assert wheel.python(tmp_path, "-c", CODECS).split() == ["decode", "encode"]
 
 
 @pytest.mark.slow

@@ -79,7 +79,7 @@ def test_tool_path_is_a_line_until_a_plan_without_points(panda: Stage, goal: Arr
 def test_plan_of_unknown_joints_does_no_harm(panda: Stage, goal: Array) -> None:
     panda.view.play(plan(panda, goal).model_copy(update={"joint_names": [f"other_{i}" for i in range(7)]}))
     panda.joints(goal)
-    panda.say(topics.DISPLAY_TRAJECTORY, plan(panda, goal - 0.3))
+    panda.say(topics.DISPLAY_TRAJECTORY, plan(panda, goal - 0.3, stamp=9))
     assert_ghost_at(panda, goal - 0.3)
 
 

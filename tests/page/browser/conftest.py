@@ -127,7 +127,7 @@ def missing(what: str) -> None:
     pytest.skip(what)
 
 
-@pytest_asyncio.fixture(loop_scope="session")
+@pytest_asyncio.fixture(scope="session", loop_scope="session")
 async def opened(browser: Browser) -> Opened:
     """A separate browser without cookies, closed after the block: `async with opened() as watched`."""
 
@@ -150,10 +150,11 @@ async def watched(opened: Opened) -> AsyncIterator[Watched]:
         yield one
 
 
-@pytest_asyncio.fixture(loop_scope="session")
-async def page(cell: Viewed, watched: Watched) -> AsyncIterator[Page]:
-    """The page of the shared cell; it must have no errors at the end."""
-    page = await watched.open(cell.address)
-    await page.get_by_role("button", name="Start").wait_for()
-    yield page
-    assert not watched.errors
+@pytest_asyncio.fixture(scope="module", loop_scope="session")
+async def page(cell: Viewed, opened: Opened) -> AsyncIterator[Page]:
+    """A page of the shared cell for the tests of a file; it must have no errors at the end."""
+    async with opened() as watched:
+        page = await watched.open(cell.address)
+        await page.get_by_role("button", name="Start").wait_for()
+        yield page
+        assert not watched.errors

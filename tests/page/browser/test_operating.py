@@ -11,11 +11,11 @@ import pytest
 
 from applications.pick_place.topics import PICK_PLACE_STATUS
 from common import topics
-from common.messages import JointState, MotionOwner, WorldObjects
+from common.messages import JointState, WorldObjects
 from common.transport.bus import Reader
 from page.world_editing import center_of, free_positions
 from tests.harness import until
-from tests.page.browser.conftest import IN_BROWSER, PATIENCE, Viewed
+from tests.page.browser.conftest import IN_BROWSER, PATIENCE, Opened, Viewed
 from tests.page.browser.test_sizes import check_stop, tab
 
 if TYPE_CHECKING:
@@ -40,6 +40,18 @@ async def assert_standstill(joints: Reader[JointState]) -> None:
     for _ in range(106):
         positions.append((await joints.next()).position)
     assert positions[-1] == pytest.approx(positions[5], abs=1e-6)
+
+
+async def test_stop_works_with_the_keyboard_alone(cell: Viewed, page: Page) -> None:
+    await page.keyboard.press("Tab")
+    assert await page.evaluate("document.activeElement.id") == "zc-stop", "it is the first element"
+    async with cell.listen() as bus:
+        motion = bus.reader(topics.MOTION_STATUS)
+        for key in ("Enter", "Space", "Escape"):
+            before = (await until(motion, lambda status: True, PATIENCE)).newest
+            await page.keyboard.press(key)
+            await until(motion, lambda status, before=before: status.newest > before, PATIENCE)
+            await page.get_by_role("status").get_by_text("Stopped by page").wait_for()
 
 
 async def test_task_is_started_paused_resumed_and_stopped(cell: Viewed, page: Page) -> None:
@@ -67,44 +79,22 @@ async def test_task_is_started_paused_resumed_and_stopped(cell: Viewed, page: Pa
         await page.locator('[data-part="notice"]').get_by_text("Stopped").wait_for()
 
 
-async def test_stop_works_with_the_keyboard_alone(cell: Viewed, page: Page) -> None:
-    await page.keyboard.press("Tab")
-    assert await page.evaluate("document.activeElement.id") == "zc-stop", "it is the first element"
-    async with cell.listen() as bus:
-        motion = bus.reader(topics.MOTION_STATUS)
-        for key in ("Enter", "Space", "Escape"):
-            before = (await until(motion, lambda status: True, PATIENCE)).newest
-            await page.keyboard.press(key)
-            await until(motion, lambda status, before=before: status.newest > before, PATIENCE)
-            await page.get_by_role("status").get_by_text("Stopped by page").wait_for()
-
-
-async def test_arm_is_jogged_only_while_the_button_is_held(cell: Viewed, page: Page) -> None:
-    await tab(page, "Move")
-    plus = page.get_by_role("button", name="jog joint1, plus")
-    async with cell.listen() as bus:
+async def test_arm_is_jogged_only_while_the_button_is_held(cell: Viewed, page: Page, opened: Opened) -> None:
+    async with cell.listen() as bus, opened() as watched:
         owner = bus.reader(topics.MOTION_OWNER)
-
-        def jogging(status: MotionOwner) -> bool:
-            return status.jogging and status.owner == "page"
-
-        for end in ("release", "leave", "blur", "stop", "close"):
-            await plus.hover()
-            await page.mouse.down()
-            await until(owner, jogging, PATIENCE)
-            if end == "release":
-                await page.mouse.up()
-            elif end == "leave":
-                await page.mouse.move(5, 400)
-            elif end == "blur":
-                await page.evaluate("window.dispatchEvent(new Event('blur'))")
-            elif end == "stop":
-                await page.keyboard.press("Escape")
-            else:
-                await page.close()
+        other = await watched.open(cell.address)
+        for shown, end in (
+            (page, page.mouse.up), (page, lambda: page.mouse.move(5, 400)),
+            (page, lambda: page.evaluate("window.dispatchEvent(new Event('blur'))")),
+            (page, lambda: page.keyboard.press("Escape")), (other, other.close),
+        ):
+            await tab(shown, "Move")
+            await shown.get_by_role("button", name="jog joint1, plus").hover()
+            await shown.mouse.down()
+            await until(owner, lambda status: status.jogging and status.owner == "page", PATIENCE)
+            await end()
             await until(owner, lambda status: not status.jogging, PATIENCE)
-            if end != "close":
-                await page.mouse.up()
+            await page.mouse.up()
 
 
 async def test_stuck_server_is_shown_in_a_banner_and_by_stop_until_it_recovers(cell: Viewed, page: Page) -> None:

@@ -63,31 +63,43 @@ async def tab(page: Page, name: str) -> None:
     await page.get_by_role("tab", name=name).or_(page.get_by_text(name, exact=True)).first.click()
 
 
-async def load(page: Page, size: str) -> None:
-    """Load the page at a size."""
+@pytest.fixture(scope="module")
+def labels() -> dict[str, str]:
+    """Labels of all elements by tab, as the first size has them."""
+    return {}
+
+
+@pytest.mark.timeout(480)  # many checks of a page without a GPU
+@pytest.mark.parametrize("size", SIZES)
+async def test_stop_is_visible_and_every_tab_complete(page: Page, size: str, labels: dict[str, str]) -> None:
     width, height = SIZES[size]
     await page.set_viewport_size({"width": width, "height": height})
     await page.reload()
     await page.get_by_role("button", name="Start").wait_for()
-
-
-@pytest.mark.parametrize("size", SIZES)
-async def test_stop_is_visible_and_clickable_whatever_is_open(page: Page, size: str) -> None:
-    await load(page, size)
     await check_stop(page)
-    for icon in await page.locator("#root .mantine-ActionIcon-root").all():  # settings and commands of the panel
-        if await icon.is_visible():
-            await icon.click(force=True)
-            await check_stop(page)
-            break
-    await load(page, size)
     if size == "phone":
-        await page.get_by_text("zencell · panda").click()  # collapses the panel
-        await check_stop(page)
-        await page.get_by_text("zencell · panda").click()
-    await page.mouse.move(SIZES[size][0] - 60, SIZES[size][1] - 60)
+        for _ in range(2):
+            await page.get_by_text("zencell · panda").click()  # collapses and expands the panel
+            await check_stop(page)
+        await page.get_by_text(re.compile("Health · ")).click()  # expands the tabs
+    await page.mouse.move(width - 60, height - 60)
     await page.mouse.wheel(0, 2000)
     await check_stop(page)
+    for name in TABS:
+        await tab(page, name)
+        if name == "Cameras":  # only images and layers with data
+            await page.get_by_text("Color mask", exact=True).wait_for()
+            await page.get_by_text("Depth image", exact=True).wait_for(state="hidden")
+        if name == "View":
+            await page.get_by_text("Targets", exact=True).wait_for()
+            await page.get_by_text("Point cloud", exact=True).wait_for(state="hidden")
+        await check_stop(page)
+        if name in labels:  # a page that was just loaded shows other elements until all messages have arrived
+            await page.wait_for_function(f"wanted => ({ELEMENTS})().labels.join() === wanted", arg=labels[name])
+        await page.wait_for_function(f"() => ({ELEMENTS})().nameless.length === 0")
+        seen = await page.evaluate(ELEMENTS)
+        assert not seen["out"] and seen["labels"], (size, name, seen["out"])
+        labels.setdefault(name, ",".join(seen["labels"]))
     await page.get_by_role("button", name="STOP: stop arm and task").click()
     await page.get_by_role("status").get_by_text("Stopped by page").wait_for()
     await tab(page, "Time")
@@ -96,28 +108,8 @@ async def test_stop_is_visible_and_clickable_whatever_is_open(page: Page, size: 
     await check_stop(page)
     await page.get_by_role("button", name="Live", exact=True).dispatch_event("click")
     await page.locator("#zc-past:empty").wait_for(state="attached")
-
-
-@pytest.mark.timeout(480)  # 24 checks of a page without a GPU
-async def test_every_tab_has_the_same_elements_at_every_size_without_overflow(page: Page) -> None:
-    offered: dict[str, list[str]] = {}
-    for size in SIZES:
-        await load(page, size)
-        if size == "phone":
-            await page.get_by_text(re.compile("Health · ")).click()  # expands the tabs
-        for name in TABS:
-            await tab(page, name)
-            if name == "Cameras":  # only images and layers with data
-                await page.get_by_text("Color mask", exact=True).wait_for()
-                await page.get_by_text("Depth image", exact=True).wait_for(state="hidden")
-            if name == "View":
-                await page.get_by_text("Targets", exact=True).wait_for()
-                await page.get_by_text("Point cloud", exact=True).wait_for(state="hidden")
+    for icon in await page.locator("#root .mantine-ActionIcon-root").all():  # settings and commands of the panel
+        if await icon.is_visible():
+            await icon.click(force=True)
             await check_stop(page)
-            if name in offered:  # a page that was just loaded shows other elements until all messages have arrived
-                await page.wait_for_function(
-                    f"wanted => ({ELEMENTS})().labels.join() === wanted", arg=",".join(offered[name]))
-            await page.wait_for_function(f"() => ({ELEMENTS})().nameless.length === 0")
-            seen = await page.evaluate(ELEMENTS)
-            assert not seen["out"] and seen["labels"], (size, name, seen["out"])
-            offered.setdefault(name, seen["labels"])
+            break
