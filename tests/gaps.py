@@ -1,7 +1,5 @@
 """Gaps in the joint states of a cell of real processes, and whether the load of the machine caused them."""
 
-from __future__ import annotations
-
 import os
 import threading
 import time

@@ -1,7 +1,5 @@
 """Payloads of real messages with seeded changes of bytes or structure."""
 
-from __future__ import annotations
-
 import math
 import random
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Descriptions of arms with four joints, as text: a SCARA, and one that only turns and nods."""
 
-from __future__ import annotations
-
 _HAND = """
 <link name="palm"><collision><origin xyz="0 0 0.02"/><geometry><box size="0.03 0.09 0.04"/></geometry></collision>
 </link>

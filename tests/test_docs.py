@@ -1,7 +1,5 @@
 """The documents match the code."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Any

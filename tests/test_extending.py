@@ -1,7 +1,5 @@
 """docs/extending.md: its files in a separate folder, and its commands, with real processes."""
 
-from __future__ import annotations
-
 import csv
 import importlib
 import json
@@ -84,7 +82,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 def test_page_lists_every_file() -> None:
     listed = re.search(r"^```\nmy_cell/\n(.*?)^```$", PAGE, re.DOTALL | re.MULTILINE)
-    assert listed is not None
     assert set(re.findall(r"[\w.]+\.\w+", listed[1])) == {Path(name).name for name in FILES}
     assert len(HERE) == 2
 
@@ -200,7 +197,6 @@ def test_custom_service_joins_a_cell(folder: Path) -> None:
     up, join, echo = COMMANDS[COMMANDS.index("zencell up panda"):][:3]
     env = environment()
     with start(up, folder, env) as cell:
-        assert cell.stdout is not None
         while "is up at" not in (output := cell.stdout.readline()):
             assert output, "the cell did not come up"
         with start(join, folder, env) as service:

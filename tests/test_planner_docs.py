@@ -1,7 +1,5 @@
 """docs/planners.md knows every planner, every option and every pipeline."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -3,8 +3,6 @@
 One run per application uses real processes; the others run on the virtual clock.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import shlex
@@ -43,7 +41,6 @@ def cell() -> Iterator[dict[str, str]]:
     env = {**os.environ, "ZENCELL_DOMAIN": str(domain)}
     line = next(line for line in LINES if " up " in line)
     with subprocess.Popen(command(line), cwd=ROOT, env=env, text=True, stdout=subprocess.PIPE) as process:
-        assert process.stdout is not None
         while "is up at" not in (output := process.stdout.readline()):
             assert output, "the cell did not start"
         env["PASTE"] = process.stdout.readline().strip()
@@ -94,7 +91,6 @@ def test_command_of_the_readme_works_with_a_running_cell(line: str, cell: dict[s
     line = line.replace("7489", str(7447 + int(cell["ZENCELL_DOMAIN"])))
     assert not line.startswith("zenoh ") or line == cell["PASTE"], "`zencell up` prints it"
     with subprocess.Popen(command(line), cwd=ROOT, env=cell, text=True, stdout=subprocess.PIPE) as process:
-        assert process.stdout is not None
         first = process.stdout.readline()
         process.send_signal(signal.SIGINT)
         try:

@@ -3,8 +3,6 @@
 Tutorials that inspect a cell share a running one; commands that start a cell use the virtual clock.
 """
 
-from __future__ import annotations
-
 import os
 import shlex
 import subprocess

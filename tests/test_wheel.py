@@ -1,7 +1,5 @@
 """Build and install the wheel, run cells from it, and check where every process loads its modules from."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

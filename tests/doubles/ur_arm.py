@@ -4,8 +4,6 @@ Joints follow `servoj` with the requested lookahead; of the program that `ur_rtd
 that move and stop it and set its payload.
 """
 
-from __future__ import annotations
-
 import sys
 import time
 from dataclasses import dataclass, field

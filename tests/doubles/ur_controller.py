@@ -5,8 +5,6 @@ It does not interpret URScript: the arm executes the commands in the registers o
 `python -m tests.doubles.ur_controller --host 127.0.0.2` runs it; lines to port 29919 inject faults.
 """
 
-from __future__ import annotations
-
 import argparse
 import asyncio
 import contextlib

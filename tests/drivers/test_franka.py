@@ -40,9 +40,7 @@ LIMITS = Limits(
 def create_arm() -> DrivenArm:
     options = {**ROBOT.hardware.options, "ahead": 0.1}
     hardware = ROBOT.hardware.model_copy(update={"options": options})
-    arm = load_hardware(ROBOT.model_copy(update={"hardware": hardware}), LIMITS, np.zeros(7))
-    assert isinstance(arm, DrivenArm)
-    return arm
+    return load_hardware(ROBOT.model_copy(update={"hardware": hardware}), LIMITS, np.zeros(7))
 
 
 @contextmanager
@@ -51,7 +49,6 @@ def rigged() -> Iterator[Rig]:
     try:
         yield rig
     finally:
-        assert rig.arm.gripper is not None
         rig.arm.gripper.close()
         rig.arm.close()
 
@@ -90,7 +87,6 @@ def move(rig: Rig, target: np.ndarray, share: float = 1.0) -> str:
 
 def test_hand_grasps_an_object_and_opens() -> None:
     config = ROBOT.gripper
-    assert config is not None
     with FrankaHost("--gripper-physics", "--gripper-object-width", "0.06"):
         gripper = DrivenGripper("drivers.franka_hand", {"host": "127.0.0.1"}, config, name="hand")
         controller, end = GripperController(gripper, config), time.monotonic() + TIMEOUT

@@ -1,7 +1,5 @@
 """How the driver of a Franka follows the arm's clock, with a library that does nothing."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterator
 from types import ModuleType, SimpleNamespace

@@ -1,7 +1,5 @@
 """The hand of Franka without its library: what it says of a grasp."""
 
-from __future__ import annotations
-
 import sys
 from types import SimpleNamespace
 
@@ -12,7 +10,6 @@ from common.hardware.driven_gripper import FingerState
 from drivers.franka_hand import connect
 
 CONFIG = load_cell("panda").robot.gripper
-assert CONFIG is not None
 
 
 class Gripper:

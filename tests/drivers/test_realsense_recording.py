@@ -1,7 +1,5 @@
 """Recordings in the format of a camera's maker, of what the project draws, played by the maker's own package."""
 
-from __future__ import annotations
-
 import asyncio
 import time
 from collections.abc import Sequence

@@ -30,7 +30,7 @@ LIMITS = Limits(tuple("abcdef"), -6 * SIX, 6 * SIX, 3 * SIX, 5 * SIX, 10 * SIX, 
 
 def create_arm(host: str, model: str = "ur5e") -> DrivenArm:
     options = Options(host=host, model=model, ahead=0.2)
-    return create(SimpleNamespace(gripper=None), LIMITS, REST, options)  # type: ignore[arg-type]
+    return create(SimpleNamespace(gripper=None), LIMITS, REST, options)
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +90,6 @@ def test_short_delay_of_the_driver_does_not_stop_the_arm(host: UrHost, rig: Rig)
     rig.until("")
     stops = host.command()["stops"]
     (driver,) = [child for child in multiprocessing.active_children() if child.is_alive()]
-    assert rig.target is not None
     q0, start, pauses = rig.target, time.monotonic(), [0.4, 0.8, 1.2]
     while (t := time.monotonic() - start) < np.pi and not rig.cycle(
         q0 + 0.5 * (1 - np.cos(2 * t)) * SIX, np.sin(2 * t) * SIX

@@ -1,7 +1,5 @@
 """Moving an arm of Universal Robots by hand, without its library: what of it is over when its program is."""
 
-from __future__ import annotations
-
 import sys
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """A fake browser: speaks viser's protocol, keeps what is shown, and clicks."""
 
-from __future__ import annotations
-
 import asyncio
 import html
 import json

@@ -1,7 +1,5 @@
 """A scene without a browser: sent messages are recorded, time is set by the test, messages are short to write."""
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -49,9 +47,7 @@ def rough_of(name: str) -> list[Piece]:
 
 
 def around_of(name: str) -> Surroundings:
-    section = cell_of(name).section(Surroundings)
-    assert isinstance(section, Surroundings)
-    return section
+    return cell_of(name).section(Surroundings)
 
 
 class Clock:

@@ -79,7 +79,7 @@ def test_nothing_is_served_without_the_token(upgrade: bool) -> None:
 
 def test_token_in_the_url_becomes_a_cookie_and_may_come_with_a_websocket() -> None:
     answer = REMOTE.check(f"/?token={SECRET}", {"host": [OWN]}, upgrade=False)
-    assert answer is not None and answer.status == HTTPStatus.OK and SECRET not in answer.text
+    assert answer.status == HTTPStatus.OK and SECRET not in answer.text
     cookie, *flags = answer.headers["Set-Cookie"].split("; ")
     assert {"HttpOnly", "SameSite=Strict"} <= set(flags)
     assert status(REMOTE, cookie=cookie, upgrade=False) == status(REMOTE, OWN, f"http://{OWN}", cookie) == 0

@@ -1,7 +1,5 @@
 """Image messages as RGB images of the page."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

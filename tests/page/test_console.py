@@ -1,7 +1,5 @@
 """The queue of actions that pages request."""
 
-from __future__ import annotations
-
 import asyncio
 import threading
 

@@ -61,8 +61,7 @@ async def page() -> AsyncIterator[Page]:
     control = ControlSocket(actions)
     control.hold_handler = page
     page.permissions.enforced = True
-    running = [asyncio.create_task(actions.run()),
-               asyncio.create_task(control.serve(page))]  # type: ignore[arg-type]
+    running = [asyncio.create_task(actions.run()), asyncio.create_task(control.serve(page))]
     page.receive(do="page", what=page.permissions.issue_key(SESSION))
     async with asyncio.timeout(10):
         yield page

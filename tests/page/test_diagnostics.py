@@ -1,7 +1,5 @@
 """Plots: the numbers that are sent to the page."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import viser

@@ -1,7 +1,5 @@
 """Topics that the page reads, always or on demand."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 from applications.outlining.topics import CONTOURS, OUTLINE_SELECT
@@ -53,7 +51,7 @@ def test_part_of_the_page_receives_new_messages_once_per_period_but_no_events() 
     shown: list[m.Message] = []
     part = SimpleNamespace(TOPICS=(topics.GRIPPER_STATE, topics.SCENE_OBJECT_UPDATES), PERIOD=0.5,
                            show=lambda _topic, message: shown.append(message))
-    updater = Updater(part, lambda topic: messages.get(topic.key))  # type: ignore[arg-type, return-value]
+    updater = Updater(part, lambda topic: messages.get(topic.key))
     states = [m.GripperState(width=width) for width in (0.01, 0.02, 0.03)]
     for state, now in zip(states, (1.0, 1.2, 1.6), strict=True):
         messages[topics.GRIPPER_STATE.key] = state

@@ -1,7 +1,5 @@
 """Frames as children of their parents in tf, in any order of arrival, and cameras at their frames."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 
@@ -47,7 +45,6 @@ class Frames:
 
     def assert_at(self, name: str, *position: float) -> None:
         pose = self.pose(name)
-        assert pose is not None
         np.testing.assert_allclose(pose[:3, 3], position)
 
 

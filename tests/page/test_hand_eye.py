@@ -1,7 +1,5 @@
 """Guided hand-eye calibration: missing views are named, views are saved, and the camera pose is found."""
 
-from __future__ import annotations
-
 import asyncio
 from dataclasses import replace
 from pathlib import Path

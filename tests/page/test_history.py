@@ -1,7 +1,5 @@
 """History of the last minutes within its bounds of time and memory, recordings, and the timeline over both."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -45,7 +43,7 @@ def test_newest_message_at_a_time_is_found_within_the_last_minutes() -> None:
     history = filled(6000, 0.1)
     for at in (500.0, 555.55, 599.0):
         state = history.latest(topics.JOINT_STATES, at)
-        assert state is not None and state.position[0] == pytest.approx(int(at * 10 + 1e-6), abs=1)
+        assert state.position[0] == pytest.approx(int(at * 10 + 1e-6), abs=1)
         assert history.latest(topics.JOINT_STATES, at) is state
     assert (history.start, history.end) == (599.9 - SECONDS, 599.9)
     stored = history.between(topics.JOINT_STATES, 0.0, 1000.0)
@@ -95,12 +93,11 @@ def timeline() -> Timeline:
     history = filled(1001, 0.1)
     for at, text in ((20.0, "Grasping"), (50.0, "Placing")):
         history.add_event(at, text)
-    return Timeline(lambda topic: joints(-1.0), history)  # type: ignore[arg-type, return-value]
+    return Timeline(lambda topic: joints(-1.0), history)
 
 
 def value(timeline: Timeline) -> float:
     state = timeline.latest(topics.JOINT_STATES)
-    assert state is not None
     return state.position[0]
 
 
@@ -203,7 +200,7 @@ def test_recording_answers_like_the_last_minutes(record: Open) -> None:
         (topics.MOTION_STATUS, 10.0, m.MotionStatus(id="g", state="aborted", error="limit")))
     assert (history.start, history.end) == (0.0, pytest.approx(10.0))
     state = history.latest(topics.JOINT_STATES, 5.04)
-    assert state is not None and state.position == [50]
+    assert state.position == [50]
     assert history.latest(topics.JOINT_STATES, 5.04) is state
     assert len(history.between(topics.JOINT_STATES, 2.0, 4.0)) == pytest.approx(20, abs=1)
     assert image_to_array(history.image(topics.CAMERA_IMAGE, 5.5))[0, 0, 0] == 50

@@ -1,7 +1,5 @@
 """Layers are found by name: those of the platform, of an application and of the user."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

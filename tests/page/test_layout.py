@@ -1,7 +1,5 @@
 """The layout of the page: default, saved by the user, and invalid."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from unittest.mock import Mock
 

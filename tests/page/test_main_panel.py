@@ -1,7 +1,5 @@
 """Messages about control of page and arm, which every page shows."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any, cast
 
@@ -78,7 +76,7 @@ async def test_controller_commands_need_the_role_operate(gui: viser.GuiApi) -> N
     permissions = Permissions()
     permissions.enforced = True
     actions = ActionQueue(permissions)
-    actions.put = lambda _action: None  # type: ignore[method-assign]
+    actions.put = lambda _action: None
     before = set(gui._gui_input_handle_from_uuid)
     ControllerPanel(gui, cast(Any, actions))
     (buttons,) = set(gui._gui_input_handle_from_uuid) - before

@@ -1,7 +1,5 @@
 """Jogging: why a held button has no effect, one page at a time, and the names of the buttons."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from typing import Any

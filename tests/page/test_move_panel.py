@@ -1,7 +1,5 @@
 """Planned motions of the Move tab, and sequences of saved poses."""
 
-from __future__ import annotations
-
 import asyncio
 from pathlib import Path
 from typing import Any
@@ -52,12 +50,12 @@ class Panel:
 
     def __init__(self, gui: viser.GuiApi) -> None:
         robot, console = robot_of("ur5"), ActionQueue()
-        console.latest = lambda _topic: None  # type: ignore[attr-defined]
+        console.latest = lambda _topic: None
         pose = dict.fromkeys(robot.joint_names, 0.1)
         save_poses(poses_file("cell"), SavedPoses(poses={"one": pose, "two": pose}))
         self.motions, self.notes = Motions(), list[tuple[str, str]]()
         self.panel: Any = MovePanel(
-            gui, console, self.motions, MagicMock(), robot, [], cell="cell", planner="", marker=False,  # type: ignore[arg-type]
+            gui, console, self.motions, MagicMock(), robot, [], cell="cell", planner="", marker=False,
             notify=lambda line, kind: self.notes.append((line, kind)))
 
 

@@ -1,7 +1,5 @@
 """Labels of the scene: those that would overlap on the screen are merged."""
 
-from __future__ import annotations
-
 from typing import Any, cast
 
 import numpy as np

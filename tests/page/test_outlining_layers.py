@@ -1,7 +1,5 @@
 """Contours on their objects, and selection of an object by a click."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -93,7 +91,7 @@ def test_outline_is_a_closed_line_and_is_removed_without_points(stage: Stage) ->
     poses = [at(*point) for point in square(0.5, 0, TOP).tolist()]
     stage.say(CONTOUR_PATH, OutlinePoints(header=WORLD, poses=poses, object="yellow_1"))
     node = stage.layer("outline").node
-    assert node is not None and len(node.points) == 4
+    assert len(node.points) == 4
     np.testing.assert_allclose(node.points[-1, 1], node.points[0, 0])
     stage.say(CONTOUR_PATH, OutlinePoints(header=WORLD, message="nothing is chosen"))
     assert stage.layer("outline").node is None

@@ -1,7 +1,5 @@
 """Permissions of pages by role, and control by one page at a time."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import pytest

@@ -1,7 +1,5 @@
 """Targets, rejections and workspace of pick and place in the scene."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Ghosts of the robot for plans, and the tool path."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -69,7 +67,6 @@ def test_tool_path_is_a_line_until_a_plan_without_points(panda: Stage, goal: Arr
     trajectory = plan(panda, goal)
     panda.say(topics.DISPLAY_TRAJECTORY, trajectory)
     line = panda.layer("tool_path").line
-    assert line is not None
     expected = [panda.robot.fk(point.positions)[:3, 3] for point in trajectory.points]
     np.testing.assert_allclose([line.points[0, 0], *line.points[:, 1]], expected, atol=1e-5)
     panda.say(topics.DISPLAY_TRAJECTORY, m.JointTrajectory(joint_names=panda.robot.joint_names, points=[]))

@@ -1,7 +1,5 @@
 """The file of saved poses, and its panel."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The complete scene: robot, objects, layers, goal marker; nothing is sent without a change or without a page."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -35,7 +33,6 @@ def targets(x: float, y: float) -> m.PoseArray:
 def test_links_and_fingers_have_the_poses_of_forward_kinematics(server: viser.ViserServer, cell: str) -> None:
     stage = Stage(server, cell)
     gripper = stage.robot.config.gripper
-    assert gripper is not None
     for share, width in ((0.0, 0.02), (0.4, 0.07)):
         q = stage.robot.named("home") + share * (stage.robot.lower - stage.robot.named("home"))
         fingers = dict(zip(gripper.joints, finger_positions(gripper, width), strict=True))
@@ -208,9 +205,7 @@ def test_invalid_pose_of_the_goal_marker_is_reverted(panda: Stage) -> None:
     panda.view.show_goal_marker(True)
     panda.view.goal.pose = GOAL
     before, node = panda.view.goal_pose, panda.view.goal._node
-    for position, wxyz in (
-        ((1e9, 0, 0), (1, 0, 0, 0)), ((0, 0, 0.5), (0, 0, 0, 0)), ((np.nan, 0, 0), (1, 0, 0, 0)),
-    ):
+    for position, wxyz in (((1e9, 0, 0), (1, 0, 0, 0)), ((0, 0, 0.5), (0, 0, 0, 0)), ((np.nan, 0, 0), (1, 0, 0, 0))):
         node._impl.position[:], node._impl.wxyz[:] = position, wxyz  # like a message of a browser
         assert panda.view.goal_pose == before
         np.testing.assert_allclose(node.position, (0.5, 0.1, 0.4))

@@ -1,7 +1,5 @@
 """Point clouds, the reachable workspace, and collision shapes in the scene."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -27,7 +25,6 @@ def cloud(**changes: object) -> PointCloud2:
 
 def test_cloud_is_thinned_out_evenly_with_its_colors() -> None:
     found = thin_out(cloud(), 2000)
-    assert found is not None
     points, colors = found
     assert 1000 < len(points) <= 2000 and (points[:, 2] == 0.5).all()
     assert (colors == [200, 0, 0]).all()
@@ -51,7 +48,6 @@ def test_cloud_is_displayed_in_the_frame_of_its_camera(panda: Stage) -> None:
 def test_tool_never_leaves_its_reachable_workspace(cell: str) -> None:
     robot = robot_of(cell)
     workspace = sample_workspace(robot)
-    assert workspace is not None
     rng = np.random.default_rng(5)
     middle = workspace.profile[[0, -1], 1].mean()
     angles = np.arctan2(workspace.profile[:, 1] - middle, workspace.profile[:, 0])

@@ -210,8 +210,7 @@ async def test_share_url_cannot_be_requested(make: Make, monkeypatch: pytest.Mon
     requests: list[str] = []
     monkeypatch.setattr(server, "request_share_url", lambda: requests.append("share"))
     processed, loop = asyncio.Event(), asyncio.get_running_loop()
-    server._websock_server.register_handler(
-        GuiUpdateMessage, lambda *_: loop.call_soon_threadsafe(processed.set))  # type: ignore[arg-type]
+    server._websock_server.register_handler(GuiUpdateMessage, lambda *_: loop.call_soon_threadsafe(processed.set))
     async with open_page(server) as connection, asyncio.timeout(PATIENCE):
         await connection.send(msgspec.msgpack.encode({"type": ShareUrlRequest.__name__}))
         await connection.send(msgspec.msgpack.encode({"type": "GuiUpdateMessage", "uuid": "none", "updates": {}}))

@@ -1,7 +1,5 @@
 """Texts of the page for states, plans and errors."""
 
-from __future__ import annotations
-
 from typing import get_args
 
 import pytest

@@ -1,7 +1,5 @@
 """The source field of the Time tab while recordings are loading, or cannot be read."""
 
-from __future__ import annotations
-
 import asyncio
 import threading
 from typing import Any
@@ -27,7 +25,7 @@ class Recordings:
         if name == "damaged.mcap":
             raise RecordingError("damaged.mcap: is damaged")
         history = RecentHistory()
-        history.now, history.close = 10.0, lambda: self.closed.append(name)  # type: ignore[method-assign]
+        history.now, history.close = 10.0, lambda: self.closed.append(name)
         return history
 
 
@@ -37,7 +35,7 @@ class Panel:
     def __init__(self, gui: viser.GuiApi) -> None:
         self.recordings = Recordings()
         self.timeline, self.now = Timeline(lambda _topic: None, RecentHistory()), 0.0
-        self.panel = TimePanel(gui, ActionQueue(), self.timeline,  # type: ignore[arg-type]
+        self.panel = TimePanel(gui, ActionQueue(), self.timeline,
                                names=lambda: list(self.recordings.readable), open_recording=self.recordings.open)
         assert self.source == LIVE_SOURCE
 

@@ -1,7 +1,5 @@
 """Ground truth, and dragging objects of the simulated world in their plane."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Fields of the Tuning tab for parameters."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from typing import Any
 

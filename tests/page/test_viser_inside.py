@@ -1,7 +1,5 @@
 """The files of viser's client, unpacked so that a browser can cache them, and messages from any thread."""
 
-from __future__ import annotations
-
 import asyncio
 import gzip
 import re
@@ -52,7 +50,7 @@ def test_client_of_the_installed_viser_is_unpacked() -> None:
 def test_path_of_a_file_depends_on_its_content() -> None:
     changed = PAGE.replace('data-ss="', 'data-ss="0', 1)
     assert set(unpack_client(changed)) == set(client_files())  # the bar is in the page itself
-    size = int(re.search(r'data-ss="(\d+)"', PAGE)[1])  # type: ignore[index]
+    size = int(re.search(r'data-ss="(\d+)"', PAGE)[1])
     other = PAGE.replace(f'data-ss="{size}"', f'data-ss="{size - 1}"', 1)
     assert not {path for path in unpack_client(other) if path.endswith("css")} & set(client_files())
 
@@ -78,7 +76,7 @@ async def test_message_from_another_thread_wakes_waiting_tasks_on_their_loop() -
     for number in range(20):
         waiting = asyncio.create_task(buffer.message_event.wait())
         await asyncio.sleep(0)
-        woken = list(buffer.message_event._waiters)  # type: ignore[attr-defined]
+        woken = list(buffer.message_event._waiters)
         assert await asyncio.to_thread(push, number, woken) == [False]
         await asyncio.wait_for(waiting, 10.0)
         buffer.message_event.clear()

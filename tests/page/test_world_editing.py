@@ -1,7 +1,5 @@
 """Edits of a simulated world, and undo."""
 
-from __future__ import annotations
-
 from contextlib import suppress
 from typing import Any
 

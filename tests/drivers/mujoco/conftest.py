@@ -1,7 +1,5 @@
 """Tests of the world with physics need MuJoCo (extra `physics`); cached meshes are deleted afterwards."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

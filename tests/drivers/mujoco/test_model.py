@@ -1,7 +1,5 @@
 """The model of a cell has the robot, the objects and the cameras where the configuration has them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import mujoco
@@ -52,7 +50,6 @@ def test_link_poses_match_the_planner(cell: str) -> None:
     robot, cell_model = model_of(cell)
     data = mujoco.MjData(cell_model.model)
     rng, fingers = np.random.default_rng(1), robot.config.gripper
-    assert fingers is not None
     for _ in range(5):
         q = rng.uniform(robot.lower, robot.upper)
         others = dict(zip(fingers.joints, finger_positions(fingers, rng.uniform(0.0, fingers.max_width)), strict=True))

@@ -1,7 +1,5 @@
 """Physics: objects fall, roll, are pushed and held by friction, and are restored after a restart."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 
@@ -10,20 +8,18 @@ import pytest
 
 from common.config import World, load_cell
 from common.errors import ConfigError, Refused
-from common.hardware.interface import Gripper, Limits, PlaceableGripper
+from common.hardware.interface import Gripper, Limits
 from common.messages import Header, Vector3, WorldEdit, WorldObject
 from common.planning.ik import solve_ik
 from common.robot.finger_joints import finger_positions
 from common.robot.model import RobotModel
 from common.robot.transforms import tool_down
 from common.sim.interface import load_world
-from drivers.mujoco.world import PhysicsWorld
 
 BALL = {"shape": "sphere", "radius": 0.03, "mass": 0.1}
 CUBE = {"shape": "box", "size": [0.05, 0.05, 0.05], "mass": 0.1}
 PERIOD = 0.01  # [s] of a cycle of control
 GRIPPER = load_cell("panda").robot.gripper
-assert GRIPPER is not None
 
 
 class Rig:
@@ -41,7 +37,6 @@ class Rig:
 
     def begin(self, q: Any) -> None:
         world = load_world(self.config, self.config.objects, None, self.robot.config.gripper)
-        assert isinstance(world, PhysicsWorld)
         robot = self.robot
         limits = Limits(tuple(robot.joint_names), robot.lower, robot.upper, robot.velocity, robot.acceleration)
         self.world, self.arm = world, world.hardware(robot, limits, np.array(q, float))
@@ -56,7 +51,6 @@ class Rig:
 
     @property
     def fingers(self) -> Gripper:
-        assert self.arm.gripper is not None
         return self.arm.gripper
 
     def wait(self, seconds: float) -> None:
@@ -77,9 +71,7 @@ class Rig:
         self.wait(0.2)
 
     def above(self, x: float, y: float, z: float) -> Any:
-        found = solve_ik(self.robot, tool_down(x, y, z), self.set_point)
-        assert found is not None
-        return found
+        return solve_ik(self.robot, tool_down(x, y, z), self.set_point)
 
     def grip(self, width: float, effort: float = 5.0, seconds: float = 0.8) -> None:
         self.fingers.command(width, self.now, effort)
@@ -94,7 +86,6 @@ class Rig:
             self.move(self.above(0.45, 0.0, lift))
 
     def place_fingers(self, width: float) -> None:
-        assert isinstance(self.fingers, PlaceableGripper)
         self.fingers.place(width)
 
     def object(self, name: str = "object_1") -> WorldObject:
@@ -195,7 +186,6 @@ def test_fingers_opening_against_an_obstacle_do_not_push_the_arm() -> None:
 def test_gripper_joints_follow_the_driven_one(cell: str) -> None:
     rig = Rig(cell=cell)
     gripper = rig.robot.config.gripper
-    assert gripper is not None
     model, data = rig.world.simulation
     for fraction in (0.2, 0.7):
         rig.grip(fraction * gripper.max_width, gripper.max_effort, 3.0)
