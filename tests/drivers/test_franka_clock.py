@@ -1,7 +1,6 @@
-"""How the driver of a Franka follows the arm's clock, with a library that does nothing."""
+"""How the driver of a Franka follows the arm's clock, with a fake library."""
 
 import sys
-from collections.abc import Iterator
 from types import ModuleType, SimpleNamespace
 
 import numpy as np
@@ -13,7 +12,7 @@ MILLISECOND = 1e-3
 
 
 class Clocks:
-    """The host's time, and that of an arm which is at a share of its speed."""
+    """The clock of the host, and that of an arm at a share of its speed."""
 
     def __init__(self, driver: franka.FrankaArm) -> None:
         self.driver, self.host, self.arms, self.share = driver, 100.0, 7.0, 1.0
@@ -30,7 +29,7 @@ class Clocks:
         return self.arms
 
     def run(self, seconds: float) -> list[tuple[float, float]]:
-        """The host's time and that of the set-points that are due, in every cycle of so long of the arm's time."""
+        """Return the host's time and the time of the due set-points, for each cycle of a period of the arm's time."""
         rows = []
         for _ in range(round(seconds / MILLISECOND)):
             self.arms += MILLISECOND
@@ -43,8 +42,8 @@ class Clocks:
 
 
 @pytest.fixture
-def clocks(monkeypatch: pytest.MonkeyPatch) -> Iterator[Clocks]:
-    def newest() -> SimpleNamespace:
+def clocks(monkeypatch: pytest.MonkeyPatch) -> Clocks:
+    def read_once() -> SimpleNamespace:
         return clocks.state()
 
     library, control = ModuleType("pylibfranka"), SimpleNamespace(writeOnce=lambda command: None)
@@ -52,12 +51,12 @@ def clocks(monkeypatch: pytest.MonkeyPatch) -> Iterator[Clocks]:
         RealtimeConfig=SimpleNamespace(kIgnore=0), ControllerMode=SimpleNamespace(JointImpedance=0),
         JointPositions=lambda q: SimpleNamespace(q=q), ControlException=RuntimeError,
         Robot=lambda host, realtime: SimpleNamespace(
-            read_once=newest, start_joint_position_control=lambda mode: control))
+            read_once=read_once, start_joint_position_control=lambda mode: control))
     monkeypatch.setitem(sys.modules, "pylibfranka", library)
     clocks = Clocks(franka.FrankaArm(franka.Options(host="nowhere")))
     control.readOnce = lambda: (clocks.state(), 0.0)
     monkeypatch.setattr(franka.time, "monotonic", clocks.monotonic)
-    yield clocks
+    return clocks
 
 
 @pytest.mark.parametrize("share", [1.0, 0.95, 0.7, 0.35])

@@ -1,4 +1,4 @@
-"""The hand of Franka without its library: what it says of a grasp."""
+"""The hand of Franka with a fake library: its report of a grasp."""
 
 import sys
 from types import SimpleNamespace
@@ -13,7 +13,7 @@ CONFIG = load_cell("panda").robot.gripper
 
 
 class Gripper:
-    """Fingers that close on what is so wide; grasped is, as in libfranka, what is as wide as was said, give or take."""
+    """Fingers that close on an object; as in libfranka, a grasp succeeds within the tolerance of the width."""
 
     between = 0.0
 

@@ -1,8 +1,9 @@
-"""Recordings in the format of a camera's maker, of what the project draws, played by the maker's own package."""
+"""Recordings of rendered images in the format of RealSense, played by the vendor's package."""
 
 import asyncio
 import time
-from collections.abc import Sequence
+from collections.abc import AsyncIterator, Sequence
+from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
@@ -27,25 +28,24 @@ rs = pytest.importorskip("pyrealsense2", reason="make setup EXTRAS=realsense", e
 
 WIDTH, HEIGHT, FOCAL = 320, 240, 300.0
 SCALE = 0.001  # [m] of one step of depth
-BETWEEN = 33.0  # [ms] two shots
-HOLE = np.s_[100:140, 20:60]  # that was not measured
+PERIOD = 33.0  # [ms] between two frames
+HOLE = np.s_[100:140, 20:60]  # without depth
+WORLD = load_cell("ur5", world="w3").world
 
 
-def drawn(number: int) -> RgbdFrame:
-    """What a camera above the objects of a cell sees, of which a part was not measured, from 1 cm further away each."""
-    cell = load_cell("ur5", world="w3")
-    T = Pinhole.from_config(cell.world.camera).T_world_optical
-    objects = load_world(cell.world, cell.world.objects).objects(Header()).objects
-    lens = Pinhole(FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, WIDTH, HEIGHT, T)
-    view = Renderer(cell.world, camera=lens).render(objects)
+def rendered(number: int) -> RgbdFrame:
+    """Render the objects of a cell from above with a hole in the depth, 1 cm further away for each number."""
+    objects = load_world(WORLD, WORLD.objects).objects(Header()).objects
+    T = Pinhole.from_config(WORLD.camera).T_world_optical
+    view = Renderer(WORLD, camera=Pinhole(FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, WIDTH, HEIGHT, T)).render(objects)
     depth = view.depth_within(0.1, 10.0) + np.float32(0.01 * number)
     depth[HOLE] = np.nan
-    assert len(np.unique(depth[np.isfinite(depth)])) > 1, "something stands there"
+    assert len(np.unique(depth[np.isfinite(depth)])) > 1, "an object is visible"
     return RgbdFrame(view.colour, depth)
 
 
 def record(file: Path, shots: Sequence[RgbdFrame], colours: str = "rgb8", *, depth_too: bool = True) -> None:
-    """Write shots as the maker's viewer does of a camera: a device made of software, and its recorder."""
+    """Record shots of a software device, as the vendor's viewer does of a camera."""
     device = rs.software_device()
     lens = rs.intrinsics()
     lens.width, lens.height, lens.fx, lens.fy, lens.ppx, lens.ppy = WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2
@@ -76,76 +76,68 @@ def record(file: Path, shots: Sequence[RgbdFrame], colours: str = "rgb8", *, dep
         for (sensor, profile, size), pixels in zip(sensors, [steps, colour][0 if depth_too else 1:], strict=True):
             frame = rs.software_video_frame()
             frame.pixels, frame.stride, frame.bpp, frame.profile = pixels, WIDTH * size, size, profile
-            frame.timestamp, frame.domain = BETWEEN * number, rs.timestamp_domain.global_time
+            frame.timestamp, frame.domain = PERIOD * number, rs.timestamp_domain.global_time
             frame.frame_number = number
             sensor.on_video_frame(frame)
     for _ in range(len(sensors) * len(shots)):
-        queue.wait_for_frame(5000)  # the recorder has had it, too
+        queue.wait_for_frame(5000)  # then the recorder has it, too
     for sensor in recorded:
         sensor.stop()
         sensor.close()
 
 
-def config_of(**options: Any) -> real_depth_camera.Config:
-    world = load_cell("ur5", world="w3").world
-    given = {"driver": "realsense", "options": options, "rate": 90.0, "world": world}
-    return check(real_depth_camera.Config, given, "services.real_depth_camera")
+@asynccontextmanager
+async def played(net: LocalNetwork, **options: Any) -> AsyncIterator[None]:
+    """Run the camera service with options of the driver."""
+    given = {"driver": "realsense", "options": options, "rate": 90.0, "world": WORLD}
+    config = check(real_depth_camera.Config, given, "services.real_depth_camera")
+    async with running_service(net, real_depth_camera.run, config, name="camera"), asyncio.timeout(30):
+        yield
 
 
 @pytest.mark.parametrize("colours", ["rgb8", "bgr8"])
-async def test_recording_is_played_as_it_was_rendered_in_a_loop(tmp_path: Path, colours: str) -> None:
-    shots = [drawn(number) for number in range(3)]
+async def test_recording_is_played_as_it_was_rendered_in_a_loop_with_current_stamps(
+    tmp_path: Path, colours: str
+) -> None:
+    shots = [rendered(number) for number in range(3)]
     record(tmp_path / "table.db3", shots, colours)
     net = LocalNetwork()
-    bus = net.bus()
+    bus, before = net.bus(), time.time_ns()
     infos, images = bus.reader(topics.DEPTH_CAMERA_INFO), bus.reader(topics.DEPTH_CAMERA_IMAGE)
     depths = bus.reader(topics.DEPTH_CAMERA_DEPTH)
-    seen = []
-    async with running_service(net, real_depth_camera.run, config_of(file=str(tmp_path / "table.db3")), name="camera"):
-        async with asyncio.timeout(30):
-            info = await infos.next()
-            while len(seen) < 3 * len(shots):  # longer than it is
-                image, depth = await images.next(), depth_of(await depths.next())
-                np.testing.assert_array_equal(image_to_array(image), shots[0].colour)
-                # What fits one picture to the other gives each measurement the pixels that it touches: edges differ.
-                assert np.isnan(depth[HOLE][2:-2, 2:-2]).all()
-                away = [np.abs(depth - shot.depth) <= SCALE / 2 + 1e-6 for shot in shots]
-                seen.append(int(np.argmax([one.sum() for one in away])))
-                assert away[seen[-1]].sum() > 0.97 * np.isfinite(shots[0].depth).sum()
+    async with played(net, file=str(tmp_path / "table.db3")):
+        info = await infos.next()
+        for _ in range(3 * len(shots)):  # longer than the recording
+            image, depth = await images.next(), depth_of(await depths.next())
+            assert image.header.stamp > before
+            np.testing.assert_array_equal(image_to_array(image), shots[0].colour)
+            # The alignment of depth to color assigns each measurement to all pixels that it touches: edges differ.
+            assert np.isnan(depth[HOLE][2:-2, 2:-2]).all()
+            same = max((np.abs(depth - shot.depth) <= SCALE / 2 + 1e-6).sum() for shot in shots)
+            assert same > 0.97 * np.isfinite(shots[0].depth).sum()
     assert (info.k[0], info.k[4], info.k[2], info.k[5]) == (FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
 
 
-async def test_stamps_of_a_recording_are_current(tmp_path: Path) -> None:
-    record(tmp_path / "table.db3", [drawn(0)])
-    net = LocalNetwork()
-    images = net.bus().reader(topics.DEPTH_CAMERA_IMAGE)
-    before = time.time_ns()
-    async with running_service(net, real_depth_camera.run, config_of(file=str(tmp_path / "table.db3")), name="camera"):
-        async with asyncio.timeout(30):
-            assert (await images.next()).header.stamp > before
-
-
-@pytest.mark.parametrize(("options", "told"), [
+@pytest.mark.parametrize(("options", "error"), [
     ({"file": "/nowhere/table.db3"}, "options.file: '/nowhere/table.db3' is no file"),
     ({"file": __file__, "serial": "0123"}, "options.serial: '0123' selects a camera, but options.file "),
 ])
-async def test_invalid_recording_option_ends_the_start_with_one_line(options: dict[str, str], told: str) -> None:
-    with pytest.raises(ConfigError) as refused:
-        async with running_service(LocalNetwork(), real_depth_camera.run, config_of(**options), name="camera"):
+async def test_invalid_recording_option_ends_the_start_with_one_line(options: dict[str, str], error: str) -> None:
+    with pytest.raises(ConfigError) as rejected:
+        async with played(LocalNetwork(), **options):
             await asyncio.sleep(10)
-    assert told in str(refused.value) and "\n" not in str(refused.value)
+    assert error in str(rejected.value) and "\n" not in str(rejected.value)
 
 
-@pytest.mark.parametrize("made", ["text", "without depth"])
-async def test_file_that_is_no_recording_or_lacks_depth_is_logged_and_retried(tmp_path: Path, made: str) -> None:
+@pytest.mark.parametrize("content", ["text", "without depth"])
+async def test_file_that_is_no_recording_or_lacks_depth_is_logged_and_retried(tmp_path: Path, content: str) -> None:
     file = tmp_path / "table.db3"
-    if made == "text":
+    if content == "text":
         file.write_text("colours and depth", encoding="utf-8")
     else:
-        record(file, [drawn(0)], depth_too=False)
+        record(file, [rendered(0)], depth_too=False)
     net = LocalNetwork()
     log = net.bus().reader(topics.LOG)
-    async with running_service(net, real_depth_camera.run, config_of(file=str(file)), name="camera"):
-        async with asyncio.timeout(30):
-            line = (await log.next()).message
+    async with played(net, file=str(file)):
+        line = (await log.next()).message
     assert line.startswith(f"camera realsense: {file}: ") and "opening it again in" in line and "\n" not in line

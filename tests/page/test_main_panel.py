@@ -14,31 +14,18 @@ from page.permissions import CURRENT_SESSION, PageSession, Permissions
 FIRST, SECOND = (PageSession(n, f"10.0.0.{n}", frozenset({"look", "operate"})) for n in (1, 2))
 
 
-class FakeConsole(ActionQueue):
-    """Replies to each request for ownership with the same owner."""
-
-    acknowledged = 0
-
-    def __init__(self, permissions: Permissions, owner: MotionOwner) -> None:
-        super().__init__(permissions)
-        self._owner = owner
-
-    def latest(self, _topic: object) -> None:
-        return None
-
-    async def own(self, _act: str, _over: bool) -> MotionOwner:
-        return self._owner
-
-
-async def nothing() -> None:
-    """Do nothing."""
-
-
 def panel_of(gui: viser.GuiApi, owner: MotionOwner) -> tuple[TaskPanel, ActionQueue]:
-    permissions = Permissions()
-    permissions.enforced = True
-    console = FakeConsole(permissions, owner)
-    return TaskPanel(gui, cast(Any, console), cast(Any, None), nothing), console
+    """Return a panel whose requests for ownership are all answered by the same owner."""
+    async def own(_act: str, _over: bool) -> MotionOwner:
+        return owner
+
+    async def nothing() -> None:
+        pass
+
+    console: Any = ActionQueue(Permissions())
+    console.permissions.enforced = True
+    console.own, console.latest, console.acknowledged = own, lambda _topic: None, 0
+    return TaskPanel(gui, console, None, nothing), console
 
 
 async def press(panel: TaskPanel, console: ActionQueue, session: PageSession, name: str) -> tuple[str, str]:

@@ -113,9 +113,8 @@ def test_arm_is_rendered_at_its_joint_positions(gl):
 
 @needs_gl
 def test_objects_cast_shadows_away_from_the_light():
-    shadow = drawn(balls([(0.3, -0.2, 0.03)]), scenery=Scenery(lights={"aside": ASIDE})).colour
-    none = drawn(balls([(0.3, -0.2, 0.03)]), scenery=Scenery(
-        lights={"aside": ASIDE.model_copy(update={"shadow": False})})).colour
+    shadow, none = (drawn(balls([(0.3, -0.2, 0.03)]), scenery=Scenery(lights={"aside": light})).colour
+                    for light in (ASIDE, ASIDE.model_copy(update={"shadow": False})))
     dark = shadow.astype(int).sum(axis=2) < 0.7 * none.astype(int).sum(axis=2)
     where = SMALL.on_plane(np.argwhere(dark & ~red(none))[:, ::-1], 0.0)
     where = where[np.linalg.norm(where - (0.3, -0.2), axis=1) < 0.12]  # arm and container have shadows of their own
@@ -133,20 +132,18 @@ def test_dimmed_and_warm_light_change_level_and_colors():
                       ABOVE.model_copy(update={"temperature": 2700.0})))
     np.testing.assert_allclose(dim.level, bright.level / 10)
     assert warm.level[2] > bright.level[2] and warm.level[0] < 0.5 * bright.level[0]
-    one, other = bright.render(balls(), AWAY).colour, dim.render(balls(), AWAY).colour
-    np.testing.assert_allclose(one, other, atol=2)
+    np.testing.assert_allclose(bright.render(balls(), AWAY).colour, dim.render(balls(), AWAY).colour, atol=2)
 
 
 @needs_gl
 def test_one_lamp_can_be_dimmed():
-    lamps = {"left": Light(position=(0.4, 0.6, 1.0), aim=(0.4, 0.2, 0.0), parallel=False, shadow=False),
-             "right": Light(position=(0.4, -0.6, 1.0), aim=(0.4, -0.2, 0.0), parallel=False, shadow=False)}
+    lamps = {name: Light(position=(0.4, 3 * y, 1.0), aim=(0.4, y, 0.0), parallel=False, shadow=False)
+             for name, y in (("left", 0.2), ("right", -0.2))}  # +y is left in the image
     renderer = PhysicsRenderer(CELL.world, Scenery(lights=lamps), ROBOT, SMALL, depth=False, gl=GL)
     both = renderer.render([], AWAY).colour * renderer.level
-    lamps = lamps | {"right": lamps["right"].model_copy(update={"illuminance": 20.0})}
-    renderer.set_light(Scenery(lights=lamps))
+    renderer.set_light(Scenery(lights=lamps | {"right": lamps["right"].model_copy(update={"illuminance": 20.0})}))
     one = renderer.render([], AWAY).colour * renderer.level
-    left, right = slice(20, 40), slice(120, 140)  # +y is left in the picture
+    left, right = slice(20, 40), slice(120, 140)
     assert one[:, right].mean() < 0.6 * both[:, right].mean() < one[:, left].mean()
 
 
@@ -180,12 +177,7 @@ def test_failing_opengl_falls_back_to_ray_casting(monkeypatch, caplog, error):
 
 
 def test_renderer_follows_the_simulator_of_the_cell(monkeypatch):
-    monkeypatch.setenv("MUJOCO_GL", "off")
-    select_gl.cache_clear()
-    try:
-        found = load_renderer(CELL.world, Scenery(simulator="mujoco"), lambda: ROBOT, plain=True, camera=SMALL)
-    finally:
-        select_gl.cache_clear()
+    monkeypatch.setattr(gl, "select_gl", lambda: "")
+    found = load_renderer(CELL.world, Scenery(simulator="mujoco"), lambda: ROBOT, plain=True, camera=SMALL)
     assert isinstance(found, PhysicsRenderer) and found.needs_arm
-    drawn_flat = load_renderer(CELL.world, Scenery(), lambda: ROBOT, plain=True, camera=SMALL)
-    assert not drawn_flat.needs_arm
+    assert not load_renderer(CELL.world, Scenery(), lambda: ROBOT, plain=True, camera=SMALL).needs_arm

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from common.config import ObjectConfig, World, load_cell
-from common.messages import Header, WorldObject
+from common.messages import Header
 from common.robot.finger_joints import finger_positions
 from common.robot.model import RobotModel
 from common.robot.transforms import pose_to_matrix
@@ -27,16 +27,12 @@ SHAPES = [
 ]
 
 
-def object_of_message(message: WorldObject) -> SceneObject:
-    """The object of a message, with the default mass."""
-    return SceneObject(message.id, solid_of_message(message), (message.color.r, message.color.g, message.color.b))
-
-
-def model_of(cell: str, visuals: bool = False) -> tuple[RobotModel, CellModel]:
+def model_of(cell: str, visuals: bool = False, world: World | None = None) -> tuple[RobotModel, CellModel]:
     config = load_cell(cell)
-    robot = RobotModel.load(config.robot)
-    message = KinematicWorld(config.world).objects(Header()).objects
-    return robot, build_model(robot, config.world, [object_of_message(thing) for thing in message], visuals=visuals)
+    world, robot = world or config.world, RobotModel.load(config.robot)
+    objects = [SceneObject(thing.id, solid_of_message(thing), (thing.color.r, thing.color.g, thing.color.b))
+               for thing in KinematicWorld(world).objects(Header()).objects]
+    return robot, build_model(robot, world, objects, visuals=visuals)
 
 
 def at_start(cell_model: CellModel) -> mujoco.MjData:
@@ -112,11 +108,9 @@ def test_arrays_are_computed_when_their_cache_file_is_truncated_or_cannot_be_wri
 
 @pytest.mark.parametrize("shape", SHAPES, ids=lambda shape: shape["id"])
 def test_every_shape_remains_where_it_is_placed(shape: dict[str, object]) -> None:
-    config = load_cell("panda", ["world.count=0"])
-    world = World.model_validate({"fixtures": config.world.fixtures, "objects": [shape]})
-    robot = RobotModel.load(config.robot)
+    world = World.model_validate({"fixtures": load_cell("panda").world.fixtures, "objects": [shape]})
     (message,) = KinematicWorld(world).objects(Header()).objects
-    cell_model = build_model(robot, world, [object_of_message(message)])
+    _, cell_model = model_of("panda", world=world)
     data = at_start(cell_model)
     before = pose_to_matrix(message.pose)
     cell_model.set_object(data, message.id, before)
@@ -129,12 +123,11 @@ def test_every_shape_remains_where_it_is_placed(shape: dict[str, object]) -> Non
 
 
 def test_camera_follows_its_optical_frame() -> None:
-    config = load_cell("panda")
     _, cell_model = model_of("panda")
     data = mujoco.MjData(cell_model.model)
     mujoco.mj_forward(cell_model.model, data)
-    (name, camera), = config.world.cameras.items()
+    (name, camera), = load_cell("panda").world.cameras.items()
     found = data.camera(name)
     assert found.xpos == pytest.approx(camera.position)
-    assert -found.xmat.reshape(3, 3)[:, 2] == pytest.approx([0, 0, -1], abs=1e-9)  # down at the table
-    assert found.xmat.reshape(3, 3)[:, 0] == pytest.approx([0, -1, 0], abs=1e-9)  # right in the image
+    right, _, back = found.xmat.reshape(3, 3).T
+    assert -back == pytest.approx([0, 0, -1], abs=1e-9) and right == pytest.approx([0, -1, 0], abs=1e-9)
