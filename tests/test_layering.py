@@ -14,6 +14,13 @@ ROOT = Path(__file__).resolve().parent.parent
 PURE = ("robot", "scene", "planning", "perception", "tasks", "hardware", "sim")
 CONTAINER_FILES = ("Dockerfile", "compose.yaml", ".dockerignore")  # with paths of the image
 MACHINE_PATH = re.compile(rb"(?<![\w.])/(?:home|root|work|Users|farm)/\w")
+PLATFORM = ("page", "drivers", "recording", "tools", "lab", "security", "cli")
+PLATFORM_SERVICES = (
+    "motion_planner", "robot_state_publisher", "trajectory_executor", "viewer", "camera_simulator", "depth_camera",
+    "camera_opencv", "real_depth_camera", "router",
+)
+APPLICATIONS = [path.parent.name for path in sorted((ROOT / "applications").glob("*/__init__.py"))]
+SHORT_FORMS = ("common/config/world.py",)  # of world files
 
 
 def sources(*folders: str) -> list[Path]:
@@ -73,17 +80,6 @@ def test_no_tracked_file_contains_a_path_of_one_machine() -> None:
             if b"\0" not in data[:1024] and (match := MACHINE_PATH.search(data)):
                 found.append(f"{name}: {match.group().decode()}")
     assert found == []
-
-
-# --- the platform knows no application ----------------------------------------------------------------------------
-
-PLATFORM = ("page", "drivers", "recording", "tools", "lab", "security", "cli")
-PLATFORM_SERVICES = (
-    "motion_planner", "robot_state_publisher", "trajectory_executor", "viewer", "camera_simulator", "depth_camera",
-    "camera_opencv", "real_depth_camera", "router",
-)
-APPLICATIONS = [path.parent.name for path in sorted((ROOT / "applications").glob("*/__init__.py"))]
-SHORT_FORMS = ("common/config/world.py",)  # of world files
 
 
 def of_platform() -> list[Path]:

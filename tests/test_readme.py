@@ -4,7 +4,6 @@ One run per application uses real processes; the others run on the virtual clock
 """
 
 import os
-import re
 import shlex
 import signal
 import subprocess
@@ -21,7 +20,6 @@ from tests.simulated.visited import no_processes
 ROOT = Path(__file__).resolve().parent.parent
 BIN = Path(sys.executable).parent
 PAGES = ("README.md", "docs/tools.md", "docs/outlining.md")
-README = pages.lines(pages.text_of("README.md"))
 LINES = [*dict.fromkeys(line.removeprefix(".venv/bin/") for page in PAGES for line in pages.lines(pages.text_of(page)))]
 RUNS = [line for line in LINES if line.startswith("zencell run")]
 WITH_CELL = [line for line in LINES if line.startswith("zen") and line not in RUNS and " up " not in line]
@@ -50,13 +48,6 @@ def cell() -> Iterator[dict[str, str]]:
             process.communicate(timeout=TIMEOUT)
         finally:
             process.kill()
-
-
-def test_readme_starts_with_the_two_make_commands() -> None:
-    assert README[:2] == ["make run", "make test"]
-    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
-    for target in ("run", "test", "setup", "check", "bench"):
-        assert re.search(rf"^{target}:", makefile, re.MULTILINE), target
 
 
 def assert_all_done(line: str, ran: subprocess.CompletedProcess[str]) -> None:
@@ -103,5 +94,3 @@ def test_command_of_the_readme_works_with_a_running_cell(line: str, cell: dict[s
               "param set": "400.0 -> 350.0", "param dump": "# Parameters of panda",
               "owner": "the motion is", "record": "", "--save mask.png": "mono8"}
     assert next(text for word, text in wanted.items() if word in line) in first
-
-

@@ -129,16 +129,15 @@ def installed(folder: Path, compiler: bool) -> Installation:
         lines = project.read_text(encoding="utf-8").splitlines(keepends=True)
         project.write_text("".join(line for line in lines if '"ziglang' not in line), encoding="utf-8")
     bare = folder / "bare"
-    subprocess.run([sys.executable, "-m", "venv", bare], check=True)
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", bare], check=True)
     site, = bare.glob("lib/python*/site-packages")
-    empty = {path.name for path in site.iterdir()}
-    pip = [bare / "bin" / "python", "-m", "pip", "--quiet", "--disable-pip-version-check"]
+    pip = [sys.executable, "-m", "pip", "--python", bare / "bin" / "python", "--quiet", "--disable-pip-version-check"]
     environment = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "CC")}
     environment["PATH"] = str(bare / "bin")
     subprocess.run([*pip, "wheel", "./source", "--no-deps", "-w", "dist"], cwd=folder, env=environment, check=True)
     made, = (folder / "dist").iterdir()
     subprocess.run([*pip, "install", "--no-deps", made], cwd=folder, env=environment, check=True)
-    added = {path.name for path in site.iterdir()} - empty
+    added = {path.name for path in site.iterdir()}
     assert {name.partition("-")[0] for name in added} == {"zencell"} and len(added) == 2, added
     # Use the dependencies installed here, but not their .pth files (an editable installation of the clone).
     here = [path for path in sys.path if Path(path).name == "site-packages"]

@@ -10,19 +10,11 @@ import zencell  # noqa: F401 - makes `common` importable, also from an installed
 from common import topics
 from common.application import find_application
 from common.config import load_cell
-from common.messages import TaskCommand, TaskStatus
+from common.messages import TaskCommand
 from common.transport.bus import Bus
-from common.transport.reader import Reader
 from lab.simulation import Simulation
 
 CELL = str(Path(__file__).with_name("cell.yaml"))
-
-
-async def wait_for_stage(status: Reader[TaskStatus], stage: str) -> None:
-    """Return when the task is at a stage."""
-    async for message in status:
-        if message.stage == stage:
-            return
 
 
 def test_every_cube_ends_in_its_own_box() -> None:
@@ -35,14 +27,13 @@ def test_task_continues_after_pause_stop_and_restart_of_its_process(stage: str) 
     cell = load_cell(CELL, seed=3)
 
     async def visit(bus: Bus) -> None:
-        status = bus.reader(find_application(cell.application).status)
-        task = bus.client(topics.TASK_COMMAND)
-        for commands in (("pause", "resume"), ("stop", "start")):
-            await wait_for_stage(status, stage)
+        status, task = bus.reader(find_application(cell.application).status), bus.client(topics.TASK_COMMAND)
+        for commands in (("pause", "resume"), ("stop", "start"), ()):
+            while (await status.next()).stage != stage:
+                pass
             for command in commands:
                 answer = await task.call(TaskCommand.model_validate({"command": command}))
                 assert answer.paused == (command == "pause")
-        await wait_for_stage(status, stage)
         simulation.kill(cell.task)
 
     simulation = Simulation(cell, 2, visit=visit)

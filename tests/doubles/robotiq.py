@@ -19,8 +19,7 @@ class Gripper:
         self.registers = {"ACT": 1, "STA": 3, "GTO": 0, "POS": OPEN, "SPE": 255, "FOR": 255, "FLT": 0}
         self.thing: int | None = None
         self.answers = b"ack"  # some versions append a line end
-        self._began, self._from, self._to = 0.0, OPEN, OPEN
-        self._reached, self._met = OPEN, False
+        self._start, self._from, self._to, self._reached, self._met = 0.0, OPEN, OPEN, OPEN, False
         self._lock = threading.Lock()
 
     def answer(self, line: str) -> bytes:
@@ -33,15 +32,15 @@ class Gripper:
             for name, value in zip(words[1::2], words[2::2], strict=True):
                 self.registers[name] = int(value)
                 if name == "POS":
-                    self._began, self._from = time.monotonic(), self._reached
+                    self._start, self._from = time.monotonic(), self._reached
                     self._to = min(max(int(value), OPEN), CLOSED)
         return self.answers
 
     def _move(self) -> None:
         rate = 50 + (SPEED - 50) * self.registers["SPE"] / 255
-        went = (time.monotonic() - self._began) * rate
+        distance = (time.monotonic() - self._start) * rate
         way = self._to - self._from
-        self._reached = self._to if went >= abs(way) else self._from + round(went if way > 0 else -went)
+        self._reached = self._to if distance >= abs(way) else self._from + round(distance if way > 0 else -distance)
         self._met = self.thing is not None and way > 0 and self._reached >= self.thing
         if self._met and self.thing is not None:
             self._reached = self.thing

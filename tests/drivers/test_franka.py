@@ -13,7 +13,6 @@ import ruckig
 
 from common.config import RobotConfig, load_cell
 from common.control.gripper_controller import GripperController
-from common.hardware.driven_arm import DrivenArm
 from common.hardware.driven_gripper import DrivenGripper
 from common.hardware.interface import HardwareFault, Limits
 from common.hardware.loading import load_hardware
@@ -37,15 +36,11 @@ LIMITS = Limits(
     tuple(MODEL.joint_names), MODEL.lower, MODEL.upper, MODEL.velocity, MODEL.acceleration, None, MODEL.jerk)
 
 
-def create_arm() -> DrivenArm:
+@contextmanager
+def connected() -> Iterator[Rig]:
     options = {**ROBOT.hardware.options, "ahead": 0.1}
     hardware = ROBOT.hardware.model_copy(update={"options": options})
-    return load_hardware(ROBOT.model_copy(update={"hardware": hardware}), LIMITS, np.zeros(7))
-
-
-@contextmanager
-def rigged() -> Iterator[Rig]:
-    rig = Rig(create_arm(), np.zeros(7))
+    rig = Rig(load_hardware(ROBOT.model_copy(update={"hardware": hardware}), LIMITS, np.zeros(7)), np.zeros(7))
     try:
         yield rig
     finally:
@@ -61,7 +56,7 @@ def host() -> Iterator[FrankaHost]:
 
 @pytest.fixture(scope="module")
 def rig(host: FrankaHost) -> Iterator[Rig]:
-    with rigged() as rig:
+    with connected() as rig:
         yield rig
 
 
@@ -108,7 +103,7 @@ def test_hand_grasps_an_object_and_opens() -> None:
 
 @in_real_time
 def test_arm_accepts_motions_at_all_limits() -> None:
-    with FrankaHost("--enforce-motion-limits", "--enforce-comm-constraints") as strict, rigged() as rig:
+    with FrankaHost("--enforce-motion-limits", "--enforce-comm-constraints") as strict, connected() as rig:
         if move(rig, MODEL.named("home"), 0.3) or rig.arm.state.speed < 1.0:
             pytest.skip("this machine is too slow to simulate the arm: late set-points count as jumps")
         rng = np.random.default_rng(1)
@@ -121,7 +116,7 @@ def test_arm_accepts_motions_at_all_limits() -> None:
 
 @in_real_time
 def test_reflex_reports_its_reason_and_ends_only_on_request() -> None:
-    with FrankaHost("--enforce-comm-constraints"), rigged() as rig:
+    with FrankaHost("--enforce-comm-constraints"), connected() as rig:
         rig.until("")
         for _ in range(30):
             rig.cycle(None, np.zeros(7))

@@ -1,4 +1,4 @@
-"""A fake browser: speaks viser's protocol, keeps what is shown, and clicks."""
+"""A fake browser: speaks viser's protocol, stores the displayed elements, and clicks."""
 
 import asyncio
 import html
@@ -23,20 +23,19 @@ CAMERA = {
 
 
 class FakeBrowser:
-    """What a browser would show: `parts` are the fields and texts of the panels by uuid.
+    """A page: `parts` are the fields and texts of its panels by uuid, `kinds` the types of viser's messages in order.
 
-    `kinds` are the types of viser's messages in their order; `status` and `results` come over the control socket.
+    `status` and `results` come over the control socket.
     """
 
     def __init__(self, connection: ClientConnection, control: ClientConnection) -> None:
         self._connection, self._control = connection, control
+        self._known, self._changed = asyncio.Event(), asyncio.Event()  # known: the key of this page was sent
         self.status: dict[str, Any] = {}
         self.results: list[tuple[int, str, str]] = []
-        self._known = asyncio.Event()  # the key of this page was sent
         self.parts: dict[str, dict[str, Any]] = {}
         self.values: dict[str, Any] = {}
         self.kinds: list[str] = []
-        self._changed = asyncio.Event()
 
     @property
     def text(self) -> str:
@@ -76,7 +75,7 @@ class FakeBrowser:
         await self._control.send(json.dumps(message))
 
     async def hold(self, what: str, press: int = 1) -> None:
-        """Send one message that a button is held down by this press."""
+        """Send one message of a button that this press holds down."""
         await self.until(lambda: self.status)
         await self.send(do="hold", what=what, n=press, at=1e3 * time.monotonic(), seen=self.status["time"])
 

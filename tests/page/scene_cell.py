@@ -16,7 +16,7 @@ from common import topics
 from common.application import find_application
 from common.config import Cell, Surroundings, load_cell
 from common.robot.model import RobotModel
-from common.robot.transforms import quaternion_to_matrix
+from common.robot.transforms import quaternion_to_matrix, transform
 from common.robot.visual_meshes import Piece, coarse, visual_pieces
 from common.topics import Topic
 from page.layers import find_layers
@@ -53,8 +53,7 @@ def around_of(name: str) -> Surroundings:
 class Clock:
     """Returns the time that the test sets [s]."""
 
-    def __init__(self) -> None:
-        self.now = 100.0
+    now = 100.0
 
     def __call__(self) -> float:
         return self.now
@@ -136,18 +135,10 @@ class Stage:
     @contextmanager
     def sent(self) -> Iterator[list[Any]]:
         """Record everything that is sent to browsers inside the block."""
-        scene: Any = self.server.scene
-        original, found = scene._queue_scene_message, []
-
-        def record(message: Any) -> None:
-            found.append(message)
-            original(message)
-
-        scene._queue_scene_message = record
-        try:
+        found: list[Any] = []
+        queue = self.server.scene._queue_scene_message
+        with patch.object(self.server.scene, "_queue_scene_message", lambda each: (found.append(each), queue(each))):
             yield found
-        finally:
-            scene._queue_scene_message = original
 
 
 def at(x: float, y: float, z: float) -> m.Pose:
@@ -163,22 +154,22 @@ def scene_of(*objects: m.CollisionObject, held: dict[str, m.CollisionObject] | N
     return m.PlanningScene(header=WORLD, objects=list(objects), attached=attached)
 
 
+def parents(server: viser.ViserServer, node: Any) -> list[Any]:
+    """Return the handles of all parents of a node and of itself, from the root."""
+    parts = node.name.split("/")[1:]
+    found = (server.scene.get_handle_by_name("/" + "/".join(parts[:depth + 1])) for depth in range(len(parts)))
+    return [handle for handle in found if handle is not None]
+
+
 def in_world(server: viser.ViserServer, node: Any) -> NDArray[np.float64]:
     """Return the (4, 4) pose of a node, through all its parents."""
     T = np.eye(4)
-    parts = node.name.split("/")[1:]
-    for depth in range(1, len(parts) + 1):
-        handle = server.scene.get_handle_by_name("/" + "/".join(parts[:depth]))
-        if handle is not None:
-            w, x, y, z = (float(value) for value in handle.wxyz)
-            step = np.eye(4)
-            step[:3, :3], step[:3, 3] = quaternion_to_matrix(x, y, z, w), handle.position
-            T = T @ step
+    for handle in parents(server, node):
+        w, x, y, z = (float(value) for value in handle.wxyz)
+        T = T @ transform(quaternion_to_matrix(x, y, z, w), handle.position)
     return T
 
 
 def is_shown(server: viser.ViserServer, node: Any) -> bool:
     """Return whether a node and all its parents are visible."""
-    parts = node.name.split("/")[1:]
-    parents = (server.scene.get_handle_by_name("/" + "/".join(parts[:i])) for i in range(1, len(parts) + 1))
-    return all(handle is None or handle.visible for handle in parents)
+    return all(handle.visible for handle in parents(server, node))

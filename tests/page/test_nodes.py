@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from page.nodes import CHAR_WIDTH, LINE_HEIGHT, Labels, brightened, group_labels, projection_of
+from page.nodes import CHAR_WIDTH, LINE_HEIGHT, Labels, group_labels, projection_of
 
 Array = NDArray[np.float64]
 
@@ -61,8 +61,3 @@ def test_projection_of_a_browser_camera() -> None:
     pixels = projection_of(cast(Any, Camera()))(np.array([[0.0, 0, 0], [0.5, 0, 0], [0, 0.5, 0], [0, 0, 3.0]]))
     assert pixels[:3] == pytest.approx(np.array([[400, 300], [550, 300], [400, 150]]))
     assert np.isnan(pixels[3]).all()
-
-
-def test_dark_colors_are_brightened_and_others_unchanged() -> None:
-    assert brightened((38, 38, 41)) == (61, 61, 64)
-    assert brightened((0, 0, 255)) == (0, 0, 255)

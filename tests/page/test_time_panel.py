@@ -13,12 +13,15 @@ from page.time_panel import LIVE_SOURCE, TimePanel
 from recording.sample import RecordingError
 
 
-class Recordings:
-    """Recordings that are read when the test allows it; one of them is damaged."""
+class Panel:
+    """A time panel with recordings that are read when the test allows it; one of them is damaged."""
 
-    def __init__(self) -> None:
+    def __init__(self, gui: viser.GuiApi) -> None:
         self.readable = {name: threading.Event() for name in ("a.mcap", "b.mcap", "damaged.mcap")}
         self.closed: list[str] = []
+        self.timeline, self.now = Timeline(lambda _topic: None, RecentHistory()), 0.0
+        self.panel = TimePanel(gui, ActionQueue(), self.timeline, names=lambda: list(self.readable),
+                               open_recording=self.open)
 
     def open(self, name: str) -> Any:
         assert self.readable[name].wait(10)
@@ -28,17 +31,6 @@ class Recordings:
         history.now, history.close = 10.0, lambda: self.closed.append(name)
         return history
 
-
-class Panel:
-    """A time panel with its timeline."""
-
-    def __init__(self, gui: viser.GuiApi) -> None:
-        self.recordings = Recordings()
-        self.timeline, self.now = Timeline(lambda _topic: None, RecentHistory()), 0.0
-        self.panel = TimePanel(gui, ActionQueue(), self.timeline,
-                               names=lambda: list(self.recordings.readable), open_recording=self.recordings.open)
-        assert self.source == LIVE_SOURCE
-
     @property
     def source(self) -> str:
         """The value of the field after an update."""
@@ -46,45 +38,40 @@ class Panel:
         self.panel.show(self.now)
         return str(self.panel._source.value)
 
-    async def select(self, name: str) -> None:
-        """Select a source as a browser does."""
+    async def select(self, name: str) -> asyncio.Task[None]:
+        """Select a source as a browser does; return the loading."""
         self.panel._source.value = name
-        await self.panel._select(name)
+        loading = asyncio.create_task(self.panel._select(name))
+        await asyncio.sleep(0)
+        return loading
 
 
 @pytest.fixture
 async def panel(gui: viser.GuiApi) -> Panel:
-    return Panel(gui)
+    panel = Panel(gui)
+    assert panel.source == LIVE_SOURCE
+    return panel
 
 
-async def test_loading_recording_remains_selected_until_the_page_returns_to_the_present(panel: Panel) -> None:
-    selection = asyncio.create_task(panel.select("a.mcap"))
-    await asyncio.sleep(0)
+async def test_recording_remains_selected_while_it_loads_and_if_another_is_unreadable(panel: Panel) -> None:
+    loading = await panel.select("a.mcap")
     assert panel.source == "a.mcap" and panel.timeline.is_present
-    panel.recordings.readable["a.mcap"].set()
-    await selection
+    for event in panel.readable.values():
+        event.set()
+    await loading
     assert panel.source == "a.mcap" and panel.timeline.recording is not None
+    with pytest.raises(RecordingError):
+        await (await panel.select("damaged.mcap"))
+    assert panel.source == "a.mcap" and panel.timeline.recording is not None
+    del panel.readable["a.mcap"]
+    assert panel.source == "a.mcap", "even if its file was deleted"
     panel.timeline.return_to_present()
     assert panel.source == LIVE_SOURCE
 
 
-async def test_unreadable_recording_leaves_the_displayed_one(panel: Panel) -> None:
-    for event in panel.recordings.readable.values():
-        event.set()
-    await panel.select("a.mcap")
-    with pytest.raises(RecordingError):
-        await panel.select("damaged.mcap")
-    assert panel.source == "a.mcap" and panel.timeline.recording is not None
-    del panel.recordings.readable["a.mcap"]
-    assert panel.source == "a.mcap", "even if its file was deleted"
-
-
 async def test_of_two_loading_recordings_the_last_selected_one_is_displayed(panel: Panel) -> None:
-    selections = {}
-    for name in ("a.mcap", "b.mcap"):
-        selections[name] = asyncio.create_task(panel.select(name))
-        await asyncio.sleep(0)
+    loading = {name: await panel.select(name) for name in ("a.mcap", "b.mcap")}
     for name in ("b.mcap", "a.mcap"):
-        panel.recordings.readable[name].set()
-        await selections[name]
-    assert panel.source == "b.mcap" and panel.recordings.closed == ["a.mcap"]
+        panel.readable[name].set()
+        await loading[name]
+    assert panel.source == "b.mcap" and panel.closed == ["a.mcap"]
