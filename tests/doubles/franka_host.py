@@ -34,7 +34,7 @@ class FrankaHost:
         folder = Path(self._folder.name)
         with self.log.open("ab") as log:
             self._process = subprocess.Popen(
-                [PYTHON, ROOT / "tests" / "doubles" / "franka_server.py", folder / "stands", *self._options],
+                [PYTHON, ROOT / "tests" / "doubles" / "franka_server.py", folder / "positions", *self._options],
                 stdout=log, stderr=log, env={**os.environ, **self._models})
         end = time.monotonic() + TIMEOUT
         while True:
@@ -56,9 +56,11 @@ class FrankaHost:
         self._process.send_signal(signal.SIGUSR1)
 
     @property
-    def stands(self) -> list[float]:
+    def positions(self) -> list[float]:
         """Joint positions [rad]."""
-        return list(np.fromfile(Path(self._folder.name) / "stands"))
+        return list(np.fromfile(Path(self._folder.name) / "positions"))
+
+    stands = positions  # in tests of cells
 
     def freeze(self, seconds: float) -> None:
         """Suspend the controller for a while [s]."""

@@ -165,7 +165,7 @@ def test_frozen_or_restarted_controller_is_connected_again_without_motion(host: 
     host.freeze(1.0)
     rig.until_it_moves()
     host.crash()
-    stopped_at = host.stands
+    stopped_at = host.positions
     if rig.arm.state.mode == "running":
         rig.until("no message")
     host.boot()

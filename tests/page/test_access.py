@@ -118,9 +118,6 @@ def test_gateway_of_a_container_is_that_of_the_default_route(tmp_path: Path) -> 
     assert gateways(tmp_path / "none") == frozenset()
 
 
-# --- tokens ---
-
-
 def test_each_token_grants_its_role_and_the_general_one_all_roles() -> None:
     tokens = {role: f"{role}-token-of-the-page" for role in ROLES}
     access = Access("127.0.0.1", 8080, SECRET, tokens)

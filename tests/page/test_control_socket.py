@@ -96,9 +96,6 @@ def test_delayed_message_is_detected_whatever_the_clocks_show() -> None:
     assert delay.update(2, 1002.0, 9000.0) == 0.0, "the browser's machine was suspended meanwhile"
 
 
-# --- lost connections ---
-
-
 def detector_of(*services: str) -> LossDetector:
     losses = LossDetector()
     assert losses.update(True, services, AVAILABLE, 0.0) == []

@@ -27,11 +27,10 @@ async def test_message_is_taken_once_and_remains_the_latest() -> None:
     net = LocalNetwork()
     feeds, writer = Feeds(net.bus("viewer"), ALWAYS, ON_DEMAND), net.bus("executor").writer(topics.GRIPPER_STATE)
     assert feeds.latest(topics.GRIPPER_STATE) is None is feeds.take(topics.GRIPPER_STATE)
-    for width in (0.01, 0.02):
-        writer.put(m.GripperState(width=width))
-        first = feeds.take(topics.GRIPPER_STATE)
-        assert first == m.GripperState(width=width)
-        assert feeds.take(topics.GRIPPER_STATE) is None and feeds.latest(topics.GRIPPER_STATE) is first
+    for message in (m.GripperState(width=0.01), m.GripperState(width=0.02)):
+        writer.put(message)
+        assert feeds.take(topics.GRIPPER_STATE) == feeds.latest(topics.GRIPPER_STATE) == message
+        assert feeds.take(topics.GRIPPER_STATE) is None
 
 
 async def test_on_demand_topics_are_read_while_selected_and_events_always() -> None:

@@ -104,9 +104,6 @@ def test_frames_are_updated_ten_times_a_second_at_most(panda: Stage) -> None:
     assert [message.name for message in sent] == ["/frames/base", "/frames/label 0"]
 
 
-# --- cameras ---
-
-
 def test_camera_follows_its_frame_on_a_moving_gripper(panda: Stage) -> None:
     panda.say(topics.CAMERA_INFO, CAMERA.info(m.Header(frame_id="eye")))
     panda.say(topics.TF_STATIC, tf(("world", "hand", at(0.5, 0, 0.5)), ("hand", "eye", POSE)))

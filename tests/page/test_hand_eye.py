@@ -2,10 +2,9 @@
 
 import asyncio
 from dataclasses import replace
-from pathlib import Path
 from threading import Event
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
@@ -34,9 +33,7 @@ INFO = CameraInfo(header=Header(stamp=1, frame_id="eye"), width=LENS.width, heig
 LEFT, RIGHT = (replace(topics.CAMERA_IMAGE, key=f"{side}/image_raw") for side in ("left", "right"))
 
 
-@pytest.fixture(autouse=True)
-def state(state_folder: Path) -> None:
-    """Save views in a folder of the test."""
+pytestmark = pytest.mark.usefixtures("state_folder")
 
 
 def start() -> HandEyeSession:
@@ -153,10 +150,17 @@ def test_view_that_cannot_be_saved_is_not_counted(arm: Arm, monkeypatch: pytest.
 # --- panel ---
 
 
+def panel_of(gui: viser.GuiApi, latest: Any, *cameras: Any) -> tuple[HandEyePanel, list[str]]:
+    """Return a panel and the list of its notifications."""
+    console, notes = ActionQueue(), list[str]()
+    console.notify = lambda line, _kind="bad": notes.append(line)
+    panel = HandEyePanel(gui, console, latest, list(cameras), load_cell("ur5").robot, on_topics=lambda: None)
+    return panel, notes
+
+
 async def test_views_are_of_the_camera_selected_at_the_start(gui: viser.GuiApi) -> None:
     requested: list[str] = []
-    panel = HandEyePanel(gui, cast(Any, ActionQueue()), lambda topic: requested.append(topic.key), [LEFT, RIGHT],
-                         load_cell("ur5").robot, on_topics=lambda: None)
+    panel, _ = panel_of(gui, lambda topic: requested.append(topic.key), LEFT, RIGHT)
 
     def needed() -> list[str]:
         return [topic.key for topic in panel.needed_topics]
@@ -176,7 +180,7 @@ async def test_views_are_of_the_camera_selected_at_the_start(gui: viser.GuiApi) 
 
 async def test_result_of_a_former_calibration_is_not_shown_for_the_next(gui: viser.GuiApi) -> None:
     """Capturing and calibrating take seconds: another calibration may have started meanwhile."""
-    proceed, notes = Event(), list[str]()
+    proceed = Event()
 
     def slow(result: Any) -> Any:
         assert proceed.wait(10)
@@ -184,9 +188,7 @@ async def test_result_of_a_former_calibration_is_not_shown_for_the_next(gui: vis
 
     session: Any = SimpleNamespace(count=9, add_image=lambda _image: slow("the arm moves"),
                                    calibrate=lambda _info: slow(Result(True, ["good: former one"])))
-    console: Any = ActionQueue()
-    console.notify = lambda line, _kind="bad": notes.append(line)
-    panel = HandEyePanel(gui, console, lambda topic: topic, [LEFT], load_cell("ur5").robot, on_topics=lambda: None)
+    panel, notes = panel_of(gui, lambda topic: topic, LEFT)
     for operation in (panel._capture, panel._calibrate):
         proceed.clear()
         panel._session = session

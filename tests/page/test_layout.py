@@ -15,14 +15,10 @@ from page.layout import TABS, Layout, Viewpoint, load_layout, save_layout
 CELLS = {"panda", "ur5"}  # with a viewpoint in the default layout
 
 
-def test_default_layout_has_every_tab() -> None:
-    layout = load_layout("", print)
+def test_layout_is_saved_for_the_user_and_the_default_is_unchanged() -> None:
+    layout, before = load_layout("", print), (config_root() / "viewer.yaml").read_text()
     assert set(layout.tabs) == set(TABS) and set(layout.viewpoints) == CELLS
     assert shown_layers(layout.layers, find_layers(find_application("outlining")))["robot"]
-
-
-def test_layout_is_saved_for_the_user_and_the_default_is_unchanged() -> None:
-    before = (config_root() / "viewer.yaml").read_text()
     path = save_layout("", Layout(dark=False))
     assert path.is_relative_to(state_folder()) and not load_layout("", print).dark
     assert (config_root() / "viewer.yaml").read_text() == before
@@ -78,6 +74,8 @@ def test_invalid_layout_is_rejected_with_file_field_and_choices(tmp_path: Path, 
     with pytest.raises(ConfigError, match=message) as error:
         load_layout(str(file), print)
     assert "mine.yaml" in str(error.value)
+    with pytest.raises(ConfigError, match="cannot be read"):
+        load_layout(str(tmp_path / "none.yaml"), print)
 
 
 @pytest.mark.parametrize("text", ["", "tabs: [Lottery]", "panel_width: 3", "tabs: [Log"])
@@ -86,8 +84,3 @@ def test_invalid_layout_of_the_user_causes_a_warning_only(text: str) -> None:
     warnings: list[str] = []
     assert set(load_layout("", warnings.append).viewpoints) == CELLS
     assert len(warnings) == 1 and "viewer.yaml" in warnings[0]
-
-
-def test_configured_layout_file_must_exist(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="cannot be read"):
-        load_layout(str(tmp_path / "none.yaml"), print)

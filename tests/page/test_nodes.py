@@ -1,6 +1,8 @@
 """Labels of the scene: those that would overlap on the screen are merged."""
 
-from typing import Any, cast
+from itertools import combinations
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +17,7 @@ Array = NDArray[np.float64]
 
 
 def project(points: Array) -> Array:
-    """A view with x to the right and y down, one pixel per millimeter."""
+    """Project with x to the right and y down, one pixel per millimeter."""
     return 1e3 * points[:, :2]
 
 
@@ -28,9 +30,8 @@ def test_groups_do_not_overlap_and_contain_every_label(made: list[tuple[str, int
     for group in groups:
         (left, low), (width, height) = group.corner, group.size(1.0)
         boxes.append((left, left + width, low - height, low))
-    for i, (left, right, top, low) in enumerate(boxes):
-        for left2, right2, top2, low2 in boxes[i + 1:]:
-            assert right <= left2 or right2 <= left or low <= top2 or low2 <= top
+    for (left, right, top, low), (left2, right2, top2, low2) in combinations(boxes, 2):
+        assert right <= left2 or right2 <= left or low <= top2 or low2 <= top
     assert sorted(text for group in groups for text in group.lines) == sorted(text for text, *_ in made)
 
 
@@ -54,10 +55,8 @@ def test_without_a_projection_near_labels_are_merged() -> None:
 
 
 def test_projection_of_a_browser_camera() -> None:
-    class Camera:  # at (0, 0, 2), looking down, x to the right
-        wxyz, position = (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 2.0)
-        image_height, image_width, fov = 600, 800, 2 * np.arctan(0.5)
-
-    pixels = projection_of(cast(Any, Camera()))(np.array([[0.0, 0, 0], [0.5, 0, 0], [0, 0.5, 0], [0, 0, 3.0]]))
+    camera: Any = SimpleNamespace(  # looking down, x to the right
+        wxyz=(0.0, 1.0, 0.0, 0.0), position=(0.0, 0.0, 2.0), image_height=600, image_width=800, fov=2 * np.arctan(0.5))
+    pixels = projection_of(camera)(np.array([[0.0, 0, 0], [0.5, 0, 0], [0, 0.5, 0], [0, 0, 3.0]]))
     assert pixels[:3] == pytest.approx(np.array([[400, 300], [550, 300], [400, 150]]))
     assert np.isnan(pixels[3]).all()
