@@ -1,8 +1,6 @@
 """The backend of the Franka Research 3 with the vendor's library, against franka-sim."""
 
-import multiprocessing
 import os
-import signal
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -112,26 +110,6 @@ def test_arm_accepts_motions_at_all_limits() -> None:
             target = (MODEL.upper + MODEL.lower) / 2 + rng.uniform(-reach, reach)
             assert move(rig, target) == "", strict.text[-2000:]
             assert np.abs(rig.arm.read(0.0)[0] - target).max() < 5e-3
-
-
-@in_real_time
-def test_reflex_reports_its_reason_and_ends_only_on_request() -> None:
-    with FrankaHost("--enforce-comm-constraints"), connected() as rig:
-        rig.until("")
-        for _ in range(30):
-            rig.cycle(None, np.zeros(7))
-        (driver,) = [child for child in multiprocessing.active_children() if "hand" not in child.name]
-        os.kill(driver.pid or 0, signal.SIGSTOP)
-        time.sleep(0.2)  # the arm tolerates 20 ms
-        os.kill(driver.pid or 0, signal.SIGCONT)
-        assert "communication constraints violation" in rig.until("has stopped for a reflex")
-        assert rig.arm.state.mode == "protective_stop"
-        where = rig.arm.read(0.0)[0]
-        for _ in range(50):
-            rig.cycle(None, np.zeros(7))
-        assert np.allclose(rig.arm.read(0.0)[0], where, atol=1e-3)
-        assert rig.done(rig.arm.order("recover")) == ""
-        rig.until("")
 
 
 def test_nothing_moves_without_a_request_and_motions_start_where_the_arm_is(host: FrankaHost, rig: Rig) -> None:

@@ -94,16 +94,6 @@ def test_number_of_frames_is_bounded_and_the_newest_are_displayed(frames: Frames
     assert frames.pose("base") is not None and frames.pose("0/1") is None and frames.pose("3/1") is not None
 
 
-def test_frames_are_updated_ten_times_a_second_at_most(panda: Stage) -> None:
-    panda.show("frames", True)
-    panda.say(topics.TF, tf(("world", "base", at(0, 0, 0))))
-    with panda.sent() as sent:
-        panda.say(topics.TF, tf(("world", "base", at(0, 0, 1))), 0.05)
-        assert not sent
-        panda.say(topics.TF, tf(("world", "base", at(0, 0, 2))), 0.06)
-    assert [message.name for message in sent] == ["/frames/base", "/frames/label 0"]
-
-
 def test_camera_follows_its_frame_on_a_moving_gripper(panda: Stage) -> None:
     panda.say(topics.CAMERA_INFO, CAMERA.info(m.Header(frame_id="eye")))
     panda.say(topics.TF_STATIC, tf(("world", "hand", at(0.5, 0, 0.5)), ("hand", "eye", POSE)))

@@ -49,20 +49,6 @@ def test_ghost_is_at_the_end_of_the_plan_until_the_robot_arrives(panda: Stage, h
         assert ghost.visible is visible
 
 
-def test_meshes_of_the_ghost_are_sent_once_with_the_first_plan(
-    panda: Stage, goal: Array, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    sent: list[str] = []
-    add = panda.server.scene.add_mesh_simple
-    monkeypatch.setattr(panda.server.scene, "add_mesh_simple",
-                        lambda name, *args, **options: (sent.append(name), add(name, *args, **options))[1])
-    panda.joints(goal - 0.05)
-    assert not [name for name in sent if name.startswith("/plan/")]
-    for _ in range(2):
-        panda.say(topics.DISPLAY_TRAJECTORY, plan(panda, goal))
-    assert len(sent) == len({name.split("/")[-2] for name in sent}) == len(panda.layer("plan").ghost.links)
-
-
 def test_tool_path_is_a_line_until_a_plan_without_points(panda: Stage, goal: Array) -> None:
     trajectory = plan(panda, goal)
     panda.say(topics.DISPLAY_TRAJECTORY, trajectory)

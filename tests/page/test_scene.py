@@ -175,13 +175,6 @@ def test_empty_messages_do_no_harm(server: viser.ViserServer, cell: str) -> None
     np.testing.assert_allclose(link_pose(stage, last), stage.robot.link_poses(q)[last], atol=1e-6)
 
 
-def test_scene_does_not_change_the_initial_camera(server: viser.ViserServer) -> None:
-    server.initial_camera.position, server.initial_camera.look_at = (3.0, 2.0, 1.0), (0.3, 0.2, 0.1)
-    Stage(server, "panda")
-    np.testing.assert_allclose(server.initial_camera.position, (3.0, 2.0, 1.0))
-    np.testing.assert_allclose(server.initial_camera.look_at, (0.3, 0.2, 0.1))
-
-
 # --- goal marker ---
 
 

@@ -38,13 +38,6 @@ def test_text_of_a_task_state(status: PickPlaceStatus | OutlineStatus | None, te
     assert TaskText.of(find_application(application)).state(status)[0] == text
 
 
-def test_texts_of_an_application_without_a_page() -> None:
-    status = m.TaskStatus(state="MOVING_IT", started=True, subject="cube", done=1, total=4, figures={"mean_mm": 0.2})
-    text = TaskText.of(None)
-    assert text.state(status)[0] == "Moving it cube" and text.progress_of(status, None) == 0.25
-    assert text.counters(status, 0) == {"done": 1, "of": 4, "mean mm": 0.2, "retries": 0, "failures": 0}
-
-
 def test_texts_of_arm_and_gripper() -> None:
     assert texts.motion_text(m.MotionStatus(state="active", progress=0.25)) == "moving, 25 % of this motion"
     assert texts.motion_text(m.MotionStatus(state="active", progress=0.25, held=True)) == "held"

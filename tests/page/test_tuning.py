@@ -10,7 +10,7 @@ from common.config import load_cell, service_config
 from common.config.tunables import describe
 from common.errors import ConfigError
 from common.messages import Parameter
-from page.tuning import ParameterField, group_of, label_of, step_of
+from page.tuning import ParameterField, group_of, label_of
 from services import vision_detector
 
 Make = Callable[..., ParameterField]
@@ -24,7 +24,12 @@ def parameter(**fields: Any) -> Parameter:
 def make(gui: viser.GuiApi) -> Iterator[Make]:
     """Make a field for a parameter; all fields are removed at the end."""
     made: list[ParameterField] = []
-    yield lambda found=None, **fields: made.append(ParameterField(gui, found or parameter(**fields), ["a"])) or made[-1]
+
+    def make_field(found: Parameter | None = None, **fields: Any) -> ParameterField:
+        made.append(ParameterField(gui, found or parameter(**fields), ["a"]))
+        return made[-1]
+
+    yield make_field
     for field in made:
         field.handle.remove()
 
@@ -83,12 +88,3 @@ def test_list_is_entered_as_yaml_and_text_as_it_is(make: Make) -> None:
     with pytest.raises(ConfigError, match=r"services\.a\.b: '\[3, ' is not a YAML value"):
         listed.parse("[3, ")
     assert make(value="a", type="string").parse("[3, ") == "[3, "
-
-
-@pytest.mark.parametrize(("fields", "step"), [
-    ({"minimum": 0, "maximum": 1}, 0.001), ({"minimum": 0, "maximum": 1000, "value": 60}, 1),
-    ({"minimum": 1, "maximum": 9, "type": "integer", "value": 2}, 1), ({"minimum": 0}, None),
-    ({"minimum": 1, "maximum": 1}, None), ({"minimum": 0, "maximum": 1000, "value": 0.5}, None),
-])
-def test_step_of_a_slider_is_round_and_fine_enough(fields: dict[str, Any], step: float | None) -> None:
-    assert step_of(parameter(**fields)) == pytest.approx(step)

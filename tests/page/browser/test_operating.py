@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import math
 import signal
 from typing import TYPE_CHECKING
@@ -111,17 +110,6 @@ async def test_stuck_server_is_shown_in_a_banner_and_by_stop_until_it_recovers(c
         viewer.send_signal(signal.SIGCONT)
     await banner.wait_for(state="hidden")
     assert await page.evaluate("document.body.dataset.stale") == ""
-
-
-async def test_killed_service_turns_red_and_comes_back(cell: Viewed, page: Page) -> None:
-    await tab(page, "Health")
-    line = page.locator('tr[data-service="workspace_validator"]')
-    await line.and_(page.locator('[data-state="ready"]')).locator(".good").wait_for()
-    red = asyncio.create_task(line.locator(".bad").wait_for())
-    await asyncio.sleep(0)
-    cell.processes()["workspace_validator"].kill()
-    await red
-    await line.and_(page.locator('[data-state="ready"][data-restarts="1"]')).locator(".good").wait_for()
 
 
 def positions(truth: WorldObjects) -> dict[str, tuple[float, float]]:
