@@ -9,6 +9,8 @@ import typer
 import yaml
 
 from cli.main import app
+from common.config import Pipeline, check, names_of, read_yaml
+from common.planning.planners import load_planner, planner_names
 from docs import generate, reference
 from docs.seed_parameters import CONTROLLER
 from tests import pages
@@ -42,6 +44,23 @@ def test_links_within_the_project_resolve(page: str) -> None:
             found = (path.parent / target).resolve() if target else path
             assert found.exists() and found.is_relative_to(ROOT), link
             assert not anchor or anchor in pages.anchors(found.read_text(encoding="utf-8")), link
+
+
+@pytest.mark.parametrize("planner", planner_names())
+def test_planner_and_its_options_are_described(planner: str) -> None:
+    text = pages.text_of("docs/planners.md")
+    assert f"| `{planner}` |" in text
+    for option in type(load_planner(planner, {})[1]).model_fields:
+        assert f"`{option}`" in text, option
+
+
+@pytest.mark.parametrize("name", names_of("pipelines"))
+def test_pipeline_is_described_and_its_planners_take_its_options(name: str) -> None:
+    pipeline = check(Pipeline, read_yaml(ROOT / "config" / "pipelines" / f"{name}.yaml"))
+    for entry in pipeline.planners:
+        load_planner(entry.name, entry.options)
+    names = ", ".join(f"`{entry.name}`" for entry in pipeline.planners)
+    assert f"| `{name}` | {names} |" in pages.text_of("docs/planners.md")
 
 
 NOT_COMMANDS = {"polish", "VERB"}  # of a reader's application; a placeholder

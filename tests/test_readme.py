@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from tests import pages
-from tests.harness import ask, free_domain
+from tests.harness import Place, ask, free_domain, place_of
 from tests.simulated.visited import no_processes
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -33,21 +33,11 @@ def command(line: str, *more: str) -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def cell() -> Iterator[dict[str, str]]:
-    """Start the README's `up` cell, and return the environment of commands that use it."""
-    domain = free_domain()
-    env = {**os.environ, "ZENCELL_DOMAIN": str(domain)}
+def cell(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Place]:
+    """Start the README's `up` cell."""
     line = next(line for line in LINES if " up " in line)
-    with subprocess.Popen(command(line), cwd=ROOT, env=env, text=True, stdout=subprocess.PIPE) as process:
-        while "is up at" not in (output := process.stdout.readline()):
-            assert output, "the cell did not start"
-        env["PASTE"] = process.stdout.readline().strip()
-        yield env
-        process.send_signal(signal.SIGINT)
-        try:
-            process.communicate(timeout=TIMEOUT)
-        finally:
-            process.kill()
+    with place_of(tmp_path_factory.mktemp("up"), *shlex.split(line)[2:]) as place:
+        yield place
 
 
 def assert_all_done(line: str, ran: subprocess.CompletedProcess[str]) -> None:
@@ -78,19 +68,18 @@ def test_simulated_run_of_the_readme_ends_done(line: str, tmp_path: Path) -> Non
 @pytest.mark.slow
 @pytest.mark.cell
 @pytest.mark.parametrize("line", WITH_CELL)
-def test_command_of_the_readme_works_with_a_running_cell(line: str, cell: dict[str, str]) -> None:
-    line = line.replace("7489", str(7447 + int(cell["ZENCELL_DOMAIN"])))
-    assert not line.startswith("zenoh ") or line == cell["PASTE"], "`zencell up` prints it"
-    with subprocess.Popen(command(line), cwd=ROOT, env=cell, text=True, stdout=subprocess.PIPE) as process:
-        first = process.stdout.readline()
+def test_command_of_the_readme_works_with_a_running_cell(line: str, cell: Place) -> None:
+    line, variables = line.replace("7489", str(7447 + cell.domain)), {"ZENCELL_DOMAIN": str(cell.domain)}
+    assert not line.startswith("zenoh ") or line in cell.started[0].lines, "`zencell up` prints it"
+    if line.startswith("zenoh ") or line.endswith("status"):  # until Ctrl-C
+        process = subprocess.Popen(command(line), env=os.environ | variables, text=True, stdout=subprocess.PIPE)
+        output = process.stdout.readline()
         process.send_signal(signal.SIGINT)
-        try:
-            process.communicate(timeout=TIMEOUT)
-        finally:
-            process.kill()
-            (ROOT / "mask.png").unlink(missing_ok=True)
+        process.communicate(timeout=TIMEOUT)
+    else:
+        output = ask(cell.folder, *shlex.split(line)[1:], environment=variables).stdout
     wanted = {"hz": "Hz", "status": '"state"', "targets": '"poses"', "list": "panda/", "zenoh": "panda/",
               "add": '"ids"', "pause": '"paused": true', " top ": "panda at speed", " tf ": "position",
-              "param set": "400.0 -> 350.0", "param dump": "# Parameters of panda",
-              "owner": "the motion is", "record": "", "--save mask.png": "mono8"}
-    assert next(text for word, text in wanted.items() if word in line) in first
+              "param set": "400.0 -> 350.0", "param dump": "# Parameters of panda", "record": "",
+              "--save mask.png": "mono8"}
+    assert next(text for word, text in wanted.items() if word in line) in output.partition("\n")[0]

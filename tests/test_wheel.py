@@ -37,32 +37,6 @@ def leave(code):
 os._exit = leave
 atexit.register(report)
 """
-SERVICE = '''"""A user's service, which ends its cell."""
-import asyncio
-from applications.pick_place.topics import PICK_PLACE_STATUS, PickPlaceStatus
-from common.config import Parameters
-from common.process.service import main
-
-class Config(Parameters):
-    """No parameters."""
-
-async def run(bus, config):
-    status = bus.writer(PICK_PLACE_STATUS)
-    await bus.ready()
-    status.put(PickPlaceStatus(header=bus.header(), state="DONE", started=True))
-    await asyncio.Event().wait()
-
-if __name__ == "__main__":
-    main(run, Config)
-'''
-CELL = """
-robot: panda
-world: balls
-pipeline: lerp
-task: task
-motion: {}
-services: {mine.task: }
-"""
 # Which kernel the doctor reports, and which planner plans around a wall.
 PLAN = """
 import zencell
@@ -209,16 +183,13 @@ def test_cell_runs_from_an_empty_folder_without_loading_a_module_twice(
 
 
 @pytest.mark.slow
-def test_user_modules_import_the_project_from_a_wheel(wheel: Installation, tmp_path: Path) -> None:
-    (tmp_path / "mine").mkdir()
-    (tmp_path / "mine" / "task.py").write_text(SERVICE, encoding="utf-8")
-    (tmp_path / "mine.yaml").write_text(CELL, encoding="utf-8")
-    output = wheel.run(tmp_path, "run", "mine.yaml", "--no-viewer", "--domain", str(DOMAIN + 1), **watched(tmp_path))
-    assert "DONE" in output and "mine.task" in mains(tmp_path, wheel)
+def test_new_project_and_user_scripts_run_from_a_wheel(wheel: Installation, tmp_path: Path) -> None:
+    wheel.run(tmp_path, "new", "fresh", "--task", "stack_cubes")
+    output = wheel.run(tmp_path, "run", "fresh/cell.yaml", "--no-viewer", "--speed", "10", "--domain", str(DOMAIN + 1),
+                       **watched(tmp_path))
+    assert "DONE" in output and "fresh.task" in mains(tmp_path, wheel)
     script = "import zencell\nfrom common.config import load_cell\nprint(load_cell('ur5').name)\n"
     assert wheel.python(tmp_path, "-c", script) == "ur5\n"
-    wheel.run(tmp_path, "new", "fresh_task", "--task", "stack_cubes")
-    assert "DONE" in wheel.run(tmp_path, "simulate", "fresh_task/cell.yaml", "--seed", "1")
 
 
 @pytest.mark.slow
