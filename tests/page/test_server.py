@@ -344,7 +344,7 @@ async def test_flood_of_messages_is_slowed_and_stop_of_another_page_is_not(page:
             await page.click(flood, "Start")
         await page.click(operator, "Stop")
         await until(lambda: "Stop" in page.done)
-        assert len(denied) < 2 * page_server.MAX_MESSAGE_RATE
+        assert len(denied) < 4 * page_server.MAX_MESSAGE_RATE
         flood.transport.abort()  # the server would read the rest of the flood before it closes
 
 
