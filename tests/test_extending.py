@@ -207,46 +207,35 @@ def test_custom_service_joins_a_cell(folder: Path) -> None:
     assert (service.returncode, cell.returncode) == (0, 0)
 
 
-# --- a task of one file ---
-
-
-def assert_cube_moved(file: Path, output: str, recording: Path, folder: Path, elsewhere: Path) -> None:
-    """Check a run, and its recording without the task module."""
-    summary = json.loads(file.read_text(encoding="utf-8"))
-    assert (summary["state"], summary["placed"], summary["targets"], summary["failures"]) == ("DONE", 1, 1, 0)
-    assert set(summary["figures"]) == {"off_mm"} and summary["figures"]["off_mm"] < 5
-    assert "off_mm" in output
-    with Recording(recording) as recorded:
-        states = list(recorded.samples(lambda topic: topic == "move_cube_status"))
-        assert {(sample.kind, json.loads(sample.schema)["title"]) for sample in states} == {("state", "MoveCubeStatus")}
-        newest = {sample.topic: sample.payload for sample in recorded.samples(
-            lambda topic: topic in ("scene_objects", "move_cube_status"))}
-    status = decode(m.TaskStatus, newest["move_cube_status"])
-    assert (status.state, status.figures) == ("DONE", summary["figures"])
-    place = decode(m.WorldObjects, newest["scene_objects"]).objects[0].pose.position
-    assert (place.x, place.y) == pytest.approx((0.52, 0.1), abs=0.005)
-    elsewhere.mkdir()
-    exported = run_command(f"zencell export {recording} --csv tables --topics move_cube_status", elsewhere)
-    assert exported.returncode == 0 and not exported.stderr, exported.stderr
-    rows = list(csv.DictReader((elsewhere / "tables" / "move_cube_status.csv").read_text().splitlines()))
-    assert (len(rows), rows[-1]["state"]) == (len(states), "DONE")
-    assert float(rows[-1]["figures.off_mm"]) == summary["figures"]["off_mm"]
-    reported = run_command(f"zencell report {recording} --cell cube.yaml -o {elsewhere / 'run.html'}", folder)
-    assert reported.returncode == 0 and "off_mm" in (elsewhere / "run.html").read_text(encoding="utf-8")
-
-
 @pytest.mark.slow
 def test_single_file_task_moves_a_cube_with_its_own_status_and_figures(folder: Path, tmp_path: Path) -> None:
     assert len(FILES["my_pkg/move_cube.py"].splitlines()) < 120
-    file, recording = tmp_path / "summary.json", tmp_path / "run.mcap"
+    file, recording, html = tmp_path / "summary.json", tmp_path / "run.mcap", tmp_path / "run.html"
     with no_processes():
         ran = ask(folder, *shlex.split(CUBE)[1:], "--summary", str(file), "--domain", str(free_domain()))
-    assert ran.returncode == 0, ran.stdout + ran.stderr
+    assert ran.returncode == 0 and "off_mm" in ran.stdout, ran.stdout + ran.stderr
+    summary = json.loads(file.read_text(encoding="utf-8"))
+    assert (summary["state"], summary["placed"], summary["targets"], summary["failures"]) == ("DONE", 1, 1, 0)
+    assert set(summary["figures"]) == {"off_mm"} and summary["figures"]["off_mm"] < 5
     line = next(line for line in COMMANDS if line.startswith("zencell simulate cube"))
     places = shlex.split(CUBE)[3:]  # of the same run
     simulated = ask(folder, *shlex.split(line)[1:], *places, "--trace", str(recording))
     assert simulated.returncode == 0 and "seed 1: DONE" in simulated.stdout, simulated.stdout + simulated.stderr
-    assert_cube_moved(file, ran.stdout, recording, folder, tmp_path / "elsewhere")
+    with Recording(recording) as recorded:
+        states = list(recorded.samples(lambda topic: topic == "move_cube_status"))
+        worlds = list(recorded.samples(lambda topic: topic == "scene_objects"))
+    assert {(sample.kind, json.loads(sample.schema)["title"]) for sample in states} == {("state", "MoveCubeStatus")}
+    status = decode(m.TaskStatus, states[-1].payload)
+    assert (status.state, status.figures) == ("DONE", summary["figures"])
+    place = decode(m.WorldObjects, worlds[-1].payload).objects[0].pose.position
+    assert (place.x, place.y) == pytest.approx((0.52, 0.1), abs=0.005)
+    exported = run_command(f"zencell export {recording} --csv tables --topics move_cube_status", tmp_path)
+    assert exported.returncode == 0 and not exported.stderr, "without the module of the task"
+    rows = list(csv.DictReader((tmp_path / "tables" / "move_cube_status.csv").read_text().splitlines()))
+    assert (len(rows), rows[-1]["state"]) == (len(states), "DONE")
+    assert float(rows[-1]["figures.off_mm"]) == summary["figures"]["off_mm"]
+    reported = ask(folder, "report", str(recording), "--cell", "cube.yaml", "-o", str(html))
+    assert reported.returncode == 0 and "off_mm" in html.read_text(encoding="utf-8")
 
 
 @pytest.mark.slow
