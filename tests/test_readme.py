@@ -71,11 +71,11 @@ def test_simulated_run_of_the_readme_ends_done(line: str, tmp_path: Path) -> Non
 def test_command_of_the_readme_works_with_a_running_cell(line: str, cell: Place) -> None:
     line, variables = line.replace("7489", str(7447 + cell.domain)), {"ZENCELL_DOMAIN": str(cell.domain)}
     assert not line.startswith("zenoh ") or line in cell.started[0].lines, "`zencell up` prints it"
-    if line.startswith("zenoh ") or line.endswith("status"):  # until Ctrl-C
-        process = subprocess.Popen(command(line), env=os.environ | variables, text=True, stdout=subprocess.PIPE)
-        output = process.stdout.readline()
-        process.send_signal(signal.SIGINT)
-        process.communicate(timeout=TIMEOUT)
+    if line.startswith("zenoh ") or ("topic echo" in line and "--count" not in line):  # until Ctrl-C
+        with subprocess.Popen(command(line), cwd=cell.folder, env=os.environ | variables, text=True,
+                              stdout=subprocess.PIPE) as process:
+            output = process.stdout.readline()
+            process.send_signal(signal.SIGINT)
     else:
         output = ask(cell.folder, *shlex.split(line)[1:], environment=variables).stdout
     wanted = {"hz": "Hz", "status": '"state"', "targets": '"poses"', "list": "panda/", "zenoh": "panda/",
