@@ -77,7 +77,9 @@ def test_command_of_the_readme_works_with_a_running_cell(line: str, cell: Place)
             output = process.stdout.readline()
             process.send_signal(signal.SIGINT)
     else:
-        output = ask(cell.folder, *shlex.split(line)[1:], environment=variables).stdout
+        ran = ask(cell.folder, *shlex.split(line)[1:], environment=variables)
+        assert ran.returncode == 0, ran.stderr
+        output = ran.stdout
     wanted = {"hz": "Hz", "status": '"state"', "targets": '"poses"', "list": "panda/", "zenoh": "panda/",
               "add": '"ids"', "pause": '"paused": true', " top ": "panda at speed", " tf ": "position",
               "param set": "400.0 -> 350.0", "param dump": "# Parameters of panda", "record": "",
