@@ -35,7 +35,8 @@ class Arm:
     registers: dict[str, list[float]] = field(default_factory=lambda: {
         f"{way}_{kind}_register": [0] * 48 for way in ("input", "output") for kind in ("int", "double")})
     stops: int = 0  # protective ones
-    commands: int = 0  # servoj commands
+    commands: int = 0  # steps with a servoj command
+    packets: int = 0  # from the client that sends commands
     fastest: float = 0.0  # highest speed of a joint [rad/s]
 
     def __post_init__(self) -> None:
@@ -94,16 +95,16 @@ class Arm:
         """Count time in which packets could arrive; a stalled machine is no silence."""
         self._silence += min(seconds, LONGEST_TURN)
 
-    def end_silence(self) -> None:
-        """Reset the watchdog."""
-        self._silence = 0.0
+    def receive(self) -> None:
+        """Count a packet of commands, and reset the watchdog."""
+        self._silence, self.packets = 0.0, self.packets + 1
 
     def start_program(self) -> None:
         """Run the uploaded program, if the arm can."""
         if self.mode == RUNNING and self.safety == NORMAL:
             self.program, self.freedrive, self._servoing, self._timeout = True, False, False, 0.0
             self.registers["output_int_register"][0] = 1
-            self.end_silence()
+            self._silence = 0.0
 
     def end_program(self) -> None:
         """Brake; the next motion needs a new upload."""

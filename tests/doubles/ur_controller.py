@@ -191,7 +191,7 @@ class Controller:
                     case "U":  # inputs
                         names = inputs[payload[0]]
                         if self._inputs.get(COMMAND) is writer:
-                            self.arm.end_silence()
+                            self.arm.receive()
                         if all(self._inputs.get(name) is writer for name in names):
                             self._set(names, payload[1:])
                     case other:
@@ -249,7 +249,8 @@ class Controller:
                     self._unplugged_until = time.monotonic() + float(seconds)
                 case ["reboot", seconds]:
                     self._rebooting = asyncio.create_task(self.reboot(float(seconds)))
-            state = {name: getattr(arm, name) for name in ("stops", "commands", "fastest", "payload", "freedrive")}
+            names = ("stops", "commands", "packets", "fastest", "payload", "freedrive")
+            state = {name: getattr(arm, name) for name in names}
             state |= {"q": arm.q.tolist(), "qd": arm.qd.tolist(), "mode": MODES[arm.mode]}
             writer.write(json.dumps(state).encode() + b"\n")
             await writer.drain()
