@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-import subprocess
+import os
 from pathlib import Path
 
 import pytest
 
-from tests.harness import command_line, environment
+from tests.harness import ask
 
 
 @pytest.fixture(scope="session")
 def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("secured") / "certificates"
-    created = subprocess.run(
-        command_line("secure", "init", str(folder)), env=environment(), umask=0, capture_output=True, text=True,
-        timeout=100, check=False,
-    )
+    parent = tmp_path_factory.mktemp("secured")
+    umask = os.umask(0)  # the modes of the files must not depend on it
+    try:
+        created = ask(parent, "secure", "init", "certificates")
+    finally:
+        os.umask(umask)
     assert created.returncode == 0, created.stderr
-    return folder
+    return parent / "certificates"

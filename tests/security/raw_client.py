@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 import threading
 from collections.abc import Callable
 from typing import Any
@@ -14,6 +15,13 @@ from common.transport.endpoint import client_config
 TIMEOUT = 30.0  # [s] only a failing test waits that long
 TIMEOUT_REPLY = b"Timeout"  # of Zenoh itself, when no queryable has replied
 REFUSAL_MS = 1500  # [ms] for which a connection is tried that must be refused
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port
 
 
 def direct(callback: Callable[[Any], None]) -> Any:
@@ -101,14 +109,21 @@ class Received:
         with self._changed:
             return {key for key, _ in self.samples}
 
-    def wait(self, condition: Callable[[list[tuple[str, bytes]]], bool]) -> None:
+    def wait_until(self, condition: Callable[[list[tuple[str, bytes]]], bool], seconds: float) -> bool:
+        """Return whether the samples satisfy a condition within `seconds`."""
         with self._changed:
-            assert self._changed.wait_for(lambda: condition(self.samples), TIMEOUT), self.samples[-5:]
+            return self._changed.wait_for(lambda: condition(self.samples), seconds)
 
-    def wait_briefly(self, seconds: float) -> bool:
-        """Return as soon as there is a sample, at the latest after `seconds`; return whether there is one."""
-        with self._changed:
-            return self._changed.wait_for(lambda: bool(self.samples), seconds)
+    def wait(self, condition: Callable[[list[tuple[str, bytes]]], bool]) -> None:
+        assert self.wait_until(condition, TIMEOUT), self.samples[-5:]
+
+    def repeat(self, publish: Callable[[], object]) -> None:
+        """Publish again until a sample arrives: the subscription takes effect some time after its declaration."""
+        for _ in range(200):
+            publish()
+            if self.wait_until(bool, 0.05):
+                return
+        raise AssertionError("no sample arrived")
 
     def wait_for(self, key: str, payload: bytes | None = None) -> None:
         self.wait(lambda samples: any(k == key and payload in (None, p) for k, p in samples))

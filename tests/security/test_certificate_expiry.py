@@ -17,8 +17,7 @@ from common.transport.router import Router, maintain
 from security.access import Rights, access_control
 from security.certificates import Authority
 from security.validation import certificate_in, require_valid
-from tests.security.raw_client import REFUSAL_MS, RawClient
-from tests.security.test_routers import free_port
+from tests.security.raw_client import REFUSAL_MS, RawClient, free_port
 from tools.doctor.network import certificates as findings
 
 NAMES = ("router", "operator", "panda.camera")
@@ -39,8 +38,9 @@ def folder(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def endpoint(folder: Path) -> Iterator[str]:
+def endpoint(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     """A router that adopts new certificates, as in its process."""
+    monkeypatch.setattr("common.transport.router._CHECK_SECONDS", 0.1)
     endpoint, stop = f"tls/127.0.0.1:{free_port()}", threading.Event()
     with Router([endpoint], folder) as router:
         maintaining = threading.Thread(target=maintain, args=[router, stop])
@@ -59,6 +59,10 @@ def until(what: str, reached: Callable[[], object]) -> None:
 
 def now_in(days: float) -> datetime.datetime:
     return datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=days)
+
+
+def renew(folder: Path, *options: str) -> None:
+    assert app.execute(["secure", "renew", str(folder), *options]) == 0
 
 
 # --- warnings ----------------------------------------------------------------------------------------------------
@@ -109,7 +113,7 @@ def test_each_expiry_is_logged_once_and_again_when_urgent(folder: Path) -> None:
 
 def test_renewal_includes_an_authority_that_would_expire_earlier(folder: Path) -> None:
     before = {name: (folder / f"{name}.pem").read_bytes() for name in (*NAMES, "ca")}
-    assert app.execute(["secure", "renew", str(folder)]) == 0
+    renew(folder)
     assert all((folder / f"{name}.pem").read_bytes() != text for name, text in before.items())
     require_valid(folder, NAMES, RENEW, now_in(363))
     (folder / "camera.pem").write_bytes(before["panda.camera"])
@@ -119,10 +123,9 @@ def test_renewal_includes_an_authority_that_would_expire_earlier(folder: Path) -
 def test_connected_client_presents_its_new_certificate_without_a_restart(folder: Path, endpoint: str) -> None:
     with RawClient(endpoint, credentials_of("panda.camera", folder)) as camera:
         assert camera.connected
-        assert app.execute(["secure", "renew", str(folder), "--authority"]) == 0
-        with_both = (folder / "ca.pem").read_bytes()
-        assert with_both.count(b"BEGIN") == 2
-        assert app.execute(["secure", "renew", str(folder), "--forget"]) == 0
+        renew(folder, "--authority")
+        assert (folder / "ca.pem").read_bytes().count(b"BEGIN") == 2
+        renew(folder, "--forget")
         # The router adopts the new files and closes all links: a client that reconnects uses the new ones, too.
         until("a client of the new authority cannot connect",
               lambda: can_connect(endpoint, credentials_of("operator", folder)))
@@ -146,12 +149,12 @@ def test_authority_is_replaced_with_overlap_and_then_no_longer_trusted(
         (elsewhere / name).write_bytes((folder / name).read_bytes())
     (elsewhere / "operator.key").chmod(0o600)
     old = credentials_of("operator", elsewhere)
-    assert app.execute(["secure", "renew", str(folder), "--authority"]) == 0
+    renew(folder, "--authority")
     (elsewhere / "ca.pem").write_bytes((folder / "ca.pem").read_bytes())
     new = credentials_of("operator", folder)
     until("the new certificate cannot connect", lambda: can_connect(endpoint, new))
     assert can_connect(endpoint, old), "both authorities are trusted"
-    assert app.execute(["secure", "renew", str(folder), "--forget"]) == 0
+    renew(folder, "--forget")
     (elsewhere / "ca.pem").write_bytes((folder / "ca.pem").read_bytes())
     until("the old certificate can still connect", lambda: not can_connect(endpoint, old))
     until("the new certificate cannot connect", lambda: can_connect(endpoint, new))

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import datetime
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -13,6 +13,7 @@ from security.certificates import Authority, write_secret
 from security.validation import require_valid
 
 RENEW = "zencell secure init DIR --renew"
+NAME = "panda.camera"
 
 
 @pytest.fixture
@@ -26,8 +27,28 @@ def open_umask() -> Iterator[None]:
 def folder(tmp_path: Path) -> Path:
     authority = Authority.new(10)
     authority.write(tmp_path / "ca.pem", tmp_path / "ca.key")
-    authority.issue("panda.camera", [], 10, tmp_path / "panda.camera.pem", tmp_path / "panda.camera.key")
+    issue(authority, NAME, tmp_path)
     return tmp_path
+
+
+def issue(authority: Authority, name: str, folder: Path, days: float = 10, file: str = "") -> None:
+    authority.issue(name, [], days, folder / f"{file or name}.pem", folder / f"{file or name}.key")
+
+
+def own_authority(folder: Path) -> Authority:
+    return Authority.load(folder / "ca.pem", folder / "ca.key")
+
+
+def swap(kind: str) -> Callable[[Path], None]:
+    def swapped(folder: Path) -> None:
+        issue(own_authority(folder), "panda.other", folder, file="other")
+        (folder / f"{NAME}.{kind}").write_bytes((folder / f"other.{kind}").read_bytes())
+
+    return swapped
+
+
+def damage(name: str) -> Callable[[Path], object]:
+    return lambda folder: (folder / name).write_text("not a certificate")
 
 
 @pytest.mark.usefixtures("open_umask")
@@ -39,73 +60,44 @@ def test_key_is_readable_by_its_owner_only_whatever_umask_and_previous_mode(tmp_
         place.chmod(0o666)
 
 
-def test_issued_certificate_is_valid(folder: Path) -> None:
-    require_valid(folder, ["panda.camera"], RENEW)
+@pytest.mark.parametrize(("change", "reason"), [
+    (lambda folder: (folder / f"{NAME}.pem").unlink(), r"has no panda\.camera\.pem"),
+    (lambda folder: issue(Authority.new(10), NAME, folder), r"panda\.camera\.pem.*is not of ca\.pem"),
+    (lambda folder: issue(own_authority(folder), "panda.other", folder, file=NAME), "is not that of"),
+    (swap("key"), "is not that of"),
+    (swap("pem"), "is not that of"),
+    (damage("ca.pem"), "ca.pem' is not a certificate"),
+    (damage(f"{NAME}.pem"), "camera.pem' is not a certificate"),
+    (damage(f"{NAME}.key"), "is not of ca.pem"),
+    *((lambda folder, mode=mode: (folder / f"{NAME}.key").chmod(mode), "can be read by others: chmod 600 it")
+      for mode in (0o640, 0o604, 0o660)),
+])
+def test_unusable_certificate_or_key_is_refused_in_one_line(
+    folder: Path, change: Callable[[Path], object], reason: str
+) -> None:
+    require_valid(folder, [NAME], RENEW)
+    change(folder)
+    with pytest.raises(ConfigError, match=reason) as refused:
+        require_valid(folder, [NAME], RENEW)
+    assert "\n" not in str(refused.value)
 
 
-def now_in(days: float) -> datetime.datetime:
-    return datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=days)
-
-
-@pytest.mark.parametrize(("days", "reason"), [(11, "expired on"), (-1, "check the clock here")])
-def test_certificate_outside_its_validity_is_named(folder: Path, days: float, reason: str) -> None:
+@pytest.mark.parametrize(("own_days", "at", "reason"), [
+    (10, 11, r"ca\.pem.*expired on.*--renew"), (10, -1, "check the clock here"),
+    (2, 3, r"panda\.camera\.pem.*expired on.*--renew"),
+])
+def test_certificate_outside_its_validity_is_named_with_the_remedy(
+    folder: Path, own_days: float, at: float, reason: str
+) -> None:
+    issue(own_authority(folder), NAME, folder, own_days)
+    now = datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=at)
     with pytest.raises(ConfigError, match=reason):
-        require_valid(folder, ["panda.camera"], RENEW, now_in(days))
-
-
-def test_certificate_that_expired_before_its_authority_is_named_with_the_remedy(folder: Path) -> None:
-    authority = Authority.load(folder / "ca.pem", folder / "ca.key")
-    authority.issue("panda.camera", [], 2, folder / "panda.camera.pem", folder / "panda.camera.key")
-    with pytest.raises(ConfigError, match=r"panda\.camera\.pem.*expired on.*--renew"):
-        require_valid(folder, ["panda.camera"], RENEW, now_in(3))
-
-
-def test_process_without_a_certificate_is_named(folder: Path) -> None:
-    with pytest.raises(ConfigError, match=r"has no panda\.gripper\.pem"):
-        require_valid(folder, ["panda.camera", "panda.gripper"], RENEW)
-
-
-def test_certificate_of_another_authority_is_named(folder: Path) -> None:
-    other = Authority.new(10)
-    other.issue("panda.camera", [], 10, folder / "panda.camera.pem", folder / "panda.camera.key")
-    with pytest.raises(ConfigError, match=r"panda\.camera\.pem.*is not of ca\.pem"):
-        require_valid(folder, ["panda.camera"], RENEW)
-
-
-@pytest.mark.parametrize("exchanged", ["panda.camera.key", "panda.camera.pem"])
-def test_key_of_another_certificate_is_refused(folder: Path, exchanged: str) -> None:
-    authority = Authority.load(folder / "ca.pem", folder / "ca.key")
-    authority.issue("panda.other", [], 10, folder / "other.pem", folder / "other.key")
-    (folder / exchanged).write_bytes((folder / f"other.{exchanged[-3:]}").read_bytes())
-    with pytest.raises(ConfigError, match="is not that of"):
-        require_valid(folder, ["panda.camera"], RENEW)
-
-
-def test_certificate_for_another_name_is_refused(folder: Path) -> None:
-    for kind in ("pem", "key"):
-        (folder / f"panda.executor.{kind}").write_bytes((folder / f"panda.camera.{kind}").read_bytes())
-    (folder / "panda.executor.key").chmod(0o600)
-    with pytest.raises(ConfigError, match=r"panda\.executor\.pem.*is not that of"):
-        require_valid(folder, ["panda.executor"], RENEW)
-
-
-@pytest.mark.parametrize("damaged", ["ca.pem", "panda.camera.pem", "panda.camera.key"])
-def test_damaged_file_is_reported_in_one_line(folder: Path, damaged: str) -> None:
-    (folder / damaged).write_text("not a certificate")
-    with pytest.raises(ConfigError) as caught:
-        require_valid(folder, ["panda.camera"], RENEW)
-    assert "\n" not in str(caught.value)
-
-
-def test_key_that_others_can_read_is_refused(folder: Path) -> None:
-    (folder / "panda.camera.key").chmod(0o640)
-    with pytest.raises(ConfigError, match="chmod 600"):
-        credentials_of("panda.camera", folder)
+        require_valid(folder, [NAME], RENEW, now)
 
 
 def test_repr_of_credentials_does_not_show_the_key(folder: Path) -> None:
-    shown = repr(credentials_of("panda.camera", folder))
-    assert (folder / "panda.camera.key").read_text().splitlines()[1] not in shown
+    shown = repr(credentials_of(NAME, folder))
+    assert (folder / f"{NAME}.key").read_text().splitlines()[1] not in shown
 
 
 def test_recorder_presents_the_observers_certificate_if_it_exists(folder: Path) -> None:

@@ -19,8 +19,7 @@ from common.transport.router import Router
 from common.transport.zenoh_session import ZenohSession, open_zenoh
 from security.certificates import Authority
 from tests.common.transport.conftest import until
-from tests.security.raw_client import REFUSAL_MS, RawClient
-from tests.security.test_routers import free_port
+from tests.security.raw_client import REFUSAL_MS, RawClient, free_port
 
 SILENT = 150  # Zenoh without the gate accepts no client for 100 ms after each
 WITHIN = 3.0  # [s]
@@ -44,12 +43,13 @@ class SecuredRouter:
         session = await open_zenoh(self.endpoint, camera, self.near if near else ())
         return session, time.monotonic() - began
 
+    def operator(self) -> RawClient:
+        return RawClient(self.endpoint, credentials_of("operator", self.certificates))
+
 
 @pytest.fixture
 def router(certificates: Path, tmp_path: Path):
-    folder = tmp_path / "certificates"
-    shutil.copytree(certificates, folder)
-    router = SecuredRouter(folder)
+    router = SecuredRouter(Path(shutil.copytree(certificates, tmp_path / "certificates")))
     with router.process:
         yield router
 
@@ -58,55 +58,51 @@ def connections(ports: list[str]) -> list[socket.socket]:
     return [socket.create_connection(("127.0.0.1", int(each.rpartition(":")[2]))) for each in ports]
 
 
+def listens(endpoint: str) -> bool:
+    try:
+        connections([endpoint])[0].close()
+    except ConnectionRefusedError:
+        return False
+    return True
+
+
 async def test_local_client_bypasses_the_gate_and_has_the_rights_of_its_certificate(router: SecuredRouter) -> None:
     session, _ = await router.connect(near=True)
     assert session.connected and not router.uses_gate and len(session._session.info.links()) == len(LINKS)
     far, _ = await router.connect(near=False)
     assert far.connected and router.uses_gate
-    with RawClient(router.endpoint, credentials_of("operator", router.certificates)) as operator:
+    keys = "panda/joint_states", "panda/camera/camera_info"
+    publishers = [session.publisher(key, "", reliable=True) for key in keys]
+    with router.operator() as operator:
         received = operator.subscribe("panda/**")
-        for _ in range(100):
-            for key in ("panda/joint_states", "panda/camera/camera_info"):
-                session.publisher(key, "", reliable=True).put(b"by the camera", b"")
-            if received.samples:
-                break
-            received.wait_briefly(0.1)
+        received.repeat(lambda: [each.put(b"by the camera", b"") for each in publishers])
         assert received.keys == {"panda/camera/camera_info"}
     for each in (session, far):
         each.close()
 
 
-@pytest.mark.parametrize("expression", ["panda/camera/camera_info", "panda/camera/*", "panda/**", "*/camera/**"])
-async def test_late_subscriber_receives_from_a_local_writer_with_any_expression(
-    router: SecuredRouter, expression: str
-) -> None:
+async def test_late_subscriber_receives_from_a_local_writer_with_any_expression(router: SecuredRouter) -> None:
     writer, _ = await router.connect(near=True)
-    answered = asyncio.get_running_loop().create_future()
     publisher = writer.publisher("panda/camera/camera_info", "", reliable=True)
-    # The reply comes after all earlier declarations: the router knows by then that there is no subscriber.
-    writer.get_tokens("panda/alive/*", lambda _: None, lambda: answered.get_loop().call_soon_threadsafe(
-        answered.set_result, None), timeout=WITHIN)
-    await answered
-    assert not publisher.matched
-    with RawClient(router.endpoint, credentials_of("operator", router.certificates)) as operator:
-        received = operator.subscribe(expression)
-        for _ in range(100):
-            publisher.put(b"by the camera", b"")
-            if received.samples:
-                break
-            received.wait_briefly(0.1)
-        assert received.keys == {"panda/camera/camera_info"}
+    for expression in ("panda/camera/camera_info", "panda/camera/*", "panda/**", "*/camera/**"):
+        answered = asyncio.get_running_loop().create_future()
+        # The reply comes after all earlier declarations: the router knows by then that there is no subscriber.
+        writer.get_tokens("panda/alive/*", lambda _: None, lambda reply=answered: reply.get_loop().call_soon_threadsafe(
+            reply.set_result, None), timeout=WITHIN)
+        await answered
+        await until(lambda: not publisher.matched)
+        with router.operator() as operator:
+            received = operator.subscribe(expression)
+            received.repeat(lambda: publisher.put(b"by the camera", b""))
+            assert received.keys == {"panda/camera/camera_info"}
     writer.close()
 
 
 @pytest.mark.parametrize("flooded", [pytest.param("near", marks=pytest.mark.slow), "gate"])
-async def test_silent_connections_at_one_listener_keep_no_client_out_at_the_other(
-    router: SecuredRouter, flooded: str
-) -> None:
-    listening = [each for each in router.near if _listens(each)]
+async def test_silent_connections_at_one_listener_block_no_client_at_any(router: SecuredRouter, flooded: str) -> None:
+    listening = [each for each in router.near if listens(each)]
     assert len(listening) == 1
-    at = listening if flooded == "near" else [router.endpoint]
-    silent = connections(at * SILENT)
+    silent = connections((listening if flooded == "near" else [router.endpoint]) * SILENT)
     for state in ("while the silent ones are open", "after the silent ones have closed"):
         for near in (True, False):
             session, took = await router.connect(near=near)
@@ -116,25 +112,15 @@ async def test_silent_connections_at_one_listener_keep_no_client_out_at_the_othe
             each.close()
 
 
-def _listens(endpoint: str) -> bool:
-    try:
-        connections([endpoint])[0].close()
-    except ConnectionRefusedError:
-        return False
-    return True
-
-
 @pytest.mark.slow
 async def test_local_listener_refuses_clients_without_a_certificate_of_the_authority(
     router: SecuredRouter, tmp_path: Path
 ) -> None:
-    authority = Authority.new(10)
     foreign = tmp_path / "foreign"
     foreign.mkdir()
-    authority.write(foreign / "ca.pem", foreign / "ca.key")
-    authority.issue("operator", [], 10, foreign / "operator.pem", foreign / "operator.key")
+    Authority.new(10).issue("operator", [], 10, foreign / "operator.pem", foreign / "operator.key")
     shutil.copy(router.certificates / "ca.pem", foreign / "ca.pem")
-    (near,) = [each for each in router.near if _listens(each)]
+    (near,) = [each for each in router.near if listens(each)]
     for credentials in (None, credentials_of("operator", foreign)):
         with pytest.raises(Exception, match="Unable to connect"):
             RawClient(near, credentials, connect_ms=REFUSAL_MS)
@@ -144,10 +130,9 @@ async def test_local_client_reconnects_locally_after_a_renewal(router: SecuredRo
     session, _ = await router.connect(near=True)
     authority = Authority.load(router.certificates / "ca.pem", router.certificates / "ca.key")
     authority.issue("router", ["127.0.0.1"], 30, router.certificates / "router.pem", router.certificates / "router.key")
-    renewed = [router.process.renew() for _ in range(2)]
-    assert renewed == [False, True]
+    assert [router.process.renew() for _ in range(2)] == [False, True]
     before = router.near[1]
-    await until(lambda: not _listens(before) and _listens(router.near[0]))
+    await until(lambda: not listens(before) and listens(router.near[0]))
     await until(lambda: session.connected and not router.uses_gate)
     session.close()
 
@@ -166,8 +151,9 @@ def test_router_starts_without_its_local_listener_if_the_port_is_taken(
 
 def test_supervisor_passes_the_local_listeners_of_its_router_to_services(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ZENCELL_SECURE", "somewhere")
-    launch = Launch("panda", domain=3, near=("tls/127.0.0.1:1", "tls/127.0.0.1:2"))
+    near = ["tls/127.0.0.1:1", "tls/127.0.0.1:2"]
+    launch = Launch("panda", domain=3, near=tuple(near))
     environment = launch.environment({})
-    assert nearby_endpoints("tls/127.0.0.1:7450", environment) == ["tls/127.0.0.1:1", "tls/127.0.0.1:2"]
+    assert nearby_endpoints("tls/127.0.0.1:7450", environment) == near
     assert nearby_endpoints("tls/192.168.1.10:7450", environment) == [] == nearby_endpoints("tls/127.0.0.1:7450", {})
-    assert launch.router_command()[-5:] == ["--near", "tls/127.0.0.1:1", "--near", "tls/127.0.0.1:2", "--gate"]
+    assert launch.router_command()[-5:] == ["--near", near[0], "--near", near[1], "--gate"]

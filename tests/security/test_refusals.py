@@ -14,14 +14,13 @@ from common.config import load_cell
 from common.errors import ConfigError
 from common.supervision.launch import Launch
 from common.supervision.multi_host import HostOptions
-from common.transport.credentials import ACCESS, ROUTER_NAME
+from common.transport.credentials import ACCESS
 from security.certificates import Authority
 from security.preflight import require_secured
 from tests.harness import free_domain
 
 CELL = load_cell("panda")
 
-Shown = pytest.CaptureFixture[str]
 Refusal = Callable[..., str]
 
 
@@ -32,7 +31,7 @@ def folder(certificates: Path, tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def refusal(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: Shown) -> Refusal:
+def refusal(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Refusal:
     """Runs a command that must be refused in one line; returns that line without the program's name."""
     for variable in ("ZENCELL_SECURE", "ZENCELL_LISTEN", "ZENCELL_LINK", "ZENCELL_CONNECT"):
         monkeypatch.setenv(variable, "")  # restored afterwards, whatever the command sets
@@ -43,90 +42,45 @@ def refusal(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: Shown) -> Ref
         options = [] if secure is None else ["--secure", secure]
         ended = app.execute([*arguments, *options, "--domain", str(free_domain())])
         shown = capsys.readouterr()
-        assert shown.out == ""
+        assert (ended, shown.out) == (code, "")
         (line,) = shown.err.splitlines() or ["nothing"]
-        assert ended == code
         assert line.startswith("zencell: ")
         return line.removeprefix("zencell: ")
 
     return run
 
 
-@pytest.mark.parametrize("verb", ["run", "up"])
-@pytest.mark.parametrize("folder_name", ["nowhere", "certs/ca.pem", ""])
 def test_missing_folder_is_named_with_the_command_that_creates_one(
-    refusal: Refusal, verb: str, folder_name: str
-) -> None:
-    line = refusal(verb, "panda", secure=folder_name)
-    assert line == f"--secure: {folder_name!r} is not a folder; make one with `zencell secure init DIR`"
-
-
-def test_missing_folder_in_the_environment_variable_is_named(
     refusal: Refusal, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    for verb, name in (("run", "nowhere"), ("up", "certs/ca.pem"), ("up", "")):
+        line = refusal(verb, "panda", secure=name)
+        assert line == f"--secure: {name!r} is not a folder; make one with `zencell secure init DIR`"
     monkeypatch.setenv("ZENCELL_SECURE", "nowhere")
     assert "'nowhere' is not a folder" in refusal("up", "panda", secure=None)
 
 
-@pytest.mark.parametrize(
-    "missing",
-    ["ca.pem", "router.pem", "router.key", "panda.supervisor.pem", "panda.vision_detector.pem", "panda.viewer.key",
-     ACCESS],
-)
-def test_missing_file_is_named(refusal: Refusal, folder: Path, missing: str) -> None:
+@pytest.mark.parametrize("missing", ["router.key", *(f"panda.{name}" for name in (
+    "supervisor.pem", "viewer.key", "recorder.key")), ACCESS])
+def test_each_process_that_is_started_needs_its_files(refusal: Refusal, folder: Path, missing: str) -> None:
     (folder / missing).unlink()
-    line = refusal("run", "panda")
+    line = refusal("run", "panda", "--only", "viewer", "--record", "all.mcap")
     assert line == f"--secure: '{folder}' has no {missing}: make it with `zencell secure init`"
 
 
-def test_recorder_that_is_started_needs_its_own_certificate(refusal: Refusal, folder: Path) -> None:
-    (folder / "panda.recorder.key").unlink()
-    line = refusal("run", "panda", "--only", "robot_state_publisher", "--record", "all.mcap")
-    assert line == f"--secure: '{folder}' has no panda.recorder.key: make it with `zencell secure init`"
-
-
-@pytest.mark.parametrize(("name", "remedy"), [(ROUTER_NAME, "--renew"), ("panda.smart_pick_place", "--renew"),
-                                              ("ca", "--renew")])
-def test_expired_certificate_is_named_with_its_date(
-    refusal: Refusal, folder: Path, name: str, remedy: str
-) -> None:
-    own = Authority.new(-1) if name == "ca" else Authority.load(folder / "ca.pem", folder / "ca.key")
-    place = folder / f"{name}.pem", folder / f"{name}.key"
-    if name == "ca":
-        own.write(*place)
-    else:
-        own.issue(name, [], -1, *place)
+def test_expired_certificate_is_named_with_its_date_and_the_remedy(refusal: Refusal, folder: Path) -> None:
+    place = folder / "panda.smart_pick_place.pem"
+    authority = Authority.load(folder / "ca.pem", folder / "ca.key")
+    authority.issue("panda.smart_pick_place", [], -1, place, place.with_suffix(".key"))
     line = refusal("up", "panda")
-    assert line.startswith(f"--secure: '{place[0]}' expired on 20")
-    assert remedy in line
+    assert line.startswith(f"--secure: '{place}' expired on 20") and "--renew" in line
 
 
-def test_certificate_of_another_authority_is_named(refusal: Refusal, folder: Path) -> None:
-    name = "panda.motion_planner"
-    Authority.new(10).issue(name, [], 10, folder / f"{name}.pem", folder / f"{name}.key")
-    assert f"{name}.pem' is not of ca.pem: `zencell secure init" in refusal("up", "panda")
-
-
-@pytest.mark.parametrize("mode", [0o640, 0o604, 0o660])
-@pytest.mark.parametrize("name", [ROUTER_NAME, "panda.trajectory_executor"])
-def test_key_that_others_can_read_is_named_with_the_remedy(
-    refusal: Refusal, folder: Path, name: str, mode: int
-) -> None:
-    key = folder / f"{name}.key"
-    key.chmod(mode)
-    assert refusal("run", "panda") == f"--secure: '{key}' can be read by others: chmod 600 it"
-
-
-@pytest.mark.parametrize("option", ["--listen", "--link", "--connect"])
-def test_unencrypted_endpoint_with_certificates_is_named(refusal: Refusal, option: str) -> None:
-    line = refusal("up", "panda", option, "tcp/192.168.1.10:7489")
-    assert line.startswith(f"{option}: 'tcp/192.168.1.10:7489' is an open endpoint: ")
-    assert line.endswith("it must be tls/HOST:PORT")
-
-
-def test_unencrypted_endpoint_of_the_environment_is_named_with_its_variable(
-    refusal: Refusal, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_unencrypted_endpoint_with_certificates_is_named(refusal: Refusal, monkeypatch: pytest.MonkeyPatch) -> None:
+    for option in ("--listen", "--link", "--connect"):
+        line = refusal("up", "panda", option, "tcp/192.168.1.10:7489")
+        assert line.startswith(f"{option}: 'tcp/192.168.1.10:7489' is an open endpoint: ")
+        assert line.endswith("it must be tls/HOST:PORT")
     monkeypatch.setenv("ZENCELL_LINK", "tls/192.168.1.10:7489, tcp/192.168.1.11:7489")
     assert refusal("up", "panda").startswith("ZENCELL_LINK: 'tcp/192.168.1.11:7489' is an open endpoint")
 
@@ -157,19 +111,9 @@ def test_host_needs_only_the_files_of_what_it_starts(folder: Path, monkeypatch: 
         require_secured(Launch("panda"), CELL)
 
 
-@pytest.mark.parametrize(
-    ("override", "reason"),
-    [
-        ("robot.gripper=null", "robot.gripper: is missing: scene_manager needs a robot with one"),
-        ("robot.urdf=package://example-robot-data/robots/unknown/unknown.urdf", "unknown.urdf' is missing"),
-        ("services.scene_manager.nothing=3", "services.scene_manager.nothing: 3 is not a parameter"),
-    ],
-)
-def test_override_that_a_service_rejects_is_reported_in_its_words(
-    refusal: Refusal, override: str, reason: str
-) -> None:
-    line = refusal("run", "panda", "--only", "scene_manager", "--set", override)
-    assert reason in line
+def test_override_that_a_service_rejects_is_reported_in_its_words(refusal: Refusal) -> None:
+    line = refusal("run", "panda", "--only", "scene_manager", "--set", "robot.gripper=null")
+    assert "robot.gripper: is missing: scene_manager needs a robot with one" in line
     assert "Error" not in line
 
 
@@ -177,15 +121,12 @@ def test_service_that_crashes_before_it_declares_anything_is_named(refusal: Refu
     package = folder.parent / "extra"
     package.mkdir()
     (package / "crashes.py").write_text(
-        "from common.config import Parameters as Config\nasync def run(bus, config):\n    raise KeyError('a bug')\n"
-    )
+        "from common.config import Parameters as Config\nasync def run(bus, config):\n    raise KeyError('a bug')\n")
     (folder.parent / "small.yaml").write_text(
         "cell: panda\nrobot: panda\nworld: balls\npipeline: cartesian_ompl\ntask: crashes\n"
-        "services: {extra.crashes: {}}\n"
-    )
+        "services: {extra.crashes: {}}\n")
     name = "panda.crashes"
     Authority.load(folder / "ca.pem", folder / "ca.key").issue(
-        name, [], 10, folder / f"{name}.pem", folder / f"{name}.key"
-    )
+        name, [], 10, folder / f"{name}.pem", folder / f"{name}.key")
     line = refusal("run", "small.yaml", code=1)
     assert line == "services.crashes: failed before it declared its topics: KeyError('a bug')"

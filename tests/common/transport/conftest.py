@@ -9,17 +9,35 @@ from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AsyncExitStack
 from pathlib import Path
+from typing import TypeVar
 
 import pytest
 
 from common.clock import Clock
-from common.transport.bus import Bus
+from common.messages import Message
+from common.transport.bus import Bus, Reader
 from common.transport.endpoint import endpoint_of
 from common.transport.local import LocalNetwork
 from common.transport.zenoh_session import connect
 from tests.harness import ROOT, environment, free_domain, wait_router
 
+M = TypeVar("M", bound=Message)
 TIMEOUT = 20.0  # only a failing test waits that long
+
+
+@pytest.fixture(autouse=True)
+def _frequent_repetition(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("common.transport.bus.REPEAT_SECONDS", 0.1)
+    monkeypatch.setattr("common.supervision.plain_keys.MATCH_PERIOD", 0.1)
+
+
+async def next_of(reader: Reader[M]) -> M:
+    return await asyncio.wait_for(reader.next(), TIMEOUT)
+
+
+def put_raw(bus: Bus, key: str, payload: bytes, attachment: bytes = b"") -> None:
+    """Publish a payload of a plain Zenoh client under a key of the cell."""
+    bus._session.publisher(f"{bus.cell}/{key}", "", reliable=True).put(payload, attachment)
 
 
 async def until(condition: Callable[[], bool]) -> None:
@@ -38,10 +56,8 @@ class Processes:
 
     def start(self, module: str, *arguments: str) -> subprocess.Popen[bytes]:
         with self.log_of(len(self._started)).open("wb") as log:
-            process = subprocess.Popen(
-                [sys.executable, "-m", module, *arguments], cwd=ROOT, stdin=subprocess.PIPE, stderr=log,
-                env=environment(),
-            )
+            process = subprocess.Popen([sys.executable, "-m", module, *arguments], cwd=ROOT, stdin=subprocess.PIPE,
+                                       stderr=log, env=environment())
         self._started.append(process)
         return process
 
@@ -51,7 +67,7 @@ class Processes:
     def output(self, process: subprocess.Popen[bytes]) -> str:
         return self.log_of(self._started.index(process)).read_text()
 
-    async def said(self, process: subprocess.Popen[bytes], text: str) -> None:
+    async def printed(self, process: subprocess.Popen[bytes], text: str) -> None:
         await until(lambda: text in self.output(process))
 
     def end(self) -> None:

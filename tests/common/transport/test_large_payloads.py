@@ -11,19 +11,15 @@ import msgpack
 import pytest
 
 from common import messages as m
-from common.application import all_topics
 from common.errors import DecodeError
 from common.messages.basics import SMALL_BYTES, Message
 from common.messages.robot import MAX_POINTS
 from common.topics import MOTION_EXECUTE
 from common.transport.codec import decode, encode
 from common.transport.local import LocalNetwork
+from tests.mutations import models
 
 JOINTS = [f"panda_joint{i}" for i in range(1, 8)]
-MESSAGES = sorted(
-    {model for topic in all_topics().values() for model in (topic.message, getattr(topic, "answer", topic.message))},
-    key=lambda model: model.__name__,
-)
 VALUES: list[Any] = [{}, [], 1, 2**60, "ab", b"", [0], {"a": 0}]
 
 
@@ -46,8 +42,8 @@ def seconds_to_decode(model: type[Message], payload: bytes) -> float:
     return min(times)
 
 
-@pytest.mark.parametrize("model", [model for model in MESSAGES if model.max_bytes <= 4 * SMALL_BYTES])
-@pytest.mark.slow
+@pytest.mark.campaign
+@pytest.mark.parametrize("model", [model for model in models() if model.max_bytes <= 4 * SMALL_BYTES])
 def test_small_payloads_are_refused_fast(model: type[Message]) -> None:
     worst = 0.0
     for field in model.model_fields:
@@ -72,13 +68,11 @@ def test_costly_payloads_are_refused_within_milliseconds(model: type[Message], p
 
 
 def test_longest_trajectory_fits_and_decodes_the_same_in_pieces() -> None:
-    request = execute(MAX_POINTS)
-    payload = encode(request)
+    payload = encode(execute(MAX_POINTS))
     assert len(payload) <= m.ExecuteRequest.max_bytes
     assert decode(m.ExecuteRequest, payload, in_pieces=True) == decode(m.ExecuteRequest, payload)
 
 
-@pytest.mark.parametrize("in_pieces", [False, True])
 @pytest.mark.parametrize(("payload", "reason"), [
     (encode(execute(200)) + b"\x00", "1 bytes after the end"),
     (encode(execute(200))[:-1], "not msgpack"),
@@ -88,34 +82,33 @@ def test_longest_trajectory_fits_and_decodes_the_same_in_pieces() -> None:
     (msgpack.packb({"id": msgpack.ExtType(5, b"0" * SMALL_BYTES)}), "exceeds max_ext_len"),
     (msgpack.packb({"id": b"a" * SMALL_BYTES})[:-9] + b"\xc1" * 9, r"id: must be a valid string"),
 ], ids=["more", "less", "key", "lists", "list", "extension", "bytes"])
-def test_large_invalid_payloads_are_refused_the_same_in_pieces(payload: bytes, reason: str, in_pieces: bool) -> None:
-    with pytest.raises(DecodeError, match=reason):
-        decode(m.ExecuteRequest, payload, in_pieces=in_pieces)
+def test_large_invalid_payloads_are_refused_the_same_in_pieces(payload: bytes, reason: str) -> None:
+    for in_pieces in (False, True):
+        with pytest.raises(DecodeError, match=reason):
+            decode(m.ExecuteRequest, payload, in_pieces=in_pieces)
 
 
 async def test_large_requests_are_decoded_outside_the_loop_and_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
     in_thread: list[bool] = []
+    received: list[str] = []
 
     def recording_decode(model: Any, payload: bytes, *rest: Any, **more: Any) -> Message:
         if model is m.ExecuteRequest:
             in_thread.append(threading.current_thread() is not threading.main_thread())
         return decode(model, payload, *rest, **more)
 
-    monkeypatch.setattr("common.transport.codec.decode", recording_decode)
-    network = LocalNetwork()
-    server, client = network.bus("server"), network.bus("client")
-    received: list[str] = []
-
     async def handle(request: m.ExecuteRequest) -> m.MotionStatus:
         received.append(request.id)
         return m.MotionStatus(id=request.id)
 
+    monkeypatch.setattr("common.transport.codec.decode", recording_decode)
+    network = LocalNetwork()
+    server, client = network.bus("server"), network.bus("client")
     server.serve(MOTION_EXECUTE, handle)
     await server.ready()
     calls = client.client(MOTION_EXECUTE)
     sizes = {"large": 4000, "small": 2, "middle": 200, "last": 1}
-    asked = [asyncio.create_task(calls.call(execute(points, name), timeout=30.0)) for name, points in sizes.items()]
-    answers = await asyncio.gather(*asked)
+    answers = await asyncio.gather(*(calls.call(execute(points, name), timeout=30) for name, points in sizes.items()))
     assert in_thread == [True, False, True, False]
     assert received == [answer.id for answer in answers] == list(sizes)
     await client.close()

@@ -14,8 +14,8 @@ import zenoh
 from common.transport.endpoint import LINKS, client_config, endpoint_of
 from common.transport.session import RawSample
 from common.transport.zenoh_session import ZenohSession, close_within, open_zenoh
+from tests.common.transport.conftest import TIMEOUT, until
 
-TIMEOUT = 20.0  # only a failing test waits that long
 IMAGE = bytes(4_000_000)
 IMAGES = 3  # more than all buffers between writer and reader hold
 MANY = 6  # images of each of three cameras
@@ -68,7 +68,7 @@ async def plain_camera(endpoint: str) -> ZenohSession:
     return PlainCamera(await asyncio.to_thread(zenoh.open, client_config(endpoint, connect_ms=10_000)))
 
 
-async def write_all(camera: ZenohSession, writer: ZenohSession, cell: str, reader: SlowReader, until) -> None:
+async def write_all(camera: ZenohSession, writer: ZenohSession, cell: str, reader: SlowReader) -> None:
     """Publish images until the reader blocks, and then the small messages."""
     images = camera.publisher(f"{cell}/image", "", reliable=False)
     small = {name: writer.publisher(f"{cell}/{name}", "", reliable=name == "log") for name in SMALL}
@@ -83,12 +83,12 @@ async def write_all(camera: ZenohSession, writer: ZenohSession, cell: str, reade
             await asyncio.sleep(0)
 
 
-async def test_small_messages_do_not_wait_behind_images(shared_router: str, slow_reader: SlowReader, until) -> None:
+async def test_small_messages_do_not_wait_behind_images(shared_router: str, slow_reader: SlowReader) -> None:
     cell = f"test_{uuid.uuid4().hex[:8]}"
     reader, writer = await open_zenoh(shared_router), await open_zenoh(shared_router)
     try:
         reader.subscriber(f"{cell}/**", slow_reader.on_sample)
-        await write_all(writer, writer, cell, slow_reader, until)
+        await write_all(writer, writer, cell, slow_reader)
         await until(lambda: slow_reader.small == SMALL)
         assert slow_reader.received["image"] == 0  # it still blocks in the first one
     finally:
@@ -99,14 +99,14 @@ async def test_small_messages_do_not_wait_behind_images(shared_router: str, slow
 
 @pytest.mark.parametrize("open_camera", [open_zenoh, one_link, plain_camera])
 async def test_no_small_message_is_lost_behind_images_on_one_link(
-    shared_router: str, slow_reader: SlowReader, until, open_camera
+    shared_router: str, slow_reader: SlowReader, open_camera
 ) -> None:
     cell = f"test_{uuid.uuid4().hex[:8]}"
     sessions = [await one_link(shared_router), await open_camera(shared_router), await one_link(shared_router)]
     reader, camera, writer = sessions
     try:
         reader.subscriber(f"{cell}/**", slow_reader.on_sample)
-        await write_all(camera, writer if open_camera is plain_camera else camera, cell, slow_reader, until)
+        await write_all(camera, writer if open_camera is plain_camera else camera, cell, slow_reader)
         slow_reader.resume.set()
         await until(lambda: slow_reader.small == SMALL)
     finally:
@@ -117,7 +117,7 @@ async def test_no_small_message_is_lost_behind_images_on_one_link(
 
 @pytest.mark.slow
 async def test_images_for_a_slow_reader_do_not_delay_other_writers(
-    domain: int, processes, slow_reader: SlowReader, until
+    domain: int, processes, slow_reader: SlowReader
 ) -> None:
     processes.start("tests.common.transport.patient_router", "--domain", str(domain))
     endpoint, received = endpoint_of(domain), Counter[str]()

@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 import asyncio
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import pytest
 
@@ -14,12 +14,14 @@ from common.supervision.wiring import wiring
 from common.topics import Request, Topic
 from common.transport.bus import Bus
 from common.transport.local import LocalNetwork
+from tests.common.transport.conftest import TIMEOUT, next_of
 
-TIMEOUT = 20.0
+STOP = TaskCommand(command="stop")
 
 
+@dataclass
 class Config:
-    fail = False
+    fail: bool = False
 
 
 async def service(bus: Bus, config: Config) -> None:
@@ -27,12 +29,10 @@ async def service(bus: Bus, config: Config) -> None:
     status = bus.writer(PICK_PLACE_STATUS)
     bus.client(topics.MOTION_PLAN)
 
-    async def handle(request: TaskCommand) -> TaskStatus:
-        if request.command == "stop":
-            raise RuntimeError("the handler has a bug")
-        return TaskStatus()
+    async def crash(_: TaskCommand) -> TaskStatus:
+        raise RuntimeError("the handler has a bug")
 
-    bus.serve(topics.TASK_COMMAND, handle)
+    bus.serve(topics.TASK_COMMAND, crash)
     if config.fail:
         raise RuntimeError("the start has a bug")
     await bus.ready()
@@ -41,8 +41,8 @@ async def service(bus: Bus, config: Config) -> None:
         status.put(PickPlaceStatus(placed=image.header.stamp))
 
 
-def image(stamp: int) -> Image:
-    return Image(header={"stamp": stamp}, height=1, width=1, encoding="mono8", data=b"x")
+async def short(bus: Bus, config: Config) -> None:
+    bus.log.debug("nothing to do")
 
 
 async def test_service_runs_in_process_from_its_ready_to_the_end_of_the_block() -> None:
@@ -51,22 +51,25 @@ async def test_service_runs_in_process_from_its_ready_to_the_end_of_the_block() 
     status, log = tester.reader(PICK_PLACE_STATUS), tester.reader(topics.LOG)
     async with running_service(net, service, Config(), name="toy"):
         assert await tester.alive.known() == {"toy"}
-        tester.writer(topics.CAMERA_IMAGE).put(image(4))
-        assert (await asyncio.wait_for(status.next(), TIMEOUT)).placed == 4
-        assert await asyncio.wait_for(log.next(), TIMEOUT) == LogLine(
-            header=log.latest.header, service="toy", level="info", message="saw 4"
-        )
+        image = Image(header={"stamp": 4}, height=1, width=1, encoding="mono8", data=b"x")
+        tester.writer(topics.CAMERA_IMAGE).put(image)
+        assert (await next_of(status)).placed == 4
+        line = await next_of(log)
+        assert line == LogLine(header=line.header, service="toy", level="info", message="saw 4")
     await tester.alive.wait("toy", TIMEOUT, there=False)
     with pytest.raises(NoResponder):
-        await tester.client(topics.TASK_COMMAND).call(TaskCommand(command="start"))
+        await tester.client(topics.TASK_COMMAND).call(STOP)
 
 
-async def test_crash_at_the_start_is_raised() -> None:
-    config = Config()
-    config.fail = True
-    with pytest.raises(RuntimeError, match="the start has a bug"):
-        async with running_service(LocalNetwork(), service, config):
+@pytest.mark.parametrize(("run", "reason"), [
+    (service, "the start has a bug"), (short, "ended before it was ready|before ready"),
+])
+async def test_service_that_fails_before_it_is_ready_is_reported(run, reason: str) -> None:
+    with pytest.raises(RuntimeError, match=reason):
+        async with running_service(LocalNetwork(), run, Config(fail=True)):
             raise AssertionError("the block must not be entered")
+    with pytest.raises(RuntimeError, match=reason):
+        await wiring(run, Config(fail=True))
 
 
 async def test_crash_in_the_middle_ends_the_block_and_is_raised() -> None:
@@ -75,7 +78,7 @@ async def test_crash_in_the_middle_ends_the_block_and_is_raised() -> None:
 
     async def block() -> None:
         async with running_service(net, service, Config()):
-            asking = asyncio.create_task(client.call(TaskCommand(command="stop")))
+            asking = asyncio.create_task(client.call(STOP))
             asking.add_done_callback(lambda task: task.exception())
             await asyncio.Event().wait()
 
@@ -83,48 +86,26 @@ async def test_crash_in_the_middle_ends_the_block_and_is_raised() -> None:
         await asyncio.wait_for(block(), TIMEOUT)
 
 
-async def test_failure_of_the_block_is_raised_as_it_is() -> None:
-    with pytest.raises(ZeroDivisionError):
-        async with running_service(LocalNetwork(), service, Config()):
-            _ = 1 // 0
-
-
-async def test_block_that_is_cancelled_is_cancelled() -> None:
+@pytest.mark.parametrize("error", [ZeroDivisionError, asyncio.CancelledError])
+async def test_failure_or_cancellation_of_the_block_is_raised_as_it_is(error: type[BaseException]) -> None:
     async def block() -> None:
         async with running_service(LocalNetwork(), service, Config()):
+            if error is ZeroDivisionError:
+                raise error
             await asyncio.Event().wait()
 
     task = asyncio.create_task(block())
     await asyncio.sleep(0)
-    task.cancel()
-    with pytest.raises(asyncio.CancelledError):
+    if error is asyncio.CancelledError:
+        task.cancel()
+    with pytest.raises(error):
         await task
-
-
-async def test_service_that_ends_before_it_is_ready_is_reported() -> None:
-    async def short(bus: Bus, config: Config) -> None:
-        bus.log.debug("nothing to do")
-
-    with pytest.raises(RuntimeError, match="ended before it was ready"):
-        async with running_service(LocalNetwork(), short, Config(), name="short"):
-            raise AssertionError("the block must not be entered")
-    with pytest.raises(RuntimeError, match="before ready"):
-        await wiring(short, Config())
 
 
 async def test_wiring_lists_topics_and_requests_of_a_service() -> None:
     found = await wiring(service, Config())
-    assert found.reads == {topics.CAMERA_IMAGE}
-    assert found.writes == {PICK_PLACE_STATUS}
-    assert found.serves == {topics.TASK_COMMAND}
-    assert found.calls == {topics.MOTION_PLAN}
-
-
-async def test_wiring_raises_what_the_service_raises() -> None:
-    config = Config()
-    config.fail = True
-    with pytest.raises(RuntimeError, match="the start has a bug"):
-        await wiring(service, config)
+    assert (found.reads, found.writes) == ({topics.CAMERA_IMAGE}, {PICK_PLACE_STATUS})
+    assert (found.serves, found.calls) == ({topics.TASK_COMMAND}, {topics.MOTION_PLAN})
 
 
 async def test_buses_of_different_networks_or_cells_are_separate() -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import itertools
-from collections.abc import Awaitable, Callable
 from dataclasses import replace
 from unittest.mock import AsyncMock
 
@@ -19,8 +18,9 @@ from common.transport.codec import decode
 from common.transport.local import LocalNetwork
 from common.transport.ownership import Owner, Ownership, process_name, unique_owners
 from common.transport.session import Declaration, owns_key
+from tests.common.transport.conftest import NewBus
 
-NewBus = Callable[..., Awaitable[Bus]]
+KEY = "camera/image_raw"
 
 
 async def obey(_: TaskCommand) -> TaskStatus:
@@ -32,15 +32,20 @@ def _claim_without_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ownership, "CLAIM_SECONDS", 0.0)
 
 
+async def both_writing(new_bus: NewBus, *names: str) -> list[Bus]:
+    buses = [await new_bus(name) for name in names]
+    for bus in buses:
+        bus.writer(topics.CAMERA_IMAGE)
+    return buses
+
+
 async def test_second_writer_is_refused_with_both_names_and_a_remedy(new_bus: NewBus) -> None:
-    left, right = await new_bus("left_camera"), await new_bus("right_camera")
-    for bus in (left, right):
-        bus.writer(topics.CAMERA_INFO)
+    left, right = await both_writing(new_bus, "left_camera", "right_camera")
     await left.ready()
     with pytest.raises(ConfigError) as refused:
         await right.ready()
     assert str(refused.value) == (
-        "services.right_camera: left_camera has camera/camera_info already, and a key is written or served by one "
+        "services.right_camera: left_camera has camera/image_raw already, and a key is written or served by one "
         "service: give right_camera or left_camera keys of its own, as in topics: {camera/*: right_camera/*}")
     assert (await left.alive.known()) == {"left_camera"}
 
@@ -91,17 +96,16 @@ async def test_each_service_owns_its_log_and_counters_and_readers_own_nothing(ne
     found = await reader.owners()
     assert [(owner.key, owner.own, owner.service) for owner in found] == [
         ("counters/reader", "counters/reader", "reader"), ("log/reader", "log/reader", "reader"),
-        ("camera/image_raw", "camera/image_raw", "writer"), ("counters/writer", "counters/writer", "writer"),
+        (KEY, KEY, "writer"), ("counters/writer", "counters/writer", "writer"),
         ("log/writer", "log/writer", "writer")]
 
 
 async def test_own_keys_are_known_without_a_reply_of_the_network(new_bus: NewBus, monkeypatch) -> None:
-    bus = await new_bus("writer")
-    bus.writer(topics.CAMERA_IMAGE)
+    [bus] = await both_writing(new_bus, "writer")
     monkeypatch.setattr(ownership, "tokens_now", AsyncMock(return_value=[]))
     assert await bus.owners() == []  # it is not ready yet
     await bus.ready()
-    assert [owner.key for owner in await bus.owners()] == ["camera/image_raw", "counters/writer"]
+    assert [owner.key for owner in await bus.owners()] == [KEY, "counters/writer"]
 
 
 def test_process_with_a_claiming_and_a_ready_token_is_one_owner() -> None:
@@ -115,9 +119,7 @@ def test_process_with_a_claiming_and_a_ready_token_is_one_owner() -> None:
 
 async def test_second_writer_waits_until_the_first_has_closed(new_bus: NewBus, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ownership, "CLAIM_SECONDS", 20.0)
-    before, after = await new_bus("camera"), await new_bus("camera")
-    for bus in (before, after):
-        bus.writer(topics.CAMERA_IMAGE)
+    before, after = await both_writing(new_bus, "camera", "camera")
     await before.ready()
     checked, original = asyncio.Event(), Ownership.owners
 
@@ -135,9 +137,7 @@ async def test_second_writer_waits_until_the_first_has_closed(new_bus: NewBus, m
 
 
 async def test_two_services_that_start_at_once_are_never_both_ready(new_bus: NewBus) -> None:
-    buses = [await new_bus(f"camera_{number}") for number in range(2)]
-    for bus in buses:
-        bus.writer(topics.CAMERA_IMAGE)
+    buses = await both_writing(new_bus, "camera_0", "camera_1")
     ended = await asyncio.gather(*(bus.ready() for bus in buses), return_exceptions=True)
     assert any(isinstance(each, ConfigError) for each in ended)
 
@@ -154,7 +154,7 @@ async def test_owners_have_the_remapped_key_and_that_of_the_code() -> None:
 
 
 def test_token_names_its_owner() -> None:
-    owner = Owner("left/image_raw", "camera/image_raw", "left", process_name("a1", 7))
+    owner = Owner("left/image_raw", KEY, "left", process_name("a1", 7))
     assert Owner.of(f"panda{owner.token}") == owner
     assert owner.instance == "a1" and not owner.claiming and replace(owner, process=process_name("a2")).claiming
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable
 
 import pytest
 
@@ -13,8 +12,7 @@ from common.supervision.liveness_watchdog import RemoteServices
 from common.supervision.plain_keys import copy_to_plain_keys
 from common.transport.bus import Bus
 from common.transport.codec import decode
-
-NewBus = Callable[..., Awaitable[Bus]]
+from tests.common.transport.conftest import NewBus, until
 
 
 class PlainClient:
@@ -41,9 +39,7 @@ async def start_copying():
         assert isinstance(ended, asyncio.CancelledError)
 
 
-async def test_plain_subscriber_and_reader_receive_each_line_once(
-    new_bus: NewBus, until, start_copying, caplog
-) -> None:
+async def test_plain_subscriber_and_reader_receive_each_line_once(new_bus: NewBus, start_copying, caplog) -> None:
     supervisor, arm, tool = [await new_bus(name) for name in ("supervisor", "arm", "tool")]
     plain, counted = PlainClient(tool, "log", m.LogLine), PlainClient(tool, "counters", m.ServiceCounters)
     start_copying(supervisor, RemoteServices("host", ["arm"]))
@@ -76,9 +72,7 @@ async def test_plain_subscriber_and_reader_receive_each_line_once(
     assert "no longer reads that key" not in caplog.text
 
 
-async def test_two_supervisors_copy_each_line_once_and_no_forged_one(
-    new_bus: NewBus, until, start_copying
-) -> None:
+async def test_two_supervisors_copy_each_line_once_and_no_forged_one(new_bus: NewBus, start_copying) -> None:
     hosts = {host: await new_bus("supervisor") for host in ("a", "b")}
     arm, eye, tool = [await new_bus(name) for name in ("arm", "eye", "tool")]
     plain = PlainClient(tool, "log", m.LogLine)
@@ -107,7 +101,7 @@ async def test_two_supervisors_copy_each_line_once_and_no_forged_one(
         (service, text) for service in writers for text in ("genuine", "last"))
 
 
-async def test_nothing_is_copied_while_plain_keys_have_no_subscriber(new_bus: NewBus, until, start_copying) -> None:
+async def test_nothing_is_copied_while_plain_keys_have_no_subscriber(new_bus: NewBus, start_copying) -> None:
     supervisor, arm, tool = [await new_bus(name) for name in ("supervisor", "arm", "tool")]
     writer = arm.writer(topics.LOG)
     start_copying(supervisor, RemoteServices("host", ["arm"]))

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
-from collections.abc import Awaitable, Callable
-
 import pytest
 
 from common import messages as m
@@ -13,9 +10,7 @@ from common.application import find_topic
 from common.transport.bus import Bus
 from common.transport.codec import Attachment, encode, encode_attachment
 from common.transport.local import LocalNetwork
-
-NewBus = Callable[..., Awaitable[Bus]]
-TIMEOUT = 20.0
+from tests.common.transport.conftest import NewBus, next_of, put_raw, until
 
 
 def line(service: str, message: str = "") -> m.LogLine:
@@ -27,15 +22,10 @@ def counted(service: str, number: int = 0) -> m.ServiceCounters:
 
 
 def put(bus: Bus, key: str, message: m.Message, writer: str = "", sequence: int = 1) -> None:
-    attachment = encode_attachment(Attachment(writer, sequence)) if writer else b""
-    bus._session.publisher(f"{bus.cell}/{key}", "", reliable=True).put(encode(message), attachment)
+    put_raw(bus, key, encode(message), encode_attachment(Attachment(writer, sequence)) if writer else b"")
 
 
-async def next_of(reader):
-    return await asyncio.wait_for(reader.next(), TIMEOUT)
-
-
-async def test_each_service_writes_under_its_name_and_one_reader_receives_all(new_bus: NewBus, until) -> None:
+async def test_each_service_writes_under_its_name_and_one_reader_receives_all(new_bus: NewBus) -> None:
     camera, arm, tool = await new_bus("camera"), await new_bus("arm"), await new_bus("tool")
     reader, writers = tool.reader(topics.LOG), [bus.writer(topics.LOG) for bus in (camera, arm)]
     assert [writer.topic.key for writer in writers] == ["log/camera", "log/arm"]
@@ -47,7 +37,7 @@ async def test_each_service_writes_under_its_name_and_one_reader_receives_all(ne
 
 @pytest.mark.parametrize(("topic", "message_of"), [(topics.LOG, line), (topics.COUNTERS, counted)])
 async def test_message_in_the_name_of_another_service_is_refused_and_counted(
-    new_bus: NewBus, until, caplog, topic, message_of
+    new_bus: NewBus, caplog, topic, message_of
 ) -> None:
     camera, tool = await new_bus("camera"), await new_bus("tool")
     reader = tool.reader(topic)
@@ -62,7 +52,7 @@ async def test_message_in_the_name_of_another_service_is_refused_and_counted(
     assert f"/{plain}/camera, not 'arm'" in caplog.text
 
 
-async def test_forged_sequence_numbers_do_not_hide_messages_of_the_real_writer(new_bus: NewBus, until) -> None:
+async def test_forged_sequence_numbers_do_not_hide_messages_of_the_real_writer(new_bus: NewBus) -> None:
     camera, tool = await new_bus("camera"), await new_bus("tool")
     reader = tool.reader(topics.LOG)
     await until(lambda: camera.writer(topics.LOG).matched)
@@ -81,7 +71,7 @@ async def test_flood_of_one_service_displaces_no_counters_of_another() -> None:
     assert reader.latest == counted("camera", 4999) and reader.dropped == 4999
 
 
-async def test_late_reader_gets_the_counters_of_all_at_once(new_bus: NewBus, until) -> None:
+async def test_late_reader_gets_the_counters_of_all_at_once(new_bus: NewBus) -> None:
     services = [await new_bus(name) for name in ("camera", "arm")]
     for bus in services:
         await bus.ready()
@@ -90,7 +80,7 @@ async def test_late_reader_gets_the_counters_of_all_at_once(new_bus: NewBus, unt
     assert {(await next_of(reader)).service for _ in services} == {"camera", "arm"}
 
 
-async def test_former_plain_key_is_still_read_with_one_warning(new_bus: NewBus, until, caplog) -> None:
+async def test_former_plain_key_is_still_read_with_one_warning(new_bus: NewBus, caplog) -> None:
     old, tool = await new_bus("old"), await new_bus("tool")
     reader = tool.reader(topics.LOG)
     await until(lambda: old.writer(topics.LOG).matched)

@@ -61,29 +61,25 @@ def receive(connection: socket.socket, size: int) -> bytes:
     return data
 
 
-def test_handshake_is_forwarded_byte_for_byte(port: int) -> None:
-    sent = HELLO + bytes(range(256)) * 40_000
+def test_handshake_is_forwarded_byte_for_byte_until_the_end_of_the_stream(port: int) -> None:
+    data = HELLO + bytes(range(256)) * 40_000
     with connect(port) as connection:
-        threading.Thread(target=connection.sendall, args=[sent], daemon=True).start()
-        assert receive(connection, len(sent)) == sent
-
-
-@pytest.mark.parametrize("first_bytes", [b"", b"GET / HTTP/1.1\r\n", b"\x16\x03\x01\x00\x20\x02", b"\x16\x03"])
-@pytest.mark.slow
-def test_client_without_a_handshake_is_disconnected(port: int, echo: Echo, first_bytes: bytes) -> None:
-    with connect(port) as connection:
-        connection.sendall(first_bytes)
-        with suppress(ConnectionResetError):
-            assert connection.recv(1) == b""
-    assert echo.accepted == 0
-
-
-def test_end_of_stream_is_forwarded_both_ways(port: int, echo: Echo) -> None:
-    with connect(port) as connection:
-        connection.sendall(HELLO)
-        assert receive(connection, len(HELLO)) == HELLO
+        threading.Thread(target=connection.sendall, args=[data], daemon=True).start()
+        assert receive(connection, len(data)) == data
         connection.shutdown(socket.SHUT_WR)
         assert connection.recv(1) == b""
+
+
+def test_client_without_a_handshake_is_disconnected(
+    port: int, echo: Echo, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("common.transport.tls_gate.HELLO_SECONDS", 0.1)
+    for first_bytes in (b"", b"GET / HTTP/1.1\r\n", b"\x16\x03\x01\x00\x20\x02", b"\x16\x03"):
+        with connect(port) as connection:
+            connection.sendall(first_bytes)
+            with suppress(ConnectionResetError):
+                assert connection.recv(1) == b""
+    assert echo.accepted == 0
 
 
 def test_silent_clients_keep_no_other_client_out(port: int, echo: Echo) -> None:
@@ -106,5 +102,5 @@ def test_endpoint_in_use_is_named(echo: Echo) -> None:
         with pytest.raises(OSError, match="in use") as taken:
             second.open(*echo.listener.getsockname())
         assert taken.value.filename == endpoint
-    with echo.listener, pytest.raises(OSError, match="in use") as taken:
+    with pytest.raises(OSError, match="in use"):
         TlsGate([f"tls/127.0.0.1:{echo.listener.getsockname()[1]}"])

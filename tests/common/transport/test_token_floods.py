@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable
 
 import pytest
 
@@ -11,14 +10,13 @@ from common import topics
 from common.errors import ConfigError
 from common.messages import TaskCommand, TaskStatus
 from common.transport import ownership
-from common.transport.bus import Bus
 from common.transport.local import LocalNetwork, LocalSession
 from common.transport.ownership import MAX_OTHERS, MAX_WARNINGS, Owner, Ownership
 from common.transport.session import alive_key, owns_key
 from common.transport.tokens import MAX_NAMES, MAX_PER_TURN, TokenWatch
+from tests.common.transport.conftest import NewBus, until
 
-NewBus = Callable[..., Awaitable[Bus]]
-FLOOD = 3000  # enough to exceed all limits
+FLOOD = 1500  # enough to exceed all limits
 LATE = 2**63  # [ns] later than all real ones
 UNUSUAL = ("0", "-", "zz", "-1--1", "|", "%s", "[bold]", "\x1b[31m", "\u202e", "a" * 1000)
 
@@ -95,7 +93,7 @@ async def test_name_that_appears_and_vanishes_repeatedly_is_reported_once(extra:
 
 
 async def test_process_receives_only_tokens_of_its_own_keys(
-    new_bus: NewBus, monkeypatch: pytest.MonkeyPatch, until
+    new_bus: NewBus, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     received: list[str] = []
     receive = Ownership._receive

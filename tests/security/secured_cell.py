@@ -1,0 +1,103 @@
+"""A running cell with certificates, a page with a token, and a recording of everything."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import subprocess
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import psutil
+import pytest
+
+from common import messages as m
+from common import topics
+from common.errors import NoRouter
+from common.transport.credentials import credentials_of
+from common.transport.zenoh_session import connect
+from tests.harness import RunningCell, ask, command_line, environment, until
+from tests.security.raw_client import RawClient, free_port
+
+TOKEN = "the-token-of-this-page-0123456789"
+SERVICES = 9
+Socket = tuple[str, str, int]
+# A process that ends was then ended by an attack.
+NO_WATCHDOGS = ("--set", "watchdogs.silence=0", "--set", "watchdogs.loop=0")
+
+
+@dataclass
+class Secured:
+    """A running cell, and the folder of its certificates."""
+
+    cell: RunningCell
+    folder: Path
+    page: int
+    recording: Path
+
+    def client(self, name: str) -> RawClient:
+        """Return a client with the certificate of that common name."""
+        return RawClient(self.cell.endpoint, credentials_of(name, self.folder))
+
+    @property
+    def port(self) -> int:
+        """The port of the router."""
+        return int(self.cell.endpoint.rpartition(":")[2])
+
+    @property
+    def variables(self) -> dict[str, str]:
+        return {"ZENCELL_SECURE": str(self.folder), "ZENCELL_DOMAIN": str(self.cell.domain)}
+
+    def tool(self, *arguments: str, **variables: str) -> subprocess.CompletedProcess[str]:
+        """Run a zencell command with the certificates and further environment variables within this process."""
+        return ask(self.cell.folder, *arguments, environment=self.variables | variables)
+
+    def process(self, *arguments: str, **variables: str) -> subprocess.CompletedProcess[str]:
+        """Run a zencell command as a process to its end."""
+        return subprocess.run(command_line(*arguments), env={**environment(), **self.variables, **variables},
+                              cwd=self.cell.folder, capture_output=True, text=True, timeout=60, check=False)
+
+    @property
+    def processes(self) -> dict[str, psutil.Process]:
+        """All processes by name, the supervisor included."""
+        return {**self.cell.processes(), "supervisor": psutil.Process(self.cell.process.pid)}
+
+
+def sockets_of(processes: Mapping[str, psutil.Process]) -> tuple[set[Socket], set[Socket]]:
+    """Return the listening and the datagram sockets by process, address and port."""
+    listening, datagrams = set(), set()
+    for name, process in processes.items():
+        for found in process.net_connections("inet"):
+            if found.type == socket.SOCK_DGRAM:
+                datagrams.add((name, *found.laddr))
+            elif found.status == psutil.CONN_LISTEN:
+                listening.add((name, *found.laddr))
+    return listening, datagrams
+
+
+def all_ready(status: m.SupervisorStatus) -> bool:
+    return len(status.services) > SERVICES and all(service.state == "ready" for service in status.services)
+
+
+@contextmanager
+def running_secured(certificates: Path, folder: Path) -> Iterator[Secured]:
+    """Run a cell at speed 1 whose task waits, recorded from its start."""
+    page, recording = free_port(), folder / "all.mcap"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ZENCELL_SECURE", str(certificates))  # for the listeners in this process
+        with RunningCell(
+            folder, "up", "panda", "--secure", str(certificates), "--set", "autostart=false", *NO_WATCHDOGS,
+            "--viewer-port", str(page), "--record", str(recording), secrets={"ZENCELL_VIEWER_TOKEN": TOKEN},
+        ) as cell:
+
+            async def ready() -> None:
+                async with connect(cell="panda", service="watcher", endpoint=cell.endpoint, timeout=120) as bus:
+                    await until(bus.reader(topics.SUPERVISOR_STATUS), all_ready, timeout=120)
+
+            try:
+                asyncio.run(ready())
+            except (TimeoutError, NoRouter):
+                pytest.fail(f"the cell did not start:\n{cell.tail()}")
+            yield Secured(cell, certificates, page, recording)
