@@ -1,4 +1,4 @@
-"""One time for all processes of a host, whatever becomes of its system clock."""
+"""One time for all processes of a host, also when its system clock steps or the host sleeps."""
 
 import pytest
 
@@ -10,7 +10,7 @@ HOUR = 3600 * 10**9
 
 
 class Host:
-    """A host whose clocks are set by hand."""
+    """A host with simulated clocks."""
 
     def __init__(self):
         self.own, self.wall, self.asleep = 5 * HOUR, 1_700_000_000 * 10**9, 0
@@ -38,28 +38,27 @@ def host():
         yield source
 
 
-@pytest.mark.parametrize("step", [HOUR, -HOUR, 600 * 10**9])
-@pytest.mark.parametrize("speed", [1.0, 3.0])
-def test_process_that_is_started_again_after_a_step_of_the_system_clock_agrees_with_the_others(host, step, speed):
+@pytest.mark.parametrize(("speed", "step"), [(1.0, HOUR), (1.0, -HOUR), (3.0, -HOUR), (3.0, 600 * 10**9)])
+def test_process_restarted_after_a_step_of_the_system_clock_agrees_with_the_others(host, speed, step):
     supervisor = Clock(speed)
-    handed = supervisor.environment()
-    first = Clock.from_environment(handed)
+    variables = supervisor.environment()
+    first = Clock.from_environment(variables)
     host.pass_time(10**9)
     host.wall += step
     host.pass_time(10**9)
-    again = Clock.from_environment(handed)
+    again = Clock.from_environment(variables)
     assert again.now_ns() == first.now_ns() == supervisor.now_ns() == supervisor.epoch_ns + int(2e9 * speed)
 
 
-def test_host_that_slept_has_one_time_for_what_ran_before_and_what_is_started_after(host):
+def test_processes_started_before_and_after_a_sleep_of_the_host_agree(host):
     supervisor = Clock()
     host.pass_time(HOUR)
     host.asleep += HOUR
     assert supervisor.now_ns() == host.wall_ns() == Clock.from_environment(supervisor.environment()).now_ns()
-    assert Clock().now_ns() == supervisor.now_ns(), "and one without a supervisor too"
+    assert Clock().now_ns() == supervisor.now_ns(), "also without a supervisor"
 
 
-def test_processes_without_a_supervisor_agree_by_a_folder_that_they_share(host, tmp_path, monkeypatch):
+def test_processes_without_a_supervisor_agree_by_a_shared_folder_until_the_host_reboots(host, tmp_path, monkeypatch):
     boot_id = tmp_path / "boot_id"
     boot_id.write_text("a\n")
     monkeypatch.setattr(clocks, "BOOT_ID", boot_id)
@@ -69,11 +68,11 @@ def test_processes_without_a_supervisor_agree_by_a_folder_that_they_share(host, 
     assert Clock.from_environment(shared).now_ns() == first.now_ns()
     assert Clock.from_environment({}).now_ns() == first.now_ns() + HOUR
     boot_id.write_text("b\n")
-    assert Clock.from_environment(shared).now_ns() == first.now_ns() + HOUR, "the host was started anew: asked again"
+    assert Clock.from_environment(shared).now_ns() == first.now_ns() + HOUR
     assert sorted(path.name for path in tmp_path.iterdir()) == ["boot_id", "clock-a", "clock-b"]
 
 
-def test_what_was_handed_down_goes_before_what_is_kept_and_nonsense_is_told(host, tmp_path):
+def test_variable_takes_precedence_over_the_folder_and_invalid_ones_are_refused(host, tmp_path):
     both = {BOOTED_VARIABLE: "17", CLOCK_FOLDER_VARIABLE: str(tmp_path)}
     assert Clock.from_environment(both).booted_ns == 17 and not list(tmp_path.iterdir())
     with pytest.raises(ValueError, match="invalid literal"):

@@ -1,4 +1,4 @@
-"""What comes over the wire cannot steer a terminal or the page, wherever it is shown."""
+"""Received text cannot control a terminal or the page."""
 
 import json
 import logging
@@ -21,7 +21,7 @@ from page import markup
 
 ROOT = Path(__file__).parents[2]
 EVIL = "a\x1b]0;owned\x07\r\x9b2J\u202eb\u2028\x7f\ud800[/x][red]\nERROR router: forged"
-STEERING = re.compile("[\x00-\x09\x0b-\x1f\x7f-\x9f\u2028\u202e\ud800]")
+CONTROL = re.compile("[\x00-\x09\x0b-\x1f\x7f-\x9f\u2028\u202e\ud800]")
 
 
 def drawn(table: object) -> str:
@@ -30,7 +30,7 @@ def drawn(table: object) -> str:
     return console.file.getvalue()  # type: ignore[attr-defined, no-any-return]
 
 
-def test_what_steers_a_terminal_is_written_as_json_does() -> None:
+def test_control_characters_are_escaped_as_in_json() -> None:
     assert printable("a\x1b[2J\nb") == "a\\u001b[2J\\u000ab"
     assert json.loads(f'"{printable(EVIL)}"') == EVIL
     assert printable("Ω ü 球 – [x]") == "Ω ü 球 – [x]"
@@ -42,22 +42,22 @@ def test_what_steers_a_terminal_is_written_as_json_does() -> None:
     lambda: drawn(render(Content([ServiceStatus(name="camera", state="ready")], {"camera": (EVIL, 1.0)}, EVIL))),
     lambda: markup.text(EVIL),
 ], ids=["top: a service", "top: a topic", "the live table", "the page"])
-def test_text_from_the_wire_is_shown_and_steers_nothing(show: Callable[[], str]) -> None:
+def test_received_text_is_shown_without_control_characters(show: Callable[[], str]) -> None:
     text = show()
-    assert not STEERING.search(text)
+    assert not CONTROL.search(text)
     assert "[/x][red]" in text
 
 
-def test_a_line_from_a_process_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+def test_line_of_a_process_stays_one_line(capsys: pytest.CaptureFixture[str]) -> None:
     PlainScreen().line("camera", EVIL)
     PlainScreen().progress(EVIL)
     echo(EVIL, err=True)
     lines = capsys.readouterr().err.splitlines()
-    assert not STEERING.search("".join(lines))
-    assert [line.startswith("ERROR") for line in lines] == [False, False, False, True], "an own text may have lines"
+    assert not CONTROL.search("".join(lines))
+    assert [line.startswith("ERROR") for line in lines] == [False, False, False, True], "our own text may have two"
 
 
-def test_a_line_of_the_log_cannot_be_forged(capsys: pytest.CaptureFixture[str]) -> None:
+def test_log_line_cannot_be_forged(capsys: pytest.CaptureFixture[str]) -> None:
     root = logging.getLogger()
     before = root.handlers[:], root.level
     try:
@@ -69,12 +69,12 @@ def test_a_line_of_the_log_cannot_be_forged(capsys: pytest.CaptureFixture[str]) 
     finally:
         root.handlers[:], root.level = before
         logging.captureWarnings(False)
-    said = capsys.readouterr().err
-    assert not STEERING.search(said)
-    assert "ERROR router" not in said.splitlines()[1]
+    log = capsys.readouterr().err
+    assert not CONTROL.search(log)
+    assert "ERROR router" not in log.splitlines()[1]
 
 
-def test_everything_that_is_shown_goes_through_here() -> None:
+def test_only_the_terminal_module_prints() -> None:
     product = ("cli", "common", "services", "page", "recording", "tools", "lab", "security", "drivers", "applications")
     files = [path for folder in product for path in (ROOT / folder).rglob("*.py")]
     assert [p.name for p in files if re.search(r"\b(typer|click)\.s?echo\(", p.read_text())] == ["terminal.py"]

@@ -15,30 +15,30 @@ from tests.hosts.two_hosts import TwoHosts
 
 DOMAIN = "42"  # each host has ports of its own
 PORT = 7447 + int(DOMAIN)
-SPLITS = {  # by name: what runs on the first host; the rest, with the task, on the second
+SPLITS = {  # services on the first host by name of the split; the others, with the task, are on the second
     "perception": ("camera_simulator", "vision_detector", "workspace_validator"),
     "robot": ("motion_planner", "robot_state_publisher", "trajectory_executor"),
 }
 ZENCELL = str(Path(sys.executable).with_name("zencell"))
-LOOK = 0.01  # [s]
-PATIENCE = 180.0  # [s] for an event, the first of which come when both parts are up
+PERIOD = 0.01  # [s] between two checks for events
+TIMEOUT = 180.0  # [s] for an event, including the start of both parts
 
 Event = dict[str, Any]
 
 
 @dataclass
 class Cut:
-    """A link that was cut, in seconds."""
+    """Effects of a cut link; times in seconds."""
 
     seconds: float
-    noticed: float | None  # from the cut until the services of the other host were known to be gone; None: never
-    data: float | None  # from the repair until targets flowed again
+    noticed: float | None  # from the cut until the services of the other host were reported as gone; None: never
+    data: float | None  # from the repair until the next targets
     started: int  # motions that started during the cut
 
 
 @dataclass
 class CutCell:
-    """Use as a context: `run panda` on two hosts."""
+    """`run panda` on two hosts; a `with` block."""
 
     two: TwoHosts
     folder: Path
@@ -65,15 +65,15 @@ class CutCell:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        """End what still runs."""
+        """End all processes."""
         for host in self.two.hosts:
             host.stop()
 
-    def until(self, wanted: Callable[[Event], bool], timeout: float = PATIENCE) -> Event:
-        """The first event from now on that is wanted.
+    def until(self, wanted: Callable[[Event], bool], timeout: float = TIMEOUT) -> Event:
+        """Return the first event from now on that satisfies a condition.
 
         Raises:
-            TimeoutError: none came.
+            TimeoutError: there was none.
         """
         self._take()
         seen, deadline = len(self.events), time.monotonic() + timeout
@@ -83,17 +83,17 @@ class CutCell:
                 if wanted(event):
                     return event
             seen = len(self.events)
-            time.sleep(LOOK)
-        raise TimeoutError(f"nothing of the kind; the last events: {self.events[-5:]}")
+            time.sleep(PERIOD)
+        raise TimeoutError(f"no such event; the last ones: {self.events[-5:]}")
 
     def cut(self, seconds: float) -> Cut:
-        """Cut the link for so long; returns when data flow again."""
+        """Cut the link for some seconds; return when targets arrive again."""
         began = time.monotonic()
         self.two.unplug()
         time.sleep(seconds)
         ended = time.monotonic()
         self.two.plug_in()
-        # What was on its way, or came of a picture that was, is no sign of a link.
+        # Targets sent before the repair are no sign of a link.
         back = self.until(lambda e: e["what"] == "targets" and e["at"] > ended)
         gone = [e["at"] for e in self.events if e["what"] == "gone" and e["at"] > began]
         goals = {e["id"] for e in self.events if e["what"] == "motion" and began < e["at"] < ended}
@@ -102,13 +102,13 @@ class CutCell:
         return Cut(seconds, noticed, round(back["at"] - ended, 2), len(goals - before))
 
     def end(self, timeout: float = 120.0) -> dict[str, Any]:
-        """The summary of the run, once it has ended."""
+        """Wait for the end of the run; return its summary."""
         self.run.wait(timeout=timeout)
         summary: dict[str, Any] = json.loads((self.folder / "summary.json").read_text(encoding="utf-8"))
         return summary
 
     def _take(self) -> None:
         text = self._out.read_text(encoding="utf-8")
-        whole = text.rfind("\n") + 1
-        self.events += [json.loads(line) for line in text[self._read:whole].splitlines() if line.startswith("{")]
-        self._read = whole
+        complete = text.rfind("\n") + 1
+        self.events += [json.loads(line) for line in text[self._read:complete].splitlines() if line.startswith("{")]
+        self._read = complete

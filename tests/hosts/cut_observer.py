@@ -1,7 +1,5 @@
 """Print motion states, target counts and liveliness changes that a host receives, with their times."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import sys

@@ -1,7 +1,5 @@
 """Two hosts on one machine: network namespaces joined by a cable that can be unplugged."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -11,61 +9,58 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 ADDRESSES = ("10.231.77.1", "10.231.77.2")
-END = 20.0  # [s] after Ctrl-C
+END = 20.0  # [s] after SIGTERM
 
 
 def why_not() -> str:
-    """Why there can be no two hosts here; empty when there can."""
+    """Return why this machine cannot simulate two hosts; empty if it can."""
     if sys.platform != "linux":
-        return "network namespaces are Linux's"
+        return "network namespaces exist on Linux only"
     if os.geteuid() != 0:
-        return "only root makes network namespaces"
+        return "only root creates network namespaces"
     name = f"zencell-{os.getpid()}-try"
     try:
         made = subprocess.run(["ip", "netns", "add", name], capture_output=True, text=True, check=False)
     except FileNotFoundError:
-        return "there is no `ip` (iproute2)"
+        return "`ip` (iproute2) is not installed"
     if made.returncode:
-        return f"no network namespace can be made: {made.stderr.strip()}"
+        return f"no network namespace can be created: {made.stderr.strip()}"
     subprocess.run(["ip", "netns", "delete", name], check=True)
     return ""
 
 
 @dataclass
 class Host:
-    """One of the two: a network namespace."""
+    """A network namespace with one end of the cable."""
 
     namespace: str
     address: str
-    cable: str  # its end of it
+    cable: str
     processes: list[subprocess.Popen[str]] = field(default_factory=list)
 
     def start(self, *command: str, file: Path, environment: dict[str, str] | None = None) -> subprocess.Popen[str]:
-        """A process on the host; what it says goes to the file."""
+        """Start a process on the host; its output goes to the file."""
         with file.open("w", encoding="utf-8") as out:
             process = subprocess.Popen(
                 ["ip", "netns", "exec", self.namespace, *command], stdout=out, stderr=subprocess.STDOUT, text=True,
-                env={**os.environ, **(environment or {})}, start_new_session=True,
-            )
+                env={**os.environ, **(environment or {})}, start_new_session=True)
         self.processes.append(process)
         return process
 
-    def call(self, *command: str) -> str:
-        """What a command says on the host."""
-        return subprocess.run(
-            ["ip", "netns", "exec", self.namespace, *command], capture_output=True, text=True, check=True, timeout=30,
-        ).stdout
+    def call(self, *command: str) -> None:
+        """Run a command on the host."""
+        _run("ip", "netns", "exec", self.namespace, *command)
 
     def stop(self) -> None:
-        """End what still runs.
+        """End all processes of the host.
 
         Raises:
-            TimeoutError: some of it had to be killed.
+            TimeoutError: some had to be killed.
         """
         stuck = []
         for process in self.processes:
             if process.poll() is None:
-                process.terminate()  # not Ctrl-C: what a shell starts in the background ignores that
+                process.terminate()  # not SIGINT: background processes of a shell ignore it
         for process in self.processes:
             try:
                 process.wait(timeout=END)
@@ -86,30 +81,26 @@ class TwoHosts:
 
     def unplug(self) -> None:
         """Cut the link."""
-        self._cable("down")
+        self.hosts[0].call("ip", "link", "set", self.hosts[0].cable, "down")
 
     def plug_in(self) -> None:
-        """Join them again."""
-        self._cable("up")
-
-    def _cable(self, state: str) -> None:
-        host = self.hosts[0]
-        host.call("ip", "link", "set", host.cable, state)
+        """Repair the link."""
+        self.hosts[0].call("ip", "link", "set", self.hosts[0].cable, "up")
 
 
 @contextmanager
 def two_hosts() -> Iterator[TwoHosts]:
-    """Two hosts, joined; nothing of them is left afterwards."""
+    """Create two linked hosts; remove them at the end of the block."""
     tag = f"z{os.getpid() % 100000}"
     made: list[Host] = []
     try:
         for letter, address in zip("ab", ADDRESSES, strict=True):
             host = Host(f"zencell-{tag}{letter}", address, f"{tag}{letter}")
-            _ip("netns", "add", host.namespace)
+            _run("ip", "netns", "add", host.namespace)
             made.append(host)
         first, second = made
-        _ip("link", "add", first.cable, "netns", first.namespace, "type", "veth",
-            "peer", "name", second.cable, "netns", second.namespace)
+        _run("ip", "link", "add", first.cable, "netns", first.namespace, "type", "veth",
+             "peer", "name", second.cable, "netns", second.namespace)
         for host in made:
             host.call("ip", "address", "add", f"{host.address}/24", "dev", host.cable)
             host.call("ip", "link", "set", "lo", "up")
@@ -120,8 +111,8 @@ def two_hosts() -> Iterator[TwoHosts]:
             try:
                 host.stop()
             finally:
-                _ip("netns", "delete", host.namespace)
+                _run("ip", "netns", "delete", host.namespace)
 
 
-def _ip(*arguments: str) -> None:
-    subprocess.run(["ip", *arguments], check=True, capture_output=True, timeout=30)
+def _run(*command: str) -> None:
+    subprocess.run(command, check=True, capture_output=True, timeout=30)

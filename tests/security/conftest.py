@@ -1,7 +1,5 @@
 """A folder of certificates for both cells, created by `zencell secure init`."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

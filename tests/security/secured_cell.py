@@ -1,7 +1,5 @@
 """A running cell with certificates, a page with a token, and a recording of everything."""
 
-from __future__ import annotations
-
 import asyncio
 import socket
 import subprocess

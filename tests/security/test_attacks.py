@@ -3,8 +3,6 @@
 Each test also shows that a permitted client succeeds with what the attacker is denied.
 """
 
-from __future__ import annotations
-
 import asyncio
 import base64
 import json
@@ -55,9 +53,7 @@ def same_processes(secured: Secured) -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("same_processes")
-def test_program_with_the_operators_certificate_may_do_what_the_camera_may_not(
-    secured: Secured, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_program_with_the_operators_certificate_may_do_what_the_camera_may_not(secured: Secured, monkeypatch) -> None:
     monkeypatch.delenv("ZENCELL_SECURE", raising=False)
     edit = m.SceneEdit(op="add", id="post", shape="sphere", dimensions=[0.05],
                        pose=m.Pose(position=m.Vector3(x=-0.5, z=0.5)))

@@ -160,9 +160,7 @@ def test_authority_is_replaced_with_overlap_and_then_no_longer_trusted(
     until("the new certificate cannot connect", lambda: can_connect(endpoint, new))
 
 
-def test_unusable_files_leave_the_previous_ones_in_force(
-    folder: Path, endpoint: str, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_unusable_files_leave_the_previous_ones_in_force(folder: Path, endpoint: str, caplog) -> None:
     with caplog.at_level(logging.ERROR, "router"):
         (folder / "router.key").write_bytes((folder / "operator.key").read_bytes())
         until("nothing was logged", lambda: caplog.records)

@@ -1,7 +1,5 @@
 """Services of the router's host connect at a listener of their own; a flood at one listener leaves the other open."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import shutil
@@ -137,9 +135,7 @@ async def test_local_client_reconnects_locally_after_a_renewal(router: SecuredRo
     session.close()
 
 
-def test_router_starts_without_its_local_listener_if_the_port_is_taken(
-    certificates: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_router_starts_without_its_local_listener_if_the_port_is_taken(certificates: Path, caplog) -> None:
     endpoint, near = f"tls/127.0.0.1:{free_port()}", free_endpoints(1)
     with ExitStack() as stack:
         stack.enter_context(socket.create_server(("127.0.0.1", int(near[0].rpartition(":")[2]))))

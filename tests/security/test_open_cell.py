@@ -1,7 +1,5 @@
 """A cell without certificates is open to its own machine only."""
 
-from __future__ import annotations
-
 import asyncio
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """`--secure` refuses incomplete or invalid files before any process starts, in one line with the remedy."""
 
-from __future__ import annotations
-
 import shutil
 import sys
 from collections.abc import Callable
@@ -50,9 +48,7 @@ def refusal(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captur
     return run
 
 
-def test_missing_folder_is_named_with_the_command_that_creates_one(
-    refusal: Refusal, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_missing_folder_is_named_with_the_command_that_creates_one(refusal: Refusal, monkeypatch) -> None:
     for verb, name in (("run", "nowhere"), ("up", "certs/ca.pem"), ("up", "")):
         line = refusal(verb, "panda", secure=name)
         assert line == f"--secure: {name!r} is not a folder; make one with `zencell secure init DIR`"

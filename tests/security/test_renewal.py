@@ -1,7 +1,5 @@
 """`zencell secure init --renew` replaces all certificates and leaves the authority and the router's host names."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -52,9 +50,7 @@ def test_renewal_leaves_the_authority_and_the_host_names_of_the_router(init: Ini
     assert hosts(folder) == {*LOCAL, "eye.example.org"}
 
 
-def test_existing_certificates_are_not_overwritten_by_mistake(
-    init: Init, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_existing_certificates_are_not_overwritten_by_mistake(init: Init, capsys: pytest.CaptureFixture[str]) -> None:
     folder = init()
     before = (folder / "router.pem").read_bytes()
     capsys.readouterr()

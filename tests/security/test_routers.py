@@ -1,7 +1,5 @@
 """Secured routers without a cell: linked routers, unencrypted endpoints, and a router configured by a file."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys
@@ -96,9 +94,7 @@ def no_variables(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("no_variables")
-def test_config_file_equals_the_configuration_of_our_router(
-    capsys: pytest.CaptureFixture[str], folder: Path, tmp_path: Path
-) -> None:
+def test_config_file_equals_the_configuration_of_our_router(capsys, folder: Path, tmp_path: Path) -> None:
     tls, far = "tls/0.0.0.0:7449", "tcp/192.168.1.10:7489"
     credentials = credentials_of(ROUTER_NAME, folder)
     for arguments, expected in (
@@ -118,9 +114,7 @@ def test_config_file_equals_the_configuration_of_our_router(
     (["--secure", "nowhere"], "'nowhere' is not a folder"),
     (["--listen", "here"], "--listen: 'here' must be an endpoint"),
 ])
-def test_invalid_options_write_no_config_file(
-    capsys: pytest.CaptureFixture[str], arguments: list[str], reason: str
-) -> None:
+def test_invalid_options_write_no_config_file(capsys, arguments: list[str], reason: str) -> None:
     assert app.execute(["router", "config", *arguments]) == 2
     shown = capsys.readouterr()
     (line,) = shown.err.splitlines()

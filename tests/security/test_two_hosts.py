@@ -1,7 +1,5 @@
 """A secured cell on two hosts with linked routers; each host has only the certificates that it needs."""
 
-from __future__ import annotations
-
 import asyncio
 import shutil
 import time
@@ -40,9 +38,7 @@ def wait_answered(client: RawClient, key: str, received: Received) -> None:
         received.wait(lambda samples, seen=before: len(samples) > seen)  # type: ignore[misc]
 
 
-def test_run_completes_with_perception_and_arm_behind_different_routers(
-    certificates: Path, tmp_path: Path
-) -> None:
+def test_run_completes_with_perception_and_arm_behind_different_routers(certificates: Path, tmp_path: Path) -> None:
     folders = [tmp_path / "eye", tmp_path / "arm"]
     for folder in folders:
         folder.mkdir()

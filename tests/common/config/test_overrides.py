@@ -1,7 +1,5 @@
 """`--set @FILE`: the values of a file in the shape of a cell."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
@@ -19,14 +17,19 @@ def file(folder: Path, text: str) -> str:
     return f"@{path}"
 
 
-def test_the_values_of_a_file_stand_where_the_file_is_given(tmp_path: Path) -> None:
-    given = file(tmp_path, "motion: {velocity_scaling: 0.5}\nservices:\n  vision_detector:\n"
-                           "    hsv_red_lo1: [1, 2, 3]\n  camera_simulator: {}\n  scene_manager:\n")
-    assert expanded(["seed=1", given, "seed=2"]) == [
-        "seed=1", "motion.velocity_scaling=0.5", "services.vision_detector.hsv_red_lo1=[1, 2, 3]", "seed=2"]
+@pytest.mark.parametrize(("text", "overrides"), [
+    ("motion: {velocity_scaling: 0.5}\nservices:\n  vision_detector:\n    hsv_red_lo1: [1, 2, 3]\n"
+     "  camera_simulator: {}\n  scene_manager:\n",
+     ["motion.velocity_scaling=0.5", "services.vision_detector.hsv_red_lo1=[1, 2, 3]"]),
+    ("motion: {velocity_scaling: &half 0.5, acceleration_scaling: *half}\n",
+     ["motion.velocity_scaling=0.5", "motion.acceleration_scaling=0.5"]),
+    ("services: {fakes.first: {placed: 3}}", ["services.first.placed=3"]),
+], ids=["nested values", "YAML aliases", "service named by its module"])
+def test_file_is_replaced_by_its_values_in_place(tmp_path: Path, text: str, overrides: list[str]) -> None:
+    assert expanded(["seed=1", file(tmp_path, text), "seed=2"]) == ["seed=1", *overrides, "seed=2"]
 
 
-def test_a_file_changes_what_it_names_and_the_last_word_counts(tmp_path: Path) -> None:
+def test_file_changes_only_its_values_and_later_overrides_win(tmp_path: Path) -> None:
     given = file(tmp_path, "motion: {velocity_scaling: 0.5, planning_attempts: 7}\nworld: {count: 3}\n"
                            "pipeline: {validation_step: 0.02}\nservices: {vision_detector: {morph_kernel_px: 5}}\n")
     cell = load_cell("panda", [given, "motion.planning_attempts=9"])
@@ -37,30 +40,21 @@ def test_a_file_changes_what_it_names_and_the_last_word_counts(tmp_path: Path) -
     assert cell.services["scene_manager"].parameters == {}
 
 
-def test_names_in_a_file_stand_for_what_they_name(tmp_path: Path) -> None:
-    given = file(tmp_path, "motion: {velocity_scaling: &half 0.5, acceleration_scaling: *half}\n")
-    assert expanded([given]) == ["motion.velocity_scaling=0.5", "motion.acceleration_scaling=0.5"]
+def test_complete_cell_file_can_be_given(tmp_path: Path) -> None:
+    given = file(tmp_path, "world: w3\nrobot: panda\n")
+    assert load_cell("panda", [given]).world == load_cell("panda", world="w3").world
 
 
 @pytest.mark.parametrize("value", [
     100_000 * "[", "2026-13-01", "&a [*a]", "!!bool x", "!!int ''", "!!timestamp x", f"1{200 * ':0'}.5",
     r'"\UFFFFFFFF"',
 ])
-def test_a_value_that_is_none_is_refused(value: str) -> None:
+def test_invalid_yaml_value_is_refused(value: str) -> None:
     with pytest.raises(ConfigError, match=r"--set world\.count.*is not a YAML value"):
         parse_override(f"world.count={value}")
 
 
-def test_a_whole_cell_file_can_be_given(tmp_path: Path) -> None:
-    given = file(tmp_path, "world: w3\nrobot: panda\n")
-    assert load_cell("panda", [given]).world == load_cell("panda", world="w3").world
-
-
-def test_a_service_goes_by_the_last_part_of_its_module(tmp_path: Path) -> None:
-    assert expanded([file(tmp_path, "services: {fakes.first: {placed: 3}}")]) == ["services.first.placed=3"]
-
-
-@pytest.mark.parametrize(("text", "said"), [
+@pytest.mark.parametrize(("text", "reason"), [
     ("- 1\n", "must hold a mapping"), ("a: [1\nb: }", "does not parse at line 2"),
     ("made: 2026-13-01", "does not parse: month must be in 1..12"),
     ("a: " + 100_000 * "[", "does not parse at line 1, column 67: nested deeper than 64 levels"),
@@ -70,14 +64,14 @@ def test_a_service_goes_by_the_last_part_of_its_module(tmp_path: Path) -> None:
     ("made: !!bool x", "does not parse: a value does not fit its tag"),
     ("".join(f"a{n}: &a{n} [{','.join(10 * [f'*a{n - 1}' if n else '0'])}]\n" for n in range(9)), "more than 1000000"),
 ])
-def test_a_file_that_can_not_be_used_is_named(tmp_path: Path, text: str, said: str) -> None:
-    with pytest.raises(ConfigError, match=said):
+def test_unusable_file_is_refused_with_the_position(tmp_path: Path, text: str, reason: str) -> None:
+    with pytest.raises(ConfigError, match=reason):
         expanded([file(tmp_path, text)])
+
+
+def test_missing_file_and_wrong_names_or_values_in_a_file_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="no/where"):
         expanded(["@no/where.yaml"])
-
-
-def test_what_a_file_names_wrongly_is_told_as_if_it_were_set(tmp_path: Path) -> None:
     with pytest.raises(UnknownName, match="unknown service 'visoin_detector'"):
         load_cell("panda", [file(tmp_path, "services: {visoin_detector: {rate: 1}}")])
     with pytest.raises(ConfigError, match=r"motion.velocity_scaling: 7"):
@@ -91,9 +85,8 @@ plain = st.recursive(
 
 
 @given(plain)
-def test_a_value_on_a_line_reads_back_as_itself(value: object) -> None:
+def test_value_written_on_one_line_is_parsed_as_the_same_value(value: object) -> None:
     line = yaml_line(value)
     assert len(line.splitlines()) <= 1
-    path, read = parse_override(f"a.b={line}")
-    assert (path, read) == (["a", "b"], value)
+    assert parse_override(f"a.b={line}") == (["a", "b"], value)
     assert yaml.safe_load(line) == value

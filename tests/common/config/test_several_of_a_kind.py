@@ -1,6 +1,4 @@
-"""One module as several services of a cell: their names, their keys, and the camera that each looks through."""
-
-from __future__ import annotations
+"""One module as several services of a cell: their names, their keys, and the camera of each."""
 
 from pathlib import Path
 
@@ -30,14 +28,9 @@ def test_each_has_its_name_its_keys_and_its_parameters() -> None:
     assert (left.name, left.kind, left.module) == ("left_camera", "camera_opencv", "services.camera_opencv")
     assert left.topics == {"camera/*": "left_camera/*"} and "topics" not in left.parameters
     assert left.name_option == ["--name", "left_camera"] and planner.name_option == []
-    sources = [service_config(cell, name, camera_opencv.Config).source for name in ("left_camera", "right_camera")]
-    assert sources == ["a.avi", "b.avi"]
-
-
-def test_override_finds_it_by_its_own_name() -> None:
     cell = load_cell("panda", [*TWO, "services.left_camera.rate=5", "services.right_camera.topics={camera/*: r/*}"])
-    rates = [service_config(cell, name, camera_opencv.Config).rate for name in ("left_camera", "right_camera")]
-    assert rates == [5.0, 10.0]
+    configs = [service_config(cell, name, camera_opencv.Config) for name in ("left_camera", "right_camera")]
+    assert [(config.source, config.rate) for config in configs] == [("a.avi", 5.0), ("b.avi", 10.0)]
     assert cell.services["right_camera"].topics == {"camera/*": "r/*"}
     with pytest.raises(UnknownName, match="left_camera"):
         load_cell("panda", [*TWO, "services.camera_opencv.rate=5"])
@@ -55,7 +48,7 @@ def test_camera_of_a_service_is_the_one_that_it_chose() -> None:
         service_config(wrong, "left_camera", camera_opencv.Config)
 
 
-def test_a_single_camera_is_a_mapping_of_one_and_both_words_set_it(tmp_path: Path) -> None:
+def test_single_camera_is_set_under_both_names_and_one_of_several_by_a_file(tmp_path: Path) -> None:
     around = load_cell("panda", ["world.camera.fx=500", "world.cameras.camera.fy=510"]).section(Surroundings)
     assert isinstance(around, Surroundings)
     assert (around.camera.fx, around.camera.fy) == (500, 510) and around.cameras == {"camera": around.camera}
@@ -66,7 +59,7 @@ def test_a_single_camera_is_a_mapping_of_one_and_both_words_set_it(tmp_path: Pat
     assert (several["left"].width, several["right"].width) == (64, 640)
 
 
-@pytest.mark.parametrize(("overrides", "said"), [
+@pytest.mark.parametrize(("overrides", "reason"), [
     (["world.cameras={}"], r"world\.cameras: "),
     (["world.cameras={a: {}, b: {}}", "world.camera.fx=400"], r"camera is for a world with one: this one has a, b"),
     (["world.cameras={a: {frame: x}, b: {frame: x}}"], r"cameras\.b has the frame of a: x"),
@@ -82,34 +75,31 @@ def test_a_single_camera_is_a_mapping_of_one_and_both_words_set_it(tmp_path: Pat
     (cell_of("viewer: {topics: {'a*b': b}}"), r"services\.viewer\.topics: 'a\*b' is no key"),
     (cell_of("viewer: {topics: {log: b}}"), r"services\.viewer\.topics: 'log' is a key of all services"),
 ])
-def test_what_can_not_be_is_said_in_one_line(overrides: list[str], said: str) -> None:
-    with pytest.raises((ConfigError, UnknownName), match=said) as error:
+def test_invalid_cameras_and_services_are_refused_in_one_line(overrides: list[str], reason: str) -> None:
+    with pytest.raises((ConfigError, UnknownName), match=reason) as error:
         load_cell("panda", overrides)
     assert "\n" not in str(error.value)
 
 
-def test_task_under_a_name_of_its_own_is_still_that_of_its_application() -> None:
+def test_task_with_another_name_belongs_to_its_application() -> None:
     given = [*cell_of("picker: {service: smart_pick_place}"), "task=picker"]
-    cell, named = load_cell("panda", given), load_cell("panda", [*given, "application=pick_place"])
-    assert (cell.task, cell.application) == ("picker", "pick_place")
-    assert (named.task, named.application) == ("picker", "pick_place")
+    for cell in (load_cell("panda", given), load_cell("panda", [*given, "application=pick_place"])):
+        assert (cell.task, cell.application) == ("picker", "pick_place")
 
 
-def test_longest_beginning_that_fits_renames_a_key_and_shared_keys_stay() -> None:
-    table = {"*": "x/*", "camera/*": "left/*", "tf": "t", "tf_static": "tf_static"}
+@pytest.mark.parametrize(("table", "expected"), [
+    ({"*": "x/*", "camera/*": "left/*", "tf": "t", "tf_static": "tf_static"},
+     {"camera/image_raw": "left/image_raw", "camera/depth/a": "left/depth/a", "tf": "t", "tf_static": "tf_static",
+      "motion/plan": "x/motion/plan", "log": "log", "counters": "counters", "param/viewer": "param/viewer"}),
+    ({"seen": "left/seen", "other": "left/other"},
+     {"seen/mask": "left/seen/mask", "seen": "left/seen", "other/a/b": "other/a/b"}),
+], ids=["longest matching prefix, shared keys stay", "keys just below a key"])
+def test_key_is_remapped(table: dict[str, str], expected: dict[str, str]) -> None:
     remapping = Remapping(validate_table("topics", table))
-    asked = ["camera/image_raw", "camera/depth/a", "tf", "tf_static", "motion/plan", "log", "counters", "param/viewer"]
-    assert [remapping.key(key) for key in asked] == [
-        "left/image_raw", "left/depth/a", "t", "tf_static", "x/motion/plan", "log", "counters", "param/viewer"]
+    assert {key: remapping.key(key) for key in expected} == expected
 
 
-def test_what_lies_under_a_key_goes_where_that_goes() -> None:
-    remapping = Remapping(validate_table("topics", {"seen": "left/seen", "other": "left/other"}))
-    assert [remapping.key(key) for key in ("seen/mask", "seen", "other/a/b")] == [
-        "left/seen/mask", "left/seen", "other/a/b"]
-
-
-def test_entry_that_renames_nothing_is_told_with_the_keys_that_there_are() -> None:
+def test_unused_remapping_is_reported_with_the_existing_keys() -> None:
     remapping = Remapping({"camra/*": "left/*"})
     assert remapping.key("camera/image_raw") == "camera/image_raw"
     with pytest.raises(ConfigError, match=r"services\.left\.topics: 'camra/\*' .* choices: camera/image_raw"):

@@ -1,9 +1,3 @@
 """The network, process and router fixtures of the transport tests."""
 
-from tests.common.transport.conftest import (  # noqa: F401
-    domain,
-    new_bus,
-    processes,
-    shared_router,
-    until_fixture,
-)
+from tests.common.transport.conftest import domain, processes, shared_router  # noqa: F401

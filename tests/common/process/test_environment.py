@@ -1,35 +1,37 @@
 import os
 import subprocess
 import sys
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
-from common.process.environment import VARIABLES
+from common.process.environment import NICENESS, VARIABLES, lower_thread_priority
 
 ROOT = Path(__file__).resolve().parents[3]
 CLEAN = {name: value for name, value in os.environ.items() if name not in VARIABLES}
 REPORT = "import os, sys; print([os.environ[name] for name in %r], 'numpy' in sys.modules, 'pydantic' in sys.modules)"
+COMMAND = """
+import sys, types, zencell.__main__ as command
+sys.modules['cli.main'] = types.SimpleNamespace(app=lambda: None)
+command.main()
+"""
+linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="malloc_trim and priorities of threads")
 
 
-def report_after(start: str, **environment: str) -> str:
-    code = f"{start}\n{REPORT % list(VARIABLES)}"
+def output_of(code: str, **environment: str) -> str:
     return subprocess.run([sys.executable, "-c", code], env=CLEAN | environment, cwd=ROOT, capture_output=True,
                           text=True, check=True).stdout.strip()
 
 
-def test_command_sets_the_variables_before_it_imports_its_verbs():
-    report = report_after("import sys, types, zencell.__main__ as command\n"
-                      "sys.modules['cli.main'] = types.SimpleNamespace(app=lambda: None)\ncommand.main()")
-    assert report == "['1', '__all__'] False False"
-
-
-def test_service_sets_the_variables_before_numpy_and_pydantic_are_imported():
-    assert report_after("import services") == "['1', '__all__'] False False"
-
-
-def test_variables_of_the_environment_are_not_overwritten():
-    assert report_after("import services", OPENBLAS_NUM_THREADS="4") == "['4', '__all__'] False False"
+@pytest.mark.parametrize(("start", "given", "threads"), [
+    (COMMAND, {}, "1"), ("import services", {}, "1"), ("import services", {"OPENBLAS_NUM_THREADS": "4"}, "4"),
+])
+def test_missing_variables_are_set_before_numpy_and_pydantic_are_imported(
+    start: str, given: dict[str, str], threads: str
+) -> None:
+    assert output_of(f"{start}\n{REPORT % list(VARIABLES)}", **given) == f"['{threads}', '__all__'] False False"
 
 
 MEASURE = """
@@ -49,8 +51,19 @@ print(before - resident_mb())
 """
 
 
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="malloc_trim is part of glibc")
-def test_memory_of_queued_images_is_returned_to_the_system():
-    report = subprocess.run([sys.executable, "-c", MEASURE], env=CLEAN, cwd=ROOT, capture_output=True, text=True,
-                          check=True).stdout
-    assert float(report) > 30, "of the 55 MB that were allocated"
+@linux
+def test_memory_of_queued_images_is_returned_to_the_system() -> None:
+    assert float(output_of(MEASURE)) > 30, "of the 55 MB that were allocated"
+
+
+def priority() -> int:
+    return os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
+
+
+@linux
+def test_only_the_computing_thread_gets_a_lower_priority() -> None:
+    before = priority()
+    with ThreadPoolExecutor(1) as pool:
+        assert pool.submit(lambda: (lower_thread_priority(), priority())[1]).result() == NICENESS
+    lower_thread_priority()  # without effect on the main thread
+    assert priority() == before

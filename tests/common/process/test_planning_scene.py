@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import asyncio
 import errno
 import logging
@@ -14,7 +12,7 @@ from common.errors import ConfigError, RemoteError
 from common.messages import CollisionObject, Header, PlanningScene, Pose, SceneEdit
 from common.process.in_process import running_service
 from common.process.planning_scene import SceneWriter
-from common.transport.bus import Bus
+from common.transport.bus import Bus, Reader
 from common.transport.local import LocalNetwork
 
 SEEN = CollisionObject(id="ball", role="target", shape="sphere", dimensions=[0.03], pose=Pose())
@@ -23,10 +21,13 @@ POLE = SceneEdit(op="add", id="pole", shape="cylinder", dimensions=[0.02, 1.0], 
 
 async def writer(bus: Bus, config: None) -> None:
     """Publish a scene with one ball."""
-    scene_writer = SceneWriter(bus)
-    await scene_writer.begin(PlanningScene(header=Header(stamp=1), objects=[SEEN]))
+    await SceneWriter(bus).begin(PlanningScene(header=Header(stamp=1), objects=[SEEN]))
     await bus.ready()
     await asyncio.Event().wait()
+
+
+async def next_ids(scenes: Reader[PlanningScene]) -> list[str]:
+    return [each.id for each in (await scenes.next()).objects]
 
 
 @pytest.fixture(autouse=True)
@@ -35,21 +36,19 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-async def test_added_solid_is_published_with_the_perceived_scene_also_after_a_restart(
-    caplog: pytest.LogCaptureFixture
-) -> None:
+async def test_added_solid_is_published_with_the_perceived_scene_also_after_a_restart(caplog) -> None:
     net = LocalNetwork()
     bus = net.bus("tester", cell="test")
     scenes, edits = bus.reader(topics.PLANNING_SCENE), bus.client(topics.SCENE_EDIT)
     async with running_service(net, writer, None, name="writer"):
-        assert [each.id for each in (await scenes.next()).objects] == ["ball"]
+        assert await next_ids(scenes) == ["ball"]
         assert (await edits.call(POLE, 5.0)).ids == ["added/pole"]
-        assert [each.id for each in (await scenes.next()).objects] == ["ball", "added/pole"]
+        assert await next_ids(scenes) == ["ball", "added/pole"]
     with caplog.at_level(logging.WARNING, "writer"):
         async with running_service(net, writer, None, name="writer"):
-            assert [each.id for each in (await scenes.next()).objects] == ["ball", "added/pole"]
+            assert await next_ids(scenes) == ["ball", "added/pole"]
             assert (await edits.call(SceneEdit(op="remove", id="pole"), 5.0)).ids == []
-            assert [each.id for each in (await scenes.next()).objects] == ["ball"]
+            assert await next_ids(scenes) == ["ball"]
     assert "solids from an earlier session: added/pole" in caplog.text
 
 
@@ -64,7 +63,7 @@ async def test_solid_is_not_added_if_it_cannot_be_saved(monkeypatch: pytest.Monk
         with pytest.raises(RemoteError, match=r"No space left on device.*was not made") as refused:
             await bus.client(topics.SCENE_EDIT).call(POLE, 5.0)
         assert refused.value.code == "not_kept"
-        assert [each.id for each in (await bus.reader(topics.PLANNING_SCENE).next()).objects] == ["ball"]
+        assert await next_ids(bus.reader(topics.PLANNING_SCENE)) == ["ball"]
 
 
 async def test_service_does_not_start_if_its_added_solids_cannot_be_read(folder: Path) -> None:

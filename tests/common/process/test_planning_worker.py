@@ -11,9 +11,10 @@ import psutil
 ROOT = Path(__file__).resolve().parents[3]
 
 SETUP = """
-import asyncio, json, os, signal, sys, time
+import asyncio, json, multiprocessing, os, signal, sys
 from common.config import load_cell
 from common.messages import CollisionObject, Header, JointGoal, PlanningScene, PlanRequest, Pose, Vector3
+from common.process import planning_worker
 from common.process.planning_worker import PlanningWorker, WorkerDied
 from common.planning.pipeline import PlanningPipeline
 from common.robot.model import RobotModel
@@ -21,8 +22,9 @@ from common.robot.model import RobotModel
 cell = load_cell("panda", ["pipeline.planners=[{name: ompl, options: {algorithm: AORRTC, improving_time: 60}}]"]
                  if "long" in sys.argv else [])
 setup = cell.robot, cell.motion, cell.pipeline
-worker = PlanningWorker(1)
-worker.set_up(*setup, seed=3)
+worker, second = PlanningWorker(1), PlanningWorker(1)
+for each in (worker, second):
+    each.set_up(*setup, seed=3)
 wall = CollisionObject(id="wall", role="fixture", shape="box", dimensions=[0.3, 0.02, 0.4],
                        pose=Pose(position=Vector3(x=0.55, z=0.2)))
 scene = PlanningScene(header=Header(frame_id="world"), objects=[wall])
@@ -31,21 +33,31 @@ left, right = [0.6, *down.tolist()[1:]], [-0.6, *down.tolist()[1:]]
 
 runner = asyncio.Runner()
 
+def show(value):
+    print(json.dumps(value), flush=True)
+
 def request(id, seconds=20.0):
     return PlanRequest(id=id, start=left, goal=JointGoal(positions=right), planning_time=seconds)
 
-def plan(*arguments):
-    return runner.run(worker.plan(*arguments))
+def plan(*arguments, by=worker):
+    return runner.run(by.plan(*arguments))
 
-def cancelled(after):
+def failure(*arguments, by=worker):
+    try:
+        plan(*arguments, by=by)
+    except WorkerDied as error:
+        return [str(error), by._process.exitcode]
+
+def cancelled(after, by=worker):
     async def cancel_plan():
-        task = asyncio.create_task(worker.plan(request("a", 300.0), scene, None))
+        task = asyncio.create_task(by.plan(request("a", 300.0), scene, None))
         await asyncio.sleep(after)
         task.cancel()
         await asyncio.wait({task})
         return task.cancelled()
     return runner.run(cancel_plan())
 """
+DIED = ["the planning worker has ended", -9]
 
 
 def run_script(script: str, *arguments: str) -> list[object]:
@@ -62,7 +74,7 @@ own = PlanningPipeline(RobotModel.load(cell.robot), *setup[1:], seed=3)
 empty = PlanningScene(header=Header(frame_id="world"))
 for planner in (plan, own.plan):
     answers = [planner(request(name), where, None) for name, where in (("a", scene), ("b", scene), ("c", empty))]
-    print(json.dumps([[p.positions for p in each.trajectory.points] for each in answers]))
+    show([[p.positions for p in each.trajectory.points] for each in answers])
 """)
     assert by_worker == by_pipeline
     assert isinstance(by_worker, list) and by_worker[0] != by_worker[2]
@@ -70,89 +82,51 @@ for planner in (plan, own.plan):
 
 def test_cancelled_worker_plans_the_next_request() -> None:
     loading, planning, answer = run_script("""
-for after in (0.0, 2.0):
-    print(json.dumps(cancelled(after)))
-print(json.dumps(plan(request("b", 0.5), scene, None).ok))
+show(cancelled(0.0))
+show(cancelled(1.0))
+show(plan(request("b", 0.2), scene, None).ok)
 """, "long")
     assert loading and planning and answer, "a worker that ignores the cancellation would be killed"
 
 
-def test_killed_worker_is_reported() -> None:
-    assert run_script("""
-import multiprocessing
-process, = multiprocessing.active_children()
-os.kill(process.pid, signal.SIGKILL)
-try:
-    plan(request("a"), scene, None)
-except WorkerDied as error:
-    print(json.dumps(str(error)))
-""") == ["the planning worker has ended"]
+def test_worker_that_was_killed_or_stopped_is_reported_and_ended_and_no_other_is() -> None:
+    killed, large, cancelled, reported, closed = run_script("""
+planning_worker.OVERTIME = 0.1
+third, fourth, last = PlanningWorker(1), PlanningWorker(1), PlanningWorker(1)
+os.kill(worker._process.pid, signal.SIGKILL)
+show(failure(request("a"), scene, None))
+os.kill(second._process.pid, signal.SIGSTOP)
+does_not_fit_into_the_pipe = {"header": Header.model_construct(frame_id="x" * 10_000_000)}
+show(failure(request("a", 0.1), scene.model_copy(update=does_not_fit_into_the_pipe), None, by=second))
+os.kill(third._process.pid, signal.SIGSTOP)
+show(cancelled(0.0, by=third))
+show(failure(request("b"), scene, None, by=third))
+fourth.close()
+show([fourth._process.exitcode, last._process.exitcode])
+""")
+    assert killed == large == reported == DIED
+    assert cancelled is True
+    assert closed == [-9, None]
 
 
-def test_worker_ends_when_its_parent_exits() -> None:
+def test_all_workers_end_when_their_parent_exits_also_planning_and_stopped_ones() -> None:
     pids = run_script("""
-import multiprocessing
-print(json.dumps(multiprocessing.active_children()[0].pid), flush=True)
+for process in multiprocessing.active_children():
+    show(process.pid)
+    while os.getpriority(os.PRIO_PROCESS, process.pid) == os.getpriority(os.PRIO_PROCESS, 0):
+        pass  # it has just been forked
+os.kill(second._process.pid, signal.SIGSTOP)
 async def leave():
     planning = asyncio.create_task(worker.plan(request("a", 300.0), scene, None))
     await asyncio.sleep(0.5)
     os._exit(0)
 runner.run(leave())
 """, "long")
-    assert isinstance(pids[0], int)
-    with contextlib.suppress(psutil.NoSuchProcess):
-        psutil.Process(pids[0]).wait(20)
-
-
-def test_all_workers_end_when_their_parent_exits_also_a_stopped_one() -> None:
-    pids = run_script("""
-import multiprocessing
-second = PlanningWorker(1)
-for process in multiprocessing.active_children():
-    print(json.dumps(process.pid), flush=True)
-    while os.getpriority(os.PRIO_PROCESS, process.pid) == os.getpriority(os.PRIO_PROCESS, 0):
-        pass  # it has just been forked
-os.kill(second._process.pid, signal.SIGSTOP)
-os._exit(0)
-""")
+    assert len(pids) == 2
     for pid in pids:
         assert isinstance(pid, int)
         with contextlib.suppress(psutil.NoSuchProcess):
             psutil.Process(pid).wait(20)
-
-
-def test_stopped_worker_is_killed_and_reported_though_the_scene_does_not_fit_into_the_pipe() -> None:
-    assert run_script("""
-import common.process.planning_worker
-common.process.planning_worker.OVERTIME = 0.1
-scene = scene.model_copy(update={"header": Header.model_construct(frame_id="x" * 10_000_000)})
-os.kill(worker._process.pid, signal.SIGSTOP)
-try:
-    plan(request("a", 0.1), scene, None)
-except WorkerDied as error:
-    print(json.dumps([str(error), worker._process.exitcode]))
-""") == [["the planning worker has ended", -9]]
-
-
-def test_stopped_worker_is_killed_when_it_is_cancelled() -> None:
-    assert run_script("""
-import common.process.planning_worker
-common.process.planning_worker.OVERTIME = 0.1
-os.kill(worker._process.pid, signal.SIGSTOP)
-print(json.dumps(cancelled(0.0)))
-try:
-    plan(request("b"), scene, None)
-except WorkerDied as error:
-    print(json.dumps(str(error)))
-""") == [True, "the planning worker has ended"]
-
-
-def test_closed_worker_leaves_no_process_behind() -> None:
-    assert run_script("""
-second = PlanningWorker(1)
-worker.close()
-print(json.dumps([worker._process.exitcode, second._process.exitcode]))
-""") == [[-9, None]]
 
 
 def test_worker_finds_a_planner_on_a_search_path_that_its_parent_added_later(tmp_path: Path) -> None:
@@ -163,5 +137,5 @@ def test_worker_finds_a_planner_on_a_search_path_that_its_parent_added_later(tmp
 sys.path.append(sys.argv[1])
 cell = load_cell("panda", ["pipeline.planners=[{name: of_a_user.planner}]"])
 worker.set_up(cell.robot, cell.motion, cell.pipeline, seed=3)
-print(json.dumps(plan(request("a"), scene, None).planner))
+show(plan(request("a"), scene, None).planner)
 """, str(tmp_path)) == ["planner"]

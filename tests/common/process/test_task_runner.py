@@ -1,12 +1,12 @@
 """Commands of a task reach the executor once, and none that a later one has superseded."""
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from itertools import pairwise
 from typing import Any
+
+import pytest
 
 from applications.pick_place.topics import PICK_PLACE_STATUS, PickPlaceStatus
 from common import messages as m
@@ -18,7 +18,7 @@ from common.process.task_runner import NOT_ANSWERED, TaskRunner
 from common.tasks.monitoring import LivenessWatchdog
 from common.tasks.stages import Command, View
 from common.time_source import wall_ns
-from common.transport.bus import Bus
+from common.transport.bus import Bus, Client
 from common.transport.local import LocalNetwork
 
 POINT = m.JointTrajectoryPoint(time_from_start=0.0, positions=[0.0], velocities=[0.0], accelerations=[0.0])
@@ -27,12 +27,11 @@ HOLD = {"pause": m.HoldRequest(hold=True), "resume": m.HoldRequest(hold=False)}
 
 
 class Script:
-    """A task that requests a motion in its first step, and forwards each command as a hold or stop."""
+    """A task that requests motions in its first step, and forwards each command as a hold or stop."""
 
-    def __init__(self) -> None:
+    def __init__(self, first: list[Command], also: list[Command]) -> None:
         self.status = PickPlaceStatus()
-        self.first: list[Command] = [GO]
-        self.also: list[Command] = []  # sent along with every command
+        self.first, self.also = first, also  # the latter are sent along with every command
 
     def step(self, view: Any) -> list[Command]:
         commands, self.first = self.first, []
@@ -46,19 +45,6 @@ class Script:
 
     def on_goal(self, answer: m.MotionStatus | m.GripperState, view: Any) -> None:
         self.status.message = answer.state
-
-
-@asynccontextmanager
-async def running(net: LocalNetwork, *also: Command, clock: Clock | None = None) -> AsyncIterator[Bus]:
-    async def run(bus: Bus, config: None) -> None:
-        script = Script()
-        script.also = list(also)
-        runner = TaskRunner(bus, script, lambda: None, bus.writer(PICK_PLACE_STATUS), lambda: 1.0)
-        await bus.ready()
-        await runner.run(())
-
-    async with running_service(net, run, None, name="smart_pick_place", clock=clock) as bus:
-        yield bus
 
 
 class Executor:
@@ -86,116 +72,129 @@ class Executor:
         return request.acknowledged
 
 
-async def command(net: LocalNetwork, *commands: str) -> str:
-    """Send commands to the task; return its reply to the last one."""
-    client, reply = net.bus("operator").client(topics.TASK_COMMAND), ""
-    for name in commands:
-        reply = (await client.call(m.TaskCommand.model_validate({"command": name}))).message
-    return reply
+class Rig:
+    """A running task, an operator, and an executor that may start late."""
+
+    def __init__(self) -> None:
+        self.net = LocalNetwork()
+        self.client: Client[m.TaskCommand, m.TaskStatus] = self.net.bus("operator").client(topics.TASK_COMMAND)
+
+    @asynccontextmanager
+    async def running(
+        self, *also: Command, script: Script | None = None, clock: Clock | None = None, view: View | None = None,
+        watched: bool = False,
+    ) -> AsyncIterator[None]:
+        async def run(bus: Bus, config: None) -> None:
+            joints = bus.reader(topics.JOINT_STATES)
+            watchdog = [LivenessWatchdog(lambda: joints.received, lambda: 0.2)] if watched else []
+            task = script or Script([GO], list(also))
+            runner = TaskRunner(bus, task, lambda: view, bus.writer(PICK_PLACE_STATUS), lambda: 1.0, *watchdog)
+            await bus.ready()
+            await runner.run(())
+
+        async with running_service(self.net, run, None, name="smart_pick_place", clock=clock), asyncio.timeout(30):
+            yield
+
+    async def executor(self, *interlocks: m.Interlock) -> Executor:
+        executor = Executor(self.net)
+        executor.interlocks = list(interlocks)
+        await executor.bus.ready()
+        return executor
+
+    async def command(self, *commands: str, by: str = "") -> str:
+        """Send commands to the task; return its reply to the last one."""
+        reply = ""
+        for name in commands:
+            reply = (await self.client.call(m.TaskCommand.model_validate({"command": name, "by": by}))).message
+        return reply
 
 
-async def test_reply_says_that_a_command_is_lost_while_no_executor_answers() -> None:
-    net = LocalNetwork()
-    async with running(net):
-        assert NOT_ANSWERED in await command(net, "stop")
-        await (executor := Executor(net)).bus.ready()
-        await executor.next()
-        assert NOT_ANSWERED not in await command(net, "pause")
+@pytest.fixture
+async def rig() -> Rig:
+    return Rig()
 
 
-async def test_pause_and_resume_reach_the_executor_in_order() -> None:
-    net = LocalNetwork()
-    executor = Executor(net)
-    await executor.bus.ready()
-    async with running(net):
+async def test_reply_says_that_a_command_is_lost_while_no_executor_answers(rig: Rig) -> None:
+    async with rig.running():
+        assert NOT_ANSWERED in await rig.command("stop")
+        await (await rig.executor()).next()
+        assert NOT_ANSWERED not in await rig.command("pause")
+
+
+async def test_pause_and_resume_reach_the_executor_in_order(rig: Rig) -> None:
+    executor = await rig.executor()
+    async with rig.running():
         assert await executor.next() == GO
-        await command(net, "pause")
+        await rig.command("pause")
         assert await executor.next() == HOLD["pause"]
-        await command(net, "resume")
+        await rig.command("resume")
         assert await executor.next_release()
 
 
-async def test_late_executor_receives_the_newest_hold_and_no_motion_after_a_stop() -> None:
-    net = LocalNetwork()
-    async with running(net):
-        await command(net, "pause", "resume", "pause", "stop")
-        executor = Executor(net)
-        await executor.bus.ready()
+async def test_late_executor_receives_the_newest_hold_and_no_motion_after_a_stop(rig: Rig) -> None:
+    async with rig.running():
+        await rig.command("pause", "resume", "pause", "stop")
+        executor = await rig.executor()
         requests = [await executor.next(), await executor.next()]
         assert sorted(type(request).__name__ for request in requests) == ["HoldRequest", "StopRequest"]
         assert HOLD["pause"] in requests
-        await command(net, "resume")
+        await rig.command("resume")
         assert await executor.next_release()
         assert executor.requests.empty()
 
 
-async def test_late_executor_receives_the_pauses_of_two_operators() -> None:
-    net = LocalNetwork()
-    async with running(net):
-        client = net.bus("person").client(topics.TASK_COMMAND)
+async def test_late_executor_receives_the_pauses_of_two_operators(rig: Rig) -> None:
+    async with rig.running():
         for operator in ("alice", "bob"):
-            await client.call(m.TaskCommand(command="pause", by=operator))
-        executor = Executor(net)
-        await executor.bus.ready()
+            await rig.command("pause", by=operator)
+        executor = await rig.executor()
         requests = [await executor.next() for _ in range(3)]
         assert {request.owner for request in requests if isinstance(request, m.HoldRequest)} == {"alice", "bob"}
 
 
-async def test_delayed_resume_releases_no_interlock_that_is_newer_than_its_request() -> None:
-    net, fast = LocalNetwork(), Clock(10.0, wall_ns() - 3_600_000_000_000)  # `since` is no cell time
-    async with running(net, clock=fast):
+async def test_delayed_resume_releases_no_interlock_that_is_newer_than_its_request(rig: Rig) -> None:
+    fast = Clock(10.0, wall_ns() - 3_600_000_000_000)  # `since` is no cell time
+    async with rig.running(clock=fast):
         before = wall_ns()
-        await command(net, "resume")
-        executor = Executor(net)
-        await executor.bus.ready()
+        await rig.command("resume")
+        executor = await rig.executor()
         requests = [await executor.next(), await executor.next()]
         seen = [request.acknowledged for request in requests if isinstance(request, m.HoldRequest)]
         assert seen[0] is not None and before <= seen[0] <= wall_ns()
 
 
-async def test_delayed_resume_releases_its_own_pause_but_no_stop_of_another_operator_in_between() -> None:
-    for stopped, released_until in ((0, 2), (1, 0), (3, 2)):
-        net, since = LocalNetwork(), 2 * wall_ns()
-        interlocks = [m.Interlock(kind="held", by="operator", since=since + 2)]
-        interlocks += [m.Interlock(kind="stopped", by="bob", since=since + stopped)] if stopped else []
-        async with running(net):
-            await command(net, "pause", "resume")
-            executor = Executor(net)
-            executor.interlocks = interlocks
-            await executor.bus.ready()
-            requests = [await executor.next() for _ in range(3)]
-            released = [each for each in requests if isinstance(each, m.HoldRequest) and not each.hold]
-            seen = [each.acknowledged for each in released]
-            assert (seen == [since + released_until]) if released_until else (seen[0] is not None and seen[0] < since)
-
-
-async def test_delayed_resume_releases_its_pause_despite_a_watchdog_hold() -> None:
-    net, since = LocalNetwork(), 2 * wall_ns()
-    async with running(net):
-        await command(net, "pause", "resume")
-        executor = Executor(net)
-        executor.interlocks = [m.Interlock(kind="held", by="watchdog", since=since),
-                             m.Interlock(kind="held", by="operator", since=since + 1)]
-        await executor.bus.ready()
+@pytest.mark.parametrize(("interlocks", "released"), [
+    ([("held", "operator", 2)], 2),
+    ([("held", "operator", 2), ("stopped", "bob", 1)], None),
+    ([("held", "operator", 2), ("stopped", "bob", 3)], 2),
+    ([("held", "watchdog", 0), ("held", "operator", 1)], 1),
+], ids=["own pause", "stop of another operator in between", "later stop of another operator", "hold of a watchdog"])
+async def test_delayed_resume_releases_up_to_its_own_pause(
+    rig: Rig, interlocks: list[tuple[str, str, int]], released: int | None
+) -> None:
+    start = 2 * wall_ns()
+    async with rig.running():
+        await rig.command("pause", "resume")
+        executor = await rig.executor(*(
+            m.Interlock.model_validate({"kind": kind, "by": by, "since": start + since})
+            for kind, by, since in interlocks))
         requests = [await executor.next() for _ in range(3)]
-        seen = [request.acknowledged for request in requests if isinstance(request, m.HoldRequest) and not request.hold]
-        assert seen == [since + 1]
+        (seen,) = [each.acknowledged for each in requests if isinstance(each, m.HoldRequest) and not each.hold]
+        assert seen is not None
+        assert seen < start if released is None else seen == start + released
 
 
-async def test_reply_to_a_resume_that_a_stop_supersedes_does_not_call_it_pending() -> None:
-    net = LocalNetwork()
-    executor = Executor(net)
-    await executor.bus.ready()
-    async with running(net):
-        client = net.bus("person").client(topics.TASK_COMMAND)
-        async with asyncio.TaskGroup() as group:
-            resumed = group.create_task(client.call(m.TaskCommand(command="resume")))
-            group.create_task(client.call(m.TaskCommand(command="stop")))
-        assert NOT_ANSWERED not in resumed.result().message
+async def test_reply_to_a_resume_that_a_stop_supersedes_does_not_call_it_pending(rig: Rig) -> None:
+    await rig.executor()
+    async with rig.running(), asyncio.TaskGroup() as group:
+        resumed = group.create_task(rig.command("resume"))
+        group.create_task(rig.command("stop"))
+    assert NOT_ANSWERED not in resumed.result()
 
 
-async def test_refused_or_damaged_stop_and_pause_are_sent_again() -> None:
-    net, accepted = LocalNetwork(), asyncio.Queue[m.Message]()
+async def test_refused_or_damaged_stop_and_pause_are_sent_again(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("common.process.timing.RETRY_PERIOD", 0.01)
+    accepted = asyncio.Queue[m.Message]()
     codes = {m.StopRequest: ["busy", "internal", "invalid"], m.HoldRequest: ["invalid", "busy"]}
 
     async def note(request: m.StopRequest | m.HoldRequest) -> m.MotionStatus:
@@ -204,68 +203,46 @@ async def test_refused_or_damaged_stop_and_pause_are_sent_again() -> None:
         accepted.put_nowait(request)
         return m.MotionStatus()
 
-    executor = net.bus("trajectory_executor")
+    executor = rig.net.bus("trajectory_executor")
     executor.serve(topics.MOTION_STOP, note)
     executor.serve(topics.MOTION_HOLD, note)
     await executor.ready()
-    async with running(net), asyncio.timeout(30):
+    async with rig.running():
         for name, request in (("pause", HOLD["pause"]), ("stop", m.StopRequest(reason="stop"))):
-            assert NOT_ANSWERED not in await command(net, name)
+            assert NOT_ANSWERED not in await rig.command(name)
             assert await accepted.get() == request
 
 
-async def test_holds_of_a_watchdog_and_an_operator_are_independent() -> None:
-    net = LocalNetwork()
+async def test_holds_of_a_watchdog_and_an_operator_are_independent(rig: Rig) -> None:
     watchdog = m.HoldRequest(hold=True, reason="no joint states", by="watchdog")
-    async with running(net, watchdog):
-        await command(net, "pause")
-        executor = Executor(net)
-        await executor.bus.ready()
+    async with rig.running(watchdog):
+        await rig.command("pause")
+        executor = await rig.executor()
         requests = [await executor.next() for _ in range(3)]
         assert watchdog in requests and HOLD["pause"] in requests and GO in requests
 
 
-class Idle(Script):
-    """A task that requests no motion."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.first = []
-
-
-async def test_missing_joint_states_are_reported_and_hold_the_arm_until_they_return() -> None:
-    net = LocalNetwork()
-    executor = Executor(net)
-    await executor.bus.ready()
+async def test_missing_joint_states_are_reported_and_hold_the_arm_until_they_return(rig: Rig) -> None:
+    executor = await rig.executor()
     view = View(now=0.0, motion=m.MotionStatus(id="go", state="active"))
-
-    async def run(bus: Bus, config: None) -> None:
-        joints = bus.reader(topics.JOINT_STATES)
-        watchdog = LivenessWatchdog(lambda: joints.received, lambda: 0.2)
-        writer = bus.writer(PICK_PLACE_STATUS)
-        runner = TaskRunner(bus, Idle(), lambda: view, writer, lambda: 1.0, watchdog)
-        await bus.ready()
-        await runner.run(())
-
-    operator = net.bus("operator")
-    status, joints = operator.reader(PICK_PLACE_STATUS), executor.bus.writer(topics.JOINT_STATES)
-    async with running_service(net, run, None, name="smart_pick_place"):
-        joints.put(m.JointState(header=m.Header(stamp=1), name=["j"], position=[0.0]))
+    status, joints = rig.net.bus("reader").reader(PICK_PLACE_STATUS), executor.bus.writer(topics.JOINT_STATES)
+    state = m.JointState(header=m.Header(stamp=1), name=["j"], position=[0.0])
+    async with rig.running(script=Script([], []), view=view, watched=True):
+        joints.put(state)
         hold = await executor.next()
         assert isinstance(hold, m.HoldRequest) and hold.hold and hold.by == "watchdog"
-        async with asyncio.timeout(30):
-            while (await status.next()).message != "the arm waits: no joint states for 200 ms":
-                pass
+        while (await status.next()).message != "the arm waits: no joint states for 200 ms":
+            pass
         assert view.trouble
-        joints.put(m.JointState(header=m.Header(stamp=1), name=["j"], position=[0.0]))
+        joints.put(state)
         release = await executor.next()
         assert isinstance(release, m.HoldRequest) and not release.hold and release.by == "watchdog"
 
 
-async def test_repeatedly_refused_motion_is_requested_at_growing_intervals() -> None:
-    net, times, errors = LocalNetwork(), [], set()
-    loop = asyncio.get_running_loop()
-    enough = asyncio.Event()
+async def test_repeatedly_refused_motion_is_requested_at_growing_intervals(rig: Rig, monkeypatch) -> None:
+    delay = 0.02  # [s]
+    monkeypatch.setattr("common.process.task_requests.REFUSAL_DELAY", delay)
+    times, errors, enough = [], set(), asyncio.Event()
 
     class Persistent(Script):
         def on_goal(self, answer: m.MotionStatus | m.GripperState, view: Any) -> None:
@@ -279,7 +256,7 @@ async def test_repeatedly_refused_motion_is_requested_at_growing_intervals() -> 
             return [gripper if len(times) % 2 else arm] if repeat else []
 
     def note() -> None:
-        times.append(loop.time())
+        times.append(asyncio.get_running_loop().time())
         if len(times) == 6:
             enough.set()
 
@@ -291,18 +268,12 @@ async def test_repeatedly_refused_motion_is_requested_at_growing_intervals() -> 
         note()
         raise Refused("clock_ahead", "the same")
 
-    executor = net.bus("trajectory_executor")
+    executor = rig.net.bus("trajectory_executor")
     executor.serve(topics.MOTION_EXECUTE, refuse)
     executor.serve(topics.GRIPPER_COMMAND, refuse_gripper)
     await executor.ready()
-
-    async def run(bus: Bus, config: None) -> None:
-        runner = TaskRunner(bus, Persistent(), lambda: None, bus.writer(PICK_PLACE_STATUS), lambda: 1.0)
-        await bus.ready()
-        await runner.run(())
-
-    async with running_service(net, run, None, name="smart_pick_place"), asyncio.timeout(30):
+    async with rig.running(script=Persistent([], [])):
         await enough.wait()
     assert errors == {"clock_ahead"}
     waits = [after - before for before, after in pairwise(times)]
-    assert waits[1] >= 0.1 and waits[2] >= 0.2 and waits[3] >= 0.4 and waits[4] >= 0.8
+    assert all(wait >= delay * 2**doublings for doublings, wait in enumerate(waits[1:]))

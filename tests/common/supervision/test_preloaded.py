@@ -83,27 +83,27 @@ def test_forked_process_shows_its_own_command_line_and_leads_a_session(
     assert (output_of(process), process.wait()) == ("", -signal.SIGKILL)
 
 
-@pytest.mark.parametrize("command", [["true"], [sys.executable, "-c", "1"], [sys.executable, "-m", "forked_toy"]])
-def test_other_commands_are_not_forked(preloaded: Preloaded, environment: dict[str, str], command: list[str]) -> None:
-    assert preloaded.spawn(command, environment) is None
+def test_other_commands_are_not_forked(preloaded: Preloaded, environment: dict[str, str]) -> None:
+    for command in (["true"], [sys.executable, "-c", "1"], [sys.executable, "-m", "forked_toy"]):
+        assert preloaded.spawn(command, environment) is None
 
 
-async def run(child: Child) -> int:
+async def run(environment: dict[str, str], process: Preloaded, argument: str) -> tuple[int, list[str]]:
+    """Return exit code and output of a child."""
+    lines: list[str] = []
+    child = Child("it", [*COMMAND, argument], environment, lambda name, line: lines.append(line), process)
     child.start()
     child.release()
     async with asyncio.timeout(30):
-        return await child.wait()
+        return await child.wait(), lines
 
 
 async def test_child_that_was_forked_reads_its_gate_and_leaves_no_orphan(
     preloaded: Preloaded, environment: dict[str, str]
 ) -> None:
-    lines: list[str] = []
-    for argument, code in (("read", 0), ("orphan", 0)):
-        child = Child("it", [*COMMAND, argument], environment, lambda name, line: lines.append(line), preloaded)
-        assert await run(child) == code
-    assert lines[1] == "'go\\n'"
-    assert not psutil.pid_exists(int(lines[3]))
+    assert await run(environment, preloaded, "read") == (0, ["__main__ ['read'] me True", "'go\\n'"])
+    code, (_, orphan) = await run(environment, preloaded, "orphan")
+    assert code == 0 and not psutil.pid_exists(int(orphan))
 
 
 @pytest.mark.parametrize("lost", ["killed", "closed"])
@@ -116,7 +116,5 @@ async def test_child_starts_without_a_lost_preloaded_process(environment: dict[s
         newest.kill()
     else:
         process.close()
-    lines: list[str] = []
-    child = Child("it", [*COMMAND, "exit"], environment, lambda name, line: lines.append(line), process)
-    assert (await run(child), lines) == (3, ["__main__ ['exit'] me True"])
+    assert await run(environment, process, "exit") == (3, ["__main__ ['exit'] me True"])
     process.close()

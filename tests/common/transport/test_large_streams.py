@@ -1,7 +1,5 @@
 """A slow reader of images loses no small messages, and does not delay them."""
 
-from __future__ import annotations
-
 import asyncio
 import threading
 import uuid

@@ -70,9 +70,7 @@ def test_handshake_is_forwarded_byte_for_byte_until_the_end_of_the_stream(port: 
         assert connection.recv(1) == b""
 
 
-def test_client_without_a_handshake_is_disconnected(
-    port: int, echo: Echo, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_client_without_a_handshake_is_disconnected(port: int, echo: Echo, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("common.transport.tls_gate.HELLO_SECONDS", 0.1)
     for first_bytes in (b"", b"GET / HTTP/1.1\r\n", b"\x16\x03\x01\x00\x20\x02", b"\x16\x03"):
         with connect(port) as connection:
