@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import socket
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from pathlib import Path
 from typing import Any
 
 import zenoh
 
 from common.transport.credentials import Credentials
 from common.transport.endpoint import client_config
+from security.certificates import Authority
 
 TIMEOUT = 30.0  # [s] only a failing test waits that long
 TIMEOUT_REPLY = b"Timeout"  # of Zenoh itself, when no queryable has replied
@@ -22,6 +24,15 @@ def free_port() -> int:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]
         return port
+
+
+def issue(
+    authority: Authority, name: str, folder: Path, days: float = 10, *, file: str = "", hosts: Iterable[str] = ()
+) -> Credentials:
+    """Issue a certificate for a name; its files are named after it, or `file`."""
+    made = Credentials(folder / "ca.pem", folder / f"{file or name}.pem", folder / f"{file or name}.key")
+    authority.issue(name, list(hosts), days, made.certificate, made.key)
+    return made
 
 
 def direct(callback: Callable[[Any], None]) -> Any:

@@ -26,7 +26,7 @@ from recording.reader import Recording
 from security.certificates import Authority
 from security.page_tokens import ROLES, read_tokens
 from tests.harness import until
-from tests.security.raw_client import REFUSAL_MS, RawClient, Received, free_port
+from tests.security.raw_client import REFUSAL_MS, RawClient, Received, free_port, issue
 from tests.security.secured_cell import SERVICES, TOKEN, Secured, running_secured, sockets_of
 from zencell.blocking import Cell
 
@@ -83,15 +83,12 @@ def test_client_without_a_certificate_cannot_connect(secured: Secured) -> None:
 
 
 def test_invalid_certificate_cannot_connect(secured: Secured, tmp_path: Path) -> None:
-    trusted, own = secured.folder / "ca.pem", Authority.load(secured.folder / "ca.pem", secured.folder / "ca.key")
-
-    def issued(authority: Authority, name: str, days: float = 10) -> Credentials:
-        made = Credentials(trusted, tmp_path / f"{name}.pem", tmp_path / f"{name}.key")
-        authority.issue("operator", [], days, made.certificate, made.key)
-        return made
-
-    foreign, expired, good = issued(Authority.new(10), "foreign"), issued(own, "expired", -1), issued(own, "good")
-    without_key = Credentials(trusted, secured.folder / "operator.pem", foreign.key)
+    own = Authority.load(secured.folder / "ca.pem", secured.folder / "ca.key")
+    (tmp_path / "ca.pem").write_bytes((secured.folder / "ca.pem").read_bytes())
+    foreign = issue(Authority.new(10), "operator", tmp_path, file="foreign")
+    expired = issue(own, "operator", tmp_path, -1, file="expired")
+    good = issue(own, "operator", tmp_path, file="good")
+    without_key = Credentials(good.authority, secured.folder / "operator.pem", foreign.key)
     for invalid in (foreign, expired, without_key):
         with pytest.raises(zenoh.ZError):
             RawClient(secured.cell.endpoint, invalid, connect_ms=REFUSAL_MS)
@@ -99,17 +96,15 @@ def test_invalid_certificate_cannot_connect(secured: Secured, tmp_path: Path) ->
         assert one.query("panda/motion/status")
 
 
-@pytest.mark.parametrize("impostor", ["foreign router", "a service of the cell"])
-def test_client_connects_to_no_false_router(secured: Secured, tmp_path: Path, impostor: str) -> None:
-    if impostor == "foreign router":
-        Authority.new(10).issue(ROUTER_NAME, ["127.0.0.1"], 10, tmp_path / "router.pem", tmp_path / "router.key")
-        false = Credentials(secured.folder / "ca.pem", tmp_path / "router.pem", tmp_path / "router.key")
-    else:
-        false = credentials_of("panda.camera_simulator", secured.folder)
-    endpoint = f"tls/127.0.0.1:{free_port()}"
+def test_client_connects_to_no_false_router(secured: Secured, tmp_path: Path) -> None:
+    (tmp_path / "ca.pem").write_bytes((secured.folder / "ca.pem").read_bytes())
+    foreign = issue(Authority.new(10), ROUTER_NAME, tmp_path, hosts=["127.0.0.1"])
     task = credentials_of("panda.smart_pick_place", secured.folder)
-    with zenoh.open(router_config([endpoint], false)), pytest.raises(zenoh.ZError):
-        RawClient(endpoint, task, connect_ms=REFUSAL_MS)
+    for false in (foreign, credentials_of("panda.camera_simulator", secured.folder)):
+        endpoint = f"tls/127.0.0.1:{free_port()}"
+        with zenoh.open(router_config([endpoint], false)), pytest.raises(zenoh.ZError):
+            RawClient(endpoint, task, connect_ms=REFUSAL_MS)
+    endpoint = f"tls/127.0.0.1:{free_port()}"
     true = credentials_of(ROUTER_NAME, secured.folder)
     with zenoh.open(router_config([endpoint], true)), RawClient(endpoint, task) as client:
         assert client.connected
@@ -234,17 +229,15 @@ async def test_second_executor_with_the_same_certificate_is_refused_and_both_rep
     assert len(writers) == 1
 
 
-@pytest.mark.parametrize("name", ["ur5.motion_planner", "ur5.supervisor"])
-def test_service_of_one_cell_cannot_read_another(secured: Secured, name: str) -> None:
-    with secured.client(name) as stranger, secured.client("panda.motion_planner") as planner:
-        stolen = stranger.subscribe("panda/joint_states", "panda/**", "**", "*/joint_states")
-        own = planner.subscribe("panda/joint_states")
-        own.wait(lambda samples: len(samples) > 10)
-        assert stolen.samples == []
-        assert stranger.tokens("panda/alive/*") == []
-        for key in ("panda/planning_scene", "panda/motion/plan", "panda/motion/status"):
-            assert stranger.query(key, timeout=0.5) == []
-        assert planner.query("panda/planning_scene")
+def test_service_of_one_cell_cannot_read_another(secured: Secured) -> None:
+    for name in ("ur5.motion_planner", "ur5.supervisor"):
+        with secured.client(name) as stranger, secured.client("panda.motion_planner") as planner:
+            stolen = stranger.subscribe("panda/joint_states", "panda/**", "**", "*/joint_states")
+            planner.subscribe("panda/joint_states").wait(lambda samples: len(samples) > 10)
+            assert stolen.samples == stranger.tokens("panda/alive/*") == []
+            for key in ("panda/planning_scene", "panda/motion/plan", "panda/motion/status"):
+                assert stranger.query(key, timeout=0.5) == []
+            assert planner.query("panda/planning_scene")
 
 
 def test_observer_reads_everything_and_commands_nothing(secured: Secured) -> None:

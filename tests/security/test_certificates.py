@@ -9,6 +9,7 @@ from common.errors import ConfigError
 from common.transport.credentials import credentials_of, observer_identity, require_open_cell
 from security.certificates import Authority, write_secret
 from security.validation import require_valid
+from tests.security.raw_client import issue
 
 RENEW = "zencell secure init DIR --renew"
 NAME = "panda.camera"
@@ -27,10 +28,6 @@ def folder(tmp_path: Path) -> Path:
     authority.write(tmp_path / "ca.pem", tmp_path / "ca.key")
     issue(authority, NAME, tmp_path)
     return tmp_path
-
-
-def issue(authority: Authority, name: str, folder: Path, days: float = 10, file: str = "") -> None:
-    authority.issue(name, [], days, folder / f"{file or name}.pem", folder / f"{file or name}.key")
 
 
 def own_authority(folder: Path) -> Authority:

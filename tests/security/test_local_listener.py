@@ -17,7 +17,7 @@ from common.transport.router import Router
 from common.transport.zenoh_session import ZenohSession, open_zenoh
 from security.certificates import Authority
 from tests.common.transport.conftest import until
-from tests.security.raw_client import REFUSAL_MS, RawClient, free_port
+from tests.security.raw_client import REFUSAL_MS, RawClient, free_port, issue
 
 SILENT = 150  # Zenoh without the gate accepts no client for 100 ms after each
 WITHIN = 3.0  # [s]
@@ -114,12 +114,10 @@ async def test_silent_connections_at_one_listener_block_no_client_at_any(router:
 async def test_local_listener_refuses_clients_without_a_certificate_of_the_authority(
     router: SecuredRouter, tmp_path: Path
 ) -> None:
-    foreign = tmp_path / "foreign"
-    foreign.mkdir()
-    Authority.new(10).issue("operator", [], 10, foreign / "operator.pem", foreign / "operator.key")
-    shutil.copy(router.certificates / "ca.pem", foreign / "ca.pem")
+    foreign = issue(Authority.new(10), "operator", tmp_path)
+    shutil.copy(router.certificates / "ca.pem", foreign.authority)
     (near,) = [each for each in router.near if listens(each)]
-    for credentials in (None, credentials_of("operator", foreign)):
+    for credentials in (None, foreign):
         with pytest.raises(Exception, match="Unable to connect"):
             RawClient(near, credentials, connect_ms=REFUSAL_MS)
 
@@ -127,7 +125,7 @@ async def test_local_listener_refuses_clients_without_a_certificate_of_the_autho
 async def test_local_client_reconnects_locally_after_a_renewal(router: SecuredRouter) -> None:
     session, _ = await router.connect(near=True)
     authority = Authority.load(router.certificates / "ca.pem", router.certificates / "ca.key")
-    authority.issue("router", ["127.0.0.1"], 30, router.certificates / "router.pem", router.certificates / "router.key")
+    issue(authority, "router", router.certificates, 30, hosts=["127.0.0.1"])
     assert [router.process.renew() for _ in range(2)] == [False, True]
     before = router.near[1]
     await until(lambda: not listens(before) and listens(router.near[0]))

@@ -16,6 +16,7 @@ from common.transport.credentials import ACCESS
 from security.certificates import Authority
 from security.preflight import require_secured
 from tests.harness import free_domain
+from tests.security.raw_client import issue
 
 CELL = load_cell("panda")
 
@@ -65,11 +66,9 @@ def test_each_process_that_is_started_needs_its_files(refusal: Refusal, folder: 
 
 
 def test_expired_certificate_is_named_with_its_date_and_the_remedy(refusal: Refusal, folder: Path) -> None:
-    place = folder / "panda.smart_pick_place.pem"
-    authority = Authority.load(folder / "ca.pem", folder / "ca.key")
-    authority.issue("panda.smart_pick_place", [], -1, place, place.with_suffix(".key"))
+    expired = issue(Authority.load(folder / "ca.pem", folder / "ca.key"), "panda.smart_pick_place", folder, -1)
     line = refusal("up", "panda")
-    assert line.startswith(f"--secure: '{place}' expired on 20") and "--renew" in line
+    assert line.startswith(f"--secure: '{expired.certificate}' expired on 20") and "--renew" in line
 
 
 def test_unencrypted_endpoint_with_certificates_is_named(refusal: Refusal, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -121,8 +120,6 @@ def test_service_that_crashes_before_it_declares_anything_is_named(refusal: Refu
     (folder.parent / "small.yaml").write_text(
         "cell: panda\nrobot: panda\nworld: balls\npipeline: cartesian_ompl\ntask: crashes\n"
         "services: {extra.crashes: {}}\n")
-    name = "panda.crashes"
-    Authority.load(folder / "ca.pem", folder / "ca.key").issue(
-        name, [], 10, folder / f"{name}.pem", folder / f"{name}.key")
+    issue(Authority.load(folder / "ca.pem", folder / "ca.key"), "panda.crashes", folder)
     line = refusal("run", "small.yaml", code=1)
     assert line == "services.crashes: failed before it declared its topics: KeyError('a bug')"

@@ -17,7 +17,7 @@ from common.transport.router import open_router
 from security.access import Rights, access_control
 from security.certificates import Authority
 from tests.harness import ROOT, environment
-from tests.security.raw_client import RawClient, free_port
+from tests.security.raw_client import RawClient, free_port, issue
 
 
 @pytest.fixture
@@ -25,8 +25,8 @@ def folder(tmp_path: Path) -> Path:
     """Certificates of a cell with a writer of `seen` and `secret`, a reader of `seen`, and the rules for them."""
     authority = Authority.new(10)
     authority.write(tmp_path / "ca.pem", tmp_path / "ca.key")
-    for name, hosts in ((ROUTER_NAME, ["127.0.0.1"]), ("cell.writer", []), ("cell.reader", [])):
-        authority.issue(name, hosts, 10, tmp_path / f"{name}.pem", tmp_path / f"{name}.key")
+    for name in (ROUTER_NAME, "cell.writer", "cell.reader"):
+        issue(authority, name, tmp_path, hosts=["127.0.0.1"] if name == ROUTER_NAME else ())
     rights = {"writer": Rights(write={"seen", "secret"}), "reader": Rights(read={"seen"})}
     (tmp_path / ACCESS).write_text(json.dumps(access_control({"cell": rights})))
     return tmp_path

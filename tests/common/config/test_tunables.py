@@ -105,7 +105,7 @@ def test_change_is_made_in_place_by_apply_and_described_with_old_and_new_value(c
      "services.it.file: needs a restart: zencell up CELL --set services.it.file=a.png"),
     ("unknown_parameter", {"services.it.hihg": 1},
      "unknown parameter of it 'services.it.hihg' (did you mean 'services.it.high'?); choices: "),
-    *(("unknown_parameter", {path: 1}, f"unknown parameter of it '{path}' ")
+    *(("unknown_parameter", {path: 1}, f"unknown parameter of it '{path}'")
       for path in ("services.it.secret", "services.it.inner", "services.other.low", "run.seed")),
 ])
 def test_invalid_change_is_refused_in_one_line_and_changes_nothing(

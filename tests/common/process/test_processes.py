@@ -102,19 +102,7 @@ async def available(bus: Bus) -> Client:
 # --- results of a request -----------------------------------------------------------------------------------------
 
 
-async def test_killed_server_loses_the_request_and_is_then_unavailable(shared: Stage, bus: Bus) -> None:
-    toy = shared.toy()
-    client = await available(bus)
-    waiting = await shared.holding(client, toy)
-    toy.kill()
-    with pytest.raises(RequestLost):
-        await waiting
-    await until(lambda: not client.available)
-    with pytest.raises(NoResponder):
-        await client.call(START)
-
-
-async def test_frozen_server_times_out_then_loses_requests_and_serves_again_when_resumed(
+async def test_frozen_or_killed_server_loses_requests_and_a_resumed_one_serves_again(
     shared: Stage, bus: Bus
 ) -> None:
     toy = shared.toy()
@@ -130,6 +118,13 @@ async def test_frozen_server_times_out_then_loses_requests_and_serves_again_when
     toy.send_signal(signal.SIGCONT)
     await client.wait_available(TIMEOUT)
     assert (await client.call(START)).stage == "7"
+    waiting = await shared.holding(client, toy)
+    toy.kill()
+    with pytest.raises(RequestLost):
+        await waiting
+    await until(lambda: not client.available)
+    with pytest.raises(NoResponder):
+        await client.call(START)
 
 
 @pytest.mark.slow

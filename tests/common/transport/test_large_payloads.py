@@ -1,7 +1,6 @@
 """Large requests are decoded outside the loop, in pieces and in order; costly payloads are refused early."""
 
 import asyncio
-import contextlib
 import gc
 import threading
 from time import process_time
@@ -17,10 +16,8 @@ from common.messages.robot import MAX_POINTS
 from common.topics import MOTION_EXECUTE
 from common.transport.codec import decode, encode
 from common.transport.local import LocalNetwork
-from tests.mutations import models
 
 JOINTS = [f"panda_joint{i}" for i in range(1, 8)]
-VALUES: list[Any] = [{}, [], 1, 2**60, "ab", b"", [0], {"a": 0}]
 
 
 def execute(points: int, name: str = "a") -> m.ExecuteRequest:
@@ -31,29 +28,6 @@ def execute(points: int, name: str = "a") -> m.ExecuteRequest:
         id=name, trajectory=m.JointTrajectory.model_construct(header=m.Header(), joint_names=JOINTS, points=made))
 
 
-def seconds_to_decode(model: type[Message], payload: bytes) -> float:
-    """Return the least processor time of three attempts [s]."""
-    times = []
-    for _ in range(3):
-        began = process_time()
-        with contextlib.suppress(DecodeError):
-            decode(model, payload)
-        times.append(process_time() - began)
-    return min(times)
-
-
-@pytest.mark.campaign
-@pytest.mark.parametrize("model", [model for model in models() if model.max_bytes <= 4 * SMALL_BYTES])
-def test_small_payloads_are_refused_fast(model: type[Message]) -> None:
-    worst = 0.0
-    for field in model.model_fields:
-        for value in VALUES:
-            count = (model.max_bytes - 64) // len(msgpack.packb(value))
-            worst = max(worst, seconds_to_decode(model, msgpack.packb({field: [value] * count})))
-    worst = max(worst, seconds_to_decode(model, msgpack.packb({f"{i:x}": 0 for i in range(1500)})))
-    assert worst < 0.02  # measured: 1.5 ms; more on a busy machine, whose caches others fill
-
-
 @pytest.mark.parametrize(("model", "payload"), [
     (m.PoseArray, msgpack.packb({"poses": [{}] * 30_000})),
     (m.Image, msgpack.packb({"data": [[]] * 1_000_000})),
@@ -62,9 +36,13 @@ def test_small_payloads_are_refused_fast(model: type[Message]) -> None:
     (m.ServiceCounters, msgpack.packb({"service": "a", "received": {f"{i:x}": "" for i in range(2000)}})),
 ], ids=lambda value: getattr(value, "__name__", ""))
 def test_costly_payloads_are_refused_within_milliseconds(model: type[Message], payload: bytes) -> None:
-    with pytest.raises(DecodeError):
-        decode(model, payload)
-    assert seconds_to_decode(model, payload) < 0.15
+    times = []
+    for _ in range(3):
+        began = process_time()
+        with pytest.raises(DecodeError):
+            decode(model, payload)
+        times.append(process_time() - began)
+    assert min(times) < 0.15
 
 
 def test_longest_trajectory_fits_and_decodes_the_same_in_pieces() -> None:

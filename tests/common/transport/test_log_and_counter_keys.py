@@ -12,7 +12,7 @@ from common.supervision.plain_keys import copy_to_plain_keys
 from common.transport.bus import Bus
 from common.transport.codec import Attachment, decode, encode, encode_attachment
 from common.transport.local import LocalNetwork
-from tests.common.transport.conftest import next_of, put_raw, until
+from tests.common.transport.conftest import TIMEOUT, next_of, put_raw, until
 
 
 def line(service: str, message: str = "") -> m.LogLine:
@@ -40,6 +40,10 @@ async def test_each_service_writes_under_its_name_and_one_reader_receives_all(ne
     await until(lambda: all(bus._counters.raw._last for bus in (camera, arm)))
     late = (await new_bus("late")).reader(topics.COUNTERS)
     assert {(await next_of(late)).service for _ in writers} == {"camera", "arm"}, "all counters at once"
+    await tool.ready()
+    async with asyncio.timeout(TIMEOUT):
+        while (await late.next()).received != {"log/<service>": 2}:
+            pass
 
 
 @pytest.mark.parametrize(("topic", "message_of"), [(topics.LOG, line), (topics.COUNTERS, counted)])
