@@ -1,10 +1,10 @@
-"""One time for all processes of a host, also when its system clock steps or the host sleeps."""
+"""One time for all processes of a host, also when its system clock steps or the host sleeps; time while awake."""
 
 import pytest
 
 from common import clock as clocks
 from common.clock import BOOTED_VARIABLE, CLOCK_FOLDER_VARIABLE, Clock
-from common.time_source import use_time_source
+from common.time_source import WatchdogClock, use_time_source
 
 HOUR = 3600 * 10**9
 
@@ -79,3 +79,14 @@ def test_variable_takes_precedence_over_the_folder_and_invalid_ones_are_refused(
         Clock.from_environment({BOOTED_VARIABLE: "yesterday"})
     with pytest.raises(ValueError, match=r"ZENCELL_CLOCK .*/none: No such file"):
         Clock.from_environment({CLOCK_FOLDER_VARIABLE: str(tmp_path / "none")})
+
+
+def test_watchdog_clock_limits_a_gap_to_one_period_and_ignores_a_step_back() -> None:
+    clock = WatchdogClock(0.5)
+    assert [round(clock.advance(now), 6) for now in (10.0, 10.25, 10.5, 10.9)] == [0.0, 0.25, 0.5, 0.9]
+    assert clock.late == 0.0
+    assert round(clock.advance(70.0), 6) == 1.4
+    assert round(clock.late, 6) == 58.6
+    assert round(clock.advance(70.25), 6) == 1.65
+    assert clock.late == 0.0
+    assert round(clock.advance(60.0), 6) == 1.65

@@ -87,14 +87,9 @@ def test_router_reachable_from_other_hosts_warns_unless_it_is_secured(folder: Pa
 # --- the router's configuration as a file, for zenohd and other routers ----------------------------------------------
 
 
-@pytest.fixture
-def no_variables(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_config_file_equals_the_configuration_of_our_router(capsys, monkeypatch, folder: Path, tmp_path: Path) -> None:
     for variable in ("ZENCELL_SECURE", "ZENCELL_LISTEN", "ZENCELL_LINK", "ZENCELL_DOMAIN"):
         monkeypatch.setenv(variable, "42" if variable == "ZENCELL_DOMAIN" else "")
-
-
-@pytest.mark.usefixtures("no_variables")
-def test_config_file_equals_the_configuration_of_our_router(capsys, folder: Path, tmp_path: Path) -> None:
     tls, far = "tls/0.0.0.0:7449", "tcp/192.168.1.10:7489"
     credentials = credentials_of(ROUTER_NAME, folder)
     for arguments, expected in (
@@ -106,16 +101,6 @@ def test_config_file_equals_the_configuration_of_our_router(capsys, folder: Path
         file = tmp_path / "router.json5"
         file.write_text(capsys.readouterr().out)
         assert str(zenoh.Config.from_file(file)) == str(expected)
-
-
-@pytest.mark.usefixtures("no_variables")
-@pytest.mark.parametrize(("arguments", "reason"), [
-    (["--domain", "233"], "--domain: '233'"),
-    (["--secure", "nowhere"], "'nowhere' is not a folder"),
-    (["--listen", "here"], "--listen: 'here' must be an endpoint"),
-])
-def test_invalid_options_write_no_config_file(capsys, arguments: list[str], reason: str) -> None:
-    assert app.execute(["router", "config", *arguments]) == 2
+    assert app.execute(["router", "config", "--secure", "nowhere"]) == 2
     shown = capsys.readouterr()
-    (line,) = shown.err.splitlines()
-    assert shown.out == "" and reason in line
+    assert shown.out == "" and "'nowhere' is not a folder" in shown.err and shown.err.count("\n") == 1

@@ -1,7 +1,6 @@
 """Every service serves its parameters, without code of its own."""
 
 import asyncio
-import re
 from collections.abc import AsyncIterator
 from typing import Any
 
@@ -10,13 +9,14 @@ from pydantic import Field
 
 from common import topics
 from common.config import Motion, Parameters, Tunable
-from common.errors import NoResponder, RemoteError
-from common.messages import ParameterReply, ParameterRequest
+from common.config.tunables import values_of
+from common.errors import RemoteError
+from common.messages import ParameterRequest
 from common.process.in_process import running_service
 from common.process.timing import LoopRate
 from common.supervision.wiring import wiring
 from common.topics import parameters_of
-from common.transport.bus import Bus, Client
+from common.transport.bus import Bus
 from common.transport.local import LocalNetwork
 
 TIMEOUT = 20.0
@@ -38,9 +38,8 @@ async def service(bus: Bus, config: Config) -> None:
 class Rig:
     def __init__(self) -> None:
         self.net, self.config = LocalNetwork(), Config(motion=Motion())
-        self.bus = self.net.bus("tester")
-        self.log = self.bus.reader(topics.LOG)
-        self.client: Client[ParameterRequest, ParameterReply] = self.bus.client(parameters_of("toy"))
+        bus = self.net.bus("tester")
+        self.log, self.client = bus.reader(topics.LOG), bus.client(parameters_of("toy"))
 
     async def request(self, *, dry_run: bool = False, by: str = "", **values: object) -> dict[str, object]:
         full = {path.replace("__", "."): value for path, value in values.items()}
@@ -60,13 +59,8 @@ async def rig() -> AsyncIterator[Rig]:
         yield rig
 
 
-async def test_empty_request_returns_all_values(rig: Rig) -> None:
-    values = await rig.request()
-    assert values["services.toy.rate"] == 10.0 and values["motion.velocity_scaling"] == 0.2
-    assert values["services.toy.file"] == ""
-
-
 async def test_change_is_applied_logged_with_its_operator_and_reported_to_the_service(rig: Rig) -> None:
+    assert await rig.request() == values_of(rig.config, "toy"), "an empty request returns all values"
     values = await rig.request(services__toy__rate=20, motion__velocity_scaling=0.5, by="ann@desk/7")
     assert (values["services.toy.rate"], values["motion.velocity_scaling"]) == (20.0, 0.5)
     assert (rig.config.rate, rig.config.motion.velocity_scaling) == (20.0, 0.5)
@@ -83,32 +77,16 @@ async def test_dry_run_and_unchanged_value_change_and_log_nothing(rig: Rig) -> N
     assert await rig.lines(2) == ["services.toy.size: 3 -> 4 (by unknown operator)", "now at 10 Hz"]
 
 
-@pytest.mark.parametrize(("values", "code", "text"), [
-    ({"services__toy__size": 6, "dry_run": True}, "bad_value", "services.toy.size: 6"),
-    ({"services__toy__rate": 20, "services__toy__size": 9}, "bad_value", "services.toy.size: 9 must be"),
-    ({"services__toy__rate": 20, "services__toy__fiel": ""}, "unknown_parameter", "did you mean 'services.toy.file'"),
-    ({"services__toy__rate": 20, "services__toy__file": "x"}, "needs_restart", "--set services.toy.file=x"),
-    ({"services__toy__rate": float("inf")}, "bad_value", "services.toy.rate: inf"),
-    *(({"services__toy__rate": value}, "bad_value", "services.toy.rate") for value in (None, [1], {"a": 1})),
+@pytest.mark.parametrize("values", [
+    {"services__toy__size": 6, "dry_run": True}, {"services__toy__rate": 20, "services__toy__size": 9},
+    *({"services__toy__rate": value} for value in (float("inf"), None, [1], {"a": 1})),
 ])
-async def test_invalid_value_is_refused_and_leaves_all_values_unchanged(
-    rig: Rig, values: dict[str, Any], code: str, text: str
-) -> None:
+async def test_invalid_value_is_refused_and_leaves_all_values_unchanged(rig: Rig, values: dict[str, Any]) -> None:
     before = await rig.request()
-    with pytest.raises(RemoteError, match=re.escape(text)) as refused:
+    with pytest.raises(RemoteError, match=r"services.toy.(size|rate): ") as refused:
         await rig.request(**values)
-    assert refused.value.code == code
+    assert refused.value.code == "bad_value"
     assert await rig.request() == before
-
-
-async def test_ended_service_does_not_reply() -> None:
-    rig = Rig()
-    async with running_service(rig.net, service, rig.config, name="toy"):
-        await rig.bus.alive.wait("toy", TIMEOUT)
-        await rig.request()
-    await rig.bus.alive.wait("toy", TIMEOUT, there=False)
-    with pytest.raises(NoResponder):
-        await rig.request()
 
 
 async def test_wiring_of_a_service_omits_its_parameter_request() -> None:

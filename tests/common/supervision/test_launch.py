@@ -20,8 +20,7 @@ def test_command_of_a_service_has_all_options_of_the_launch() -> None:
     launch = Launch("my.yaml", ("a.b=1", "c=[2, 3]"), "w2", 5, 77)
     assert launch.service_command(ENTRY)[1:] == [
         "-P", "-m", "own.package.it", "--cell", "my.yaml", "--set", "a.b=1", "--set", "c=[2, 3]",
-        "--world", "w2", "--seed", "5", "--domain", "77", "--gate",
-    ]
+        "--world", "w2", "--seed", "5", "--domain", "77", "--gate"]
     assert launch.router_command()[-3:] == ["--domain", "77", "--gate"]
     connected = Launch("panda", connect="tcp/10.0.0.1:7447", log_json=True).service_command(ENTRY)
     assert connected[-4:] == ["--connect", "tcp/10.0.0.1:7447", "--gate", "--log-json"]
@@ -48,24 +47,20 @@ def test_environment_passes_on_clock_and_module_paths(tmp_path: Path, monkeypatc
     assert rest == ["/opt/mine", str(tmp_path)]
 
 
-@pytest.mark.parametrize(("domain", "connect", "environ", "location"), [
-    (None, None, {}, (42, None)),
-    (None, None, {"ZENCELL_DOMAIN": "7"}, (7, None)),
-    ("9", None, {"ZENCELL_DOMAIN": "7", "ZENCELL_CONNECT": "tcp/h:1"}, (9, None)),
-    (None, None, {"ZENCELL_DOMAIN": "7", "ZENCELL_CONNECT": "tcp/h:1"}, (42, "tcp/h:1")),
-    ("9", "tcp/h:2", {}, (42, "tcp/h:2")),
-])
-def test_options_take_precedence_over_the_environment(domain, connect, environ, location) -> None:
-    assert router_location(domain, connect, environ) == location
+def test_options_for_the_router_take_precedence_over_the_environment() -> None:
+    both = {"ZENCELL_DOMAIN": "7", "ZENCELL_CONNECT": "tcp/h:1"}
+    given = ((None, None, {}), (None, None, {"ZENCELL_DOMAIN": "7"}), (None, None, both), ("9", None, both),
+             ("9", "tcp/h:2", {}))
+    assert [router_location(*each) for each in given] == [
+        (42, None), (7, None), (42, "tcp/h:1"), (9, None), (42, "tcp/h:2")]
+    with pytest.raises(ConfigError):
+        router_location("233", None, {})
 
 
-def test_bad_router_location_or_speed_is_refused() -> None:
-    for domain, connect in (("233", None), (None, "nowhere")):
-        with pytest.raises(ConfigError):
-            router_location(domain, connect, {})
-    for speed in (0.0, 0.09, 10.1, -1.0, float("nan")):
-        with pytest.raises(ConfigError, match=r"--speed: .* must be 0.1 to 10"):
-            clock_at_speed(speed)
+@pytest.mark.parametrize("speed", [0.0, 0.09, 10.1, -1.0, float("nan")])
+def test_speed_out_of_bounds_is_refused(speed: float) -> None:
+    with pytest.raises(ConfigError, match=r"--speed: .* must be 0.1 to 10"):
+        clock_at_speed(speed)
 
 
 def test_used_port_is_reported_with_its_process() -> None:
