@@ -17,13 +17,12 @@ from security.certificates import Authority
 TIMEOUT = 30.0  # [s] only a failing test waits that long
 TIMEOUT_REPLY = b"Timeout"  # of Zenoh itself, when no queryable has replied
 REFUSAL_MS = 1500  # [ms] for which a connection is tried that must be refused
+Samples = list[tuple[str, bytes]]
 
 
 def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        return int(probe.getsockname()[1])
 
 
 def issue(
@@ -57,16 +56,15 @@ class RawClient:
     def connected(self) -> bool:
         return bool(self._session.info.routers_zid())
 
-    def put(self, key: str, payload: bytes = b"", attachment: bytes | None = None) -> None:
-        self._session.put(key, payload, attachment=attachment, congestion_control=zenoh.CongestionControl.BLOCK)
+    def put(self, key: str, payload: bytes = b"") -> None:
+        self._session.put(key, payload, congestion_control=zenoh.CongestionControl.BLOCK)
 
     def delete(self, key: str) -> None:
         self._session.delete(key, congestion_control=zenoh.CongestionControl.BLOCK)
 
     def subscribe(self, *keys: str) -> Received:
         received = Received()
-        for key in keys:
-            self._declarations.append(self._session.declare_subscriber(key, direct(received.add)))
+        self._declarations += [self._session.declare_subscriber(key, direct(received.add)) for key in keys]
         return received
 
     def serve(self, key: str, payload: bytes) -> Received:
@@ -107,7 +105,7 @@ class Received:
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
-        self.samples: list[tuple[str, bytes]] = []
+        self.samples: Samples = []
 
     def add(self, sample: Any) -> None:
         payload = sample.payload.to_bytes() if sample.payload is not None else b""
@@ -120,13 +118,16 @@ class Received:
         with self._changed:
             return {key for key, _ in self.samples}
 
-    def wait_until(self, condition: Callable[[list[tuple[str, bytes]]], bool], seconds: float) -> bool:
+    def wait_until(self, condition: Callable[[Samples], bool], seconds: float) -> bool:
         """Return whether the samples satisfy a condition within `seconds`."""
         with self._changed:
             return self._changed.wait_for(lambda: condition(self.samples), seconds)
 
-    def wait(self, condition: Callable[[list[tuple[str, bytes]]], bool]) -> None:
+    def wait(self, condition: Callable[[Samples], bool]) -> None:
         assert self.wait_until(condition, TIMEOUT), self.samples[-5:]
+
+    def wait_for(self, key: str, payload: bytes | None = None) -> None:
+        self.wait(lambda samples: any(k == key and payload in (None, p) for k, p in samples))
 
     def repeat(self, publish: Callable[[], object]) -> None:
         """Publish again until a sample arrives: the subscription takes effect some time after its declaration."""
@@ -135,6 +136,3 @@ class Received:
             if self.wait_until(bool, 0.05):
                 return
         raise AssertionError("no sample arrived")
-
-    def wait_for(self, key: str, payload: bytes | None = None) -> None:
-        self.wait(lambda samples: any(k == key and payload in (None, p) for k, p in samples))

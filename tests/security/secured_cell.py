@@ -13,17 +13,15 @@ import pytest
 
 from common import messages as m
 from common import topics
-from common.errors import NoRouter
 from common.transport.credentials import credentials_of
-from common.transport.zenoh_session import connect
 from tests.harness import RunningCell, ask, command_line, environment, until
 from tests.security.raw_client import RawClient, free_port
 
 TOKEN = "the-token-of-this-page-0123456789"
 SERVICES = 9
-Socket = tuple[str, str, int]
 # A process that ends was then ended by an attack.
 NO_WATCHDOGS = ("--set", "watchdogs.silence=0", "--set", "watchdogs.loop=0")
+Socket = tuple[str, str, int]
 
 
 @dataclass
@@ -36,31 +34,32 @@ class Secured:
     recording: Path
 
     def client(self, name: str) -> RawClient:
-        """Return a client with the certificate of that common name."""
         return RawClient(self.cell.endpoint, credentials_of(name, self.folder))
 
     @property
     def port(self) -> int:
-        """The port of the router."""
         return int(self.cell.endpoint.rpartition(":")[2])
 
     @property
     def variables(self) -> dict[str, str]:
         return {"ZENCELL_SECURE": str(self.folder), "ZENCELL_DOMAIN": str(self.cell.domain)}
 
-    def tool(self, *arguments: str, **variables: str) -> subprocess.CompletedProcess[str]:
-        """Run a zencell command with the certificates and further environment variables within this process."""
-        return ask(self.cell.folder, *arguments, environment=self.variables | variables)
+    def tool(self, *arguments: str) -> subprocess.CompletedProcess[str]:
+        """Run a zencell command within this process."""
+        return ask(self.cell.folder, *arguments, environment=self.variables)
 
     def process(self, *arguments: str, **variables: str) -> subprocess.CompletedProcess[str]:
-        """Run a zencell command as a process to its end."""
+        """Run a zencell command as a process to its end, with further environment variables."""
         return subprocess.run(command_line(*arguments), env={**environment(), **self.variables, **variables},
                               cwd=self.cell.folder, capture_output=True, text=True, timeout=60, check=False)
 
     @property
     def processes(self) -> dict[str, psutil.Process]:
-        """All processes by name, the supervisor included."""
-        return {**self.cell.processes(), "supervisor": psutil.Process(self.cell.process.pid)}
+        return all_processes(self.cell)
+
+
+def all_processes(cell: RunningCell) -> dict[str, psutil.Process]:
+    return {**cell.processes(), "supervisor": psutil.Process(cell.process.pid)}
 
 
 def sockets_of(processes: Mapping[str, psutil.Process]) -> tuple[set[Socket], set[Socket]]:
@@ -75,8 +74,14 @@ def sockets_of(processes: Mapping[str, psutil.Process]) -> tuple[set[Socket], se
     return listening, datagrams
 
 
-def all_ready(status: m.SupervisorStatus) -> bool:
-    return len(status.services) > SERVICES and all(service.state == "ready" for service in status.services)
+async def ready(cell: RunningCell, services: int) -> None:
+    """Return when the cell has that many services or more, and all are ready."""
+
+    def all_ready(status: m.SupervisorStatus) -> bool:
+        return len(status.services) >= services and all(service.state == "ready" for service in status.services)
+
+    async with cell.listen() as bus:
+        await until(bus.reader(topics.SUPERVISOR_STATUS), all_ready, timeout=120)
 
 
 @contextmanager
@@ -89,13 +94,5 @@ def running_secured(certificates: Path, folder: Path) -> Iterator[Secured]:
             folder, "up", "panda", "--secure", str(certificates), "--set", "autostart=false", *NO_WATCHDOGS,
             "--viewer-port", str(page), "--record", str(recording), secrets={"ZENCELL_VIEWER_TOKEN": TOKEN},
         ) as cell:
-
-            async def ready() -> None:
-                async with connect(cell="panda", service="watcher", endpoint=cell.endpoint, timeout=120) as bus:
-                    await until(bus.reader(topics.SUPERVISOR_STATUS), all_ready, timeout=120)
-
-            try:
-                asyncio.run(ready())
-            except (TimeoutError, NoRouter):
-                pytest.fail(f"the cell did not start:\n{cell.tail()}")
+            asyncio.run(ready(cell, SERVICES + 1))
             yield Secured(cell, certificates, page, recording)

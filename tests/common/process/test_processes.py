@@ -178,33 +178,38 @@ async def test_killed_router_loses_the_request_and_all_recovers_when_it_restarts
 
 async def reach(stage: Stage, state: str) -> list[Process]:
     """Return two toys in that state, one for each signal."""
-    router = None if state == "connecting" else await stage.router()
     mode = state if state in ("busy", "stubborn") else "serve"
     gate = ["--gate"] if state == "gated" else []
-    toys = [stage.toy(*gate, mode=mode, cell=cell) for cell in ("one", "other")]  # a cell admits only one of a name
+    cells = [f"{state.replace(' ', '_')}_{number}" for number in range(2)]  # a cell admits only one of a name
+    toys = [stage.toy(*gate, mode=mode, cell=cell) for cell in cells]
     for toy in toys:
         if state == "gated":
             await stage.connected(toy)
         else:
             await stage.printed(toy, "no router at" if state == "connecting" else "is ready")
-    if state == "router dead":
-        router.kill()
-        for toy in toys:
-            await stage.printed(toy, "the router is lost")
-    if state == "router frozen":
-        freeze(router)
     return toys
 
 
-@pytest.mark.parametrize("state", ["stubborn", *(pytest.param(state, marks=pytest.mark.slow) for state in (
-    "connecting", "gated", "running", "busy", "router dead", "router frozen"))])
-async def test_sigint_and_sigterm_end_a_service_with_exit_code_0_in_every_state(stage: Stage, state: str) -> None:
-    interrupted, terminated = await reach(stage, state)
-    interrupted.send_signal(signal.SIGINT)
-    interrupted.send_signal(signal.SIGINT)  # a second one changes nothing
-    terminated.send_signal(signal.SIGTERM)
-    assert [await stage.ended(interrupted), await stage.ended(terminated)] == [0, 0]
-    for toy in (interrupted, terminated):
+SLOW_STATES = ("connecting",), ("gated", "busy"), ("router dead",), ("router frozen",)
+
+
+@pytest.mark.parametrize("states", [
+    ("running", "stubborn"), *(pytest.param(states, marks=pytest.mark.slow) for states in SLOW_STATES)],
+    ids=" and ".join)
+async def test_sigint_and_sigterm_end_a_service_with_exit_code_0_in_every_state(stage: Stage, states: list[str]) -> None:
+    router = await stage.router() if states != ("connecting",) else None
+    pairs = await asyncio.gather(*(reach(stage, state) for state in states))
+    if states == ("router dead",):
+        router.kill()
+        await asyncio.gather(*(stage.printed(toy, "the router is lost") for toy in pairs[0]))
+    if states == ("router frozen",):
+        freeze(router)
+    for interrupted, terminated in pairs:
+        interrupted.send_signal(signal.SIGINT)
+        interrupted.send_signal(signal.SIGINT)  # a second one changes nothing
+        terminated.send_signal(signal.SIGTERM)
+    for toy in (toy for pair in pairs for toy in pair):
+        assert await stage.ended(toy) == 0
         assert "Traceback" not in stage.output(toy)
 
 

@@ -9,7 +9,8 @@ from contextlib import asynccontextmanager
 import psutil
 import pytest
 
-from common.config import Cell, ServiceEntry, load_cell
+from common.config import ServiceEntry, load_cell
+from common.messages import ServiceStatus
 from common.supervision.launch import Launch
 from common.supervision.lifecycle import recover_missed_tokens
 from common.supervision.supervisor import BadConfiguration, StartFailed, Supervisor
@@ -34,19 +35,15 @@ class Scripts(Launch):
         return [sys.executable, "-c", entry.module]
 
 
-def cell_of(**scripts: str) -> Cell:
-    entries = {name: ServiceEntry(name=name, module=script) for name, script in scripts.items()}
-    return load_cell("panda").model_copy(update={"services": entries})
-
-
 class Rig:
     """A supervisor and the lines of its processes."""
 
     def __init__(self, timeouts: dict[str, float], **scripts: str) -> None:
         self.lines: list[tuple[str, str]] = []
         self._new = asyncio.Event()
-        launch = Scripts("panda", connect="tcp/127.0.0.1:1")
-        self.supervisor = Supervisor(cell_of(**scripts), launch, self._on_line, **timeouts)
+        entries = {name: ServiceEntry(name=name, module=script) for name, script in scripts.items()}
+        cell = load_cell("panda").model_copy(update={"services": entries})
+        self.supervisor = Supervisor(cell, Scripts("panda", connect="tcp/127.0.0.1:1"), self._on_line, **timeouts)
         self.supervisor.start()
 
     def _on_line(self, name: str, line: str) -> None:
@@ -61,11 +58,11 @@ class Rig:
             self._new.clear()
             await self._new.wait()
 
-    def state(self, name: str) -> str:
-        return next(status.state for status in self.supervisor.statuses if status.name == name)
+    def status(self, name: str) -> ServiceStatus:
+        return next(status for status in self.supervisor.statuses if status.name == name)
 
-    def pid(self, name: str) -> int | None:
-        return next(status.pid for status in self.supervisor.statuses if status.name == name)
+    def state(self, name: str) -> str:
+        return self.status(name).state
 
     async def up(self) -> None:
         admitting = asyncio.create_task(self.supervisor.admit_all())
@@ -128,7 +125,7 @@ async def test_exit_code_2_ends_the_start_with_the_printed_line_also_behind_a_cl
 async def test_once_the_cell_is_up_a_process_with_exit_code_2_is_restarted() -> None:
     async with supervised(first=GATE + "sys.stdin.readline(); sys.exit(2)") as rig:
         await rig.up()
-        psutil.Process(rig.pid("first")).kill()
+        psutil.Process(rig.status("first").pid).kill()
         await rig.wrote("first", "in", times=2)
         assert rig.supervisor.restarts == {"first": 1}
         assert rig.state("first") == "starting"
@@ -140,7 +137,7 @@ async def test_process_that_ignores_sigterm_is_killed() -> None:
     async with supervised({"term_timeout": 0.2}, first=WAIT, second=DEAF) as rig:
         await rig.up()
         await rig.wrote("second", "deaf")
-        pids = [rig.pid("first"), rig.pid("second")]
+        pids = [rig.status("first").pid, rig.status("second").pid]
         await rig.supervisor.stop()
         assert not any(psutil.pid_exists(pid) for pid in pids if pid)
         assert rig.state("second") == "stopped"
@@ -174,8 +171,7 @@ async def test_stop_does_not_wait_for_a_pending_restart() -> None:
         while rig.supervisor.restarts["first"] < 2:
             rig.supervisor.changed.clear()
             await rig.supervisor.changed.wait()
-    assert rig.state("first") == "stopped"
-    assert rig.pid("first") is None
+    assert (rig.state("first"), rig.status("first").pid) == ("stopped", None)
 
 
 async def test_readiness_token_that_the_subscription_missed_is_found_by_a_query(caplog) -> None:
