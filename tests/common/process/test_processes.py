@@ -196,7 +196,7 @@ SLOW_STATES = ("connecting",), ("gated", "busy"), ("router dead",), ("router fro
 @pytest.mark.parametrize("states", [
     ("running", "stubborn"), *(pytest.param(states, marks=pytest.mark.slow) for states in SLOW_STATES)],
     ids=" and ".join)
-async def test_sigint_and_sigterm_end_a_service_with_exit_code_0_in_every_state(stage: Stage, states: list[str]) -> None:
+async def test_sigint_and_sigterm_end_a_service_with_exit_code_0_in_every_state(stage: Stage, states) -> None:
     router = await stage.router() if states != ("connecting",) else None
     pairs = await asyncio.gather(*(reach(stage, state) for state in states))
     if states == ("router dead",):
