@@ -81,9 +81,13 @@ class RawClient:
 
     def query(self, key: str, payload: bytes | None = None, *, timeout: float = 2.0) -> list[bytes]:
         """Return the replies, error replies included, of all queryables of the key."""
-        replies = self._session.get(key, payload=payload, timeout=timeout, target=zenoh.QueryTarget.ALL,
-                                    consolidation=zenoh.ConsolidationMode.NONE)
-        results = [reply.ok or reply.err for reply in replies]
+        return self.query_all([key], payload, timeout=timeout)
+
+    def query_all(self, keys: Iterable[str], payload: bytes | None = None, *, timeout: float = 2.0) -> list[bytes]:
+        """Return the replies to simultaneous queries."""
+        queries = [self._session.get(key, payload=payload, timeout=timeout, target=zenoh.QueryTarget.ALL,
+                                     consolidation=zenoh.ConsolidationMode.NONE) for key in keys]
+        results = [reply.ok or reply.err for replies in queries for reply in replies]
         answers = [result.payload.to_bytes() for result in results if result is not None]
         return [answer for answer in answers if answer != TIMEOUT_REPLY]
 

@@ -1,3 +1,5 @@
+"""A scene writer publishes added solids with the perceived scene, and only those that are safe in its file."""
+
 import asyncio
 import errno
 import logging
