@@ -204,9 +204,7 @@ def test_service_cannot_impersonate_another(secured: Secured) -> None:
         assert "panda/serves/motion/plan/camera_simulator" not in served.keys
 
 
-async def test_second_executor_with_the_same_certificate_is_refused_and_both_report_it(
-    secured: Secured, tmp_path: Path
-) -> None:
+async def test_second_executor_is_refused_and_both_report_it(secured: Secured, tmp_path: Path) -> None:
     writers = set()
 
     def note_writer(sample: RawSample) -> None:

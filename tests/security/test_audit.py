@@ -9,9 +9,7 @@ from tests.harness import ROOT
 
 
 @pytest.mark.parametrize(("reachable", "audited", "code"), [(True, 0, 0), (True, 1, 1), (False, 1, 0)])
-def test_exit_code_is_that_of_pip_audit_if_the_database_is_reachable(
-    tmp_path: Path, reachable: bool, audited: int, code: int
-) -> None:
+def test_exit_code_is_that_of_pip_audit(tmp_path: Path, reachable: bool, audited: int, code: int) -> None:
     fakes = {"python": f"exit {0 if reachable else 1}", "pip-audit": f'echo audited "$@"; exit {audited}'}
     for name, script in fakes.items():
         (tmp_path / name).write_text(f"#!/bin/sh\n{script}\n")

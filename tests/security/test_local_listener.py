@@ -1,6 +1,7 @@
 """Services of the router's host connect at a listener of their own; a flood at one listener leaves the other open."""
 
 import asyncio
+import functools
 import logging
 import shutil
 import socket
@@ -80,20 +81,19 @@ async def test_local_client_bypasses_the_gate_and_has_the_rights_of_its_certific
 
 
 async def test_late_subscriber_receives_from_a_local_writer_with_any_expression(router: SecuredRouter) -> None:
-    writer, _ = await router.connect(near=True)
-    publisher = writer.publisher("panda/camera/camera_info", "", reliable=True)
     for expression in ("panda/camera/camera_info", "panda/camera/*", "panda/**", "*/camera/**"):
-        answered = asyncio.get_running_loop().create_future()
+        writer, _ = await router.connect(near=True)
+        publisher, answered = writer.publisher("panda/camera/camera_info", "", reliable=True), asyncio.Event()
+        done = functools.partial(asyncio.get_running_loop().call_soon_threadsafe, answered.set)
         # The reply comes after all earlier declarations: the router knows by then that there is no subscriber.
-        writer.get_tokens("panda/alive/*", lambda _: None, lambda reply=answered: reply.get_loop().call_soon_threadsafe(
-            reply.set_result, None), timeout=WITHIN)
-        await answered
-        await until(lambda: not publisher.matched)
+        writer.get_tokens("panda/alive/*", lambda _: None, done, timeout=WITHIN)
+        await answered.wait()
+        assert not publisher.matched
         with router.operator() as operator:
             received = operator.subscribe(expression)
-            received.repeat(lambda: publisher.put(b"by the camera", b""))
+            received.repeat(lambda: publisher.put(b"by the camera", b""))  # noqa: B023
             assert received.keys == {"panda/camera/camera_info"}
-    writer.close()
+        writer.close()
 
 
 @pytest.mark.parametrize("flooded", [pytest.param("near", marks=pytest.mark.slow), "gate"])
@@ -111,9 +111,7 @@ async def test_silent_connections_at_one_listener_block_no_client_at_any(router:
 
 
 @pytest.mark.slow
-async def test_local_listener_refuses_clients_without_a_certificate_of_the_authority(
-    router: SecuredRouter, tmp_path: Path
-) -> None:
+async def test_local_listener_refuses_invalid_certificates(router: SecuredRouter, tmp_path: Path) -> None:
     foreign = issue(Authority.new(10), "operator", tmp_path)
     shutil.copy(router.certificates / "ca.pem", foreign.authority)
     (near,) = [each for each in router.near if listens(each)]

@@ -29,9 +29,7 @@ TRAJECTORY = {"joint_names": ["a"], "points": []}
     (m.MotionOwner, {"owner": "person", "kind": "operator"}, {"owner": "operator"}),
     (m.RobotCommand, {"act": "enable", "owner": "person"}, {"owner": "operator"}),
 ])
-def test_former_names_are_read_and_current_names_are_written(
-    model: type[m.Message], former: dict[str, object], current: dict[str, object]
-) -> None:
+def test_former_names_are_read_and_current_ones_written(model: type[m.Message], former, current) -> None:
     message = decode(model, msgpack.packb(former))
     written = msgpack.unpackb(encode(message))
     assert {name: written[name] for name in current} == current

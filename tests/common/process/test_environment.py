@@ -28,9 +28,7 @@ def output_of(code: str, **environment: str) -> str:
 @pytest.mark.parametrize(("start", "given", "threads"), [
     (COMMAND, {}, "1"), ("import services", {}, "1"), ("import services", {"OPENBLAS_NUM_THREADS": "4"}, "4"),
 ])
-def test_missing_variables_are_set_before_numpy_and_pydantic_are_imported(
-    start: str, given: dict[str, str], threads: str
-) -> None:
+def test_missing_variables_are_set_before_other_imports(start: str, given: dict[str, str], threads: str) -> None:
     assert output_of(f"{start}\n{REPORT % list(VARIABLES)}", **given) == f"['{threads}', '__all__'] False False"
 
 

@@ -102,9 +102,7 @@ async def available(bus: Bus) -> Client:
 # --- results of a request -----------------------------------------------------------------------------------------
 
 
-async def test_frozen_or_killed_server_loses_requests_and_a_resumed_one_serves_again(
-    shared: Stage, bus: Bus
-) -> None:
+async def test_frozen_or_killed_server_loses_requests_until_it_resumes(shared: Stage, bus: Bus) -> None:
     toy = shared.toy()
     client = await available(bus)
     freeze(toy)
@@ -213,9 +211,7 @@ async def test_sigint_and_sigterm_end_a_service_with_exit_code_0_in_every_state(
         assert "Traceback" not in stage.output(toy)
 
 
-async def test_token_appears_when_the_gate_opens_and_vanishes_when_it_closes_or_at_a_signal(
-    shared: Stage, bus: Bus
-) -> None:
+async def test_token_exists_from_the_opening_of_the_gate_to_the_end(shared: Stage, bus: Bus) -> None:
     toy = shared.toy("--gate")
     await shared.connected(toy)
     assert "toy" not in await bus.alive.known()

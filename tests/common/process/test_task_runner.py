@@ -169,9 +169,7 @@ async def test_delayed_resume_releases_no_interlock_that_is_newer_than_its_reque
     ([("held", "operator", 2), ("stopped", "bob", 3)], 2),
     ([("held", "watchdog", 0), ("held", "operator", 1)], 1),
 ], ids=["own pause", "stop of another operator in between", "later stop of another operator", "hold of a watchdog"])
-async def test_delayed_resume_releases_up_to_its_own_pause(
-    rig: Rig, interlocks: list[tuple[str, str, int]], released: int | None
-) -> None:
+async def test_delayed_resume_releases_up_to_its_own_pause(rig: Rig, interlocks, released: int | None) -> None:
     start = 2 * wall_ns()
     async with rig.running():
         await rig.command("pause", "resume")

@@ -44,7 +44,7 @@ async def run(bus: Bus, config: Config) -> None:
     if config.mode == "stuck":
         hang()
     if config.mode == "native":
-        await asyncio.to_thread(time.sleep, 3.0)
+        await asyncio.to_thread(time.sleep, 2.0)
         bus.log.info("woke up")
     if config.mode == "stubborn":
         while True:

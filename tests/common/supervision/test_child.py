@@ -113,9 +113,7 @@ def output_of(process: Forked) -> str:
 @pytest.mark.parametrize(("argument", "code", "text"), [
     ("run", 0, ""), ("exit", 3, ""), ("raise", 1, "RuntimeError: oh no\n"),
 ])
-def test_forked_module_has_arguments_environment_parent_output_and_exit_code(
-    preloaded: Preloaded, environment: dict[str, str], argument: str, code: int, text: str
-) -> None:
+def test_forked_module_runs_like_a_started_one(preloaded, environment, argument: str, code: int, text: str) -> None:
     process = preloaded.spawn([*COMMAND, argument, "--option"], {**environment, "WHO": "you"})
     output = output_of(process)
     assert output.startswith(f"__main__ ['{argument}', '--option'] you True\n") and output.endswith(text)
@@ -123,9 +121,7 @@ def test_forked_module_has_arguments_environment_parent_output_and_exit_code(
 
 
 @linux
-def test_forked_process_has_its_own_command_line_and_session_and_other_commands_are_not_forked(
-    preloaded: Preloaded, environment: dict[str, str]
-) -> None:
+def test_forked_process_has_its_own_command_line_and_session(preloaded: Preloaded, environment: dict[str, str]) -> None:
     process = preloaded.spawn([*COMMAND, "wait", "--gate"], environment)
     process.stdout.readline()
     shown = psutil.Process(process.pid).cmdline()
@@ -138,9 +134,7 @@ def test_forked_process_has_its_own_command_line_and_session_and_other_commands_
 
 
 @linux
-async def test_child_that_was_forked_reads_its_gate_and_leaves_no_orphan(
-    preloaded: Preloaded, environment: dict[str, str]
-) -> None:
+async def test_forked_child_reads_its_gate_and_leaves_no_orphan(preloaded: Preloaded, environment) -> None:
     _, lines, code = await run([*COMMAND, "read"], environment, preloaded)
     assert (lines, code) == (["__main__ ['read'] me True", "'go\\n'"], 0)
     _, (_, orphan), code = await run([*COMMAND, "orphan"], environment, preloaded)

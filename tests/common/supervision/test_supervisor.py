@@ -113,9 +113,7 @@ async def test_start_timeout_names_the_service_and_its_last_lines() -> None:
     "no", "zencell: no", "ERROR first: no", '{"level": "error", "message": "no", "service": "first"}',
 ])
 @pytest.mark.parametrize("name", ["first", "second"])
-async def test_exit_code_2_ends_the_start_with_the_printed_line_also_behind_a_closed_gate(
-    name: str, printed: str
-) -> None:
+async def test_exit_code_2_ends_the_start_also_behind_a_closed_gate(name: str, printed: str) -> None:
     scripts = {"first": WAIT, "second": WAIT, name: f"import sys; print({printed!r}); sys.exit(2)"}
     async with supervised(**scripts) as rig:
         with pytest.raises(BadConfiguration, match=r"^no$"):

@@ -105,12 +105,6 @@ def shared_router(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
 
 NewBus = Callable[..., Awaitable[Bus]]
-Until = Callable[[Callable[[], bool]], Awaitable[None]]
-
-
-@pytest.fixture(name="until")
-def until_fixture() -> Until:
-    return until
 
 
 @pytest.fixture(params=["local", "zenoh"])

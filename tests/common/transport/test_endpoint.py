@@ -21,9 +21,7 @@ from common.transport.endpoint import OVERHEAD_BYTES, endpoint_of, size_limits
     (5, None, {"ZENCELL_CONNECT": "tcp/router:7447"}, "tcp/127.0.0.1:7452"),
     (5, "tls/[::1]:7447", {}, "tls/[::1]:7447"),
 ])
-def test_endpoint_follows_options_before_environment(
-    domain: int | str | None, connect: str | None, environ: dict[str, str], endpoint: str
-) -> None:
+def test_options_take_precedence_over_the_environment(domain, connect: str | None, environ, endpoint: str) -> None:
     assert endpoint_of(domain, connect, environ) == endpoint
 
 

@@ -210,9 +210,7 @@ async def split():
 
 
 @pytest.mark.parametrize("first", [0, 1])
-async def test_service_that_was_ready_first_survives_when_a_split_network_heals(
-    split, monkeypatch, caplog, first: int
-) -> None:
+async def test_first_service_survives_when_a_split_network_heals(split, monkeypatch, caplog, first: int) -> None:
     monkeypatch.setattr(ownership, "CONFLICT_SECONDS", 0.0)
     for side in (first, 1 - first):
         await split.start(side)

@@ -113,9 +113,7 @@ async def echo(request: TaskCommand) -> TaskCommand:
     (call_a_missing_server, TaskStatus, "upstream", "motion/stop: no service"),
     (echo, TaskCommand, "bad_answer", "cannot be read"),
 ])
-async def test_failed_request_reaches_the_requester_with_code_and_reason_and_the_server_continues(
-    new_bus, handler: Handler, answer_type, code: str, reason: str
-) -> None:
+async def test_failed_request_is_answered_with_code_and_reason(new_bus, handler, answer_type, code, reason) -> None:
     _, _, client = await serving(new_bus, handler, Request("task/command", TaskCommand, answer_type, ""))
     for _ in range(2):
         with pytest.raises(RemoteError, match=reason) as caught:

@@ -107,52 +107,34 @@ async def test_process_receives_only_tokens_of_its_own_keys(new_bus, monkeypatch
     assert not [token for token in received if "camera" in token]
 
 
-class Flooded:
-    """A camera whose key is claimed by thousands of forged tokens with later times."""
+async def test_few_claimants_are_reported_and_an_earlier_owner_is_found_among_them(monkeypatch, caplog) -> None:
+    net, resolved, resolve = LocalNetwork(), [], Ownership._resolve
 
-    def __init__(self, monkeypatch) -> None:
-        self.net = LocalNetwork()
-        self.resolved: list[Owner] = []
-        resolve = Ownership._resolve
+    def note(owners: Ownership, other: Owner, now: float) -> None:
+        resolved.append(other)
+        resolve(owners, other, now)
 
-        def note(owners: Ownership, other: Owner, now: float) -> None:
-            self.resolved.append(other)
-            resolve(owners, other, now)
-
-        monkeypatch.setattr(Ownership, "_resolve", note)
-        monkeypatch.setattr(ownership, "CONFLICT_SECONDS", 0.0)
-        self.bus = self.net.bus("camera")
-        self.bus.writer(topics.CAMERA_IMAGE)
-        self.ran = asyncio.create_task(self.bus.run(self._run()))
-        self._session = self.net.session()
-
-    async def _run(self) -> None:
-        await self.bus.ready()
+    async def run() -> None:
+        await bus.ready()
         await asyncio.Event().wait()
 
-    async def flood(self) -> None:
-        """Declare forged tokens; return when all owners that lasted long enough have been resolved."""
-        await self.bus.ready_event.wait()
-        for number in range(FLOOD):
-            self._session.token(forged(number))
-        for own_key in (*UNUSUAL, "*"):
-            for process in UNUSUAL:
-                self._session.token(owns_key("test", KEY, own_key, "camera", f"x{process}"))
-        self._session.token("test/owns/**")
-        for _ in range(4):
-            await asyncio.sleep(0)
-
-
-async def test_few_claimants_of_a_key_are_resolved_and_reported_and_an_earlier_owner_is_among_them(
-    monkeypatch, caplog
-) -> None:
-    flooded = Flooded(monkeypatch)
-    await flooded.flood()
-    assert len(flooded.resolved) <= 2 * MAX_OTHERS
-    assert 0 < caplog.text.count("gives way") <= MAX_WARNINGS and not flooded.ran.done()
-    flooded.net.session().token(owns_key("test", KEY, KEY, "camera", f"{7:016x}-first"))
+    monkeypatch.setattr(Ownership, "_resolve", note)
+    monkeypatch.setattr(ownership, "CONFLICT_SECONDS", 0.0)
+    bus, flooder = net.bus("camera"), net.session()
+    bus.writer(topics.CAMERA_IMAGE)
+    running = asyncio.create_task(bus.run(run()))
+    await bus.ready_event.wait()
+    malformed = [owns_key("test", KEY, own_key, "camera", f"x{process}")
+                 for own_key in (*UNUSUAL, "*") for process in UNUSUAL]
+    for token in (*(forged(number) for number in range(FLOOD)), *malformed, "test/owns/**"):
+        flooder.token(token)
+    for _ in range(4):  # until all owners that lasted long enough have been resolved
+        await asyncio.sleep(0)
+    assert 0 < len(resolved) <= 2 * MAX_OTHERS
+    assert 0 < caplog.text.count("gives way") <= MAX_WARNINGS and not running.done()
+    net.session().token(owns_key("test", KEY, KEY, "camera", f"{7:016x}-first"))
     with pytest.raises(ConfigError, match=r"another camera \(process first\) .* was there first: this one ends"):
-        await asyncio.wait_for(flooded.ran, TIMEOUT)
+        await asyncio.wait_for(running, TIMEOUT)
 
 
 async def test_claim_warnings_resume_later_with_the_number_of_omitted_ones() -> None:
