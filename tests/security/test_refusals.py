@@ -57,12 +57,18 @@ def test_missing_folder_is_named_with_the_command_that_creates_one(refusal: Refu
     assert "'nowhere' is not a folder" in refusal("up", "panda", secure=None)
 
 
-@pytest.mark.parametrize("missing", ["router.key", *(f"panda.{name}" for name in (
-    "supervisor.pem", "viewer.key", "recorder.key")), ACCESS])
+@pytest.mark.parametrize("missing", ["router.key", "panda.supervisor.pem", "panda.viewer.key", ACCESS])
 def test_each_process_that_is_started_needs_its_files(refusal: Refusal, folder: Path, missing: str) -> None:
     (folder / missing).unlink()
-    line = refusal("run", "panda", "--only", "viewer", "--record", "all.mcap")
+    line = refusal("run", "panda", "--only", "viewer")
     assert line == f"--secure: '{folder}' has no {missing}: make it with `zencell secure init`"
+
+
+def test_recorder_that_is_started_needs_its_own_certificate(refusal: Refusal, folder: Path, monkeypatch) -> None:
+    (folder / "panda.recorder.key").unlink()
+    monkeypatch.setattr("security.preflight._require_rules", lambda *_: None)  # in another process
+    line = refusal("run", "panda", "--only", "robot_state_publisher", "--record", "all.mcap")
+    assert line == f"--secure: '{folder}' has no panda.recorder.key: make it with `zencell secure init`"
 
 
 def test_expired_certificate_is_named_with_its_date_and_the_remedy(refusal: Refusal, folder: Path) -> None:

@@ -6,7 +6,7 @@ import json
 import signal
 import subprocess
 import uuid
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 
 import psutil
@@ -30,35 +30,28 @@ START, HOLD = TaskCommand(command="start"), TaskCommand(command="pause")
 Process = subprocess.Popen[bytes]
 
 
-class Stage:
+class Stage(Processes):
     """Toys in a cell of their own, at a router that is shared or their own."""
 
-    def __init__(self, processes: Processes, endpoint: str) -> None:
-        self.processes, self.endpoint = processes, endpoint
+    def __init__(self, folder: Path, endpoint: str) -> None:
+        super().__init__(folder)
+        self.endpoint = endpoint
+        self.port = int(endpoint.rpartition(":")[2])
+        self.domain = self.port - port_of(0)
         self.cell = f"toy_{uuid.uuid4().hex[:8]}"
 
-    @property
-    def port(self) -> int:
-        return int(self.endpoint.rpartition(":")[2])
-
     async def router(self) -> Process:
-        process = self.processes.start("services.router", "--domain", str(self.port - port_of(0)))
+        process = self.start("services.router", "--domain", str(self.domain))
         await wait_router(self.endpoint, TIMEOUT)
         return process
 
     def toy(self, *arguments: str, mode: str = "serve", cell: str = "") -> Process:
         cell = f"cell={cell or self.cell}"
-        return self.processes.start("tests.common.process.toy", "--cell", CELL, "--connect", self.endpoint,
-                                    "--set", cell, "--set", f"services.toy.mode={mode}", *arguments)
+        return self.start("tests.common.process.toy", "--cell", CELL, "--connect", self.endpoint,
+                          "--set", cell, "--set", f"services.toy.mode={mode}", *arguments)
 
     async def ended(self, process: Process) -> int:
         return await asyncio.to_thread(process.wait, TIMEOUT)
-
-    def output(self, process: Process) -> str:
-        return self.processes.output(process)
-
-    async def printed(self, process: Process, text: str) -> None:
-        await self.processes.printed(process, text)
 
     async def connected(self, process: Process) -> None:
         """Return when a process has a link to the router, before it logs anything."""
@@ -77,14 +70,18 @@ class Stage:
 
 
 @pytest.fixture
-def stage(processes: Processes, domain: int) -> Stage:
+def stage(tmp_path: Path, domain: int) -> Iterator[Stage]:
     """Without a router yet."""
-    return Stage(processes, endpoint_of(domain))
+    stage = Stage(tmp_path, endpoint_of(domain))
+    yield stage
+    stage.end()
 
 
 @pytest.fixture
-def shared(processes: Processes, shared_router: str) -> Stage:
-    return Stage(processes, shared_router)
+def shared(tmp_path: Path, shared_router: str) -> Iterator[Stage]:
+    stage = Stage(tmp_path, shared_router)
+    yield stage
+    stage.end()
 
 
 @pytest.fixture
@@ -102,6 +99,7 @@ async def available(bus: Bus) -> Client:
 # --- results of a request -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 async def test_frozen_or_killed_server_loses_requests_until_it_resumes(shared: Stage, bus: Bus) -> None:
     toy = shared.toy()
     client = await available(bus)
@@ -231,17 +229,17 @@ async def test_token_exists_from_the_opening_of_the_gate_to_the_end(shared: Stag
 
 
 @pytest.mark.slow
-async def test_router_ends_on_signals_and_with_its_supervisor(processes: Processes, domain: int) -> None:
+async def test_router_ends_on_signals_and_with_its_supervisor(stage: Stage) -> None:
     for end in (signal.SIGINT, signal.SIGTERM, None):
-        router = processes.start("services.router", "--domain", str(domain), "--gate")
+        router = stage.start("services.router", "--domain", str(stage.domain), "--gate")
         router.stdin.write(b"\n")
         router.stdin.flush()
-        await processes.printed(router, "listening at")
+        await stage.printed(router, "listening at")
         if end is None:
             router.stdin.close()
         else:
             router.send_signal(end)
-        assert await asyncio.to_thread(router.wait, TIMEOUT) == 0
+        assert await stage.ended(router) == 0
 
 
 # --- bad starts ---------------------------------------------------------------------------------------------------
@@ -284,8 +282,8 @@ async def test_exit_code_and_log_show_how_a_service_ended(shared: Stage) -> None
 async def test_second_router_names_the_process_that_holds_the_port(shared: Stage) -> None:
     (router,) = [each.pid for each in psutil.net_connections("tcp")
                  if each.status == psutil.CONN_LISTEN and each.laddr.port == shared.port]
-    domain = shared.port - port_of(0)
-    with pytest.raises(PortInUse, match=rf"port {shared.port} \(domain {domain}\) is in use by process {router} "):
+    found = rf"port {shared.port} \(domain {shared.domain}\) is in use by process {router} "
+    with pytest.raises(PortInUse, match=found):
         open_router([shared.endpoint])
 
 

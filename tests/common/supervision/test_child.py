@@ -142,15 +142,12 @@ async def test_forked_child_reads_its_gate_and_leaves_no_orphan(preloaded: Prelo
 
 
 @linux
-@pytest.mark.parametrize("lost", ["killed", "closed"])
-async def test_child_starts_without_a_lost_preloaded_process(environment: dict[str, str], lost: str) -> None:
+async def test_child_starts_without_a_lost_preloaded_process(environment: dict[str, str]) -> None:
     process = Preloaded(environment)
     process.wait_ready()
-    if lost == "killed":
-        newest = max(psutil.Process().children(), key=lambda child: child.create_time())
-        assert "common.supervision.preloaded" in newest.cmdline()
-        newest.kill()
-    else:
-        process.close()
-    assert (await run([*COMMAND, "exit"], environment, process))[1:] == (["__main__ ['exit'] me True"], 3)
-    process.close()
+    newest = max(psutil.Process().children(), key=lambda child: child.create_time())
+    assert "common.supervision.preloaded" in newest.cmdline()
+    for lose in (newest.kill, process.close):
+        lose()
+        _, lines, code = await run([*COMMAND, "exit"], environment, process)
+        assert (lines, code) == (["__main__ ['exit'] me True"], 3)
