@@ -84,7 +84,7 @@ def test_cancelled_worker_plans_the_next_request() -> None:
     loading, planning, answer = run_script("""
 show(cancelled(0.0))
 show(cancelled(1.0))
-show(plan(request("b", 0.2), scene, None).ok)
+show(plan(request("b", 1.0), scene, None).ok)
 """, "long")
     assert loading and planning and answer, "a worker that ignores the cancellation would be killed"
 
