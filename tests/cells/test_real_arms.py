@@ -88,9 +88,7 @@ async def test_outline_survives_a_protective_stop_and_a_pulled_cable(tmp_path: P
 
 
 @on_ur
-async def test_outline_survives_a_long_disconnection_and_a_controller_reboot(
-    tmp_path: Path,
-) -> None:
+async def test_outline_survives_a_long_disconnection_and_a_controller_reboot(tmp_path: Path) -> None:
     with UrHost("127.0.0.52", q=HOME) as host, outliner(tmp_path, host) as cell:
         async with cell.listen() as bus:
             robot, motion = bus.reader(topics.ROBOT_STATUS), bus.reader(topics.MOTION_STATUS)
@@ -133,9 +131,7 @@ def picker(folder: Path) -> RunningCell:
 
 @on_franka
 @pytest.mark.timeout(600)
-async def test_balls_are_placed_despite_a_reflex_silences_and_a_controller_restart(
-    tmp_path: Path,
-) -> None:
+async def test_balls_are_placed_despite_a_reflex_silences_and_a_controller_restart(tmp_path: Path) -> None:
     with FrankaHost() as host, picker(tmp_path) as cell:
         async with cell.listen() as bus:
             robot, motion = bus.reader(topics.ROBOT_STATUS), bus.reader(topics.MOTION_STATUS)

@@ -49,8 +49,7 @@ async def replay(path: Path, name: str, service: str, topic: Topic[Any], states:
             for sample in recording.samples(lambda key: key in (*states, pictures)):
                 if sample.topic not in writers:
                     kind: Literal["state", "stream"] = "state" if sample.topic in states else "stream"
-                    writers[sample.topic] = bus.raw_writer(
-                        f"{name}/{sample.topic}", encoding_of(sample.message), kind)
+                    writers[sample.topic] = bus.raw_writer(f"{name}/{sample.topic}", encoding_of(sample.message), kind)
                 writers[sample.topic].put(sample.payload, sample.trace)
                 if sample.topic == pictures:
                     async with asyncio.timeout(60):

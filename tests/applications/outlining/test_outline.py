@@ -372,9 +372,7 @@ def test_arm_goes_home_first() -> None:
 
 
 @pytest.mark.parametrize("colliding", [None, ("base", "Object_2")])
-def test_arm_that_cannot_retreat_still_goes_home(
-    colliding: tuple[str, str] | None,
-) -> None:
+def test_arm_that_cannot_retreat_still_goes_home(colliding: tuple[str, str] | None) -> None:
     cell = OutlineDouble()
     cell.q, cell.colliding = list(AWAY), colliding
     cell.unplannable = lambda r: "no_ik" if r.stage == "retreat" and not cell.moves() else ""

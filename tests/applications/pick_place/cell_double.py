@@ -1,4 +1,4 @@
-"""A fake pick-and-place cell without a network."""
+"""Fake pick-and-place cell without a network."""
 
 from __future__ import annotations
 
@@ -15,6 +15,10 @@ from tests.common.tasks.task_double import MOTION, TaskDouble
 CELL = load_cell("panda")
 SEVEN = [tuple(spot) for spot in CELL.world.spots[:7]]
 FINGERS, LEAD = 0.25, 0.1  # [s] duration of a gripper command, and lead of the fingers before standstill
+
+
+def _vector(place: tuple[float, float, float]) -> m.Vector3:
+    return m.Vector3(x=place[0], y=place[1], z=place[2])
 
 
 class CellDouble(TaskDouble):
@@ -43,6 +47,15 @@ class CellDouble(TaskDouble):
         self.task = CellDouble([]).task
         self.task.prefix = f"again{self.now:.1f}"
 
+    def steps(self, count: int) -> list[m.Message]:
+        """Step several times and return all requests."""
+        return [request for _ in range(count) for request in self.step()]
+
+    def fail_motion(self, state: str = "aborted", message: str = "path tolerance") -> None:
+        """End the running motion in another way than by arrival."""
+        self.running.clear()
+        self.motion = self.motion.model_copy(update={"state": state, "message": message})
+
     def view(self) -> PickPlaceView:
         if self.camera_on:
             self._stamp = self.now + self.camera_ahead
@@ -51,22 +64,20 @@ class CellDouble(TaskDouble):
         objects += [self._sphere(f"slot_{k}", "contained", fell[k]) for k in range(self.contained)]
         objects += [self._sphere(f"beneath_{k}", "contained", (0.55, 0.25, 0.035), unseen=True)
                     for k in range(self.beneath)]
-        attached = []
-        if self.held:
-            attached = [m.AttachedObject(link="panda_hand_tcp", object=self._sphere(self.held, "attached", (0, 0, 0)))]
+        attached = [m.AttachedObject(link="panda_hand_tcp", object=self._sphere(held, "attached", (0, 0, 0)))
+                    for held in filter(None, [self.held])]
         header = m.Header(stamp=int(self._stamp * 1e9), frame_id="world")
         reachable = [p for p in self.balls.values() if p[:2] not in self.unreachable]
         scene = m.PlanningScene(header=header, objects=objects, attached=attached)
-        seen = m.PoseArray(header=header, poses=[m.Pose(position=m.Vector3(x=x, y=y, z=z)) for x, y, z in reachable])
-        tcp = m.Pose(position=m.Vector3(x=self.tcp[0], y=self.tcp[1], z=self.tcp[2]))
+        seen = m.PoseArray(header=header, poses=[m.Pose(position=_vector(place)) for place in reachable])
+        tcp = m.Pose(position=_vector(self.tcp))
         return PickPlaceView(self.now, scene, self.gripper, self.motion, [0.0], tcp, seen=seen)
 
     @staticmethod
     def _sphere(name: str, role: str, p: tuple[float, float, float], unseen: bool = False) -> m.CollisionObject:
         return m.CollisionObject.model_validate({
             "id": name, "role": role, "shape": "sphere", "dimensions": [0.03],
-            "pose": m.Pose(position=m.Vector3(x=p[0], y=p[1], z=p[2])), "unseen": unseen,
-        })
+            "pose": m.Pose(position=_vector(p)), "unseen": unseen})
 
     def advance(self) -> None:
         if self._waiting is not None and self.motion.state != "active":
@@ -110,8 +121,7 @@ class CellDouble(TaskDouble):
             "header": self.header, "id": request.id, "state": "active", "moving": True})
 
     def _go_to_end(self, request: m.ExecuteRequest) -> None:
-        pose = self._goals.get(request.trajectory.header.frame_id)
-        if pose is not None:
+        if pose := self._goals.get(request.trajectory.header.frame_id):
             self.tcp = (pose.position.x, pose.position.y, pose.position.z)
 
     def arrive(self, request: m.ExecuteRequest) -> None:

@@ -69,9 +69,7 @@ def test_balls_are_released_above_the_lowest_columns() -> None:
 
 
 @given(st.floats(0.005, 0.08), st.floats(0.01, 0.2), st.booleans())
-def test_released_object_of_any_size_falls_clear_of_the_walls(
-    radius: float, wide: float, flat: bool,
-) -> None:
+def test_released_object_of_any_size_falls_clear_of_the_walls(radius: float, wide: float, flat: bool) -> None:
     task = CellDouble([], place_pos_tol=wide).task
     sequences, box = MotionSequences(task.p, task.gripper), task.p.world.container
     size = (math.sqrt(2) * radius, math.sqrt(2) * radius) if flat else None

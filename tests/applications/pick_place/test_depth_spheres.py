@@ -80,9 +80,7 @@ def test_flat_object_is_an_outlier(shape: str, size: tuple[float, float, float],
     assert len(found) == 1 and [one.reason for one in detector.outliers] == [NOT_ROUND]
 
 
-def test_balls_on_a_red_cloth_are_found_with_few_attempts(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_balls_on_a_red_cloth_are_found_with_few_attempts(monkeypatch: pytest.MonkeyPatch) -> None:
     tries, fitted = [], depth_balls._fitted
     monkeypatch.setattr(depth_balls, "_fitted", lambda *given: tries.append(1) or fitted(*given))
     places = [(0.4, -0.1, 0.002 + R), (0.5, 0.05, 0.002 + R)]

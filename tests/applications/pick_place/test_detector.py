@@ -101,9 +101,7 @@ def test_every_ball_of_random_layouts_is_found_within_a_millimetre(noise, bright
     rng = np.random.default_rng(1)
     for _ in range(15):
         balls = random_layout(rng)
-        picture = draw_spheres(
-            balls, camera, around, noise_std=noise, brightness=brightness, rng=rng, rim_width=rim
-        )
+        picture = draw_spheres(balls, camera, around, noise_std=noise, brightness=brightness, rng=rng, rim_width=rim)
         check(balls, picture, within=0.001)
 
 
@@ -117,8 +115,7 @@ def test_touching_balls_are_separated(name, noise, brightness, rim):
     rng = np.random.default_rng(2)
     for _ in range(5):
         balls = moved_into_view(CLUSTERS[name](rng), rng)
-        picture = draw_spheres(
-            balls, camera, around, noise_std=noise, brightness=brightness, rng=rng, rim_width=rim)
+        picture = draw_spheres(balls, camera, around, noise_std=noise, brightness=brightness, rng=rng, rim_width=rim)
         check(balls, picture)
 
 

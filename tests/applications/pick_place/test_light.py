@@ -86,9 +86,7 @@ def test_balls_are_found_in_rendered_light_and_shadow(number: int) -> None:
 @pytest.mark.parametrize(("color", "count"), [
     ((0, 85, 255), 0), ((14, 85, 255), 1), ((0, 40, 170), 1),  # the floor's; a ball's as bright; one in the shadow
 ])
-def test_overexposed_orange_container_floor_is_no_ball(
-    color: tuple[int, int, int], count: int,
-) -> None:
+def test_overexposed_orange_container_floor_is_no_ball(color: tuple[int, int, int], count: int) -> None:
     box = AROUND.container
     picture = np.full((CAMERA.height, CAMERA.width, 3), 128, np.uint8)
     for place in ((box.x, box.y, 0.035), PLACES[0]):
@@ -115,9 +113,7 @@ def test_balls_in_a_container_are_found_however_warm_and_bright_the_light_is(
 
 
 @pytest.mark.parametrize("color", [(1.0, 0.0, 0.1), (1.0, 0.01, 0.1), (0.8, 0.0, 0.2), (1.0, 0.15, 0.1)])
-def test_balls_in_the_container_are_found_for_any_configured_color(
-    color: tuple[float, float, float],
-) -> None:
+def test_balls_in_the_container_are_found_for_any_configured_color(color: tuple[float, float, float]) -> None:
     around, box = AROUND.model_copy(update={"ball_color": color}), AROUND.container
     picture = Renderer(AROUND, camera=CAMERA).render(balls([(box.x, box.y, 0.035)])).colour
     bright = np.clip(np.rint(picture * 2.0), 0, 255).astype(np.uint8)

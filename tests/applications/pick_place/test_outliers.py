@@ -127,9 +127,7 @@ def test_no_ball_of_a_stack_is_offered(place: tuple[float, float]) -> None:
 
 @pytest.mark.parametrize("place", PLACES)
 @pytest.mark.parametrize("others", [True, False])
-def test_no_ball_of_a_stack_is_offered_to_a_side_camera(
-    place: tuple[float, float], others: bool,
-) -> None:
+def test_no_ball_of_a_stack_is_offered_to_a_side_camera(place: tuple[float, float], others: bool) -> None:
     camera, around = Pinhole.from_config(SIDE), AROUND.model_copy(update={"camera": SIDE})
     nearby = [ball(x, y) for x, y in OTHERS] if others else []
     picture = Renderer(around, camera=camera).render([ball(*place), ball(*place, 0.09), *nearby]).colour
@@ -196,9 +194,7 @@ def painted(camera: Pinhole, places: list[tuple[float, float]], wider: list[floa
 @pytest.mark.parametrize(("wider", "higher"), [
     ([0.45] * 4, [-0.45] * 4), ([-0.45] * 4, [0.45] * 4), ([0.41, 0, 0, 0], [0.41, 0, 0, 0]),
 ])
-def test_outline_tolerance_in_pixels_is_independent_of_distance(
-    wider: list[float], higher: list[float],
-) -> None:
+def test_outline_tolerance_in_pixels_is_independent_of_distance(wider: list[float], higher: list[float]) -> None:
     camera, around = Pinhole.from_config(SIDE), AROUND.model_copy(update={"camera": SIDE})
     places = [(0.10, -0.40), (0.10, 0.10), (0.20, -0.20), (0.60, -0.10)]
     detector = Detector(around)
@@ -221,12 +217,8 @@ def test_ball_on_top_of_something_looks_too_large_from_the_side(
     assert ["it lies higher" in one.reason for one in detector.outliers] == [True]
 
 
-@pytest.mark.parametrize("places", [
-    [(0.544, 0.265), (0.514, 0.21), (0.579, 0.216)], [(0.552, 0.273), (0.539, 0.214)],
-])
-def test_ball_leaning_on_the_wall_carries_no_phantom_ball(
-    places: list[tuple[float, float]],
-) -> None:
+@pytest.mark.parametrize("places", [[(0.544, 0.265), (0.514, 0.21), (0.579, 0.216)], [(0.552, 0.273), (0.539, 0.214)]])
+def test_ball_leaning_on_the_wall_carries_no_phantom_ball(places: list[tuple[float, float]]) -> None:
     things = [ball(x, y, 0.035) for x, y in places]
     found = Detector(AROUND).detect(Renderer(AROUND, camera=CAMERA).render(things).colour, CAMERA)
     assert len(found) == len(places)
@@ -234,9 +226,7 @@ def test_ball_leaning_on_the_wall_carries_no_phantom_ball(
 
 @pytest.mark.parametrize("place", PLACES[:2])
 @pytest.mark.parametrize(("diameter", "below"), [(0.07, 0.0), (0.1, 0.0), (0.06, 0.17)])
-def test_much_larger_blob_is_counted_as_too_large(
-    place: tuple[float, float], diameter: float, below: float,
-) -> None:
+def test_much_larger_blob_is_counted_as_too_large(place: tuple[float, float], diameter: float, below: float) -> None:
     detector = look(red("sphere", (*place, below + diameter / 2), (diameter, diameter, diameter)))
     assert detector.too_large == 1 and detector.outliers == []
     assert _remark(detector, "eye") == "1 round red thing looks much larger than a ball on the table"
