@@ -14,7 +14,7 @@ from common.sim.depth_sensor import DepthSensorParameters, simulate_depth
 from common.sim.objects import world_object
 from common.sim.ray_caster import Mesh, cast, empty_view
 from common.sim.solids import fixture_mesh
-from tests.applications.outlining.outline_scenes import (WORLDS, dense, distances, seen, seen_world, upright, world)
+from tests.applications.outlining.outline_scenes import WORLDS, dense, distances, seen, seen_world, upright, world
 
 SEED, FINE = (ContourOptions(subpixel=False), TopFaceOptions(rounding=0.001)), (ContourOptions(), TopFaceOptions())
 L_SHAPE = world("w4").objects[0].polygon
