@@ -1,6 +1,4 @@
-"""What the figures of a run say of an outline that was traced well."""
-
-from __future__ import annotations
+"""Checks of the figures of a run whose outline was traced well."""
 
 from typing import Any
 
@@ -17,11 +15,11 @@ def assert_good(summary: dict[str, Any]) -> None:
 
 
 def assert_cube_outlined(summary: dict[str, Any]) -> None:
-    """Of the world w2, in one go, with every figure."""
+    """Check every figure of an uninterrupted outline of the world w2."""
     assert_good(summary)
     outline = summary["outline"]
     assert set(outline) == {"object", "points", "fraction", "length_m", "closed", "deviation_mm", "tracking_mm"}
     assert outline["length_m"] == pytest.approx(0.4, abs=0.002)
     assert 4 <= outline["points"] < 1000
-    assert [plan["fraction"] for plan in summary["plans"]] == [1.0] * 5, "one for each stage, and none again"
+    assert [plan["fraction"] for plan in summary["plans"]] == [1.0] * 5, "one for each stage, none repeated"
     assert summary["restarts"] == {}

@@ -1,4 +1,4 @@
-"""Cells on the virtual clock in which things go wrong: they end well, the same each time, and bugs are found."""
+"""Cells on the virtual clock with faults: they end well, the same each time, and known bugs are found."""
 
 from functools import cache
 
@@ -12,10 +12,8 @@ from lab.observers import with_observed_arm
 from lab.simulation import LIMIT, Outcome, Simulation
 from tests.simulated.known_bugs import BUGS, RARE, found_within
 
-pytestmark = pytest.mark.timeout(600)  # some seconds of work, on a machine that may be busy
-
-
 PANDA = load_cell("panda", ["world.count=2"])
+AT_ONCE = ["what is not newer is read", "the task reads the truth", "a request that waits without end"]
 
 
 @cache
@@ -27,8 +25,8 @@ def outcome_of(name: str, seed: int) -> Outcome:
 @pytest.mark.slow
 @pytest.mark.parametrize(("cell", "seed"), [
     ("panda", 1),
-    pytest.param("panda", 2, marks=pytest.mark.campaign),  # the answer to who is there comes late, to a second instance
     ("ur5", 2),
+    pytest.param("panda", 2, marks=pytest.mark.campaign),  # the liveliness reply is late, to a second instance
     pytest.param("ur5", 22, marks=pytest.mark.campaign),  # stopped where it cannot go up any further
     pytest.param("ur5", 45, marks=pytest.mark.campaign),  # jogged towards the pedestal of the object, in a fast cell
 ])
@@ -41,37 +39,24 @@ def test_cell_succeeds_under_all_faults(cell, seed):
 
 
 @pytest.mark.slow
-def test_same_seed_is_the_same_run_with_faults():
-    first, second = outcome_of("panda", 1), Simulation(PANDA, 1, faults=True, digest=True).run()
-    assert first.digest == second.digest and first.faults == second.faults
-
-
-@pytest.mark.slow
 def test_campaign_run_is_reproduced_by_its_seed():
-    [among_others] = run_seeds(PANDA, [1], True, 1, LIMIT)
+    [in_campaign] = run_seeds(PANDA, [1], True, 1, LIMIT)
     alone = outcome_of("panda", 1)
-    assert (among_others.messages, among_others.seconds, among_others.requests, among_others.faults) == (
+    assert (in_campaign.messages, in_campaign.seconds, in_campaign.requests, in_campaign.faults) == (
         alone.messages, alone.seconds, alone.requests, alone.faults)
 
 
 @pytest.mark.slow
 def test_campaign_replaces_worker_processes(monkeypatch):
     monkeypatch.setattr("lab.campaign.SEEDS_A_PROCESS", 1)
-    outcomes = [*run_seeds(PANDA, [1, 2, 3], False, 1, 1.0)]  # none ends within that time
-    assert [outcome.seed for outcome in outcomes] == [1, 2, 3]
-
-
-AT_ONCE = ["what is not newer is read", "the task reads the truth", "a request that waits without end"]
+    outcomes = [*run_seeds(PANDA, [1, 2], False, 1, 0.5)]  # none ends within that time
+    assert [outcome.seed for outcome in outcomes] == [1, 2]
 
 
 @pytest.mark.parametrize(
     "bug", [bug if bug in AT_ONCE else pytest.param(bug, marks=pytest.mark.campaign) for bug in BUGS])
 def test_known_bug_is_found_within_tens_of_seeds(bug):
     assert found_within(bug, 400 if bug in RARE else 30) is not None
-
-
-def test_at_least_ten_bugs_are_known():
-    assert len(BUGS) >= 10 and set(AT_ONCE) < set(BUGS)
 
 
 def test_every_plan_has_three_crashes_a_cut_and_wrong_clocks():
@@ -83,19 +68,14 @@ def test_every_plan_has_three_crashes_a_cut_and_wrong_clocks():
         assert plan.links.loss > 0 and plan.links.hiccup > 0 and plan.links.duplicated > 0 and plan.links.late > 0
         assert plan.shuffled and plan.speed in (1.0, *SPEEDS)
         assert all(abs(skew) <= SKEW for _, skew in plan.skews) and len(plan.skews) == 3
-
-
-def test_plans_of_two_seeds_differ():
-    assert make_plan(1, ["one", "two"]) != make_plan(2, ["one", "two"])
-    assert make_plan(1, ["one", "two"]) == make_plan(1, ["one", "two"])
+    assert make_plan(1, ["one", "two"]) == make_plan(1, ["one", "two"]) != make_plan(2, ["one", "two"])
 
 
 def test_real_arm_cannot_be_simulated(tmp_path, monkeypatch):
-    (tmp_path / "steel.py").write_text(
+    (tmp_path / "real_arms").mkdir()
+    (tmp_path / "real_arms" / "__init__.py").write_text("")
+    (tmp_path / "real_arms" / "steel.py").write_text(
         "from common.hardware.mock import Options, create\nsimulated = False\n__all__ = ['Options', 'create']\n")
-    (tmp_path / "of").mkdir()
-    (tmp_path / "of" / "__init__.py").write_text("")
-    (tmp_path / "steel.py").rename(tmp_path / "of" / "steel.py")
     monkeypatch.syspath_prepend(str(tmp_path))
     with pytest.raises(ConfigError, match="is a real arm"):
-        with_observed_arm(load_cell("panda", ["robot.hardware.backend=of.steel"]))
+        with_observed_arm(load_cell("panda", ["robot.hardware.backend=real_arms.steel"]))

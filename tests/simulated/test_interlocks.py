@@ -1,6 +1,4 @@
-"""Operators' interlocks in complete cells, which no restart of a process may undo."""
-
-from __future__ import annotations
+"""Interlocks of operators in complete cells survive restarts of processes."""
 
 import asyncio
 
@@ -16,13 +14,11 @@ from tests.harness import until
 from tests.simulated.test_pausing import assert_still, held, moves
 from tests.simulated.visited import SimulatedCell
 
-pytestmark = pytest.mark.timeout(600)  # some seconds of work, on a machine that may be busy
-
 TASK, EXECUTOR = "smart_pick_place", "trajectory_executor"
 
 
-async def command(bus: Bus, said: str, by: str, override: bool = False) -> None:
-    asked = TaskCommand.model_validate({"command": said, "by": by, "override": override})
+async def command(bus: Bus, order: str, by: str, override: bool = False) -> None:
+    asked = TaskCommand.model_validate({"command": order, "by": by, "override": override})
     await bus.client(topics.TASK_COMMAND).call(asked, 10.0)
 
 
@@ -54,7 +50,7 @@ def test_stopped_robot_stays_stopped_over_restarts_until_an_operator_starts_it()
     async def visit(cell: SimulatedCell, bus: Bus) -> None:
         motion, status = bus.reader(topics.MOTION_STATUS), bus.reader(PICK_PLACE_STATUS)
         await moving(cell, bus, status, "pre-grasp")
-        # The page asks the executor itself; the task hangs, and is killed by a watchdog.
+        # The page asks the executor itself; the task hangs, and a watchdog kills it.
         answer = await bus.client(topics.MOTION_STOP).call(StopRequest(reason="smoke", owner="anna"))
         assert answer.stopped.endswith("UTC by anna (smoke)")
         cell.kill(TASK)
@@ -103,9 +99,9 @@ def test_operators_hold_and_speed_survive_restarts_and_only_the_operator_release
         await again(cell, bus, TASK, EXECUTOR)
         assert "by anna" in (await until(status, lambda s: s.paused and "found held" in s.message)).message
         await assert_standstill(cell, bus)
-        for said in ("resume", "start"):
+        for order in ("resume", "start"):
             with pytest.raises(RemoteError, match=r"held since .* by anna .*: only they can release it, unless"):
-                await command(bus, said, "bert")
+                await command(bus, order, "bert")
         with pytest.raises(MotionFailed):
             await OperatorMotion(bus, [], "bert").move(JointGoal(named="home"))
         await assert_standstill(cell, bus)

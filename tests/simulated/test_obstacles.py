@@ -1,7 +1,5 @@
 """Obstacles in the path of running motions in complete cells: the arm brakes, waits, resumes or is replanned."""
 
-from __future__ import annotations
-
 import asyncio
 
 import pytest
@@ -16,11 +14,9 @@ from tests.simulated.intruder import Intruder, watched_cell
 from tests.simulated.sees_more import SEEN
 from tests.simulated.visited import SimulatedCell
 
-pytestmark = pytest.mark.timeout(600)  # some seconds of work, on a machine that may be busy
-
 
 @pytest.mark.parametrize(("name", "overrides"), [
-    ("panda", ["world.count=1"]), pytest.param("ur5", [], marks=pytest.mark.slow),
+    ("panda", ["world.count=1"]), pytest.param("ur5", [], marks=pytest.mark.campaign),
 ])
 @pytest.mark.slow
 def test_added_obstacle_is_never_touched_and_the_task_is_done(name: str, overrides: list[str]) -> None:
@@ -32,8 +28,8 @@ def test_added_obstacle_is_never_touched_and_the_task_is_done(name: str, overrid
     assert cell.summary["failures"] == sum(one.given_up for one in intruder.found) > 0
 
 
-class Way:
-    """The way of the motion that runs, and a ball in the middle of what is left of it."""
+class ObstructedPath:
+    """The path of the running motion, and a ball in the middle of the rest of it."""
 
     def __init__(self, cell: SimulatedCell, bus: Bus) -> None:
         SEEN.clear()
@@ -42,7 +38,7 @@ class Way:
         self._robot, self._followed = RobotModel.load(cell.cell.robot), bus.client(topics.MOTION_FOLLOWED)
 
     async def block(self) -> MotionStatus:
-        """The status of a long motion that is held now, early on its way."""
+        """Obstruct a long motion early on its path and return its status once it is held."""
         while True:
             status = await until(self.motion, lambda m: m.state == "active" and 0.05 < m.progress < 0.3)
             try:
@@ -69,19 +65,19 @@ class Way:
 
 def test_removed_obstacle_resumes_the_motion_unless_an_operator_holds_the_arm() -> None:
     async def visit(cell: SimulatedCell, bus: Bus) -> None:
-        way, hold = Way(cell, bus), bus.client(topics.MOTION_HOLD)
-        held = await way.block()
+        path, hold = ObstructedPath(cell, bus), bus.client(topics.MOTION_HOLD)
+        held = await path.block()
         await hold.call(HoldRequest(hold=True, owner="anna"))
         SEEN.clear()
-        left = await until(way.motion, lambda m: m.held_by == ["operator"], 2.0)
+        left = await until(path.motion, lambda m: m.held_by == ["operator"], 2.0)
         await asyncio.sleep(2.0)
-        assert way.motion.latest is not None and way.motion.latest.progress == left.progress
-        SEEN.update(way.seen)
-        await until(way.motion, lambda m: "scene_monitor" in m.held_by, 2.0)
+        assert path.motion.latest is not None and path.motion.latest.progress == left.progress
+        SEEN.update(path.seen)
+        await until(path.motion, lambda m: "scene_monitor" in m.held_by, 2.0)
         await hold.call(HoldRequest(hold=False, owner="anna"))
-        assert (await until(way.motion, lambda m: "operator" not in m.held_by)).held
+        assert (await until(path.motion, lambda m: "operator" not in m.held_by)).held
         SEEN.clear()
-        assert (await until(way.motion, lambda m: m.progress > 0.9, 10.0)).id == held.id
+        assert (await until(path.motion, lambda m: m.progress > 0.9, 10.0)).id == held.id
 
     summary = SimulatedCell(watched_cell("panda", ["world.count=1"]), visit=visit).summary
     assert (summary["state"], summary["failures"]) == ("DONE", 0)
@@ -91,17 +87,17 @@ def test_removed_obstacle_resumes_the_motion_unless_an_operator_holds_the_arm() 
 @pytest.mark.slow
 def test_restarted_planner_rechecks_the_motion_it_held(stays: bool) -> None:
     async def visit(cell: SimulatedCell, bus: Bus) -> None:
-        way = Way(cell, bus)
-        held = await way.block()
+        path = ObstructedPath(cell, bus)
+        held = await path.block()
         cell.kill("motion_planner")
-        await until(way.motion, lambda m: "watchdog" in m.held_by, 5.0)
+        await until(path.motion, lambda m: "watchdog" in m.held_by, 5.0)
         if not stays:
             SEEN.clear()
         await bus.alive.wait("motion_planner")
-        over = await until(way.motion, lambda m: m.id != held.id or m.state != "active" or m.progress > 0.9, 20.0)
+        over = await until(path.motion, lambda m: m.id != held.id or m.state != "active" or m.progress > 0.9, 20.0)
         assert (over.id == held.id and over.progress > 0.9) is not stays
         if stays:
-            assert over.state == "cancelled" and not (await until(way.motion, lambda m: not m.held, 2.0)).held
+            assert over.state == "cancelled" and not (await until(path.motion, lambda m: not m.held, 2.0)).held
             SEEN.clear()
 
     cell = SimulatedCell(watched_cell("panda", ["world.count=1"]), visit=visit)

@@ -1,4 +1,6 @@
-"""A table that is hidden is not an empty one: whole cells with the arm in the picture, and with a covered camera."""
+"""A hidden table is not an empty one: complete cells with the arm in the image, a covered camera, or depth."""
+
+from pathlib import Path
 
 import pytest
 
@@ -23,8 +25,17 @@ def test_task_with_a_covered_camera_never_ends_done() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("place", [[], SIDE], ids=["above", "side"])
-@pytest.mark.parametrize("seed", [1, 2])
-def test_table_is_cleared_with_the_arm_in_the_image(place: list[str], seed: int) -> None:
-    summary = SimulatedCell("panda", [ARM, *place], seed=seed).summary
-    assert (summary["state"], summary["placed"], summary["targets"], summary["failures"]) == ("DONE", 7, 7, 0), summary
-    assert summary["truth"]["in_box"] == 7
+@pytest.mark.parametrize(("count", "seed"), [
+    (2, 1), *(pytest.param(7, seed, marks=pytest.mark.campaign) for seed in (1, 2))])
+def test_table_is_cleared_with_the_arm_in_the_image(place: list[str], count: int, seed: int) -> None:
+    summary = SimulatedCell("panda", [ARM, f"world.count={count}", *place], seed=seed).summary
+    assert (summary["state"], summary["placed"], summary["targets"], summary["failures"]) == ("DONE", count, count, 0)
+    assert summary["truth"]["in_box"] == count
+
+
+@pytest.mark.slow
+def test_table_is_cleared_by_color_and_depth() -> None:
+    cell = Path(__file__).parents[1] / "data" / "depth_balls.yaml"
+    summary = SimulatedCell(cell, ["world.count=2"]).summary
+    assert (summary["state"], summary["placed"], summary["failures"]) == ("DONE", 2, 0), summary
+    assert summary["truth"]["in_box"] == 2

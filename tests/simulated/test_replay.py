@@ -1,6 +1,4 @@
-"""What a detector found live it finds again in the recording, alone, with no camera and no cell."""
-
-from __future__ import annotations
+"""Detections of replayed images equal the live ones, without a camera or a cell."""
 
 import asyncio
 import importlib
@@ -21,9 +19,7 @@ from recording.reader import Recording
 from recording.sample import encoding_of
 from tests.simulated.visited import SimulatedCell
 
-pytestmark = pytest.mark.timeout(600)  # some seconds of work, on a machine that may be busy
-
-LEAST = 5  # pictures whose results are compared
+LEAST = 5  # images whose results are compared
 CASES = [
     ("panda", "vision_detector", DETECTED_OBJECTS, ["camera/camera_info", "tf_static"], "camera/image_raw"),
     ("ur5", "contour_detector", CONTOURS, [], "depth_camera/image_raw"),
@@ -31,14 +27,14 @@ CASES = [
 
 
 def found_in(path: Path, topic: str) -> dict[int, Any]:
-    """What was found in each picture, by the stamp of the picture."""
+    """Return the detections of each image by its stamp."""
     with Recording(path) as recording:
         messages = [msgpack.unpackb(sample.payload) for sample in recording.samples(lambda name: name == topic)]
     return {message["header"]["stamp"]: message for message in messages}
 
 
 async def replay(path: Path, name: str, service: str, topic: Topic[Any], states: list[str], pictures: str) -> list[Any]:
-    """What the service finds in each picture of the recording."""
+    """Return the detections of the service in each image of the recording."""
     cell, net, found = load_cell(name), LocalNetwork(), []
     module = importlib.import_module(f"services.{service}")
     bus, results = net.bus("player", cell=name), asyncio.Queue[bytes]()

@@ -30,6 +30,11 @@ from tests.harness import running_with
 Visit = Callable[["SimulatedCell", Bus], Coroutine[Any, Any, None]]
 
 
+def in_box(count: int) -> dict[str, Any]:
+    """Return the ground truth of a table whose balls are all in the box."""
+    return {"in_box": count, "on_table": 0, "elsewhere": 0, "containers": {"box": count}}
+
+
 class SimulatedCell:
     """A run of a cell: outcome, summary and log lines."""
 
