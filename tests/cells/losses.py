@@ -1,4 +1,4 @@
-"""Counts from outside what is lost on the way: the messages of each writer are numbered."""
+"""Counts messages that are lost on the way, by the sequence numbers of each writer."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ WATCHED = [topic for topic in all_topics().values()
 
 @dataclass
 class Arrivals:
-    """What came of one topic."""
+    """Messages of one topic that arrived and that were lost."""
 
     came: int = 0
     lost: int = 0
@@ -44,7 +44,7 @@ class Arrivals:
         before = self.newest.get(attachment.writer)
         if before is not None:
             if attachment.sequence <= before:
-                return  # a state that is put again each second
+                return  # a repeated state
             self.lost += attachment.sequence - before - 1
         self.newest[attachment.writer] = attachment.sequence
         if self.came:
@@ -61,24 +61,24 @@ class Losses:
         """Subscribe."""
         self._prefix = f"{bus.cell}/"
         self.of: dict[str, Arrivals] = {topic.key: Arrivals() for topic in WATCHED}
-        # On the network's thread, so that a busy loop of the watcher is not taken for a loss.
+        # On the network's thread, so that a busy event loop of the test does not lose messages.
         self._declared = [bus.raw_subscriber(self._prefix + topic.expression, self._arrive) for topic in WATCHED]
 
     def _arrive(self, sample: RawSample) -> None:
         self.of[topics.general_key(sample.key.removeprefix(self._prefix))].add(sample)
 
     def stop(self) -> None:
-        """Listen no more."""
+        """Undeclare the subscribers."""
         while self._declared:
             self._declared.pop().undeclare()
 
     @staticmethod
     def kind(key: str) -> str:
-        """Of a topic."""
+        """Return the kind of a topic."""
         return all_topics()[key].kind
 
     def table(self) -> list[str]:
-        """Lines for what came at all."""
+        """Return lines of a table of the topics with messages."""
         lines = ["| topic | kind | came | lost | rate [Hz] | longest gap [ms] |", "|---|---|---|---|---|---|"]
         lines += [
             f"| {key} | {self.kind(key)} | {one.came} | {one.lost} | {one.rate:.2f} | "

@@ -1,4 +1,4 @@
-"""A service for tests: once its parameter says so, its event loop does not turn any more."""
+"""A service for tests whose event loop is stuck once its parameter is set."""
 
 import asyncio
 import time

@@ -1,6 +1,7 @@
-"""Subscribers that do not keep up, as processes of their own: one reads slowly, one has stopped reading at all.
+"""Subscriber processes that do not keep up: slow ones, and frozen ones.
 
-`python -m tests.cells.subscribers ENDPOINT KEY SECONDS` is a subscriber that sleeps in each callback.
+`python -m tests.cells.subscribers ENDPOINT KEY SECONDS` is a subscriber that sleeps in each callback until its standard
+input is closed.
 """
 
 from __future__ import annotations
@@ -11,7 +12,6 @@ import subprocess
 import sys
 import time
 from contextlib import suppress
-from typing import IO
 
 import zenoh
 
@@ -22,32 +22,32 @@ CONNECT_MS = 30_000
 
 
 class Subscriber:
-    """A process that subscribes to everything of a cell; gone at the end of its `with` block."""
+    """A subscriber process that ends with its `with` block."""
 
     def __init__(self, endpoint: str, key: str, rest: float) -> None:
-        """Start it; it has subscribed when this returns.
+        """Start the process and wait until it has subscribed.
 
         Args:
             endpoint: of the router.
             key: key expression, such as `panda/**`.
-            rest: how long it does nothing over each message [s].
+            rest: time that it sleeps in the callback of each message [s].
 
         Raises:
-            RuntimeError: it ended instead.
+            RuntimeError: the process ended instead.
         """
         command = [sys.executable, "-m", "tests.cells.subscribers", endpoint, key, str(rest)]
-        self.process = subprocess.Popen(command, cwd=ROOT, env=environment(), stdout=subprocess.PIPE, text=True)
+        self.process = subprocess.Popen(command, cwd=ROOT, env=environment(), stdin=subprocess.PIPE,
+                                        stdout=subprocess.PIPE, text=True)
         assert self.process.stdout is not None
-        self._output: IO[str] = self.process.stdout
-        if not self._output.readline():
+        if not self.process.stdout.readline():
             raise RuntimeError(f"a subscriber ended with {self.process.wait()}")
 
     def freeze(self) -> None:
-        """Stop it in the middle of whatever it does: its connection stays open and nothing is read from it."""
+        """Stop the process: its connection stays open and nothing is read from it."""
         self.process.send_signal(signal.SIGSTOP)
 
     def wake(self) -> None:
-        """Let it go on; if it was dropped by the router meanwhile, it comes back."""
+        """Continue the process; it reconnects if the router dropped it meanwhile."""
         self.process.send_signal(signal.SIGCONT)
 
     def __enter__(self) -> Subscriber:
@@ -56,23 +56,19 @@ class Subscriber:
     def __exit__(self, *_: object) -> None:
         with suppress(ProcessLookupError):
             self.process.kill()
-        self.process.wait()
-        self._output.close()
+        self.process.communicate()
 
 
 def main() -> int:
-    """Subscribe, say so, and rest over each message until killed."""
+    """Subscribe, print it, and sleep in each callback until the parent process closes the standard input or dies."""
     endpoint, key, rest = sys.argv[1:]
-    parent = os.getppid()
     session = zenoh.open(client_config(endpoint, connect_ms=CONNECT_MS))
     seconds = float(rest)
-    # Direct: what is not read waits in the connection and not in a queue of this process.
-    subscriber = session.declare_subscriber(
-        key, zenoh.handlers.Callback(lambda _sample: time.sleep(seconds), indirect=False)
-    )
+    # Direct: unread messages wait in the connection and not in a queue of this process.
+    slowly = zenoh.handlers.Callback(lambda _sample: time.sleep(seconds), indirect=False)
+    subscriber = session.declare_subscriber(key, slowly)
     print("subscribed to", subscriber.key_expr, flush=True)  # noqa: T201
-    while os.getppid() == parent:
-        time.sleep(0.5)
+    sys.stdin.read()
     os._exit(0)  # closing would wait for the sleeping callback
 
 

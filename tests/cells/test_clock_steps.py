@@ -24,7 +24,7 @@ time.time_ns = lambda: _time_ns() + int(1e9 * float(_step.read_text()))
 """
 
 
-@pytest.mark.parametrize("step", [3600.0, -600.0])
+@pytest.mark.parametrize("step", [pytest.param(3600.0, marks=pytest.mark.campaign), -600.0])
 async def test_restarted_service_keeps_cell_time_after_a_clock_step(tmp_path: Path, step: float) -> None:
     hook, file = tmp_path / "hook", tmp_path / "step"
     hook.mkdir()

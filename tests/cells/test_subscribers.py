@@ -1,7 +1,5 @@
 """Slow and frozen subscribers of a complete cell, which must not be affected."""
 
-from __future__ import annotations
-
 import asyncio
 from collections import Counter
 from pathlib import Path
@@ -15,6 +13,7 @@ from common.transport.bus import Bus
 from tests.cells.losses import Losses
 from tests.cells.subscribers import Subscriber
 from tests.harness import RunningCell, running_with, until
+from tests.simulated.visited import in_box
 
 pytestmark = [pytest.mark.cell, pytest.mark.slow]
 
@@ -26,7 +25,7 @@ async def newest_counters(bus: Bus, newest: dict[str, ServiceCounters]) -> None:
 
 async def test_slow_and_frozen_subscribers_block_no_service(tmp_path: Path) -> None:
     newest: dict[str, ServiceCounters] = {}
-    settings = ("autostart=false", "world.count=2", "services.camera_simulator.rate=30")
+    settings = ("autostart=false", "world.count=1", "services.camera_simulator.rate=30")
     with RunningCell(tmp_path, "up", "panda", "--speed", "5", *(f"--set={one}" for one in settings)) as cell:
         async with cell.listen() as bus:
             losses, task, status = Losses(bus), bus.client(topics.TASK_COMMAND), bus.reader(PICK_PLACE_STATUS)
@@ -44,12 +43,12 @@ async def test_slow_and_frozen_subscribers_block_no_service(tmp_path: Path) -> N
         assert await cell.ended(20) == 0, cell.tail()
         summary = cell.summary
     assert summary["state"] == "DONE"
-    assert summary["truth"] == {"in_box": 2, "on_table": 0, "elsewhere": 0, "containers": {"box": 2}}
+    assert summary["truth"] == in_box(1)
     assert not any(summary["restarts"].values())
     came = {key: one for key, one in losses.of.items() if one.came}
     assert came.keys() >= {"scene_object_updates", "planning_scene", "motion/status", "gripper/state",
                            topics.COUNTERS.key}
-    # On a machine that is too busy a state may be replaced on its way by the next one; `make soak` counts those too.
+    # On a busy machine a state may be replaced on its way by the next one; `make soak` counts those too.
     assert not {key: one.lost for key, one in came.items() if one.lost and losses.kind(key) == "event"}
     overflow = sum((Counter(counters.overflow) for counters in newest.values()), Counter())
     assert newest and not overflow
