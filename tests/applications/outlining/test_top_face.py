@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from applications.outlining.contours import ContourOptions, find_contours, is_hole
-from applications.outlining.top_face import TopFaceOptions, rounded, top_face
+from applications.outlining.top_face import TopFaceOptions, top_face
 from common.perception.depth import DepthError
 from common.sim.depth_sensor import DepthSensorParameters, simulate_depth
 from common.sim.objects import world_object
@@ -44,24 +44,24 @@ def outlines(scene, objects, mode):
 
 
 @pytest.mark.parametrize("name", WORLDS)
-def test_pixel_mode_is_within_the_bounds_of_the_original_system(name):
+def test_outlines_of_both_modes_are_accurate(name):
     found = list(outlines(seen_world(name), world(name).objects, SEED))
     assert len(found) == {"w5": 3, "w6": 2}.get(name, 1)
     for face, thing, true in found:
         off = distances(dense(face.outline), true)
         assert off.max() < 1.2e-3 and off.mean() < 0.4e-3
-        assert face.top == pytest.approx(thing.base + thing.height, abs=1e-5)
-        assert face.base == pytest.approx(1, abs=1e-5)
+        assert (face.top, face.base) == pytest.approx((thing.base + thing.height, 1), abs=1e-5)
         np.testing.assert_allclose(face.outline * 1000, np.rint(face.outline * 1000), atol=1e-6)
-
-
-@pytest.mark.parametrize("name", WORLDS)
-def test_sub_pixel_outlines_are_within_a_third_of_a_millimeter_in_both_directions(name):
     for face, thing, true in outlines(seen_world(name), world(name).objects, FINE):
         off = distances(dense(face.outline), true)
         assert off.max() < 0.25e-3 and off.mean() < 0.03e-3
         assert distances(dense(true), face.outline).max() < 0.4e-3  # no part is missing; corners are a little rounded
         assert face.upright and face.filled == 0 and face.outline[:, 2] == pytest.approx(thing.base + thing.height)
+        step = np.roll(face.outline, -1, axis=0)[:, :2] - face.outline[:, :2]
+        lengths = np.linalg.norm(step, axis=1)
+        both_long = (lengths > 2e-4) & (np.roll(lengths, -1) > 2e-4)
+        back = (step * np.roll(step, -1, axis=0)).sum(axis=1) < -0.5 * lengths * np.roll(lengths, -1)
+        assert not (back & both_long).any(), "the outline never turns back"
 
 
 @pytest.mark.parametrize("name", ELSEWHERE)
@@ -77,21 +77,11 @@ def test_visible_walls_do_not_degrade_the_outline(name):
 
 @given(x=st.floats(0.43, 0.57), y=st.floats(-0.18, 0.18), yaw=st.floats(0, 3.2), height=st.floats(0.01, 0.2),
        a=st.floats(0.03, 0.09), b=st.floats(0.03, 0.09))
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=8)
 def test_boxes_anywhere_are_outlined_to_half_a_millimeter(x, y, yaw, height, a, b):
     thing = upright(shape="box", x=x, y=y, yaw=yaw, height=height, size=(a, b))
     for face, _, true in outlines(seen([thing]), [thing], FINE):
         assert distances(dense(face.outline), true).max() < 0.5e-3
-
-
-def test_outline_advances_in_small_steps():
-    for name in WORLDS:
-        for face, _, _ in outlines(seen_world(name), world(name).objects, FINE):
-            step = np.roll(face.outline, -1, axis=0)[:, :2] - face.outline[:, :2]
-            turn = (step * np.roll(step, -1, axis=0)).sum(axis=1)
-            lengths = np.linalg.norm(step, axis=1)
-            back = turn < -0.5 * lengths * np.roll(lengths, -1)
-            assert not (back & (lengths > 2e-4) & (np.roll(lengths, -1) > 2e-4)).any()
 
 
 def test_depth_noise_hardly_moves_the_outline():
@@ -99,11 +89,10 @@ def test_depth_noise_hardly_moves_the_outline():
     camera, picture, depth = seen([thing])
     noisy = (depth + np.random.default_rng(0).normal(0, 0.001, depth.shape)).astype(np.float32)
     for face, _, true in outlines((camera, picture, noisy), [thing], FINE):
-        assert distances(dense(face.outline), true).max() < 0.4e-3
-        assert face.top == pytest.approx(1.2, abs=2e-4)
+        assert distances(dense(face.outline), true).max() < 0.4e-3 and face.top == pytest.approx(1.2, abs=2e-4)
 
 
-@pytest.mark.parametrize("name", ["w2", "w3", "w6"])
+@pytest.mark.parametrize("name", ["w3", "w6"])
 def test_stereo_depth_with_frayed_edges_hardly_moves_the_outline(name):
     camera, picture, depth = seen_world(name)
     stereo = DepthSensorParameters(baseline=0.075)
@@ -136,7 +125,7 @@ def test_missing_depth_is_filled_from_the_object_and_counted(mode):
         top_face(pixels, holed, camera, mode[1])
 
 
-@pytest.mark.parametrize("size", [3, 5, 7])
+@pytest.mark.parametrize("size", [3, 7])
 @pytest.mark.parametrize("mode", [SEED, FINE], ids=["seed", "fine"])
 def test_single_wrong_depth_is_not_the_top_of_a_small_object(size, mode):
     camera, picture, depth = seen([])
@@ -177,9 +166,3 @@ def test_contour_pixels_are_centres_of_pixels():
         face, _, _ = next(outlines(seen_world("w3"), world("w3").objects, mode))
         middle = dense(face.outline).mean(axis=0)
         assert math.dist(middle, (0.5, 0.0)) < close
-
-
-def test_points_are_rounded_to_the_step_if_any():
-    points = np.array([[0.12345, -0.5001, 1.0004]])
-    np.testing.assert_allclose(rounded(points, 0.001), [[0.123, -0.5, 1.0]], atol=1e-12)
-    assert rounded(points, 0.0) is points

@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from applications.pick_place.segmentation import Outline, all_of
-from applications.pick_place.sphere_fit import fit_each, fit_spheres, near_points
+from applications.pick_place.sphere_fit import fit_each, fit_spheres
 from common.config import CameraConfig
 from common.perception.pinhole import Pinhole
 from common.perception.sphere import silhouette
@@ -53,16 +53,6 @@ def test_partial_outline_with_known_offset_is_enough(center, step, first, length
     assert offsets[0] == -0.001
 
 
-def test_points_near_a_silhouette_face_the_same_direction():
-    center = np.array((0.4, 0.1, 0.03))
-    outline = outline_of(center)
-    turned = Outline(outline.pixels, outline.rays, -outline.inward)
-    at = center[None] - camera.position
-    assert near_points(outline, at, R, 1e-4).all()
-    assert not near_points(turned, at, R, 1e-4).any()
-    assert not near_points(outline, at, R + 0.001, 1e-4).any()
-
-
 @given(places, st.floats(-0.002, 0.002), st.floats(-1, 1))
 @settings(deadline=None)
 def test_touching_spheres_are_fitted_with_their_offset(center, offset, angle):
@@ -73,14 +63,6 @@ def test_touching_spheres_are_fitted_with_their_offset(center, offset, angle):
     np.testing.assert_allclose(fit.centers + camera.position, [center, other], atol=2e-5)
     assert fit.offset == pytest.approx(offset, abs=2e-5)
     assert (fit.owner == np.repeat([0, 1], 120)).mean() > 0.95
-
-
-def test_expected_offset_dominates_for_a_short_outline():
-    center = (0.4, 0.1, 0.03)
-    outline = outline_of(center, R - 0.001, slice(0, 24))
-    start = np.array([center]) - camera.position
-    sure = fit_spheres(outline, start, R, offset=-0.001, offset_std=1e-5)
-    np.testing.assert_allclose(sure.centers[0] + camera.position, center, atol=1e-4)
 
 
 def test_points_off_all_outlines_are_ignored():

@@ -1,6 +1,4 @@
-"""The task of a cell whose camera is on the hand: it looks from home before it decides, and moves for nothing else."""
-
-from __future__ import annotations
+"""With a camera on the hand the task looks from home before each decision."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -21,7 +19,7 @@ AWAY = [position + 0.3 for position in HOME]
 
 
 class HandCell(CellDouble):
-    """Its camera sees from home alone; elsewhere the last picture is the newest."""
+    """Its camera sees from home only; elsewhere the last image stays the newest."""
 
     def __init__(self, balls: list[tuple[float, float]], q: list[float], **parameters: Any) -> None:
         self.q, self._homes, self._seen = q, set[str](), None
@@ -48,10 +46,6 @@ class HandCell(CellDouble):
         super().arrive(request)
         self.q = HOME if request.plan in self._homes else AWAY
 
-    def stages(self) -> list[str]:
-        """Names of the motions that were planned."""
-        return [request.stage for request in self.requests if isinstance(request, m.PlanRequest)]
-
 
 def test_task_looks_from_home_before_each_choice_and_before_done() -> None:
     cell = HandCell([(0.40, -0.10), (0.52, -0.10)], HOME)
@@ -68,29 +62,24 @@ def test_task_looks_from_home_before_each_choice_and_before_done() -> None:
 
 def test_task_goes_home_first_from_anywhere() -> None:
     cell = HandCell([(0.40, -0.10)], AWAY)
-    for _ in range(3):
-        cell.step()
+    cell.steps(3)
     assert cell.stages() == ["home"]
-    while cell.task.status.state != "DONE":
-        cell.step()
+    cell.until("DONE")
     assert cell.contained == 1
 
 
 def test_arm_moved_after_the_end_stays_there() -> None:
     cell = HandCell([], HOME)
-    while cell.task.status.state != "DONE":
-        cell.step()
+    cell.until("DONE")
     cell.q = AWAY
-    before = len(cell.requests)
-    for _ in range(50):
-        cell.step()
-    assert len(cell.requests) == before
+    assert cell.steps(50) == []
     cell.command("start")
     cell.step()
     assert cell.stages()[-1] == "home"
 
 
 def test_page_uses_the_camera_of_the_cell() -> None:
-    said = [yaml.safe_load(text) for kind, text in pages.blocks(pages.text_of("docs/calibration.md")) if kind == "yaml"]
-    camera = next(block["world"]["camera"] for block in said if isinstance(block.get("world"), dict))
+    texts = [text for kind, text in pages.blocks(pages.text_of("docs/calibration.md")) if kind == "yaml"]
+    worlds = [block["world"] for block in map(yaml.safe_load, texts) if isinstance(block.get("world"), dict)]
+    camera = worlds[0]["camera"]
     assert CameraConfig(**camera) == CELL.world.camera

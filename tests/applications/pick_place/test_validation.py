@@ -1,3 +1,5 @@
+"""Detections become targets, rejections with a reason, unknown positions, or contents of the container."""
+
 import numpy as np
 
 from applications.pick_place.detections import Validation
@@ -7,7 +9,6 @@ from common.perception.pinhole import Pinhole
 
 around = Surroundings()
 camera = Pinhole.from_config(around.camera)
-SECOND = 10**9
 
 
 class Reach:
@@ -22,17 +23,10 @@ def validation(**values):
     return Validation(around, Reach(), **values)
 
 
-def frame(*places, stamp=0, partial=False):
-    return MarkerArray(
-        header=Header(stamp=stamp, frame_id="world"),
-        markers=[
-            Marker(
-                ns="ball", id=i, type="sphere", pose=Pose(position=Vector3(x=x, y=y, z=0.03)), scale=Vector3(),
-                partial=partial,
-            )
-            for i, (x, y) in enumerate(places)
-        ],
-    )  # fmt: skip
+def frame(*places, stamp=0.0, partial=False):
+    markers = [Marker(ns="ball", id=i, type="sphere", pose=Pose(position=Vector3(x=x, y=y, z=0.03)), scale=Vector3(),
+                      partial=partial) for i, (x, y) in enumerate(places)]
+    return MarkerArray(header=Header(stamp=int(stamp * 1e9), frame_id="world"), markers=markers)
 
 
 def test_detections_are_classified():
@@ -53,35 +47,19 @@ def test_container_precedes_partial_view_precedes_reach():
 
 def test_rejected_position_is_reported_once_until_it_was_empty():
     judge = validation(forget_after=2.0)
-
-    def reports(stamp, *places):
-        return len(judge.validate(frame(*places, stamp=int(stamp * SECOND)), camera).rejections)
-
-    assert reports(0, (0.4, -0.2)) == 1
-    assert reports(1.5, (0.4, -0.201)) == 0
-    assert reports(3.0, (0.402, -0.2)) == 0, "it was never empty"
-    assert reports(4.0) == 0
-    assert reports(4.9, (0.4, -0.2)) == 0, "a frame without it is no while"
-    assert reports(6.0) == reports(7.0) == 0
-    assert reports(7.1, (0.4, -0.2)) == 1
-
-
-def test_touching_balls_are_different_positions():
-    verdict = validation().validate(frame((0.4, -0.2), (0.4, -0.26)), camera)
-    assert len(verdict.rejections) == 2
-
-
-def test_validating_a_frame_twice_reports_once():
-    judge, seen = validation(), frame((0.4, -0.2), (0.4, 0.1))
-    first, second = judge.validate(seen, camera), judge.validate(seen, camera)
-    assert first.targets == second.targets and len(first.rejections) == 1 and not second.rejections
+    for stamp, places, reports in (
+        (0, [(0.4, -0.2)], 1), (0, [(0.4, -0.2)], 0), (1.5, [(0.4, -0.201)], 0), (3.0, [(0.402, -0.2)], 0),
+        (4.0, [], 0), (4.9, [(0.4, -0.2)], 0),  # a single frame without it is too short
+        (6.0, [], 0), (7.0, [], 0), (7.1, [(0.4, -0.2)], 1),
+    ):
+        assert len(judge.validate(frame(*places, stamp=stamp), camera).rejections) == reports, stamp
+    assert len(validation().validate(frame((0.4, -0.2), (0.4, -0.26)), camera).rejections) == 2, "touching balls"
 
 
 def test_pixel_decides_whether_a_detection_is_in_the_container():
     place = camera.on_plane(camera.project((0.583, 0.283, 0.095)), 0.03)
-    seen = frame((float(place[0]), float(place[1])))
     assert np.hypot(*(place - (0.583, 0.283))) > 0.02, "the top layer is seen far from where it is"
-    assert validation().validate(seen, camera).inside == 1
+    assert validation().validate(frame(tuple(map(float, place))), camera).inside == 1
 
 
 def test_remark_describes_visible_non_targets():
