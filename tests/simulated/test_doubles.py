@@ -84,13 +84,6 @@ def test_start_must_acknowledge_the_newest_stop():
     assert Simulation(cell_of("panda"), 1, visit=visit).run().ok
 
 
-def test_doubles_replace_perception_and_planner_only():
-    cell, complete = cell_of("panda"), load_cell("panda")
-    assert list(cell.services) == ["motion_planner", "trajectory_executor", "perception", "smart_pick_place"]
-    assert cell.services["smart_pick_place"] == complete.services["smart_pick_place"]
-    assert cell.services["trajectory_executor"].module == complete.services["trajectory_executor"].module
-
-
 @pytest.mark.campaign
 @pytest.mark.parametrize("bug", DECISIONS)
 def test_interlock_bug_is_found_within_tens_of_seeds(bug):

@@ -1,23 +1,15 @@
 """A cell with two cameras and two detectors, each with its own name, that feed one scene."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from common import messages as m
-from common import topics
-from common.config import load_cell, service_config
-from common.errors import ConfigError
-from common.process.in_process import running_service
+from common.config import load_cell
 from common.supervision.wiring import owned_in, require_one_owner, wiring_of
-from common.transport import ownership
-from common.transport.local import LocalNetwork
 from lab.observers import Trace
 from lab.simulation import Simulation
 from recording.capture import CustomTopics
 from recording.reader import Recording
-from services import camera_simulator
 
 CELL = str(Path(__file__).parents[1] / "data" / "two_cameras.yaml")
 
@@ -69,26 +61,6 @@ async def test_keys_and_owners_follow_from_the_cell() -> None:
     assert "camera/image_raw" not in owned and "detected_objects" not in owned
     read = {topic.key for topic in wirings["scene_manager"].reads}
     assert {"left/detected_objects", "right/detected_objects", "left/camera/camera_info"} < read
-
-
-async def test_each_camera_has_its_own_frame_in_tf(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ownership, "CLAIM_SECONDS", 0.0)
-    cell, net = load_cell(CELL), LocalNetwork()
-    bus = net.bus("tester")
-    infos = {side: bus.reader(replace(topics.CAMERA_INFO, key=f"{side}/camera/camera_info"))
-             for side in ("left", "right")}
-    entries = [cell.services[f"{side}_camera"] for side in infos]
-    left, right = (service_config(cell, entry.name, camera_simulator.Config) for entry in entries)
-    async with (
-        running_service(net, camera_simulator.run, left, name="left_camera", topics=entries[0].topics),
-        running_service(net, camera_simulator.run, right, name="right_camera", topics=entries[1].topics),
-    ):
-        bus.writer(topics.SCENE_OBJECTS).put(m.WorldObjects())
-        frames = {side: (await reader.next()).header.frame_id for side, reader in infos.items()}
-        assert frames == {"left": "left_optical_frame", "right": "right_optical_frame"}
-        with pytest.raises(ConfigError, match=r"services\.third: left_camera has left/camera/\w+ already"):
-            async with running_service(net, camera_simulator.run, left, name="third", topics=entries[0].topics):
-                pytest.fail("the second writer was accepted")
 
 
 CUP = "robot.gripper={cup: {}, links: [panda_hand, panda_leftfinger, panda_rightfinger]}"

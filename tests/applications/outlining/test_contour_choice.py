@@ -4,18 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from applications.outlining.contour_choice import (
-    CHOSEN,
-    NAMES,
-    ContourTracker,
-    NoSuchContour,
-    annotate_contours,
-    choose,
-    colour_name,
-    described,
-    middle_of,
-    parse_choice,
-)
+from applications.outlining import contour_choice as choice
 from applications.outlining.contours import ContourOptions, find_contours
 from applications.outlining.topics import Contour, OutlineSelect
 from common.messages import Color
@@ -44,12 +33,12 @@ def on_grey(*boxes):
 
 def test_auto_selects_the_largest_contour_off_the_border():
     contours = contours_of((0, 0, 80, 80, RED), (100, 20, 20, 20, BLUE), (100, 60, 30, 30, GREEN))
-    assert colour_name(choose(contours, OutlineSelect()).color) == "green"
-    assert colour_name(choose(contours, OutlineSelect(rule="colour", colour="Blue")).color) == "blue"
-    with pytest.raises(NoSuchContour, match="every red contour touches the border"):
-        choose(contours, OutlineSelect(rule="colour", colour="red"))
+    assert choice.colour_name(choice.choose(contours, OutlineSelect()).color) == "green"
+    assert choice.colour_name(choice.choose(contours, OutlineSelect(rule="colour", colour="Blue")).color) == "blue"
+    with pytest.raises(choice.NoSuchContour, match="every red contour touches the border"):
+        choice.choose(contours, OutlineSelect(rule="colour", colour="red"))
     red = next(c for c in contours if c.touches_border)
-    assert choose(contours, OutlineSelect(rule="index", index=red.index)) is red
+    assert choice.choose(contours, OutlineSelect(rule="index", index=red.index)) is red
 
 
 @pytest.mark.parametrize(("wanted", "message"), [
@@ -59,72 +48,72 @@ def test_auto_selects_the_largest_contour_off_the_border():
     (OutlineSelect(rule="colour", colour="beige"), "'beige' is no colour; choices: red, orange"),
 ])
 def test_missing_contour_is_rejected_with_the_choices(wanted, message):
-    with pytest.raises(NoSuchContour, match=message):
-        choose(contours_of((20, 20, 30, 30, RED)), wanted)
+    with pytest.raises(choice.NoSuchContour, match=message):
+        choice.choose(contours_of((20, 20, 30, 30, RED)), wanted)
 
 
 def test_empty_image_has_no_contour_to_select():
-    assert contours_of() == [] and described([]) == "none"
-    with pytest.raises(NoSuchContour, match="the picture has no contour"):
-        choose([], OutlineSelect())
+    assert contours_of() == [] and choice.described([]) == "none"
+    with pytest.raises(choice.NoSuchContour, match="the picture has no contour"):
+        choice.choose([], OutlineSelect())
 
 
 @pytest.mark.parametrize(("text", "rule", "value"), [
     ("auto", "auto", None), (3, "index", 3), ("3", "index", 3), ("Object_2", "index", 2), ("gray", "colour", "gray")])
 def test_text_is_parsed_to_a_selection(text, rule, value):
-    wanted = parse_choice(text)
+    wanted = choice.parse_choice(text)
     assert wanted.rule == rule and value in (None, wanted.index, wanted.colour)
 
 
 def test_empty_text_selects_nothing_and_nonsense_is_rejected():
-    assert parse_choice("none") is parse_choice("") is None
-    with pytest.raises(NoSuchContour, match="choices: none, auto, an index, red"):
-        parse_choice("largest")
+    assert choice.parse_choice("none") is choice.parse_choice("") is None
+    with pytest.raises(choice.NoSuchContour, match="choices: none, auto, an index, red"):
+        choice.parse_choice("largest")
 
 
 @pytest.mark.parametrize(("rgb", "name"), [
     ((1, 1, 0), "yellow"), ((1, 0, 0), "red"), ((0, 1, 0), "green"), ((0, 0, 1), "blue"), ((0, 0, 0), "black"),
     ((1, 1, 1), "white"), ((0.7, 0.7, 0.7), "grey"), ((1, 0, 0.05), "red"), ((1, 0.5, 0), "orange")])
 def test_colors_have_their_common_names(rgb, name):
-    assert colour_name(Color(r=rgb[0], g=rgb[1], b=rgb[2])) == name and name in NAMES
+    assert choice.colour_name(Color(r=rgb[0], g=rgb[1], b=rgb[2])) == name and name in choice.NAMES
 
 
 def test_annotation_draws_the_selected_contour_on_a_copy():
     image = rectangles((20, 20, 60, 60, RED), (100, 60, 20, 20, BLUE))
     before = image.copy()
     contours = find_contours(image, SEED)
-    shown = annotate_contours(image, contours, choose(contours, OutlineSelect()).index)
+    shown = choice.annotate_contours(image, contours, choice.choose(contours, OutlineSelect()).index)
     np.testing.assert_array_equal(image, before)
-    assert (shown == CHOSEN).all(axis=2).sum() > 200
+    assert (shown == choice.CHOSEN).all(axis=2).sum() > 200
     assert cv2.absdiff(shown, image)[62:78, 102:118].any() or cv2.absdiff(shown, image)[55:85, 90:130].any()
 
 
 def test_selected_object_is_followed_and_not_replaced():
-    tracker = ContourTracker(OutlineSelect())
+    tracker = choice.ContourTracker(OutlineSelect())
     here = contours_of((20, 20, 30, 30, RED), (80, 60, 20, 20, BLUE))
     index, problem = tracker.find(here)
-    assert colour_name(here[index].color) == "red" and not problem
+    assert choice.colour_name(here[index].color) == "red" and not problem
     moved = contours_of((25, 22, 30, 30, RED), (80, 60, 20, 20, BLUE), (100, 5, 50, 50, GREEN))
-    assert colour_name(moved[tracker.find(moved)[0]].color) == "red"
+    assert choice.colour_name(moved[tracker.find(moved)[0]].color) == "red"
     hidden = contours_of((80, 60, 20, 20, BLUE), (100, 5, 50, 50, GREEN))
     index, problem = tracker.find(hidden)
     assert index == -1 and "not seen any more" in problem
-    assert colour_name(moved[tracker.find(moved)[0]].color) == "red"
+    assert choice.colour_name(moved[tracker.find(moved)[0]].color) == "red"
 
 
 def test_selection_without_match_is_retried_and_a_rejected_one_changes_nothing():
-    tracker = ContourTracker(OutlineSelect(rule="colour", colour="blue"))
+    tracker = choice.ContourTracker(OutlineSelect(rule="colour", colour="blue"))
     assert tracker.find(contours_of((20, 20, 30, 30, RED)))[0] == -1
     both = contours_of((20, 20, 30, 30, RED), (80, 60, 20, 20, BLUE))
-    assert colour_name(both[tracker.find(both)[0]].color) == "blue"
-    with pytest.raises(NoSuchContour):
+    assert choice.colour_name(both[tracker.find(both)[0]].color) == "blue"
+    with pytest.raises(choice.NoSuchContour):
         tracker.select(both, OutlineSelect(rule="index", index=9))
-    assert colour_name(both[tracker.find(both)[0]].color) == "blue"
-    assert ContourTracker(None).find(both) == (-1, f"no object is chosen; choices: {described(both)}")
+    assert choice.colour_name(both[tracker.find(both)[0]].color) == "blue"
+    assert choice.ContourTracker(None).find(both) == (-1, f"no object is chosen; choices: {choice.described(both)}")
 
 
 def test_gradually_occluded_object_is_found_again():
-    tracker = ContourTracker(OutlineSelect())
+    tracker = choice.ContourTracker(OutlineSelect())
     for side in (100, 80, 60, 45, 35, 27, 20):
         assert tracker.find([square(0, 100, 100, side)]) == (0, "")
     assert tracker.find([])[0] == -1
@@ -132,7 +121,7 @@ def test_gradually_occluded_object_is_found_again():
 
 
 def test_slowly_changing_object_stays_selected():
-    tracker = ContourTracker(OutlineSelect())
+    tracker = choice.ContourTracker(OutlineSelect())
     tracker.find([square(0, 100, 100, 50)])
     for step in range(1, 12):
         moved = square(1, 100 + 20 * step, 100, 50 + 5 * step)
@@ -142,7 +131,7 @@ def test_slowly_changing_object_stays_selected():
 @pytest.mark.parametrize(("by_operator", "found"), [(False, (1, "")), (True, (-1, "Object_0 is not seen any more"))])
 def test_automatically_selected_part_is_replaced_by_the_complete_object(by_operator, found):
     part, others = square(0, 110, 110, 20), [square(0, 300, 100, 200), square(1, 100, 100, 100)]
-    tracker = ContourTracker(OutlineSelect())
+    tracker = choice.ContourTracker(OutlineSelect())
     assert tracker.find([part]) == (0, "")
     if by_operator:
         tracker.select([part], OutlineSelect())
@@ -167,27 +156,27 @@ AT_BORDER = (0, 100, 300, 100, RED)
      on_grey((150, 150, 160, 160, GREEN)), 0),
 ])
 def test_hole_cut_off_object_or_other_color_does_not_replace_the_selected_object(rule, there, gone, index):
-    tracker = ContourTracker(rule)
+    tracker = choice.ContourTracker(rule)
     assert tracker.find(there) == (index, "")
     assert tracker.find(gone)[0] == -1
     assert tracker.find(there) == (index, "")
 
 
 def test_object_at_the_border_can_be_selected_by_its_index():
-    tracker = ContourTracker(OutlineSelect(rule="index", index=0))
+    tracker = choice.ContourTracker(OutlineSelect(rule="index", index=0))
     assert [tracker.find(on_grey(AT_BORDER))[0] for _ in range(2)] == [0, 0]
 
 
 def test_selection_by_position_is_independent_of_the_numbering():
     seen = [square(0, 100, 300, 50), square(1, 400, 100, 50)]
     now = [square(0, 300, 400, 50), square(1, 101, 300, 50), square(2, 400, 100, 50)]
-    tracker = ContourTracker(None)
+    tracker = choice.ContourTracker(None)
     for contour, index in zip(seen, (1, 2), strict=True):
-        choice = OutlineSelect(rule="index", index=contour.index, at=middle_of(contour))
-        assert tracker.select(now, choice).index == index == tracker.find(now)[0]
-    with pytest.raises(NoSuchContour, match="contour 1 is not where it was seen"):
-        tracker.select(now[:2], OutlineSelect(rule="index", index=1, at=middle_of(seen[1])))
+        wanted = OutlineSelect(rule="index", index=contour.index, at=choice.middle_of(contour))
+        assert tracker.select(now, wanted).index == index == tracker.find(now)[0]
+    with pytest.raises(choice.NoSuchContour, match="contour 1 is not where it was seen"):
+        tracker.select(now[:2], OutlineSelect(rule="index", index=1, at=choice.middle_of(seen[1])))
     nested = [square(0, 100, 100, 100), square(1, 130, 131, 40)]  # an object and its central hole
     for contour in nested:
-        choice = OutlineSelect(rule="index", index=contour.index, at=middle_of(contour))
-        assert ContourTracker(None).select(nested, choice) is contour
+        wanted = OutlineSelect(rule="index", index=contour.index, at=choice.middle_of(contour))
+        assert choice.ContourTracker(None).select(nested, wanted) is contour

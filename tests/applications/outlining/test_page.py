@@ -1,10 +1,6 @@
 """Selecting an object on the page starts its trace once the path is known, unless the arm is stopped before."""
 
-from __future__ import annotations
-
 import asyncio
-from collections.abc import Callable
-from typing import Any
 
 import pytest
 
@@ -30,41 +26,51 @@ STOP_BEFORE, STOP_SINCE = (m.Interlock(kind="stopped", by="page", since=since) f
 
 
 class Cell:
-    """Task, executor and detector, as far as the page has to do with them."""
+    """Task, executor and detector, as far as the page uses them."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         network = LocalNetwork()
         self.bus, page = network.bus("cell"), network.bus("viewer")
         self.motion = self.bus.writer(topics.MOTION_STATUS)
         self.status, self.path = self.bus.writer(OUTLINE_STATUS), self.bus.writer(CONTOUR_PATH)
-        self.commands: list[tuple[str, int | None]] = []
+        self.commands, self.notices = [], []
         self.executor_answers, self.labels = True, ["Object_0"]
         self.bus.serve(OUTLINE_SELECT, self._select)
         self.bus.serve(topics.TASK_COMMAND, self._command)
         self.bus.serve(topics.MOTION_STOP, self._stop)
         feeds = Feeds(page, [topics.MOTION_STATUS, OUTLINE_STATUS, CONTOUR_PATH])
         self.console = Console(page, Members(services=[], task="task"), feeds, [OUTLINE_SELECT])
+        self.console.notify = lambda line, _kind="bad": self.notices.append(line)
 
-    async def until(self, condition: Callable[[], bool]) -> None:
+    async def until(self, condition):
         async with asyncio.timeout(10):
             while not condition():  # noqa: ASYNC110
                 await asyncio.sleep(0)
 
-    async def _select(self, _wanted: OutlineSelect) -> OutlineSelection:
+    async def _select(self, _wanted):
         return OutlineSelection(index=0, label=self.labels.pop(0))
 
-    async def _command(self, command: m.TaskCommand) -> m.TaskStatus:
+    async def _command(self, command):
         self.commands.append((command.command, command.acknowledged))
         return m.TaskStatus()
 
-    async def _stop(self, _request: m.StopRequest) -> m.MotionStatus:
+    async def _stop(self, _request):
         if not self.executor_answers:
-            raise Refused("busy", "too much is asked")
+            raise Refused("busy", "too many requests")
         return m.MotionStatus(interlocks=[STOP_SINCE])
+
+    async def start_choosing(self):
+        """Select an object; its path is not known yet."""
+        count = len(self.labels)
+        choosing = asyncio.create_task(choose(self.console, OutlineSelect()))
+        await self.until(lambda: len(self.labels) < count)
+        for _ in range(50):
+            await asyncio.sleep(0)
+        return choosing
 
 
 @pytest.fixture
-async def cell() -> Cell:
+async def cell():
     cell = Cell()
     await cell.bus.ready()
     cell.status.put(OutlineStatus())
@@ -73,55 +79,36 @@ async def cell() -> Cell:
     return cell
 
 
-async def chosen(cell: Cell, meanwhile: Any) -> list[tuple[str, int | None]]:
-    """Return the task commands after a selection, an event, and the arrival of the path."""
-    choosing = asyncio.create_task(choose(cell.console, OutlineSelect()))
-    for _ in range(50):
-        await asyncio.sleep(0)
-    await meanwhile()
+async def test_selection_releases_an_earlier_stop(cell):
+    choosing = await cell.start_choosing()
     cell.path.put(OutlinePoints(object="Object_0"))
     await choosing
-    return cell.commands
+    assert cell.commands == [("start", 3)]
 
 
-async def test_selection_releases_an_earlier_stop(cell: Cell) -> None:
-    async def nothing() -> None:
-        pass
-
-    assert await chosen(cell, nothing) == [("start", 3)]
-
-
-@pytest.mark.parametrize("by", ["the page", "the page, and the arm does not answer", "the command line"])
-async def test_stop_after_the_selection_stays(cell: Cell, by: str) -> None:
-    notices: list[str] = []
-    cell.console.notify = lambda line, _kind="bad": notices.append(line)
+@pytest.mark.parametrize("by", ["the page", "the page without an answer", "the command line"])
+async def test_stop_after_the_selection_stays(cell, by):
+    choosing = await cell.start_choosing()
     cell.executor_answers = by == "the page"
-
-    async def stop() -> None:
-        if by == "the command line":
-            cell.motion.put(m.MotionStatus(interlocks=[STOP_BEFORE, STOP_SINCE]))
-            await cell.until(lambda: STOP_SINCE in getattr(cell.console.latest(topics.MOTION_STATUS), "interlocks", ()))
-            return
+    if by == "the command line":
+        cell.motion.put(m.MotionStatus(interlocks=[STOP_BEFORE, STOP_SINCE]))
+        await cell.until(lambda: STOP_SINCE in getattr(cell.console.latest(topics.MOTION_STATUS), "interlocks", ()))
+    else:
         try:
             await cell.console.stop()
         except RequestFailed:
             assert not cell.executor_answers
+    cell.path.put(OutlinePoints(object="Object_0"))
+    await choosing
+    assert [command for command, _ in cell.commands if command != "stop"] == []
+    assert cell.notices[-1].startswith("Object_0 is chosen, but not traced")
 
-    assert [command for command, _ in await chosen(cell, stop) if command != "stop"] == []
-    assert notices[-1].startswith("Object_0 is chosen, but not traced")
 
-
-async def test_only_the_second_of_two_selections_is_traced_once(cell: Cell) -> None:
-    notices: list[str] = []
-    cell.console.notify = lambda line, _kind="bad": notices.append(line)
+async def test_only_the_second_of_two_selections_is_traced_once(cell):
     cell.labels = ["Object_0", "Object_1"]
-    first = asyncio.create_task(choose(cell.console, OutlineSelect()))
-    await cell.until(lambda: cell.labels == ["Object_1"])
-    second = asyncio.create_task(choose(cell.console, OutlineSelect()))
-    await cell.until(lambda: not cell.labels)
+    first, second = await cell.start_choosing(), await cell.start_choosing()
     cell.path.put(OutlinePoints(object="Object_1"))
     await second
-    cell.path.put(OutlinePoints(object="Object_0"))  # as the next picture counts
+    cell.path.put(OutlinePoints(object="Object_0"))  # as the next image numbers it
     await first
-    assert cell.commands == [("start", 3)]
-    assert notices[-1] == "Object_1 is chosen"
+    assert cell.commands == [("start", 3)] and cell.notices[-1] == "Object_1 is chosen"

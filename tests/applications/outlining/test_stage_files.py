@@ -1,3 +1,5 @@
+"""Files of the stages of an outline: round trips, and rejections that name the file."""
+
 import json
 
 import numpy as np
@@ -8,15 +10,19 @@ from applications.outlining.stage_files import StageFileError
 from tests.applications.outlining.outline_scenes import seen_world
 
 
-def test_images_round_trip(tmp_path):
-    _, picture, depth = seen_world("w2")
-    files.write_pictures(tmp_path / "new" / "folder", picture, depth)
-    again, metres = files.read_pictures(tmp_path / "new" / "folder")
-    np.testing.assert_array_equal(again, picture)
-    np.testing.assert_array_equal(metres, depth)
-    assert sorted(p.name for p in (tmp_path / "new" / "folder").iterdir()) == [
+@pytest.fixture(scope="module")
+def images():
+    return seen_world("w2")[1:]
+
+
+def test_images_round_trip(tmp_path, images):
+    folder = tmp_path / "new" / "folder"
+    files.write_pictures(folder, *images)
+    for read, written in zip(files.read_pictures(folder), images, strict=True):
+        np.testing.assert_array_equal(read, written)
+    assert sorted(p.name for p in folder.iterdir()) == [
         "camera_image.png", "depth_camera_image.png", "depth_camera_image_normalized.png", "depth_data.npy"]
-    shown = files.read_picture(tmp_path / "new" / "folder" / files.NORMALIZED)[..., 0]
+    shown = files.read_picture(folder / files.NORMALIZED)[..., 0]
     assert shown[384, 512] == 255 and shown[0, 0] == 0 and 0 < shown[384, 5] < 255
 
 
@@ -30,72 +36,60 @@ def test_points_round_trip_and_integral_pixels_have_no_decimal_point(tmp_path):
     assert len(json.loads((tmp_path / files.CLEARED).read_text())) == 3
 
 
-@pytest.mark.parametrize("text, said", [
-    ("", "is not valid JSON"), ("[[1, 2, 3]", "is not valid JSON"), ("{}", r"list of at least 3 points .*, not dict"),
-    ("[]", "not 0 entries"),
-    ("[[1,2,3],[1,2,3],[1,2]]", r"entry 2 must be \[x, y, z\] of finite numbers, not \[1, 2\]"),
-    ("[[1,2,3],[1,2,NaN],[1,2,3]]", "entry 1 "), ('[[1,2,3],[1,2,"3"],[1,2,3]]', "entry 1 "),
-    ("[[1,2,3],[1,2,true],[1,2,3]]", "entry 1 "), ("[[1,2,3],7,[1,2,3]]", "entry 1 .*not 7"),
-    ("[[1,2,3],[1,2,1e400],[1,2,3]]", "entry 1 "), ("[" * 100_000, "is not valid JSON"),
+@pytest.mark.parametrize(("text", "problem"), [
+    (b"", "is not valid JSON"), (b"[[1, 2, 3]", "is not valid JSON"), (b"[" * 100_000, "is not valid JSON"),
+    (b"\xff\xfe\x00", "is not valid JSON"), (b"{}", r"list of at least 3 points .*, not dict"),
+    (b"[]", "not 0 entries"),
+    (b"[[1,2,3],[1,2,3],[1,2]]", r"entry 2 must be \[x, y, z\] of finite numbers, not \[1, 2\]"),
+    (b"[[1,2,3],[1,2,NaN],[1,2,3]]", "entry 1 "), (b'[[1,2,3],[1,2,"3"],[1,2,3]]', "entry 1 "),
+    (b"[[1,2,3],[1,2,true],[1,2,3]]", "entry 1 "), (b"[[1,2,3],7,[1,2,3]]", "entry 1 .*not 7"),
+    (b"[[1,2,3],[1,2,1e400],[1,2,3]]", "entry 1 "),
 ])
-def test_malformed_points_are_rejected_with_the_file_name(tmp_path, text, said):
+def test_malformed_points_are_rejected_with_the_file_name(tmp_path, text, problem):
     path = tmp_path / files.CLEARED
-    path.write_text(text)
-    with pytest.raises(StageFileError, match=said) as caught:
+    path.write_bytes(text)
+    with pytest.raises(StageFileError, match=problem) as caught:
         files.read_coordinates(path)
     assert str(path) in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_missing_files_are_named(tmp_path):
-    for read, name in ((files.read_pictures, files.PICTURE), (files.read_depth, files.DEPTH),
-                       (files.read_pixels, files.PIXELS)):
-        path = tmp_path if read is files.read_pictures else tmp_path / name
-        with pytest.raises(StageFileError, match=f"{name}: is missing"):
-            read(path)
+@pytest.mark.parametrize(("read", "name"), [
+    (files.read_picture, files.PICTURE), (files.read_depth, files.DEPTH), (files.read_pixels, files.PIXELS)])
+def test_missing_file_is_named(tmp_path, read, name):
+    with pytest.raises(StageFileError, match=f"{name}: is missing"):
+        read(tmp_path / name)
 
 
-def test_wrong_binary_files_are_rejected(tmp_path):
-    picture, depth = tmp_path / files.PICTURE, tmp_path / files.DEPTH
-    for content in (b"", b"not a picture"):
-        picture.write_bytes(content)
-        with pytest.raises(StageFileError, match="is no picture"):
-            files.read_picture(picture)
-        depth.write_bytes(content)
-        with pytest.raises(StageFileError, match="is no array that numpy can read"):
-            files.read_depth(depth)
-    (tmp_path / files.PIXELS).write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(StageFileError, match="is not valid JSON"):
-        files.read_pixels(tmp_path / files.PIXELS)
+@pytest.mark.parametrize("content", [b"", b"not a picture"])
+def test_wrong_binary_files_are_rejected(tmp_path, content):
+    for read, name, problem in ((files.read_picture, files.PICTURE, "is no picture"),
+                                (files.read_depth, files.DEPTH, "is no array that numpy can read")):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(StageFileError, match=problem):
+            read(tmp_path / name)
 
 
-@pytest.mark.parametrize("array, said", [
+@pytest.mark.parametrize(("array", "problem"), [
     (np.zeros((4, 5, 3), np.float32), "must be an array"), (np.array([["a"]]), "must be an array"),
     (np.full((4, 5), np.nan), "no valid depth at all"), (np.zeros((4, 5)), "no valid depth at all"),
+    (np.array([[{}]], dtype=object), "is no array that numpy can read"),  # never unpickled
 ])
-def test_invalid_depth_is_rejected(tmp_path, array, said):
-    np.save(tmp_path / files.DEPTH, array)
-    with pytest.raises(StageFileError, match=said):
+def test_invalid_depth_is_rejected(tmp_path, array, problem):
+    np.save(tmp_path / files.DEPTH, array, allow_pickle=True)
+    with pytest.raises(StageFileError, match=problem):
         files.read_depth(tmp_path / files.DEPTH)
 
 
-def test_objects_in_an_array_file_are_never_unpickled(tmp_path):
-    np.save(tmp_path / files.DEPTH, np.array([[{}]], dtype=object), allow_pickle=True)
-    with pytest.raises(StageFileError, match="is no array that numpy can read"):
-        files.read_depth(tmp_path / files.DEPTH)
-
-
-def test_image_and_depth_of_different_sizes_are_rejected(tmp_path):
-    _, picture, depth = seen_world("w2")
-    files.write_pictures(tmp_path, picture, depth)
-    np.save(tmp_path / files.DEPTH, depth[::2])
+def test_image_and_depth_of_different_sizes_are_rejected(tmp_path, images):
+    files.write_pictures(tmp_path, *images)
+    np.save(tmp_path / files.DEPTH, images[1][::2])
     with pytest.raises(StageFileError, match=r"depth_data.npy: is 1024x384, but camera_image.png is 1024x768"):
         files.read_pictures(tmp_path)
 
 
-def test_unwritable_folder_is_named(tmp_path):
+def test_unwritable_folder_is_named(tmp_path, images):
     (tmp_path / "file").write_text("")
-    _, picture, depth = seen_world("w2")
     with pytest.raises(StageFileError, match="cannot be written"):
-        files.write_pictures(tmp_path / "file", picture, depth)
+        files.write_pictures(tmp_path / "file", *images)
     with pytest.raises(StageFileError, match="cannot be written"):
         files.write_points(tmp_path / "file" / files.PIXELS, np.zeros((3, 2)))
