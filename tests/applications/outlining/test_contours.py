@@ -9,14 +9,12 @@ from hypothesis import strategies as st
 
 from applications.outlining.contour_choice import choose, colour_name
 from applications.outlining.contours import (
-    SHORTEST,
     ContourOptions,
     channel_of,
     find_contours,
     is_hole,
     normals,
     refine,
-    smoothed,
 )
 from applications.outlining.solids import simplified
 from applications.outlining.topics import Contours, OutlineSelect
@@ -179,11 +177,6 @@ def test_clean_contours_and_details_in_noise_stay_unchanged(shape, monkeypatch):
     monkeypatch.setattr("applications.outlining.contours.SHORTEST", np.inf)
     assert np.array_equal(outlined(shape, 0.0)[0], clean)
     assert off.mean() < 1.1 * outlined(shape, 12.0)[1].mean()
-
-
-def test_short_contour_is_not_smoothed():
-    few = np.random.default_rng(0).normal(0, 5, (SHORTEST - 1, 2))
-    assert smoothed(few) is few
 
 
 def test_normals_point_out_of_the_object_at_its_edge_and_into_a_hole():

@@ -51,13 +51,12 @@ def test_everything_is_planned_and_the_fingers_are_closed_before_the_first_motio
     assert [r.allowed_collisions for r in cell.plans()] == [[], TOUCHING, TOUCHING, TOUCHING, []]
     kinds = [type(r) for r in cell.requests]
     assert cell.gripper.width == 0.0 and kinds.index(m.GripperCommand) < kinds.index(m.ExecuteRequest)
-
-
-def test_closed_fingers_are_not_commanded() -> None:
-    cell = OutlineDouble()
-    cell.gripper = m.GripperState(width=0.0)
+    cell.fraction = 0.995
     cell.until("DONE")
-    assert not [r for r in cell.requests if isinstance(r, m.GripperCommand)]
+    cell.command("start")
+    cell.until("DONE")
+    assert kinds.count(m.GripperCommand) == [type(r) for r in cell.requests].count(m.GripperCommand), "closed already"
+    assert (cell.status.fraction, cell.status.closed) == (0.995, False), "nearly complete"
 
 
 @pytest.mark.parametrize("path", [
@@ -283,17 +282,13 @@ def test_frozen_camera_starts_no_motion(stage: str) -> None:
         freeze()
     steps(cell, 200)
     assert frozen and cell.status.message == "no fresh picture" and executed(cell) == []
+    cell.task.p = cell.task.p.model_copy(update={"selection_timeout": 1.0})
+    cell.until("ERROR")
+    assert cell.status.message == "no fresh picture" and executed(cell) == []
     cell.camera_on = True
+    cell.command("start")
     cell.until("DONE")
     assert cell.moves() == WHOLE
-
-
-def test_frozen_camera_ends_the_task_with_the_reason() -> None:
-    cell = OutlineDouble()
-    cell.camera_on = False
-    cell.now += 10
-    cell.until("ERROR")
-    assert cell.status.message == "no fresh picture" and cell.moves() == []
 
 
 @pytest.mark.parametrize(("can_retreat", "colliding"), [(True, None), (False, None), (False, ("base", "Object_2"))])
@@ -304,13 +299,6 @@ def test_arm_goes_home_first(can_retreat: bool, colliding: tuple[str, str] | Non
     cell.until("DONE")
     assert cell.moves() == [*(["retreat"] if can_retreat else []), "home", *WHOLE]
     assert cell.status.failures == 0
-
-
-def test_nearly_complete_contour_is_done_and_not_closed() -> None:
-    cell = OutlineDouble()
-    cell.fraction = 0.995
-    cell.until("DONE")
-    assert (cell.status.fraction, cell.status.closed) == (0.995, False)
 
 
 def test_missing_topics_are_named() -> None:

@@ -94,7 +94,6 @@ def test_balls_in_a_container_are_found_however_warm_and_bright_the_light_is(col
 
 
 @pytest.mark.parametrize("color", [(1.0, 0.0, 0.1), (1.0, 0.01, 0.1), (0.8, 0.0, 0.2), (1.0, 0.15, 0.1)])
-def test_balls_in_the_container_are_found_for_any_configured_color(color):
-    around = AROUND.model_copy(update={"ball_color": color})
+def test_ball_in_the_container_is_found_for_any_configured_color(color):
     bright = in_light(picture([ball(BOX.x, BOX.y, 0.035)]), 2.0)
-    assert len(Detector(around).detect(bright, CAMERA)) == 1
+    assert len(Detector(AROUND.model_copy(update={"ball_color": color})).detect(bright, CAMERA)) == 1

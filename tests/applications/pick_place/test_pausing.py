@@ -104,6 +104,18 @@ def test_stop_while_paused_ends_the_motion_and_start_releases_the_hold(moving: D
     assert status.failures == 0
 
 
+def test_ball_lost_while_paused_is_picked_after_the_resume() -> None:
+    cell = CellDouble([(0.40, -0.30)])
+    cell.until("across")
+    cell.command("pause")
+    cell.drop()
+    wait(cell)
+    assert cell.motion.state == "cancelled"
+    cell.command("resume")
+    cell.until("DONE")
+    assert cell.contained == 1
+
+
 def test_stop_also_stops_motions_of_other_clients() -> None:
     cell = CellDouble([])
     cell.until("DONE")
@@ -134,17 +146,13 @@ def test_task_that_finds_the_robot_held_stays_paused(cell: Double, command: str)
     cell.until("DONE")
 
 
-def test_early_start_releases_a_held_robot(cell: Double) -> None:
-    cell.motion = m.MotionStatus(held=True)
-    cell.command("start")
-    assert not cell.motion.held
-    cell.until("DONE")
-
-
-def test_task_waits_for_start(cell: Double) -> None:
+@pytest.mark.parametrize("held", [False, True])
+def test_task_waits_for_start_which_releases_a_held_robot(cell: Double, held: bool) -> None:
     cell.task.status.started = False
+    cell.motion = m.MotionStatus(held=held)
     assert wait(cell, 50) == [] and cell.task.status.state == "IDLE"
     cell.command("start")
+    assert not cell.motion.held
     cell.until("DONE")
 
 
@@ -155,19 +163,6 @@ def test_nothing_starts_while_another_client_holds_the_robot(moving: Double) -> 
     moving.motion = moving.motion.model_copy(update={"held": False})
     moving.until("DONE")
     assert moving.task.status.failures == 0
-
-
-def test_ball_lost_while_paused_is_picked_after_the_resume() -> None:
-    cell = CellDouble([(0.40, -0.30)])
-    cell.until("across")
-    cell.command("pause")
-    wait(cell, 5)
-    cell.drop()
-    wait(cell)
-    assert cell.motion.state == "cancelled"
-    cell.command("resume")
-    cell.until("DONE")
-    assert cell.contained == 1
 
 
 def test_task_waits_for_motions_of_other_clients_without_a_failure(cell: Double) -> None:
