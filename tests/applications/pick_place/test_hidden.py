@@ -51,15 +51,16 @@ def test_occluded_target_counts_only_while_in_the_planning_scene():
     assert dataclasses.replace(view, seen=seen).targets == [(0.4, 0.0, 0.03)]
 
 
-def test_contained_objects_stay_while_occluded():
+@pytest.mark.parametrize(("z", "count"), [(0.035, 1), (0.095, 2)])  # the upper one lies on another
+def test_contained_objects_stay_while_occluded(z, count):
     scene = PerceivedScene(SceneParameters(), AROUND, CELL.robot.gripper, "panda_hand_tcp")
-    pixel = CAMERA.project([0.55 - 0.033, 0.25 - 0.033, 0.035])
+    pixel = CAMERA.project([0.55 - 0.033, 0.25 - 0.033, z])
     ball = m.Marker(ns="ball", id=0, type="sphere", pose=m.Pose(), scale=m.Vector3(x=0.06, y=0.06, z=0.06),
                     pixel=tuple(pixel))
     for k in range(20):
         frame = m.MarkerArray(header=m.Header(stamp=int(1e9 + k * 1e8)), markers=[ball] if k < 2 else [])
         scene.update_detections(frame, CAMERA, None, hidden=COVERED if k >= 2 else None)
-    assert [thing.role for thing in scene.scene().objects].count("contained") == 1
+    assert [thing.role for thing in scene.scene().objects].count("contained") == count
 
 
 def test_viewing_pose_is_the_smallest_rotation():
