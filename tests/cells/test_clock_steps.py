@@ -1,7 +1,5 @@
 """The system clock of a host is set while a cell runs: real processes that read it from a file."""
 
-from __future__ import annotations
-
 import signal
 from pathlib import Path
 
