@@ -155,14 +155,14 @@ def hand_eye(
     intrinsics_file: Annotated[
         str, typer.Option("--intrinsics", metavar="FILE", help="YAML file of `zencell calibrate intrinsics`")
     ],
-    mount: Annotated[str, typer.Option("--camera", metavar="hand|beside", help="on the hand, or beside an arm "
+    mount: Annotated[str, typer.Option("--camera", metavar="hand|beside", help="on the hand, or fixed next to an arm "
                                                                                "that holds the board")],
     output: Annotated[
         str, typer.Option("-o", "--output", metavar="FILE", help="YAML file to write [the file of --intrinsics]")
     ] = "",
     squares: Squares = "7x5", square: Square = "0.036", marker: Marker = "0", dictionary: Dictionary = "4x4_50",
 ) -> None:
-    """Estimate the pose of a camera on the hand, or beside an arm that holds the board."""
+    """Estimate the pose of a camera on the hand, or fixed next to an arm that holds the board."""
     from typing import get_args
 
     from common.perception.camera_file import CameraFile

@@ -1,4 +1,4 @@
-"""Requests: any of them as JSON, and the two that a person sends most often."""
+"""Send requests: any of them as JSON; verbs of the task and of the simulated world."""
 
 from __future__ import annotations
 
@@ -70,10 +70,10 @@ def send(at: CellTarget, request: Request[Any, Any], message: Message, timeout: 
 # --- task -------------------------------------------------------------------------------------------------------
 
 
-def _task(at: CellTarget, tell: Callable[[TaskControl], Awaitable[Message]]) -> None:
+def _task(at: CellTarget, command: Callable[[TaskControl], Awaitable[Message]]) -> None:
     async def visit(joined: Client) -> Message:
         try:
-            return await tell(joined.task)
+            return await command(joined.task)
         finally:
             if joined.task.unsaved:
                 echo(f"zencell: {joined.task.unsaved}", err=True)
@@ -124,7 +124,7 @@ def _position(x: str, y: str) -> dict[str, float]:
 
 
 def _triple(option: str, text: str, names: str) -> dict[str, float]:
-    """Three numbers that stand apart by commas, or one for all of them, by name."""
+    """Three numbers separated by commas, or one for all of them, by name."""
     found = options.numbers(option, text)
     if len(found) not in (1, 3):
         raise ConfigError(option, text, "must be three numbers separated by commas, or one")

@@ -1,4 +1,4 @@
-"""Parameters of running services: what there is, changing it, and keeping it in a file."""
+"""Parameters of running services: list, read, change, and save them in a file."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ Assignments = Annotated[
 @app.command("list")
 def list_(
     service: Annotated[
-        str | None, typer.Argument(metavar="SERVICE", help="of one; of all if not given",
+        str | None, typer.Argument(metavar="SERVICE", help="of one service; of all if not given",
                                    autocompletion=choices.services)
     ] = None,
     at: CellTarget = RUNNING,
     as_json: options.Json = False,
 ) -> None:
-    """List parameters: path, value, whether a change needs a restart, range, and what it is."""
+    """List parameters: path, value, whether a change needs a restart, range and description."""
     from common.client.parameters import listing, range_text
     from common.config import yaml_line
     from common.messages.schema import to_json
@@ -56,7 +56,7 @@ def list_(
 
 @app.command()
 def get(path: PathArgument, at: CellTarget = RUNNING, as_json: options.Json = False) -> None:
-    """Print the value of a parameter as YAML; with --json everything that is known of it."""
+    """Print the value of a parameter as YAML; with --json also type, range and description."""
     from common.client.parameters import look_up
     from common.config import yaml_line
     from common.messages.schema import to_json
@@ -67,7 +67,7 @@ def get(path: PathArgument, at: CellTarget = RUNNING, as_json: options.Json = Fa
 
 @app.command("set", context_settings={"ignore_unknown_options": True})
 def set_(assignments: Assignments, at: CellTarget = RUNNING) -> None:
-    """Change parameters at once, all of them or none, and say what was changed."""
+    """Change parameters at once, all of them or none, and print the changes."""
     from common.client.parameters import change
     from common.config import expanded, parse_override, yaml_line
 
@@ -86,11 +86,11 @@ def dump(
         list[str] | None, typer.Argument(metavar="SERVICE...", help="all if none is given",
                                          autocompletion=choices.services)
     ] = None,
-    everything: Annotated[bool, typer.Option("--all", help="what is as by default, too")] = False,
-    output: Annotated[str, typer.Option("-o", "--output", metavar="FILE", help="write there, not here")] = "",
+    everything: Annotated[bool, typer.Option("--all", help="also values that equal the default")] = False,
+    output: Annotated[str, typer.Option("-o", "--output", metavar="FILE", help="file to write [stdout]")] = "",
     at: CellTarget = RUNNING,
 ) -> None:
-    """Write what differs from the defaults as YAML in the shape of a cell file; `--set @FILE` reads it back."""
+    """Write values that differ from the defaults as YAML in the form of a cell file; `--set @FILE` reads it back."""
     from common.client.parameters import dumped
 
     text = at.visit(lambda bus: dumped(bus, services, everything=everything))

@@ -144,7 +144,7 @@ def take(
                                                       "waits for `zencell task start`")] = False,
     at: CellTarget = RUNNING,
 ) -> None:
-    """Take motion authority until you give it back: no task and no other client can move the robot."""
+    """Take motion authority until you release it: no task and no other client can move the robot."""
     _own(at, "take", over=over)
 
 

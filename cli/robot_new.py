@@ -128,7 +128,7 @@ def _ask(question: str, guess: str, yes: bool) -> str:
     except typer.Abort:
         if sys.stdin.isatty():
             raise
-        raise ConfigError("--yes", ..., "is needed where nobody answers: it takes the best guesses") from None
+        raise ConfigError("--yes", ..., "is needed without a terminal: it takes the best guesses") from None
 
 
 def _plain_name(text: str) -> str:

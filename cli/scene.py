@@ -1,4 +1,4 @@
-"""Solids of the planning scene that nobody perceives: a person says that they are there."""
+"""Solids that an operator adds to the planning scene because no camera sees them."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from common.terminal import echo
 
 app = CommandGroup("Add solids to the planning scene that no camera sees.")
 
-Name = Annotated[str, typer.Argument(metavar="NAME", help="of your own; in the scene it is added/NAME")]
+Name = Annotated[str, typer.Argument(metavar="NAME", help="name of your choice; its id in the scene is added/NAME")]
 
 
 @app.command("list")
 def list_(at: CellTarget = RUNNING, as_json: options.Json = False) -> None:
-    """List what was added; `zencell topic echo planning_scene` has all that motion keeps away from."""
+    """List the added solids; `zencell topic echo planning_scene` shows all obstacles."""
     from common.messages.schema import to_json
 
     for solid in at.join(lambda cell: cell.scene.objects()):
@@ -32,25 +32,25 @@ def add(
     shape: Annotated[str, typer.Argument(metavar="SHAPE", help="box, sphere or cylinder")],
     size: Annotated[str, typer.Argument(
         metavar="SIZE", help="X,Y,Z of a box; radius of a sphere; radius,length of a cylinder [m]")],
-    middle: Annotated[str, typer.Argument(metavar="X,Y,Z", help="its middle in world [m]")],
+    middle: Annotated[str, typer.Argument(metavar="X,Y,Z", help="its center in world [m]")],
     rpy: Annotated[str, typer.Option("--rpy", metavar="R,P,Y", help="roll, pitch, yaw [rad]")] = "0,0,0",
     color: Annotated[str, typer.Option("--color", metavar="R,G,B", help="0 to 1 each")] = "",
     at: CellTarget = RUNNING,
 ) -> None:
-    """Add a solid, until it is removed: it stays through restarts. An arm on its way into it brakes."""
+    """Add a solid; it persists over restarts until it is removed. A motion that would hit it brakes."""
     from common.client.goals import pose
 
     x, y, z = options.three("X,Y,Z", middle)
-    asked: dict[str, Any] = {"at": pose(x, y, z, rpy=options.three("--rpy", rpy))}
+    options_given: dict[str, Any] = {"at": pose(x, y, z, rpy=options.three("--rpy", rpy))}
     if color:
-        asked["color"] = options.three("--color", color)
+        options_given["color"] = options.three("--color", color)
     kind = cast(Literal["box", "sphere", "cylinder"], shape)
     dimensions = options.numbers("SIZE", size)
-    echo(at.join(lambda cell: cell.scene.add(name, kind, dimensions, **asked)))
+    echo(at.join(lambda cell: cell.scene.add(name, kind, dimensions, **options_given)))
 
 
 @app.command()
 def remove(name: Name, at: CellTarget = RUNNING) -> None:
-    """Take out what was added, by whomever."""
+    """Remove a solid by name, also one that another operator added."""
     left = at.join(lambda cell: cell.scene.remove(name))
     echo(f"still added: {', '.join(left) or 'nothing'}")

@@ -71,7 +71,7 @@ def renew_(
     valid, place = options.whole("--days", days, 1), Path(folder)
     assert valid is not None
     if authority and forget:
-        raise ConfigError("--forget", ..., "comes once every host has certificates of the new authority: not with "
+        raise ConfigError("--forget", ..., "needs certificates of the new authority on every host first: not with "
                                            "--authority")
     certificate = authority_files(place)[0]
     if forget:
@@ -140,7 +140,7 @@ def check(
             names = [ROUTER_NAME, *([] if only else [OPERATOR]), *(common_name(cell.name, one) for one in processes)]
             require_valid(place, names, again)
         require_current(place, read_access(place), cell.name, rights, again)
-        echo(f"{cell.name}: {len(rights)} processes, certificates and rules are as they need them")
+        echo(f"{cell.name}: {len(rights)} processes, certificates and rules match their declarations")
 
 
 router = CommandGroup("Configuration of a cell's router.")

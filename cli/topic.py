@@ -145,7 +145,7 @@ def pub(
 ) -> None:
     """Publish a message until Ctrl-C, N times or once. A missing stamp is set to the cell time of each message.
 
-    A state can be queried while this runs. Keys of custom services take any JSON; {"base64": "..."} stands for bytes.
+    A state can be queried while this runs. Keys of custom services take any JSON; {"base64": "..."} encodes bytes.
     """
     from common.client.inspection import publish
     from common.client.joining import cell_clock

@@ -17,7 +17,7 @@ from common.errors import ConfigError, ZencellError
 R = TypeVar("R", bound=BaseModel)
 
 STATE_VARIABLE = "ZENCELL_STATE"  # folder of persistent state: interlocks, added solids, the simulated world
-RUNTIME_VARIABLE = "ZENCELL_STANDING"  # folder of state that lasts until the cell ends, such as the simulated world
+RUNTIME_VARIABLE = "ZENCELL_STANDING"  # folder of state that is deleted when the cell ends, such as the simulated world
 MAX_BYTES = 1_000_000  # that are read of a file
 ROOM = 128 * 1024  # [bytes] reserved for each file: more than the largest record
 

@@ -1,7 +1,7 @@
 """Remap the keys in a service's code to other keys of the cell: so one service runs several times in a cell.
 
 `{"camera/*": "left_camera/*", "tf": "left/tf"}`: a key is looked up as it is, then as the longest prefix that ends in
-`*`, which stands for the rest of the key. Keys below a remapped key follow it. Keys that each service has for itself
+`*`, which matches the rest of the key. Keys below a remapped key follow it. Keys that each service has for itself
 are never remapped.
 """
 

@@ -153,7 +153,7 @@ def service_table(cell_name: str) -> str:
 
 
 def shown_key(topic: topics.AnyTopic) -> str:
-    """Return the key of a topic; one key stands for the parameters of all services."""
+    """Return the key of a topic; one key represents the parameters of all services."""
     return topics.PARAMETERS.key if topic.key.startswith("param/") else topic.key
 
 

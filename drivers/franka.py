@@ -66,7 +66,7 @@ def simulated(options: Options) -> bool:
 
 
 def create(robot: RobotConfig, limits: Limits, start: Vector, options: Options) -> DrivenArm:
-    """Create the arm, wherever it is, and its hand where the robot has a gripper."""
+    """Create the arm at any address, and its hand if the robot has a gripper."""
     try:
         import pylibfranka  # noqa: F401
     except ImportError:

@@ -54,7 +54,7 @@ class FrankaHand:
         return FingerState(state.width, False, holding, self._effort if holding else 0.0)
 
     def move(self, width: float, effort: float) -> None:
-        """Open to a width [m]; or close on whatever is there, and press with an effort [N].
+        """Open to a width [m]; or close on the object between the fingers, and press with an effort [N].
 
         Without an object, closing ends where the fingers meet: the hand has no motion that closes to a width and
         presses on what it meets before.

@@ -76,7 +76,7 @@ def simulated(options: Options) -> bool:
 
 
 def create(robot: RobotConfig, limits: Limits, start: Vector, options: Options) -> DrivenArm:
-    """Create the arm, wherever it is."""
+    """Create the arm at any address."""
     try:
         import rtde_control  # noqa: F401
     except ImportError:

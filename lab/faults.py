@@ -179,7 +179,7 @@ def _last_faults(seed: int, services: Sequence[str], sooner: float) -> list[Faul
 
 
 def _party(random: np.random.Generator, kind: Kind) -> Party:
-    """Return whom a fault hits while a goal is being requested; empty if it does not wait for a goal."""
+    """Return the process that a fault hits while a goal is being requested; empty if it does not wait for a goal."""
     if kind == "late goal" or (kind in ("crash", "cut") and random.random() < DURING_GOAL_SHARE):
         return "client" if random.random() < 0.5 else "server"
     return ""

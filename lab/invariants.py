@@ -1,4 +1,4 @@
-"""What must hold at every step of a simulated cell, whatever faults happen."""
+"""Invariants that hold at every step of a simulated cell, under all injected faults."""
 
 from __future__ import annotations
 

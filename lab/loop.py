@@ -47,7 +47,7 @@ def current_incarnation() -> Incarnation | None:
 
 
 def context_of(incarnation: Incarnation) -> Context:
-    """Return a new context; whatever is started in it belongs to the incarnation."""
+    """Return a new context; all tasks started in it belong to the incarnation."""
     context = Context()
     context.run(_current.set, incarnation)
     return context

@@ -135,7 +135,7 @@ class GoalFields:
         assign(self._choice, self.kind)
 
     def check_marker(self, now: float) -> tuple[str, str] | None:
-        """Return a new line on whether the arm can reach the marker, with its kind; once it rests with the reason."""
+        """Return a new line on whether the arm can reach the marker, and its kind; a marker at rest gets the reason."""
         from common.planning.ik import explain_ik_failure, solve_ik
 
         if not self.marker or (seed := self._readout.joints()) is None:

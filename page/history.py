@@ -23,7 +23,7 @@ M = TypeVar("M", bound=Message)
 
 SECONDS = 180.0  # [s] of messages in memory
 MAX_IMAGE_BYTES = 48 << 20  # of all images in memory
-MAX_TOPIC_BYTES = 4 << 20  # of the messages of a topic: large ones are kept for a shorter time
+MAX_TOPIC_BYTES = 4 << 20  # of the messages of a topic: large ones are stored for a shorter time
 MAX_EVENTS = 300
 FAST_PERIOD, SLOW_PERIOD = 0.09, 0.45  # [s] minimum time between two stored messages of a topic
 FAST_TOPICS = (topics.JOINT_STATES.key, topics.SCENE_OBJECTS.key)

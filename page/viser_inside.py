@@ -15,7 +15,7 @@ Nothing else needs checking when viser is updated.
   and antialiasing as options that apply before the client starts.
 - **A bar above everything, and buttons that are held down.** viser's panels can be collapsed, scrolled and covered, and
   its button events share a connection with images. overlay.js and overlay.css add a bar above the client, and use the
-  WebSocket at `CONTROL_PATH` (control_socket.py). `send_key` tells the script which of viser's connections belongs to
+  WebSocket at `CONTROL_PATH` (control_socket.py). `send_key` links the script to the viser connection of
   its page. Upstream requests: a panel that is always visible; an application's WebSocket path; a button release event.
 - **Messages from any thread.** viser sets an `asyncio.Event` from foreign threads, which may fail or wake no task. It
   sets it again on its loop, which is sufficient (`_ThreadSafeEvent`). Upstream request: remove the first call.

@@ -1,1 +1,1 @@
-"""Certificates of a secured cell and who may do what in it."""
+"""Certificates of a secured cell and the access rights of its processes."""

@@ -1,4 +1,4 @@
-"""One process each: a thin shell that declares, is ready, loops, asks and publishes. What it thinks is in common/."""
+"""Services, one process each: thin shells that declare keys, loop, call and publish. Logic is in common/."""
 
 from common.process.environment import set_startup_variables
 

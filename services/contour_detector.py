@@ -73,7 +73,7 @@ async def run(bus: Bus, config: Config) -> None:
 
     async def select(wanted: OutlineSelect) -> OutlineSelection:
         if last is None:
-            raise Refused("no_picture", "no picture came yet")
+            raise Refused("no_picture", "no image received yet")
         try:
             contour = following.select(last[2], wanted)
         except NoSuchContour as error:

@@ -126,7 +126,7 @@ class DepthBuffer:
                     await self._arrived.wait()
         found = next((image for image in self._images if image.header.stamp == stamp), None)
         if found is None:
-            raise FrameError("depth", "no depth image of the same time came")
+            raise FrameError("depth", "no depth image with the same stamp received")
         depth = depth_of(found)
         try:
             check_depth(depth, camera.width, camera.height)

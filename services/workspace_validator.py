@@ -64,7 +64,7 @@ class OcclusionReport:
         All views are needed: what only one of them sees is unknown without it.
         """
         if missing := views.missing():
-            return f"no picture comes from {' and '.join(missing)}", False
+            return f"no image received from {' and '.join(missing)}", False
         hiding = [one.hidden for one in seen if one.hidden is not None]
         if not hiding:
             return "", False

@@ -204,7 +204,7 @@ class Outline(Task[OutlineView]):
         if path is not None and min(view.stamps) < self.images_after:
             path = None
         solid = view.solid()
-        unseen = "no contour came from the camera" if path is None else self.unseen(view)
+        unseen = "no contour received from the camera" if path is None else self.unseen(view)
         if path is not None and len(path.poses) > 1 and solid is not None and not unseen:
             self._take(path, solid, view)
             return

@@ -182,7 +182,7 @@ async def store_stages(bus: Bus, folder: Path, wanted: OutlineSelect | None) -> 
                     raise NoOutline(f"{late[-1].message}; the picture is in {folder}")
                 await more.wait()
     except TimeoutError:
-        raise NoOutline(f"no outline came within {TIMEOUT:g} s: does the cell have a depth camera?") from None
+        raise NoOutline(f"no outline received within {TIMEOUT:g} s: does the cell have a depth camera?") from None
     finally:
         for task in noting:
             task.cancel()

@@ -193,7 +193,7 @@ class CellSession:
     async def _run(self, work: Callable[[Bus], Awaitable[int]]) -> int:
         """Do the work in the cell and return its exit code.
 
-        The state of simulated hardware lasts as long as the cell; interlocks of operators last longer.
+        The state of simulated hardware is deleted with the cell; interlocks of operators persist.
         """
         from common.atomic_file import RUNTIME_VARIABLE, STATE_VARIABLE, state_folder
         from common.transport.endpoint import DEFAULT_DOMAIN

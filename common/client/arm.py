@@ -46,12 +46,12 @@ class Arm(Part):
     themselves. A cancelled motion, also by Ctrl-C, is stopped.
     """
 
-    owner: str  # in whose name it is moved
+    owner: str  # client name in its requests
 
     def __init__(
         self, subscriptions: Subscriptions, owner: str, tf: Callable[[str, str], Coroutine[Any, Any, Array]]
     ) -> None:
-        """The arm of a cell, moved in the name of `owner`."""
+        """The arm of a cell, requested by the client `owner`."""
         self._set(owner=owner)
         self._motion = OperatorMotion(subscriptions.bus, owner=owner)
         self._subscriptions, self._bus, self._tf = subscriptions, subscriptions.bus, tf
@@ -87,7 +87,7 @@ class Arm(Part):
         return await self._tf(frame, (await self.description()).tcp)
 
     async def status(self) -> MotionStatus:
-        """Return its goal, its progress, and who stopped or holds it."""
+        """Return its goal, its progress, and the operator who stopped or holds it."""
         return await self._subscriptions.query(topics.MOTION_STATUS)
 
     async def robot(self) -> RobotStatus:
@@ -148,10 +148,10 @@ class Arm(Part):
 
         Args:
             plan: starts at the current state.
-            timeout: stop after so long without progress, holds not counted [s, wall].
+            timeout: stop after this long without progress, not counting holds [s, wall].
 
         Raises:
-            MotionFailed: another client has the robot, or the motion did not succeed; see `code` and the message.
+            MotionFailed: another client has motion authority, or the motion failed; see `code` and the message.
             RequestFailed: the executor does not answer.
         """
         return await self._follow(plan, timeout)
@@ -159,7 +159,7 @@ class Arm(Part):
     async def move(
         self, to: GoalLike | WaypointPath, *, timeout: float = PROGRESS_TIMEOUT, **how: Any
     ) -> MotionStatus:
-        """Plan and execute, with the arguments of both. A stop or hold by anyone during planning blocks the motion."""
+        """Plan and execute, with the arguments of both. Any stop or hold during planning blocks the motion."""
         acknowledged = (await self.status()).newest  # may miss our last request
         await self.require_free()
         return await self._follow(await self.plan(to, **how), timeout, acknowledged)
@@ -192,15 +192,15 @@ class Arm(Part):
             await asyncio.wait(moving)
 
     async def require_free(self) -> MotionStatus:
-        """Return the motion status if nothing moves the robot and no other client has it.
+        """Return the motion status if the robot is at standstill and no other client has motion authority.
 
         Raises:
-            MotionFailed: a task or another operator has it, or its state is unknown.
+            MotionFailed: a task or another operator has motion authority, or the state is unknown.
         """
         return await self._motion.require_free()
 
-    async def stop(self, reason: str = "a program asked for it") -> MotionStatus:
-        """Stop the arm, whoever moves it; a task then waits for a start, also after any restart."""
+    async def stop(self, reason: str = "requested by a program") -> MotionStatus:
+        """Stop the arm, also if another client moves it; a task then waits for a start, also after any restart."""
         request = check(StopRequest, {"reason": reason, "owner": self.owner}, "stop")
         return await self._bus.client(topics.MOTION_STOP).call(request, TIMEOUT)
 
@@ -257,7 +257,7 @@ class Arm(Part):
         self, act: Literal["take", "give"], *, over: bool = False, lease: float = 0.0,
         kind: Literal["operator", "script"] = "script",
     ) -> MotionOwner:
-        """Take motion authority until it is given back, or give it back; see `owned`."""
+        """Take motion authority until it is released, or release it; see `owned`."""
         request = check(
             OwnRequest, {"act": act, "owner": self.owner, "kind": kind, "over": over, "lease": lease}, "own")
         return await self._bus.client(topics.MOTION_OWN).call(request, TIMEOUT)
@@ -269,8 +269,8 @@ class Arm(Part):
         A nested block keeps the authority of the outer one, and its lease unless it has one of its own.
 
         Args:
-            over: take it from its owner; their motion is stopped, and a task then waits for a start.
-            lease: give it back after so long without a motion [s, wall], in case this program hangs; 0: never.
+            over: take it from its owner; the owner's motion is stopped, and a task then waits for a start.
+            lease: release it after this long without a motion [s, wall], in case this program hangs; 0: never.
 
         Raises:
             RemoteError: another client has it.
@@ -289,7 +289,7 @@ class Arm(Part):
             await self._give()
 
     async def _give(self) -> None:
-        """Give motion authority back, unless an outer block still needs it."""
+        """Release motion authority, unless an outer block still needs it."""
         if not self._owning:
             await self.own("give")
 

@@ -53,7 +53,7 @@ class Cell(Part):
     """One work cell, joined inside `async with`. Several programs may join the same cell.
 
     Attributes:
-        owner: in whose name it is moved.
+        owner: name of this client in its requests.
         arm: state, plans, motions, jogging.
         gripper: fingers or suction cup.
         task: start, pause, resume, stop, status.
@@ -83,7 +83,7 @@ class Cell(Part):
             domain: 0 to 232, as for `--domain`; default: ZENCELL_DOMAIN, or 42.
             connect: endpoint of its router, such as tcp/192.168.1.10:7489; default: ZENCELL_CONNECT.
             secure: folder of certificates with that of the operator; default: ZENCELL_SECURE.
-            owner: in whose name it is moved; default: user and host.
+            owner: name of this client in its requests; default: user and host.
             application: dotted module of a custom application.
             remapped: keys of the cell by the platform's names, like `topics:` of a service in a cell file, for a cell
                 with several arms.
@@ -115,10 +115,10 @@ class Cell(Part):
             world: another world, by name or path.
             seed: of all random numbers.
             overrides: values of the cell, as for `--set`.
-            autostart: start its task at once; otherwise nothing moves until it is told to.
+            autostart: start its task at once; otherwise nothing moves before a request.
             viewer: start the operator's page.
             domain: 0 to 232; default: a free one.
-            owner: in whose name it is moved; default: user and host.
+            owner: name of this client in its requests; default: user and host.
             application: dotted module of a custom application.
         """
         started = cls(owner=owner, application=application)
@@ -129,7 +129,7 @@ class Cell(Part):
 
     @classmethod
     def on(cls, bus: Bus, *, owner: str | None = None, application: str = "") -> Cell:
-        """Return the cell of an existing bus, which this does not close."""
+        """Return the cell of an existing bus, which the caller closes."""
         cell = cls(bus.cell, owner=owner, application=application)
         cell._attach(bus)
         return cell
@@ -312,7 +312,7 @@ class Cell(Part):
             UnknownName: no service of zencell writes the key and it is not `plain`, or it is not a valid key.
             ConfigError: it is a request.
             DecodeError: a payload is not msgpack.
-            NothingReceived: no message came in time.
+            NothingReceived: no message arrived in time.
         """
         topic = None if plain else await self._topic(key)
         if plain:
@@ -336,5 +336,5 @@ class Cell(Part):
             try:
                 value = msgpack.unpackb(sample.payload, strict_map_key=False)
             except (ValueError, TypeError, RecursionError, msgpack.UnpackException):
-                raise DecodeError(f"{key}: {len(sample.payload)} bytes came that are not msgpack") from None
+                raise DecodeError(f"{key}: {len(sample.payload)} bytes received that are not msgpack") from None
             yield value

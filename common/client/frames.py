@@ -1,4 +1,4 @@
-"""The coordinate frames of a cell: a tree from tf and tf_static that is kept up to date."""
+"""The coordinate frames of a cell: a tree that follows tf and tf_static."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ class Gripper(Part):
     """The gripper: fingers, or a suction cup that draws air at width 0."""
 
     def __init__(self, subscriptions: Subscriptions, owner: str, arm: Arm) -> None:
-        """The gripper of a cell, moved in the name of `owner`."""
+        """The gripper of a cell, commanded by the client `owner`."""
         self._subscriptions, self._bus, self._owner, self._arm = subscriptions, subscriptions.bus, owner, arm
 
     async def state(self) -> GripperState:
@@ -46,7 +46,7 @@ class Gripper(Part):
 
         Raises:
             ConfigError: invalid values.
-            MotionFailed: another client has the robot, the command was rejected, or the fingers do not come to rest.
+            MotionFailed: another client has motion authority, the command was rejected, or timed out.
             RequestFailed: the executor does not answer.
         """
         if not (await self._arm.description()).gripper:
@@ -84,5 +84,5 @@ class Gripper(Part):
         return await self.move((await self._arm.description()).gripper_width, force)
 
     async def close(self, force: float = 0.0, **more: Any) -> GripperState:
-        """Close until the fingers meet or hold an object: `holding` says which."""
+        """Close until the fingers touch each other or an object; `holding` of the result is true for an object."""
         return await self.move(0.0, force, **more)

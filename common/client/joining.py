@@ -50,7 +50,7 @@ class SeveralCellsRunning(UnknownName):
 
 
 def is_listening(endpoint: str) -> bool:
-    """Return whether a program accepts connections at an endpoint; True for UDP and QUIC, where only Zenoh can tell."""
+    """Return whether a program accepts connections at an endpoint; True for UDP and QUIC, which cannot be tested."""
     protocol, _, address = endpoint.partition("/")
     if protocol in ("udp", "quic"):
         return True
@@ -201,7 +201,7 @@ async def newest_interlock(bus: Bus) -> int:
 
 
 def operator_name() -> str:
-    """Return USER@HOST, by which a cell remembers who stopped or holds its robot."""
+    """Return USER@HOST, the default name of an operator in requests, stops and holds."""
     try:
         user = getpass.getuser()
     except (KeyError, OSError):  # a user without a name, as in a container

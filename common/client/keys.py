@@ -142,7 +142,7 @@ async def raw_samples(bus: Bus, key: str) -> AsyncGenerator[RawSample, None]:
     """Yield samples of a key of the cell without repetitions, first its current value if it is a state.
 
     Raises:
-        SilentKey: none came within `SILENCE`.
+        SilentKey: no message arrived within `SILENCE`.
     """
     from common.transport.reader import SequenceFilter
 
@@ -158,7 +158,7 @@ async def raw_samples(bus: Bus, key: str) -> AsyncGenerator[RawSample, None]:
         if not latched:
             await asyncio.wait({following}, timeout=SILENCE)
             if not following.done():
-                raise SilentKey(key, f"nothing came on {full} within {SILENCE:g} s")
+                raise SilentKey(key, f"no message on {full} within {SILENCE:g} s")
         while True:
             sample = await following
             following = asyncio.ensure_future(anext(arriving))
@@ -170,10 +170,10 @@ async def raw_samples(bus: Bus, key: str) -> AsyncGenerator[RawSample, None]:
 
 
 async def require_messages(bus: Bus, key: str) -> None:
-    """Return when a message came on a key.
+    """Return when a message arrives on a key.
 
     Raises:
-        SilentKey: none came within `SILENCE`.
+        SilentKey: no message arrived within `SILENCE`.
     """
     async with aclosing(raw_samples(bus, key)) as samples:
         await anext(samples)

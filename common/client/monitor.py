@@ -1,4 +1,4 @@
-"""Load of a running cell's services and rates of its topics, without making the cell work more."""
+"""Load of a running cell's services and rates of its topics, without adding load to the cell."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ class CellMonitor:
     """Subscribes to a cell inside `async with`; `view` returns a snapshot."""
 
     def __init__(self, bus: Bus, clock: Clock) -> None:
-        """Subscribe to what the cell publishes anyway.
+        """Subscribe to topics that the cell publishes in any case.
 
         Args:
             bus: in the cell.
@@ -206,7 +206,7 @@ class Processes:
         return self._own.cpu_percent()
 
     def load_of(self, pid: int, service: str) -> tuple[float | None, float | None]:
-        """Return CPU [% of one core] since the last call, and memory [MB], of a service; None if it is not here."""
+        """Return CPU [% of one core] since the last call, and memory [MB], of a service; None on another host."""
         try:
             process = self._known.get(pid)
             if process is None or not process.is_running():

@@ -101,12 +101,12 @@ class OperatorMotion:
         Args:
             goal: where to move.
             more: see `plan`.
-            timeout: stop after so long without progress, holds not counted [s, wall].
+            timeout: stop after this long without progress, not counting holds [s, wall].
             acknowledged: `newest` of the motion status when the operator requested this, for later motions of a
                 sequence: newer interlocks of the same operator block it. Default: now.
 
         Raises:
-            MotionFailed: a task has the robot, there is no path, or the motion did not succeed.
+            MotionFailed: a task has motion authority, there is no path, or the motion did not succeed.
             RequestFailed: planner or executor do not answer.
         """
         before = await self.require_free()
@@ -148,10 +148,10 @@ class OperatorMotion:
             raise
 
     async def require_free(self) -> m.MotionStatus:
-        """Return the motion status if nothing moves the robot and no other operator blocks it.
+        """Return the motion status if the robot is at standstill and no other operator blocks it.
 
         Raises:
-            MotionFailed: a task or another operator has it, it is stopped or held meanwhile, or its state is unknown.
+            MotionFailed: another client has motion authority, the robot is stopped or held, or its state is unknown.
         """
         known, requested = self._motion.latest, wall_ns()
         status = await self._current_status()
@@ -215,7 +215,7 @@ class OperatorMotion:
 
     async def _stop_goal(self, goal: str) -> None:
         try:
-            stop = m.StopRequest(id=goal, reason="its operator gave up", by="requester")
+            stop = m.StopRequest(id=goal, reason="its requester timed out", by="requester")
             await self._stop.call(stop, REQUEST_TIMEOUT)
         except RequestFailed as error:
             log.warning("the robot may still move: %s", error)
@@ -240,8 +240,8 @@ class JogFailed(ZencellError):
     exit_code = 1
 
     def __init__(self, owner: str, why: str) -> None:
-        super().__init__(f"the arm is not jogged: the motion is {owner}{why and f'; {why}'}. The log of the executor "
-                         "says more: zencell topic echo log/trajectory_executor")
+        super().__init__(f"the arm is not jogged: the motion is {owner}{why and f'; {why}'}. See the executor's log: "
+                         "zencell topic echo log/trajectory_executor")
 
 
 def check_seconds(seconds: float, field: str = "seconds") -> None:

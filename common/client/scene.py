@@ -20,7 +20,7 @@ class Scene(Part):
     """Solids that an operator adds to the planning scene because no camera sees them; they stay until removed."""
 
     def __init__(self, subscriptions: Subscriptions, owner: str) -> None:
-        """The planning scene of a cell, edited in the name of `owner`."""
+        """The planning scene of a cell, edited by the client `owner`."""
         self._subscriptions, self._owner = subscriptions, owner
 
     async def add(
@@ -30,7 +30,7 @@ class Scene(Part):
         """Add a solid, and return its id in the planning scene. A motion that would hit it brakes.
 
         Args:
-            name: chosen by you; adding the same solid again changes nothing.
+            name: name of your choice; adding the same solid again changes nothing.
             shape: of the solid.
             dimensions: box (x, y, z), sphere (radius,), cylinder (radius, length along z) [m].
             at: its centre in world [m], or its pose (4, 4).
@@ -47,7 +47,7 @@ class Scene(Part):
         return (await self._edit(edit)).id
 
     async def remove(self, name: str) -> list[str]:
-        """Remove a solid by name, whichever operator added it, and return the ids of the remaining ones.
+        """Remove a solid by name, also one that another operator added, and return the ids of the remaining ones.
 
         Raises:
             RemoteError: `unknown`, with the names that exist.

@@ -180,7 +180,7 @@ async def watch_statistics(bus: Bus, key: str, kind: str, *, known: bool) -> Asy
         known: whether the project describes the key; an unknown one must have messages.
 
     Raises:
-        SilentKey: nothing comes on an unknown key.
+        SilentKey: no message arrives on an unknown key.
         NoStamp: the messages have no stamp, and the delay is requested.
     """
     from common.client.joining import cell_clock
@@ -207,7 +207,7 @@ async def watch_statistics(bus: Bus, key: str, kind: str, *, known: bool) -> Asy
 
 def _describe_arrivals(figures: dict[str, Any], *, in_bytes: bool) -> str:
     if not figures["messages"]:
-        return "nothing came yet"
+        return "no message received yet"
     if figures["min"] is None or figures["max"] is None:
         return f"{figures['messages']} messages, too few for a rate"
     if in_bytes:
@@ -219,9 +219,9 @@ def _describe_arrivals(figures: dict[str, Any], *, in_bytes: bool) -> str:
 
 def _describe_delays(figures: dict[str, Any]) -> str:
     if not figures["messages"]:
-        return "nothing new came yet"
+        return "no new message received yet"
     if figures["mean"] is None:
-        return f"nothing new came lately, {figures['messages']} messages"
+        return f"no new message lately, {figures['messages']} messages"
     return (
         f"mean {figures['mean']:.2f} ms, min {figures['min']:.2f}, max {figures['max']:.2f}, "
         f"p99 {figures['p99']:.2f} ms, {figures['messages']} messages"

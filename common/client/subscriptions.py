@@ -60,7 +60,7 @@ class NothingReceived(RequestFailed):
     """No message arrived on a key in time."""
 
     def __init__(self, keys: str, seconds: float = TIMEOUT) -> None:
-        super().__init__(f"nothing came on {keys} within {seconds:g} s")
+        super().__init__(f"no message on {keys} within {seconds:g} s")
 
 
 def topic_of_owner(owner: Owner) -> AnyTopic | None:
@@ -99,7 +99,7 @@ class Subscriptions:
         """Return the newest message of a topic; wait for the first one.
 
         Raises:
-            NothingReceived: none came.
+            NothingReceived: none arrived in time.
         """
         reader = self.reader(topic)
         return reader.latest or await self._next(reader, None, seconds)
@@ -124,7 +124,7 @@ class Subscriptions:
         """Return the first message of a stream that arrives from now on.
 
         Raises:
-            NothingReceived: none came.
+            NothingReceived: none arrived in time.
         """
         reader = self.reader(topic)
         return await self._next(reader, reader.latest, seconds)

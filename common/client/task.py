@@ -51,7 +51,7 @@ async def send_task_command(
     Args:
         client: of task/command.
         command: to send.
-        operator: who sends it.
+        operator: name of the sender.
         override: also release holds of other operators.
         acknowledged: `since` of the newest interlock that the operator knows; a start or resume releases no newer one.
         timeout: [s, wall].
@@ -63,7 +63,7 @@ async def send_task_command(
 
 @dataclass(frozen=True)
 class StopResult:
-    """The answers of arm and task to a stop, or why there is none."""
+    """The replies of arm and task to a stop, or the errors instead."""
 
     arm: MotionStatus | RequestFailed
     task: TaskStatus | RequestFailed
@@ -80,7 +80,7 @@ async def stop_arm_and_task(
     Args:
         arm: client of motion/stop.
         task: client of task/command.
-        operator: who stops them.
+        operator: name of the sender.
         reason: for the log and the motion status.
         timeout: [s, wall].
     """
@@ -107,7 +107,7 @@ class TaskControl(Part):
 
         Args:
             subscriptions: of the cell.
-            owner: in whose name it is commanded.
+            owner: name of this client in its commands.
             application: dotted module of a custom application, needed for its status.
         """
         self._subscriptions, self._bus = subscriptions, subscriptions.bus

@@ -33,7 +33,7 @@ class Goal:
     """The goal that moves the robot. `time` is on the trajectory's own time axis [s], which passes at the pace's rate.
 
     The difference `offset` to where the robot was fades in the time `blend` [s]. `share` is the speed at which the
-    limits can be kept, 1 for a valid trajectory.
+    limits hold, 1 for a valid trajectory.
     """
 
     id: str

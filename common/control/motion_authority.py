@@ -1,7 +1,7 @@
-"""Who may move the arm now: the owner of the motion, interlocks, and what a stop, a hold and a hand-over do.
+"""Motion authority: the owner of the motion, interlocks, and the effects of a stop, a hold and a hand-over.
 
 One task, operator or script owns the motion at a time; motions of all others are refused. A requester of a motion that
-has no owner owns it until that motion ends; requested ownership lasts until it is returned. Stops and holds need no
+has no owner owns it until that motion ends; requested ownership is valid until its release. Stops and holds need no
 ownership; an operator's stop ends it.
 """
 
@@ -189,7 +189,7 @@ class MotionAuthority:
     def note_refusal(self, request: ExecuteRequest | GripperCommand, status: MotionStatus | GripperState) -> None:
         """Stop the robot if a new goal of the task was refused because an operator owns the motion.
 
-        So the task does not continue by itself once the motion is given back. A repeated request of that goal gets the
+        So the task does not continue by itself after the release. A repeated request of that goal gets the
         same answer, and has no effect.
         """
         if status.error == NOT_OWNER and not request.owner and self._ownership.now.asked:
@@ -229,7 +229,7 @@ class MotionAuthority:
         return self._ownership.now.model_copy(update={"jogging": self._jogged})
 
     def own(self, request: OwnRequest, now: float) -> MotionOwner:
-        """Return the owner after a request for ownership, or after it was given back; cell time [s].
+        """Return the owner after a request or release of ownership; cell time [s].
 
         A motion that is taken over is brought to rest. A task that lost it waits for a start by an operator, as after
         a stop: a restart of any process does not continue it.
@@ -324,7 +324,7 @@ class MotionAuthority:
         return self._arm.status, released
 
     def _hands_over(self, request: HoldRequest) -> bool:
-        """Return whether a release ends the ownership; another named operator keeps what they took.
+        """Return whether a release ends the ownership; it does not end that of another named operator.
 
         A start that did not release all stops is older than one of them, and starts nothing.
         """

@@ -87,7 +87,7 @@ class WorldThread:
 
 
 class RequestHandlers:
-    """One method for each request of the executor's service; `start` comes before the first request."""
+    """One method for each request of the executor's service; call `start` before the first request."""
 
     def __init__(
         self, name: str, settings: Settings, clock: Clock, log: logging.Logger,
@@ -185,7 +185,7 @@ class RequestHandlers:
         return await self._persisted(status)
 
     async def own(self, request: OwnRequest) -> MotionOwner:
-        """Take the motion, or give it back."""
+        """Take or release motion ownership."""
         before = self._executor.authority.owner
         now = self._executor.authority.own(request, self._clock.now())
         if now.owner != before.owner and {before.kind, now.kind} != {"none", "task"}:

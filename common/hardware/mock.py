@@ -43,7 +43,7 @@ class MockHardware:
 class SimulatedFingers:
     """A gripper whose width follows a jerk-limited motion and stops at an obstruction; also the valve of a suction cup.
 
-    While something blocks them the fingers press: when it is gone they close to the commanded width.
+    While an object blocks the fingers they press; without it they close to the commanded width.
     """
 
     def __init__(self, config: GripperConfig, width: float | None = None) -> None:

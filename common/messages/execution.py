@@ -244,7 +244,7 @@ class JogCommand(Message):
 
 
 class OwnRequest(Message):
-    """Take or give back the ownership of motion. It has one owner at a time; motions of others are refused."""
+    """Take or release the ownership of motion. It has one owner at a time; motions of others are refused."""
 
     max_bytes: ClassVar[int] = SMALL_BYTES
 
@@ -253,7 +253,7 @@ class OwnRequest(Message):
     kind: Literal["task", "operator", "script"] = "operator"
     over: bool = Field(False, description="take it from its owner, whose motion is stopped; is logged")
     lease: Annotated[float, Field(ge=0, le=86_400, allow_inf_nan=False)] = Field(
-        0.0, description="give it back after this long without a motion or another take [s, wall]; 0: never")
+        0.0, description="release it after this long without a motion or another take [s, wall]; 0: never")
 
 
 class MotionOwner(Message):
@@ -265,7 +265,7 @@ class MotionOwner(Message):
     owner: OperatorName = ""
     kind: OwnerKind = "none"
     since: Since = Field(0, description="[ns since the Unix epoch]")
-    asked: bool = Field(False, description="taken until it is given back; else for one motion")
+    asked: bool = Field(False, description="owned until it is released; else for one motion")
     jogging: bool = False
 
     @property

@@ -172,7 +172,7 @@ class TaskRequests(Generic[V]):
 
 
 def _kind(command: Command) -> str:
-    """Return the kind of a command, of which only the newest counts; holds are told apart by their owner."""
+    """Return the kind of a command, of which only the newest counts; each owner's holds are a kind of their own."""
     if not isinstance(command, m.HoldRequest):
         return f"{type(command).__name__} "
     if command.by == "operator":

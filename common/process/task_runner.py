@@ -49,7 +49,7 @@ async def run_task(
         config: of the task.
         make: class of the task.
         status: topic of its status.
-        view: class of what it knows: `View`, or a subclass of the application.
+        view: class of its input: `View`, or a subclass of the application.
         reads: topics whose newest messages the view holds, by the name of its field.
     """
     scene, gripper = bus.reader(topics.PLANNING_SCENE), bus.reader(topics.GRIPPER_STATE)
@@ -233,7 +233,7 @@ def _require_allowed(command: m.TaskCommand, motion: m.MotionStatus | None, owne
         return
     unnamed = m.UNKNOWN_OPERATOR
     if owner is not None and owner.asked and owner.kind != "task" and owner.owner not in (unnamed, command.by):
-        raise Refused("not_owner", f"the motion is {owner.description}: only the owner gives it back; else override")
+        raise Refused("not_owner", f"the motion is {owner.description}: only the owner can release it, or override")
     if motion is None:
         return
     others = [interlock.description for interlock in motion.interlocks
@@ -243,7 +243,7 @@ def _require_allowed(command: m.TaskCommand, motion: m.MotionStatus | None, owne
 
 
 class TaskMemory:
-    """What a task has to know after a restart, in a file that lasts as long as the cell is up, if it has a folder."""
+    """State that a restarted task restores, in a file that is deleted when the cell ends; nothing without a folder."""
 
     def __init__(self, bus: Bus, task: Task[Any]) -> None:
         """Start with the memory of a new task; nothing is written yet."""

@@ -113,7 +113,7 @@ class Ground:
     def _nearest(
         self, outline: Array, at: tuple[float, float], bottom: float, blocks: list[Block], box: Container | None
     ) -> tuple[float, float, float] | None:
-        """Nearest position (x, y, height) where an outline about its own origin rests, inside a container if given."""
+        """Nearest stable position (x, y, height) of an outline about its own origin, inside a container if given."""
         inner, parts = box.half_side - box.wall_thickness if box else 0.0, convex_parts(outline)
         levels = [b.high for b in blocks if b.flat and b.low < bottom and covers_point(b.outline, *at)]
         level = max(levels, default=self._world.table_height)  # it slides down to what is below its center, never up
@@ -135,7 +135,7 @@ class Ground:
     def _height(
         self, outline: Array, parts: Array, x: float, y: float, bottom: float, blocks: list[Block]
     ) -> float | None:
-        """Height at which an outline with these convex parts rests [m]; None if it would not stay."""
+        """Stable height of an outline with these convex parts [m]; None if it would slide or tip."""
         touched = [block for block in blocks if block.low < bottom and block.reaches(outline, parts)]
         if not touched:
             return self._world.table_height if self._unbounded else None

@@ -197,7 +197,7 @@ class SimulatedCell:
             between = self._felt.obstruction(self._kinematics.fk(q), state.width)
             self._blockable.obstruct(between)
             pressing = target is not None and target < state.width <= between + CONTACT
-            if stopped and not pressing:  # pressing goes on, moving does not
+            if stopped and not pressing:  # pressing continues, moving does not
                 target = state.width
         return PersistedState(q, state.width, target, state.commanded_effort)
 

@@ -1,1 +1,1 @@
-"""Reports: what a recording of a run says, as numbers, pictures and one page. Knows nothing of files and networks."""
+"""Reports: figures, charts and one page about the recording of a run. No file or network access."""

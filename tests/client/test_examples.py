@@ -27,7 +27,7 @@ SAYS = {  # what a script prints among other lines
     "jog": r"the motion is .*\(script\).*\nstopped: stopped since .*\(lunch\)\n"
            r"the arm is not jogged: .*an operator enters",
     "listen": r"joints\.csv: \d{3} rows\ngoal .*\nheld: True",
-    "tune": r"400 px: 3 seen\n800 px: 3 seen\n6400 px: 0 seen\nunknown parameter .*\nnothing came on .* only with 3 ",
+    "tune": r"400 px: 3 seen\n800 px: 3 seen\n6400 px: 0 seen\nunknown parameter .*\nno message on .* only with 3 ",
     "world": r"ball_2 was added, 2 are seen\noff_table: .*\nball_2 is seen [0-4]\.\d mm from where it is\nleft: ball_1",
 }
 

@@ -27,7 +27,7 @@ def test_even_arrivals_have_their_rate(rate: float, size: int) -> None:
 
 def test_figures_as_text() -> None:
     arrivals = Arrivals()
-    assert KINDS["hz"](arrivals.figures(0.0)) == "nothing came yet"
+    assert KINDS["hz"](arrivals.figures(0.0)) == "no message received yet"
     arrivals.add(0.0, 1000)
     assert KINDS["bw"](arrivals.figures(0.0)) == "1 messages, too few for a rate"
     arrivals.add(0.1, 1000)

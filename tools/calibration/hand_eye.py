@@ -1,4 +1,4 @@
-"""Hand-eye calibration: pose of a camera on the gripper or beside the arm, from views of a board and joint readings.
+"""Hand-eye calibration: pose of a camera on the gripper or next to the arm, from views of a board and joint readings.
 
 Camera on the gripper, board fixed: finds the camera in the tool center point, and the board in world. Camera fixed,
 board on the gripper: finds the camera in world, and the board in the tool center point. In both cases
@@ -46,7 +46,7 @@ class HandEyeCalibration:
     """A calibrated camera.
 
     Attributes:
-        mount: on the gripper ("hand") or beside the arm.
+        mount: on the gripper ("hand") or fixed next to the arm ("beside").
         T_mount_camera: (4, 4) optical frame in the tool center point, or in world.
         T_other_board: (4, 4) board in world, or in the tool center point.
         position_std: standard deviation of the optical center along x, y, z [m], by leaving out each view.
@@ -122,8 +122,8 @@ def calibrate_hand_eye(views: Sequence[View], camera: CameraFile, mount: Mount) 
     if rms > _MAX_RMS or len(dropped) > len(problem.views):
         raise CalibrationFailed(
             f"the views are inconsistent: residual {rms:.1f} px, {len(dropped)} of {len(views)} dropped; check "
-            f"that the camera is {'on the gripper' if mount == 'hand' else 'beside the arm'}, board and camera did not "
-            "slip, the joints belong to the images, and the square size")
+            f"that the camera is {'on the gripper' if mount == 'hand' else 'next to the arm'}, that nothing slipped, "
+            "that the joints belong to the images, and the square size")
     position, rotation = problem.jackknife(A, B)
     far = float(np.median([(invert(A) @ M @ B)[2, 3] for M in problem.known]))
     pictures = [ViewResidual(view.detection.name, len(ideal), r)

@@ -44,7 +44,7 @@ def format_pose(result: PoseCalibration) -> str:
 
 
 def format_hand_eye(result: HandEyeCalibration) -> str:
-    """Text: pose of a camera on the gripper, or beside an arm that holds the board."""
+    """Text: pose of a camera on the gripper, or fixed next to an arm that holds the board."""
     return "\n".join([
         f"{len(result.pictures)} views, residual {result.rms:.3f} px rms, {1e3 * result.rms_at_board:.2f} mm at the "
         f"board; {_per_view(result.pictures)}",
@@ -98,7 +98,7 @@ def with_pose(
 
 
 def with_hand_eye(camera: CameraFile, found: HandEyeCalibration, source: str, robot: str, mount: str) -> CameraFile:
-    """Return the camera with its pose on the gripper, or in world beside the arm."""
+    """Return the camera with its pose on the gripper, or in world if it is fixed."""
     record: dict[str, Any] = {
         "date": _today(), "source": source, "robot": robot, "camera": mount, "views": len(found.pictures),
         "rms_px": found.rms, "rms_mm": 1e3 * found.rms_at_board, "verdict": found.verdict, **_deviations(found)}

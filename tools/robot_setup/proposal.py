@@ -165,7 +165,7 @@ def _limits(proposal: Proposal, arm: Arm) -> None:
         proposal.guessed.append(f"velocity_limits of {', '.join(missing)}: the URDF gives none, so {SPEED:g}")
         proposal.notes["velocity_limits"] = f"GUESSED for {', '.join(missing)}, for which the URDF gives none."
     proposal.notes["acceleration_limits"] = (
-        f"GUESSED: each joint comes to its speed limit in {TO_SPEED:g} s. A URDF does not say it; the data sheet does.")
+        f"GUESSED: each joint comes to its speed limit in {TO_SPEED:g} s. URDFs lack this value; see the data sheet.")
     proposal.notes["jerk_limits"] = f"GUESSED: each joint comes to its acceleration limit in {TO_ACCELERATION:g} s."
     proposal.guessed += [f"acceleration_limits: to the speed limit in {TO_SPEED:g} s",
                      f"jerk_limits: to the acceleration limit in {TO_ACCELERATION:g} s"]
@@ -197,7 +197,7 @@ def _turned(
     poses = robot.link_poses((robot.lower + robot.upper) / 2)
     T_flange_palm = invert(poses[flange]) @ poses[effector.palm]
     points_out = T_flange_palm[:3, :3] @ effector.grip.approach
-    proposal.guessed.append(f"attachments: the gripper sits at {flange} itself, without a plate between")
+    proposal.guessed.append(f"attachments: the gripper is mounted directly on {flange}, without a plate between")
     if points_out @ out > ALIGNED:
         return robot, effector
     attachment["rpy"] = [round(value, 6) for value in matrix_to_rpy(rotation_between(points_out, out))]
