@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from cli import options
-from cli.target import RUNNING, CellTarget, CommandGroup
+from cli.options import RUNNING, CellTarget, CommandGroup
 from common.errors import ConfigError, UnknownName
 from common.terminal import echo
 

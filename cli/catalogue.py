@@ -13,7 +13,7 @@ from typing import Annotated
 import typer
 
 from cli import choices, options
-from cli.model_sources import ROOT
+from cli.choices import ROOT
 from common.errors import ConfigError, UnknownName
 from common.terminal import echo
 

@@ -19,24 +19,19 @@ from cli import (
     calibrate,
     catalogue,
     checks,
+    choices,
     commands,
-    completion,
-    export,
-    graph,
     node,
     param,
-    playing,
     recording,
     robot,
-    scene,
     secure,
-    simulate,
     tf,
     top,
     topic,
     verbs,
 )
-from cli.target import CommandGroup
+from cli.options import CommandGroup
 from common.errors import RequestFailed, ZencellError
 from common.terminal import echo, printable
 
@@ -54,7 +49,7 @@ class CommandLine(CommandGroup):
 
     def execute(self, arguments: Sequence[str]) -> int:
         """Run a verb, print its error if it fails, and return the exit code."""
-        completion.prepare()
+        choices.prepare()
         try:
             of_applications.take_own(arguments)
             command = typer.main.get_command(self)
@@ -106,7 +101,7 @@ app = CommandLine(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-app.callback()(completion.root)
+app.callback()(choices.root)
 of_applications = verbs.ApplicationVerbs(app, {"task": commands.task}, bringup.run, last="chaos")
 app.command()(bringup.run)
 app.command()(bringup.up)
@@ -120,22 +115,22 @@ app.command(context_settings={"ignore_unknown_options": True})(commands.call)
 app.add_typer(node.app, name="node")
 app.add_typer(param.app, name="param")
 app.add_typer(tf.app, name="tf")
-app.command()(graph.graph)
+app.command()(node.graph)
 app.add_typer(commands.task, name="task")
 app.add_typer(commands.world, name="world")
-app.add_typer(scene.app, name="scene")
+app.add_typer(commands.scene, name="scene")
 of_applications.take_all()
 app.add_typer(robot.app, name="robot")
 app.add_typer(calibrate.app, name="calibrate")
 app.command("record")(recording.record_)
 app.command()(recording.info)
-app.command("play")(playing.play_)
+app.command("play")(recording.play_)
 app.command()(recording.recover)
-app.command()(export.report)
-app.command()(export.export)
+app.command()(recording.report)
+app.command()(recording.export)
 app.add_typer(secure.app, name="secure")
 app.add_typer(secure.router, name="router")
-app.command()(simulate.simulate)
+app.command()(checks.simulate)
 app.command()(checks.check)
 app.command()(checks.doctor)
 

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from cli import choices, options
-from cli.target import RUNNING, CellTarget, CommandGroup
+from cli.options import RUNNING, CellTarget, CommandGroup
 from common.terminal import echo
 
 app = CommandGroup("List, read, change and save parameters of running services.")

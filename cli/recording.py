@@ -1,21 +1,30 @@
-"""Recordings: record, show the contents, recover a truncated file."""
+"""Recordings: record, show the contents, recover, play, export, report."""
 
 from __future__ import annotations
 
 import asyncio
 import json
 import sys
+import warnings
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from cli import choices, options
-from cli.target import RUNNING, CellTarget
+from cli.options import RUNNING, CellTarget
 from common.errors import ConfigError
-from common.terminal import echo, rewrite
+from common.terminal import echo, printable, rewrite
 from recording.formatting import format_bytes, format_contents, require_new
+
+if TYPE_CHECKING:
+    from recording.player import Player
+
+if TYPE_CHECKING:
+    from recording.reader import Recording
+    from recording.sample import Decoder
+    from recording.selection import Selection
 
 MIN_FILE_SIZE = 1.0  # [MB] of a recording that is split
 
@@ -110,3 +119,185 @@ def recover(
     lost += [f"{saved.damaged_chunks} damaged chunks"] if saved.damaged_chunks else []
     echo(f"saved {saved.messages:,} messages, {saved.seconds:.1f} s: {target}; "
          f"lost {' and '.join(lost) or 'nothing'}")
+
+
+MAX_RATE = 1000.0
+
+
+def play_(
+    file: File,
+    keys: Annotated[list[str] | None, typer.Argument(metavar="KEY", help="only these; * and ** as wildcards")] = None,
+    topics: Annotated[
+        list[str] | None, typer.Option("--topics", metavar="KEY", help="only these: the same as naming them after FILE")
+    ] = None,
+    exclude: Exclude = None,
+    remap: Annotated[
+        list[str] | None, typer.Option("--remap", metavar="FROM:=TO", help="publish under another key; repeatable")
+    ] = None,
+    rate: Annotated[str, typer.Option("--rate", metavar="X", help="speed factor")] = "1",
+    loop: Annotated[bool, typer.Option("--loop", help="repeat until Ctrl-C")] = False,
+    start_offset: Annotated[str, typer.Option("--start-offset", metavar="S", help="start at this time of the "
+                                                                                  "recording [s]")] = "0",
+    start_paused: Annotated[bool, typer.Option("--start-paused", help="wait for space at the start")] = False,
+    stamp_now: Annotated[
+        bool, typer.Option("--stamp-now", help="shift stamps to the present [stamps as recorded]")
+    ] = False,
+    wait: Annotated[
+        list[str] | None, typer.Option("--wait", metavar="SERVICE", help="start once this service is ready; repeatable")
+    ] = None,
+    cell: Annotated[str | None, typer.Option("--cell", metavar="NAME", help="play as this cell")] = None,
+    domain: options.Domain = None,
+    connect: options.Connect = None,
+) -> None:
+    """Publish the messages of a recording with their timing; start a router if none is running.
+
+    On a terminal space pauses, right steps one message, down one image, left goes back 5 s, q quits.
+    """
+    from common.remapping import is_cell
+    from common.transport.credentials import require_open_cell
+    from recording.player import play, played_topics, renaming
+    from recording.reader import Recording
+    from recording.selection import Selection
+
+    require_open_cell("play")
+    selection = Selection.of([*(keys or ()), *(topics or ())], None, exclude)
+    renamed = renaming(remap or [])
+    speed, offset = options.number("--rate", rate), options.number("--start-offset", start_offset)
+    if not 0 < speed <= MAX_RATE:
+        raise ConfigError("--rate", rate, f"must be more than 0 and at most {MAX_RATE:g}")
+    on_terminal = sys.stdin.isatty() and sys.stderr.isatty()
+    if start_paused and not on_terminal:
+        raise ConfigError("--start-paused", ..., "needs a terminal, where space continues; --wait SERVICE needs none")
+    with Recording(Path(file)) as recording:
+        if not 0 <= offset <= recording.seconds:
+            raise ConfigError("--start-offset", start_offset, f"must be 0 to {recording.seconds:.1f}, its length [s]")
+        played = played_topics(recording, selection)
+        if loop and recording.seconds == 0:
+            raise ConfigError("--loop", ..., f"needs a recording with a length, but {file} has none")
+
+        def create() -> Player:
+            from recording.player import Player
+
+            return Player(recording, selection.wants, renamed, rate=speed, offset=offset, loop=loop,
+                          paused=start_paused, stamp_now=stamp_now)
+
+        name = cell or recording.cell
+        if not name:
+            raise ConfigError("--cell", ..., f"{file} does not name its cell: name one")
+        if not is_cell(name):
+            raise ConfigError("--cell", name, "is not a valid name of a cell")
+        show = rewrite if on_terminal else None
+        code = asyncio.run(play(create, recording, played, name, wait or [], domain, connect, echo, show))
+    raise typer.Exit(code)
+
+
+PLOT_ERRORS = (ArithmeticError, ValueError, LookupError, TypeError)  # errors from values that no real run contains
+
+
+def export(
+    file: File,
+    foxglove: Annotated[
+        str | None, typer.Option("--foxglove", metavar="OUT.mcap", help="for Foxglove: JSON with its own schemas")
+    ] = None,
+    csv: Annotated[str | None, typer.Option("--csv", metavar="DIR", help="a table for each topic")] = None,
+    images: Annotated[str | None, typer.Option("--images", metavar="DIR", help="a PNG for each image")] = None,
+    video: Annotated[
+        str | None, typer.Option("--video", metavar="OUT.mp4", help="video of one topic, named with --topics")
+    ] = None,
+    topics: Annotated[list[str] | None, typer.Option("--topics", metavar="KEY", help="only these; repeatable")] = None,
+    exclude: Exclude = None,
+) -> None:
+    """Export a recording for other programs: Foxglove, tables, images, a video."""
+    from recording.reader import Recording
+    from recording.sample import Decoder
+    from recording.selection import Selection
+
+    if not (foxglove or csv or images or video):
+        raise ConfigError("export", ..., "needs one or more of --foxglove OUT.mcap, --csv DIR, --images DIR, "
+                                         "--video OUT.mp4")
+    selection = Selection.of(topics or (), None, exclude)
+    if foxglove:
+        require_new(Path(foxglove), "--foxglove")
+    for option, folder in (("--csv", csv), ("--images", images)):
+        if folder and Path(folder).exists() and not Path(folder).is_dir():
+            raise ConfigError(option, folder, "must be a folder")
+    if video:
+        require_new(Path(video), "--video", ".mp4")
+    decoder = Decoder()
+    with Recording(Path(file)) as recording:
+        selection.require_in(recording.topics(), recording.path, "--topics")
+        if foxglove:
+            _foxglove(recording, Path(foxglove), selection, decoder)
+        if csv:
+            _tables(recording, Path(csv), selection, decoder)
+        if images:
+            _images(recording, Path(images), selection, decoder)
+        if video:
+            _video(recording, Path(video), selection, decoder)
+    for topic, count in sorted(decoder.skipped.items()):
+        echo(f"{printable(topic)}: {count} messages left out: this version does not know their type", err=True)
+
+
+def _foxglove(recording: Recording, target: Path, selection: Selection, decoder: Decoder) -> None:
+    from recording.foxglove import export_foxglove
+
+    count = export_foxglove(recording, target, selection.wants, decoder)
+    echo(f"{target}: {count:,} messages, {format_bytes(target.stat().st_size)}, for Foxglove")
+
+
+def _tables(recording: Recording, folder: Path, selection: Selection, decoder: Decoder) -> None:
+    from recording.export import export_tables
+
+    for name, count in export_tables(recording, folder, selection.wants, decoder).items():
+        echo(f"{folder / name}: {count:,} rows")
+
+
+def _images(recording: Recording, folder: Path, selection: Selection, decoder: Decoder) -> None:
+    from recording.export import export_images, file_names, image_topics
+
+    if not image_topics(recording, selection.wants):
+        raise ConfigError("--images", str(recording.path), "has no images among the selected topics")
+    names = file_names(image_topics(recording, selection.wants))
+    for topic, count in export_images(recording, folder, selection.wants, decoder).items():
+        echo(f"{folder / names[topic]}: {count:,} images")
+
+
+def _video(recording: Recording, target: Path, selection: Selection, decoder: Decoder) -> None:
+    from recording.export import export_video, image_topics
+
+    choices = image_topics(recording, selection.wants)
+    if len(choices) != 1:
+        named = ", ".join(choices) or "none"
+        raise ConfigError("--video", str(target), f"needs one topic with images, by --topics KEY; choices: {named}")
+    count, rate = export_video(recording, target, choices[0], decoder)
+    echo(f"{target}: {count:,} images of {choices[0]} at {rate:g} Hz")
+
+
+def report(
+    file: File,
+    output: Annotated[str, typer.Option("-o", "--output", metavar="FILE.html", help="[next to the recording]")] = "",
+    cell: Annotated[
+        str | None, typer.Option("--cell", metavar="CELL", help="cell with the robot [the cell of the recording]")
+    ] = None,
+) -> None:
+    """Write an HTML report of a recorded run: timeline, plans, latency, joints, detections and failures."""
+    from recording.reader import Recording
+    from recording.report.build import build_report, truncated_note
+    from recording.sample import RecordingError
+
+    path = Path(file)
+    page_path = Path(output).expanduser() if output else path.with_suffix(".html")
+    if page_path.suffix not in (".html", ".htm"):
+        raise ConfigError("--output", output, "must end in .html")
+    if not page_path.absolute().parent.is_dir():
+        raise ConfigError("--output", output, "cannot be written: the folder does not exist")
+    with Recording(path) as recording:
+        try:
+            with warnings.catch_warnings(action="ignore"):  # about values that a plot cannot show
+                text = build_report(recording, cell)
+        except PLOT_ERRORS as error:
+            raise RecordingError(f"{path}: has values that cannot be shown: {type(error).__name__}: {error}") from error
+        if not recording.finished:
+            echo(f"zencell: {truncated_note(recording)}", err=True)
+    options.write_text(str(page_path), text)
+    echo(f"{page_path}: {len(text) / 1e6:.1f} MB")

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from cli import options
-from cli.target import RUNNING, CellTarget, CommandGroup
+from cli.options import RUNNING, CellTarget, CommandGroup
 from common import terminal
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from cli import options
-from cli.target import RUNNING, CellTarget
+from cli.options import RUNNING, CellTarget
 from common.terminal import STATE_STYLES, echo, printable
 
 if TYPE_CHECKING:

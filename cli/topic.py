@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from cli import choices, options
-from cli.target import RUNNING, CellTarget, CommandGroup
+from cli.options import RUNNING, CellTarget, CommandGroup
 from common import terminal
 from common.errors import ConfigError
 

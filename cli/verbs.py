@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, get_type_hints
 import typer
 
 from cli import options
-from cli.target import CellTarget
+from cli.options import CellTarget
 from common.application import Application, applications, find_application
 from common.errors import ConfigError
 from common.verbs import BeforeRun, Verbs

@@ -7,7 +7,7 @@ from typing import Any
 import yaml
 
 from common.atomic_file import STATE_VARIABLE
-from deploy.containers import (
+from deploy.compose import (
     DATA,
     IMAGE,
     ROUTER,

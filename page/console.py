@@ -26,8 +26,8 @@ from common.messages import (
     ParameterRequest,
 )
 from common.topics import Request, Topic
+from page.access import CURRENT_SESSION, Permission, Permissions
 from page.feeds import Feeds
-from page.permissions import CURRENT_SESSION, Permission, Permissions
 from page.status_text import USER_ERRORS, error_text
 from page.viser_inside import element_id
 

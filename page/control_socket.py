@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from websockets.exceptions import ConnectionClosed
 
 from common.time_source import monotonic
-from page.permissions import CURRENT_SESSION
+from page.access import CURRENT_SESSION
 from page.status_text import USER_ERRORS, TaskText, error_text, motion_text
 
 if TYPE_CHECKING:

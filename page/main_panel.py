@@ -13,9 +13,9 @@ import viser
 from common import topics
 from common.errors import RemoteError, ZencellError
 from common.messages import MotionOwner, MotionStatus, RobotCommand, RobotStatus, TaskStatus
+from page.access import CURRENT_SESSION
 from page.console import SLIDER_DEBOUNCE, Console, assign
 from page.markup import STYLE, Html, block, buttons, fields, line, press, span, text
-from page.permissions import CURRENT_SESSION
 from page.status_text import TaskText, arm_blocked, command_blocked, controller_mode, error_text, motion_text
 from page.viser_inside import element_id
 

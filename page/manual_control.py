@@ -29,9 +29,9 @@ from page.markup import Html, block, buttons, hold, live, press, text
 if TYPE_CHECKING:
     from common.config import GripperConfig
     from common.robot.model import RobotModel
+    from page.access import Permissions
     from page.console import ActionQueue, Console
     from page.feeds import Latest
-    from page.permissions import Permissions
 
 Array = NDArray[np.float64]
 Numbers = tuple[float, float, float]

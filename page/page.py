@@ -18,6 +18,7 @@ from common.application import Application
 from common.config import Members, RobotConfig
 from common.messages import Rejections, TaskStatus
 from common.topics import Topic
+from page.access import CURRENT_SESSION
 from page.application import page_of
 from page.camera_panel import CameraPanel
 from page.console import Console
@@ -30,10 +31,8 @@ from page.layers import Layers, shown_layers
 from page.layout import TABS, Layout, LayoutSaver, Tab, ViewPanel
 from page.main_panel import ControllerPanel, TaskPanel
 from page.move_panel import Motions, MovePanel
-from page.permissions import CURRENT_SESSION
 from page.recorded_history import HistoryRecorder, RecordedHistory, recordings_in
-from page.rejections import RejectedPositions
-from page.status_text import TaskText, gripper_text
+from page.status_text import RejectedPositions, TaskText, gripper_text
 from page.time_panel import TimePanel
 from page.tuning import TuningPanel
 from page.viser_inside import send_key

@@ -27,9 +27,8 @@ from websockets.http11 import Request, Response
 
 from common.errors import ConfigError
 from common.time_source import monotonic
-from page.access import Access, Answer, gateways
+from page.access import CURRENT_SESSION, Access, Answer, PageSession, Permissions, gateways
 from page.address import is_loopback, listen_error, open_socket
-from page.permissions import CURRENT_SESSION, PageSession, Permissions
 from page.viser_inside import (
     CONTROL_PATH,
     ClientFile,

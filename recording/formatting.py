@@ -11,7 +11,7 @@ from common.errors import ConfigError
 from common.terminal import printable
 
 if TYPE_CHECKING:
-    from recording.sink import RecordingStats
+    from recording.capture import RecordingStats
     from recording.summary import Summary
 
 MOST_SHOWN = 200  # [characters] of each value that describes the run

@@ -18,10 +18,9 @@ from common.transport.credentials import RECORDER
 from common.transport.endpoint import endpoint_of
 from common.transport.session import call_on_loop
 from common.transport.zenoh_session import connect as connect_to
-from recording.capture import Capture, CustomTopics
+from recording.capture import Capture, CustomTopics, Sink
 from recording.formatting import about, format_progress, format_result
 from recording.selection import Selection
-from recording.sink import Sink
 from recording.writer import SplitWriter
 
 SHOW_PERIOD = 0.5  # [s]

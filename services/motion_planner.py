@@ -18,8 +18,7 @@ from common.messages import PlanningScene, PlanRequest, PlanResponse
 from common.planning.camera_obstacles import PointsOptions
 from common.planning.pipeline import PlanningPipeline
 from common.process.environment import NICENESS
-from common.process.obstacle_reader import ObstacleReader
-from common.process.obstruction_watchdog import ObstructionWatchdog
+from common.process.obstacles import ObstacleReader, ObstructionWatchdog
 from common.process.planning_worker import (
     PlannerPool,
     PlanningWorker,

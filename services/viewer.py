@@ -14,6 +14,7 @@ from common.config import Members, Parameters, RobotConfig, Run, Surroundings
 from common.process.service import main
 from common.transport.bus import Bus
 from common.transport.credentials import secure_folder
+from page.access import Permissions
 from page.address import page_url
 from page.console import Console
 from page.control_socket import ControlSocket
@@ -21,7 +22,6 @@ from page.feeds import Feeds, Schedule, Topics
 from page.layers import Layers, find_layers
 from page.layout import load_layout
 from page.page import Page
-from page.permissions import Permissions
 from page.recorded_history import recordings_folder
 from page.server import close_server, make_server
 from security.page_tokens import read_tokens

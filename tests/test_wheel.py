@@ -40,7 +40,7 @@ atexit.register(report)
 # Which kernel the doctor reports, and which planner plans around a wall.
 PLAN = """
 import zencell
-from tools.doctor.software import kernel
+from tools.doctor.examination import kernel
 from common.config import load_cell
 from common.messages import CollisionObject, Header, JointGoal, PlanningScene, PlanRequest, Pose, Vector3
 from common.planning.pipeline import PlanningPipeline

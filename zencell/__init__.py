@@ -21,9 +21,8 @@ if _FOLDER not in sys.path:
 if TYPE_CHECKING:
     from common.client.cell import Cell
     from common.client.goals import Plan, any_of, pose, region, through
-    from common.client.joining import NoCellRunning
+    from common.client.joining import NoCellRunning, NotStarted
     from common.client.operator_motion import JogFailed, MotionFailed
-    from common.client.starting import NotStarted
     from common.client.subscriptions import NothingReceived
     from common.errors import (
         ConfigError,
@@ -41,8 +40,7 @@ _FROM = {  # imported at first use: the command line starts without them
     "common.client.cell": ("Cell",),
     "common.client.goals": ("Plan", "any_of", "pose", "region", "through"),
     "common.client.subscriptions": ("NothingReceived",),
-    "common.client.joining": ("NoCellRunning",),
-    "common.client.starting": ("NotStarted",),
+    "common.client.joining": ("NoCellRunning", "NotStarted"),
     "common.errors": ("ConfigError", "NoResponder", "RemoteError", "RequestFailed", "RequestLost", "RequestTimeout",
                       "UnknownName", "ZencellError"),
     "common.messages": ("Pose",),

@@ -12,7 +12,7 @@ from applications.outlining.topics import CONTOUR_PATH, OUTLINE_STATUS, OutlineP
 from common.config import RobotConfig
 from common.messages import Color, JointState, TaskStatus, WorldObjects
 from common.topics import JOINT_STATES, SCENE_OBJECTS, Topic
-from recording.foxglove_scene import closed_line, entity, update
+from recording.foxglove import closed_line, entity, update
 from recording.report import application
 
 if TYPE_CHECKING:

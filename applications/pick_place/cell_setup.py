@@ -28,7 +28,7 @@ from common.sim.objects import initial_pose, solid_of
 from common.sim.table import is_inside
 from tools.check import Finding, error, warning
 from tools.check.arm import Arm
-from tools.robot_setup.home import hits
+from tools.robot_setup.sampling import hits
 
 ALONG = 0.03  # [m] tolerated offset of the position above a container: half of place_pos_tol
 

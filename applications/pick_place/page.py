@@ -17,7 +17,7 @@ from common.topics import Topic
 from page.application import ApplicationPage
 from page.layers import Layer
 from page.nodes import FLAT, Labels, Markers, points_of, ring
-from page.rejections import RejectedPosition, RejectedPositions
+from page.status_text import RejectedPosition, RejectedPositions
 
 if TYPE_CHECKING:
     import viser

@@ -41,7 +41,7 @@ def resolve(
     from common.transport.endpoint import endpoint_of
     from recording.report.aggregator import RunAggregator
     from security.page_tokens import VIEWER
-    from security.preflight import require_secured, with_near
+    from security.validation import require_secured, with_near
     from tools.check.cell import require_safe
 
     summary_file = _summary_file(summary)

@@ -21,8 +21,7 @@ from common.supervision.multi_host import HostOptions
 from common.terminal import printable
 
 if TYPE_CHECKING:
-    from cli.session.live_table import Content
-    from cli.session.screens import Screen
+    from cli.session.screens import Content, Screen
     from common.messages import Interlock
     from common.supervision.supervisor import Supervisor
     from common.transport.bus import Bus
@@ -118,7 +117,7 @@ class CellSession:
         from common.transport.credentials import RECORDER
         from recording.capture import CustomTopics
         from recording.formatting import require_new
-        from security.preflight import require_recorder
+        from security.validation import require_recorder
 
         path = Path(file).absolute()
         require_new(path, "--record")
@@ -160,7 +159,7 @@ class CellSession:
             Exit code: 0 if the task is DONE, 1 if not, 130 after Ctrl-C, 3 if it is DONE but the simulated world has
             objects left for which the summary gives no reason.
         """
-        from common.process.dropping_writer import DroppingWriter
+        from common.process.log import DroppingWriter
         from common.supervision.supervisor import StartFailed
         from recording.report.summary import describe
 
@@ -262,7 +261,7 @@ class CellSession:
         root.setLevel(logging.INFO)
 
     def _content(self) -> Content:
-        from cli.session.live_table import Content
+        from cli.session.screens import Content
 
         assert self._supervisor is not None
         statuses = self._supervisor.statuses

@@ -17,11 +17,10 @@ from common.application import all_topics, find_topic
 from common.client.arm import Arm
 from common.client.frames import Frames
 from common.client.gripper import Gripper
-from common.client.joining import cell_clock, joined, operator_name, supervisor_status
+from common.client.joining import StartedCell, cell_clock, joined, operator_name, supervisor_status
 from common.client.keys import published_keys, require_key
 from common.client.parameters import Parameters
 from common.client.scene import Scene, World
-from common.client.starting import StartedCell
 from common.client.subscriptions import (
     AnyTopic,
     Camera,

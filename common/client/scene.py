@@ -10,7 +10,7 @@ from common.client.goals import Point, array_of, numbers, pose_of
 from common.client.subscriptions import Part, Subscriptions
 from common.config import check
 from common.messages import CollisionObject, Pose, SceneEdit, SceneEditReply, WorldEdit, WorldObject
-from common.scene.added_solids import added_solids
+from common.scene.fixtures import added_solids
 from common.transport.bus import Bus
 
 TIMEOUT = 5.0  # [s] wall for an answer

@@ -9,7 +9,7 @@ the true poses of objects; all other services declare `Surroundings`.
 from __future__ import annotations
 
 from common.config.basics import Coordinate, Length, Number, Parameters, Point, Rgb, Section, Tunable, check
-from common.config.cell import Cell, Members, Reach, ServiceEntry
+from common.config.cell import Cell, Grasp, Members, Motion, Pipeline, PlannerEntry, Reach, Run, ServiceEntry, Watchdogs
 from common.config.files import config_root, find_file, names_of, parse_yaml, read_robot, read_yaml
 from common.config.loading import (
     expanded,
@@ -20,7 +20,6 @@ from common.config.loading import (
     service_names,
     yaml_line,
 )
-from common.config.motion import Grasp, Motion, Pipeline, PlannerEntry, Run, Watchdogs
 from common.config.robot import (
     AttachmentConfig,
     FingerShape,

@@ -1,15 +1,103 @@
-"""A resolved cell."""
+"""A resolved cell, and its sections for motion, grasping, planning and watchdogs."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
-from common.config.basics import Section
-from common.config.motion import Grasp, Motion, Pipeline, Run, Watchdogs
+from common.config.basics import Section, Tunable
 from common.config.robot import RobotConfig
 from common.config.world import Scenery, Surroundings, World
+from common.remapping import is_cell
+
+
+class Motion(Section):
+    """Speed of motions and effort of planning, unless a request overrides them."""
+
+    velocity_scaling: Tunable[float] = Field(0.2, gt=0, le=1, description="fraction of the joints' velocity limits")
+    acceleration_scaling: Tunable[float] = Field(
+        0.2, gt=0, le=1, description="fraction of the joints' acceleration limits"
+    )
+    cartesian_speed_scale: Tunable[float] = Field(
+        1.0, gt=0, le=1, description="stretch of straight-line trajectories after retiming: t/s, v*s, a*s^2"
+    )
+    planning_attempts: Tunable[int] = Field(
+        5, ge=1, le=100, description="attempts of a sampling planner; the best one is used"
+    )
+    planning_time: Tunable[float] = Field(10.0, gt=0, le=600, description="wall time for one plan [s]")
+    object_padding: Tunable[float] = Field(
+        0.003, ge=0, le=0.05, description="padding of perceived objects in planning [m]"
+    )
+    start_tolerance: Tunable[float] = Field(
+        0.05, ge=0, le=0.5, description="a plan may start this far beyond a joint limit, and moves inwards first [rad]"
+    )
+
+
+class Grasp(Section):
+    """How an object is picked and placed, for the tool centre point with the tool pointing down."""
+
+    approach_clearance: float = Field(0.10, ge=0.02, le=0.5, description="pre-grasp above the grasp [m]")
+    grasp_clearance: float = Field(0.0, ge=-0.02, le=0.05, description="grasp above the centre of the object [m]")
+    min_grasp_z: float = Field(0.012, ge=0.0, le=0.5, description="the tool centre point never goes below this [m]")
+    lift_height: float = Field(0.15, ge=0.05, le=0.5, description="lift above the grasp [m]")
+    drop_z: float = Field(0.225, ge=0.18, le=0.6, description="height of release above the container [m]")
+
+    max_tilt: float | None = Field(
+        None, ge=0.0, le=1.5, description="largest tilt of the tool at a grasp [rad]; default: 0, and 0.35 for an arm "
+        "of fewer than six joints, which cannot choose it")
+
+    def tilt(self, joints: int) -> float:
+        """Return the largest tilt at a grasp of an arm with this many joints [rad]."""
+        return self.max_tilt if self.max_tilt is not None else 0.0 if joints >= 6 else 0.35
+
+    def height(self, z: float) -> float:
+        """Return z of the tool centre point at the grasp of an object with its centre at z [m]."""
+        return max(z + self.grasp_clearance, self.min_grasp_z)
+
+
+class PlannerEntry(Section):
+    """A planner of the pipeline: a module of common/planning/planners, or a dotted module of a user."""
+
+    name: str
+    options: dict[str, Any] = {}
+
+
+class Pipeline(Section):
+    """Planners in the order of their use, and the validation of their plans."""
+
+    planners: list[PlannerEntry] = Field(min_length=1)
+    validation_step: Tunable[float] = Field(
+        0.01, gt=0, le=0.2, description="largest joint step between validated states [rad]"
+    )
+
+
+def _cell(name: str) -> str:
+    if not is_cell(name):
+        raise ValueError(f"{name!r} is no name of a cell, the first part of its keys: use letters, digits, _, - and .")
+    return name
+
+
+class Run(Section):
+    """Settings of one run."""
+
+    cell: Annotated[str, AfterValidator(_cell)]
+    seed: int = Field(0, ge=0, le=2**31 - 1)
+    autostart: bool = True
+
+
+class Watchdogs(Section):
+    """Timeouts of processes that are alive but stuck; wall time."""
+
+    loop: float = Field(
+        5.0, ge=0, le=600, description="a service whose event loop is stuck for this long ends itself; 0: never [s]"
+    )
+    silence: float = Field(
+        7.0, ge=0, le=600, description="a process that is silent for this long is killed and restarted; 0: never [s]"
+    )
+    start: float = Field(
+        60.0, ge=5, le=600, description="a restarted process that is not ready after this time is killed too [s]"
+    )
 
 
 class ServiceEntry(Section):

@@ -30,17 +30,18 @@ from common.planning.problem import (
     ToolPath,
     timing_failure,
 )
-from common.planning.request_checks import (
-    BadRequest,
-    CheckedRequest,
-    check_collisions,
-    check_constraints,
-    check_request,
-)
 from common.planning.retiming import RetimingFailed, limited_jerk
 from common.planning.robot_geometry import RobotGeometry
 from common.planning.trajectory import TimedPath, TooLong, cubics, join, require_sendable, stretch, trajectory_message
-from common.planning.validation import Fault, validate
+from common.planning.validation import (
+    BadRequest,
+    CheckedRequest,
+    Fault,
+    check_collisions,
+    check_constraints,
+    check_request,
+    validate,
+)
 from common.planning.waypoint_timing import BLENDS, limit_tool_speed, retime
 from common.robot.model import RobotModel
 from common.time_source import monotonic

@@ -8,7 +8,7 @@ from common import topics
 from common.atomic_file import AtomicFile, Unreadable, state_folder
 from common.errors import ConfigError, Refused
 from common.messages import PlanningScene, SceneEdit, SceneEditReply
-from common.scene.added_solids import AddedSolids, added_id
+from common.scene.fixtures import AddedSolids, added_id
 from common.transport.bus import Bus
 
 

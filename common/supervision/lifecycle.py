@@ -22,8 +22,12 @@ from common.supervision.launch import Launch
 from common.supervision.liveness_watchdog import PERIOD, LivenessWatchdog, RemoteServices
 from common.supervision.supervisor import Supervisor
 from common.time_source import monotonic
+from common.topics import Topic
+from common.transport.bus import Bus
+from common.transport.codec import encode, encoding_of
 from common.transport.credentials import SUPERVISOR, CertificateMonitor
 from common.transport.session import alive_key
+from common.transport.writer import COPY, plain_key
 
 if TYPE_CHECKING:
     from common.transport.bus import Bus
@@ -134,7 +138,7 @@ async def _connect_and_work(
     prepare: Callable[[Bus], None],
 ) -> T:
     from common.process.log import BusLog
-    from common.supervision.plain_keys import copy_to_plain_keys
+    from common.supervision.lifecycle import copy_to_plain_keys
     from common.transport.zenoh_session import connect
 
     timeout = CONNECT_TIMEOUT if launch.connect else None  # our own router is watched by the supervisor
@@ -309,3 +313,35 @@ async def run_with_background(background: Coroutine[Any, Any, None], main: Corou
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
+
+
+MATCH_PERIOD = 1.0  # [s] between checks for subscribers of a plain key
+
+
+async def copy_to_plain_keys(bus: Bus, remote: RemoteServices) -> None:
+    """Copy log lines and counters to their plain keys while those have subscribers.
+
+    Args:
+        bus: of the supervisor.
+        remote: services whose messages another supervisor copies.
+    """
+
+    async def follow_supervisors() -> None:
+        async for status in bus.reader(topics.SUPERVISOR_STATUS):
+            remote.update(status)
+
+    await asyncio.gather(follow_supervisors(), *(_copy(bus, topic, remote) for topic in (topics.LOG, topics.COUNTERS)))
+
+
+async def _copy(bus: Bus, topic: Topic[Any], remote: RemoteServices) -> None:
+    out = bus.raw_publisher(f"{bus.cell}/{plain_key(topic)}", encoding_of(topic.message), reliable=True)
+    reader = bus.reader(replace(topic, plain=False), listening=False)
+    while True:
+        bus.listen(reader, out.matched)
+        try:
+            async with asyncio.timeout(MATCH_PERIOD):
+                message = await reader.next()
+        except TimeoutError:
+            continue
+        if remote.is_copied_here(message.service):
+            out.put(encode(message), COPY)

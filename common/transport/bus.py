@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 
 from common import topics
 from common.clock import Clock
+from common.errors import ConfigError
 from common.messages import Header, Message, ServiceCounters
 from common.remapping import Remapping
 from common.topics import Request, Topic, of_service
@@ -17,10 +18,66 @@ from common.transport.codec import DEFAULT_LIMIT
 from common.transport.ownership import SHARED, Owner, Ownership
 from common.transport.reader import Reader
 from common.transport.requests import Client, Server
-from common.transport.service_run import ServiceRun
 from common.transport.session import Declaration, RawReply, Session, alive_key, call_on_loop, serves_key
 from common.transport.tokens import Alive, TokenWatch
 from common.transport.writer import RawAccess, Writer
+
+_END_SECONDS = 1.0  # for a cancelled service to end
+
+
+class ServiceRun:
+    """Runs the coroutine of a bus and ends it after a failure elsewhere."""
+
+    def __init__(self, service: str, log: logging.Logger, withdraw: Callable[[], Awaitable[None]]) -> None:
+        """Prepare a run on the running loop.
+
+        Args:
+            service: name of the task.
+            log: of the service.
+            withdraw: awaited when another process has one of the service's keys, before the service is cancelled.
+        """
+        self._service, self._log, self._withdraw = service, log, withdraw
+        self._failure: asyncio.Future[BaseException] = asyncio.get_running_loop().create_future()
+        self._running = False
+        self._keys_lost = False
+
+    def fail(self, error: BaseException) -> None:
+        """End the service because a request handler crashed."""
+        if not self._running:  # a tool's bus has no service to end
+            self._log.error("the handler of a request crashed", exc_info=error)
+        elif not self._failure.done():
+            self._failure.set_result(error)
+
+    def lose_keys(self, error: ConfigError) -> None:
+        """End the service because another process has one of its keys."""
+        self._keys_lost = True
+        self.fail(error)
+
+    async def run(self, service: Coroutine[Any, Any, None]) -> None:
+        """Run the coroutine to its end or to the first failure, which is raised."""
+        self._running = True
+        task = asyncio.create_task(service, name=self._service)
+        both: set[asyncio.Future[Any]] = {task, self._failure}
+        try:
+            await asyncio.wait(both, return_when=asyncio.FIRST_COMPLETED)
+            if self._keys_lost:
+                await self._withdraw()
+        finally:
+            await self._end(task)
+        if self._failure.done():
+            raise self._failure.result()
+        await task
+
+    async def _end(self, task: asyncio.Task[None]) -> None:
+        if task.done():
+            return
+        task.cancel()
+        await asyncio.wait({task}, timeout=_END_SECONDS)
+        if not task.done():
+            self._log.error("the service ignores its cancellation")
+        elif not task.cancelled() and task.exception() is not None:
+            self._log.error("crashed while it ended", exc_info=task.exception())
+
 
 __all__ = ["Bus", "Client", "Reader", "Writer"]  # for type hints of services
 

@@ -6,7 +6,7 @@ from common.clock import Clock
 from common.config import Parameters
 from common.process.service import serve_parameters
 from common.transport.local import LocalNetwork
-from tools.doctor.clocks import Skew, clock_findings, skews_of
+from tools.doctor.network import Skew, clock_findings, skews_of
 
 
 class Shifted(Clock):

@@ -14,10 +14,10 @@ from pathlib import Path
 
 import pytest
 
+from recording.capture import RecordingStats
 from recording.formatting import format_bytes, format_progress, format_result
-from recording.keyboard import names_of
+from recording.player import names_of
 from recording.reader import Recording
-from recording.sink import RecordingStats
 from recording.summary import summarise
 from tests.cli.conftest import make_folder
 from tests.harness import PATIENCE, Place, Zencell, ask, command_line, environment, free_domain, place_of

@@ -6,8 +6,16 @@ import threading
 
 from rich.console import Console
 
-from cli.session.live_table import MOST_LINES, LiveScreen, render
-from cli.session.screens import Content, JsonScreen, PlainScreen, ScreenHandler, open_screen
+from cli.session.screens import (
+    MOST_LINES,
+    Content,
+    JsonScreen,
+    LiveScreen,
+    PlainScreen,
+    ScreenHandler,
+    open_screen,
+    render,
+)
 from common.messages import ServiceStatus
 
 CONTENT = Content(

@@ -6,7 +6,7 @@ from typer.testing import CliRunner
 
 from cli import options
 from cli.main import app as zencell
-from cli.target import RUNNING, CellTarget, CommandGroup
+from cli.options import RUNNING, CellTarget, CommandGroup
 
 seen: list[tuple[CellTarget, str]] = []
 app = CommandGroup("CommandGroup.")

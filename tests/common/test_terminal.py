@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from cli.session.live_table import render
-from cli.session.screens import Content, PlainScreen
+from cli.session.screens import Content, PlainScreen, render
 from cli.top import services_table, topics_table
 from common.client.monitor import ServiceRow, TopicRow
 from common.messages import ServiceStatus

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from deploy.containers import USER
+from deploy.compose import USER
 from deploy.generate import ROOT
 from tests.deploy.engine import Containers, build_image, require_engine, run
 

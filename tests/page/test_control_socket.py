@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from page.access import CURRENT_SESSION, PageSession, Permissions
 from page.console import ActionQueue
 from page.control_socket import (
     GRACE,
@@ -19,7 +20,6 @@ from page.control_socket import (
     LossDetector,
     PressDelay,
 )
-from page.permissions import CURRENT_SESSION, PageSession, Permissions
 
 SESSION = PageSession(1, "127.0.0.1", frozenset({"look", "operate"}))
 AVAILABLE = {"arm": ("no arm", True), "task": ("no task", True)}

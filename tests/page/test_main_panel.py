@@ -7,9 +7,9 @@ import pytest
 import viser
 
 from common.messages import MotionOwner
+from page.access import CURRENT_SESSION, PageSession, Permissions
 from page.console import ActionQueue
 from page.main_panel import ControllerPanel, TaskPanel
-from page.permissions import CURRENT_SESSION, PageSession, Permissions
 
 FIRST, SECOND = (PageSession(n, f"10.0.0.{n}", frozenset({"look", "operate"})) for n in (1, 2))
 

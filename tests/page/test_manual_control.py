@@ -9,9 +9,9 @@ import viser
 
 from common.messages import MotionOwner, MotionStatus
 from common.time_source import use_time_source
+from page.access import PAGE, Permissions
 from page.console import ActionQueue
 from page.manual_control import Jogger, JogPanel
-from page.permissions import PAGE, Permissions
 from tests.page.test_permissions import Clock
 
 OURS, FREE = MotionOwner(owner=PAGE, kind="operator", jogging=True), MotionOwner()

@@ -25,8 +25,8 @@ from common.config import load_cell, service_config
 from common.config.tunables import describe
 from common.errors import ConfigError
 from page import server as page_server
+from page.access import Permission, Permissions
 from page.console import ActionQueue
-from page.permissions import Permission, Permissions
 from page.server import close_server, make_server
 from page.viser_inside import client_files, element_id
 from security.page_tokens import ROLES, TOKEN_VARIABLE

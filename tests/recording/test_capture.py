@@ -14,11 +14,10 @@ from common.transport.bus import Bus
 from common.transport.codec import encode
 from common.transport.local import LocalNetwork
 from common.transport.session import RawSample
-from recording.capture import Capture, CustomTopics
+from recording.capture import Capture, CustomTopics, Sink
 from recording.reader import Recording
 from recording.sample import Sample, schema_of
 from recording.selection import Selection
-from recording.sink import Sink
 from recording.writer import SplitWriter
 
 TWO_CAMERAS = str(Path(__file__).parents[1] / "data" / "two_cameras.yaml")

@@ -7,9 +7,9 @@ from random import Random
 
 import pytest
 
+from recording.capture import MAX_KEYS, Sink
 from recording.reader import Recording
 from recording.sample import MOST_WRITERS, RecordingError, Sequences
-from recording.sink import MAX_KEYS, Sink
 from recording.writer import SplitWriter, WriteFailed
 from tests.recording.samples import fill_disk, joints, status
 

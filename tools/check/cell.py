@@ -3,17 +3,25 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import pickle
-from collections.abc import Callable, Iterator, Mapping
-from typing import TYPE_CHECKING
+import xml.etree.ElementTree as ET
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from difflib import get_close_matches
+from typing import TYPE_CHECKING, NamedTuple
 
 from common.application import find_application
-from common.config import Cell, Surroundings
+from common.config import Cell, GripperConfig, RobotConfig, Surroundings
 from common.errors import ConfigError, ZencellError
 from common.hardware.loading import is_simulated
+from common.robot.finger_joints import driven_position
+from common.robot.urdf import merged_urdf
 from common.sim.interface import require_simulator
 from common.supervision.launch import module_command
-from tools.check import Finding, refusal
+from common.supervision.wiring import WiringFailed, wire_service
+from common.transport import ownership
+from common.transport.ownership import SHARED, Owner
+from tools.check import Finding, error, refusal, warning
 
 if TYPE_CHECKING:
     from common.robot.model import RobotModel
@@ -25,7 +33,7 @@ def blocking_errors(cell: Cell) -> list[Finding]:
     Errors that services find when they start are left out: parameters, joints and links of the robot, keys with two
     owners, and collisions at the home pose.
     """
-    from tools.check.robot_file import check_robot_file
+    from tools.check.cell import check_robot_file
 
     try:
         return [found for found in check_robot_file(cell.robot) if found.refused]
@@ -54,7 +62,7 @@ def quick_warnings(cell: Cell) -> list[Finding]:
 
 def check_files(cell: Cell) -> list[Finding]:
     """Return findings from the files; the robot model is loaded only for a camera on the arm."""
-    from tools.check.robot_file import check_robot_file
+    from tools.check.cell import check_robot_file
     from tools.check.world import check_world
 
     of_robot = _collect(lambda: check_robot_file(cell.robot))
@@ -144,3 +152,137 @@ async def warnings_in_subprocess(cell: Cell, environ: Mapping[str, str]) -> list
         raise QuickCheckFailed(f"the quick check failed (exit code {process.returncode}); see `zencell check`")
     found: list[Finding] = pickle.loads(output)
     return found
+
+
+TURNS, SLIDES = ("revolute", "continuous"), ("prismatic",)  # joint types
+SLACK = 1e-3  # [m] or [rad] by which a finger position may exceed its limit: both files have rounded numbers
+
+
+def check_robot_file(config: RobotConfig) -> Iterator[Finding]:
+    """Yield contradictions between a robot file and its description.
+
+    Raises:
+        ConfigError: the description does not exist, or cannot be parsed.
+    """
+    gripper = config.gripper
+    if gripper is None:
+        return
+    robot = ET.fromstring(merged_urdf(config))
+    links = [link.get("name", "") for link in robot.findall("link")]
+    joints = {joint.get("name", ""): joint for joint in robot.findall("joint")}
+    for name in gripper.links:
+        if name not in links:
+            yield error(f"robot.gripper.links: {name!r} is no link of the description, so that the fingers may not "
+                        "touch what they take", f"name links among {', '.join(links)}", refused=True)
+    moving = [name for name, joint in joints.items() if joint.get("type") in (*TURNS, *SLIDES)]
+    for number, name in enumerate(gripper.joints):
+        if name not in moving:
+            yield error(f"robot.gripper.joints: {name!r} is no joint of the description that moves",
+                        f"name joints among {', '.join(moving)}", refused=True)
+        elif name in config.joints:
+            yield error(f"robot.gripper.joints: {name!r} is one of robot.joints, too: the arm would move as the "
+                        "fingers close", "leave it in one of the two", refused=True)
+        else:
+            yield from _opening(gripper, number, joints[name])
+
+
+def _opening(gripper: GripperConfig, number: int, joint: ET.Element) -> Iterator[Finding]:
+    """Check that a finger's joint fits the conversion of widths to its positions."""
+    name, turns = gripper.joints[number], joint.get("type") in TURNS
+    angles = "linkage" if gripper.linkage is not None else "jaw" if gripper.jaw is not None else ""
+    if turns and not angles and number == 0:
+        yield error(f"robot.gripper.joints: {name!r} turns ({joint.get('type')}), but without gripper.linkage half of "
+                    "the width [m] is taken for its position [rad]", "give gripper.linkage: length, open_angle and "
+                    "closed; or gripper.jaw, where the other finger is fixed", refused=True)
+        return
+    if not turns and angles and number == 0:
+        yield error(f"robot.gripper.joints: {name!r} slides ({joint.get('type')}), but gripper.{angles} gives angles "
+                    "for it", f"leave gripper.{angles} out", refused=True)
+        return
+    if turns and not angles:
+        return
+    limit, factor = joint.find("limit"), gripper.mimic[number] if gripper.mimic else 1.0
+    if limit is None or joint.get("type") == "continuous":
+        return
+    low, high = (float(limit.get(side, "nan")) for side in ("lower", "upper"))
+    unit = "rad" if turns else "m"
+    ends = [factor * driven_position(gripper, width) for width in (0.0, gripper.max_width)]
+    if not (math.isnan(low) or math.isnan(high)) and (min(ends) < low - SLACK or max(ends) > high + SLACK):
+        yield warning(f"robot.gripper: {name!r} would go from {min(ends):g} to {max(ends):g} {unit} between closed and "
+                      f"open, its limits are {low:g} to {high:g}",
+                      f"correct gripper.max_width, gripper.{angles or 'closed'} or gripper.mimic")
+
+
+VIEWER = "viewer"  # shows any topics, so none is missing
+
+
+def examine(cell: Cell) -> Iterator[Finding]:
+    """Yield all findings of a cell, each once; the quick ones first."""
+    known: set[str] = set()
+    for found in (*check_files(cell), *check_model(cell), *wiring(cell)):
+        if not any(found.what.startswith(what) for what in known):  # a service may find the same
+            known.add(found.what)
+            yield found
+
+
+def wiring(cell: Cell) -> Iterator[Finding]:
+    """Yield configurations that services refuse, a missing task, and keys that do not match."""
+    found, complete = [], True
+    if cell.task not in cell.services:
+        yield error(f"task: {cell.task!r} is no service of the cell, so that a run never ends",
+                    f"name one of {', '.join(cell.services)}")
+    for entry in cell.services.values():
+        try:
+            each = wire_service(cell, entry)
+        except ConfigError as problem:
+            yield refusal(problem)
+        except WiringFailed as problem:
+            yield error(str(problem), "correct the service, or its parameters", refused=True)
+        except ZencellError as problem:
+            yield error(f"services.{entry.name}: {problem}", "correct it", refused=True)
+        else:
+            found.append(Keys(each.name, each.reads, each.writes, each.serves, each.calls, entry.kind == VIEWER))
+            continue
+        complete = False
+    for finding in check_wiring(found):
+        if complete or finding.severity == "error":  # keys of a refused service are unknown
+            yield finding
+
+
+PER_SERVICE = ("log", "counters", "param")  # first parts of keys that each service or the supervisor has
+
+
+class Keys(NamedTuple):
+    """Keys of a service in the cell."""
+
+    service: str
+    reads: Collection[str]
+    writes: Collection[str]
+    serves: Collection[str]
+    calls: Collection[str]
+    reads_any: bool = False  # a viewer, whose unwritten keys are no problem
+
+
+def check_wiring(services: Sequence[Keys]) -> Iterator[Finding]:
+    """Yield keys with two owners, and keys that are read or called but not written or served."""
+    owners: dict[str, str] = {}
+    reported: set[tuple[str, str]] = set()
+    for each in services:
+        for key in sorted({*each.writes, *each.serves} - {*SHARED}):
+            first = owners.setdefault(key, each.service)
+            if first != each.service and (first, each.service) not in reported:
+                reported.add((first, each.service))
+                said = ownership.refusal(Owner(key, key, each.service, each.service), Owner(key, key, first, first))
+                what, _, remedy = said.partition(": ")
+                yield error(f"services.{each.service}: {what}", remedy, refused=True)
+    served = {key for each in services for key in each.serves}
+    for each in services:
+        if each.reads_any:
+            continue
+        for verb, done, keys in (("reads", "writes", {*each.reads} - {*owners, *SHARED}),
+                                 ("calls", "serves", {*each.calls} - served)):
+            for key in sorted(key for key in keys if key.partition("/")[0] not in PER_SERVICE):
+                near = get_close_matches(key, owners, n=1)
+                remedy = f"add the service that {done} it, or rename it with topics of services.{each.service}"
+                yield warning(f"services.{each.service}: {verb} {key}, which no service of the cell {done}",
+                              remedy + (f" (is it {near[0]}?)" if near else ""))

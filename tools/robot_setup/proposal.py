@@ -19,7 +19,6 @@ from common.robot.finger_joints import finger_positions
 from common.robot.model import RobotModel
 from common.robot.transforms import invert, matrix_to_rpy, transform
 from common.robot.urdf import read_urdf
-from tools.robot_setup.disabled_collisions import disabled_pairs, srdf
 from tools.robot_setup.end_effector import (
     GripperProposal,
     check_gripper,
@@ -30,7 +29,7 @@ from tools.robot_setup.end_effector import (
     section,
 )
 from tools.robot_setup.fingers import ALIGNED, link_points
-from tools.robot_setup.home import find_home
+from tools.robot_setup.sampling import disabled_pairs, find_home, srdf
 from tools.robot_setup.tree import (
     SPEED,
     TO_ACCELERATION,

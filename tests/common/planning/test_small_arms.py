@@ -18,8 +18,8 @@ from tests.common.planning.checks import assert_refused, last
 from tests.common.planning.requests import down, to
 from tests.common.planning.scenes import CELL, only
 from tests.small_arms import nodding, scara
-from tools.robot_setup.disabled_collisions import disabled_pairs, srdf
 from tools.robot_setup.proposal import draft
+from tools.robot_setup.sampling import disabled_pairs, srdf
 
 ANYWHERE = WorkspaceBounds(min_radius=0.1, max_radius=2.0)
 HOMES = {"scara": [0.3, 0.8, -0.02, 0.0], "nodding": [0.0, 0.2, 1.4, 1.5]}

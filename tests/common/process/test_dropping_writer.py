@@ -7,8 +7,7 @@ import os
 
 import pytest
 
-from common.process.dropping_writer import DroppingWriter
-from common.process.log import log_to_stderr
+from common.process.log import DroppingWriter, log_to_stderr
 
 SMALL = 4096
 WAIT = 20.0  # [s] until a test gives up

@@ -7,7 +7,7 @@ from common.atomic_file import ROOM
 from common.errors import Refused
 from common.messages import CollisionObject, SceneEdit
 from common.messages.scene import MAX_ADDED
-from common.scene.added_solids import AddedSolids, added_solids
+from common.scene.fixtures import AddedSolids, added_solids
 
 
 def edit(op: str = "add", name: str = "shelf", **more: Any) -> SceneEdit:

@@ -10,7 +10,7 @@ from common.config import ObjectConfig, World, check, config_root, read_yaml
 from common.errors import ConfigError, Refused
 from common.messages import Color, Vector3
 from common.robot.transforms import matrix_to_rpy, tool_down
-from common.sim import edits
+from common.sim import layout
 from common.sim.interface import ObjectSnapshot
 from common.sim.objects import centre_of
 from tests.common.sim.rig import BOX, CUBE, R, Rig
@@ -129,6 +129,7 @@ def test_dropped_ball_slips_out_of_closed_fingers(spot: tuple[float, float], lab
 
 # --- refusals ---
 
+
 BALLS = lambda: Rig.with_balls((0.5, 0.0), (0.3, 0.3))  # noqa: E731
 CUBES = lambda: Rig(CUBE)  # noqa: E731
 OBJECTS = lambda: rig_of("w5")  # noqa: E731
@@ -192,8 +193,8 @@ def test_impossible_position_is_a_configuration_error(position: tuple[float, flo
 
 
 def test_number_of_objects_and_corners_is_limited(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert edits.MAX_OBJECTS <= 1000, "the limit of messages"
-    monkeypatch.setattr(edits, "MAX_OBJECTS", 3)
+    assert layout.MAX_OBJECTS <= 1000, "the limit of messages"
+    monkeypatch.setattr(layout, "MAX_OBJECTS", 3)
     rig = Rig.with_balls()
     small = {"shape": "sphere", "size": Vector3(x=0.01)}
     for i in range(2):
@@ -202,8 +203,8 @@ def test_number_of_objects_and_corners_is_limited(monkeypatch: pytest.MonkeyPatc
         rig.edit("add", at=(0.7, 0.0), **small)
     rig.edit("remove", "sphere_1")
     rig.edit("add", at=(0.7, 0.0), **small)
-    monkeypatch.setattr(edits, "MAX_OBJECTS", 100)
-    monkeypatch.setattr(edits, "MAX_CORNERS", 500)
+    monkeypatch.setattr(layout, "MAX_OBJECTS", 100)
+    monkeypatch.setattr(layout, "MAX_CORNERS", 500)
     cylinder = {"shape": "cylinder", "size": Vector3(x=0.01, y=0.01, z=0.01)}
     rig.edit("add", at=(0.3, 0.2), **cylinder)
     with pytest.raises(Refused, match="at most 500"):

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from common.config import CameraConfig, Scenery, load_cell
-from common.config.objects import Light
+from common.config.world import Light
 from common.messages import Color, Header, JointState, Pose, Vector3, WorldObject
 from common.perception.pinhole import Pinhole
 from common.robot.model import RobotModel

@@ -13,8 +13,8 @@ from common.robot.model import RobotModel
 from common.robot.transforms import pose_to_matrix
 from common.sim.kinematic import KinematicWorld
 from common.sim.objects import solid_of, solid_of_message
-from drivers.mujoco.mesh_cache import cached_arrays
 from drivers.mujoco.model import CellModel, build_model
+from drivers.mujoco.robot import cached_arrays
 from drivers.mujoco.scene import SceneObject
 
 SHAPES = [

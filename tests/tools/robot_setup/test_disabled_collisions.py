@@ -8,7 +8,7 @@ from common.config import RobotConfig, load_cell
 from common.planning.robot_geometry import RobotGeometry, convex_hulls
 from common.robot.model import RobotModel
 from tests.common.planning.ur5_scene import ROBOT
-from tools.robot_setup.disabled_collisions import disabled_pairs, sample_configurations, srdf
+from tools.robot_setup.sampling import disabled_pairs, sample_configurations, srdf
 
 PANDA = RobotModel.load(load_cell("panda").robot)
 

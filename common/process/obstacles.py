@@ -1,17 +1,73 @@
-"""Hold the arm while an object in the newest planning scene obstructs the rest of the running motion."""
+"""Obstacles of the planner: camera points for plans, and a hold while an object obstructs the running motion."""
 
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, Literal
 
 from common import topics
 from common.config import RobotConfig
-from common.errors import RemoteError, RequestFailed
-from common.messages import FollowedRequest, HoldRequest, MotionStatus, PlanningScene
+from common.errors import Refused, RemoteError, RequestFailed
+from common.messages import CameraInfo, FollowedRequest, HoldRequest, Image, MotionStatus, PlanningScene, PointCloud2
+from common.planning.camera_obstacles import Camera, CameraMessages, CameraObstacles, JointHistory, PointsOptions
+from common.planning.pipeline import PlanningPipeline
+from common.planning.point_obstacles import PointObstacle
 from common.planning.scene_monitor import NotMonitored, SceneMonitor
 from common.transport.bus import Bus
 from common.transport.reader import Reader
+
+
+class ObstacleReader:
+    """The newest messages of each camera, and the joint positions of the last seconds."""
+
+    _obstacles: CameraObstacles  # set by `load`
+    _joints: JointHistory
+
+    def __init__(self, bus: Bus, options: PointsOptions) -> None:
+        self._bus, self._options = bus, options
+        self._readers = [_readers(bus, camera) for camera in options.cameras]
+        self._poses, self._states = bus.reader(topics.TF_STATIC), bus.reader(topics.JOINT_STATES)
+
+    def load(self, pipeline: PlanningPipeline) -> None:
+        """Load the robot's geometry."""
+        self._obstacles = CameraObstacles(pipeline.robot, pipeline.geometry, self._options)
+        self._joints = JointHistory(pipeline.robot)
+
+    async def follow(self) -> None:
+        """Record joint states until cancelled."""
+        async for state in self._states:
+            self._joints.add(state)
+
+    def snapshot(self, scene: PlanningScene, stage: str) -> Callable[[], list[PointObstacle]]:
+        """Return a function for a thread that computes the obstacles of the messages received until now.
+
+        The function raises Refused with the stage and the reason if the messages of a camera cannot be used.
+        """
+        now, poses = self._bus.clock.now_ns(), self._poses.latest
+        seen = [
+            CameraMessages(camera, images.latest, None if infos is None else infos.latest)
+            for camera, (images, infos) in zip(self._options.cameras, self._readers, strict=True)
+        ]
+
+        def obstacles() -> list[PointObstacle]:
+            try:
+                return self._obstacles.obstacles(seen, poses, self._joints, scene, now)
+            except Refused as error:
+                raise Refused(error.code, f"{stage}: {error}") from None
+
+        return obstacles
+
+
+def _readers(
+    bus: Bus, camera: Camera
+) -> tuple[Reader[PointCloud2] | Reader[Image], Reader[CameraInfo] | None]:
+    if camera.points:
+        return bus.reader(replace(topics.DEPTH_CAMERA_POINTS, key=camera.points)), None
+    depths = bus.reader(replace(topics.DEPTH_CAMERA_DEPTH, key=camera.depth))
+    return depths, bus.reader(replace(topics.DEPTH_CAMERA_INFO, key=camera.info))
+
 
 HOLDER: Literal["scene_monitor"] = "scene_monitor"
 REQUEST_TIMEOUT = 0.2  # [s] wall; the request is repeated after that

@@ -1,8 +1,11 @@
-"""Pairs of links that need no collision check: found by sampling, written as an SRDF."""
+"""Properties of a robot from sampled configurations: a home pose, and pairs of links that need no collision check."""
 
 from __future__ import annotations
 
+import itertools
+import math
 import xml.etree.ElementTree as ET
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -10,11 +13,142 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from common.planning.robot_geometry import convex_hulls
+from common.planning.ik import controls_full_pose, solve_tool_down_ik
+from common.planning.robot_geometry import RobotGeometry, convex_hulls
 from common.robot.finger_joints import finger_positions
 from common.robot.model import RobotModel
 
 Array = NDArray[np.float64]
+
+RADII, HEIGHTS = (0.4, 0.5, 0.6, 0.7), (0.2, 0.3, 0.4, 0.5)  # of the tool, in units of the reach with the tool down
+LOWER = (0.15, 0.1, 0.06)  # for arms that do not reach those heights, such as SCARA arms
+LOW = 0.03  # above the table, in units of the reach of the stretched arm
+TURNS = (0.0, math.pi / 2, -math.pi / 2, math.pi, math.pi / 4, -math.pi / 4)  # of the tool [rad]
+SEEDS = 6
+EVALUATED = 12  # best candidates
+PLACES = [(radius, angle) for radius in (0.45, 0.65, 0.85) for angle in (-0.9, -0.45, 0.0, 0.45, 0.9)]
+STEPS = 16  # IK iterations, as in the reach test of a cell
+
+
+@dataclass(frozen=True)
+class Home:
+    """Joint positions (dof,) [rad], whether the tool points down, and the share of test positions in reach."""
+
+    positions: Array
+    down: bool
+    served: float
+    hits: list[str]  # colliding pairs of links; empty if a free pose was found
+
+
+def find_home(robot: RobotModel, geometry: RobotGeometry) -> Home:
+    """Return the pose from which most positions in front of the arm are in reach with the tool down.
+
+    Candidates are all collision-free IK solutions with the tool down in front of the base. Those farthest from joint
+    limits and with the links high above the table are evaluated. For an arm that cannot point down, the result is the
+    middle of its joint ranges, or the best of random poses.
+    """
+    rng = np.random.default_rng(0)
+    middle = (robot.lower + robot.upper) / 2
+    neutral = np.clip(np.zeros(robot.dof), robot.lower + 0.15 * (robot.upper - robot.lower),
+                   robot.upper - 0.15 * (robot.upper - robot.lower))
+    seeds = [neutral, middle, *(rng.uniform(robot.lower, robot.upper) for _ in range(SEEDS))]
+    table = float(robot.config.base_position[2])
+    reach = down_reach(robot, table)
+
+    def down_at(heights: Sequence[float]) -> Iterator[tuple[float, Array]]:
+        for radius, height, turn in itertools.product(RADII, heights, _turns(robot)):
+            x, y = place(robot, radius * reach, 0.0)
+            for seed in seeds:
+                q = solve_tool_down_ik(robot, (x, y, table + height * reach), turn, seed, iterations=60)
+                if q is not None and not hits(robot, geometry, q):
+                    yield _comfort(robot, q, neutral, table) + height, q
+
+    found = (list(down_at(HEIGHTS)) or list(down_at(LOWER))) if reach else []
+    found.sort(key=lambda each: -each[0])
+    best = [(_served(robot, geometry, q, table, reach), value, q) for value, q in _different(found)[:EVALUATED]]
+    if best:
+        served, _, q = max(best, key=lambda each: each[0] + each[1])
+        return Home(q, True, served, [])
+    poses = [neutral, middle, *(rng.uniform(robot.lower, robot.upper) for _ in range(200))]
+    free = [q for q in poses if not hits(robot, geometry, q)]
+    if free[:1]:
+        return Home(max(free, key=lambda q: _comfort(robot, q, neutral, table)), False, 0.0, [])
+    return Home(neutral, False, 0.0, hits(robot, geometry, neutral))
+
+
+def _turns(robot: RobotModel) -> tuple[float, ...]:
+    """Return yaw angles of the tool [rad]: one suffices for an arm that cannot choose its yaw."""
+    return TURNS if controls_full_pose(robot) else TURNS[:1]
+
+
+def down_reach(robot: RobotModel, table: float) -> float:
+    """Return the largest distance from the base axis at which the tool can point down just above a table [m].
+
+    0 if there is none. `table` is the height of the table [m].
+    """
+    middle = (robot.lower + robot.upper) / 2
+    for share in np.arange(1.0, 0.1, -0.05):
+        x, y = place(robot, float(share) * robot.reach, 0.0)
+        at = x, y, table + 2 * LOW * robot.reach
+        if any(solve_tool_down_ik(robot, at, turn, middle, restarts=30, iterations=40) is not None
+               for turn in _turns(robot)):
+            return float(share) * robot.reach
+    return 0.0
+
+
+def place(robot: RobotModel, radius: float, angle: float) -> tuple[float, float]:
+    """Return (x, y) [m] at a radius [m] and an angle [rad] from the base's x axis."""
+    heading = robot.base_axes[:2, 0]
+    turned = math.atan2(heading[1], heading[0]) + angle
+    x, y = robot.foot[:2] + radius * np.array([math.cos(turned), math.sin(turned)])
+    return float(x), float(y)
+
+
+def _comfort(robot: RobotModel, q: Array, neutral: Array, table: float) -> float:
+    """Return a score, larger is better: far from joint limits and singularities, near zero, links above the table."""
+    margin = float((np.minimum(q - robot.lower, robot.upper - q) / (robot.upper - robot.lower)).min())
+    singular = float(np.linalg.svd(robot.jacobian(q), compute_uv=False)[min(robot.dof, 6) - 1])
+    heights = [pose[2, 3] - table for pose in robot.link_poses(q).values()]
+    low = min(0.0, float(np.sort(heights)[min(2, len(heights) - 1)]) - 0.02 * robot.reach)
+    raised = float(np.mean(heights)) / robot.reach
+    away = float(np.abs(q - neutral).max()) / math.pi
+    return 2 * min(margin, 0.15) + min(singular, 0.2) + raised / 2 - 0.5 * away + 10 * low
+
+
+def _different(found: list[tuple[float, Array]]) -> list[tuple[float, Array]]:
+    """Return the candidates without those similar to an earlier one."""
+    chosen: list[tuple[float, Array]] = []
+    for value, q in found:
+        if all(float(np.abs(q - other).max()) > 0.3 for _, other in chosen):
+            chosen.append((value, q))
+    return chosen
+
+
+def _served(robot: RobotModel, geometry: RobotGeometry, home: Array, table: float, reach: float) -> float:
+    """Return the share of test positions that IK reaches from a home pose with all links above the table.
+
+    It is low for a posture that needs the elbow below the table when the tool is low.
+    """
+    tried = []
+    for (radius, angle), height in itertools.product(PLACES, (LOW, 3 * LOW)):
+        at = *place(robot, radius * reach, angle), table + height * robot.reach
+        found = (solve_tool_down_ik(robot, at, turn, home, iterations=STEPS) for turn in _turns(robot))
+        tried.append(any(
+            q is not None and not hits(robot, geometry, q)
+            and min(pose[2, 3] for pose in robot.link_poses(q).values()) > table - 0.01 for q in found))
+    return sum(map(bool, tried)) / len(tried)
+
+
+def hits(robot: RobotModel, geometry: RobotGeometry, q: Array) -> list[str]:
+    """Return the colliding pairs of links."""
+    data, shapes = robot.model.createData(), pin.GeometryData(geometry.geometry)
+    pin.computeCollisions(robot.model, data, geometry.geometry, shapes, q, False)
+    pairs = geometry.geometry.collisionPairs
+    return list(dict.fromkeys(f"{geometry.links[pair.first]} and {geometry.links[pair.second]}"
+                              for pair, result in zip(pairs, shapes.collisionResults, strict=True)
+                              if result.isCollision()))
+
+
 Reason = Literal["Adjacent", "Fixed", "Always", "Never"]
 
 ALMOST_ALWAYS = 0.95  # of the samples
