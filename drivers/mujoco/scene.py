@@ -109,7 +109,6 @@ def _volume(points: Array) -> float:
 
 # Contact parameters and collision filtering; docs/physics.md explains the values
 
-
 TIMESTEP = 0.002  # [s]
 IMPRATIO = 10.0  # friction stiffer than contact: held objects do not creep
 SOLREF = (0.004, 1.0)  # time constant [s], damping; with MuJoCo's default 0.02 fingers sink 11 mm into objects
@@ -154,7 +153,6 @@ def visual_only(geom: Any) -> Any:
 
 
 # Surroundings and cameras
-
 
 MIN_HEIGHT = 0.3  # [m] smallest height of fixtures that reach the floor
 FLOOR_COLOR = (0.62, 0.62, 0.60, 1.0)

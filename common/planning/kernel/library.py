@@ -25,7 +25,7 @@ _SIGNATURES: dict[str, tuple[object, list[object]]] = {
     "zk_pairs": (c_int, [c_void_p, c_int, c_void_p, c_void_p]),
     "zk_rules": (None, [c_void_p, c_void_p, c_void_p, c_int, c_void_p, c_void_p, c_double]),
     "zk_keep": (c_int, [c_void_p, c_int, c_int, *[c_void_p] * 7]),
-    "zk_within": (c_int, [c_void_p, c_int, c_void_p, c_double, c_double, c_void_p]),
+    "zk_kept": (c_int, [c_void_p, c_int, c_void_p, c_double, c_double, c_void_p]),
     "zk_free": (None, [c_void_p]),
     "zk_scratch": (c_void_p, [c_void_p]),
     "zk_scratch_free": (None, [c_void_p]),

@@ -232,7 +232,7 @@ class KernelWorld:
         given, where = self._cubics(coefficients), c_double()
         with self._lock:
             piece = int(
-                self.library.zk_within(self._scratch, len(given), address(given), accepted, proved, byref(where)))
+                self.library.zk_kept(self._scratch, len(given), address(given), accepted, proved, byref(where)))
         return None if piece < 0 else (piece, where.value)
 
     def colliding(self, q: Array) -> int:

@@ -429,7 +429,7 @@ API int zk_cubics(scratch *c, int count, const double *coefficients, double *at)
 
 /* The first of cubics (count, 4, dof), as in zk_cubics, that violates a tool constraint, -1 if none, and where on it.
    States may use the share `accepted` of the slack; the share `proved` is proved between them. */
-API int zk_within(scratch *c, int count, const double *coefficients, double accepted, double proved, double *at) {
+API int zk_kept(scratch *c, int count, const double *coefficients, double accepted, double proved, double *at) {
     curve e;
     for (int i = 0; i < count; i++) {
         cubic_curve(c->w, coefficients + 4 * c->w->dof * i, &e);
