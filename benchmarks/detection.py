@@ -18,8 +18,7 @@ import numpy.typing as npt
 from applications.pick_place.detector import Detector
 from common.config import Surroundings, load_cell
 from common.messages import Color, Pose, Vector3, WorldObject
-from common.perception.pinhole import Pinhole
-from common.perception.sphere import sphere_in_view
+from common.perception.pinhole import Pinhole, sphere_in_view
 from common.robot.model import RobotModel
 from common.scene.workspace import unreachable_reason
 from common.sim.rendering import draw

@@ -23,7 +23,7 @@ from benchmarks.detection import objects
 from common.config import Cell, Light, Scenery, Surroundings, load_cell
 from common.messages import Header, JointState, WorldObjects
 from common.perception.occlusion import RobotSilhouettes
-from common.perception.sphere import silhouettes as outlines
+from common.perception.pinhole import silhouettes as outlines
 from common.robot.model import RobotModel
 from common.sim.camera import CameraParameters, Lens, SimulatedCamera
 from drivers.mujoco.gl import select_gl

@@ -16,12 +16,10 @@ import numpy as np
 
 from common.config import Light, Scenery, load_cell
 from common.messages import Header, JointState, WorldObject
-from common.perception.pinhole import Pinhole
-from common.perception.sphere import silhouette
+from common.perception.pinhole import Pinhole, silhouette
 from common.robot.model import RobotModel
-from common.sim.depth_sensor import DepthSensorParameters, simulate_depth
 from common.sim.interface import load_world
-from common.sim.photometry import REFERENCE, Sensor, SensorParameters
+from common.sim.sensors import REFERENCE, DepthSensorParameters, Sensor, SensorParameters, simulate_depth
 from drivers.mujoco.gl import select_gl
 from drivers.mujoco.rendering import PhysicsRenderer
 

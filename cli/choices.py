@@ -1,6 +1,7 @@
-"""Completions of cells, robots, services, keys and parameters, each with a description.
+"""Shell completion: scripts of the shells, and choices of cells, services, keys and parameters with descriptions.
 
-They are read from syntax trees, so that a completion does not import pydantic: it must answer while a user types."""
+They are read from syntax trees, so that a completion does not import pydantic: it must answer while a user types.
+"""
 
 from __future__ import annotations
 

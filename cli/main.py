@@ -22,11 +22,9 @@ from cli import (
     choices,
     commands,
     node,
-    param,
     recording,
     robot,
     secure,
-    tf,
     top,
     topic,
     verbs,
@@ -113,8 +111,8 @@ app.command()(top.top)
 app.add_typer(topic.app, name="topic")
 app.command(context_settings={"ignore_unknown_options": True})(commands.call)
 app.add_typer(node.app, name="node")
-app.add_typer(param.app, name="param")
-app.add_typer(tf.app, name="tf")
+app.add_typer(node.param, name="param")
+app.add_typer(topic.tf, name="tf")
 app.command()(node.graph)
 app.add_typer(commands.task, name="task")
 app.add_typer(commands.world, name="world")

@@ -1,4 +1,4 @@
-"""compose.yaml: one container per service of each cell, and the router."""
+"""Containers of each cell (commands, environment, memory), and the text of compose.yaml."""
 
 from __future__ import annotations
 

@@ -13,9 +13,8 @@ from pydantic import BaseModel
 import zencell
 from cli.main import app
 from common.application import all_topics
-from common.client.arm import Arm
+from common.client.arm import Arm, Gripper
 from common.client.cell import Cell
-from common.client.gripper import Gripper
 from common.client.parameters import Parameters
 from common.client.scene import Scene, World
 from common.client.subscriptions import Camera

@@ -10,8 +10,7 @@ from typing import Any
 from common import topics
 from common.config import Cell, HardwareConfig, Parameters, RobotConfig
 from common.errors import ConfigError
-from common.hardware.interface import Gripper, Hardware, Limits, Vector
-from common.hardware.loading import find_backend, load_hardware
+from common.hardware.interface import Gripper, Hardware, Limits, Vector, find_backend, load_hardware
 from common.messages import SupervisorStatus
 from common.transport.codec import decode, decode_attachment
 from common.transport.reader import SequenceFilter

@@ -1,4 +1,4 @@
-"""Texts of the page for states and errors. A state also has a kind, which is its color: good, busy, bad, off."""
+"""Texts of the page for states, errors and rejected targets. A state's kind is its color: good, busy, bad, off."""
 
 from __future__ import annotations
 

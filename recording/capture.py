@@ -1,4 +1,4 @@
-"""Captures messages of a cell from the network for a recording."""
+"""Capture messages of a cell from the network, queue them, and write them to a file on a thread."""
 
 from __future__ import annotations
 

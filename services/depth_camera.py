@@ -15,9 +15,9 @@ from common.perception.image import array_to_image
 from common.process.service import main
 from common.process.timing import LoopRate
 from common.sim.camera import CameraParameters, SimulatedCamera
-from common.sim.depth_sensor import DepthSensorParameters, simulate_depth
 from common.sim.ray_caster import View
 from common.sim.rendering import add_depth_noise
+from common.sim.sensors import DepthSensorParameters, simulate_depth
 from common.transport.bus import Bus
 
 

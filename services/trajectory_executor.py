@@ -25,15 +25,21 @@ from common.control.request_handlers import MAX_STOPS, RequestHandlers
 from common.control.status import Report
 from common.control.trajectory import Tolerances
 from common.errors import ConfigError
-from common.hardware.interface import ControlledArm, Limits
-from common.hardware.loading import is_simulated, load_hardware
+from common.hardware.interface import ControlledArm, Limits, is_simulated, load_hardware
 from common.messages import MotionOwner, MotionStatus
 from common.process.service import main
 from common.robot.model import RobotModel
 from common.scene.workspace import configured_bounds
 from common.sim.interface import GraspTolerances, PhysicalWorld
-from common.sim.simulated_cell import Saver, SimulatedCell, create_world, matching_state
-from common.sim.state_file import BackgroundSaver, StateFile, state_file
+from common.sim.simulated_cell import (
+    BackgroundSaver,
+    Saver,
+    SimulatedCell,
+    StateFile,
+    create_world,
+    matching_state,
+    state_file,
+)
 from common.transport.bus import Bus
 from common.transport.writer import Writer
 

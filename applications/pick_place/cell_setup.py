@@ -16,7 +16,7 @@ from common.application import Checks
 from common.config import CameraConfig, Cell, Container, Grasp, ObjectConfig, Reach, service_config
 from common.config.basics import Rgb
 from common.errors import ConfigError
-from common.hardware.loading import is_simulated
+from common.hardware.interface import is_simulated
 from common.perception.pinhole import Pinhole
 from common.planning.ik import controls_full_pose, solve_tool_down_ik
 from common.planning.robot_geometry import RobotGeometry

@@ -49,8 +49,7 @@ from applications.pick_place.sphere_fit import Fit, fit_each, fit_spheres, separ
 from common.config import CameraConfig, Parameters, Surroundings, Tunable
 from common.perception.depth import Depth
 from common.perception.illumination import BoolMask, blank_image_reason, blue_share, sampled_pixels
-from common.perception.pinhole import Pinhole
-from common.perception.sphere import ray_distances, silhouettes
+from common.perception.pinhole import Pinhole, ray_distances, silhouettes
 
 Array = npt.NDArray[np.float64]
 Picture = npt.NDArray[np.uint8]

@@ -16,8 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from applications.pick_place.segmentation import Mask, Outline
-from common.perception.pinhole import Pinhole
-from common.perception.sphere import ray_distances, silhouettes
+from common.perception.pinhole import Pinhole, ray_distances, silhouettes
 
 Array = npt.NDArray[np.float64]
 

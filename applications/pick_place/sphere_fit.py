@@ -17,8 +17,7 @@ import numpy.typing as npt
 
 from applications.pick_place.ball_places import BallGeometry
 from applications.pick_place.segmentation import Mask, Outline
-from common.perception.pinhole import Pinhole
-from common.perception.sphere import ray_distances, silhouettes
+from common.perception.pinhole import Pinhole, ray_distances, silhouettes
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.intp]

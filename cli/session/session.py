@@ -209,7 +209,7 @@ class CellSession:
 
     @property
     def _simulated(self) -> bool:
-        from common.hardware.loading import is_simulated
+        from common.hardware.interface import is_simulated
 
         return is_simulated(self.cell.robot)
 

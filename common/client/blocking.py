@@ -17,13 +17,13 @@ import weakref
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from typing import Any, TypeVar
 
-from common.client import arm, cell, gripper, parameters, scene, subscriptions, task
+from common.client import arm, cell, parameters, scene, subscriptions, task
 from common.errors import ZencellError
 
 T = TypeVar("T")
 
 END_TIMEOUT = 5.0  # [s] for pending calls to end
-WRAPPED = (arm.Arm, gripper.Gripper, subscriptions.Camera, parameters.Parameters, task.TaskControl, scene.Scene,
+WRAPPED = (arm.Arm, arm.Gripper, subscriptions.Camera, parameters.Parameters, task.TaskControl, scene.Scene,
            scene.World)
 
 

@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 
 from common import topics
 from common.application import all_topics, find_topic
-from common.client.arm import Arm
+from common.client.arm import Arm, Gripper
 from common.client.frames import Frames
-from common.client.gripper import Gripper
 from common.client.joining import StartedCell, cell_clock, joined, operator_name, supervisor_status
 from common.client.keys import published_keys, require_key
 from common.client.parameters import Parameters

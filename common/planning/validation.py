@@ -1,4 +1,4 @@
-"""The last check of a trajectory before it is sent: what a real controller would refuse, and collisions."""
+"""Checks of a plan request before planning, and the last check of a trajectory: limits, continuity and collisions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Log lines as text or JSON on stderr and as messages on `log`, and a writer that drops lines instead of blocking."""
+"""Log lines as text or JSON on stderr and as messages on `log`, and a writer that drops lines instead of blocking.
+
+A reader stalls on Ctrl-S, behind a full pipe or on a full disk.
+"""
 
 from __future__ import annotations
 

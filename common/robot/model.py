@@ -1,4 +1,4 @@
-"""The robot model: joints of the planning group, limits, forward kinematics."""
+"""The robot model: joints of the planning group, limits, forward kinematics, and the home pose."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Solids of the configuration, fixtures and containers; and the slots of equal spheres in a container."""
+"""Solids that no camera sees: fixtures, containers with their slots for equal spheres, and solids of operators."""
 
 from __future__ import annotations
 

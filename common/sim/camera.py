@@ -16,8 +16,8 @@ from common.messages import CameraInfo, Header, JointState, Vector3, WorldObject
 from common.perception.camera_file import CameraFile, Rectifier
 from common.perception.pinhole import MountedCamera, Pinhole
 from common.sim.interface import load_renderer
-from common.sim.photometry import Sensor, SensorParameters
 from common.sim.ray_caster import View
+from common.sim.sensors import Sensor, SensorParameters
 
 if TYPE_CHECKING:  # only cameras that show the arm, or are mounted on it, load the robot model
     from common.robot.model import RobotModel

@@ -18,8 +18,7 @@ from common.errors import ConfigError, Refused, UnknownName
 from common.messages import Header, WorldEdit, WorldObject, WorldObjects
 from common.robot.finger_joints import closing_frame
 from common.robot.transforms import invert, transform
-from common.sim.bodies import Body, Rest, WorldEvents, restored
-from common.sim.gripping import pressed_ends
+from common.sim.bodies import Body, Rest, WorldEvents, pressed_ends, restored
 from common.sim.interface import GraspTolerances, ObjectSnapshot
 from common.sim.layout import new_body, requested_position, require_room
 from common.sim.objects import initial_pose, solid_of, solid_of_message

@@ -17,13 +17,12 @@ import numpy.typing as npt
 
 from common.config import Container, Scenery, Surroundings
 from common.messages import JointState, WorldObject
-from common.perception.pinhole import Pinhole
-from common.perception.sphere import silhouette
+from common.perception.pinhole import Pinhole, silhouette
 from common.robot.transforms import pose_to_matrix
 from common.scene.fixtures import container_panels
 from common.sim.objects import appearance_of, solid_of_message
-from common.sim.photometry import white_level
 from common.sim.ray_caster import Mesh, View, cast, empty_view
+from common.sim.sensors import white_level
 from common.sim.solids import fixture_mesh, primitive, transformed
 from common.sim.table import tables
 

@@ -1,4 +1,9 @@
-"""A cell from start to shutdown: run its processes, publish their status, kill frozen ones, react to signals."""
+"""A cell from start to shutdown: run its processes, publish their status, kill frozen ones, react to signals.
+
+The supervisor also copies log lines and counters to the plain keys `log` and `counters`, their names before each
+service had its own, for plain Zenoh clients and one version more. Our readers skip these copies
+(`common/transport/copies.py`). A message under the key of another service is not copied.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The bus: everything a service may do on the network, the same over Zenoh and in process."""
+"""The bus of a service: its operations on the network, the same over Zenoh and in process; one run of its coroutine."""
 
 from __future__ import annotations
 

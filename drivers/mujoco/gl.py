@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 
 from common.config import Scenery
 from common.perception.pinhole import Pinhole
-from common.sim.photometry import CUTOFF, ambient, lamps, tint
 from common.sim.ray_caster import View
+from common.sim.sensors import CUTOFF, ambient, lamps, tint
 
 Array = NDArray[np.float64]
 T = TypeVar("T")

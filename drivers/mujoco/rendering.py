@@ -1,7 +1,10 @@
 """Render the physics world with light, shadow and the arm: by OpenGL, or by ray casting without it.
 
 Pixel values are proportional to light and use their full range: `level` is the light of the value 255, and a sensor
-(`common/sim/photometry.py`) applies the exposure.
+(`common/sim/sensors.py`) applies the exposure.
+
+Nothing in the rendered model has mass or contact; links and objects are set to published poses. The dynamics model in
+`model.py` has coarser shapes.
 """
 
 from __future__ import annotations
@@ -21,9 +24,9 @@ from common.perception.pinhole import Pinhole
 from common.robot.model import RobotModel
 from common.robot.transforms import matrix_to_quaternion, pose_to_matrix
 from common.sim.objects import Solid, appearance_of, solid_of_message
-from common.sim.photometry import CUTOFF, ambient, lamps, tint, white_level
 from common.sim.ray_caster import View
 from common.sim.rendering import STILL, STILL_POSE, link_poses
+from common.sim.sensors import CUTOFF, ambient, lamps, tint, white_level
 from common.sim.table import tables
 from drivers.mujoco.gl import FAR, Canvas, SingleThread
 from drivers.mujoco.robot import cached_visual_meshes

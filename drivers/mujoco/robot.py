@@ -1,4 +1,4 @@
-"""Add a robot to a MuJoCo spec: bodies, joints, masses and shapes of its URDF, and finger couplings."""
+"""Add a robot to a MuJoCo spec: bodies, joints, masses, cached meshes of its URDF, and finger couplings."""
 
 from __future__ import annotations
 

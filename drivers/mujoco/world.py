@@ -22,8 +22,17 @@ from common.sim.interface import GraspTolerances, Numbers, ObjectSnapshot
 from common.sim.kinematic import KinematicWorld
 from drivers.mujoco.arm import PhysicsArm, tune
 from drivers.mujoco.model import CellModel, build_model
-from drivers.mujoco.object_states import REST_SPEED, Contacts, ObjectStates, pose_changed, snap_upright
-from drivers.mujoco.scene import DEFAULT_MASS, ROBOT, TIMESTEP, SceneObject
+from drivers.mujoco.scene import (
+    DEFAULT_MASS,
+    REST_SPEED,
+    ROBOT,
+    TIMESTEP,
+    Contacts,
+    ObjectStates,
+    SceneObject,
+    pose_changed,
+    snap_upright,
+)
 
 Array = NDArray[np.float64]
 

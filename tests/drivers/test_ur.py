@@ -12,8 +12,7 @@ import pytest
 
 from common.errors import ConfigError
 from common.hardware.driven_arm import DrivenArm, Reading
-from common.hardware.interface import Limits
-from common.hardware.loading import is_simulated
+from common.hardware.interface import Limits, is_simulated
 from drivers.ur import Options, create
 from tests.common.hardware.test_backends import robot
 from tests.doubles.ur_host import UrHost

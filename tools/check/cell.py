@@ -1,4 +1,7 @@
-"""Checks of a cell: from its files within milliseconds, and with a model of its robot."""
+"""Checks of a cell: its files within milliseconds, its robot with a model, and its services as they declare keys.
+
+`RobotModel` itself checks joints, locked_joints, tcp_link, base_link and the limits of named poses.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from common.application import find_application
 from common.config import Cell, GripperConfig, RobotConfig, Surroundings
 from common.errors import ConfigError, ZencellError
-from common.hardware.loading import is_simulated
+from common.hardware.interface import is_simulated
 from common.robot.finger_joints import driven_position
 from common.robot.urdf import merged_urdf
 from common.sim.interface import require_simulator

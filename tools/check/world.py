@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from common.application import Application
 from common.config import Cell, Container, GripperConfig, ObjectConfig, World
-from common.hardware.loading import is_simulated
+from common.hardware.interface import is_simulated
 from common.perception.pinhole import Pinhole
 from common.sim.footprints import overlap, within
 from common.sim.objects import Solid, initial_pose, solid_of

@@ -1,4 +1,4 @@
-"""All checks of a machine in order of importance, and the checks of its robot and cell files."""
+"""All checks of a machine in order of importance; Python, packages, kernel, cameras, robot and cell files."""
 
 from __future__ import annotations
 

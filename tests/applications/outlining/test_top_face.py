@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from applications.outlining.contours import ContourOptions, find_contours, is_hole
 from applications.outlining.top_face import TopFaceOptions, top_face
 from common.perception.depth import DepthError
-from common.sim.depth_sensor import DepthSensorParameters, simulate_depth
 from common.sim.objects import world_object
 from common.sim.ray_caster import Mesh, cast, empty_view
+from common.sim.sensors import DepthSensorParameters, simulate_depth
 from common.sim.solids import fixture_mesh
 from tests.applications.outlining.outline_scenes import WORLDS, dense, distances, seen, seen_world, upright, world
 

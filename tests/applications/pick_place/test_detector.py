@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 
 from applications.pick_place.detector import Detector, DetectorOptions, annotate, warm_up
 from common.config import Container, Surroundings
-from common.perception.pinhole import Pinhole
-from common.perception.sphere import ray_distances, silhouette, sphere_in_view
+from common.perception.pinhole import Pinhole, ray_distances, silhouette, sphere_in_view
 from common.robot.transforms import rpy_to_matrix, transform
 from tests.common.sim.spheres import draw_spheres
 

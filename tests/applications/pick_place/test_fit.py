@@ -6,8 +6,7 @@ from hypothesis import strategies as st
 from applications.pick_place.segmentation import Outline, all_of
 from applications.pick_place.sphere_fit import fit_each, fit_spheres
 from common.config import CameraConfig
-from common.perception.pinhole import Pinhole
-from common.perception.sphere import silhouette
+from common.perception.pinhole import Pinhole, silhouette
 
 camera = Pinhole.from_config(CameraConfig())
 R = 0.03

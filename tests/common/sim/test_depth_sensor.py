@@ -3,7 +3,7 @@ import pytest
 
 from common.config import CameraConfig
 from common.perception.pinhole import Pinhole
-from common.sim.depth_sensor import DepthSensorParameters, simulate_depth
+from common.sim.sensors import DepthSensorParameters, simulate_depth
 
 CAMERA = Pinhole.from_config(CameraConfig(width=320, height=240, cx=159.5, cy=119.5))
 BASELINE = 0.075

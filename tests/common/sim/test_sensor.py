@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from common.sim.photometry import EXPOSURE, REFERENCE, Sensor, SensorParameters, grey_balance, tint
+from common.sim.sensors import EXPOSURE, REFERENCE, Sensor, SensorParameters, grey_balance, tint
 
 DAY = np.full(3, REFERENCE)
 
