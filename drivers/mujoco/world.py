@@ -21,18 +21,8 @@ from common.sim.bodies import Body, WorldEvents
 from common.sim.interface import GraspTolerances, Numbers, ObjectSnapshot
 from common.sim.kinematic import KinematicWorld
 from drivers.mujoco.arm import PhysicsArm, tune
-from drivers.mujoco.model import CellModel, build_model
-from drivers.mujoco.scene import (
-    DEFAULT_MASS,
-    REST_SPEED,
-    ROBOT,
-    TIMESTEP,
-    Contacts,
-    ObjectStates,
-    SceneObject,
-    pose_changed,
-    snap_upright,
-)
+from drivers.mujoco.model import REST_SPEED, CellModel, Contacts, ObjectStates, build_model, pose_changed, snap_upright
+from drivers.mujoco.scene import DEFAULT_MASS, ROBOT, TIMESTEP, SceneObject
 
 Array = NDArray[np.float64]
 
