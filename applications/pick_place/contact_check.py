@@ -14,7 +14,8 @@ from applications.pick_place.topics import SCENE_BALLS
 from common import topics
 from common.config import Cell, Surroundings
 from common.messages import CollisionObject, GripperState, JointState, PlanningScene, Pose, PoseArray
-from common.planning.collision import CollisionWorld, Pair, interpolate
+from common.planning.collision import CollisionWorld, interpolate
+from common.planning.contact_rules import Pair
 from common.planning.obstacles import ObstacleCache
 from common.planning.robot_geometry import RobotGeometry
 from common.robot.finger_joints import measured_width

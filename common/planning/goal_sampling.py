@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from common.planning.collision import Pair
+from common.planning.contact_rules import Pair
 from common.planning.ik import controls_full_pose, solve_ik, solve_region_ik
 from common.planning.problem import Cancel, Problem, Region, Result
 from common.robot.transforms import invert, transform

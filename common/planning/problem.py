@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from common.messages import PlanAttempt
-from common.planning.collision import CollisionWorld, Pair
+from common.planning.collision import CollisionWorld
+from common.planning.contact_rules import Pair
 from common.planning.retiming import RetimingFailed
 from common.planning.trajectory import TimedPath, TooLong
 from common.robot.model import RobotModel

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from common.config import RobotConfig
 from common.errors import ZencellError
 from common.messages import CollisionObject, JointTrajectory, PlanningScene, PlanRequest
-from common.planning.collision import PERCEIVED, CollisionWorld, Hit
+from common.planning.collision import CollisionWorld, Hit
+from common.planning.contact_rules import PERCEIVED
 from common.planning.obstacles import InvalidShape, ObstacleCache
 from common.planning.robot_geometry import RobotGeometry
 from common.planning.trajectory import cubics, timed_path

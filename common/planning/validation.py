@@ -22,8 +22,9 @@ from common.messages import (
     PoseGoal,
     SequenceGoal,
 )
-from common.planning.collision import CollisionWorld, Pair, interpolate
+from common.planning.collision import CollisionWorld, interpolate
 from common.planning.constraints import ToolConstraints
+from common.planning.contact_rules import Pair
 from common.planning.problem import Arc, Goal, GoalChoice, GoalSequence, Region, SequenceItem, ToolPath
 from common.planning.trajectory import TimedPath, cubics, end_accelerations, sample
 from common.robot.model import RobotModel
