@@ -62,7 +62,7 @@ def _session(
 ) -> CellSession:
     """Return the session that the options of `run` and `up` describe; these are its parameters."""
     from common.supervision.lifecycle import interrupt_at_stdin_end
-    from security.validation import choose
+    from security.preflight import choose
 
     choose(secure)
     session = CellSession(

@@ -20,11 +20,10 @@ from recording.formatting import format_bytes, format_contents, require_new
 
 if TYPE_CHECKING:
     from recording.player import Player
-
-if TYPE_CHECKING:
     from recording.reader import Recording
     from recording.sample import Decoder
     from recording.selection import Selection
+
 
 MIN_FILE_SIZE = 1.0  # [MB] of a recording that is split
 
@@ -153,7 +152,6 @@ def play_(
 
     On a terminal space pauses, right steps one message, down one image, left goes back 5 s, q quits.
     """
-    from common.remapping import is_cell
     from common.transport.credentials import require_open_cell
     from recording.player import play, played_topics, renaming
     from recording.reader import Recording
@@ -181,14 +179,25 @@ def play_(
             return Player(recording, selection.wants, renamed, rate=speed, offset=offset, loop=loop,
                           paused=start_paused, stamp_now=stamp_now)
 
-        name = cell or recording.cell
-        if not name:
-            raise ConfigError("--cell", ..., f"{file} does not name its cell: name one")
-        if not is_cell(name):
-            raise ConfigError("--cell", name, "is not a valid name of a cell")
-        show = rewrite if on_terminal else None
+        name, show = _cell_of(recording, file, cell), rewrite if on_terminal else None
         code = asyncio.run(play(create, recording, played, name, wait or [], domain, connect, echo, show))
     raise typer.Exit(code)
+
+
+def _cell_of(recording: Recording, file: str, named: str | None) -> str:
+    """Return the cell as which a recording is played: the named one, else that of the recording.
+
+    Raises:
+        ConfigError: there is none, or its name is not valid.
+    """
+    from common.remapping import is_cell
+
+    name = named or recording.cell
+    if not name:
+        raise ConfigError("--cell", ..., f"{file} does not name its cell: name one")
+    if not is_cell(name):
+        raise ConfigError("--cell", name, "is not a valid name of a cell")
+    return name
 
 
 PLOT_ERRORS = (ArithmeticError, ValueError, LookupError, TypeError)  # errors from values that no real run contains

@@ -18,7 +18,9 @@ from common.terminal import echo
 
 if TYPE_CHECKING:
     from common.robot.model import RobotModel
+    from tools.robot_setup.files import Layout
     from tools.robot_setup.proposal import Proposal
+    from tools.robot_setup.tree import Tree
 
 app = CommandGroup("Prepare a robot file, command the arm's controller, jog the arm.")
 
@@ -218,9 +220,9 @@ def new(
     """Write a robot file from a URDF: declared and measured values, and guesses, which are marked."""
     from common.config import names_of
     from common.robot.urdf import read_urdf
-    from tools.robot_setup.files import folders_of_meshes, robot_file, world_layout, write_cell
-    from tools.robot_setup.proposal import draft, finish
-    from tools.robot_setup.tree import find_wrists, read_tree
+    from tools.robot_setup.files import folders_of_meshes, robot_file, write_cell
+    from tools.robot_setup.proposal import finish
+    from tools.robot_setup.tree import read_tree
 
     sources = {"urdf": urdf, "--gripper": gripper}
     urdf, gripper = (_as_urdf(each, out, force) for each in (urdf, gripper))
@@ -237,21 +239,8 @@ def new(
     template = like or names_of("cells")[0]
     _require_writable("--out", path, force)
     _require_writable("--out", pairs, force, (".srdf",))
-    layout = None
-    if cell:
-        _require_writable("--cell", Path(cell).expanduser(), force)
-        if Path(cell).expanduser().resolve() == path.resolve():
-            raise ConfigError("--cell", cell, "is the file of the robot: name another file")
-        layout = world_layout(template)
-    wrists = find_wrists(tree)
-    if tip is None and len(wrists) > 1 and not yes:
-        longest = max(wrists, key=lambda link: len(tree.above(link)))
-        tip = _ask(f"arms end at {', '.join(wrists)}; which", longest, yes)
-    made = draft(urdf, chosen, gripper=gripper, tip=tip, package_dirs=folders)
-    fitting = [each.link for each in made.candidates if each.fits]
-    if tip is None and len(fitting) > 1 and not yes:
-        tip = _ask(f"tool centre point: {', '.join(fitting)}; which", made.values.get("tcp_link", fitting[0]), yes)
-        made = draft(urdf, chosen, gripper=gripper, tip=tip, package_dirs=folders)
+    layout = _layout_of(cell, path, template, force) if cell else None
+    made = _draft(tree, urdf, chosen, gripper, tip, folders, yes)
     echo("computing collision pairs and a home pose: a few seconds, a minute with detailed meshes", err=True)
     robot = finish(made)
     head = f"{chosen}, written by `zencell robot new` from its URDF. Check the values marked GUESSED."
@@ -265,6 +254,36 @@ def new(
     echo(f"      zencell up {where} --set autostart=false    # check it on its page: View, Frames")
     if robot.config.gripper is not None:
         echo(f"      zencell run {where}")
+
+
+def _layout_of(cell: str, robot: Path, template: str, force: bool) -> Layout:
+    """Return the layout for the world of a new cell; its file must be writable, and not that of the robot."""
+    from tools.robot_setup.files import world_layout
+
+    path = Path(cell).expanduser()
+    _require_writable("--cell", path, force)
+    if path.resolve() == robot.resolve():
+        raise ConfigError("--cell", cell, "is the file of the robot: name another file")
+    return world_layout(template)
+
+
+def _draft(
+    tree: Tree, urdf: str, name: str, gripper: str, tip: str | None, folders: list[str], yes: bool
+) -> Proposal:
+    """Return a draft of the robot file; ask for the end of the arm if several links may be it."""
+    from tools.robot_setup.proposal import draft
+    from tools.robot_setup.tree import find_wrists
+
+    wrists = find_wrists(tree)
+    if tip is None and len(wrists) > 1 and not yes:
+        longest = max(wrists, key=lambda link: len(tree.above(link)))
+        tip = _ask(f"arms end at {', '.join(wrists)}; which", longest, yes)
+    made = draft(urdf, name, gripper=gripper, tip=tip, package_dirs=folders)
+    fitting = [each.link for each in made.candidates if each.fits]
+    if tip is None and len(fitting) > 1 and not yes:
+        tip = _ask(f"tool centre point: {', '.join(fitting)}; which", made.values.get("tcp_link", fitting[0]), yes)
+        made = draft(urdf, name, gripper=gripper, tip=tip, package_dirs=folders)
+    return made
 
 
 @app.command()

@@ -125,7 +125,8 @@ def check(
     from common.errors import ConfigError
     from common.transport.credentials import OPERATOR, RECORDER, ROUTER_NAME, common_name, read_access
     from security.access import rights_in
-    from security.validation import renewal, require_current, require_valid
+    from security.preflight import renewal
+    from security.validation import require_current, require_valid
 
     if only and len(cells or ()) != 1:
         raise ConfigError("--only", ",".join(only), "needs the one cell that they are services of: --cell CELL")
@@ -163,7 +164,8 @@ def config(
         parse_domain,
         router_settings,
     )
-    from security.validation import choose, require_valid
+    from security.preflight import choose
+    from security.validation import require_valid
 
     choose(secure)
     given = os.environ.get(DOMAIN_VARIABLE, DEFAULT_DOMAIN) if domain is None else domain

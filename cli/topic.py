@@ -18,12 +18,10 @@ from common.errors import ConfigError
 
 if TYPE_CHECKING:
     from common.client.keys import Known
+    from common.robot.transform_tree import TransformTree
     from common.topics import Topic
     from common.transport.bus import Bus
 
-if TYPE_CHECKING:
-    from common.robot.transform_tree import TransformTree
-    from common.transport.bus import Bus
 
 app = CommandGroup("List, show, measure and publish topics.")
 

@@ -16,7 +16,7 @@ from common.perception.pinhole import Pinhole
 from common.process.camera_reader import CameraReader
 from common.process.planning_scene import SceneWriter
 from common.process.service import main
-from common.robot.model import HomeMonitor
+from common.robot.home import HomeMonitor
 from common.transport.bus import Bus
 
 BUFFERED = 5  # depth images that wait for their contours

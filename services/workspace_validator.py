@@ -104,7 +104,12 @@ def shells(config: Config, header: Header) -> MarkerArray:
 
 
 def targets(visible: list[Place], occluded: list[Place], **fields: Any) -> PoseArray:
-    """Return targets as a message with these other fields; labels only if some targets are occluded."""
+    """Return targets as a message with these other fields; labels only if some targets are occluded.
+
+    Targets of several crowded views may not fit into a message: the rest is offered later.
+    """
+    visible = visible[:MAX_POSES]
+    occluded = occluded[: MAX_POSES - len(visible)]
     poses = [Pose(position=Vector3(x=x, y=y, z=z)) for x, y, z in [*visible, *occluded]]
     labels = [*("" for _ in visible), *(HIDDEN for _ in occluded)] if occluded else []
     return PoseArray(poses=poses, labels=labels, **fields)
@@ -137,8 +142,6 @@ async def run(bus: Bus, config: Config) -> None:
         unfinished = seen if result.unknown else []
         header = Header(stamp=min(one.frame.header.stamp for one in seen), frame_id=WORLD)
         occluded = remembered.hidden(result.targets, [place for place, _ in result.refused], hiding(seen, radius))
-        # Several crowded views may not fit: the rest is offered later.
-        result.targets, occluded = result.targets[:MAX_POSES], occluded[: max(0, MAX_POSES - len(result.targets))]
         unseen, blind = watched.unseen(seen, views, config.may_hide)
         validated.put(targets(
             result.targets, occluded, header=header, remark=result.remark, unseen=unseen, blind=blind))

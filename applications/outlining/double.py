@@ -12,7 +12,7 @@ from common.config import Parameters, RobotConfig, Surroundings, Tunable
 from common.messages import Header, Pose, Vector3, WorldObject
 from common.process.planning_scene import SceneWriter
 from common.process.timing import LoopRate
-from common.robot.model import HomeMonitor
+from common.robot.home import HomeMonitor
 from common.transport.bus import Bus
 
 WORLD = "world"

@@ -20,7 +20,8 @@ from common.perception.camera_input import FrameError, SkippedFrames, require_ca
 from common.perception.occlusion import Occlusion, RobotOcclusion, RobotSilhouettes
 from common.perception.pinhole import Pinhole
 from common.process.camera_reader import CameraReader
-from common.robot.model import HomeMonitor, RobotModel
+from common.robot.home import HomeMonitor
+from common.robot.model import RobotModel
 from common.scene.workspace import INSIDE_CONTAINER, PARTLY_OUT_OF_VIEW, ReachCache
 from common.transport.bus import Bus
 

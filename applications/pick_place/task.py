@@ -23,7 +23,7 @@ from applications.pick_place.grasping import Config
 from applications.pick_place.motion_sequences import MotionSequences
 from applications.pick_place.topics import PickPlaceStatus
 from common import messages as m
-from common.robot.model import is_home
+from common.robot.home import is_home
 from common.tasks.engine import Task
 from common.tasks.stages import MISSES, AwaitImage, Cycle, DwellTimer, Grip, Move, Stage
 

@@ -10,14 +10,12 @@ import signal
 import sys
 import tempfile
 import time
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
-from cli.session.resolve import resolve, without
-from common.supervision.multi_host import HostOptions
+from cli.session.plan import SessionPlan
 from common.terminal import printable
 
 if TYPE_CHECKING:
@@ -26,7 +24,6 @@ if TYPE_CHECKING:
     from common.supervision.supervisor import Supervisor
     from common.transport.bus import Bus
     from lab.chaos.agent import Chaos
-    from page.address import PageAddress
     from recording.report.aggregator import Collector
 
 T = TypeVar("T")
@@ -39,102 +36,15 @@ SUMMARY_TIMEOUT = 5.0  # [s] for a slow reader of the summary
 UNEXPLAINED_EXIT = 3  # exit code of a task that is DONE although the simulated world has objects left
 
 
-class Faults(NamedTuple):
-    """Injected faults, as requested."""
+class CellSession(SessionPlan):
+    """One cell, from its start to its shutdown."""
 
-    seed: int
-    per_minute: float
-    until_ended: bool  # stop in time for the run to finish; otherwise never
-
-
-class CellSession:
-    """One cell, from its options to its shutdown."""
-
-    def __init__(
-        self, cell: str, overrides: Sequence[str] | None = None, *, world: str | None = None, seed: int | None = None,
-        speed: float = 1.0, domain: str | None = None, connect: str | None = None, no_viewer: bool = False,
-        summary: str | None = None, log_json: bool = False, host: HostOptions | None = None,
-    ) -> None:
-        """Check all options; nothing is started yet.
-
-        Args:
-            cell: name or path of its file.
-            overrides: as for `--set`.
-            world: another world, by name or path.
-            seed: of all random numbers.
-            speed: cell time per wall time.
-            domain: of the router, as for `--domain`.
-            connect: endpoint of another router, as for `--connect`.
-            no_viewer: without the operator's page.
-            summary: file for the figures of a run.
-            log_json: write log lines as JSON.
-            host: what runs on this host.
-
-        Raises:
-            ConfigError, UnknownName: one line naming the option, the value and the choices.
-        """
-        from common.supervision.launch import process_start_time
-
-        self.began = process_start_time()
-        resolved = resolve(
-            cell, overrides, world=world, seed=seed, speed=speed, domain=domain, connect=connect, no_viewer=no_viewer,
-            summary=summary, log_json=log_json, host=host or HostOptions())
-        self.launch, self.cell, self.file = resolved.launch, resolved.cell, resolved.summary_file
-        self.aggregator = resolved.aggregator
-        self.summary = self.aggregator.summary
-        self.first: Callable[[Bus], Awaitable[None]] | None = None  # runs at the terminal once the cell is up
-        self._supervisor: Supervisor | None = None
-        self._collector: Collector | None = None
-        self._screen: Screen | None = None
-        self._page: PageAddress | None = None
-        self._watchers: dict[str, list[str]] = {}  # commands of observing processes by name
-        self._faults: Faults | None = None
-        self._chaos: Chaos | None = None
-        self._checking: asyncio.Task[None] | None = None
-
-    def serve_page(self, host: str | None, port: str | None) -> None:
-        """Set where the operator's page listens, if the cell has one.
-
-        Raises:
-            ConfigError: the cell has no page, the port is in use, or host or port are not valid.
-        """
-        from page.address import plan_page
-
-        self._page = page = plan_page(self.cell, host, port)
-        if page is not None:
-            overrides = (*self.launch.overrides, *page.overrides)
-            self.launch = replace(self.launch, overrides=overrides, extra=page.environment)
-
-    def record_to(self, file: str | None) -> None:
-        """Record everything, from before the services are ready until after their end.
-
-        Raises:
-            ConfigError: the file cannot be a recording.
-        """
-        if file is None:
-            return
-        from common.supervision.launch import module_command
-        from common.transport.credentials import RECORDER
-        from recording.capture import CustomTopics
-        from recording.formatting import require_new
-        from security.validation import require_recorder
-
-        path = Path(file).absolute()
-        require_new(path, "--record")
-        require_recorder(self.launch, self.cell)
-        router = ["--connect", self.launch.connect] if self.launch.connect else ["--domain", str(self.launch.domain)]
-        self._watchers[RECORDER] = [
-            *module_command("cli.main"), "record", "--cell", self.cell.name, "-o", str(path), *router, "--gate",
-            "--own", str(CustomTopics.of(self.cell)),
-        ]
-
-    def inject_faults(self, seed: int, per_minute: float, *, until_ended: bool) -> None:
-        """Inject faults once the cell is up: without end, or until a run has time left to finish."""
-        self._faults = Faults(seed, per_minute, until_ended)
-
-    def leave_out(self, name: str) -> None:
-        """Do not start a service."""
-        self.cell = without(self.cell, [name])
+    first: Callable[[Bus], Awaitable[None]] | None = None  # runs at the terminal once the cell is up
+    _supervisor: Supervisor | None = None
+    _collector: Collector | None = None
+    _screen: Screen | None = None
+    _chaos: Chaos | None = None
+    _checking: asyncio.Task[None] | None = None
 
     def visit(self, visit: Callable[[Bus], Awaitable[T]]) -> T:
         """Bring the cell up, and return the result of `visit`.
@@ -184,11 +94,6 @@ class CellSession:
         self.write_summary()
         return 0 if self.summary.ready is not None else code
 
-    def write_summary(self) -> None:
-        """Write the figures of the run to its summary file, if there is one."""
-        if self.file is not None:
-            self.summary.write(self.file)
-
     async def _run(self, work: Callable[[Bus], Awaitable[int]]) -> int:
         """Do the work in the cell and return its exit code.
 
@@ -206,12 +111,6 @@ class CellSession:
             extra = {**self.launch.extra, STATE_VARIABLE: str(folder), RUNTIME_VARIABLE: until_end}
             self.launch = replace(self.launch, extra=extra)
             return await self._supervised(work)
-
-    @property
-    def _simulated(self) -> bool:
-        from common.hardware.interface import is_simulated
-
-        return is_simulated(self.cell.robot)
 
     async def _supervised(self, work: Callable[[Bus], Awaitable[int]]) -> int:
         from common.supervision.preloaded import Preloaded

@@ -27,7 +27,6 @@ _HALF = 0.55  # of the distance between the ends: the path of a turning point is
 _STILL = coal.Transform3s()
 
 
-
 @dataclass(frozen=True)
 class NearPairs:
     """Pairs within reach, at several positions of the robot.

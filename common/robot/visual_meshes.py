@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ET
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Sized
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast
+from typing import Any, Literal, cast
 
 import fast_simplification
 import numpy as np
@@ -19,51 +19,10 @@ import trimesh
 from numpy.typing import NDArray
 
 from common.errors import ConfigError
+from common.robot.mesh_files import parts_of
 from common.robot.model import RobotModel
 from common.robot.transforms import rpy_to_matrix, transform
 from common.robot.urdf import find_description
-
-if TYPE_CHECKING:
-    import trimesh
-
-_MAX_SHOWN = 120  # characters of a reader's error
-
-T = TypeVar("T", bound=Sized)
-
-
-def triangles_of(field: str, path: Path) -> NDArray[np.float64]:
-    """Return the corners (n, 3, 3) of all triangles of a file, in its own units.
-
-    Raises:
-        ConfigError: the file is unreadable; names the configuration field that refers to it.
-    """
-    import trimesh  # takes a third of a second to import
-
-    return _read(field, path, lambda: np.array(trimesh.load_mesh(str(path), process=False).triangles, dtype=np.float64))
-
-
-def parts_of(field: str, path: Path) -> list[trimesh.Trimesh]:
-    """Return the meshes of a file with their materials, each posed as in its scene.
-
-    Raises:
-        ConfigError: the file is unreadable; names the configuration field that refers to it.
-    """
-    import trimesh
-
-    return _read(field, path, lambda: [
-        part for part in trimesh.load_scene(path).dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)])
-
-
-def _read(field: str, path: Path, read: Callable[[], T]) -> T:
-    try:
-        found = read()
-        if not len(found):
-            raise ValueError("it has no triangles")  # for example a truncated file
-        return found
-    except Exception as error:  # the readers of the formats raise any exception on a damaged file
-        reason = " ".join(str(error).split())[:_MAX_SHOWN] or type(error).__name__
-        raise ConfigError(field, str(path), f"is a mesh that cannot be read: {reason}") from None
-
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

@@ -16,8 +16,8 @@ from common.config.world import Shape
 from common.errors import ConfigError
 from common.messages import Color, Pose, Vector3, WorldObject
 from common.planning.prism import convex_hull
+from common.robot.mesh_files import triangles_of
 from common.robot.transforms import matrix_to_pose, pose_to_matrix, rpy_to_matrix, transform
-from common.robot.visual_meshes import triangles_of
 from common.sim.ray_caster import Mesh
 from common.sim.solids import circle, extrude, primitive, transformed
 

@@ -96,7 +96,6 @@ def white_level(scenery: Scenery) -> Array:
     return np.asarray(sum(each, ambient(scenery)))
 
 
-
 class SensorParameters(Parameters):
     """Exposure and noise of a simulated camera; the defaults change nothing."""
 

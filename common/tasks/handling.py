@@ -18,7 +18,7 @@ from pydantic import Field
 
 from common import messages as m
 from common.config import Grasp, Surroundings, Tunable
-from common.robot.model import HOME_TOLERANCE
+from common.robot.home import HOME_TOLERANCE
 from common.robot.transforms import invert, matrix_to_pose, matrix_to_rpy, pose_to_matrix, rpy_to_matrix, tool_down
 from common.tasks.decisions import TaskConfig
 from common.tasks.engine import Task

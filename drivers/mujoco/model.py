@@ -180,7 +180,6 @@ def _contacts_at_home(cell: CellModel) -> list[tuple[str, str]]:
     return sorted(pairs)
 
 
-
 MOVED = 1e-4  # [m] smallest published motion
 TURNED = 1e-3  # [rad] smallest published rotation
 UPRIGHT = 1 - 1e-6  # cosine of the tilt up to which an object counts as upright

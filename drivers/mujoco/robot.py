@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 
 from common.errors import ConfigError
 from common.robot.finger_joints import finger_factors
+from common.robot.mesh_files import triangles_of
 from common.robot.model import RobotModel
 from common.robot.transforms import rpy_to_matrix, transform
 from common.robot.urdf import WORLD, find_description
-from common.robot.visual_meshes import triangles_of
 from drivers.mujoco.scene import COLLIDES, ROBOT, SOLIMP, SOLREF, set_contact, set_finger_contact, visual_only, wxyz
 
 if TYPE_CHECKING:
@@ -30,8 +30,6 @@ if TYPE_CHECKING:
 
 CACHE_VARIABLE = "ZENCELL_CACHE"  # cache folder; default: zencell in the user's cache
 _FORMAT = b"1"  # version of the cached format
-if TYPE_CHECKING:
-    from common.robot.visual_meshes import Piece
 
 Arrays = dict[str, NDArray[Any]]
 

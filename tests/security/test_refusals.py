@@ -14,7 +14,7 @@ from common.supervision.launch import Launch
 from common.supervision.multi_host import HostOptions
 from common.transport.credentials import ACCESS
 from security.certificates import Authority
-from security.validation import require_secured
+from security.preflight import require_secured
 from tests.harness import free_domain
 from tests.security.raw_client import issue
 

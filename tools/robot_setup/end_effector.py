@@ -200,8 +200,6 @@ def section(gripper: GripperProposal, closing: str) -> dict[str, Any]:
     }
 
 
-
-
 def out_of(robot: RobotModel, arm: Arm, links: Sequence[str]) -> Array:
     """Return the (3,) unit vector out of the tool in the frame of the wrist: along the last joint, away from the arm.
 

@@ -83,61 +83,74 @@ def measure(
         None if no two links with shapes move against each other.
     """
     q = np.clip(np.zeros(robot.dof), robot.lower, robot.upper)
-    seen = [robot.link_poses(q, dict(zip(joints, row, strict=True))) for row in positions]
-
-    def placed(link: str, at: int) -> Array:
-        return invert(seen[at][carrier]) @ seen[at][link]
-
-    def cloud(link: str, at: int) -> Array:
-        T = placed(link, at)
-        return np.asarray(points[link] @ T[:3, :3].T + T[:3, 3])
-
+    fingers = _Fingers(carrier, points, [robot.link_poses(q, dict(zip(joints, row, strict=True))) for row in positions])
     shaped = [link for link in links if link in points]
-    first = [link for link in links if robot.link_parents.get(link) not in links]
     if not shaped:
         return None
-    start = np.mean([placed(link, 0)[:3, 3] for link in first], axis=0)
-    moved = {link: cloud(link, -1).mean(axis=0) - cloud(link, 0).mean(axis=0) for link in shaped}
-    reach = {link: float(np.linalg.norm(cloud(link, 0) - start, axis=1).max()) for link in shaped}
-    one = max(shaped, key=lambda link: (round(reach[link], 3), float(np.linalg.norm(moved[link]))))
-    against = [link for link in shaped if moved[link] @ moved[one] < -1e-9]
-    if not against:
+    first = [link for link in links if robot.link_parents.get(link) not in links]
+    start = np.mean([fingers.placed(link, 0)[:3, 3] for link in first], axis=0)
+    chosen = fingers.pads(shaped, start)
+    if chosen is None:
         return None
-    other = max(against, key=lambda link: reach[link])
-    closing = _unit(moved[one] - moved[other])
-    along = (cloud(one, 0).mean(axis=0) + cloud(other, 0).mean(axis=0)) / 2 - start
-    approach = along - (along @ closing) * closing
+    one, other, closing = chosen
+    along = (fingers.cloud(one, 0).mean(axis=0) + fingers.cloud(other, 0).mean(axis=0)) / 2 - start
+    approach = _flat(along, closing)
     if np.linalg.norm(approach) < VAGUE:  # the fingers surround their frames: they point away from the arm
         robot.fk(q)
-        T_carrier_world, wrist = invert(seen[0][carrier]), robot.data.oMi[robot.dof].translation
-        along = along + start - (T_carrier_world[:3, :3] @ wrist + T_carrier_world[:3, 3])
-        approach = along - (along @ closing) * closing
+        T_carrier_world, wrist = invert(fingers.seen[0][carrier]), robot.data.oMi[robot.dof].translation
+        approach = _flat(along + start - (T_carrier_world[:3, :3] @ wrist + T_carrier_world[:3, 3]), closing)
     if np.linalg.norm(approach) < 1e-3:
         return None
-    approach = _unit(approach)
+    return fingers.grip(one, other, closing, _unit(approach))
 
-    def tip(link: str, at: int) -> Array:
-        own = cloud(link, at)
-        heights = own @ approach
-        return np.asarray(own[heights > heights.max() - TIP])
 
-    def ends(link: str, at: int, axis: Array) -> tuple[float, float]:
-        values = tip(link, at) @ axis
-        return float(values.min()), float(values.max())
+@dataclass(frozen=True)
+class _Fingers:
+    """Finger links in the frame of their carrier; `seen` has the poses of all links at each position of the fingers."""
 
-    widths = [ends(one, at, closing)[0] - ends(other, at, closing)[1] for at in range(len(seen))]
-    across = np.cross(closing, approach)
-    sides = ends(one, 0, across)
-    inner = (ends(one, 0, closing)[0] + ends(other, 0, closing)[1]) / 2
-    height = max(float((cloud(link, 0) @ approach).max()) for link in (one, other))
-    turns = [placed(one, 0)[:3, :3].T @ placed(one, at)[:3, :3] for at in range(len(seen))]
-    low, high = ends(one, 0, closing)
-    return Grip(
-        pads=(one, other), closing=closing, approach=approach,
-        middle=inner * closing + sum(sides) / 2 * across + height * approach,
-        widths=widths, turned=max(math.acos(min(1.0, max(-1.0, (np.trace(R) - 1) / 2))) for R in turns),
-        depth=high - low, half_width=(sides[1] - sides[0]) / 2,
-    )
+    carrier: str
+    points: dict[str, Array]
+    seen: list[dict[str, Array]]
+
+    def placed(self, link: str, at: int) -> Array:
+        return invert(self.seen[at][self.carrier]) @ self.seen[at][link]
+
+    def cloud(self, link: str, at: int) -> Array:
+        return _placed(self.seen[at][self.carrier], self.seen[at][link], self.points[link])
+
+    def pads(self, links: Sequence[str], start: Array) -> tuple[str, str, Array] | None:
+        """Return two end links that move against each other and the unit axis of closing; None if there are none."""
+        moved = {link: self.cloud(link, -1).mean(axis=0) - self.cloud(link, 0).mean(axis=0) for link in links}
+        reach = {link: float(np.linalg.norm(self.cloud(link, 0) - start, axis=1).max()) for link in links}
+        one = max(links, key=lambda link: (round(reach[link], 3), float(np.linalg.norm(moved[link]))))
+        against = [link for link in links if moved[link] @ moved[one] < -1e-9]
+        if not against:
+            return None
+        other = max(against, key=lambda link: reach[link])
+        return one, other, _unit(moved[one] - moved[other])
+
+    def grip(self, one: str, other: str, closing: Array, approach: Array) -> Grip:
+        """Measure the tips of two pads."""
+
+        def ends(link: str, at: int, axis: Array) -> tuple[float, float]:
+            own = self.cloud(link, at)
+            heights = own @ approach
+            values = own[heights > heights.max() - TIP] @ axis
+            return float(values.min()), float(values.max())
+
+        across, count = np.cross(closing, approach), len(self.seen)
+        sides = ends(one, 0, across)
+        low, high = ends(one, 0, closing)
+        inner = (low + ends(other, 0, closing)[1]) / 2
+        height = max(float((self.cloud(link, 0) @ approach).max()) for link in (one, other))
+        turns = [self.placed(one, 0)[:3, :3].T @ self.placed(one, at)[:3, :3] for at in range(count)]
+        return Grip(
+            pads=(one, other), closing=closing, approach=approach,
+            middle=inner * closing + sum(sides) / 2 * across + height * approach,
+            widths=[ends(one, at, closing)[0] - ends(other, at, closing)[1] for at in range(count)],
+            turned=max(math.acos(min(1.0, max(-1.0, (np.trace(R) - 1) / 2))) for R in turns),
+            depth=high - low, half_width=(sides[1] - sides[0]) / 2,
+        )
 
 
 def _unit(vector: Array) -> Array:
@@ -196,7 +209,6 @@ def axis_name(axis: Array) -> str:
     return f"({', '.join(f'{value:.2f}' for value in axis)})"
 
 
-
 ALONG = math.cos(math.radians(35))  # largest angle between last joint axis and tip direction for a tool axis
 DROP = 0.012  # largest retreat of the jaw's tip while it opens [m]
 CLOSED = 0.05  # tolerance between configured and measured closed position [rad]
@@ -234,7 +246,7 @@ def measure_jaw(robot: RobotModel, joint: str, points: dict[str, Array]) -> Jaw 
     moved = links_moved(robot, [joint])
     carrier = robot.link_parents[next(link for link in moved if robot.link_parents[link] not in moved)]
     shaped = [link for link in moved if link in points]
-    fixed = [link for link in points if link not in moved and _rigid(robot, link) == _rigid(robot, carrier)]
+    fixed = [link for link in points if link not in moved and _joint_of(model, link) == _joint_of(model, carrier)]
     if not shaped or not fixed:
         return f"{joint} has no shape, or nothing fixed has one that it would close against"
     q = np.clip(np.zeros(robot.dof), robot.lower, robot.upper)
@@ -245,45 +257,60 @@ def measure_jaw(robot: RobotModel, joint: str, points: dict[str, Array]) -> Jaw 
     still = np.vstack([_placed(poses[carrier], poses[link], points[link]) for link in fixed])
     first = next(link for link in moved if robot.link_parents[link] not in moved)
     T = {at: invert(seen[at][carrier]) @ seen[at][first] for at in ends}
-    pivot = T[ends[0]][:3, 3]
     turn = pin.log3(T[ends[1]][:3, :3] @ T[ends[0]][:3, :3].T)
-    axis = turn / np.linalg.norm(turn)
-
-    def far(cloud: Array) -> Array:
-        """Return the distances of points from the axis (N,)."""
-        away = cloud - pivot
-        return np.asarray(np.linalg.norm(away - np.outer(away @ axis, axis), axis=1))
-
-    def farthest(cloud: Array) -> Array:
-        return np.asarray(cloud[int(np.argmax(far(cloud)))])
-
-    def gap(at: float) -> float:
-        """Return the gap between the tips of jaw and finger, seen along the axis [m]."""
-        one, other = (cloud[far(cloud) > far(cloud).max() - TIP] for cloud in (jaws[at], still))
-        ways = (one[:, None] - other[None]).reshape(-1, 3)
-        return float(np.linalg.norm(ways - np.outer(ways @ axis, axis), axis=1).min())
-
-    closed, opened = sorted(ends, key=gap)
-    approach = _tool_axis(robot, q, seen[closed][carrier], _flat(farthest(jaws[closed]) - pivot, axis))
-    closing = np.cross(approach, axis)  # the sign follows
-    tip = jaws[closed][jaws[closed] @ approach > (jaws[closed] @ approach).max() - TIP]
-    if (farthest(jaws[opened]) - farthest(jaws[closed])) @ closing < 0:
-        closing = -closing
-    inner = tip[int(np.argmin(tip @ closing))]
-    if gap(closed) > APART:
+    swing = _Swing(T[ends[0]][:3, 3], turn / np.linalg.norm(turn))
+    closed, opened = sorted(ends, key=lambda at: swing.gap(jaws[at], still))
+    if swing.gap(jaws[closed], still) > APART:
         return f"the jaw of {joint} does not reach the fixed finger: the gap is more than {1e3 * APART:.0f} mm"
-    along, out = float((inner - pivot) @ approach), float((inner - pivot) @ closing)
+    out = _flat(swing.farthest(jaws[closed]) - swing.pivot, swing.axis)
+    approach = _tool_axis(robot, q, seen[closed][carrier], out)
+    return _jaw_of(swing, (shaped[0], carrier), approach, (closed, jaws[closed]), (opened, jaws[opened]))
+
+
+@dataclass(frozen=True)
+class _Swing:
+    """The axis of a jaw in the frame of its carrier: a point (3,) and a unit vector (3,)."""
+
+    pivot: Array
+    axis: Array
+
+    def distances(self, cloud: Array) -> Array:
+        """Return the distances of points from the axis (N,)."""
+        away = cloud - self.pivot
+        return np.asarray(np.linalg.norm(away - np.outer(away @ self.axis, self.axis), axis=1))
+
+    def farthest(self, cloud: Array) -> Array:
+        return np.asarray(cloud[int(np.argmax(self.distances(cloud)))])
+
+    def gap(self, jaw: Array, finger: Array) -> float:
+        """Return the gap between the tips of jaw and finger, seen along the axis [m]."""
+        one, other = (cloud[(far := self.distances(cloud)) > far.max() - TIP] for cloud in (jaw, finger))
+        ways = (one[:, None] - other[None]).reshape(-1, 3)
+        return float(np.linalg.norm(ways - np.outer(ways @ self.axis, self.axis), axis=1).min())
+
+
+def _jaw_of(
+    swing: _Swing, pads: tuple[str, str], approach: Array, closed: tuple[float, Array], opened: tuple[float, Array],
+) -> Jaw:
+    """Return the jaw of two pads, from its joint position and points (N, 3) when it is closed and open."""
+    points = closed[1]
+    closing = np.cross(approach, swing.axis)  # the sign follows
+    if (swing.farthest(opened[1]) - swing.farthest(points)) @ closing < 0:
+        closing = -closing
+    tip = points[points @ approach > (points @ approach).max() - TIP]
+    inner = tip[int(np.argmin(tip @ closing))]
+    along, out = float((inner - swing.pivot) @ approach), float((inner - swing.pivot) @ closing)
     radius, angle = math.hypot(along, out), math.atan2(out, along)
-    most = min(abs(opened - closed), math.acos(max(0.0, math.cos(angle) - DROP / radius)) - angle)
+    most = min(abs(opened[0] - closed[0]), math.acos(max(0.0, math.cos(angle) - DROP / radius)) - angle)
     width = radius * (math.sin(angle + most) - math.sin(angle))
     across = np.cross(closing, approach)
     sides, faces = tip @ across, tip @ closing
     height = float((tip @ approach).max())
     middle = (float(inner @ closing) + width / 2) * closing + float(sides.max() + sides.min()) / 2 * across
-    grip = Grip(pads=(shaped[0], carrier), closing=closing, approach=approach, middle=middle + height * approach,
+    grip = Grip(pads=pads, closing=closing, approach=approach, middle=middle + height * approach,
                 widths=[0.0, width], turned=most, depth=float(faces.max() - faces.min()),
                 half_width=float(sides.max() - sides.min()) / 2)
-    return Jaw(carrier, round(radius, 5), round(angle, 5), round(closed, 5), 1 if opened > closed else -1,
+    return Jaw(pads[1], round(radius, 5), round(angle, 5), round(closed[0], 5), 1 if opened[0] > closed[0] else -1,
                round(width - 5e-5, 4), grip)
 
 
@@ -311,11 +338,6 @@ def check_jaw(robot: RobotModel, points: dict[str, Array] | None = None) -> list
     elif abs(given.radius - found.radius) > 0.1 * found.radius:
         problems.append(f"gripper.jaw.radius: its tip is {found.radius:.4f} m from its axis, not {given.radius:g} m")
     return problems
-
-
-def _rigid(robot: RobotModel, link: str) -> int:
-    model = robot.full_model
-    return int(model.frames[model.getFrameId(link, pin.FrameType.BODY)].parentJoint)
 
 
 def _placed(T_world_carrier: Array, T_world_link: Array, points: Array) -> Array:

@@ -9,7 +9,7 @@ import yaml
 from applications.pick_place.choice import PickPlaceView
 from common import messages as m
 from common.config import CameraConfig, Surroundings, load_cell
-from common.robot.model import is_home
+from common.robot.home import is_home
 from tests import pages
 from tests.applications.pick_place.cell_double import CellDouble
 
