@@ -236,7 +236,7 @@ CONVERSION_ERRORS = (ZencellError, ArithmeticError, ValueError, LookupError, Typ
 CHUNK_BYTES = 1024 * 1024
 
 # Not the package foxglove-sdk 0.30: it sets neither publish time nor sequence number of a message, needs the same
-# conversions (it saves only the schemas in foxglove_scene.py), and has 54 MB.
+# conversions (it saves only the schemas below), and has 54 MB.
 
 
 def export_foxglove(recording: Recording, target: Path, wants: Wanted, decoder: Decoder) -> int:
