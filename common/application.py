@@ -135,7 +135,7 @@ class Application:
     default: bool = False
     """Whether cell files that name a task but no application get this one."""
     figures: Lazy[Any] = Lazy()
-    """Class derived from `recording.report.summary.Figures`: what summary and report show of a run."""
+    """Class derived from `recording.report.application.Figures`: what summary and report show of a run."""
     foxglove: Lazy[Sequence[Any]] = Lazy()
     """Converters of its messages for Foxglove, as `recording.foxglove.KINDS`."""
     truth_check: Lazy[Callable[[WorldObjects], str]] = Lazy()

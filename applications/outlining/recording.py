@@ -13,7 +13,7 @@ from common.config import RobotConfig
 from common.messages import Color, JointState, TaskStatus, WorldObjects
 from common.topics import JOINT_STATES, SCENE_OBJECTS, Topic
 from recording.foxglove import closed_line, entity, update
-from recording.report import summary
+from recording.report import application
 
 if TYPE_CHECKING:
     from recording.report.history import RunHistory
@@ -27,7 +27,7 @@ MAX_GAP = 2.0  # [s] at start and end without joint states, in which the tool ma
 MOST_STATES = 100_000  # joint states of one outline: a quarter of an hour at 100 Hz
 
 
-class OutlineFigures(summary.Figures):
+class OutlineFigures(application.Figures):
     """Block "outline" of a summary, and the section of a report."""
 
     STATE_COLORS: ClassVar = {
@@ -84,9 +84,9 @@ class OutlineFigures(summary.Figures):
                 facts.append((name, f"{figures['mean']:.2f} mm ({figures['max']:.2f} at most)"))
         return facts
 
-    def picture(self, run: RunHistory, tool: Array) -> summary.Section:
+    def picture(self, run: RunHistory, tool: Array) -> application.Section:
         """Return a top view of the detected contour and the motion of the tool tip along it."""
-        return summary.Section("outline", "Outline", (
+        return application.Section("outline", "Outline", (
             f"{self.traced.picture()}<p>{self.traced.figures()['points']} points of the contour; the true edge is "
             "shown for comparison only.</p>"
         ))

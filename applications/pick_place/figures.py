@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from applications.pick_place.topics import DETECTED_OBJECTS, SCENE_BALLS, VALIDATED_TARGETS
 from common.messages import MarkerArray, PoseArray
 from common.topics import Topic
-from recording.report import summary
+from recording.report import application
 
 if TYPE_CHECKING:
     import numpy as np
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from recording.report.history import RunHistory
 
 
-class PickPlaceFigures(summary.Figures):
+class PickPlaceFigures(application.Figures):
     """Figures of every run, and the positions of detections and targets."""
 
     COUNTED = "placed"
@@ -42,6 +42,6 @@ class PickPlaceFigures(summary.Figures):
 
         count_places(self._targets, targets.poses)
 
-    def picture(self, run: RunHistory, tool: npt.NDArray[np.float64]) -> summary.Section | None:
+    def picture(self, run: RunHistory, tool: npt.NDArray[np.float64]) -> application.Section | None:
         """Return the top view of the table with the detections."""
-        return summary.top_view_section(run, tool, {"detections": self._detections, "targets": self._targets})
+        return application.top_view_section(run, tool, {"detections": self._detections, "targets": self._targets})

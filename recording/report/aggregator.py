@@ -17,7 +17,8 @@ from common.config import RobotConfig
 from common.messages import Message, TaskStatus
 from common.time_source import monotonic
 from common.topics import Topic
-from recording.report.summary import Figures, Listener, Summary, figures_of
+from recording.report.application import Figures, Listener, figures_of
+from recording.report.summary import Summary
 
 if TYPE_CHECKING:
     from common.transport.bus import Bus, Reader

@@ -31,8 +31,8 @@ if TYPE_CHECKING:
     from common.config import Cell
     from common.messages import JointState
     from recording.reader import Recording, Run
+    from recording.report.application import Figures
     from recording.report.clips import Clip
-    from recording.report.summary import Figures
 
 # Overrides in a recording that are applied: numbers or one word, which can name neither a file nor a module.
 HARMLESS = re.compile(r"[\w.]{1,100}=([A-Za-z_]\w{0,60}|[-+0-9.eE, \[\]]{1,100})", re.ASCII)

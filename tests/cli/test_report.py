@@ -126,11 +126,11 @@ def test_custom_application_is_reported_with_its_own_figures(tmp_path, monkeypat
     (tmp_path / "own_words").mkdir()
     (tmp_path / "own_words" / "polish.py").write_text(
         "from common import messages as m\nfrom common.application import Application, ApplicationTopics\n"
-        "from recording.report import summary\n"
+        "from recording.report import application\n"
         "from common.topics import Topic\n\n"
         "class PolishStatus(m.TaskStatus):\n    pass\n\n"
         'STATUS = Topic("polish_status", PolishStatus, "state", "how smooth it is")\n\n'
-        'class Figures(summary.Figures):\n    COUNTED = "polished"\n\n'
+        'class Figures(application.Figures):\n    COUNTED = "polished"\n\n'
         "APPLICATION = Application(topics=ApplicationTopics(status=STATUS), figures=Figures)\n"
     )
     (tmp_path / "cell.yaml").write_text(

@@ -15,8 +15,9 @@ from common.messages import (
     Vector3,
     WorldObjects,
 )
+from recording.report.application import Figures
 from recording.report.history import Truth
-from recording.report.summary import Figures, Rejected, Summary, describe, percentile
+from recording.report.summary import Rejected, Summary, describe, percentile
 
 PLAN = PlanFigure(planner="cartesian", seconds=0.01, fraction=1.0, attempts=1)
 
