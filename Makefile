@@ -57,6 +57,7 @@ check: setup
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	.ci/dialect
 
 audit: setup  ## known vulnerabilities of the dependencies, where the database can be reached
 	.ci/audit $(BIN)
