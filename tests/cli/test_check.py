@@ -8,8 +8,7 @@ import pytest
 from common.config import Cell, load_cell, names_of
 from common.errors import ConfigError
 from tests.harness import ask
-from tools.check.cell import blocking_errors, check_files, check_model
-from tools.check.services import Keys, check_wiring, wiring
+from tools.check.cell import Keys, blocking_errors, check_files, check_model, check_wiring, wiring
 
 HAND = str(Path(__file__).parents[1] / "data" / "hand_camera.yaml")  # what is seen is seen from home
 ONE = "world.count=1"

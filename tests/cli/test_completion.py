@@ -4,7 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from cli import choices, completion
+from cli import choices
+from cli import choices as completion
 from common.application import all_topics
 from common.config import load_cell, service_config, service_names
 from common.config.tunables import leaves

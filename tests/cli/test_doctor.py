@@ -25,7 +25,8 @@ from common.process import environment
 from common.transport.codec import Attachment, encode, encode_attachment
 from common.transport.local import LocalNetwork
 from tests.harness import ROOT
-from tools.doctor import Finding, examination, machine, network, software
+from tools.doctor import Finding, examination, machine, network
+from tools.doctor import examination as software
 from tools.doctor.examination import examine
 from tools.doctor.machine import Process, process_findings
 
@@ -295,9 +296,9 @@ def free(monkeypatch, tmp_path):
     (machine.container_engine, {"shutil.which": "/usr/bin/it"}, "ok", ["docker and podman for the image"]),
     (software.python, {}, "ok", []),
     (software.python, {"sys.version_info": (3, 10, 4)}, "fail", ["install Python 3.11"]),
-    (software.kernel, {"tools.doctor.software.library_path": Path("planning_kernel_avx2.so")}, "ok",
+    (software.kernel, {"tools.doctor.examination.library_path": Path("planning_kernel_avx2.so")}, "ok",
      ["planning_kernel_avx2.so"]),
-    (software.kernel, {"tools.doctor.software.library_path": None}, "warn", [software.INSTALL]),
+    (software.kernel, {"tools.doctor.examination.library_path": None}, "warn", [software.INSTALL]),
 ])
 def test_resources_and_software_are_compared_with_the_needs_of_a_cell(free, examined, results, level, parts):
     free(**results)

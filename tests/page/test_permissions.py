@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import pytest
 
 from common.time_source import use_time_source
-from page.permissions import LOG_INTERVAL, OPERATE_TIMEOUT, PageSession, Permission, Permissions
+from page.access import LOG_INTERVAL, OPERATE_TIMEOUT, PageSession, Permission, Permissions
 from security.page_tokens import ALL_ROLES
 
 ELEMENTS: dict[str, Permission] = {"STOP": "stop", "Tab": "look", "Start": "operate", "Slider": "tune", "Take": "take"}

@@ -5,7 +5,7 @@ import pytest
 
 from applications.pick_place.topics import DETECTED_OBJECTS, REJECTED_TARGETS, VALIDATED_TARGETS, WORKSPACE_MARKERS
 from common import messages as m
-from page.rejections import RejectedPositions
+from page.status_text import RejectedPositions
 from tests.page.scene_cell import WORLD, Stage, at
 
 TOO_FAR = "too far: 0.873 m from the base axis, more than 0.820 m"

@@ -9,11 +9,11 @@ import pytest
 from applications.pick_place.detector import Detector
 from common.config import Light, Scenery
 from common.messages import Header, JointState, WorldObjects
-from common.perception.sphere import silhouettes
+from common.perception.pinhole import silhouettes
 from common.robot.model import RobotModel
 from common.sim.camera import CameraParameters, SimulatedCamera
-from common.sim.photometry import tint
 from common.sim.rendering import Renderer
+from common.sim.sensors import tint
 from tests.applications.pick_place.rendered import AROUND, CAMERA, CELL, SIDE, ball, camera_of, in_light, picture
 
 PLACES = [(0.40, -0.30, 0.03), (0.60, -0.10, 0.03), (0.25, 0.20, 0.03), (0.15, -0.15, 0.03), (0.62, 0.02, 0.03)]

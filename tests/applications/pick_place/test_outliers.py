@@ -11,8 +11,7 @@ from applications.pick_place.detections import Validation
 from applications.pick_place.detector import Detector, DetectorOptions
 from applications.pick_place.outliers import COVERED, FLAT, NOT_ROUND, THIN
 from common.config import CameraConfig
-from common.perception.pinhole import Pinhole
-from common.perception.sphere import silhouettes
+from common.perception.pinhole import Pinhole, silhouettes
 from services.vision_detector import _remark, markers
 from tests.applications.pick_place.rendered import AROUND, CAMERA, SIDE, ball, camera_of, picture, red
 from tests.simulated.visited import SimulatedCell

@@ -6,8 +6,8 @@ import pytest
 
 from common.config import Surroundings, load_cell
 from common.perception.illumination import amplify_green, blank_image_reason, green_gain, sampled_pixels
-from common.sim.photometry import tint
 from common.sim.rendering import Renderer, add_image_noise
+from common.sim.sensors import tint
 
 AROUND = load_cell("panda").section(Surroundings)
 TABLE, RED = (0.10, 0.35, 0.55), (0.10, 0.15, 1.0)  # blue, green, red

@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 
 from common.config import CameraConfig
 from common.messages import CameraInfo, Header
-from common.perception.pinhole import CameraError, Pinhole
-from common.perception.sphere import ray_distances, silhouette
+from common.perception.pinhole import CameraError, Pinhole, ray_distances, silhouette
 from common.robot.transforms import rpy_to_matrix, transform
 
 angle = st.floats(-math.pi, math.pi)

@@ -11,7 +11,7 @@ from common.hardware.mock import SimulatedFingers
 from common.messages import Header
 from common.robot.finger_joints import finger_positions
 from common.robot.transforms import rpy_to_matrix, tool_down, transform
-from common.sim.gripping import lies_on
+from common.sim.bodies import lies_on
 from common.sim.kinematic import KinematicWorld
 from common.sim.objects import centre_of, solid_of
 

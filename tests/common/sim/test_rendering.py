@@ -10,8 +10,7 @@ import pytest
 from common.config import CameraConfig, Container, Fixture, Surroundings, World
 from common.errors import DecodeError
 from common.messages import Color, Header, JointState, WorldObject, WorldObjects
-from common.perception.pinhole import Pinhole
-from common.perception.sphere import ray_distances, silhouette
+from common.perception.pinhole import Pinhole, ray_distances, silhouette
 from common.sim import rendering
 from common.sim.objects import solid_of_message, world_object
 from common.sim.rendering import ARM, Renderer, add_depth_noise

@@ -26,7 +26,7 @@ TIMEOUT = 20.0  # only a failing test waits that long
 @pytest.fixture(autouse=True)
 def _frequent_repetition(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("common.transport.bus.REPEAT_SECONDS", 0.1)
-    monkeypatch.setattr("common.supervision.plain_keys.MATCH_PERIOD", 0.1)
+    monkeypatch.setattr("common.supervision.lifecycle.MATCH_PERIOD", 0.1)
 
 
 async def next_of(reader: Reader[M]) -> M:

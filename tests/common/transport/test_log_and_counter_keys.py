@@ -7,8 +7,8 @@ import pytest
 from common import messages as m
 from common import topics
 from common.application import find_topic
+from common.supervision.lifecycle import copy_to_plain_keys
 from common.supervision.liveness_watchdog import RemoteServices
-from common.supervision.plain_keys import copy_to_plain_keys
 from common.transport.bus import Bus
 from common.transport.codec import Attachment, decode, encode, encode_attachment
 from common.transport.local import LocalNetwork

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from tools.doctor import software
+from tools.doctor import examination as software
 
 
 def plug(sys: Path, port: str, **attributes: str) -> None:
