@@ -201,7 +201,7 @@ def test_custom_service_joins_a_cell(folder: Path) -> None:
     value = json.loads(shown[0])
     assert value["distance"] > 0.2 and set(value) == {"header", "position", "distance"} and not shown[1]
     assert " Hz, " in rate[0] and not rate[1]
-    assert "unknown key 'neerest_target'" in slip[1] and "nothing came on panda/neerest_target within 2 s" in slip[1]
+    assert "unknown key 'neerest_target'" in slip[1] and "no message on panda/neerest_target within 2 s" in slip[1]
     assert [command.returncode for command in commands] == [0, 0, 2]
     assert (service.returncode, cell.returncode) == (0, 0)
 

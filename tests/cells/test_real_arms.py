@@ -112,11 +112,11 @@ async def test_outline_is_traced_at_thirty_percent_of_the_speed_slider(tmp_path:
 async def standstill(bus: Bus, host: FrankaHost) -> list[float]:
     """Return the position of the arm [rad] once it has not changed for some time, by the stamps of joint states."""
     joints = bus.reader(topics.JOINT_STATES)
-    since, position = (await joints.next()).header.stamp, host.stands
+    since, position = (await joints.next()).header.stamp, host.positions
     async with asyncio.timeout(SOON):
         async for state in joints:
-            if host.stands != pytest.approx(position, abs=1e-3):
-                since, position = state.header.stamp, host.stands
+            if host.positions != pytest.approx(position, abs=1e-3):
+                since, position = state.header.stamp, host.positions
             elif state.header.stamp > since + STANDSTILL:
                 break
     return position
@@ -156,10 +156,10 @@ async def test_balls_are_placed_despite_a_reflex_silences_and_a_controller_resta
             await under_way()
             host.crash()
             await until(robot, lambda status: status.mode == "disconnected", SOON)
-            stopped_at = host.stands
+            stopped_at = host.positions
             await asyncio.to_thread(host.boot)
             await until(robot, lambda status: status.mode == "running", SOON)
-            assert host.stands == pytest.approx(stopped_at, abs=0.05), "it resumed from where it stopped"
+            assert host.positions == pytest.approx(stopped_at, abs=0.05), "it resumed from where it stopped"
             assert await cell.ended(2 * WHOLE) == 0, cell.tail()
     summary = cell.summary
     assert summary["state"] == "DONE" and summary["failures"] == 0, cell.text

@@ -170,7 +170,7 @@ def test_stop_that_is_not_saved_is_reported_to_the_operator(place):
 @pytest.mark.parametrize(("arguments", "code", "message"), [
     (["tf", "echo", "world", "hnad", "--once"], 2, "unknown frame 'hnad' (did you mean 'hand'?); choices: base, cart"),
     (["tf", "echo", "world", "cart", "--once"], 2, "the root of one is 'world', of the other 'map'"),
-    (["tf", "frames", "--cell", "other"], 1, "nothing came on other/tf and other/tf_static"),
+    (["tf", "frames", "--cell", "other"], 1, "no message on other/tf and other/tf_static"),
     (["node", "list", "--cell", "other"], 1, "other"),
     (["call", "task/command", '{"command": "stop"}'], 1, "task/command: not now [busy]"),
     (["task", "resume", "--cell", "other"], 1, "task/command: no service answers this key"),

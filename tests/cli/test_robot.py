@@ -99,7 +99,7 @@ def test_name_is_asked_for_with_a_guess(folder, monkeypatch):
     monkeypatch.setattr("sys.stdin", io.StringIO(""))
     done = ask(folder, "robot", "new", "side_arm.urdf", "--force")
     assert done.returncode == 2
-    assert done.stderr.splitlines()[-1] == "zencell: --yes: is needed where nobody answers: it takes the best guesses"
+    assert done.stderr.splitlines()[-1] == "zencell: --yes: is needed without a terminal: it takes the best guesses"
 
 
 def test_xacro_file_is_read_and_overwrites_no_urdf(tmp_path):

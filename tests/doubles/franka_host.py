@@ -60,8 +60,6 @@ class FrankaHost:
         """Joint positions [rad]."""
         return list(np.fromfile(Path(self._folder.name) / "positions"))
 
-    stands = positions  # in tests of cells
-
     def freeze(self, seconds: float) -> None:
         """Suspend the controller for a while [s]."""
         self._process.send_signal(signal.SIGSTOP)

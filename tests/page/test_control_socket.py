@@ -57,12 +57,12 @@ class Page(HoldHandler):
 @pytest.fixture
 async def page() -> AsyncIterator[Page]:
     page = Page()
-    actions = ActionQueue(page.access)
+    actions = ActionQueue(page.permissions)
     control = ControlSocket(actions)
     control.hold_handler = page
-    page.access.enforced = True
+    page.permissions.enforced = True
     running = [asyncio.create_task(actions.run()), asyncio.create_task(control.serve(page))]
-    page.receive(do="page", what=page.access.issue_key(SESSION))
+    page.receive(do="page", what=page.permissions.issue_key(SESSION))
     async with asyncio.timeout(10):
         yield page
     for task in running:
@@ -82,7 +82,7 @@ async def test_press_whose_messages_are_all_late_has_no_effect(page: Page) -> No
 async def test_closed_page_cannot_act_over_its_open_control_socket(page: Page) -> None:
     page.hold_down(1, time.monotonic())
     await page.presses.get()
-    page.access.remove(SESSION)
+    page.permissions.remove(SESSION)
     page.hold_down(2, time.monotonic())
     assert "nothing was done" in await page.results.get()
     assert page.presses.empty()

@@ -83,7 +83,7 @@ async def test_largest_object_becomes_the_path_also_after_it_was_moved():
 
 async def test_object_selected_by_color_stays_selected_and_missing_ones_are_rejected_with_the_choices():
     async with running(select="none") as cell:
-        with pytest.raises(RemoteError, match="no picture"):
+        with pytest.raises(RemoteError, match="no image"):
             await cell.select.call(OutlineSelect())
         cell.show(W5.objects)
         none = await until(cell.points, lambda p: p.message)

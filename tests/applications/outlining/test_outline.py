@@ -223,7 +223,7 @@ def test_arm_in_contact_is_freed() -> None:
 
 
 @pytest.mark.parametrize(("path", "message"), [
-    (None, "no contour came from the camera"),
+    (None, "no contour received from the camera"),
     (OutlinePoints(message="every contour touches the border of the picture"), "touches the border"),
     (OutlinePoints(), "no object is chosen"),
     (outline_of([(0.5, 0.0)], 0), "the contour of Object_1 is a single point"),

@@ -104,7 +104,7 @@ def test_undetermined_problems_are_rejected():
              for n, view in enumerate(views)]
     for given, mount, reason in ((views[:5], "hand", "5 views of the board, 6 are needed"),
                                  (still, "hand", "degrees about a second axis, 5 are needed"),
-                                 (views, "beside", r"are inconsistent.* the camera is beside the arm")):
+                                 (views, "beside", r"are inconsistent.* the camera is next to the arm")):
         with pytest.raises(CalibrationFailed, match=reason):
             calibrate_hand_eye(given, CAMERA, mount)
 
