@@ -77,6 +77,7 @@ class Standstill:
         self._missed = self._relocated = False  # the last goal ended off its path; the arm was then held where it was
         self._deviation = 0.0 * start  # of an arm that stays off wherever it is held [rad]
         self._moved_at = -math.inf  # cell time at which the arm was last found moved from outside [s]
+        self._coasted_at = -math.inf  # cell time at which jogging or coasting last changed the set-point [s]
 
     def locate(self, measured: Vector, velocity: Vector | None = None) -> None:
         """Start set-points where the arm is (dof,) [rad], at its velocity [rad/s] if it moves."""
@@ -98,6 +99,12 @@ class Standstill:
     def goal_accepted(self) -> None:
         """Record that a goal takes over from here."""
         self._missed = False
+
+    def is_trailing(self, measured: Vector, velocity: Vector) -> bool:
+        """Return whether each joint that is off the newest set-point moves towards it: the arm is late, not moved."""
+        behind = self._limiter.position - measured
+        near = np.abs(behind) <= self._tolerances.start
+        return bool(np.all(near | (np.sign(behind) * velocity > self._tolerances.stopped_velocity)))
 
     def start_of_motion(self, measured: Vector) -> Vector:
         """Return where a motion starts (dof,) [rad]: at the set-point, unless the arm was moved from outside since."""
@@ -126,6 +133,8 @@ class Standstill:
         Raises:
             HardwareFault: the arm does not stay where it is held.
         """
+        if self.jog_velocity is not None or self.coasting:
+            self._coasted_at = now
         if self.jog_velocity is not None:
             off = np.abs(measured - self._history.expected(now, self._limiter.position, measured)[1])
             if np.all(off <= self._tolerances.path):
@@ -159,6 +168,8 @@ class Standstill:
                 else:
                     self.position = measured.copy()
                 self._missed, self._relocated = not self._relocated, True
+            return False
+        if now - self._coasted_at <= self._tolerances.goal_time and self.is_trailing(measured, velocity):
             return False
         j = int(np.argmax(off))
         moved = f"{self._limits.names[j]} was moved from outside by {off[j]:.4f} rad"
@@ -215,10 +226,10 @@ class GoalFollower:
             goal.ended = now
         return set_point, velocity
 
-    def resume_from_rest(self, goal: Goal, now: float, measured: Vector) -> Outcome | None:
+    def resume_from_rest(self, goal: Goal, now: float, measured: Vector, velocity: Vector) -> Outcome | None:
         """Continue from rest at the newest set-point, or where the arm is; end a goal whose arm was moved too far."""
         off = float(np.abs(measured - self._limiter.position).max())
-        if off > self._tolerances.start:
+        if off > self._tolerances.start and not self._standstill.is_trailing(measured, velocity):
             self._limiter.rest(measured)
             self._history.clear()
             goal.behind = off

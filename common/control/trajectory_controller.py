@@ -271,7 +271,8 @@ class TrajectoryController:
             elapsed = self._period
             if self._goal is None:
                 self._limiter.rest()
-            elif outcome := self._follower.resume_from_rest(self._goal, now - elapsed, measured):
+            elif outcome := self._follower.resume_from_rest(
+                    self._goal, now - elapsed, measured, measured_velocity):
                 self._finish(outcome)
         longest = max(LATE * self._period, self.bridges)
         elapsed = min(elapsed, longest)
