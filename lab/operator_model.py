@@ -28,7 +28,8 @@ from lab.loop import Incarnation, context_of
 from lab.processes import SimulatedBus, SimulatedHost
 
 POLL = 0.1  # [s] between checks of a condition
-OPERATOR, PAGE = "operator", "page"
+OPERATOR, PAGE = "operator", "page"  # sessions
+NAME = "anna"  # of the operator, who has motions without the page
 EXECUTOR = "trajectory_executor"
 SPEED = f"services.{EXECUTOR}.speed_scaling"
 SLOWEST, SLOW = 0.1, 0.4  # speed that an operator sets, share of the full speed
@@ -110,7 +111,7 @@ class OperatorModel:
         seconds = float(random.uniform(*START_LATE))
 
         async def start() -> None:
-            request = m.TaskCommand(command="start", acknowledged=_newest_interlock(motion))
+            request = m.TaskCommand(command="start", by=NAME, acknowledged=_newest_interlock(motion))
             with contextlib.suppress(RequestFailed):
                 await command.call(request, TIMEOUT)
 
@@ -128,8 +129,8 @@ class OperatorModel:
     async def _abandon(self, bus: SimulatedBus, _fault: Fault) -> None:
         """Stop the task, send the arm home by a delayed goal, cancel that, and start the task."""
         host, random = self._host, self._late
-        status, motion = bus.reader(topics.MOTION_STATUS), OperatorMotion(bus, [bus.reader(self._status)])
-        await _call_until_answered(bus, topics.TASK_COMMAND, m.TaskCommand(command="stop"))
+        status, motion = bus.reader(topics.MOTION_STATUS), OperatorMotion(bus, [bus.reader(self._status)], NAME)
+        await _call_until_answered(bus, topics.TASK_COMMAND, m.TaskCommand(command="stop", by=NAME))
         seconds = float(random.uniform(*GOAL_LATE))
         if (executor := host.processes[self._executor].session) is not None:
             key = f"{host.cell.name}/{topics.MOTION_EXECUTE.key}"
@@ -156,7 +157,7 @@ class OperatorModel:
             until_standstill = (JOG_LATE + DEADMAN + BRAKING_TIME) * speed
             return age < JOG_LATE * speed and clearance.clear(state, scene, velocities, age + until_standstill)
 
-        take = m.OwnRequest(act="take", owner=m.UNKNOWN_OPERATOR, over=True)
+        take = m.OwnRequest(act="take", owner=NAME, over=True)
         await _call_until_answered(bus, topics.MOTION_OWN, take)
         for _ in range(JOGS):
             velocities = {str(random.choice(joints)): float(random.uniform(-1.0, 1.0))}
@@ -164,7 +165,7 @@ class OperatorModel:
                 if not clear(velocities):
                     break
                 acknowledged = _newest_interlock(motion)
-                jogs.put(m.JogCommand(header=bus.header(), acknowledged=acknowledged, joints=velocities))
+                jogs.put(m.JogCommand(header=bus.header(), owner=NAME, acknowledged=acknowledged, joints=velocities))
                 await asyncio.sleep(JOG_PERIOD)
             await asyncio.sleep(float(random.uniform(0.0, JOG_GAP)))
         await self._start_task(bus, motion)
@@ -209,7 +210,7 @@ class OperatorModel:
         """Start the task as an operator does: repeat until it runs and no operator's interlock is left."""
         status = bus.reader(self._status)
         while True:
-            command = m.TaskCommand(command="start", acknowledged=_newest_interlock(motion))
+            command = m.TaskCommand(command="start", by=NAME, acknowledged=_newest_interlock(motion))
             await _call_until_answered(bus, topics.TASK_COMMAND, command)
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(TIMEOUT):
@@ -223,7 +224,7 @@ class OperatorModel:
         """Stop the task, then send the arm home and start the task concurrently, as from two independent clients."""
         bus.session.slow = float(self._restarts.uniform(0.0, MOST_SLOW))
         command, status = bus.client(topics.TASK_COMMAND), bus.reader(topics.MOTION_STATUS)
-        motion = OperatorMotion(bus, [bus.reader(self._status)])
+        motion = OperatorMotion(bus, [bus.reader(self._status)], NAME)
 
         async def go_home() -> None:
             await asyncio.sleep(float(self._restarts.uniform(0.0, MOST_LATE)))
@@ -231,7 +232,7 @@ class OperatorModel:
                 await motion.move(m.JointGoal(named="home"))
 
         with contextlib.suppress(RequestFailed):
-            await command.call(m.TaskCommand(command="stop"), TIMEOUT)
+            await command.call(m.TaskCommand(command="stop", by=NAME), TIMEOUT)
         async with asyncio.TaskGroup() as group:
             group.create_task(go_home())
             await asyncio.sleep(float(self._restarts.uniform(0.0, MOST_LATE)))
@@ -245,7 +246,7 @@ def _newest_interlock(motion: Reader[m.MotionStatus]) -> int:
 
 def _started(task: m.TaskStatus | None, motion: m.MotionStatus | None) -> bool:
     """Return whether the task runs and no operator's interlock blocks it."""
-    blocked = motion is None or any(interlock.by in (m.UNKNOWN_OPERATOR, PAGE) for interlock in motion.interlocks)
+    blocked = motion is None or any(interlock.by in (m.UNKNOWN_OPERATOR, NAME, PAGE) for interlock in motion.interlocks)
     return task is not None and task.started and not blocked
 
 

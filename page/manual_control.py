@@ -19,7 +19,7 @@ from common import topics
 from common.client.operator_motion import UNREACHABLE
 from common.config import check
 from common.control.jogging import PAUSE
-from common.messages import SELF_RELEASING, UNKNOWN_OPERATOR, GripperCommand, MotionOwner, MotionStatus
+from common.messages import GripperCommand, MotionOwner, MotionStatus
 from common.robot.transforms import matrix_to_rpy
 from common.time_source import monotonic, new_id
 from page.control_socket import HoldHandler
@@ -156,9 +156,9 @@ class Jogger(HoldHandler):
 
     def _interlocked(self, motion: MotionStatus | None) -> str:
         """Return the stops and holds of other operators."""
-        ours = (self._sender.permissions.client_name, UNKNOWN_OPERATOR, *SELF_RELEASING)
+        client = self._sender.permissions.client_name
         interlocks = motion.interlocks if motion is not None else []
-        return "; ".join(f"the arm is {one.description}" for one in interlocks if one.by not in ours)
+        return "; ".join(f"the arm is {one.description}" for one in interlocks if one.blocks(client))
 
     def _without_effect(self, owner: MotionOwner | None, is_new: bool, now: float) -> str:
         """Return why jog commands have had no effect for a second."""

@@ -157,7 +157,7 @@ class OperatorMotion:
         status = await self._current_status()
         self._require_no_task()
         for interlock in status.interlocks:
-            if interlock.by not in (self._owner(), m.UNKNOWN_OPERATOR, *m.SELF_RELEASING):
+            if interlock.blocks(self._owner()):
                 raise MotionFailed(interlock.kind, f"the robot is {interlock.description}")
         try:
             async with asyncio.timeout(BRAKING_TIMEOUT):

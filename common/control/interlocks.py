@@ -10,6 +10,7 @@ import asyncio
 import contextlib
 import logging
 import os
+import re
 import socket
 from collections.abc import AsyncIterator, Callable, Iterable, Mapping
 from pathlib import Path
@@ -36,6 +37,7 @@ RETRY_PERIOD = 1.0  # [s] after interlocks could not be written
 LOCK_TIMEOUT = 3.0  # [s] for a process that is just ending: it brakes first
 LOCK_PERIOD = 0.02  # [s] between two attempts to get the lock
 HOLDER_ROOM = 512  # [bytes] for the name of the holder in the lock file
+UNSAFE = re.compile(r"[^A-Za-z0-9._-]")  # in the name of a file
 
 
 def _not_late(interlock: Interlock) -> Interlock:
@@ -121,8 +123,9 @@ class Interlocks:
         released = [interlock for interlock in self._by_operators.values() if _releases(request, interlock)]
         for interlock in released:
             del self._by_operators[interlock.kind, interlock.by]
-            if request.into_stop and ("stopped", interlock.by) not in self._by_operators:
-                self._by_operators["stopped", interlock.by] = interlock.model_copy(update={"kind": "stopped"})
+            by = (request.owner or UNKNOWN_OPERATOR) if interlock.by == UNKNOWN_OPERATOR else interlock.by
+            if request.into_stop and ("stopped", by) not in self._by_operators:
+                self._by_operators["stopped", by] = interlock.model_copy(update={"kind": "stopped", "by": by})
         return released
 
     def set_internal_hold(self, holder: str, hold: bool, reason: str) -> None:
@@ -145,13 +148,16 @@ class Interlocks:
 
         Args:
             goal: its id.
-            owner: the operator who requests it. Stops of this operator do not block it if the operator knew them.
+            owner: the operator who requests it. Stops of this operator do not block it if the operator knew them;
+                a stop without a name blocks every motion until it is released.
             acknowledged: `since` of the newest interlock that the operator knew.
         """
         if goal in self._goals:
             return Refused(STOPPED, f"goal {goal!r} was stopped before")
-        own = (owner, UNKNOWN_OPERATOR) if owner and acknowledged is not None else ()
-        stops = [stop for stop in self.stops if stop.by not in own or stop.since > (acknowledged or 0)]
+        named = owner not in ("", UNKNOWN_OPERATOR)
+        # An acknowledgement of what was never published acknowledges nothing.
+        known = acknowledged if named and acknowledged is not None and acknowledged <= self._newest else 0
+        stops = [stop for stop in self.stops if stop.by != owner or stop.since > known]
         return Refused(STOPPED, "; ".join(stop.description for stop in stops)) if stops else None
 
     def _with_problem(self, interlock: Interlock) -> Interlock:
@@ -224,13 +230,30 @@ class InterlockFile(AtomicFile[Record]):
                 str(error))
 
 
-def interlock_file(cell: str, environ: Mapping[str, str] = os.environ) -> InterlockFile:
-    """Return the file of a cell, which has the same name wherever its executor runs.
+def interlock_file(cell: str, arm: str | None = None, environ: Mapping[str, str] = os.environ) -> InterlockFile:
+    """Return the file of a cell, or of a real arm, which may be part of several cells; the names are of early versions.
+
+    The first use for a real arm takes over the file of the cell, where interlocks of a real arm were before.
+
+    Args:
+        cell: its name.
+        arm: identity of a real arm, else None.
+        environ: environment variables.
 
     Raises:
-        ConfigError: there is no folder for it.
+        ConfigError: there is no folder for it, or the file of the cell cannot be taken over.
     """
-    return InterlockFile(state_folder(environ) / f"{cell}.inhibits.json")  # the name of earlier versions
+    folder = state_folder(environ)
+    of_cell = folder / f"{cell}.inhibits.json"
+    if arm is None:
+        return InterlockFile(of_cell)
+    of_arm = folder / f"arm-{UNSAFE.sub('_', arm)}.inhibits.json"
+    try:
+        if of_cell.exists() and not os.path.lexists(of_arm):
+            of_cell.rename(of_arm)
+    except OSError as error:
+        raise _not_writable(of_arm, error) from None
+    return InterlockFile(of_arm)
 
 
 def _not_writable(path: Path, error: OSError) -> ConfigError:
@@ -265,7 +288,7 @@ async def exclusive_lock(record: Path, holder: str) -> AsyncIterator[None]:
             if monotonic() > deadline:
                 other = path.read_bytes()[:HOLDER_ROOM].decode(errors="replace").strip() or "another process"
                 raise ConfigError(STATE_VARIABLE, str(record.parent), f"is in use by {other}: each would undo stops of "
-                                  "the other; choose another folder")
+                                  "the other")
             await asyncio.sleep(LOCK_PERIOD)
     except OSError as error:
         raise _not_writable(record, error) from None

@@ -10,6 +10,7 @@ from pydantic import Field
 from common.messages.basics import (
     MAX_JOINTS,
     MAX_STAMP,
+    SELF_RELEASING,
     SMALL_BYTES,
     UNKNOWN_OPERATOR,
     Count,
@@ -122,6 +123,11 @@ class Interlock(Message):
         """Kind, time, operator and reason in one line."""
         when = datetime.fromtimestamp(self.since * 1e-9, UTC)
         return f"{self.kind} since {when:%Y-%m-%d %H:%M:%S} UTC by {self.by}{self.reason and f' ({self.reason})'}"
+
+    def blocks(self, operator: str) -> bool:
+        """Return whether it blocks motions of an operator who knows it; anyone may release a hold without a name."""
+        return self.by != operator and self.by not in SELF_RELEASING and (
+            self.kind == "stopped" or self.by != UNKNOWN_OPERATOR)
 
 
 class MotionStatus(Message):

@@ -108,7 +108,7 @@ def test_operator_who_takes_over_from_a_task_stops_it_until_a_start(arm, task_al
     assert arm.at_rest() and arm.executor.arm.goal == ""
     assert arm.execute("two").error == "stopped"
     assert arm.authority.interlocks.record.interlocks[0].by == "ann", "it persists"
-    assert arm.execute("three", "ann", acknowledged=arm.stamp + 1).state == "active"
+    assert arm.execute("three", "ann", acknowledged=arm.executor.arm.status.newest).state == "active"
     arm.run(3.0)
     arm.start_task("ann")
     assert arm.owner == NO_OWNER and start_of_a_task(arm) and arm.execute("four").state == "active"
@@ -181,7 +181,7 @@ def test_start_decided_before_a_later_stop_has_no_effect(arm):
     decided = arm.stamp
     arm.run(0.1)
     arm.own(over=True)
-    arm.execute("one", "ann", acknowledged=arm.stamp + 1)
+    arm.execute("one", "ann", acknowledged=arm.executor.arm.status.newest)
     arm.run(0.5)
     arm.start_task("bob", override=True, acknowledged=decided)
     arm.run(0.5)
@@ -191,8 +191,8 @@ def test_start_decided_before_a_later_stop_has_no_effect(arm):
 
 def test_operator_who_turns_a_hold_into_a_stop_gets_the_motion_of_a_task_and_of_no_operator(owned):
     def into_stop(goal):
-        owned.hold("bob", hold=False, into_stop=True, acknowledged=owned.stamp + 1)
-        return owned.execute(goal, "bob", acknowledged=owned.stamp + 1)
+        owned.hold("bob", hold=False, into_stop=True, acknowledged=owned.executor.arm.status.newest)
+        return owned.execute(goal, "bob", acknowledged=owned.executor.arm.status.newest)
 
     owned.hold("bob")
     assert into_stop("one").error == "not_owner" and owned.owner == ("ann", "operator")
