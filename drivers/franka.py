@@ -46,6 +46,8 @@ MODES: dict[str, tuple[RobotMode, str]] = {
     "AutomaticErrorRecovery": ("idle", "is recovering"),
 }
 
+simulated = False  # also with a simulated world around it
+
 
 class Options(Parameters):
     """Address of the arm, and how it is driven."""
@@ -60,9 +62,14 @@ class Options(Parameters):
     )
 
 
-def simulated(options: Options) -> bool:
-    """Return whether the simulated world belongs to the arm."""
+def has_simulated_world(options: Options) -> bool:
+    """Return whether cameras, fingers and objects around the arm are simulated."""
     return options.world == "simulated"
+
+
+def identity(options: Options) -> str:
+    """Return the address of the arm, to which its interlocks belong."""
+    return options.host
 
 
 def create(robot: RobotConfig, limits: Limits, start: Vector, options: Options) -> DrivenArm:
@@ -75,7 +82,7 @@ def create(robot: RobotConfig, limits: Limits, start: Vector, options: Options) 
     if len(limits.names) != 7:
         raise ConfigError("robot.joints", list(limits.names), "must be the seven joints of the arm")
     gripper: Gripper | None = None
-    if simulated(options):
+    if has_simulated_world(options):
         gripper = simulated_fingers(robot)
     elif robot.gripper is not None:
         gripper = franka_hand.create_gripper(robot.gripper, franka_hand.GripperOptions(host=options.host))

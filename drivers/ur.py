@@ -52,6 +52,8 @@ MODES: dict[int, tuple[RobotMode, str]] = {
     5: ("idle", "the brakes are on: `zencell robot enable`"),
 }
 
+simulated = False  # also with a simulated world around it
+
 
 class Options(Parameters):
     """Address and model of the arm, and how it is servoed."""
@@ -70,9 +72,14 @@ class Options(Parameters):
     )
 
 
-def simulated(options: Options) -> bool:
-    """Return whether the simulated world belongs to the arm."""
+def has_simulated_world(options: Options) -> bool:
+    """Return whether cameras, fingers and objects around the arm are simulated."""
     return options.world == "simulated"
+
+
+def identity(options: Options) -> str:
+    """Return the address of the arm, to which its interlocks belong."""
+    return options.host
 
 
 def create(robot: RobotConfig, limits: Limits, start: Vector, options: Options) -> DrivenArm:
@@ -82,7 +89,7 @@ def create(robot: RobotConfig, limits: Limits, start: Vector, options: Options) 
     except ImportError:
         raise ConfigError("robot.hardware.backend", "ur", "needs the extra `ur`: pip install 'zencell[ur]'") from None
     gripper: Gripper | None = None
-    if simulated(options):
+    if has_simulated_world(options):
         gripper = simulated_fingers(robot)
     elif robot.gripper is not None and options.gripper:
         gripper = robotiq.create_gripper(

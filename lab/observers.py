@@ -82,7 +82,7 @@ def with_observed_arm(cell: Cell) -> Cell:
         ConfigError: its arm is real, so it cannot run on virtual time.
     """
     hardware = cell.robot.hardware
-    if find_backend(cell.robot).simulated is not True:  # a backend that talks to an arm has a clock of its own
+    if not find_backend(cell.robot).simulated:  # a backend that talks to an arm has a clock of its own
         raise ConfigError("robot.hardware.backend", hardware.backend, "is a real arm: simulate needs a simulated one")
     observed = HardwareConfig(backend=__name__, options={"backend": hardware.backend, "options": hardware.options})
     return cell.model_copy(update={"robot": cell.robot.model_copy(update={"hardware": observed})})

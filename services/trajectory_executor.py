@@ -25,7 +25,7 @@ from common.control.request_handlers import MAX_STOPS, RequestHandlers
 from common.control.status import Report
 from common.control.trajectory import Tolerances
 from common.errors import ConfigError
-from common.hardware.interface import ControlledArm, Limits, is_simulated, load_hardware
+from common.hardware.interface import ControlledArm, Limits, has_simulated_world, load_hardware, real_arm
 from common.messages import MotionOwner, MotionStatus
 from common.process.service import main
 from common.robot.model import RobotModel
@@ -175,14 +175,14 @@ async def run(
         file_lock: keeps other executors, also of another cell of that name, from the interlock store.
         saver_for: creates what saves the state of simulated hardware without blocking the loop.
     """
-    simulated = is_simulated(config.robot)
+    simulated = has_simulated_world(config.robot)
     publishers = Publishers(bus, config, simulated)
     jog_commands = bus.reader(topics.MOTION_JOG)
     handlers = RequestHandlers(bus.service, config, bus.clock, bus.log, publishers.put)
     serve(bus, config, handlers, simulated)
     await bus.acquire_keys()  # before, another executor may still change the file
     async with contextlib.AsyncExitStack() as stack:
-        file = interlock_file(bus.cell)
+        file = interlock_file(bus.cell, real_arm(config.robot))
         await stack.enter_async_context(file_lock(file.path, f"{bus.service} of {bus.cell}"))
         file.require_writable()
         began = bus.clock.now_ns()  # an executor before this one may have executed what was decided until now

@@ -16,7 +16,7 @@ from common.application import Checks
 from common.config import CameraConfig, Cell, Container, Grasp, ObjectConfig, Reach, service_config
 from common.config.basics import Rgb
 from common.errors import ConfigError
-from common.hardware.interface import is_simulated
+from common.hardware.interface import has_simulated_world
 from common.perception.pinhole import Pinhole
 from common.planning.ik import controls_full_pose, solve_tool_down_ik
 from common.planning.robot_geometry import RobotGeometry
@@ -35,7 +35,7 @@ ALONG = 0.03  # [m] tolerated offset of the position above a container: half of 
 
 def quick(cell: Cell) -> Iterator[Finding]:
     """Find objects that the detectors would not detect, and containers without room for the objects."""
-    things = cell.world.objects if is_simulated(cell.robot) else []
+    things = cell.world.objects if has_simulated_world(cell.robot) else []
     detectors = _detectors(cell)
     of_others = any(entry.module.rpartition(".")[0] != "services" for entry in cell.services.values())
     for thing in things if detectors and not of_others else []:
@@ -136,7 +136,7 @@ def reach(cell: Cell, arm: Arm) -> Iterator[Finding]:
     turns = [yaw + (math.pi / 2 if gripper is not None and gripper.closing_axis == "x" else 0.0)
              for yaw in (yaw_candidates(bounds.yaw_count) if controls_full_pose(arm.robot) else [0.0])]
     things = []
-    if is_simulated(cell.robot):
+    if has_simulated_world(cell.robot):
         layout(cell.world, cell.run.seed,
                lambda x, y, z: not unreachable_reason(arm.robot, (x, y, z), cell.grasp, bounds, explained=False))
         things = [thing for thing in cell.world.objects if thing.placed]

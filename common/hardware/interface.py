@@ -3,9 +3,13 @@
 Times are cell time [s], passed in: a backend has no clock. An arm backend is a module (in this folder, in drivers/, an
 installed entry point or a dotted module of the user) with
 
-    simulated: bool          # whether a simulated world belongs to it; or a function of the options that returns it
+    simulated: bool          # whether the arm itself is simulated
     class Options(Parameters)
     def create(robot: RobotConfig, limits: Limits, start: Vector, options: Options) -> Hardware
+    def has_simulated_world(options: Options) -> bool  # optional, for a real arm: whether cameras and objects around it
+                                                       # are simulated; a simulated arm always has a simulated world
+    def identity(options: Options) -> str              # optional, for a real arm: its address or serial number, to
+                                                       # which its interlocks belong; without it they belong to the cell
 
 `start` is the pose at which a simulated arm starts; a real arm is where it is. A gripper backend has `GripperOptions`
 and `create_gripper(gripper: GripperConfig, options: GripperOptions) -> Gripper`; one module may be both.
@@ -237,7 +241,7 @@ GRIPPER_FIELD = "robot.gripper.hardware"
 class Backend(Protocol):
     """A module that moves joints: see common.hardware.interface."""
 
-    simulated: bool | Callable[[Any], bool]
+    simulated: bool
     Options: type[Parameters]
 
     def create(self, robot: RobotConfig, limits: Limits, start: Vector, options: Any, /) -> Hardware:
@@ -280,6 +284,9 @@ def find_backend(robot: RobotConfig) -> Backend:
     missing = [part for part in ("Options", "create", "simulated") if not hasattr(module, part)]
     if missing:
         raise ConfigError("robot.hardware.backend", name, f"is no backend: it has no {', '.join(missing)}")
+    if not isinstance(module.simulated, bool):
+        raise ConfigError("robot.hardware.backend", name, "is no backend: `simulated` must be True or False; the world "
+                          "around a real arm may be simulated: `has_simulated_world(options)` says so")
     return cast(Backend, module)
 
 
@@ -299,17 +306,36 @@ def find_gripper_backend(hardware: HardwareConfig) -> GripperBackend:
 
 
 def is_simulated(robot: RobotConfig) -> bool:
-    """Return whether a simulated world belongs to the robot's hardware; some backends have an option for that.
+    """Return whether the arm itself is simulated: then no interlock of it needs to outlive a deliberate new run.
+
+    Raises:
+        UnknownName, ConfigError: no such backend.
+    """
+    return find_backend(robot).simulated
+
+
+def has_simulated_world(robot: RobotConfig) -> bool:
+    """Return whether the surroundings of the arm are simulated, which a real arm's backend may have an option for.
 
     Raises:
         UnknownName, ConfigError: no such backend, also of the gripper, or an invalid option.
     """
-    backend = find_backend(robot)
+    backend, options = _checked_backend(robot)
     if robot.gripper is not None and robot.gripper.hardware is not None:
         _gripper_options(find_gripper_backend(robot.gripper.hardware), robot.gripper.hardware)
-    if callable(backend.simulated):
-        return backend.simulated(check(backend.Options, robot.hardware.options, "robot.hardware.options"))
-    return backend.simulated
+    decide = getattr(backend, "has_simulated_world", None)
+    return backend.simulated or (decide is not None and decide(options))
+
+
+def real_arm(robot: RobotConfig) -> str | None:
+    """Return what identifies a real arm, such as `ur-192.168.0.5`; None: it is simulated, or its backend cannot say.
+
+    Raises:
+        UnknownName, ConfigError: no such backend, or an invalid option.
+    """
+    backend, options = _checked_backend(robot)
+    identify = getattr(backend, "identity", None)
+    return None if backend.simulated or identify is None else f"{robot.hardware.backend}-{identify(options)}".lower()
 
 
 def load_hardware(
@@ -338,6 +364,11 @@ def load_hardware(
     return arm
 
 
+def _checked_backend(robot: RobotConfig) -> tuple[Backend, Parameters]:
+    backend = find_backend(robot)
+    return backend, check(backend.Options, robot.hardware.options, "robot.hardware.options")
+
+
 def _gripper_options(backend: GripperBackend, hardware: HardwareConfig) -> Parameters:
     return check(backend.GripperOptions, hardware.options, f"{GRIPPER_FIELD}.options")
 
@@ -345,8 +376,7 @@ def _gripper_options(backend: GripperBackend, hardware: HardwareConfig) -> Param
 def _load_arm(
     robot: RobotConfig, limits: Limits, start: Vector, world_arm: Callable[[], Hardware] | None
 ) -> Hardware:
-    backend = find_backend(robot)
-    options = check(backend.Options, robot.hardware.options, "robot.hardware.options")
+    backend, options = _checked_backend(robot)
     if world_arm is None:
         return backend.create(robot, limits, start, options)
     if hasattr(backend, "around"):

@@ -19,7 +19,7 @@ from common import topics
 from common.application import all_topics, find_application
 from common.config import Cell, World
 from common.errors import DecodeError, RequestFailed
-from common.hardware.interface import is_simulated
+from common.hardware.interface import has_simulated_world
 from common.messages import Message, WorldEdit
 from common.supervision.supervisor import Supervisor
 from common.time_source import monotonic
@@ -317,7 +317,7 @@ def create_chaos(
     """
     services = [entry.name for entry in cell.services.values()]
     processes = [status.name for status in supervisor.statuses if status.name in (ROUTER, *services)]
-    objects = find_application(cell.application).grasps and cell.task in services and is_simulated(cell.robot)
+    objects = find_application(cell.application).grasps and cell.task in services and has_simulated_world(cell.robot)
     keys = list(known)
     if until_ended:
         seconds = CELL_SECONDS / bus.clock.speed

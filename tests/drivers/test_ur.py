@@ -12,7 +12,7 @@ import pytest
 
 from common.errors import ConfigError
 from common.hardware.driven_arm import DrivenArm, Reading
-from common.hardware.interface import Limits, is_simulated
+from common.hardware.interface import Limits, has_simulated_world, is_simulated, real_arm
 from drivers.ur import Options, create
 from tests.common.hardware.test_backends import robot
 from tests.doubles.ur_host import UrHost
@@ -249,8 +249,9 @@ def test_cb3_controller_is_served_at_its_rate() -> None:
 
 def test_simulated_world_is_an_option() -> None:
     assert not is_simulated(robot("ur", host="10.0.0.1", model="ur10e"))
-    assert is_simulated(robot("ur", host="10.0.0.1", model="ur10e", world="simulated"))
+    on_a_double = robot("ur", host="10.0.0.1", model="ur10e", world="simulated")
+    assert has_simulated_world(on_a_double) and not is_simulated(on_a_double) and real_arm(on_a_double) == "ur-10.0.0.1"
     with pytest.raises(ConfigError, match=r"model"):
-        is_simulated(robot("ur", host="10.0.0.1", model="ur6"))
+        has_simulated_world(robot("ur", host="10.0.0.1", model="ur6"))
     with pytest.raises(ConfigError, match=r"host"):
-        is_simulated(robot("ur"))
+        has_simulated_world(robot("ur"))

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from common.application import find_application
 from common.config import Cell, GripperConfig, RobotConfig, Surroundings
 from common.errors import ConfigError, ZencellError
-from common.hardware.interface import is_simulated
+from common.hardware.interface import has_simulated_world
 from common.robot.finger_joints import driven_position
 from common.robot.urdf import merged_urdf
 from common.sim.interface import require_simulator
@@ -51,7 +51,7 @@ def require_safe(cell: Cell) -> None:
         ConfigError: they would not, with the finding of `zencell check`; or the simulator is not usable.
         UnknownName: the simulator does not exist.
     """
-    if is_simulated(cell.robot):
+    if has_simulated_world(cell.robot):
         require_simulator(cell.world.simulator)
     for found in blocking_errors(cell):
         field, _, rest = found.line.partition(": ")

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from common.application import Application
 from common.config import Cell, Container, GripperConfig, ObjectConfig, World
-from common.hardware.interface import is_simulated
+from common.hardware.interface import has_simulated_world
 from common.perception.pinhole import Pinhole
 from common.sim.footprints import overlap, within
 from common.sim.objects import Solid, initial_pose, solid_of
@@ -40,7 +40,7 @@ def check_world(cell: Cell, application: Application, seen_from: str = "") -> It
         ConfigError: a mesh cannot be read.
     """
     world = cell.world
-    placed = [item for item in world.objects if item.placed] if is_simulated(cell.robot) else []
+    placed = [item for item in world.objects if item.placed] if has_simulated_world(cell.robot) else []
     solids = {item.id: solid_of(item) for item in placed}
     yield from _visibility(world, placed, solids, seen_from)
     yield from _positions(world, placed, solids)

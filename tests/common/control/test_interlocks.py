@@ -197,7 +197,7 @@ def largest() -> Record:
 def test_saved_record_is_loaded_again_also_through_a_link(tmp_path: Path, stopped: Made) -> None:
     stopped.block_goals(["a"])
     stopped.speed, stopped.arm_stopped = Speed(scaling=0.05, configured=1.0), True
-    file = interlock_file("panda", {"ZENCELL_STATE": str(tmp_path / "new" / "folder")})
+    file = interlock_file("panda", environ={"ZENCELL_STATE": str(tmp_path / "new" / "folder")})
     file.require_writable()
     assert file.load() == (Record(), "")
     file.save(stopped.record)
@@ -319,3 +319,12 @@ def test_folder_is_the_configured_one_or_one_in_the_home() -> None:
     assert state_folder({"ZENCELL_STATE": "/data", "XDG_STATE_HOME": "/x"}) == Path("/data")
     assert state_folder({"ZENCELL_STATE": "", "XDG_STATE_HOME": "/x"}) == Path("/x/zencell")
     assert state_folder({}) == Path.home() / ".local" / "state" / "zencell"
+
+
+def test_interlocks_of_a_real_arm_belong_to_the_arm_whatever_its_cell_is_called(tmp_path: Path, stopped: Made) -> None:
+    environ = {"ZENCELL_STATE": str(tmp_path)}
+    interlock_file("a", environ=environ).save(stopped.record)  # as earlier versions did
+    for cell in ("a", "b", "c"):
+        assert interlock_file(cell, "ur-10.0.0.5", environ).read().interlocks == stopped.record.interlocks
+    assert interlock_file("a", "ur-10.0.0.6", environ).find() is None
+    assert interlock_file("a", "ur-../x", environ).path.parent == tmp_path

@@ -119,7 +119,7 @@ def test_arm_is_created_without_its_own_gripper_if_another_one_is_named(limits, 
 ])
 def test_unsuitable_gripper_backend_is_refused_with_the_choices(limits, gripper, error):
     config = robot("mock", gripper)
-    for refuse in (loading.is_simulated, lambda config: loading.load_hardware(config, limits, START)):
+    for refuse in (loading.has_simulated_world, lambda config: loading.load_hardware(config, limits, START)):
         with pytest.raises((ConfigError, UnknownName), match=error):
             refuse(config)
 
