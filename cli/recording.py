@@ -141,6 +141,10 @@ def play_(
     stamp_now: Annotated[
         bool, typer.Option("--stamp-now", help="shift stamps to the present [stamps as recorded]")
     ] = False,
+    into_live: Annotated[
+        list[str] | None, typer.Option("--into-live", metavar="KEY", help="publish commands of this key although a "
+                                       "cell is up, after a confirmation on the terminal; repeatable")
+    ] = None,
     wait: Annotated[
         list[str] | None, typer.Option("--wait", metavar="SERVICE", help="start once this service is ready; repeatable")
     ] = None,
@@ -177,11 +181,30 @@ def play_(
             from recording.player import Player
 
             return Player(recording, selection.wants, renamed, rate=speed, offset=offset, loop=loop,
-                          paused=start_paused, stamp_now=stamp_now)
+                          paused=start_paused, stamp_now=stamp_now, into_live=into_live or ())
 
         name, show = _cell_of(recording, file, cell), rewrite if on_terminal else None
+        _confirm_commands(into_live or [], [*map(renamed, played)], name, on_terminal)
         code = asyncio.run(play(create, recording, played, name, wait or [], domain, connect, echo, show))
     raise typer.Exit(code)
+
+
+def _confirm_commands(into_live: list[str], played: list[str], cell: str, on_terminal: bool) -> None:
+    """Ask whether commands of these keys may reach a cell.
+
+    Raises:
+        ConfigError: they are not commands that are played, or the operator did not confirm them.
+    """
+    from recording.player import is_command
+
+    for key in into_live:
+        if not is_command(key) or key not in played:
+            commands = ", ".join(filter(is_command, played)) or "none"
+            raise ConfigError("--into-live", key, f"is no command that is played; played commands: {commands}")
+        if not on_terminal:
+            raise ConfigError("--into-live", key, "needs a terminal, to confirm that the cell may move")
+        if typer.prompt(f"{key} moves the robot of {cell} as recorded. To confirm, type {cell}") != cell:
+            raise ConfigError("--into-live", key, "was not confirmed")
 
 
 def _cell_of(recording: Recording, file: str, named: str | None) -> str:

@@ -39,6 +39,7 @@ class Topic(Generic[M]):
     former: InitVar[str | None] = None
     signed: bool = field(default=False, kw_only=True)
     plain: bool = field(default=True, kw_only=True)  # whether readers of a signed topic also read its former plain key
+    commands: bool = field(default=False, kw_only=True)  # whether its messages make something move or switch
 
     @property
     def expression(self) -> str:
@@ -92,7 +93,7 @@ MOTION_STATUS = Topic("motion/status", m.MotionStatus, "state", "newest goal: st
 MOTION_OWNER = Topic("motion/owner", m.MotionOwner, "state", "current owner of motion: motions of others are refused")
 MOTION_JOG = Topic("motion/jog", m.JogCommand, "stream",
                    "velocities of joints or tool: the arm moves while they are repeated, at least every 0.1 s; "
-                   "any client writes it")
+                   "any client writes it", commands=True)
 ROBOT_STATUS = Topic("robot/status", m.RobotStatus, "state",
                      "state of the arm's own controller: mode, why it cannot move, speed slider")
 ROBOT_DESCRIPTION = Topic("robot/description", m.RobotDescription, "state",

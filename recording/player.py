@@ -10,16 +10,20 @@ import sys
 import termios
 import time
 import tty
-from collections.abc import AsyncIterator, Callable
+from collections import Counter
+from collections.abc import AsyncIterator, Callable, Collection
+from functools import cache
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Protocol
 
+from common.application import find_topic
 from common.client.joining import is_listening
 from common.client.keys import writers_of
 from common.clock import Clock
 from common.errors import ConfigError
 from common.remapping import is_key
 from common.supervision.lifecycle import Interrupts
+from common.topics import MOTION_EXECUTE, Topic
 from common.transport.bus import Bus
 from common.transport.endpoint import endpoint_of
 from common.transport.router import open_router
@@ -99,6 +103,7 @@ class Player:
     def __init__(
         self, recording: Recording, wants: Callable[[str], bool], rename: Callable[[str], str], *, rate: float = 1.0,
         offset: float = 0.0, loop: bool = False, paused: bool = False, stamp_now: bool = False,
+        into_live: Collection[str] = (),
     ) -> None:
         """Prepare to play.
 
@@ -111,8 +116,12 @@ class Player:
             loop: whether to start again at the end.
             paused: whether to wait for a key at the start.
             stamp_now: whether to shift all stamps to the present, so that ages are as recorded.
+            into_live: keys of commands that are published into a live cell, too.
         """
         self.published = 0
+        self.left_out: Counter[str] = Counter()  # commands by key
+        self.is_live: Callable[[], bool] = lambda: True  # whether commands could reach a running cell
+        self._into_live = into_live
         self.quit = False
         self._recording = recording
         self._wants = wants
@@ -211,6 +220,10 @@ class Player:
                 pass
 
     def _publish(self, sample: Sample) -> None:
+        key = self.renamed(sample.topic)
+        if is_command(key) and key not in self._into_live and self.is_live():
+            self.left_out[key] += 1
+            return
         payload = restamp(sample.payload, self._present) if self._stamp_now else sample.payload
         if writer := self._writers.get(sample.topic):  # a damaged index may omit a topic
             writer.put(payload, sample.trace)
@@ -246,6 +259,13 @@ def renaming(pairs: list[str]) -> Callable[[str], str]:
             raise ConfigError("--remap", pair, "must be FROM:=TO, such as camera/image_raw:=test/image")
         table[match[1]] = match[2]
     return lambda topic: table.get(topic, topic)
+
+
+@cache
+def is_command(key: str) -> bool:
+    """Return whether messages of a key make something move or switch."""
+    topic = find_topic(key)
+    return isinstance(topic, Topic) and topic.commands
 
 
 def played_topics(recording: Recording, selection: Selection) -> dict[str, tuple[str, str]]:
@@ -290,7 +310,8 @@ async def play(
         _router(endpoint, may_start=connect is None) as own_router,
         connect_to(cell=cell, service=TOOL, endpoint=endpoint, clock=Clock.from_environment()) as bus,
     ):
-        player = create()
+        player, executor = create(), bus.client(MOTION_EXECUTE)
+        player.is_live = lambda: not own_router or executor.available
         player.declare(bus, topics)
         with Keys(player.on_key, on_terminal=show is not None):
             tasks = [asyncio.create_task(_wait_and_run(player, bus, wait)), asyncio.create_task(interrupts.stop.wait())]
@@ -316,6 +337,9 @@ async def play(
                 if show:
                     show("")
         echo(f"played {player.published:,} messages")
+        for key, count in player.left_out.items():
+            echo(f"left out {count:,} of {key}: they would command {cell}, which is up. Play in a domain of its own "
+                 f"(--domain), or see --into-live", err=True)
         if own_router and player.has_subscribers:
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(LINGER):
