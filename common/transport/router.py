@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import logging
+import math
+import os
 import socket
+import stat
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from pathlib import Path
 
 import zenoh
@@ -17,6 +21,8 @@ from common.errors import ConfigError, ZencellError
 from common.transport.credentials import (
     ACCESS,
     AUTHORITY,
+    OBSERVER,
+    OPERATOR,
     ROUTER_NAME,
     Credentials,
     credentials_of,
@@ -29,6 +35,10 @@ from common.transport.tls_gate import TlsGate
 log = logging.getLogger("router")
 
 _CHECK_SECONDS = 0.5  # between two checks of the links with other routers
+MAX_SESSIONS = 16  # of a service's certificate: it restarts, and its previous session may last for a while
+MAX_TOOLS = 100  # of a certificate that all tools, or the routers of all hosts, share
+SHARED_CERTIFICATES = (OPERATOR, OBSERVER, ROUTER_NAME)
+LOG_SECONDS = 60.0  # between two log lines about a certificate
 
 
 class PortInUse(ZencellError):
@@ -148,7 +158,7 @@ class Router:
         return True
 
 
-@contextmanager
+@contextlib.contextmanager
 def _explain_listen_errors() -> Iterator[None]:
     """Replace an OSError of the gate by one that names the endpoint and its holder, or the reason."""
     try:
@@ -202,6 +212,45 @@ def open_router(
         raise ConfigError("endpoint", endpoint, f"cannot be listened at: {reason}") from None
 
 
+class SessionLimits:
+    """Ends sessions of a certificate that has too many: Zenoh has room for some 500 of all certificates together."""
+
+    def __init__(self) -> None:
+        """Start without a session."""
+        self._known: dict[tuple[str, str], None] = {}  # certificate and remote address, oldest first
+        self._logged: dict[str, float] = {}  # time of the last log line by certificate [s]
+
+    def enforce(self, session: zenoh.Session) -> None:
+        """End the newest sessions beyond the limit of their certificate."""
+        links = [(link.auth_identifier, link.dst) for link in session.info.links() if link.auth_identifier]
+        self._known = dict.fromkeys([*filter(set(links).__contains__, self._known), *links])
+        by_certificate: dict[str, list[str]] = {}
+        for certificate, remote in self._known:
+            by_certificate.setdefault(certificate, []).append(remote)
+        excess: set[tuple[str, int]] = set()
+        for certificate, remotes in by_certificate.items():
+            most = MAX_TOOLS if certificate in SHARED_CERTIFICATES else MAX_SESSIONS
+            if len(remotes) > most:
+                excess.update(map(address_of, remotes[most:]))
+                if time.monotonic() - self._logged.get(certificate, -math.inf) > LOG_SECONDS:
+                    self._logged[certificate] = time.monotonic()
+                    log.error("certificate %s has %d sessions, at most %d are allowed: the newest ones are ended",
+                              certificate, len(remotes), most)
+        if excess:
+            _shut_down(excess)
+
+
+def _shut_down(remotes: set[tuple[str, int]]) -> None:
+    """Shut down this process's connections with remote addresses; Zenoh, which owns them, cannot close a session."""
+    for name in os.listdir("/dev/fd"):
+        with contextlib.suppress(OSError):  # not connected, or closed meanwhile
+            if not stat.S_ISSOCK(os.fstat(int(name)).st_mode):
+                continue
+            with socket.socket(fileno=os.dup(int(name))) as connection:
+                if connection.getpeername()[:2] in remotes:
+                    connection.shutdown(socket.SHUT_RDWR)
+
+
 def maintain(router: Router, stop: threading.Event, check: Callable[[], None] = lambda: None) -> None:
     """Reload certificates and log which routers of other hosts are connected and lost, until stopped.
 
@@ -211,6 +260,7 @@ def maintain(router: Router, stop: threading.Event, check: Callable[[], None] = 
         check: called periodically.
     """
     linked: set[str] = set()
+    limits = SessionLimits()
     while not stop.wait(_CHECK_SECONDS):
         try:
             if router.renew():
@@ -218,6 +268,7 @@ def maintain(router: Router, stop: threading.Event, check: Callable[[], None] = 
         except ZencellError as error:
             log.error("%s; the previous ones stay in force", error)
         check()
+        limits.enforce(router.session)
         now = {str(zid) for zid in router.session.info.routers_zid()}
         for zid in now - linked:
             log.info("linked with router %s", zid)
