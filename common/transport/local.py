@@ -106,10 +106,10 @@ class PendingGet:
 class LocalQuery:
     """A `get` that reached a queryable."""
 
-    def __init__(self, pending: PendingGet, responder: LocalSession, key: str, parameters: str, payload: bytes | None,
-                 attachment: bytes | None) -> None:
+    def __init__(
+        self, pending: PendingGet, responder: LocalSession, key: str, payload: bytes | None, attachment: bytes | None
+    ) -> None:
         self.key = key
-        self.parameters = parameters
         self.payload = payload
         self.attachment = attachment
         self.pending = pending
@@ -182,13 +182,13 @@ class LocalSession:
         timeout: float = 10.0,
     ) -> Callable[[], None]:
         """Query all matching queryables; the caller enforces the time-out. Returns a cancel function."""
-        key, _, parameters = key.partition("?")
+        key = key.partition("?")[0]
         reached = self.network.matching(self.network.queryables, key)
         one = next((entry for entry in reached if entry.complete and entry.key == key), None)
         if one is not None:
             reached = [one]
         pending = PendingGet(self, on_reply, on_done)
-        queries = [LocalQuery(pending, entry.session, key, parameters, payload, attachment) for entry in reached]
+        queries = [LocalQuery(pending, entry.session, key, payload, attachment) for entry in reached]
         pending.open.update(dict.fromkeys(queries))
         self.pending[pending] = None
         if not queries:

@@ -129,9 +129,9 @@ class Server(Generic[Q, A]):
 
     def _check(self, query: Query) -> bytes | None:
         """Return the payload; refuse a query without one or with a wildcard, such as of a tool, and return None."""
-        if query.key != self._key or query.parameters:
-            asked = f"{query.key}?{query.parameters}" if query.parameters else query.key
-            self._refuse(query, "bad_request", ValueError(f"{self._key} is a request: ask exactly for it, not {asked}"))
+        if query.key != self._key:
+            reason = f"{self._key} is a request: ask exactly for it, not {query.key}"
+            self._refuse(query, "bad_request", ValueError(reason))
             return None
         if not query.payload:
             reason = f"{self._key} is a request: a {self.topic.message.__name__} as payload is needed"

@@ -35,7 +35,7 @@ from common.transport.tls_gate import TlsGate
 log = logging.getLogger("router")
 
 _CHECK_SECONDS = 0.5  # between two checks of the links with other routers
-MAX_SESSIONS = 16  # of a service's certificate: it restarts, and its previous session may last for a while
+PER_CERTIFICATE = 16  # of a service's certificate: it restarts, and its previous session may last for a while
 MAX_TOOLS = 100  # of a certificate that all tools, or the routers of all hosts, share
 SHARED_CERTIFICATES = (OPERATOR, OBSERVER, ROUTER_NAME)
 LOG_SECONDS = 60.0  # between two log lines about a certificate
@@ -229,7 +229,7 @@ class SessionLimits:
             by_certificate.setdefault(certificate, []).append(remote)
         excess: set[tuple[str, int]] = set()
         for certificate, remotes in by_certificate.items():
-            most = MAX_TOOLS if certificate in SHARED_CERTIFICATES else MAX_SESSIONS
+            most = MAX_TOOLS if certificate in SHARED_CERTIFICATES else PER_CERTIFICATE
             if len(remotes) > most:
                 excess.update(map(address_of, remotes[most:]))
                 if time.monotonic() - self._logged.get(certificate, -math.inf) > LOG_SECONDS:

@@ -94,7 +94,6 @@ class _Query:
         self._query = query
         self._queue = queue
         self.key = str(query.key_expr)
-        self.parameters = str(query.parameters)
         self.payload = query.payload.to_bytes() if query.payload is not None else None
         self.attachment = query.attachment.to_bytes() if query.attachment is not None else None
 

@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 
 from common.transport.credentials import credentials_of
-from common.transport.router import MAX_SESSIONS, Router, maintain
+from common.transport.router import PER_CERTIFICATE, Router, maintain
 from tests.security.raw_client import RawClient
 from tests.security.test_routers import free_port
 
-MORE = MAX_SESSIONS + 8
+MORE = PER_CERTIFICATE + 8
 
 
 @pytest.mark.parametrize("at", ["gate", "near"])
@@ -36,7 +36,7 @@ def test_newest_sessions_beyond_the_limit_are_ended_for_a_service_only(certifica
         fewest = MORE
         for _ in range(300):
             fewest = min(fewest, sessions("panda.camera_simulator"))
-            if fewest <= MAX_SESSIONS:
+            if fewest <= PER_CERTIFICATE:
                 break
             stop.wait(0.05)
-        assert fewest == MAX_SESSIONS and sessions("operator") == MORE
+        assert fewest == PER_CERTIFICATE and sessions("operator") == MORE
