@@ -134,12 +134,7 @@ class Limiter:
         jump = np.abs(change - self._mean_acceleration)
         slack_share = 1.0 if self._approach_state is None else 0.5  # an approach ends no faster than it was
         # It must be possible to stop before the end of the joint.
-        free = np.where(mean > 0, self._highest - target, target - self._lowest)
-        if self._beyond:
-            beyond = np.where(mean > 0, self._highest > self._upper, self._lowest < self._lower)
-            free += np.where(beyond, ROUNDING, POSITION_SLACK)
-        else:
-            free += POSITION_SLACK
+        free = np.where(mean > 0, self._highest - target, target - self._lowest) + ROUNDING
         passes = (
             (np.abs(velocity - mean) <= hardest * (seconds * slack_share) + ROUNDING)
             & (np.abs(change) <= hardest)
@@ -155,8 +150,8 @@ class Limiter:
         fastest, hardest = share * self._velocity, self._acceleration
         lower, upper = self._lowest, self._highest
         target = np.clip(np.where(np.isfinite(target), target, self.position), lower, upper)
-        free = np.minimum(upper - target, target - lower)  # to reach that velocity, and rest again
-        ending = np.minimum(fastest, np.sqrt(hardest * free))
+        free = np.minimum(upper - target, target - lower)  # to reach that velocity, and rest again after another step
+        ending = np.minimum(fastest, hardest * (np.sqrt(seconds**2 + free / hardest) - seconds))
         velocity = np.clip(np.where(np.isfinite(velocity), velocity, 0.0), -ending, ending)
         problem = self._problem(hardest)
         problem.target_position, problem.target_velocity = target.tolist(), velocity.tolist()

@@ -20,7 +20,7 @@ def assert_within(positions, limits=LIMITS, share=1.0, acceleration=None, period
     """Check the differences between set-points."""
     most = limits.acceleration if acceleration is None else acceleration
     q = np.array(positions)
-    assert np.all(q >= limits.lower - 2.5 * POSITION_SLACK) and np.all(q <= limits.upper + 2.5 * POSITION_SLACK)
+    assert np.all(q >= limits.lower - 1.1 * POSITION_SLACK) and np.all(q <= limits.upper + 1.1 * POSITION_SLACK)
     v = np.diff(q, axis=0) / period
     a = np.diff(v, axis=0) / period
     assert np.all(np.abs(v) <= share * limits.velocity * 1.021), np.abs(v).max(axis=0)
@@ -113,7 +113,7 @@ def test_no_joint_creeps_beyond_its_limit(beyond, speed):
     for _ in range(int(6 * POSITION_SLACK / (speed * PERIOD))):
         target = target + speed * PERIOD
         position, _ = limiter.step(target, np.full(2, speed), PERIOD)
-        assert np.all(position <= np.maximum(start + 1e-8, LIMITS.upper + 2.5 * POSITION_SLACK)), position - start
+        assert np.all(position <= np.maximum(start + 1e-8, LIMITS.upper + 1.1 * POSITION_SLACK)), position - start
 
 
 @given(
@@ -130,4 +130,4 @@ def test_joint_beyond_its_limit_moves_no_farther_at_any_speed_or_jump(out, steps
             target = start + asked if jumps else limiter.position + asked * PERIOD
             position, _ = limiter.step(target, STILL if jumps else asked, PERIOD)
             excess = np.maximum(LIMITS.lower - position, position - LIMITS.upper)
-            assert np.all(excess <= np.maximum(farthest + 1e-8, 4 * POSITION_SLACK))  # the slack, and to brake
+            assert np.all(excess <= np.maximum(farthest + 1e-8, 1.1 * POSITION_SLACK))
