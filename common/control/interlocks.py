@@ -14,10 +14,11 @@ import re
 import socket
 from collections.abc import AsyncIterator, Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
+from zlib import crc32
 
 from filelock import FileLock, Timeout
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 from common.atomic_file import STATE_VARIABLE, AtomicFile, Unreadable, state_folder
 from common.errors import ConfigError, Refused
@@ -67,6 +68,15 @@ class Record(BaseModel):
     speed: Speed | None = None
     newest: int = Field(0, ge=0, le=LATEST)  # `since` of the newest interlock there ever was
     arm_stopped: bool = False  # by a safety stop of the arm's own controller from which no operator has recovered it
+    checksum: int | None = None  # CRC-32 of the rest; records of earlier versions have none
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        expected = crc32(self.model_dump_json(exclude={"checksum"}).encode())
+        if self.checksum not in (None, expected):
+            raise ValueError("the checksum does not match")
+        self.checksum = expected
+        return self
 
 
 class Interlocks:

@@ -328,3 +328,19 @@ def test_interlocks_of_a_real_arm_belong_to_the_arm_whatever_its_cell_is_called(
         assert interlock_file(cell, "ur-10.0.0.5", environ).read().interlocks == stopped.record.interlocks
     assert interlock_file("a", "ur-10.0.0.6", environ).find() is None
     assert interlock_file("a", "ur-../x", environ).path.parent == tmp_path
+
+
+def test_no_flipped_bit_of_the_record_lifts_a_stop_or_raises_the_speed(tmp_path: Path) -> None:
+    interlocks = made()
+    interlocks.stop(StopRequest(owner="anna", reason="fire"))
+    interlocks.speed = Speed(scaling=0.25, configured=1.0)
+    file = InterlockFile(tmp_path / "r")
+    file.save(interlocks.record)
+    text = file.path.read_bytes().rstrip()
+    for position in range(len(text)):
+        for bit in range(8):
+            damaged = bytearray(text)
+            damaged[position] ^= 1 << bit
+            file.path.write_bytes(damaged)
+            record, problem = file.load()
+            assert problem or record == interlocks.record, damaged.decode(errors="replace")
