@@ -203,10 +203,12 @@ async def run(
                 handlers.jog(command)
 
         jogging = asyncio.create_task(jog(), name="jog")
+        restoring = asyncio.create_task(store.restore_file(), name="restore interlock file")
         try:
             await control(bus, config, executor, handlers, publishers, jogging, period)
         finally:
             jogging.cancel()
+            restoring.cancel()
             await handlers.close()
             executor.close()
 

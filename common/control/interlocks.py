@@ -322,6 +322,7 @@ class InterlockStore:
         self._saved, problem = file.load()
         self._problem = ""  # why the newest change is not on disk
         self._retrying: asyncio.Task[None] | None = None
+        self._removed = False  # whether the file is to be written again, as it is gone
         self.on_change: Callable[[], None] = lambda: None
         self.interlocks = Interlocks(self._saved)
         if problem:
@@ -334,7 +335,7 @@ class InterlockStore:
         """Write all changes so far; return "", or why they are not on disk. A failed write is retried each second."""
         async with self._writing:
             record = self.interlocks.record
-            if record == self._saved and not self._problem:
+            if record == self._saved and not self._problem and not self._removed:
                 return ""
             before = self._problem
             try:
@@ -348,13 +349,23 @@ class InterlockStore:
                 if self._retrying is None:
                     self._retrying = asyncio.create_task(self._retry(), name="save interlocks")
             else:
-                self._saved, self._problem = record, ""
+                self._saved, self._problem, self._removed = record, "", False
                 self.interlocks.note_saved(record)
                 if before:
                     self._log.warning("%s is written again: all interlocks persist", self._file.path)
             if before or self._problem:
                 self.on_change()
             return self._problem
+
+    async def restore_file(self) -> None:
+        """Write the file again whenever it was removed, until cancelled."""
+        while True:
+            await asyncio.sleep(RETRY_PERIOD)
+            if not self._problem and not await asyncio.to_thread(os.path.lexists, self._file.path):
+                self._log.error("%s was removed while it was in use: it is written again. Leave the folder of persistent "
+                                "state alone, as stops are lost with it", self._file.path)
+                self._removed = True
+                await self.save()
 
     async def _retry(self) -> None:
         while self._problem:
