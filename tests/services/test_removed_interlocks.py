@@ -17,7 +17,7 @@ async def test_stop_is_written_again_after_its_folder_was_removed(caplog, monkey
         file = interlock_file(CELL)
         shutil.rmtree(file.path.parent)
         async with asyncio.timeout(10):
-            while file.find() is None:
+            while file.find() is None:  # noqa: ASYNC110 - a file has no event
                 await asyncio.sleep(0.05)
         assert [stop.by for stop in file.read().interlocks] == ["anna"]
         assert "was removed while it was in use" in caplog.text
