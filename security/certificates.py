@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import datetime
+import errno
 import ipaddress
 import json
 import os
+import stat
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
@@ -15,12 +17,21 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from common.errors import ConfigError
-from common.transport.credentials import ACCESS, AUTHORITY, OBSERVER, OPERATOR, ROUTER_NAME, common_name
+from common.transport.credentials import (
+    ACCESS,
+    AUTHORITY,
+    OBSERVER,
+    OPERATOR,
+    ROUTER_NAME,
+    common_name,
+    require_unwritable,
+)
 from security.access import Rights, access_control
 from security.page_tokens import ROLES, make_token, token_file
 from security.validation import certificate_in, hosts_in
 
 CA_NAME = "zencell certificate authority"
+NOT_OWN = "is a link or no regular file: writing to it would change another file; remove it"
 BACKDATED = datetime.timedelta(minutes=5)  # clocks of two hosts differ
 LOCAL = ("localhost", "127.0.0.1", "::1")
 ACCESS_HEAD = "// Access rules from the declarations of the services; all else is denied. By `zencell secure init`.\n"
@@ -65,7 +76,7 @@ class Authority:
             others: certificates of further trusted authorities, written after its own.
         """
         every = [self._certificate, *(each for each in others if each != self._certificate)]
-        certificate.write_bytes(b"".join(each.public_bytes(serialization.Encoding.PEM) for each in every))
+        write_file(certificate, b"".join(each.public_bytes(serialization.Encoding.PEM) for each in every))
         write_secret(key, _key_bytes(self._key))
 
     def issue(self, name: str, hosts: Sequence[str], days: float, certificate: Path, key: Path) -> None:
@@ -88,7 +99,7 @@ class Authority:
             x509.SubjectAlternativeName([_general_name(host) for host in hosts or [name]]), critical=False
         )
         signed = builder.sign(self._key, hashes.SHA256())
-        certificate.write_bytes(signed.public_bytes(serialization.Encoding.PEM))
+        write_file(certificate, signed.public_bytes(serialization.Encoding.PEM))
         write_secret(key, _key_bytes(own))
 
 
@@ -132,9 +143,27 @@ def _key_bytes(key: ec.EllipticCurvePrivateKey) -> bytes:
 
 def write_secret(path: Path, data: bytes) -> None:
     """Write a file that at no moment another user can read."""
-    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
+    write_file(path, data, 0o600)
+
+
+def write_file(path: Path, data: bytes, mode: int = 0o644) -> None:
+    """Write a file that only this user can change; at no moment it has more permissions than `mode`.
+
+    Raises:
+        ConfigError: it is a link, also a hard one, whose target would be overwritten, or not a regular file.
+    """
+    try:
+        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o600)
+    except OSError as error:
+        if error.errno not in (errno.ELOOP, errno.ENXIO):
+            raise
+        raise ConfigError("DIR", str(path), NOT_OWN) from None
     with os.fdopen(descriptor, "wb") as file:
-        os.fchmod(file.fileno(), 0o600)  # an existing file may have been readable by others
+        found = os.fstat(descriptor)
+        if not stat.S_ISREG(found.st_mode) or found.st_nlink > 1:
+            raise ConfigError("DIR", str(path), NOT_OWN)
+        os.fchmod(descriptor, mode)  # an existing file may have had others
+        file.truncate()
         file.write(data)
 
 
@@ -166,6 +195,7 @@ def make(
     if not renew and certificate.exists():
         raise ConfigError("DIR", str(place), "has certificates already: --renew replaces all except the authority")
     place.mkdir(parents=True, exist_ok=True, mode=0o700)
+    require_unwritable(place)
     authority = Authority.load(certificate, key) if renew else Authority.new(days)
     if not renew:
         authority.write(certificate, key)
@@ -182,7 +212,7 @@ def make(
         for role in ROLES:
             write_secret(token_file(place, cell, role), f"{make_token()}\n".encode())
     text = ACCESS_HEAD + json.dumps(access_control(rights), indent=1) + "\n"
-    (place / ACCESS).write_text(text, encoding="utf-8")
+    write_file(place / ACCESS, text.encode())
     return len(names) + 1
 
 

@@ -362,8 +362,8 @@ class InterlockStore:
         while True:
             await asyncio.sleep(RETRY_PERIOD)
             if not self._problem and not await asyncio.to_thread(os.path.lexists, self._file.path):
-                self._log.error("%s was removed while it was in use: it is written again. Leave the folder of persistent "
-                                "state alone, as stops are lost with it", self._file.path)
+                self._log.error("%s was removed while it was in use: it is written again. Leave the folder "
+                                "of persistent state alone, as stops are lost with it", self._file.path)
                 self._removed = True
                 await self.save()
 

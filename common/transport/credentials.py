@@ -8,6 +8,7 @@ import logging
 import os
 import re
 import ssl
+import stat
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -90,7 +91,21 @@ def credentials_of(name: str, folder: Path) -> Credentials:
             raise ConfigError("--secure", str(file), "cannot be read by this user")
     if found.key.stat().st_mode & 0o077:
         raise ConfigError("--secure", str(found.key), "can be read by others: chmod 600 it")
+    for path in (folder, found.authority, found.certificate):
+        require_unwritable(path)
     return found
+
+
+def require_unwritable(path: Path) -> None:
+    """Return if only its owner can change a file, or replace the files of a folder.
+
+    Raises:
+        ConfigError: other users can.
+    """
+    mode = path.stat().st_mode
+    sticky = stat.S_ISDIR(mode) and mode & stat.S_ISVTX  # there, as in volumes of secrets, each replaces only own files
+    if mode & 0o022 and not sticky:
+        raise ConfigError("--secure", str(path), "can be changed by other users: chmod go-w it, and check its contents")
 
 
 def require_pair(found: Credentials) -> None:
@@ -114,6 +129,9 @@ def read_access(folder: Path) -> dict[str, Any]:
         ConfigError: the file is missing, malformed, or does not enable access control.
     """
     path = folder / ACCESS
+    if path.is_file():
+        require_unwritable(folder)
+        require_unwritable(path)
     try:
         text = path.read_text(encoding="utf-8")
         lines = [line for line in text.splitlines() if not line.lstrip().startswith("//")]
