@@ -1,4 +1,4 @@
-"""Files of certificates that other users could change are rejected, and links are not followed when they are written."""
+"""Files of certificates that other users could change are rejected; links are not followed when they are written."""
 
 import os
 import shutil
