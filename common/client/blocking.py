@@ -12,6 +12,7 @@ import concurrent.futures
 import contextlib
 import functools
 import inspect
+import os
 import threading
 import weakref
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
@@ -19,6 +20,7 @@ from typing import Any, TypeVar
 
 from common.client import arm, cell, parameters, scene, subscriptions, task
 from common.errors import ZencellError
+from common.transport.zenoh_session import Forked
 
 T = TypeVar("T")
 
@@ -36,12 +38,15 @@ class LoopThread:
     def __init__(self) -> None:
         """Start the thread."""
         self.ended = False
+        self._process = os.getpid()
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, name="zencell", daemon=True)
         self._thread.start()
 
     def wait(self, begin: Callable[[], Awaitable[T]]) -> T:
         """Run a coroutine on the loop and return its result. Ctrl-C cancels it, waits for its end, and is raised."""
+        if self._process != os.getpid():
+            raise Forked
         if self.ended:
             raise ZencellError("the cell was closed")
         done: concurrent.futures.Future[T] = concurrent.futures.Future()
@@ -84,7 +89,7 @@ class LoopThread:
 
     def end(self) -> None:
         """Cancel pending calls and end the thread."""
-        if not self.ended:
+        if not self.ended and self._process == os.getpid():
             self.wait(self._cancel_all)
             self.ended = True
             self._loop.call_soon_threadsafe(self._loop.stop)

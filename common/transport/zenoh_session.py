@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import os
 import threading
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
@@ -14,7 +15,7 @@ from typing import Any
 import zenoh
 
 from common.clock import Clock
-from common.errors import NoRouter
+from common.errors import NoRouter, ZencellError
 from common.transport.bus import Bus
 from common.transport.credentials import OPERATOR, Credentials, common_name, credentials_of, secure_folder
 from common.transport.endpoint import LARGE_BYTES, client_config, nearby_endpoints
@@ -327,6 +328,27 @@ def _open(endpoint: str, credentials: Credentials | None, near: Sequence[str] = 
         return attempt(two_links=False)
 
 
+class Forked(ZencellError):
+    """This process was forked from one with a connection, whose threads and locks do not work here."""
+
+    def __init__(self) -> None:
+        super().__init__("this process was forked from one that has a cell open, which cannot work: start it with "
+                         'multiprocessing.get_context("spawn")')
+
+
+class _Opened:
+    """Whether this process has opened a connection, and whether it was forked from one that had."""
+
+    any = forked = False
+
+    @classmethod
+    def note_fork(cls) -> None:
+        cls.forked = cls.forked or cls.any
+
+
+os.register_at_fork(after_in_child=_Opened.note_fork)
+
+
 async def open_zenoh(
     endpoint: str, credentials: Credentials | None = None, near: Sequence[str] | None = None
 ) -> ZenohSession:
@@ -334,6 +356,9 @@ async def open_zenoh(
 
     The `near` endpoints of the same router are tried first; by default those that a supervisor handed down.
     """
+    if _Opened.forked:
+        raise Forked
+    _Opened.any = True
     near = nearby_endpoints(endpoint) if near is None else near
     loop = asyncio.get_running_loop()
     opened: asyncio.Future[ZenohSession] = loop.create_future()
