@@ -28,6 +28,7 @@ MOST_COLUMNS = 5000  # of a table
 COLORS = ("bgr8", "rgb8", "mono8")
 CODEC = "mp4v"
 DEFAULT_RATE = 10.0  # [Hz] of a video of one image
+FORMULA = ("=", "+", "-", "@", "\t", "\r")  # beginnings of texts that spreadsheets evaluate
 LONGEST = 100  # [characters] of a file name
 
 
@@ -57,10 +58,10 @@ def export_tables(recording: Recording, folder: Path, wants: Wanted, decoder: De
         path = folder / f"{name}.csv"
         with path.open("w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, list(columns))
-            writer.writeheader()
+            writer.writerow({column: _inert(column) for column in columns})
             counts[path.name] = 0
             for row in _rows(recording, topic, decoder):
-                writer.writerow(row)
+                writer.writerow({column: _inert(value) for column, value in row.items()})
                 counts[path.name] += 1
     return counts
 
@@ -70,6 +71,11 @@ def _rows(recording: Recording, topic: str, decoder: Decoder) -> Iterator[dict[s
         message = decoder.message(sample)
         if message is not None and not isinstance(message, NO_TABLES):
             yield {"time": _seconds(sample.log_time), "stamp": _seconds(sample.publish_time), **row_of(message)}
+
+
+def _inert(value: Any) -> Any:
+    """Return a cell that no spreadsheet evaluates as a formula: a text that begins like one gets an apostrophe."""
+    return f"'{value}" if isinstance(value, str) and value[:1] in FORMULA else value
 
 
 def _seconds(nanoseconds: int) -> str:
