@@ -100,7 +100,8 @@ def _require_rules(launch: Launch, services: Sequence[str], folder: Path) -> Non
     command = [*module_command("cli.main"), "secure", "check", str(folder), "--only-rules", "--cell", launch.cell,
                "--only", ",".join(services)]
     for text in launch.overrides:
-        command += ["--set", text]
+        if not text.partition("=")[0].endswith("token"):  # a secret, which every user could read in the command line
+            command += ["--set", text]
     if launch.world is not None:
         command += ["--world", launch.world]
     if launch.seed is not None:

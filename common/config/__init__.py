@@ -12,6 +12,7 @@ from common.config.basics import Coordinate, Length, Number, Parameters, Point, 
 from common.config.cell import Cell, Grasp, Members, Motion, Pipeline, PlannerEntry, Reach, Run, ServiceEntry, Watchdogs
 from common.config.files import config_root, find_file, names_of, parse_yaml, read_robot, read_yaml
 from common.config.loading import (
+    OVERRIDES_VARIABLE,
     expanded,
     load_cell,
     load_robot,

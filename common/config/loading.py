@@ -33,6 +33,7 @@ from common.remapping import SERVICE_NAME, validate_table
 NOT_A_SERVICE = ("router", "supervisor", "recorder")  # names of other processes
 SECTIONS = ("robot", "world", "pipeline", "services")  # an override of a complete one precedes those of its fields
 P = TypeVar("P", bound=Parameters)
+OVERRIDES_VARIABLE = "ZENCELL_SET"  # JSON list of overrides that a supervisor gives to its services
 
 
 def parse_override(text: str, option: str = "--set") -> tuple[list[str], Any]:

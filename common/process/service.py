@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import asyncio
 import gc
+import json
 import logging
 import os
 import sys
@@ -15,7 +16,7 @@ from typing import Any, Generic, NoReturn, Protocol, TypeVar
 
 from common import topics
 from common.clock import BOOTED_VARIABLE, CLOCK_FOLDER_VARIABLE, EPOCH_VARIABLE, SPEED_VARIABLE, Clock
-from common.config import Cell, Parameters, Watchdogs, load_cell, service_config
+from common.config import OVERRIDES_VARIABLE, Cell, Parameters, Watchdogs, load_cell, service_config
 from common.config.tunables import apply, checked, describe, values_of
 from common.errors import ConfigError, UnknownName, ZencellError
 from common.messages import ParameterReply, ParameterRequest
@@ -121,7 +122,8 @@ def prepare(kind: str, config: type[P], options: argparse.Namespace) -> Start[P]
     if not chosen:
         raise ConfigError("--cell", "", f"must name a cell; {CELL_VARIABLE} is read too")
     endpoint = endpoint_of(options.domain, options.connect)
-    cell = load_cell(chosen, options.set, world=options.world, seed=options.seed)
+    overrides = [*json.loads(os.environ.get(OVERRIDES_VARIABLE, "[]")), *options.set]
+    cell = load_cell(chosen, overrides, world=options.world, seed=options.seed)
     name = name_in(cell, kind, options.name)
     folder = secure_folder()
     credentials = credentials_of(common_name(cell.name, name), folder) if folder else None

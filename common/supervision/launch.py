@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib.util
+import json
 import os
 import socket
 import sys
@@ -14,7 +15,7 @@ from pathlib import Path
 
 from common.application import import_folders, import_from_working_directory
 from common.clock import MAX_SPEED, MIN_SPEED, Clock
-from common.config import Cell, ServiceEntry
+from common.config import OVERRIDES_VARIABLE, Cell, ServiceEntry
 from common.errors import ConfigError
 from common.transport.endpoint import (
     CONNECT_VARIABLE,
@@ -57,9 +58,9 @@ class Launch:
         return [*command, *self._process_options()]
 
     def service_command(self, entry: ServiceEntry, *, gate: bool = True) -> list[str]:
-        """Return the command line of a service; with `gate` it waits behind its gate."""
+        """Return the command line of a service; with `gate` it waits behind its gate, and gets overrides unseen."""
         command = [*module_command(entry.module), *entry.name_option, "--cell", self.cell]
-        for text in self.overrides:
+        for text in () if gate else self.overrides:
             command += ["--set", text]
         if self.world is not None:
             command += ["--world", self.world]
@@ -73,8 +74,10 @@ class Launch:
 
     def environment(self, inherited: Mapping[str, str] = os.environ) -> dict[str, str]:
         """Return the environment of every process: inherited and extra variables, near endpoints, clock, PYTHONPATH."""
+        # Every user of the host can read command lines, and an override may be a token.
+        overrides = {OVERRIDES_VARIABLE: json.dumps(self.overrides)} if self.overrides else {}
         near = {NEAR_VARIABLE: f"{endpoint_of(self.domain)}={','.join(self.near)}"} if self.near else {}
-        return {**inherited, **self.extra, **near, **self.clock.environment(),
+        return {**inherited, **self.extra, **overrides, **near, **self.clock.environment(),
                 "PYTHONPATH": pythonpath(inherited, self.cell)}
 
 

@@ -330,12 +330,10 @@ def test_interlocks_of_a_real_arm_belong_to_the_arm_whatever_its_cell_is_called(
     assert interlock_file("a", "ur-../x", environ).path.parent == tmp_path
 
 
-def test_no_flipped_bit_of_the_record_lifts_a_stop_or_raises_the_speed(tmp_path: Path) -> None:
-    interlocks = made()
-    interlocks.stop(StopRequest(owner="anna", reason="fire"))
-    interlocks.speed = Speed(scaling=0.25, configured=1.0)
+def test_no_flipped_bit_of_the_record_lifts_a_stop_or_raises_the_speed(tmp_path: Path, stopped: Made) -> None:
+    stopped.speed = Speed(scaling=0.25, configured=1.0)
     file = InterlockFile(tmp_path / "r")
-    file.save(interlocks.record)
+    file.save(stopped.record)
     text = file.path.read_bytes().rstrip()
     for position in range(len(text)):
         for bit in range(8):
@@ -343,4 +341,4 @@ def test_no_flipped_bit_of_the_record_lifts_a_stop_or_raises_the_speed(tmp_path:
             damaged[position] ^= 1 << bit
             file.path.write_bytes(damaged)
             record, problem = file.load()
-            assert problem or record == interlocks.record, damaged.decode(errors="replace")
+            assert problem or record == stopped.record, damaged.decode(errors="replace")

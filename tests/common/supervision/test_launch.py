@@ -1,5 +1,6 @@
 """Command lines, environment and location of the router that a cell is launched with."""
 
+import json
 import os
 import socket
 import sys
@@ -16,11 +17,12 @@ from common.transport.endpoint import remapped_small_keys
 ENTRY = ServiceEntry(name="it", module="own.package.it")
 
 
-def test_command_of_a_service_has_all_options_of_the_launch() -> None:
-    launch = Launch("my.yaml", ("a.b=1", "c=[2, 3]"), "w2", 5, 77)
+def test_service_gets_all_options_of_the_launch_and_no_command_line_shows_an_override() -> None:
+    launch = Launch("my.yaml", ("services.viewer.token=secret", "c=[2, 3]"), "w2", 5, 77)
     assert launch.service_command(ENTRY)[1:] == [
-        "-P", "-m", "own.package.it", "--cell", "my.yaml", "--set", "a.b=1", "--set", "c=[2, 3]",
-        "--world", "w2", "--seed", "5", "--domain", "77", "--gate"]
+        "-P", "-m", "own.package.it", "--cell", "my.yaml", "--world", "w2", "--seed", "5", "--domain", "77", "--gate"]
+    assert json.loads(launch.environment({})["ZENCELL_SET"]) == ["services.viewer.token=secret", "c=[2, 3]"]
+    assert "--set" in launch.service_command(ENTRY, gate=False), "for someone who starts it by hand"
     assert launch.router_command()[-3:] == ["--domain", "77", "--gate"]
     connected = Launch("panda", connect="tcp/10.0.0.1:7447", log_json=True).service_command(ENTRY)
     assert connected[-4:] == ["--connect", "tcp/10.0.0.1:7447", "--gate", "--log-json"]
