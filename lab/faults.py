@@ -144,7 +144,7 @@ def _main_faults(random: np.random.Generator, services: Sequence[str], sooner: f
         if kind == "operator":
             faults.append(Fault(at, kind))
             continue
-        target, party, seconds = str(random.choice(list(services))), _party(random, kind), 0.0
+        target, party, seconds = str(random.choice(list(services))), _requesting_process(random, kind), 0.0
         if kind in SECONDS:
             seconds = float(random.uniform(*SECONDS[kind]))
         if kind == "cut" and any(fault.kind == "cut" for fault in faults) and random.random() < ROUTER_SHARE:
@@ -178,7 +178,7 @@ def _last_faults(seed: int, services: Sequence[str], sooner: float) -> list[Faul
     return faults
 
 
-def _party(random: np.random.Generator, kind: Kind) -> Party:
+def _requesting_process(random: np.random.Generator, kind: Kind) -> Party:
     """Return the process that a fault hits while a goal is being requested; empty if it does not wait for a goal."""
     if kind == "late goal" or (kind in ("crash", "cut") and random.random() < DURING_GOAL_SHARE):
         return "client" if random.random() < 0.5 else "server"

@@ -68,7 +68,7 @@ class OcclusionReport:
         hiding = [one.hidden for one in seen if one.hidden is not None]
         if not hiding:
             return "", False
-        if len(hiding) == len(seen) and all(hidden.everything for hidden in hiding):
+        if len(hiding) == len(seen) and all(hidden.covers_image for hidden in hiding):
             return hiding[0].by, True
         self._region = self._region or VisibleTable(self._around, self._bounds)
         robot, silhouettes = views.robot

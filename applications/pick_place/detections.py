@@ -239,7 +239,7 @@ class ValidationResult:
 
     @property
     def remark(self) -> str:
-        """Detections that are no targets, as a text; empty for none."""
+        """Text about detections that are not targets; empty without any."""
         parts = list(dict.fromkeys(self.remarks))
         if self.refused:
             count, reason = len(self.refused), self.refused[0][1]

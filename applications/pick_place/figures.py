@@ -33,14 +33,14 @@ class PickPlaceFigures(application.Figures):
         return {DETECTED_OBJECTS: self._on_detections, VALIDATED_TARGETS: self._on_targets}
 
     def _on_detections(self, _time: float, found: MarkerArray) -> None:
-        from recording.report.history import count_places
+        from recording.report.history import count_positions
 
-        count_places(self._detections, (marker.pose for marker in found.markers))
+        count_positions(self._detections, (marker.pose for marker in found.markers))
 
     def _on_targets(self, _time: float, targets: PoseArray) -> None:
-        from recording.report.history import count_places
+        from recording.report.history import count_positions
 
-        count_places(self._targets, targets.poses)
+        count_positions(self._targets, targets.poses)
 
     def picture(self, run: RunHistory, tool: npt.NDArray[np.float64]) -> application.Section | None:
         """Return the top view of the table with the detections."""

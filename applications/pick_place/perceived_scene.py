@@ -270,7 +270,7 @@ class PerceivedScene:
             self._unsorted[view] = unsorted
         else:
             self._retain_occluded(view, now, hidden)
-            if unsorted or not hidden.everything:
+            if unsorted or not hidden.covers_image:
                 self._unsorted[view] = unsorted
         self._occupied[view] = now
         self._since = {slot: self._since.get(slot, stamp) for slot in self._occupied_slots(beneath=False)}

@@ -71,7 +71,7 @@ def models_in(annotation: Any) -> Iterator[type[BaseModel]]:
         yield from models_in(argument)
 
 
-def _bound(metadata: Any) -> str:
+def _bound_text(metadata: Any) -> str:
     for name, sign in (("gt", ">"), ("ge", ">="), ("lt", "<"), ("le", "<=")):
         if getattr(metadata, name, None) is not None:
             return f"{sign} {getattr(metadata, name):g}"

@@ -44,7 +44,7 @@ class Occlusion:
     distance: npt.NDArray[np.float32] | None = None
 
     @property
-    def everything(self) -> bool:
+    def covers_image(self) -> bool:
         """Whether the complete image is unusable."""
         return self.distance is None
 

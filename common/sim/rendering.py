@@ -157,7 +157,7 @@ class Renderer:
                 self.camera, _centre(obj), obj.size.x / 2, self._rim_width)
             self._spheres[key] = coverage
             if coverage is not None:
-                _blend_sphere(view, coverage, _bgr(obj), occluded=occluded)
+                _draw_sphere(view, coverage, _bgr(obj), occluded=occluded)
         return view
 
     def _mesh(self, obj: WorldObject, cache: Mapping[tuple[object, ...], Array]) -> Mesh:
@@ -273,7 +273,7 @@ def sphere_coverage(camera: Pinhole, center: Array, radius: float, rim_width: fl
     return SphereCoverage(low, high, rim[..., None], inner[..., None], near[..., None])
 
 
-def _blend_sphere(view: View, sphere: SphereCoverage, color: tuple[int, int, int], *, occluded: bool) -> None:
+def _draw_sphere(view: View, sphere: SphereCoverage, color: tuple[int, int, int], *, occluded: bool) -> None:
     """Blend a sphere into the image; with `hidden`, nearer depth in the view occludes it."""
     (left, top), (right, bottom) = sphere.low, sphere.high
     weight: float | npt.NDArray[np.float32] = 1.0

@@ -168,7 +168,7 @@ class RemoteServices:
 
     @property
     def notices(self) -> list[Notice]:
-        """Notices of other hosts."""
+        """Changes that other hosts announced."""
         return [each for host in sorted(self._notices) for each in self._notices[host]][:MOST_NOTICES]
 
     def is_copied_here(self, service: str) -> bool:

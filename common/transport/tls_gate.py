@@ -76,7 +76,7 @@ class TlsGate:
         self.refused = 0
         for endpoint in endpoints:
             try:
-                self._listeners[endpoint] = _bound(*address_of(endpoint))
+                self._listeners[endpoint] = _bound_listener(*address_of(endpoint))
             except OSError as error:
                 self.close()
                 error.filename = endpoint
@@ -296,7 +296,7 @@ def _is_gone(client: socket.socket) -> bool:
     return bool(poll.poll(0))
 
 
-def _bound(host: str, port: int) -> socket.socket:
+def _bound_listener(host: str, port: int) -> socket.socket:
     listener = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)
     try:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

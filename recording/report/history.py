@@ -339,7 +339,7 @@ def _while(spans: list[Span], time: float, active: bool, label: str) -> bool:
     return False
 
 
-def count_places(places: dict[tuple[int, int], int], poses: Iterable[m.Pose]) -> None:
+def count_positions(places: dict[tuple[int, int], int], poses: Iterable[m.Pose]) -> None:
     """Count poses by their position from above, in steps of `SAME_PLACE`."""
     for pose in poses:
         key = round(pose.position.x / SAME_PLACE), round(pose.position.y / SAME_PLACE)

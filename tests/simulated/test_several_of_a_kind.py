@@ -39,7 +39,7 @@ def test_task_is_not_done_while_one_of_two_cameras_is_silent() -> None:
     lost = "services.right_detector.topics={camera/*: nowhere/camera/*, detect*: right/detect*}"
     outcome = Simulation(load_cell(CELL, [lost, "services.smart_pick_place.look_timeout=3"]), 1).run()
     assert (outcome.state, outcome.done) == ("ERROR", 2), outcome
-    assert "no image received from right for 3 s" in outcome.message
+    assert "no image received from right, for 3 s" in outcome.message
 
 
 def test_two_cameras_on_one_key_are_rejected_at_the_start() -> None:

@@ -56,7 +56,7 @@ def test_arm_behind_the_camera_occludes_nothing(robot: RobotModel) -> None:
 
 def test_unusable_image_occludes_everything() -> None:
     unusable = Occlusion(ABOVE, "the lens is covered")
-    assert unusable.everything
+    assert unusable.covers_image
     assert unusable.occludes([(0.4, 0.0, 0.03)])[0] and unusable.touches([(0.4, 0.0, 0.03)])[0]
 
 
