@@ -34,7 +34,7 @@ def fields_of(model: type[BaseModel], indent: int = 0, seen: tuple[type[BaseMode
     """Yield the fields of a message and of its nested messages: name, type, default, description."""
     for name, field in model.model_fields.items():
         line = f"{'  ' * indent}{name}: {type_name(field.annotation)}"
-        if bounds := ", ".join(text for text in map(_bound, field.metadata) if text):
+        if bounds := ", ".join(text for text in map(_bound_text, field.metadata) if text):
             line += f" ({bounds})"
         if not field.is_required() and isinstance(field.default, str | int | float | bool):
             line += f" = {field.default!r}"
