@@ -114,3 +114,15 @@ def test_error_reply_survives_encoding_and_differs_from_one_of_zenoh() -> None:
 
 def test_encoding_names_the_message() -> None:
     assert encoding_of(m.Image) == "application/msgpack;Image"
+
+
+@pytest.mark.parametrize(("message", "left_out"), [
+    (m.HoldRequest(hold=True), {"goal"}),
+    (m.HoldRequest(hold=True, goal="a"), set()),
+    (m.GripperCommand(id="a", width=0.01), set(m.GripperCommand.omitted_defaults)),
+    (m.GripperCommand(id="a", width=0.01, owner="ann"), {*m.GripperCommand.omitted_defaults} - {"owner"}),
+])
+def test_fields_that_earlier_readers_do_not_know_are_sent_only_with_another_value_than_their_default(message, left_out):
+    sent = msgpack.unpackb(encode(message))
+    assert set(type(message).model_fields) - set(sent) == left_out
+    assert decode(type(message), encode(message)) == message
