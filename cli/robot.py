@@ -77,13 +77,13 @@ def _order(at: CellTarget, act: str, value: float = 0.0, **more: Any) -> None:
 
 @app.command()
 def enable(at: CellTarget = RUNNING) -> None:
-    """Power the joints and release the brakes."""
+    """Power the joints and release the brakes; rejected in a protective or emergency stop."""
     _order(at, "enable")
 
 
 @app.command()
 def recover(at: CellTarget = RUNNING) -> None:
-    """Recover the arm from a protective stop."""
+    """Release the arm from a protective or emergency stop; rejected while its joints are without power."""
     _order(at, "recover")
 
 

@@ -34,6 +34,8 @@ STANDSTILL = 0.02  # [rad/s] a faster joint is not at rest
 SETTLE_TIMEOUT = 0.5  # [s] for the arm to come to rest once its set-points are at rest
 PROGRAM_RUNS = 2  # of the robot's status bits
 POWER_TIMEOUT = 30.0  # [s] for powering the joints and releasing the brakes
+RELEASE_TIMEOUT = 10.0  # [s] for the end of a protective stop
+RUNNING, PROTECTIVE_STOP = 7, 3  # robot mode, safety mode
 VARIABLES = ["timestamp", "actual_q", "actual_qd", "robot_mode", "safety_mode", "safety_status_bits", "runtime_state",
              "target_speed_fraction", "speed_scaling", "robot_status_bits", "actual_digital_input_bits",
              "actual_digital_output_bits"]
@@ -41,8 +43,8 @@ SAFETY: dict[int, tuple[RobotMode, str]] = {
     3: ("protective_stop", "protective stop: find the cause, then `zencell robot recover`"),
     4: ("protective_stop", "in recovery mode: move the joints back within their limits at the pendant"),
     5: ("protective_stop", "safeguard stop: the safeguard input is open"),
-    6: ("emergency_stop", "the system's emergency stop is pressed"),
-    7: ("emergency_stop", "the emergency stop is pressed"),
+    6: ("emergency_stop", "the system's emergency stop is pressed: release it, then `zencell robot recover`"),
+    7: ("emergency_stop", "the emergency stop is pressed: release it, then `zencell robot recover`"),
     8: ("fault", "safety violation: restart safety at the pendant"),
     9: ("fault", "fault of the safety system: restart the controller"),
 }
@@ -199,7 +201,7 @@ class UrArm:
         safety, robot = self._receive.getSafetyMode(), self._receive.getRobotMode()
         if safety in SAFETY:
             return SAFETY[safety]
-        if robot != 7:
+        if robot != RUNNING:
             return MODES.get(robot, ("fault", f"robot mode {robot}"))
         if self._freedrive:
             return "freedrive", "is moved by hand: `zencell robot freedrive off`"
@@ -255,8 +257,11 @@ class UrArm:
 
     def do(self, act: str, value: float = 0.0, *more: float) -> None:
         """Enable, recover, free-drive, or set the payload."""
-        if act in ("enable", "recover"):
+        if act == "enable":
             self._enable()
+            return
+        if act == "recover":
+            self._recover()
             return
         if act == "freedrive" and value:
             self._freedrive = True  # no set-points from now on
@@ -283,22 +288,37 @@ class UrArm:
             raise ValueError("the arm refused it")
 
     def _enable(self) -> None:
-        safety = self._receive.getSafetyMode()
-        if safety == 3:
+        """Power the joints and release the brakes; never end a safety stop."""
+        end, commanded = time.monotonic() + POWER_TIMEOUT, False
+        while True:
+            safety, robot = self._receive.getSafetyMode(), self._receive.getRobotMode()
+            if safety in SAFETY:
+                raise ValueError(SAFETY[safety][1])
+            if robot == RUNNING:
+                return
+            if not commanded:
+                self._dashboard.powerOn()
+                self._dashboard.brakeRelease()
+                commanded = True
+            if time.monotonic() > end:
+                raise ValueError(f"the arm is in mode {robot}, safety mode {safety}")
+            time.sleep(0.02)
+
+    def _recover(self) -> None:
+        """End a protective stop; never power the joints."""
+        safety, robot = self._receive.getSafetyMode(), self._receive.getRobotMode()
+        if safety == PROTECTIVE_STOP:
             self._dashboard.closeSafetyPopup()
             self._dashboard.unlockProtectiveStop()
-        elif safety in SAFETY:
+            end = time.monotonic() + RELEASE_TIMEOUT
+            while (safety := self._receive.getSafetyMode()) == PROTECTIVE_STOP:
+                if time.monotonic() > end:
+                    raise ValueError(f"the protective stop was not released within {RELEASE_TIMEOUT:g} s")
+                time.sleep(0.02)
+        elif safety not in SAFETY and robot != RUNNING:
+            raise ValueError(MODES.get(robot, ("fault", f"robot mode {robot}"))[1])
+        if safety in SAFETY:
             raise ValueError(SAFETY[safety][1])
-        end = time.monotonic() + POWER_TIMEOUT
-        robot = self._receive.getRobotMode()
-        if robot != 7:
-            self._dashboard.powerOn()
-            self._dashboard.brakeRelease()
-        while (robot := self._receive.getRobotMode()) != 7 or self._receive.getSafetyMode() in SAFETY:
-            if time.monotonic() > end:
-                raise ValueError(f"the arm is in mode {robot}, safety mode {self._receive.getSafetyMode()}")
-            time.sleep(0.02)
-        self._freedrive = False
 
     def close(self) -> None:
         """Release the arm, at rest."""

@@ -222,7 +222,8 @@ class ControllerPanel:
         self._folder = gui.add_folder("Robot controller", visible=False)
         with self._folder:
             group = gui.add_button_group("Command", tuple(CONTROLLER_COMMANDS), hint=(
-                "Enable: power and brakes. Recover: continue after a protective stop; find its cause first"))
+                "Enable: power and brakes, not in a safety stop. Recover: release a protective stop, once its cause is "
+                "found; it powers nothing"))
             console.on_choice(group, self._command)
             self._state = Html(gui)
 

@@ -18,6 +18,7 @@ from common.control.trajectory import Tolerances
 from common.control.trajectory_controller import PERIOD, TrajectoryController
 from common.errors import ConfigError, Refused
 from common.hardware.interface import (
+    SAFETY_STOPS,
     ControlledArm,
     Hardware,
     HardwareFault,
@@ -292,12 +293,16 @@ class Executor:
         """Start a function of the arm's own controller; return a number for `outcome`.
 
         Raises:
-            Refused: it has no controller, or a goal is being followed.
+            Refused: it has no controller, a goal is being followed, or the arm is in a safety stop (`enable`) or
+                without power (`recover`).
         """
         if self._controlled is None:
             raise Refused("no_controller", "this arm has no controller of its own that could do that")
         if request.act == "freedrive" and request.value and self.arm.goal:
             raise Refused("busy", f"goal {self.arm.goal!r} is still being followed: stop it first")
+        state = self._controlled.state
+        if state.mode in {"enable": SAFETY_STOPS, "recover": ("off",)}.get(request.act, ()):
+            raise Refused("robot", f"{request.act}: {state.message or state.mode.replace('_', ' ')}")
         return self._controlled.order(request.act, *request.values)
 
     def order_outcome(self, number: int) -> str | None:

@@ -24,10 +24,9 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from common.hardware.driver_process import DriverProcess, run_driver
-from common.hardware.interface import ArmState, Gripper, HardwareFault, Limits, Vector
+from common.hardware.interface import SAFETY_STOPS, ArmState, Gripper, HardwareFault, Limits, Vector
 from common.hardware.streaming import REST, SetPointStream
 
-SAFETY_STOPS, RELEASES = ("protective_stop", "emergency_stop"), ("enable", "recover")
 STOPPED = "was stopped for safety: `zencell robot recover` lets it move again"
 TIMEOUT = 0.25  # [s] without a message of the process or a state of the arm, after which its position is unknown
 PRIORITY = 20  # real-time priority of the process, where the system grants one
@@ -181,7 +180,7 @@ class DrivenArm:
         """Start a function of the arm; return a number for `outcome`."""
         self._number += 1
         self._orders[self._number] = None
-        if act in RELEASES:
+        if act == "recover":
             self._releases.add(self._number)
         if not self._process.send(("do", self._number, act, *values)):
             self._orders[self._number] = self._process.problem or f"{self._name} is not connected"

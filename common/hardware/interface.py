@@ -31,6 +31,7 @@ from common.messages import Header, RobotMode, SceneUpdate, WorldEdit, WorldEdit
 from common.plugins import find_plugin, plugin_names
 
 Vector = NDArray[np.float64]
+SAFETY_STOPS = ("protective_stop", "emergency_stop")  # modes of an arm that an operator has to recover
 
 
 class HardwareFault(ZencellError):
@@ -167,7 +168,8 @@ class ControlledArm(Hardware, Protocol):
     def order(self, act: str, *values: float) -> int:
         """Start a function of the arm's controller; return a number for `outcome`.
 
-        `enable`, `recover`, `freedrive` (1 or 0), `payload` ([kg], and its centre of mass from the flange, x, y, z
+        `enable` (power and brakes; never ends a safety stop), `recover` (ends a safety stop; never powers the arm),
+        `freedrive` (1 or 0), `payload` ([kg], and its centre of mass from the flange, x, y, z
         [m]), `output` (1 or 0, and its number).
         """
 

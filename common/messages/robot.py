@@ -134,8 +134,9 @@ class RobotCommand(Message):
 
     header: Header = Header()
     act: Literal["enable", "recover", "freedrive", "payload", "output"] = Field(
-        description="enable: power and brakes; recover: from a protective stop; freedrive: move by hand, value 1 or 0; "
-                    "payload: mass carried by the tool, value in kg; output: a digital output, value 1 or 0")
+        description="enable: power and brakes, not in a safety stop; recover: from a safety stop, without powering; "
+                    "freedrive: move by hand, value 1 or 0; payload: mass carried by the tool, value in kg; output: a "
+                    "digital output, value 1 or 0")
     value: Annotated[float, Field(ge=0, le=1000, allow_inf_nan=False)] = 0.0
     output: int = Field(0, ge=0, lt=32, description="number of the digital output")
     com: Vector3 = Field(Vector3(), description="centre of mass of the payload, from the flange [m]")

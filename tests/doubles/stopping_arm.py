@@ -15,19 +15,21 @@ class Options(Parameters):
 
 
 class StoppingArm(MockHardware):
-    """Executes orders at once; `stopped` is a safety stop, `refuses` the outcome of orders."""
+    """Executes orders at once; `stopped` is a safety stop, `powered` its joints, `refuses` the outcome of orders."""
 
     delay = ahead = late = 0.0
 
     def __init__(self, start: Vector, gripper: SimulatedFingers | None) -> None:
         super().__init__(start, gripper)
-        self.stopped = False
+        self.stopped, self.powered = False, True
         self.orders: list[tuple[object, ...]] = []
         self.refuses = ""
 
     @property
     def state(self) -> ArmState:
         q, dq = self.read(0.0)
+        if not self.powered:
+            return ArmState(q.tolist(), dq.tolist(), "off", "without power: `zencell robot enable`")
         return ArmState(q.tolist(), dq.tolist(), "protective_stop" if self.stopped else "running", "stopped for safety")
 
     def write(self, positions: Vector, velocities: Vector, now: float) -> None:
@@ -38,6 +40,7 @@ class StoppingArm(MockHardware):
     def order(self, act: str, *values: float) -> int:
         self.orders.append((act, *values))
         self.stopped = self.stopped and act != "recover"
+        self.powered = self.powered or act == "enable"
         return len(self.orders)
 
     def outcome(self, number: int) -> str:

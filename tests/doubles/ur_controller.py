@@ -237,7 +237,7 @@ class Controller:
                 case ["protect"]:
                     arm.protect("requested by a test")
                 case ["emergency"]:
-                    arm.safety = EMERGENCY_STOP
+                    arm.safety, arm.mode = EMERGENCY_STOP, POWER_OFF
                     arm.end_program()
                 case ["end"]:
                     arm.end_program()

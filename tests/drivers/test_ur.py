@@ -145,6 +145,8 @@ def test_protective_stop_persists_over_a_lost_link_and_ends_only_on_request(host
     assert rig.wave(2.0) != ""
     rig.until("protective stop")
     assert rig.arm.state.mode == "protective_stop"
+    assert "robot recover" in rig.done(rig.arm.order("enable"))
+    assert rig.arm.state.mode == "protective_stop" and rig.arm.stopped
     host.command("pull 1")
     rig.until("no message")
     host.command("normal")  # at the pendant: that alone moves nothing
@@ -164,8 +166,12 @@ def test_stop_before_a_restart_of_this_process_blocks_motions(rig: Rig) -> None:
 def test_request_does_not_end_an_emergency_stop(host: UrHost, rig: Rig) -> None:
     host.command("emergency")
     rig.until("emergency stop")
-    assert "pressed" in rig.done(rig.arm.order("recover"))
+    for act in ("recover", "enable"):
+        assert "pressed" in rig.done(rig.arm.order(act))
     host.command("normal")
+    rig.until("without power")
+    assert "robot enable" in rig.done(rig.arm.order("recover")) and host.command()["mode"] == "POWER_OFF"
+    assert rig.done(rig.arm.order("enable")) == ""
     recover(rig)
 
 

@@ -1,4 +1,4 @@
-"""Freedrive of an arm of Universal Robots, and silence of its controller, without the vendor's library."""
+"""Orders to an arm of Universal Robots, and silence of its controller, without the vendor's library."""
 
 import sys
 from types import SimpleNamespace
@@ -11,7 +11,7 @@ from drivers.ur import LONGEST_STEP, STATE_TIMEOUT, Options, SilenceTimer, UrArm
 
 SIX = np.ones(6)
 LIMITS = Limits(tuple("abcdef"), -6 * SIX, 6 * SIX, 3 * SIX, 5 * SIX, 10 * SIX, 500 * SIX)
-OFF, RUNNING, NORMAL, PROTECTIVE_STOP = 3, 7, 1, 3
+OFF, IDLE, RUNNING, NORMAL, PROTECTIVE_STOP, EMERGENCY_STOP = 3, 5, 7, 1, 3, 7
 
 
 class Controller:
@@ -37,6 +37,15 @@ class Controller:
 
     def disconnect(self) -> None:
         self.by_hand = False
+
+    def powerOn(self) -> None:  # noqa: N802
+        self.mode = IDLE
+
+    def brakeRelease(self) -> None:  # noqa: N802
+        self.mode = RUNNING
+
+    def unlockProtectiveStop(self) -> None:  # noqa: N802
+        self.safety = NORMAL
 
     def __getattr__(self, name: str) -> object:
         answers = {"getRobotMode": self.mode, "getSafetyMode": self.safety, "getRobotStatus": 1 | self.program << 1,
@@ -88,6 +97,40 @@ def test_protective_stop_or_end_of_the_program_ends_freedrive(controller: Contro
     assert arm.read().mode == "freedrive"
     arm.do("freedrive", 0.0)
     assert arm.read().mode == "running" and not controller.by_hand
+
+
+@pytest.mark.parametrize("mode", [OFF, IDLE, RUNNING])
+def test_enable_never_ends_a_stop_and_recover_never_powers(controller: Controller, arm: UrArm, mode: int) -> None:
+    controller.mode, controller.safety = mode, PROTECTIVE_STOP
+    with pytest.raises(ValueError, match="zencell robot recover"):
+        arm.do("enable")
+    assert (controller.mode, controller.safety) == (mode, PROTECTIVE_STOP)
+    arm.do("recover")
+    assert (controller.mode, controller.safety) == (mode, NORMAL)
+    if mode != RUNNING:
+        with pytest.raises(ValueError, match="zencell robot enable"):
+            arm.do("recover")
+        assert controller.mode == mode
+    arm.do("enable")
+    assert controller.mode == RUNNING
+
+
+@pytest.mark.parametrize("act", ["enable", "recover"])
+def test_emergency_stop_is_neither_powered_nor_released(controller: Controller, arm: UrArm, act: str) -> None:
+    controller.mode, controller.safety = OFF, EMERGENCY_STOP
+    with pytest.raises(ValueError, match="release it, then `zencell robot recover`"):
+        arm.do(act)
+    assert (controller.mode, controller.safety) == (OFF, EMERGENCY_STOP)
+
+
+def test_enable_ends_with_the_reason_when_a_stop_occurs_meanwhile(controller: Controller, arm: UrArm) -> None:
+    def stop() -> None:
+        controller.mode, controller.safety = IDLE, PROTECTIVE_STOP
+
+    controller.mode, controller.brakeRelease = OFF, stop  # type: ignore[method-assign]
+    with pytest.raises(ValueError, match="zencell robot recover"):
+        arm.do("enable")
+    assert controller.safety == PROTECTIVE_STOP
 
 
 def test_silence_is_the_time_of_listening_since_the_last_message() -> None:

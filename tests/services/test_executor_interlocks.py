@@ -152,6 +152,22 @@ async def test_safety_stop_of_the_arm_persists_until_an_operator_has_it_recover(
         assert not stopping_arm.created[-1].stopped
 
 
+async def test_enable_is_rejected_in_a_safety_stop_and_recover_without_power(monkeypatch, tmp_path):
+    monkeypatch.setenv(STATE_VARIABLE, str(tmp_path))
+    async with executor("robot.hardware.backend=tests.doubles.stopping_arm", speed=1.0) as client:
+        arm, order = stopping_arm.created[-1], client.bus.client(topics.ROBOT_COMMAND)
+        arm.stopped = True
+        with pytest.raises(RemoteError, match="enable: stopped for safety"):
+            await order.call(RobotCommand(act="enable", owner="tester"))
+        arm.powered = False
+        with pytest.raises(RemoteError, match="recover: without power: `zencell robot enable`"):
+            await order.call(RobotCommand(act="recover", owner="tester"))
+        assert arm.stopped and not arm.powered and ("enable", 0.0) not in arm.orders
+        answer = await order.call(RobotCommand(act="enable", owner="tester"))
+        assert answer.mode == "protective_stop", "power alone ends no stop"
+        assert (await order.call(RobotCommand(act="recover", owner="tester"))).mode == "running"
+
+
 # --- the file ---
 
 
