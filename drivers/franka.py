@@ -27,6 +27,7 @@ from drivers import franka_hand
 
 Array = NDArray[np.float64]
 
+MAX_PAYLOAD = 3.0  # [kg] rated payload, from the maker's data sheet
 RATE = 1000.0  # [Hz] of set-points, in the arm's time
 BLEND = 0.5  # [s] in which a motion leads from the arm's own reference to the set-points
 SMOOTHED = 20  # set-points whose mean is commanded: the arm checks acceleration and jerk from one to the next
@@ -72,6 +73,11 @@ def identity(options: Options) -> str:
     return options.host
 
 
+def max_payload(options: Options) -> float:
+    """Return the rated payload of the arm [kg]."""
+    return MAX_PAYLOAD
+
+
 def create(robot: RobotConfig, limits: Limits, start: Vector, options: Options) -> DrivenArm:
     """Create the arm at any address, and its hand if the robot has a gripper."""
     try:
@@ -87,7 +93,8 @@ def create(robot: RobotConfig, limits: Limits, start: Vector, options: Options) 
     elif robot.gripper is not None:
         gripper = franka_hand.create_gripper(robot.gripper, franka_hand.GripperOptions(host=options.host))
     return DrivenArm(__name__, options.model_dump(), limits, gripper=gripper, ahead=options.ahead,
-                     delay=options.ahead + SMOOTHED / 2 / RATE, name=f"arm at {options.host}")
+                     delay=options.ahead + SMOOTHED / 2 / RATE, name=f"arm at {options.host}",
+                     max_payload=max_payload(options))
 
 
 def connect(options: dict[str, Any], limits: Limits) -> FrankaArm:

@@ -24,7 +24,10 @@ from common.hardware.mock import simulated_fingers
 from common.messages import RobotMode
 from drivers import robotiq
 
-MODELS = r"^ur((3|5|10)e?|16e|15|20|30)$"
+# Rated payload [kg] by model, from the maker's data sheets; the UR30 carries its 35 kg with the tool pointing down.
+PAYLOADS = {"3": 3.0, "5": 5.0, "10": 10.0, "3e": 3.0, "5e": 5.0, "7e": 7.5, "10e": 12.5, "12e": 12.5, "16e": 16.0,
+            "15": 15.0, "20": 20.0, "30": 35.0}
+MODELS = rf"^ur({'|'.join(PAYLOADS)})$"
 CB3 = re.compile(r"^ur(3|5|10)$")
 STATE_TIMEOUT = 0.15  # [s] without a new state of the arm, after which it counts as disconnected
 LONGEST_STEP = 0.02  # [s] that count of the time between two checks: a driver that was held up has not listened
@@ -84,6 +87,11 @@ def identity(options: Options) -> str:
     return options.host
 
 
+def max_payload(options: Options) -> float:
+    """Return the rated payload of the arm [kg]."""
+    return PAYLOADS[options.model.removeprefix("ur")]
+
+
 def create(robot: RobotConfig, limits: Limits, start: Vector, options: Options) -> DrivenArm:
     """Create the arm at any address."""
     try:
@@ -98,7 +106,7 @@ def create(robot: RobotConfig, limits: Limits, start: Vector, options: Options) 
             robot.gripper, robotiq.GripperOptions(host=options.host, model=options.gripper))
     delay = options.ahead + options.lookahead + Smoothing(rate_of(options.model)).delay
     return DrivenArm(__name__, options.model_dump(), limits, gripper=gripper, name=f"{options.model} at "
-                     f"{options.host}", ahead=options.ahead, delay=delay)
+                     f"{options.host}", ahead=options.ahead, delay=delay, max_payload=max_payload(options))
 
 
 def connect(options: dict[str, Any], limits: Limits) -> UrArm:

@@ -94,11 +94,12 @@ class DrivenArm:
 
     def __init__(
         self, module: str, options: Mapping[str, Any], limits: Limits, *, gripper: Gripper | None, ahead: float,
-        delay: float, name: str,
+        delay: float, name: str, max_payload: float = math.inf,
     ) -> None:
         """Start the process; `module` has `connect(options, limits) -> ArmDriver`, `name` is for messages.
 
-        Set-points are sent `ahead` of time [s]; the arm reaches them after `delay` [s].
+        Set-points are sent `ahead` of time [s]; the arm reaches them after `delay` [s]. Payloads above `max_payload`
+        [kg] are rejected.
         """
         self.gripper = gripper
         self.ahead, self._delay = ahead, delay
@@ -106,6 +107,7 @@ class DrivenArm:
         self.stopped = False
         self._process = DriverProcess(name, drive, (module, dict(options), limits, ahead), self._on_message,
                                       self._on_end)
+        self._max_payload = max_payload
         self._name, self._dof = name, len(limits.names)
         self._newest: Reading | None = None
         self._epoch = -1
@@ -182,7 +184,10 @@ class DrivenArm:
         self._orders[self._number] = None
         if act == "recover":
             self._releases.add(self._number)
-        if not self._process.send(("do", self._number, act, *values)):
+        if act == "payload" and values[0] > self._max_payload:
+            limit = f"{self._max_payload:g} kg of {self._name}"
+            self._orders[self._number] = f"{values[0]:g} kg exceeds the limit of {limit}"
+        elif not self._process.send(("do", self._number, act, *values)):
             self._orders[self._number] = self._process.problem or f"{self._name} is not connected"
         return self._number
 

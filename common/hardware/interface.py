@@ -10,6 +10,7 @@ installed entry point or a dotted module of the user) with
                                                        # are simulated; a simulated arm always has a simulated world
     def identity(options: Options) -> str              # optional, for a real arm: its address or serial number, to
                                                        # which its interlocks belong; without it they belong to the cell
+    def max_payload(options: Options) -> float         # optional: rated payload [kg], which no gripper may exceed
 
 `start` is the pose at which a simulated arm starts; a real arm is where it is. A gripper backend has `GripperOptions`
 and `create_gripper(gripper: GripperConfig, options: GripperOptions) -> Gripper`; one module may be both.
@@ -350,9 +351,10 @@ def load_hardware(
     `robot.gripper.hardware`, by default the one that the arm's backend brings.
 
     Raises:
-        UnknownName, ConfigError: no such backend, an invalid option, or a backend that moves the joints itself in a
-            world that does.
+        UnknownName, ConfigError: no such backend, an invalid option, a gripper heavier than the rated payload, or a
+            backend that moves the joints itself in a world that does.
     """
+    _require_rated(robot)
     own = robot.gripper.hardware if robot.gripper is not None else None
     if robot.gripper is None or own is None:
         return _load_arm(robot, limits, start, world_arm)
@@ -373,6 +375,16 @@ def _checked_backend(robot: RobotConfig) -> tuple[Backend, Parameters]:
 
 def _gripper_options(backend: GripperBackend, hardware: HardwareConfig) -> Parameters:
     return check(backend.GripperOptions, hardware.options, f"{GRIPPER_FIELD}.options")
+
+
+def _require_rated(robot: RobotConfig) -> None:
+    backend, options = _checked_backend(robot)
+    payload = robot.gripper.payload if robot.gripper is not None else None
+    if payload is None or not hasattr(backend, "max_payload"):
+        return
+    if payload.mass > (most := backend.max_payload(options)):
+        raise ConfigError("robot.gripper.payload.mass", payload.mass,
+                          f"exceeds the rated payload of the arm, {most:g} kg")
 
 
 def _load_arm(
