@@ -30,6 +30,7 @@ _OVERSHOOT = 1.01  # of the acceleration limits, by the cubics between the state
 _MIN_INTERVALS = 20  # also on a short path: speed changes at grid points only
 _SHARP = 0.02  # of the largest jump of acceleration: a larger jump gets states where it begins and ends
 _SLOPE_CHANGE = 0.2  # of the jerk limit: the same where the acceleration's slope changes by more
+_SHORTEST = 1e-5  # averaging time by duration: over less, rounding of the integrals exceeds low limits
 _MIN_GAP = 0.005  # of the averaging time, between two states
 _JERK_MARGIN = 0.02  # share by which a jerk limit may be exceeded
 _ROUNDING = 1e-3  # of the largest jump of acceleration: a smaller one is rounding
@@ -214,6 +215,7 @@ def _averaged(trajectory: TimedPath, limit: Array) -> TimedPath:
     span = float((2 * peaks / limit).max())
     if (np.abs(slopes) <= limit * (1 + _JERK_MARGIN)).all() and (jumps <= _ROUNDING * span * limit).all():
         return trajectory
+    span = max(span, _SHORTEST * trajectory.duration)
     bends = np.abs(np.diff(np.concatenate([still, slopes, still]), axis=0))
     sharp = (jumps > _SHARP * span * limit).any(axis=1) | (bends > _SLOPE_CHANGE * limit).any(axis=1)
     sharp[[0, -1]] = True

@@ -106,3 +106,14 @@ def test_same_request_gives_the_same_answer_and_a_slower_one_takes_longer(planne
         durations.append(response.trajectory.points[-1].time_from_start)
         ends.append([point.positions for point in response.trajectory.points])
     assert durations[0] > 1.5 * durations[1] and ends[1] == ends[2]
+
+
+@pytest.mark.parametrize("planner", ALL)
+def test_lowest_speed_share_of_a_request_is_planned(planner):
+    durations = []
+    for scaling in (1e-3, 1e-4):
+        request = request_for(planner, tool_down(0.5, 0.0, 0.3, 0.2), RIGHT, velocity_scaling=scaling, seed=5)
+        response = PIPELINES[planner].plan(request, TABLE)
+        last(response)
+        durations.append(response.trajectory.points[-1].time_from_start)
+    assert durations[1] == pytest.approx(10 * durations[0], rel=0.1)
