@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from common import topics
 from common.client.operator_motion import UNREACHABLE
 from common.config import check
-from common.control.jogging import PAUSE
+from common.control.jogging import ENDED, PAUSE
 from common.messages import GripperCommand, MotionOwner, MotionStatus
 from common.robot.transforms import matrix_to_rpy
 from common.time_source import monotonic, new_id
@@ -134,10 +134,11 @@ class Jogger(HoldHandler):
         reason = self._arm_blocked() or self._interlocked(motion)
         if not (reason or is_new) and motion is not None and newest > self._acknowledged:
             reason = f"the arm is {motion.interlocks[-1].description}"
-        reason = reason or self._without_effect(owner, is_new, now)
+        ended = motion.message if motion is not None and motion.message.startswith(ENDED) else ""
+        reason = reason or self._without_effect(owner, is_new, now, ended)
         if is_new:
             self._press, self._started = (client, press), now
-            if newest != self._acknowledged:  # after a stop the executor requires a pause before it accepts commands
+            if newest != self._acknowledged or ended:  # the executor requires a pause before it accepts commands again
                 self._acknowledged, self._started = newest, now + PAUSE
         if reason:
             self.release(client)
@@ -160,15 +161,17 @@ class Jogger(HoldHandler):
         interlocks = motion.interlocks if motion is not None else []
         return "; ".join(f"the arm is {one.description}" for one in interlocks if one.blocks(client))
 
-    def _without_effect(self, owner: MotionOwner | None, is_new: bool, now: float) -> str:
-        """Return why jog commands have had no effect for a second."""
+    def _without_effect(self, owner: MotionOwner | None, is_new: bool, now: float, ended: str) -> str:
+        """Return why jogging has ended, with the executor's reason `ended`, or has had no effect for a second."""
         jogging = owner is not None and owner.jogging and owner.owner == self._sender.permissions.client_name
         self._moved = jogging or (self._moved and not is_new)
+        if ended and self._moved and not jogging:
+            return ended
         if owner is None or is_new or jogging or now - self._started <= NO_EFFECT_TIMEOUT:
             return ""
         if self._moved and owner.kind == "none" and not owner.jogging:
             return "the connection was interrupted (slow network or busy machine): press the button again"
-        return f"{UNREACHABLE}; the motion is {owner.description}"
+        return ended or f"{UNREACHABLE}; the motion is {owner.description}"
 
 
 class JogPanel:

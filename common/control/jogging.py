@@ -23,11 +23,17 @@ PAUSE = 0.3  # [s] wall without a command, after a refused one
 TOOL_SPEED = 0.25  # [m/s] of the TCP at most: manual reduced speed of ISO 10218-1
 ACCELERATION_SHARE = 0.5  # of the acceleration is used to slow down before the end of a joint,
 END_TIME = 0.15  # [s] time constant of the approach to that end
-DAMPING = 0.05  # of the least squares, where the tool loses a direction
-NEAR_SINGULAR = 0.02  # [m, rad per rad] least singular value of the Jacobian below which it is damped
+NEAR_SINGULAR = 0.02  # [m, rad per rad] singular value of the Jacobian below which the tool is at the end of its reach
+LOST = 0.002  # below that a direction counts as lost
 MAX_REFUSED = 16  # remembered names; while there are more, new names are refused
-MAX_ASIDE = 0.3  # deviation from the requested direction at which the tool moves slowest, relative to the request
-SLOWEST = 0.2  # share of the speed with which it still moves there, and leaves again
+MAX_ASIDE = 0.05  # deviation from the requested direction, relative to the request: 3 degrees
+SLOWEST = 0.05  # share of the possible speed at which the tool stops there
+STALLED = 0.01  # share of the requested speed below which the end of a joint has stopped the tool
+ENDED = "jogging ended: the tool cannot keep its direction, as"
+
+
+class DirectionLost(Exception):
+    """The tool cannot keep the requested direction, with the reason."""
 
 
 class ToolKinematics(Protocol):
@@ -60,12 +66,17 @@ def velocity_before_end(room: Vector, limits: Limits) -> Vector:
 
 
 class Jogging:
-    """Turns the newest command into joint velocities."""
+    """Turns the newest command into joint velocities.
+
+    Attributes:
+        ended: why jogging ended by itself; empty again from the next accepted command on.
+    """
 
     def __init__(self, limits: Limits, kinematics: ToolKinematics | None) -> None:
         """Jog an arm with these limits; without kinematics only its joints."""
         self._limits, self._kinematics = limits, kinematics
         self._fastest = np.minimum(limits.velocity, stoppable_velocity(BRAKING_TIME, limits))
+        self.ended = ""
         self._command: JogCommand | None = None
         self._received = 0.0  # [s] wall: time of that command
         self._started: float | None = None  # [s] wall: commands soon after may belong to a stream before a restart
@@ -97,7 +108,7 @@ class Jogging:
             self._bar(request.owner, now)
             raise
         self._refused.pop(request.owner, None)
-        self._command, self._received = request, now
+        self._command, self._received, self.ended = request, now, ""
 
     def interrupt(self, now: float) -> None:
         """Come to rest; the operator must release the button first; wall time [s]."""
@@ -128,10 +139,12 @@ class Jogging:
         if command.joints:
             dq = np.clip([command.joints.get(name, 0.0) for name in limits.names], lowest, highest)
         else:
-            dq = self._by_tool(command, q)
-            with np.errstate(divide="ignore", invalid="ignore"):  # the slowest joint keeps the direction
-                room = np.where(dq < 0, lowest, highest) / dq
-            dq = dq * min(float(np.min(room, where=dq != 0, initial=1.0)), 1.0)
+            try:
+                dq = self._before_ends(self._by_tool(command, q), lowest, highest)
+            except DirectionLost as reason:
+                self.interrupt(now)
+                self.ended = f"{ENDED} {reason}"
+                return None
         if not dq.any():
             return None
         dq = dq / max(float((np.abs(dq) / np.minimum(self._fastest, share * limits.velocity)).max()), 1.0)
@@ -139,24 +152,54 @@ class Jogging:
             dq = dq / max(float(np.linalg.norm(self._kinematics.jacobian(q)[:3] @ dq)) / TOOL_SPEED, 1.0)
         return np.asarray(dq)
 
+    def _before_ends(self, dq: Vector, lowest: Vector, highest: Vector) -> Vector:
+        """Return velocities (dof,) [rad/s] slowed down in proportion: the slowest joint keeps the direction.
+
+        Raises:
+            DirectionLost: a joint is at its end.
+        """
+        with np.errstate(divide="ignore", invalid="ignore"):
+            room = np.where(dq == 0, np.inf, np.where(dq < 0, lowest, highest) / dq)
+        joint = int(np.argmin(room))
+        if room[joint] < STALLED:
+            raise DirectionLost(f"{self._limits.names[joint]} is at its limit")
+        return dq * min(float(room[joint]), 1.0)
+
     def _by_tool(self, command: JogCommand, q: Vector) -> Vector:
+        """Return joint velocities (dof,) [rad/s] that move the tool as requested, or slower if joints are too slow.
+
+        An arm of fewer than six joints leaves free what is not requested: position or orientation.
+
+        Raises:
+            DirectionLost: the tool is at the end of its reach and would move on, or has lost the direction.
+        """
         assert self._kinematics is not None
         axes = {"world": np.eye(3), "base": self._kinematics.base_axes, "tool": self._kinematics.fk(q)[:3, :3]}
         rotation = axes[command.frame]
-        linear, angular = ([v.x, v.y, v.z] for v in (command.linear, command.angular))
-        jacobian = self._kinematics.jacobian(q)
-        least = float(np.linalg.svd(jacobian, compute_uv=False)[-1])
-        damping = DAMPING * max(1 - least / NEAR_SINGULAR, 0.0)
-        square = jacobian @ jacobian.T + damping**2 * np.eye(6)
+        linear, angular = (np.array([v.x, v.y, v.z]) for v in (command.linear, command.angular))
+        requested = slice(0, 3) if not angular.any() else slice(3, 6) if not linear.any() else slice(0, 6)
+        rows = requested if len(q) < 6 else slice(0, 6)
         twist = np.concatenate([rotation @ linear, rotation @ angular])
-        dq = np.asarray(jacobian.T @ np.linalg.lstsq(square, twist)[0])
-        part = slice(0, 3) if any(linear) else slice(3, 6)
-        actual, requested = (jacobian @ dq)[part], twist[part]
-        size = float(np.linalg.norm(requested))
+        size = float(np.linalg.norm(twist))
         if size == 0.0:
-            return dq
-        aside = actual - (actual @ requested) / size**2 * requested
-        return np.asarray(dq * max(1 - float(np.linalg.norm(aside)) / size / MAX_ASIDE, SLOWEST))
+            return np.zeros(len(q))
+        jacobian = self._kinematics.jacobian(q)
+        left, values, right = np.linalg.svd(jacobian[rows], full_matrices=False)
+        parts = left.T @ twist[rows]
+        dq = np.asarray((np.where(values > LOST, 1 / np.maximum(values, LOST), values / LOST**2) * parts) @ right)
+        actual = (jacobian @ dq)[requested]
+        aside = actual - float(actual @ twist[requested]) / size**2 * twist[requested]
+        along = float(actual @ twist[requested]) / size
+        if float(np.linalg.norm(aside)) > MAX_ASIDE * along:
+            raise DirectionLost("the arm is in a singular pose: jog its joints out of it")
+        share = 1.0
+        if values[-1] < 2 * NEAR_SINGULAR and abs(parts[-1]) > MAX_ASIDE * size:
+            ahead = self._kinematics.jacobian(q + 1e-3 * dq / np.abs(dq).max())[rows]
+            if np.linalg.svd(ahead, compute_uv=False)[-1] < values[-1]:
+                share = float(values[-1]) / NEAR_SINGULAR - 1  # slow where it stops: braking joints leave the line
+                if share < SLOWEST:
+                    raise DirectionLost("the arm is at the end of its reach, or near a singular pose")
+        return np.asarray(share * dq / max(float((np.abs(dq) / self._fastest).max()), 1.0))
 
     def _require_valid(self, request: JogCommand) -> None:
         names = self._limits.names

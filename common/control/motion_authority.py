@@ -210,12 +210,19 @@ class MotionAuthority:
         refusal = refusal or self.check_owner(request.owner)
         if refusal is None and self._arm.goal:
             refusal = Refused("busy", f"goal {self._arm.goal!r} is still being followed")
+        ended = self._jogging.ended
         self._jogging.command(request, monotonic(), refusal)
+        if ended and self._arm.reports.newest.message == ended:
+            self._arm.reports.set_message("")
         self.use(request.owner)
 
     def jog_velocity(self, share: float) -> Vector | None:
         """Return the joint velocities of jogging (dof,) [rad/s] at a share of the speed, or None without jogging."""
-        return self._jogging.velocity(self._arm.set_point, monotonic(), share)
+        before = self._jogging.ended
+        velocity = self._jogging.velocity(self._arm.set_point, monotonic(), share)
+        if self._jogging.ended != before:
+            self._arm.note(self._jogging.ended)
+        return velocity
 
     def interrupt_jogging(self) -> None:
         """End jogging: the operator must release the button first."""

@@ -45,14 +45,14 @@ class TrajectoryController:
         self._limiter = Limiter(limits, start, period)
         self.history = SetPointHistory()
         self._standstill = Standstill(
-            limits, start, self._tolerances, self._limiter, self.history, self._on_moved)
+            limits, start, self._tolerances, self._limiter, self.history, self.note)
         self._follower = GoalFollower(limits, self._tolerances, self._limiter, self.history, self._standstill)
         self._period = self._usual = period
         self._last: float | None = None  # cell time of the newest set-point
         self._goal: Goal | None = None
         self.reports = GoalReports(name, remember)
         self._found: Vector | None = None  # first reading of an arm that moves
-        self._moved = ""  # description of a motion from outside, until it is logged
+        self._noted = ""  # description of a motion from outside, until it is logged
         self.bridges = 0.0
 
     # --- state ----------------------------------------------------------------------------------------------------
@@ -78,12 +78,13 @@ class TrajectoryController:
         return bool(self.reports.fault) or self._limiter.at_rest
 
     def pop_log_line(self) -> str:
-        """Return a line for the log if the arm was moved from outside since the last call; else ""."""
-        moved, self._moved = self._moved, ""
-        return moved
+        """Return the line for the log that was noted since the last call; else ""."""
+        noted, self._noted = self._noted, ""
+        return noted
 
-    def _on_moved(self, message: str) -> None:
-        self._moved = message
+    def note(self, message: str) -> None:
+        """Log a message, and report it unless a goal is active."""
+        self._noted = message
         self.reports.set_message(message)
 
     # --- goals ----------------------------------------------------------------------------------------------------

@@ -215,6 +215,18 @@ def test_jogging_moves_for_the_requested_time() -> None:
     run(program)
 
 
+def test_jog_in_a_direction_that_the_arm_cannot_keep_fails_with_the_reason() -> None:
+    async def program(cell: Cell) -> None:
+        for seconds in (20.0, 0.5):  # until the end of reach, and from there
+            with pytest.raises(JogFailed, match="the tool cannot keep its direction, as the arm is at the end"):
+                await cell.arm.jog(linear=(0.2, 0.0, 0.1), seconds=seconds)
+        await cell.arm.jog(linear=(-0.2, 0.0, -0.1), seconds=0.5)
+        assert not (await cell.arm.status()).message
+        await cell.arm.move("home")
+
+    run(program)
+
+
 def test_jog_of_a_stalled_program_reports_late_commands(monkeypatch: pytest.MonkeyPatch) -> None:
     async def program(cell: Cell) -> None:
         async def stall() -> None:

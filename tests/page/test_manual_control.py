@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 import viser
 
+from common.control.jogging import ENDED
 from common.messages import MotionOwner, MotionStatus
 from common.time_source import use_time_source
 from page.access import PAGE, Permissions
@@ -23,8 +24,8 @@ class Arm:
 
     def __init__(self, clock: Clock) -> None:
         self.permissions, self.owner, self.clock, self.rejected = Permissions(), FREE, clock, list[str]()
-        self.jogs = 0
-        self.jogger = Jogger(self, lambda _: {"joints": {"a": 0.1}}, lambda: (MotionStatus(), self.owner), lambda: "")
+        self.jogs, self.motion = 0, MotionStatus()
+        self.jogger = Jogger(self, lambda _: {"joints": {"a": 0.1}}, lambda: (self.motion, self.owner), lambda: "")
 
     def jog(self, acknowledged: int, **velocities: Any) -> None:
         self.jogs += bool(velocities)
@@ -54,6 +55,21 @@ def test_held_button_without_effect_is_rejected_once_a_press_with_the_reason(
     assert len(arm.rejected) == 1 and reason in arm.rejected[0]
     arm.hold(*[FREE] * 7, press=2)
     assert len(arm.rejected) == 2 and "its controller does not accept it" in arm.rejected[1]
+
+
+@pytest.mark.parametrize("before", [OURS, FREE])
+def test_button_that_asks_for_a_lost_direction_is_rejected_with_the_executors_reason(
+    arm: Arm, before: MotionOwner
+) -> None:
+    arm.hold(FREE, *[before] * 2)
+    arm.motion = MotionStatus(message=f"{ENDED} one is at its limit")
+    arm.hold(*[FREE] * 7)
+    assert arm.rejected == [f"Jogging rejected: {ENDED} one is at its limit"]
+    jogs = arm.jogs
+    arm.hold(FREE, press=2)
+    assert arm.jogs == jogs, "the executor requires a pause"
+    arm.hold(FREE, FREE, press=2)
+    assert arm.jogs > jogs and len(arm.rejected) == 1
 
 
 def test_one_page_jogs_at_a_time(arm: Arm) -> None:

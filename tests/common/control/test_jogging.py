@@ -43,7 +43,7 @@ def test_set_points_keep_the_limits_for_any_commands(arm):
             arm.run(0.01 * rng.integers(1, 20))
     arm.assert_within_limits()
     q = np.array([q for _, q in arm.sent])
-    assert not arm.refused and np.ptp(q, axis=0).min() > 0.05
+    assert set(arm.refused) <= {RELEASE_FIRST} and np.ptp(q, axis=0).min() > 0.05
     assert (arm.robot.lower - q).max() < 1e-6 and (q - arm.robot.upper).max() < 1e-6
 
 
@@ -109,7 +109,36 @@ def test_tool_keeps_speed_and_line_where_a_joint_reaches_its_end(arm):
     arm.run(0.5)
     assert arm.tool_speed() <= 0.251
     aside = np.linalg.norm((arm.positions - arm.positions[0])[:, :2], axis=1)
-    assert aside.max() < 0.06  # slowly aside, at its limits
+    assert aside.max() < 0.006
+    assert any("cannot keep its direction" in message for message in messages(arm))
+
+
+def messages(arm):
+    return [report.motion.message for report in arm.reports if report.motion]
+
+
+@pytest.mark.parametrize("linear", [(0.2, 0.0, 0.1), (0.2, 0.0, 0.0), (0.1, 0.1, 0.1), (0.1, -0.2, 0.0)])
+def test_tool_keeps_its_direction_to_the_end_of_reach_and_stops_there_with_a_reason(arm, linear):
+    direction = np.array(linear) / np.linalg.norm(linear)
+    before = arm.tcp
+    arm.jog_tool(6.0, linear)
+    arm.run(0.5)
+    steps = np.diff(arm.positions[::5], axis=0)
+    steps = steps[np.linalg.norm(steps, axis=1) > 1e-3]
+    assert len(steps) > 20 and (steps @ direction / np.linalg.norm(steps, axis=1)).min() > np.cos(np.radians(8))
+    away = arm.positions - before[:3, 3]
+    assert np.linalg.norm(away - np.outer(away @ direction, direction), axis=1).max() < 5e-3
+    assert np.allclose(arm.tcp[:3, :3], before[:3, :3], atol=5e-3), "it does not turn"
+    assert messages(arm)[-1].startswith("jogging ended: the tool cannot keep its direction, as the arm is at the end")
+    assert sum("jogging ended" in note for report in arm.reports for note in report.notes) == 1
+    end = arm.tcp[:3, 3]
+    arm.jog_tool(1.0, linear)
+    arm.run(0.5)
+    assert np.linalg.norm(arm.tcp[:3, 3] - end) < 1e-3
+    arm.jog_tool(1.0, -np.array(linear))
+    moved = arm.tcp[:3, 3] - end
+    assert moved @ -direction > 0.05 and moved @ -direction / np.linalg.norm(moved) > np.cos(np.radians(5))
+    assert messages(arm)[-1] == "", "the reason is over"
 
 
 @pytest.mark.slow
@@ -117,7 +146,8 @@ def test_tool_hardly_moves_at_the_end_of_its_reach_and_comes_back(arm):
     arm.jog_tool(20.0, (0.2, 0.0, 0.0))
     before = arm.tcp[:3, 3]
     arm.jog_tool(0.5, (0.2, 0.0, 0.0))
-    assert np.linalg.norm(arm.tcp[:3, 3] - before) < 0.02
+    assert np.linalg.norm(arm.tcp[:3, 3] - before) < 0.001
+    arm.run(0.35)  # the button is released
     arm.jog_tool(8.0, (-0.2, 0.0, 0.0))
     assert arm.tcp[0, 3] < before[0] - 0.03
     arm.assert_within_limits()
