@@ -198,7 +198,7 @@ class Jogging:
             if np.linalg.svd(ahead, compute_uv=False)[-1] < values[-1]:
                 share = float(values[-1]) / NEAR_SINGULAR - 1  # slow where it stops: braking joints leave the line
                 if share < SLOWEST:
-                    raise DirectionLost("the arm is at the end of its reach, or near a singular pose")
+                    raise DirectionLost("the arm is at the end of its reach, or near a singular pose: jog another way")
         return np.asarray(share * dq / max(float((np.abs(dq) / self._fastest).max()), 1.0))
 
     def _require_valid(self, request: JogCommand) -> None:
