@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, TypeVar, get_args, get_origin
+from types import NoneType, UnionType
+from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -75,13 +76,13 @@ def _first_error(error: ValidationError, model: type[BaseModel], prefix: str) ->
 
 def _fields_at(model: type[BaseModel], location: Sequence[int | str]) -> list[str]:
     """Return the field names of the nested model at a location within `model`."""
-    current, table = model, None
+    current, item = model, None
     for part in location:
-        # In a mapping of models the location has the key between the field and its fields.
+        # In a mapping or list of models the location has a key or an index between the field and its fields.
         field = current.model_fields.get(str(part))
-        annotation = table or (field.annotation if field else None)
-        table = get_args(annotation)[-1] if get_origin(annotation) is dict else None
-        if table is not None:
+        annotation = _required(item or (field.annotation if field else None))
+        item = get_args(annotation)[-1] if get_origin(annotation) in (dict, list) else None
+        if item is not None:
             continue
         if not (isinstance(annotation, type) and issubclass(annotation, BaseModel)):
             break
@@ -91,6 +92,12 @@ def _fields_at(model: type[BaseModel], location: Sequence[int | str]) -> list[st
         (name, field) for name, field in current.model_fields.items() if not is_section(field.annotation)
     )
     return sorted(name for name, _ in own)
+
+
+def _required(annotation: Any) -> Any:
+    """Return X of `X | None`; any other type as it is."""
+    options = [each for each in get_args(annotation) if each is not NoneType]
+    return options[0] if get_origin(annotation) in (Union, UnionType) and len(options) == 1 else annotation
 
 
 def is_section(annotation: object) -> bool:

@@ -64,6 +64,8 @@ def test_single_camera_is_set_under_both_names_and_one_of_several_by_a_file(tmp_
     (["world.cameras={a: {}, b: {}}", "world.camera.fx=400"], r"camera is for a world with one: this one has a, b"),
     (["world.cameras={a: {frame: x}, b: {frame: x}}"], r"cameras\.b has the frame of a: x"),
     (["world.cameras={a: {fz: 3}}"], r"world\.cameras\.a\.fz: 3 is not a parameter; choices: cx, cy"),
+    (["robot.gripper.cup.radius=1"], r"robot\.gripper\.cup\.radius: 1 is not a parameter; choices: give, lip_radius$"),
+    (["robot.attachments=[{urdf: a, parent_link: b, xyz: 0}]"], r"\.0\.xyz: .* choices: parent_link, position, rpy"),
     (cell_of("a: {service: camera_open}"), r"unknown service 'camera_open' \(did you mean 'camera_opencv'"),
     (cell_of("a: {service: 3}"), r"services\.a\.service: 3 must be a service"),
     (cell_of("my.cam:", "your.cam:"), r"services\.your\.cam: my\.cam has the name cam already.*another_cam"),
