@@ -127,10 +127,12 @@ def test_xacro_file_is_read_and_overwrites_no_urdf(tmp_path):
     (TEXT, "--out a.srdf", ["--out", "'a.srdf'", ".yaml"]),
     (TEXT, "--out a.yaml --cell ./a.yaml", ["--cell", "'./a.yaml'", "another"]),
     (TEXT, f"--gripper {URDF}", ["--gripper", "upper_slide moves there already"]),
+    (TEXT.replace('"prismatic"', '"fixed"'), "--gripper cup.urdf", ["no moving joint", "suction cup", "gripper.cup"]),
     (TEXT, "--cell a.yaml --like ur5", ["outlining", "lays out no world"]),
 ], ids=lambda value: ", ".join(value)[:40] if isinstance(value, list) else "")
 def test_unusable_description_or_option_is_one_line(text, options, wanted, tmp_path, monkeypatch, rejection):
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "cup.urdf").write_text(NO_ARM)
     if text is not None:
         (tmp_path / "bad.urdf").write_text(text)
     line = rejection("robot", "new", "bad.urdf", *shlex.split(options), "--yes")

@@ -177,7 +177,8 @@ def _mount(
     part = read_tree(read_urdf("--gripper", gripper, package_dirs), gripper)
     moving = [joint for joint in part.joints if joint.moves]
     if not moving:
-        raise ConfigError("--gripper", gripper, "has no moving joint: it is no gripper")
+        raise ConfigError("--gripper", gripper, "has no moving joint: it is no gripper. For a suction cup, leave "
+                          "--gripper out and add gripper.cup to the robot file (docs/extending.md)")
     others = {joint.name: _rest(joint) for joint in tree.joints if joint.moves and joint not in arm.joints}
     middle = [(low + high) / 2 for low, high in proposal.values["position_limits"]]
     alone = Proposal(proposal.values | {"locked_joints": others, "named_poses": {"home": middle}})
