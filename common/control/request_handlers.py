@@ -37,6 +37,7 @@ from common.messages import (
 T = TypeVar("T")
 
 MAX_STOPS = 50  # unread requests to stop: each takes about 1 ms
+ON_REQUEST = "on request"  # logged for a stop or a hold without a reason
 MAX_JOG_NAMES = 16  # operators whose refused jogging was logged
 
 
@@ -145,7 +146,7 @@ class RequestHandlers:
     async def stop(self, request: StopRequest) -> MotionStatus:
         """Bring the arm to rest; an operator's stop blocks other motions."""
         if request.by == "operator":
-            self._log.info("stopped by %s: %s", request.owner or UNKNOWN_OPERATOR, request.reason)
+            self._log.info("stopped by %s: %s", request.owner or UNKNOWN_OPERATOR, request.reason or ON_REQUEST)
         return await self._persisted(self._executor.authority.stop(request, self._clock.now()))
 
     def stop_for_unread(self) -> str:
@@ -166,7 +167,7 @@ class RequestHandlers:
         before, owner = len(self._store.interlocks.all), authority.owner
         status, released = authority.hold(request, self._clock.now())
         by = (request.owner or UNKNOWN_OPERATOR) if request.by == "operator" else request.by
-        why = request.reason or "on request"
+        why = request.reason or ON_REQUEST
         if request.hold and not status.held:
             self._log.info("%s requested a hold of %s, which is over: %s", by, request.goal, why)
         elif request.hold:

@@ -48,6 +48,12 @@ async def test_status_is_published_before_the_answer_to_a_stop_or_a_hold() -> No
         assert [one.by for one in client.motion.latest.interlocks] == ["ann"]
 
 
+async def test_log_gives_a_reason_for_a_stop_without_one(caplog) -> None:
+    async with executor() as client:
+        await client.stop.call(StopRequest(owner="ann", reason=""))
+    assert messages(caplog, "stopped by") == ["stopped by ann: on request"]
+
+
 async def test_hold_of_an_operator_persists_and_that_of_a_watchdog_does_not() -> None:
     async with executor() as client:
         await client.hold.call(HoldRequest(hold=True, by="watchdog"))
