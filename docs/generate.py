@@ -191,6 +191,7 @@ def main() -> int:
         return 1 if old else 0
     for path in old:
         path.write_text(files[path], encoding="utf-8")
+        sys.stdout.write(f"docs/{path.relative_to(DOCS)} written\n")
     return 0
 
 
