@@ -22,7 +22,10 @@ ViewerHost = Annotated[
 ]
 SummaryFile = Annotated[str | None, typer.Option("--summary", metavar="FILE.json", help="write the figures of the run")]
 LogJson = Annotated[bool, typer.Option("--log-json", help="write log lines as JSON objects")]
-Record = Annotated[str | None, typer.Option("--record", metavar="FILE.mcap", help="record all messages")]
+Record = Annotated[
+    str | None, typer.Option("--record", metavar="FILE.mcap", help="record all published messages; requests are not "
+                                                                   "recorded")
+]
 ChaosSeed = Annotated[
     str | None, typer.Option("--chaos", metavar="SEED", help="inject faults; the same seed plans the same faults")
 ]

@@ -48,7 +48,8 @@ class PickPlaceStatus(TaskStatus):
 
 
 SCENE_BALLS = Topic("scene_balls", m.PoseArray, "state", "the truth: where every ball is; simulated hardware only")
-DETECTED_OBJECTS = Topic("detected_objects", m.MarkerArray, "stream", "balls found in the picture, in world")
+DETECTED_OBJECTS = Topic("detected_objects", m.MarkerArray, "stream",
+                         "balls found in the picture, in world; also rejected red objects, with the reason as `text`")
 DETECTION_IMAGE = Topic("detection_image", m.Image, "stream", "the picture with what was found")
 DETECTION_MASK = Topic("detection_image/mask", m.Image, "stream",
                        "white where the picture has a colour that is looked for; sent only while someone listens")
