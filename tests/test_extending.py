@@ -30,6 +30,7 @@ from common.tasks.stages import View
 from common.topics import CAMERA_IMAGE, CAMERA_INFO, GRIPPER_STATE, SCENE_OBJECTS
 from common.transport.codec import decode
 from common.transport.local import LocalNetwork
+from lab.simulation import Simulation
 from page.server import close_server, make_server
 from recording.reader import Recording
 from tests import pages
@@ -93,6 +94,17 @@ def test_robot_has_the_links_of_arm_and_gripper(folder: Path) -> None:
     assert T_tool_tcp[:3, 3] == pytest.approx([0, 0, 0.1])
     srdf = (folder / "my_robot.srdf").read_text(encoding="utf-8")
     assert 'link1="palm" link2="left_finger"' in srdf and 'link1="forearm_link" link2="palm"' not in srdf
+
+
+@pytest.mark.slow
+def test_suction_cup_places_every_ball(folder: Path) -> None:
+    urdf, sections = (text for _, text in pages.blocks(PAGE.partition("### A suction cup")[2])[:2])
+    (folder / "my_cup.urdf").write_text(urdf, encoding="utf-8")
+    robot = yaml.safe_load(FILES["my_robot.yaml"]) | yaml.safe_load(sections) | {"srdf": "cup.srdf"}
+    (folder / "cup.yaml").write_text(yaml.safe_dump(robot), encoding="utf-8")
+    assert run_command("zencell robot collisions cup.yaml -o cup.srdf", folder).returncode == 0
+    outcome = Simulation(load_cell("panda", ["world.count=2", f"robot={folder / 'cup.yaml'}"]), 1).run()
+    assert (outcome.state, outcome.done, outcome.broken) == ("DONE", 2, [])
 
 
 def test_custom_hardware_reads_in_encoder_steps(folder: Path) -> None:

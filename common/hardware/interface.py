@@ -87,7 +87,10 @@ class ArmState(NamedTuple):
 
 
 class GripperReading(NamedTuple):
-    """State of the fingers: `width` between their inner faces [m], its rate [m/s], `effort` they press with [N]."""
+    """State of the fingers: `width` between their inner faces [m], its rate [m/s], `effort` they press with [N].
+
+    A cup reads `max_width` without suction, `held_width` with `holding` while it holds an object, 0 with nothing.
+    """
 
     width: float
     velocity: float
@@ -97,7 +100,7 @@ class GripperReading(NamedTuple):
 
 
 class Gripper(Protocol):
-    """Two fingers that open and close."""
+    """Two fingers that open and close, or the valve of a cup: width 0 switches suction on, `max_width` releases."""
 
     def command(self, width: float, now: float, effort: float) -> None:
         """Start to move the fingers to a width [m], pressing with an effort [N]; replaces a motion under way."""
