@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import json
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
@@ -19,6 +18,7 @@ from websockets.exceptions import ConnectionClosed
 
 from common.time_source import monotonic
 from page.access import CURRENT_SESSION
+from page.browser_values import to_json
 from page.status_text import USER_ERRORS, TaskText, error_text, motion_text
 
 if TYPE_CHECKING:
@@ -163,7 +163,7 @@ class ControlSocket:
                 "note": {"number": number, "text": text, "kind": kind},
             }
             try:
-                await connection.send(json.dumps({"status": message}))
+                await connection.send(to_json({"status": message}))
             except ConnectionClosed:
                 return
             await asyncio.sleep(STATUS_PERIOD)
@@ -184,7 +184,7 @@ class ControlSocket:
         loop = asyncio.get_running_loop()
 
         def reply(text: str, kind: str, n: int = 0) -> None:
-            result = json.dumps({"n": n, "result": text, "kind": kind})
+            result = to_json({"n": n, "result": text, "kind": kind})
             asyncio.run_coroutine_threadsafe(_send(connection, result), loop)
 
         actions, permissions = self._actions, self._actions.permissions

@@ -14,11 +14,13 @@ from pydantic import JsonValue, TypeAdapter
 from common.config import parse_yaml
 from common.errors import ConfigError
 from common.messages import Parameter
+from page.browser_values import INVALID, is_acceptable
 from page.console import SLIDER_DEBOUNCE, Console, assign
 from page.markup import Html, block, span
 from page.status_text import USER_ERRORS, error_text
 
 MIN_SLIDER_STEPS = 200
+MIN_STEP = 1e-9  # of a slider
 MAX_STEP_AT_ZERO = 10  # step of a slider around a value of 0
 TYPING_DEBOUNCE = 0.8  # [s] without a key press, after which a text or number is sent
 
@@ -125,7 +127,7 @@ class ParameterField:
             return gui.add_checkbox(self._label, value, hint=hint)
         if p.choices and value in p.choices:
             return gui.add_dropdown(self._label, p.choices, initial_value=str(value), hint=hint)
-        if p.type in ("number", "integer") and isinstance(value, int | float):
+        if _is_number(p) and isinstance(value, int | float):
             is_integer = p.type == "integer"
             number: Any = int if is_integer else float
             low, high = (None if bound is None else number(bound) for bound in (p.minimum, p.maximum))
@@ -142,6 +144,8 @@ class ParameterField:
     def _text(self, value: JsonValue) -> str:
         if not self.as_yaml:
             return str(value)
+        if isinstance(value, float) and not math.isfinite(value):
+            return INVALID
         text = str(yaml.safe_dump(value, default_flow_style=True, width=10_000))
         return text.removesuffix("\n").removesuffix("\n...")
 
@@ -181,8 +185,13 @@ class ParameterField:
 
 def _form(p: Parameter) -> tuple[object, ...]:
     """Return the properties of a parameter that determine its field."""
-    kind = "number" if isinstance(p.value, int | float) and not isinstance(p.value, bool) else type(p.value).__name__
+    kind = "number" if _is_number(p) else type(p.value).__name__
     return p.path, p.type, p.minimum, p.maximum, p.choices, kind, p.choices and p.value in p.choices
+
+
+def _is_number(p: Parameter) -> bool:
+    """Return whether a field for numbers can show the value of a parameter; text can show any value."""
+    return p.type in ("number", "integer") and type(p.value) in (int, float) and is_acceptable(p.value)
 
 
 def label_of(parameter: Parameter) -> str:
@@ -202,7 +211,10 @@ def step_of(parameter: Parameter) -> float | None:
     """Return a round step for a slider; None without bounds, or if it would exceed a quarter of the value."""
     if parameter.minimum is None or parameter.maximum is None or parameter.maximum <= parameter.minimum:
         return None
-    step = 10 ** math.floor(math.log10((parameter.maximum - parameter.minimum) / MIN_SLIDER_STEPS))
+    least = (parameter.maximum - parameter.minimum) / MIN_SLIDER_STEPS
+    if least < MIN_STEP:
+        return None
+    step = 10 ** math.floor(math.log10(least))
     if parameter.type == "integer":
         step = max(1, step)
     sizes = [abs(v) for v in (parameter.value, parameter.default)

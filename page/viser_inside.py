@@ -9,6 +9,8 @@ Nothing else needs checking when viser is updated.
   Upstream request: `ViserServer(..., allow_share_url=False)`.
 - **Messages of a browser.** `filter_messages` drops what the page may not do.
   Upstream request: a hook that accepts or rejects a client's message.
+- **Values that cannot be sent.** A value that msgpack rejects ends the connection of every page. All values pass
+  `_prepare`. Upstream request: check values when they are assigned.
 - **A client that starts fast.** viser's client is one packed file, which a browser unpacks and compiles at each start.
   Sent as script, style sheet and decoder, each under a name derived from its content, it compiles while it loads and
   the browser caches the result. Upstream requests: a client build in separate files; `configure_environment_map`
@@ -30,6 +32,7 @@ import asyncio
 import gzip
 import hashlib
 import json
+import math
 import re
 import threading
 from collections.abc import Awaitable, Callable, Iterator, Mapping
@@ -53,8 +56,11 @@ from viser._messages import (
     ShareUrlRequest,
     ViewerCameraMessage,
 )
+from viser.infra import _messages as infra_messages
 from viser.infra._async_message_buffer import AsyncMessageBuffer
 from websockets.http11 import Request, Response
+
+from page.browser_values import sendable
 
 if TYPE_CHECKING:
     import socket
@@ -88,6 +94,27 @@ def _init_with_safe_event(buffer: AsyncMessageBuffer, *args: Any, **options: Any
 
 
 AsyncMessageBuffer.__init__ = _init_with_safe_event  # type: ignore[method-assign, assignment]
+
+# --- values that cannot be sent ---
+
+_prepare_value = infra_messages._prepare_for_serialization
+
+
+def _prepare(value: Any, annotation: object, binary_buffers: list[memoryview] | None = None) -> Any:
+    """Return a value of a message for the encoder; viser calls this for each part of it.
+
+    An invalid number becomes NaN: the client computes with it. viser's own infinite numbers stay, msgpack carries them.
+    """
+    if isinstance(value, int | str) and not isinstance(value, bool):
+        value = sendable(value, math.nan)
+    elif isinstance(value, dict):
+        value = {str(sendable(name)): each for name, each in value.items()}
+    if isinstance(value, float) and not math.isfinite(value):
+        return float(value)  # also where the client expects an integer
+    return _prepare_value(value, annotation, binary_buffers)
+
+
+infra_messages._prepare_for_serialization = _prepare
 
 # --- the server ---
 

@@ -22,6 +22,7 @@ MAX_POINTS = 20_000  # of a cloud: a browser without a GPU draws them several ti
 _POINT_SIZE = 0.003  # [m]
 _CAMERA_COLOR = (120, 170, 255)
 _IMAGE_WIDTH = 0.14  # in the scene [m]
+_MIN_ANGLE, _MAX_ASPECT = 1e-3, 1e3  # vertical angle of view [rad]; ratio of the sides of the view
 _IMAGE_PIXELS = 320  # maximum width
 _IMAGE_PERIOD = 0.5  # [s]
 _CAMERA_PERIOD = 0.1  # [s] between two poses of a moving camera
@@ -110,13 +111,15 @@ class Camera(Layer):
 
     def _show(self, name: str, m: CameraInfo) -> None:
         known = self._infos.get(name)
+        angle, aspect = 2 * math.atan2(m.height / 2, m.k[4]), (m.width / m.k[0]) / (m.height / m.k[4])
+        if not (_MIN_ANGLE < angle < math.pi - _MIN_ANGLE and 1 / _MAX_ASPECT < aspect < _MAX_ASPECT):
+            return  # no camera has such a view
         self._infos[name] = m
         if known is not None and (m.k, m.width, m.height) == (known.k, known.width, known.height):
             return
         node = self.nodes[name] = self.scene.add_camera_frustum(
-            f"{self.root}/{name.replace('/', '_')}", 2 * math.atan2(m.height / 2, m.k[4]),
-            (m.width / m.k[0]) / (m.height / m.k[4]), color=_CAMERA_COLOR, thickness=1.5, thickness_units="screen",
-            format="jpeg", jpeg_quality=70, **FLAT,
+            f"{self.root}/{name.replace('/', '_')}", angle, aspect, color=_CAMERA_COLOR, thickness=1.5,
+            thickness_units="screen", format="jpeg", jpeg_quality=70, **FLAT,
         )
         node.scale = _IMAGE_WIDTH * m.k[0] / m.width / node.compute_canonical_frustum_size()[2]
         self._last_image[name] = -math.inf
