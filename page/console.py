@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import math
 from collections.abc import Callable, Coroutine, Iterable
 from contextvars import Context, copy_context
 from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeVar
@@ -60,15 +59,6 @@ class Field(Protocol[V_co]):
 def assign(handle: Field[V], value: V) -> None:
     """Set the value of a field in every browser."""
     handle.value = value  # type: ignore[misc]  # it has a setter, behind a decorator
-
-
-def is_valid_input(handle: object, value: object) -> bool:
-    """Return whether a browser could have entered this value: a modified client can send anything."""
-    if isinstance(value, float) and not math.isfinite(value):
-        return False
-    if isinstance(value, list | tuple) and not all(is_valid_input(None, each) for each in value):
-        return False
-    return not isinstance(handle, viser.GuiDropdownHandle) or value in handle.options
 
 
 class Notify(Protocol):
@@ -171,7 +161,7 @@ class ActionQueue:
 
         async def changed(event: viser.GuiEvent[viser.GuiInputHandle[V]]) -> None:
             value = event.target.value
-            if event.client_id is not None and is_valid_input(event.target, value):
+            if event.client_id is not None:
                 self.put(lambda: action(value))
 
         handle.on_update(changed)

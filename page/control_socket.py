@@ -18,7 +18,7 @@ from websockets.exceptions import ConnectionClosed
 
 from common.time_source import monotonic
 from page.access import CURRENT_SESSION
-from page.browser_values import to_json
+from page.browser_values import MAX_NUMBER, to_json
 from page.status_text import USER_ERRORS, TaskText, error_text, motion_text
 
 if TYPE_CHECKING:
@@ -47,10 +47,10 @@ class PageMessage(BaseModel):
     model_config = ConfigDict(extra="ignore", frozen=True)
 
     do: Literal["stop", "press", "hold", "release", "page"]
-    n: int = 0  # number of a STOP, returned in its reply; number of the press for "hold"
+    n: int = Field(0, ge=-(2**53), le=2**53)  # number of a STOP, returned in its reply; number of the press for "hold"
     what: str = Field("", max_length=100)  # name of the button; for "page" the secret key of the page
-    at: float = Field(0.0, allow_inf_nan=False)  # [ms] by the clock of the browser
-    seen: float = Field(0.0, allow_inf_nan=False)  # [s] `time` of the newest status that the page had received
+    at: float = Field(0.0, ge=-MAX_NUMBER, le=MAX_NUMBER)  # [ms] by the clock of the browser
+    seen: float = Field(0.0, ge=-MAX_NUMBER, le=MAX_NUMBER)  # [s] `time` of the newest status it had received
 
 
 @dataclass(frozen=True)

@@ -95,10 +95,10 @@ def make_server(
     if permissions is not None:
         permissions.enforced = access.requires_token
 
-        def allowed(element: str, value: object) -> bool:
-            return permissions.allow(CURRENT_SESSION.get(), element, value)
+    def allowed(element: str, value: object) -> bool:
+        return permissions is None or permissions.allow(CURRENT_SESSION.get(), element, value)
 
-        filter_messages(server, allowed)
+    filter_messages(server, allowed)
     if not (published or is_loopback(host)):
         log.warning(
             "the page is reachable from other machines, without encryption; `ssh -L %d:127.0.0.1:%d HOST` to a page on "

@@ -7,8 +7,9 @@ Nothing else needs checking when viser is updated.
   during the call. Upstream request: `ViserServer(..., sock=, process_request=, websocket_options=)`.
 - **No tunnel to a public server.** Any page may request a share URL; `create_server` removes these handlers.
   Upstream request: `ViserServer(..., allow_share_url=False)`.
-- **Messages of a browser.** `filter_messages` drops what the page may not do.
-  Upstream request: a hook that accepts or rejects a client's message.
+- **Messages of a browser.** viser stores and broadcasts any value of any size, and keeps uploads for fields without
+  one. `_ACCEPTED` names the messages that the page uses, `_is_bounded` checks their values, and `filter_messages` drops
+  what the page may not do. Upstream request: a hook that accepts or rejects a client's message.
 - **Values that cannot be sent.** A value that msgpack rejects ends the connection of every page. All values pass
   `_prepare`. Upstream request: check values when they are assigned.
 - **A client that starts fast.** viser's client is one packed file, which a browser unpacks and compiles at each start.
@@ -49,18 +50,24 @@ import websockets.asyncio.server as websocket_server
 import zstandard
 from rich import get_console
 from viser._messages import (
-    GetRenderResponseMessage,
+    CommandTriggerMessage,
     GuiUpdateMessage,
     RunJavascriptMessage,
+    SceneNodeClickMessage,
+    SceneNodeDragMessage,
     ShareUrlDisconnect,
     ShareUrlRequest,
+    TransformControlsDragEndMessage,
+    TransformControlsDragStartMessage,
+    TransformControlsUpdateMessage,
     ViewerCameraMessage,
 )
 from viser.infra import _messages as infra_messages
 from viser.infra._async_message_buffer import AsyncMessageBuffer
+from viser.infra._infra import WebsockMessageHandler
 from websockets.http11 import Request, Response
 
-from page.browser_values import sendable
+from page.browser_values import is_acceptable, sendable
 
 if TYPE_CHECKING:
     import socket
@@ -179,12 +186,68 @@ def silence_console() -> Iterator[None]:
         console.quiet = before
 
 
-# Messages that affect their own browser only; all others change the page for every browser.
-_PRIVATE = (ViewerCameraMessage, GetRenderResponseMessage)
+# The messages of browsers that the page uses. viser stores the parts of an upload to any field, and broadcasts others.
+_ACCEPTED = (
+    CommandTriggerMessage, GuiUpdateMessage, SceneNodeClickMessage, SceneNodeDragMessage,
+    TransformControlsDragEndMessage, TransformControlsDragStartMessage, TransformControlsUpdateMessage,
+    ViewerCameraMessage,
+)
+_NORM_TOLERANCE = 0.01  # of quaternions
+_VECTOR_SIZES = {"wxyz": 4, "position": 3, "look_at": 3, "up_direction": 3, "start_position": 3, "end_position": 3}
+
+
+def _is_bounded(message: object) -> bool:
+    """Return whether a message is one that the page uses, with bounded values of the right sizes."""
+    if not isinstance(message, _ACCEPTED):
+        return False
+    fields = dict(vars(message))
+    updates = fields.pop("updates", {"value": None})
+    if set(updates) != {"value"}:
+        return False  # viser would set any attribute of our handle
+    if not all(map(is_acceptable, [*fields.values(), updates["value"]])):
+        return False
+    for name, size in _VECTOR_SIZES.items():
+        vector = fields.get(name, (0.0,) * size)
+        if len(vector) != size or not all(type(each) is float for each in vector):
+            return False
+    return (abs(math.hypot(*fields.get("wxyz", (1.0,))) - 1) < _NORM_TOLERANCE
+            and 0 < fields.get("fov", 1.0) < math.pi)
+
+
+_handle_message = WebsockMessageHandler._handle_incoming_message
+
+
+async def _handle_bounded(handler: WebsockMessageHandler, client_id: Any, message: Any) -> None:
+    if _is_bounded(message):
+        await _handle_message(handler, client_id, message)
+
+
+WebsockMessageHandler._handle_incoming_message = _handle_bounded  # type: ignore[method-assign, assignment]
+
+
+def _fit(field: Any, value: Any) -> Any:
+    """Return the value of a field that a browser entered, within its limits; None if it has another type."""
+    before = field.value
+    if isinstance(before, tuple):
+        if not isinstance(value, list | tuple) or len(value) != len(before):
+            return None
+        parts = [_fit_one(each, one, None, None) for each, one in zip(before, value, strict=True)]
+        return None if None in parts else parts
+    if isinstance(field, viser.GuiDropdownHandle | viser.GuiButtonGroupHandle):
+        return value if value in field.options else None
+    return _fit_one(before, value, getattr(field, "min", None), getattr(field, "max", None))
+
+
+def _fit_one(before: Any, value: Any, low: float | None, high: float | None) -> Any:
+    if isinstance(before, bool | str):
+        return value if type(value) is type(before) else None
+    if not isinstance(before, int | float) or isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    return min(max(value, value if low is None else low), value if high is None else high)
 
 
 def filter_messages(server: viser.ViserServer, allowed: Callable[[str, object], bool]) -> None:
-    """Drop messages of browsers that would change the page for others, unless they are allowed.
+    """Drop messages with invalid values, and those that would change the page for others unless they are allowed.
 
     Args:
         server: of the page.
@@ -192,7 +255,6 @@ def filter_messages(server: viser.ViserServer, allowed: Callable[[str, object], 
             context of the connection.
     """
     inside = server._websock_server
-    handle = inside._handle_incoming_message
 
     def restore_value(client_id: Any, element: str) -> None:
         """Send the value of a field to the browser that shows another value now."""
@@ -201,14 +263,22 @@ def filter_messages(server: viser.ViserServer, allowed: Callable[[str, object], 
             client._websock_connection.queue_message(GuiUpdateMessage(element, {"value": field.value}))
 
     async def handle_if_allowed(client_id: Any, message: Any) -> None:
-        if not isinstance(message, _PRIVATE):
-            if isinstance(message, GuiUpdateMessage) and set(message.updates) != {"value"}:
-                return  # viser would set any attribute of our handle
-            value = message.updates.get("value") if isinstance(message, GuiUpdateMessage) else None
-            if not allowed(getattr(message, "uuid", ""), value):
-                restore_value(client_id, getattr(message, "uuid", ""))
+        if not _is_bounded(message):
+            restore_value(client_id, getattr(message, "uuid", ""))
+            return
+        if not isinstance(message, ViewerCameraMessage):  # which affects its own browser only
+            element, value = getattr(message, "uuid", ""), None
+            if isinstance(message, GuiUpdateMessage):
+                field = server.gui._gui_input_handle_from_uuid.get(element)
+                value = _fit(field, message.updates["value"]) if field is not None else None
+                if value is None:
+                    restore_value(client_id, element)
+                    return
+                message.updates["value"] = value
+            if not allowed(element, value):
+                restore_value(client_id, element)
                 return
-        await handle(client_id, message)
+        await _handle_message(inside, client_id, message)
 
     inside._handle_incoming_message = handle_if_allowed  # type: ignore[method-assign]
 

@@ -17,7 +17,7 @@ import msgspec
 import pytest
 import viser
 import websockets
-from viser._messages import GuiUpdateMessage, ShareUrlRequest
+from viser._messages import CommandTriggerMessage, ShareUrlRequest
 from websockets.asyncio.client import ClientConnection
 from websockets.asyncio.client import connect as connect_socket
 
@@ -205,10 +205,11 @@ async def test_share_url_cannot_be_requested(make: Make, monkeypatch: pytest.Mon
     requests: list[str] = []
     monkeypatch.setattr(server, "request_share_url", lambda: requests.append("share"))
     processed, loop = asyncio.Event(), asyncio.get_running_loop()
-    server._websock_server.register_handler(GuiUpdateMessage, lambda *_: loop.call_soon_threadsafe(processed.set))
+    server._websock_server.register_handler(
+        CommandTriggerMessage, lambda *_: loop.call_soon_threadsafe(processed.set))
     async with open_page(server) as connection, asyncio.timeout(PATIENCE):
         await connection.send(msgspec.msgpack.encode({"type": ShareUrlRequest.__name__}))
-        await connection.send(msgspec.msgpack.encode({"type": "GuiUpdateMessage", "uuid": "none", "updates": {}}))
+        await connection.send(msgspec.msgpack.encode({"type": "CommandTriggerMessage", "uuid": "none"}))
         await processed.wait()
     server._thread_executor.shutdown()
     assert requests == []
