@@ -10,6 +10,7 @@ everything. Every page may stop the robot.
 
 from __future__ import annotations
 
+import hashlib
 import hmac
 import ipaddress
 import re
@@ -102,14 +103,18 @@ class Access:
         if not self.requires_token:
             return ALL_ROLES
         pairs = [part.strip().partition("=") for header in cookies for part in header.split(";")]
-        return frozenset().union(*(self._roles_of(value) for name, _, value in pairs if name == self._cookie))
+        return frozenset().union(*(
+            self._roles_of(value, self._cookie_of) for name, _, value in pairs if name == self._cookie))
 
-    def _roles_of(self, token: str) -> frozenset[str]:
-        """Return the roles that a token grants; none for an unknown token."""
-        found = {role for role, known in self.tokens.items() if _equal(token, known)}
-        if self.token and _equal(token, self.token):
+    def _roles_of(self, secret: str, derive: Callable[[str], str] = str) -> frozenset[str]:
+        """Return the roles of the tokens from which `derive` makes a secret; none for an unknown secret."""
+        found = {role for role, known in self.tokens.items() if _equal(secret, derive(known))}
+        if self.token and _equal(secret, derive(self.token)):
             found |= ALL_ROLES
         return frozenset(found | {"look"}) if found else frozenset()
+
+    def _cookie_of(self, token: str) -> str:
+        return cookie_value(token, self.port)
 
     @property
     def _cookie(self) -> str:
@@ -120,7 +125,7 @@ class Access:
         return Answer(
             HTTPStatus.OK,
             '<!doctype html><meta charset="utf-8"><title>zencell</title><script>location.replace("/")</script>',
-            {"Set-Cookie": f"{self._cookie}={token}; Path=/; HttpOnly; SameSite=Strict"},
+            {"Set-Cookie": f"{self._cookie}={self._cookie_of(token)}; Path=/; HttpOnly; SameSite=Strict"},
         )
 
     def _is_our_name(self, name: str) -> bool:
@@ -135,6 +140,14 @@ class Access:
         address = parse_address(peer.partition("%")[0])
         mapped = getattr(address, "ipv4_mapped", None) or address
         return mapped is not None and (mapped.is_loopback or str(mapped) in self.trusted_peers)
+
+
+def cookie_value(token: str, port: int) -> str:
+    """Return the value of a page's cookie, which proves the token without revealing it and fits no other port.
+
+    A browser sends a cookie to every server of the same host, whatever its port.
+    """
+    return hmac.new(token.encode("utf-8", "replace"), f"zencell page {port}".encode(), hashlib.sha256).hexdigest()
 
 
 def gateways(table: Path = Path("/proc/net/route")) -> frozenset[str]:

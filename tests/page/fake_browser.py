@@ -15,6 +15,8 @@ import zstandard
 from websockets import Subprotocol
 from websockets.asyncio.client import ClientConnection, connect
 
+from page.access import cookie_value
+
 PATIENCE = 20.0  # [s]
 CAMERA = {
     "type": "ViewerCameraMessage", "wxyz": [1.0, 0.0, 0.0, 0.0], "position": [1.0, 2.0, 3.0], "fov": 1.0, "near": 0.1,
@@ -143,7 +145,7 @@ class FakeBrowser:
 @asynccontextmanager
 async def opened(port: int, token: str = "") -> AsyncIterator[FakeBrowser]:
     """A page that is open inside the block."""
-    cookie = {"Cookie": f"zencell-{port}={token}"} if token else None
+    cookie = {"Cookie": f"zencell-{port}={cookie_value(token, port)}"} if token else None
     async with (
         connect(f"ws://127.0.0.1:{port}/", proxy=None, max_size=None, open_timeout=PATIENCE,
                 subprotocols=[Subprotocol(f"viser-v{viser.__version__}")], additional_headers=cookie) as connection,

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from common.errors import ConfigError
-from page.access import Access, gateways
+from page.access import Access, cookie_value, gateways
 from page.address import is_loopback, page_url
 from security.certificates import write_secret
 from security.page_tokens import ROLES, TOKEN_PATTERN, make_token, read_tokens, token_file
@@ -16,7 +16,7 @@ SECRET = "correct-horse-battery"
 LOCAL = Access("127.0.0.1", 8080)
 REMOTE = Access("0.0.0.0", 8080, SECRET)
 NAMED = Access("cell.lab", 8080, SECRET)
-COOKIE = f"other=1; zencell-8080={SECRET}"
+COOKIE = f"other=1; zencell-8080={cookie_value(SECRET, 8080)}"
 OWN = "127.0.0.1:8080"
 
 
@@ -72,7 +72,8 @@ def test_foreign_origins_are_rejected_even_with_a_token(origin: str | list[str])
 @pytest.mark.parametrize("upgrade", [True, False])
 def test_nothing_is_served_without_the_token(upgrade: bool) -> None:
     for path in ("/", "/index.html", "/?token=", "/?token=correct-horse-batterx", "/?tokem=" + SECRET, "/" + SECRET):
-        for cookie in ("", f"zencell-8081={SECRET}", "zencell-8080=", "zencell-8080=wrong", SECRET):
+        for cookie in ("", f"zencell-8081={cookie_value(SECRET, 8081)}", f"zencell-8080={SECRET}", "zencell-8080=",
+                       "zencell-8080=wrong", SECRET):
             assert status(REMOTE, OWN, [], cookie, path, upgrade) == HTTPStatus.UNAUTHORIZED
     assert status(REMOTE, cookie="zencell-8080=é\udcff", path="/?token=%ff%C3%A9") == HTTPStatus.UNAUTHORIZED
 
@@ -122,10 +123,12 @@ def test_each_token_grants_its_role_and_the_general_one_all_roles() -> None:
     tokens = {role: f"{role}-token-of-the-page" for role in ROLES}
     access = Access("127.0.0.1", 8080, SECRET, tokens)
     for role, token in tokens.items():
-        assert access.roles([f"zencell-8080={token}"]) == {"look", role}
-        assert status(access, cookie=f"zencell-8080={token}") == status(access, path=f"/?token={token}") == 0
-    assert access.roles([f"zencell-8080={SECRET}"]) == LOCAL.roles([]) == set(ROLES)
-    assert not access.roles(["zencell-8080=look", "zencell-8081=" + SECRET])
+        assert access.roles([f"zencell-8080={cookie_value(token, 8080)}"]) == {"look", role}
+        cookie = f"zencell-8080={cookie_value(token, 8080)}"
+        assert status(access, cookie=cookie) == status(access, path=f"/?token={token}") == 0
+    assert access.roles([COOKIE]) == LOCAL.roles([]) == set(ROLES)
+    assert not access.roles([
+        "zencell-8080=look", f"zencell-8080={SECRET}", f"zencell-8081={cookie_value(SECRET, 8081)}"])
     assert status(access) == HTTPStatus.UNAUTHORIZED
     assert SECRET not in repr(access) and "of-the-page" not in repr(access), "a log must not show tokens"
 

@@ -25,7 +25,7 @@ from common.config import load_cell, service_config
 from common.config.tunables import describe
 from common.errors import ConfigError
 from page import server as page_server
-from page.access import Permission, Permissions
+from page.access import Permission, Permissions, cookie_value
 from page.console import ActionQueue
 from page.server import close_server, make_server
 from page.viser_inside import client_files, element_id
@@ -122,6 +122,19 @@ async def test_remote_page_opens_with_its_token_only(make: Make) -> None:
     assert "<html" in get(server, Cookie=cookie).text
     assert await status_of(server, cookie=cookie, origin=f"http://127.0.0.1:{server.get_port()}") == 101
     assert await status_of(server, cookie=cookie, origin="http://evil.example") == 403
+
+
+def test_cookie_neither_reveals_the_token_nor_opens_the_page_at_another_port(make: Make) -> None:
+    first, second = make(token=SECRET, secured=True), make(token=SECRET, secured=True)
+    name, _, rest = get(first, f"/?token={SECRET}").headers["Set-Cookie"].partition("=")
+    value, *attributes = rest.split("; ")
+    assert name == f"zencell-{first.get_port()}" and SECRET not in rest
+    assert attributes == ["Path=/", "HttpOnly", "SameSite=Strict"]
+    assert get(first, Cookie=f"{name}={value}").status == 200
+    for page, cookie in ((first, f"{name}={SECRET}"), (second, f"{name}={value}"),
+                         (second, f"zencell-{second.get_port()}={value}")):
+        assert get(page, Cookie=cookie).status == 401
+    assert get(first, f"/?token={value}").status == 401
 
 
 def test_remote_and_secured_pages_need_a_token_of_configuration_or_environment(
@@ -283,7 +296,8 @@ class Operated:
     done: list[str]
 
     def cookie(self, role: str) -> str:
-        return f"zencell-{self.server.get_port()}={role}-token-of-the-page"
+        port = self.server.get_port()
+        return f"zencell-{port}={cookie_value(f'{role}-token-of-the-page', port)}"
 
     def open(self, role: str) -> connect_socket:
         return open_page(self.server, cookie=self.cookie(role))

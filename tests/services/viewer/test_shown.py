@@ -29,6 +29,7 @@ from common import messages as m
 from common import topics
 from common.application import find_application
 from common.config import Members, load_cell
+from page.access import cookie_value
 from page.layout import Layout
 from services import viewer
 from tests.page.fake_browser import PATIENCE, FakeBrowser, opened
@@ -243,7 +244,8 @@ async def test_scene_is_loaded_when_the_cell_is_up_or_a_page_is_open(scenes, mon
 async def test_control_socket_rejects_foreign_origins_and_missing_tokens() -> None:
     async with serve_page("panda", token=TOKEN) as services:
         address = f"ws://127.0.0.1:{services.port}/control"
-        for status, headers in ((401, {}), (403, {"Cookie": f"zencell-{services.port}={TOKEN}", "Origin": "http://a.b"})):
+        for status, headers in ((401, {}), (403, {
+            "Cookie": f"zencell-{services.port}={cookie_value(TOKEN, services.port)}", "Origin": "http://a.b"})):
             with pytest.raises(InvalidStatus) as caught:
                 async with connect(address, proxy=None, additional_headers=headers):
                     pass
