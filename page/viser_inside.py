@@ -206,6 +206,8 @@ def _is_bounded(message: object) -> bool:
         return False  # viser would set any attribute of our handle
     if not all(map(is_acceptable, [*fields.values(), updates["value"]])):
         return False
+    if any(isinstance(each, list) for each in fields.values()):
+        return False  # viser leaves a list of a wrong size, or in place of a name, as it is
     for name, size in _VECTOR_SIZES.items():
         vector = fields.get(name, (0.0,) * size)
         if len(vector) != size or not all(type(each) is float for each in vector):
@@ -256,11 +258,14 @@ def filter_messages(server: viser.ViserServer, allowed: Callable[[str, object], 
     """
     inside = server._websock_server
 
-    def restore_value(client_id: Any, element: str) -> None:
+    def find_field(element: object) -> Any:
+        return server.gui._gui_input_handle_from_uuid.get(element) if isinstance(element, str) else None
+
+    def restore_value(client_id: Any, element: object) -> None:
         """Send the value of a field to the browser that shows another value now."""
-        field, client = server.gui._gui_input_handle_from_uuid.get(element), server.get_clients().get(client_id)
+        field, client = find_field(element), server.get_clients().get(client_id)
         if field is not None and client is not None and not isinstance(field, viser.GuiButtonHandle):
-            client._websock_connection.queue_message(GuiUpdateMessage(element, {"value": field.value}))
+            client._websock_connection.queue_message(GuiUpdateMessage(element_id(field), {"value": field.value}))
 
     async def handle_if_allowed(client_id: Any, message: Any) -> None:
         if not _is_bounded(message):
@@ -269,7 +274,7 @@ def filter_messages(server: viser.ViserServer, allowed: Callable[[str, object], 
         if not isinstance(message, ViewerCameraMessage):  # which affects its own browser only
             element, value = getattr(message, "uuid", ""), None
             if isinstance(message, GuiUpdateMessage):
-                field = server.gui._gui_input_handle_from_uuid.get(element)
+                field = find_field(element)
                 value = _fit(field, message.updates["value"]) if field is not None else None
                 if value is None:
                     restore_value(client_id, element)

@@ -1,6 +1,7 @@
 """Values that no unmodified browser sends: they are neither stored nor sent to other pages."""
 
 import asyncio
+import gc
 import math
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager
@@ -155,3 +156,14 @@ async def test_pose_of_a_gizmo_is_bounded(own_server: viser.ViserServer) -> None
                          position=[0.5, 0.0, 0.0])
         await pages.received()
         assert [*gizmo.position] == [0.5, 0.0, 0.0], "a valid pose is stored"
+
+
+async def test_list_in_place_of_a_name_raises_nothing(
+    own_server: viser.ViserServer, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with open_pages(own_server) as pages:
+        for fields in ({"type": "GuiUpdateMessage", "updates": {"value": 1}}, {"type": "CommandTriggerMessage"}):
+            await pages.send(uuid=[1.0], **fields)
+        await pages.received()
+    gc.collect()  # reports exceptions of tasks
+    assert not caplog.records
