@@ -106,7 +106,7 @@ def test_token_is_printed_once_and_is_in_no_command_line_and_no_summary(folder, 
     token = address.partition("/?token=")[2]
     command.until("zenoh --mode client")
     shown = [" ".join(process.cmdline()) for process in command.children().values()]
-    assert any("services.viewer.host=0.0.0.0" in line for line in shown)
+    assert not any("services.viewer" in line for line in shown)
     command.interrupt()
     assert command.end() == 0
     assert any(hashlib.sha256(token.encode()).hexdigest() in line for line in command.lines)
