@@ -20,8 +20,9 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from common.errors import ZencellError
+from common.errors import ConfigError, ZencellError
 from common.perception.depth import Depth, is_valid
+from common.perception.image_files import read_array, read_image
 
 Array = npt.NDArray[np.float64]
 Picture = npt.NDArray[np.uint8]
@@ -33,6 +34,7 @@ NORMALIZED = "depth_camera_image_normalized.png"
 PIXELS = "relevant_contours_pixels.json"
 COORDINATES = "relevant_contours_coordinates.json"
 CLEARED = "relevant_contours_cleared_coordinates.json"
+MAX_TEXT = 2**24  # [bytes] of a JSON file: 400,000 points
 
 
 class StageFileError(ZencellError):
@@ -101,10 +103,12 @@ def read_picture(path: Path) -> Picture:
     Raises:
         StageFileError: it is missing or no image.
     """
-    picture = cv2.imdecode(np.frombuffer(_bytes(path), np.uint8), cv2.IMREAD_COLOR) if _bytes(path) else None
-    if picture is None:
-        raise StageFileError(path, "is no picture that can be read")
-    return np.asarray(picture, np.uint8)
+    if not path.is_file():
+        raise StageFileError(path, "is missing")
+    try:
+        return read_image(path)
+    except ConfigError as error:
+        raise StageFileError(path, error.expected) from None
 
 
 def read_depth(path: Path) -> Depth:
@@ -116,9 +120,9 @@ def read_depth(path: Path) -> Depth:
     if not path.is_file():
         raise StageFileError(path, "is missing")
     try:
-        depth = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise StageFileError(path, f"is no array that numpy can read: {_one_line(error)}") from None
+        depth = read_array(path)
+    except ConfigError as error:
+        raise StageFileError(path, error.expected) from None
     if not isinstance(depth, np.ndarray) or depth.ndim != 2 or depth.dtype.kind not in "fiu" or 0 in depth.shape:
         form = f"{depth.dtype} of shape {depth.shape}" if isinstance(depth, np.ndarray) else "an archive"
         raise StageFileError(path, f"must be an array (height, width) of depths in metres, not {form}")
@@ -165,6 +169,8 @@ def _bytes(path: Path) -> bytes:
     if not path.is_file():
         raise StageFileError(path, "is missing")
     try:
+        if path.stat().st_size > MAX_TEXT:
+            raise StageFileError(path, f"has {path.stat().st_size:,} bytes; at most {MAX_TEXT:,} are read")
         return path.read_bytes()
     except OSError as error:
         raise StageFileError(path, f"cannot be read: {error.strerror or error}") from None

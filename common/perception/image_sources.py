@@ -12,11 +12,10 @@ import numpy as np
 import numpy.typing as npt
 
 from common.errors import ConfigError
+from common.perception.image_files import IMAGE_SUFFIXES, MAX_PIXELS, read_image
 from common.time_source import monotonic
 
 Pixels = npt.NDArray[np.uint8]
-
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 
 
 class Source(Protocol):
@@ -83,11 +82,7 @@ class Folder:
         path = self._paths[self._next]
         self._next += 1
         self.name = path.name
-        data = np.frombuffer(path.read_bytes(), np.uint8)
-        image = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None  # OpenCV raises on empty data
-        if image is None:
-            raise ConfigError("source", str(path), "is not a readable image")
-        return _as_bgr8(image)
+        return read_image(path)
 
     def close(self) -> None:
         """Do nothing: no file stays open between reads."""
@@ -128,12 +123,19 @@ def open_source(
         if not images:
             raise ConfigError("source", str(source), f"contains no image; supported: {', '.join(IMAGE_SUFFIXES)}")
         return Folder(images, loop=loop)
+    if path.suffix.lower() in IMAGE_SUFFIXES:
+        return Folder([path], loop=loop)
     if not path.is_file():
         raise ConfigError("source", str(source), "is not a device number, /dev path, video file or image folder")
     capture = cv2.VideoCapture(str(path))
     if not capture.isOpened():
         capture.release()
         raise ConfigError("source", str(source), "is not a readable video")
+    width, height = (int(capture.get(each)) for each in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+    if width * height > MAX_PIXELS:
+        capture.release()
+        raise ConfigError("source", str(source), f"has frames of {width}x{height}; at most "
+                                                 f"{MAX_PIXELS:,} pixels are read")
     return Video(capture, live=False, loop=loop)
 
 

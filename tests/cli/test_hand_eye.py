@@ -87,7 +87,7 @@ def test_camera_at_the_hand_is_calibrated_from_a_folder(tmp_path, capsys, reject
     assert "unknown --camera 'foot'; choices: beside, hand" in rejection(*command, "--camera", "foot")
     assert "the views are inconsistent" in rejection(*command, "--camera", "beside", code=1)
     (tmp_path / "views" / "view_004.png").unlink()
-    assert "view_004.png' is not an image in that folder" in rejection(*command, "--camera", "hand")
+    assert "view_004.png' is not a file" in rejection(*command, "--camera", "hand")
 
 
 def test_views_are_collected_from_a_running_cell(tmp_path, monkeypatch):

@@ -9,7 +9,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -23,6 +22,7 @@ from common.messages import Image
 from common.perception.camera_file import CameraFile
 from common.perception.camera_input import FrameError, decode_color_image
 from common.perception.image import ImageError, image_to_array
+from common.perception.image_files import read_image
 from common.robot.model import RobotModel
 from common.transport.bus import Bus
 from common.transport.reader import Reader
@@ -161,9 +161,7 @@ def load_views(
     _require_joints(folder, contents, robot)
     views, reason = [], []
     for name, q in contents.pictures.items():
-        add_image: Any = cv2.imread(str(folder / Path(name).name))
-        if add_image is None:
-            raise ConfigError(f"{folder / JOINTS_FILE}: pictures", name, "is not an image in that folder")
+        add_image = read_image(folder / Path(name).name, f"{folder / JOINTS_FILE}: pictures")
         found, reasons = detect_boards(board, [(name, add_image)], camera, MAX_BLUR)
         reason += [f"{name}: {reason}" for reason in reasons]
         views += [View(detection, robot.fk(q)) for detection in found]

@@ -62,7 +62,7 @@ def test_missing_file_is_named(tmp_path, read, name):
 
 @pytest.mark.parametrize("content", [b"", b"not a picture"])
 def test_wrong_binary_files_are_rejected(tmp_path, content):
-    for read, name, problem in ((files.read_picture, files.PICTURE, "is no picture"),
+    for read, name, problem in ((files.read_picture, files.PICTURE, "is not a readable image"),
                                 (files.read_depth, files.DEPTH, "is no array that numpy can read")):
         (tmp_path / name).write_bytes(content)
         with pytest.raises(StageFileError, match=problem):
