@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from recording.selection import Selection
 
 
+MOST_HOLES = 3  # that a line lists
 MIN_FILE_SIZE = 1.0  # [MB] of a recording that is split
 
 File = Annotated[str, typer.Argument(metavar="FILE.mcap", help="a recording")]
@@ -107,15 +108,19 @@ def recover(
         str | None, typer.Option("-o", "--output", metavar="FILE.mcap", help="[FILE_recovered.mcap]")
     ] = None,
 ) -> None:
-    """Write a complete file from a recording that was truncated by a kill or a full disk."""
+    """Write a complete file from a truncated or damaged recording: every intact chunk, also those behind a hole."""
     from recording.reader import recover as recover_file
 
     source = Path(file)
     target = Path(output) if output else source.with_name(f"{source.stem}_recovered.mcap")
     require_new(target)
     saved = recover_file(source, target)
-    lost = [f"{format_bytes(saved.lost_bytes)} after the cut"] if saved.lost_bytes else []
+    lost = [f"{format_bytes(size)} in a hole" for size in saved.holes[:MOST_HOLES]]
+    if more := saved.holes[MOST_HOLES:]:
+        lost.append(f"{format_bytes(sum(more))} in {len(more)} more holes")
+    lost += [f"{format_bytes(saved.lost_bytes)} after the last record"] if saved.lost_bytes else []
     lost += [f"{saved.damaged_chunks} damaged chunks"] if saved.damaged_chunks else []
+    lost += [f"{saved.unknown:,} messages whose topic is unknown"] if saved.unknown else []
     echo(f"saved {saved.messages:,} messages, {saved.seconds:.1f} s: {target}; "
          f"lost {' and '.join(lost) or 'nothing'}")
 
@@ -255,19 +260,19 @@ def export(
             raise ConfigError(option, folder, "must be a folder")
     if video:
         require_new(Path(video), "--video", ".mp4")
-    decoder = Decoder()
     with Recording(Path(file)) as recording:
         selection.require_in(recording.topics(), recording.path, "--topics")
-        if foxglove:
-            _foxglove(recording, Path(foxglove), selection, decoder)
-        if csv:
-            _tables(recording, Path(csv), selection, decoder)
-        if images:
-            _images(recording, Path(images), selection, decoder)
-        if video:
-            _video(recording, Path(video), selection, decoder)
-    for topic, count in sorted(decoder.skipped.items()):
-        echo(f"{printable(topic)}: {count} messages left out: this version does not know their type", err=True)
+        for option, target, write in (("--foxglove", foxglove, _foxglove), ("--csv", csv, _tables),
+                                      ("--images", images, _images), ("--video", video, _video)):
+            if target:
+                decoder = Decoder()
+                write(recording, Path(target), selection, decoder)
+                for counts, why in ((decoder.skipped, "this version does not know their type"),
+                                    (decoder.unfit, f"{option} cannot hold them")):
+                    for topic, count in sorted(counts.items()):
+                        echo(f"{printable(topic)}: {count:,} messages left out: {why}", err=True)
+        if recording.flaw:
+            echo(f"the recording is {recording.flaw}; to repair it: zencell recover {file}", err=True)
 
 
 def _foxglove(recording: Recording, target: Path, selection: Selection, decoder: Decoder) -> None:

@@ -16,13 +16,12 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from common.messages import Image, JointState, Message, PointCloud2
+from common.messages import JointState, Message
 from common.perception.image import displayable
 from recording.reader import Recording, Wanted
 from recording.sample import Decoder, RecordingError
 from recording.writer import ExportFailed
 
-NO_TABLES = (Image, PointCloud2)
 NO_TABLE_NAMES = ("Image", "PointCloud2")
 MOST_COLUMNS = 5000  # of a table
 COLORS = ("bgr8", "rgb8", "mono8")
@@ -42,25 +41,23 @@ def export_tables(recording: Recording, folder: Path, wants: Wanted, decoder: De
         RecordingError: the recording is damaged.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    topics = [topic for topic, (name, _) in recording.topics().items() if name not in NO_TABLE_NAMES and wants(topic)]
     counts: dict[str, int] = {}
-    names = file_names(sorted(topics))
+    names = file_names(sorted(filter(wants, recording.topics())))
     for topic, name in names.items():
         # Two passes over the topic: the columns are known only after the last row.
         columns: dict[str, None] = {}
-        for row in _rows(recording, topic, Decoder()):
+        for row in _rows(recording, topic, decoder):
             columns |= dict.fromkeys(row)
             if len(columns) > MOST_COLUMNS:
                 raise RecordingError(f"{recording.path}: {topic} has more than {MOST_COLUMNS:,} columns")
         if not columns:
-            decoder.skipped[topic] += 1
             continue
         path = folder / f"{name}.csv"
         with path.open("w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, list(columns))
             writer.writerow({column: _inert(column) for column in columns})
             counts[path.name] = 0
-            for row in _rows(recording, topic, decoder):
+            for row in _rows(recording, topic, Decoder()):
                 writer.writerow({column: _inert(value) for column, value in row.items()})
                 counts[path.name] += 1
     return counts
@@ -68,8 +65,9 @@ def export_tables(recording: Recording, folder: Path, wants: Wanted, decoder: De
 
 def _rows(recording: Recording, topic: str, decoder: Decoder) -> Iterator[dict[str, Any]]:
     for sample in recording.samples(lambda name: name == topic):
-        message = decoder.message(sample)
-        if message is not None and not isinstance(message, NO_TABLES):
+        if sample.message in NO_TABLE_NAMES:
+            decoder.unfit[topic] += 1
+        elif (message := decoder.message(sample)) is not None:
             yield {"time": _seconds(sample.log_time), "stamp": _seconds(sample.publish_time), **row_of(message)}
 
 
@@ -137,9 +135,10 @@ def export_images(recording: Recording, folder: Path, wants: Wanted, decoder: De
     names = file_names(sorted(topics))
     counts: Counter[str] = Counter()
     for sample in recording.samples(lambda topic: topic in topics):
-        pixels = displayable(decoder.message(sample))
+        message = decoder.message(sample)
+        pixels = displayable(message)
         if pixels is None:
-            decoder.skipped[sample.topic] += 1
+            decoder.unfit[sample.topic] += message is not None
             continue
         subfolder = folder / names[sample.topic]
         subfolder.mkdir(parents=True, exist_ok=True)
@@ -165,9 +164,10 @@ def export_video(recording: Recording, target: Path, topic: str, decoder: Decode
     written = 0
     try:
         for sample in recording.samples(lambda name: name == topic):
-            pixels = _color_image(decoder.message(sample))
+            message = decoder.message(sample)
+            pixels = _color_image(message)
             if pixels is None or (writer is not None and pixels.shape[1::-1] != size):
-                decoder.skipped[topic] += 1
+                decoder.unfit[topic] += message is not None
                 continue
             if writer is None:
                 size = (pixels.shape[1], pixels.shape[0])

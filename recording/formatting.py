@@ -63,9 +63,8 @@ def format_contents(file: str, cell: str, summary: Summary) -> list[str]:
     if summary.run:
         values = {key: printable(value)[:MOST_SHOWN] for key, value in summary.run.items() if value and key != "epoch"}
         lines.append("  " + ", ".join(f"{printable(key)} {value}" for key, value in values.items()))
-    if not summary.finished:
-        lines.append("  not finished: the recorder was killed or is still recording. To repair it: "
-                     f"zencell recover {file}")
+    if summary.flaw:
+        lines.append(f"  {summary.flaw}. To repair it: zencell recover {file}")
     lines.append(f"{'topic':<30} {'type':<16} {'messages':>9} {'Hz':>8} {'payload':>10}")
     for name, topic in summary.topics.items():
         rate = f"{topic.hz:8.2f}" if topic.messages > 1 else " " * 8

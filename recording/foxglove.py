@@ -272,7 +272,7 @@ def _write(recording: Recording, file: AppendedFile, wants: Wanted, decoder: Dec
         try:
             name, value = convert(message)
         except CONVERSION_ERRORS:
-            decoder.skipped[sample.topic] += 1
+            decoder.unfit[sample.topic] += 1
             continue
         if name not in schemas:
             text = json.dumps(SCHEMAS[name]).encode() if name in SCHEMAS else sample.schema or schema_of(name)

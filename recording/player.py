@@ -322,8 +322,8 @@ async def play(
             echo(f"playing {recording.path} ({recording.seconds:.1f} s) as {cell} at {where}")
             if show:
                 echo(HELP)
-            if not recording.finished:
-                echo(f"the recording is not finished; to repair it: zencell recover {recording.path}", err=True)
+            if recording.flaw:
+                echo(f"the recording is {recording.flaw}; to repair it: zencell recover {recording.path}", err=True)
             for name, topic in await writers_of(bus, map(player.renamed, topics)):
                 echo(f"{name} is up and publishes {topic} too: subscribers receive both", err=True)
             try:

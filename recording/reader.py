@@ -14,8 +14,9 @@ import msgpack
 from mcap.records import Channel, Message, Schema
 
 from common.remapping import is_cell
+from recording.formatting import format_bytes
 from recording.mcap_layout import DAMAGE, ChunkPosition, Layout, read_layout, records_of
-from recording.sample import BAD_PAYLOAD, RecordingError, Sample
+from recording.sample import BAD_PAYLOAD, RecordingError, Sample, topic_of
 from recording.writer import ABOUT, ENDED, RUN, TRACES_SCHEMA, ExportFailed, RecordingWriter, WriteFailed
 
 Wanted = Callable[[str], bool]  # takes a topic: the key without the cell
@@ -57,8 +58,6 @@ class Recording:
             raise RecordingError(f"{path}: cannot be read: {error.strerror}") from None
         try:
             self.layout: Layout = read_layout(self.file, path)
-            if self.layout.loose_messages:
-                raise RecordingError(f"{path}: has messages outside of chunks, which no recording of zencell has")
         except BaseException:
             self.file.close()
             raise
@@ -78,8 +77,15 @@ class Recording:
 
     @property
     def finished(self) -> bool:
-        """Whether the file was closed; if not, `zencell recover` repairs it."""
+        """Whether the file was closed and has no hole; if not, `zencell recover` repairs it."""
         return self.layout.finished
+
+    @property
+    def flaw(self) -> str:
+        """Why the recording is not finished; empty if it is."""
+        if holes := self.layout.holes:
+            return f"damaged: {format_bytes(sum(holes))} in {len(holes)} place{'s'[len(holes) == 1:]} are no records"
+        return "" if self.finished else "not finished: the recorder was killed or is still recording"
 
     @property
     def start(self) -> int:
@@ -151,7 +157,7 @@ class Recording:
             raise self._invalid(how, values, "numbers of messages by key")
         counts: Counter[str] = Counter()
         for key, count in values.items():
-            counts[_topic(key)] += count
+            counts[topic_of(key)] += count
         return dict(counts)
 
     def _invalid(self, name: str, value: object, valid: str) -> RecordingError:
@@ -169,7 +175,7 @@ class Recording:
         if not self._channels.keys() >= set(used):
             raise RecordingError(f"{self.path}: has messages of channels that it does not describe")
         found = [(self._channels[i], self._name(i)) for i in used if self._name(i) != TRACES_SCHEMA]
-        return {_topic(channel.topic): (name, channel.metadata.get("kind", "stream")) for channel, name in found}
+        return {topic_of(channel.topic): (name, channel.metadata.get("kind", "stream")) for channel, name in found}
 
     # --- messages -----------------------------------------------------------------------------------------------------
 
@@ -194,7 +200,7 @@ class Recording:
             RecordingError: a chunk is damaged; names where.
         """
         def is_state(channel: Channel) -> bool:
-            return channel.metadata.get("kind") == "state" and wants(_topic(channel.topic))
+            return channel.metadata.get("kind") == "state" and wants(topic_of(channel.topic))
 
         found: dict[tuple[str, str], Sample] = {}
         for chunk in self.layout.chunks:
@@ -215,7 +221,7 @@ class Recording:
     def _may_have(self, chunk: ChunkPosition, wants: Wanted) -> bool:
         if not chunk.channels:
             return True
-        return any(wants(_topic(self._channels[i].topic)) for i in chunk.channels if i in self._channels)
+        return any(wants(topic_of(self._channels[i].topic)) for i in chunk.channels if i in self._channels)
 
     def _records(self, chunk: ChunkPosition) -> list[Any]:
         try:
@@ -242,25 +248,28 @@ class Recording:
                     messages.append(record)
         for message in messages:
             channel = self._channels[message.channel_id]
-            if since <= message.log_time <= until and wants(_topic(channel.topic)):
+            if since <= message.log_time <= until and wants(topic_of(channel.topic)):
                 yield Sample(
                     channel.topic, message.data, message.log_time, message.publish_time,
                     self._name(message.channel_id), channel.metadata.get("kind", "stream"),
                     channel.metadata.get("writer", ""), message.sequence,
-                    traces.get((message.channel_id, message.sequence), ""), self._schema(message.channel_id),
+                    traces.get((message.channel_id, message.sequence), ""), *self._described(channel),
                 )
 
-    def _schema(self, channel: int) -> bytes:
-        schema = self._schemas.get(self._channels[channel].schema_id)
-        return schema.data if schema else b""
+    def _described(self, channel: Channel) -> tuple[bytes, tuple[str, dict[str, str], str] | None]:
+        """Return the schema of a channel, and what a copy needs to know about one of another program."""
+        schema = self._schemas.get(channel.schema_id)
+        data, encoding = (schema.data, schema.encoding) if schema else (b"", "")
+        own = channel.message_encoding == "msgpack"
+        return data, None if own else (channel.message_encoding, channel.metadata, encoding)
+
+    def unknown(self, records: list[Any]) -> int:
+        """Return the number of messages whose channel is not described, so that their topic is unknown."""
+        return sum(isinstance(record, Message) and record.channel_id not in self._channels for record in records)
 
     def _name(self, channel: int) -> str:
         schema = self._schemas.get(self._channels[channel].schema_id)
         return schema.name if schema else ""
-
-
-def _topic(key: str) -> str:
-    return key.partition("/")[2]
 
 
 def _value(text: str) -> Any:
@@ -287,12 +296,14 @@ class Recovered:
     messages: int
     seconds: float
     was_finished: bool
-    lost_bytes: int  # after the last complete record
+    lost_bytes: int  # after the last record
     damaged_chunks: int
+    holes: list[int]  # [bytes] of each part between records
+    unknown: int  # messages whose topic is lost
 
 
 def recover(source: Path, target: Path) -> Recovered:
-    """Copy every undamaged chunk of a recording to a new file with an index.
+    """Copy every undamaged chunk of a recording to a new file with an index, also those behind a hole.
 
     Raises:
         RecordingError: the source is no recording, or the target exists already or cannot be written.
@@ -315,23 +326,26 @@ def recover(source: Path, target: Path) -> Recovered:
 def _copy(recording: Recording, target: Path) -> Recovered:
     layout = recording.layout
     writer = RecordingWriter(target, recording.metadata(ABOUT))
-    damaged = 0
+    damaged = unknown = 0
     try:
         names = dict.fromkeys(record.name for record in layout.metadata if record.name != ABOUT)
         for name in names:
             writer.describe(name, recording.metadata(name))
         for chunk in layout.chunks:
             try:
-                samples = list(recording.samples_of(records_of(recording.file, chunk)))
+                records = records_of(recording.file, chunk)
             except DAMAGE:
                 damaged += 1
                 continue
+            samples = list(recording.samples_of(records))
+            unknown += recording.unknown(records)
             for sample in samples:
                 writer.add(sample)
     except BaseException:
         writer.abandon()
         raise
-    lost = layout.size - layout.complete
-    ended = {} if recording.finished else {"reason": "cut", "lost_bytes": lost}
-    writer.close({**recording.metadata(ENDED), **ended, "recovered": True, "damaged_chunks": damaged})
-    return Recovered(writer.messages, recording.seconds, recording.finished, 0 if recording.finished else lost, damaged)
+    lost = layout.unread
+    ended = {} if layout.closed else {"reason": "cut", "lost_bytes": lost}
+    writer.close({**recording.metadata(ENDED), **ended, "recovered": True, "damaged_chunks": damaged,
+                  "holes": layout.holes})
+    return Recovered(writer.messages, recording.seconds, layout.closed, lost, damaged, layout.holes, unknown)

@@ -43,16 +43,24 @@ class Sample:
     sequence: int = 0
     trace: str = ""
     schema: bytes = field(default=b"", repr=False, compare=False)  # JSON schema from the recording
+    foreign: tuple[str, dict[str, str], str] | None = field(default=None, repr=False, compare=False)
+    """Message encoding, metadata and schema encoding of the channel in a recording of another program."""
 
     @property
     def topic(self) -> str:
         """The key without the cell."""
-        return self.key.partition("/")[2]
+        return topic_of(self.key)
 
     @property
     def cell(self) -> str:
         """Name of the cell."""
         return self.key.partition("/")[0]
+
+
+def topic_of(key: str) -> str:
+    """Return a key without its cell; a key of another program may have only one part."""
+    _, slash, topic = key.partition("/")
+    return topic if slash else key
 
 
 def message_of(encoding: str) -> str:
@@ -148,12 +156,16 @@ class Sequences:
 
 
 class Decoder:
-    """Decodes samples, and counts by topic those of unknown class or version in `skipped`."""
+    """Decodes samples, and counts by topic those of unknown class or version in `skipped`.
+
+    An export counts in `unfit` those that its format cannot hold.
+    """
 
     def __init__(self, custom: Iterable[type[Message]] = ()) -> None:
         """Know message classes of the user besides those of the project."""
         self._custom = {model.__name__: model for model in custom}
         self.skipped: Counter[str] = Counter()
+        self.unfit: Counter[str] = Counter()
 
     def message(self, sample: Sample) -> Message | None:
         """Return the message of a sample; None if it cannot be decoded."""

@@ -36,6 +36,7 @@ class Summary:
     path: str
     size: int  # [bytes] on disk
     finished: bool
+    flaw: str  # why it is not finished
     start: int  # log time [ns]
     seconds: float
     messages: int
@@ -74,7 +75,7 @@ def summarise(recording: Recording) -> Summary:
         for name, count in recording.lost(field_name).items():
             setattr(topics.setdefault(name, TopicSummary("", "")), field_name, count)
     return Summary(
-        str(recording.path), recording.layout.size, recording.finished, recording.start, recording.seconds,
-        sum(topic.messages for topic in topics.values()), recording.metadata(ABOUT), recording.metadata(RUN),
-        dict(sorted(topics.items())),
+        str(recording.path), recording.layout.size, recording.finished, recording.flaw, recording.start,
+        recording.seconds, sum(topic.messages for topic in topics.values()), recording.metadata(ABOUT),
+        recording.metadata(RUN), dict(sorted(topics.items())),
     )

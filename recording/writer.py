@@ -182,16 +182,17 @@ class RecordingWriter:
             return None
         if (about, writer) not in self._channels:
             self._known.add(about)
+            encoding, metadata, _ = sample.foreign or ("msgpack", {"kind": sample.kind, "writer": writer}, "")
             self._channels[about, writer] = self._writer.register_channel(
-                sample.key, "msgpack", self._schema_of(sample), {"kind": sample.kind, "writer": writer}
-            )
+                sample.key, encoding, self._schema_of(sample), metadata)
         return self._channels[about, writer]
 
     def _schema_of(self, sample: Sample) -> int:
         message = sample.message
         if message not in self._schemas:
             data = sample.schema or schema_of(message)
-            self._schemas[message] = self._writer.register_schema(message, "jsonschema" if data else "", data)
+            encoding = sample.foreign[2] if sample.foreign else "jsonschema" if data else ""
+            self._schemas[message] = self._writer.register_schema(message, encoding, data)
         return self._schemas[message]
 
     def flush(self) -> None:

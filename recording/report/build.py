@@ -133,7 +133,8 @@ def _application_of(recording: Recording, cell: Cell | None) -> Application | No
 
 def truncated_note(recording: Recording) -> str:
     """Return the note about an unfinished recording."""
-    return (f"{recording.path} is truncated: the report shows its complete chunks; to make a file that other programs "
+    flaw = recording.flaw if recording.layout.holes else "truncated"
+    return (f"{recording.path} is {flaw}; the report shows its complete chunks; to make a file that other programs "
             f"can read: zencell recover {recording.path}")
 
 

@@ -17,6 +17,7 @@ from mcap.reader import make_reader
 
 from applications.outlining.topics import OutlinePoints
 from applications.pick_place.topics import PickPlaceStatus
+from cli.main import app
 from common import messages as m
 from common.messages import Header, Image, Message, Pose, Quaternion, Vector3
 from common.perception.image import array_to_image
@@ -149,6 +150,17 @@ def test_foxglove_file_is_complete_and_skipped_messages_are_counted(tmp_path, re
     assert found[0] == ("foxglove.JointStates", "panda/joint_states", "json", START)
     assert [name for name, *_ in found] == [
         "foxglove.JointStates", "foxglove.JointStates", "PickPlaceStatus", "foxglove.CompressedImage"]
+
+
+def test_export_counts_what_it_leaves_out(tmp_path, capsys):
+    strange = joints(9, key="panda/mine", message="Mine", payload=b"\xc1")
+    path = write(tmp_path / "a.mcap", [joints(0), *(image(n, PICTURE) for n in range(3)), strange, strange])
+    assert app.execute(["export", str(path), "--csv", str(tmp_path / "csv"), "--images", str(tmp_path / "png")]) == 0
+    shown = capsys.readouterr()
+    assert sorted(shown.err.splitlines()) == [
+        "camera/image_raw: 3 messages left out: --csv cannot hold them",
+        "mine: 2 messages left out: this version does not know their type"]
+    assert "joint_states.csv: 1 rows" in shown.out and "image_raw: 3 images" in shown.out
 
 
 def test_messages_of_unknown_classes_are_exported_by_their_recorded_schema(tmp_path):
