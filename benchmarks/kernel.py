@@ -21,7 +21,7 @@ from common.planning.kernel.oracle import Comparison, compare, random_geometry
 from common.planning.kernel.world import KernelWorld
 from common.planning.robot_geometry import RobotGeometry, convex_hulls
 from common.robot.model import RobotModel
-from common.robot.urdf import package_folders
+from common.robot.packages import package_folders
 
 Models = tuple[pin.Model, pin.GeometryModel]
 

@@ -34,8 +34,8 @@ from common.planning.pipeline import PlanningPipeline
 from common.planning.robot_geometry import RobotGeometry
 from common.planning.trajectory import timed_path
 from common.planning.validation import fine_samples
+from common.robot.packages import package_folders
 from common.robot.transforms import pose_to_matrix
-from common.robot.urdf import package_folders
 
 Array = NDArray[np.float64]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 import sys
 from collections import Counter
@@ -198,8 +199,10 @@ NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,39}")
 
 @app.command()
 def new(
-    urdf: Annotated[str, typer.Argument(metavar="URDF", help="URDF of the arm: a path, package://..., or a "
-                                                             "xacro file")],
+    urdf: Annotated[str, typer.Argument(metavar="URDF", help="URDF or xacro file of the arm: a path, or "
+                                                             "package://...")],
+    arguments: Annotated[list[str] | None, typer.Argument(
+        metavar="NAME:=VALUE", help="arguments of xacro files")] = None,
     gripper: Annotated[str, typer.Option("--gripper", metavar="URDF", help="URDF of a gripper to mount on the "
                                                                            "flange")] = "",
     name: Annotated[str, typer.Option("--name", metavar="NAME", help="name of the robot")] = "",
@@ -209,29 +212,29 @@ def new(
     tip: Annotated[str | None, typer.Option("--tip", metavar="LINK", help="link at the end of the arm: the tool centre "
                                             "point, or the mount of --gripper")] = None,
     package_dir: Annotated[list[str] | None, typer.Option(
-        "--package-dir", metavar="DIR", help="search path of package://; repeatable")] = None,
+        "--package-dir", metavar="DIR", help="folder with packages, searched a few levels deep; repeatable")] = None,
     cell: Annotated[str, typer.Option("--cell", metavar="FILE.yaml", help="also write a cell, with a world "
                                                                           "within reach of this arm")] = "",
     like: Annotated[str, typer.Option("--like", metavar="CELL", help="template of that cell",
                                       autocompletion=choices.cells)] = "",
     yes: Annotated[bool, typer.Option("--yes", "-y", help="ask no questions: use the best guesses")] = False,
     force: Annotated[bool, typer.Option("--force", help="overwrite existing files")] = False,
+    trust: Annotated[bool, typer.Option("--trust", help="let expressions of xacro files run any Python")] = False,
 ) -> None:
     """Write a robot file from a URDF: declared and measured values, and guesses, which are marked."""
     from common.config import names_of
-    from common.robot.urdf import read_urdf
-    from tools.robot_setup.files import folders_of_meshes, robot_file, write_cell
+    from tools.robot_setup.descriptions import Reader, parse_arguments, written
+    from tools.robot_setup.files import robot_file, write_cell
     from tools.robot_setup.proposal import finish
     from tools.robot_setup.tree import read_tree
 
-    sources = {"urdf": urdf, "--gripper": gripper}
-    urdf, gripper = (_as_urdf(each, out, force) for each in (urdf, gripper))
-    folders = [str(Path(each).expanduser().resolve()) for each in package_dir or []]
-    for field, each in (("urdf", urdf), ("--gripper", gripper)):
-        if each:
-            folders += folders_of_meshes(field, each, folders, sources[field])
-    tree = read_tree(read_urdf("urdf", urdf, folders), urdf)
-    chosen = name or _ask("name of the robot", _plain_name(tree.name or Path(urdf).stem), yes)
+    reader = Reader([str(Path(each).expanduser().resolve()) for each in package_dir or []],
+                    parse_arguments(arguments or []), trust)
+    arm = reader.read("urdf", urdf)
+    hand = reader.read("--gripper", gripper) if gripper else None
+    reader.check_arguments()
+    tree = read_tree(arm.root, urdf)
+    chosen = name or _ask("name of the robot", _plain_name(tree.name or Path(urdf).name.split(".")[0]), yes)
     if not NAME.fullmatch(chosen):
         raise ConfigError("--name", chosen, "must be letters, digits, - and _, and begin with a letter")
     path = Path(out or f"{chosen}.yaml").expanduser()
@@ -240,9 +243,15 @@ def new(
     _require_writable("--out", path, force)
     _require_writable("--out", pairs, force, (".srdf",))
     layout = _layout_of(cell, path, template, force) if cell else None
-    made = _draft(tree, urdf, chosen, gripper, tip, folders, yes)
-    echo("computing collision pairs and a home pose: a few seconds, a minute with detailed meshes", err=True)
-    robot = finish(made)
+    with contextlib.ExitStack() as stack:
+        if arm.expanded:
+            urdf = stack.enter_context(written(arm, path.with_suffix(".urdf"), force))
+        if hand and hand.expanded:
+            gripper = stack.enter_context(written(hand, path.with_suffix(".gripper.urdf"), force))
+        made = _draft(tree, urdf, chosen, gripper, tip, reader.folders, yes)
+        echo("computing collision pairs and a home pose: a few seconds, a minute with detailed meshes", err=True)
+        robot = finish(made)
+    made.check += [*arm.notes, *(hand.notes if hand else [])]
     head = f"{chosen}, written by `zencell robot new` from its URDF. Check the values marked GUESSED."
     path.write_text(robot_file(made, head, path.parent, pairs.name), encoding="utf-8")
     pairs.write_text(made.srdf, encoding="utf-8")
@@ -337,15 +346,6 @@ def _require_writable(option: str, path: Path, force: bool, suffixes: Sequence[s
         raise ConfigError(option, str(path), f"cannot be written: the folder {path.parent} does not exist")
     if path.exists() and not force:
         raise ConfigError(option, str(path), "is there already; --force overwrites it")
-
-
-def _as_urdf(urdf: str, out: str, force: bool) -> str:
-    """Return the path of the URDF; a xacro file is converted first."""
-    if not urdf.endswith(".xacro"):
-        return urdf
-    from tools.robot_setup.files import urdf_of_xacro
-
-    return urdf_of_xacro(urdf, Path(out).expanduser().parent if out else Path(), overwrite=force)
 
 
 def _print_result(made: Proposal, robot: RobotModel, path: Path, pairs: Path) -> None:

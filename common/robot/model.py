@@ -11,8 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from common.config import RobotConfig
 from common.errors import ConfigError, UnknownName
+from common.robot.packages import package_folders
 from common.robot.transforms import rpy_to_matrix
-from common.robot.urdf import WORLD, find_description, merged_urdf, package_folders
+from common.robot.urdf import WORLD, find_description, merged_urdf
 
 Array = NDArray[np.float64]
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import functools
-import importlib.util
 import math
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
@@ -11,31 +9,14 @@ from pathlib import Path
 
 from common.config import AttachmentConfig, RobotConfig, config_root
 from common.errors import ConfigError
+from common.robot.description_file import read_xml
+from common.robot.mesh_references import SCHEME, resolve_meshes
+from common.robot.packages import package_folders, package_paths
 
-SCHEME = "package://"
 WORLD = "world"
 FULL_TURN = 2 * math.pi  # [rad]
 
 Numbers = Sequence[float]
-
-
-@functools.cache
-def installed_share() -> Path | None:
-    """Return the share/ folder of description packages from PyPI (cmeel wheels), next to pinocchio; None if missing."""
-    spec = importlib.util.find_spec("pinocchio")
-    if spec is None or spec.origin is None:
-        return None
-    for parent in Path(spec.origin).resolve().parents:
-        if parent.name == "cmeel.prefix":
-            return parent / "share"
-    return None
-
-
-def package_folders(configured: Sequence[str]) -> list[Path]:
-    """Return the folders that are searched for package://, in order."""
-    folders = [Path(folder).expanduser() for folder in configured]
-    share = installed_share()
-    return [*folders, share] if share else folders
 
 
 def find_description(field: str, reference: str, configured: Sequence[str] = ()) -> Path:
@@ -51,16 +32,16 @@ def find_description(field: str, reference: str, configured: Sequence[str] = ())
     """
     if reference.startswith(SCHEME):
         inside = reference.removeprefix(SCHEME)
-        folders = package_folders(configured)
-        advice = f"install its package (pip install {inside.partition('/')[0]}) or set robot.package_dirs"
+        name, _, rest = inside.partition("/")
+        folders, paths = package_folders(configured), (folder / rest for folder in package_paths(name, configured))
+        advice = f"install its package (pip install {name}) or set robot.package_dirs"
     else:
         inside = str(Path(reference).expanduser())
         folders = [Path(), config_root() / "robots"]
+        paths = (folder / inside for folder in folders)
         advice = "give a path that exists or package://<package>/<file>"
-    for folder in folders:
-        path = folder / inside
-        if path.is_file():
-            return path.resolve()
+    if (path := next((each for each in paths if each.is_file()), None)) is not None:
+        return path.resolve()
     searched = ", ".join(str(folder) for folder in folders) or "nowhere"
     raise ConfigError(field, reference, f"is missing (searched {searched}); {advice}")
 
@@ -97,22 +78,14 @@ def merged_urdf(config: RobotConfig) -> str:
 
 
 def read_urdf(field: str, reference: str, package_dirs: Sequence[str]) -> ET.Element:
-    """Return the elements of a URDF with absolute instead of relative mesh paths.
+    """Return the elements of a URDF with absolute paths of its meshes, without visual ones that are missing.
 
     Raises:
         ConfigError: it is missing or does not parse; names the field.
     """
     path = find_description(field, reference, package_dirs)
-    try:
-        root = ET.parse(path).getroot()
-    except (ET.ParseError, OSError) as error:
-        raise ConfigError(field, str(path), f"does not parse: {error}") from None
-    if root.tag != "robot":
-        raise ConfigError(field, str(path), f"does not parse: its root is <{root.tag}>, not <robot>")
-    for mesh in root.iter("mesh"):
-        name = mesh.get("filename", "")
-        if name and "://" not in name and not Path(name).is_absolute():
-            mesh.set("filename", str(path.parent / name))
+    root = read_xml(field, path)
+    resolve_meshes(root, path, package_dirs)
     return root
 
 

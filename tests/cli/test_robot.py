@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 import yaml
 
 from common.config import RobotConfig, check, config_root, load_cell, read_robot
@@ -102,16 +103,32 @@ def test_name_is_asked_for_with_a_guess(folder, monkeypatch):
     assert done.stderr.splitlines()[-1] == "zencell: --yes: is needed without a terminal: it takes the best guesses"
 
 
-def test_xacro_file_is_read_and_overwrites_no_urdf(tmp_path):
-    pytest.importorskip("xacro")
-    head = '<robot name="x" xmlns:xacro="http://www.ros.org/wiki/xacro"><xacro:property name="speed" value="2.5"/>'
-    text = TEXT.replace('<robot name="side arm">', head).replace('velocity="3"', 'velocity="${speed}"')
-    (tmp_path / "arm.urdf.xacro").write_text(text)
-    done = ask(tmp_path, "robot", "new", "arm.urdf.xacro", "--yes")
+def test_xacro_file_of_a_package_needs_no_ros(tmp_path):
+    package = tmp_path / "clone"
+    package.mkdir()
+    (package / "package.xml").write_text("<package><name>side_description</name></package>")
+    macro = TEXT.replace('<robot name="side arm">', '<xacro:macro name="side" params="speed">') \
+        .replace("</robot>", "</xacro:macro>").replace('velocity="3"', 'velocity="${speed / 2}"') \
+        .replace('<box size="0.04 0.05 0.11"/>', '<mesh filename="file://$(find side_description)/hand.stl"/>')
+    head = '<robot name="x" xmlns:xacro="http://www.ros.org/wiki/xacro">'
+    (package / "parts.xacro").write_text(f"{head}{macro[macro.index('<xacro'):]}</robot>")
+    (package / "hand.stl").write_bytes(trimesh.creation.box((0.04, 0.05, 0.11)).export(file_type="stl"))
+    (package / "arm.urdf.xacro").write_text(
+        f'{head}<xacro:include filename="$(find side_description)/parts.xacro"/>'
+        '<xacro:side speed="$(arg speed)"/></robot>')
+    new = ("robot", "new", "clone/arm.urdf.xacro", "--yes")
+    done = ask(tmp_path, *new, "speed:=5")
     assert done.returncode == 0, done.stderr
-    assert yaml.safe_load((tmp_path / "x.yaml").read_text())["velocity_limits"] == [2, 2, 2, 2.5, 2.5, 1]
-    done = ask(tmp_path, "robot", "new", "arm.urdf.xacro", "--yes", "--name", "y")
-    assert done.returncode == 2 and "arm.urdf, which is there already" in done.stderr
+    values = yaml.safe_load((tmp_path / "x.yaml").read_text())
+    assert values["velocity_limits"] == [2, 2, 2, 2.5, 2.5, 1]
+    assert (values["urdf"], values["package_dirs"]) == ("x.urdf", ["clone"])
+    assert "package://side_description/hand.stl" in (tmp_path / "x.urdf").read_text()
+    assert ask(tmp_path, "robot", "check", "x.yaml").returncode == 0
+    for arguments, wanted in ((["speed:=5"], "is there already; --force"),
+                              ([], "needs the argument speed: give speed:="),
+                              (["sped:=5", "speed:=5"], "choices: speed"), (["speed=5"], "must be name:=value")):
+        done = ask(tmp_path, *new, *arguments)
+        assert done.returncode == 2 and wanted in done.stderr and len(done.stderr.splitlines()) == 1, done.stderr
 
 
 @pytest.mark.parametrize(("text", "options", "wanted"), [

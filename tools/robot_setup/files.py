@@ -1,8 +1,7 @@
-"""Files of `zencell robot new`: URDFs from xacro, mesh folders, the robot file as text, and a cell for the robot."""
+"""Files of `zencell robot new`: the robot file as text, and a cell for the robot."""
 
 from __future__ import annotations
 
-import importlib
 import os
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
@@ -14,62 +13,11 @@ import yaml
 from common.application import find_application
 from common.config import config_root, find_file, load_cell, load_robot, read_yaml
 from common.errors import ConfigError
+from common.robot.mesh_references import SCHEME
 from common.robot.model import RobotModel
-from common.robot.urdf import SCHEME, find_description, installed_share, package_folders, read_urdf
+from common.robot.packages import installed_share
+from common.robot.urdf import find_description
 from tools.robot_setup.proposal import Proposal
-
-
-def urdf_of_xacro(reference: str, folder: Path, *, overwrite: bool) -> str:
-    """Convert a xacro file to a URDF in a folder and return its path.
-
-    Raises:
-        ConfigError: xacro is not installed or cannot read the file, or a URDF of that name exists.
-    """
-    path = find_description("urdf", reference)
-    try:
-        xacro = importlib.import_module("xacro")
-    except ImportError:
-        raise ConfigError("urdf", reference, "is a xacro file: pip install xacro, which makes a URDF of it") from None
-    try:
-        text = xacro.process_file(str(path)).toxml()
-    except Exception as error:  # xacro may raise anything
-        said = " ".join(str(error).split()) or type(error).__name__
-        raise ConfigError("urdf", reference, f"is no xacro file that can be read: {said}") from None
-    name = path.name.removesuffix(".xacro").removesuffix(".urdf")
-    made = folder / f"{name}.urdf"
-    if made.exists() and not overwrite:
-        raise ConfigError("urdf", reference, f"becomes {made}, which is there already; --force overwrites it")
-    made.write_text(text, encoding="utf-8")
-    return str(made)
-
-
-def folders_of_meshes(field: str, urdf: str, configured: Sequence[str], source: str = "") -> list[str]:
-    """Return folders above a URDF (or its xacro file) that contain packages not found otherwise.
-
-    Raises:
-        ConfigError: a mesh does not exist.
-    """
-    root = read_urdf(field, urdf, configured)
-    above = find_description(field, source or urdf, configured).parents
-    found: list[str] = []
-    missing: list[str] = []
-    for name in dict.fromkeys(mesh.get("filename", "") for mesh in root.iter("mesh")):
-        inside = name.removeprefix(SCHEME)
-        if not name.startswith(SCHEME):
-            path = Path(name.removeprefix("file://"))
-            missing += [] if path.is_file() else [name]
-        elif not any((folder / inside).is_file() for folder in package_folders([*configured, *found])):
-            holder = next((folder for folder in above if (folder / inside).is_file()), None)
-            if holder is None:
-                missing.append(name)
-            else:
-                found.append(str(holder))
-    if missing:
-        more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
-        raise ConfigError(field, urdf, f"has missing meshes: {missing[0]}{more}; --package-dir DIR names "
-                                       "the folder of their package")
-    return found
-
 
 WIDTH = 118
 ORDER = ("name", "urdf", "srdf", "package_dirs", "attachments", "joints", "base_link", "tcp_link", "tcp",
