@@ -7,6 +7,7 @@ import errno
 import ipaddress
 import json
 import os
+import secrets
 import stat
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -48,7 +49,9 @@ class Authority:
     def new(cls, days: int) -> Authority:
         """Return a new authority that is valid for this many days."""
         key = ec.generate_private_key(ec.SECP256R1())
-        return cls(_self_signed(key, days), key)
+        # OpenSSL finds the authority of a certificate by its name: two that are trusted at a time must differ.
+        name = f"{CA_NAME} {secrets.token_hex(4)}"
+        return cls(_self_signed(key, days, x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])), key)
 
     @property
     def until(self) -> datetime.datetime:
@@ -57,7 +60,7 @@ class Authority:
 
     def prolonged(self, days: int) -> Authority:
         """Return the same authority valid for this many days from now; certificates it signed fit both."""
-        return Authority(_self_signed(self._key, days), self._key)
+        return Authority(_self_signed(self._key, days, self._certificate.subject), self._key)
 
     @classmethod
     def load(cls, certificate: Path, key: Path) -> Authority:
@@ -103,8 +106,7 @@ class Authority:
         write_secret(key, _key_bytes(own))
 
 
-def _self_signed(key: ec.EllipticCurvePrivateKey, days: float) -> x509.Certificate:
-    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, CA_NAME)])
+def _self_signed(key: ec.EllipticCurvePrivateKey, days: float, name: x509.Name) -> x509.Certificate:
     usage = x509.KeyUsage(
         digital_signature=False, content_commitment=False, key_encipherment=False, data_encipherment=False,
         key_agreement=False, key_cert_sign=True, crl_sign=True, encipher_only=False, decipher_only=False,

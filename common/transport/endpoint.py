@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ipaddress
 import json
 import os
 from collections.abc import Iterable, Mapping, Sequence
@@ -12,6 +13,8 @@ from common.transport.credentials import SECURE_VARIABLE, Credentials
 
 if TYPE_CHECKING:
     import zenoh
+
+    from common.transport.inner_certificates import InnerAuthority
 
 BASE_PORT = 7447
 DEFAULT_DOMAIN = 42
@@ -130,6 +133,14 @@ def address_of(endpoint: str) -> tuple[str, int]:
     return host.strip("[]"), int(port)
 
 
+def peer_group(address: str) -> str:
+    """Return what counts as one peer: an IPv4 address, or the network (/64) of an IPv6 address."""
+    parsed = ipaddress.ip_address(address.partition("%")[0])
+    if isinstance(parsed, ipaddress.IPv6Address):
+        return str(parsed.ipv4_mapped or ipaddress.ip_network((parsed.packed[:8] + bytes(8), 64)))
+    return str(parsed)
+
+
 def _host_of(endpoint: str) -> str:
     return endpoint.partition("/")[2].rpartition(":")[0].strip("[]")
 
@@ -193,16 +204,16 @@ def _locators(endpoint: str) -> list[str]:
 
 
 def router_config(
-    endpoints: Sequence[str], credentials: Credentials | None = None, access: dict[str, Any] | None = None,
-    links: Sequence[str] = (), small: Sequence[str] = (),
+    endpoints: Sequence[str], credentials: Credentials | InnerAuthority | None = None,
+    access: dict[str, Any] | None = None, links: Sequence[str] = (), small: Sequence[str] = (),
 ) -> zenoh.Config:
     """Return the configuration of a router: `router_settings`."""
     return _config(router_settings(endpoints, credentials, access, links, small))
 
 
 def router_settings(
-    endpoints: Sequence[str], credentials: Credentials | None = None, access: dict[str, Any] | None = None,
-    links: Sequence[str] = (), small: Sequence[str] = (),
+    endpoints: Sequence[str], credentials: Credentials | InnerAuthority | None = None,
+    access: dict[str, Any] | None = None, links: Sequence[str] = (), small: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Return the settings of a router that differ from Zenoh's defaults, as the tree of a configuration file.
 

@@ -30,6 +30,7 @@ from common.transport.credentials import (
     require_pair,
 )
 from common.transport.endpoint import address_of, client_config, is_encrypted, port_of, router_config
+from common.transport.inner_certificates import InnerAuthority
 from common.transport.tls_gate import TlsGate
 
 log = logging.getLogger("router")
@@ -111,21 +112,22 @@ class Router:
             self._gate.close()
 
     def _open(self) -> zenoh.Session:
-        if self._gate is None:
-            return open_router(self._ungated, self._secured, self._links, self._small)
+        if self._gate is None or self._secured is None:
+            return open_router(self._ungated, None, self._links, self._small)
+        authority = InnerAuthority(credentials_of(ROUTER_NAME, self._secured))
         host, port = "127.0.0.1", _free_port()
         behind = [f"tls/{host}:{port}", *self._ungated]
         self._near.rotate(1)  # the previous session still listens at the previous one
         try:
-            session = open_router([*behind, *[*self._near][:1]], self._secured, self._links, self._small)
+            session = open_router([*behind, *[*self._near][:1]], self._secured, self._links, self._small, authority)
         except PortInUse:
             if not self._near:
                 raise
             log.warning("%s is in use by %s: services of this host connect through the gate", self._near[0],
                         port_holder(address_of(self._near[0])[1]))
-            session = open_router(behind, self._secured, self._links, self._small)
+            session = open_router(behind, self._secured, self._links, self._small, authority)
         with _explain_listen_errors():
-            self._gate.open(host, port)
+            self._gate.open(host, port, authority)
         return session
 
     def _read_files(self) -> dict[str, bytes]:
@@ -182,7 +184,8 @@ def _require_encrypted(endpoints: Sequence[str], links: Sequence[str]) -> None:
 
 
 def open_router(
-    endpoints: Sequence[str], secured: Path | None = None, links: Sequence[str] = (), small: Sequence[str] = ()
+    endpoints: Sequence[str], secured: Path | None = None, links: Sequence[str] = (), small: Sequence[str] = (),
+    inner: InnerAuthority | None = None,
 ) -> zenoh.Session:
     """Open a session that routes for all clients at the endpoints, and listens nowhere else.
 
@@ -191,6 +194,7 @@ def open_router(
         secured: folder of certificates and rules; without it every client may do everything.
         links: endpoints of routers of other hosts, which need not be up yet.
         small: further keys of small messages, without the cell.
+        inner: authority of the TLS gate in front of it.
 
     Raises:
         PortInUse: names the port, the domain and the process that holds it.
@@ -201,7 +205,7 @@ def open_router(
     try:
         if secured is None:
             return zenoh.open(router_config(endpoints, links=links, small=small))
-        credentials = credentials_of(ROUTER_NAME, secured)
+        credentials = inner or credentials_of(ROUTER_NAME, secured)
         return zenoh.open(router_config(endpoints, credentials, read_access(secured), links, small))
     except zenoh.ZError as error:
         text = str(error)

@@ -1,37 +1,38 @@
-"""The gate of a secured router: only clients that start a TLS handshake at once get as far as Zenoh.
+"""The gate of a secured router: only clients with a valid certificate get as far as Zenoh.
 
-Zenoh sleeps for 100 ms whenever a TLS handshake fails, and accepts no client meanwhile. So the gate holds silent
-connections, for a second and a few of each address, and delays addresses whose handshakes failed. It forwards admitted
-connections byte for byte in both directions, and decrypts nothing.
+Zenoh accepts no client for 100 ms after each TLS handshake that fails. So the gate does the handshake itself, and
+connects to the router with a certificate of the same name (`InnerAuthority`). A connection passes two stages until it
+is admitted: the handshake, and the opening of Zenoh. Each has a time limit and room for some connections; beyond it the
+oldest one of the address, or then of the certificate, with the most is ended. So those that stay in a stage keep no
+client out.
 """
 
 from __future__ import annotations
 
 import contextlib
 import logging
-import select
 import selectors
 import socket
+import ssl
 import threading
 import time
-from collections import deque
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
-from common.transport.endpoint import address_of
+from common.errors import ConfigError
+from common.transport.endpoint import address_of, peer_group
+from common.transport.inner_certificates import InnerAuthority, name_of
 
 log = logging.getLogger("router")
 
-HELLO_SECONDS = 1.0  # in which a client must start its handshake: in TLS it speaks first
-HANDSHAKE_SECONDS = 3.0  # in which it must be authenticated; a loaded machine takes 1 s
-FAILURES = 10  # failed handshakes of an address before it is delayed: services start together
-FORGIVEN_RATE = 4.0  # [1/s] of these that are forgiven; Zenoh endures ten
-MAX_PER_ADDRESS = 32  # held connections; a new one replaces the oldest
-MAX_HELD = 512  # held connections of all addresses
-ROUNDS = 4  # of client and router, after which a client was admitted: TLS, the opening of Zenoh, and what follows
+STAGE_SECONDS = 3.0  # a loaded machine takes 1 s for each stage
+MAX_HANDSHAKES = 512  # clients whose handshake is not complete
+MAX_OPENING = 16  # that have not opened Zenoh, which has room for 32, those of the local listener included
+ROUNDS = 2  # of client and router, which open Zenoh
 LOG_SECONDS = 60.0  # between two log lines about refused connections
 CHUNK = 256 * 1024  # [bytes] that are forwarded at once
-_HELLO = b"\x16\x03"  # of a TLS record that is part of a handshake
+_CONNECT_SECONDS = 0.5  # to the router, which is in this process
 _BACKLOG = 1024
 _CHECK_SECONDS = 0.05
 
@@ -40,15 +41,14 @@ _CHECK_SECONDS = 0.05
 class _End:
     """One end of a forwarded connection, and the data to be written to it."""
 
-    socket: socket.socket
+    socket: ssl.SSLSocket
     other: _End | None = None
     unsent: memoryview = field(default_factory=lambda: memoryview(b""))
     ended: bool = False  # whether the other end has closed its side
+    handshaking: bool = True
     # Of a client:
-    address: str = ""
+    group: str = ""  # its address, then the name in its certificate
     since: float = 0.0
-    partial: bool = False  # whether only a part of the first bytes has arrived
-    hello: bool = False  # whether it has started a handshake
     spoke: bool = False  # whether the client spoke last, not the router
     rounds: int = 0
 
@@ -64,10 +64,9 @@ class TlsGate:
         """
         self._selector = selectors.DefaultSelector()
         self._listeners: dict[str, socket.socket] = {}  # by endpoint
-        self._held: dict[str, deque[_End]] = {}  # by address, oldest first
-        self._unproven: deque[_End] = deque()  # admitted, and not authenticated for sure
-        self._failed: dict[str, tuple[float, float]] = {}  # by address: unforgiven failures at a time
-        self._router: tuple[str, int] | None = None
+        self._handshaking: dict[_End, None] = {}  # oldest first
+        self._opening: dict[_End, None] = {}
+        self._router: tuple[tuple[str, int], InnerAuthority] | None = None
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="tls gate", daemon=True)
         self._sockets: set[socket.socket] = set()
@@ -88,13 +87,13 @@ class TlsGate:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def open(self, host: str, port: int) -> None:
-        """Forward new connections to a router at this address; existing ones stay where they are.
+    def open(self, host: str, port: int, authority: InnerAuthority) -> None:
+        """Forward new connections to a router that trusts the authority; existing ones stay where they are.
 
         Raises:
             OSError: another process listens at an endpoint by now; its `filename` is the endpoint.
         """
-        self._router = host, port
+        self._router = (host, port), authority
         if self._thread.is_alive():
             return
         for endpoint, listener in self._listeners.items():
@@ -117,111 +116,96 @@ class TlsGate:
 
     def _run(self) -> None:
         while not self._stop.is_set():
-            for key, events in self._selector.select(_CHECK_SECONDS if self._held or self._unproven else 0.5):
+            for key, events in self._selector.select(_CHECK_SECONDS if self._handshaking or self._opening else 0.5):
                 end = key.data
                 try:
                     if end is None:
                         self._accept(key.fileobj)  # type: ignore[arg-type]
-                    elif end.other is None:
-                        self._read_hello(end)
+                    elif end.handshaking:
+                        self._shake_hands(end)
                     else:
                         self._forward(end, events)
-                except OSError:
+                except (OSError, ConfigError):
                     if end is not None:
                         self._end(end)
             self._check(time.monotonic())
 
-    # --- held connections -----------------------------------------------------------------------------------------
+    # --- until a connection is admitted ---------------------------------------------------------------------------
 
     def _accept(self, listener: socket.socket) -> None:
+        assert self._router is not None
         try:
             accepted, address = listener.accept()
-        except OSError as error:  # gone again, or out of file descriptors: drop the oldest held one
-            if not isinstance(error, BlockingIOError) and self._held:
-                self._end_oldest()
+        except OSError as error:  # gone again, or out of file descriptors: drop the oldest one
+            if not isinstance(error, BlockingIOError) and self._handshaking:
+                self._end(next(iter(self._handshaking)))
             return
-        accepted.setblocking(False)
-        end = _End(accepted, since=time.monotonic(), address=address[0])
-        queue = self._held.setdefault(end.address, deque())
-        queue.append(end)
-        self._sockets.add(accepted)
-        self._selector.register(accepted, selectors.EVENT_READ, end)
-        if len(queue) > MAX_PER_ADDRESS:
-            self._end(queue[0])
-        elif sum(map(len, self._held.values())) > MAX_HELD:
-            self._end_oldest()
+        end = _End(self._wrap(accepted, self._router[1].server, server=True), group=peer_group(address[0]))
+        self._selector.register(end.socket, selectors.EVENT_READ, end)
+        self._enter(end, self._handshaking, MAX_HANDSHAKES)
 
-    def _end_oldest(self) -> None:
-        self._end(min((queue[0] for queue in self._held.values()), key=lambda end: end.since))
+    def _wrap(self, plain: socket.socket, context: ssl.SSLContext, *, server: bool) -> ssl.SSLSocket:
+        plain.setblocking(False)
+        try:
+            plain.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            wrapped = context.wrap_socket(plain, server_side=server, do_handshake_on_connect=False)
+        except OSError:
+            plain.close()
+            raise
+        self._sockets.add(wrapped)
+        return wrapped
 
-    def _read_hello(self, end: _End) -> None:
-        """Admit a connection that starts a handshake, end any other."""
-        first = end.socket.recv(6, socket.MSG_PEEK)
-        if not first or first[:2] != _HELLO[: len(first)] or (len(first) == 6 and first[5] != 1):
-            self._end(end)
-            return
-        end.partial = len(first) < 6
-        with contextlib.suppress(KeyError):
-            self._selector.unregister(end.socket)  # further data is read when it is admitted
-        if not end.partial:
-            end.hello = True
-            self._admit(end, time.monotonic())
+    def _enter(self, end: _End, stage: dict[_End, None], most: int) -> None:
+        """Add a connection to a stage; make room by ending the oldest one of the group with the most."""
+        end.since = time.monotonic()
+        stage[end] = None
+        if len(stage) > most:
+            # Zenoh's side completes its handshake, in some milliseconds: it would sleep after a failure.
+            settled = [each for each in stage if each.other is None or not each.other.handshaking]
+            sizes = Counter(each.group for each in settled)
+            largest = max(sizes.values(), default=0)
+            for each in [each for each in settled if sizes[each.group] == largest][: len(stage) - most]:
+                self._end(each)
 
-    def _admit(self, end: _End, now: float) -> None:
-        if self._failures(end.address, now) > FAILURES - 1:
+    def _shake_hands(self, end: _End) -> None:
+        try:
+            end.socket.do_handshake()
+        except ssl.SSLWantReadError:
+            self._selector.modify(end.socket, selectors.EVENT_READ, end)
             return
-        if _is_gone(end.socket):
-            self._end(end)
+        except ssl.SSLWantWriteError:
+            self._selector.modify(end.socket, selectors.EVENT_WRITE, end)
             return
+        end.handshaking = False
+        if end.other is None:
+            self._connect(end)
+        else:  # the router's side, which is the last
+            self._selector.modify(end.socket, selectors.EVENT_READ, end)
+            self._selector.register(end.other.socket, selectors.EVENT_READ, end.other)
+
+    def _connect(self, end: _End) -> None:
+        """Connect an authenticated client with the router."""
         assert self._router is not None
-        inner = socket.create_connection(self._router, timeout=HELLO_SECONDS)
-        inner.setblocking(False)
-        self._sockets.add(inner)
-        for forwarded in (end.socket, inner):
-            forwarded.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        other = _End(inner, end)
-        self._remove_held(end)
-        end.other, end.since = other, now
-        self._unproven.append(end)
-        for each in (end, other):
-            self._selector.register(each.socket, selectors.EVENT_READ, each)
-
-    def _remove_held(self, end: _End) -> None:
-        queue = self._held.get(end.address)
-        if queue and end in queue:
-            queue.remove(end)
-            if not queue:
-                del self._held[end.address]
+        address, authority = self._router
+        self._selector.unregister(end.socket)
+        del self._handshaking[end]
+        end.group = name_of(end.socket)
+        inner = socket.create_connection(address, timeout=_CONNECT_SECONDS)
+        end.other = _End(self._wrap(inner, authority.client(end.group), server=False), end)
+        self._selector.register(end.other.socket, selectors.EVENT_WRITE, end.other)
+        self._enter(end, self._opening, MAX_OPENING)
 
     def _check(self, now: float) -> None:
-        """End connections that took too long, and admit delayed ones."""
+        """End connections that took too long."""
         if now - self._checked < _CHECK_SECONDS:
             return
         self._checked = now
         if self.refused and now - self._logged > LOG_SECONDS:
             log.warning("ended %d connections that did not authenticate themselves", self.refused)
             self._logged, self.refused = now, 0
-        while self._unproven and now - self._unproven[0].since > HANDSHAKE_SECONDS:
-            if (unproven := self._unproven.popleft()).rounds < ROUNDS:
-                self._end(unproven)
-        for queue in [*self._held.values()]:
-            for end in [*reversed(queue)]:  # the newest client most likely still waits
-                try:
-                    if end.partial:
-                        self._read_hello(end)
-                    elif end.hello:
-                        self._admit(end, now)
-                except OSError:
-                    self._end(end)
-                if end.other is None and now - end.since > (HANDSHAKE_SECONDS if end.hello else HELLO_SECONDS):
-                    self._end(end)
-        if len(self._failed) > MAX_HELD:
-            self._failed = {address: known for address, known in self._failed.items() if self._failures(address, now)}
-
-    def _failures(self, address: str, now: float) -> float:
-        """Return the failed handshakes of an address that are not forgiven yet."""
-        count, then = self._failed.get(address, (0.0, now))
-        return max(0.0, count - FORGIVEN_RATE * (now - then))
+        for stage in (self._handshaking, self._opening):
+            while stage and now - (oldest := next(iter(stage))).since > STAGE_SECONDS:
+                self._end(oldest)
 
     # --- admitted connections -------------------------------------------------------------------------------------
 
@@ -231,14 +215,15 @@ class TlsGate:
         if events & selectors.EVENT_WRITE:
             self._write(end, end.unsent)
         if events & selectors.EVENT_READ and not other.unsent:
-            try:
-                data = end.socket.recv(CHUNK)
-            except BlockingIOError:
+            data = _read(end.socket)
+            if data is None:
                 return
-            if end.address:
+            if end.group:
                 end.spoke = True
             elif other.spoke:
                 other.spoke, other.rounds = False, other.rounds + 1
+                if other.rounds == ROUNDS:
+                    self._opening.pop(other, None)
             other.ended = not data
             self._write(other, memoryview(data))
 
@@ -247,8 +232,8 @@ class TlsGate:
         if not data and not end.ended and not end.unsent:
             return
         had = bool(end.unsent)
-        if data:
-            with contextlib.suppress(BlockingIOError):
+        with contextlib.suppress(ssl.SSLWantWriteError, ssl.SSLWantReadError):
+            while data:
                 data = data[end.socket.send(data):]
         end.unsent = data
         if end.ended and not data:
@@ -273,27 +258,29 @@ class TlsGate:
             self._selector.modify(end.socket, events, end)
 
     def _end(self, end: _End) -> None:
-        self._remove_held(end)
         for each in (end, end.other):
             if each is None:
                 continue
-            if each.address and each.rounds < ROUNDS:
+            if each.group and each.rounds < ROUNDS:
                 self.refused += 1
-                if each.other is not None:  # Zenoh sleeps now
-                    now = time.monotonic()
-                    self._failed[each.address] = min(1 + self._failures(each.address, now), 1.5 * FAILURES), now
                 each.rounds = ROUNDS  # counted once
+            self._handshaking.pop(each, None)
+            self._opening.pop(each, None)
             with contextlib.suppress(KeyError, ValueError):
                 self._selector.unregister(each.socket)
             each.socket.close()
             self._sockets.discard(each.socket)
 
 
-def _is_gone(client: socket.socket) -> bool:
-    """Return whether a client has closed its side, which a read does not show while data is left."""
-    poll = select.poll()
-    poll.register(client, select.POLLRDHUP)
-    return bool(poll.poll(0))
+def _read(source: ssl.SSLSocket) -> bytes | None:
+    """Return what has arrived, empty at the end of the stream; None if that is nothing yet."""
+    parts: list[bytes] = []
+    with contextlib.suppress(ssl.SSLWantReadError, ssl.SSLWantWriteError):
+        while sum(map(len, parts)) < CHUNK:  # TLS gives a record of 16 kB at a time
+            parts.append(source.recv(CHUNK))
+            if not parts[-1]:
+                return b"".join(parts)
+    return b"".join(parts) or None
 
 
 def _bound_listener(host: str, port: int) -> socket.socket:
