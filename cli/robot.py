@@ -213,6 +213,10 @@ def new(
                                             "point, or the mount of --gripper")] = None,
     package_dir: Annotated[list[str] | None, typer.Option(
         "--package-dir", metavar="DIR", help="folder with packages, searched a few levels deep; repeatable")] = None,
+    srdf: Annotated[str, typer.Option("--srdf", metavar="FILE", help="the maker's SRDF: its pairs without collision "
+                                      "checks, the arm's group, named poses")] = "",
+    group: Annotated[str, typer.Option("--group", metavar="NAME", help="group of that SRDF which is the arm "
+                                                                       "[the first chain]")] = "",
     cell: Annotated[str, typer.Option("--cell", metavar="FILE.yaml", help="also write a cell, with a world "
                                                                           "within reach of this arm")] = "",
     like: Annotated[str, typer.Option("--like", metavar="CELL", help="template of that cell",
@@ -225,6 +229,7 @@ def new(
     from common.config import names_of
     from tools.robot_setup.descriptions import Reader, parse_arguments, written
     from tools.robot_setup.files import robot_file, write_cell
+    from tools.robot_setup.maker_srdf import MakerSrdf, read_srdf
     from tools.robot_setup.proposal import finish
     from tools.robot_setup.tree import read_tree
 
@@ -232,8 +237,10 @@ def new(
                     parse_arguments(arguments or []), trust)
     arm = reader.read("urdf", urdf)
     hand = reader.read("--gripper", gripper) if gripper else None
-    reader.check_arguments()
     tree = read_tree(arm.root, urdf)
+    maker = read_srdf(reader.read("--srdf", srdf).root, tree) if srdf else MakerSrdf()
+    group = maker.arm(group) if srdf or group else ""
+    reader.check_arguments()
     chosen = name or _ask("name of the robot", _plain_name(tree.name or Path(urdf).name.split(".")[0]), yes)
     if not NAME.fullmatch(chosen):
         raise ConfigError("--name", chosen, "must be letters, digits, - and _, and begin with a letter")
@@ -248,10 +255,10 @@ def new(
             urdf = stack.enter_context(written(arm, path.with_suffix(".urdf"), force))
         if hand and hand.expanded:
             gripper = stack.enter_context(written(hand, path.with_suffix(".gripper.urdf"), force))
-        made = _draft(tree, urdf, chosen, gripper, tip, reader.folders, yes)
+        made = _draft(tree, urdf, chosen, gripper, tip, reader.folders, yes, maker.arms.get(group, []))
         echo("computing collision pairs and a home pose: a few seconds, a minute with detailed meshes", err=True)
-        robot = finish(made)
-    made.check += [*arm.notes, *(hand.notes if hand else [])]
+        robot = finish(made, maker.pairs, maker.arm_poses(group))
+    made.check += [*arm.notes, *(hand.notes if hand else []), *maker.notes(group)]
     head = f"{chosen}, written by `zencell robot new` from its URDF. Check the values marked GUESSED."
     path.write_text(robot_file(made, head, path.parent, pairs.name), encoding="utf-8")
     pairs.write_text(made.srdf, encoding="utf-8")
@@ -277,21 +284,21 @@ def _layout_of(cell: str, robot: Path, template: str, force: bool) -> Layout:
 
 
 def _draft(
-    tree: Tree, urdf: str, name: str, gripper: str, tip: str | None, folders: list[str], yes: bool
+    tree: Tree, urdf: str, name: str, gripper: str, tip: str | None, folders: list[str], yes: bool, group: Sequence[str]
 ) -> Proposal:
     """Return a draft of the robot file; ask for the end of the arm if several links may be it."""
     from tools.robot_setup.proposal import draft
     from tools.robot_setup.tree import find_wrists
 
     wrists = find_wrists(tree)
-    if tip is None and len(wrists) > 1 and not yes:
+    if tip is None and not group and len(wrists) > 1 and not yes:
         longest = max(wrists, key=lambda link: len(tree.above(link)))
         tip = _ask(f"arms end at {', '.join(wrists)}; which", longest, yes)
-    made = draft(urdf, name, gripper=gripper, tip=tip, package_dirs=folders)
+    made = draft(urdf, name, gripper=gripper, tip=tip, package_dirs=folders, group=group)
     fitting = [each.link for each in made.candidates if each.fits]
     if tip is None and len(fitting) > 1 and not yes:
         tip = _ask(f"tool centre point: {', '.join(fitting)}; which", made.values.get("tcp_link", fitting[0]), yes)
-        made = draft(urdf, name, gripper=gripper, tip=tip, package_dirs=folders)
+        made = draft(urdf, name, gripper=gripper, tip=tip, package_dirs=folders, group=group)
     return made
 
 

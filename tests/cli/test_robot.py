@@ -131,6 +131,43 @@ def test_xacro_file_of_a_package_needs_no_ros(tmp_path):
         assert done.returncode == 2 and wanted in done.stderr and len(done.stderr.splitlines()) == 1, done.stderr
 
 
+def test_maker_s_srdf_gives_pairs_group_and_poses(folder, tmp_path):
+    joints = ["turn", "lift", "bend", "roll", "pitch", "spin"]
+    poses = yaml.safe_load((folder / "side.yaml").read_text())["named_poses"]
+    home = [round(value + 0.01, 4) for value in poses["home"]]
+
+    def state(name: str, values: list[float]) -> str:
+        inside = "".join(f'<joint name="{joint}" value="{value}"/>'
+                         for joint, value in zip(joints, values, strict=False))
+        return f'<group_state name="{name}" group="arm">{inside}</group_state>'
+
+    def maker(*states: str) -> None:
+        (tmp_path / "maker.srdf").write_text(
+            '<robot name="side"><group name="short"><joint name="turn"/></group><group name="arm"><group name="inner"/>'
+            '</group><group name="inner"><chain base_link="foot" tip_link="flange"/></group>'
+            '<group name="loop"><group name="loop"/></group>' + "".join(states)
+            + '<disable_collisions link1="foot" link2="upper_finger"/>'
+            '<disable_collisions link1="foot" link2="gone"/></robot>')
+
+    new = ("robot", "new", str(URDF), "--srdf", "maker.srdf", "--yes", "--force", "--name", "side")
+    maker(state("home", home), state("far", [9.0] * 6), state("part", [0.1]), state("bent", [0.1] * 6))
+    done = ask(tmp_path, *new)
+    assert done.returncode == 0, done.stderr
+    values = yaml.safe_load((tmp_path / "side.yaml").read_text())
+    assert (values["joints"], values["named_poses"]) == (joints, {"home": home, "bent": [0.1] * 6})
+    for line in ("the SRDF names links that the URDF lacks: gone", "pose far of the SRDF is left out",
+                 "group arm of the SRDF is the arm; --group selects inner"):
+        assert line in done.stdout
+    assert 'link1="foot" link2="upper_finger"' in (tmp_path / "side.srdf").read_text()
+    maker(state("home", [0.1] * 6))
+    done = ask(tmp_path, *new, "--group", "arm")
+    values = yaml.safe_load((tmp_path / "side.yaml").read_text())
+    assert values["named_poses"]["maker_home"] == [0.1] * 6 != values["named_poses"]["home"]
+    for options, wanted in ((["--group", "legs"], "choices: arm, inner"), (["--srdf", str(URDF)], "--srdf")):
+        done = ask(tmp_path, *new, *options)
+        assert done.returncode == 2 and wanted in done.stderr and len(done.stderr.splitlines()) == 1, done.stderr
+
+
 @pytest.mark.parametrize(("text", "options", "wanted"), [
     (None, "", ["bad.urdf", "is missing"]),
     ("joint: 1", "", ["bad.urdf", "does not parse"]),

@@ -99,7 +99,7 @@ class Reader:
         """Return the text of a xacro file, and the packages that it asked for."""
         here = str(Path.cwd())
         request = {"file": str(path), "arguments": dict(self.arguments), "folders": list(around), "trust": self.trust,
-                   "readable": [*self.folders, str(path.parent), *_repository(path)],
+                   "readable": [*self.folders, str(path), *_own_folders(path)],
                    "root": str(_WORKER.parents[2]), "python": [each for each in sys.path if each not in ("", here)]}
         # A file of a stranger gets no variables but those that find packages.
         environment = os.environ if self.trust else {
@@ -136,10 +136,10 @@ class Reader:
                                   f"asks for; choices: {', '.join(sorted(self.asked)) or 'none, it has no arguments'}")
 
 
-def _repository(path: Path) -> list[str]:
-    """Return the folder of the clone that contains a file."""
-    tops = [str(each) for each in path.parents if (each / ".git").exists() and each != Path.home()]
-    return tops[:1]
+def _own_folders(path: Path) -> list[str]:
+    """Return the folder of a file and that of its clone, but not the home folder."""
+    clone = [each for each in path.parents if (each / ".git").exists()]
+    return [str(each) for each in (path.parent, *clone[:1]) if each != Path.home()]
 
 
 def is_xacro(path: Path) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 import xml.etree.ElementTree as ET
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -29,7 +29,8 @@ from tools.robot_setup.end_effector import (
     section,
 )
 from tools.robot_setup.fingers import ALIGNED, link_points
-from tools.robot_setup.sampling import disabled_pairs, find_home, srdf
+from tools.robot_setup.maker_srdf import fitting_poses
+from tools.robot_setup.sampling import DisabledPair, disabled_pairs, find_home, srdf
 from tools.robot_setup.tree import (
     SPEED,
     TO_ACCELERATION,
@@ -82,6 +83,7 @@ class Proposal:
 
 def draft(
     urdf: str, name: str, *, gripper: str = "", tip: str | None = None, package_dirs: Sequence[str] = (),
+    group: Sequence[str] = (),
 ) -> Proposal:
     """Return the robot file of an arm without home pose and unchecked pairs, which `finish` adds.
 
@@ -91,12 +93,13 @@ def draft(
         gripper: description of a gripper that is mounted at its end.
         tip: the tool centre point or mounting link, if the arm has several ends.
         package_dirs: folders that resolve package://.
+        group: joints of the arm, if the maker's SRDF states them.
 
     Raises:
         ConfigError, UnknownName: a description is invalid.
     """
     tree = read_tree(read_urdf("urdf", urdf, package_dirs), urdf)
-    arm = find_arm(tree, urdf, tip)
+    arm = find_arm(tree, urdf, tip, group)
     proposal = Proposal({
         "name": name, "urdf": urdf, "package_dirs": list(package_dirs),
         "joints": [joint.name for joint in arm.joints], "base_link": arm.base, "tcp_link": arm.wrist,
@@ -293,16 +296,31 @@ def _write_gripper(proposal: Proposal, effector: GripperProposal, closing: str) 
         "Joints outside the arm, at the positions that planning assumes; fingers are open.")
 
 
-def finish(proposal: Proposal) -> RobotModel:
-    """Add the home pose and the unchecked pairs: seconds of work, a minute with detailed meshes."""
+def finish(
+    proposal: Proposal, pairs_of_maker: Sequence[tuple[str, str]] = (),
+    poses: Mapping[str, Sequence[float]] | None = None,
+) -> RobotModel:
+    """Add the home pose and the unchecked pairs: seconds of work, a minute with detailed meshes.
+
+    Args:
+        proposal: a draft.
+        pairs_of_maker: links that are not checked either.
+        poses: further named poses. One that is called home is used as such if its tool points down and nothing touches.
+    """
     robot = _model(proposal)
     pairs = disabled_pairs(robot)
+    pairs += [DisabledPair(*links, "Maker") for links in pairs_of_maker
+              if not any({pair.one, pair.other} == set(links) for pair in pairs)]
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "pairs.srdf"
         path.write_text(srdf(robot, pairs), encoding="utf-8")
         robot = RobotModel.load(robot.config.model_copy(update={"srdf": str(path)}))
-        home = find_home(robot, RobotGeometry(robot))
-    proposal.values["named_poses"] = {"home": [round(float(value), 4) + 0.0 for value in home.positions]}
+        geometry = RobotGeometry(robot)
+        saved, remarks = fitting_poses(robot, geometry, poses or {})
+        home = find_home(robot, geometry, saved.pop("home", None))
+    proposal.check += remarks
+    proposal.values["named_poses"] = {name: [round(float(value), 4) + 0.0 for value in q]
+                                      for name, q in ({"home": home.positions} | saved).items()}
     robot = _model(proposal)
     proposal.srdf = srdf(robot, pairs)
     x, y, z = robot.fk(robot.named("home"))[:3, 3]

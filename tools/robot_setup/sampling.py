@@ -40,12 +40,12 @@ class Home:
     hits: list[str]  # colliding pairs of links; empty if a free pose was found
 
 
-def find_home(robot: RobotModel, geometry: RobotGeometry) -> Home:
+def find_home(robot: RobotModel, geometry: RobotGeometry, given: Array | None = None) -> Home:
     """Return the pose from which most positions in front of the arm are in reach with the tool down.
 
     Candidates are all collision-free IK solutions with the tool down in front of the base. Those farthest from joint
     limits and with the links high above the table are evaluated. For an arm that cannot point down, the result is the
-    middle of its joint ranges, or the best of random poses.
+    middle of its joint ranges, or the best of random poses. A `given` pose with the tool down is the only candidate.
     """
     rng = np.random.default_rng(0)
     middle = (robot.lower + robot.upper) / 2
@@ -63,7 +63,9 @@ def find_home(robot: RobotModel, geometry: RobotGeometry) -> Home:
                 if q is not None and not hits(robot, geometry, q):
                     yield _comfort(robot, q, neutral, table) + height, q
 
-    found = (list(down_at(HEIGHTS)) or list(down_at(LOWER))) if reach else []
+    found = [(0.0, given)] if given is not None else []
+    if reach and not found:
+        found = list(down_at(HEIGHTS)) or list(down_at(LOWER))
     found.sort(key=lambda each: -each[0])
     best = [(_served(robot, geometry, q, table, reach), value, q) for value, q in _different(found)[:EVALUATED]]
     if best:
@@ -149,7 +151,7 @@ def hits(robot: RobotModel, geometry: RobotGeometry, q: Array) -> list[str]:
                               if result.isCollision()))
 
 
-Reason = Literal["Adjacent", "Fixed", "Always", "Never"]
+Reason = Literal["Adjacent", "Fixed", "Always", "Never", "Maker"]
 
 ALMOST_ALWAYS = 0.95  # of the samples
 
@@ -160,7 +162,7 @@ class DisabledPair:
 
     Adjacent: a joint connects them. Fixed: no joint of the group moves one against the other. Always: they touch at
     every sample; on both sides of one joint at almost every sample, as overlapping hulls of a wrist do. Never: they
-    came no closer than the margin at any sample.
+    came no closer than the margin at any sample. Maker: listed in the maker's SRDF.
     """
 
     one: str

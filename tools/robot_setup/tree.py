@@ -168,14 +168,17 @@ def _may_turn(text: str) -> bool:
         return True
 
 
-def find_arm(tree: Tree, source: str, tip: str | None = None) -> Arm:
-    """Return the longest chain of moving joints up to the fingers, or the one that carries `tip`.
+def find_arm(tree: Tree, source: str, tip: str | None = None, group: Sequence[str] = ()) -> Arm:
+    """Return the longest chain of moving joints up to the fingers, the one that carries `tip`, or the joints `group`.
 
     Raises:
         ConfigError: no joint moves, or none moves `tip`. UnknownName: the link `tip` does not exist.
     """
     if tip is not None and tip not in tree.links:
         raise UnknownName("link", tip, tree.links)
+    if group:
+        chain = [next(joint for joint in tree.joints if joint.name == name) for name in group]
+        return Arm(chain, _base(tree), chain[-1].child, tree.moving_below(chain[-1].child))
     wrists = find_wrists(tree)
     if not wrists:
         raise ConfigError("urdf", source, "has no joint that moves: it is no arm")

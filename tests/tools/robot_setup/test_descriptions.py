@@ -154,6 +154,14 @@ def test_expression_of_a_stranger_reaches_neither_python_nor_files_nor_the_envir
     assert ATTACKS[attack] in str(caught.value) and len(str(caught.value).splitlines()) == 1
 
 
+def test_xacro_in_the_home_folder_opens_none_of_its_files(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    (tmp_path / "secret.yaml").write_text("secret")
+    (tmp_path / "arm.xacro").write_text(f'<robot {XACRO}><link name="${{load_yaml(\'secret.yaml\')}}"/></robot>')
+    with pytest.raises(ConfigError, match="opens"):
+        Reader([]).read("urdf", str(tmp_path / "arm.xacro"))
+
+
 @pytest.mark.parametrize(("body", "wanted"), [
     ('<xacro:macro name="m"><xacro:m/></xacro:macro><xacro:m/>', "call themselves"),
     ('<xacro:include filename="arm.xacro"/>', "call themselves"),
