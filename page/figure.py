@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from common.config import CameraConfig
 from common.messages import TFMessage, TransformStamped
+from common.robot.link_shapes import Rgb
 from common.robot.model import RobotModel
 from common.robot.transform_tree import MAX_FRAMES
 from common.robot.transforms import pose_to_matrix, rpy_to_matrix, transform
-from common.robot.visual_meshes import Piece, Rgb
+from common.robot.visual_meshes import Piece
 from page.nodes import brightened
 
 Array = NDArray[np.float64]

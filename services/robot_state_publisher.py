@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 from numpy.typing import NDArray
 from pydantic import Field
 
@@ -45,7 +46,7 @@ class LinkFrames:
         """Determine which links move relative to their parents and which are fixed to them."""
         self._robot = robot
         model = robot.full_model
-        joint = {frame.name: frame.parentJoint for frame in model.frames if frame.name in robot.link_names}
+        joint = {frame.name: frame.parentJoint for frame in model.frames if frame.type == pin.FrameType.BODY}
         self.root = next(link for link in robot.link_names if link not in robot.link_parents)
         self.T_world_root = robot.link_poses(robot.named("home"))[self.root]
         self._fixed = [link for link, parent in robot.link_parents.items() if joint[link] == joint[parent]]

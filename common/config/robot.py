@@ -176,6 +176,12 @@ class RobotConfig(Section):
     attachments: list[AttachmentConfig] = Field([], description="descriptions added to the URDF")
     group: str = "arm"
     group_aliases: list[str] = []
+    visual_as_collision: list[str] = Field(
+        [], description="links that collide with their visual shapes, as they have no collision shapes"
+    )
+    allowed_pairs: list[tuple[str, str]] = Field(
+        [], description="pairs of links that may touch, besides those that the SRDF disables"
+    )
     joints: list[str] = Field(min_length=1, description="joints of the group, in order")
     base_link: str
     base_position: Point = Field((0.0, 0.0, 0.0), description="of base_link in world [m]")

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import coal
 import numpy as np
 import numpy.typing as npt
-import pinocchio as pin
 
 from common.perception.pinhole import Pinhole
 from common.robot.model import RobotModel
@@ -176,7 +175,7 @@ def _project(camera: Pinhole, points: Array) -> Array:
 def _corners(robot: RobotModel) -> dict[str, Array]:
     """Points (n, 3) [m] whose convex hull contains each link's shapes, by link."""
     parts: dict[str, list[Array]] = {}
-    for item in robot.full_geometry(pin.GeometryType.COLLISION).geometryObjects:
+    for item in robot.full_geometry().geometryObjects:
         frame = robot.full_model.frames[item.parentFrame]
         T = invert(np.array(frame.placement.homogeneous)) @ np.array(item.placement.homogeneous)
         shape = item.geometry

@@ -218,9 +218,7 @@ def _split_scene(
     for item in scene.attached:
         if attach and item.object.id != attach:
             continue  # released before the motion takes the other object
-        if item.link not in robot.link_names:
-            raise UnknownName("link", item.link, robot.link_names)
-        frame = model.getFrameId(item.link)
+        frame = robot.frame(item.link)
         T_joint_link = model.frames[frame].placement.homogeneous
         held.append((item.object, frame, T_joint_link @ pose_to_matrix(item.object.pose)))
     if attach and attach not in {item.id for item, _, _ in held}:

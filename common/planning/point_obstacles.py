@@ -157,7 +157,7 @@ class KnownShapeFilter:
         model = self._cache.robot.robot.model
         solids, poses = [Solid.of(o) for o in scene.objects], [pose_to_matrix(o.pose) for o in scene.objects]
         for item in scene.attached:
-            frame = model.getFrameId(item.link)
+            frame = self._cache.robot.robot.frame(item.link)
             solids.append(Solid.of(item.object, model.frames[frame].parentJoint, frame))
             poses.append(model.frames[frame].placement.homogeneous @ pose_to_matrix(item.object.pose))
         bank = self._cache.bank(tuple(solids))

@@ -35,8 +35,8 @@ class RobotGeometry:
             ConfigError: a mesh is missing, or the SRDF does not parse.
         """
         self.robot = robot
-        full = convex_hulls(robot.full_geometry(pin.GeometryType.COLLISION))
-        _, geometry = pin.buildReducedModel(robot.full_model, full, robot.locked_ids, robot.full_reference)
+        full = convex_hulls(robot.full_geometry())
+        geometry = robot.reduced(full)[1]
         geometry.addAllCollisionPairs()
         if robot.srdf is not None:
             try:

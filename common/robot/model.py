@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import xml.etree.ElementTree as ET
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -11,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from common.config import RobotConfig
 from common.errors import ConfigError, UnknownName
+from common.robot.link_shapes import link_shapes
 from common.robot.packages import package_folders
 from common.robot.transforms import rpy_to_matrix
 from common.robot.urdf import WORLD, find_description, merged_urdf
@@ -43,7 +46,7 @@ class RobotModel:
         self.srdf = srdf
         self.full_model = full_model
         self.locked_ids, self.full_reference = _locked(config, full_model)
-        self.model = pin.buildReducedModel(full_model, self.locked_ids, self.full_reference)
+        self.model, _ = self.reduced(pin.GeometryModel())
         self.data = self.model.createData()
         self._full_data = full_model.createData()
         self.joint_names: list[str] = list(self.model.names)[1:]
@@ -89,9 +92,11 @@ class RobotModel:
         urdf = merged_urdf(config)
         srdf = find_description("robot.srdf", config.srdf, config.package_dirs) if config.srdf else None
         try:
-            full_model = pin.buildModelFromXML(urdf)
+            full_model = pin.buildModelFromXML(_without_shapes(urdf))
         except ValueError as error:
             raise ConfigError("robot.urdf", config.urdf, f"does not parse: {str(error).strip()}") from None
+        if lost := sorted(_described_links(urdf) - set(_link_frames(full_model))):
+            raise ConfigError("robot.urdf", config.urdf, f"has links that its parser dropped: {', '.join(lost)}")
         return cls(config, full_model, urdf, srdf)
 
     @property
@@ -113,18 +118,39 @@ class RobotModel:
         """Folders that are searched for the URDF's package:// meshes."""
         return package_folders(self.config.package_dirs)
 
-    def full_geometry(self, kind: pin.GeometryType) -> pin.GeometryModel:
-        """Return collision or visual shapes of all links, placed on the joints of `full_model`.
+    def full_geometry(self) -> pin.GeometryModel:
+        """Return the collision shapes of all links, placed on the joints of `full_model`.
 
         Raises:
-            ConfigError: a mesh is missing or cannot be read.
+            ConfigError: a mesh is missing, cannot be read or has no extent.
         """
-        folders = [str(folder) for folder in self.package_folders]
-        try:
-            return pin.buildGeomFromUrdfString(self.full_model, self.urdf, kind, package_dirs=folders)
-        except ValueError as error:
-            reason = " ".join(str(error).split())
-            raise ConfigError("robot.urdf", self.config.urdf, f"has a mesh that cannot be loaded: {reason}") from None
+        from common.robot.collision_shapes import coal_shape
+
+        shapes = defaultdict(list)
+        for shape in link_shapes(ET.fromstring(self.urdf), "collision", "robot.urdf", self.config.urdf):
+            shapes[shape.link].append(shape)
+        geometry = pin.GeometryModel()
+        for link, index in self._full_links.items():
+            frame = self.full_model.frames[index]
+            for number, shape in enumerate(shapes[link]):
+                path = find_description("robot.urdf", shape.file, self.config.package_dirs) if shape.file else None
+                geometry.addGeometryObject(pin.GeometryObject(
+                    f"{link}_{number}", frame.parentJoint, index, frame.placement * pin.SE3(shape.T_link_shape),
+                    coal_shape(shape, "robot.urdf", path)))
+        return geometry
+
+    def reduced(self, geometry: pin.GeometryModel) -> tuple[pin.Model, pin.GeometryModel]:
+        """Return the model of the group, and shapes of `full_model` placed on its joints."""
+        joints = set(self.full_model.names)
+        alike = [i for i, f in enumerate(self.full_model.frames) if f.type == pin.FrameType.BODY and f.name in joints]
+        names = [self.full_model.frames[i].name for i in alike]
+        whole = self.full_model.copy()
+        for index in alike:  # pinocchio reduces no model in which a link has the name of a joint
+            whole.frames[index].name += " (link)"
+        model, placed = pin.buildReducedModel(whole, geometry, self.locked_ids, self.full_reference)
+        for name in names:
+            model.frames[model.getFrameId(f"{name} (link)")].name = name
+        return model, placed
 
     @property
     def groups(self) -> list[str]:
@@ -141,6 +167,16 @@ class RobotModel:
     def link_names(self) -> list[str]:
         """All links of the robot."""
         return list(self._links)
+
+    def frame(self, link: str) -> int:
+        """Return the index of a link's frame in `model`; a joint may have the same name.
+
+        Raises:
+            UnknownName: with the choices.
+        """
+        if link not in self._links:
+            raise UnknownName("link", link, list(self._links))
+        return self._links[link]
 
     def fk(self, q: ArrayLike) -> Array:
         """Return (4, 4) T_world_tcp at joint positions q (dof,) [rad]."""
@@ -257,6 +293,19 @@ def _locked(config: RobotConfig, model: pin.Model) -> tuple[list[int], Array]:
 def _link_frames(model: pin.Model) -> dict[str, int]:
     """Return the frame index of each link of the robot, without `world`."""
     return {f.name: i for i, f in enumerate(model.frames) if f.type == pin.FrameType.BODY and f.name != WORLD}
+
+
+def _without_shapes(urdf: str) -> str:
+    """Return a URDF for the kinematics alone: pinocchio's parser would print and skip what it cannot read of shapes."""
+    root = ET.fromstring(urdf)
+    for link in root.findall("link"):
+        for part in [*link.findall("visual"), *link.findall("collision")]:
+            link.remove(part)
+    return ET.tostring(root, encoding="unicode")
+
+
+def _described_links(urdf: str) -> set[str]:
+    return {str(link.get("name")) for link in ET.fromstring(urdf).findall("link")} - {WORLD}
 
 
 def _link_parents(model: pin.Model) -> dict[str, str]:

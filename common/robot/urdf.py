@@ -10,6 +10,7 @@ from pathlib import Path
 from common.config import AttachmentConfig, RobotConfig, config_root
 from common.errors import ConfigError
 from common.robot.description_file import read_xml
+from common.robot.link_shapes import link_shapes
 from common.robot.mesh_references import SCHEME, resolve_meshes
 from common.robot.packages import package_folders, package_paths
 
@@ -67,6 +68,11 @@ def merged_urdf(config: RobotConfig) -> str:
         _fix(robot, tcp.link, tcp.parent, tcp.position, tcp.rpy)
         ET.SubElement(robot, "link", name=tcp.link)
     links = _links(robot)
+    for name in config.visual_as_collision:
+        _require_link(robot, "robot.visual_as_collision", name)
+        link = next(link for link in robot.findall("link") if link.get("name") == name)
+        for visual in [] if link.find("collision") is not None else link.findall("visual"):
+            ET.SubElement(link, "collision").extend([part for part in visual if part.tag != "material"])
     for joint in robot.findall("joint"):
         if joint.get("type") == "continuous":
             _limit_continuous(joint)
@@ -81,11 +87,13 @@ def read_urdf(field: str, reference: str, package_dirs: Sequence[str]) -> ET.Ele
     """Return the elements of a URDF with absolute paths of its meshes, without visual ones that are missing.
 
     Raises:
-        ConfigError: it is missing or does not parse; names the field.
+        ConfigError: it is missing or does not parse, or one of its shapes is incomplete; names the field.
     """
     path = find_description(field, reference, package_dirs)
     root = read_xml(field, path)
     resolve_meshes(root, path, package_dirs)
+    for kind in ("collision", "visual"):
+        list(link_shapes(root, kind, field, str(path)))  # raises where a shape is incomplete
     return root
 
 

@@ -11,22 +11,19 @@ from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, cast
 
 import fast_simplification
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from common.errors import ConfigError
+from common.robot.link_shapes import Kind, Rgb, Shape, link_shapes, rgb
 from common.robot.mesh_files import parts_of
 from common.robot.model import RobotModel
-from common.robot.transforms import rpy_to_matrix, transform
 from common.robot.urdf import find_description
 
-Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
-Rgb = tuple[int, int, int]
 
 _PLAIN: Rgb = (230, 230, 230)  # without a colour in URDF and file
 _MIN_TRIANGLES = 150  # of a connected part
@@ -58,7 +55,7 @@ def visual_pieces(robot: RobotModel, triangles: int = 25_000) -> list[Piece]:
     Raises:
         ConfigError: a mesh is missing or cannot be read.
     """
-    return _pieces(visible_shapes(robot), triangles)
+    return _pieces(robot, visible_shapes(robot), triangles)
 
 
 def collision_pieces(robot: RobotModel, triangles: int = 12_000) -> list[Piece]:
@@ -67,13 +64,13 @@ def collision_pieces(robot: RobotModel, triangles: int = 12_000) -> list[Piece]:
     Raises:
         ConfigError: a mesh is missing or cannot be read.
     """
-    return _pieces(urdf_shapes(robot, "collision"), triangles)
+    return _pieces(robot, urdf_shapes(robot, "collision"), triangles)
 
 
-def _pieces(shapes: Iterable[Shape], triangles: int) -> list[Piece]:
+def _pieces(robot: RobotModel, shapes: Iterable[Shape], triangles: int) -> list[Piece]:
     found: dict[tuple[str, Rgb], list[trimesh.Trimesh]] = defaultdict(list)
     for shape in shapes:
-        for color, mesh in _coloured(shape):
+        for color, mesh in _coloured(robot, shape):
             found[shape.link, color].append(mesh.apply_transform(shape.T_link_shape))
     joined = [_merged(trimesh.util.concatenate(meshes)) for meshes in found.values()]
     share = triangles / max(1, sum(len(mesh.faces) for mesh in joined))
@@ -158,14 +155,14 @@ def _piece(link: str, color: Rgb, mesh: trimesh.Trimesh) -> Piece:
                  index.reshape(-1, 3).astype(np.uint32))
 
 
-def _coloured(shape: Shape) -> list[tuple[Rgb, trimesh.Trimesh]]:
+def _coloured(robot: RobotModel, shape: Shape) -> list[tuple[Rgb, trimesh.Trimesh]]:
     """Return the triangles of a shape by colour; the URDF's colour overrides the file's."""
-    if shape.path is None:
-        return [(shape.color or _PLAIN, _merged(shape.primitive))]
+    if not shape.file:
+        return [(shape.color or _PLAIN, _merged(_primitive(shape)))]
     meshes = []
-    for mesh in parts_of("robot.urdf", shape.path):
+    for mesh in parts_of("robot.urdf", mesh_path(robot, shape)):
         color = shape.color or _file_color(mesh) or _PLAIN
-        mesh.vertices = mesh.vertices * np.array(shape.scale)
+        mesh.vertices = mesh.vertices * np.array(shape.size)
         meshes.append((color, _merged(mesh)))
     return meshes
 
@@ -175,25 +172,8 @@ def _file_color(mesh: trimesh.Trimesh) -> Rgb | None:
     visual: Any = mesh.visual
     material = getattr(visual, "material", None)
     if material is not None:
-        return _rgb(material.main_color[:3])
-    return _rgb(visual.main_color[:3]) if visual.defined else None
-
-
-def _rgb(values: Iterable[float]) -> Rgb:
-    r, g, b = (round(float(value)) for value in values)
-    return r, g, b
-
-
-@dataclass(frozen=True, eq=False)
-class Shape:
-    """A shape of a link: a file with its scale, or a mesh created from dimensions."""
-
-    link: str
-    T_link_shape: Array
-    color: Rgb | None  # None: that of the file
-    path: Path | None = None
-    scale: tuple[float, ...] = (1.0, 1.0, 1.0)
-    primitive: trimesh.Trimesh | None = None
+        return rgb(material.main_color[:3])
+    return rgb(visual.main_color[:3]) if visual.defined else None
 
 
 def visible_shapes(robot: RobotModel) -> list[Shape]:
@@ -211,58 +191,30 @@ def visible_shapes(robot: RobotModel) -> list[Shape]:
                       if shape.link not in seen and above.get(shape.link) not in seen]
 
 
-def urdf_shapes(robot: RobotModel, kind: Literal["visual", "collision"]) -> Iterator[Shape]:
-    """Yield every shape of a kind, in the order of the robot's URDF.
+def urdf_shapes(robot: RobotModel, kind: Kind) -> Iterator[Shape]:
+    """Yield every shape of a kind, in the order of the robot's URDF."""
+    return link_shapes(ET.fromstring(robot.urdf), kind, "robot.urdf", robot.config.urdf)
+
+
+def mesh_path(robot: RobotModel, shape: Shape) -> Path:
+    """Return the file of a mesh.
 
     Raises:
-        ConfigError: a mesh is missing, or a shape is unknown.
+        ConfigError: it is missing.
     """
-    root = ET.fromstring(robot.urdf)
-    named = {str(m.get("name")): rgb for m in root.iter("material") if (rgb := _material_color(m)) is not None}
-    for link in root.findall("link"):
-        for part in link.findall(kind):
-            origin, material, shape = part.find("origin"), part.find("material"), part.find("geometry/*")
-            if shape is None:
-                continue
-            color = named.get(str(material.get("name"))) if material is not None else None
-            if material is not None:
-                color = _material_color(material) or color
-            at = _numbers(origin, "xyz", "0 0 0")
-            T = transform(rpy_to_matrix(*_numbers(origin, "rpy", "0 0 0")), (at[0], at[1], at[2]))
-            name = str(link.get("name"))
-            if shape.tag == "mesh":
-                path = find_description("robot.urdf", str(shape.get("filename")), robot.config.package_dirs)
-                yield Shape(name, T, color, path, _numbers(shape, "scale", "1 1 1"))
-            else:
-                yield Shape(name, T, color, primitive=_primitive(shape))
+    return find_description("robot.urdf", shape.file, robot.config.package_dirs)
 
 
-def _primitive(shape: ET.Element) -> trimesh.Trimesh:
+def _primitive(shape: Shape) -> trimesh.Trimesh:
     """Return the mesh of a shape that is described by its dimensions [m]."""
     mesh: trimesh.Trimesh
-    if shape.tag == "box":
-        mesh = trimesh.creation.box(extents=_numbers(shape, "size", ""))
-    elif shape.tag in ("cylinder", "capsule"):
-        radius, length = float(shape.get("radius", "nan")), float(shape.get("length", "nan"))
-        if shape.tag == "cylinder":
-            mesh = trimesh.creation.cylinder(radius=radius, height=length, sections=32)
-        else:
-            mesh = trimesh.creation.capsule(radius=radius, height=length)
-            mesh.apply_translation(-mesh.bounds.mean(axis=0))
-    elif shape.tag == "sphere":
-        mesh = trimesh.creation.icosphere(subdivisions=3, radius=float(shape.get("radius", "nan")))
+    if shape.kind == "box":
+        mesh = trimesh.creation.box(extents=shape.size)
+    elif shape.kind == "cylinder":
+        mesh = trimesh.creation.cylinder(radius=shape.size[0], height=shape.size[1], sections=32)
+    elif shape.kind == "capsule":
+        mesh = trimesh.creation.capsule(radius=shape.size[0], height=shape.size[1])
+        mesh.apply_translation(-mesh.bounds.mean(axis=0))
     else:
-        raise ConfigError("robot.urdf", shape.tag, "is an unknown shape; choices: box, capsule, cylinder, mesh, sphere")
+        mesh = trimesh.creation.icosphere(subdivisions=3, radius=shape.size[0])
     return mesh
-
-
-def _material_color(material: ET.Element) -> Rgb | None:
-    color = material.find("color")
-    if color is None:
-        return None
-    return _rgb(255 * value for value in _numbers(color, "rgba", "1 1 1 1")[:3])
-
-
-def _numbers(element: ET.Element | None, name: str, usual: str) -> tuple[float, ...]:
-    text = element.get(name, usual) if element is not None else usual
-    return tuple(float(value) for value in text.split())

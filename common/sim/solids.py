@@ -137,10 +137,9 @@ def robot_shapes(robot: RobotModel) -> dict[str, Array]:
     Raises:
         ConfigError: a mesh is missing.
     """
-    import pinocchio as pin
 
     parts: dict[str, list[Array]] = {}
-    for item in robot.full_geometry(pin.GeometryType.COLLISION).geometryObjects:
+    for item in robot.full_geometry().geometryObjects:
         frame = robot.full_model.frames[item.parentFrame]
         T_link_shape = invert(np.array(frame.placement.homogeneous)) @ np.array(item.placement.homogeneous)
         parts.setdefault(frame.name, []).append(transformed(triangles(item.geometry), T_link_shape))

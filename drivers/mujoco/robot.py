@@ -18,8 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from common.errors import ConfigError
+from common.robot.collision_shapes import distinct, solid
 from common.robot.finger_joints import finger_factors
-from common.robot.mesh_files import triangles_of
+from common.robot.link_shapes import Shape, link_shapes
+from common.robot.mesh_files import content_of, triangles_of
 from common.robot.model import RobotModel
 from common.robot.transforms import rpy_to_matrix, transform
 from common.robot.urdf import WORLD, find_description
@@ -29,7 +31,7 @@ if TYPE_CHECKING:
     from common.robot.visual_meshes import Piece
 
 CACHE_VARIABLE = "ZENCELL_CACHE"  # cache folder; default: zencell in the user's cache
-_FORMAT = b"1"  # version of the cached format
+_FORMAT = b"2"  # version of the cached format
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -41,23 +43,24 @@ def cache_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "zencell"
 
 
-def hull_points(path: Path) -> NDArray[np.float64]:
-    """(n, 3) distinct vertices of a mesh file in its units; their convex hull is the collision shape.
+def hull_points(path: Path, scale: tuple[float, ...]) -> NDArray[np.float64]:
+    """(n, 3) distinct vertices [m] of a mesh file; their convex hull is the collision shape.
 
     Raises:
-        ConfigError: the file cannot be read.
+        ConfigError: the file cannot be read, or has no extent.
     """
     def read() -> Arrays:
-        return {"points": np.unique(triangles_of("robot.urdf", path).reshape(-1, 3), axis=0)}
+        corners = solid(triangles_of("robot.urdf", path) * np.array(scale), "robot.urdf", path)
+        return {"points": distinct(corners)[0]}
 
-    return cached_arrays("hull", [path.read_bytes()], read)["points"]
+    return cached_arrays("hull", [content_of("robot.urdf", path), repr(scale).encode()], read)["points"]
 
 
 def cached_visual_meshes(robot: RobotModel, triangles: int) -> list[Piece]:
     """Visual meshes of all links, simplified to about this many triangles: see `common.robot.visual_meshes`."""
-    from common.robot.visual_meshes import Piece, visible_shapes, visual_pieces  # imports trimesh
+    from common.robot.visual_meshes import Piece, mesh_path, visible_shapes, visual_pieces  # imports trimesh
 
-    files = [shape.path.read_bytes() for shape in visible_shapes(robot) if shape.path is not None]
+    files = [content_of("robot.urdf", mesh_path(robot, shape)) for shape in visible_shapes(robot) if shape.file]
 
     def make() -> Arrays:
         arrays: Arrays = {}
@@ -116,6 +119,9 @@ def add_robot(spec: mujoco.MjSpec, robot: RobotModel, visuals: bool) -> None:
     joints = defaultdict(list)
     for joint in root.findall("joint"):
         joints[_link(joint, "parent")].append(joint)
+    shapes: defaultdict[str, list[Shape]] = defaultdict(list)
+    for shape in link_shapes(root, "collision", "robot.urdf", robot.config.urdf):
+        shapes[shape.link].append(shape)
     seen: defaultdict[str, list[Piece]] = defaultdict(list)
     for piece in cached_visual_meshes(robot, _TRIANGLES) if visuals else ():
         seen[piece.link].append(piece)
@@ -127,8 +133,8 @@ def add_robot(spec: mujoco.MjSpec, robot: RobotModel, visuals: bool) -> None:
         _place(body, joint.find("origin"))
         _add_joint(body, joint, robot)
         _add_inertia(body, links[name])
-        for index, shape in enumerate(links[name].findall("collision")):
-            geom = _shape(spec, body, shape, f"{name}.{index}", robot)
+        for index, shape in enumerate(shapes[name]):
+            geom = _add_shape(spec, body, shape, f"{name}.{index}", robot)
             set_contact(geom, ROBOT, group=COLLIDES).density = DENSITY
             if name in grippers:
                 set_finger_contact(geom)
@@ -198,28 +204,21 @@ def _add_inertia(body: Any, link: ET.Element) -> None:
     body.fullinertia = [tensor[0, 0], tensor[1, 1], tensor[2, 2], tensor[0, 1], tensor[0, 2], tensor[1, 2]]
 
 
-def _shape(spec: mujoco.MjSpec, body: Any, shape: ET.Element, name: str, robot: RobotModel) -> Any:
-    geometry = shape.find("geometry/*")
-    tag = geometry.tag if geometry is not None else "nothing"
-    geom = body.add_geom(name=name)
-    _place(geom, shape.find("origin"))
-    kinds = mujoco.mjtGeom
-    if geometry is None or tag not in ("box", "cylinder", "capsule", "sphere", "mesh"):
-        raise ConfigError("robot.urdf", tag,
-                          "is no supported collision shape; choices: box, capsule, cylinder, mesh, sphere")
-    if tag == "mesh":
-        path = find_description("robot.urdf", str(geometry.get("filename")), robot.config.package_dirs)
-        points = hull_points(path) * _numbers(geometry, "scale", "1 1 1")
+def _add_shape(spec: mujoco.MjSpec, body: Any, shape: Shape, name: str, robot: RobotModel) -> Any:
+    geom, kinds, size = body.add_geom(name=name), mujoco.mjtGeom, shape.size
+    geom.pos, geom.quat = shape.T_link_shape[:3, 3], wxyz(shape.T_link_shape[:3, :3])
+    if shape.kind == "mesh":
+        corners = hull_points(find_description("robot.urdf", shape.file, robot.config.package_dirs), size)
         mesh = spec.add_mesh(name=name)
-        mesh.uservert = points.ravel()
+        mesh.uservert = corners.ravel()
         geom.type, geom.meshname = kinds.mjGEOM_MESH, name
-    elif tag == "box":
-        geom.type, geom.size = kinds.mjGEOM_BOX, [side / 2 for side in _numbers(geometry, "size", "")]
-    elif tag == "sphere":
-        geom.type, geom.size = kinds.mjGEOM_SPHERE, [float(geometry.get("radius", "nan")), 0.0, 0.0]
+    elif shape.kind == "box":
+        geom.type, geom.size = kinds.mjGEOM_BOX, [side / 2 for side in size]
+    elif shape.kind == "sphere":
+        geom.type, geom.size = kinds.mjGEOM_SPHERE, [size[0], 0.0, 0.0]
     else:
-        geom.type = kinds.mjGEOM_CYLINDER if tag == "cylinder" else kinds.mjGEOM_CAPSULE
-        geom.size = [float(geometry.get("radius", "nan")), float(geometry.get("length", "nan")) / 2, 0.0]
+        geom.type = kinds.mjGEOM_CYLINDER if shape.kind == "cylinder" else kinds.mjGEOM_CAPSULE
+        geom.size = [size[0], size[1] / 2, 0.0]
     return geom
 
 

@@ -24,6 +24,10 @@ NO_MESH = NO_ARM.replace('<link name="b"/>', '<link name="b"><collision><geometr
                                              '</geometry></collision></link>')
 
 
+def with_shape(shape: str) -> str:
+    return TEXT.replace('<box size="0.04 0.05 0.11"/>', shape)
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """A folder with the files of a new robot."""
@@ -173,7 +177,14 @@ def test_maker_s_srdf_gives_pairs_group_and_poses(folder, tmp_path):
     ("joint: 1", "", ["bad.urdf", "does not parse"]),
     ("<sdf/>", "", ["its root is <sdf>"]),
     (NO_MESH, "", ["package://gone/b.stl", "--package-dir"]),
-    (TEXT.replace('<box size="0.04 0.05 0.11"/>', '<mesh filename="bad.urdf"/>'), "", ["a mesh that cannot be loaded"]),
+    (with_shape('<mesh filename="bad.urdf"/>'), "", ["a mesh that cannot be read"]),
+    (with_shape('<mesh filename="a.stl" scale="0.001"/>'), "", ["link ", "'0.001'"]),
+    (with_shape('<box size="0,04 0.05 0.11"/>'), "", ["bad.urdf", "size of <box>", "'0,04 0.05 0.11'"]),
+    (with_shape('<box size="nan 0.05 0.11"/>'), "", ["size of <box>", "'nan 0.05 0.11'"]),
+    (with_shape('<box size="-1 0.05 0.11"/>'), "", ["negative"]),
+    (with_shape('<sphere/>'), "", ["<sphere> has no radius"]),
+    (with_shape('<cone/>'), "", ["<cone>", "choices: box, capsule"]),
+    (with_shape(''), "", ["has no <geometry>"]),
     (TEXT.replace('upper="2.6"', 'upper="${wide}"'), "", ["'bend'", "'${wide}'"]),
     (TEXT.replace(' velocity="0"', ""), "", ["'spin'", "no velocity"]),
     (TEXT, "--name 'my arm'", ["--name", "'my arm'"]),
@@ -187,6 +198,7 @@ def test_maker_s_srdf_gives_pairs_group_and_poses(folder, tmp_path):
 def test_unusable_description_or_option_is_one_line(text, options, wanted, tmp_path, monkeypatch, rejection):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "cup.urdf").write_text(NO_ARM)
+    (tmp_path / "a.stl").write_text("solid")
     if text is not None:
         (tmp_path / "bad.urdf").write_text(text)
     line = rejection("robot", "new", "bad.urdf", *shlex.split(options), "--yes")

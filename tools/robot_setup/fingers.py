@@ -53,7 +53,7 @@ def link_points(robot: RobotModel) -> dict[str, Array]:
         ConfigError: a mesh does not exist.
     """
     found: dict[str, list[Array]] = {}
-    for item in convex_hulls(robot.full_geometry(pin.GeometryType.COLLISION)).geometryObjects:
+    for item in convex_hulls(robot.full_geometry()).geometryObjects:
         frame = robot.full_model.frames[item.parentFrame]
         T_link_shape = frame.placement.actInv(item.placement)
         if hasattr(item.geometry, "points"):

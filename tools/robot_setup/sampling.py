@@ -181,11 +181,11 @@ def disabled_pairs(
         margin: pairs that come closer than this [m] at some sample are not reported as Never.
         rng: source of the samples; without it they are the same each time.
     """
-    geometry = convex_hulls(robot.full_geometry(pin.GeometryType.COLLISION))
+    geometry = convex_hulls(robot.full_geometry())
     model = robot.full_model
     names = [model.frames[item.parentFrame].name for item in geometry.geometryObjects]
     links = list(dict.fromkeys(names))
-    bodies = {name: robot.model.frames[robot.model.getFrameId(name)].parentJoint for name in links}
+    bodies = {name: robot.model.frames[robot.frame(name)].parentJoint for name in links}
     found: dict[tuple[str, str], Reason] = {}
     for i, one in enumerate(links):
         for other in links[i + 1:]:

@@ -36,7 +36,7 @@ CASES = [(GAP, CLOSED, True), (GAP, OPEN, False), (WALL, OPEN, True), (WALL, CLO
 
 @cache
 def collision_hulls(robot: RobotModel) -> pin.GeometryModel:
-    return convex_hulls(robot.full_geometry(pin.GeometryType.COLLISION))
+    return convex_hulls(robot.full_geometry())
 
 
 class CoalReference:

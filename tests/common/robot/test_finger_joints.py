@@ -3,7 +3,6 @@
 import xml.etree.ElementTree as ET
 
 import numpy as np
-import pinocchio as pin
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -17,7 +16,7 @@ from common.robot.transforms import invert
 CONFIG = check(RobotConfig, read_robot(find_file("robots", "ur5")))
 ROBOT = RobotModel.load(CONFIG)
 GRIPPER = CONFIG.gripper
-SHAPES = ROBOT.full_geometry(pin.GeometryType.COLLISION)
+SHAPES = ROBOT.full_geometry()
 WIDTHS = st.floats(0.0, 0.085)
 SIDES = {"left": 1, "right": -1}
 

@@ -1,5 +1,10 @@
 """Meshes of the robot: files of every format, and pieces for viewers with colors and few triangles."""
 
+import io
+import json
+import re
+import struct
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +16,29 @@ from numpy.typing import NDArray
 
 from common.config import RobotConfig
 from common.errors import ConfigError
+from common.planning.robot_geometry import convex_hulls
 from common.robot.mesh_files import parts_of, triangles_of
 from common.robot.model import RobotModel
 from common.robot.visual_meshes import coarse, collision_pieces, visual_pieces
 from tests.page.scene_cell import pieces_of, robot_of
+
+
+def archive(name: str, content: bytes) -> bytes:
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as file:
+        file.writestr(name, content)
+    return packed.getvalue()
+
+
+def binary_gltf(accessor: dict[str, int]) -> bytes:
+    """Return a mesh whose values are in another file, or nowhere."""
+    text = json.dumps({
+        "asset": {"version": "2.0"}, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}], "bufferViews": [{"buffer": 0, "byteLength": 36}],
+        "buffers": [{"uri": "/dev/zero", "byteLength": 36}], "accessors": [accessor | {
+            "componentType": 5126, "type": "VEC3"}]}).encode()
+    return b"glTF" + struct.pack("<4I", 2, 20 + len(text), len(text), 0x4E4F534A) + text
+
 
 BOX = trimesh.creation.box((0.1, 0.2, 0.3))
 DAMAGED = {
@@ -25,6 +49,19 @@ DAMAGED = {
     "out_of_range.obj": b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 300\n",
     "nothing.obj": b"# nothing\n",
     "unknown.xyzzy": b"?",
+    "lying_count.stl": bytes(80) + (4 * 10**9).to_bytes(4, "little") + BOX.export(file_type="stl")[84:],
+    "no_number.stl": BOX.export(file_type="stl").replace(np.float32(0.05).tobytes(), np.float32(np.nan).tobytes()),
+    "huge.obj": b"v 1e30 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n",
+    "points.obj": b"v 0 0 0\nv 1 0 0\n",
+    "unit.dae": BOX.export(file_type="dae").replace(b"<asset>", b'<asset><unit meter="0,001"/>'),
+    "bomb.dae": archive("box.dae", b" " * 10**7),
+    "bomb.zae": archive("box.dae", b" " * 10**7),
+    "doubled.dae": BOX.export(file_type="dae").replace(b"<library_visual_scenes>", b"<library_nodes>" + b"".join(
+        b'<node id="n%d">' % i + b'<instance_node url="#n%d"/>' % (i - 1) * 2 + b"</node>" for i in range(40))
+        + b"</library_nodes><library_visual_scenes>").replace(
+            b"</visual_scene>", b'<node><instance_node url="#n39"/></node></visual_scene>'),
+    "announced.glb": binary_gltf({"count": 10**10}),
+    "outside.glb": binary_gltf({"count": 3, "bufferView": 0}),
 }
 
 
@@ -47,6 +84,45 @@ def test_damaged_mesh_is_named_in_a_line(tmp_path: Path, name: str, read) -> Non
         read("robot.urdf", path)
     message = str(refused.value)
     assert message.startswith(f"robot.urdf: {str(path)!r} is a mesh that cannot be read: ") and "\n" not in message
+
+
+def test_file_larger_than_a_mesh_is_not_read(tmp_path: Path) -> None:
+    path = tmp_path / "sparse.stl"
+    with path.open("wb") as file:
+        file.truncate(8 * 2**30)
+    with pytest.raises(ConfigError, match="8590 MB, more than 100"):
+        triangles_of("robot.urdf", path)
+
+
+@pytest.mark.parametrize(("unit", "meters"), [("", 1.0), ('<unit meter="0.001" name="mm"/>', 0.001), ("<unit/>", 1.0)])
+def test_unit_of_a_collada_file_counts_in_planning_and_on_the_page(tmp_path: Path, unit: str, meters: float) -> None:
+    text = re.sub("<unit[^>]*>", "", BOX.export(file_type="dae").decode())
+    (tmp_path / "box.dae").write_text(text.replace("</asset>", f"{unit}<up_axis>Y_UP</up_axis></asset>"))
+    shape = '<geometry><mesh filename="box.dae" scale="2 2 2"/></geometry>'
+    robot = post(tmp_path, links=f'<link name="foot"/><link name="arm"><visual>{shape}</visual><collision>{shape}'
+                                 "</collision></link>")
+    (piece,), (item,) = visual_pieces(robot), robot.full_geometry().geometryObjects
+    for points in (piece.vertices, corners(item.geometry)):
+        assert np.ptp(points, axis=0) == pytest.approx(np.array([0.2, 0.4, 0.6]) * meters, rel=1e-5)
+
+
+@pytest.mark.parametrize("scale", [(0.1, 0.1, 0), (0.1, 1e-9, 0.1)])
+def test_flat_mesh_is_a_thin_plate(tmp_path: Path, scale: tuple[float, ...]) -> None:
+    turned = BOX.copy().apply_scale(scale).apply_transform(trimesh.transformations.rotation_matrix(0.7, (1, 2, 3)))
+    turned.export(tmp_path / "flat.stl")
+    robot = post(tmp_path, '<collision><geometry><mesh filename="flat.stl"/></geometry></collision>')
+    (item,) = convex_hulls(robot.full_geometry()).geometryObjects
+    found = np.array(item.geometry.points())
+    across = np.linalg.svd(found - found.mean(axis=0))[2][2]
+    assert np.ptp(found @ across) == pytest.approx(0.001, rel=1e-3)
+
+
+@pytest.mark.parametrize("scale", ["1 0 0", "0 0 0", "1e5 1e5 1"])
+def test_mesh_without_extent_or_far_too_large_is_named(tmp_path: Path, scale: str) -> None:
+    BOX.export(tmp_path / "box.stl")
+    robot = post(tmp_path, f'<collision><geometry><mesh filename="box.stl" scale="{scale}"/></geometry></collision>')
+    with pytest.raises(ConfigError, match=r"box\.stl' is a mesh of .* m: (its corners lie on a line|check its unit)"):
+        robot.full_geometry()
 
 
 each_cell = pytest.mark.parametrize("cell", [pytest.param("panda", marks=pytest.mark.campaign), "ur5"])
@@ -110,7 +186,8 @@ def test_every_visual_of_the_description_moves_with_its_link(cell: str) -> None:
     links = robot.link_poses(arm, others)
     pin.forwardKinematics(model, data, q)
     described: dict[str, list[NDArray[np.float64]]] = {}
-    for item in robot.full_geometry(pin.GeometryType.VISUAL).geometryObjects:
+    folders = [str(folder) for folder in robot.package_folders]
+    for item in pin.buildGeomFromUrdfString(model, robot.urdf, pin.GeometryType.VISUAL, folders).geometryObjects:
         T = (data.oMi[item.parentJoint] * item.placement).homogeneous
         points = corners(item.geometry) @ T[:3, :3].T + T[:3, 3]
         described.setdefault(model.frames[item.parentFrame].name, []).append(points)
@@ -173,7 +250,7 @@ def test_file_without_colors_gets_color_and_scale_of_the_urdf(tmp_path: Path, me
 @pytest.mark.parametrize(("shape", "message"), [
     ('<mesh filename="/nowhere/box.stl"/>', r"nowhere/box\.stl"),
     ('<mesh filename="box.unknown"/>', r"box\.unknown"),
-    ("<torus/>", "'torus' is an unknown shape; choices: box, capsule"),
+    ("<torus/>", "<torus> is an unknown shape; choices: box, capsule"),
 ])
 def test_unreadable_mesh_and_unknown_shape_are_named(tmp_path: Path, shape: str, message: str) -> None:
     robot = post(tmp_path)

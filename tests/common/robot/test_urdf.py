@@ -50,7 +50,7 @@ def mounted(folder: Path, **changes: object) -> list[dict[str, object]]:
 
 
 def shapes(robot: RobotModel) -> list[pin.GeometryObject]:
-    return list(robot.full_geometry(pin.GeometryType.COLLISION).geometryObjects)
+    return list(robot.full_geometry().geometryObjects)
 
 
 def test_base_pose_of_the_robot_file_moves_the_complete_robot(make):

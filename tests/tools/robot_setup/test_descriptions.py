@@ -3,7 +3,6 @@
 import gzip
 from pathlib import Path
 
-import pinocchio as pin
 import pytest
 import trimesh
 
@@ -56,7 +55,7 @@ def test_package_is_found_by_its_name_wherever_it_is(mesh, place, given, tmp_pat
     robot = RobotModel.load(check(RobotConfig, {
         "name": "arm", "urdf": str(urdf), "package_dirs": reader.folders, "joints": ["turn"], "base_link": "base",
         "tcp_link": "tip", "named_poses": {"home": [0.0]}, "acceleration_limits": [1], "jerk_limits": [1]}, "robot"))
-    assert len(robot.full_geometry(pin.GeometryType.COLLISION).geometryObjects) == 1
+    assert len(robot.full_geometry().geometryObjects) == 1
 
 
 def test_missing_visual_mesh_is_reported_and_drawn_by_the_collision_shape(tmp_path):

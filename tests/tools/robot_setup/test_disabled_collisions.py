@@ -33,7 +33,7 @@ def test_same_seed_gives_the_same_pairs():
 def test_never_colliding_pairs_do_not_collide_at_other_samples(robot):
     never = named(disabled_pairs(robot), "Never")
     assert never
-    geometry = convex_hulls(robot.full_geometry(pin.GeometryType.COLLISION))
+    geometry = convex_hulls(robot.full_geometry())
     names = [robot.full_model.frames[item.parentFrame].name for item in geometry.geometryObjects]
     for i, one in enumerate(names):
         for j in range(i):
