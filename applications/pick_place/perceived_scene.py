@@ -90,6 +90,7 @@ class Track:
     last_seen: float
     sighting: Sighting = Sighting((0.0, 0.0, 0.0))
     view: int = 0
+    before: float = 0.0  # time of the view's frame before the first detection [s]
 
 
 class Tracks:
@@ -101,6 +102,7 @@ class Tracks:
         self._tracks: list[Track] = []
         self._count = 0
         self.crowded = False  # whether the last frame had more objects than fit
+        self._newest: dict[int, float] = {}  # last frame of each view [s]
         self._looked: dict[int, float] = {}  # last frame of cameras that look at times [s]
         self._hides: dict[int, tuple[float, Hides | None]] = {}  # of other cameras: last frame [s], its occlusion
 
@@ -146,9 +148,10 @@ class Tracks:
         new = [sighting for j, sighting in enumerate(sightings) if j not in matched]
         room = MOST - len(self._tracks)
         self.crowded = len(new) > room
+        before, self._newest[view] = self._newest.get(view, 0.0), now
         for sighting in new[: max(room, 0)]:
             self._count += 1
-            self._tracks.append(Track(f"track_{self._count}", sighting.position, 1, now, sighting, view))
+            self._tracks.append(Track(f"track_{self._count}", sighting.position, 1, now, sighting, view, before))
 
     def _is_hidden(self, track: Track, now: float) -> bool:
         """Return whether its position is occluded in all current views."""
@@ -162,6 +165,11 @@ class Tracks:
     def confirmed(self) -> list[Track]:
         """Return the objects detected often enough to be published."""
         return [t for t in self._tracks if t.seen >= self.p.confirm_frames]
+
+    def settled(self) -> float | None:
+        """Return the time of the newest frame without unconfirmed objects [s]; None: the newest one of all has none."""
+        return min((t.before for t in self._tracks
+                    if t.seen < self.p.confirm_frames and t.last_seen >= self._newest.get(t.view, 0.0)), default=None)
 
     def take(self, position: Place, radius: float, width: float = 0.0) -> Track | None:
         """Remove and return the object nearest to a position, within `radius` [m].
@@ -187,6 +195,8 @@ Array = NDArray[np.float64]
 GREY = m.Color(r=0.6, g=0.6, b=0.6)  # color of what is not seen
 LEVEL = 0.005  # [m] an object this little above the table lies on it
 MAX_UNSORTED = 50  # objects in containers but in no slot
+MOST_BELOW = 0.015  # [m] below the tool, of a held object of unknown size: it may be as close to a table as it likes
+LEAST_SIZE = 1e-3  # [m]
 AT_REST = 0.5  # [s] for which a slot must look occupied before the object counts as at rest
 
 
@@ -228,6 +238,8 @@ class PerceivedScene:
         self._free: set[int] = set()  # slots empty at the last grasp, without an object at rest since
         self._since: dict[int, int] = {}  # stamp since which a slot looks occupied
         self._unsorted: dict[int, list[Sighting]] = {}  # other objects in containers, by view
+        self._undetected_width: float | None = None  # of a held object that no detector reported [m]
+        self._has_balls = False  # whether a detector reported any
         self._held: m.AttachedObject | None = None
         self._changed_hands_at = 0
         self._stamp = 0
@@ -254,6 +266,11 @@ class PerceivedScene:
             thing = Sighting.of(marker)
             if thing is None:
                 continue
+            if thing.shape == "sphere" and not self._has_balls:
+                self._has_balls = True
+                if self._held is not None and self._undetected_width is not None:  # it may be one, too
+                    held = self._undetected(self._held.object.id, self._undetected_width)
+                    self._held = self._held.model_copy(update={"object": held})
             pixel = marker.pixel or tuple(camera.project(list(thing.position)))
             shown = [box for box in self._resting if box.shows_container(camera, pixel)]
             if shown and thing.shape == "sphere" and shown[0].container is self._with_slots:
@@ -319,9 +336,22 @@ class PerceivedScene:
         if track is not None and track.sighting.shape != "sphere":
             T_tcp_object[:3, :3] = T_world_tcp[:3, :3].T @ pose_to_matrix(_pose(track))[:3, :3]
         pose = matrix_to_pose(T_tcp_object)
-        thing = self._object(track.id, "attached", track.sighting, pose) if track else self._ball(
-            self._tracks.new_id(), "attached", pose)
+        thing = self._object(track.id, "attached", track.sighting, pose) if track else self._undetected(
+            self._tracks.new_id(), gripper.width)
+        self._undetected_width = None if track else gripper.width
         self._held = m.AttachedObject(link=self.tcp_link, object=thing)
+
+    def _undetected(self, name: str, width: float) -> m.CollisionObject:
+        """Return a held object that no camera reported: the fingers measure its width [m], nothing its other sizes."""
+        cup = self.gripper.cup
+        if cup is None and self._has_balls and abs(width - 2 * self.around.ball_radius) <= WIDTH_SLACK:
+            return self._ball(name, "attached", m.Pose())
+        size = 2 * min(MOST_BELOW, self.gripper.fingers.half_width if cup is None else cup.lip_radius)
+        across = size if cup is not None else max(width, LEAST_SIZE)
+        dimensions = [across, size, size] if self.gripper.closing_axis == "x" else [size, across, size]
+        return m.CollisionObject.model_validate({
+            "id": name, "role": "attached", "shape": "box", "dimensions": dimensions, "color": GREY,
+            "pose": m.Pose(position=m.Vector3(z=0.0 if cup is None else size / 2))})
 
     @property
     def crowded(self) -> bool:
@@ -342,8 +372,10 @@ class PerceivedScene:
             for k, thing in enumerate(unsorted[:MAX_UNSORTED])
         ]
         held = [self._held] if self._held is not None else []
+        settled = self._tracks.settled()
         return m.PlanningScene(
             header=m.Header(stamp=self._stamp, frame_id="world"),
+            settled=None if settled is None else round(settled * 1e9),
             objects=[*self._fixed, *table, *contained, *self._below(table)],
             attached=held,
             allowed_collisions=[(link, h.object.id) for h in held for link in self.gripper.links],

@@ -8,6 +8,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import Field, model_validator
 
 from common.messages.basics import (
+    MAX_STAMP,
     SMALL_BYTES,
     Color,
     Corners,
@@ -78,8 +79,12 @@ class PlanningScene(Message):
 
     max_bytes: ClassVar[int] = 256 * 1024
     max_parts: ClassVar[int] = 8 * 1024
+    omitted_defaults: ClassVar[tuple[str, ...]] = ("settled",)
 
     header: Header
+    settled: Annotated[int, Field(ge=0, le=MAX_STAMP)] | None = Field(
+        None, description="stamp of the newest image whose objects are all in the scene: later ones show some that are "
+        "not confirmed yet; default: header.stamp")
     objects: list[CollisionObject] = Field([], max_length=500)
     attached: list[AttachedObject] = Field([], max_length=50)
     allowed_collisions: Pairs = Field([], description="pairs of link or object names that may touch")

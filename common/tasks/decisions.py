@@ -258,10 +258,10 @@ class TaskDecisions(Generic[V]):
         return self._frames.problem(view.now, view.stamps, self.p.frame_timeout, self.p.clock_tolerance)
 
     def has_fresh_image(self, view: V) -> bool:
-        """Return whether a usable image is newer than `images_after`; the status reports an unusable one."""
+        """Return whether the scene shows a usable image after `images_after`; the status reports an unusable one."""
         if unseen := self.unseen(view):
             self.status.message = unseen
-        return not unseen and min(view.stamps) > self.images_after
+        return not unseen and min(*view.stamps, view.settled_stamp) > self.images_after
 
     def starts_in_contact(self, move: Move, response: m.PlanResponse) -> bool:
         """Return whether a plan failed because the arm touches something at its start; a retreat may free it."""

@@ -48,6 +48,10 @@ class HandlingConfig(TaskConfig):
     settle: Tunable[float] = Field(1.0, ge=0, le=600, description="for so long all must look done before it is [s]")
     give_up: Tunable[float] = Field(20.0, gt=0, le=3600, description="wait for what is missing [s]")
     most_tries: Tunable[int] = Field(4, ge=1, le=100, description="for one object, before the task gives up")
+    finger_clearance: Tunable[float] = Field(
+        0.02, ge=0.01, le=0.5, description="how much wider than an object the fingers are before they grip it and after "
+                                           "they release it, where they open so far [m]"
+    )
     width_tolerance: Tunable[float] = Field(
         0.01, gt=0, le=0.05, description="what is gripped may be so much wider or narrower than it was seen [m]"
     )
@@ -75,6 +79,11 @@ class Handling(Task[View]):
         """Return the pose of the held object's center in world; None puts it aside, to be seen first."""
         raise NotImplementedError
 
+    def opening(self, width: float | None) -> float:
+        """Return the finger width before a grasp and at a release of an object of a width, None if unknown [m]."""
+        most = self.gripper.max_width
+        return most if width is None else min(width + self.p.finger_clearance, most)
+
     # --- used by the task ----------------------------------------------------------------------------------------
 
     def bring(self, things: Sequence[m.CollisionObject], view: View) -> None:
@@ -101,7 +110,7 @@ class Handling(Task[View]):
 
     def shown(self, view: View) -> bool:
         """Return whether the scene includes everything done so far, so that counting is valid."""
-        return self.running is None and not view.holding and view.scene_stamp > self.images_after
+        return self.running is None and not view.holding and view.settled_stamp > self.images_after
 
     def container_of(self, thing: m.CollisionObject) -> str:
         """Return the id of the container that an object is in or above; empty for none."""
@@ -137,13 +146,13 @@ class Handling(Task[View]):
         if self.status.state == "DONE":  # no operator asked for more
             return
         if view.holding and view.gripper.outcome in MISSES:  # another object than intended
-            self.queue += [self._open(None), *self.back_off(view.released())]
+            self.queue += [Grip("open", "GRASPING", width=self.gripper.max_width), *self.back_off(view.released())]
         elif view.holding and not view.scene.header.stamp:  # the surroundings are only seen from home
             self.queue += [self.home(view), AwaitImage()] if away else []
         elif view.holding:
             if view.scene.attached:  # else the planning scene is not up to date yet
                 held = view.scene.attached[0].object
-                self.queue += self._put(held, held.pose, Cycle(held.id), view)
+                self.queue += self._put(held, held.pose, Cycle(held.id), view, view.gripper.width)
         elif away:
             self.queue += self.back_off(view)
         elif self.has_fresh_image(view):
@@ -186,17 +195,18 @@ class Handling(Task[View]):
         held = matrix_to_pose(invert(T_world_tcp) @ pose_to_matrix(thing.pose))
         above = _raised(T_world_tcp, self.p.grasp.approach_clearance)
         return [
-            self._open(cycle),
+            Grip("open", "GRASPING", cycle, width=self.opening(width)),
             Move("pre-grasp", "GRASPING", cycle, goal=_at(above), needs_full_plan=True, needs_fresh_image=True),
             Move("descend", "GRASPING", cycle, goal=_at(T_world_tcp), straight=True, touches=self._fingers_on(thing)),
             Grip("close", "GRASPING", cycle, width=0.0, holds=True, effort=thing.grip_effort, mass=thing.mass,
                  expected_width=width, width_tolerance=self.p.width_tolerance),
             Move("lift", "GRASPING", cycle, goal=_at(above), straight=True, carries=True, attach=thing.id,
                  attach_pose=held),
-            *self._put(thing, held, cycle, view),
+            *self._put(thing, held, cycle, view, width),
         ]
 
-    def _put(self, thing: m.CollisionObject, held: m.Pose, cycle: Cycle, view: View) -> list[Stage]:
+    def _put(self, thing: m.CollisionObject, held: m.Pose, cycle: Cycle, view: View,
+             width: float | None) -> list[Stage]:
         """Move above the destination, lower, release, move up, go home and look."""
         goal = self.destination(thing, view) if thing.kind else None
         goal = goal or self._aside(thing, view)
@@ -210,7 +220,7 @@ class Handling(Task[View]):
             Move("across", "PLACING", cycle, goal=_at(above), carries=True, attach=thing.id, attach_pose=expected),
             Move("lower", "PLACING", cycle, goal=_at(down), straight=True, carries=True, attach=thing.id,
                  attach_pose=expected, touches=[(thing.id, other.id) for other in self._under(thing, goal, view)]),
-            Grip("release", "PLACING", cycle, width=self.gripper.max_width, carries=True, holds=False),
+            Grip("release", "PLACING", cycle, width=self.opening(width), carries=True, holds=False),
             Move("up", "HOMING", cycle, goal=_at(above), straight=True, touches=self._fingers_on(thing)),
             Move("home", "HOMING", cycle, goal=m.JointGoal(named="home")),
             AwaitImage(),
@@ -253,14 +263,12 @@ class Handling(Task[View]):
         turns = sorted((math.radians(5 * k) for k in range(-12, 13)), key=lambda turn: abs(turn - math.atan2(y, x)))
         places = [(far * math.cos(turn), far * math.sin(turn)) for turn in turns]
         at = next((p for p in places if all(math.dist(p, o[:2]) > ASIDE + self._half(o) for o in others)), places[0])
-        return m.Pose(position=m.Vector3(x=at[0], y=at[1], z=self.p.world.table_height + height_of(thing) / 2))
+        height = height_of(thing) if thing.kind else max(thing.dimensions)  # of an undetected one the width is known
+        return m.Pose(position=m.Vector3(x=at[0], y=at[1], z=self.p.world.table_height + height / 2))
 
     def _half(self, place: Place) -> float:
         """Half side of the container centered at a position [m]; 0 where there is none."""
         return next((box.half_side for box in self.p.world.containers.values() if (box.x, box.y) == place[:2]), 0.0)
-
-    def _open(self, cycle: Cycle | None) -> Grip:
-        return Grip("open", "GRASPING", cycle, width=self.gripper.max_width)
 
     def _fingers_on(self, thing: m.CollisionObject) -> list[tuple[str, str]]:
         return [(link, thing.id) for link in self.gripper.links]

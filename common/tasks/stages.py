@@ -94,7 +94,7 @@ class Grip(Stage):
 
 @dataclass(eq=False)
 class AwaitImage(Stage):
-    """Only a later image may decide what follows; images up to here are outdated."""
+    """Only a later image may decide what follows, with its objects confirmed; images up to here are outdated."""
 
     name: str = "look"
     state: str = ""
@@ -217,6 +217,12 @@ class View:
     def scene_stamp(self) -> float:
         """Time of the newest image in the planning scene [s]."""
         return self.scene.header.stamp * 1e-9 if self.scene else 0.0
+
+    @property
+    def settled_stamp(self) -> float:
+        """Time of the newest image whose objects are all in the planning scene [s]."""
+        settled = self.scene.settled if self.scene else None
+        return self.scene_stamp if settled is None else settled * 1e-9
 
     @property
     def tool(self) -> Place:

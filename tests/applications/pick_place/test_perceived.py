@@ -80,6 +80,30 @@ def test_ball_held_at_the_start_is_attached_at_the_tool():
     assert attached.link == "panda_hand_tcp" and attached.object.pose.position == m.Vector3()
 
 
+@pytest.mark.parametrize("width", [0.0, 0.024, 0.06])
+def test_held_object_that_no_detector_reported_has_the_width_of_the_fingers(width):
+    s = Scene()
+    s.grip(1.0, True, tool_down(0.4, 0.1, 0.012), width)
+    thing = s.scene().attached[0].object
+    assert (thing.shape, thing.kind, thing.dimensions[1]) == ("box", "", max(width, 0.001))
+    assert thing.dimensions[2] <= 0.03, "a table 12 mm below the tool must not prevent a lift"
+    s.see(1.1, (0.5, -0.2, 0.03), tcp=tool_down(0.4, 0.1, 0.2))
+    after = s.scene().attached[0].object
+    assert (after.id, after.shape) == (thing.id, "sphere" if width == 0.06 else "box"), "it may be a ball like others"
+
+
+def test_scene_is_settled_up_to_the_newest_image_without_unconfirmed_objects():
+    s, first, second = Scene(confirm_frames=3), (0.5, -0.2, 0.03), (0.4, -0.1, 0.03)
+    s.see((1.0, 1.1), first)
+    assert s.scene().settled == 0
+    s.see(1.2, first)
+    assert s.scene().settled is None
+    s.see((1.3, 1.4), first, second)
+    assert s.scene().settled == 1_200_000_000
+    s.see(1.5, first)
+    assert s.scene().settled is None, "it was an outlier"
+
+
 def test_released_ball_in_the_container_is_contained():
     s = Scene()
     s.grip(1.0, True, OVER_BOX)

@@ -92,10 +92,28 @@ def test_a_long_box_is_gripped_across_and_its_width_is_expected() -> None:
     assert [stage.expected_width for stage in stages if isinstance(stage, Grip) and stage.name == "close"] == [0.03]
 
 
+def test_nothing_is_chosen_before_the_objects_of_the_newest_image_are_confirmed() -> None:
+    of, seen = task(), view(box("a", 0.5, 0.0))
+    assert seen.scene is not None
+    of.images_after = 9.0
+    seen.scene.settled = 8_900_000_000
+    assert Decided(seen, of).stages == [] and not of.shown(seen)
+    seen.scene.settled = 9_500_000_000
+    assert Decided(seen, of).stages and of.shown(seen)
+
+
+@pytest.mark.parametrize(("clearance", "width"), [(0.02, 0.06), (0.5, 0.08)])
+def test_fingers_open_as_wide_as_the_task_says(clearance: float, width: float) -> None:
+    for stages in (Decided(view(box("a", 0.5, 0.0)), task(finger_clearance=clearance)).stages,
+                   Decided(view(held=box("a", 0.0, 0.0, z=0.0)), task(finger_clearance=clearance)).stages):
+        opened = [one.width for one in stages if isinstance(one, Grip) and one.name != "close"]
+        assert opened == pytest.approx([width] * len(opened)) and opened
+
+
 def test_only_the_support_may_be_touched() -> None:
     of = task()
     of.queue.extend(of._put(box("a", 0.5, 0.0), m.Pose(), Cycle("a"), view(
-        box("below", 0.4, 0.2, z=-0.02), box("near", 0.4, 0.23))))
+        box("below", 0.4, 0.2, z=-0.02), box("near", 0.4, 0.23)), None))
     assert next(stage for stage in of.queue if stage.name == "lower").touches == [("a", "below")]
 
 
