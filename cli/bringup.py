@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from cli import options, verbs
+from cli.session.plan import require_task
 from cli.session.session import CellSession
 from common.supervision.multi_host import HostOptions
 
@@ -109,6 +110,7 @@ def run(**given: Any) -> None:
     of_applications = {name: given.pop(name) for name in given.keys() - _OPTIONS}
     before = verbs.before_run(given["cell"], given["overrides"], given["world"], of_applications)
     session = _session(**{**given, "overrides": before.overrides}, until_ended=True)
+    require_task(session.cell)
     session.first = before.first
     raise typer.Exit(session.run_to_end())
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from cli import options
+from cli.session.plan import require_task
 from common.terminal import echo
 
 if TYPE_CHECKING:
@@ -112,6 +113,7 @@ def simulate(
     if doubles:
         settings = (*settings_of(loaded.application), *(overrides or ()))
         loaded = with_doubles(load_cell(cell, settings, world=world))
+    require_task(loaded)
     with_observed_arm(loaded)  # raises an error if the cell cannot be simulated
     if one is None:
         raise typer.Exit(_campaign(loaded, all_seeds, faults, at_a_time, longest))

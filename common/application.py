@@ -188,12 +188,14 @@ def applications() -> Iterator[Application]:
 
 
 def find_application(name: str) -> Application:
-    """Return the application of that name.
+    """Return the application of that name; for no name one that brings nothing.
 
     Raises:
         UnknownName: no application has that plain name; lists the choices.
         ConfigError: a dotted module cannot be imported, or declares no application.
     """
+    if not name:
+        return Application()
     if "." not in name and name not in application_names():
         raise UnknownName("application", name, application_names())
     import_from_working_directory()

@@ -11,8 +11,11 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import pkgutil
+import sys
 from collections.abc import Iterator
+from contextlib import suppress
 from importlib.metadata import entry_points
+from pathlib import Path
 from types import ModuleType
 
 from common.errors import ConfigError, UnknownName
@@ -51,9 +54,26 @@ def find_plugin(group: str, name: str, *, field: str, noun: str, marker: str = "
             module = importlib.import_module(path)
             if hasattr(module, marker or "__name__"):
                 return module
+    except ModuleNotFoundError as error:
+        missing = f"{name}.".startswith(f"{error.name}.")
+        raise ConfigError(field, name, where_searched(name) if missing else f"cannot be imported: {error}") from None
     except ImportError as error:
         raise ConfigError(field, name, f"cannot be imported: {error}") from None
     raise UnknownName(noun, name, plugin_names(group, marker))
+
+
+def where_searched(name: str) -> str:
+    """Return an error text for a dotted module that does not exist: where it was searched."""
+    package, _, last = name.rpartition(".")
+    while package:
+        with suppress(ImportError):
+            folders = getattr(importlib.import_module(package), "__path__", None)
+            return "is not a module: " + (f"there is no {last} in {' or '.join(folders)}, the package {package}"
+                                          if folders else f"{package} is no package")
+        package, _, last = package.rpartition(".")
+    own = [folder or "." for folder in dict.fromkeys(sys.path) if not Path(folder).is_relative_to(sys.base_prefix)
+           and not Path(folder).is_relative_to(sys.prefix) and not folder.endswith(".zip")]
+    return f"is not a module: there is no {last} in {', '.join(own)} or among the installed packages"
 
 
 def plugin_names(group: str, marker: str = "") -> list[str]:

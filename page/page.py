@@ -87,7 +87,7 @@ class Page:
         self._layout, self._schedule, self._recordings = layout, schedule, recordings
         self._topics, self._text = Topics(application, layers.values(), members.keys), TaskText.of(application)
         self._shown, self._editing = shown_layers(layout.layers, layers), layout.edit_world
-        self._losses = LossDetector()
+        self._losses, self._has_task = LossDetector(), bool(members.task)
         self._recorder = HistoryRecorder(feeds, self._text.states)
         self.timeline = Timeline(feeds.latest, self._recorder.recent)
         self._scene: Scene | None = None
@@ -242,8 +242,9 @@ class Page:
         """Publish the status bar of every page."""
         motion, owner = self._feeds.latest(topics.MOTION_STATUS), self._feeds.latest(topics.MOTION_OWNER)
         permissions = self.console.permissions
-        responders = {"arm": (ARM_LOST, self.console.is_available(topics.MOTION_STOP)),
-                      "task": (TASK_LOST, self.console.is_available(topics.TASK_COMMAND))}
+        responders = {"arm": (ARM_LOST, self.console.is_available(topics.MOTION_STOP))}
+        if self._has_task:
+            responders["task"] = TASK_LOST, self.console.is_available(topics.TASK_COMMAND)
         self._control.publish(PageStatus(
             summary=summarize(self._cell, self._text, self._status, motion, owner,
                               permissions.operating_page if permissions.enforced else None),

@@ -94,17 +94,19 @@ class TaskText:
     counters: Callable[[TaskStatus, int], Mapping[str, object]] = counters
     progress: Callable[[TaskStatus, MotionStatus | None], float] = progress
     latency: str = ApplicationPage.latency
+    unknown: str = "Task state unknown"
 
     @classmethod
     def of(cls, application: Application | None) -> TaskText:
         """Return the texts of an application."""
         page = page_of(application)
-        return cls({**STATES, **page.states}, page.counters or counters, page.progress or progress, page.latency)
+        return cls({**STATES, **page.states}, page.counters or counters, page.progress or progress, page.latency,
+                   cls.unknown if application is not None else "No task")
 
     def state(self, status: TaskStatus | None) -> tuple[str, str]:
         """Return the state of the task and its kind."""
         if status is None:
-            return "Task state unknown", OFF
+            return self.unknown, OFF
         name = state_name(status, self.states)
         if status.state == "ERROR":
             return name, BAD

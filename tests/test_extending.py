@@ -295,4 +295,4 @@ def test_custom_layer_is_drawn_on_the_page(folder: Path) -> None:
 def test_unknown_service_module_is_rejected_by_name(folder: Path) -> None:
     result = ask(folder, "service", "my_pkg.farthest_target", "--cell", "panda")
     assert result.returncode == 2 and result.stderr.count("\n") == 1
-    assert "'my_pkg.farthest_target' is not a module on the search path" in result.stderr
+    assert "'my_pkg.farthest_target' is not a module: there is no farthest_target in " in result.stderr

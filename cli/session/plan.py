@@ -180,6 +180,17 @@ def _summary_file(summary: str | None) -> Path | None:
     return file
 
 
+def require_task(cell: Cell) -> None:
+    """Return if the cell has a task.
+
+    Raises:
+        ConfigError: it has none.
+    """
+    if not cell.task:
+        raise ConfigError("task", ..., f"is missing: {cell.name} has nothing to run; `zencell up` brings it up, and "
+                          "clients can move its arm")
+
+
 def without(cell: Cell, services: Sequence[str]) -> Cell:
     """Return the cell without some services, given by name."""
     rest = {key: entry for key, entry in cell.services.items() if entry.name not in services}

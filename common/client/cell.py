@@ -83,8 +83,7 @@ class Cell(Part):
             secure: folder of certificates with that of the operator; default: ZENCELL_SECURE.
             owner: name of this client in its requests; default: user and host.
             application: dotted module of a custom application.
-            remapped: keys of the cell by the platform's names, like `topics:` of a service in a cell file, for a cell
-                with several arms.
+            remapped: keys of the cell by the platform's names, like `topics:` of a service in a cell file.
 
         Raises:
             ConfigError: the owner is not a valid name.

@@ -66,7 +66,8 @@ def _first_error(error: ValidationError, model: type[BaseModel], prefix: str) ->
     message = first["msg"].removeprefix("Value error, ").replace("Input should be", "must be").replace("Input ", "")
     if first["type"] == "extra_forbidden":
         names = _fields_at(model, first["loc"][:-1])
-        return ConfigError(field, first["input"], f"is not a parameter; choices: {', '.join(names)}")
+        choices = f"choices: {', '.join(names)}" if names else "there are none here"
+        return ConfigError(field, first["input"], f"is not a parameter; {choices}")
     if first["type"] == "missing":
         return ConfigError(field, ..., "is missing")
     if first["type"] == "value_error":
@@ -87,11 +88,13 @@ def _fields_at(model: type[BaseModel], location: Sequence[int | str]) -> list[st
         if not (isinstance(annotation, type) and issubclass(annotation, BaseModel)):
             break
         current = annotation
-    # Sections of the cell are no parameters of the service itself.
-    own = current.model_fields.items() if issubclass(current, Section) else (
-        (name, field) for name, field in current.model_fields.items() if not is_section(field.annotation)
-    )
-    return sorted(name for name, _ in own)
+    return own_fields(current)
+
+
+def own_fields(model: type[BaseModel]) -> list[str]:
+    """Return the fields of a model, sorted; sections of the cell are no parameters of a service."""
+    return sorted(name for name, field in model.model_fields.items()
+                  if issubclass(model, Section) or not is_section(field.annotation))
 
 
 def _required(annotation: Any) -> Any:

@@ -123,7 +123,7 @@ class Members(Section):
     """All services of the cell, for services that monitor all of it."""
 
     services: list[str] = Field(description="in start order")
-    task: str = Field(description="the service that runs the task")
+    task: str = Field("", description="the service that runs the task; empty: the cell has none")
     application: str = Field("", description="application: a name, or a dotted module")
     keys: list[dict[str, str]] = Field([], description="remapping tables: keys of the cell by the keys in the code")
 
@@ -145,8 +145,8 @@ class Cell(Section):
     pipeline: Pipeline
     watchdogs: Watchdogs = Watchdogs()
     services: dict[str, ServiceEntry]
-    task: str = Field(description="the service that runs the task and ends in DONE")
-    application: str = Field(description="application: a name, or a dotted module")
+    task: str = Field("", description="the service that runs the task and ends in DONE; default: no task")
+    application: str = Field("", description="application: a name, or a dotted module")
 
     @property
     def name(self) -> str:

@@ -49,6 +49,8 @@ def _require_bounded(events: Iterable[yaml.Event]) -> None:
     """Return if the text is within the limits: libyaml builds values by recursion, and a deep text would crash."""
     named: dict[str, tuple[int, int]] = {}  # nodes and levels of each anchor, aliases expanded
     within: list[tuple[str | None, int, int]] = []  # anchor, nodes and levels so far of each open collection
+    keys: list[set[str] | None] = []  # keys so far of each open mapping; None: of a list
+    is_key: list[bool] = []  # for each of them, whether a key comes next
 
     def refuse(problem: str, event: yaml.Event) -> NoReturn:
         error = yaml.MarkedYAMLError(problem=problem)
@@ -58,11 +60,15 @@ def _require_bounded(events: Iterable[yaml.Event]) -> None:
     for event in events:
         if isinstance(event, yaml.CollectionStartEvent):
             within.append((event.anchor, 1, 1))
+            keys.append(set() if isinstance(event, yaml.MappingStartEvent) else None)
+            is_key.append(True)
             if len(within) > MAX_LEVELS:
                 refuse(f"nested deeper than {MAX_LEVELS} levels", event)
             continue
         if isinstance(event, yaml.CollectionEndEvent):
             name, size, levels = within.pop()
+            keys.pop()
+            is_key.pop()
         elif isinstance(event, yaml.AliasEvent):
             if any(name == event.anchor for name, _, _ in within):
                 refuse(f"{event.anchor!r} contains itself", event)
@@ -71,6 +77,10 @@ def _require_bounded(events: Iterable[yaml.Event]) -> None:
                 refuse(f"nested deeper than {MAX_LEVELS} levels", event)
         elif isinstance(event, yaml.ScalarEvent):
             name, size, levels = event.anchor, 1, 0
+            if keys and (known := keys[-1]) is not None and is_key[-1]:
+                if event.value in known:  # the parser would ignore the first one
+                    refuse(f"{event.value!r} is given twice", event)
+                known.add(event.value)
         else:
             continue
         if name is not None:
@@ -78,6 +88,7 @@ def _require_bounded(events: Iterable[yaml.Event]) -> None:
         if size > MAX_NODES:
             refuse(f"expands to more than {MAX_NODES} values", event)
         if within:
+            is_key[-1] = not is_key[-1]
             above, so_far, deep = within[-1]
             within[-1] = above, so_far + size, max(deep, levels + 1)
 

@@ -12,7 +12,7 @@ import yaml
 from pydantic_core import to_jsonable_python
 
 from common.application import application_of_task, find_application, import_from_folder_of
-from common.config.basics import Parameters, check, is_section
+from common.config.basics import Parameters, check, is_section, own_fields
 from common.config.cell import Cell
 from common.config.files import (
     find_file,
@@ -287,6 +287,9 @@ def service_config(cell: Cell, name: str, config: type[P]) -> P:
         raise ConfigError(f"services.{name}.camera", camera, f"must be one of {', '.join(cell.world.cameras)}")
     for field, info in config.model_fields.items():
         if is_section(info.annotation):
+            if field in values:  # it would be replaced by the cell's
+                raise ConfigError(f"services.{name}.{field}", values[field], "is a section of the cell, no parameter "
+                                  f"of a service; choices: {', '.join(own_fields(config))}")
             # A copy, because each service changes its parameters at run time.
             values[field] = cell.section(info.annotation, camera).model_copy()  # type: ignore[arg-type]
     return check(config, values, f"services.{name}")

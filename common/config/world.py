@@ -21,6 +21,7 @@ TCP = "tcp"  # as a mount: the link of the tool centre point, whatever its name
 Shape = Literal["sphere", "box", "cylinder", "prism", "ring", "mesh"]
 NEEDS = {"sphere": ["radius"], "box": ["size", "height"], "cylinder": ["radius", "height"],
          "prism": ["polygon", "height"], "ring": ["radius", "inner_radius", "height"], "mesh": ["mesh"]}
+OF_SHAPES = ("height", "size", "radius", "inner_radius", "polygon", "mesh", "scale")  # fields that not all shapes use
 
 
 class Fixture(Section):
@@ -32,6 +33,13 @@ class Fixture(Section):
     position: Point
     rpy: tuple[Number, Number, Number] = Field((0.0, 0.0, 0.0), description="roll, pitch, yaw [rad], R = Rz Ry Rx")
     color: Rgb = (0.5, 0.5, 0.5)
+
+    @model_validator(mode="after")
+    def _require_dimensions(self) -> Fixture:
+        needed = {"box": 3, "sphere": 1, "cylinder": 2}[self.shape]
+        if len(self.dimensions) != needed:
+            raise ValueError(f"{self.id}: a {self.shape} has {needed} of dimensions, not {len(self.dimensions)}")
+        return self
 
 
 class Container(Section):
@@ -113,6 +121,9 @@ class ObjectConfig(Section):
     @model_validator(mode="after")
     def _require_fields_of_shape(self) -> ObjectConfig:
         missing = [field for field in NEEDS[self.shape] if not getattr(self, field)]
+        used = [*NEEDS[self.shape], *(["scale"] if self.shape == "mesh" else [])]
+        if ignored := [field for field in OF_SHAPES if field not in used and self._differs(field)]:
+            raise ValueError(f"{self.id}: {ignored[0]} has no effect on a {self.shape}; choices: {', '.join(used)}")
         if self.shape == "box" and self.size is not None and len(self.size) == 3:
             if self.height is not None and self.height != self.size[2]:
                 raise ValueError(f"{self.id}: height {self.height:g} is not that of size, {self.size[2]:g}")
@@ -132,7 +143,15 @@ class ObjectConfig(Section):
             raise ValueError(f"{self.id}: either position, or x and y")
         if (self.x is None) != (self.y is None):
             raise ValueError(f"{self.id}: x and y go together")
+        ignored = ("z", "yaw") if self.position is not None else ("rpy",) if self.x is not None else ()
+        for field in ignored:
+            if self._differs(field):
+                of = "position, only rpy has" if self.position is not None else "x and y, only z and yaw have"
+                raise ValueError(f"{self.id}: {field} has no effect on {of}")
         return self
+
+    def _differs(self, field: str) -> bool:
+        return bool(getattr(self, field) != type(self).model_fields[field].default)
 
     @property
     def placed(self) -> bool:

@@ -17,6 +17,7 @@ from common.application import import_folders, import_from_working_directory
 from common.clock import MAX_SPEED, MIN_SPEED, Clock
 from common.config import OVERRIDES_VARIABLE, Cell, ServiceEntry
 from common.errors import ConfigError
+from common.plugins import where_searched
 from common.transport.endpoint import (
     CONNECT_VARIABLE,
     DEFAULT_DOMAIN,
@@ -152,7 +153,7 @@ def require_module(key: str, entry: ServiceEntry) -> None:
     except ModuleNotFoundError:
         found = False
     if not found:
-        raise ConfigError(f"services.{key}", entry.module, "is not a module on the search path")
+        raise ConfigError(f"services.{key}", entry.module, where_searched(entry.module))
 
 
 def free_endpoints(count: int) -> tuple[str, ...]:

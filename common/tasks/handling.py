@@ -49,8 +49,8 @@ class HandlingConfig(TaskConfig):
     give_up: Tunable[float] = Field(20.0, gt=0, le=3600, description="wait for what is missing [s]")
     most_tries: Tunable[int] = Field(4, ge=1, le=100, description="for one object, before the task gives up")
     finger_clearance: Tunable[float] = Field(
-        0.02, ge=0.01, le=0.5, description="how much wider than an object the fingers are before they grip it and after "
-                                           "they release it, where they open so far [m]"
+        0.02, ge=0.01, le=0.5, description="how much wider than an object the fingers open before they grip it, and "
+                                           "when they release it [m]"
     )
     width_tolerance: Tunable[float] = Field(
         0.01, gt=0, le=0.05, description="what is gripped may be so much wider or narrower than it was seen [m]"

@@ -57,9 +57,8 @@ class RunAggregator:
         self._topics: dict[str, Topic[Any]] = {}
         self._listeners: dict[str, list[Listener]] = {}
         summary = self.summary
-        if application is not None:
+        if application is not None and application.topics is not None:
             self._add(application.status, self._on_status)
-            assert application.topics is not None
             decided_by, rejected = application.topics.decided_by, application.topics.rejected
             if decided_by is not None:
                 self._add(decided_by, self._on_decided)

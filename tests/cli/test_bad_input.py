@@ -26,12 +26,17 @@ ROWS = [  # a command, and parts of its line
     ("run broken.yaml", "broken.yaml", "does not parse at line 2"),
     ("run list.yaml", "list.yaml", "must hold a mapping"),
     ("run empty.yaml", "empty.yaml", "must hold a mapping"),
-    ("run taskless.yaml", "task: is missing"),
-    ("run fake.yaml --set services.first.x=1", "services.fakes.first", "not a module"),
+    ("run taskless.yaml", "task: is missing", "nothing to run", "`zencell up`"),
+    ("simulate taskless.yaml", "task: is missing"),
+    ("run fake.yaml --set services.first.x=1", "services.fakes.first", "is not a module: there is no fakes in"),
+    ("run panda --set application=common.tasks.none", "is not a module: there is no none in", "common/tasks"),
+    ("check twice.yaml", "twice.yaml", "does not parse at line 3", "'cell' is given twice"),
+    ("up panda --set 'services={trajectory_executor: {}, arm: {service: trajectory_executor}}'",
+     "services.arm: is a second trajectory_executor", "one arm"),
     ("check 'a cell.yaml'", "'a cell' is no name of a cell", "letters"),
     ("check ~no_such_user/cell.yaml", "begins with ~", "without a home"),
     ("run panda --world moon", "unknown world 'moon'", "balls"),
-    ("run panda --set world.simulator=no.such", "world.simulator", "cannot be imported"),
+    ("run panda --set world.simulator=no.such", "world.simulator", "is not a module: there is no no in"),
     ("run panda --set world.cuont=3", "world.cuont", "3", "choices:", "count"),
     ("run panda --set wrold.count=3", "wrold", "choices:", "world"),
     ("run panda --set world.count=9", "world.count", "9", "less than or equal to 8"),
@@ -137,6 +142,7 @@ def files(tmp_path_factory):
     cell = "robot: panda\nworld: balls\npipeline: cartesian_ompl\n"
     task = "task: first\nservices: {fakes.first: {}}\n"
     for name, text in {"a cell": cell + task, "fake": cell + task, "broken": "cell: [1,\nrobot: }\n", "list": "- 1\n",
+                       "twice": "cell: a\nrobot: panda\ncell: b\n",
                        "empty": "", "taskless": cell + "services: {motion_planner: {}}\n"}.items():
         (folder / f"{name}.yaml").write_text(text)
     write(folder / "there.mcap", [joints(n) for n in range(12)])

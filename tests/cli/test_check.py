@@ -115,6 +115,28 @@ def test_second_writer_and_missing_writers_and_servers_are_found():
     ]
 
 
+def test_object_fits_the_fingers_where_it_is_thin(tmp_path):
+    bars = ((0.14, 0.024, 0.0), (0.03, 0.12, 0.085))  # a hammer: handle and head along x and y, center of x [m]
+    corners = [(c + i * x / 2, j * y / 2, z) for x, y, c in bars for i in (-1, 1) for j in (-1, 1) for z in (0, 0.03)]
+    faces = [(a + n, b + n, c + n) for n in (1, 9) for a, b, c in (
+        (0, 1, 2), (1, 2, 3), (4, 5, 6), (5, 6, 7), (0, 1, 4), (1, 4, 5), (2, 3, 6), (3, 6, 7), (0, 2, 4), (2, 4, 6),
+        (1, 3, 5), (3, 5, 7))]
+    lines = [f"v {x} {y} {z}" for x, y, z in corners] + [f"f {a} {b} {c}" for a, b, c in faces]
+    (tmp_path / "hammer.obj").write_text("\n".join(lines))
+    for scale, fits in ((1, True), (4, False)):
+        thing = f"{{id: hammer, shape: mesh, mesh: {tmp_path}/hammer.obj, scale: {scale}, x: 0.45, y: -0.1}}"
+        found = check_files(load_cell("panda", ["world.balls=[[0.4, 0.3]]", f"world.objects=[{thing}]"]))
+        assert any("the fingers open to 80 mm" in each.what for each in found) != fits
+
+
+def test_section_of_the_cell_below_a_service_is_rejected_and_jogging_needs_no_writer(tmp_path):
+    cell = load_cell("panda", ["services.motion_planner.robot={base_position: [1, 0, 0]}"])
+    (found,) = (each for each in wiring(cell) if each.refused)
+    assert found.what.endswith("is a section of the cell, no parameter of a service; choices: helpers, points, watch")
+    keys = "services.trajectory_executor.topics={motion/jog: arm/jog}"
+    assert not [each for each in wiring(load_cell("panda", [keys])) if "jog" in each.what]
+
+
 def test_check_lists_unknown_parameters_and_keys_once(tmp_path):
     done = ask(tmp_path, "check", "panda", "--set", ONE, "--set", "services.vision_detector.speling=3", "--set",
                "services.scene_manager.topics={camra/*: left/camra/*}", "--json")

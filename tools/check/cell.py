@@ -39,7 +39,7 @@ def blocking_errors(cell: Cell) -> list[Finding]:
     from tools.check.cell import check_robot_file
 
     try:
-        return [found for found in check_robot_file(cell.robot) if found.refused]
+        return [found for found in (*check_arms(cell), *check_robot_file(cell.robot)) if found.refused]
     except ConfigError:  # a service reports it
         return []
 
@@ -68,7 +68,7 @@ def check_files(cell: Cell) -> list[Finding]:
     from tools.check.cell import check_robot_file
     from tools.check.world import check_world
 
-    of_robot = _collect(lambda: check_robot_file(cell.robot))
+    of_robot = [*check_arms(cell), *_collect(lambda: check_robot_file(cell.robot))]
     try:
         seen = seen_from_home(cell)
     except ConfigError as problem:
@@ -161,6 +161,14 @@ TURNS, SLIDES = ("revolute", "continuous"), ("prismatic",)  # joint types
 SLACK = 1e-3  # [m] or [rad] by which a finger position may exceed its limit: both files have rounded numbers
 
 
+def check_arms(cell: Cell) -> Iterator[Finding]:
+    """Yield a second executor: the files describe one arm, and each executor would drive it."""
+    executors = [entry.name for entry in cell.services.values() if entry.kind == EXECUTOR]
+    if len(executors) > 1:
+        yield error(f"services.{executors[1]}: is a second {EXECUTOR} besides {executors[0]}, but a cell has one arm",
+                    "take a cell for each arm, in domains of their own", refused=True)
+
+
 def check_robot_file(config: RobotConfig) -> Iterator[Finding]:
     """Yield contradictions between a robot file and its description.
 
@@ -216,6 +224,7 @@ def _opening(gripper: GripperConfig, number: int, joint: ET.Element) -> Iterator
                       f"correct gripper.max_width, gripper.{angles or 'closed'} or gripper.mimic")
 
 
+EXECUTOR = "trajectory_executor"
 VIEWER = "viewer"  # shows any topics, so none is missing
 
 
@@ -231,7 +240,7 @@ def examine(cell: Cell) -> Iterator[Finding]:
 def wiring(cell: Cell) -> Iterator[Finding]:
     """Yield configurations that services refuse, a missing task, and keys that do not match."""
     found, complete = [], True
-    if cell.task not in cell.services:
+    if cell.task and cell.task not in cell.services:
         yield error(f"task: {cell.task!r} is no service of the cell, so that a run never ends",
                     f"name one of {', '.join(cell.services)}")
     for entry in cell.services.values():
@@ -244,7 +253,8 @@ def wiring(cell: Cell) -> Iterator[Finding]:
         except ZencellError as problem:
             yield error(f"services.{entry.name}: {problem}", "correct it", refused=True)
         else:
-            found.append(Keys(each.name, each.reads, each.writes, each.serves, each.calls, entry.kind == VIEWER))
+            reads = [key for key in each.reads if not getattr(each.topics[key], "commands", False)]  # of any client
+            found.append(Keys(each.name, reads, each.writes, each.serves, each.calls, entry.kind == VIEWER))
             continue
         complete = False
     for finding in check_wiring(found):

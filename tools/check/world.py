@@ -6,7 +6,7 @@ Positions of objects are known for simulated worlds only; for others only camera
 from __future__ import annotations
 
 from collections.abc import Iterator
-from itertools import combinations
+from itertools import combinations, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,9 @@ Array = NDArray[np.float64]
 GRID = 21  # points along each side of a table that are projected into the images
 LEAST_VISIBLE = 0.5  # share of a table: cameras need not see its rim
 INTO = 5e-4  # [m] overlap that rounding may cause
+STEP = 2e-3  # [m] between sampled points of edges
+MOST_POINTS = 20_000  # exact; more of them are rounded to a grid
+PARALLEL = 0.1  # share by which an extent may differ between two halves of a finger
 THINNEST = 2e-3  # [m] width of a held object: a thinner one looks like an empty gripper
 
 
@@ -149,6 +152,30 @@ def _square(container: Container, half: float) -> Array:
     return square
 
 
+def _edge_points(triangles: Array) -> Array:
+    """Return points (N, 2) [m], at most STEP apart, on the edges of triangles (n, 3, 3), seen from above."""
+    first, second = triangles[..., :2].reshape(-1, 2), np.roll(triangles, -1, axis=1)[..., :2].reshape(-1, 2)
+    count = np.ceil(np.linalg.norm(second - first, axis=1) / STEP).astype(int) + 1
+    share = (np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)) / np.repeat(count, count)
+    start = np.repeat(first, count, axis=0)
+    points: Array = start + share[:, None] * (np.repeat(second, count, axis=0) - start)
+    return points if len(points) <= MOST_POINTS else np.unique(np.round(points / STEP), axis=0) * STEP
+
+
+def _narrowest(along: Array, across: Array, finger: float) -> float:
+    """Return the smallest extent (N,) [m] along an axis between parallel sides as wide as a finger [m], across it."""
+    order = np.argsort(across)
+    along, across = along[order], across[order]
+    finger = min(finger, across[-1] - across[0])
+    narrowest = float(np.ptp(along))
+    for start in np.arange(across[0], across[-1] - finger + STEP / 2, STEP):
+        ends = np.searchsorted(across, [start - STEP, start + finger / 2, start + finger + STEP])
+        first, second = (float(np.ptp(along[a:b])) if b > a else np.inf for a, b in pairwise(ends))
+        if abs(first - second) < PARALLEL * max(first, second):  # else it is a corner
+            narrowest = min(narrowest, max(first, second))
+    return narrowest
+
+
 # --- gripper ------------------------------------------------------------------------------------------------------
 
 
@@ -157,10 +184,10 @@ def _width(gripper: GripperConfig, item: ObjectConfig, solid: Solid) -> Iterator
     if solid.shape == "sphere":
         narrowest = 2 * solid.radius
     else:
-        outline = solid.footprint(initial_pose(item, solid)[:3, :3])
+        edges = _edge_points(solid.triangles @ initial_pose(item, solid)[:3, :3].T)
         turns = np.linspace(0.0, np.pi, 36, endpoint=False)
-        along = outline @ np.stack([np.cos(turns), np.sin(turns)])
-        narrowest = float(np.ptp(along, axis=0).min())
+        narrowest = min(_narrowest(edges @ [np.cos(turn), np.sin(turn)], edges @ [-np.sin(turn), np.cos(turn)],
+                                   2 * gripper.fingers.half_width) for turn in turns)
     if narrowest >= gripper.max_width:
         yield error(f"world.objects: {item.id} is {1e3 * narrowest:.0f} mm wide, the fingers open to "
                     f"{1e3 * gripper.max_width:.0f} mm (robot.gripper.max_width)",
