@@ -1,4 +1,4 @@
-"""Descriptions of arms with four joints, as text: a SCARA, and one that only turns and nods."""
+"""Descriptions of arms as text: a SCARA, one that only turns and nods, and one of six joints and any size."""
 
 _HAND = """
 <link name="palm"><collision><origin xyz="0 0 0.02"/><geometry><box size="0.03 0.09 0.04"/></geometry></collision>
@@ -54,3 +54,19 @@ def nodding() -> str:
         _joint("elbow", "revolute", "upper", "fore", "0 0 0.36", "0 1 0", -2.5, 2.5),
         _joint("wrist_nod", "revolute", "fore", "wrist", "0 0 0.32", "0 1 0", -2.2, 2.2),
         _HAND.format(wrist="wrist", at="0 0 0.06"), "</robot>"])
+
+
+def six(size: float) -> str:
+    """Six joints, from the size of an arm on a desk, 0.08, to that of one on the floor of a factory, 1."""
+    links = {"base": (0.6, 0.6), "l1": (0.5, 0.5), "l2": (0.3, 1.4), "l3": (0.3, 0.6), "l4": (0.25, 0.6),
+             "l5": (0.25, 0.3), "l6": (0.2, 0.1)}
+    joints = [("base", "l1", 0.75, "0 0 1", -2.9, 2.9), ("l1", "l2", 0.5, "0 1 0", -1.2, 2.0),
+              ("l2", "l3", 1.5, "0 1 0", 0.2, 1.9), ("l3", "l4", 0.75, "0 0 1", -2.9, 2.9),
+              ("l4", "l5", 0.75, "0 1 0", -2.1, 2.1), ("l5", "l6", 0.4, "0 0 1", -3.1, 3.1)]
+    return "\n".join([
+        '<robot name="six">',
+        *(_link(name, f"{wide * size} {wide * size} {long * size}", f"0 0 {long * size / 2}")
+          for name, (wide, long) in links.items()),
+        *(_joint(f"j{number}", "revolute", parent, child, f"0 0 {high * size}", axis, low, top)
+          for number, (parent, child, high, axis, low, top) in enumerate(joints)),
+        _HAND.format(wrist="l6", at=f"0 0 {0.1 * size}"), "</robot>"])

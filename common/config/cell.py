@@ -41,7 +41,7 @@ class Grasp(Section):
     grasp_clearance: float = Field(0.0, ge=-0.02, le=0.05, description="grasp above the centre of the object [m]")
     min_grasp_z: float = Field(0.012, ge=0.0, le=0.5, description="the tool centre point never goes below this [m]")
     lift_height: float = Field(0.15, ge=0.05, le=0.5, description="lift above the grasp [m]")
-    drop_z: float = Field(0.225, ge=0.18, le=0.6, description="height of release above the container [m]")
+    drop_z: float = Field(0.225, ge=0.05, le=0.6, description="height of release above the container [m]")
 
     max_tilt: float | None = Field(
         None, ge=0.0, le=1.5, description="largest tilt of the tool at a grasp [rad]; default: 0, and 0.35 for an arm "

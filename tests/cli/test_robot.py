@@ -13,7 +13,7 @@ from common.config import RobotConfig, check, config_root, load_cell, read_robot
 from common.robot.model import RobotModel
 from lab.simulation import Simulation
 from tests.harness import ROOT, ask
-from tests.small_arms import nodding, scara
+from tests.small_arms import nodding, scara, six
 from tools.robot_setup.fingers import check_tool_frame
 
 URDF = ROOT / "tests" / "data" / "side_arm.urdf"
@@ -236,10 +236,28 @@ def test_new_arm_clears_its_table(folder):
     clear_table(folder / "side_cell.yaml")
 
 
+@pytest.mark.parametrize(("size", "below", "camera"), [(0.08, 0.0, 0.4), (0.25, 0.0, 0.8), (1.0, 0.7, 0.8)])
+def test_table_container_and_camera_suit_the_size_of_the_arm(size, below, camera, tmp_path):
+    (tmp_path / "arm.urdf").write_text(six(size))
+    done = ask(tmp_path, "robot", "new", "arm.urdf", "--yes", "--name", "six", "--cell", "six_cell.yaml")
+    assert done.returncode == 0, done.stderr
+    cell = load_cell(str(tmp_path / "six_cell.yaml"))
+    assert cell.robot.base_position == (0.0, 0.0, -below)
+    x, _, height = cell.world.camera.position
+    reach = RobotModel.load(cell.robot).reach
+    assert height == pytest.approx(camera) and 0.2 * reach < x < 0.8 * reach
+    (table,) = cell.world.fixtures
+    edge = table.position[0] - table.dimensions[0] / 2
+    assert edge > 0.3 if below else edge == pytest.approx(0.0)  # not where the arm stands
+    checked = ask(tmp_path, "check", "six_cell.yaml")
+    assert "no errors, no warnings" in checked.stdout, checked.stdout
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("arm", [
-    scara, pytest.param(nodding, marks=pytest.mark.campaign), "package://example-robot-data/robots/z1_description/urdf/z1.urdf"])
-def test_arm_of_four_joints_or_with_one_jaw_clears_its_table(arm, tmp_path):
+    scara, lambda: six(0.08), lambda: six(1.0), pytest.param(nodding, marks=pytest.mark.campaign),
+    "package://example-robot-data/robots/z1_description/urdf/z1.urdf"])
+def test_arm_of_any_size_of_four_joints_or_with_one_jaw_clears_its_table(arm, tmp_path):
     if not isinstance(arm, str):
         (tmp_path / "arm.urdf").write_text(arm())
     done = ask(tmp_path, "robot", "new", arm if isinstance(arm, str) else "arm.urdf", "--yes", "--name", "few",

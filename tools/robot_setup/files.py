@@ -20,9 +20,9 @@ from common.robot.urdf import find_description
 from tools.robot_setup.proposal import Proposal
 
 WIDTH = 118
-ORDER = ("name", "urdf", "srdf", "package_dirs", "attachments", "joints", "base_link", "tcp_link", "tcp",
-         "locked_joints", "named_poses", "position_limits", "velocity_limits", "acceleration_limits", "jerk_limits",
-         "gripper")
+ORDER = ("name", "urdf", "srdf", "package_dirs", "attachments", "joints", "base_link", "base_position", "base_rpy",
+         "tcp_link", "tcp", "locked_joints", "named_poses", "position_limits", "velocity_limits",
+         "acceleration_limits", "jerk_limits", "gripper")
 
 
 def robot_file(proposal: Proposal, head: str, folder: Path, srdf: str) -> str:

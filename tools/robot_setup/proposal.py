@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import tempfile
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
@@ -30,6 +31,7 @@ from tools.robot_setup.end_effector import (
 )
 from tools.robot_setup.fingers import ALIGNED, link_points
 from tools.robot_setup.maker_srdf import fitting_poses
+from tools.robot_setup.mounting import find_mount
 from tools.robot_setup.sampling import DisabledPair, disabled_pairs, find_home, srdf
 from tools.robot_setup.tree import (
     SPEED,
@@ -307,7 +309,7 @@ def finish(
         pairs_of_maker: links that are not checked either.
         poses: further named poses. One that is called home is used as such if its tool points down and nothing touches.
     """
-    robot = _model(proposal)
+    robot = _mounted(proposal)
     pairs = disabled_pairs(robot)
     pairs += [DisabledPair(*links, "Maker") for links in pairs_of_maker
               if not any({pair.one, pair.other} == set(links) for pair in pairs)]
@@ -333,5 +335,21 @@ def finish(
                          f"{', '.join(home.hits[:3])}")
     proposal.guessed.append(f"named_poses.home: the tool at ({x:.2f}, {y:.2f}, {z:.2f})")
     proposal.check += check_gripper(robot)
-    proposal.check.append("base_position: not set, so the base is at the origin of the world")
     return robot
+
+
+def _mounted(proposal: Proposal) -> RobotModel:
+    """Add where the base is, for an arm that does not stand on the table facing x."""
+    robot = _model(proposal)
+    mount = find_mount(robot)
+    if not mount.height and not mount.yaw:
+        proposal.check.append("base_position: not set, so the base is at the origin of the world")
+        return robot
+    proposal.values["base_position"] = [0.0, 0.0, -mount.height]
+    proposal.values["base_rpy"] = [0.0, 0.0, round(mount.yaw, 6)]
+    proposal.notes["base_position"] = (
+        f"GUESSED: the top of the table is z = 0 of the world, {mount.height:g} m above the base, and the work is "
+        "towards x, where this arm serves most of it with its tool down.")
+    proposal.guessed.append(f"base_position, base_rpy: the base is {mount.height:g} m below the top of the table"
+                            + (f", turned by {math.degrees(mount.yaw):.0f} degrees to face it" if mount.yaw else ""))
+    return _model(proposal)

@@ -26,6 +26,7 @@ LOW = 0.03  # above the table, in units of the reach of the stretched arm
 TURNS = (0.0, math.pi / 2, -math.pi / 2, math.pi, math.pi / 4, -math.pi / 4)  # of the tool [rad]
 SEEDS = 6
 EVALUATED = 12  # best candidates
+TABLE = 0.0  # height of the table in world, which the arm works on [m]
 PLACES = [(radius, angle) for radius in (0.45, 0.65, 0.85) for angle in (-0.9, -0.45, 0.0, 0.45, 0.9)]
 STEPS = 16  # IK iterations, as in the reach test of a cell
 
@@ -52,7 +53,7 @@ def find_home(robot: RobotModel, geometry: RobotGeometry, given: Array | None = 
     neutral = np.clip(np.zeros(robot.dof), robot.lower + 0.15 * (robot.upper - robot.lower),
                    robot.upper - 0.15 * (robot.upper - robot.lower))
     seeds = [neutral, middle, *(rng.uniform(robot.lower, robot.upper) for _ in range(SEEDS))]
-    table = float(robot.config.base_position[2])
+    table = TABLE
     reach = down_reach(robot, table)
 
     def down_at(heights: Sequence[float]) -> Iterator[tuple[float, Array]]:
@@ -99,10 +100,8 @@ def down_reach(robot: RobotModel, table: float) -> float:
 
 
 def place(robot: RobotModel, radius: float, angle: float) -> tuple[float, float]:
-    """Return (x, y) [m] at a radius [m] and an angle [rad] from the base's x axis."""
-    heading = robot.base_axes[:2, 0]
-    turned = math.atan2(heading[1], heading[0]) + angle
-    x, y = robot.foot[:2] + radius * np.array([math.cos(turned), math.sin(turned)])
+    """Return (x, y) [m] at a radius [m] from the first joint and an angle [rad] from the x axis of world."""
+    x, y = robot.foot[:2] + radius * np.array([math.cos(angle), math.sin(angle)])
     return float(x), float(y)
 
 
@@ -110,7 +109,7 @@ def _comfort(robot: RobotModel, q: Array, neutral: Array, table: float) -> float
     """Return a score, larger is better: far from joint limits and singularities, near zero, links above the table."""
     margin = float((np.minimum(q - robot.lower, robot.upper - q) / (robot.upper - robot.lower)).min())
     singular = float(np.linalg.svd(robot.jacobian(q), compute_uv=False)[min(robot.dof, 6) - 1])
-    heights = [pose[2, 3] - table for pose in robot.link_poses(q).values()]
+    heights = _heights(robot, q, table)
     low = min(0.0, float(np.sort(heights)[min(2, len(heights) - 1)]) - 0.02 * robot.reach)
     raised = float(np.mean(heights)) / robot.reach
     away = float(np.abs(q - neutral).max()) / math.pi
@@ -137,8 +136,16 @@ def _served(robot: RobotModel, geometry: RobotGeometry, home: Array, table: floa
         found = (solve_tool_down_ik(robot, at, turn, home, iterations=STEPS) for turn in _turns(robot))
         tried.append(any(
             q is not None and not hits(robot, geometry, q)
-            and min(pose[2, 3] for pose in robot.link_poses(q).values()) > table - 0.01 for q in found))
+            and min(_heights(robot, q, table)) > -0.01 for q in found))
     return sum(map(bool, tried)) / len(tried)
+
+
+def _heights(robot: RobotModel, q: Array, table: float) -> list[float]:
+    """Return the heights of the links above a table [m]; for an arm next to it, of those above it."""
+    places = [pose[:3, 3] for pose in robot.link_poses(q).values()]
+    near = 0.25 * robot.reach if robot.config.base_position[2] < table else 0.0
+    return [float(at[2]) - table for at in places
+            if float(np.hypot(*(at[:2] - robot.foot[:2]))) >= near] or [0.0]
 
 
 def hits(robot: RobotModel, geometry: RobotGeometry, q: Array) -> list[str]:
