@@ -26,6 +26,8 @@ Square = Annotated[str, typer.Option("--square", metavar="M", help="measured sid
 Marker = Annotated[str, typer.Option("--marker", metavar="M", help="side length of a marker [m]; 0: 3/4 of a square")]
 Dictionary = Annotated[str, typer.Option("--dictionary", metavar="NAME", help="dictionary of the markers: "
                                                                               "4x4_50, 5x5_50, ...")]
+Legacy = Annotated[bool, typer.Option("--legacy", help="the board has the pattern of OpenCV before 4.6: with an even "
+                                                       "number of rows its upper left square is white")]
 Size = Annotated[str, typer.Option("--size", metavar="WxH", help="image size to request from a device [px]")]
 Seconds = Annotated[str, typer.Option("--seconds", metavar="S", help="how long to read images from a device [s]")]
 
@@ -34,12 +36,13 @@ Seconds = Annotated[str, typer.Option("--seconds", metavar="S", help="how long t
 def board_command(
     output: Annotated[str, typer.Option("-o", "--output", metavar="FILE", help="a .png or .pdf file")],
     squares: Squares = "7x5", square: Square = "0.036", marker: Marker = "0", dictionary: Dictionary = "4x4_50",
+    legacy: Legacy = False,
 ) -> None:
     """Write a board to print at 100 %; a line on it of known length shows whether the print has the right scale."""
     suffix = Path(output).suffix.lower()
     if suffix not in BOARD_FORMATS:
         raise ConfigError("--output", output, f"must end in {' or '.join(BOARD_FORMATS)}")
-    board = board_of(squares, square, marker, dictionary)
+    board = board_of(squares, square, marker, dictionary, legacy)
     import matplotlib.image
 
     page, density = board.page()
@@ -58,6 +61,7 @@ def intrinsics(
     source: Annotated[str, typer.Argument(metavar="SOURCE", help=SOURCE_HELP)],
     output: Annotated[str, typer.Option("-o", "--output", metavar="FILE", help="YAML file to write")] = "camera.yaml",
     squares: Squares = "7x5", square: Square = "0.036", marker: Marker = "0", dictionary: Dictionary = "4x4_50",
+    legacy: Legacy = False,
     views: Annotated[str, typer.Option("--views", metavar="N", help="number of distinct views to collect")] = "8",
     k_coefficients: Annotated[
         str, typer.Option("--k-coefficients", metavar="N", help="number of radial coefficients: 0 no "
@@ -74,9 +78,9 @@ def intrinsics(
     least = options.whole("--views", views, 3) or 3
     settings = check(CollectingOptions, {"least_views": least, "most_views": max(60, least),
                                          "k_coefficients": options.whole("--k-coefficients", k_coefficients, 0)})
-    collector = ViewSelector(board_of(squares, square, marker, dictionary), settings)
+    collector = ViewSelector(board_of(squares, square, marker, dictionary, legacy), settings)
     terminal = sys.stderr.isatty()
-    for name, image in read_images(source, parse_size(size), options.number("--seconds", seconds)):
+    for name, image in read_images(source, parse_size(size), options.number("--seconds", seconds), warn):
         reason = collector.add(image, name)
         if terminal:
             part, unseen = collector.coverage()
@@ -85,6 +89,8 @@ def intrinsics(
         if collector.complete:
             break
     collector.require_enough()
+    if collector.rejections:
+        warn(f"left out of {collector.images} images: {collector.rejections}")
     found = calibrate_intrinsics(collector.views, settings)
     camera = camera_from_intrinsics(found, source, str(collector.board.options))
     old = Path(output).expanduser()
@@ -100,7 +106,8 @@ def pose(
     sources: Annotated[list[str], typer.Argument(metavar="SOURCE...", help=f"{SOURCE_HELP}; one for each board "
                                                                            f"position")],
     intrinsics_file: Annotated[
-        str, typer.Option("--intrinsics", metavar="FILE", help="YAML file of `zencell calibrate intrinsics`")
+        str, typer.Option("--intrinsics", metavar="FILE", help="YAML file of `zencell calibrate intrinsics`, "
+                                                             "camera_info of ROS, or a file of OpenCV")
     ],
     board_position: Annotated[
         list[str], typer.Option("--board-position", metavar="X,Y,Z", help="lower left corner of the squares in world "
@@ -115,6 +122,7 @@ def pose(
         str, typer.Option("-o", "--output", metavar="FILE", help="YAML file to write [the file of --intrinsics]")
     ] = "",
     squares: Squares = "7x5", square: Square = "0.036", marker: Marker = "0", dictionary: Dictionary = "4x4_50",
+    legacy: Legacy = False,
     images_of_each: Annotated[
         str, typer.Option("--pictures", metavar="N", help="images of each board position, at most")
     ] = "20",
@@ -129,6 +137,7 @@ def pose(
     from tools.calibration.camera_pose import calibrate_pose, detect_boards_in
     from tools.calibration.report import format_pose, with_pose
 
+    file = output or _own(intrinsics_file)
     rotations = board_rpy or ["0,0,0"]
     if len(board_position) != len(sources):
         raise ConfigError("--board-position", len(board_position), f"times for {len(sources)} sources")
@@ -138,12 +147,11 @@ def pose(
     rotations = rotations * len(sources) if len(rotations) == 1 else rotations
     positions = [options.three("--board-position", text) for text in board_position]
     angles = [options.three("--board-rpy", text) for text in rotations]
-    camera, board = CameraFile.load(intrinsics_file), board_of(squares, square, marker, dictionary)
+    camera, board = CameraFile.load(intrinsics_file), board_of(squares, square, marker, dictionary, legacy)
     most, limit = options.whole("--pictures", images_of_each, 1) or 1, options.number("--seconds", seconds)
-    places = [(transform(rpy_to_matrix(*rpy), position), detect_boards_in(source, board, camera, most, limit))
+    places = [(transform(rpy_to_matrix(*rpy), position), detect_boards_in(source, board, camera, most, limit, warn))
               for source, position, rpy in zip(sources, positions, angles, strict=True)]
     result = calibrate_pose(places, camera)
-    file = output or intrinsics_file
     with_pose(camera, result, sources, positions, angles).save(file)
     echo(format_pose(result))
     echo(f"{file} holds intrinsics and pose; a cell takes both with --set world.camera={file}")
@@ -153,7 +161,8 @@ def pose(
 def hand_eye(
     folder: Annotated[str, typer.Argument(metavar="FOLDER", help="views of `zencell calibrate collect`")],
     intrinsics_file: Annotated[
-        str, typer.Option("--intrinsics", metavar="FILE", help="YAML file of `zencell calibrate intrinsics`")
+        str, typer.Option("--intrinsics", metavar="FILE", help="YAML file of `zencell calibrate intrinsics`, "
+                                                             "camera_info of ROS, or a file of OpenCV")
     ],
     mount: Annotated[str, typer.Option("--camera", metavar="hand|beside", help="on the hand, or fixed next to an arm "
                                                                                "that holds the board")],
@@ -161,24 +170,30 @@ def hand_eye(
         str, typer.Option("-o", "--output", metavar="FILE", help="YAML file to write [the file of --intrinsics]")
     ] = "",
     squares: Squares = "7x5", square: Square = "0.036", marker: Marker = "0", dictionary: Dictionary = "4x4_50",
+    legacy: Legacy = False,
 ) -> None:
     """Estimate the pose of a camera on the hand, or fixed next to an arm that holds the board."""
     from typing import get_args
 
+    from common.config import load_robot
     from common.perception.camera_file import CameraFile
-    from tools.calibration.hand_eye import MIN_VIEWS, Mount, calibrate_hand_eye
+    from common.robot.model import RobotModel
+    from tools.calibration.hand_eye import MIN_VIEWS, Mount
     from tools.calibration.intrinsics import CalibrationFailed
     from tools.calibration.report import format_hand_eye, with_hand_eye
-    from tools.calibration.views import load_views
+    from tools.calibration.views import calibrate_views, load_views
 
     if mount not in get_args(Mount):
         raise UnknownName("--camera", mount, get_args(Mount))
-    camera, board = CameraFile.load(intrinsics_file), board_of(squares, square, marker, dictionary)
+    file = output or _own(intrinsics_file)
+    camera, board = CameraFile.load(intrinsics_file), board_of(squares, square, marker, dictionary, legacy)
     views, problems, header = load_views(Path(folder).expanduser(), board, camera)
     if len(views) < MIN_VIEWS and problems:
         raise CalibrationFailed(f"{len(views)} views of the board, {MIN_VIEWS} are needed; {problems[0]}")
-    result = calibrate_hand_eye(views, camera, "hand" if mount == "hand" else "beside")
-    file = output or intrinsics_file
+    for problem in problems:
+        warn(problem)
+    robot = RobotModel.load(load_robot(header.robot))
+    result = calibrate_views(views, robot, camera, "hand" if mount == "hand" else "beside")
     with_hand_eye(camera, result, folder, header.robot, mount).save(file)
     echo(format_hand_eye(result))
     place = "the pose on the hand" if mount == "hand" else "pose"
@@ -193,6 +208,7 @@ def collect(
     key: Annotated[str, typer.Option("--key", metavar="KEY", help="topic of the camera's images")] = "camera/image_raw",
     views: Annotated[str, typer.Option("--views", metavar="N", help="number of views to collect")] = "15",
     squares: Squares = "7x5", square: Square = "0.036", marker: Marker = "0", dictionary: Dictionary = "4x4_50",
+    legacy: Legacy = False,
     at: CellTarget = RUNNING,
 ) -> None:
     """Save board images and joint positions of a running cell each time the arm is at standstill in a new pose.
@@ -204,14 +220,32 @@ def collect(
     from tools.calibration.views import HandEyeCollector, collect_views
 
     model = RobotModel.load(load_robot(robot))
-    board, needed = board_of(squares, square, marker, dictionary), options.whole("--views", views, 1) or 1
+    board, needed = board_of(squares, square, marker, dictionary, legacy), options.whole("--views", views, 1) or 1
     collector = HandEyeCollector(Path(folder).expanduser(), model, robot, board)
     at.visit(lambda bus: collect_views(bus, key, collector, needed, echo))
     echo(f"{folder} holds {collector.count} views; next: zencell calibrate hand-eye {folder} --intrinsics FILE "
          "--camera hand|beside")
 
 
-def board_of(squares: str, square: str, marker: str, dictionary: str) -> Board:
+def _own(file: str) -> str:
+    """Return a file that a pose may be added to.
+
+    Raises:
+        ConfigError: another program wrote it.
+    """
+    from common.perception.camera_formats import read_foreign
+
+    if read_foreign(Path(file).expanduser()) is not None:
+        raise ConfigError("--output", ..., f"is needed: {file} is of another program")
+    return file
+
+
+def warn(line: str) -> None:
+    """Write a line to stderr."""
+    echo(line, err=True)
+
+
+def board_of(squares: str, square: str, marker: str, dictionary: str, legacy: bool) -> Board:
     """Return the board that the options describe.
 
     Raises:
@@ -228,7 +262,8 @@ def board_of(squares: str, square: str, marker: str, dictionary: str) -> Board:
     side = options.number("--square", square)
     given = options.number("--marker", marker)
     return b.Board(check(b.BoardOptions, {"columns": columns, "rows": rows, "square": side,
-                                          "marker": given or round(0.75 * side, 6), "dictionary": dictionary}, "board"))
+                                          "marker": given or round(0.75 * side, 6), "dictionary": dictionary,
+                                          "legacy": legacy}, "board"))
 
 
 def parse_size(text: str) -> tuple[int, int] | None:

@@ -113,14 +113,13 @@ class HandEyeSession:
             ConfigError: the file cannot be written.
         """
         from common.perception.camera_file import CameraFile
-        from tools.calibration.hand_eye import calibrate_hand_eye
         from tools.calibration.report import with_hand_eye
-        from tools.calibration.views import load_views
+        from tools.calibration.views import calibrate_views, load_views
 
         camera = CameraFile(width=info.width, height=info.height, fx=info.k[0], fy=info.k[4], cx=info.k[2],
                             cy=info.k[5], d=list(info.d), frame=info.header.frame_id or None)
         views, skipped, joints = load_views(self.folder, self._board, camera, self._robot)
-        found = calibrate_hand_eye(views, camera, self.mount)
+        found = calibrate_views(views, self._robot, camera, self.mount)
         file = self.folder / "camera.yaml"
         with_hand_eye(camera, found, str(self.folder), joints.robot, self.mount).save(str(file))
         position = ", ".join(f"{1e3 * value:.1f}" for value in found.position)
@@ -164,7 +163,7 @@ class HandEyePanel:
         self._images = {topic.key: topic for topic in images}
         self._values: dict[str, Any] = {
             "name": "", "camera": next(iter(self._images), ""), "mount": next(iter(MOUNTS)), "columns": 7, "rows": 5,
-            "square": 36.0, "auto": True}
+            "square": 36.0, "legacy": False, "auto": True}
         self._session: HandEyeSession | None = None
         self._camera = next(iter(self._images))  # of the current session
         self._busy, self._note, self._next_image = False, "", 0.0
@@ -178,6 +177,7 @@ class HandEyePanel:
             ("rows", gui.add_number("Board squares along y", 5, min=3, max=50, step=1)),
             ("square", gui.add_number("Square size [mm]", 36.0, min=1.0, max=1000.0, step=0.1,
                                       hint="measured on the print of `zencell calibrate board`")),
+            ("legacy", gui.add_checkbox("Board pattern before OpenCV 4.6", False)),
             ("auto", gui.add_checkbox("Capture automatically", True, hint="whenever the arm is at rest in a new pose")),
         ]
         for name, handle in inputs:
@@ -258,7 +258,8 @@ class HandEyePanel:
 
         square = 1e-3 * self._values["square"]
         board = Board(check(BoardOptions, {"columns": round(self._values["columns"]), "square": square,
-                                           "rows": round(self._values["rows"]), "marker": round(0.75 * square, 6)},
+                                           "rows": round(self._values["rows"]), "marker": round(0.75 * square, 6),
+                                           "legacy": self._values["legacy"]},
                             "board"))
         camera = self._values["camera"]
         self._session = await asyncio.to_thread(

@@ -14,6 +14,7 @@ from pydantic import Field
 from common.config import CameraConfig, Number, Parameters, check, read_yaml
 from common.config.basics import Point
 from common.errors import ConfigError
+from common.perception.camera_formats import read_foreign
 
 Array = npt.NDArray[np.float64]
 
@@ -44,12 +45,13 @@ class CameraFile(Parameters):
 
     @classmethod
     def load(cls, path: str) -> CameraFile:
-        """Load the camera from a YAML file.
+        """Load the camera from a YAML file, or its intrinsics from a file of ROS or OpenCV.
 
         Raises:
             ConfigError: the file cannot be read; or names the invalid field.
         """
-        return check(cls, read_yaml(Path(path).expanduser()), path)
+        file = Path(path).expanduser()
+        return check(cls, read_foreign(file) or read_yaml(file), path)
 
     @classmethod
     def of(cls, camera: CameraConfig) -> CameraFile:

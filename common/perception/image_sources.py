@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -62,34 +62,51 @@ class Folder:
 
     live = False
 
-    def __init__(self, paths: list[Path], *, loop: bool) -> None:
-        """Read these paths once, or repeatedly with `loop`."""
+    def __init__(self, paths: list[Path], *, loop: bool, report: Callable[[str], object] | None = None) -> None:
+        """Read these paths once, or repeatedly with `loop`; with `report`, skip those that are no images."""
         self.name = ""
         self._paths = paths
         self._loop = loop
+        self._report = report
+        self._reported: set[str] = set()
+        self._good = False  # whether any was readable
         self._next = 0
 
     def read(self) -> Pixels | None:
         """Return the next image; None at the end.
 
         Raises:
-            ConfigError: a file is no image.
+            ConfigError: a file is no image, or with `report` all are.
         """
-        if self._next >= len(self._paths):
-            if not self._loop:
-                return None
-            self._next = 0
-        path = self._paths[self._next]
-        self._next += 1
-        self.name = path.name
-        return read_image(path)
+        while self._next < len(self._paths) or self._loop:
+            self._next %= len(self._paths)
+            path = self._paths[self._next]
+            self._next += 1
+            self.name = path.name
+            try:
+                image = read_image(path, report=self._report_once)
+                self._good = True
+                return image
+            except ConfigError as error:
+                if self._report is None or len(self._paths) == 1:
+                    raise
+                self._report(f"skipped: {error}")
+        if not self._good:
+            raise ConfigError("source", str(self._paths[0].parent), "contains no readable image")
+        return None
+
+    def _report_once(self, text: str) -> None:
+        if self._report and text not in self._reported:
+            self._reported.add(text)
+            self._report(f"{self.name} {text}")
 
     def close(self) -> None:
         """Do nothing: no file stays open between reads."""
 
 
 def open_source(
-    source: str | int, size: tuple[int, int] | None, rate: float | None, *, loop: bool
+    source: str | int, size: tuple[int, int] | None, rate: float | None, *, loop: bool,
+    report: Callable[[str], object] | None = None,
 ) -> Source | None:
     """Open the source that a device number or path, a video file or an image folder names; None if no device is there.
 
@@ -98,6 +115,7 @@ def open_source(
         size: requested width and height of a device [px]; None: the device's default.
         rate: requested images per second of a device [Hz]; None: the device's default.
         loop: restart a file or folder at its end.
+        report: gets a line for each file of a folder that is skipped because it is no image; None: that is an error.
 
     Raises:
         ConfigError: the path is none of these.
@@ -119,10 +137,11 @@ def open_source(
         return Video(capture, live=True, loop=False)
     path = Path(str(source)).expanduser()
     if path.is_dir():
-        images = sorted((p for p in path.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES), key=_natural)
+        images = sorted((p for p in path.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and p.name[0] != "."),
+                        key=_natural)
         if not images:
             raise ConfigError("source", str(source), f"contains no image; supported: {', '.join(IMAGE_SUFFIXES)}")
-        return Folder(images, loop=loop)
+        return Folder(images, loop=loop, report=report)
     if path.suffix.lower() in IMAGE_SUFFIXES:
         return Folder([path], loop=loop)
     if not path.is_file():
@@ -149,13 +168,17 @@ def _as_bgr8(image: npt.NDArray[Any]) -> Pixels:
     return np.ascontiguousarray(image[..., :3], np.uint8)
 
 
-def read_images(source: str, size: tuple[int, int] | None, seconds: float) -> Iterator[tuple[str, Pixels]]:
+def read_images(
+    source: str, size: tuple[int, int] | None, seconds: float, report: Callable[[str], object]
+) -> Iterator[tuple[str, Pixels]]:
     """Yield images of a source with their names: all of a file or folder, or those within some seconds of a device.
+
+    `report` gets a line for each file that is no image.
 
     Raises:
         ConfigError: the source cannot be read.
     """
-    opened = open_source(source, size, None, loop=False)
+    opened = open_source(source, size, None, loop=False, report=report)
     if opened is None:
         raise ConfigError("SOURCE", source, "cannot be opened: no such device")
     until = monotonic() + seconds

@@ -74,6 +74,25 @@ def test_output_has_residuals_uncertainty_and_the_next_command(calibrated):
     assert "calibrate pose" in output and f"--set world.camera={calibrated}" in output
 
 
+def test_files_that_are_no_images_are_skipped_and_deep_ones_stretched(folder, tmp_path, capsys):
+    views = shutil.copytree(folder / "views", tmp_path / "views")
+    for name, content in (("._p1.png", b"\0\5"), (".hidden.png", b""), ("Thumbs.db", b"x"), ("empty.png", b""),
+                          ("cut.png", (views / "p1.png").read_bytes()[:5000]), ("text.jpg", b"hello")):
+        (views / name).write_bytes(content)
+    (views / "folder.png").mkdir()
+    cv2.imwrite(str(views / "small.png"), cv2.resize(cv2.imread(str(views / "p1.png")), (800, 600)))
+    for k in (0, 3):  # 12 bits in 16
+        cv2.imwrite(str(views / f"p{k}.png"), cv2.imread(str(views / f"p{k}.png"), 0).astype(np.uint16) * 16)
+    output = tmp_path / "camera.yaml"
+    assert app.execute(["calibrate", "intrinsics", str(views), "-o", str(output)]) == 0
+    assert yaml.safe_load(output.read_text())["fx"] == pytest.approx(LENS.fx, rel=2e-3)
+    lines = capsys.readouterr().err.splitlines()
+    skipped = [Path(line.split("'")[1]).name for line in lines if line.startswith("skipped: ")]
+    assert sorted(skipped) == ["cut.png", "empty.png", "folder.png", "text.jpg"]
+    assert [line for line in lines if not line.startswith("skipped")] == [
+        "p0.png has 12 bits per value, which are stretched to 8", "left out of 9 images: 1 have another size"]
+
+
 @pytest.mark.slow
 def test_new_intrinsics_remove_the_pose(calibrated, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(calibrated.parent)

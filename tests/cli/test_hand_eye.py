@@ -87,7 +87,16 @@ def test_camera_at_the_hand_is_calibrated_from_a_folder(tmp_path, capsys, reject
     assert "unknown --camera 'foot'; choices: beside, hand" in rejection(*command, "--camera", "foot")
     assert "the views are inconsistent" in rejection(*command, "--camera", "beside", code=1)
     (tmp_path / "views" / "view_004.png").unlink()
-    assert "view_004.png' is not a file" in rejection(*command, "--camera", "hand")
+    capsys.readouterr()
+    assert app.execute([*command, "--camera", "hand"]) == 0
+    output, error = capsys.readouterr()
+    assert "7 views, residual 0.0" in output and "view_004.png' is not a file" in error and error.count("\n") == 1
+    joints = tmp_path / "views" / "joints.yaml"
+    values = yaml.safe_load(joints.read_text())
+    degrees = {name: np.degrees(q).tolist() for name, q in values["pictures"].items() if name != "view_004.png"}
+    joints.write_text(yaml.safe_dump({**values, "pictures": degrees}))
+    line = rejection(*command, "--camera", "hand", code=1)
+    assert "the joints are in degrees: converted to rad, the residual is 0.0" in line
 
 
 def test_views_are_collected_from_a_running_cell(tmp_path, monkeypatch):

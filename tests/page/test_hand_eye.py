@@ -103,7 +103,7 @@ def test_invalid_name_is_rejected(name: str) -> None:
 
 
 @pytest.mark.parametrize(("encoding", "data", "reason"), [
-    ("mono8", bytes(48 * 64), "no marker"), ("32FC1", bytes(48 * 64 * 4), "'32FC1'"),
+    ("mono8", bytes(48 * 64), "too dark"), ("32FC1", bytes(48 * 64 * 4), "'32FC1'"),
     ("16UC1", bytes(48 * 64 * 2), "'16UC1'"), ("bgr8", b"few", "too few for 64x48")])
 def test_unusable_image_is_rejected_with_the_reason(arm: Arm, encoding: str, data: bytes, reason: str) -> None:
     image = Image(header=Header(), width=64, height=48, encoding=encoding, data=data)

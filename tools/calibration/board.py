@@ -26,6 +26,8 @@ Dictionary = Literal["4x4_50", "4x4_250", "5x5_50", "5x5_250", "6x6_50", "6x6_25
 _MARGIN = 0.012  # [m] white border; the lower one holds the print instructions
 _PRINT_DENSITY = 300 / 0.0254  # [px/m], about
 _MIN_CORNERS = 6
+MIN_MARKERS = 4  # that determine how they are arranged
+_DARK = 30  # [grey levels] of the brightest part
 _MIN_FITTING = 0.7  # fraction of markers that must match the board
 _MARKER_TOLERANCE = 0.1, 1.5  # of marker length: relative, or shrinkage by blur [px]
 _PAGE_SIDES = (24, 48, 96, 192)  # [px] of a square in the reference pages
@@ -42,6 +44,8 @@ class BoardOptions(Parameters):
     square: float = Field(0.036, gt=0, le=1, description="length of a square [m]")
     marker: float = Field(0.027, gt=0, le=1, description="length of a marker [m]")
     dictionary: Dictionary = Field("4x4_50", description="dictionary of the markers")
+    legacy: bool = Field(False, description="pattern of OpenCV before 4.6: with an even number of rows, the upper left "
+                                            "square is white")
 
     @model_validator(mode="after")
     def _fits_together(self) -> BoardOptions:
@@ -54,7 +58,7 @@ class BoardOptions(Parameters):
 
     def __str__(self) -> str:
         return (f"{self.columns} x {self.rows} squares of {1e3 * self.square:g} mm, "
-                f"markers of {1e3 * self.marker:g} mm, {self.dictionary}")
+                f"markers of {1e3 * self.marker:g} mm, {self.dictionary}{', legacy' if self.legacy else ''}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +86,7 @@ class BoardDetection:
 class NoBoard:
     """Why an image shows no board: `kind` for counting, `reason` for people."""
 
-    kind: Literal["nothing", "blurred", "few corners", "other board"]
+    kind: Literal["nothing", "blurred", "few corners", "other board", "dark", "flipped"]
     reason: str
 
 
@@ -92,14 +96,9 @@ class Board:
     def __init__(self, options: BoardOptions | None = None) -> None:
         """Prepare the detector."""
         o = self.options = options or BoardOptions()
-        self._board = cv2.aruco.CharucoBoard(
-            (o.columns, o.rows), o.square, o.marker, _dictionary(o.dictionary)
-        )
+        self._board = _charuco(o)
         self._detector = cv2.aruco.CharucoDetector(self._board)
-        self._markers = {
-            int(number): self._to_board_frame(corners)[:, :2]
-            for number, corners in zip(self._board.getIds(), self._board.getObjPoints(), strict=True)
-        }
+        self._markers = self._markers_of(self._board)
         self.corners = self._to_board_frame(self._board.getChessboardCorners())
         """(n, 3) inner corners in the frame of the board [m], z = 0."""
 
@@ -114,6 +113,11 @@ class Board:
         """Width and height of all squares [m]."""
         return self.options.columns * self.options.square, self.options.rows * self.options.square
 
+    def _markers_of(self, board: cv2.aruco.CharucoBoard) -> dict[int, Array]:
+        """(4, 2) corners of each marker in the board's frame [m]."""
+        return {int(number): self._to_board_frame(corners)[:, :2]
+                for number, corners in zip(board.getIds(), board.getObjPoints(), strict=True)}
+
     def _to_board_frame(self, points: npt.ArrayLike) -> Array:
         """Convert from OpenCV's frame (origin upper left, y down) to the board's."""
         p = np.array(points, dtype=float).reshape(-1, 3)
@@ -122,7 +126,7 @@ class Board:
     def _draw(self, side: int) -> npt.NDArray[np.float32]:
         """Draw squares of `side` pixels, antialiased; OpenCV rounds markers to whole pixels."""
         o, dictionary = self.options, self._board.getDictionary()
-        dark = np.indices((o.rows, o.columns)).sum(axis=0) % 2 == 0
+        dark = np.indices((o.rows, o.columns)).sum(axis=0) % 2 == (o.legacy and o.rows % 2 == 0)
         page = np.where(np.kron(dark, np.ones((side, side), bool)), np.float32(0), np.float32(255))
         cells = dictionary.markerSize + 2
         for number, corners in zip(self._board.getIds(), self._board.getObjPoints(), strict=True):
@@ -164,25 +168,27 @@ class Board:
         """Detect the board in a bgr8 or grey image; otherwise return the reason."""
         grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8) if image.ndim == 3 else image
         pixels, ids, marker_pixels, marker_ids = self._detector.detectBoard(grey)
+        if (marker_ids is None or len(marker_ids) < MIN_MARKERS) and (flipped := self._flipped(grey)):
+            return flipped
         if marker_ids is None or not len(marker_ids):
-            return _blurred(grey) or NoBoard("nothing", "no marker is visible")
+            return _too_poor(grey) or NoBoard("nothing", "no marker is visible")
         markers = {int(number): np.asarray(corners, float).reshape(4, 2)
                    for number, corners in zip(np.ravel(marker_ids), marker_pixels, strict=True)}
         mismatch = self._other_board(markers)
         if mismatch:
-            return NoBoard("other board", mismatch)
+            return self._flipped(grey) or NoBoard("other board", mismatch)
         if ids is None or len(ids) < _MIN_CORNERS or self._board.checkCharucoCornersCollinear(ids):
-            return _blurred(grey) or NoBoard("few corners", f"{0 if ids is None else len(ids)} corners are visible; "
+            return _too_poor(grey) or NoBoard("few corners", f"{0 if ids is None else len(ids)} corners are visible; "
                                                             f"{_MIN_CORNERS} not on one line are needed")
         points, found = self.corners[np.ravel(ids)], np.asarray(pixels, float).reshape(-1, 2)
         mismatch = self._other_length(homography(points[:, :2], found), markers)
         if mismatch:
-            return _blurred(grey) or NoBoard("other board", mismatch)
+            return _too_poor(grey) or NoBoard("other board", mismatch)
         low, high = np.maximum(found.min(axis=0) - _WINDOW, 0).astype(int), found.max(axis=0).astype(int) + _WINDOW
         blur = _blur(grey[low[1] : high[1], low[0] : high[0]])
         found, matching = refine(grey, self._print, points[:, :2], found, blur)
         if matching.sum() < _MIN_CORNERS or np.linalg.matrix_rank(points[matching] - points[matching][0], 1e-6) < 2:
-            return _blurred(grey) or NoBoard("few corners", f"{matching.sum()} of {len(matching)} corners match the "
+            return _too_poor(grey) or NoBoard("few corners", f"{matching.sum()} of {len(matching)} corners match the "
                                                             f"print; {_MIN_CORNERS} not on one line are needed")
         points, found = points[matching], found[matching]
         H = homography(points[:, :2], found)
@@ -200,16 +206,24 @@ class Board:
         if len(foreign) > 0.3 * len(markers):
             return (f"marker {max(foreign)} is not on a board of {self.options.columns}x{self.options.rows} squares, "
                     f"which has {len(self._markers)}")
-        known = [number for number in markers if number in self._markers]
-        if len(known) < 4:
-            return ""
-        expected = np.array([self._markers[number].mean(axis=0) for number in known])
-        seen = np.array([markers[number].mean(axis=0) for number in known])
-        side = float(np.median([_side(markers[number]) for number in known]))
-        _, fitting = cv2.findHomography(expected, seen, cv2.RANSAC, max(2.0, 0.25 * side))
-        if fitting is None or fitting.mean() >= _MIN_FITTING:
-            return ""
-        return f"the layout of the markers differs from a board of {self.options.columns}x{self.options.rows} squares"
+        o, share = self.options, _share(markers, self._markers)
+        mismatch = f"the layout of the markers differs from a board of {o.columns}x{o.rows} squares"
+        other = o.model_copy(update={"legacy": not o.legacy})
+        if _share(markers, self._markers_of(_charuco(other))) > max(share + 0.05, _MIN_FITTING):
+            return mismatch + (", but is that of OpenCV before 4.6: add --legacy" if other.legacy else
+                               " of OpenCV before 4.6: leave out --legacy")
+        return "" if share >= _MIN_FITTING else mismatch
+
+    def _flipped(self, grey: Pixels) -> NoBoard | None:
+        """Return that the image is mirrored or a negative if the markers fit the board only otherwise."""
+        for changed, name in ((cv2.flip(grey, 1), "mirrored"), (255 - grey, "a negative")):
+            _, _, found, ids = self._detector.detectBoard(np.ascontiguousarray(changed))
+            markers = {int(number): np.asarray(corners, float).reshape(4, 2)
+                       for number, corners in zip(np.ravel(ids if ids is not None else ()), found, strict=False)}
+            known = markers.keys() & self._markers.keys()
+            if len(known) >= MIN_MARKERS and _share(markers, self._markers) >= _MIN_FITTING:
+                return NoBoard("flipped", f"the image is {name}: its markers can be read only after undoing that")
+        return None
 
     def _other_length(self, H: Array | None, markers: dict[int, Array]) -> str:
         """Why the marker length differs from the board's; empty if it matches or is unknown."""
@@ -224,6 +238,24 @@ class Board:
             return ""
         return (f"markers are {length / self.options.square:.2f} of a square long, not "
                 f"{self.options.marker / self.options.square:.2f} as {1e3 * self.options.marker:g} mm would be")
+
+
+def _charuco(o: BoardOptions) -> cv2.aruco.CharucoBoard:
+    board = cv2.aruco.CharucoBoard((o.columns, o.rows), o.square, o.marker, _dictionary(o.dictionary))
+    board.setLegacyPattern(o.legacy)
+    return board
+
+
+def _share(markers: dict[int, Array], expected: dict[int, Array]) -> float:
+    """Share of the known markers that are arranged as expected; 1 if they are too few to tell."""
+    known = [number for number in markers if number in expected]
+    if len(known) < MIN_MARKERS:
+        return 1.0
+    points = np.array([expected[number].mean(axis=0) for number in known])
+    seen = np.array([markers[number].mean(axis=0) for number in known])
+    side = float(np.median([_side(markers[number]) for number in known]))
+    _, fitting = cv2.findHomography(points, seen, cv2.RANSAC, max(2.0, 0.25 * side))
+    return 1.0 if fitting is None else float(fitting.mean())
 
 
 def _dictionary(name: str) -> cv2.aruco.Dictionary:
@@ -248,8 +280,12 @@ def _rounding_error(side: int, options: BoardOptions, bits: int) -> float:
     return round(abs(edge - round(edge)) + bits * abs(cell - round(cell)), 6)
 
 
-def _blurred(grey: Pixels) -> NoBoard | None:
-    if np.ptp(np.percentile(grey, (1, 99))) < _MIN_CONTRAST:
+def _too_poor(grey: Pixels) -> NoBoard | None:
+    """Why an image cannot show a board: too dark or blurred; None if it can."""
+    low, high = np.percentile(grey, (1, 99))
+    if high < _DARK:
+        return NoBoard("dark", f"too dark: its brightest part is {high:.0f} of 255")
+    if high - low < _MIN_CONTRAST:
         return None
     blur = _blur(grey)
     return NoBoard("blurred", f"edges are blurred over {blur:.1f} px") if blur > _BLURRED else None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -109,7 +109,9 @@ def calibrate_pose(
     return PoseCalibration(T_world_camera, position, rotation, place, rms, _rms(on_board), pictures, dropped)
 
 
-def detect_boards_in(source: str, board: Board, camera: CameraFile, most: int, seconds: float) -> list[BoardDetection]:
+def detect_boards_in(
+    source: str, board: Board, camera: CameraFile, most: int, seconds: float, report: Callable[[str], object]
+) -> list[BoardDetection]:
     """Detect the board in the images of a source, in at most `most` of them.
 
     Args:
@@ -118,6 +120,7 @@ def detect_boards_in(source: str, board: Board, camera: CameraFile, most: int, s
         camera: its intrinsics.
         most: images with the board.
         seconds: duration for a device.
+        report: gets a line for each file that is no image.
 
     Raises:
         CalibrationFailed: no image shows it; reports the most frequent reason.
@@ -125,7 +128,7 @@ def detect_boards_in(source: str, board: Board, camera: CameraFile, most: int, s
     """
     detected: list[BoardDetection] = []
     reasons_: list[str] = []
-    for name, picture in read_images(source, (camera.width, camera.height), seconds):
+    for name, picture in read_images(source, (camera.width, camera.height), seconds, report):
         found, reasons = detect_boards(board, [(f"{source}: {name}", picture)], camera)
         detected, reasons_ = detected + found, reasons_ + reasons
         if len(detected) >= most:
@@ -138,18 +141,14 @@ def detect_boards_in(source: str, board: Board, camera: CameraFile, most: int, s
 
 def detect_boards(board: Board, pictures: Sequence[tuple[str, npt.NDArray[np.uint8]]], camera: CameraFile,
                  max_blur: float = 2.5) -> tuple[list[BoardDetection], list[str]]:
-    """Return the detections, and the reason for each image without the board.
-
-    Raises:
-        CalibrationFailed: an image size differs from the intrinsics.
-    """
+    """Return the detections, and the reason for each image without the board or of another size."""
     found: list[BoardDetection] = []
     reasons: list[str] = []
     for name, picture in pictures:
         height, width = picture.shape[:2]
         if (width, height) != (camera.width, camera.height):
-            raise CalibrationFailed(f"{name} is {width}x{height}, but the intrinsics are for "
-                                    f"{camera.width}x{camera.height}")
+            reasons.append(f"{name} is {width}x{height}, but the intrinsics are for {camera.width}x{camera.height}")
+            continue
         detection = board.find(picture, name)
         if isinstance(detection, NoBoard):
             reasons.append(detection.reason)

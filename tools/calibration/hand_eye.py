@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import cv2
@@ -35,10 +35,11 @@ GOOD, FAIR = 1e-3, 3e-3  # [m] limits of the position uncertainty
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A detection of the board, and the tool center point in world (4, 4) at that time."""
+    """A detection of the board, and the tool center point in world (4, 4) and joints (n,) at that time."""
 
     detection: BoardDetection
     T_world_tcp: Array
+    q: Array = field(default_factory=lambda: np.zeros(0))
 
 
 @dataclass(frozen=True, eq=False)

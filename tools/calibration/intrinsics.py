@@ -17,6 +17,10 @@ from tools.calibration.board import Board, BoardDetection, NoBoard
 Array = npt.NDArray[np.float64]
 Pixels = npt.NDArray[np.uint8]
 
+_REJECTIONS = {"nothing": "show no marker", "blurred": "are blurred", "few corners": "show too little of the board",
+               "like another view": "repeat an earlier pose", "other board": "show another board",
+               "dark": "are too dark", "flipped": "are mirrored or negatives", "other size": "have another size"}
+_EXPLAINED = ("other board", "few corners", "flipped", "other size")  # rejections with an example
 CELLS = 8, 6  # coverage grid of the image, columns and rows
 _REGIONS = (("upper left", "upper middle", "upper right"), ("left", "middle", "right"),
             ("lower left", "lower middle", "lower right"))
@@ -102,18 +106,14 @@ class ViewSelector:
         return len(self.views) >= self.options.most_views
 
     def add(self, image: Pixels, name: str) -> str:
-        """Evaluate an image; return an empty string for a new view, else the reason.
-
-        Raises:
-            CalibrationFailed: its size differs from earlier images.
-        """
+        """Evaluate an image; return an empty string for a new view, else the reason."""
         self.images += 1
         detection = self.board.find(image, name)
         if isinstance(detection, NoBoard):
             return self._reject(detection.kind, detection.reason)
         if self.views and detection.size != self.views[0].size:
-            raise CalibrationFailed(f"{name} is {detection.size[0]}x{detection.size[1]}, but {self.views[0].name} is "
-                                    f"{self.views[0].size[0]}x{self.views[0].size[1]}: all must have the same size")
+            return self._reject("other size", f"{name} is {detection.size[0]}x{detection.size[1]}, but "
+                                f"{self.views[0].name} is {self.views[0].size[0]}x{self.views[0].size[1]}")
         if detection.blur > self.options.max_blur:
             return self._reject("blurred", f"edges are blurred over {detection.blur:.1f} px")
         nearest = min((_distance(detection, view) for view in self.views), default=np.inf)
@@ -131,17 +131,19 @@ class ViewSelector:
         least = self.options.least_views
         if len(self.views) >= least:
             return
-        reasons = {"nothing": "show no marker", "blurred": "are blurred", "few corners": "show too little of the board",
-                "like another view": "repeat an earlier pose", "other board": "show another board"}
-        parts = [f"{count} {reasons[kind]}" for kind, count in self._rejected.most_common()]
         hint = ""
-        if self._rejected and (kind := self._rejected.most_common(1)[0][0]) in ("other board", "few corners"):
+        if self._rejected and (kind := self._rejected.most_common(1)[0][0]) in _EXPLAINED:
             hint = f" ({self._example[kind]})"
         missing = least - len(self.views)
         raise CalibrationFailed(
             f"{len(self.views)} of {self.images} images are usable views of the board ({self.board.options}), "
-            f"{least} are needed, {missing} more; {', '.join(parts) or 'there were no more images'}{hint}"
+            f"{least} are needed, {missing} more; {self.rejections or 'there were no more images'}{hint}"
         )
+
+    @property
+    def rejections(self) -> str:
+        """How many images were rejected, and why."""
+        return ", ".join(f"{count} {_REJECTIONS[kind]}" for kind, count in self._rejected.most_common())
 
     def coverage(self) -> tuple[float, list[str]]:
         """Fraction of image cells with a corner, and names of regions without any."""

@@ -28,7 +28,8 @@ from common.transport.bus import Bus
 from common.transport.reader import Reader
 from tools.calibration.board import Board, NoBoard
 from tools.calibration.camera_pose import detect_boards
-from tools.calibration.hand_eye import View
+from tools.calibration.hand_eye import HandEyeCalibration, Mount, View, calibrate_hand_eye
+from tools.calibration.intrinsics import CalibrationFailed
 
 Array = npt.NDArray[np.float64]
 Pixels = npt.NDArray[np.uint8]
@@ -152,7 +153,6 @@ def load_views(
 
     Raises:
         ConfigError: there are no views, or they do not match the robot.
-        CalibrationFailed: an image size differs from the intrinsics.
     """
     contents = _read(folder)
     robot = moved or RobotModel.load(load_robot(contents.robot))
@@ -161,11 +161,33 @@ def load_views(
     _require_joints(folder, contents, robot)
     views, reason = [], []
     for name, q in contents.pictures.items():
-        add_image = read_image(folder / Path(name).name, f"{folder / JOINTS_FILE}: pictures")
+        try:
+            add_image = read_image(folder / Path(name).name, f"{folder / JOINTS_FILE}: pictures")
+        except ConfigError as error:
+            reason.append(f"skipped: {error}")
+            continue
         found, reasons = detect_boards(board, [(name, add_image)], camera, MAX_BLUR)
         reason += [f"{name}: {reason}" for reason in reasons]
-        views += [View(detection, robot.fk(q)) for detection in found]
+        views += [View(detection, robot.fk(q), np.array(q)) for detection in found]
     return views, reason, contents
+
+
+def calibrate_views(views: list[View], robot: RobotModel, camera: CameraFile, mount: Mount) -> HandEyeCalibration:
+    """Fit the pose of the camera to the views.
+
+    Raises:
+        CalibrationFailed: the views do not determine it; names joints that are in degrees.
+    """
+    try:
+        return calibrate_hand_eye(views, camera, mount)
+    except CalibrationFailed as failure:
+        converted = [replace(view, T_world_tcp=robot.fk(np.radians(view.q))) for view in views]
+        try:
+            rms = calibrate_hand_eye(converted, camera, mount).rms
+        except CalibrationFailed:
+            raise failure from None
+        raise CalibrationFailed(f"the joints are in degrees: converted to rad, the residual is {rms:.2f} px; "
+                                f"write them in rad to {JOINTS_FILE}") from None
 
 
 def _near(a: Array, b: Array) -> bool:

@@ -74,6 +74,36 @@ def test_other_and_missing_boards_are_recognized(printed, kind, reason):
     assert isinstance(found, NoBoard) and found.kind == kind and reason in found.reason
 
 
+@pytest.mark.parametrize("rows", [4, 5, 6])
+def test_pattern_of_older_opencv_is_detected_drawn_and_suggested(rows):
+    new = Board(BoardOptions(rows=rows))
+    old = Board(BoardOptions(rows=rows, legacy=True))
+    T = facing(new, 0, 0, 0.5, 0.3, 0.2)
+    for board, other, advice in ((new, old, "leave out --legacy"), (old, new, "add --legacy")):
+        off = errors(found_in(render(board, LENS, T), board), T)
+        assert len(off) == 6 * (rows - 1) and off.max() < 0.08
+        mismatch = other.find(render(board, LENS, T), "an image")
+        assert isinstance(mismatch, BoardDetection) if rows % 2 else advice in mismatch.reason
+        assert len(found_in(opencv_page(board), board).points) == 6 * (rows - 1), "the print of OpenCV is the same"
+
+
+def opencv_page(board):
+    o = board.options
+    printed = cv2.aruco.CharucoBoard((o.columns, o.rows), o.square, o.marker, cv2.aruco.getPredefinedDictionary(0))
+    printed.setLegacyPattern(o.legacy)
+    return cv2.GaussianBlur(np.pad(printed.generateImage((o.columns * 60, o.rows * 60)), 40, constant_values=255),
+                            (0, 0), 0.7)
+
+
+@pytest.mark.parametrize(("change", "reason"), [
+    (lambda image: cv2.flip(image, 1), "is mirrored"), (lambda image: cv2.flip(image, 0), "is mirrored"),
+    (lambda image: 255 - image, "is a negative"), (lambda image: image // 12, "too dark: its brightest part is "),
+])
+def test_mirrored_negative_and_dark_images_are_named(change, reason):
+    image = render(BOARD, LENS, facing(BOARD, 0, 0, 0.5, 0.3, 0.2))
+    assert reason in BOARD.find(np.ascontiguousarray(change(image)), "an image").reason
+
+
 def test_blur_is_measured_and_limited():
     for true in (0.7, 1.0, 1.4):
         found = found_in(render(BOARD, LENS, facing(BOARD, 0, 0, 0.42), blur=true, noise=1))
