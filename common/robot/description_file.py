@@ -13,10 +13,9 @@ MAX_BYTES = 50_000_000
 MAX_ELEMENTS = 200_000
 MAX_DEPTH = 100  # of elements in each other
 MAX_NAME = 200  # characters
-MAX_LINKS = 1000
+MAX_LINKS = 400
 LFS = "is a pointer of Git LFS, not the file itself: run `git lfs pull` in its clone"
 _KINDS = ((b"version https://git-lfs", LFS), (b"\x1f\x8b", "is compressed (gzip): unpack it first"),
-          (b"PK\x03\x04", "is a zip archive: unpack it first"),
           (b"<!doctype html", "is a page of a web site, not the file: download the raw file"),
           (b"<html", "is a page of a web site, not the file: download the raw file"))
 

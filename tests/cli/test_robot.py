@@ -20,6 +20,9 @@ URDF = ROOT / "tests" / "data" / "side_arm.urdf"
 TEXT = URDF.read_text()
 NO_ARM = '<robot name="post"><link name="a"/><link name="b"/><joint name="j" type="fixed">' \
          '<parent link="a"/><child link="b"/></joint></robot>'
+CHAIN = '<robot name="chain">' + "".join(f'<link name="l{i}"/>' for i in range(40)) + "".join(
+    f'<joint name="j{i}" type="continuous"><parent link="l{i}"/><child link="l{i + 1}"/></joint>' for i in range(39)
+) + "</robot>"
 NO_MESH = NO_ARM.replace('<link name="b"/>', '<link name="b"><collision><geometry><mesh filename="package://gone/b.stl"/>'
                                              '</geometry></collision></link>')
 
@@ -187,6 +190,7 @@ def test_maker_s_srdf_gives_pairs_group_and_poses(folder, tmp_path):
     (with_shape(''), "", ["has no <geometry>"]),
     (TEXT.replace('upper="2.6"', 'upper="${wide}"'), "", ["'bend'", "'${wide}'"]),
     (TEXT.replace(' velocity="0"', ""), "", ["'spin'", "no velocity"]),
+    (CHAIN, "", ["39 of them in one chain", "30"]),
     (TEXT, "--name 'my arm'", ["--name", "'my arm'"]),
     (TEXT, "--out no/a.yaml", ["--out", "does not exist"]),
     (TEXT, "--out a.srdf", ["--out", "'a.srdf'", ".yaml"]),

@@ -111,7 +111,7 @@ def _comfort(robot: RobotModel, q: Array, neutral: Array, table: float) -> float
     singular = float(np.linalg.svd(robot.jacobian(q), compute_uv=False)[min(robot.dof, 6) - 1])
     heights = _heights(robot, q, table)
     low = min(0.0, float(np.sort(heights)[min(2, len(heights) - 1)]) - 0.02 * robot.reach)
-    raised = float(np.mean(heights)) / robot.reach
+    raised = float(np.mean(heights)) / max(robot.reach, 1e-6)
     away = float(np.abs(q - neutral).max()) / math.pi
     return 2 * min(margin, 0.15) + min(singular, 0.2) + raised / 2 - 0.5 * away + 10 * low
 

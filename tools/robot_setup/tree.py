@@ -13,6 +13,8 @@ from common.errors import ConfigError, UnknownName
 MOVING = ("revolute", "continuous", "prismatic")
 FINGER_WORDS = ("finger", "gripper", "jaw", "knuckle", "claw")
 LEAST_JOINTS = 3  # of an arm: a tree that branches earlier has several arms
+MOST_JOINTS = 30  # in one chain
+MOST_MOVING = 120
 FINGER_JOINTS = 3  # longest chain of a finger
 
 
@@ -125,6 +127,10 @@ def read_tree(root: ET.Element, source: str) -> Tree:
     held = {roots[0], *(joint.child for joint in tree.below(roots[0]))}
     if loose := [link for link in links if link not in held]:
         raise ConfigError("urdf", source, f"has links that hang on each other, not on {roots[0]}: {', '.join(loose)}")
+    longest, moving = max(len(_moving(tree, link)) for link in links), sum(joint.moves for joint in joints)
+    if longest > MOST_JOINTS or moving > MOST_MOVING:
+        raise ConfigError("urdf", source, f"has {moving} moving joints, {longest} of them in one chain; "
+                                          f"at most {MOST_MOVING} and {MOST_JOINTS} are supported")
     return tree
 
 
@@ -217,7 +223,8 @@ def _ends_arm(tree: Tree, link: str) -> bool:
 
 def _depth(tree: Tree, joint: Joint) -> int:
     """Return the number of joints in a chain that starts with this one."""
-    return 1 + max((_depth(tree, other) for other in tree.moving_below(joint.child)), default=0)
+    before = len(_moving(tree, joint.parent))
+    return max(len(_moving(tree, other.child)) for other in (joint, *tree.moving_below(joint.child))) - before
 
 
 def _base(tree: Tree) -> str:

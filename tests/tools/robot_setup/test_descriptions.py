@@ -90,6 +90,7 @@ def names(name: str) -> bytes:
     (b'<?xml version="1.0" encoding="nonsense"?><robot/>', "does not parse"),
     *((names(f"turn{each}gripper: 1"), "has a name with the character") for each in (
         "\u2028", "\u2029", "\u0085", "&#10;", "&#9;", "\u202e", "\u200b")),
+    (("<robot>" + "".join(f'<link name="l{i}"/>' for i in range(401)) + "</robot>").encode(), "401 links"),
     (names("x" * 500), "500 characters"),
 ])
 def test_file_that_is_no_usable_description_is_one_line(content, wanted, tmp_path):
