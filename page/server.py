@@ -24,9 +24,11 @@ import websockets.asyncio.server as websocket_server
 from websockets import Data, Headers
 from websockets.exceptions import WebSocketException
 from websockets.http11 import Request, Response
+from websockets.protocol import State
 
 from common.errors import ConfigError
 from common.time_source import monotonic
+from common.transport.endpoint import peer_group
 from page.access import CURRENT_SESSION, Access, Answer, PageSession, Permissions, gateways
 from page.address import is_loopback, listen_error, open_socket
 from page.viser_inside import (
@@ -46,7 +48,8 @@ log = logging.getLogger(__name__)
 MAX_PAGES = 24  # open at the same time
 MAX_VIEWERS = 16  # of these for sessions that may only look, so that operators always find room
 MAX_MESSAGE_RATE = 100  # messages per second, and in a burst, from each connection; dragging sends fewer
-MAX_CONNECTIONS = 96  # including those that have not sent a request yet
+MAX_WAITING = 64  # connections that are no open page: silent ones, and those that receive a file
+BACKLOG = 1024  # connections that wait to be accepted
 MAX_MESSAGE_SIZE = 4 * 2**20  # [bytes] from a browser
 OPEN_TIMEOUT = 5.0  # [s] until a connection has sent its request
 CLOSE_TIMEOUT = 0.5  # [s] for the closing handshake of a browser
@@ -151,6 +154,8 @@ class RequestGate:
             path, upgrade = urlsplit(request.path).path, "upgrade" in request.headers
             peer = str((connection.remote_address or ("",))[0])
             answer = self.access.check(request.path, headers, upgrade=upgrade, peer=peer)
+            if isinstance(connection, BoundedConnection):
+                connection.admitted = answer is None
             if answer is None and upgrade:
                 answer = self._open_session(connection, path == CONTROL_PATH, peer, headers["cookie"])
             if answer is not None:
@@ -201,9 +206,11 @@ def _count(connections: Iterable[websocket_server.ServerConnection], control: bo
 
 
 class BoundedConnection(websocket_server.ServerConnection):
-    """A connection with a message rate limit, dropped at once if there are too many connections."""
+    """A connection with a message rate limit; beyond `MAX_WAITING` the oldest of the address with the most is ended."""
 
+    admitted = False  # whether its request passed all checks
     _budget, _last = 0.0, 0.0
+    _peer = ""
 
     async def recv(self, decode: bool | None = None) -> Data:  # type: ignore[override]
         """Return the next message; delay it beyond the rate limit, so that a flood does not delay other pages."""
@@ -216,10 +223,16 @@ class BoundedConnection(websocket_server.ServerConnection):
         return data
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Start; abort if there are too many connections."""
+        """Start, and make room among the connections that are no open page."""
         super().connection_made(transport)
-        if len(self.server.handlers) > MAX_CONNECTIONS:
-            self.transport.abort()
+        self._peer = peer_group(str((self.remote_address or ("::",))[0]))
+        waiting = [each for each in self.server.handlers if isinstance(each, BoundedConnection)
+                   and each.state is not State.OPEN and not each.transport.is_closing()]
+        if len(waiting) > MAX_WAITING:
+            strangers = [each for each in waiting if not each.admitted] or waiting
+            counts = Counter(each._peer for each in strangers)
+            most = max(counts.values())
+            next(each for each in strangers if counts[each._peer] == most).transport.abort()
 
 
 # --- responses ---
@@ -279,6 +292,7 @@ WEBSOCKET_OPTIONS: Mapping[str, Any] = {
     "max_size": MAX_MESSAGE_SIZE,
     "open_timeout": OPEN_TIMEOUT,
     "close_timeout": CLOSE_TIMEOUT,
+    "backlog": BACKLOG,
     "logger": _connection_log,
     "server_header": None,
 }

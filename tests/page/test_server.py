@@ -242,32 +242,31 @@ async def test_number_of_open_pages_is_limited(make: Make, monkeypatch: pytest.M
             await third.recv()
 
 
-async def test_flood_of_connections_is_dropped_and_the_page_recovers(
-    make: Make, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+@pytest.mark.parametrize("sent", [
+    "", "GET / HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\nX", "GET / HTTP/1.1\r\nHost: evil\r\n\r\n"])
+async def test_connections_without_a_token_keep_no_operator_out(
+    sent: str, make: Make, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(page_server, "MAX_CONNECTIONS", 10)
+    monkeypatch.setattr(page_server, "MAX_WAITING", 10)
     monkeypatch.setitem(page_server.WEBSOCKET_OPTIONS, "open_timeout", 600.0)  # only the limit ends them
-    server = make()
-
-    async def end_of(reader: asyncio.StreamReader) -> None:
-        with suppress(OSError):
-            await reader.read()
-
-    def is_up() -> bool:
-        with suppress(OSError):
-            return get(server).status == 200
-        return False
-
-    async with asyncio.timeout(PATIENCE):
-        opened = [await asyncio.open_connection("127.0.0.1", server.get_port()) for _ in range(40)]
-        ended = [asyncio.create_task(end_of(reader)) for reader, _ in opened]
-        await until(lambda: sum(task.done() for task in ended) >= 30)
-        assert sum(task.done() for task in ended) == 30
+    server = make(token=SECRET)
+    port = server.get_port()
+    cookie = f"zencell-{port}={cookie_value(SECRET, port)}"
+    async with open_page(server, cookie=cookie) as before:
+        await before.recv()
+        opened = [await asyncio.open_connection("127.0.0.1", port) for _ in range(40)]
         for _, writer in opened:
+            writer.write(sent.format(port=port).encode())
+        assert (await asyncio.to_thread(get, server, Cookie=cookie)).status == 200
+        async with open_page(server, cookie=cookie) as page:
+            await page.recv()
+        for reader, writer in opened[:29]:  # the oldest ones
+            with suppress(OSError):
+                await asyncio.wait_for(reader.read(), PATIENCE)
             writer.close()
-        await asyncio.gather(*ended, *(writer.wait_closed() for _, writer in opened), return_exceptions=True)
-        while not await asyncio.to_thread(is_up):
-            pass
+        assert before.state is websockets.State.OPEN
+    for _, writer in opened[29:]:
+        writer.close()
     assert not caplog.records
 
 
