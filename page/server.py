@@ -48,7 +48,8 @@ log = logging.getLogger(__name__)
 MAX_PAGES = 24  # open at the same time
 MAX_VIEWERS = 16  # of these for sessions that may only look, so that operators always find room
 MAX_MESSAGE_RATE = 100  # messages per second, and in a burst, from each connection; dragging sends fewer
-MAX_WAITING = 64  # connections that are no open page: silent ones, and those that receive a file
+MAX_WAITING = 256  # connections that are no open page: silent ones, and those that receive a file
+ACCEPTED_AT_ONCE = 32  # fewer than MAX_WAITING: requests are read in between
 BACKLOG = 1024  # connections that wait to be accepted
 MAX_MESSAGE_SIZE = 4 * 2**20  # [bytes] from a browser
 OPEN_TIMEOUT = 5.0  # [s] until a connection has sent its request
@@ -95,6 +96,7 @@ def make_server(
                     gateways() if published else frozenset())
     gate = RequestGate(access, permissions)
     server = create_server(listening, gate.wrap, WEBSOCKET_OPTIONS, control or _close_at_once)
+    listening.listen(BACKLOG)  # asyncio also accepts as many connections at once as its backlog
     if permissions is not None:
         permissions.enforced = access.requires_token
 
@@ -292,7 +294,7 @@ WEBSOCKET_OPTIONS: Mapping[str, Any] = {
     "max_size": MAX_MESSAGE_SIZE,
     "open_timeout": OPEN_TIMEOUT,
     "close_timeout": CLOSE_TIMEOUT,
-    "backlog": BACKLOG,
+    "backlog": ACCEPTED_AT_ONCE,
     "logger": _connection_log,
     "server_header": None,
 }
