@@ -89,12 +89,13 @@ def fit_world(robot: RobotModel, cell: dict[str, Any]) -> dict[str, Any]:
         raise ConfigError("--cell", ..., "needs a robot with a gripper, because the task picks objects; "
                           "--gripper robotiq_2f85.urdf mounts one")
     widest = (gripper.max_width - ROOM) / 2
-    if round(min(BALL, widest), 3) < SMALLEST:
+    smallest = max(SMALLEST, round(gripper.travel[0][0] / 2 + 0.002, 3) if gripper.travel else 0.0)
+    if round(min(BALL, widest), 3) < smallest:
         raise ConfigError("gripper.max_width", gripper.max_width,
-                          f"is too narrow for the smallest ball, {2 * SMALLEST:g} m in diameter")
+                          f"is too narrow for the smallest ball, {2 * smallest:g} m in diameter")
     geometry, most, edge = RobotGeometry(robot), 0, _edge(robot)
     for factor, heights in ATTEMPTS:
-        scale = Scale(factor, max(round(min(BALL * factor, widest), 3), SMALLEST), heights)
+        scale = Scale(factor, max(round(min(BALL * factor, widest), 3), smallest), heights)
         grasp = Grasp.model_validate(heights)
         bounds = WorkspaceBounds(min_radius=scale.nearest, max_radius=round(robot.reach, 2))
         reached = _reached(robot, grasp, bounds, scale, edge)

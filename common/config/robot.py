@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
@@ -88,6 +89,8 @@ class GripperConfig(Section):
     linkage: ParallelLinkage | None = Field(None, description="linkage of the driven joint; default: fingers slide")
     jaw: TurningJaw | None = Field(None, description="one finger turns and the other is fixed")
     closed: Number = Field(0.0, description="driven joint of closed sliding fingers [m]")
+    travel: list[list[Number]] = Field([], description="instead of all these, rows from closed to open: the width [m] "
+                                                       "and the position of each joint [rad or m]")
     links: list[str] = Field(description="links that may touch a grasped object")
     max_width: Length = Field(0.08, description="fully open [m]")
     speed: Length = Field(0.2, description="closing speed of the width [m/s]")
@@ -108,6 +111,8 @@ class GripperConfig(Section):
             raise ValueError(f"gripper.mimic has {len(self.mimic)} values for {len(self.joints)} joints")
         if self.mimic and self.mimic[0] != 1:
             raise ValueError(f"gripper.mimic begins with the driven joint itself: 1, not {self.mimic[0]:g}")
+        if self.travel:
+            self._require_travel()
         if (self.linkage is not None or self.jaw is not None) and self.closed:
             raise ValueError("gripper.closed is for sliding fingers; a linkage and a jaw have their own closed")
         if self.jaw is not None:
@@ -129,6 +134,19 @@ class GripperConfig(Section):
             if width > self.max_width:
                 raise ValueError(f"named width {name} is {width:g} m, more than max_width {self.max_width:g} m")
         return self
+
+    def _require_travel(self) -> None:
+        rows = self.travel
+        if self.linkage is not None or self.jaw is not None or self.closed or self.mimic:
+            raise ValueError("gripper.travel replaces linkage, jaw, closed and mimic: leave them out")
+        if len(rows) < 2 or any(len(row) != 1 + len(self.joints) for row in rows):
+            raise ValueError(f"gripper.travel needs two rows or more, each of {1 + len(self.joints)} numbers")
+        steps = [[after - before for before, after in zip(row, other, strict=True)]
+                 for row, other in pairwise(rows)]
+        if rows[0][0] < 0 or not all(step[0] > 0 and step[1] * steps[0][1] > 0 for step in steps):
+            raise ValueError("gripper.travel must have growing widths and a driven joint that turns one way")
+        if abs(rows[-1][0] - self.max_width) > 1e-4:
+            raise ValueError(f"gripper.travel opens to {rows[-1][0]:g} m, but max_width is {self.max_width:g} m")
 
     def least_time(self, distance: float) -> float:
         """Return the least time [s] of fingers at rest for a change of the width by a distance [m]."""

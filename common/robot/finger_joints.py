@@ -10,12 +10,16 @@ from numpy.typing import NDArray
 
 from common.config import GripperConfig
 
+TINY = 1e-5  # change of the width from which velocities are computed [m]
+
 
 def driven_position(gripper: GripperConfig, width: float) -> float:
     """Return the position of the driven joint [rad or m] at a width [m]: half of it beyond `closed`, or an angle.
 
     The pads move with the ends of the linkage's bars, sideways by length * sin(open_angle - a).
     """
+    if gripper.travel:
+        return _between(gripper, 0, 1, width)
     if (jaw := gripper.jaw) is not None:
         sine = math.sin(jaw.angle) + width / jaw.radius
         return jaw.closed + jaw.opens * (math.asin(min(max(sine, -1.0), 1.0)) - jaw.angle)
@@ -28,6 +32,8 @@ def driven_position(gripper: GripperConfig, width: float) -> float:
 
 def width_at(gripper: GripperConfig, position: float) -> float:
     """Return the width [m] at a position of the driven joint [rad or m]: the inverse of `driven_position`."""
+    if gripper.travel:
+        return _between(gripper, 1, 0, position)
     if (jaw := gripper.jaw) is not None:
         turned = jaw.opens * (position - jaw.closed)
         return jaw.radius * (math.sin(jaw.angle + turned) - math.sin(jaw.angle))
@@ -47,12 +53,23 @@ def measured_width(gripper: GripperConfig | None, names: Sequence[str], position
 
 def finger_positions(gripper: GripperConfig, width: float) -> list[float]:
     """Return positions [rad or m] of the gripper's joints, in their order, at a width [m]."""
+    if gripper.travel:
+        return [_between(gripper, 0, column + 1, width) for column in range(len(gripper.joints))]
     driven = driven_position(gripper, width)
-    return [factor * driven for factor in finger_factors(gripper)]
+    return [factor * driven for factor, _ in finger_couplings(gripper)]
+
+
+def _between(gripper: GripperConfig, known: int, wanted: int, value: float) -> float:
+    """Return a column of the travel, interpolated at a value of another one that grows or falls."""
+    rows = sorted(gripper.travel, key=lambda row: row[known])
+    return float(np.interp(value, [row[known] for row in rows], [row[wanted] for row in rows]))
 
 
 def finger_velocities(gripper: GripperConfig, width: float, rate: float) -> list[float]:
     """Return velocities [rad/s or m/s] of the gripper's joints at a width [m] that changes at a rate [m/s]."""
+    if gripper.travel:
+        ends = (finger_positions(gripper, width + sign * TINY) for sign in (1, -1))
+        return [rate * (after - before) / (2 * TINY) for after, before in zip(*ends, strict=True)]
     driven = rate / 2
     if gripper.linkage is not None:
         bars = gripper.linkage
@@ -60,7 +77,7 @@ def finger_velocities(gripper: GripperConfig, width: float, rate: float) -> list
     if (jaw := gripper.jaw) is not None:
         turned = jaw.opens * (driven_position(gripper, width) - jaw.closed)
         driven = jaw.opens * rate / (jaw.radius * max(math.cos(jaw.angle + turned), 1e-3))
-    return [factor * driven for factor in finger_factors(gripper)]
+    return [factor * driven for factor, _ in finger_couplings(gripper)]
 
 
 def closing_frame(gripper: GripperConfig) -> NDArray[np.float64]:
@@ -71,6 +88,10 @@ def closing_frame(gripper: GripperConfig) -> NDArray[np.float64]:
     return T_tcp_closing
 
 
-def finger_factors(gripper: GripperConfig) -> list[float]:
-    """Return the factor of each joint relative to the driven joint, which is the first."""
-    return list(gripper.mimic) or [1.0] * len(gripper.joints)
+def finger_couplings(gripper: GripperConfig) -> list[tuple[float, float]]:
+    """Return factor and offset of each joint relative to the driven joint, which is the first."""
+    if gripper.travel:
+        (_, start, *starts), (_, end, *ends) = gripper.travel[0], gripper.travel[-1]
+        factors = [(after - before) / (end - start) for before, after in zip(starts, ends, strict=True)]
+        return [(1.0, 0.0), *((factor, at - factor * start) for factor, at in zip(factors, starts, strict=True))]
+    return [(factor, 0.0) for factor in gripper.mimic or [1.0] * len(gripper.joints)]

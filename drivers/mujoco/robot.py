@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from common.errors import ConfigError
 from common.robot.collision_shapes import distinct, solid
-from common.robot.finger_joints import finger_factors
+from common.robot.finger_joints import finger_couplings
 from common.robot.link_shapes import Shape, link_shapes
 from common.robot.mesh_files import content_of, triangles_of
 from common.robot.model import RobotModel
@@ -228,8 +228,8 @@ def _couple(spec: mujoco.MjSpec, root: ET.Element, robot: RobotModel) -> None:
     follows: dict[str, tuple[str, float, float]] = {}
     if gripper is not None and gripper.joints:
         driven, *others = gripper.joints
-        for name, factor in zip(others, finger_factors(gripper)[1:], strict=True):
-            follows[name] = driven, factor, 0.0
+        for name, coupling in zip(others, finger_couplings(gripper)[1:], strict=True):
+            follows[name] = driven, *coupling
     moved = {*robot.joint_names, *follows, *(gripper.joints[:1] if gripper else [])}
     for joint in root.findall("joint"):
         name, mimic = str(joint.get("name")), joint.find("mimic")

@@ -201,26 +201,30 @@ def _opening(gripper: GripperConfig, number: int, joint: ET.Element) -> Iterator
     """Check that a finger's joint fits the conversion of widths to its positions."""
     name, turns = gripper.joints[number], joint.get("type") in TURNS
     angles = "linkage" if gripper.linkage is not None else "jaw" if gripper.jaw is not None else ""
+    if gripper.travel:
+        angles, positions = "travel", [row[number + 1] for row in gripper.travel]
+    else:
+        factor = gripper.mimic[number] if gripper.mimic else 1.0
+        positions = [factor * driven_position(gripper, width) for width in (0.0, gripper.max_width)]
     if turns and not angles and number == 0:
         yield error(f"robot.gripper.joints: {name!r} turns ({joint.get('type')}), but without gripper.linkage half of "
                     "the width [m] is taken for its position [rad]", "give gripper.linkage: length, open_angle and "
                     "closed; or gripper.jaw, where the other finger is fixed", refused=True)
         return
-    if not turns and angles and number == 0:
+    if not turns and angles not in ("", "travel") and number == 0:
         yield error(f"robot.gripper.joints: {name!r} slides ({joint.get('type')}), but gripper.{angles} gives angles "
                     "for it", f"leave gripper.{angles} out", refused=True)
         return
     if turns and not angles:
         return
-    limit, factor = joint.find("limit"), gripper.mimic[number] if gripper.mimic else 1.0
+    limit = joint.find("limit")
     if limit is None or joint.get("type") == "continuous":
         return
     low, high = (float(limit.get(side, "nan")) for side in ("lower", "upper"))
     unit = "rad" if turns else "m"
-    ends = [factor * driven_position(gripper, width) for width in (0.0, gripper.max_width)]
-    if not (math.isnan(low) or math.isnan(high)) and (min(ends) < low - SLACK or max(ends) > high + SLACK):
-        yield warning(f"robot.gripper: {name!r} would go from {min(ends):g} to {max(ends):g} {unit} between closed and "
-                      f"open, its limits are {low:g} to {high:g}",
+    if not (math.isnan(low) or math.isnan(high)) and (min(positions) < low - SLACK or max(positions) > high + SLACK):
+        yield warning(f"robot.gripper: {name!r} would go from {min(positions):g} to {max(positions):g} {unit} between "
+                      f"closed and open, its limits are {low:g} to {high:g}",
                       f"correct gripper.max_width, gripper.{angles or 'closed'} or gripper.mimic")
 
 

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from common.robot.model import RobotModel
 from common.robot.transforms import invert
-from tools.robot_setup.fingers import PARALLEL, Grip, check_jaw, check_tool_frame, links_moved, measure, measure_jaw
+from tools.robot_setup.finger_travel import CONTACT, WIDEST, Couplings, Travel
+from tools.robot_setup.fingers import PARALLEL, Grip, check_jaw, check_tool_frame, measure_jaw
 from tools.robot_setup.tree import Arm, Joint, Tree
 
 Array = NDArray[np.float64]
@@ -36,6 +37,7 @@ class GripperProposal:
     grip: Grip
     closed: float = 0.0
     jaw: dict[str, float] | None = None
+    travel: list[list[float]] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
 
 
@@ -44,9 +46,9 @@ def find_gripper(
 ) -> GripperProposal | str:
     """Return the gripper that joints form, or why the platform cannot drive it.
 
-    One joint is driven and the others follow: by `mimic` of the URDF, or as a pair of equal slides. Slides are closed
-    at their lower end; fingers on parallelograms are open at 0, and their pads stay parallel. An independent joint
-    that carries none of the coupled fingers is locked.
+    One joint is driven and the others follow: by `mimic` of the URDF, or as a pair of equal fingers. The shapes show
+    where they are closed. What neither slides nor moves on parallelograms gets a table of measured positions. An
+    independent joint that carries none of the coupled fingers is locked.
     """
     fingers, locked = _without_others(tree, fingers)
     names = [joint.name for joint in fingers]
@@ -65,35 +67,35 @@ def find_gripper(
             return f"{', '.join(independent)} move independently of {driven.name}"
         factors = {driven.name: 1.0} | {joint.name: joint.mimic[1] for joint in fingers if joint.mimic}
     order = [driven, *(joint for joint in fingers if joint is not driven)]
-    palm = _palm(tree, order)
-    links = links_moved(robot, names)
-    low, high = driven.lower or 0.0, driven.upper or 0.0
-    if len(factors) < len(order):
-        other = order[1]
-        sign = 1.0 if abs((other.upper or 0.0) - high) + abs((other.lower or 0.0) - low) < 1e-3 else -1.0
-        factors[other.name] = sign
-    mimic = [factors[joint.name] for joint in order]
-    slides = driven.kind == "prismatic"
-    if not low < high or low < -1e-6:
-        start = "start at 0 or more" if slides else "start at 0"
-        return f"{driven.name} runs from {low:g} to {high:g}; the platform drives joints that {start}"
-    travel = np.linspace(low if slides else 0.0, high, STEPS)
-    rows = [[factor * float(at) for factor in mimic] for at in (travel if slides else travel[::-1])]
-    grip = measure(robot, palm, links, [joint.name for joint in order], rows, points)
-    if grip is None:
+    low, high = max(driven.lower or 0.0, -WIDEST), min(driven.upper or 0.0, WIDEST)
+    if not low < high:
+        return f"{driven.name} runs from {low:g} to {high:g}: it does not move"
+    pair = Couplings([joint.name for joint in order], [factors.get(joint.name, 1.0) for joint in order],
+                     [joint.offset if joint.mimic else 0.0 for joint in order])
+    found = pair.measured(robot, _palm(tree, order), points, np.linspace(low, high, STEPS))
+    if len(factors) < len(order):  # two independent fingers: their shapes show which way the other one moves
+        opposite = Couplings(pair.joints, [1.0, -1.0], pair.offsets)
+        other = opposite.measured(robot, _palm(tree, order), points, np.linspace(low, high, STEPS))
+        if found is None or (other is not None and other[0].widths[-1] > found[0].widths[-1]):
+            pair, found = opposite, other
+    if found is None:
         return f"no two links that {', '.join(names)} move approach each other"
-    if grip.widths[-1] <= grip.widths[0]:
-        return (f"the fingers are {'open' if slides else 'closed'} where {driven.name} is 0; the platform takes slides "
-                "to be closed there, and linkages to be open")
-    if grip.turned > PARALLEL:
-        return (f"the pads {' and '.join(grip.pads)} turn by {math.degrees(grip.turned):.0f} degrees while "
-                "they close; the platform drives pads that stay parallel")
+    grip, at = found
+    slides = driven.kind == "prismatic"
     gripper = GripperProposal(
-        palm, [joint.name for joint in order], mimic, None, [palm, *grip.pads], round(2 * high, 4),
+        _palm(tree, order), pair.joints, pair.factors, None, [_palm(tree, order), *grip.pads], round(2 * high, 4),
         round(min(2 * (driven.velocity or SPEED / 2), 0.2), 4), grip)
     if locked:
         gripper.remarks.append(f"gripper: {', '.join(locked)} is locked: it moves independently of {driven.name}")
-    return _slides(gripper, low, high) if slides else _with_linkage(gripper, driven, travel[::-1])
+    if not any(pair.offsets) and grip.turned <= PARALLEL:
+        meet = grip.widths[0] <= CONTACT
+        if slides and meet and at[0] < at[-1] and {abs(factor) for factor in pair.factors} == {1.0}:
+            return _slides(gripper, low, high)
+        if not slides and at[0] > at[-1] and abs(low) < 1e-6:
+            linked = _with_linkage(gripper, driven, at)
+            if not isinstance(linked, str):
+                return linked
+    return _with_travel(gripper, driven, pair.travel(robot, gripper.palm, points, at))
 
 
 def check_gripper(robot: RobotModel) -> list[str]:
@@ -134,19 +136,27 @@ def _without_others(tree: Tree, fingers: Sequence[Joint]) -> tuple[list[Joint], 
 
 
 def _slides(gripper: GripperProposal, low: float, high: float) -> GripperProposal:
-    closed = gripper.grip.widths[0]
-    if low > 0:  # the shapes show whether the fingers touch at their lower end
-        gripper.closed = round(low - closed / 2, 5)
+    if abs(low) > 1e-6 or abs(gripper.grip.widths[0]) > CONTACT:  # the shapes show where the fingers touch
+        gripper.closed = round(low - gripper.grip.widths[0] / 2, 5)
         gripper.max_width = round(2 * (high - gripper.closed), 4)
-        if gripper.closed < low - 1e-4:
-            gripper.remarks.append(
-                f"gripper.closed: the fingers would meet at {gripper.closed:g}, beyond the end of {gripper.joints[0]}, "
-                f"{low:g}")
-        return gripper
-    if abs(closed) > 0.003:
-        gripper.remarks.append(
-            f"gripper.max_width: the fingers are {1e3 * closed:.0f} mm apart where the platform assumes contact; held "
-            "objects are measured too narrow by that")
+    return gripper
+
+
+def _with_travel(gripper: GripperProposal, driven: Joint, found: Travel | str) -> GripperProposal | str:
+    """Add a table of widths and joint positions."""
+    if isinstance(found, str):
+        return found
+    gripper.grip, gripper.travel, gripper.links = found.grip, found.rows, [gripper.palm, *found.grip.pads]
+    gripper.max_width = found.rows[-1][0]
+    moved = abs(found.rows[-1][1] - found.rows[0][1])
+    slowest = driven.velocity or (SPEED / 2 if driven.kind == "prismatic" else 0.5)
+    gripper.speed = round(min(gripper.max_width / moved * slowest, 0.2), 4)
+    if found.grip.turned > PARALLEL:
+        gripper.remarks.append(f"gripper.travel: the pads turn by {math.degrees(found.grip.turned):.0f} degrees while "
+                               "they close: they hold an object at their tips only")
+    if found.rows[0][0] > CONTACT:
+        gripper.remarks.append(f"gripper.travel: closed fingers are {1e3 * found.rows[0][0]:.0f} mm apart: they hold "
+                               "nothing narrower")
     return gripper
 
 
@@ -188,6 +198,8 @@ def section(gripper: GripperProposal, closing: str) -> dict[str, Any]:
     values: dict[str, Any] = {"joints": gripper.joints}
     if any(factor != 1 for factor in gripper.mimic):
         values["mimic"] = gripper.mimic
+    if gripper.travel:
+        values = {"joints": gripper.joints, "travel": gripper.travel}
     if gripper.linkage:
         values["linkage"] = gripper.linkage
     if gripper.closed:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import pinocchio as pin
@@ -32,6 +32,7 @@ class Grip:
         closing: (3,) unit axis of closing; approach: (3,) from the start of the fingers to their tips.
         middle: (3,) between the closed pads, at the height of the tips.
         widths: between the pads at each requested position.
+        heights: of the tips along `approach` at each of them.
         turned: largest rotation of a pad [rad].
         depth: of a tip along `closing`; half_width: half its size across.
     """
@@ -44,6 +45,7 @@ class Grip:
     turned: float
     depth: float
     half_width: float
+    heights: list[float] = field(default_factory=list)
 
 
 def link_points(robot: RobotModel) -> dict[str, Array]:
@@ -101,6 +103,7 @@ def measure(
         approach = _flat(along + start - (T_carrier_world[:3, :3] @ wrist + T_carrier_world[:3, 3]), closing)
     if np.linalg.norm(approach) < 1e-3:
         return None
+    approach = _flat(_tool_axis(robot, q, fingers.seen[0][carrier], approach), closing)
     return fingers.grip(one, other, closing, _unit(approach))
 
 
@@ -150,6 +153,8 @@ class _Fingers:
             widths=[ends(one, at, closing)[0] - ends(other, at, closing)[1] for at in range(count)],
             turned=max(math.acos(min(1.0, max(-1.0, (np.trace(R) - 1) / 2))) for R in turns),
             depth=high - low, half_width=(sides[1] - sides[0]) / 2,
+            heights=[max(float((self.cloud(link, at) @ approach).max()) for link in (one, other))
+                     for at in range(count)],
         )
 
 
@@ -188,6 +193,7 @@ def check_tool_frame(robot: RobotModel, points: dict[str, Array] | None = None) 
                     [finger_positions(gripper, width) for width in widths], points or link_points(robot))
     if found is None:
         return [f"gripper.joints: no two links that {', '.join(gripper.joints)} move approach each other"]
+    opening = gripper.max_width - (gripper.travel[0][0] if gripper.travel else 0.0)  # what the fingers move apart
     problems = []
     if abs(found.closing["xy".index(axis)]) < ALIGNED:
         way = axis_name(found.closing).removeprefix("-")
@@ -195,7 +201,7 @@ def check_tool_frame(robot: RobotModel, points: dict[str, Array] | None = None) 
     if found.approach[2] < ALIGNED:
         problems.append(f"tcp_link: z of {name} must point from the palm to the tips of the fingers, which is "
                           f"{axis_name(found.approach)}")
-    elif abs(found.widths[1] - found.widths[0] - gripper.max_width) > 0.1 * gripper.max_width:
+    elif abs(found.widths[1] - found.widths[0] - opening) > 0.1 * gripper.max_width:
         problems.append(f"gripper.max_width: the fingers open by {found.widths[1] - found.widths[0]:.4f} m, not by "
                           f"{gripper.max_width:g} m")
     return problems

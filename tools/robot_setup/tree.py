@@ -22,7 +22,7 @@ FINGER_JOINTS = 3  # longest chain of a finger
 class Joint:
     """A joint of a URDF; `lower`, `upper` [rad or m] and `velocity` [rad/s or m/s] are None if not given.
 
-    `mimic` is the joint that it follows, and the multiplier.
+    `mimic` is the joint that it follows, and the multiplier; `offset` is added to that.
     """
 
     name: str
@@ -33,6 +33,7 @@ class Joint:
     upper: float | None = None
     velocity: float | None = None
     mimic: tuple[str, float] | None = None
+    offset: float = 0.0
 
     @property
     def moves(self) -> bool:
@@ -163,7 +164,7 @@ def _joint(element: ET.Element, links: Sequence[str], source: str) -> Joint:
         factor = value(mimic, "multiplier")
         follows = (mimic.get("joint", ""), 1.0 if factor is None else factor)
     return Joint(name, kind, ends[0], ends[1], value(limit, "lower"), value(limit, "upper"),
-                 value(limit, "velocity") or None, follows)
+                 value(limit, "velocity") or None, follows, value(mimic, "offset") or 0.0)
 
 
 def _may_turn(text: str) -> bool:

@@ -116,6 +116,58 @@ def test_slides_closed_at_a_positive_position_report_it(scara_with):
     assert width_at(gripper, 0.04) == pytest.approx(0.02)
 
 
+LIMITS = 'lower="0" upper="0.04"'
+LEFT, RIGHT = (f'<joint name="{side}_finger" type="prismatic"><parent link="palm"/><child link="{side}"/>'
+               f'<origin xyz="0 0 0.04"/>\n <axis xyz="{axis}"/>'
+               for side, axis in (("left", "0 1 0"), ("right", "0 -1 0")))
+MIMIC = '<mimic joint="left_finger"/>'
+
+
+def turning(joint, axis):
+    return joint, joint.replace("prismatic", "revolute").replace("0 1 0", axis).replace("0 -1 0", axis)
+
+
+@pytest.mark.parametrize(("changes", "opens", "closed", "opened"), [
+    # the range begins below 0
+    ([('xyz="0 0.005 0.03"', 'xyz="0 0.015 0.03"'), ('xyz="0 -0.005 0.03"', 'xyz="0 -0.015 0.03"'),
+      (LIMITS, 'lower="-0.01" upper="0.03"')], 0.08, [-0.01, -0.01], [0.03, 0.03]),
+    # closed fingers are apart
+    ([('xyz="0 0.005 0.03"', 'xyz="0 0.01 0.03"'), ('xyz="0 -0.005 0.03"', 'xyz="0 -0.01 0.03"')],
+     0.09, [0.0, 0.0], [0.04, 0.04]),
+    # open at the lower end
+    ([("0 1 0", "0 -1 0"), (RIGHT, RIGHT.replace("0 -1 0", "0 1 0")), (LIMITS, 'lower="-0.04" upper="0"')],
+     0.08, [0.0, 0.0], [-0.04, -0.04]),
+    # independent fingers that move the same way at equal positions
+    ([(f"{RIGHT}<limit {LIMITS}", f'{RIGHT.replace("0 -1 0", "0 1 0")}<limit lower="-0.04" upper="0"'), (MIMIC, "")],
+     0.08, [0.0, 0.0], [0.04, -0.04]),
+    # fingers that turn, one with an offset; a tip may retreat by 12 mm
+    ([turning(LEFT, "-1 0 0"), turning(RIGHT, "1 0 0"), (LIMITS, 'lower="-0.1" upper="0.4"'),
+      (MIMIC, '<mimic joint="left_finger" multiplier="0.5" offset="0.05"/>')], None, None, None),
+], ids=["below 0", "apart", "reversed", "independent", "turning"])
+def test_fingers_get_the_width_that_their_shapes_show(changes, opens, closed, opened, scara_with):
+    proposal = scara_with(*changes)
+    assert proposal.lost == []
+    robot = RobotModel.load(check(RobotConfig, proposal.values, "robot"))
+    gripper = robot.config.gripper
+    assert check_gripper(robot) == []
+    for width in np.linspace(gripper.travel[0][0] if gripper.travel else 0.0, gripper.max_width, 9):
+        assert width_at(gripper, finger_positions(gripper, width)[0]) == pytest.approx(width, abs=1e-5)
+    if opens is None:
+        left, right = finger_positions(gripper, 0.04)
+        assert right == pytest.approx(0.5 * left + 0.05, abs=1e-4)
+        assert 0.03 < gripper.max_width < 0.07
+        return
+    assert gripper.max_width == pytest.approx(opens, abs=1e-4)
+    assert finger_positions(gripper, 0.0) == pytest.approx(closed, abs=1e-4)
+    assert finger_positions(gripper, gripper.max_width) == pytest.approx(opened, abs=1e-4)
+
+
+def test_fingers_that_do_not_meet_are_no_gripper(scara_with):
+    proposal = scara_with(('xyz="0 0.005 0.03"', 'xyz="0 0.03 0.03"'), ('xyz="0 -0.005 0.03"', 'xyz="0 -0.03 0.03"'))
+    assert proposal.lost == ["no gripper: the fingers of left_finger do not meet: they are 50 mm apart where they are "
+                             "closest"]
+
+
 def test_independent_joint_that_carries_no_finger_is_locked(scara_with):
     proposal = scara_with((
         "</robot>", '<link name="bar"/><joint name="bar_turns" type="continuous"><parent link="palm"/>'
