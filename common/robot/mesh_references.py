@@ -12,6 +12,7 @@ from common.robot.description_file import fault_of
 from common.robot.packages import package_paths
 
 SCHEME = "package://"
+_LEVELS = 3  # above a description, where its meshes may be
 
 
 @dataclass
@@ -21,13 +22,13 @@ class MeshReferences:
     Attributes:
         missing: collision meshes without a usable file, and why.
         undrawn: visual meshes without one; they are removed, so that a link is drawn by its collision shape.
-        moved: paths of another machine, and the file here.
+        moved: paths of another machine, or of packages that are not here, and the file that is used instead.
         packages: folders of the packages that were used, by name.
     """
 
     missing: dict[str, str] = field(default_factory=dict)
     undrawn: dict[str, str] = field(default_factory=dict)
-    moved: dict[str, str] = field(default_factory=dict)
+    moved: dict[str, Path] = field(default_factory=dict)
     packages: dict[str, Path] = field(default_factory=dict)
 
 
@@ -75,15 +76,21 @@ def _located(name: str, source: Path, folders: Sequence[str], result: MeshRefere
     """Return the file of a mesh reference; None if there is none."""
     if name.startswith(SCHEME):
         package, _, rest = name.removeprefix(SCHEME).partition("/")
-        return _in_package(package, rest, source, folders, result)
-    plain = unquote(name.removeprefix("file://")) if name.startswith("file://") else name
-    if "://" in plain or not plain:
-        return None
-    if (path := source.parent / plain).is_file():
-        return path
-    for package, rest in _tails(plain):
         if (found := _in_package(package, rest, source, folders, result)) is not None:
-            result.moved[name] = f"{SCHEME}{package}/{rest}"
+            return found
+        tails = [(package, rest)]
+    else:
+        plain = unquote(name.removeprefix("file://")) if name.startswith("file://") else name
+        if "://" in plain or not plain:
+            return None
+        if (path := source.parent / plain).is_file():
+            return path
+        tails = list(_tails(plain))
+    for package, rest in tails:
+        near = (path for folder in source.resolve().parents[:_LEVELS] if (path := folder / rest).is_file())
+        found = _in_package(package, rest, source, folders, result) or next(near, None)
+        if rest and found is not None:
+            result.moved[name] = found
             return found
     return None
 

@@ -86,7 +86,7 @@ class Reader:
                                                  f"{fault}{advice}")
         if meshes.moved:
             used = next(iter(meshes.moved.values()))
-            found.notes.append(f"{_first(meshes.moved)} is a path of another machine: {used} is used")
+            found.notes.append(f"{_first(meshes.moved)} is not on this machine: {used} is used")
         if meshes.undrawn:
             fault = next(iter(meshes.undrawn.values()))
             found.notes.append(f"mesh {_first(meshes.undrawn)} {fault}: the link is drawn by its collision shape")
@@ -99,7 +99,7 @@ class Reader:
         """Return the text of a xacro file, and the packages that it asked for."""
         here = str(Path.cwd())
         request = {"file": str(path), "arguments": dict(self.arguments), "folders": list(around), "trust": self.trust,
-                   "readable": [*self.folders, str(path), *_own_folders(path)],
+                   "readable": [*self.folders, str(path), *_own_folders(path), *self.arguments.values()],
                    "root": str(_WORKER.parents[2]), "python": [each for each in sys.path if each not in ("", here)]}
         # A file of a stranger gets no variables but those that find packages.
         environment = os.environ if self.trust else {
@@ -198,6 +198,6 @@ def _portable(description: Description, folder: Path) -> str:
     return f'<?xml version="1.0"?>\n{ET.tostring(root, encoding="unicode")}\n'
 
 
-def _first(names: Mapping[str, str]) -> str:
+def _first(names: Mapping[str, object]) -> str:
     more = f" (and {len(names) - 1} more)" if len(names) > 1 else ""
     return f"{next(iter(names))}{more}"

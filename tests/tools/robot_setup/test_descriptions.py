@@ -41,17 +41,19 @@ def package(folder: Path, name: str) -> Path:
 ])
 @pytest.mark.parametrize(("place", "given"), [
     ("src/a_clone", ["."]), ("src/a_clone", ["src/a_clone"]), ("src/repository/nested/a_clone", ["src"]),
-    ("description", []), ("that_arm", []),
+    ("description", []), ("that_arm", []), ("src/repository/exported_by_CAD", []),
 ])
 def test_package_is_found_by_its_name_wherever_it_is(mesh, place, given, tmp_path):
     folder = package(tmp_path / place, "that_arm")
+    if "CAD" in place:
+        (folder / "package.xml").write_text("<package><name>another_name</name></package>")
     urdf = tmp_path / "arm.urdf" if given or place == "that_arm" else folder / "urdf" / "arm.urdf"
     urdf.parent.mkdir(exist_ok=True)
     urdf.write_text(arm(shape("collision", mesh)))
     reader = Reader([str(tmp_path / each) for each in given])
     found = reader.read("urdf", str(urdf))
     assert [each.get("filename") for each in found.root.iter("mesh")] == [str(folder / "meshes" / "link.stl")]
-    assert bool(found.notes) == (not mesh.startswith("package"))
+    assert bool(found.notes) == (not mesh.startswith("package") or "CAD" in place)
     robot = RobotModel.load(check(RobotConfig, {
         "name": "arm", "urdf": str(urdf), "package_dirs": reader.folders, "joints": ["turn"], "base_link": "base",
         "tcp_link": "tip", "named_poses": {"home": [0.0]}, "acceleration_limits": [1], "jerk_limits": [1]}, "robot"))
