@@ -114,7 +114,7 @@ def read_layout(file: BinaryIO, path: Path) -> Layout:
             limits.count(opcode, length, here, first)
             _add_record(found, opcode, here, length, first, file)
         except DAMAGE:
-            after = search.record_after(here)
+            after = search.record_after(here + 1)
             if after is None:
                 return found
             found.holes.append(after - here)

@@ -4,17 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import os
 import re
-import sys
-import termios
 import time
-import tty
 from collections import Counter
 from collections.abc import AsyncIterator, Callable, Collection
 from functools import cache
-from types import TracebackType
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from common.application import find_topic
 from common.client.joining import is_listening
@@ -29,6 +24,7 @@ from common.transport.endpoint import endpoint_of
 from common.transport.router import open_router
 from common.transport.zenoh_session import close_within
 from common.transport.zenoh_session import connect as connect_to
+from recording.keyboard import Keys
 from recording.reader import Recording
 from recording.sample import RecordingError, encoding_of, restamp
 from recording.selection import Selection
@@ -371,55 +367,3 @@ async def _show(player: Player, recording: Recording, show: Callable[[str], None
         state = "paused" if player.head.paused else f"x{player.head.rate:g}"
         show(f"{player.position:7.1f} / {recording.seconds:.1f} s  {state}  {player.published:,} messages")
         await asyncio.sleep(SHOW_PERIOD)
-
-
-NAMES = {b"\x1b[C": "right", b"\x1b[D": "left", b"\x1b[B": "down", b"\x1b[A": "up", b" ": "space"}
-
-
-class Keys:
-    """Calls back with the name of each key during the block; does nothing without a terminal.
-
-    The end of the block restores the terminal. Ctrl-C stays a signal.
-    """
-
-    def __init__(self, on_key: Callable[[str], None], *, on_terminal: bool) -> None:
-        """Prepare without changing the terminal; the block needs a running loop."""
-        self._on_terminal = on_terminal
-        self._on_key = on_key
-        self._before: list[Any] | None = None
-
-    def __enter__(self) -> Keys:
-        if self._on_terminal:
-            self._before = termios.tcgetattr(sys.stdin.fileno())
-            tty.setcbreak(sys.stdin.fileno())
-            asyncio.get_running_loop().add_reader(sys.stdin.fileno(), self._read)
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if self._before is not None:
-            asyncio.get_running_loop().remove_reader(sys.stdin.fileno())
-            termios.tcsetattr(sys.stdin.fileno(), termios.TCSADRAIN, self._before)
-
-    def _read(self) -> None:
-        data = os.read(sys.stdin.fileno(), 64)
-        if not data:  # the terminal was closed
-            asyncio.get_running_loop().remove_reader(sys.stdin.fileno())
-        for name in names_of(data):
-            self._on_key(name)
-
-
-def names_of(data: bytes) -> list[str]:
-    """Return the keys of bytes from a terminal: right, left, up, down, space, or a letter."""
-    names = []
-    while data:
-        known = next((code for code in NAMES if data.startswith(code)), None)
-        if known is not None:
-            names.append(NAMES[known])
-        elif data[0] != 0x1B:
-            names.append(chr(data[0]))
-        else:  # another escape sequence, whose letters are no keys
-            break
-        data = data[len(known) if known else 1 :]
-    return names

@@ -16,7 +16,7 @@ import pytest
 
 from recording.capture import RecordingStats
 from recording.formatting import format_bytes, format_progress, format_result
-from recording.player import names_of
+from recording.keyboard import names_of
 from recording.reader import Recording
 from recording.summary import summarise
 from tests.cli.conftest import make_folder

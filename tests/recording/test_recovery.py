@@ -153,6 +153,19 @@ def test_file_without_chunks_is_read_and_copied_with_its_encodings(loose, folder
     assert copied == [(number, number + 4, *about) for number in numbers]
 
 
+def test_record_that_does_not_parse_is_a_hole(folder):
+    path = folder / "odd.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file, use_chunking=False)
+        writer.start()
+        for topic in ("panda/bad", "panda/good"):
+            writer.add_message(writer.register_channel(topic, "msgpack", 0), 1, b"\x80", 1)
+        writer.finish()
+    path.write_bytes(path.read_bytes().replace(b"bad", b"\xff\xfe\xfd"))
+    with Recording(path) as recording:
+        assert [sample.topic for sample in recording.samples()] == ["good"]
+
+
 def test_search_for_records_ends_at_once_in_a_file_made_to_prolong_it(whole, folder):
     path = folder / "endless.mcap"
     for filler in (b"\x06\x28\0\0\0\0\0\0\0", b"\x05\x16" + bytes(7) + b"\1" * 22 + b"\xff"):

@@ -20,7 +20,7 @@ Pixels = npt.NDArray[np.uint8]
 _REJECTIONS = {"nothing": "show no marker", "blurred": "are blurred", "few corners": "show too little of the board",
                "like another view": "repeat an earlier pose", "other board": "show another board",
                "dark": "are too dark", "flipped": "are mirrored or negatives", "other size": "have another size"}
-_EXPLAINED = ("other board", "few corners", "flipped", "other size")  # rejections with an example
+_EXPLAINED = ("other board", "few corners", "flipped")  # rejections with an example
 CELLS = 8, 6  # coverage grid of the image, columns and rows
 _REGIONS = (("upper left", "upper middle", "upper right"), ("left", "middle", "right"),
             ("lower left", "lower middle", "lower right"))
@@ -95,10 +95,15 @@ class ViewSelector:
         """Start without views."""
         self.board = board
         self.options = options or CollectingOptions()
-        self.views: list[BoardDetection] = []
+        self._by_size: dict[tuple[int, int], list[BoardDetection]] = {}
         self.images = 0
         self._rejected: Counter[str] = Counter()
         self._example: dict[str, str] = {}
+
+    @property
+    def views(self) -> list[BoardDetection]:
+        """The views of the most frequent size."""
+        return max(self._by_size.values(), key=len, default=[])
 
     @property
     def complete(self) -> bool:
@@ -111,15 +116,13 @@ class ViewSelector:
         detection = self.board.find(image, name)
         if isinstance(detection, NoBoard):
             return self._reject(detection.kind, detection.reason)
-        if self.views and detection.size != self.views[0].size:
-            return self._reject("other size", f"{name} is {detection.size[0]}x{detection.size[1]}, but "
-                                f"{self.views[0].name} is {self.views[0].size[0]}x{self.views[0].size[1]}")
         if detection.blur > self.options.max_blur:
             return self._reject("blurred", f"edges are blurred over {detection.blur:.1f} px")
-        nearest = min((_distance(detection, view) for view in self.views), default=np.inf)
+        same_size = self._by_size.setdefault(detection.size, [])
+        nearest = min((_distance(detection, view) for view in same_size), default=np.inf)
         if nearest < self.options.distinct:
             return self._reject("like another view", "the board has the same pose as in another view")
-        self.views.append(detection)
+        same_size.append(detection)
         return ""
 
     def require_enough(self) -> None:
@@ -143,7 +146,9 @@ class ViewSelector:
     @property
     def rejections(self) -> str:
         """How many images were rejected, and why."""
-        return ", ".join(f"{count} {_REJECTIONS[kind]}" for kind, count in self._rejected.most_common())
+        other_size = sum(map(len, self._by_size.values())) - len(self.views)
+        counts = self._rejected + Counter({"other size": other_size})
+        return ", ".join(f"{count} {_REJECTIONS[kind]}" for kind, count in counts.most_common())
 
     def coverage(self) -> tuple[float, list[str]]:
         """Fraction of image cells with a corner, and names of regions without any."""

@@ -123,11 +123,13 @@ def test_too_few_views_report_why_images_were_rejected():
     assert "\n" not in line
 
 
-def test_images_of_different_sizes_are_rejected():
-    collector = collect([facing(BOARD, 0, 0, 0.5)])
-    big = cv2.resize(render(BOARD, LENS, facing(BOARD, 0.1, 0, 0.5)), (800, 600))
-    assert collector.add(big, "big") == "big is 800x600, but view 0 is 640x480"
-    assert collector.rejections == "1 have another size" and len(collector.views) == 1
+def test_images_of_the_most_frequent_size_are_used():
+    collector = ViewSelector(BOARD)
+    assert collector.add(cv2.resize(render(BOARD, LENS, facing(BOARD, 0.1, 0, 0.5)), (800, 600)), "big") == ""
+    for x in (0.0, 0.1):
+        assert collector.add(render(BOARD, LENS, facing(BOARD, x, 0, 0.5)), f"at {x}") == ""
+    assert collector.rejections == "1 have another size"
+    assert [view.size for view in collector.views] == [(640, 480)] * 2
 
 
 def test_coverage_names_regions_without_corners():
