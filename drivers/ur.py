@@ -154,7 +154,7 @@ class SilenceTimer:
 class UrArm:
     """The three connections to a controller: its state, the program that moves the arm, and its dashboard."""
 
-    paced_by_arm, realtime = False, True
+    paced_by_arm, realtime, slowed = False, True, True
 
     def __init__(self, options: Options, limits: Limits) -> None:
         """Connect; an arm that is ready gets its program and stays at rest."""

@@ -12,7 +12,15 @@ import numpy as np
 
 from common.config import GripperConfig
 from common.errors import Refused
-from common.hardware.interface import ControlledArm, Gripper, GripperReading, Hardware, HardwareFault, Vector
+from common.hardware.interface import (
+    ControlledArm,
+    Gripper,
+    GripperReading,
+    Hardware,
+    HardwareFault,
+    Interrupted,
+    Vector,
+)
 from common.messages.basics import clean
 
 SHORTEST, LONGEST = 0.2, 5.0  # [s] cell time for which a failed device is left alone
@@ -34,7 +42,7 @@ def call_device(doing: str, call: Callable[P, T], *args: P.args, **kwargs: P.kwa
     except Exception as error:
         text = clean(str(error))  # the message of a device may contain anything
         if isinstance(error, HardwareFault) and text:
-            raise HardwareFault(text) from error
+            raise (Interrupted if isinstance(error, Interrupted) else HardwareFault)(text) from error
         line = text.partition("\n")[0]
         raise HardwareFault(f"{doing}: {type(error).__name__}{': ' if line else ''}{line}") from error
 

@@ -6,6 +6,8 @@ changed. Requests are checked by the motion authority, which knows interlocks an
 
 from __future__ import annotations
 
+from typing import Any
+
 from common.config import GripperConfig
 from common.control.devices import DeviceFault, PayloadReporter, call_device, read_gripper, read_joints
 from common.control.goals import Assessment
@@ -22,8 +24,10 @@ from common.hardware.interface import (
     ControlledArm,
     Hardware,
     HardwareFault,
+    Interrupted,
     Limits,
     PersistedState,
+    SlowedArm,
     Vector,
     WorldBackend,
 )
@@ -132,13 +136,22 @@ class Executor:
             if self.gripper is not None:
                 self.gripper.fault(str(fault))
         if self._controlled is None or self._update_controlled_arm(self._controlled):
-            self.arm.jog(self.authority.jog_velocity(self.arm.reports.speed_scaling))
+            slider = self._controlled.state.speed if self._controlled is not None else 1.0
+            self.arm.jog(self.authority.jog_velocity(self._speed_scaling), slider)
             set_points = self.arm.update(now, self._q, dq)
             if set_points is not None:
-                call_device("sending set-points", self._hardware.write, *set_points, now)
-                self._arm_fault.clear(now)
+                self._send(*set_points, now)
         width = self.gripper.state.width if self.gripper is not None else 0.0
         return joint_state(header, self._limits.names, self._q, dq, self._gripper_config, width, self._width_rate)
+
+    def _send(self, positions: Vector, velocities: Vector, now: float) -> None:
+        if isinstance(self._controlled, SlowedArm):
+            self._controlled.share = self.arm.share_of_speed(velocities, self._speed_scaling)
+        try:
+            call_device("sending set-points", self._hardware.write, positions, velocities, now)
+            self._arm_fault.clear(now)
+        except Interrupted as reason:
+            self.arm.interrupt(str(reason), now)
 
     def _update_controlled_arm(self, arm: ControlledArm) -> bool:
         """Return whether the arm's own controller accepts set-points."""
@@ -189,7 +202,7 @@ class Executor:
             gripper.cancel_deferred(*failed)
 
     def _report_changes(self, report: Report, header: Header) -> None:
-        report.robot = self._changes.robot(header, robot_fields(self._controlled, self._arm_fault.reason), self._late)
+        report.robot = self._changes.robot(header, self._robot_fields, self._late)
         report.notes = [*filter(None, (self._arm_fault.pop_log_line(), self._gripper_fault.pop_log_line(),
                                        self.arm.pop_log_line(), self._payload.pop_log_line()))]
         report.owner = self.authority.changed_owner(header)
@@ -313,7 +326,11 @@ class Executor:
     @property
     def robot(self) -> RobotStatus:
         """State of the arm."""
-        return RobotStatus(**robot_fields(self._controlled, self._arm_fault.reason), late=self._late)
+        return RobotStatus(**self._robot_fields, late=self._late)
+
+    @property
+    def _robot_fields(self) -> dict[str, Any]:
+        return robot_fields(self._controlled, self._arm_fault.reason, self.arm.resumed)
 
     @property
     def _late(self) -> float:

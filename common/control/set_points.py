@@ -13,12 +13,14 @@ from common.control.limiter import Limiter
 from common.control.trajectory import Tolerances
 from common.errors import Refused
 from common.hardware.interface import HardwareFault, Limits, Vector
+from common.hardware.pace import RAMP_UP, SHORTEST_STOP
 
 RAMP_SHARE = 0.95  # of the accelerations is for resuming: differences also see the curvature of the path
 JERK_SHARE = 0.85  # the same of jerk, also in a stop: where the rate changes, that of the path is added
 BEHIND = 1e-3  # [rad] between path and set-point at which the goal's time stops
 ARRIVED = 1e-6  # [rad] closer, the set-point is on the path
 JITTER = 0.1  # [s] cell time by which the delay of an arm behind its set-points may grow: hosts and networks vary
+REWOUND, SAMPLES = 1.5, 1501  # [s] of a path, before the newest set-point, where an interrupted arm may have stopped
 RELOCATION_PERIOD = 1.0  # [s] cell time: an arm moved from outside more often than this does not stay where it is held
 
 
@@ -38,16 +40,19 @@ class SetPointHistory:
         """Forget set-points that are not followed any more."""
         self._sent.clear()
 
-    def expected(self, now: float, newest: Vector, measured: Vector) -> tuple[Vector, Vector]:
-        """Record the newest set-point (dof,) [rad]; return where the arm should be now, at its delay.
-
-        The second result is the one of the last JITTER before that which is closest to the measured position.
-        """
+    def record(self, now: float, newest: Vector) -> None:
+        """Record the newest set-point (dof,) [rad]."""
         if self.delay == 0.0:
-            return newest, newest
+            self._sent.clear()
         self._sent.append((now, newest))
         while len(self._sent) > 1 and self._sent[1][0] <= now - self.delay - JITTER:
             self._sent.popleft()
+
+    def expected(self, now: float, measured: Vector) -> tuple[Vector, Vector]:
+        """Return where the arm should be now (dof,) [rad], at its delay.
+
+        The second result is the set-point of the last JITTER before that which is closest to the measured position.
+        """
         past = [q for sent, q in self._sent if sent <= now - self.delay + 1e-6] or [self._sent[0][1]]
         return past[-1], min(past, key=lambda q: float(np.abs(measured - q).max()))
 
@@ -74,6 +79,7 @@ class Standstill:
         self.position = start.copy()
         self.coasting = False
         self.jog_velocity: Vector | None = None
+        self.full_speed = 0.0  # of the fastest joint in the newest jogging, with the arm's slider at 1 [rad/s]
         self._missed = self._relocated = False  # the last goal ended off its path; the arm was then held where it was
         self._deviation = 0.0 * start  # of an arm that stays off wherever it is held [rad]
         self._moved_at = -math.inf  # cell time at which the arm was last found moved from outside [s]
@@ -87,10 +93,12 @@ class Standstill:
         self.coasting = velocity is not None and bool(np.any(np.abs(velocity) > self._tolerances.stopped_velocity))
         self._limiter.rest(measured, velocity if self.coasting else None)
 
-    def jog(self, velocity: Vector | None) -> None:
-        """Jog at joint velocities (dof,) [rad/s] until the next call; None: come to rest."""
+    def jog(self, velocity: Vector | None, slider: float = 1.0) -> None:
+        """Jog at a share of joint velocities (dof,) [rad/s] until the next call; None: come to rest."""
         self.coasting = self.coasting or (velocity is None and self.jog_velocity is not None)
-        self.jog_velocity = velocity
+        self.jog_velocity = None
+        if velocity is not None:
+            self.jog_velocity, self.full_speed = slider * velocity, float(np.abs(velocity).max())
 
     def goal_missed(self) -> None:
         """Record that a goal ended with the arm off its path."""
@@ -135,8 +143,9 @@ class Standstill:
         """
         if self.jog_velocity is not None or self.coasting:
             self._coasted_at = now
+        self._history.record(now, self._limiter.position)
         if self.jog_velocity is not None:
-            off = np.abs(measured - self._history.expected(now, self._limiter.position, measured)[1])
+            off = np.abs(measured - self._history.expected(now, measured)[1])
             if np.all(off <= self._tolerances.path):
                 self.coasting = False
                 set_point = self._limiter.go_at(self.jog_velocity, step)
@@ -169,6 +178,8 @@ class Standstill:
                     self.position = measured.copy()
                 self._missed, self._relocated = not self._relocated, True
             return False
+        if np.all(np.abs(measured - self._history.expected(now, measured)[1]) <= self._tolerances.start):
+            return False  # where it was commanded to be at the time of the reading
         if now - self._coasted_at <= self._tolerances.goal_time and self.is_trailing(measured, velocity):
             return False
         j = int(np.argmax(off))
@@ -207,6 +218,7 @@ class GoalFollower:
         """
         braking = goal.stopping or held
         share = max(speed_scaling, goal.pace.rate)
+        goal.pace.ramp_up = SHORTEST_STOP if speed_scaling * goal.share < goal.pace.rate else RAMP_UP
         catching_up = max(0.0, 1 - goal.behind / BEHIND)
         goal.time = goal.pace.advance(
             goal.at, goal.time, 0.0 if braking else speed_scaling * goal.share * catching_up,
@@ -222,9 +234,26 @@ class GoalFollower:
         )
         goal.behind = float(np.abs(position - set_point).max())
         over = goal.time >= goal.duration or (goal.stopping and goal.pace.rate == 0.0)
-        if over and goal.ended is None and goal.behind <= ARRIVED:
+        arrived = goal.behind <= ARRIVED or (share == 0.0 and self._limiter.at_rest)
+        if over and goal.ended is None and arrived:
             goal.ended = now
         return set_point, velocity
+
+    def rewind(self, goal: Goal, now: float, measured: Vector) -> Outcome | None:
+        """Continue from rest at the place of the path where the arm is at rest; end a goal whose arm is not on it.
+
+        Where the path passes there more than once, the first time counts.
+        """
+        times = np.linspace(max(goal.time - REWOUND, 0.0), goal.time, SAMPLES)
+        off = np.abs(goal.positions_at(times) - measured).max(axis=1)
+        nearest = int(np.argmax(off <= off.min() + ARRIVED))
+        goal.time = float(times[nearest])
+        self._standstill.position = goal.at(goal.time)[0]
+        self._limiter.rest(measured)
+        self._history.clear()
+        goal.behind, goal.last, goal.ended = float(off[nearest]), now, None
+        goal.pace.rest()
+        return self._check_place(measured, goal.behind)
 
     def resume_from_rest(self, goal: Goal, now: float, measured: Vector, velocity: Vector) -> Outcome | None:
         """Continue from rest at the newest set-point, or where the arm is; end a goal whose arm was moved too far."""
@@ -237,6 +266,9 @@ class GoalFollower:
             self._limiter.rest()
         goal.last = now
         goal.pace.rest()
+        return self._check_place(measured, off)
+
+    def _check_place(self, measured: Vector, off: float) -> Outcome | None:
         if off <= self._tolerances.path:
             return None
         name = self._limits.names[int(np.argmax(np.abs(measured - self._standstill.position)))]
@@ -246,7 +278,8 @@ class GoalFollower:
 
     def off_path(self, now: float, measured: Vector) -> tuple[str, Vector]:
         """Return a message if the arm is off its path, and its distance from the expected set-point (dof,) [rad]."""
-        expected, nearest = self._history.expected(now, self._limiter.position, measured)
+        self._history.record(now, self._limiter.position)
+        expected, nearest = self._history.expected(now, measured)
         off = np.abs(measured - nearest)
         j = int(np.argmax(off))
         message = ""

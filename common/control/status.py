@@ -83,13 +83,13 @@ class ChangeDetector:
         return state.model_copy(update={"header": header})
 
 
-def robot_fields(arm: ControlledArm | None, fault: str) -> dict[str, Any]:
+def robot_fields(arm: ControlledArm | None, fault: str, resumed: int = 0) -> dict[str, Any]:
     """Return the published state of the arm; one without a controller of its own runs, unless it has a fault."""
     if arm is None:
         return {"mode": "fault" if fault else "running", "message": fault}
     state = arm.state
     return {"mode": state.mode, "message": state.message, "speed": state.speed, "inputs": state.inputs,
-            "outputs": state.outputs, "controller": True}
+            "outputs": state.outputs, "controller": True, "resumed": resumed}
 
 
 def joint_state(

@@ -15,7 +15,7 @@ from common.control.limiter import Limiter
 from common.control.set_points import GoalFollower, SetPointHistory, Standstill
 from common.control.trajectory import Tolerances, checked_trajectory
 from common.errors import Refused
-from common.hardware.interface import Limits, Vector
+from common.hardware.interface import HardwareFault, Limits, Vector
 from common.messages import Holder, JointTrajectory, MotionStatus
 from common.messages.basics import clean
 
@@ -23,6 +23,8 @@ PERIOD = 0.01  # [s] cell time between cycles, by default
 LATE = 2  # periods: a later cycle moves the arm by no more, and
 STALLED = 2  # usual cycles: after a later one the motion resumes from rest, where the arm is
 USUAL_SHARE = 0.2  # weight of the newest cycle in the mean duration of cycles
+FROZEN, RECENT = 0.1, 0.5  # [s] cell time between cycles after which an interruption ends a motion, if it was recent
+REST_TIMEOUT = 5.0  # [s] for an interrupted arm to come to rest: a low slider makes it slow
 LONG = 3000  # points and samples of a trajectory, which cost a few milliseconds
 
 
@@ -33,6 +35,7 @@ class TrajectoryController:
         reports: state of the goals, with the holds and the speed scaling.
         history: set-points of the last moments, with the delay of the arm.
         bridges: time between set-points that the arm bridges by itself, as they are sent ahead of time [s].
+        resumed: number of interruptions after which the motion continued.
     """
 
     def __init__(
@@ -54,6 +57,10 @@ class TrajectoryController:
         self._found: Vector | None = None  # first reading of an arm that moves
         self._noted = ""  # description of a motion from outside, until it is logged
         self.bridges = 0.0
+        self.resumed = 0
+        self._frozen_at = -math.inf  # cell time at which a cycle last came later than FROZEN [s]
+        self._interrupted_at: float | None = None  # cell time since which set-points are not accepted [s],
+        self._reason, self._waiting = "", False  # why, and whether the controller waits until the arm is at rest
 
     # --- state ----------------------------------------------------------------------------------------------------
 
@@ -75,7 +82,16 @@ class TrajectoryController:
     @property
     def at_rest(self) -> bool:
         """Whether the set-points are at rest, or there are none because the hardware does not work."""
-        return bool(self.reports.fault) or self._limiter.at_rest
+        return bool(self.reports.fault) or (self._limiter.at_rest and self._interrupted_at is None)
+
+    def share_of_speed(self, velocity: Vector, speed_scaling: float) -> float:
+        """Return the share of its full speed at which the newest set-point moves the arm, 0 to 1.
+
+        The full speed is that with the arm's own slider at 1, at the scaling set by operators and programs.
+        """
+        if self._goal is not None:
+            return min(self._goal.pace.rate / (self._goal.share * speed_scaling), 1.0)
+        return min(float(np.abs(velocity).max()) / max(self._standstill.full_speed, 1e-9), 1.0)
 
     def pop_log_line(self) -> str:
         """Return the line for the log that was noted since the last call; else ""."""
@@ -193,12 +209,15 @@ class TrajectoryController:
             return self._report_active(self._goal, self.reports.hold_message(self._goal))
         return self.status
 
-    def jog(self, velocity: Vector | None) -> None:
-        """Jog at joint velocities (dof,) [rad/s] until the next call; None: come to rest. A goal has priority."""
+    def jog(self, velocity: Vector | None, slider: float = 1.0) -> None:
+        """Jog at a share of joint velocities (dof,) [rad/s] until the next call; None: come to rest.
+
+        A goal has priority.
+        """
         blocked = self._goal is not None or self.reports.holds or self.reports.fault
         if blocked or self._last is None or self._found is not None:
             velocity = None
-        self._standstill.jog(velocity)
+        self._standstill.jog(velocity, slider)
 
     def abort(self, error: str, message: str, source: str = "") -> None:
         """Bring the robot to rest along its path; then the goal is aborted, and the robot held where it is."""
@@ -207,9 +226,23 @@ class TrajectoryController:
             self._goal.source = source
             self._report_active(self._goal, f"stopping: {message}")
 
+    def interrupt(self, reason: str, now: float) -> None:
+        """Wait until the arm is at rest, where it was interrupted; then continue from there.
+
+        Raises:
+            HardwareFault: this controller was held up too long itself.
+        """
+        if now - self._frozen_at < RECENT:
+            raise HardwareFault(reason)
+        if self._interrupted_at is None:
+            self._interrupted_at, self._reason = now, reason
+            self.resumed += 1
+            self._noted = f"{reason}: the motion continues once the arm is at rest"
+        self._waiting = True
+
     def fault(self, message: str) -> None:
         """End the running goal: the hardware does not work. Goals are rejected until the next `update`."""
-        self.reports.fault = clean(message)
+        self.reports.fault, self._interrupted_at, self._waiting = clean(message), None, False
         if self._goal is not None:
             self._finish(Outcome("aborted", "hardware_fault", message, "hardware"))
 
@@ -266,6 +299,11 @@ class TrajectoryController:
             return None
         elapsed = self._period if self._last is None else max(now - self._last, 0.0)
         self._last = now
+        if elapsed > FROZEN:
+            self._frozen_at = now
+        if self._waiting:
+            return self._continue_at_rest(now, measured, measured_velocity)
+        self._interrupted_at = None
         stalled = elapsed > max(STALLED * self._usual, self.bridges) + 1e-6
         self._usual = max(self._period, self._usual + USUAL_SHARE * (elapsed - self._usual))
         if stalled:  # the arm had no set-points meanwhile, and is at rest
@@ -287,6 +325,24 @@ class TrajectoryController:
         if not goal.stopping:
             self.reports.update_active(goal, self.history.delay)
         return set_points
+
+    def _continue_at_rest(self, now: float, measured: Vector, velocity: Vector) -> tuple[Vector, Vector] | None:
+        """Return a set-point where the interrupted arm is (dof,) [rad], [rad/s]; None until it has come to rest.
+
+        Raises:
+            HardwareFault: it does not come to rest.
+        """
+        assert self._interrupted_at is not None
+        if now - self._interrupted_at > REST_TIMEOUT:
+            raise HardwareFault(f"{self._reason}; the arm was not at rest within {REST_TIMEOUT:g} s")
+        if np.any(np.abs(velocity) > self._tolerances.stopped_velocity):
+            return None
+        self._waiting = False  # unless this set-point is not accepted, either
+        if self._goal is None:
+            self._standstill.locate(measured)
+        elif outcome := self._follower.rewind(self._goal, now, measured):
+            self._finish(outcome)
+        return measured, 0.0 * measured
 
     def _locate_arm(self, now: float, measured: Vector, velocity: Vector) -> bool:
         """Start set-points where the arm is after a start or a fault; return whether they may start.

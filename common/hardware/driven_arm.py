@@ -24,8 +24,8 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from common.hardware.driver_process import DriverProcess, run_driver
-from common.hardware.interface import SAFETY_STOPS, ArmState, Gripper, HardwareFault, Limits, Vector
-from common.hardware.streaming import REST, SetPointStream
+from common.hardware.interface import SAFETY_STOPS, ArmState, Gripper, HardwareFault, Interrupted, Limits, Vector
+from common.hardware.streaming import JUMP, REST, SetPointStream
 
 STOPPED = "was stopped for safety: `zencell robot recover` lets it move again"
 TIMEOUT = 0.25  # [s] without a message of the process or a state of the arm, after which its position is unknown
@@ -40,6 +40,7 @@ class ArmDriver(Protocol):
     rate: float  # [Hz] of set-points, in the host's time; it may change
     paced_by_arm: bool  # whether `read` blocks until the arm's next cycle
     realtime: bool  # whether the process asks for real-time priority
+    # slowed: bool  # optional: whether the arm's own controller slows set-points by its speed slider
 
     def read(self) -> ArmState:
         """Return the newest state; raise when the arm does not report any more."""
@@ -72,7 +73,8 @@ class Reading(NamedTuple):
 
     `epoch` counts interruptions of the set-points; the process does not play what was sent in an earlier epoch. `late`
     is the longest delay of a cycle since the last reading [s], `behind` the delay of the set-points caused by it [s].
-    `ceased` says why the process brings the arm to rest by itself, which ends the epoch.
+    `ceased` says why the process brings the arm to rest by itself, which ends the epoch; the motion may continue in the
+    next one if it is `resumable`.
     """
 
     stamp: float
@@ -82,6 +84,7 @@ class Reading(NamedTuple):
     late: float
     behind: float = 0.0
     ceased: str = ""
+    resumable: bool = False
 
 
 class DrivenArm:
@@ -90,6 +93,7 @@ class DrivenArm:
     Attributes:
         late: longest delay of a cycle of the process so far [s].
         stopped: whether a safety stop, also of an earlier process, still waits for an operator to have it recover.
+        share: of the full speed at which the next set-point moves the arm, 0 to 1.
     """
 
     def __init__(
@@ -103,7 +107,7 @@ class DrivenArm:
         """
         self.gripper = gripper
         self.ahead, self._delay = ahead, delay
-        self.late = 0.0
+        self.late, self.share = 0.0, 1.0
         self.stopped = False
         self._process = DriverProcess(name, drive, (module, dict(options), limits, ahead), self._on_message,
                                       self._on_end)
@@ -161,6 +165,7 @@ class DrivenArm:
 
         Raises:
             HardwareFault: the arm cannot be moved now, or has ended the motion: the next one starts where the arm is.
+            Interrupted: it comes to rest, or has, and the motion may continue from there.
         """
         newest = self._newest
         if newest is None:
@@ -169,13 +174,14 @@ class DrivenArm:
             raise HardwareFault(f"{self._name}: {state.message or state.mode.replace('_', ' ')}")
         if newest.ceased and newest.epoch <= self._epoch:
             self._epoch = newest.epoch + 1  # of the set-points that are sent once the arm is at rest
-            raise HardwareFault(f"{self._name}: {newest.ceased}")
+            raise (Interrupted if newest.resumable else HardwareFault)(f"{self._name}: {newest.ceased}")
         if newest.epoch != self._epoch:
             first, self._epoch = self._epoch < 0, newest.epoch
             if not first:  # after connecting nothing was sent yet, and set-points start where the arm was read
-                raise HardwareFault(f"{self._name}: {newest.why or 'was released for a moment'}")
+                raise (Interrupted if newest.resumable else HardwareFault)(
+                    f"{self._name}: {newest.why or 'was released for a moment'}")
         self._offset = min(self._offset, time.monotonic() - now)
-        if not self._process.send(("set", self._epoch, now + self._offset, positions, velocities)):
+        if not self._process.send(("set", self._epoch, now + self._offset, positions, velocities, self.share)):
             raise HardwareFault(self._process.failure)
 
     def order(self, act: str, *values: float) -> int:
@@ -254,6 +260,8 @@ class Player:
         self._acts, self._results = ThreadPoolExecutor(1), deque[tuple[str, int, str]]()
         self._period, self._epoch, self._playing, self._why = 1 / arm.rate, 0, False, ""
         self._target: Vector | None = None  # newest set-point since the arm became ready
+        self._resumable = False  # whether a motion may continue in this epoch
+        self._slowed: bool = getattr(arm, "slowed", False)
         self._due, self._reported_at = time.monotonic(), 0.0
         self._reported: tuple[str, str, int, str] = ("", "", -1, "")
 
@@ -279,17 +287,28 @@ class Player:
     def _receive(self) -> None:
         while self._pipe.poll():
             match self._pipe.recv():
-                case ("set", epoch, at, q, dq):
+                case ("set", epoch, at, q, dq, share):
                     if epoch == self._epoch:
                         if not self._playing:
-                            start = np.array(self._arm.read().q) if self._target is None else self._target
-                            self._stream.begin(start, at)
+                            self._stream.begin(self._start(q), at)
                             self._playing = True
-                        self._stream.put(at, q, dq)
+                        self._stream.put(at, q, dq, share)
                 case ("do", number, act, *values):
                     self._acts.submit(self._do, act, *values).add_done_callback(partial(self._note_result, number))
                 case ("end",):
                     raise EOFError
+
+    def _start(self, q: Vector) -> Vector:
+        """Return where the curve to a first set-point (dof,) [rad] starts: where the last one ended, or the arm is.
+
+        An arm that its slider has stopped is behind the last one.
+        """
+        measured = np.array(self._arm.read().q)
+        if self._target is not None and not (
+            self._slowed and np.abs(q - measured).max() < np.abs(q - self._target).max() - JUMP
+        ):
+            return self._target
+        return measured
 
     def _points(self, state: ArmState) -> list[Vector]:
         """Return the set-points (dof,) [rad] that are due."""
@@ -297,28 +316,34 @@ class Player:
         if state.mode != "running":
             if self._playing or self._target is not None:
                 self._epoch, self._playing, self._target, self._why = self._epoch + 1, False, None, state.message
+                self._resumable = False
             return points
+        slider = state.speed if self._slowed else 1.0
         times = self._arm.due()
         self._stream.period = 1 / self._arm.rate
         for at in times:
             if self._playing:
-                self._target, dq = self._stream.at(at)
+                self._target, dq = self._stream.at(at, slider)
                 if self._stream.ceased and not np.any(np.abs(dq) > REST):
                     self._epoch, self._playing, self._why = self._epoch + 1, False, self._stream.ceased
+                    self._resumable = self._stream.resumable
             if self._target is not None:
                 points.append(self._target)
         return points
 
     def _report(self, now: float, state: ArmState) -> None:
         """Send a reading if it is new or due, and the pipe takes it: the arm must not wait for the reader."""
-        behind, ceased = (self._stream.behind, self._stream.ceased) if self._playing else (0.0, "")
+        behind = self._stream.behind if self._playing or self._resumable else 0.0
+        ceased, resumable = "", self._resumable
+        if self._playing:
+            ceased, resumable = self._stream.ceased, self._stream.resumable
         news = (state.mode, state.message, self._epoch, ceased)
         if (news != self._reported or now - self._reported_at >= REPORT_PERIOD) and (
             select.select([], [self._pipe], [], 0.0)[1]
         ):
             self._reported_at, self._reported = now, news
             late = max(0.0, now - self._due)
-            self._pipe.send(Reading(now, state, self._epoch, self._why, late, behind, ceased))
+            self._pipe.send(Reading(now, state, self._epoch, self._why, late, behind, ceased, resumable))
 
     def _do(self, act: str, *values: float) -> str:
         try:

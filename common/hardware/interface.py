@@ -42,6 +42,10 @@ class HardwareFault(ZencellError):
     """
 
 
+class Interrupted(HardwareFault):
+    """Raised by `write` while an arm that was interrupted comes to rest by itself: the motion may continue then."""
+
+
 @dataclass(frozen=True)
 class Limits:
     """Limits of the joints, in the order of `names`; arrays are (dof,) in [rad], [rad/s], [rad/s^2], [rad/s^3].
@@ -179,6 +183,16 @@ class ControlledArm(Hardware, Protocol):
 
     def outcome(self, number: int) -> str | None:
         """Return None while the order runs, then once "" for success or the reason of its failure."""
+
+
+@runtime_checkable
+class SlowedArm(ControlledArm, Protocol):
+    """An arm whose own speed slider slows the set-points that it was sent.
+
+    The executor sets `share` before each set-point: the share of the full speed at which it moves the arm, 0 to 1.
+    """
+
+    share: float
 
 
 class PersistedState(NamedTuple):

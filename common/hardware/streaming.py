@@ -8,6 +8,9 @@ the arm comes to rest by itself within the limits.
 The player may be held up. The arm slows down meanwhile, as it receives nothing: the curve continues where it was, as
 slow as the arm is then, and ramps up to its speed. The delay is made up where the limits leave room, and at the next
 rest.
+
+An arm whose own speed slider slows it would fall behind, and jump once the slider is raised: set-points that were sent
+at a larger share of the speed than the slider allows now are played more slowly by that ratio.
 """
 
 from __future__ import annotations
@@ -40,7 +43,8 @@ MOST = 1000  # set-points in the queue; a sender that is so far ahead is broken
 class Point:
     """A set-point (dof,) [rad], [rad/s], and how much faster than it was sent the arm may move to it.
 
-    Its acceleration [rad/s^2] is known once the next one has arrived, or its time has come.
+    Its acceleration [rad/s^2] is known once the next one has arrived, or its time has come. It was computed for an arm
+    at this `share` of the full speed.
     """
 
     time: float
@@ -48,6 +52,7 @@ class Point:
     dq: Vector
     faster: float = FASTER
     ddq: Vector | None = None
+    share: float = 1.0
 
 
 class SetPointStream:
@@ -56,6 +61,7 @@ class SetPointStream:
     Attributes:
         period: see `__init__`; an arm may want set-points less often for a while.
         ceased: why set-points are ignored until the next `begin`; empty in normal operation.
+        resumable: whether the motion may continue then, from where the arm has come to rest.
     """
 
     def __init__(self, limits: Limits, ahead: float, period: float = 0.002) -> None:
@@ -71,7 +77,7 @@ class SetPointStream:
         self._called = self._time = 0.0  # times [s] of the last call, and up to which set-points were played
         self._pace = Pace(1.0, np.zeros(0))
         self._played = np.zeros(0), np.zeros(0)
-        self.ceased = ""
+        self.ceased, self.resumable = "", False
 
     @property
     def behind(self) -> float:
@@ -83,13 +89,16 @@ class SetPointStream:
         rest = np.zeros_like(q)
         self._points.clear()
         self._points.append(Point(now - self._ahead, q.copy(), rest, ddq=rest))
-        self._braking, self.ceased = None, ""
+        self._braking, self.ceased, self.resumable = None, "", False
         self._last, self._newest = rest, Piece(math.inf, rest, rest)
         self._called, self._time, self._pace = now, now - self._ahead, Pace(1.0, rest)
         self._played = q.copy(), rest
 
-    def put(self, time: float, q: Vector, dq: Vector) -> None:
-        """Accept a set-point (dof,) [rad], [rad/s] for `time`; one that no arm could follow ends the motion instead."""
+    def put(self, time: float, q: Vector, dq: Vector, share: float = 1.0) -> None:
+        """Accept a set-point (dof,) [rad], [rad/s] for `time`; one that no arm could follow ends the motion instead.
+
+        `share` is the share of the full speed at which it moves the arm, 0 to 1.
+        """
         if self.ceased or not self._points:
             return
         newest = self._points[-1]
@@ -107,7 +116,7 @@ class SetPointStream:
             return
         gap = step > STALL  # no sender takes so long; the player may have been held up for as long
         if gap and np.any(np.abs(dq0) > REST):
-            self._cease(f"set-points ceased to come for {step * 1e3:.0f} ms")
+            self._cease(f"set-points ceased to come for {step * 1e3:.0f} ms", resumable=True)
             return
         piece = Piece(step, *accelerations(step, q0, dq0, q, dq))
         if np.all(np.abs(dq0) <= REST) and np.all(q == q0):
@@ -125,14 +134,16 @@ class SetPointStream:
             math.sqrt(float((np.maximum(np.abs(a0), np.abs(a1)) / self._limits.acceleration).max())),
             float(np.cbrt((jerk / (RAMP_SHARE * self._limits.jerks)).max())),
         )
-        self._points.append(Point(time, q.copy(), dq.copy(), min(max(1 / max(over, 1e-9), 1.0), FASTER)))
+        self._points.append(Point(time, q.copy(), dq.copy(), min(max(1 / max(over, 1e-9), 1.0), FASTER), share=share))
         if piece.step == math.inf:
             self._points[-1].ddq = piece.end
         elif before <= self._time and np.all(np.abs(dq) <= REST):  # the arm moves to it before the next one arrives
             self._points[-1].ddq = 0 * q
 
-    def at(self, now: float) -> tuple[Vector, Vector]:
+    def at(self, now: float, slider: float = 1.0) -> tuple[Vector, Vector]:
         """Return the position (dof,) [rad] and velocity [rad/s] at a time that never decreases.
+
+        `slider` is the share of its set-points' speed at which the arm moves, 0 to 1.
 
         After a long time without a call during a motion, the arm is at rest at its last position and stays there.
 
@@ -144,16 +155,23 @@ class SetPointStream:
         if elapsed > STALL and np.any(np.abs(dq) > REST):
             self._cease(f"the driver was held up for {elapsed * 1e3:.0f} ms")
             self._brake(q, 0 * q, 0 * q)
-        self._advance(elapsed, now - self._ahead)
+        self._advance(elapsed, now - self._ahead, slider)
         self._played = self._now()
         if self.behind > LONGEST_DELAY and self._braking is None:
-            self._cease(f"the driver was held up too often: it is {self.behind * 1e3:.0f} ms late")
+            why = "the driver was held up too often" if slider == 1.0 else f"the speed slider is at {slider:.0%}"
+            self._cease(f"{why}: it is {self.behind * 1e3:.0f} ms late", resumable=True)
         return self._played
 
-    def _cease(self, why: str) -> None:
-        self.ceased = self.ceased or why
+    def _cease(self, why: str, resumable: bool = False) -> None:
+        if not self.ceased:
+            self.ceased, self.resumable = why, resumable
 
-    def _advance(self, elapsed: float, nominal: float) -> None:
+    def _possible_rate(self, slider: float) -> float:
+        """Return the rate at which the next set-point can be played, 0 to 1."""
+        share = next((point for point in self._points if point.time > self._time), self._points[-1]).share
+        return 1.0 if share <= slider else slider / share
+
+    def _advance(self, elapsed: float, nominal: float, slider: float) -> None:
         """Play on for `elapsed` [s]; without delay the set-point time would be `nominal` [s] then."""
         pace, held_up = self._pace, elapsed > self.period + JITTER
         still_until = self._at_rest_until()
@@ -171,6 +189,11 @@ class SetPointStream:
             target = 0.0  # along the path as far as it has arrived
         elif self._braking is None and late > (CAUGHT_UP if pace.rate <= 1.0 else 0.0):
             target = min(point.faster for point in self._points)
+        if self._braking is None and (possible := self._possible_rate(slider)) < 1.0:
+            fastest = possible * max(target, 1.0)
+            target = min(target, fastest)
+            if pace.rate > fastest:  # the arm slows down by itself
+                pace.rate, pace.slope, pace.acceleration = fastest, 0.0, 0 * pace.acceleration
         if pace.rate == target == 1.0 and pace.slope == 0.0:
             self._time += step
             pace.acceleration = 0 * pace.acceleration
@@ -201,7 +224,7 @@ class SetPointStream:
         moves = self._pace.rate > 0.0 and np.any(np.abs(dq) > REST)
         if self._braking is None and len(self._points) == 1 and moves:
             over = (self._time - time) / self._pace.rate
-            self._cease(f"set-points ceased to come {(over + self._ahead) * 1e3:.0f} ms ago")
+            self._cease(f"set-points ceased to come {(over + self._ahead) * 1e3:.0f} ms ago", resumable=True)
             rate, self._time = self._pace.rate, time + over
             self._brake(q, dq * rate, self._last * rate**2, time)
         q, dq = self._curve(self._time)

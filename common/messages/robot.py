@@ -109,7 +109,7 @@ class JointTrajectory(Message):
 class RobotStatus(Message):
     """State of the arm's own controller: its mode, speed slider, timing and digital inputs and outputs."""
 
-    omitted_defaults: ClassVar[tuple[str, ...]] = ("controller",)
+    omitted_defaults: ClassVar[tuple[str, ...]] = ("controller", "resumed")
 
     header: Header = Header()
     mode: RobotMode
@@ -119,6 +119,8 @@ class RobotStatus(Message):
     inputs: int = Field(0, ge=0, lt=2**32, description="digital inputs, one bit each")
     outputs: int = Field(0, ge=0, lt=2**32, description="digital outputs, one bit each")
     controller: bool = Field(False, description="whether the arm has a controller that accepts robot/command")
+    resumed: int = Field(0, ge=0, description="interruptions of motions so far, by delays of its driver or executor "
+                                              "or by the slider, after which they continued")
 
 
 class RobotCommand(Message):

@@ -24,9 +24,11 @@ def trajectory(rows: Iterable[Sequence], names: Sequence[str] = LIMITS.names) ->
 
 def rest_to_rest(
     start: Sequence[float], end: Sequence[float], duration: float = 1.0, points: int = 21,
+    names: Sequence[str] = LIMITS.names,
 ) -> JointTrajectory:
     """Return a quintic from rest to rest, sampled at `points` instants."""
     q0, move = np.array(start, dtype=float), np.array(end, dtype=float) - np.array(start, dtype=float)
-    return trajectory((u * duration, q0 + move * (10 * u**3 - 15 * u**4 + 6 * u**5),
-                       move * (30 * u**2 - 60 * u**3 + 30 * u**4) / duration,
-                       move * (60 * u - 180 * u**2 + 120 * u**3) / duration**2) for u in np.linspace(0.0, 1.0, points))
+    rows = ((u * duration, q0 + move * (10 * u**3 - 15 * u**4 + 6 * u**5),
+             move * (30 * u**2 - 60 * u**3 + 30 * u**4) / duration,
+             move * (60 * u - 180 * u**2 + 120 * u**3) / duration**2) for u in np.linspace(0.0, 1.0, points))
+    return trajectory(rows, names)
