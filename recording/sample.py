@@ -163,13 +163,13 @@ class Decoder:
 
     def __init__(self, custom: Iterable[type[Message]] = ()) -> None:
         """Know message classes of the user besides those of the project."""
-        self._custom = {model.__name__: model for model in custom}
+        self.custom = {model.__name__: model for model in custom}
         self.skipped: Counter[str] = Counter()
         self.unfit: Counter[str] = Counter()
 
     def message(self, sample: Sample) -> Message | None:
         """Return the message of a sample; None if it cannot be decoded."""
-        known = self._custom.get(sample.message) or message_class(sample.message)
+        known = self.custom.get(sample.message) or message_class(sample.message)
         if known is not None or sample.schema:
             try:
                 model = known or _open_model(sample.message)

@@ -10,16 +10,17 @@ from typing import Any, TypeVar
 
 from common import topics
 from common.application import find_application
-from common.client.joining import newest_interlock
+from common.client.joining import newest_interlock, supervisor_status
 from common.client.subscriptions import Part, Subscriptions, local_key, topic_of_owner
-from common.errors import RequestFailed, UnknownName, ZencellError
-from common.messages import MotionStatus, StopRequest, TaskCommand, TaskStatus
+from common.errors import NoResponder, RequestFailed, UnknownName, ZencellError
+from common.messages import HoldRequest, MotionStatus, StopRequest, TaskCommand, TaskStatus
 from common.topics import Topic
 from common.transport.requests import Client
 
 TIMEOUT = 5.0  # [s] wall for an answer
 ENDED = ("DONE", "ERROR")
 A = TypeVar("A")
+Answer = TaskStatus | MotionStatus  # the latter in a cell without a task
 
 _stopping: set[asyncio.Future[Any]] = set()  # keeps stops alive whose caller was cancelled
 
@@ -114,23 +115,25 @@ class TaskControl(Part):
         self._owner, self._application = owner, application
         self._unsaved = ""
 
-    async def start(self, *, override: bool = False) -> TaskStatus:
+    async def start(self, *, override: bool = False) -> Answer:
         """Start the task, or restart it; releases your own holds, and with `override` those of others too.
+
+        In a cell without a task, this and the other commands only release, hold or stop the arm.
 
         Raises:
             RemoteError: another operator holds the robot or has motion authority. A start ends stops of others.
         """
         return await self._send("start", override)
 
-    async def pause(self) -> TaskStatus:
+    async def pause(self) -> Answer:
         """Stop the robot on its path at once and hold it there."""
         return await self._send("pause")
 
-    async def resume(self, *, override: bool = False) -> TaskStatus:
+    async def resume(self, *, override: bool = False) -> Answer:
         """Let the robot continue along its path after your pause."""
         return await self._send("resume", override)
 
-    async def stop(self) -> TaskStatus:
+    async def stop(self) -> Answer:
         """Stop the robot, abandon its motion, and wait for a start; works also if the task does not answer.
 
         Raises:
@@ -144,6 +147,8 @@ class TaskControl(Part):
             raise result.task if isinstance(result.task, RequestFailed) else ArmStopFailed(result.arm)
         self._unsaved = result.arm.unsaved
         if isinstance(result.task, RequestFailed):
+            if isinstance(result.task, NoResponder) and not await self._exists():
+                return result.arm
             raise TaskStopFailed(result.task)
         return result.task
 
@@ -152,10 +157,22 @@ class TaskControl(Part):
         """Warning about the last stop if it could not be saved and would be lost at a restart; else empty."""
         return self._unsaved
 
-    async def _send(self, command: str, override: bool = False) -> TaskStatus:
+    async def _send(self, command: str, override: bool = False) -> Answer:
         acknowledged = await newest_interlock(self._bus) if command in ("start", "resume") else None
-        return await send_task_command(self._bus.client(topics.TASK_COMMAND), command, self._owner, override=override,
-                                       acknowledged=acknowledged)
+        try:
+            return await send_task_command(self._bus.client(topics.TASK_COMMAND), command, self._owner,
+                                           override=override, acknowledged=acknowledged)
+        except NoResponder:
+            if await self._exists():
+                raise
+        request = HoldRequest(hold=command == "pause", stops=command == "start", owner=self._owner, override=override,
+                              acknowledged=acknowledged, reason=f"{command} in a cell without a task")
+        return await self._bus.client(topics.MOTION_HOLD).call(request, TIMEOUT)
+
+    async def _exists(self) -> bool:
+        """Return whether the cell has a task, which may be down; without one, commands go to the executor."""
+        supervisor = await supervisor_status(self._bus)
+        return supervisor is None or supervisor.has_task
 
     async def topic(self) -> Topic[TaskStatus]:
         """Return the topic of the task's status.

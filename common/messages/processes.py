@@ -49,9 +49,11 @@ class SupervisorStatus(Message):
 
     max_bytes: ClassVar[int] = 256 * 1024
     max_parts: ClassVar[int] = 8 * 1024
+    omitted_defaults: ClassVar[tuple[str, ...]] = ("has_task",)
 
     header: Header = Header()
     cell: Label
+    has_task: bool = Field(True, description="without a task operators release their stops themselves")
     services: list[ServiceStatus] = Field(max_length=1000)
     host: Label = Field("", description="name of the host of this supervisor; each reports the complete cell")
     speed: Positive = Field(1.0, description="cell time per wall time")

@@ -190,10 +190,9 @@ class TaskRunner(Generic[V]):
         self._commanded += requests
         self._woken.set()
         now, answered = self._task.status, await self._requests.carried_out(requests)
-        return m.TaskStatus(
-            header=self._bus.header(), state=now.state, paused=now.paused, started=now.started, stage=now.stage,
-            message=now.message if answered else NOT_ANSWERED,
-        )
+        reported = {name: getattr(now, name) for name in m.TaskStatus.model_fields.keys() - {"plans"}}
+        return m.TaskStatus.model_validate(
+            {**reported, "header": self._bus.header(), "message": now.message if answered else NOT_ANSWERED})
 
     def _publish(self) -> None:
         """Publish the status if more than its time has changed."""

@@ -275,7 +275,7 @@ async def publish_status(
             supervisor.changed.clear()
             published = now
             out.put(SupervisorStatus(
-                header=bus.header(), cell=bus.cell, host=remote.host,
+                header=bus.header(), cell=bus.cell, has_task=bool(cell.task), host=remote.host,
                 services=[*remote.ours(supervisor.statuses), *now[0]],
                 speed=bus.clock.speed, epoch=bus.clock.epoch_ns, booted=bus.clock.booted_ns,
                 seed=cell.run.seed, world=launch.world or "",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import time
 from collections import Counter
@@ -13,12 +14,13 @@ import numpy as np
 import numpy.typing as npt
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from common.application import find_application
+from common.application import Application, ApplicationTopics, find_application
 from common.config import load_cell, names_of
 from common.errors import UnknownName, ZencellError
+from common.messages import TaskStatus
 from common.robot.model import RobotModel
 from common.terminal import printable
-from common.topics import general_key
+from common.topics import Topic, general_key
 from recording.report import charts
 from recording.report.aggregator import RunAggregator, recorded_application
 from recording.report.clips import clips
@@ -27,15 +29,16 @@ from recording.sample import Decoder, RecordingError
 from recording.writer import ABOUT
 
 if TYPE_CHECKING:
-    from common.application import Application
     from common.config import Cell
     from common.messages import JointState
     from recording.reader import Recording, Run
     from recording.report.application import Figures
     from recording.report.clips import Clip
+    from recording.sample import Sample
 
 # Overrides in a recording that are applied: numbers or one word, which can name neither a file nor a module.
 HARMLESS = re.compile(r"[\w.]{1,100}=([A-Za-z_]\w{0,60}|[-+0-9.eE, \[\]]{1,100})", re.ASCII)
+STATUS_FIELDS = {"state", "started", "stage", "subject", "done", "total", "figures"}  # of every task's status
 TOOL_PERIOD = 0.05  # [s] between positions of the tool that are shown
 
 Array = npt.NDArray[np.float64]
@@ -118,6 +121,8 @@ def _aggregate(recording: Recording, run: Run, aggregator: RunAggregator) -> Cou
     wanted = {topic.key: topic for topic in aggregator.topics}
     decoder = Decoder(topic.message for topic in aggregator.topics)
     for sample in recording.samples(lambda topic: general_key(topic) in wanted):
+        if wanted[general_key(sample.topic)].message is TaskStatus:  # of a task that is not installed
+            decoder.custom[sample.message] = TaskStatus
         message = decoder.message(sample)
         if isinstance(message, wanted[general_key(sample.topic)].message):
             since = run.epoch or sample.log_time
@@ -127,8 +132,26 @@ def _aggregate(recording: Recording, run: Run, aggregator: RunAggregator) -> Cou
 
 
 def _application_of(recording: Recording, cell: Cell | None) -> Application | None:
-    """Return the application of the cell; without a cell the one whose status was recorded."""
-    return find_application(cell.application) if cell is not None else recorded_application(list(recording.topics()))
+    """Return the application of the cell; without a cell the one whose status was recorded.
+
+    An application that is not installed is reported by what every task's status has.
+    """
+    if cell is not None:
+        return find_application(cell.application)
+    if (found := recorded_application(list(recording.topics()))) is not None:
+        return found
+    for key, (_, kind) in recording.topics().items():
+        if kind == "state" and _is_task_status(next(recording.samples(lambda topic, key=key: topic == key), None)):
+            return Application(topics=ApplicationTopics(status=Topic(key, TaskStatus, "state", "")))
+    return None
+
+
+def _is_task_status(sample: Sample | None) -> bool:
+    """Return whether the recorded schema of a message has the fields of a task's status."""
+    try:
+        return sample is not None and set(json.loads(sample.schema)["properties"]) >= STATUS_FIELDS
+    except (ValueError, TypeError, KeyError):
+        return False
 
 
 def truncated_note(recording: Recording) -> str:

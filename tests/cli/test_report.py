@@ -149,6 +149,8 @@ def test_custom_application_is_reported_with_its_own_figures(tmp_path, monkeypat
         page = report(tape.path, "--cell", "cell.yaml")
     assert all(part in page.head for part in ("shop: DONE", "polished 2 of 2", "roughness_um 0.8"))
     assert "RUBBING" in page.sections["timeline"]
+    page = report(tape.path)
+    assert all(part in page.head for part in ("shop: DONE", "done 2 of 2", "roughness_um 0.8"))
 
 
 @pytest.mark.slow
