@@ -206,12 +206,14 @@ class CellTarget:
     def join(self, visit: Callable[[Cell], Awaitable[T]]) -> T:
         """Join the cell with the Python client and return the result of `visit`."""
         from common.client.cell import Cell
+        from common.client.joining import cell_clock
 
-        async def joined() -> T:
-            async with Cell(self.cell, domain=self.domain, connect=self.connect) as client:
+        async def visited(bus: Bus) -> T:
+            bus.clock = await cell_clock(bus)
+            async with Cell.on(bus) as client:
                 return await visit(client)
 
-        return asyncio.run(joined())
+        return self.visit(visited)
 
     def answer(self, visit: Callable[[Cell], Awaitable[Message]]) -> None:
         """Join the cell with the Python client and print the result of `visit` as JSON."""

@@ -76,18 +76,26 @@ def echo(
     at: CellTarget = RUNNING,
     count: options.Count = None,
     as_json: options.Json = False,
+    timeout: Annotated[
+        str, typer.Option("--timeout", metavar="S", help="exit 1 after this time without a message [s; no limit]")
+    ] = "",
     save: Annotated[
         str, typer.Option("--save", metavar="FILE.png", help="save the newest image in this file")
     ] = "",
 ) -> None:
     """Show messages until Ctrl-C or N messages, images as one line. Keys of custom services work too."""
-    from common.client.inspection import message_lines, require_images
+    from common.client.inspection import message_lines, noting_silence, require_images
     from common.client.keys import published_topic
 
     topic = published_topic(key)
     if save:
         require_images(topic, key, save)
-    _show(at, lambda bus: message_lines(bus, topic, key, as_json, save), topic, key, count)
+    seconds = options.number("--timeout", timeout) if timeout else None
+    if seconds is not None and seconds <= 0:
+        raise ConfigError("--timeout", timeout, "must be more than 0")
+    _show(at, lambda bus: noting_silence(
+        bus, message_lines(bus, topic, key, as_json, save), topic.key if topic is not None and not topic.signed else "",
+        seconds, lambda line: terminal.echo(line, err=True)), topic, key, count)
 
 
 def _show(

@@ -309,6 +309,7 @@ async def play(
         player, executor = create(), bus.client(MOTION_EXECUTE)
         player.is_live = lambda: not own_router or executor.available
         player.declare(bus, topics)
+        bus.announce()
         with Keys(player.on_key, on_terminal=show is not None):
             tasks = [asyncio.create_task(_wait_and_run(player, bus, wait)), asyncio.create_task(interrupts.stop.wait())]
             ending = set(tasks)

@@ -78,6 +78,10 @@ def __getattr__(name: str) -> object:
     current = _FORMER.get(name, name)
     if current not in _MODULE:
         raise AttributeError(f"module 'zencell' has no attribute {name!r}")
+    if name == "Cell":
+        from common.client.uncaught import install
+
+        install()
     return getattr(importlib.import_module(_MODULE[current]), current)
 
 

@@ -16,7 +16,7 @@ from common import topics
 from common.application import all_topics, find_topic
 from common.client.arm import Arm, Gripper
 from common.client.frames import Frames
-from common.client.joining import StartedCell, cell_clock, joined, operator_name, supervisor_status
+from common.client.joining import StartedCell, cell_clock, domain_of_only, joined, operator_name, supervisor_status
 from common.client.keys import published_keys, require_key
 from common.client.parameters import Parameters
 from common.client.scene import Scene, World
@@ -78,7 +78,8 @@ class Cell(Part):
 
         Args:
             name: of the cell; not needed if only one is running.
-            domain: 0 to 232, as for `--domain`; default: ZENCELL_DOMAIN, or 42.
+            domain: 0 to 232, as for `--domain`; default: ZENCELL_DOMAIN, or 42, or the one with the only cell of this
+                host if nothing runs in 42.
             connect: endpoint of its router, such as tcp/192.168.1.10:7489; default: ZENCELL_CONNECT.
             secure: folder of certificates with that of the operator; default: ZENCELL_SECURE.
             owner: name of this client in its requests; default: user and host.
@@ -147,6 +148,8 @@ class Cell(Part):
                 up = await stack.enter_async_context(self._started)
                 self._name, self._where = up.name, {**self._where, "domain": up.domain}
             if self._bus is None:
+                if self._where["domain"] is None and self._where["connect"] is None:
+                    self._where["domain"] = await domain_of_only(self._name, self._where["secure"])
                 bus = await stack.enter_async_context(joined(self._name, identity=OPERATOR, **self._where))
                 bus.clock = await cell_clock(bus)
                 self._attach(bus)

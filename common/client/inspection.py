@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import time
-from collections.abc import AsyncGenerator, Iterator, Mapping
+from collections.abc import AsyncGenerator, Callable, Iterator, Mapping
 from contextlib import aclosing
 from pathlib import Path
 from typing import Any
@@ -15,8 +15,8 @@ import msgpack
 from common import topics as keys
 from common.client.joining import RunningCell, joined
 from common.client.json_codec import decode, stamped
-from common.client.keys import raw_samples
-from common.client.subscriptions import AnyTopic, find_live_topic
+from common.client.keys import SILENCE, raw_samples, writers_of
+from common.client.subscriptions import AnyTopic, NothingReceived, find_live_topic
 from common.config import Cell, ServiceEntry, load_cell, names_of, service_names
 from common.config.tunables import describe
 from common.errors import ConfigError, RequestFailed, UnknownName
@@ -85,6 +85,34 @@ async def message_lines(
     async with aclosing(lines):
         async for line in lines:
             yield line
+
+
+async def noting_silence(
+    bus: Bus, lines: AsyncGenerator[str, None], key: str, timeout: float | None, note: Callable[[str], None],
+) -> AsyncGenerator[str, None]:
+    """Yield the lines; note once in a silence that no service publishes the key, if it is given.
+
+    Raises:
+        NothingReceived: no line came within `timeout` [s].
+    """
+    async with aclosing(lines):
+        while True:
+            line = asyncio.ensure_future(anext(lines, None))
+            try:
+                first = SILENCE if timeout is None else min(SILENCE, timeout)
+                done, _ = await asyncio.wait({line}, timeout=first)
+                if not done and key and not await writers_of(bus, [key]):
+                    note(f"zencell: no service publishes {key} now")
+                if not done:
+                    done, _ = await asyncio.wait({line}, timeout=None if timeout is None else timeout - first)
+                if not done:
+                    raise NothingReceived(f"{bus.cell}/{key}", timeout or 0.0)
+                if (found := await line) is None:
+                    return
+            finally:
+                line.cancel()
+                await asyncio.wait({line})
+            yield found
 
 
 async def _known_lines(bus: Bus, topic: Topic[Any], as_json: bool, save: str) -> AsyncGenerator[str, None]:

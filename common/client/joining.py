@@ -26,7 +26,7 @@ from common.supervision.launch import module_command, pythonpath, require_free_p
 from common.transport.bus import Bus
 from common.transport.codec import decode
 from common.transport.credentials import OPERATOR, SECURE_VARIABLE
-from common.transport.endpoint import MAX_DOMAIN, endpoint_of, parse_domain
+from common.transport.endpoint import CONNECT_VARIABLE, DOMAIN_VARIABLE, MAX_DOMAIN, endpoint_of, parse_domain
 from common.transport.router import PortInUse
 from common.transport.zenoh_session import connect as connect_to
 
@@ -50,10 +50,9 @@ class NoCellRunning(RequestFailed):
 class SeveralCellsRunning(UnknownName):
     """Several cells are running and none was named."""
 
-    def __init__(self, cells: Iterable[str]) -> None:
+    def __init__(self, cells: Iterable[str], how: str = "by Cell(NAME) or --cell NAME") -> None:
         super().__init__("cell", "", cells)
-        self.args = (f"several cells are up: name one, by Cell(NAME) or --cell NAME; choices: "
-                     f"{', '.join(self.choices)}",)
+        self.args = (f"several cells are up: name one, {how}; choices: {', '.join(self.choices)}",)
 
 
 def is_listening(endpoint: str) -> bool:
@@ -124,6 +123,37 @@ async def joined(
             yield bus
     except NoRouter:
         raise NoCellRunning(endpoint, "no router") from None
+
+
+async def domain_of_only(cell: str | None, secure: str | None) -> int | None:
+    """Return the domain of this host with the only running cell, if the default domain has no router.
+
+    Args:
+        cell: its name; default: any.
+        secure: folder of certificates; default: that of the environment.
+
+    Raises:
+        SeveralCellsRunning: several are running; names their domains.
+    """
+    environ = {**os.environ, SECURE_VARIABLE: secure} if secure else os.environ
+    if {DOMAIN_VARIABLE, CONNECT_VARIABLE} & environ.keys() or await asyncio.to_thread(
+            is_listening, endpoint_of(environ=environ)):
+        return None
+
+    def listening() -> list[int]:
+        return [number for number in range(MAX_DOMAIN + 1) if is_listening(endpoint_of(number, environ=environ))]
+
+    async def cells_in(domain: int) -> set[tuple[str, int]]:
+        with contextlib.suppress(RequestFailed):
+            async with joined(any_cell=True, domain=domain, secure=secure) as bus:
+                return {(name, domain) for name, _ in await ready_services(bus)}
+        return set()
+
+    found = set().union(*await asyncio.gather(*map(cells_in, await asyncio.to_thread(listening))))
+    domains = {domain: name for name, domain in found if cell in (None, name)}
+    if len(domains) > 1:
+        raise SeveralCellsRunning((f"{name} in domain {domain}" for domain, name in domains.items()), "by domain=")
+    return next(iter(domains), None)
 
 
 def _only(cells: set[str], endpoint: str) -> str:

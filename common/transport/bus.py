@@ -276,6 +276,10 @@ class Bus(RawAccess):
         self.ready_event.set()
         self._declare_token(alive_key(self.cell, self.service))
 
+    def announce(self) -> None:
+        """Let tools find this process in the cell, although it is no service."""
+        self._declare_token(alive_key(self.cell, self.service))
+
     def _open(self, server: Server[Any, Any]) -> None:
         server.open()
         self._declare_token(serves_key(self.cell, server.topic.key, self.service))

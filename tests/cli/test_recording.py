@@ -133,7 +133,7 @@ def test_play_needs_no_router_and_loops_until_ctrl_c(tmp_path, zencell):
     write(tmp_path / "a.mcap", [f(n) for n in range(20) for f in (joints, status)])
     command = zencell("play", "a.mcap", "--loop", "--topics", "joint_states", "pick_place_status", "--stamp-now")
     assert "a router of its own" in command.until("playing")
-    echo = ask(tmp_path, "topic", "echo", "pick_place_status", "-n", "25", "--json", "--cell", "panda",
+    echo = ask(tmp_path, "topic", "echo", "pick_place_status", "-n", "25", "--json",
                "--domain", str(command.domain))
     values = [json.loads(line) for line in echo.stdout.splitlines()]
     assert len(values) == 25, echo.stderr  # more than were recorded

@@ -53,6 +53,7 @@ def net(monkeypatch: pytest.MonkeyPatch) -> LocalNetwork:
             session.close()
 
     monkeypatch.setattr(joining, "wait_for_listener", listens)
+    monkeypatch.setattr(joining, "is_listening", lambda endpoint: True)
     monkeypatch.setattr(joining, "connect_to", connected)
     return network
 
@@ -80,6 +81,25 @@ async def test_only_running_cell_is_joined_and_one_of_several_must_be_named(net:
                                        "choices: anna, bert")
             async with Cell("bert") as cell:
                 assert cell.name == "bert"
+
+
+async def test_cell_is_found_in_another_domain_only_if_it_is_the_only_one(
+    net: LocalNetwork, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ports: list[int] = [7447 + 61]
+    monkeypatch.setattr(joining, "is_listening", lambda endpoint: int(endpoint.rpartition(":")[2]) in ports)
+    monkeypatch.delenv("ZENCELL_DOMAIN", raising=False)
+    async with publishing(net, None, cell="anna"):
+        assert await joining.domain_of_only(None, None) == await joining.domain_of_only("anna", None) == 61
+        assert await joining.domain_of_only("bert", None) is None
+        ports.append(7447 + 62)
+        with pytest.raises(SeveralCellsRunning, match="by domain=; choices: anna in domain 61, anna in domain 62"):
+            await joining.domain_of_only(None, None)
+        ports.append(7447 + 42)
+        assert await joining.domain_of_only(None, None) is None, "the default domain comes first"
+        monkeypatch.setenv("ZENCELL_DOMAIN", "63")
+        ports.pop()
+        assert await joining.domain_of_only(None, None) is None, "the operator chose a domain"
 
 
 async def test_arm_is_stopped_and_task_started_under_remapped_keys(net: LocalNetwork) -> None:

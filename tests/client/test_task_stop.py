@@ -10,7 +10,7 @@ from common import messages as m
 from common import topics
 from common.client.subscriptions import Subscriptions
 from common.client.task import ArmStopFailed, TaskControl, TaskStopFailed
-from common.errors import Refused, RemoteError
+from common.errors import NoResponder, Refused, RemoteError
 from common.messages.execution import NOT_PERSISTED
 from common.transport.local import LocalNetwork
 
@@ -56,6 +56,32 @@ async def test_stop_reports_which_of_arm_and_task_did_not_confirm_it(arm, task, 
             await control.stop()
     assert stopped["arm"].is_set() and stopped["task"].is_set(), "both, whatever the other answers"
     assert ("disk is full" in control.unsaved) == arm
+
+
+@pytest.mark.parametrize("has_task", [True, False])
+async def test_commands_reach_the_executor_of_a_cell_without_a_task(has_task: bool) -> None:
+    network, holds = LocalNetwork(), list[m.HoldRequest]()
+    cell = network.bus("cell")
+
+    async def stop(_: m.StopRequest) -> m.MotionStatus:
+        return m.MotionStatus()
+
+    async def hold(request: m.HoldRequest) -> m.MotionStatus:
+        holds.append(request)
+        return m.MotionStatus()
+
+    cell.serve(topics.MOTION_STOP, stop)
+    cell.serve(topics.MOTION_HOLD, hold)
+    cell.writer(topics.SUPERVISOR_STATUS).put(m.SupervisorStatus(cell=cell.cell, services=[], has_task=has_task))
+    await cell.ready()
+    control = TaskControl(Subscriptions(network.bus("operator")), "ann")
+    if has_task:  # it is down
+        for command in (control.stop, control.start):
+            with pytest.raises((TaskStopFailed, NoResponder)):
+                await command()
+    else:
+        assert [type(await command()) for command in (control.stop, control.start)] == [m.MotionStatus] * 2
+    assert [(one.hold, one.stops, one.owner) for one in holds] == ([] if has_task else [(False, True, "ann")])
 
 
 @pytest.mark.parametrize("turns", range(1, 6))

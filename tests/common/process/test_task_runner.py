@@ -121,6 +121,15 @@ async def test_reply_says_that_a_command_is_lost_while_no_executor_answers(rig: 
         assert NOT_ANSWERED not in await rig.command("pause")
 
 
+async def test_reply_has_the_counts_and_figures_of_the_status(rig: Rig) -> None:
+    await rig.executor()
+    script = Script([GO], [])
+    script.status = PickPlaceStatus(total=7, done=3, failures=2, figures={"x": 1.5}, started=True)
+    async with rig.running(script=script):
+        reply = await rig.client.call(m.TaskCommand(command="pause"))
+        assert (reply.total, reply.done, reply.failures, reply.figures) == (7, 3, 2, {"x": 1.5})
+
+
 async def test_pause_and_resume_reach_the_executor_in_order(rig: Rig) -> None:
     executor = await rig.executor()
     async with rig.running():
