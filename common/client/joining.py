@@ -136,8 +136,8 @@ async def domain_of_only(cell: str | None, secure: str | None) -> int | None:
         SeveralCellsRunning: several are running; names their domains.
     """
     environ = {**os.environ, SECURE_VARIABLE: secure} if secure else os.environ
-    if {DOMAIN_VARIABLE, CONNECT_VARIABLE} & environ.keys() or await asyncio.to_thread(
-            is_listening, endpoint_of(environ=environ)):
+    chosen = bool({DOMAIN_VARIABLE, CONNECT_VARIABLE} & environ.keys())
+    if chosen or await asyncio.to_thread(is_listening, endpoint_of(environ=environ)):
         return None
 
     def listening() -> list[int]:
@@ -149,7 +149,8 @@ async def domain_of_only(cell: str | None, secure: str | None) -> int | None:
                 return {(name, domain) for name, _ in await ready_services(bus)}
         return set()
 
-    found = set().union(*await asyncio.gather(*map(cells_in, await asyncio.to_thread(listening))))
+    domains_up = await asyncio.to_thread(listening)
+    found = [pair for pairs in await asyncio.gather(*map(cells_in, domains_up)) for pair in sorted(pairs)]
     domains = {domain: name for name, domain in found if cell in (None, name)}
     if len(domains) > 1:
         raise SeveralCellsRunning((f"{name} in domain {domain}" for domain, name in domains.items()), "by domain=")

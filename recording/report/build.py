@@ -141,7 +141,7 @@ def _application_of(recording: Recording, cell: Cell | None) -> Application | No
     if (found := recorded_application(list(recording.topics()))) is not None:
         return found
     for key, (_, kind) in recording.topics().items():
-        if kind == "state" and _is_task_status(next(recording.samples(lambda topic, key=key: topic == key), None)):
+        if kind == "state" and _is_task_status(next(recording.samples(key.__eq__), None)):
             return Application(topics=ApplicationTopics(status=Topic(key, TaskStatus, "state", "")))
     return None
 
