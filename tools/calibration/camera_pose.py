@@ -120,7 +120,7 @@ def detect_boards_in(
         camera: its intrinsics.
         most: images with the board.
         seconds: duration for a device.
-        report: gets a line for each file that is no image.
+        report: gets a line for each file that is no image, and one about images without the board.
 
     Raises:
         CalibrationFailed: no image shows it; reports the most frequent reason.
@@ -133,9 +133,11 @@ def detect_boards_in(
         detected, reasons_ = detected + found, reasons_ + reasons
         if len(detected) >= most:
             break
+    reason = max(set(reasons_), key=reasons_.count, default="there are none")
     if not detected:
-        raise CalibrationFailed(f"{source}: the board ({board.options}) is in none of {len(reasons_)} images: "
-                                f"{max(set(reasons_), key=reasons_.count)}")
+        raise CalibrationFailed(f"{source}: the board ({board.options}) is in none of {len(reasons_)} images: {reason}")
+    if reasons_:
+        report(f"{source}: {len(reasons_)} images left out; most often: {reason}")
     return detected
 
 
@@ -147,7 +149,7 @@ def detect_boards(board: Board, pictures: Sequence[tuple[str, npt.NDArray[np.uin
     for name, picture in pictures:
         height, width = picture.shape[:2]
         if (width, height) != (camera.width, camera.height):
-            reasons.append(f"{name} is {width}x{height}, but the intrinsics are for {camera.width}x{camera.height}")
+            reasons.append(f"the image is {width}x{height}, but the intrinsics are for {camera.width}x{camera.height}")
             continue
         detection = board.find(picture, name)
         if isinstance(detection, NoBoard):

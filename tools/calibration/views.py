@@ -162,7 +162,7 @@ def load_views(
     views, reason = [], []
     for name, q in contents.pictures.items():
         try:
-            add_image = read_image(folder / Path(name).name, f"{folder / JOINTS_FILE}: pictures")
+            add_image = read_image(folder / Path(name).name, f"{folder / JOINTS_FILE}: {name}")
         except ConfigError as error:
             reason.append(f"skipped: {error}")
             continue

@@ -74,5 +74,5 @@ def test_missing_board_and_wrong_size_are_one_line_errors():
     images = [("a", np.zeros((240, 320, 3), np.uint8)), ("b", np.full((480, 640, 3), 90, np.uint8)),
               ("c", np.zeros((480, 640, 3), np.uint8))]
     assert detect_boards(BOARD, images, CAMERA) == ([], [
-        "a is 320x240, but the intrinsics are for 640x480", "no marker is visible",
+        "the image is 320x240, but the intrinsics are for 640x480", "no marker is visible",
         "too dark: its brightest part is 0 of 255"])
