@@ -313,10 +313,13 @@ def check(
     from common.config import load_robot
     from common.planning.robot_geometry import RobotGeometry
     from common.robot.model import RobotModel
+    from tools.robot_setup.descriptions import Reader
     from tools.robot_setup.end_effector import check_gripper
     from tools.robot_setup.sampling import hits
 
     robot = RobotModel.load(load_robot(name))
+    for note in Reader(robot.config.package_dirs).read("robot.urdf", robot.config.urdf).notes:
+        echo(note)
     faults = check_gripper(robot)
     touching = hits(robot, RobotGeometry(robot), robot.named("home"))
     faults += [f"named_poses.home: {pair} touch" for pair in touching]

@@ -29,7 +29,7 @@ def fault_of(path: Path) -> str:
     return next((fault for start, fault in _KINDS if head[:len(start)].lower() == start), "")
 
 
-def read_xml(field: str, path: Path, root: str = "robot") -> ET.Element:
+def read_xml(field: str, path: Path) -> ET.Element:
     """Return the elements of a description; without prefixes of namespaces.
 
     Raises:
@@ -45,10 +45,10 @@ def read_xml(field: str, path: Path, root: str = "robot") -> ET.Element:
         fault = f"cannot be read: {error.strerror}"
     if fault:
         raise ConfigError(field, str(path), fault)
-    return parse_xml(field, str(path), data, root)
+    return parse_xml(field, str(path), data)
 
 
-def parse_xml(field: str, source: str, data: bytes, root: str = "robot") -> ET.Element:
+def parse_xml(field: str, source: str, data: bytes) -> ET.Element:
     """Return the elements of a description's text; `source` names it in errors, which are those of `read_xml`."""
     builder, parser = ET.TreeBuilder(), expat.ParserCreate()
     depth = count = 0
@@ -76,8 +76,8 @@ def parse_xml(field: str, source: str, data: bytes, root: str = "robot") -> ET.E
     except (expat.ExpatError, ValueError, LookupError) as error:  # also an unknown encoding
         raise ConfigError(field, source, f"does not parse: {error}") from None
     found = builder.close()
-    if found.tag != root:
-        raise ConfigError(field, source, f"does not parse: its root is <{found.tag[:MAX_NAME]}>, not <{root}>")
+    if found.tag != "robot":
+        raise ConfigError(field, source, f"does not parse: its root is <{found.tag[:MAX_NAME]}>, not <robot>")
     _check_names(field, source, found)
     return found
 

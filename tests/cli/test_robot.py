@@ -78,6 +78,11 @@ def test_guessed_limits_are_marked(folder):
 def test_check_compares_the_tool_with_the_fingers(folder):
     done = ask(folder, "robot", "check", "side.yaml")
     assert (done.returncode, done.stderr) == (0, "") and "fingers close along its y" in done.stdout
+    (folder / "undrawn.urdf").write_text(TEXT.replace(
+        '<link name="foot">', '<link name="foot"><visual><geometry><mesh filename="gone.dae"/></geometry></visual>'))
+    (folder / "undrawn.yaml").write_text((folder / "side.yaml").read_text().replace("side_arm.urdf", "undrawn.urdf"))
+    done = ask(folder, "robot", "check", "undrawn.yaml")
+    assert done.returncode == 0 and "mesh gone.dae is missing: the link is drawn" in done.stdout
     (folder / "wrong.yaml").write_text((folder / "side.yaml").read_text().replace("closing_axis: y", "closing_axis: x"))
     done = ask(folder, "robot", "check", "wrong.yaml")
     assert done.returncode == 1

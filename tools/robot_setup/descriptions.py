@@ -17,7 +17,7 @@ from typing import Any
 from common.errors import ConfigError
 from common.robot.description_file import parse_xml, read_xml
 from common.robot.mesh_references import SCHEME, resolve_meshes
-from common.robot.packages import neighbours, package_paths
+from common.robot.packages import neighbours, package_name, package_paths
 from common.robot.urdf import find_description
 
 _SECONDS = 60  # of waiting for a xacro file on a busy machine
@@ -34,7 +34,6 @@ class Description:
         path: file it was read from.
         root: its elements, meshes with absolute paths.
         expanded: it was a xacro file.
-        folders: further folders in which its packages are found.
         packages: folders of its packages, by name.
         notes: what was changed, for the user.
     """
@@ -42,7 +41,6 @@ class Description:
     path: Path
     root: ET.Element
     expanded: bool = False
-    folders: list[str] = field(default_factory=list)
     packages: dict[str, Path] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
@@ -52,17 +50,23 @@ class Reader:
     """Reads descriptions.
 
     Attributes:
-        folders: `--package-dir`; those that a description needs in addition are added.
+        given: folders of `--package-dir`; found: those that descriptions need in addition.
         arguments: of xacro files; asked: those that some file asked for.
         trust: evaluate expressions of xacro files with all of Python.
     """
 
-    folders: list[str]
+    given: list[str]
     arguments: Mapping[str, str] = field(default_factory=dict)
     trust: bool = False
     asked: set[str] = field(default_factory=set)
+    found: list[str] = field(default_factory=list)
 
-    def read(self, option: str, reference: str, root: str = "robot") -> Description:
+    @property
+    def folders(self) -> list[str]:
+        """All folders in which packages are found."""
+        return [*self.given, *self.found]
+
+    def read(self, option: str, reference: str) -> Description:
         """Return a description; its collision meshes exist.
 
         Raises:
@@ -72,10 +76,10 @@ class Reader:
         around = [*self.folders, *map(str, neighbours(path))]
         if is_xacro(path):
             reply = self._expanded(option, reference, path, around)
-            found = Description(path, parse_xml(option, reference, reply["text"].encode(), root), True)
+            found = Description(path, parse_xml(option, reference, reply["text"].encode()), True)
             found.packages = {name: Path(folder) for name, folder in reply["packages"].items()}
         else:
-            found = Description(path, read_xml(option, path, root))
+            found = Description(path, read_xml(option, path))
         meshes = resolve_meshes(found.root, path, around)
         found.packages |= {name: folder.resolve() for name, folder in meshes.packages.items()}
         if meshes.missing:
@@ -92,14 +96,15 @@ class Reader:
             found.notes.append(f"mesh {_first(meshes.undrawn)} {fault}: the link is drawn by its collision shape")
         for name, folder in found.packages.items():
             if not any(each.resolve() == folder for each in package_paths(name, self.folders)):
-                self.folders.append(str(folder.parent if folder.name == name else folder))
+                self.found.append(str(folder if package_name(folder) == name else folder.parent))
         return found
 
     def _expanded(self, option: str, reference: str, path: Path, around: Sequence[str]) -> dict[str, Any]:
         """Return the text of a xacro file, and the packages that it asked for."""
         here = str(Path.cwd())
         request = {"file": str(path), "arguments": dict(self.arguments), "folders": list(around), "trust": self.trust,
-                   "readable": [*self.folders, str(path), *_own_folders(path), *self.arguments.values()],
+                   "readable": [*self.given, str(path), *_own_folders(path),
+                                *(os.path.abspath(each) for each in self.arguments.values() if os.path.isfile(each))],
                    "root": str(_WORKER.parents[2]), "python": [each for each in sys.path if each not in ("", here)]}
         # A file of a stranger gets no variables but those that find packages.
         environment = os.environ if self.trust else {

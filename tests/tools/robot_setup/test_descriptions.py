@@ -57,6 +57,7 @@ def test_package_is_found_by_its_name_wherever_it_is(mesh, place, given, tmp_pat
     robot = RobotModel.load(check(RobotConfig, {
         "name": "arm", "urdf": str(urdf), "package_dirs": reader.folders, "joints": ["turn"], "base_link": "base",
         "tcp_link": "tip", "named_poses": {"home": [0.0]}, "acceleration_limits": [1], "jerk_limits": [1]}, "robot"))
+    assert str(tmp_path) not in reader.found
     assert len(robot.full_geometry().geometryObjects) == 1
 
 
