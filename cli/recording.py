@@ -15,7 +15,7 @@ import typer
 from cli import choices, options
 from cli.options import RUNNING, CellTarget
 from common.errors import ConfigError
-from common.terminal import echo, printable, rewrite
+from common.terminal import Progress, echo, printable, rewrite
 from recording.formatting import format_bytes, format_contents, require_new
 
 if TYPE_CHECKING:
@@ -93,7 +93,7 @@ def info(file: File, as_json: options.Json = False) -> None:
     from recording.reader import Recording
     from recording.summary import summarise
 
-    with Recording(Path(file)) as recording:
+    with Progress(f"reading {file}") as read, Recording(Path(file), read) as recording:
         summary = summarise(recording)
     if as_json:
         echo(json.dumps(summary.as_dict()))
@@ -114,7 +114,8 @@ def recover(
     source = Path(file)
     target = Path(output) if output else source.with_name(f"{source.stem}_recovered.mcap")
     require_new(target)
-    saved = recover_file(source, target)
+    with Progress(f"reading {file}") as read:
+        saved = recover_file(source, target, read)
     lost = [f"{format_bytes(size)} in a hole" for size in saved.holes[:MOST_HOLES]]
     if more := saved.holes[MOST_HOLES:]:
         lost.append(f"{format_bytes(sum(more))} in {len(more)} more holes")
@@ -175,7 +176,7 @@ def play_(
     on_terminal = sys.stdin.isatty() and sys.stderr.isatty()
     if start_paused and not on_terminal:
         raise ConfigError("--start-paused", ..., "needs a terminal, where space continues; --wait SERVICE needs none")
-    with Recording(Path(file)) as recording:
+    with Progress(f"reading {file}") as read, Recording(Path(file), read) as recording:
         if not 0 <= offset <= recording.seconds:
             raise ConfigError("--start-offset", start_offset, f"must be 0 to {recording.seconds:.1f}, its length [s]")
         played = played_topics(recording, selection)
@@ -260,7 +261,7 @@ def export(
             raise ConfigError(option, folder, "must be a folder")
     if video:
         require_new(Path(video), "--video", ".mp4")
-    with Recording(Path(file)) as recording:
+    with Progress(f"reading {file}") as read, Recording(Path(file), read) as recording:
         selection.require_in(recording.topics(), recording.path, "--topics")
         for option, target, write in (("--foxglove", foxglove, _foxglove), ("--csv", csv, _tables),
                                       ("--images", images, _images), ("--video", video, _video)):
@@ -328,7 +329,7 @@ def report(
         raise ConfigError("--output", output, "must end in .html")
     if not page_path.absolute().parent.is_dir():
         raise ConfigError("--output", output, "cannot be written: the folder does not exist")
-    with Recording(path) as recording:
+    with Progress(f"reading {path}") as read, Recording(path, read) as recording:
         try:
             with warnings.catch_warnings(action="ignore"):  # about values that a plot cannot show
                 text = build_report(recording, cell)

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import re
 import sys
+import time
+from collections.abc import Callable
 
 # Control characters, marks that change the direction of text or end a line, and lone surrogates (not encodable).
 _CONTROL = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ufeff\ud800-\udfff]")
@@ -29,6 +31,26 @@ def echo(text: str, *, err: bool = False, nl: bool = True) -> None:
     import typer
 
     typer.echo(printable(text, keep="\n\t"), err=err, nl=nl)
+
+
+class Progress:
+    """Shows the part of a long task that is done, on stderr if that is a terminal; use it in a `with` block."""
+
+    def __init__(self, what: str) -> None:
+        """Show nothing for the first second."""
+        self._what, self._next, self._shown = what, time.monotonic() + 1.0, False
+
+    def __enter__(self) -> Callable[[float], None]:
+        return self._show
+
+    def __exit__(self, *_: object) -> None:
+        if self._shown:
+            rewrite("")
+
+    def _show(self, part: float) -> None:
+        if (now := time.monotonic()) >= self._next and sys.stderr.isatty():
+            self._next, self._shown = now + 0.2, True
+            rewrite(f"{self._what}: {100 * part:.0f} %")
 
 
 def rewrite(text: str) -> None:

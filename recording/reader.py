@@ -6,6 +6,7 @@ import json
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO
@@ -15,7 +16,15 @@ from mcap.records import Channel, Message, Schema
 
 from common.remapping import is_cell
 from recording.formatting import format_bytes
-from recording.mcap_layout import DAMAGE, ChunkPosition, Layout, read_layout, records_of
+from recording.mcap_layout import (
+    DAMAGE,
+    LEAST_MESSAGE,
+    MESSAGES_FREE,
+    ChunkPosition,
+    Layout,
+    read_layout,
+    records_of,
+)
 from recording.sample import BAD_PAYLOAD, RecordingError, Sample, topic_of
 from recording.writer import ABOUT, ENDED, RUN, TRACES_SCHEMA, ExportFailed, RecordingWriter, WriteFailed
 
@@ -43,8 +52,12 @@ def _all(_topic: str) -> bool:
 class Recording:
     """An open recording; use it in a `with` block."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, on_progress: Callable[[float], None] = lambda part: None) -> None:
         """Open a file and scan its layout.
+
+        Args:
+            path: of the file.
+            on_progress: called again and again with the part of the file at which it is read.
 
         Raises:
             RecordingError: the file does not exist, cannot be read, or is no recording of zencell.
@@ -57,10 +70,14 @@ class Recording:
         except OSError as error:
             raise RecordingError(f"{path}: cannot be read: {error.strerror}") from None
         try:
-            self.layout: Layout = read_layout(self.file, path)
+            self.layout: Layout = read_layout(self.file, path, on_progress)
         except BaseException:
             self.file.close()
             raise
+        self._on_progress = on_progress
+        offsets = [*(chunk.offset for chunk in self.layout.chunks), self.layout.size]
+        self._unread = {here: after - here for here, after in pairwise(offsets)}  # [bytes] of chunks with their index
+        self._count = self._bytes = 0  # of the chunks that were read
         self._schemas: dict[int, Schema] = dict(self.layout.schemas)
         self._channels: dict[int, Channel] = dict(self.layout.channels)
         self._channels_known = self.layout.finished  # otherwise they are described among the messages
@@ -224,11 +241,27 @@ class Recording:
         return any(wants(topic_of(self._channels[i].topic)) for i in chunk.channels if i in self._channels)
 
     def _records(self, chunk: ChunkPosition) -> list[Any]:
+        self._on_progress(chunk.offset / self.layout.size)
         try:
-            return records_of(self.file, chunk)
+            records = records_of(self.file, chunk)
         except DAMAGE:
             where = f"{self.path}: is damaged at byte {chunk.offset}"
             raise RecordingError(f"{where}; to save the rest: zencell recover {self.path}") from None
+        return self.counted(chunk, records)
+
+    def counted(self, chunk: ChunkPosition, records: list[Any]) -> list[Any]:
+        """Return the records of a chunk.
+
+        Raises:
+            RecordingError: with those of other chunks they are more than a real file has in as many bytes.
+        """
+        if chunk.offset in self._unread:
+            self._count += len(records)
+            self._bytes += self._unread.pop(chunk.offset)
+        if self._count > MESSAGES_FREE + self._bytes / LEAST_MESSAGE:
+            raise RecordingError(f"{self.path}: has {self._count:,} messages in {self._bytes:,} B, "
+                                 "more than a real recording has")
+        return records
 
     def samples_of(
         self, records: list[Any], wants: Wanted = _all, since: int = 0, until: int = LAST
@@ -302,7 +335,7 @@ class Recovered:
     unknown: int  # messages whose topic is lost
 
 
-def recover(source: Path, target: Path) -> Recovered:
+def recover(source: Path, target: Path, on_progress: Callable[[float], None] = lambda part: None) -> Recovered:
     """Copy every undamaged chunk of a recording to a new file with an index, also those behind a hole.
 
     Raises:
@@ -313,7 +346,7 @@ def recover(source: Path, target: Path) -> Recovered:
     part = target.with_name(target.name + ".part")
     part.unlink(missing_ok=True)
     try:
-        with Recording(source) as recording:
+        with Recording(source, on_progress) as recording:
             saved = _copy(recording, part)
         part.replace(target)
     except WriteFailed as error:
@@ -333,7 +366,7 @@ def _copy(recording: Recording, target: Path) -> Recovered:
             writer.describe(name, recording.metadata(name))
         for chunk in layout.chunks:
             try:
-                records = records_of(recording.file, chunk)
+                records = recording.counted(chunk, records_of(recording.file, chunk))
             except DAMAGE:
                 damaged += 1
                 continue

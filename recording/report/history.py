@@ -20,6 +20,8 @@ Position = tuple[float, float, float]  # x, y, z [m] in world
 SAME_OBJECT = 0.05  # [m] from an object to its detection: less accurate at the image border
 BOX = "box"  # the container in recordings without container ids
 MOST_LINES = 300  # of the log, and of any other list
+MOST_ENTRIES = 20_000  # of a list of the history; later ones are left out
+MOST_JOINT_STATES = 100_000  # 17 min at 100 Hz; of a longer recording every second, fourth, ... is kept
 SAME_PLACE = 0.002  # [m] detections closer than this are shown as one
 _LEVELS = ("warning", "error", "critical")
 _ENDED = ("succeeded", "aborted", "cancelled", "rejected")
@@ -174,6 +176,8 @@ class RunHistory:
     counters: dict[str, m.ServiceCounters] = field(default_factory=dict)
     truth: Truth = field(default_factory=Truth)  # that of the aggregator
     end: float = 0.0
+    _joint_count: int = 0
+    _joint_stride: int = 1
     _target: str = ""
     _failed: int | None = None  # failures so far; those before the recording are no events
     _ended_before: str | None = None  # goal that had ended before the recording
@@ -194,12 +198,13 @@ class RunHistory:
         _change(self.tasks, time, status.state, status.subject)
         failed = status.failures + status.retries
         if self._failed is not None and failed > self._failed:
-            self.failures.append(Event(time, f"{status.state} {status.subject}".strip(), status.message))
+            _append(self.failures, Event(time, f"{status.state} {status.subject}".strip(), status.message))
         self._failed = failed  # lower after a restart of the task
         _while(self.paused, time, status.paused, "paused")
         for place in status.skipped:
             p = place.position
-            self.skipped.setdefault((p.x, p.y, p.z), Mark(time, (p.x, p.y, p.z), place.reason))
+            if len(self.skipped) < MOST_ENTRIES:
+                self.skipped.setdefault((p.x, p.y, p.z), Mark(time, (p.x, p.y, p.z), place.reason))
 
     def on_motion(self, time: float, status: m.MotionStatus) -> None:
         """Add a motion status."""
@@ -211,7 +216,7 @@ class RunHistory:
         current = self.motions[-1] if self.motions else None
         if status.id and (current is None or current.label != status.id) and status.state != "none":
             current = Motion(status.id, time)
-            self.motions.append(current)
+            _append(self.motions, current)
         if current is not None and status.state in _ENDED and current.until is None:
             current.until, current.note = time, status.state
             current.error, current.message, current.source = status.error, status.message, status.source
@@ -219,28 +224,34 @@ class RunHistory:
     def on_gripper(self, time: float, state: m.GripperState) -> None:
         """Add a gripper state; the start of holding is a pick."""
         if _while(self.holding, time, state.holding, self._target or "something") and self._target in self._scene:
-            self.picks.append(Mark(time, self._scene[self._target], self._target))
+            _append(self.picks, Mark(time, self._scene[self._target], self._target))
 
     def on_trajectory(self, time: float, trajectory: m.JointTrajectory) -> None:
         """Add a plan."""
-        self.trajectories.append((time, trajectory.points[-1].time_from_start if trajectory.points else 0.0))
+        _append(self.trajectories, (time, trajectory.points[-1].time_from_start if trajectory.points else 0.0))
 
     def on_joints(self, time: float, state: m.JointState) -> None:
         """Add joint states."""
+        self._joint_count += 1
+        if self._joint_count % self._joint_stride:
+            return
+        if len(self.joint_states) >= MOST_JOINT_STATES:
+            del self.joint_times[::2], self.joint_states[::2]
+            self._joint_stride *= 2
         self.joint_times.append(time)
         self.joint_states.append(state)
 
     def on_rejections(self, time: float, rejections: m.Rejections) -> None:
         """Add rejected targets."""
         for one in rejections.rejected:
-            self.rejections.append(Mark(time, (one.position.x, one.position.y, one.position.z), one.reason))
+            _append(self.rejections, Mark(time, (one.position.x, one.position.y, one.position.z), one.reason))
 
     def on_scene(self, _time: float, scene: m.PlanningScene) -> None:
         """Add obstacles, and the newest position of each target: the gripper occludes it during the grasp."""
         for item in scene.objects:
             if item.role in ("target", "contained"):
                 self._scene[item.id] = _xyz(item.pose)
-            elif item.id not in self.footprints:
+            elif item.id not in self.footprints and len(self.footprints) < MOST_ENTRIES:
                 self.footprints[item.id] = footprint(item)
 
     def on_objects(self, time: float, world: m.WorldObjects) -> None:
@@ -251,14 +262,14 @@ class RunHistory:
             elif each.id in self._in_place:
                 self._in_place.discard(each.id)
                 position = "({:.3f}, {:.3f}, {:.3f})".format(*_xyz(each.pose))
-                self.losses.append(Event(time, each.id, f"lies elsewhere, at {position}"))
+                _append(self.losses, Event(time, each.id, f"lies elsewhere, at {position}"))
 
     def on_services(self, time: float, status: m.SupervisorStatus) -> None:
         """Add the states of processes."""
         for one in status.services:
             before = self.services.get(one.name)
             if before is not None and one.restarts > before.restarts:
-                self.restarts.append(Event(time, one.name, one.message))
+                _append(self.restarts, Event(time, one.name, one.message))
             self.services[one.name] = Service(one.state, one.restarts, one.ready_seconds)
 
     def on_log(self, time: float, line: m.LogLine) -> None:
@@ -319,20 +330,25 @@ def _xyz(pose: m.Pose) -> Position:
     return pose.position.x, pose.position.y, pose.position.z
 
 
+def _append(entries: list[Any], entry: object) -> None:
+    if len(entries) < MOST_ENTRIES:
+        entries.append(entry)
+
+
 def _change(spans: list[Span], time: float, label: str, note: str) -> None:
     """Start a new span if label or note change."""
     if spans and (spans[-1].label, spans[-1].note) == (label, note):
         return
     if spans:
         spans[-1].until = time
-    spans.append(Span(label, time, None, note))
+    _append(spans, Span(label, time, None, note))
 
 
 def _while(spans: list[Span], time: float, active: bool, label: str) -> bool:
     """Open or close a span; return whether one was opened."""
     open_one = spans[-1] if spans and spans[-1].until is None else None
     if active and open_one is None:
-        spans.append(Span(label, time))
+        _append(spans, Span(label, time))
         return True
     if not active and open_one is not None:
         open_one.until = time

@@ -103,6 +103,9 @@ BOMBS: dict[str, Callable[[], bytes]] = {
     "lz4 that claims to be huge": lambda: chunk(lz4.frame.compress(ZEROS), "lz4", 2**40),
     "many messages of zeros": lambda: 1000 * packed_chunk(record(0x05, MESSAGE + bytes(40_000_000))),
     "very many tiny messages": lambda: packed_chunk(200_000 * record(0x05, MESSAGE)),
+    "very many chunks of tiny messages": lambda: (
+        record(0x04, struct.pack("<HH", 1, 0) + text("panda/a") + text("msgpack") + struct.pack("<I", 0))
+        + 500 * packed_chunk(40_000 * record(0x05, MESSAGE))),
     "very many channels": channels,
     "very many channels in a chunk": lambda: packed_chunk(channels()),
     "metadata of 100 MB": lambda: record(0x0C, text("run") + struct.pack("<I", 100_000_000) + bytes(100_000_000)),
