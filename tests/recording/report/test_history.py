@@ -105,3 +105,14 @@ def test_long_curves_are_thinned_and_keep_their_extremes():
     indices = charts.thinned(times, values)
     assert len(indices) <= charts.MAX_POINTS + 4 and {1234, 4321, 6000} <= set(indices.tolist())
     assert charts.thinned(times[:50], values[:50]).tolist() == list(range(50))
+
+
+def test_history_of_any_length_has_a_bounded_number_of_entries(run, monkeypatch):
+    monkeypatch.setattr("recording.report.history.MOST_JOINT_STATES", 100)
+    monkeypatch.setattr("recording.report.history.MOST_ENTRIES", 50)
+    for k in range(1000):
+        run.on_joints(k, m.JointState(name=["a"], position=[k]))
+        run.on_trajectory(k, m.JointTrajectory())
+    assert 50 <= len(run.joint_states) <= 100 and len(run.trajectories) == 50
+    steps = {b - a for a, b in zip(run.joint_times, run.joint_times[1:], strict=False)}
+    assert run.joint_times[0] < 32 and run.joint_times[-1] > 980 and len(steps) == 1, "the whole run, evenly"
