@@ -35,8 +35,8 @@ def package(folder: Path, name: str) -> Path:
 
 @pytest.mark.parametrize("mesh", [
     "package://that_arm/meshes/link.stl",
-    "file:///home/someone/ws/install/that_arm/share/that_arm/meshes/link.stl",
-    "/home/some%20one/ws/src/clone/that_arm/meshes/link.stl",
+    "file:///srv/someone/ws/install/that_arm/share/that_arm/meshes/link.stl",
+    "/srv/some%20one/ws/src/clone/that_arm/meshes/link.stl",
     "file:///C:/ws/that_arm/meshes/link.stl",
 ])
 @pytest.mark.parametrize(("place", "given"), [
