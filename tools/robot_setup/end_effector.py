@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -146,7 +146,9 @@ def _with_travel(gripper: GripperProposal, driven: Joint, found: Travel | str) -
     """Add a table of widths and joint positions."""
     if isinstance(found, str):
         return found
-    gripper.grip, gripper.travel, gripper.links = found.grip, found.rows, [gripper.palm, *found.grip.pads]
+    grip = found.grip  # a tip that turns may be farther out between open and closed
+    gripper.grip = replace(grip, middle=grip.middle + (max(grip.heights) - grip.heights[0]) * grip.approach)
+    gripper.travel, gripper.links = found.rows, [gripper.palm, *grip.pads]
     gripper.max_width = found.rows[-1][0]
     moved = abs(found.rows[-1][1] - found.rows[0][1])
     slowest = driven.velocity or (SPEED / 2 if driven.kind == "prismatic" else 0.5)

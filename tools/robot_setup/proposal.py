@@ -225,7 +225,9 @@ def _tool(
                                grip.middle - BEHIND_TIPS * grip.approach)
         parent = palm
         out = poses[palm][:3, :3] @ grip.approach
-        near = [link for link in links if _distance(poses[link], poses[palm] @ T_palm_tcp) < NEAR_GRIP]
+        tcp = poses[palm] @ T_palm_tcp
+        near = [link for link in links if _distance(poses[link], tcp) < NEAR_GRIP
+                and (tcp - poses[link])[:3, 3] @ out < BEHIND_TIPS]  # else the tips reach the table before the grip
         if effector.jaw:  # descriptions have no link between the open jaws
             near = []
     else:
