@@ -309,7 +309,8 @@ class Validation:
                 result.inside += 1
             elif reason:
                 result.refused.append((place, reason))
-                if not marker.text or self._stays(place, stamp):  # a falling object is an outlier for a moment
+                # A falling object is an outlier for a moment; a carried one may cross the border of the image.
+                if not (marker.text or marker.partial) or self._stays(place, stamp):
                     self._report(result, place, reason, stamp)
             else:
                 result.targets.append(place)

@@ -77,6 +77,10 @@ class Truth:
         return [each for each in self.objects or () if each.state != "contained" and all(
             math.dist(each.position[:2], place[:2]) > SAME_OBJECT for place in explained)]
 
+    def is_left_at(self, place: Sequence[float]) -> bool:
+        """Return whether an object outside of containers is at a position (x, y, ...) [m]."""
+        return len(self.left([place])) < len(self.left([]))
+
     def counted(self) -> dict[str, Any] | None:
         """Return the number of objects in containers, on the table and elsewhere; None without ground truth."""
         if self.objects is None:

@@ -18,6 +18,7 @@ from common.messages import (
     TaskStatus,
     Vector3,
 )
+from common.scene.workspace import PARTLY_OUT_OF_VIEW
 from recording.report.application import Figures
 from recording.report.history import Truth
 
@@ -167,6 +168,9 @@ class Summary:
     def _all_rejected(self) -> Rejected:
         rejected = Rejected(list(self.rejected.places))
         rejected.add(self.status.skipped)
+        if self.truth.objects is not None:  # one that was carried across the border of an image is not left there
+            rejected.places = [place for place in rejected.places if place.reason != PARTLY_OUT_OF_VIEW
+                               or self.truth.is_left_at(_xyz(place.position))]
         return rejected
 
     def write(self, file: Path) -> None:

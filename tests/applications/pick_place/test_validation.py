@@ -40,8 +40,11 @@ def test_detections_are_classified():
 
 
 def test_container_precedes_partial_view_precedes_reach():
-    verdict = validation().validate(frame((0.4, 0.05), (0.55, 0.25), partial=True), camera)
-    assert [one.reason for one in verdict.rejections] == ["partly out of view"]
+    judge, reported = validation(), []
+    for stamp in (0.0, 0.3, 0.6):  # one that is carried across the border is not reported
+        verdict = judge.validate(frame((0.4, 0.05), (0.55, 0.25), stamp=stamp, partial=True), camera)
+        reported.append([one.reason for one in verdict.rejections])
+    assert reported == [[], [], ["partly out of view"]]
     assert verdict.inside == 1 and not verdict.targets
 
 

@@ -1,6 +1,7 @@
 import json
 import math
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -13,8 +14,10 @@ from common.messages import (
     Rejection,
     Rejections,
     Vector3,
+    WorldObject,
     WorldObjects,
 )
+from common.scene.workspace import PARTLY_OUT_OF_VIEW
 from recording.report.application import Figures
 from recording.report.history import Truth
 from recording.report.summary import Rejected, Summary, describe, percentile
@@ -57,6 +60,18 @@ def test_rejected_position_is_listed_once_and_skipped_targets_with_it():
     summary.rejected.add([at(0.9, 0.0)])
     summary.on_status(status("DONE", 10, skipped=[at(0.4, -0.3, "no path"), at(0.9, 0.01, "no path")]))
     assert [place["reason"] for place in summary.as_dict()["rejected"]] == ["no path", "no path"]
+
+
+@pytest.mark.parametrize(("position", "state", "listed"), [
+    ((0.9, 0.02), "table", True), ((0.5, 0.0), "table", False), ((0.9, 0.0), "contained", False)])
+def test_object_that_crossed_the_border_of_an_image_is_not_left_there(position, state, listed):
+    summary = Summary("panda", 0, 1.0)
+    summary.on_rejections(0.0, Rejections(header=Header(), rejected=[at(0.9, 0.0, PARTLY_OUT_OF_VIEW)]))
+    assert len(summary.as_dict()["rejected"]) == 1, "without the truth all count"
+    pose = Pose(position=Vector3(x=position[0], y=position[1], z=0.03))
+    thing = WorldObject(id="ball_1", shape="sphere", pose=pose, state=state)
+    summary.truth.on_objects(WorldObjects(objects=[thing]))
+    assert len(summary.as_dict()["rejected"]) == listed
 
 
 def test_newest_of_many_rejections_are_listed():
