@@ -255,6 +255,10 @@ class Choice:
             self._given_up.remove(left)
         self._given_up.append(AbandonedTarget(target, reason, view.spots(None, self.radius), retry))
 
+    def was_given_up(self, target: Target) -> bool:
+        """Return whether a ball was abandoned before, and may be in its retry."""
+        return self._given_up_at(target.position) is not None
+
     def rejections(self) -> list[m.Rejection]:
         """Return the abandoned objects with the reasons."""
         return [

@@ -6,6 +6,7 @@ Its state is read from gripper, planning scene and image; `common/tasks/engine.p
 from __future__ import annotations
 
 import math
+import re
 
 from pydantic import BaseModel
 
@@ -28,6 +29,8 @@ from common.tasks.engine import Task
 from common.tasks.stages import MISSES, AwaitImage, Cycle, DwellTimer, Grip, Move, Stage
 
 GONE = "the ball is no longer where it was seen"
+APPROACH = ("pre-grasp", "descend")  # stages
+NUMBER = re.compile(r"[-\d.]+")
 MOST = 400  # characters of a message
 STANDING = 0.5  # [s] of occlusion before the arm moves aside: images arrive with a delay
 
@@ -46,6 +49,7 @@ class PickPlace(Task[PickPlaceView]):
         self._choice = Choice(config, config.world.container, config.world.ball_radius, lambda: self.status.done)
         self._viewing, self._hidden = ViewingPoses(config), DwellTimer()
         self._counter = ObjectCounter(config)
+        self._last_failure = "", ""  # id of the object that the gripper approached, and the reason without numbers
 
     # --- what to do next -------------------------------------------------------------------------------------
 
@@ -228,6 +232,17 @@ class PickPlace(Task[PickPlaceView]):
             self.queue += self._sequences.pick_and_place(pick)
         else:
             self._choice.give_up(pick.target, pick.first_error, view, retry=not pick.again)
+
+    def fail(self, message: str, view: PickPlaceView, *, go_home: bool = True) -> None:
+        """Count a failure; after the second equal one at an object the others, or another approach, come first."""
+        approached = self.status.subject if self.status.stage in APPROACH and not view.holding else ""
+        failure = approached, NUMBER.sub("", message)
+        ball = next((ball for ball in view.balls() if approached and ball.id == approached), None)
+        if ball is not None and failure == self._last_failure:
+            self._choice.give_up(ball, message, view, retry=not self._choice.was_given_up(ball))
+            failure = "", ""
+        self._last_failure = failure
+        super().fail(message, view, go_home=go_home)
 
     # --- what its motions need -------------------------------------------------------------------------------
 

@@ -165,6 +165,12 @@ class Handling(Task[View]):
             self._note_try(move.cycle, response.message)
         super().plan_failed(move, response, view)
 
+    def obstructed(self, stage: Stage, view: View, problem: str) -> None:
+        """Record the attempt."""
+        if stage.cycle is not None:
+            self._note_try(stage.cycle, problem)
+        super().obstructed(stage, view, problem)
+
     def missed(self, stage: Grip, view: View) -> None:
         """Record the attempt, then open, back off and look again."""
         if stage.cycle is not None:

@@ -267,6 +267,26 @@ def test_last_target_without_a_descent_is_retried_once_from_home(plannable_from_
     assert len(seeds) == 2  # else the same goals were drawn again
 
 
+class Blocked(CellDouble):
+    """The descent to the first ball is aborted until the other one is gone; `order` are the balls approached."""
+
+    def arrive(self, request: m.ExecuteRequest) -> None:
+        super().arrive(request)
+        if self.task.status.stage == "pre-grasp":
+            self.order.append(self.task.status.target)
+            if self.task.status.target == "track_0" and len(self.balls) > 1:
+                what = f"waypoint {len(self.order)} of 10 collides (fraction 0.{len(self.order)})"
+                self.motion = self.motion.model_copy(update={"state": "aborted", "message": what})
+
+
+def test_ball_whose_approach_failed_twice_for_one_reason_comes_after_the_others() -> None:
+    cell = Blocked([(0.40, -0.20), (0.52, -0.30)], joined=False)
+    cell.order = []
+    cell.until("DONE")
+    assert cell.order == ["track_0", "track_0", "track_1", "track_0"] and cell.contained == 2
+    assert cell.task.status.failures == 2
+
+
 def test_start_in_collision_causes_a_retreat_with_allowed_contact() -> None:
     cell = CellDouble(ONE)
     failing = ["start_in_collision"]
