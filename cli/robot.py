@@ -227,14 +227,13 @@ def new(
 ) -> None:
     """Write a robot file from a URDF: declared and measured values, and guesses, which are marked."""
     from common.config import names_of
-    from tools.robot_setup.descriptions import Reader, parse_arguments, written
+    from tools.robot_setup.descriptions import Reader, existing_folders, parse_arguments, written
     from tools.robot_setup.files import robot_file, write_cell
     from tools.robot_setup.maker_srdf import MakerSrdf, read_srdf
     from tools.robot_setup.proposal import finish
     from tools.robot_setup.tree import read_tree
 
-    reader = Reader([str(Path(each).expanduser().resolve()) for each in package_dir or []],
-                    parse_arguments(arguments or []), trust)
+    reader = Reader(existing_folders(package_dir or []), parse_arguments(arguments or []), trust)
     arm = reader.read("urdf", urdf)
     hand = reader.read("--gripper", gripper) if gripper else None
     tree = read_tree(arm.root, urdf)

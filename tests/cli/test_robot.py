@@ -162,11 +162,11 @@ def test_maker_s_srdf_gives_pairs_group_and_poses(folder, tmp_path):
             '<disable_collisions link1="foot" link2="gone"/></robot>')
 
     new = ("robot", "new", str(URDF), "--srdf", "maker.srdf", "--yes", "--force", "--name", "side")
-    maker(state("home", home), state("far", [9.0] * 6), state("part", [0.1]), state("bent", [0.1] * 6))
+    maker(state("home", home), state("far", [9.0] * 6), state("part", [0.1]), state("bent: 0 #", [0.1] * 6))
     done = ask(tmp_path, *new)
     assert done.returncode == 0, done.stderr
     values = yaml.safe_load((tmp_path / "side.yaml").read_text())
-    assert (values["joints"], values["named_poses"]) == (joints, {"home": home, "bent": [0.1] * 6})
+    assert (values["joints"], values["named_poses"]) == (joints, {"home": home, "bent: 0 #": [0.1] * 6})
     for line in ("the SRDF names links that the URDF lacks: gone", "pose far of the SRDF is left out",
                  "group arm of the SRDF is the arm; --group selects inner"):
         assert line in done.stdout
@@ -196,6 +196,7 @@ def test_maker_s_srdf_gives_pairs_group_and_poses(folder, tmp_path):
     (TEXT.replace('upper="2.6"', 'upper="${wide}"'), "", ["'bend'", "'${wide}'"]),
     (TEXT.replace(' velocity="0"', ""), "", ["'spin'", "no velocity"]),
     (CHAIN, "", ["39 of them in one chain", "30"]),
+    (TEXT, "--package-dir gone", ["--package-dir", "'gone'", "not a folder"]),
     (TEXT, "--name 'my arm'", ["--name", "'my arm'"]),
     (TEXT, "--out no/a.yaml", ["--out", "does not exist"]),
     (TEXT, "--out a.srdf", ["--out", "'a.srdf'", ".yaml"]),

@@ -31,14 +31,12 @@ class Description:
     """A parsed description.
 
     Attributes:
-        path: file it was read from.
         root: its elements, meshes with absolute paths.
         expanded: it was a xacro file.
         packages: folders of its packages, by name.
         notes: what was changed, for the user.
     """
 
-    path: Path
     root: ET.Element
     expanded: bool = False
     packages: dict[str, Path] = field(default_factory=dict)
@@ -76,10 +74,10 @@ class Reader:
         around = [*self.folders, *map(str, neighbours(path))]
         if is_xacro(path):
             reply = self._expanded(option, reference, path, around)
-            found = Description(path, parse_xml(option, reference, reply["text"].encode()), True)
+            found = Description(parse_xml(option, reference, reply["text"].encode()), True)
             found.packages = {name: Path(folder) for name, folder in reply["packages"].items()}
         else:
-            found = Description(path, read_xml(option, path))
+            found = Description(read_xml(option, path))
         meshes = resolve_meshes(found.root, path, around)
         found.packages |= {name: folder.resolve() for name, folder in meshes.packages.items()}
         if meshes.missing:
@@ -154,6 +152,18 @@ def is_xacro(path: Path) -> bool:
     with contextlib.suppress(OSError), path.open("rb") as file:
         return re.search(rb"<xacro:\w", file.read(1_000_000)) is not None
     return False
+
+
+def existing_folders(given: Sequence[str]) -> list[str]:
+    """Return the absolute paths of `--package-dir`.
+
+    Raises:
+        ConfigError: one is no folder.
+    """
+    for each in given:
+        if not Path(each).expanduser().is_dir():
+            raise ConfigError("--package-dir", each, "is not a folder")
+    return [str(Path(each).expanduser().resolve()) for each in given]
 
 
 def parse_arguments(given: Sequence[str]) -> dict[str, str]:

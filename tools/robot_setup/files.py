@@ -74,7 +74,7 @@ def _comment(text: str) -> list[str]:
 def _entry(name: str, value: Any) -> list[str]:
     """Return a field in block style, with inner values in one line each."""
     if name in ("named_poses", "gripper"):
-        inner = [f"  {key}: {_flow(each)}" for key, each in value.items()]
+        inner = [f"  {_flow(str(key))}: {_flow(each)}" for key, each in value.items()]
         return [f"{name}:", *inner]
     if name in ("position_limits", "attachments"):
         return [f"{name}:", *(f"  - {_flow(each)}" for each in value)]

@@ -73,6 +73,21 @@ def test_missing_visual_mesh_is_reported_and_drawn_by_the_collision_shape(tmp_pa
     assert [piece.link for piece in visual_pieces(robot)] == ["base"]
 
 
+def test_packages_of_a_sourced_ros_are_found_through_links_into_its_source(tmp_path, monkeypatch):
+    folder = package(tmp_path / "ws" / "src" / "clone", "that_arm")
+    (folder / "limits.yaml").write_text("name: found\n")
+    share = tmp_path / "ws" / "install" / "share" / "that_arm"
+    share.mkdir(parents=True)
+    for each in ("package.xml", "limits.yaml", "meshes"):
+        (share / each).symlink_to(folder / each)
+    monkeypatch.setenv("AMENT_PREFIX_PATH", f"/opt/none:{tmp_path / 'ws' / 'install'}")
+    path = tmp_path / "elsewhere" / "arm.xacro"
+    path.parent.mkdir()
+    path.write_text(f'<robot {XACRO}><link name="${{load_yaml(\'$(find that_arm)/limits.yaml\').name}}">'
+                    f'{shape("collision", "package://that_arm/meshes/link.stl")}</link></robot>')
+    assert Reader([]).read("urdf", str(path)).root[0].get("name") == "found"
+
+
 def names(name: str) -> bytes:
     return arm("").replace('"turn"', f'"{name}"').encode()
 
