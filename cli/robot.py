@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import re
 import sys
 from collections import Counter
@@ -11,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
+from typer.core import TyperCommand
 
 from cli import choices, options
 from cli.options import RUNNING, CellTarget, CommandGroup
@@ -197,7 +199,17 @@ def jog(
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,39}")
 
 
-@app.command()
+class CommandWithPairs(TyperCommand):
+    """A command whose option --allow-pair takes two values, which typer cannot declare for an option that repeats."""
+
+    def __init__(self, *given: Any, **settings: Any) -> None:
+        super().__init__(*given, **settings)
+        for each in self.params:
+            if each.name == "allow_pair":
+                each.nargs = 2
+
+
+@app.command(cls=CommandWithPairs)
 def new(
     urdf: Annotated[str, typer.Argument(metavar="URDF", help="URDF or xacro file of the arm: a path, or "
                                                              "package://...")],
@@ -221,6 +233,8 @@ def new(
                                                                           "within reach of this arm")] = "",
     like: Annotated[str, typer.Option("--like", metavar="CELL", help="template of that cell",
                                       autocompletion=choices.cells)] = "",
+    allow_pair: Annotated[list[Any] | None, typer.Option(
+        "--allow-pair", metavar="LINK LINK", parser=lambda pair: pair, help="links that may touch; repeatable")] = None,
     yes: Annotated[bool, typer.Option("--yes", "-y", help="ask no questions: use the best guesses")] = False,
     force: Annotated[bool, typer.Option("--force", help="overwrite existing files")] = False,
     trust: Annotated[bool, typer.Option("--trust", help="let expressions of xacro files run any Python")] = False,
@@ -254,7 +268,8 @@ def new(
             urdf = stack.enter_context(written(arm, path.with_suffix(".urdf"), force))
         if hand and hand.expanded:
             gripper = stack.enter_context(written(hand, path.with_suffix(".gripper.urdf"), force))
-        made = _draft(tree, urdf, chosen, gripper, tip, reader.folders, yes, maker.arms.get(group, []))
+        made = _draft(tree, urdf, chosen, gripper, tip, reader.folders, yes, maker.arms.get(group, []),
+                      [(one, other) for one, other in allow_pair or []])
         echo("computing collision pairs and a home pose: a few seconds, a minute with detailed meshes", err=True)
         robot = finish(made, maker.pairs, maker.arm_poses(group))
     made.check += [*arm.notes, *(hand.notes if hand else []), *maker.notes(group)]
@@ -283,7 +298,8 @@ def _layout_of(cell: str, robot: Path, template: str, force: bool) -> Layout:
 
 
 def _draft(
-    tree: Tree, urdf: str, name: str, gripper: str, tip: str | None, folders: list[str], yes: bool, group: Sequence[str]
+    tree: Tree, urdf: str, name: str, gripper: str, tip: str | None, folders: list[str], yes: bool,
+    group: Sequence[str], allowed: Sequence[tuple[str, str]],
 ) -> Proposal:
     """Return a draft of the robot file; ask for the end of the arm if several links may be it."""
     from tools.robot_setup.proposal import draft
@@ -293,11 +309,13 @@ def _draft(
     if tip is None and not group and len(wrists) > 1 and not yes:
         longest = max(wrists, key=lambda link: len(tree.above(link)))
         tip = _ask(f"arms end at {', '.join(wrists)}; which", longest, yes)
-    made = draft(urdf, name, gripper=gripper, tip=tip, package_dirs=folders, group=group)
+    make = functools.partial(
+        draft, urdf, name, gripper=gripper, package_dirs=folders, group=group, allowed_pairs=allowed)
+    made = make(tip=tip)
     fitting = [each.link for each in made.candidates if each.fits]
     if tip is None and len(fitting) > 1 and not yes:
         tip = _ask(f"tool centre point: {', '.join(fitting)}; which", made.values.get("tcp_link", fitting[0]), yes)
-        made = draft(urdf, name, gripper=gripper, tip=tip, package_dirs=folders, group=group)
+        made = make(tip=tip)
     return made
 
 
@@ -314,12 +332,16 @@ def check(
     from common.robot.model import RobotModel
     from tools.robot_setup.descriptions import Reader
     from tools.robot_setup.end_effector import check_gripper
+    from tools.robot_setup.plausibility import findings
     from tools.robot_setup.sampling import hits
 
     robot = RobotModel.load(load_robot(name))
     for note in Reader(robot.config.package_dirs).read("robot.urdf", robot.config.urdf).notes:
         echo(note)
-    faults = check_gripper(robot)
+    impossible, notes = findings(robot)
+    for note in notes:
+        echo(note)
+    faults = [*check_gripper(robot), *impossible]
     touching = hits(robot, RobotGeometry(robot), robot.named("home"))
     faults += [f"named_poses.home: {pair} touch" for pair in touching]
     for line in faults:

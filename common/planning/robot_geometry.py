@@ -24,7 +24,8 @@ class RobotGeometry:
     """Convex hulls of the links of a robot.
 
     Attributes:
-        geometry: pinocchio geometry model with the pairs that can collide: all but those the SRDF disables.
+        geometry: pinocchio geometry model with the pairs that can collide: all but those that the SRDF disables, or the
+            robot file allows.
         links: link name of each hull; joints: index of the joint in `robot.model` that carries it, 0 for the base.
     """
 
@@ -47,6 +48,10 @@ class RobotGeometry:
         self.geometry = geometry
         self._full_data = robot.full_model.createData()
         self.links: list[str] = [robot.model.frames[item.parentFrame].name for item in geometry.geometryObjects]
+        allowed = [set(pair) for pair in robot.config.allowed_pairs]
+        for pair in list(geometry.collisionPairs) if allowed else []:
+            if {self.links[pair.first], self.links[pair.second]} in allowed:
+                geometry.removeCollisionPair(pair)
         self.joints: list[int] = [item.parentJoint for item in geometry.geometryObjects]
         self._fingers = self._moved_by_fingers(full)
         self._openings: dict[float | None, list[tuple[int, pin.SE3, Array]]] = {}

@@ -50,6 +50,10 @@ class RobotModel:
         self.data = self.model.createData()
         self._full_data = full_model.createData()
         self.joint_names: list[str] = list(self.model.names)[1:]
+        for element in ET.fromstring(urdf).findall("joint"):
+            if element.get("name") in self.joint_names and (mimic := element.find("mimic")) is not None:
+                raise ConfigError("robot.joints", element.get("name"),
+                                  f"follows {mimic.get('joint')} (mimic); joints of an arm must move independently")
         if self.joint_names != config.joints:
             raise ConfigError("robot.joints", config.joints, f"must be in the URDF's order: {self.joint_names}")
         if self.model.nq != len(self.joint_names):
@@ -76,6 +80,12 @@ class RobotModel:
                 raise ConfigError(f"robot.{field}", link, f"is not a link; choices: {', '.join(self._links)}")
         self.tcp_frame: int = self._links[config.tcp_link]
         self.link_parents = _link_parents(full_model)
+        for one, other in config.allowed_pairs:
+            for each in (one, other):
+                if each not in self._links:
+                    raise ConfigError("robot.allowed_pairs", each, f"is not a link; choices: {', '.join(self._links)}")
+            if one == other:
+                raise ConfigError("robot.allowed_pairs", one, "is one link: a pair needs another one")
         for name, positions in config.named_poses.items():
             for joint, value, low, high in zip(self.joint_names, positions, self.lower, self.upper, strict=True):
                 if not low <= value <= high:

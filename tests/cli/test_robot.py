@@ -1,6 +1,7 @@
 """`zencell robot`: a robot file from a URDF alone and a cell that picks with it, its check, and its collision pairs."""
 
 import io
+import re
 import shlex
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import trimesh
 import yaml
 
 from common.config import RobotConfig, check, config_root, load_cell, read_robot
+from common.planning.robot_geometry import RobotGeometry
 from common.robot.model import RobotModel
 from lab.simulation import Simulation
 from tests.harness import ROOT, ask
@@ -93,6 +95,69 @@ def test_check_compares_the_tool_with_the_fingers(folder):
     done = ask(folder, "robot", "check", "bare.yaml")
     assert done.returncode == 1
     assert "z of flange must point from the palm to the tips of the fingers, which is x" in done.stdout
+
+
+JAW = '<link name="lower_jaw">', '<link name="upper_jaw">'
+WRIST = '<joint name="bend"', '<joint name="pitch"'
+
+
+def new_robot(folder: Path, text: str, *options: str) -> tuple[list[str], RobotConfig]:
+    """Return the lines of `zencell robot new` that begin with check or lost, and the robot file."""
+    (folder / "arm.urdf").write_text(text)
+    done = ask(folder, "robot", "new", "arm.urdf", "--yes", "--name", "r", "--force", *options)
+    assert done.returncode == 0, done.stderr
+    lines = [line for line in done.stdout.splitlines() if line.startswith(("check:", "lost:"))]
+    return lines, check(RobotConfig, read_robot(folder / "r.yaml"), "robot")
+
+
+def test_links_without_collision_shapes_collide_with_their_visuals(tmp_path):
+    lines, config = new_robot(tmp_path, re.sub("(</?)collision>", r"\1visual>", TEXT))
+    links = ["foot", "shoulder", "upper", "fore", "wrist", "flange", "upper_finger", "lower_finger"]
+    assert config.visual_as_collision == links
+    assert any(f"no collision shape: {', '.join(links)}; they collide" in line for line in lines), lines
+    geometry = RobotGeometry(RobotModel.load(config))
+    assert sorted(geometry.links) == sorted(links) and geometry.geometry.collisionPairs
+    assert "visual_as_collision" not in ask(tmp_path, "robot", "check", "r.yaml").stdout
+    (tmp_path / "r.yaml").write_text(re.sub("(?m)^visual_as.*$", "", (tmp_path / "r.yaml").read_text()))
+    assert "check: links with a visual and no collision shape: foot" in ask(tmp_path, "robot", "check", "r.yaml").stdout
+
+
+def test_sizes_and_limits_that_cannot_be_right_are_named(tmp_path):
+    text = TEXT.replace('upper="2.6"', 'upper="150"').replace('velocity="3"', 'velocity="180"')
+    lines, _ = new_robot(tmp_path, text.replace('<box size="0.04 0.05 0.11"/>', '<box size="0.04 50 0.11"/>'))
+    for words in ("limits of bend", "150, look like degrees", "velocity limit of", "0.04 x 50 x 0.11 m large"):
+        assert any(words in line for line in lines), (words, lines)
+    done = ask(tmp_path, "robot", "check", "r.yaml")
+    assert done.returncode == 1 and "0.04 x 50 x 0.11 m large" in done.stdout
+
+
+def test_joint_of_the_arm_that_follows_another_is_refused(tmp_path, monkeypatch, rejection):
+    monkeypatch.chdir(tmp_path)
+    Path("arm.urdf").write_text(TEXT.replace('<child link="fore"/>', '<child link="fore"/><mimic joint="lift"/>'))
+    assert "'bend' follows lift" in rejection("robot", "new", "arm.urdf", "--yes", "--name", "r")
+
+
+def test_joint_and_link_may_have_one_name(tmp_path):
+    _, config = new_robot(tmp_path, TEXT.replace('name="spin"', 'name="foot"').replace('name="roll"', 'name="wrist"'))
+    assert config.joints == ["turn", "lift", "bend", "wrist", "pitch", "foot"]
+    robot = RobotModel.load(config)
+    plain = RobotModel.load(new_robot(tmp_path, TEXT)[1])
+    home = plain.named("home")
+    assert {link: pose.tolist() for link, pose in robot.link_poses(home).items()} == {
+        link: pose.tolist() for link, pose in plain.link_poses(home).items()}
+    assert RobotGeometry(robot).links == RobotGeometry(plain).links
+
+
+def test_allowed_pairs_are_written_checked_and_not_planned_around(tmp_path, monkeypatch, rejection):
+    _, config = new_robot(tmp_path, TEXT, "--allow-pair", "foot", "fore", "--allow-pair", "foot", "flange")
+    assert config.allowed_pairs == [("foot", "fore"), ("foot", "flange")]
+    geometry = RobotGeometry(RobotModel.load(config))
+    pairs = [{geometry.links[pair.first], geometry.links[pair.second]} for pair in geometry.geometry.collisionPairs]
+    assert {"foot", "fore"} not in pairs and {"foot", "wrist"} in pairs
+    assert "not checked: foot and fore: allowed_pairs" in ask(tmp_path, "robot", "check", "r.yaml").stdout
+    monkeypatch.chdir(tmp_path)
+    line = rejection("robot", "new", "arm.urdf", "--yes", "--name", "s", "--allow-pair", "foot", "nose")
+    assert "robot.allowed_pairs: 'nose' is not a link; choices: foot" in line
 
 
 def test_files_are_overwritten_only_on_request(folder):

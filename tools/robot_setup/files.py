@@ -20,9 +20,9 @@ from common.robot.urdf import find_description
 from tools.robot_setup.proposal import Proposal
 
 WIDTH = 118
-ORDER = ("name", "urdf", "srdf", "package_dirs", "attachments", "joints", "base_link", "base_position", "base_rpy",
-         "tcp_link", "tcp", "locked_joints", "named_poses", "position_limits", "velocity_limits",
-         "acceleration_limits", "jerk_limits", "gripper")
+ORDER = ("name", "urdf", "srdf", "package_dirs", "attachments", "visual_as_collision", "allowed_pairs", "joints",
+         "base_link", "base_position", "base_rpy", "tcp_link", "tcp", "locked_joints", "named_poses", "position_limits",
+         "velocity_limits", "acceleration_limits", "jerk_limits", "gripper")
 
 
 def robot_file(proposal: Proposal, head: str, folder: Path, srdf: str) -> str:
@@ -76,7 +76,7 @@ def _entry(name: str, value: Any) -> list[str]:
     if name in ("named_poses", "gripper"):
         inner = [f"  {_flow(str(key))}: {_flow(each)}" for key, each in value.items()]
         return [f"{name}:", *inner]
-    if name in ("position_limits", "attachments"):
+    if name in ("position_limits", "attachments", "allowed_pairs"):
         return [f"{name}:", *(f"  - {_flow(each)}" for each in value)]
     return [f"{name}: {_flow(value)}"]
 

@@ -32,7 +32,8 @@ from tools.robot_setup.end_effector import (
 from tools.robot_setup.fingers import ALIGNED, link_points
 from tools.robot_setup.maker_srdf import fitting_poses
 from tools.robot_setup.mounting import find_mount
-from tools.robot_setup.sampling import DisabledPair, disabled_pairs, find_home, srdf
+from tools.robot_setup.plausibility import FASTEST, bare_links, doubts
+from tools.robot_setup.sampling import DisabledPair, find_home, srdf, survey_pairs
 from tools.robot_setup.tree import (
     SPEED,
     TO_ACCELERATION,
@@ -85,7 +86,7 @@ class Proposal:
 
 def draft(
     urdf: str, name: str, *, gripper: str = "", tip: str | None = None, package_dirs: Sequence[str] = (),
-    group: Sequence[str] = (),
+    group: Sequence[str] = (), allowed_pairs: Sequence[tuple[str, str]] = (),
 ) -> Proposal:
     """Return the robot file of an arm without home pose and unchecked pairs, which `finish` adds.
 
@@ -96,6 +97,7 @@ def draft(
         tip: the tool centre point or mounting link, if the arm has several ends.
         package_dirs: folders that resolve package://.
         group: joints of the arm, if the maker's SRDF states them.
+        allowed_pairs: pairs of links that may touch.
 
     Raises:
         ConfigError, UnknownName: a description is invalid.
@@ -105,6 +107,7 @@ def draft(
     proposal = Proposal({
         "name": name, "urdf": urdf, "package_dirs": list(package_dirs),
         "joints": [joint.name for joint in arm.joints], "base_link": arm.base, "tcp_link": arm.wrist,
+        "allowed_pairs": list(allowed_pairs),
     })
     _limits(proposal, arm)
     others = [joint for joint in tree.joints if joint.moves and joint not in arm.joints]
@@ -118,6 +121,13 @@ def draft(
     middle = [(low + high) / 2 for low, high in proposal.values["position_limits"]]
     proposal.values["named_poses"] = {"home": middle}
     robot = _model(proposal)
+    if bare := bare_links(robot):
+        proposal.values["visual_as_collision"] = bare
+        proposal.notes["visual_as_collision"] = "Links that the URDF gives no collision shape."
+        proposal.check.append(f"links with a visual and no collision shape: {', '.join(bare)}; they collide with the "
+                              "convex hull of the visual (visual_as_collision)")
+        robot = _model(proposal)
+    proposal.check += doubts(robot, [*arm.joints, *fingers])
     points = link_points(robot)
     complete = read_tree(ET.fromstring(robot.urdf), urdf)
     effector: GripperProposal | None = None
@@ -153,9 +163,9 @@ def _limits(proposal: Proposal, arm: Arm) -> None:
         positions.append((low, high))
         if changed:
             narrowed.append(joint.name)
-        if not joint.velocity:
+        if not joint.velocity or joint.velocity > FASTEST:
             missing.append(joint.name)
-        speeds.append(joint.velocity or SPEED)
+        speeds.append(SPEED if joint.name in missing else joint.velocity or SPEED)
     accelerations = [guessed_acceleration(speed) for speed in speeds]
     proposal.values["position_limits"], proposal.values["velocity_limits"] = positions, speeds
     proposal.values["acceleration_limits"] = accelerations
@@ -166,8 +176,8 @@ def _limits(proposal: Proposal, arm: Arm) -> None:
             "since a second way round only misleads planning.")
         proposal.guessed.append(f"position_limits of {', '.join(narrowed)}: half a turn either way")
     if missing:
-        proposal.guessed.append(f"velocity_limits of {', '.join(missing)}: the URDF gives none, so {SPEED:g}")
-        proposal.notes["velocity_limits"] = f"GUESSED for {', '.join(missing)}, for which the URDF gives none."
+        proposal.guessed.append(f"velocity_limits of {', '.join(missing)}: the URDF gives no usable one, so {SPEED:g}")
+        proposal.notes["velocity_limits"] = f"GUESSED for {', '.join(missing)}, for which the URDF gives no usable one."
     proposal.notes["acceleration_limits"] = (
         f"GUESSED: each joint comes to its speed limit in {TO_SPEED:g} s. URDFs lack this value; see the data sheet.")
     proposal.notes["jerk_limits"] = f"GUESSED: each joint comes to its acceleration limit in {TO_ACCELERATION:g} s."
@@ -312,9 +322,11 @@ def finish(
         poses: further named poses. One that is called home is used as such if its tool points down and nothing touches.
     """
     robot = _mounted(proposal)
-    pairs = disabled_pairs(robot)
+    pairs, overlaps = survey_pairs(robot)
     pairs += [DisabledPair(*links, "Maker") for links in pairs_of_maker
               if not any({pair.one, pair.other} == set(links) for pair in pairs)]
+    allowed = [{*links} for links in (*pairs_of_maker, *robot.config.allowed_pairs)]
+    proposal.check += [each.line for each in overlaps if {each.one, each.other} not in allowed]
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "pairs.srdf"
         path.write_text(srdf(robot, pairs), encoding="utf-8")

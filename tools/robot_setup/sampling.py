@@ -158,9 +158,11 @@ def hits(robot: RobotModel, geometry: RobotGeometry, q: Array) -> list[str]:
                               if result.isCollision()))
 
 
-Reason = Literal["Adjacent", "Fixed", "Always", "Never", "Maker"]
+Reason = Literal["Adjacent", "Fixed", "Always", "Hulls", "Never", "Maker"]
 
 ALMOST_ALWAYS = 0.95  # of the samples
+OFTEN = 0.5  # of the samples: pairs close to each other that touch more often are reported
+NEAR = 2  # joints between two links
 
 
 @dataclass(frozen=True)
@@ -168,8 +170,8 @@ class DisabledPair:
     """Two links that are not checked, and why.
 
     Adjacent: a joint connects them. Fixed: no joint of the group moves one against the other. Always: they touch at
-    every sample; on both sides of one joint at almost every sample, as overlapping hulls of a wrist do. Never: they
-    came no closer than the margin at any sample. Maker: listed in the maker's SRDF.
+    every sample; with at most two joints between them, at almost every sample. Hulls: so do their hulls, and their
+    shapes at none. Never: they came no closer than the margin at any sample. Maker: listed in the maker's SRDF.
     """
 
     one: str
@@ -177,10 +179,44 @@ class DisabledPair:
     reason: Reason
 
 
+@dataclass(frozen=True)
+class Overlap:
+    """Two links with at most two joints between them that touch often but not always; shares of the samples.
+
+    Attributes:
+        hulls, shapes: share at which their convex hulls, and their shapes, touch; None: not computed.
+        reason: why they are not checked; None: they are.
+    """
+
+    one: str
+    other: str
+    hulls: float
+    shapes: float | None
+    reason: Reason | None
+
+    @property
+    def line(self) -> str:
+        """What a user should know about the pair."""
+        names, as_shapes = f"{self.one} and {self.other}", f", their shapes in {self.shapes or 0:.2%}"
+        touch = f"their convex hulls touch in {self.hulls:.2%} of the poses{'' if self.shapes is None else as_shapes}"
+        return f"{names} are not checked: {touch}" if self.reason else (
+            f"{names} are checked: {touch}; --allow-pair {self.one} {self.other} leaves them out")
+
+
 def disabled_pairs(
     robot: RobotModel, *, samples: int = 10000, margin: float = 0.005, rng: np.random.Generator | None = None
 ) -> list[DisabledPair]:
-    """Return pairs of links that need no check, in the order of the description; ignores the robot's own SRDF.
+    """Return the pairs of `survey_pairs` that need no check."""
+    return survey_pairs(robot, samples=samples, margin=margin, rng=rng)[0]
+
+
+def survey_pairs(
+    robot: RobotModel, *, samples: int = 10000, margin: float = 0.005, rng: np.random.Generator | None = None
+) -> tuple[list[DisabledPair], list[Overlap]]:
+    """Return pairs of links that need no check, and pairs that often touch, in the order of the description.
+
+    The robot's own SRDF is ignored. A pair whose shapes touch at some samples and not at others stays checked, even if
+    their hulls touch at almost all.
 
     Args:
         robot: the model; its group is sampled uniformly within the limits, its fingers over their widths.
@@ -208,25 +244,54 @@ def disabled_pairs(
     generator = rng if rng is not None else np.random.default_rng(0)
     configurations = sample_configurations(robot, samples, generator)
     close = _hits(model, geometry, configurations, margin)
-
-    def least(pair: tuple[str, str]) -> float:
-        """Return the share of samples at which a pair must touch to be reported as Always."""
-        one, other = (bodies[link] for link in pair)
-        return ALMOST_ALWAYS if robot.model.parents[one] == other or robot.model.parents[other] == one else 1.0
-
     columns = {pair: [k for k, other in enumerate(between) if other == pair] for pair in between}
+    apart = {pair: _joints_between(robot, *(bodies[link] for link in pair)) for pair in columns}
     suspects = []
     for pair, own in columns.items():
         if not close[:, own].any():
             found[pair] = "Never"
-        elif close[:, own].any(axis=1).mean() >= least(pair):
+        elif close[:, own].any(axis=1).mean() >= (OFTEN if apart[pair] <= NEAR else 1.0):
             suspects.append(pair)
-    if suspects:
-        touching = _hits(model, geometry, configurations, 0.0)
-        found.update({pair: "Always" for pair in suspects
-                      if touching[:, columns[pair]].any(axis=1).mean() >= least(pair)})
+    hulls = _shares(model, geometry, configurations, suspects)
+    doubtful = [pair for pair in suspects if ALMOST_ALWAYS <= hulls[pair] < 1.0 and apart[pair] <= NEAR]
+    shapes = _shares(model, robot.full_geometry(), configurations, doubtful) if doubtful else {}
+    overlaps = []
+    for pair in suspects:
+        reason: Reason | None = "Always" if hulls[pair] == 1.0 or shapes.get(pair, 0.0) >= ALMOST_ALWAYS else None
+        if pair in shapes and shapes[pair] == 0.0:
+            reason = "Hulls"
+        if reason:
+            found[pair] = reason
+        if OFTEN <= hulls[pair] < 1.0 and apart[pair] <= NEAR:
+            overlaps.append(Overlap(pair[0], pair[1], hulls[pair], shapes.get(pair), reason))
     return [DisabledPair(one, other, found[one, other])
-            for i, one in enumerate(links) for other in links[i + 1:] if (one, other) in found]
+            for i, one in enumerate(links) for other in links[i + 1:] if (one, other) in found], overlaps
+
+
+def _joints_between(robot: RobotModel, one: int, other: int) -> float:
+    """Return the number of joints between two bodies of the group; inf if none carries the other."""
+    lower, upper, count = max(one, other), min(one, other), 0
+    while lower > upper:
+        lower, count = robot.model.parents[lower], count + 1
+    return count if lower == upper else math.inf
+
+
+def _shares(
+    model: pin.Model, geometry: pin.GeometryModel, configurations: Array, pairs: Sequence[tuple[str, str]]
+) -> dict[tuple[str, str], float]:
+    """Return the share of configurations at which the shapes of each pair of links touch."""
+    items: dict[str, list[int]] = {}
+    for index, item in enumerate(geometry.geometryObjects):
+        items.setdefault(model.frames[item.parentFrame].name, []).append(index)
+    geometry.removeAllCollisionPairs()
+    columns = {}
+    for one, other in pairs:
+        own = [pin.CollisionPair(*sorted(both)) for both in itertools.product(items[one], items[other])]
+        columns[one, other] = slice(len(geometry.collisionPairs), len(geometry.collisionPairs) + len(own))
+        for each in own:
+            geometry.addCollisionPair(each)
+    touching = _hits(model, geometry, configurations, 0.0)
+    return {pair: float(touching[:, own].any(axis=1).mean()) for pair, own in columns.items()}
 
 
 def sample_configurations(robot: RobotModel, samples: int, rng: np.random.Generator) -> Array:

@@ -1,14 +1,16 @@
+import re
 import xml.etree.ElementTree as ET
 
 import numpy as np
 import pinocchio as pin
 import pytest
+import trimesh
 
 from common.config import RobotConfig, load_cell
 from common.planning.robot_geometry import RobotGeometry, convex_hulls
 from common.robot.model import RobotModel
 from tests.common.planning.ur5_scene import ROBOT
-from tools.robot_setup.sampling import disabled_pairs, sample_configurations, srdf
+from tools.robot_setup.sampling import disabled_pairs, sample_configurations, srdf, survey_pairs
 
 PANDA = RobotModel.load(load_cell("panda").robot)
 
@@ -82,12 +84,13 @@ def test_srdf_contains_groups_and_poses_and_is_loaded_by_the_planner(tmp_path):
 
 
 def robot_of(tmp_path, *parts):
-    """Load a robot of links (`name`, position and size of a box) and revolute or fixed joints (`parent`, `child`)."""
+    """Load a robot of links (`name`, position, size or file) and revolute or fixed joints (`parent`, `child`)."""
     text = ""
     for part in parts:
         if len(part) == 3:
             name, at, size = part
-            shape = f'<origin xyz="{at}"/><geometry><box size="{size}"/></geometry>'
+            shape = f'<mesh filename="{size}"/>' if size.endswith(".stl") else f'<box size="{size}"/>'
+            shape = f'<origin xyz="{at}"/><geometry>{shape}</geometry>'
             text += f'<link name="{name}"><collision>{shape}</collision></link>'
         else:
             parent, child = part
@@ -116,3 +119,19 @@ def test_neighbors_that_almost_always_touch_are_disabled(gap, reason, tmp_path):
                      ("base", "arm"), ("arm", "hand"), ("hand", "wall"))
     found = {frozenset((p.one, p.other)): p.reason for p in disabled_pairs(robot, samples=400)}
     assert found.get(frozenset(("arm", "wall"))) == reason
+
+
+@pytest.mark.parametrize(("post", "reason", "line"), [
+    ([], "Hulls", r"base and tip are not checked: .* touch in 9\d.\d\d% of the poses, their shapes in 0.00%"),
+    ([(0.0757, 0.0757)], None, "base and tip are checked: .* --allow-pair base tip leaves them out"),
+])
+def test_shapes_decide_where_hulls_of_links_two_joints_apart_almost_always_touch(post, reason, line, tmp_path):
+    """The tip circles between the posts of the base, in their hull but for four directions."""
+    corners = [(x, y) for x in (-0.1, 0.1) for y in (-0.1, 0.1)]
+    boxes = [trimesh.creation.box((0.01, 0.01, 0.1)).apply_translation((x, y, 0)) for x, y in [*corners, *post]]
+    trimesh.util.concatenate(boxes).export(tmp_path / "posts.stl")
+    robot = robot_of(tmp_path, ("base", "0 0 0", "posts.stl"), ("arm", "0 0 0.2", "0.02 0.02 0.02"),
+                     ("tip", "0.10702 0 0", "0.004 0.004 0.004"), ("base", "arm"), ("arm", "tip"))
+    pairs, (overlap,) = survey_pairs(robot, samples=1000)
+    assert {frozenset((p.one, p.other)): p.reason for p in pairs}.get(frozenset(("base", "tip"))) == reason
+    assert re.fullmatch(line, overlap.line)
