@@ -43,9 +43,15 @@ V_co = TypeVar("V_co", covariant=True)
 
 EXECUTOR = "trajectory_executor"
 SPEED = f"services.{EXECUTOR}.speed_scaling"
+STOPPED = "stopped on the page"  # reason of its stops
 SLIDER_DEBOUNCE = 0.15  # [s] without a change, after which the value of a slider is sent
 _FAST_TIMEOUT = 2.0  # [s] wall: for stopping, and for replies that need no work
 _TIMEOUT = 5.0  # [s] wall: for all other requests
+
+
+def stopped_by(client: str) -> str:
+    """Return the result of a STOP of arm and task."""
+    return f"Stopped by {client}"
 
 
 class Field(Protocol[V_co]):
@@ -254,13 +260,13 @@ class Console(ActionQueue):
         self.stop_count += 1
         client = self.permissions.client_name
         result = await stop_arm_and_task(self._clients[topics.MOTION_STOP.key], self._clients[topics.TASK_COMMAND.key],
-                                         client, "stopped on the page", _FAST_TIMEOUT)
+                                         client, STOPPED, _FAST_TIMEOUT)
         if isinstance(result.arm, RequestFailed):
             raise result.arm
         self._own_stop = result.arm.newest
         if isinstance(result.task, RequestFailed):
             return f"Arm stopped by {client}; task NOT stopped: {error_text(result.task)}"
-        return f"Stopped by {client}"
+        return stopped_by(client)
 
     async def own(self, act: Literal["take", "give"], over: bool = False) -> MotionOwner:
         """Take motion ownership for the current session until it is released, or release it."""

@@ -19,12 +19,13 @@ from websockets.exceptions import ConnectionClosed
 from common.time_source import monotonic
 from page.access import CURRENT_SESSION
 from page.browser_values import MAX_NUMBER, to_json
-from page.status_text import USER_ERRORS, TaskText, error_text, motion_text
+from page.situation import Situation, control_text
+from page.status_text import USER_ERRORS, error_text
 
 if TYPE_CHECKING:
     from websockets.asyncio.server import ServerConnection
 
-    from common.messages import MotionOwner, MotionStatus, TaskStatus
+    from common.messages import MotionOwner
     from page.console import ActionQueue
 
 STOP, HOLD = "control:stop", "control:hold"  # element ids for the permissions
@@ -73,18 +74,22 @@ class PageStatus:
     """The status that every page shows; times are monotonic [s].
 
     Attributes:
-        summary: texts of the status bar, each with its kind (good, busy, bad, off, dim).
+        situation: first line of the status bar.
+        summary: texts of its second line, each with its kind (good, busy, bad, off, dim).
         lost: lost connections.
         note: number, text and kind of the newest message for the operator.
+        note_time: when it was shown.
         owner: motion owner.
         live: numbers in panels, by name.
         past: position in time that is displayed; empty for the present.
         at: when this was published.
     """
 
+    situation: Situation = field(default_factory=Situation)
     summary: tuple[tuple[str, str], ...] = ()
     lost: tuple[Loss, ...] = ()
     note: tuple[int, str, str] = (0, "", "")
+    note_time: float = 0.0
     owner: MotionOwner | None = None
     live: Mapping[str, str] = field(default_factory=dict)
     past: str = ""
@@ -157,10 +162,13 @@ class ControlSocket:
             if now - status.at > STATUS_TIMEOUT:
                 lost, stale = [("The viewer service does not respond", round(now - status.at, 1))], {"all"}
             number, text, kind = status.note
+            first, control = status.situation, control_text(status.owner, self._actions.permissions.client_name)
             message = {
-                "time": now, "summary": status.summary, "blocked": self._blocked(status.owner),
-                "live": dict(status.live), "lost": lost, "past": status.past, "stale": sorted(stale),
-                "note": {"number": number, "text": text, "kind": kind},
+                "time": now, "summary": [*status.summary, (f"Control: {control}", "")],
+                "situation": {"text": first.text, "kind": first.kind, "hint": first.hint, "since": first.since * 1e-6},
+                "blocked": self._blocked(status.owner), "live": {**status.live, "control": control}, "lost": lost,
+                "past": status.past, "stale": sorted(stale),
+                "note": {"number": number, "text": text, "kind": kind, "age": max(now - status.note_time, 0.0)},
             }
             try:
                 await connection.send(to_json({"status": message}))
@@ -172,7 +180,7 @@ class ControlSocket:
         """Return why this page cannot move the arm, whatever state the arm is in; empty if it can."""
         permissions = self._actions.permissions
         if owner is not None and owner.asked and owner.kind != "task" and owner.owner != permissions.client_name:
-            return f"the motion is {owner.description}: take control of the arm, or wait until it is released"
+            return f"{owner.owner or 'another operator'} controls the arm: press Take control, or wait for its release"
         return permissions.check(CURRENT_SESSION.get(), "operate")
 
     def _handle(self, connection: ServerConnection, data: str | bytes, delay: PressDelay) -> bool:
@@ -278,17 +286,3 @@ class LossDetector:
             found.append(Loss(f"{', '.join(names[:MAX_NAMED])}{more} {verb} not respond",
                               min(lost[name] for name in names)))
         return found
-
-
-def summarize(
-    cell: str, task_text: TaskText, task: TaskStatus | None, motion: MotionStatus | None, owner: MotionOwner | None,
-    operating_page: str | None,
-) -> tuple[tuple[str, str], ...]:
-    """Return the texts of the status bar, each with its kind; `operating_page` is None without access tokens."""
-    arm = "jogging" if owner is not None and owner.jogging else motion_text(motion)
-    summary = [(cell, "dim"), task_text.state(task), (f"arm {arm}", "")]
-    if owner is not None and owner.kind != "none":
-        summary.append((f"motion owner: {owner.owner or 'the task'}", "dim"))
-    if operating_page is not None:
-        summary.append((f"control: {operating_page or 'free'}", "dim"))
-    return tuple(summary)

@@ -264,6 +264,6 @@ def _plot(
     )
     return gui.add_uplot(
         data, (uplot.Series(label="time [s]"), *series), title=title, scales=scales,
-        axes=(axis, axis), legend=uplot.Legend(show=len(names) > 1),
+        axes=(axis, axis), legend=uplot.Legend(show=len(names) > 1, live=False),
         height=HEIGHT, padding=(4, 12, 0, 0),
     )

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from page.console import ActionQueue
 
 FILE = "viewer.yaml"
-Tab = Literal["Cameras", "Health", "Plots", "Log", "Tuning", "Move", "View", "Time"]
+Tab = Literal["Move", "Cameras", "Log", "View", "Plots", "Health", "Tuning", "Time"]
 TABS: tuple[Tab, ...] = get_args(Tab)
 HEADER = '# Layout of the operator\'s page. "Save layout" on the page writes this file.\n'
 Coordinate = Annotated[float, Field(ge=-1000, le=1000, allow_inf_nan=False)]
@@ -153,6 +153,7 @@ class ViewPanel:
             name: gui.add_checkbox(kind.LABEL or name, self.shown[name]) for name, kind in kinds.items()}
         for name, checkbox in self._checkboxes.items():
             actions.on_change(checkbox, partial(self._set, name), "look")
+        Html(gui, block(span("This browser draws without a graphics card: the scene is slow.", "busy"), "software"))
         checkbox = gui.add_checkbox("Shadows", shadows, hint="slow in a browser without a GPU")
         actions.on_change(checkbox, self._set_shadows, "look")
         self._legend = Html(gui)

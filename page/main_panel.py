@@ -1,22 +1,22 @@
-"""The panel that is always visible: task state and commands, control of the arm, and the robot controller."""
+"""The panel that is always visible: commands and figures of the task, control of the arm, and the robot controller."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import Callable, Coroutine
 from functools import partial
-from typing import Any, Literal
+from typing import Literal
 
 import viser
 
 from common import topics
 from common.errors import RemoteError, ZencellError
 from common.messages import MotionOwner, MotionStatus, RobotCommand, RobotStatus, TaskStatus
+from common.time_source import monotonic
 from page.access import CURRENT_SESSION
-from page.console import SLIDER_DEBOUNCE, Console, assign
-from page.markup import STYLE, Html, block, buttons, fields, line, press, span, text
-from page.status_text import TaskText, arm_blocked, command_blocked, controller_mode, error_text, motion_text
+from page.console import SLIDER_DEBOUNCE, Console, assign, stopped_by
+from page.markup import STYLE, Html, block, buttons, fields, line, live, press, span, text
+from page.status_text import HINTS, TaskText, command_blocked, controller_mode, error_text, plain
 from page.viser_inside import element_id
 
 COMMANDS = ("Start", "Pause", "Resume")
@@ -30,24 +30,15 @@ class TaskPanel:
 
     Attributes:
         note: number, text and kind of the newest message for operators.
+        note_time: when it was shown [s, monotonic].
     """
 
-    def __init__(
-        self, gui: viser.GuiApi, console: Console, task_text: TaskText,
-        go_home: Callable[[], Coroutine[Any, Any, None]],
-    ) -> None:
-        """Build the panel.
-
-        Args:
-            gui: of the server.
-            console: sends the commands.
-            task_text: texts for the task.
-            go_home: moves the arm to its home pose.
-        """
+    def __init__(self, gui: viser.GuiApi, console: Console, task_text: TaskText) -> None:
+        """Build the panel; `console` sends the commands, `task_text` has the texts for the task."""
         self._console, self._text = console, task_text
         self._rejected: object = None  # the rejected request; requesting it again overrides other operators
         self._entered_speed = self._shown_speed = 100  # [%]
-        self.note = (0, "", "")
+        self.note, self.note_time = (0, "", ""), 0.0
         gui.add_html(STYLE)
         palette = gui.add_command("Stop arm and task", icon=viser.Icon.HAND_STOP)
 
@@ -58,7 +49,6 @@ class TaskPanel:
         palette.on_trigger(stop_pressed)
         for name in COMMANDS:
             console.on_press(name.lower(), partial(self._command, name), name)
-        console.on_press("home", go_home, "Go to home pose")
         console.on_press("take", partial(self._own, "take"), "Take control of the arm")
         console.on_press("give", partial(self._own, "give"), "Release control of the arm")
         console.on_press("operate", self._operate, "Take control of the page", "take")
@@ -69,16 +59,13 @@ class TaskPanel:
         # Below the buttons: the number of lines changes, and buttons must not move under the pointer.
         self._state = Html(gui)
         self._progress = gui.add_progress_bar(0.0)
-        self._notice = Html(gui)
 
     def notify(self, message: str, kind: str = "bad") -> None:
-        """Show a message for operators on every page; an empty one clears it."""
-        self.note = (self.note[0] + 1, message, kind)
-        self._notice.set(block(span(message, kind), "notice", kind=kind) if message else "")
+        """Show a message for operators in the status bar of every page; an empty one clears it."""
+        self.note, self.note_time = (self.note[0] + 1, plain(message), kind), monotonic()
 
     def show(
-        self, task: TaskStatus | None, motion: MotionStatus | None, owner: MotionOwner | None, gripper: str,
-        rejected: int,
+        self, task: TaskStatus | None, motion: MotionStatus | None, owner: MotionOwner | None, rejected: int
     ) -> None:
         """Update the panel.
 
@@ -86,26 +73,15 @@ class TaskPanel:
             task: its status.
             motion: motion status of the arm.
             owner: motion owner.
-            gripper: text for the state of the gripper.
             rejected: number of rejected targets.
         """
         self._show_buttons(task, motion, owner)
-        state, kind = self._text.state(task)
-        lines = [f'<div>{span("●", kind + " dot")} {span(state, "big")}</div>']
-        if task is not None and task.stage and task.state not in ("DONE", "ERROR"):
-            lines.append(_labeled("Stage:", task.stage.replace("_", " ")))
-        if task is not None and task.message:
-            lines.append(line(task.message, "bad" if task.state == "ERROR" else "dim"))
-        lines.append(_labeled("Arm:", f"{motion_text(motion)} · {gripper}"))
-        if owner is not None:
-            lines.append(_labeled("Motion:", owner.description))
-        if self._console.permissions.enforced:
-            lines.append(_labeled("Page with control:", self._console.permissions.operating_page or "none"))
-        for one in motion.interlocks if motion is not None else ():
-            if task is None or one.description not in task.message:
-                lines.append(line(one.description, "dim"))
+        # The status bar shows the state: here are the details of a task that runs, and its figures.
+        lines = []
+        if task is not None and task.started and not task.paused and task.state not in ("DONE", "ERROR"):
+            lines.append(_labeled("Step:", task.stage.replace("_", " ").replace("-", " ") or "–"))
         if task is not None:
-            lines.append(fields(self._text.counters(task, rejected)))
+            lines.append(fields(self._text.counters(task, rejected), HINTS))
         self._state.set(block("".join(lines), "task", state=task.state if task else "",
                               paused=bool(task and task.paused), held=motion.held if motion else False))
         assign(self._progress, round(100 * self._text.progress_of(task, motion), 1))
@@ -121,17 +97,17 @@ class TaskPanel:
         taken = owner is not None and owner.kind == "operator"
         ours = taken and owner is not None and owner.asked and owner.owner == permissions.client_name
         rows = [
-            buttons(*(press(name, name.lower(), blocked[name]) for name in COMMANDS), label="Task"),
-            buttons(
-                press("Go home", "home", arm_blocked(task, motion), arm=True),
-                press("Take control", "take", "this page controls the arm already" if ours else ""),
-                press("Release control", "give", "" if taken else "no operator controls the arm"), label="Arm"),
+            buttons(*(press(name, name.lower(), blocked[name], main=name != "Pause") for name in COMMANDS),
+                    label="Task"),
+            f'<div class="buttons">{span("Control:", "dim")}{live("control")}'
+            + press("Take control", "take", "this page controls the arm already" if ours else "")
+            + press("Release control", "give", "" if taken else "no operator controls the arm") + "</div>",
         ]
         if permissions.enforced:
             rows.append(buttons(
                 press("Take page control", "operate"),
                 press("Release page control", "leave", "" if permissions.operating_page else "no page has control"),
-                label="Page"))
+                label="Operating page"))
         self._buttons.set(block("".join(rows), "orders"))
 
     # --- commands ---
@@ -147,7 +123,8 @@ class TaskPanel:
         except ZencellError as error:
             self.notify(f"NOT stopped: {error_text(error)}")
             raise
-        self.notify(result, "busy")
+        # The status bar shows a stop of all by itself.
+        self.notify(*(("",) if result == stopped_by(self._console.permissions.client_name) else (result, "bad")))
         return result
 
     async def _stop(self) -> None:
@@ -182,9 +159,10 @@ class TaskPanel:
             self.notify(f"{error_text(error)}: press Take control again to override")
         else:
             failed = act == "give" and owner.owner not in ("", self._console.permissions.client_name)
-            message = f"The motion is {owner.description}"
-            self.notify(f"This page has no control to release. {message}" if failed else message,
-                        "bad" if failed else "good")
+            if failed:
+                self.notify(f"This page has no control to release: {owner.owner} controls the arm")
+            else:
+                self.notify(f"{owner.owner or 'No operator'} controls the arm now", "good")
 
     async def _command(self, name: str) -> None:
         self.notify("")
@@ -235,10 +213,9 @@ class ControllerPanel:
         if robot is None or not has_controller:
             return
         mode, kind = controller_mode(robot)
-        lines = [f'<div>{span("●", kind + " dot")} {span(mode, "big")}</div>']
-        if robot.message:
-            lines.append(line(robot.message, kind))
-        lines.append(fields({"speed slider": f"{robot.speed:.0%}", "max cycle delay": f"{robot.late * 1e3:.0f} ms"}))
+        lines = [line(f"● {mode}", kind), fields(
+            {"speed slider": f"{robot.speed:.0%}", "max cycle delay": f"{robot.late * 1e3:.0f} ms"},
+            {"speed slider": "share of the speed that the robot's own pendant allows"})]
         self._state.set(block("".join(lines), "robot", mode=robot.mode))
 
     async def _command(self, name: str) -> None:

@@ -41,8 +41,7 @@ NO_EFFECT_TIMEOUT = 1.0  # [s] of jog messages without effect, after which that 
 EXCLUSIVE_TIME = 0.5  # [s] after the last message of a page, in which no other page jogs
 TOOL_SPEED, TURN_SPEED = 0.25, 1.0  # [m/s] reduced speed of ISO 10218-1, [rad/s], at 100 %
 INITIAL_SPEED = 20  # [%]
-JOINTS = "joints"
-FRAMES = {"tool, base frame": "base", "tool, tool frame": "tool", "tool, world frame": "world"}
+FRAMES = ("base", "tool", "world")
 AXES = "xyz"
 
 
@@ -175,7 +174,7 @@ class Jogger(HoldHandler):
 
 
 class JogPanel:
-    """Selection of joints or a tool frame, speed, and buttons to hold down."""
+    """Buttons to hold down for each joint and each axis of the tool, with the current values between them."""
 
     def __init__(self, gui: viser.GuiApi, actions: ActionQueue, joints: Sequence[str], limits: Sequence[float]) -> None:
         """Build the panel.
@@ -187,15 +186,14 @@ class JogPanel:
             limits: their velocity limits [rad/s].
         """
         self._joints, self._limits = list(joints), list(limits)
-        self._mode, self._speed = JOINTS, INITIAL_SPEED / 100
-        mode = gui.add_dropdown(
-            "Jog mode", [JOINTS, *FRAMES], initial_value=JOINTS, hint="joints, or the tool along axes")
-        actions.on_change(mode, self._set_mode)
+        self._frame, self._speed, self._disabled = FRAMES[0], INITIAL_SPEED / 100, ""
+        self._html = Html(gui, self._buttons())
         speed = gui.add_slider("Jog speed [%]", 1, 100, 1, INITIAL_SPEED, hint=(
             "100 % is 250 mm/s and 1 rad/s for the tool, and the velocity limit for a joint"))
         actions.on_change(speed, self._set_speed)
-        self._disabled = ""
-        self._html = Html(gui, self._buttons())
+        frame = gui.add_dropdown("Tool axes of", FRAMES, initial_value=FRAMES[0],
+                                 hint="frame whose axes the tool moves along and rotates about")
+        actions.on_change(frame, self._set_frame)
 
     def show(self, disabled: str) -> None:
         """Disable the buttons for a reason, or enable them."""
@@ -212,30 +210,30 @@ class JogPanel:
         if kind == "joint" and name in self._joints:
             return {"joints": {name: factor * self._limits[self._joints.index(name)]}}
         frame, _, axis = name.rpartition(":")
-        if frame not in FRAMES.values() or len(axis) != 1 or axis not in AXES or kind not in ("move", "turn"):
+        if frame not in FRAMES or len(axis) != 1 or axis not in AXES or kind not in ("move", "turn"):
             return None
         field, limit = ("linear", TOOL_SPEED) if kind == "move" else ("angular", TURN_SPEED)
         return {"frame": frame, field: {axis: factor * limit}}
 
     def _buttons(self) -> str:
-        if self._mode == JOINTS:
-            rows = [self._row(short, f"joint:{name}", short if "joint" in short.lower() else f"joint {short}",
-                              f"j:{name}") for name, short in zip(self._joints, short_names(self._joints), strict=True)]
-        else:
-            frame = FRAMES[self._mode]
-            rows = [self._row(axis.upper(), f"move:{frame}:{axis}", f"tool along {axis}", f"p:{axis}") for axis in AXES]
-            rows += [self._row(f"R{axis.upper()}", f"turn:{frame}:{axis}", f"rotate tool about {axis}",
-                               f"r:{axis}") for axis in AXES]
-        note = self._disabled or "hold a button to move; no collision checking"
-        return block(f'<div class="dim small">{text(note)}</div><div class="pad">{"".join(rows)}</div>', "jog")
+        joints = [self._row(short, f"joint:{name}", short if "joint" in short.lower() else f"joint {short}",
+                            f"j:{name}") for name, short in zip(self._joints, short_names(self._joints), strict=True)]
+        tool = [self._row(axis.upper(), f"move:{self._frame}:{axis}", f"tool along {axis}", f"p:{axis}")
+                for axis in AXES]
+        tool += [self._row(f"R{axis.upper()}", f"turn:{self._frame}:{axis}", f"rotate tool about {axis}", f"r:{axis}")
+                 for axis in AXES]
+        columns = "".join(f'<div>{"".join(rows)}</div>' for rows in (joints, tool))
+        note = self._disabled or f"Hold a button to move a joint (left) or the tool (right, axes of {self._frame}, " \
+                                 f"position in world). Collisions are not checked."
+        return block(f'<div class="pad">{columns}</div><div class="dim small">{text(note)}</div>', "jog")
 
     def _row(self, label: str, name: str, spoken: str, number: str) -> str:
         minus = hold("−", f"{name}:-", f"jog {spoken}, minus", self._disabled)
         plus = hold("+", f"{name}:+", f"jog {spoken}, plus", self._disabled)
-        return f'<div><span class="name">{text(label)}</span>{live(number)}{minus}{plus}</div>'
+        return f'<div>{minus}<span class="name"><span class="dim">{text(label)}</span>{live(number)}</span>{plus}</div>'
 
-    def _set_mode(self, mode: str) -> None:
-        self._mode = mode
+    def _set_frame(self, frame: str) -> None:
+        self._frame = frame
         self._html.set(self._buttons())
 
     def _set_speed(self, percent: float) -> None:
@@ -246,7 +244,11 @@ class JogPanel:
 
 
 class GripperPanel:
-    """Buttons that open and close the gripper, or move it to a width."""
+    """Buttons that open and close the gripper, or move it to a width.
+
+    Attributes:
+        buttons: HTML of the buttons that open and close it.
+    """
 
     def __init__(
         self, gui: viser.GuiApi, console: Console, gripper: GripperConfig,
@@ -270,14 +272,13 @@ class GripperPanel:
         for name, target in (("open", lambda: 1e3 * gripper.max_width), ("close", lambda: 0.0),
                              ("width", lambda: self._width)):
             console.on_press(f"gripper:{name}", self._command(name, target), f"Gripper: {name}")
-        self._html = Html(gui)
+        self._html, self.buttons = Html(gui), ""
 
     def show(self, disabled: str) -> None:
         """Disable the buttons for a reason, or enable them."""
-        self._html.set(block(buttons(
-            *(press(label, f"gripper:{name}", disabled, arm=True) for label, name in
-              (("Open", "open"), ("Close", "close"), ("Move to width", "width"))))
-            + (f'<div class="dim small">{text(disabled)}</div>' if disabled else ""), "gripper"))
+        self.buttons = "".join(press(label, f"gripper:{name}", disabled, arm=True)
+                               for label, name in (("Open", "open"), ("Close", "close")))
+        self._html.set(block(buttons(press("Move to width", "gripper:width", disabled, arm=True)), "gripper"))
 
     def _command(self, name: str, width: Callable[[], float]) -> Callable[[], Any]:
         async def command() -> None:

@@ -39,17 +39,19 @@ STYLE = """<style>
 .zc .buttons .what { flex: 0 0 4.5em; }
 .zc button { flex: 1 1 4.5em; min-height: 2.2em; padding: 0.2em 0.6em; font: inherit; border-radius: 0.25em;
   border: 1px solid #4dabf7; color: #4dabf7; background: transparent; cursor: pointer; }
+.zc button.main:not([aria-disabled]) { background: #1c7ed6; border-color: #1c7ed6; color: #fff; font-weight: 600; }
+.zc [data-live="control"] { flex: 1 1 3em; text-align: left; font-weight: 600; }
 .zc button:hover { background: rgba(77, 171, 247, 0.15); }
 .zc button:focus-visible { outline: 2px solid currentColor; outline-offset: 1px; }
-.zc button.hold { touch-action: none; user-select: none; -webkit-user-select: none; flex: 0 1 3.6em;
-  min-height: 2.6em; }
+.zc button.hold { touch-action: pan-y; user-select: none; -webkit-user-select: none; flex: 0 0 3.2em;
+  min-height: 2.7em; padding: 0; font-size: 1.1em; }
 .zc button.held { background: #f59f00; border-color: #f59f00; color: #000; }
 .zc button[aria-disabled="true"] { border-color: rgba(128, 128, 128, 0.4); color: rgba(128, 128, 128, 0.8);
   background: transparent; cursor: not-allowed; }
-.zc .pad { display: grid; grid-template-columns: repeat(auto-fill, minmax(13em, 1fr)); gap: 0.3em 1em; }
-.zc .pad > div { display: flex; gap: 0.35em; align-items: center; }
-.zc .pad .name { flex: 1; min-width: 2em; } .zc .live { min-width: 4.6em; text-align: right;
-  font-variant-numeric: tabular-nums; }
+.zc .pad { display: grid; grid-template-columns: 1fr 1fr; gap: 0 1em; }
+.zc .pad > div > div { display: flex; gap: 0.3em; align-items: center; margin-top: 0.25em; }
+.zc .pad .name { flex: 1; min-width: 0; text-align: center; line-height: 1.2; overflow-wrap: normal; }
+.zc .pad .name > * { display: block; } .zc .live { font-variant-numeric: tabular-nums; }
 /* A checkbox is placed before its label, which then fits on one line. */
 .mantine-Flex-root:has(> div input[type="checkbox"]) { flex-direction: row-reverse; justify-content: flex-end; }
 .mantine-Flex-root:has(> div input[type="checkbox"]) > div { flex-grow: 0 !important; }
@@ -88,16 +90,17 @@ def block(inner: str, name: str, **data: object) -> str:
     return f'<div class="zc" data-part="{text(name)}"{attributes}>{inner}</div>'
 
 
-def fields(values: Mapping[str, object]) -> str:
-    """Return numbers next to each other, each with its name below."""
+def fields(values: Mapping[str, object], hints: Mapping[str, str] = {}) -> str:
+    """Return numbers next to each other, each with its name below, and its meaning where one points at it."""
     cells = (
-        f'<div data-field="{text(name)}"><b>{text(value)}</b><span class="dim">{text(name)}</span></div>'
+        f'<div data-field="{text(name)}" title="{text(hints.get(name, ""))}"><b>{text(value)}</b>'
+        f'<span class="dim">{text(name)}</span></div>'
         for name, value in values.items()
     )
     return f'<div class="fields">{"".join(cells)}</div>'
 
 
-def press(label: str, name: str, disabled: str = "", *, arm: bool = False) -> str:
+def press(label: str, name: str, disabled: str = "", *, arm: bool = False, main: bool = False) -> str:
     """Return a button to click.
 
     Args:
@@ -105,8 +108,9 @@ def press(label: str, name: str, disabled: str = "", *, arm: bool = False) -> st
         name: under which `ActionQueue.on_press` has its action.
         disabled: why the button is disabled; empty: it is enabled.
         arm: it moves the arm, so it is also disabled on pages that must not do that.
+        main: it is what an operator usually does next.
     """
-    return _button(label, f'data-press="{text(name)}"' + arm * _MOVES_ARM, disabled, "")
+    return _button(label, f'data-press="{text(name)}"' + arm * _MOVES_ARM, disabled, "main" if main else "")
 
 
 def hold(label: str, name: str, spoken: str, disabled: str = "") -> str:

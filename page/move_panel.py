@@ -83,13 +83,14 @@ class MovePanel:
         self._discarded = 0  # number of times that plans were discarded
         self._blocked = ""
         self.readout = ArmReadout(robot, console.latest)
-        with gui.add_folder("Jog", expand_by_default=True):
-            self._jog = JogPanel(gui, console, robot.joint_names, robot.velocity.tolist())
+        self._arm = Html(gui)
+        console.on_press("home", self.go_home, "Go to home pose")
+        self._jog = JogPanel(gui, console, robot.joint_names, robot.velocity.tolist())
         self.jogger = Jogger(console, self._jog.velocities, self._state, lambda: self._blocked)
         gripper = robot.config.gripper
         self._gripper: GripperPanel | None = None
         if gripper is not None:
-            with gui.add_folder("Gripper", expand_by_default=True):
+            with gui.add_folder("Gripper width and force", expand_by_default=False):
                 self._gripper = GripperPanel(gui, console, gripper, motions.require_free)
         with gui.add_folder("Move to goal", expand_by_default=True):
             self._goal = GoalFields(
@@ -133,6 +134,10 @@ class MovePanel:
         self._jog.show(self._blocked or jog_blocked(motion))
         if self._gripper is not None:
             self._gripper.show(self._blocked)
+        home = press("Go home", "home", self._blocked, arm=True)
+        self._arm.set(block('<div class="buttons">' + (
+            f"{span('Gripper', 'dim')}{self._gripper.buttons}" if self._gripper is not None else "") + home + "</div>",
+            "arm"))
         self._poses.show(self._blocked)
         self._discard_if_marker_moved()
 

@@ -1,27 +1,38 @@
 // The bar above the page: STOP and its result, the status of the cell, lost connections. It uses a WebSocket of its own
 // (control_socket.py) that images never delay. Buttons of the panels use it too: one with data-press sends a message when
-// it is clicked; one with data-hold sends messages while it is held down, and none afterwards.
+// it is clicked; one with data-hold sends messages while it is held down, and none afterwards. An image is enlarged by a
+// click.
 (() => {
   const HOLD_PERIOD = 40;  // [ms]
   const STATUS_TIMEOUT = 1500;  // [ms] without a status, after which the connection counts as lost; one is due each 250 ms
   const START_TIMEOUT = 6000;  // [ms] for the first status
   const STOP_TIMEOUT = 3000;  // [ms] for the result of STOP
+  const NOTE_TIME = {good: 6000, dim: 6000, bad: 60000, busy: 60000};  // [ms] for which a note is shown
+  const DWELL = 150, SLOP = 10;  // [ms], [px]: a finger that rests holds a button down, one that moves before scrolls
   const MAX_BUFFERED = 2000;  // [bytes] waiting to be sent: hold messages would arrive too late
 
+  const ICONS = {".tabler-icon-adjustments": "Settings of this view", ".tabler-icon-list-search": "Search for a command",
+    ".tabler-icon-chevrons-right": "Hide the panels", ".tabler-icon-chevrons-left": "Show the panels"};
+
   let socket = null, lastMessage = null, pageKey = "", stops = 0, pendingStops = new Map();
-  let shownNote = 0, held = null, presses = 0, statusTime = 0;
+  let shownNote = 0, held = null, touch = null, presses = 0, statusTime = 0, noteEnd = 0, enlarged = null;
   const opened = Date.now();
   const bar = document.createElement("div");
   bar.id = "zc-bar";
   bar.innerHTML = `<div id="zc-row"><button id="zc-stop" type="button" title="Stop arm and task (Escape)"
       aria-label="STOP: stop arm and task" aria-keyshortcuts="Escape">STOP</button>
-    <div id="zc-text"><div id="zc-summary"></div><div id="zc-note" role="status" aria-live="assertive"></div></div></div>
+    <div id="zc-text"><div role="status" aria-live="polite"><b id="zc-state"></b> <span id="zc-hint"></span></div>
+      <div id="zc-second"><span id="zc-summary"></span><span id="zc-note" role="status" aria-live="assertive"></span></div>
+    </div><button id="zc-more" type="button" aria-expanded="false" title="Show the figures of the task">Details</button></div>
     <div id="zc-past" role="status"></div><div id="zc-lost" role="alert"></div>`;
   const part = id => bar.querySelector(`#zc-${id}`);
   const clock = when => new Date(when).toLocaleTimeString([], {hour12: false});
+  const setText = (element, text) => { if (element.textContent !== text) element.textContent = text; };
 
-  function notify(text, kind) {
-    part("note").textContent = text ? `${clock(Date.now())} ${text}` : "";
+  function notify(text, kind, age = 0) {
+    const when = Date.now() - age;
+    noteEnd = when + (NOTE_TIME[kind] ?? NOTE_TIME.bad);
+    part("note").textContent = text && noteEnd > Date.now() ? `${clock(when)} ${text}` : "";
     part("note").className = kind || "";
   }
 
@@ -57,6 +68,11 @@
   }
 
   function show(status) {
+    const {text, kind, hint, since} = status.situation;
+    setText(part("state"), since ? `${text} at ${clock(since)}` : text);
+    part("state").className = kind;
+    setText(part("hint"), hint);
+    bar.dataset.kind = kind;
     const spans = status.summary.map(([text, kind]) => {
       const span = document.createElement("span");
       span.textContent = text;
@@ -69,16 +85,17 @@
       part("summary").dataset.shown = summary;
     }
     if (status.note.number > shownNote) {
-      if (shownNote || status.note.text) notify(status.note.text, status.note.kind);
+      if (shownNote || status.note.text) notify(status.note.text, status.note.kind, 1000 * status.note.age);
       shownNote = status.note.number;
     }
+    // The first line shows a stop by itself.
+    if (Date.now() > noteEnd || part("note").textContent.endsWith(` ${text}`)) setText(part("note"), "");
     const past = status.past ? `Not live: the scene shows ${status.past}` : "";
-    if (part("past").textContent !== past) part("past").textContent = past;
+    setText(part("past"), past);
     document.body.toggleAttribute("data-past", past !== "");
     block(status.blocked);
     for (const element of document.querySelectorAll("[data-live]")) {
-      const value = status.live[element.dataset.live] ?? "–";
-      if (element.textContent !== value) element.textContent = value;
+      setText(element, status.live[element.dataset.live] ?? "–");
     }
     showLost(status.lost.map(([text, age]) => `${text} (since ${clock(Date.now() - 1000 * age)})`), status.stale);
   }
@@ -101,11 +118,9 @@
 
   function showLost(lines, stale) {
     const text = lines.join(" — ");
-    if (part("lost").textContent !== text) part("lost").textContent = text;
+    setText(part("lost"), text);
     part("lost").classList.toggle("on", text !== "");
     document.body.dataset.stale = stale.join(" ");
-    const opacity = stale.includes("all") ? "0.4" : "";
-    if (part("summary").style.opacity !== opacity) part("summary").style.opacity = opacity;
   }
 
   setInterval(() => {
@@ -188,15 +203,20 @@
     const element = button(event.target, "hold");
     if (!element || event.button !== 0) return;
     if (element.hasPointerCapture?.(event.pointerId)) element.releasePointerCapture(event.pointerId);
-    grab(element, event.pointerId);
+    if (event.pointerType !== "touch") grab(element, event.pointerId);
+    else if (!touch) touch = {id: event.pointerId, x: event.clientX, y: event.clientY,
+      timer: setTimeout(() => grab(element, event.pointerId), DWELL)};
   });
+  const lift = event => { if (touch && touch.id === event.pointerId) { clearTimeout(touch.timer); touch = null; } };
+  document.addEventListener("touchmove", event => { if (held && event.cancelable) event.preventDefault(); }, {passive: false});
   document.addEventListener("pointermove", event => {
+    if (!held && touch && Math.hypot(event.clientX - touch.x, event.clientY - touch.y) > SLOP) lift(event);
     if (!held || held.pointer !== event.pointerId) return;
     const under = button(document.elementFromPoint(event.clientX, event.clientY), "hold");
     if (!under || under.dataset.hold !== held.what || event.buttons === 0) release();
   }, true);
   for (const name of ["pointerup", "pointercancel"])
-    window.addEventListener(name, event => { if (held && held.pointer === event.pointerId) release(); }, true);
+    window.addEventListener(name, event => { lift(event); if (held && held.pointer === event.pointerId) release(); }, true);
   document.addEventListener("keydown", event => {
     const element = button(event.target, "hold");
     if (!element || (event.key !== " " && event.key !== "Enter")) return;
@@ -210,10 +230,45 @@
   document.addEventListener("focusout", event => { if (held && typeof held.pointer === "string") release(); });
   for (const name of ["blur", "pagehide", "beforeunload"]) window.addEventListener(name, release);
 
-  // --- accessible names ---
+  // --- details on a phone, and enlarged images ---
+
+  part("more").addEventListener("click", () => {
+    part("more").setAttribute("aria-expanded", String(document.body.toggleAttribute("data-details")));
+  });
+  const picture = document.createElement("button");
+  picture.id = "zc-picture";
+  picture.type = "button";
+  picture.title = "Close the image";
+  picture.innerHTML = `<img alt="Enlarged image of the camera">`;
+  picture.addEventListener("click", () => { enlarged = null; picture.remove(); });
+  document.addEventListener("click", event => {
+    if (!(event.target instanceof HTMLImageElement) || !event.target.closest("#root")) return;
+    enlarged = event.target;
+    document.body.append(picture);
+  });
+  setInterval(() => {  // it covers the 3D scene, neither STOP nor the panels
+    if (!enlarged) return;
+    const image = picture.firstElementChild, at = document.querySelector("#root canvas")?.getBoundingClientRect();
+    if (enlarged.isConnected && image.src !== enlarged.src) image.src = enlarged.src;
+    if (at) Object.assign(picture.style,
+      {left: `${at.left}px`, top: `${at.top}px`, width: `${at.width}px`, height: `${at.height}px`});
+  }, 100);
+
+  // --- accessible names and tooltips ---
 
   // viser displays the label of a field next to it, but does not associate the two.
   setInterval(() => {
+    // The upper panel takes no more height than it needs: the lower one has the buttons to jog.
+    const upper = document.querySelector('[data-dock-leaf]:has([data-part="orders"])');
+    const content = upper?.querySelector(".mantine-ScrollArea-content"), view = content?.parentElement;
+    if (view) document.documentElement.style.setProperty(
+      "--zc-upper", `${upper.offsetHeight - view.clientHeight + content.offsetHeight + 4}px`);
+    for (const image of document.querySelectorAll("#root img:not([title])")) image.title = "Click to enlarge";
+    for (const [icon, title] of Object.entries(ICONS))
+      for (const element of document.querySelectorAll(`#root ${icon}`)) {
+        const button = element.closest("button, [role=button]") || element.parentElement;
+        if (!button.title) button.title = title;
+      }
     for (const input of document.querySelectorAll("#root input:not([aria-label])")) {
       if (input.type === "hidden" || (input.labels && input.labels.length)) continue;
       for (let row = input.closest(".mantine-Flex-root"); row; row = row.parentElement?.closest(".mantine-Flex-root")) {
@@ -235,7 +290,7 @@
       if (!notice) return;
       observer.disconnect();
       notice.querySelector("button")?.click();
-      if (!part("note").textContent) notify("this browser renders without a GPU: the scene is slow", "dim");
+      document.body.dataset.software = "";  // the View tab shows it
     }).observe(document.body, {childList: true, subtree: true});
     new ResizeObserver(() =>
       document.documentElement.style.setProperty("--zc-bar", `${bar.offsetHeight}px`)).observe(bar);

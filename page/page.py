@@ -6,7 +6,7 @@ An application extends it by an `ApplicationPage` (application.py).
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Coroutine, Iterable, Mapping
+from collections.abc import Callable, Coroutine, Mapping
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,28 +16,30 @@ import viser
 from common import topics
 from common.application import Application
 from common.config import Members, RobotConfig
-from common.messages import Rejections, TaskStatus
+from common.messages import TaskStatus
 from common.topics import Topic
 from page.access import CURRENT_SESSION
 from page.application import page_of
 from page.camera_panel import CameraPanel
-from page.console import Console
-from page.control_socket import ARM_LOST, HOLD, STOP, TASK_LOST, ControlSocket, LossDetector, PageStatus, summarize
-from page.diagnostics import SECONDS, HealthPanel, Limits, LogPanel, PlotPanel
+from page.console import EXECUTOR, Console
+from page.control_socket import ARM_LOST, HOLD, STOP, TASK_LOST, ControlSocket, LossDetector, PageStatus
+from page.diagnostics import SECONDS, Limits, PlotPanel
 from page.feeds import ANNOTATED, DEPTH, LIVE, MASK, Feeds, Schedule, Topics, Updater
 from page.hand_eye import HandEyePanel
 from page.history import Timeline
 from page.layers import Layers, shown_layers
-from page.layout import TABS, Layout, LayoutSaver, Tab, ViewPanel
-from page.main_panel import ControllerPanel, TaskPanel
+from page.layout import Layout, LayoutSaver, ViewPanel
+from page.markup import BAD
 from page.move_panel import Motions, MovePanel
+from page.panels import Panels
 from page.recorded_history import HistoryRecorder, RecordedHistory, recordings_in
-from page.status_text import RejectedPositions, TaskText, gripper_text
+from page.situation import situation, summarize
+from page.status_text import TaskText, gripper_text
+from page.subscriptions import Subscriptions
 from page.time_panel import TimePanel
-from page.tuning import TuningPanel
+from page.viewpoint import keep_framed, prepare_scene
 from page.viser_inside import send_key
 from page.world_editing import WorldPanel
-from recording.report.summary import NOT_LEFT_BEHIND
 
 if TYPE_CHECKING:
     from common.robot.model import RobotModel
@@ -87,7 +89,7 @@ class Page:
         self._layout, self._schedule, self._recordings = layout, schedule, recordings
         self._topics, self._text = Topics(application, layers.values(), members.keys), TaskText.of(application)
         self._shown, self._editing = shown_layers(layout.layers, layers), layout.edit_world
-        self._losses, self._has_task = LossDetector(), bool(members.task)
+        self._losses, self._task = LossDetector(), members.task  # its loss is shown as that of the task
         self._recorder = HistoryRecorder(feeds, self._text.states)
         self.timeline = Timeline(feeds.latest, self._recorder.recent)
         self._scene: Scene | None = None
@@ -95,8 +97,8 @@ class Page:
         self._move: MovePanel | None = None
         self.pages = 0
         self.visited = asyncio.Event()
-        _prepare_scene(server, layout, cell)
-        self._panels = Panels(server, console, layout, cell, self._text, go_home=self._go_home)
+        prepare_scene(server, layout, cell)
+        self._panels = Panels(server, console, layout, cell, self._text)
         create = page_of(application).controls
         self._controls = create(server.gui, console) if create is not None else None
         self._controls_updater = Updater(self._controls, feeds.latest) if self._controls is not None else None
@@ -143,6 +145,7 @@ class Page:
             if (session := CURRENT_SESSION.get()) is not None:
                 send_key(client, console.permissions.issue_key(session))
             console.put(self._count_pages)
+            await keep_framed(client)
 
         async def disconnected(_client: viser.ClientHandle) -> None:
             console.put(self._count_pages)
@@ -229,10 +232,11 @@ class Page:
     def _show_panels(self, now: float) -> None:
         latest = self._feeds.latest
         self._panels.task.show(self._status, latest(topics.MOTION_STATUS), latest(topics.MOTION_OWNER),
-                        gripper_text(latest(topics.GRIPPER_STATE)), len(self._subscriptions.rejected.positions))
+                               len(self._subscriptions.rejected.positions))
         if self._move is not None:
             self._move.show(self._status, now)
         self._panels.controller.show(latest(topics.ROBOT_STATUS))
+        self._panels.alarm_panel.show()
         self._panels.log.show()
         self._world.show()
         self._time.show(now)
@@ -240,16 +244,20 @@ class Page:
 
     def _publish_status(self, now: float, alive: frozenset[str], connected: bool) -> None:
         """Publish the status bar of every page."""
-        motion, owner = self._feeds.latest(topics.MOTION_STATUS), self._feeds.latest(topics.MOTION_OWNER)
-        permissions = self.console.permissions
-        responders = {"arm": (ARM_LOST, self.console.is_available(topics.MOTION_STOP))}
-        if self._has_task:
-            responders["task"] = TASK_LOST, self.console.is_available(topics.TASK_COMMAND)
+        latest, task, panels = self._feeds.latest, self._panels.task, self._panels
+        owner, permissions = latest(topics.MOTION_OWNER), self.console.permissions
+        arm, has_task = (self.console.is_available(each) for each in (topics.MOTION_STOP, topics.TASK_COMMAND))
+        responders = {"arm": (ARM_LOST, arm)} | ({"task": (TASK_LOST, has_task)} if self._task else {})
+        lost = self._losses.update(connected, alive | {EXECUTOR, self._task}, responders, now)
+        motion = latest(topics.MOTION_STATUS) if arm else None
+        first = situation(self._text, self._status if has_task else None, motion, owner, latest(topics.ROBOT_STATUS))
+        panels.alarms.update([*([first.text] if first.kind == BAD else []), *(loss.message for loss in lost)])
         self._control.publish(PageStatus(
-            summary=summarize(self._cell, self._text, self._status, motion, owner,
-                              permissions.operating_page if permissions.enforced else None),
-            lost=tuple(self._losses.update(connected, alive, responders, now)), note=self._panels.task.note,
-            owner=owner, live=self._move.readout.live() if self._move is not None else {}, past=self._time.position))
+            situation=first, summary=summarize(
+                self._cell, motion, gripper_text(latest(topics.GRIPPER_STATE)),
+                permissions.operating_page if permissions.enforced else None, panels.alarms.unacknowledged),
+            lost=tuple(lost), note=task.note, note_time=task.note_time, owner=owner,
+            live=self._move.readout.live() if self._move is not None else {}, past=self._time.position))
 
     def _show_images(self, now: float) -> None:
         timeline = self.timeline
@@ -329,12 +337,6 @@ class Page:
         self._feeds.select(selected)
         self.timeline.resend_images()
 
-    async def _go_home(self) -> None:
-        if self._move is None:
-            self._panels.task.notify("The page is still loading: try again in a moment.", "busy")
-        else:
-            await self._move.go_home()
-
     def _set_layer(self, name: str, on: bool) -> None:
         self._shown[name] = on
         if self._scene is not None:
@@ -346,136 +348,3 @@ class Page:
         if self._scene is not None:
             self._scene.set_editing(on)
         self._select_topics()
-
-
-class Panels:
-    """The panels that need neither the scene nor topics on demand: main panel, Health, Log, Tuning; and all tabs.
-
-    Attributes:
-        task, controller, health, log, tuning: the panels.
-        tabs: container of each tab; one that the layout leaves out is invisible.
-    """
-
-    def __init__(
-        self, server: viser.ViserServer, console: Console, layout: Layout, cell: str, text: TaskText, *,
-        go_home: Callable[[], Coroutine[Any, Any, None]],
-    ) -> None:
-        """Build the main panel and empty tabs.
-
-        Args:
-            server: that serves the page.
-            console: sends requests to the cell.
-            layout: initial layout.
-            cell: its name.
-            text: texts for the task.
-            go_home: moves the arm to its home pose.
-        """
-        self._gui, self._console, self._layout = server.gui, console, layout
-        gui = server.gui
-        gui.configure_theme(dark_mode=layout.dark, show_logo=False, show_share_button=False)
-        gui.set_panel_label(f"zencell · {cell}")
-        gui.main_panel.dock_right()
-        gui.main_panel.set_width(layout.panel_width)
-        self.task = TaskPanel(gui, console, text, go_home)
-        self.controller = ControllerPanel(gui, console)
-        self.tabs: dict[Tab, viser.GuiTabHandle | viser.GuiFolderHandle] = {}
-
-    def add_tabs(self) -> None:
-        """Add the tabs below the main panel."""
-        panel = self._gui.add_panel()
-        tabs = {name: panel.add_tab(name) for name in self._layout.tabs}
-        panel.dock_below(self._gui.main_panel)
-        hidden = self._gui.add_folder(None, visible=False)
-        self.tabs = {tab: tabs.get(tab, hidden) for tab in TABS}
-
-    def add_diagnostics(self, services: Iterable[str]) -> None:
-        """Fill the tabs Health, Log and Tuning."""
-        with self.tabs["Health"]:
-            self.health = HealthPanel(self._gui, services)
-        with self.tabs["Log"]:
-            self.log = LogPanel(self._gui, self._console, self._layout.log_level)
-        self.tuning = TuningPanel(self._gui, self.tabs["Tuning"], self._console)
-
-
-class Subscriptions:
-    """Handles messages of which every one counts: events, log lines, counters, rejections, latencies.
-
-    Attributes:
-        rejected: positions of rejected targets.
-    """
-
-    def __init__(
-        self, feeds: Feeds, topics_: Topics, layers: Layers, panels: Panels, recorder: HistoryRecorder
-    ) -> None:
-        """Pass messages to the panels and the recorder."""
-        self._feeds, self._topics, self._layers = feeds, topics_, layers
-        self._panels, self._recorder = panels, recorder
-        self.rejected = RejectedPositions()
-        self._scene: Scene | None = None
-        self._plots: PlotPanel | None = None
-        self._pending_events: list[tuple[Topic[Any], Any]] = []  # until there is a scene
-
-    def connect(self, scene: Scene, plots: PlotPanel) -> None:
-        """Pass messages to scene and plots too, and former events to the scene."""
-        self._scene, self._plots = scene, plots
-        for topic, event in self._pending_events:
-            scene.handle_event(topic, event)
-        self._pending_events.clear()
-
-    def clear_rejected(self) -> None:
-        """Forget rejected positions after a reset of the world, if no detections will clear them."""
-        if not self._topics.detected:
-            self.rejected.positions.clear()
-
-    def tasks(self, age_ms: Callable[[int], float]) -> list[Coroutine[Any, Any, None]]:
-        """Return a coroutine for each topic; `age_ms` returns the wall time [ms] since a stamp."""
-        now = asyncio.get_running_loop().time
-
-        def add_latency(message: Any) -> None:
-            if self._plots is not None:
-                self._plots.add_latency(age_ms(message.header.stamp), now())
-
-        def reject(rejections: Rejections) -> None:
-            left = [each for each in rejections.rejected if NOT_LEFT_BEHIND not in each.reason]
-            self.rejected.update(rejections.model_copy(update={"rejected": left}))
-            self._recorder.record_events(rejections, now())
-
-        health, log = self._panels.health, self._panels.log
-        handlers: dict[Topic[Any], list[Callable[[Any], None]]] = {
-            topics.LOG: [log.add], topics.COUNTERS: [lambda counters: health.count(counters, now())],
-        }
-        for topic in self._topics.decided_by:
-            handlers.setdefault(topic, []).extend((add_latency, self.rejected.update))
-        for topic in self._topics.rejected:
-            handlers.setdefault(topic, []).append(reject)
-        for topic in self._topics.detected:
-            handlers.setdefault(topic, []).append(self.rejected.update)
-        for topic in {topic for kind in self._layers.values() for topic in kind.TOPICS if topic.kind == "event"}:
-            handlers.setdefault(topic, []).append(partial(self._handle_event, topic))
-        return [self._read(*each) for each in handlers.items()]
-
-    async def _read(self, topic: Topic[Any], handlers: list[Callable[[Any], None]]) -> None:
-        if (reader := self._feeds.reader(topic)) is not None:
-            async for message in reader:
-                for handle in handlers:
-                    handle(message)
-
-    def _handle_event(self, topic: Topic[Any], event: Any) -> None:
-        if self._scene is not None:
-            self._scene.handle_event(topic, event)
-        else:
-            self._pending_events.append((topic, event))
-
-
-def _prepare_scene(server: viser.ViserServer, layout: Layout, cell: str) -> None:
-    """Set lights and camera before anything else is sent: later changes of the lights would recompile all shaders."""
-    scene, camera, viewpoint = server.scene, server.initial_camera, layout.viewpoint(cell)
-    scene.set_up_direction("+z")
-    scene.configure_default_lights(cast_shadow=layout.shadows)
-    scene.configure_environment_map(hdri=None)  # a browser without a GPU needs seconds to prepare one
-    scene.add_light_hemisphere("/sky", sky_color=(255, 255, 255), ground_color=(120, 115, 110), intensity=2.0)
-    scene.world_axes.visible = False
-    camera.up = (0.0, 0.0, 1.0)
-    camera.fov = 0.9
-    camera.position = viewpoint.position
-    camera.look_at = viewpoint.look_at

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -55,6 +56,24 @@ GOAL_STATES = {
     "aborted": "motion aborted",
     "cancelled": "motion stopped",
 }
+# What operators call the keys of the cell.
+KEY_NAMES = {
+    "motion/status": "the arm", "joint_states": "the joint positions", "gripper/state": "the gripper",
+    "gripper/command": "the gripper", "motion/plan": "the motion planner", "motion/execute": "the arm's controller",
+    "motion/stop": "the arm's controller", "motion/hold": "the arm's controller", "motion/own": "the arm's controller",
+    "planning_scene": "the planning scene", "task/command": "the task", "robot/command": "the robot controller",
+    "world/edit": "the simulated world", "camera/image_raw": "the camera", "camera/camera_info": "the camera",
+    "depth_camera/image_raw": "the depth camera", "depth_camera/camera_info": "the depth camera",
+}
+_KEYS = re.compile(rf"(?<![\w/])({'|'.join(KEY_NAMES)})(?![\w/])")
+HINTS = {  # what the figures mean
+    "done": "parts that the task has finished, of all that it knows of",
+    "cycle time": "average time for one part since the start of the task",
+    "per hour": "parts in one hour at this cycle time",
+    "rejected": "seen, but not usable: the scene shows where and why",
+    "retries": "motions that were planned again",
+    "failures": "attempts that failed: the task decided again",
+}
 CLOSED_WIDTH = 0.001  # [m] below which the gripper counts as closed
 
 USER_ERRORS = (ZencellError, ValidationError)  # caused by what an operator requested, such as a value out of bounds
@@ -72,8 +91,21 @@ def counters(status: TaskStatus, rejected: int) -> dict[str, object]:
     """Return the figures of any task by name."""
     figures = {name.replace("_", " "): value for name, value in status.figures.items() if value is not None}
     seen = {"rejected": rejected} if rejected else {}
-    return {"done": status.done, "of": status.total, **figures, **seen, "retries": status.retries,
+    return {"done": of_total(status), **throughput(status), **figures, **seen, "retries": status.retries,
             "failures": status.failures}
+
+
+def of_total(status: TaskStatus) -> str:
+    """Return how much is done: 2 of 8."""
+    return f"{status.done} of {status.total}" if status.total else str(status.done)
+
+
+def throughput(status: TaskStatus) -> dict[str, str]:
+    """Return cycle time and rate of a task that has done something, by name, in cell time."""
+    if not status.done or status.task_seconds <= 0:
+        return {"cycle time": "–", "per hour": "–"}
+    cycle = status.task_seconds / status.done
+    return {"cycle time": f"{cycle:.1f} s", "per hour": f"{3600 / cycle:.0f}"}
 
 
 def progress(status: TaskStatus, motion: MotionStatus | None) -> float:
@@ -115,8 +147,8 @@ class TaskText:
         if status.state == "DONE":
             return name, GOOD
         if not status.started:
-            return "Stopped" if status.state != "IDLE" else "Waiting for start", OFF
-        return f"{name} {status.subject}".rstrip(), GOOD
+            return "Stopped" if status.state != "IDLE" else "Ready", OFF
+        return f"{name} {status.subject.replace('_', ' ')}".rstrip(), GOOD
 
     def progress_of(self, status: TaskStatus | None, motion: MotionStatus | None) -> float:
         """Return the progress of the task, 0 to 1."""
@@ -146,7 +178,7 @@ def jog_blocked(motion: MotionStatus | None) -> str:
     if motion is None:
         return ""
     if motion.held:
-        return "the arm is held: press Resume or Start to release it"
+        return "the arm is held: press Resume to release it"
     return "the arm is executing a motion" if motion.state == "active" else ""
 
 
@@ -158,7 +190,7 @@ def command_blocked(task: TaskStatus | None, motion: MotionStatus | None) -> dic
     running = task.started and task.state not in ("DONE", "ERROR")
     paused = task.paused or (motion is not None and motion.paused)
     moving = motion is not None and motion.state == "active"
-    start = "" if not running or stopped else "the task is paused: press Resume" if paused else "already running"
+    start = "" if stopped else "paused: press Resume" if paused else "already running" if running else ""
     pause = "already paused" if paused else "" if running or moving else "nothing is running"
     resume = "nothing is paused" if not paused else "the arm was stopped: press Start" if stopped else ""
     return {"Start": start, "Pause": pause, "Resume": resume}
@@ -210,8 +242,13 @@ def error_text(error: ZencellError | ValidationError) -> str:
     if isinstance(error, RemoteError):
         return error.message
     if isinstance(error, NoResponder):
-        return f"no service answers {error.key} now"
+        return f"{KEY_NAMES.get(error.key, error.key)} does not respond"
     return str(error)
+
+
+def plain(message: str) -> str:
+    """Return a message with the operators' names of keys."""
+    return _KEYS.sub(lambda found: KEY_NAMES[found[0]], message)
 
 
 def plan_text(response: PlanResponse) -> str:

@@ -17,7 +17,7 @@ from common.topics import Topic
 from page.application import ApplicationPage
 from page.layers import Layer
 from page.nodes import FLAT, Labels, Markers, points_of, ring
-from page.status_text import RejectedPosition, RejectedPositions
+from page.status_text import RejectedPosition, RejectedPositions, of_total, throughput
 
 if TYPE_CHECKING:
     import viser
@@ -30,7 +30,7 @@ _STILL = 1e-3  # [m] noise of detections
 
 def counters(status: TaskStatus, rejected: int) -> dict[str, object]:
     """Figures of the task by label."""
-    return {"placed": status.done, "targets": status.total, "rejected": rejected, "retries": status.retries,
+    return {"placed": of_total(status), **throughput(status), "rejected": rejected, "retries": status.retries,
             "failures": status.failures}
 
 
@@ -100,6 +100,7 @@ class Workspace(Layer):
     """The reachable shell and the excluded column around the base."""
 
     LABEL = "Workspace"
+    ON = False
     TOPICS = (WORKSPACE_MARKERS,)
 
     def build(self) -> None:

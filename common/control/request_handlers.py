@@ -146,7 +146,10 @@ class RequestHandlers:
     async def stop(self, request: StopRequest) -> MotionStatus:
         """Bring the arm to rest; an operator's stop blocks other motions."""
         if request.by == "operator":
-            self._log.info("stopped by %s: %s", request.owner or UNKNOWN_OPERATOR, request.reason or ON_REQUEST)
+            by = request.owner or UNKNOWN_OPERATOR  # the task passes the stop of its operator on: one line is enough
+            again = any(one.by == by for one in self._store.interlocks.stops)
+            self._log.log(logging.DEBUG if again else logging.INFO, "stopped by %s: %s", by,
+                          request.reason or ON_REQUEST)
         return await self._persisted(self._executor.authority.stop(request, self._clock.now()))
 
     def stop_for_unread(self) -> str:

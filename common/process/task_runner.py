@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
 from collections.abc import Callable, Iterable
 from typing import Any, Generic, Protocol, TypeVar
 
@@ -15,7 +16,7 @@ from common.process.task_requests import GOAL_TIMEOUT, SELF_RELEASING, AnswerHan
 from common.robot.model import RobotModel
 from common.robot.transforms import matrix_to_pose
 from common.tasks.decisions import TaskConfig
-from common.tasks.engine import Task
+from common.tasks.engine import START, Task
 from common.tasks.monitoring import LOOK_PERIOD, LivenessWatchdog
 from common.tasks.stages import Command, View, within_range
 from common.time_source import monotonic, new_id
@@ -177,7 +178,9 @@ class TaskRunner(Generic[V]):
         return holds
 
     async def _obey(self, command: m.TaskCommand) -> m.TaskStatus:
-        self._bus.log.info("command %s%s", command.command, f" by {command.by}" if command.by else "")
+        self._bus.log.log(  # the executor logs a stop
+            logging.DEBUG if command.command == "stop" else logging.INFO, "command %s%s", command.command,
+            f" by {command.by}" if command.by else "")
         view = self._observe()
         _require_allowed(command, view.motion if view else None, self._owner.latest)
         requests = self._task.command(command.command, view)
@@ -206,7 +209,8 @@ class TaskRunner(Generic[V]):
             return
         if now.state == "ERROR" and (before is None or before.state != "ERROR"):
             self._bus.log.error("%s", now.message)
-        elif now.message not in ("", before.message if before else "") or (before and now.state != before.state):
+        elif (now.message not in ("", before.message if before else "") and not now.message.endswith(START)) or (
+                before and now.state != before.state):
             self._bus.log.info("%s", f"{now.state} {now.message}".rstrip())
         now.header = self._bus.header()
         self._status.put(now)

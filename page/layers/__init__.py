@@ -49,7 +49,7 @@ FIELD = "services.viewer.layers"
 ATTRIBUTES = ("LABEL", "ON", "PERIOD", "LEGEND", "TOPICS", "show")  # of a module that is a layer
 # Modules of this package, before and after the layers of an application and of the user.
 FIRST, LAST = ("robot", "planning"), ("truth", "frames")
-_POSE_TOPICS = {topics.TF.key, topics.TF_STATIC.key, topics.JOINT_STATES.key}
+_POSE_TOPICS = {topics.TF.key, topics.TF_STATIC.key, topics.JOINT_STATES.key, topics.MOTION_STATUS.key}
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,7 @@ Layers = Mapping[str, type[Layer]]
 def has_data(kind: type[Layer], published: Collection[str]) -> bool:
     """Return whether a layer can display anything in a cell where these keys are published.
 
-    Poses are published in every cell, so they do not count if the layer has other topics.
+    Poses and the motion status are published in every cell, so they do not count if the layer has other topics.
     """
     keys = [topic.key for topic in kind.TOPICS if topic.key not in _POSE_TOPICS] or [
         topic.key for topic in kind.TOPICS]

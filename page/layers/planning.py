@@ -11,7 +11,7 @@ import viser
 from numpy.typing import NDArray
 
 from common import topics
-from common.messages import CollisionObject, JointTrajectory
+from common.messages import CollisionObject, JointTrajectory, MotionStatus
 from common.topics import Topic
 from page.layers import Layer
 from page.nodes import Rgb, Solid, add_line, add_solid, position_of, wxyz_of
@@ -29,7 +29,22 @@ _PATH_SAMPLES = 120  # points of the line
 _JOINT_TOLERANCE = 0.01  # [rad] the robot has reached the end of a plan, or has left its start
 _SAME_POSITION = 0.01  # [m] and
 _SAME_ROTATION = 0.9999  # cosine of half the angle (0.03 rad), at which a ghost's link coincides with the robot's
+NO_PLAN = JointTrajectory(joint_names=["none"], points=[])
 _PAUSE = 1.0  # [s] at the end of an animation, before it starts again
+
+
+class EndedMotion:
+    """Tells when a published plan is dead: an operator has stopped the arm, or its motion has failed."""
+
+    def __init__(self) -> None:
+        self._ended = False
+        self.stopped = False  # plans of the task are dead until an operator starts it
+
+    def update(self, motion: MotionStatus) -> bool:
+        """Return whether a motion has just ended before its goal."""
+        before, self.stopped = self._ended, bool(motion.stopped)
+        self._ended = self.stopped or motion.state in ("aborted", "cancelled")
+        return self._ended and not before
 
 
 class Plan(Layer):
@@ -38,11 +53,13 @@ class Plan(Layer):
     LABEL = "Planned motion (ghost)"
     LEGEND = (("end of the planned motion", GHOST),)
     COLOR: ClassVar[Rgb] = GHOST
-    TOPICS: ClassVar[Sequence[Topic[Any]]] = (topics.DISPLAY_TRAJECTORY, topics.JOINT_STATES)
+    TOPICS: ClassVar[Sequence[Topic[Any]]] = (topics.DISPLAY_TRAJECTORY, topics.MOTION_STATUS, topics.JOINT_STATES)
 
     def build(self) -> None:
         """Start without a plan."""
         from page.figure import Figure, LinkPoses
+
+        self._motion = EndedMotion()
 
         self.ghost = Figure(self.scene, f"{self.root}/robot", self.stage.rough, LinkPoses(self.stage.robot),
                             color=self.COLOR, opacity=0.35, visible=False)
@@ -56,8 +73,11 @@ class Plan(Layer):
         """Display another plan, or follow the joint states."""
         if topic == topics.JOINT_STATES:
             self._follow()
-        elif message.header.stamp not in (self._played, self._compared):  # displayed already: would restart it
-            self._set_plan(message)
+        elif topic == topics.MOTION_STATUS:
+            if self._motion.update(message):
+                self._set_plan(NO_PLAN)
+        elif message.header.stamp not in (self._played, self._compared) and not self._motion.stopped:
+            self._set_plan(message)  # one that is displayed already would restart
 
     def play(self, plan: JointTrajectory) -> None:
         """Animate a plan in a loop."""
@@ -162,19 +182,23 @@ class ToolPath(Layer):
 
     LABEL = "Planned tool path"
     LEGEND = (("planned tool path", PATH),)
-    TOPICS = (topics.DISPLAY_TRAJECTORY,)
+    TOPICS = (topics.DISPLAY_TRAJECTORY, topics.MOTION_STATUS)
 
     def build(self) -> None:
         """Start without a path."""
         from page.figure import LinkPoses
 
+        self._motion = EndedMotion()
         self._tool = LinkPoses(self.stage.robot)
         self.line: viser.LineSegmentsHandle | None = None
         self._played = self._compared = -1  # stamps
 
     def show(self, topic: Topic[Any], message: Any) -> None:
         """Display the path of a plan; one without points clears it."""
-        if message.header.stamp not in (self._played, self._compared):
+        if topic == topics.MOTION_STATUS:
+            if self._motion.update(message):
+                self._draw(NO_PLAN)
+        elif message.header.stamp not in (self._played, self._compared) and not self._motion.stopped:
             self._draw(message)
 
     def compare(self, plan: JointTrajectory | None) -> None:
