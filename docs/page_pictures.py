@@ -28,7 +28,7 @@ def take(cell: str, page: Page) -> None:
     page.get_by_text("STOP", exact=True).wait_for()
     page.get_by_role("button", name="Start", exact=True).click()
     if cell == "panda":
-        page.wait_for_function(f"[...document.querySelectorAll('*')].some(e => e.textContent.trim() === '{PLACED}')")
+        page.wait_for_function(f"[...document.querySelectorAll('*')].some(e => e.textContent.startsWith('{PLACED} of'))")
     page.get_by_text(STATES[cell]).first.wait_for()
     page.wait_for_timeout(4000)
     page.screenshot(path=HERE / f"page_{cell}.jpg", type="jpeg", quality=80)

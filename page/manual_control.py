@@ -8,7 +8,7 @@ hold, or another page's jog ends it until the button is released.
 from __future__ import annotations
 
 import math
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -19,7 +19,7 @@ from common import topics
 from common.client.operator_motion import UNREACHABLE
 from common.config import check
 from common.control.jogging import ENDED, PAUSE
-from common.messages import GripperCommand, MotionOwner, MotionStatus
+from common.messages import GripperCommand, Interlock, MotionOwner, MotionStatus
 from common.robot.transforms import matrix_to_rpy
 from common.time_source import monotonic, new_id
 from page.control_socket import HoldHandler
@@ -132,7 +132,7 @@ class Jogger(HoldHandler):
         newest = motion.newest if motion is not None else 0
         reason = self._arm_blocked() or self._interlocked(motion)
         if not (reason or is_new) and motion is not None and newest > self._acknowledged:
-            reason = f"the arm is {motion.interlocks[-1].description}"
+            reason = f"the arm is {_names(motion.interlocks[-1:])}"
         ended = motion.message if motion is not None and motion.message.startswith(ENDED) else ""
         reason = reason or self._without_effect(owner, is_new, now, ended)
         if is_new:
@@ -158,7 +158,8 @@ class Jogger(HoldHandler):
         """Return the stops and holds of other operators."""
         client = self._sender.permissions.client_name
         interlocks = motion.interlocks if motion is not None else []
-        return "; ".join(f"the arm is {one.description}" for one in interlocks if one.blocks(client))
+        blocking = _names(one for one in interlocks if one.blocks(client))
+        return f"the arm is {blocking}" if blocking else ""
 
     def _without_effect(self, owner: MotionOwner | None, is_new: bool, now: float, ended: str) -> str:
         """Return why jogging has ended, with the executor's reason `ended`, or has had no effect for a second."""
@@ -170,7 +171,12 @@ class Jogger(HoldHandler):
             return ""
         if self._moved and owner.kind == "none" and not owner.jogging:
             return "the connection was interrupted (slow network or busy machine): press the button again"
-        return ended or f"{UNREACHABLE}; the motion is {owner.description}"
+        controlled = f"; {owner.owner or owner.kind} controls the arm" if owner.kind != "none" else ""
+        return ended or f"{UNREACHABLE}{controlled}"
+
+
+def _names(interlocks: Iterable[Interlock]) -> str:
+    return ", ".join(f"{one.kind} by {one.by}" + (f" ({one.reason})" if one.reason else "") for one in interlocks)
 
 
 class JogPanel:

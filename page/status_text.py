@@ -186,13 +186,16 @@ def command_blocked(task: TaskStatus | None, motion: MotionStatus | None) -> dic
     """Return why each command to the task would have no effect now."""
     if task is None:
         return dict.fromkeys(("Start", "Pause", "Resume"), "the task's state is unknown: it does not respond")
-    stopped = motion is not None and bool(motion.stopped)
+    if motion is None:
+        return dict.fromkeys(("Start", "Pause", "Resume"), "the arm's controller does not respond")
+    stopped = bool(motion.stopped)
     running = task.started and task.state not in ("DONE", "ERROR")
-    paused = task.paused or (motion is not None and motion.paused)
-    moving = motion is not None and motion.state == "active"
-    start = "" if stopped else "paused: press Resume" if paused else "already running" if running else ""
+    paused = task.paused or motion.paused
+    moving = motion.state == "active"
+    fault = f"robot fault: {motion.fault}" if motion.fault else ""
+    start = fault or ("" if stopped else "paused: press Resume" if paused else "already running" if running else "")
     pause = "already paused" if paused else "" if running or moving else "nothing is running"
-    resume = "nothing is paused" if not paused else "the arm was stopped: press Start" if stopped else ""
+    resume = "nothing is paused" if not paused else "the arm was stopped: press Start" if stopped else fault
     return {"Start": start, "Pause": pause, "Resume": resume}
 
 

@@ -20,6 +20,7 @@ from common.tasks.stages import AwaitImage, Command, Execution, Grip, Move, Repo
 # Rejections that say nothing about the motion itself: the task decides again.
 NOT_ITS_FAULT = ("busy", "stale_request", "clock_ahead", "stopped", "not_owner")
 START = ": start to go on"
+MISSING = "waiting for "
 NO_ARM = "the arm cannot be moved: "
 FOUND_HELD = "the robot was found held; resume or start to go on"
 FINGERS_OFF = 0.003  # [m] tolerated difference between the finger width now and the one of the plan
@@ -117,8 +118,10 @@ class Task(ExecutionMonitor[V]):
         """Return the requests to send now."""
         status = self.status
         if view.missing:
-            status.message = f"waiting for {', '.join(view.missing)}"
+            status.message = f"{MISSING}{', '.join(view.missing)}"
             return []
+        if status.message.startswith(MISSING):
+            status.message = ""
         assert view.motion is not None and view.gripper is not None
         if not self._found:
             self._found, status.paused = True, view.motion.paused

@@ -41,8 +41,10 @@ class FakeBrowser:
 
     @property
     def text(self) -> str:
-        """The HTML of all panels."""
-        return "\n".join(str(part.get("content", "")) for part in self.parts.values())
+        """The HTML of all panels, and the texts of the status bar."""
+        bar = [self.status["situation"]["text"], self.status["situation"]["hint"], self.status["note"]["text"],
+               *(text for text, _ in self.status["summary"])] if self.status else []
+        return "\n".join([*(str(part.get("content", "")) for part in self.parts.values()), *bar])
 
     def label(self, label: str) -> str:
         """Return the uuid of the only field with this label."""

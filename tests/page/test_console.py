@@ -43,7 +43,7 @@ async def test_errors_are_shown_and_neither_they_nor_pending_requests_delay_othe
     async def wait() -> None:
         await asyncio.Event().wait()
 
-    assert await run(wait, reject, request) == ["not now", "no service answers motion/plan now"]
+    assert await run(wait, reject, request) == ["not now", "the motion planner does not respond"]
 
 
 async def test_bug_ends_the_service() -> None:

@@ -62,7 +62,7 @@ def test_tab_newer_than_a_saved_layout_is_added_unless_it_was_removed_on_purpose
 
 
 @pytest.mark.parametrize(("text", "message"), [
-    ("tabs: [Cameras, Lottery]", r"tabs\.1: 'Lottery' must be 'Cameras', 'Health'"),
+    ("tabs: [Cameras, Lottery]", r"tabs\.1: 'Lottery' must be 'Move', 'Cameras'"),
     ("panel_width: 3", "panel_width: 3 must be greater than or equal to 280"),
     ("colour: red", "colour: 'red' is not a parameter; choices: annotated_image"),
     ("viewpoints: {panda: {position: [0, 0, .nan]}}", "position"),

@@ -19,13 +19,10 @@ def panel_of(gui: viser.GuiApi, owner: MotionOwner) -> tuple[TaskPanel, ActionQu
     async def own(_act: str, _over: bool) -> MotionOwner:
         return owner
 
-    async def nothing() -> None:
-        pass
-
     console: Any = ActionQueue(Permissions())
     console.permissions.enforced = True
     console.own, console.latest, console.acknowledged = own, lambda _topic: None, 0
-    return TaskPanel(gui, console, None, nothing), console
+    return TaskPanel(gui, console, cast(Any, None)), console
 
 
 async def press(panel: TaskPanel, console: ActionQueue, session: PageSession, name: str) -> tuple[str, str]:

@@ -46,7 +46,7 @@ def arm() -> Iterator[Arm]:
 
 @pytest.mark.parametrize(("before", "then", "reason"), [
     (OURS, FREE, "press the button again"), (FREE, FREE, "its controller does not accept it"),
-    (OURS, BOBS, "owned by bob"),
+    (OURS, BOBS, "bob controls the arm"),
 ])
 def test_held_button_without_effect_is_rejected_once_a_press_with_the_reason(
     arm: Arm, before: MotionOwner, then: MotionOwner, reason: str
@@ -92,4 +92,5 @@ def test_one_page_jogs_at_a_time(arm: Arm) -> None:
 async def test_jog_buttons_have_accessible_names(gui: viser.GuiApi, joints: list[str], names: list[str]) -> None:
     panel = JogPanel(gui, ActionQueue(), joints, [1.0, 1.0])
     labels = re.findall(r'aria-label="([^"]*)"', panel._html.content)
-    assert labels == [f"jog {name}, {sign}" for name in names for sign in ("minus", "plus")]
+    tool = [f"{what} {axis}" for what in ("tool along", "rotate tool about") for axis in "xyz"]
+    assert labels == [f"jog {name}, {sign}" for name in [*names, *tool] for sign in ("minus", "plus")]

@@ -74,6 +74,7 @@ def test_number_of_displayed_rejections_is_bounded(panda: Stage) -> None:
 
 
 def test_workspace_is_a_translucent_cylinder_that_is_sent_once(panda: Stage) -> None:
+    panda.show("workspace", True)
     shell = m.Marker(ns="workspace", id=0, type="cylinder", pose=at(0, 0, 0.4), scale=m.Vector3(x=1.6, y=1.6, z=1.0),
                      color=m.Color(r=0.2, g=0.8, b=0.3, a=0.15))
     panda.say(WORKSPACE_MARKERS, m.MarkerArray(header=WORLD, markers=[shell]))
@@ -86,6 +87,7 @@ def test_workspace_is_a_translucent_cylinder_that_is_sent_once(panda: Stage) -> 
 
 
 def test_markers_of_every_type_are_displayed(panda: Stage) -> None:
+    panda.show("workspace", True)
     types = ("sphere", "box", "text", "cylinder")
     panda.say(WORKSPACE_MARKERS, m.MarkerArray(header=WORLD, markers=[
         m.Marker(ns="x", id=i, type=each, pose=at(0, 0, i), scale=m.Vector3(x=1, y=1, z=1), text="a wall")

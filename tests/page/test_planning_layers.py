@@ -1,5 +1,7 @@
 """Ghosts of the robot for plans, and the tool path."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -101,3 +103,16 @@ def test_two_plans_are_animated_concurrently_until_the_robot_moves(panda: Stage,
     np.testing.assert_allclose(panda.layer("tool_path").line.points[-1][1], panda.robot.fk(goal)[:3, 3], atol=1e-4)
     panda.joints(home + 0.05)
     assert not compared.ghost.visible and compared.line is None
+
+
+@pytest.mark.parametrize("ended", [
+    {"interlocks": [m.Interlock(kind="stopped", by="page", since=9)]}, {"state": "aborted"}])
+def test_plan_of_a_stopped_or_failed_motion_disappears(panda: Stage, goal: Array, ended: dict[str, Any]) -> None:
+    ghost, path = panda.layer("plan").ghost, panda.layer("tool_path")
+    panda.say(topics.MOTION_STATUS, m.MotionStatus(state="active"))
+    panda.say(topics.DISPLAY_TRAJECTORY, plan(panda, goal, 1))
+    assert ghost.visible and path.line is not None
+    panda.say(topics.MOTION_STATUS, m.MotionStatus(**ended))
+    assert not ghost.visible and path.line is None
+    panda.view.play(plan(panda, goal, 2))  # of an operator
+    assert ghost.visible and path.line is not None

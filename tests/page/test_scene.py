@@ -161,6 +161,7 @@ def test_empty_messages_do_no_harm(server: viser.ViserServer, cell: str) -> None
         m.Rejections: m.Rejections(header=WORLD, rejected=[]), m.MarkerArray: m.MarkerArray(header=WORLD, markers=[]),
         m.JointTrajectory: m.JointTrajectory(joint_names=["a"], points=[]), m.TFMessage: m.TFMessage(transforms=[]),
         Contours: Contours(header=WORLD, width=64, height=48), m.PoseArray: m.PoseArray(),
+        m.MotionStatus: m.MotionStatus(),
         OutlinePoints: OutlinePoints(), m.WorldObjects: m.WorldObjects(),
         m.PointCloud2: m.PointCloud2(header=WORLD, height=1, width=1, row_step=16, data=b""),
     }

@@ -23,14 +23,14 @@ def test_every_state_has_a_text() -> None:
 
 @pytest.mark.parametrize(("status", "text"), [
     (None, "Task state unknown"),
-    (PickPlaceStatus(), "Waiting for start"),
+    (PickPlaceStatus(), "Ready"),
     (PickPlaceStatus(started=True), "Waiting"),
-    (PickPlaceStatus(state="GRASPING", started=True, target="track_2"), "Grasping track_2"),
+    (PickPlaceStatus(state="GRASPING", started=True, target="track_2"), "Grasping track 2"),
     (PickPlaceStatus(state="GRASPING", started=True, paused=True), "Paused"),
     (PickPlaceStatus(state="PLACING"), "Stopped"),
     (PickPlaceStatus(state="DONE", started=True), "Done"),
     (PickPlaceStatus(state="ERROR", paused=True), "Failed"),
-    (OutlineStatus(state="TRACING", started=True, object="Object_1"), "Tracing Object_1"),
+    (OutlineStatus(state="TRACING", started=True, object="Object_1"), "Tracing Object 1"),
     (OutlineStatus(state="SELECTING", started=True), "Waiting for a choice"),
 ])
 def test_text_of_a_task_state(status: PickPlaceStatus | OutlineStatus | None, text: str) -> None:
@@ -62,7 +62,7 @@ def test_text_of_a_plan_has_planner_and_duration_or_the_colliding_objects_once()
 
 @pytest.mark.parametrize(("error", "text"), [
     (RemoteError("motion/plan", "no_scene", "there is no planning scene yet"), "there is no planning scene yet"),
-    (NoResponder("task/command"), "no service answers task/command now"),
+    (NoResponder("task/command"), "the task does not respond"),
     (ConfigError("speed", 3, "must be 1"), "speed: 3 must be 1"),
 ])
 def test_error_text_has_no_details_for_programs(error: ZencellError, text: str) -> None:

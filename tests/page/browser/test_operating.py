@@ -64,18 +64,19 @@ async def test_task_is_started_paused_resumed_and_stopped(cell: Viewed, page: Pa
         await pause.click()
         await until(motion, lambda status: status.held, PATIENCE)
         await assert_standstill(joints)
-        await page.locator('[data-part="task"][data-paused="True"]').get_by_text("Paused", exact=True).wait_for()
+        await page.locator('[data-part="task"][data-paused="True"]').wait_for(state="attached")
+        await page.get_by_text("Press Resume to continue.").wait_for()
         assert await pause.bounding_box() == place, "it must not move under the pointer"
         await page.get_by_role("button", name="Resume").click()
         await until(joints, is_moving, PATIENCE)
         assert not (await until(status, lambda status: not status.paused, PATIENCE)).paused
-        await page.locator('[data-part="task"][data-paused="False"][data-held="False"]').wait_for()
+        await page.locator('[data-part="task"][data-paused="False"][data-held="False"]').wait_for(state="attached")
         await page.get_by_role("button", name="STOP").click()
         stopped = await until(status, lambda status: not status.started, PATIENCE)
         ended = await until(motion, lambda status: status.state != "active", PATIENCE)
         assert ended.state == "cancelled" and stopped.state != "ERROR"
         await assert_standstill(joints)
-        await page.locator('[data-part="notice"]').get_by_text("Stopped").wait_for()
+        await page.get_by_text("Check the cell, then press Start.").wait_for()
 
 
 async def test_arm_is_jogged_only_while_the_button_is_held(cell: Viewed, page: Page, opened: Opened) -> None:

@@ -1,8 +1,7 @@
-"""The page at three sizes: STOP stays visible, every tab has the same elements with names, and none overflows."""
+"""The page at three sizes: STOP, jogging and gripper in reach, every tab has the same elements, and none overflows."""
 
 from __future__ import annotations
 
-import re
 from typing import TYPE_CHECKING
 
 import pytest
@@ -15,7 +14,7 @@ if TYPE_CHECKING:
 
 pytestmark = IN_BROWSER
 
-SIZES = {"usual": (1280, 800), "small": (800, 600), "phone": (390, 844)}
+SIZES = {"usual": (1600, 900), "tablet": (1024, 768), "phone": (390, 844)}
 
 # What is at the center and the corners of STOP, its size, and whether the bar covers any part of the page; the layout
 # follows a taller bar in the next frame.
@@ -46,6 +45,32 @@ ELEMENTS = r"""() => {
       && !(each.labels && each.labels.length) && each.type !== "hidden");
   return {labels: [...new Set(seen.map(words).filter(each => each && !/\d\d:\d\d:\d\d$/.test(each)))].sort(),
     out: out.map(html), nameless: nameless.map(html)};
+}"""
+
+
+# Buttons that an operator uses without scrolling which are covered or too small, and the size of the visible scene.
+REACH = """() => {
+  const covered = ['[data-press="start"]', '[data-press="gripper:open"]', '[data-press="gripper:close"]',
+    '[data-hold="joint:panda_joint1:+"]', '[data-hold="move:base:x:-"]', '[data-hold="turn:base:z:+"]'].filter(name => {
+    const button = document.querySelector(name), at = button.getBoundingClientRect();
+    return at.height < 24 || document.elementFromPoint(at.x + at.width / 2, at.y + at.height / 2) !== button; });
+  const scene = document.querySelector("#root canvas").getBoundingClientRect();
+  const panel = document.querySelector('[data-part="orders"]').getBoundingClientRect();
+  return {covered, width: scene.width, height: scene.height,
+    apart: panel.left >= scene.right - 1 || panel.top >= scene.bottom - 1};
+}"""
+
+# Whether a finger that rests on a button for a while, or moves by some pixels first, holds it down.
+TOUCH = """async pixels => {
+  const button = document.querySelector('[data-hold="joint:panda_joint1:+"]'), at = button.getBoundingClientRect();
+  const send = (type, y) => button.dispatchEvent(new PointerEvent(type, {bubbles: true, button: 0, buttons: 1,
+    pointerType: "touch", pointerId: 7, clientX: at.x + at.width / 2, clientY: at.y + at.height / 2 + y}));
+  send("pointerdown", 0);
+  send("pointermove", pixels);
+  await new Promise(later => setTimeout(later, 400));
+  const held = button.classList.contains("held");
+  send("pointerup", pixels);
+  return held;
 }"""
 
 
@@ -81,7 +106,6 @@ async def test_stop_is_visible_and_every_tab_complete(page: Page, size: str, lab
         for _ in range(2):
             await page.get_by_text("zencell · panda").click()  # collapses and expands the panel
             await check_stop(page)
-        await page.get_by_text(re.compile("Health · ")).click()  # expands the tabs
     await page.mouse.move(width - 60, height - 60)
     await page.mouse.wheel(0, 2000)
     await check_stop(page)
@@ -94,6 +118,12 @@ async def test_stop_is_visible_and_every_tab_complete(page: Page, size: str, lab
             await page.get_by_text("Targets", exact=True).wait_for()
             await page.get_by_text("Point cloud", exact=True).wait_for(state="hidden")
         await check_stop(page)
+        if name == "Move":
+            await page.locator('[data-hold="joint:panda_joint1:+"]:not([aria-disabled])').wait_for()
+            await page.wait_for_function(f"() => {{ const at = ({REACH})(); return !at.covered.length && at.apart; }}")
+            seen = await page.evaluate(REACH)
+            assert seen["width"] >= 300 and seen["height"] >= 200, seen
+            assert [await page.evaluate(TOUCH, pixels) for pixels in (14, 0)] == [False, True]
         if name in labels:  # a page that was just loaded shows other elements until all messages have arrived
             await page.wait_for_function(f"wanted => ({ELEMENTS})().labels.join() === wanted", arg=labels[name])
         await page.wait_for_function(f"() => ({ELEMENTS})().nameless.length === 0")
@@ -102,6 +132,8 @@ async def test_stop_is_visible_and_every_tab_complete(page: Page, size: str, lab
         labels.setdefault(name, ",".join(seen["labels"]))
     await page.get_by_role("button", name="STOP: stop arm and task").click()
     await page.get_by_role("status").get_by_text("Stopped by page").wait_for()
+    bar = page.locator("#zc-bar")
+    assert await bar.get_attribute("data-kind") == "busy" and (await bar.inner_text()).count("Stopped by") == 1
     await tab(page, "Time")
     await page.get_by_role("button", name="− 1 s").dispatch_event("click")
     await page.get_by_role("status").get_by_text("Not live: the scene shows").wait_for()

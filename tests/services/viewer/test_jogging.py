@@ -32,7 +32,7 @@ async def test_each_hold_message_sends_one_jog_command(panda: FakeServices, page
     await page.send(do="release")
     rest = await next_of(reader)
     assert not rest.joints and rest.linear == m.Vector3()
-    await page.set("Jog mode", "tool, tool frame")
+    await page.set("Tool axes of", "tool")
     await page.until(lambda: "move:tool:z:+" in page.text)
     await page.hold("move:tool:z:+", press=2)
     jog = await next_of(reader)
@@ -57,7 +57,7 @@ async def test_stop_ends_jogging_until_the_button_is_released(panda: FakeService
     await next_of(reader)
     stop = m.Interlock(kind="stopped", by="page", since=7)
     panda.put_motion(stop)
-    await page.until(lambda: "stopped since" in page.text)
+    await page.until(lambda: "Stopped by page" in page.text)
     await page.hold("joint:panda_joint1:+")
     assert not (await next_of(reader)).joints
     for _ in range(3):
@@ -115,9 +115,9 @@ async def test_control_is_taken_from_another_operator_by_pressing_twice(panda, p
 
     panda.bus.serve(topics.MOTION_OWN, own)
     panda.put(topics.MOTION_OWNER, anna)
-    await page.until(lambda: all("owned by anna (operator)" in shown for shown in (page.text, page.status["blocked"])))
+    await page.until(lambda: "Control: anna" in page.text and "anna controls the arm" in page.status["blocked"])
     await page.press("Take control")
     await page.until(lambda: "press Take control again to override" in page.text)
     await page.press("Take control")
-    await page.until(lambda: "The motion is owned by page" in page.text)
+    await page.until(lambda: "page controls the arm now" in page.text)
     assert [(one.act, one.over, one.owner) for one in requests] == [("take", False, "page"), ("take", True, "page")]

@@ -17,13 +17,16 @@ async def test_stop_stops_the_arm_and_the_task(panda: FakeServices, page: FakeBr
     await page.send(do="stop", n=3)
     await until(lambda: panda.stops and panda.commands)
     assert (panda.stops, panda.commands) == (["stopped on the page"], ["stop"])
-    await page.until(lambda: ">Stopped by page<" in page.text and page.results == [(3, "Stopped by page", "good")])
-    await page.until(lambda: page.status["note"]["text"] == "Stopped by page")
+    panda.put_motion(m.Interlock(kind="stopped", by="page", reason="stopped on the page", since=5_000_000))
+    await page.until(lambda: page.results == [(3, "Stopped by page", "good")])
+    await page.until(lambda: page.status["situation"]["text"] == "Stopped by page")
+    assert page.status["situation"]["since"] == 5.0, "[ms]"
+    assert page.text.count("Stopped by") == 1 and not page.status["note"]["text"]
 
 
 @pytest.mark.parametrize(("arm", "line", "kind"), [
-    (True, "Arm stopped by page; task NOT stopped: no service answers task/command now", "good"),
-    (False, "NOT stopped: no service answers motion/stop now", "bad"),
+    (True, "Arm stopped by page; task NOT stopped: the task does not respond", "good"),
+    (False, "NOT stopped: the arm's controller does not respond", "bad"),
 ])
 async def test_missing_answer_to_a_stop_is_shown(arm: bool, line: str, kind: str) -> None:
     async with page_of("panda", serve=False) as (services, page):
@@ -38,7 +41,7 @@ async def test_missing_answer_to_a_stop_is_shown(arm: bool, line: str, kind: str
     ("Start", {"state": "IDLE"}, {"Pause": "nothing is running", "Resume": "nothing is paused"}),
     ("Pause", {"state": "GRASPING", "started": True}, {"Start": "already running", "Resume": "nothing is paused"}),
     ("Resume", {"state": "GRASPING", "started": True, "paused": True},
-     {"Start": "the task is paused: press Resume", "Pause": "already paused"}),
+     {"Start": "paused: press Resume", "Pause": "already paused"}),
     ("Start", {"state": "DONE", "started": True}, {"Pause": "nothing is running", "Resume": "nothing is paused"}),
 ])
 async def test_command_is_sent_and_commands_without_effect_are_disabled(panda, page, command, state, others):
@@ -58,22 +61,20 @@ async def test_hold_of_another_operator_is_overridden_by_pressing_twice(panda: F
     panda.put_motion(held=True)
     await page.press("Resume")
     await page.until(lambda: "the robot is held by anna: press Resume again to override" in page.text)
-    await page.press("Start")
-    await page.until(lambda: "press Start again" in page.text)
-    await page.press("Start")
-    await page.until(lambda: "press Start again" not in page.text)
-    assert panda.commands == ["resume", "start", "start"]
+    await page.press("Resume")
+    await page.until(lambda: "press Resume again" not in page.text)
+    assert panda.commands == ["resume", "resume"] and page.button("Start")[1] == "paused: press Resume"
 
 
 async def test_new_hold_after_a_rejection_is_shown_before_it_is_overridden(panda, page):
     panda.put_task()
     for since, panda.holder in ((5, "anna"), (9, "bob")):
         panda.put_motion(m.Interlock(kind="held", by=panda.holder, since=since), held=True)
-        await page.until(lambda: f"UTC by {panda.holder}" in page.text)
-        await page.press("Start")
-        await page.until(lambda: f"the robot is held by {panda.holder}: press Start again to override" in page.text)
+        await page.until(lambda: f"Paused by {panda.holder}" in page.text)
+        await page.press("Resume")
+        await page.until(lambda: f"the robot is held by {panda.holder}: press Resume again to override" in page.text)
     panda.put_motion(m.Interlock(kind="stopped", by="anna", reason="smoke", since=0))
-    await page.until(lambda: "stopped since 1970-01-01 00:00:00 UTC by anna (smoke)" in page.text)
+    await page.until(lambda: "Stopped by anna: smoke" in page.text)
 
 
 async def test_robot_controller_shows_its_state_and_is_recovered(panda: FakeServices, page: FakeBrowser) -> None:

@@ -42,9 +42,11 @@ AREA = "min area [px^2]"
 async def test_state_and_counters_are_shown(panda: FakeServices, page: FakeBrowser) -> None:
     panda.put_task(state="GRASPING", started=True, target="track_4", placed=2, targets=7, stage="pre_grasp")
     panda.put_motion(state="active", progress=0.5, held=True)
-    await page.until(lambda: "Grasping track_4" in page.text and "pre grasp" in page.text)
-    await page.until(lambda: 'data-held="True"' in page.text and "held" in page.text)
-    assert '<div data-field="placed"><b>2</b>' in page.text and '<div data-field="targets"><b>7</b>' in page.text
+    await page.until(lambda: 'data-held="True"' in page.text and "pre grasp" in page.text)
+    await page.until(lambda: "Paused" in page.text and "Press Resume to continue." in page.text)
+    assert "<b>2 of 7</b>" in page.text
+    panda.put_motion(state="active", progress=0.5)
+    await page.until(lambda: "Grasping track 4" in page.text and "arm moving, 50 % of this motion" in page.text)
 
 
 async def test_images_and_truth_are_read_only_while_displayed(panda: FakeServices) -> None:
@@ -186,7 +188,8 @@ async def test_scene_is_updated_while_a_page_is_open(panda: FakeServices, scenes
     panda.put(WORKSPACE_MARKERS, markers)
     await until(lambda: scenes)
     assert not scenes[0].calls_of("refresh") and scenes[0].latest(WORKSPACE_MARKERS) is None
-    async with opened(panda.port):
+    async with opened(panda.port) as page:
+        await page.set("Workspace", True)
         await until(lambda: scenes[0].calls_of("refresh") and scenes[0].latest(WORKSPACE_MARKERS) == markers)
 
 
@@ -216,11 +219,11 @@ async def test_rejected_positions_are_counted_once_while_they_are_detected(panda
     panda.put_task()
     for x, reason in ((1.1, "too far"), (1.11, "too far"), (0.2, "too near"), (0.5, "inside the container")):
         panda.put(REJECTED_TARGETS, rejections((x, 0.8), reason=reason, stamp=10))
-    await page.until(lambda: '<div data-field="rejected"><b>2</b>' in page.text)
+    await page.until(lambda: '<b>2</b><span class="dim">rejected' in page.text)
     remaining = m.Marker(ns="balls", id=1, type="sphere", pose=at(1.1, 0.8, 0.0),
                          scale=m.Vector3(x=0.06, y=0.06, z=0.06))
     panda.put(DETECTED_OBJECTS, m.MarkerArray(header=m.Header(stamp=5_000_000_000), markers=[remaining]))
-    await page.until(lambda: '<div data-field="rejected"><b>1</b>' in page.text)
+    await page.until(lambda: '<b>1</b><span class="dim">rejected' in page.text)
 
 
 async def test_scene_is_loaded_when_the_cell_is_up_or_a_page_is_open(scenes, monkeypatch):
@@ -296,6 +299,6 @@ APPLICATION = Application(topics=ApplicationTopics(status=STATUS))
     async with page_of("panda", members=members) as (services, page):
         status = find_application("apps.moving").status
         services.put(status, status.message(state="CARRYING", started=True, subject="cube", done=1, total=2))
-        await page.until(lambda: "Carrying cube" in page.text and '<div data-field="done"><b>1</b>' in page.text)
+        await page.until(lambda: "Carrying cube" in page.text and "<b>1 of 2</b>" in page.text)
         with pytest.raises(LookupError):
             page.label("Targets")
