@@ -14,6 +14,7 @@ from applications.outlining.contours import is_hole
 from applications.outlining.topics import Contour, OutlineSelect
 from common.errors import ZencellError
 from common.messages import Color
+from common.perception.labels import draw_labels
 
 HUES = {"red": 0, "orange": 30, "yellow": 60, "green": 120, "cyan": 180, "blue": 240, "magenta": 300}  # [degrees]
 SAME_MIDDLE = 3.0  # [px] contours whose centers are this close are nested
@@ -248,15 +249,6 @@ def annotate_contours(picture: Picture, contours: Sequence[Contour], selected: i
         points = np.array(contour.pixels)
         fixed = np.rint(points * 16).astype(np.int32)
         cv2.polylines(shown, [fixed], True, color, 3 if contour.index == selected else 2, cv2.LINE_AA, 4)
-        _label(shown, contour.label, points, color)
+    outlines = [(contour.label, np.array(contour.pixels)) for contour in contours]
+    draw_labels(shown, [(label, *at.mean(axis=0), float(np.ptp(at[:, 1])) / 2) for label, at in outlines])
     return shown
-
-
-def _label(shown: Picture, text: str, points: npt.NDArray[np.float64], color: tuple[int, int, int]) -> None:
-    font, scale = cv2.FONT_HERSHEY_SIMPLEX, 0.6
-    (width, height), _ = cv2.getTextSize(text, font, scale, 1)
-    u, v = points.mean(axis=0)
-    x = round(min(max(u - width / 2, 2), shown.shape[1] - width - 2))
-    y = round(min(max(v + height / 2, height + 2), shown.shape[0] - 4))
-    cv2.putText(shown, text, (x, y), font, scale, (0, 0, 0), 4, cv2.LINE_AA)
-    cv2.putText(shown, text, (x, y), font, scale, color, 1, cv2.LINE_AA)

@@ -24,11 +24,10 @@ from common import topics
 from common.config import Fixture
 from common.messages import CollisionObject, MotionStatus, TaskStatus
 from common.perception.pinhole import CameraError, Pinhole
-from common.terminal import printable
 from common.topics import Topic
 from page.application import ApplicationPage
 from page.layers import Layer
-from page.nodes import FLAT, add_line, points_of, rgb_of
+from page.nodes import FLAT, Labels, add_line, points_of, rgb_of
 
 if TYPE_CHECKING:
     import viser
@@ -157,7 +156,8 @@ class ContourChoice(Layer):
     def build(self) -> None:
         """Start without contours."""
         self._shown: object = None
-        self.nodes: list[viser.LineSegmentsHandle | viser.LabelHandle | viser.IcosphereHandle] = []
+        self.nodes: list[viser.LineSegmentsHandle | viser.IcosphereHandle] = []
+        self.labels = Labels(self.scene, self.root, scale=0.8)
 
     def show(self, topic: Topic[Any], message: Any) -> None:
         """Show the newest contours on the objects with their labels, as their camera sees them."""
@@ -179,16 +179,21 @@ class ContourChoice(Layer):
         for node in self.nodes:
             node.remove()
         self.nodes = []
+        labels = {}
         for contour, height in zip(largest, heights, strict=True):
-            self._add(contour, height + _LIFTED, camera, chosen=contour.index == m.selected)
+            at = self._add(contour, height + _LIFTED, camera, chosen=contour.index == m.selected)
+            if at is not None:
+                labels[str(contour.index)] = f"{contour.index}: {contour.label}", at
+        self.labels.show(labels, self.stage.projection())
 
-    def _add(self, contour: Contour, height: float, camera: Pinhole, *, chosen: bool) -> None:
+    def _add(self, contour: Contour, height: float, camera: Pinhole, *, chosen: bool) -> Array | None:
+        """Add the contour and its pin; return the position of its label."""
         pixels = np.array(contour.pixels)
         some = pixels[np.unique(np.linspace(0, len(pixels) - 1, _POINTS).round().astype(int))]
         at = camera.on_plane(some, height)
         points = np.column_stack([at, np.full(len(at), height)])
         if not np.isfinite(points).all():  # the camera does not look down at it
-            return
+            return None
         name, color = f"{self.root}/{contour.index}", CHOSEN if chosen else rgb_of(contour.color)
         line = add_line(self.scene, f"{name}_line", points, color, 2.0, closed=True)
         x, y = (points[:, :2].min(axis=0) + points[:, :2].max(axis=0)) / 2
@@ -199,11 +204,8 @@ class ContourChoice(Layer):
         async def _(_event: object) -> None:
             console.put(lambda: choose(console, choice))
 
-        label = self.scene.add_label(
-            f"{name}_label", printable(f"{contour.index}: {contour.label}"), position=(x, y, height + 4 * _PIN),
-            anchor="bottom-center", font_screen_scale=0.8,
-        )
-        self.nodes += [line, pin, label]
+        self.nodes += [line, pin]
+        return np.array([x, y, height + 4 * _PIN])
 
     def _support(self, contour: Contour, camera: Pinhole) -> float:
         """Height [m] of the highest flat fixture below the contour, else of the table."""

@@ -49,6 +49,7 @@ from applications.pick_place.sphere_fit import Fit, fit_each, fit_spheres, separ
 from common.config import CameraConfig, Parameters, Surroundings, Tunable
 from common.perception.depth import Depth
 from common.perception.illumination import BoolMask, blank_image_reason, blue_share, sampled_pixels
+from common.perception.labels import draw_labels
 from common.perception.pinhole import Pinhole, ray_distances, silhouettes
 
 Array = npt.NDArray[np.float64]
@@ -448,6 +449,6 @@ def annotate(picture: Picture, detections: Sequence[Detection]) -> Picture:
         cv2.polylines(shown, [points], True, color, 1, cv2.LINE_AA, 4)
         u, v = (round(value) for value in d.pixel)
         cv2.drawMarker(shown, (u, v), color, cv2.MARKER_CROSS, 9, 1)
-        label = f"{d.position[0]:.3f} {d.position[1]:+.3f}{' partial' if d.partial else ''}"
-        cv2.putText(shown, label, (u - 40, v - 26), cv2.FONT_HERSHEY_SIMPLEX, 0.35, (0, 0, 0), 1, cv2.LINE_AA)
+    draw_labels(shown, [(f"{d.position[0]:.3f} {d.position[1]:+.3f}{' partial' if d.partial else ''}", *d.pixel,
+                         float(np.ptp(d.outline[:, 1])) / 2) for d in detections])
     return shown

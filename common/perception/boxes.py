@@ -20,6 +20,7 @@ from common.config import Parameters, Section, Tunable
 from common.config.basics import Length, Rgb
 from common.perception.camera_input import require_in_range
 from common.perception.depth import Depth, Rays, is_valid
+from common.perception.labels import draw_labels
 from common.perception.pinhole import Pinhole
 
 Array = npt.NDArray[np.float64]
@@ -153,10 +154,9 @@ def draw_boxes(image: Pixels, boxes: list[DetectedBox]) -> Pixels:
     shown = image.copy()
     for box in boxes:
         cv2.polylines(shown, [np.rint(box.corners * 16).astype(np.int32)], True, (255, 255, 255), 1, cv2.LINE_AA, 4)
-        u, v = box.corners.mean(axis=0)
-        label = f"{box.kind} {box.position[0]:.3f} {box.position[1]:+.3f} {math.degrees(box.yaw):.0f} deg"
-        cv2.putText(shown, label, (round(u) - 50, round(v) - 22), cv2.FONT_HERSHEY_SIMPLEX, 0.35, (0, 0, 0), 1,
-                    cv2.LINE_AA)
+    draw_labels(shown, [
+        (f"{box.kind} {box.position[0]:.3f} {box.position[1]:+.3f} {math.degrees(box.yaw):.0f} deg",
+         *box.corners.mean(axis=0), float(np.ptp(box.corners[:, 1])) / 2) for box in boxes])
     return shown
 
 

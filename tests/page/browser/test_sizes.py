@@ -132,8 +132,8 @@ async def test_stop_is_visible_and_every_tab_complete(page: Page, size: str, lab
         labels.setdefault(name, ",".join(seen["labels"]))
     await page.get_by_role("button", name="STOP: stop arm and task").click()
     await page.get_by_role("status").get_by_text("Stopped by page").wait_for()
-    bar = page.locator("#zc-bar")
-    assert await bar.get_attribute("data-kind") == "busy" and (await bar.inner_text()).count("Stopped by") == 1
+    await page.wait_for_function("""() => { const bar = document.querySelector("#zc-bar");
+        return bar.dataset.kind === "busy" && bar.innerText.split("Stopped by").length === 2; }""")
     await tab(page, "Time")
     await page.get_by_role("button", name="− 1 s").dispatch_event("click")
     await page.get_by_role("status").get_by_text("Not live: the scene shows").wait_for()
