@@ -8,7 +8,7 @@
   const START_TIMEOUT = 6000;  // [ms] for the first status
   const STOP_TIMEOUT = 3000;  // [ms] for the result of STOP
   const NOTE_TIME = {good: 6000, dim: 6000, bad: 60000, busy: 60000};  // [ms] for which a note is shown
-  const DWELL = 150, SLOP = 10;  // [ms], [px]: a finger that rests holds a button down, one that moves before scrolls
+  const DWELL = 150, SLOP = 10;  // [ms], [px]: a finger that stays holds a button down, one that moves first scrolls
   const MAX_BUFFERED = 2000;  // [bytes] waiting to be sent: hold messages would arrive too late
 
   const ICONS = {".tabler-icon-adjustments": "Settings of this view", ".tabler-icon-list-search": "Search for a command",

@@ -34,11 +34,11 @@ _PAUSE = 1.0  # [s] at the end of an animation, before it starts again
 
 
 class EndedMotion:
-    """Tells when a published plan is dead: an operator has stopped the arm, or its motion has failed."""
+    """Detects that a published plan is obsolete: an operator has stopped the arm, or its motion has failed."""
 
     def __init__(self) -> None:
         self._ended = False
-        self.stopped = False  # plans of the task are dead until an operator starts it
+        self.stopped = False  # plans of the task are obsolete until an operator starts it
 
     def update(self, motion: MotionStatus) -> bool:
         """Return whether a motion has just ended before its goal."""

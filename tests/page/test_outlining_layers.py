@@ -61,7 +61,7 @@ def test_largest_contours_and_the_selected_one_are_offered_in_noise(stage: Stage
 def test_each_contour_has_a_pin_and_a_label_and_the_selected_one_is_white(stage: Stage) -> None:
     stage.say(CONTOURS, TWO)
     shown = nodes(stage)
-    assert ur5.layer("contours").labels.texts == ["0: red_1", "1: blue_1"]
+    assert stage.layer("contours").labels.texts == ["1: blue_1", "0: red_1"]
     assert shown["1_pin"].color == (255, 255, 255)
     np.testing.assert_allclose(shown["0_pin"].position[:2], [0.45, 0.0], atol=0.002)
     with stage.sent() as sent:

@@ -11,7 +11,7 @@ from page.status_text import TaskText, command_blocked
 
 STOP = m.Interlock(kind="stopped", by="page", reason="stopped on the page", since=5)
 HOLD = m.Interlock(kind="held", by="anna", reason="the task is paused", since=7)
-BLOCKED = m.Interlock(kind="held", by="scene_monitor", reason="ball_2 is in the way", since=7)
+BLOCKED = m.Interlock(kind="held", by="scene_monitor", reason="ball_2 obstructs the motion", since=7)
 RUNS = {"state": "GRASPING", "started": True, "done": 2, "total": 7}
 
 
@@ -31,7 +31,7 @@ def shown(task: dict[str, Any] | None, owner: str = "none", robot: m.RobotStatus
     (RUNS | {"paused": True}, {"held": True, "held_by": ["operator"], "interlocks": [HOLD]},
      Situation("Paused by anna", "busy", "Press Resume to continue.", 7)),
     (RUNS, {"held": True, "held_by": ["scene_monitor"], "interlocks": [BLOCKED]},
-     Situation("Arm waits: ball_2 is in the way", "busy", "It continues by itself.", 7)),
+     Situation("Arm waits: ball_2 obstructs the motion", "busy", "It continues by itself.", 7)),
     ({"state": "ERROR", "started": True, "message": "no plan"}, {},
      Situation("Failed: no plan", "bad", "Check the cell, then press Start.")),
     ({"state": "DONE", "started": True}, {}, Situation("Done", "good", "Press Start to run the task again.")),
@@ -60,5 +60,5 @@ def test_start_and_resume_are_never_both_possible(task: dict[str, Any], motion: 
     (None, "unknown"), (m.MotionOwner(), "free"), (m.MotionOwner(kind="task", owner="mover"), "task"),
     (m.MotionOwner(kind="operator", owner="page"), "you"), (m.MotionOwner(kind="operator", owner="anna"), "anna"),
 ])
-def test_control_is_told_from_the_view_of_the_operator(owner: m.MotionOwner | None, text: str) -> None:
+def test_control_is_shown_as_the_operator_sees_it(owner: m.MotionOwner | None, text: str) -> None:
     assert control_text(owner, "page") == text

@@ -60,7 +60,7 @@ REACH = """() => {
     apart: panel.left >= scene.right - 1 || panel.top >= scene.bottom - 1};
 }"""
 
-# Whether a finger that rests on a button for a while, or moves by some pixels first, holds it down.
+# Whether a finger that stays on a button for a while, or moves by some pixels first, holds it down.
 TOUCH = """async pixels => {
   const button = document.querySelector('[data-hold="joint:panda_joint1:+"]'), at = button.getBoundingClientRect();
   const send = (type, y) => button.dispatchEvent(new PointerEvent(type, {bubbles: true, button: 0, buttons: 1,
