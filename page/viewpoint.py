@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
 
 import viser
@@ -11,6 +12,8 @@ from page.layout import Layout
 FOV = 0.9  # [rad] vertical field of view where the scene is at least
 ASPECT = 1.0  # times as wide as high: a narrower one gets a larger field of view, which is as wide as this one
 MAX_FOV = 1.6  # [rad]
+LAYOUT_CHECKS, LAYOUT_PERIOD = 4, 1.0  # number and [s]: the size of the scene changes while the panels arrive
+NUDGE = 1e-3  # [rad]
 
 
 def field_of_view(width: float, height: float) -> float:
@@ -31,6 +34,9 @@ async def keep_framed(client: viser.ClientHandle) -> None:
 
     client.camera.on_update(update)
     await update(client.camera)
+    for _ in range(LAYOUT_CHECKS):  # a browser reports its size with its camera only: a tiny change makes it do so
+        await asyncio.sleep(LAYOUT_PERIOD)
+        client.camera.fov += NUDGE
 
 
 def prepare_scene(server: viser.ViserServer, layout: Layout, cell: str) -> None:
