@@ -87,7 +87,7 @@ def service(
         entry = entries.get(name) or ServiceEntry(name=name.rpartition(".")[2], module=name)
         require_module(name, entry)
         command = launch.service_command(entry, gate=False)
-    os.execvpe(command[0], command, {**os.environ, "PYTHONPATH": pythonpath(cell=cell)})
+    os.execvpe(command[0], command, {**os.environ, "PYTHONPATH": pythonpath()})
 
 
 def new(

@@ -22,7 +22,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any, Generic, TypeVar, overload
 
 from common.errors import ConfigError, UnknownName
-from common.plugins import find_plugin, plugin_names
+from common.plugins import extend_path, find_plugin, import_from_working_directory, plugin_names
 
 if TYPE_CHECKING:  # these imports take too long for the command line and shell completion
     from common.messages import Message, TaskStatus, WorldObjects
@@ -198,7 +198,6 @@ def find_application(name: str) -> Application:
         return Application()
     if "." not in name and name not in application_names():
         raise UnknownName("application", name, application_names())
-    import_from_working_directory()
     return _load(name)
 
 
@@ -220,14 +219,9 @@ def _imported_part(reference: str, field_name: str) -> Any:
         raise ConfigError(field_name, reference, f"cannot be imported: {error}") from None
 
 
-def import_from_working_directory() -> None:
-    """Let Python import modules from the working directory, after all others."""
-    _extend_path(str(Path.cwd()))
-
-
 def import_from_folder_of(cell: str) -> None:
     """Let Python import modules from the folder of a cell file and the folder around it, after all others."""
-    _extend_path(*import_folders(cell))
+    extend_path(*import_folders(cell))
 
 
 def import_folders(cell: str) -> list[str]:
@@ -236,10 +230,6 @@ def import_folders(cell: str) -> list[str]:
         return []
     folder = Path(cell).expanduser().resolve().parent
     return [str(folder), str(folder.parent)]
-
-
-def _extend_path(*folders: str) -> None:
-    sys.path.extend(folder for folder in folders if folder not in sys.path)
 
 
 def application_of_task(task: str) -> str:
@@ -274,9 +264,9 @@ def import_topics(modules: Iterable[str]) -> dict[str, AnyTopic]:
 
     A module that cannot be imported contributes none: the service that it implements reports the error.
     """
-    import_from_working_directory()
     found: dict[str, AnyTopic] = {}
     for name in modules:
+        import_from_working_directory(name)
         with suppress(Exception):
             module = importlib.import_module(name)
             found |= _topics_in(module)

@@ -33,6 +33,21 @@ PACKAGES = {
 }
 
 
+def import_from_working_directory(module: str) -> None:
+    """Let Python import a dotted module from the working directory, after all others, if its package is there.
+
+    Otherwise a file of a stranger there would be imported in place of a package that is not installed.
+    """
+    here, package = Path.cwd(), module.partition(".")[0]
+    if "." in module and ((here / package).is_dir() or (here / f"{package}.py").is_file()):
+        extend_path(str(here))
+
+
+def extend_path(*folders: str) -> None:
+    """Let Python import modules from folders, after all others: none hides another one."""
+    sys.path.extend(folder for folder in folders if folder not in sys.path)
+
+
 def find_plugin(group: str, name: str, *, field: str, noun: str, marker: str = "") -> ModuleType:
     """Return the module of a plug-in.
 
@@ -49,6 +64,7 @@ def find_plugin(group: str, name: str, *, field: str, noun: str, marker: str = "
     """
     try:
         if "." in name:
+            import_from_working_directory(name)
             return importlib.import_module(name)
         for path in _paths(group, name):
             module = importlib.import_module(path)
@@ -71,8 +87,9 @@ def where_searched(name: str) -> str:
             return "is not a module: " + (f"there is no {last} in {' or '.join(folders)}, the package {package}"
                                           if folders else f"{package} is no package")
         package, _, last = package.rpartition(".")
-    own = [folder or "." for folder in dict.fromkeys(sys.path) if not Path(folder).is_relative_to(sys.base_prefix)
-           and not Path(folder).is_relative_to(sys.prefix) and not folder.endswith(".zip")]
+    python = (sys.base_prefix, sys.prefix)
+    own = [folder or "." for folder in dict.fromkeys([*sys.path, str(Path.cwd())])
+           if not any(Path(folder).is_relative_to(each) for each in python) and not folder.endswith(".zip")]
     return f"is not a module: there is no {last} in {', '.join(own)} or among the installed packages"
 
 

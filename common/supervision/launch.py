@@ -13,11 +13,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from common.application import import_folders, import_from_working_directory
 from common.clock import MAX_SPEED, MIN_SPEED, Clock
 from common.config import OVERRIDES_VARIABLE, Cell, ServiceEntry
 from common.errors import ConfigError
-from common.plugins import where_searched
+from common.plugins import import_from_working_directory, where_searched
 from common.transport.endpoint import (
     CONNECT_VARIABLE,
     DEFAULT_DOMAIN,
@@ -29,6 +28,7 @@ from common.transport.endpoint import (
 
 ROUTER_MODULE = "services.router"
 PROJECT_ROOT = Path(__file__).resolve().parent.parent.parent
+OWN_MODULE = Path(__file__).with_name("own_module.py")
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class Launch:
         overrides = {OVERRIDES_VARIABLE: json.dumps(self.overrides)} if self.overrides else {}
         near = {NEAR_VARIABLE: f"{endpoint_of(self.domain)}={','.join(self.near)}"} if self.near else {}
         return {**inherited, **self.extra, **overrides, **near, **self.clock.environment(),
-                "PYTHONPATH": pythonpath(inherited, self.cell)}
+                "PYTHONPATH": pythonpath(inherited)}
 
 
 def clock_at_speed(speed: float, epoch: int | None = None) -> Clock:
@@ -112,19 +112,18 @@ def router_location(
 def module_command(module: str) -> list[str]:
     """Return a command line that runs a module with this interpreter."""
     # -P: a folder named `services` or `common` in the working directory must not hide the project's own.
-    return [sys.executable, "-P", "-m", module]
+    package = module.partition(".")[0]
+    own = [] if package == "zencell" or (PROJECT_ROOT / package).is_dir() else [str(OWN_MODULE)]
+    return [sys.executable, "-P", *own, "-m", module]
 
 
-def pythonpath(inherited: Mapping[str, str] = os.environ, cell: str = "") -> str:
-    """Return PYTHONPATH of the processes: project, the caller's, working directory, and the folder of a cell file.
+def pythonpath(inherited: Mapping[str, str] = os.environ) -> str:
+    """Return PYTHONPATH of the processes: the project, then the caller's.
 
-    Args:
-        inherited: the caller's environment.
-        cell: name, or path of a YAML file.
+    Not the working directory, nor the folder of a cell: a `sitecustomize` or `numpy` there would be imported at once.
     """
     given = [part for part in inherited.get("PYTHONPATH", "").split(os.pathsep) if part]
-    places = [str(PROJECT_ROOT), *given, str(Path.cwd()), *import_folders(cell)]
-    return os.pathsep.join(dict.fromkeys(places))
+    return os.pathsep.join(dict.fromkeys([str(PROJECT_ROOT), *given]))
 
 
 def require_modules(cell: Cell) -> None:
@@ -147,7 +146,7 @@ def require_module(key: str, entry: ServiceEntry) -> None:
     Raises:
         ConfigError: it cannot.
     """
-    import_from_working_directory()
+    import_from_working_directory(entry.module)
     try:
         found = importlib.util.find_spec(entry.module) is not None
     except ModuleNotFoundError:

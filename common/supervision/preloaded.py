@@ -26,6 +26,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import BinaryIO, NoReturn
 
+from common.supervision import own_module
+
 MODULES = (  # what most services import
     "common.process.service", "common.process.planning_scene", "common.perception.image", "common.robot.model",
     "common.planning.collision", "common.sim.interface", "common.tasks.engine",
@@ -70,7 +72,7 @@ class Preloaded:
 
     def spawn(self, command: Sequence[str], environment: Mapping[str, str]) -> Forked | None:
         """Fork `python -P -m MODULE ARGUMENTS...`; None if that is impossible: start it in the usual way then."""
-        if self._socket is None or list(command[:3]) != [sys.executable, "-P", "-m"]:
+        if self._socket is None or command[0] != sys.executable or "-m" not in command[2:4]:
             return None
         stdin, gate = os.pipe()
         output, stdout = os.pipe()
@@ -183,8 +185,12 @@ def _run(supervisor: int, descriptors: list[int], command: list[str], environmen
     os.environ.clear()
     os.environ.update(environment)
     _set_command_line(command)
-    module, sys.argv[1:] = command[3], command[4:]
-    runpy.run_module(module, run_name="__main__", alter_sys=True)
+    at = command.index("-m") + 1
+    if at == 3:
+        sys.argv[1:] = command[4:]
+        runpy.run_module(command[at], run_name="__main__", alter_sys=True)
+    else:
+        own_module.run(command[at], command[at + 1 :])
 
 
 def _set_command_line(command: list[str]) -> None:

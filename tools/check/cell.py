@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import math
 import pickle
+import sys
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from difflib import get_close_matches
@@ -136,7 +137,7 @@ async def warnings_in_subprocess(cell: Cell, environ: Mapping[str, str]) -> list
 
     Args:
         cell: as it was loaded.
-        environ: of the subprocess; its PYTHONPATH has the modules that the cell names.
+        environ: of the subprocess.
 
     Raises:
         QuickCheckFailed: the subprocess failed; stderr has its output.
@@ -146,7 +147,7 @@ async def warnings_in_subprocess(cell: Cell, environ: Mapping[str, str]) -> list
         env=environ, start_new_session=True,  # so that it does not get Ctrl-C
     )
     try:
-        output, _ = await process.communicate(pickle.dumps(cell))
+        output, _ = await process.communicate(pickle.dumps(sys.path) + pickle.dumps(cell))
     finally:
         if process.returncode is None:
             process.kill()

@@ -9,6 +9,7 @@ import os
 import pickle
 import sys
 
+from common.plugins import extend_path
 from common.process.lifeline import die_when_orphaned
 from tools.check.cell import NICE, quick_warnings
 
@@ -19,6 +20,7 @@ def main() -> None:
     os.nice(NICE)
     with os.fdopen(os.dup(1), "wb") as answer:
         os.dup2(2, 1)  # so that prints of the user's modules do not mix with the answer
+        extend_path(*pickle.load(sys.stdin.buffer))  # with the modules that the cell names
         answer.write(pickle.dumps(quick_warnings(pickle.load(sys.stdin.buffer))))
 
 

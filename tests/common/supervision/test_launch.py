@@ -11,7 +11,14 @@ import pytest
 from common.clock import Clock
 from common.config import ServiceEntry, load_cell
 from common.errors import ConfigError, ZencellError
-from common.supervision.launch import Launch, clock_at_speed, require_free_port, require_modules, router_location
+from common.supervision.launch import (
+    OWN_MODULE,
+    Launch,
+    clock_at_speed,
+    require_free_port,
+    require_modules,
+    router_location,
+)
 from common.transport.endpoint import remapped_small_keys
 
 ENTRY = ServiceEntry(name="it", module="own.package.it")
@@ -20,7 +27,8 @@ ENTRY = ServiceEntry(name="it", module="own.package.it")
 def test_service_gets_all_options_of_the_launch_and_no_command_line_shows_an_override() -> None:
     launch = Launch("my.yaml", ("services.viewer.token=secret", "c=[2, 3]"), "w2", 5, 77)
     assert launch.service_command(ENTRY)[1:] == [
-        "-P", "-m", "own.package.it", "--cell", "my.yaml", "--world", "w2", "--seed", "5", "--domain", "77", "--gate"]
+        "-P", str(OWN_MODULE), "-m", "own.package.it", "--cell", "my.yaml", "--world", "w2", "--seed", "5",
+        "--domain", "77", "--gate"]
     assert json.loads(launch.environment({})["ZENCELL_SET"]) == ["services.viewer.token=secret", "c=[2, 3]"]
     assert "--set" in launch.service_command(ENTRY, gate=False), "for someone who starts it by hand"
     assert launch.router_command()[-3:] == ["--domain", "77", "--gate"]
@@ -46,7 +54,7 @@ def test_environment_passes_on_clock_and_module_paths(tmp_path: Path, monkeypatc
     assert (received.speed, received.epoch_ns) == (5.0, clock.epoch_ns)
     project, *rest = environment["PYTHONPATH"].split(os.pathsep)
     assert (Path(project) / "common").is_dir()
-    assert rest == ["/opt/mine", str(tmp_path)]
+    assert rest == ["/opt/mine"], "a stranger's sitecustomize.py in the working directory is not imported"
 
 
 def test_options_for_the_router_take_precedence_over_the_environment() -> None:
