@@ -14,7 +14,7 @@ from pydantic import JsonValue
 from common import topics
 from common.client.task import send_task_command, stop_arm_and_task
 from common.config import Members
-from common.errors import RequestFailed
+from common.errors import RemoteError, RequestFailed
 from common.messages import (
     Header,
     JogCommand,
@@ -25,7 +25,7 @@ from common.messages import (
     ParameterRequest,
 )
 from common.topics import Request, Topic
-from page.access import CURRENT_SESSION, Permission, Permissions
+from page.access import CURRENT_SESSION, PAGE, Permission, Permissions
 from page.feeds import Feeds
 from page.status_text import USER_ERRORS, error_text
 from page.viser_inside import element_id
@@ -236,8 +236,19 @@ class Console(ActionQueue):
 
     async def call(self, request: Request[Q, A], message: Q, timeout: float = _TIMEOUT) -> A:
         """Return the answer to a request of the page, or to one that an application lists in its `REQUESTS`."""
+        self._require("operate")
         client: Client[Q, A] = self._clients[request.key]
         return await client.call(message, timeout)
+
+    def _require(self, role: str) -> None:
+        """Check the role of the page that causes a request once more where the request leaves this process.
+
+        Raises:
+            RemoteError: its token has not that role.
+        """
+        session = CURRENT_SESSION.get()  # None: the service itself causes it
+        if self.permissions.enforced and session is not None and role not in session.roles:
+            raise RemoteError(PAGE, "denied", f"{session} has no token for the role {role!r}")
 
     async def command(self, command: str, override: bool = False, acknowledged: int | None = None) -> None:
         """Send the task a command: start, pause, resume or stop.
@@ -247,6 +258,8 @@ class Console(ActionQueue):
             override: start or resume although another operator holds the arm.
             acknowledged: newest stop or hold known when this was decided; newer ones stay in force. Default: now.
         """
+        if command != "stop":
+            self._require("operate")
         acknowledged = self.acknowledged if acknowledged is None else acknowledged
         await send_task_command(self._clients[topics.TASK_COMMAND.key], command, self.permissions.client_name,
                                 override=override, acknowledged=acknowledged, timeout=_TIMEOUT)
@@ -275,6 +288,8 @@ class Console(ActionQueue):
 
     def jog(self, acknowledged: int, **velocities: Any) -> None:
         """Move with velocities, as fields of a `JogCommand`, for the next 0.1 s; without any come to a stop."""
+        if velocities:
+            self._require("operate")
         fields = {"header": self._bus.header(), "owner": self.permissions.client_name, "acknowledged": acknowledged}
         self._jog_writer.put(JogCommand.model_validate(fields | velocities))
 
@@ -292,11 +307,12 @@ class Console(ActionQueue):
         except RequestFailed:
             return None  # shown as lost elsewhere, or requested again soon
 
-    async def set_parameter(self, services: list[str], path: str, value: JsonValue) -> None:
-        """Set a parameter in every service that has it."""
+    async def set_parameter(self, services: list[str], path: str, value: JsonValue, role: str = "tune") -> None:
+        """Set a parameter in every service that has it; the page must have the role."""
+        self._require(role)
         request = ParameterRequest(set={path: value}, by=self.permissions.client_name)
         await asyncio.gather(*(self._parameters[name].call(request, _FAST_TIMEOUT) for name in services))
 
     async def set_speed(self, scaling: float) -> None:
         """Set the speed at which trajectories are executed, 0 to 1."""
-        await self.set_parameter([EXECUTOR], SPEED, scaling)
+        await self.set_parameter([EXECUTOR], SPEED, scaling, "operate")

@@ -2,11 +2,16 @@
 
 import asyncio
 import threading
+from unittest.mock import AsyncMock, Mock
 
 import pytest
 
-from common.errors import NoResponder, ZencellError
-from page.console import Action, ActionQueue
+from common import topics
+from common.config import Members
+from common.errors import NoResponder, RemoteError, ZencellError
+from common.messages import Header
+from page.access import CURRENT_SESSION, PageSession, Permissions
+from page.console import EXECUTOR, Action, ActionQueue, Console
 
 
 async def run(*queued: Action) -> list[str]:
@@ -57,3 +62,39 @@ async def test_bug_ends_the_service() -> None:
         async with asyncio.timeout(30):
             await actions.run()
     assert error.group_contains(KeyError)
+
+
+@pytest.mark.parametrize(("roles", "denied"), [
+    ({"look"}, {"call", "start", "own", "jog", "set", "speed"}),
+    ({"look", "tune"}, {"call", "start", "own", "jog", "speed"}),
+    ({"look", "operate"}, {"set"}), ({"look", "operate", "tune"}, set()), (None, set())])
+async def test_roles_are_checked_again_where_a_request_leaves_the_page(
+    roles: set[str] | None, denied: set[str]
+) -> None:
+    console = Console(Mock(), Members(services=[EXECUTOR], task="task"), Mock(), [], Permissions())
+    console.permissions.enforced = True
+    answer = AsyncMock(side_effect=NoResponder("sent"))
+    console._clients = dict.fromkeys(console._clients, Mock(call=answer))
+    console._parameters = {EXECUTOR: Mock(call=answer)}
+    console.latest = lambda _topic: None  # type: ignore[method-assign]
+    console._jog_writer.put = Mock(side_effect=NoResponder("sent"))  # type: ignore[method-assign]
+    console._bus.header.return_value = Header(stamp=1)  # type: ignore[attr-defined]
+    tries = {"call": lambda: console.call(topics.GRIPPER_COMMAND, Mock()), "start": lambda: console.command("start"),
+             "stop": lambda: console.command("stop"), "own": lambda: console.own("take"),
+             "jog": lambda: asyncio.to_thread(console.jog, 0, joints={"a": 0.1}),
+             "speed": lambda: console.set_speed(0.5),
+             "set": lambda: console.set_parameter([EXECUTOR], "services.x", 1)}
+    token = CURRENT_SESSION.set(None if roles is None else PageSession(1, "10.0.0.1", frozenset(roles)))
+    try:
+        found = set()
+        for name, attempt in tries.items():
+            try:
+                await attempt()
+            except RemoteError as error:
+                assert "no token for the role" in str(error)
+                found.add(name)
+            except NoResponder:
+                pass
+        assert found == denied
+    finally:
+        CURRENT_SESSION.reset(token)
