@@ -6,6 +6,7 @@ import asyncio
 import json
 import sys
 import warnings
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -190,12 +191,13 @@ def play_(
                           paused=start_paused, stamp_now=stamp_now, into_live=into_live or ())
 
         name, show = _cell_of(recording, file, cell), rewrite if on_terminal else None
-        _confirm_commands(into_live or [], [*map(renamed, played)], name, on_terminal)
+        messages = {renamed(topic): message for topic, (message, _) in played.items()}
+        _confirm_commands(into_live or [], messages, name, on_terminal)
         code = asyncio.run(play(create, recording, played, name, wait or [], domain, connect, echo, show))
     raise typer.Exit(code)
 
 
-def _confirm_commands(into_live: list[str], played: list[str], cell: str, on_terminal: bool) -> None:
+def _confirm_commands(into_live: list[str], played: Mapping[str, str], cell: str, on_terminal: bool) -> None:
     """Ask whether commands of these keys may reach a cell.
 
     Raises:
@@ -204,8 +206,8 @@ def _confirm_commands(into_live: list[str], played: list[str], cell: str, on_ter
     from recording.player import is_command
 
     for key in into_live:
-        if not is_command(key) or key not in played:
-            commands = ", ".join(filter(is_command, played)) or "none"
+        if key not in played or not is_command(key, played[key]):
+            commands = ", ".join(each for each, message in played.items() if is_command(each, message)) or "none"
             raise ConfigError("--into-live", key, f"is no command that is played; played commands: {commands}")
         if not on_terminal:
             raise ConfigError("--into-live", key, "needs a terminal, to confirm that the cell may move")

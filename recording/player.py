@@ -11,7 +11,7 @@ from collections.abc import AsyncIterator, Callable, Collection
 from functools import cache
 from typing import TYPE_CHECKING, Protocol
 
-from common.application import find_topic
+from common.application import all_topics
 from common.client.joining import is_listening
 from common.client.keys import writers_of
 from common.clock import Clock
@@ -217,7 +217,7 @@ class Player:
 
     def _publish(self, sample: Sample) -> None:
         key = self.renamed(sample.topic)
-        if is_command(key) and key not in self._into_live and self.is_live():
+        if is_command(key, sample.message) and key not in self._into_live and self.is_live():
             self.left_out[key] += 1
             return
         payload = restamp(sample.payload, self._present) if self._stamp_now else sample.payload
@@ -258,10 +258,10 @@ def renaming(pairs: list[str]) -> Callable[[str], str]:
 
 
 @cache
-def is_command(key: str) -> bool:
-    """Return whether messages of a key make something move or switch."""
-    topic = find_topic(key)
-    return isinstance(topic, Topic) and topic.commands
+def is_command(key: str, message: str) -> bool:
+    """Return whether messages of a key make something move or switch; a cell may have remapped it to any other key."""
+    commands = [topic for topic in all_topics().values() if isinstance(topic, Topic) and topic.commands]
+    return any(key == topic.key or message == topic.message.__name__ for topic in commands)
 
 
 def played_topics(recording: Recording, selection: Selection) -> dict[str, tuple[str, str]]:
