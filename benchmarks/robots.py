@@ -77,7 +77,8 @@ ARMS = (
     _bare("Sawyer", "RethinkRobotics/sawyer_robot", "sawyer_description/urdf/sawyer.urdf.xacro"),
     Arm("Stretch RE1", "hello-robot/stretch_urdf",
         "stretch_urdf/RE1V0/stretch_description_RE1V0_tool_stretch_gripper.urdf"),
-    _bare("Ned2", "NiryoRobotics/ned_ros", "niryo_robot_description/urdf/ned2/niryo_ned2.urdf.xacro"),
+    _bare("Ned2", "NiryoRobotics/ned_ros", "niryo_robot_description/urdf/ned2/niryo_ned2.urdf.xacro", "--srdf",
+          "niryo_robot_moveit_config/niryo_moveit_config_standalone/config/ned2/niryo_ned2.srdf"),
 )
 
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from common.errors import ConfigError, UnknownName
+from common.robot.urdf import WORLD
 
 MOVING = ("revolute", "continuous", "prismatic")
 FINGER_WORDS = ("finger", "gripper", "jaw", "knuckle", "claw")
@@ -229,8 +230,10 @@ def _depth(tree: Tree, joint: Joint) -> int:
 
 
 def _base(tree: Tree) -> str:
-    """Return the root, without links that only fix it in a world."""
+    """Return the root, without links that only fix it in a world, whatever else is fixed there."""
     link = tree.root
+    if link == WORLD and (moving := next((joint for joint in tree.below(link) if joint.moves), None)) is not None:
+        link = next((joint.child for joint in tree.above(moving.child) if not joint.moves), link)
     while link not in tree.shaped and len(held := tree.on(link)) == 1 and not held[0].moves:
         link = held[0].child
     return link

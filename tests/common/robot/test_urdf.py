@@ -1,5 +1,6 @@
 """Robots of several descriptions: base pose, attachments, TCP, limits."""
 
+import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from common.config import RobotConfig, check, find_file, read_robot
 from common.errors import ConfigError
 from common.robot.model import RobotModel
 from common.robot.transforms import rpy_to_matrix, transform
+from tools.robot_setup.tree import find_arm, read_tree
 
 BOX = '<collision><geometry><box size="0.1 0.1 0.1"/></geometry></collision>'
 
@@ -87,6 +89,13 @@ def test_attachment_is_fixed_to_its_link_and_the_tcp_to_the_attachment(make, tmp
     assert robot.link_parents == {"arm": "base", "palm": "arm", "thumb": "palm", "tip": "thumb"}
     assert np.allclose(robot.fk([0.0])[:3, 3], (0, 0.1, 0.75))
     assert np.allclose(robot.fk([0.0])[:3, 2], (0, 1, 0)) and len(shapes(robot)) == 3
+
+
+def test_link_called_world_is_replaced_and_what_else_is_fixed_to_it_stays(make):
+    arm = (link("world") + joint("world", "base", "fixed", "0 0 0.2") + ARM + link("lamp", BOX)
+           + joint("world", "lamp", "fixed", "0.3 0 0.5"))
+    assert make(arm).link_poses([0.3])["lamp"][:3, 3] == pytest.approx((0.3, 0.0, 0.3))
+    assert find_arm(read_tree(ET.fromstring(f"<robot>{arm}</robot>"), "arm"), "arm").base == "base"
 
 
 @pytest.mark.parametrize(("changes", "message"), [
