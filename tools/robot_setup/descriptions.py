@@ -19,8 +19,10 @@ from common.robot.description_file import parse_xml, read_xml
 from common.robot.mesh_references import SCHEME, resolve_meshes
 from common.robot.packages import neighbours, package_name, package_paths
 from common.robot.urdf import find_description
+from common.terminal import printable
 
 _SECONDS = 60  # of waiting for a xacro file on a busy machine
+_MAX_SHOWN = 300  # characters of what a file states
 _TAGS = ("link", "joint", "material")
 _TRUST = ". If you trust the author, --trust evaluates it with all of Python"
 _WORKER = Path(__file__).with_name("xacro_worker.py")
@@ -81,10 +83,9 @@ class Reader:
         meshes = resolve_meshes(found.root, path, around)
         found.packages |= {name: folder.resolve() for name, folder in meshes.packages.items()}
         if meshes.missing:
-            (name, fault), *others = meshes.missing.items()
-            more = f" (and {len(others)} more)" if others else ""
+            fault = next(iter(meshes.missing.values()))
             advice = "" if "lfs" in fault else "; --package-dir DIR names a folder with its package"
-            raise ConfigError(option, reference, f"needs the mesh {name} for collision checks{more}, which "
+            raise ConfigError(option, reference, f"needs the mesh {_first(meshes.missing)} for collision checks, which "
                                                  f"{fault}{advice}")
         if meshes.moved:
             used = next(iter(meshes.moved.values()))
@@ -124,7 +125,8 @@ class Reader:
         self.asked |= set(reply.get("asked", ()))
         if "error" in reply:
             advice = _TRUST if reply.get("refused") and not self.trust else ""
-            raise ConfigError(option, reference, f"is a xacro file that {reply['error']}{advice}")
+            reason = printable(" ".join(reply["error"].split()))[:_MAX_SHOWN]
+            raise ConfigError(option, reference, f"is a xacro file that {reason}{advice}")
         return reply
 
     def check_arguments(self) -> None:
@@ -215,4 +217,4 @@ def _portable(description: Description, folder: Path) -> str:
 
 def _first(names: Mapping[str, object]) -> str:
     more = f" (and {len(names) - 1} more)" if len(names) > 1 else ""
-    return f"{next(iter(names))}{more}"
+    return f"{printable(next(iter(names)))[:_MAX_SHOWN]}{more}"
