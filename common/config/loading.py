@@ -207,6 +207,9 @@ def _name_application(tree: dict[str, Any]) -> None:
     Raises:
         UnknownName, ConfigError: the application does not exist.
     """
+    for name in ("task", "application"):
+        if tree.get(name, "") is None:  # `task:` without a value
+            del tree[name]
     task, application = tree.get("task"), tree.get("application")
     kinds = {name: entry["module"].rpartition(".")[2] for name, entry in tree["services"].items()}
     if application is None and isinstance(task, str):

@@ -103,6 +103,13 @@ def test_task_must_be_a_service_of_the_cell():
     assert "smart_pick_place" in found.remedy
 
 
+def test_service_without_the_status_of_a_task_is_no_task_and_a_cell_needs_none():
+    (found,) = wiring(load_cell("panda", ["task=vision_detector", "application=pick_place"]))
+    assert (found.what, found.severity) == (
+        "task: vision_detector publishes no status of a task, so that a run never ends", "error")
+    assert list(wiring(load_cell("panda", ["task=", "application="]))) == []
+
+
 def test_second_writer_and_missing_writers_and_servers_are_found():
     found = list(check_wiring([
         Keys("left", ["image"], ["found"], [], ["motion/plan"]), Keys("right", [], ["found"], ["move"], ["move"]),

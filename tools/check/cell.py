@@ -18,6 +18,7 @@ from common.application import find_application
 from common.config import Cell, GripperConfig, RobotConfig, Surroundings
 from common.errors import ConfigError, ZencellError
 from common.hardware.interface import has_simulated_world
+from common.messages import TaskStatus
 from common.robot.finger_joints import driven_position
 from common.robot.urdf import merged_urdf
 from common.sim.interface import require_simulator
@@ -258,6 +259,10 @@ def wiring(cell: Cell) -> Iterator[Finding]:
         except ZencellError as problem:
             yield error(f"services.{entry.name}: {problem}", "correct it", refused=True)
         else:
+            if entry.name == cell.task and not any(
+                    issubclass(each.topics[key].message, TaskStatus) for key in each.writes):
+                yield error(f"task: {cell.task} publishes no status of a task, so that a run never ends",
+                            "name the service that does, or leave task out")
             reads = [key for key in each.reads if not getattr(each.topics[key], "commands", False)]  # of any client
             found.append(Keys(each.name, reads, each.writes, each.serves, each.calls, entry.kind == VIEWER))
             continue
