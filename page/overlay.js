@@ -15,7 +15,7 @@
     ".tabler-icon-chevrons-right": "Hide the panels", ".tabler-icon-chevrons-left": "Show the panels"};
 
   let socket = null, lastMessage = null, pageKey = "", stops = 0, pendingStops = new Map();
-  let shownNote = 0, held = null, touch = null, presses = 0, statusTime = 0, noteEnd = 0, enlarged = null;
+  let shownNote = 0, held = null, touch = null, presses = 0, statusTime = 0, noteEnd = 0, first = "", enlarged = null;
   const opened = Date.now();
   const bar = document.createElement("div");
   bar.id = "zc-bar";
@@ -63,12 +63,13 @@
       clearTimeout(pendingStops.get(message.n));
       pendingStops.delete(message.n);
       if (message.kind === "bad" && message.n === 0) release();
-      notify(message.result, message.kind);
+      notify(message.result === first ? "" : message.result, message.kind);  // the first line shows a stop by itself
     }
   }
 
   function show(status) {
     const {text, kind, hint, since} = status.situation;
+    first = text;
     setText(part("state"), since ? `${text} at ${clock(since)}` : text);
     part("state").className = kind;
     setText(part("hint"), hint);
@@ -88,7 +89,6 @@
       if (shownNote || status.note.text) notify(status.note.text, status.note.kind, 1000 * status.note.age);
       shownNote = status.note.number;
     }
-    // The first line shows a stop by itself.
     if (Date.now() > noteEnd || part("note").textContent.endsWith(` ${text}`)) setText(part("note"), "");
     const past = status.past ? `Not live: the scene shows ${status.past}` : "";
     setText(part("past"), past);
