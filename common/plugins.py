@@ -70,11 +70,9 @@ def find_plugin(group: str, name: str, *, field: str, noun: str, marker: str = "
             module = importlib.import_module(path)
             if hasattr(module, marker or "__name__"):
                 return module
-    except ModuleNotFoundError as error:
-        missing = f"{name}.".startswith(f"{error.name}.")
-        raise ConfigError(field, name, where_searched(name) if missing else f"cannot be imported: {error}") from None
     except ImportError as error:
-        raise ConfigError(field, name, f"cannot be imported: {error}") from None
+        missing = isinstance(error, ModuleNotFoundError) and f"{name}.".startswith(f"{error.name}.")
+        raise ConfigError(field, name, where_searched(name) if missing else f"cannot be imported: {error}") from None
     raise UnknownName(noun, name, plugin_names(group, marker))
 
 

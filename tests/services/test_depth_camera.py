@@ -202,7 +202,7 @@ async def test_unsupported_mode_is_reported_with_the_request(realsense: FakeReal
 
 @pytest.mark.parametrize(("config", "message"), [
     ({"driver": ""}, "driver: '' must be one of oak, realsense, or the dotted name of a module"),
-    ({"driver": "my_pkg.nothing"}, "driver: 'my_pkg.nothing' cannot be imported: No module named"),
+    ({"driver": "my_pkg.nothing"}, "driver: 'my_pkg.nothing' is not a module: there is no"),
     ({"driver": "common.errors"}, "'common.errors' is no camera driver: it lacks Options, open_camera"),
     ({"options": {"fps": 900}}, "options.fps: 900 must be less than or equal to 90"),
     ({"options": {"speed": 3}}, "services.real_depth_camera.options.speed: "),
