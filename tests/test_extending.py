@@ -273,7 +273,7 @@ def test_single_file_task_continues_with_a_held_object(folder: Path) -> None:
 
 def test_invalid_application_module_is_rejected_by_name(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(folder)
-    with pytest.raises(ConfigError, match=r"application: 'my_pkg\.move_ball' is not a module: there is no move_ball in .*my_pkg,"):
+    with pytest.raises(ConfigError, match=r"'my_pkg\.move_ball' is not a module: there is no move_ball in .*my_pkg,"):
         load_cell("cube.yaml", ["application=my_pkg.move_ball"])
     with pytest.raises(ConfigError, match="is no application: the module has no APPLICATION"):
         find_application("my_pkg.over_home")
