@@ -1,6 +1,6 @@
 """Whether motions continue after hold-ups: the speed slider of the arm, freezes of its driver or of the executor.
 
-Run as `python -m benchmarks.held_up slider|stop|freeze [--backend ur|mock|lag] [--count N]`. The arm of
+Run as `python -m benchmarks.held_up slider|stop|freeze|grid [--backend ur|mock|lag] [--count N]`. The arm of
 Universal Robots is the double of the tests; set-points are sent by an executor in this process, every 10 ms.
 """
 
@@ -25,7 +25,7 @@ from common.robot.model import RobotModel
 from tests.common.control.trajectories import rest_to_rest
 from tests.doubles.ur_host import UrHost
 
-HOST, PERIOD = "127.0.0.119", 0.01
+HOST, PERIOD = f"127.0.1.{os.getpid() % 250 + 1}", 0.01
 SEQUENCES = ("1 0 1", "1 0.02 1", "1 0.3 1")
 FREEZES = (0.025, 0.04, 0.06, 0.25)  # [s]; the last one is too long
 
@@ -36,7 +36,8 @@ class Rig:
     def __init__(self, backend: str, ahead: float, host: UrHost | None) -> None:
         config = load_cell("ur5").robot
         robot = RobotModel.load(config)
-        options = {"host": HOST, "model": "ur5e", "world": "simulated", "ahead": ahead} if backend == "ur" else {}
+        real = backend not in ("mock", "lag")
+        options = {"host": HOST, "model": "ur5e", "world": "simulated", "ahead": ahead} if real else {}
         config = config.model_copy(update={"hardware": config.hardware.model_copy(
             update={"backend": backend, "options": options}), "gripper": None})
         self.limits = Limits(tuple(robot.joint_names), robot.lower, robot.upper, robot.velocity, robot.acceleration,
@@ -208,25 +209,58 @@ def freezes(rig: Rig, count: int, speed: float) -> None:
                 report(f"{what} frozen for {1e3 * seconds:.0f} ms in a {kind}", good, count, why, rig)
 
 
+def differences(times: np.ndarray, q: np.ndarray, limits: Limits) -> np.ndarray:
+    """Return accelerations relative to the limit, of the joint closest to it."""
+    v = np.diff(q, axis=0) / np.diff(times)[:, None]
+    between = (times[2:] - times[:-2]) / 2
+    return np.asarray((np.abs(np.diff(v, axis=0) / between[:, None]) / limits.acceleration).max(axis=1))
+
+
+def grid(rig: Rig, count: int, speed: float) -> None:
+    """Accelerations of set-points in motions: as the controller reads them each 2 ms, and by the times they arrived."""
+    assert rig.host is not None
+    for n in range(count):
+        rig.host.command("targets")
+        rig.settle()
+        rig.host.command("forget")
+        rig.move((-1) ** n * np.array([0.6, 0.2, -0.2, 0.1, 0, 0]), speed)
+        rig.run(60, lambda: rig.executor.arm.status.state != "active")
+        state = rig.host.command("targets")
+        q, arrivals = np.array(state["targets"]), np.array(state["arrivals"])
+        read = differences(np.arange(len(q)) * 0.002, q, rig.limits)
+        even = np.arange(arrivals[0, 0], arrivals[-1, 0], 0.02)
+        by_arrival = np.array([np.interp(even, arrivals[:, 0], joint) for joint in arrivals.T[1:]]).T
+        true = differences(even, by_arrival, rig.limits)
+        print(f"read each 2 ms: {100 * np.mean(read > 1.1):.2f} % of cycles above the limit, largest {read.max():.1f}; "
+              f"by arrival over 20 ms: largest {true.max():.2f}; {rig.executor.arm.status.state}, "
+              f"{rig.executor.arm.resumed} interruptions", flush=True)
+
+
 def main() -> None:
     """Run what the command line names."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("what", choices=("slider", "stop", "freeze"))
-    parser.add_argument("--backend", default="ur", choices=("ur", "mock", "lag"))
+    parser.add_argument("what", choices=("slider", "stop", "freeze", "grid"))
+    parser.add_argument("--backend", default="ur", help="ur, mock, lag or a dotted module")
     parser.add_argument("--count", type=int, default=12)
     parser.add_argument("--ahead", type=float, default=0.05)
     parser.add_argument("--speed", type=float, default=0.3, help="of the fastest joint [rad/s]")
     parser.add_argument("--wait", type=float, default=1.5, help="at each position of the slider [s]")
+    parser.add_argument("--priority", action="store_true", help="real-time priority for executor and double")
     args = parser.parse_args()
     with contextlib.ExitStack() as stack:
         host = None
-        if args.backend == "ur":
+        if args.backend not in ("mock", "lag"):
             host = stack.enter_context(UrHost(HOST, q="0,-1.9,1.9,-1.6,-1.57,0"))
+        if args.priority:  # as on a host that is not busy
+            for process in (os.getpid(), *([host._process.pid] if host else [])):
+                os.sched_setscheduler(process, os.SCHED_FIFO, os.sched_param(10))
         rig = Rig(args.backend, args.ahead, host)
         stack.callback(rig.executor.close)
         rig.run(20, lambda: rig.executor.robot.mode == "running")
         if args.what == "slider":
             sliders(rig, args.count, args.speed, args.wait)
+        elif args.what == "grid":
+            grid(rig, args.count, args.speed)
         elif args.what == "stop":
             stops(rig, args.count, args.speed)
         else:

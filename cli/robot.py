@@ -70,7 +70,7 @@ def status(at: CellTarget = RUNNING) -> None:
     state = at.join(lambda cell: cell.arm.robot())
     echo(f"{state.mode}{f': {state.message}' if state.message else ''}")
     echo(f"speed slider {state.speed:.0%}, latest cycle {state.late * 1e3:.1f} ms late, "
-         f"inputs {state.inputs:#b}, outputs {state.outputs:#b}")
+         f"{state.resumed} interruptions resumed, inputs {state.inputs:#b}, outputs {state.outputs:#b}")
 
 
 def _order(at: CellTarget, act: str, value: float = 0.0, **more: Any) -> None:

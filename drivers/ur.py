@@ -31,6 +31,9 @@ MODELS = rf"^ur({'|'.join(PAYLOADS)})$"
 CB3 = re.compile(r"^ur(3|5|10)$")
 STATE_TIMEOUT = 0.15  # [s] without a new state of the arm, after which it counts as disconnected
 LONGEST_STEP = 0.02  # [s] that count of the time between two checks: a driver that was held up has not listened
+POLL = 3e-4  # [s] between two looks for a new state
+EARLY = 0.2  # share of a cycle of the controller at which set-points are sent: this process may be late, but not early
+CLOCK_DRIFT, CLOCK_BEND = 1e-4, 1e-3  # relative drift of the controller's clock, and of its estimate at most
 WATCHDOG = 10.0  # [Hz] below this rate the arm's program ends by itself
 SMOOTHED = 0.02  # [s] whose mean is commanded: between the sender's cycles the jerk is up to 5 times as large
 STANDSTILL = 0.02  # [rad/s] a faster joint is not at rest
@@ -154,7 +157,7 @@ class SilenceTimer:
 class UrArm:
     """The three connections to a controller: its state, the program that moves the arm, and its dashboard."""
 
-    paced_by_arm, realtime, slowed = False, True, True
+    paced_by_arm, realtime, slowed = True, True, True
 
     def __init__(self, options: Options, limits: Limits) -> None:
         """Connect; an arm that is ready gets its program and stays at rest."""
@@ -171,22 +174,31 @@ class UrArm:
         self._control: Any = None
         self._control_lock = threading.Lock()  # the control interface is not thread-safe
         self._stamp, self._since = -1.0, time.monotonic()
+        self._cycle = 0  # of the controller, in which the newest set-point was sent
+        self._offset = 0.0  # estimated host time minus the controller's time [s], when its state arrives at once
         self._no_state, self._not_accepted = SilenceTimer(), SilenceTimer()
         self._freedrive = self._servoing = False
         self._program_seen = False  # whether the uploaded program was seen running
         self._ending: threading.Thread | None = None
 
     def read(self) -> ArmState:
-        """Return the newest state; upload the program when the arm is ready and has none.
+        """Return the newest state early in the controller's next cycle; upload the program to a ready arm.
 
         Raises:
             ConnectionError: no new state for STATE_TIMEOUT.
         """
-        stamp, now = self._receive.getTimestamp(), time.monotonic()
-        silent = self._no_state.update(now, stamp != self._stamp)
-        if silent == 0.0:
-            self._stamp, self._since = stamp, now
-        elif silent > STATE_TIMEOUT:
+        end = (min(self._cycle, self._cycle_now()) + 1 + EARLY) / self.rate + self._offset
+        received = False
+        while True:
+            stamp, now = self._receive.getTimestamp(), time.monotonic()
+            if stamp != self._stamp:
+                self._follow_clock(stamp, now)
+                self._stamp, self._since, received = stamp, now, True
+            if now >= end:
+                break
+            time.sleep(min(end - now, POLL))
+        silent = self._no_state.update(now, received)
+        if silent > STATE_TIMEOUT:
             raise ConnectionError(f"no message from the controller for {now - self._since:.2f} s")
         mode, message = self._mode()
         if self._control is not None:
@@ -231,9 +243,22 @@ class UrArm:
         self._ending = threading.Thread(target=control.disconnect, daemon=True)  # it waits for its own threads
         self._ending.start()
 
+    def _follow_clock(self, stamp: float, now: float) -> None:
+        """Estimate the offset of the controller's clock by the states that arrived earliest, without a jump."""
+        late, passed = now - stamp - self._offset, stamp - self._stamp
+        if passed > 0 and abs(late) < STATE_TIMEOUT:
+            self._offset += max(min(late, CLOCK_DRIFT * passed), -CLOCK_BEND * passed)
+        else:  # it was restarted, or held up
+            self._offset = now - stamp
+
     def due(self) -> list[float]:
-        """Return one time, now: a late driver slows the motion down."""
-        return [time.monotonic()]
+        """Return one time, at which the controller starts its next cycle: a late driver slows the motion down."""
+        self._cycle = self._cycle_now()
+        return [(self._cycle + 1) / self.rate + self._offset]
+
+    def _cycle_now(self) -> int:
+        """Return the number of the controller's present cycle, by its clock."""
+        return math.floor((time.monotonic() - self._offset) * self.rate)
 
     def servo(self, points: list[Vector]) -> None:
         """Move to the last of the set-points (6,) [rad], smoothed, within one period.

@@ -23,7 +23,7 @@ PERIOD = 0.01  # [s] cell time between cycles, by default
 LATE = 2  # periods: a later cycle moves the arm by no more, and
 STALLED = 2  # usual cycles: after a later one the motion resumes from rest, where the arm is
 USUAL_SHARE = 0.2  # weight of the newest cycle in the mean duration of cycles
-FROZEN, RECENT = 0.1, 0.5  # [s] cell time between cycles after which an interruption ends a motion, if it was recent
+FROZEN, RECENT = 0.15, 0.5  # [s] cell time between cycles after which an interruption ends a motion, if it was recent
 REST_TIMEOUT = 5.0  # [s] for an interrupted arm to come to rest: a low slider makes it slow
 LONG = 3000  # points and samples of a trajectory, which cost a few milliseconds
 
@@ -85,10 +85,7 @@ class TrajectoryController:
         return bool(self.reports.fault) or (self._limiter.at_rest and self._interrupted_at is None)
 
     def share_of_speed(self, velocity: Vector, speed_scaling: float) -> float:
-        """Return the share of its full speed at which the newest set-point moves the arm, 0 to 1.
-
-        The full speed is that with the arm's own slider at 1, at the scaling set by operators and programs.
-        """
+        """Return the share, 0 to 1, of the speed with the arm's slider at 1 at which the newest set-point moves it."""
         if self._goal is not None:
             return min(self._goal.pace.rate / (self._goal.share * speed_scaling), 1.0)
         return min(float(np.abs(velocity).max()) / max(self._standstill.full_speed, 1e-9), 1.0)
@@ -210,10 +207,7 @@ class TrajectoryController:
         return self.status
 
     def jog(self, velocity: Vector | None, slider: float = 1.0) -> None:
-        """Jog at a share of joint velocities (dof,) [rad/s] until the next call; None: come to rest.
-
-        A goal has priority.
-        """
+        """Jog at a share of velocities (dof,) [rad/s] until the next call; None: come to rest. A goal has priority."""
         blocked = self._goal is not None or self.reports.holds or self.reports.fault
         if blocked or self._last is None or self._found is not None:
             velocity = None

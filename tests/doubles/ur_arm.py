@@ -5,7 +5,7 @@ that move and stop it and set its payload.
 """
 
 import sys
-import time
+from collections import deque
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -38,12 +38,14 @@ class Arm:
     commands: int = 0  # steps with a servoj command
     packets: int = 0  # from the client that sends commands
     fastest: float = 0.0  # highest speed of a joint [rad/s]
+    time: float = 0.0  # [s] of its clock
+    targets: deque[list[float]] = field(default_factory=lambda: deque(maxlen=4000))  # of its newest cycles
+    arrivals: deque[list[float]] = field(default_factory=lambda: deque(maxlen=4000))  # time, target
 
     def __post_init__(self) -> None:
         """Start at standstill."""
         self.qd = np.zeros(6)
         self.target = self.q.copy()
-        self._started = time.monotonic()
         self._lookahead = 0.03
         self._servoing = False
         self._silence = 0.0  # [s] since the last packet
@@ -51,6 +53,7 @@ class Arm:
 
     def step(self, seconds: float) -> None:
         """Execute the command in the registers, and move the joints."""
+        self.time += seconds
         if self.program:
             self._execute(int(self.registers["input_int_register"][0]))
         able = self.mode == RUNNING and self.safety == NORMAL
@@ -58,6 +61,7 @@ class Arm:
             sys.stderr.write(f"watchdog: no packet for {self._silence:.2f} s\n")
             self.end_program()
         servoing = able and self.program and self._servoing
+        self.targets.append(self.target.tolist())
         off = self.target - self.q if servoing else 0.0 * self.q
         wanted = off / max(self._lookahead, 2 * seconds) * self.slider
         change = (wanted - self.qd) / seconds
@@ -122,7 +126,7 @@ class Arm:
         powered = self.mode in (IDLE, RUNNING)
         q, qd = self.q.tolist(), self.qd.tolist()
         return {
-            "timestamp": time.monotonic() - self._started, "actual_q": q, "actual_qd": qd, "target_q": q,
+            "timestamp": self.time, "actual_q": q, "actual_qd": qd, "target_q": q,
             "target_qd": qd, "robot_mode": self.mode, "safety_mode": self.safety, "safety_status": self.safety,
             "runtime_state": 2 if self.program else 1, "robot_status_bits": powered | (self.program << 1),
             "safety_status_bits": {PROTECTIVE_STOP: 4, EMERGENCY_STOP: 0xC0}.get(self.safety, 1),

@@ -194,6 +194,8 @@ class Controller:
                             self.arm.receive()
                         if all(self._inputs.get(name) is writer for name in names):
                             self._set(names, payload[1:])
+                            values = self.arm.registers["input_double_register"]
+                            self.arm.arrivals.append([time.monotonic(), *values[:6]])
                     case other:
                         raise NotImplementedError(f"packet {other}")
                 await writer.drain()
@@ -243,6 +245,9 @@ class Controller:
                     arm.end_program()
                 case ["normal"]:
                     arm.safety = NORMAL
+                case ["forget"]:
+                    arm.targets.clear()
+                    arm.arrivals.clear()
                 case ["slider", share]:
                     arm.slider = float(share)
                 case ["pull", seconds]:
@@ -251,6 +256,8 @@ class Controller:
                     self._rebooting = asyncio.create_task(self.reboot(float(seconds)))
             names = ("stops", "commands", "packets", "fastest", "payload", "freedrive")
             state = {name: getattr(arm, name) for name in names}
+            if line == b"targets\n":
+                state |= {"targets": list(arm.targets), "arrivals": list(arm.arrivals)}
             state |= {"q": arm.q.tolist(), "qd": arm.qd.tolist(), "mode": MODES[arm.mode]}
             writer.write(json.dumps(state).encode() + b"\n")
             await writer.drain()
