@@ -210,11 +210,14 @@ def load_mesh(name: str, path: Path, scale: float) -> Array:
     """Load scaled triangles (n, 3, 3) [m] from a file.
 
     Raises:
-        ConfigError: the file cannot be read, or has too many triangles.
+        ConfigError: the file cannot be read, has no extent, or too many triangles.
     """
-    triangles = scale * triangles_of(f"world.objects.{name}.mesh", path)
+    from common.robot.collision_shapes import solid
+
+    field = f"world.objects.{name}.mesh"
+    triangles = solid(scale * triangles_of(field, path), field, path)
     if len(triangles) > MAX_TRIANGLES:
-        raise ConfigError(f"world.objects.{name}.mesh", str(path),
+        raise ConfigError(field, str(path),
                           f"has {len(triangles)} triangles; at most {MAX_TRIANGLES} can be simulated: simplify it")
     return triangles
 

@@ -136,9 +136,13 @@ def test_mesh_from_a_file_is_grasped_placed_and_restored(wedge: Path) -> None:
     assert again.objects(Header()) == rig.world.objects(Header()) and again.ids == ["wedge", "wedge_1"]
 
 
-def test_missing_mesh_file_is_named(wedge: Path) -> None:
-    (wedge.parent / "wedge.stl").unlink()
-    with pytest.raises(ConfigError, match=r"world\.objects\.wedge\.mesh: .*wedge\.stl' is a mesh that cannot be read"):
+@pytest.mark.parametrize(("content", "problem"), [
+    (b"", "that cannot be read"),
+    (bytes(80) + b"\1\0\0\0" + bytes(50), "its corners lie on a line"),  # one triangle without extent
+])
+def test_unusable_mesh_file_is_named(content: bytes, problem: str, wedge: Path) -> None:
+    (wedge.parent / "wedge.stl").write_bytes(content)
+    with pytest.raises(ConfigError, match=rf"world\.objects\.wedge\.mesh: .*wedge\.stl' is a mesh .*{problem}"):
         KinematicWorld(load_cell("panda", world=str(wedge)).world)
 
 
