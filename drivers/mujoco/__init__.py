@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from common.sim.interface import Renderer
     from drivers.mujoco.world import PhysicsWorld
 
+ROLLING = 0.001  # [m] coefficient of rolling friction; without it round objects never stop
+
 
 def create(
     world: World, objects: Sequence[ObjectConfig], tolerances: GraspTolerances, gripper: GripperConfig | None

@@ -18,6 +18,7 @@ from common.robot.transforms import matrix_to_quaternion, rpy_to_matrix
 from common.sim.footprints import convex_parts
 from common.sim.objects import Solid
 from common.sim.resting import FLOOR_BELOW_TABLE
+from drivers.mujoco import ROLLING
 
 Array = NDArray[np.float64]
 
@@ -113,7 +114,7 @@ TIMESTEP = 0.002  # [s]
 IMPRATIO = 10.0  # friction stiffer than contact: held objects do not creep
 SOLREF = (0.004, 1.0)  # time constant [s], damping; with MuJoCo's default 0.02 fingers sink 11 mm into objects
 SOLIMP = (0.95, 0.99, 0.001, 0.5, 2.0)
-SLIDING, TORSION, ROLLING = 1.0, 0.01, 0.001  # coefficient, [m], [m]; without rolling friction round objects never stop
+SLIDING, TORSION = 1.0, 0.01  # coefficient, [m]
 FINGER_SLIDING = 1.5  # rubber pads
 CONDIM = 6  # sliding, torsion and rolling
 

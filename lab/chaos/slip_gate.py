@@ -8,7 +8,7 @@ from common.config import World
 from common.messages import WorldObject, WorldObjects
 from common.sim.kinematic import GRAVITY
 from common.sim.layout import sphere_in_image
-from drivers.mujoco.scene import ROLLING
+from drivers.mujoco import ROLLING
 
 CLEARANCE = 0.12  # [m] from a container's edge: an object between its wall and this may be occluded by the wall
 FALLS_STRAIGHT = "kinematic"  # simulator in which a released object has no velocity

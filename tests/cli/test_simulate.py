@@ -5,6 +5,7 @@ import os
 import re
 import signal
 import subprocess
+import sys
 import time
 from contextlib import suppress
 
@@ -14,7 +15,7 @@ from cli.main import app
 from common.errors import ConfigError
 from lab.campaign import format_counts, seeds_of
 from recording.reader import Recording
-from tests.harness import command_line
+from tests.harness import ROOT, command_line
 
 pytestmark = pytest.mark.timeout(600)  # some seconds of work, on a machine that may be busy
 SMALL = ["panda", "--set", "world.count=1"]
@@ -28,6 +29,19 @@ def test_campaign_counts_faults_and_checked_invariants(capfd):
     assert crashes and int(crashes[1]) >= 6
     for row in ("fault: lost", "fault: duplicated", "invariant: one goal at a time", "invariant: a goal id acts once"):
         assert row in table
+
+
+def test_no_module_but_drivers_needs_an_extra():
+    imports = """
+import importlib, pathlib, sys
+sys.modules |= dict.fromkeys(("mujoco", "OpenGL", "rtde_control", "pylibfranka", "pyrealsense2", "depthai"))
+for folder in ("applications", "cli", "common", "lab", "page", "recording", "security", "services", "tools", "zencell"):
+    for path in pathlib.Path(folder).rglob("*.py"):
+        if path.stem != "__main__":
+            importlib.import_module(".".join(path.with_suffix("").parts).removesuffix(".__init__"))
+"""
+    done = subprocess.run([sys.executable, "-c", imports], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.slow
