@@ -174,7 +174,8 @@ def stops(rig: Rig, count: int, speed: float) -> None:
             rig.slider("1")
             rig.run(1.0)
             after.append(float(np.abs(rig.q - where).max()))
-            rig.executor.authority.hold(HoldRequest(hold=False, owner="ann", stops=True), time.time())
+            rig.executor.authority.hold(HoldRequest(
+                hold=False, owner="ann", stops=True, acknowledged=time.time_ns()), time.time())
             rig.recover()
         print(f"STOP at {share}: {dict(states)} after {max(times):.2f} s, then moves {max(after):.4f} rad", flush=True)
 

@@ -60,10 +60,12 @@ def call(
 def send(at: CellTarget, request: Request[Any, Any], message: Message, timeout: float = TIMEOUT) -> None:
     """Send a request to a cell that is up and print the answer as JSON."""
     from common.client.joining import newest_interlock
-    from common.messages import TaskCommand
+    from common.messages import HoldRequest, TaskCommand
 
     async def visit(joined: Client) -> Message:
-        if isinstance(message, TaskCommand) and message.command in ("start", "resume") and message.acknowledged is None:
+        if isinstance(message, TaskCommand | HoldRequest) and message.acknowledged is None and (
+            not message.hold if isinstance(message, HoldRequest) else message.command in ("start", "resume")
+        ):
             message.acknowledged = await newest_interlock(joined.bus)
         answer: Message = await joined.call(request, message, timeout=timeout)
         return answer

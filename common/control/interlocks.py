@@ -31,6 +31,7 @@ OTHERS = "others"  # name of the shared entry when there are too many
 MAX_ENTRIES = 16  # interlocks of operators
 MAX_REASON = 300  # characters
 MAX_GOALS = 200  # ids of stopped goals
+AHEAD = 10 * 10**9  # [ns] that the clock of a client may be ahead
 SLOWEST = 0.05  # speed scaling when the persisted one cannot be read
 STOPPED = "stopped"
 LATEST = 7 * 10**18  # [ns since the Unix epoch], in the year 2191: a later `since` leaves no room for those after it
@@ -130,7 +131,8 @@ class Interlocks:
         if request.hold:
             self._put("held", request.owner, request.reason)
             return []
-        released = [interlock for interlock in self._by_operators.values() if _releases(request, interlock)]
+        latest = max(self._newest, self._now() + AHEAD)
+        released = [interlock for interlock in self._by_operators.values() if _releases(request, interlock, latest)]
         for interlock in released:
             del self._by_operators[interlock.kind, interlock.by]
             by = (request.owner or UNKNOWN_OPERATOR) if interlock.by == UNKNOWN_OPERATOR else interlock.by
@@ -164,7 +166,7 @@ class Interlocks:
         """
         if goal in self._goals:
             return Refused(STOPPED, f"goal {goal!r} was stopped before")
-        named = owner not in ("", UNKNOWN_OPERATOR)
+        named = owner not in ("", UNKNOWN_OPERATOR, OTHERS)
         # An acknowledgement of what was never published acknowledges nothing.
         known = acknowledged if named and acknowledged is not None and acknowledged <= self._newest else 0
         stops = [stop for stop in self.stops if stop.by != owner or stop.since > known]
@@ -188,8 +190,11 @@ class Interlocks:
         return Interlock(kind=kind, by=by, reason=reason[:MAX_REASON], since=self._newest)
 
 
-def _releases(request: HoldRequest, interlock: Interlock) -> bool:
-    if request.acknowledged is not None and interlock.since > request.acknowledged:
+def _releases(request: HoldRequest, interlock: Interlock, latest: int) -> bool:
+    """Return whether a request releases an interlock; an acknowledgement later than `latest` acknowledges nothing."""
+    if request.acknowledged is None and interlock.kind == "stopped":
+        return False
+    if request.acknowledged is not None and not interlock.since <= request.acknowledged <= latest:
         return False  # added after the operator decided on that request
     if request.override:
         return True
@@ -232,7 +237,10 @@ class InterlockFile(AtomicFile[Record]):
     def load(self) -> tuple[Record, str]:
         """Return the record, and the problem of an unreadable file: then the record stops the robot and slows it."""
         try:
-            return self.read(), ""
+            record = self.find()
+            if record is None and os.path.lexists(self._new):
+                raise Unreadable(self.path, "it was removed")
+            return record or Record(), ""
         except Unreadable as error:
             reason = f"the saved interlocks cannot be read: {error.path}: {error.why}. Check the cell before a start"
             stop = Interlock(kind="stopped", by="trajectory_executor", reason=reason[:MAX_REASON], since=wall_ns())
@@ -261,6 +269,7 @@ def interlock_file(cell: str, arm: str | None = None, environ: Mapping[str, str]
     try:
         if of_cell.exists() and not os.path.lexists(of_arm):
             of_cell.rename(of_arm)
+            of_cell.with_name(f"{of_cell.name}.new").unlink(missing_ok=True)
     except OSError as error:
         raise _not_writable(of_arm, error) from None
     return InterlockFile(of_arm)

@@ -107,7 +107,8 @@ class HoldRequest(Message):
     into_stop: bool = Field(
         False, description="turn released holds into stops of the same time: only this operator moves the robot")
     acknowledged: Acknowledged = Field(
-        None, description="`since` of the newest interlock that the operator has seen: later ones stay")
+        None, description="`since` of the newest interlock that the operator has seen: later ones stay. Without it "
+                          "all stops stay")
 
 
 class Interlock(Message):

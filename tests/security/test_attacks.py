@@ -7,6 +7,7 @@ import asyncio
 import base64
 import json
 import re
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -244,7 +245,7 @@ def test_observer_reads_everything_and_commands_nothing(secured: Secured) -> Non
         stop = encode(m.StopRequest())
         assert observer.query_all(["panda/motion/stop", "panda/motion/*", "panda/**"], stop, timeout=1.0) == []
         assert operator.query("panda/motion/stop", stop)
-        release = encode(m.HoldRequest(hold=False, stops=True))
+        release = encode(m.HoldRequest(hold=False, stops=True, acknowledged=time.time_ns()))
         assert operator.query("panda/motion/hold", release)  # for the tests after it
 
 

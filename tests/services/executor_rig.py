@@ -74,6 +74,8 @@ class ExecutorClient(FakeCell):
         return await latest(self.gripper, lambda g: g.id == goal and g.state != "active" and not g.moving)
 
     async def release(self, owner, **more):
+        if more.get("stops"):
+            more["acknowledged"] = (await latest(self.motion)).newest
         return await self.hold.call(m.HoldRequest(hold=False, owner=owner, **more))
 
     async def edit(self, timeout=20.0, **edit):

@@ -86,6 +86,7 @@ class JoggedArm:
 
     def start_task(self, owner, **more):
         """Release stops and holds, as a start of the task does."""
+        more.setdefault("acknowledged", self.authority.interlocks.record.newest)
         return self.hold(owner, hold=False, stops=True, **more)
 
     def execute(self, goal, owner="", **more):

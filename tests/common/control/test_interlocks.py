@@ -29,6 +29,7 @@ from common.control.interlocks import (
 )
 from common.errors import ConfigError
 from common.messages import HoldRequest, MotionStatus, StopRequest
+from common.messages.basics import MAX_STAMP
 
 T0 = 1_700_000_000_000_000_000
 
@@ -43,7 +44,9 @@ class Made(Interlocks):
         self.stop(StopRequest(owner=owner, reason=reason))
 
     def release(self, owner: str = "", **more: Any) -> list[str]:
-        """Release holds; return whose."""
+        """Release holds, and known stops if requested; return whose."""
+        if more.get("stops"):
+            more.setdefault("acknowledged", self.record.newest)
         return [gone.by for gone in self.hold(HoldRequest(hold=False, owner=owner, **more))]
 
     @property
@@ -90,8 +93,18 @@ def test_request_decided_before_a_stop_neither_releases_it_nor_moves_the_arm(sto
     stopped.stop_by("anna")
     stopped.release(stops=True, override=True, acknowledged=acknowledged)
     assert stopped.check("go there", "anna", acknowledged) and stopped.check("go there", "anna")
+    for unknown in (None, 0, T0 + 3600 * 10**9, MAX_STAMP):  # what the executor never published names no stop
+        stopped.release("anna", stops=True, override=True, acknowledged=unknown)
+        assert stopped.check("task"), unknown
     stopped.release(stops=True, acknowledged=stopped.stops[0].since)
     assert stopped.check("task") is None
+
+
+def test_stop_in_the_entry_of_too_many_operators_blocks_an_operator_of_its_name(interlocks: Made) -> None:
+    for number in range(MAX_ENTRIES + 1):
+        interlocks.stop_by(f"{number}")
+    refused = interlocks.check("go there", "others", interlocks.record.newest)
+    assert refused is not None and "by others" in str(refused)
 
 
 def test_hold_turned_into_a_stop_still_blocks_all_others(interlocks: Made) -> None:
@@ -109,7 +122,7 @@ def test_later_interlock_has_a_later_time_for_any_clock_also_after_a_restart(tim
     for number in range(len(times)):
         interlocks.stop(StopRequest(owner=f"{number % 3}"))
         seen.append(max(stop.since for stop in interlocks.stops))
-        interlocks.hold(HoldRequest(hold=False, stops=True))
+        interlocks.hold(HoldRequest(hold=False, stops=True, acknowledged=seen[-1]))
         saved = Record.model_validate_json(interlocks.record.model_dump_json())
         interlocks = Interlocks(saved, lambda: next(clock))
     assert seen == sorted(set(seen))
@@ -291,7 +304,7 @@ MANY = json.dumps({"interlocks": [{"kind": "held", "by": f"p{number}", "since": 
     b"", b"{", b"\xff" * 99, b'{"version": 2}', b'{"version": 1, "interlocks": [{}]}', MANY,
     b'{"newest": 9223372036854775807}', b'{"newest": -1}', b'{"newest": 1e30}',
     b'{"interlocks": [{"kind": "stopped", "by": "a", "since": 9223372036854775807}]}',
-    "link to nothing", "pipe", "folder", "link in a circle",
+    "link to nothing", "pipe", "folder", "link in a circle", "removed",
 ])
 def test_unreadable_record_counts_as_a_stop_at_the_slowest_speed_and_does_not_block(
     path: Path, content: bytes | str
@@ -300,7 +313,8 @@ def test_unreadable_record_counts_as_a_stop_at_the_slowest_speed_and_does_not_bl
         path.write_bytes(content)
     else:
         {"link to nothing": lambda: path.symlink_to(path.with_name("gone")), "pipe": lambda: os.mkfifo(path),
-         "folder": path.mkdir, "link in a circle": lambda: path.symlink_to(path)}[content]()
+         "folder": path.mkdir, "link in a circle": lambda: path.symlink_to(path),
+         "removed": lambda: (InterlockFile(path).require_writable(), path.unlink())}[content]()
     if isinstance(content, bytes):
         InterlockFile(path).require_writable()
         assert path.read_bytes() == content, "it stays for inspection"
@@ -310,7 +324,7 @@ def test_unreadable_record_counts_as_a_stop_at_the_slowest_speed_and_does_not_bl
     refused = interlocks.check("a")
     assert refused is not None and str(path) in str(refused) and effective_speed(interlocks.speed, 1.0) == SLOWEST
     assert interlocks.arm_stopped, "it may have been stopped"
-    interlocks.hold(HoldRequest(hold=False, stops=True))
+    interlocks.hold(HoldRequest(hold=False, stops=True, acknowledged=record.newest))
     assert interlocks.check("a") is None
 
 
