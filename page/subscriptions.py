@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from common import topics
 from common.messages import Rejections
+from common.messages.camera import INSIDE_CONTAINER
 from common.topics import Topic
 from page.diagnostics import PlotPanel
 from page.feeds import Feeds, Topics
@@ -16,7 +17,6 @@ from page.layers import Layers
 from page.panels import Panels
 from page.recorded_history import HistoryRecorder
 from page.status_text import RejectedPositions
-from recording.report.summary import NOT_LEFT_BEHIND
 
 if TYPE_CHECKING:
     from page.scene import Scene
@@ -61,7 +61,7 @@ class Subscriptions:
                 self._plots.add_latency(age_ms(message.header.stamp), now())
 
         def reject(rejections: Rejections) -> None:
-            left = [each for each in rejections.rejected if NOT_LEFT_BEHIND not in each.reason]
+            left = [each for each in rejections.rejected if INSIDE_CONTAINER not in each.reason]
             self.rejected.update(rejections.model_copy(update={"rejected": left}))
             self._recorder.record_events(rejections, now())
 

@@ -16,13 +16,14 @@ from applications.pick_place.topics import DETECTED_OBJECTS
 from common import topics
 from common.config import Parameters, RobotConfig, Surroundings
 from common.messages import Marker, MarkerArray, Rejection, Vector3
+from common.messages.camera import INSIDE_CONTAINER, PARTLY_OUT_OF_VIEW
 from common.perception.camera_input import FrameError, SkippedFrames, require_capacity
 from common.perception.occlusion import Occlusion, RobotOcclusion, RobotSilhouettes
 from common.perception.pinhole import Pinhole
 from common.process.camera_reader import CameraReader
 from common.robot.home import HomeMonitor
 from common.robot.model import RobotModel
-from common.scene.workspace import INSIDE_CONTAINER, PARTLY_OUT_OF_VIEW, ReachCache
+from common.scene.workspace import ReachCache
 from common.transport.bus import Bus
 
 OLDEST = 0.5  # [s, cell time] a camera this far behind the newest one does not show the current state

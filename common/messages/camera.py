@@ -98,6 +98,11 @@ class PointCloud2(Message):
     data: bytes
 
 
+# Reasons of a `Rejection` that readers treat apart.
+INSIDE_CONTAINER = "inside the container"
+PARTLY_OUT_OF_VIEW = "partly out of view"
+
+
 class Rejection(Message):
     """A detected object that is not offered to the task, and the reason."""
 

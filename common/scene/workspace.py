@@ -19,9 +19,6 @@ from common.robot.transforms import tool_down
 
 Array = npt.NDArray[np.float64]
 
-INSIDE_CONTAINER = "inside the container"
-PARTLY_OUT_OF_VIEW = "partly out of view"
-
 # IK iterations: solutions are found within 12 from home, and within 4 from two centimetres away.
 _FROM_HOME = 16
 _FROM_NEAR = 8

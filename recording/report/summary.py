@@ -18,12 +18,11 @@ from common.messages import (
     TaskStatus,
     Vector3,
 )
-from common.scene.workspace import PARTLY_OUT_OF_VIEW
+from common.messages.camera import INSIDE_CONTAINER, PARTLY_OUT_OF_VIEW
 from recording.report.application import Figures
 from recording.report.history import Truth
 
 SAME_PLACE = 0.03  # [m] rejections closer than this are of the same object
-NOT_LEFT_BEHIND = "inside the container"  # reason of a rejected detection of a placed object
 MOST_PLACES = 1000  # newest rejected positions that are listed
 MOST_PLANS = 10_000  # newest plans, over restarts of the task
 MAX_LATENCIES = 20_000  # of frames; then the older half is dropped: at 10 Hz the last quarter of an hour stays
@@ -39,7 +38,7 @@ class Rejected:
         """Add rejected objects; a newer one replaces an older one at the same position [m]."""
         at = [_place(known.position) for known in self.places]
         for rejection in rejections:
-            if NOT_LEFT_BEHIND in rejection.reason:
+            if INSIDE_CONTAINER in rejection.reason:
                 continue
             place = _place(rejection.position)
             for index, known in enumerate(at):

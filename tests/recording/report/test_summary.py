@@ -17,7 +17,7 @@ from common.messages import (
     WorldObject,
     WorldObjects,
 )
-from common.scene.workspace import PARTLY_OUT_OF_VIEW
+from common.messages.camera import PARTLY_OUT_OF_VIEW
 from recording.report.application import Figures
 from recording.report.history import Truth
 from recording.report.summary import Rejected, Summary, describe, percentile
