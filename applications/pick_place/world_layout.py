@@ -108,7 +108,7 @@ def fit_world(robot: RobotModel, cell: dict[str, Any]) -> dict[str, Any]:
             bounds = bounds.model_copy(update={"min_radius": nearest})
             return {**cell, "world": _world(scale, *box, edge), **({"grasp": heights} if heights else {}),
                     "services": _services(cell["services"], bounds)}
-    raise ConfigError("--cell", ..., f"the arm takes things from {most} of the places {scale.step:g} m apart in front "
+    raise ConfigError("--cell", ..., f"the arm takes things from at most {most} of the places that were tried in front "
                       f"of it, tool down, up to {robot.reach:.2f} m away: too few for {BALLS} balls and a box")
 
 
