@@ -386,9 +386,5 @@ def _print_result(made: Proposal, robot: RobotModel, path: Path, pairs: Path) ->
     for each in made.candidates:
         echo(f"  {each.link}: z points {each.z}")
     for title, lines in (("guessed", made.guessed), ("check", made.check), ("lost", made.lost)):
-        _print_lines(title, lines)
-
-
-def _print_lines(title: str, lines: Sequence[str]) -> None:
-    for line in lines:
-        echo(f"{title}: {line}")
+        for line in lines:
+            echo(f"{title}: {line}")

@@ -1,7 +1,6 @@
 """`zencell new` writes a complete project."""
 
 import subprocess
-import sys
 
 import pytest
 
@@ -33,9 +32,10 @@ def test_project_has_a_cell_and_a_task_whose_process_starts_in_any_folder(kind, 
     cell = load_cell(str(folder / "cell.yaml"))
     assert (cell.name, cell.task, cell.application) == (name, "task", f"{name}.task")
     assert find_application(cell.application).status.key == f"{name}_status"
-    launch = Launch(str(folder / "cell.yaml")).environment({})
-    process = subprocess.run([sys.executable, "-P", "-m", f"{name}.task", "--help"], cwd="/", capture_output=True,
-                             env=environment() | launch, text=True, check=False)
+    launch = Launch(str(folder / "cell.yaml"))
+    command = [*launch.service_command(cell.services[cell.task], gate=False), "--help"]
+    process = subprocess.run(command, cwd="/", env=environment() | launch.environment({}), capture_output=True,
+                             text=True, check=False)
     assert process.returncode == 0 and "--cell" in process.stdout, process.stderr
 
 
