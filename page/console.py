@@ -180,6 +180,7 @@ class Console(ActionQueue):
         on_object_selected: called with the id of an object of the simulated world that was clicked in the scene.
         on_object_moved: called with the id and the new center x, y [m] of one that was dragged in the scene.
         stop_count: number of STOPs on this page, successful or not.
+        has_task: whether the cell has a task, which may be down.
     """
 
     def __init__(
@@ -199,7 +200,7 @@ class Console(ActionQueue):
         self._feeds, self._bus, self._jog_writer = feeds, bus, bus.writer(topics.MOTION_JOG)
         self.on_object_selected: Callable[[str], None] = lambda _name: None
         self.on_object_moved: Callable[[str, float, float], Coroutine[Any, Any, None] | None] = lambda *_moved: None
-        self.stop_count = 0
+        self.stop_count, self.has_task = 0, bool(members.task)
         self._own_stop = 0  # `since` of the newest stop of this page
         used: list[Request[Any, Any]] = [
             topics.TASK_COMMAND, topics.MOTION_STOP, topics.MOTION_OWN, topics.GRIPPER_COMMAND,
@@ -277,7 +278,7 @@ class Console(ActionQueue):
         if isinstance(result.arm, RequestFailed):
             raise result.arm
         self._own_stop = result.arm.newest
-        if isinstance(result.task, RequestFailed):
+        if isinstance(result.task, RequestFailed) and self.has_task:
             return f"Arm stopped by {client}; task NOT stopped: {error_text(result.task)}"
         return stopped_by(client)
 

@@ -92,7 +92,7 @@ class TaskPanel:
     def _show_buttons(self, task: TaskStatus | None, motion: MotionStatus | None, owner: MotionOwner | None) -> None:
         task = task if self._console.is_available(topics.TASK_COMMAND) else None
         motion = motion if self._console.is_available(topics.MOTION_STOP) else None
-        blocked = command_blocked(task, motion)
+        blocked = command_blocked(task, motion, has_task=self._console.has_task)
         permissions = self._console.permissions
         taken = owner is not None and owner.kind == "operator"
         ours = taken and owner is not None and owner.asked and owner.owner == permissions.client_name

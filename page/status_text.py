@@ -182,8 +182,12 @@ def jog_blocked(motion: MotionStatus | None) -> str:
     return "the arm is executing a motion" if motion.state == "active" else ""
 
 
-def command_blocked(task: TaskStatus | None, motion: MotionStatus | None) -> dict[str, str]:
-    """Return why each command to the task would have no effect now."""
+def command_blocked(
+    task: TaskStatus | None, motion: MotionStatus | None, *, has_task: bool = True
+) -> dict[str, str]:
+    """Return why each command to the task would have no effect now; `has_task` is False for a cell without one."""
+    if not has_task:
+        return dict.fromkeys(("Start", "Pause", "Resume"), "this cell has no task")
     if task is None:
         return dict.fromkeys(("Start", "Pause", "Resume"), "the task's state is unknown: it does not respond")
     if motion is None:

@@ -56,6 +56,11 @@ def test_start_and_resume_are_never_both_possible(task: dict[str, Any], motion: 
     assert blocked["Start"] or blocked["Resume"]
 
 
+def test_commands_say_that_the_cell_has_no_task() -> None:
+    blocked = command_blocked(None, m.MotionStatus(), has_task=False)
+    assert blocked == dict.fromkeys(("Start", "Pause", "Resume"), "this cell has no task")
+
+
 @pytest.mark.parametrize(("owner", "text"), [
     (None, "unknown"), (m.MotionOwner(), "free"), (m.MotionOwner(kind="task", owner="mover"), "task"),
     (m.MotionOwner(kind="operator", owner="page"), "you"), (m.MotionOwner(kind="operator", owner="anna"), "anna"),

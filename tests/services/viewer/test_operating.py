@@ -8,6 +8,7 @@ import pytest
 
 from common import messages as m
 from common import topics
+from common.config import Members
 from common.errors import Refused
 from tests.page.fake_browser import PATIENCE, FakeBrowser
 from tests.services.viewer.conftest import FakeServices, page_of, until
@@ -35,6 +36,14 @@ async def test_missing_answer_to_a_stop_is_shown(arm: bool, line: str, kind: str
         await page.send(do="stop", n=1)
         await page.until(lambda: line in page.text and page.results == [(1, line, kind)])
         assert len(services.stops) == arm
+
+
+async def test_stop_in_a_cell_without_a_task_mentions_none() -> None:
+    async with page_of("panda", serve=False, members=Members(services=[])) as (services, page):
+        services.bus.serve(topics.MOTION_STOP, services.stop)
+        await page.send(do="stop", n=1)
+        await page.until(lambda: page.results == [(1, "Stopped by page", "good")])
+        await page.until(lambda: page.button("Start")[1] == "this cell has no task")
 
 
 @pytest.mark.parametrize(("command", "state", "others"), [
