@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import socket
 import stat
 from collections.abc import Mapping
 from pathlib import Path
@@ -41,6 +42,15 @@ def runtime_folder(environ: Mapping[str, str] = os.environ) -> Path | None:
     """Return the folder of state that outlives a service but not the cell; None: it is not saved."""
     folder = environ.get(RUNTIME_VARIABLE) or environ.get(STATE_VARIABLE)
     return Path(folder) if folder else None
+
+
+def world_file(cell: str, environ: Mapping[str, str] = os.environ) -> Path | None:
+    """Return the file of a cell's simulated world, or None if no folder is configured.
+
+    The name includes the host: a restarted container has the same name, a new one has not.
+    """
+    folder = runtime_folder(environ)
+    return folder / f"{cell}-{socket.gethostname()}.state" if folder else None
 
 
 class Unreadable(ZencellError):

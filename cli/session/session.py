@@ -99,10 +99,12 @@ class CellSession(SessionPlan):
 
         The state of simulated hardware is deleted with the cell; interlocks of operators persist.
         """
-        from common.atomic_file import RUNTIME_VARIABLE, STATE_VARIABLE, state_folder
+        from common.atomic_file import RUNTIME_VARIABLE, STATE_VARIABLE, state_folder, world_file
         from common.transport.endpoint import DEFAULT_DOMAIN
 
         if os.environ.get(STATE_VARIABLE):
+            if self._simulated and (world := world_file(self.cell.name)) and world.exists():
+                self.summary.continued = str(world)
             return await self._supervised(work)
         folder = state_folder()
         if self._simulated and not self.launch.connect and self.launch.domain != DEFAULT_DOMAIN:

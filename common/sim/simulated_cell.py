@@ -10,7 +10,6 @@ import contextlib
 import errno
 import math
 import os
-import socket
 import struct
 import threading
 import zlib
@@ -24,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AliasChoices, BaseModel, ConfigDict, Field
 
-from common.atomic_file import Unreadable, open_regular, runtime_folder
+from common.atomic_file import Unreadable, open_regular, world_file
 from common.config import Grasp, GripperConfig, World
 from common.errors import ConfigError
 from common.hardware.interface import (
@@ -358,9 +357,6 @@ def _checksum(number: int, body: bytes) -> int:
 
 
 def state_file(cell: str, environ: Mapping[str, str] = os.environ) -> StateFile | None:
-    """Return the state file of a cell, or None if no folder is configured.
-
-    The name includes the host: a restarted container has the same name, a new one has not.
-    """
-    folder = runtime_folder(environ)
-    return StateFile(folder / f"{cell}-{socket.gethostname()}.state") if folder else None
+    """Return the state file of a cell, or None if no folder is configured."""
+    path = world_file(cell, environ)
+    return StateFile(path) if path else None

@@ -115,6 +115,7 @@ class Summary:
         self.fills = fills
         self.rejected = Rejected()
         self.restarts: dict[str, int] = {}
+        self.continued = ""  # file of the simulated world of an earlier run from which this one continued
         self.failed = False  # whether the cell did not come up
         self.chaos: list[dict[str, object]] | None = None  # injected faults, if enabled
         self._latencies = array("d")  # [ms]
@@ -210,6 +211,7 @@ class Summary:
             "figures": dict(self.status.figures),
             "overlooked": self.status.overlooked,
             "unexplained": self.unexplained,
+            **({"continued": self.continued} if self.continued else {}),
             **self.figures.blocks(),
             **({"chaos": list(self.chaos)} if self.chaos is not None else {}),
         }
@@ -240,6 +242,9 @@ def describe(summary: dict[str, Any], application: Figures) -> list[str]:
         lines.append(f"  {summary['overlooked']}")
     for x, y, z in summary.get("unexplained", ()):
         lines.append(f"  left at ({x:.3f}, {y:.3f}, {z:.3f}): not rejected by the task")
+    if summary.get("continued") and summary["state"] == "DONE" and seconds["first_motion"] is None:
+        lines.append(f"  nothing was left to do in the simulated world of an earlier run, {summary['continued']}: "
+                     "`zencell world reset` in `zencell up`, or a run without ZENCELL_STATE, has the first layout")
     times = [
         f"ready {_seconds(seconds['ready'])}",
         f"first motion {_seconds(seconds['first_motion'])}",

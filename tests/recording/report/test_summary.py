@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from applications.pick_place.topics import PickPlaceStatus
 from common.messages import (
     Header,
+    MotionStatus,
     PlanFigure,
     Pose,
     PoseArray,
@@ -48,6 +49,17 @@ def test_summary_has_the_fields_that_scripts_read():
     assert list(summary["frame_to_target_ms"]) == ["p50", "p99"]
     assert summary["truth"] is None
     json.dumps(summary)
+
+
+@pytest.mark.parametrize(("state", "moved", "listed"), [("DONE", False, 1), ("DONE", True, 0), ("ERROR", False, 0)])
+def test_finished_world_of_an_earlier_run_is_named(state, moved, listed):
+    summary = Summary("panda", 0, 1.0)
+    summary.continued = "/data/panda.state"
+    summary.on_status(status(state, 10))
+    if moved:
+        summary.on_motion(2.0, MotionStatus(state="active"))
+    lines = [line for line in describe(summary.as_dict(), Figures()) if "an earlier run, /data/panda.state" in line]
+    assert len(lines) == listed and all("world reset" in line for line in lines)
 
 
 def test_rejected_position_is_listed_once_and_skipped_targets_with_it():
