@@ -110,7 +110,7 @@ def run(**given: Any) -> None:
     of_applications = {name: given.pop(name) for name in given.keys() - _OPTIONS}
     before = verbs.before_run(given["cell"], given["overrides"], given["world"], of_applications)
     session = _session(**{**given, "overrides": before.overrides}, until_ended=True)
-    require_task(session.cell)
+    require_task(session.on_all_hosts)
     session.first = before.first
     raise typer.Exit(session.run_to_end())
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -58,7 +59,7 @@ class SessionPlan:
             cell, overrides, world=world, seed=seed, speed=speed, domain=domain, connect=connect, no_viewer=no_viewer,
             summary=summary, log_json=log_json, host=host or HostOptions())
         self.launch, self.cell, self.file = resolved.launch, resolved.cell, resolved.summary_file
-        self.aggregator = resolved.aggregator
+        self.aggregator, self.on_all_hosts = resolved.aggregator, resolved.on_all_hosts
         self.summary = self.aggregator.summary
         self._page: PageAddress | None = None
         self._watchers: dict[str, list[str]] = {}  # commands of observing processes by name
@@ -122,10 +123,11 @@ class SessionPlan:
 
 @dataclass
 class Resolved:
-    """A launch, the part of the cell that runs on this host, and the aggregator of its figures."""
+    """A launch, the part of the cell that runs on this host, the complete cell, and the aggregator of its figures."""
 
     launch: Launch
     cell: Cell
+    on_all_hosts: Cell
     aggregator: RunAggregator
     summary_file: Path | None
 
@@ -162,11 +164,12 @@ def resolve(
         speed=launch.clock.speed, containers=list(loaded.world.containers))
     require_modules(loaded)
     require_safe(loaded)
+    here = host.part_of(loaded)
+    _require_valid_services(here)
     if endpoint is None:
         require_free_port(endpoint_of(number))
-    here = host.part_of(loaded)
     require_secured(launch, here)
-    return Resolved(with_near(launch), here, aggregator, summary_file)
+    return Resolved(with_near(launch), here, loaded, aggregator, summary_file)
 
 
 def _summary_file(summary: str | None) -> Path | None:
@@ -180,15 +183,46 @@ def _summary_file(summary: str | None) -> Path | None:
     return file
 
 
-def require_task(cell: Cell) -> None:
-    """Return if the cell has a task.
+def _require_valid_services(cell: Cell) -> None:
+    """Validate parameters and remapped keys of services before any process starts.
+
+    A service without either has its defaults, and its imports would delay the start.
 
     Raises:
-        ConfigError: it has none.
+        ConfigError: names the field, the value and the choices.
+    """
+    given = [entry for entry in cell.services.values() if entry.parameters or entry.topics]
+    if not given:
+        return
+    from common.supervision.wiring import WiringFailed, load_service, wire_service
+
+    for entry in given:
+        with contextlib.suppress(WiringFailed):  # its process reports the error
+            load_service(cell, entry)
+            if entry.topics:
+                wire_service(cell, entry)
+
+
+def require_task(cell: Cell) -> None:
+    """Return if the cell has a task, and the services without which no task moves an arm.
+
+    Args:
+        cell: with its services on all hosts.
+
+    Raises:
+        ConfigError: it has none, or a service is missing.
     """
     if not cell.task:
         raise ConfigError("task", ..., f"is missing: {cell.name} has nothing to run; `zencell up` brings it up, and "
                           "clients can move its arm")
+    if cell.task not in cell.services:
+        raise ConfigError("services", ..., f"{cell.task}, the task of {cell.name}, is missing among them: "
+                          f"{', '.join(cell.services) or 'there are none'}")
+    if all(entry.module.startswith("services.") for entry in cell.services.values()):  # others may serve the same keys
+        kinds = {entry.kind for entry in cell.services.values()}
+        for kind in ("motion_planner", "trajectory_executor"):
+            if kind not in kinds:
+                raise ConfigError("services", ..., f"{kind} is missing among them: it is needed by {cell.task}")
 
 
 def without(cell: Cell, services: Sequence[str]) -> Cell:

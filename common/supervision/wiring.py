@@ -175,6 +175,23 @@ class ServiceWiring:
     topics: dict[str, AnyTopic] = field(default_factory=dict)  # all of these, by key
 
 
+def load_service(cell: Cell, entry: ServiceEntry) -> tuple[Any, Parameters]:
+    """Return the module of a service and its configuration in the cell.
+
+    Raises:
+        ConfigError: its parameters or its module are not valid.
+        WiringFailed: the module cannot be imported.
+    """
+    require_module(entry.name, entry)
+    try:
+        with redirect_stdout(sys.stderr):  # stdout carries the output of the command
+            module = importlib.import_module(entry.module)
+        kind: type[Parameters] = module.Config
+    except Exception as error:  # a user's module may raise anything
+        raise WiringFailed(entry.name, error) from error
+    return module, service_config(cell, entry.name, kind)
+
+
 def wire_service(cell: Cell, entry: ServiceEntry) -> ServiceWiring:
     """Run one service of a cell until it would be ready, on a network of its own, and return its keys.
 
@@ -182,14 +199,9 @@ def wire_service(cell: Cell, entry: ServiceEntry) -> ServiceWiring:
         ConfigError: its parameters or its module are not valid.
         WiringFailed: it failed before it was ready.
     """
-    require_module(entry.name, entry)
-    try:
-        module = importlib.import_module(entry.module)
-    except Exception as error:  # a user's module may raise anything
-        raise WiringFailed(entry.name, error) from error
-    config = service_config(cell, entry.name, module.Config)
+    module, config = load_service(cell, entry)
     # The same service may run now: its recorded copy must not bind the same port.
-    unbound = config.model_copy(update={"port": 0}) if "port" in module.Config.model_fields else config
+    unbound = config.model_copy(update={"port": 0}) if "port" in type(config).model_fields else config
     try:
         with redirect_stdout(sys.stderr):  # stdout carries the output of the command
             found = asyncio.run(wiring(module.run, unbound, service=entry.name, topics=entry.topics))

@@ -28,6 +28,16 @@ ROWS = [  # a command, and parts of its line
     ("run empty.yaml", "empty.yaml", "must hold a mapping"),
     ("run taskless.yaml", "task: is missing", "nothing to run", "`zencell up`"),
     ("simulate taskless.yaml", "task: is missing"),
+    ("run panda --set services={}", "services: smart_pick_place, the task of panda, is missing", "there are none"),
+    ("run panda --set services=[]", "services: [] must be a mapping"),
+    ("run panda --set services=null", "services: None must be a mapping"),
+    ("run panda --set 'services={smart_pick_place: {}, motion_planner: {}}'",
+     "services: trajectory_executor is missing", "needed by smart_pick_place"),
+    ("simulate panda --set 'services={smart_pick_place: {}, trajectory_executor: {}}'",
+     "services: motion_planner is missing", "needed by smart_pick_place"),
+    ("up panda --set services.trajectory_executor.speed_scaling=nan", "services.trajectory_executor.speed_scaling",
+     "'nan' must be less than or equal to 1"),
+    ("up renamed.yaml", "services.vision_detector.topics: 'nonsense' is no key", "camera/image_raw"),
     ("run fake.yaml --set services.first.x=1", "services.fakes.first", "is not a module: there is no fakes in"),
     ("run panda --set application=common.tasks.none", "is not a module: there is no none in", "common/tasks"),
     ("check twice.yaml", "twice.yaml", "does not parse at line 3", "'cell' is given twice"),
@@ -143,6 +153,7 @@ def files(tmp_path_factory):
     task = "task: first\nservices: {fakes.first: {}}\n"
     for name, text in {"a cell": cell + task, "fake": cell + task, "broken": "cell: [1,\nrobot: }\n", "list": "- 1\n",
                        "twice": "cell: a\nrobot: panda\ncell: b\n",
+                       "renamed": cell + "services: {vision_detector: {topics: {nonsense: x}}}\n",
                        "empty": "", "taskless": cell + "services: {motion_planner: {}}\n"}.items():
         (folder / f"{name}.yaml").write_text(text)
     write(folder / "there.mcap", [joints(n) for n in range(12)])
