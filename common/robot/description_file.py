@@ -8,6 +8,7 @@ from pathlib import Path
 from xml.parsers import expat
 
 from common.errors import ConfigError
+from common.robot.description_values import check_values
 
 MAX_BYTES = 50_000_000
 MAX_ELEMENTS = 200_000
@@ -34,7 +35,7 @@ def read_xml(field: str, path: Path) -> ET.Element:
 
     Raises:
         ConfigError: the file cannot be read, exceeds the bounds, declares entities, or contains names with line breaks,
-            control or invisible characters.
+            control or invisible characters, duplicate names, or unusable numbers.
     """
     try:
         fault = fault_of(path)
@@ -79,6 +80,7 @@ def parse_xml(field: str, source: str, data: bytes) -> ET.Element:
     if found.tag != "robot":
         raise ConfigError(field, source, f"does not parse: its root is <{found.tag[:MAX_NAME]}>, not <robot>")
     _check_names(field, source, found)
+    check_values(field, source, found)
     return found
 
 

@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from common.errors import ConfigError
+from common.robot.description_values import FARTHEST, numbers
 from common.robot.transforms import rpy_to_matrix, transform
 
 Array = NDArray[np.float64]
 Rgb = tuple[int, int, int]
 Kind = Literal["collision", "visual"]
 
-LARGEST = 1e6  # number of any kind
 THINNEST = 1e-4  # [m] of a box, cylinder or sphere with a side of 0
 _SIZES = {"box": {"size": 3}, "capsule": {"radius": 1, "length": 1}, "cylinder": {"radius": 1, "length": 1},
           "mesh": {}, "sphere": {"radius": 1}}
@@ -72,34 +72,19 @@ def _shape(link: str, part: ET.Element, colors: dict[str, Rgb]) -> Shape:
         raise ValueError(f"<{geometry.tag}> is an unknown shape; choices: {', '.join(_SIZES)}")
     if unknown := set(origin.keys() if origin is not None else ()) - {"xyz", "rpy"}:
         raise ValueError(f"{unknown.pop()} of <origin> is unknown; choices: xyz, rpy")
-    x, y, z = _numbers(origin, "xyz", 3, "0 0 0")
-    T = transform(rpy_to_matrix(*_numbers(origin, "rpy", 3, "0 0 0")), (x, y, z))
+    x, y, z = numbers(origin, "xyz", 3, "0 0 0", FARTHEST)
+    T = transform(rpy_to_matrix(*numbers(origin, "rpy", 3, "0 0 0")), (x, y, z))
     color = None
     if material is not None:
         color = _material_color(material) or colors.get(str(material.get("name")))
     if geometry.tag == "mesh":
         if not geometry.get("filename"):
             raise ValueError("<mesh> has no filename")
-        return Shape(link, "mesh", _numbers(geometry, "scale", 3, "1 1 1"), T, color, str(geometry.get("filename")))
-    size = [value for name, count in _SIZES[geometry.tag].items() for value in _numbers(geometry, name, count)]
+        return Shape(link, "mesh", numbers(geometry, "scale", 3, "1 1 1"), T, color, str(geometry.get("filename")))
+    size = [value for name, count in _SIZES[geometry.tag].items() for value in numbers(geometry, name, count)]
     if min(size) < 0:
         raise ValueError(f"<{geometry.tag}> has a negative side: {min(size):g}")
     return Shape(link, geometry.tag, tuple(max(value, THINNEST) for value in size), T, color)
-
-
-def _numbers(element: ET.Element | None, name: str, count: int, default: str | None = None) -> tuple[float, ...]:
-    text = element.get(name, default) if element is not None else default
-    tag = element.tag if element is not None else name
-    if text is None:
-        raise ValueError(f"<{tag}> has no {name}")
-    try:
-        values = tuple(float(value) for value in text.split())
-    except ValueError:
-        values = ()
-    if len(values) != count or not all(abs(value) < LARGEST for value in values) or "_" in text:
-        wanted = "a number" if count == 1 else f"{count} numbers"
-        raise ValueError(f"{name} of <{tag}> is {text!r}, but must be {wanted} below {LARGEST:g}")
-    return values
 
 
 def _material_color(material: ET.Element) -> Rgb | None:

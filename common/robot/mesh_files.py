@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
+_NAMES = {"dae": "COLLADA", "glb": "binary glTF"}
 FORMATS = ("dae", "glb", "obj", "off", "ply", "stl")
 _MAX_BYTES = 100_000_000  # two million triangles as STL
 _LARGEST = 1e9  # coordinate
@@ -32,6 +33,10 @@ _MAX_SHOWN = 120  # characters of a reader's error
 _STL_HEAD, _STL_TRIANGLE = 84, np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
 T = TypeVar("T", bound=Sized)
+
+
+class UnusableMesh(ValueError):
+    """A file whose content is no mesh within the bounds; the text is for the user."""
 
 
 def triangles_of(field: str, path: Path) -> Array:
@@ -71,11 +76,16 @@ def _read(field: str, path: Path, read: Callable[[], T]) -> T:
     try:
         found = read()
         if not len(found):
-            raise ValueError("it has no triangles")  # for example a truncated file
+            raise UnusableMesh("it has no triangles")  # for example a truncated file
         return found
     except Exception as error:  # the readers of the formats raise any exception on a damaged file
-        reason = " ".join(str(error).split())[:_MAX_SHOWN] or type(error).__name__
-        raise ConfigError(field, str(path), f"is a mesh that cannot be read: {reason}") from None
+        if isinstance(error, OSError) and error.strerror:
+            reason = f": {error.strerror}"
+        elif isinstance(error, UnusableMesh | ET.ParseError):
+            reason = f": {' '.join(str(error).split())[:_MAX_SHOWN]}"
+        else:  # its text describes the reader's code, not the file
+            reason = f" as {_NAMES.get(_suffix(path), _suffix(path).upper())}: the file is damaged or of another format"
+        raise ConfigError(field, str(path), f"is a mesh that cannot be read{reason}") from None
 
 
 def _suffix(path: Path) -> str:
@@ -86,12 +96,12 @@ def _checked(path: Path) -> bytes:
     """Return the content of a file whose format is known and that is no larger than meshes are."""
     suffix = _suffix(path)
     if suffix not in FORMATS:
-        raise ValueError(f"unknown format; choices: {', '.join(FORMATS)}")
+        raise UnusableMesh(f"unknown format; choices: {', '.join(FORMATS)}")
     if (size := path.stat().st_size) > _MAX_BYTES:
-        raise ValueError(f"it has {size / 1e6:.0f} MB, more than {_MAX_BYTES / 1e6:.0f}: simplify it")
+        raise UnusableMesh(f"it has {size / 1e6:.0f} MB, more than {_MAX_BYTES / 1e6:.0f}: simplify it")
     data = path.read_bytes()
     if suffix == "dae" and zipfile.is_zipfile(io.BytesIO(data)):
-        raise ValueError("it is an archive, not a .dae: unpack it")
+        raise UnusableMesh("it is an archive, not a .dae: unpack it")
     return data
 
 
@@ -99,7 +109,7 @@ def _binary_stl(data: bytes) -> Array | None:
     """Return the corners (n, 3, 3) of a binary STL, or None for a text one.
 
     Raises:
-        ValueError: the file ends before its last triangle.
+        UnusableMesh: the file ends before its last triangle.
     """
     if len(data) < _STL_HEAD:
         return None
@@ -108,7 +118,7 @@ def _binary_stl(data: bytes) -> Array | None:
     if there != count and data.lstrip().startswith(b"solid"):
         return None
     if there < count:
-        raise ValueError(f"it announces {count} triangles but ends after {math.floor(there)}")
+        raise UnusableMesh(f"it announces {count} triangles but ends after {math.floor(there)}")
     return _finite(np.array(np.frombuffer(data, _STL_TRIANGLE, count, _STL_HEAD)["corners"], dtype=float))
 
 
@@ -131,7 +141,7 @@ def _scene(path: Path, data: bytes) -> list[trimesh.Trimesh]:
         def get(self, name: str) -> bytes:
             beside = path.parent / name
             if not beside.is_file() or beside.stat().st_size > _MAX_BYTES:
-                raise ValueError(f"it refers to {name}, which is missing or too large")
+                raise UnusableMesh(f"it refers to {name}, which is missing or too large")
             return beside.read_bytes()
 
     loaded = trimesh.load_scene(io.BytesIO(data), file_type=suffix, process=False, resolver=Resolver(str(path)))
@@ -143,7 +153,7 @@ def _scene(path: Path, data: bytes) -> list[trimesh.Trimesh]:
 
 def _finite(values: Array) -> Array:
     if not (np.abs(values) < _LARGEST).all():  # also without numbers
-        raise ValueError(f"a coordinate of it is no number below {_LARGEST:g}")
+        raise UnusableMesh(f"a coordinate of it is no number below {_LARGEST:g}")
     return values
 
 
@@ -151,10 +161,10 @@ def _check_collada(data: bytes) -> float:
     """Return the unit of a COLLADA file [m]. Its axis that points up is ignored, as RViz and Gazebo do.
 
     Raises:
-        ValueError: its unit is unusable, or its nodes refer to each other more often than scenes do.
+        UnusableMesh: its unit is unusable, or its nodes refer to each other more often than scenes do.
     """
     if data.count(b"<") > 2 * _MAX_ELEMENTS:
-        raise ValueError(f"it has more than {_MAX_ELEMENTS} elements")
+        raise UnusableMesh(f"it has more than {_MAX_ELEMENTS} elements")
     root = ET.fromstring(data)
     for element in root.iter():
         element.tag = element.tag.rpartition("}")[2]
@@ -169,9 +179,9 @@ def _check_collada(data: bytes) -> float:
     try:
         used = sum(count(node) for scene in root.iter("visual_scene") for node in scene.findall("node"))
     except RecursionError:
-        raise ValueError("its nodes contain each other, or too many of them") from None
+        raise UnusableMesh("its nodes contain each other, or too many of them") from None
     if used > _MAX_PARTS:
-        raise ValueError(f"its scene has more than {_MAX_PARTS} nodes")
+        raise UnusableMesh(f"its scene has more than {_MAX_PARTS} nodes")
     unit = root.find("asset/unit")
     text = "1" if unit is None else unit.get("meter", "1")
     try:
@@ -179,17 +189,17 @@ def _check_collada(data: bytes) -> float:
     except ValueError:
         meters = math.nan
     if not 0 < meters < math.inf:
-        raise ValueError(f"its unit is {text!r} m")
+        raise UnusableMesh(f"its unit is {text!r} m")
     return meters
 
 
 def _check_glb(data: bytes) -> None:
-    """Raise ValueError if a glTF file describes more than it holds: its counts are allocated before they are read."""
+    """Raise UnusableMesh if a glTF file describes more than it holds: its counts are allocated before they are read."""
     length = struct.unpack_from("<I", data, 12)[0]
     head = json.loads(data[20:20 + length])
     if sum(int(each.get("count", 0)) for each in head.get("accessors", [])) > len(data):
-        raise ValueError("it announces more values than it has bytes")
+        raise UnusableMesh("it announces more values than it has bytes")
     used = [node for each in head.get("nodes", []) for node in each.get("children", [])]
     used += [node for scene in head.get("scenes", []) for node in scene.get("nodes", [])]
     if len(set(used)) < len(used):
-        raise ValueError("its nodes are no tree")
+        raise UnusableMesh("its nodes are no tree")

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from common.config import RobotConfig
 from common.errors import ConfigError, UnknownName
+from common.robot.description_values import MOVING
 from common.robot.link_shapes import link_shapes
 from common.robot.packages import package_folders
 from common.robot.transforms import rpy_to_matrix
@@ -102,7 +103,7 @@ class RobotModel:
         urdf = merged_urdf(config)
         srdf = find_description("robot.srdf", config.srdf, config.package_dirs) if config.srdf else None
         try:
-            full_model = pin.buildModelFromXML(_without_shapes(urdf))
+            full_model = pin.buildModelFromXML(_kinematics(urdf))
         except ValueError as error:
             raise ConfigError("robot.urdf", config.urdf, f"does not parse: {str(error).strip()}") from None
         if lost := sorted(_described_links(urdf) - set(_link_frames(full_model))):
@@ -202,7 +203,8 @@ class RobotModel:
     def jacobian(self, q: ArrayLike) -> Array:
         """Return the Jacobian (6, dof) of the TCP: linear [m/s], then angular [rad/s], along world's axes."""
         axes = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
-        return np.array(pin.computeFrameJacobian(self.model, self.data, self._checked(q), self.tcp_frame, axes))
+        found = pin.computeFrameJacobian(self.model, self.data, self._checked(q), self.tcp_frame, axes)
+        return np.array(found).reshape(6, self.dof)  # pinocchio returns (6,) for one joint
 
     @property
     def base_axes(self) -> Array:
@@ -305,13 +307,19 @@ def _link_frames(model: pin.Model) -> dict[str, int]:
     return {f.name: i for i, f in enumerate(model.frames) if f.type == pin.FrameType.BODY and f.name != WORLD}
 
 
-def _without_shapes(urdf: str) -> str:
-    """Return a URDF for the kinematics alone: pinocchio's parser would print and skip what it cannot read of shapes."""
+def _kinematics(urdf: str) -> str:
+    """Return names of links, and joints: of all else, pinocchio's parser would print and skip what it cannot read."""
     root = ET.fromstring(urdf)
+    found = ET.Element("robot", name=root.get("name") or "robot")
     for link in root.findall("link"):
-        for part in [*link.findall("visual"), *link.findall("collision")]:
-            link.remove(part)
-    return ET.tostring(root, encoding="unicode")
+        ET.SubElement(found, "link", name=str(link.get("name")))
+    for joint in root.findall("joint"):
+        for part in [*joint.findall("origin"), *joint.findall("axis"), *joint.findall("limit")]:
+            part.attrib = {key: " ".join(value.split()) for key, value in part.items()}  # it accepts no other space
+        parts = [part for part in joint if part.tag in ("parent", "child", "origin", "axis", "limit", "mimic")]
+        ET.SubElement(found, "joint", name=str(joint.get("name")), type=str(joint.get("type"))).extend(
+            part for part in parts if part.tag != "limit" or joint.get("type") in MOVING)
+    return ET.tostring(found, encoding="unicode")
 
 
 def _described_links(urdf: str) -> set[str]:

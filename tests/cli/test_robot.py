@@ -124,8 +124,10 @@ def test_links_without_collision_shapes_collide_with_their_visuals(tmp_path):
 
 def test_sizes_and_limits_that_cannot_be_right_are_named(tmp_path):
     text = TEXT.replace('upper="2.6"', 'upper="150"').replace('velocity="3"', 'velocity="180"')
+    text = text.replace('"0.3 0 0"', '"12 0 0"')
     lines, _ = new_robot(tmp_path, text.replace('<box size="0.04 0.05 0.11"/>', '<box size="0.04 50 0.11"/>'))
-    for words in ("limits of bend", "150, look like degrees", "velocity limit of", "0.04 x 50 x 0.11 m large"):
+    for words in ("limits of bend", "150, look like degrees", "velocity limit of", "0.04 x 50 x 0.11 m large",
+                  "check: the arm reaches 12"):
         assert any(words in line for line in lines), (words, lines)
     done = ask(tmp_path, "robot", "check", "r.yaml")
     assert done.returncode == 1 and "0.04 x 50 x 0.11 m large" in done.stdout
@@ -261,6 +263,8 @@ def test_maker_s_srdf_gives_pairs_group_and_poses(folder, tmp_path):
     (TEXT.replace('upper="2.6"', 'upper="${wide}"'), "", ["'bend'", "'${wide}'"]),
     (TEXT.replace(' velocity="0"', ""), "", ["'spin'", "no velocity"]),
     (CHAIN, "", ["39 of them in one chain", "30"]),
+    (TEXT.replace('xyz="0.3 0 0"', 'xyz="75 0 0"').replace('xyz="0 0 0.36"', 'xyz="0 0 90"'), "",
+     ["bad.urdf", "reaches 165.2 m", "look like millimetres"]),
     (TEXT, "--package-dir gone", ["--package-dir", "'gone'", "not a folder"]),
     (TEXT, "--name 'my arm'", ["--name", "'my arm'"]),
     (TEXT, "--out no/a.yaml", ["--out", "does not exist"]),

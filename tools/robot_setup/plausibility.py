@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from common.planning.robot_geometry import shape_corners
+from common.robot.description_values import FARTHEST
 from common.robot.model import RobotModel
 from common.robot.urdf import WORLD
 from tools.robot_setup.tree import Joint
@@ -20,6 +21,7 @@ LARGE, SMALL = 3.0, 0.001  # [m] largest side of a link: larger and smaller ones
 BEYOND = 3.0  # times the reach of the arm: a link that is LARGE too cannot be right
 TURNS = 4 * math.pi + 0.01  # [rad] farthest position of a joint that turns
 FASTEST = 30.0  # [rad/s or m/s] a faster joint is not believed
+LONGEST = 10.0  # [m] reach of an arm: a longer one is reported
 TRAVEL = 10.0  # [m] farthest position of a joint that slides
 
 
@@ -48,12 +50,15 @@ def led_joints(robot: RobotModel) -> dict[str, str]:
 
 
 def odd_sizes(robot: RobotModel) -> list[tuple[str, bool]]:
-    """Return a line for each link whose collision shapes are too large or too small, and whether it cannot be right."""
+    """Return a line for a long arm and each large or small link by its shapes, and whether it cannot be right."""
     corners: dict[str, list[Array]] = {}
     for item in robot.full_geometry().geometryObjects:
         frame = robot.full_model.frames[item.parentFrame]
         corners.setdefault(frame.name, []).append(shape_corners(item.geometry, frame.placement.actInv(item.placement)))
     found = []
+    if robot.reach > LONGEST:
+        found.append((f"the arm reaches {robot.reach:.3g} m: its lengths look like millimetres, and must be m",
+                      robot.reach > FARTHEST))
     for link, parts in corners.items():
         sides = np.ptp(np.concatenate(parts), axis=0)
         shown = " x ".join(f"{side:.3g}" for side in sides)

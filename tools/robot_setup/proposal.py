@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from common.config import RobotConfig, check
 from common.errors import ConfigError
 from common.planning.robot_geometry import RobotGeometry
+from common.robot.description_values import FARTHEST
 from common.robot.finger_joints import finger_positions
 from common.robot.model import RobotModel
 from common.robot.transforms import invert, matrix_to_rpy, transform
@@ -121,6 +122,9 @@ def draft(
     middle = [(low + high) / 2 for low, high in proposal.values["position_limits"]]
     proposal.values["named_poses"] = {"home": middle}
     robot = _model(proposal)
+    if robot.reach > FARTHEST:
+        raise ConfigError("urdf", urdf, f"has an arm that reaches {robot.reach:.4g} m, more than {FARTHEST:g}: its "
+                                        "lengths look like millimetres, and must be m")
     if bare := bare_links(robot):
         proposal.values["visual_as_collision"] = bare
         proposal.notes["visual_as_collision"] = "Links that the URDF gives no collision shape."

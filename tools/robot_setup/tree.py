@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from common.errors import ConfigError, UnknownName
+from common.robot.description_values import MOVING
 from common.robot.urdf import WORLD
 
-MOVING = ("revolute", "continuous", "prismatic")
 FINGER_WORDS = ("finger", "gripper", "jaw", "knuckle", "claw")
 LEAST_JOINTS = 3  # of an arm: a tree that branches earlier has several arms
 MOST_JOINTS = 30  # in one chain
@@ -113,8 +113,8 @@ def read_tree(root: ET.Element, source: str) -> Tree:
     """Return the links and joints of a parsed URDF.
 
     Raises:
-        ConfigError: it is no tree: no link, several roots, a link with two parents, or a cycle; or a joint is
-            incomplete.
+        ConfigError: it is no tree: no link, several roots, a link with two parents, or a cycle; or a joint's link is
+            missing.
     """
     links = [link.get("name", "") for link in root.findall("link")]
     joints = [_joint(element, links, source) for element in root.findall("joint")]
@@ -146,20 +146,8 @@ def _joint(element: ET.Element, links: Sequence[str], source: str) -> Joint:
 
     def value(of: ET.Element | None, key: str) -> float | None:
         text = of.get(key) if of is not None else None
-        try:
-            number = None if text is None else float(text)
-        except ValueError:
-            number = math.nan
-        if number is not None and not math.isfinite(number):
-            raise ConfigError("urdf", source, f"has a joint {name!r} whose {key} is {text!r}, no number")
-        return number
+        return None if text is None else float(text)
 
-    axis = element.find("axis")
-    if kind in MOVING and axis is not None and not any(map(_may_turn, axis.get("xyz", "1 0 0").split())):
-        raise ConfigError("urdf", source, f"has a joint {name!r} whose axis is {axis.get('xyz')!r}, which is none")
-    missing = next((key for key in ("effort", "velocity") if limit is not None and limit.get(key) is None), None)
-    if missing is not None and kind in MOVING:
-        raise ConfigError("urdf", source, f"has a joint {name!r} whose limit has no {missing}, which a URDF must give")
     follows = None
     if mimic is not None:
         factor = value(mimic, "multiplier")
@@ -168,19 +156,11 @@ def _joint(element: ET.Element, links: Sequence[str], source: str) -> Joint:
                  value(limit, "velocity") or None, follows, value(mimic, "offset") or 0.0)
 
 
-def _may_turn(text: str) -> bool:
-    """Return whether a number of an axis is not 0; the URDF loader reports invalid ones."""
-    try:
-        return float(text) != 0
-    except ValueError:
-        return True
-
-
 def find_arm(tree: Tree, source: str, tip: str | None = None, group: Sequence[str] = ()) -> Arm:
     """Return the longest chain of moving joints up to the fingers, the one that carries `tip`, or the joints `group`.
 
     Raises:
-        ConfigError: no joint moves, or none moves `tip`. UnknownName: the link `tip` does not exist.
+        ConfigError: fewer than three joints move, or none moves `tip`. UnknownName: the link `tip` does not exist.
     """
     if tip is not None and tip not in tree.links:
         raise UnknownName("link", tip, tree.links)
@@ -196,7 +176,11 @@ def find_arm(tree: Tree, source: str, tip: str | None = None, group: Sequence[st
         if not moving:
             raise ConfigError("--tip", tip, f"is moved by no joint; arms end at {', '.join(wrists)}")
         wrist = moving[-1].child
-    return Arm(_moving(tree, wrist), _base(tree), wrist, tree.moving_below(wrist))
+    joints = _moving(tree, wrist)
+    if len(joints) < LEAST_JOINTS:
+        raise ConfigError("urdf", source, f"has an arm of fewer than {LEAST_JOINTS} moving joints: only "
+                                          f"{', '.join(joint.name for joint in joints)} up to link {wrist}")
+    return Arm(joints, _base(tree), wrist, tree.moving_below(wrist))
 
 
 def find_wrists(tree: Tree) -> list[str]:

@@ -62,7 +62,11 @@ DAMAGED = {
             b"</visual_scene>", b'<node><instance_node url="#n39"/></node></visual_scene>'),
     "announced.glb": binary_gltf({"count": 10**10}),
     "outside.glb": binary_gltf({"count": 3, "bufferView": 0}),
+    "no_scene.dae": b"<COLLADA><asset/></COLLADA>",
+    "word.obj": b"v 1 a 0\nf 1 2 3\n",
+    "cut_off.glb": b"glTF",
 }
+UNREADABLE = {"no_scene.dae": "COLLADA", "word.obj": "OBJ", "out_of_range.obj": "OBJ", "cut_off.glb": "binary glTF"}
 
 
 @pytest.mark.parametrize("suffix", ["stl", "dae", "obj"])
@@ -83,7 +87,9 @@ def test_damaged_mesh_is_named_in_a_line(tmp_path: Path, name: str, read) -> Non
     with pytest.raises(ConfigError) as refused:
         read("robot.urdf", path)
     message = str(refused.value)
-    assert message.startswith(f"robot.urdf: {str(path)!r} is a mesh that cannot be read: ") and "\n" not in message
+    assert message.startswith(f"robot.urdf: {str(path)!r} is a mesh that cannot be read") and "\n" not in message
+    if name in UNREADABLE:
+        assert message.endswith(f"read as {UNREADABLE[name]}: the file is damaged or of another format")
 
 
 def test_file_larger_than_a_mesh_is_not_read(tmp_path: Path) -> None:

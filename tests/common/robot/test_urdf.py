@@ -60,7 +60,7 @@ def test_base_pose_of_the_robot_file_moves_the_complete_robot(make):
     T_world_base = transform(rpy_to_matrix(0.1, -0.2, 0.7), (1.0, -0.5, 0.75))
     for name, T in at_origin.link_poses([0.3]).items():
         assert np.allclose(moved.link_poses([0.3])[name], T_world_base @ T, atol=1e-9)
-    assert np.allclose(moved.fk([0.3]), T_world_base @ at_origin.fk([0.3]))
+    assert np.allclose(moved.fk([0.3]), T_world_base @ at_origin.fk([0.3])) and moved.jacobian([0.3]).shape == (6, 1)
     assert np.allclose(shapes(moved)[0].placement.homogeneous, T_world_base, atol=1e-9)
     assert (at_origin.world_frames, moved.world_frames) == (["", "world", "base"], ["", "world"])
     assert set(moved.link_names) == {"base", "arm"} and moved.link_parents == {"arm": "base"}
@@ -83,6 +83,13 @@ def test_fixed_joint_may_have_the_name_of_a_link(make):
     assert robot.link_poses([0.3])["stand"][2, 3] == pytest.approx(1.0)
 
 
+def test_what_planning_does_not_use_of_a_description_prints_nothing(make, capfd):
+    inside = '<safety_controller/><calibration rising="x"/><limit'
+    unused = '<material name="m"><color rgba="x"/></material>' + link("a", "<inertial/>") + joint("arm", "a", "fixed")
+    make(ARM.replace("<limit", inside).replace('"0 0 0.5"', '"0&#9;0 0.5"').replace('"-2"', '"-2 "') + unused)
+    assert capfd.readouterr() == ("", "")
+
+
 def test_attachment_is_fixed_to_its_link_and_the_tcp_to_the_attachment(make, tmp_path):
     tcp = {"link": "tip", "parent": "thumb", "position": [0, 0, 0.05], "rpy": [0, np.pi / 2, 0]}
     robot = make(attachments=mounted(tmp_path, rpy=[0, 0, np.pi / 2]), tcp=tcp, tcp_link="")
@@ -95,6 +102,7 @@ def test_link_called_world_is_replaced_and_what_else_is_fixed_to_it_stays(make):
     arm = (link("world") + joint("world", "base", "fixed", "0 0 0.2") + ARM + link("lamp", BOX)
            + joint("world", "lamp", "fixed", "0.3 0 0.5"))
     assert make(arm).link_poses([0.3])["lamp"][:3, 3] == pytest.approx((0.3, 0.0, 0.3))
+    arm += link("a") + joint("arm", "a") + link("b") + joint("a", "b")
     assert find_arm(read_tree(ET.fromstring(f"<robot>{arm}</robot>"), "arm"), "arm").base == "base"
 
 

@@ -92,6 +92,33 @@ def names(name: str) -> bytes:
     return arm("").replace('"turn"', f'"{name}"').encode()
 
 
+LIMIT, TIP = '<limit lower="-1" upper="1" velocity="1" effort="1"/>', '<link name="tip"/>'
+VALUES = {  # change of the arm: part of its line
+    (LIMIT, LIMIT.replace('"-1"', '"nan"')): "joint 'turn' that is unusable: lower of <limit> is 'nan'",
+    (LIMIT, LIMIT.replace('"-1"', '"-1e30"')): "lower of <limit> is '-1e30'",
+    (LIMIT, LIMIT.replace('"-1"', '"-1 -2"')): "lower of <limit> is '-1 -2', but must be a number",
+    (LIMIT, LIMIT.replace('velocity="1"', 'velocity="-1"')): "velocity of <limit> is '-1', but must not be negative",
+    (LIMIT, LIMIT.replace('effort="1"', "")): "<limit> has no effort",
+    (LIMIT, LIMIT + '<dynamics damping="x"/>'): "damping of <dynamics> is 'x'",
+    (LIMIT, LIMIT + "<mimic/>"): "<mimic> has no joint",
+    (LIMIT, LIMIT + "<axis/>"): "<axis> has no xyz",
+    ("revolute", "spinny"): "its type is 'spinny'; choices: revolute",
+    ('name="tip"', 'name="base"'): "more than one link called 'base'",
+    ("</robot>", '<joint name="turn" type="fixed"/></robot>'): "more than one joint called 'turn'",
+    ('name="turn"', 'name=" "'): "a joint without a name",
+    **{(LIMIT, f'{LIMIT}<{tag} {key}="{value}"/>'): f"{key} of <{tag}> is {value!r}" for tag, key, values in (
+        ("origin", "xyz", ("0 nan 0", "inf 0 0", "0 0 1e30", "0 0", "0 0 300", "1_0 0 0", "0 0 \u0663")),
+        ("origin", "rpy", ("nan 0 0", "0 0 0 0", "1e30 0 0")),
+        ("axis", "xyz", ("0 1", "nan 0 1", "0 0 0", "0 -0.0 0.0", "1e300 0 0", "1e-300 0 0")),
+    ) for value in values},
+    **{(TIP, f'<link name="tip"><inertial>{part}</inertial></link>'): f"link 'tip' that is unusable: {wanted}"
+       for part, wanted in (('<mass value="nan"/>', "value of <mass> is 'nan'"), ("<mass/>", "<mass> has no value"),
+                            ('<mass value="-1"/>', "value of <mass> is '-1', but must not be negative"),
+                            ('<inertia ixy="x"/>', "ixy of <inertia> is 'x'"),
+                            ('<origin xyz="0 0"/>', "xyz of <origin> is '0 0'"))},
+}
+
+
 @pytest.mark.parametrize(("content", "wanted"), [
     (b"", "is empty"), (b" \n", "is empty"), (gzip.compress(b"<robot/>", mtime=0), "unpack it"),
     (b"\n<!DOCTYPE html>\n<html></html>", "download the raw file"),
@@ -111,6 +138,7 @@ def names(name: str) -> bytes:
         "\u2028", "\u2029", "\u0085", "&#10;", "&#9;", "\u202e", "\u200b")),
     (("<robot>" + "".join(f'<link name="l{i}"/>' for i in range(401)) + "</robot>").encode(), "401 links"),
     (names("x" * 500), "500 characters"),
+    *((arm("").replace(*change).encode(), wanted) for change, wanted in VALUES.items()),
 ])
 def test_file_that_is_no_usable_description_is_one_line(content, wanted, tmp_path):
     (tmp_path / "pointer.stl").write_bytes(b"version https://git-lfs.github.com/spec/v1\noid sha256:1\n")
