@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from common.errors import ConfigError
-from common.robot.description_values import FARTHEST, numbers
+from common.robot.description_values import FARTHEST, LARGEST, numbers
 from common.robot.transforms import rpy_to_matrix, transform
 
 Array = NDArray[np.float64]
@@ -64,6 +64,12 @@ def link_shapes(root: ET.Element, kind: Kind, field: str, source: str) -> Iterat
                 raise ConfigError(field, source, f"is no usable description: {problem}") from None
 
 
+def pose_of_origin(origin: ET.Element | None, bound: float = LARGEST) -> Array:
+    """Return the pose (4, 4) of an <origin>; raise ValueError if a number is unusable."""
+    x, y, z = numbers(origin, "xyz", 3, "0 0 0", bound)
+    return transform(rpy_to_matrix(*numbers(origin, "rpy", 3, "0 0 0", bound)), (x, y, z))
+
+
 def _shape(link: str, part: ET.Element, colors: dict[str, Rgb]) -> Shape:
     origin, material, geometry = part.find("origin"), part.find("material"), part.find("geometry/*")
     if geometry is None:
@@ -72,8 +78,7 @@ def _shape(link: str, part: ET.Element, colors: dict[str, Rgb]) -> Shape:
         raise ValueError(f"<{geometry.tag}> is an unknown shape; choices: {', '.join(_SIZES)}")
     if unknown := set(origin.keys() if origin is not None else ()) - {"xyz", "rpy"}:
         raise ValueError(f"{unknown.pop()} of <origin> is unknown; choices: xyz, rpy")
-    x, y, z = numbers(origin, "xyz", 3, "0 0 0", FARTHEST)
-    T = transform(rpy_to_matrix(*numbers(origin, "rpy", 3, "0 0 0")), (x, y, z))
+    T = pose_of_origin(origin, FARTHEST)
     color = None
     if material is not None:
         color = _material_color(material) or colors.get(str(material.get("name")))

@@ -8,15 +8,14 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from common.config import AttachmentConfig, RobotConfig, config_root
 from common.errors import ConfigError
 from common.robot.description_file import read_xml
-from common.robot.link_shapes import link_shapes
+from common.robot.link_shapes import link_shapes, pose_of_origin
 from common.robot.mesh_references import SCHEME, resolve_meshes
 from common.robot.packages import package_folders, package_paths
-from common.robot.transforms import invert, matrix_to_rpy, rpy_to_matrix, transform
+from common.robot.transforms import invert, matrix_to_rpy
 
 WORLD = "world"
 FULL_TURN = 2 * math.pi  # [rad]
@@ -126,22 +125,14 @@ def _drop_above(robot: ET.Element, config: RobotConfig) -> None:
         if joint.get("type") != "fixed":
             raise ConfigError("robot.base_link", config.base_link,
                               f"cannot be the root: its parent is {link} and joint {joint.get('name')} moves")
-        T_base_link = T_base_link @ invert(_placement(joint))
+        T_base_link = T_base_link @ invert(pose_of_origin(joint.find("origin")))
         for sibling in [j for j in robot.findall("joint") if _end(j, "parent") == link]:
-            T = T_base_link @ _placement(sibling)
+            T = T_base_link @ pose_of_origin(sibling.find("origin"))
             for part in sibling.findall("parent") + sibling.findall("origin"):
                 sibling.remove(part)
             ET.SubElement(sibling, "parent", link=config.base_link)
             ET.SubElement(sibling, "origin", xyz=_text(T[:3, 3].tolist()), rpy=_text(matrix_to_rpy(T[:3, :3])))
         robot.remove(next(element for element in robot.findall("link") if element.get("name") == link))
-
-
-def _placement(joint: ET.Element) -> NDArray[np.float64]:
-    """Return the pose (4, 4) of a joint in its parent link."""
-    origin = joint.find("origin")
-    xyz, rpy = (np.array([float(value) for value in (text or "0 0 0").split()])
-                for text in (origin.get(key) if origin is not None else None for key in ("xyz", "rpy")))
-    return transform(rpy_to_matrix(*rpy.tolist()), xyz)
 
 
 def _limit_continuous(joint: ET.Element) -> None:

@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 
 from common.errors import ConfigError
 from common.robot.collision_shapes import distinct, solid
+from common.robot.description_values import numbers
 from common.robot.finger_joints import finger_couplings
-from common.robot.link_shapes import Shape, link_shapes
+from common.robot.link_shapes import Shape, link_shapes, pose_of_origin
 from common.robot.mesh_files import content_of, triangles_of
 from common.robot.model import RobotModel
-from common.robot.transforms import rpy_to_matrix, transform
 from common.robot.urdf import WORLD, find_description
 from drivers.mujoco.scene import COLLIDES, ROBOT, SOLIMP, SOLREF, set_contact, set_finger_contact, visual_only, wxyz
 
@@ -157,16 +157,6 @@ def _link(joint: ET.Element, which: str) -> str:
     return "" if found is None else str(found.get("link"))
 
 
-def _numbers(element: ET.Element | None, name: str, default: str) -> list[float]:
-    return [float(value) for value in (element.get(name, default) if element is not None else default).split()]
-
-
-def pose_of_origin(origin: ET.Element | None) -> Array:
-    """(4, 4) pose of an <origin> element."""
-    x, y, z = _numbers(origin, "xyz", "0 0 0")
-    return transform(rpy_to_matrix(*_numbers(origin, "rpy", "0 0 0")), (x, y, z))
-
-
 def _place(element_: Any, origin: ET.Element | None) -> None:
     T = pose_of_origin(origin)
     element_.pos, element_.quat = T[:3, 3], wxyz(T[:3, :3])
@@ -180,7 +170,7 @@ def _add_joint(body: Any, joint: ET.Element, robot: RobotModel) -> None:
         raise ConfigError("robot.urdf", name, f"is a {kind} joint, which is not supported; choices: fixed, "
                                               f"{', '.join(_JOINTS)}")
     limit, dynamics = joint.find("limit"), joint.find("dynamics")
-    mj_joint = body.add_joint(name=name, type=_JOINTS[kind], axis=_numbers(joint.find("axis"), "xyz", "1 0 0"))
+    mj_joint = body.add_joint(name=name, type=_JOINTS[kind], axis=numbers(joint.find("axis"), "xyz", 3, "1 0 0"))
     low, high = (float(limit.get(end, 0.0)) if limit is not None else 0.0 for end in ("lower", "upper"))
     if low < high and kind != "continuous":  # a joint without range is locked
         mj_joint.range, mj_joint.limited = [low, high], True
