@@ -186,12 +186,13 @@ def _summary_file(summary: str | None) -> Path | None:
 def _require_valid_services(cell: Cell) -> None:
     """Validate parameters and remapped keys of services before any process starts.
 
-    A service without either has its defaults, and its imports would delay the start.
+    A service of the project without either has its defaults, and its imports would delay the start.
 
     Raises:
         ConfigError: names the field, the value and the choices.
     """
-    given = [entry for entry in cell.services.values() if entry.parameters or entry.topics]
+    given = [entry for entry in cell.services.values()
+             if entry.parameters or entry.topics or not entry.module.startswith("services.")]
     if not given:
         return
     from common.supervision.wiring import WiringFailed, load_service, wire_service

@@ -32,7 +32,8 @@ Tunable = Annotated[T, AtRunTime()]  # as in `min_area: Tunable[float] = Field(.
 class Section(BaseModel):
     """A section of the cell, which any service may declare."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)  # see common/messages/basics.py
+    # defer_build: see common/messages/basics.py
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, defer_build=True)
 
 
 class Parameters(BaseModel):
@@ -42,7 +43,7 @@ class Parameters(BaseModel):
     other field ever changes.
     """
 
-    model_config = ConfigDict(extra="forbid", defer_build=True)
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, defer_build=True)
 
 
 C = TypeVar("C", bound=BaseModel)

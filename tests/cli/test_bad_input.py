@@ -36,7 +36,9 @@ ROWS = [  # a command, and parts of its line
     ("simulate panda --set 'services={smart_pick_place: {}, trajectory_executor: {}}'",
      "services: motion_planner is missing", "needed by smart_pick_place"),
     ("up panda --set services.trajectory_executor.speed_scaling=nan", "services.trajectory_executor.speed_scaling",
-     "'nan' must be less than or equal to 1"),
+     "'nan' must be a finite number"),
+    ("up mine.yaml", "services.needs.gain: is missing"),
+    ("up mine.yaml --set services.needs.gain=.inf", "services.needs.gain: inf must be a finite number"),
     ("up renamed.yaml", "services.vision_detector.topics: 'nonsense' is no key", "camera/image_raw"),
     ("run fake.yaml --set services.first.x=1", "services.fakes.first", "is not a module: there is no fakes in"),
     ("run panda --set application=common.tasks.none", "is not a module: there is no none in", "common/tasks"),
@@ -154,10 +156,14 @@ def files(tmp_path_factory):
     for name, text in {"a cell": cell + task, "fake": cell + task, "broken": "cell: [1,\nrobot: }\n", "list": "- 1\n",
                        "twice": "cell: a\nrobot: panda\ncell: b\n",
                        "renamed": cell + "services: {vision_detector: {topics: {nonsense: x}}}\n",
+                       "mine": cell + "services: {mine.needs: {}}\n",
                        "empty": "", "taskless": cell + "services: {motion_planner: {}}\n"}.items():
         (folder / f"{name}.yaml").write_text(text)
     write(folder / "there.mcap", [joints(n) for n in range(12)])
     (folder / "panda.mcap").symlink_to(RECORDING)
+    (folder / "mine").mkdir()
+    (folder / "mine" / "needs.py").write_text(
+        "from common.config import Parameters\n\n\nclass Config(Parameters):\n    gain: float\n")
     (folder / "taken").mkdir()
     (folder / "taken" / "mine.txt").touch()
     (folder / "a_file").touch()
@@ -168,6 +174,7 @@ def files(tmp_path_factory):
 def test_bad_input_is_one_line_and_changes_no_file(row, files, monkeypatch, rejection):
     monkeypatch.chdir(files)
     monkeypatch.setattr("sys.stdin", io.StringIO())
+    monkeypatch.setattr("sys.dont_write_bytecode", True)
     monkeypatch.setattr("common.client.joining.CONNECT_TIMEOUT", 0.05)
     before = sorted(files.rglob("*"))
     line = rejection(*shlex.split(row[0]))

@@ -97,7 +97,7 @@ def test_change_is_made_in_place_by_apply_and_described_with_old_and_new_value(c
     ("bad_value", {"motion.velocity_scaling": 1.5}, "motion.velocity_scaling: 1.5 must be less than or equal to 1"),
     ("bad_value", {"services.it.low": "many"}, "services.it.low: 'many' must be a valid integer"),
     ("bad_value", {"services.it.low": 7}, "services.it: low 7 is above high 5"),
-    ("bad_value", {"services.it.wait": float("nan")}, "services.it.wait: nan must be finite"),
+    ("bad_value", {"services.it.wait": float("nan")}, "services.it.wait: nan must be a finite number"),
     ("bad_value", {"services.it.point": [1.0]}, "services.it.point.1"),
     *(("bad_value", {path: value}, f"{path}: {value!r} must be a number") for value in (True, "1")
       for path in ("services.it.wait", "services.it.high", "motion.velocity_scaling")),
