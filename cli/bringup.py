@@ -8,7 +8,6 @@ from typing import Annotated, Any
 import typer
 
 from cli import options, verbs
-from cli.session.plan import require_task
 from cli.session.session import CellSession
 from common.supervision.multi_host import HostOptions
 
@@ -108,6 +107,8 @@ def run(**given: Any) -> None:
     Exit 3 if it is DONE but the simulated world has objects left that the summary does not explain.
     """
     of_applications = {name: given.pop(name) for name in given.keys() - _OPTIONS}
+    from tools.check.cell import require_task  # slow to import
+
     before = verbs.before_run(given["cell"], given["overrides"], given["world"], of_applications)
     session = _session(**{**given, "overrides": before.overrides}, until_ended=True)
     require_task(session.on_all_hosts)

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from cli import options
-from cli.session.plan import require_task
 from common.terminal import echo
 
 if TYPE_CHECKING:
@@ -98,6 +97,7 @@ def simulate(
     from lab.campaign import seeds_of
     from lab.doubles import settings_of, with_doubles
     from lab.observers import with_observed_arm
+    from tools.check.cell import require_task
 
     if seeds is not None and seed is not None:
         raise ConfigError("--seed", seed, "does not go with --seeds")

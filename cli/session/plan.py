@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -148,7 +147,7 @@ def resolve(
     from recording.report.aggregator import RunAggregator
     from security.page_tokens import VIEWER
     from security.preflight import require_secured, with_near
-    from tools.check.cell import require_safe
+    from tools.check.cell import require_safe, require_valid_services
 
     summary_file = _summary_file(summary)
     number, endpoint = router_location(domain, connect)
@@ -165,7 +164,7 @@ def resolve(
     require_modules(loaded)
     require_safe(loaded)
     here = host.part_of(loaded)
-    _require_valid_services(here)
+    require_valid_services(here)
     if endpoint is None:
         require_free_port(endpoint_of(number))
     require_secured(launch, here)
@@ -181,49 +180,6 @@ def _summary_file(summary: str | None) -> Path | None:
     if file.is_dir():
         raise ConfigError("--summary", summary, "is a folder")
     return file
-
-
-def _require_valid_services(cell: Cell) -> None:
-    """Validate parameters and remapped keys of services before any process starts.
-
-    A service of the project without either has its defaults, and its imports would delay the start.
-
-    Raises:
-        ConfigError: names the field, the value and the choices.
-    """
-    given = [entry for entry in cell.services.values()
-             if entry.parameters or entry.topics or not entry.module.startswith("services.")]
-    if not given:
-        return
-    from common.supervision.wiring import WiringFailed, load_service, wire_service
-
-    for entry in given:
-        with contextlib.suppress(WiringFailed):  # its process reports the error
-            load_service(cell, entry)
-            if entry.topics:
-                wire_service(cell, entry)
-
-
-def require_task(cell: Cell) -> None:
-    """Return if the cell has a task, and the services without which no task moves an arm.
-
-    Args:
-        cell: with its services on all hosts.
-
-    Raises:
-        ConfigError: it has none, or a service is missing.
-    """
-    if not cell.task:
-        raise ConfigError("task", ..., f"is missing: {cell.name} has nothing to run; `zencell up` brings it up, and "
-                          "clients can move its arm")
-    if cell.task not in cell.services:
-        raise ConfigError("services", ..., f"{cell.task}, the task of {cell.name}, is missing among them: "
-                          f"{', '.join(cell.services) or 'there are none'}")
-    if all(entry.module.startswith("services.") for entry in cell.services.values()):  # others may serve the same keys
-        kinds = {entry.kind for entry in cell.services.values()}
-        for kind in ("motion_planner", "trajectory_executor"):
-            if kind not in kinds:
-                raise ConfigError("services", ..., f"{kind} is missing among them: it is needed by {cell.task}")
 
 
 def without(cell: Cell, services: Sequence[str]) -> Cell:

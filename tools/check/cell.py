@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import math
 import pickle
 import sys
@@ -23,7 +24,7 @@ from common.robot.finger_joints import driven_position
 from common.robot.urdf import merged_urdf
 from common.sim.interface import require_simulator
 from common.supervision.launch import module_command
-from common.supervision.wiring import WiringFailed, wire_service
+from common.supervision.wiring import WiringFailed, load_service, wire_service
 from common.transport import ownership
 from common.transport.ownership import SHARED, Owner
 from tools.check import Finding, error, refusal, warning
@@ -58,6 +59,47 @@ def require_safe(cell: Cell) -> None:
     for found in blocking_errors(cell):
         field, _, rest = found.line.partition(": ")
         raise ConfigError(field, ..., rest)
+
+
+def require_valid_services(cell: Cell) -> None:
+    """Validate parameters and remapped keys of services before any process starts.
+
+    A service of the project without either has its defaults, and its imports would delay the start.
+
+    Raises:
+        ConfigError: names the field, the value and the choices.
+    """
+    given = [entry for entry in cell.services.values()
+             if entry.parameters or entry.topics or not entry.module.startswith("services.")]
+    if not given:
+        return
+    for entry in given:
+        with contextlib.suppress(WiringFailed):  # its process reports the error
+            load_service(cell, entry)
+            if entry.topics:
+                wire_service(cell, entry)
+
+
+def require_task(cell: Cell) -> None:
+    """Return if the cell has a task, and the services without which no task moves an arm.
+
+    Args:
+        cell: with its services on all hosts.
+
+    Raises:
+        ConfigError: it has none, or a service is missing.
+    """
+    if not cell.task:
+        raise ConfigError("task", ..., f"is missing: {cell.name} has nothing to run; `zencell up` brings it up, and "
+                          "clients can move its arm")
+    if cell.task not in cell.services:
+        raise ConfigError("services", ..., f"{cell.task}, the task of {cell.name}, is missing among them: "
+                          f"{', '.join(cell.services) or 'there are none'}")
+    if all(entry.module.startswith("services.") for entry in cell.services.values()):  # others may serve the same keys
+        kinds = {entry.kind for entry in cell.services.values()}
+        for kind in ("motion_planner", "trajectory_executor"):
+            if kind not in kinds:
+                raise ConfigError("services", ..., f"{kind} is missing among them: it is needed by {cell.task}")
 
 
 def quick_warnings(cell: Cell) -> list[Finding]:

@@ -193,7 +193,8 @@ def test_every_visual_of_the_description_moves_with_its_link(cell: str) -> None:
     pin.forwardKinematics(model, data, q)
     described: dict[str, list[NDArray[np.float64]]] = {}
     folders = [str(folder) for folder in robot.package_folders]
-    for item in pin.buildGeomFromUrdfString(model, robot.urdf, pin.GeometryType.VISUAL, folders).geometryObjects:
+    visuals = pin.buildGeomFromUrdfString(model, robot.urdf, pin.GeometryType.VISUAL, package_dirs=folders)
+    for item in visuals.geometryObjects:
         T = (data.oMi[item.parentJoint] * item.placement).homogeneous
         points = corners(item.geometry) @ T[:3, :3].T + T[:3, 3]
         described.setdefault(model.frames[item.parentFrame].name, []).append(points)
