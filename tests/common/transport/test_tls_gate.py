@@ -1,4 +1,4 @@
-"""The gate forwards clients with a valid certificate, byte for byte, and is kept from it by no other client."""
+"""The gate forwards what clients with a valid certificate send, and no other client can block it."""
 
 import socket
 import ssl
