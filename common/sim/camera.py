@@ -14,7 +14,8 @@ from common.config import CameraConfig, Light, RobotConfig, Scenery, Surrounding
 from common.errors import ConfigError
 from common.messages import CameraInfo, Header, JointState, Vector3, WorldObject, WorldObjects
 from common.perception.camera_file import CameraFile, Rectifier
-from common.perception.pinhole import MountedCamera, Pinhole
+from common.perception.pinhole import MountedCamera, Pinhole, camera_in_mount
+from common.robot.transforms import matrix_to_rpy, rpy_to_matrix, transform
 from common.sim.interface import load_renderer
 from common.sim.ray_caster import View
 from common.sim.sensors import Sensor, SensorParameters
@@ -40,6 +41,10 @@ class CameraParameters(SensorParameters):
         {}, max_length=7, description="replaces world.lights: to move and dim them at runtime"
     )
     ambient: Tunable[float | None] = Field(None, ge=0, le=100_000, description="replaces world.ambient [lx]")
+    pose_error: tuple[float, float, float, float, float, float] = Field(
+        (0.0,) * 6, description="calibration error: the true optical frame in the configured one, x, y, z [m], roll, "
+                                "pitch, yaw [rad]"
+    )
 
 
 class SimulatedCamera:
@@ -73,7 +78,8 @@ class SimulatedCamera:
         self._scenery, self._config = scenery, config
         self._robot: RobotModel | None = None
         self._robot_config = robot
-        self._mounted = MountedCamera(self._lens.rendered, self._model() if around.camera.mount else None)
+        self._mounted = MountedCamera(displaced(self._lens.rendered, config.pose_error),
+                                      self._model() if around.camera.mount else None)
         self._camera = around.camera
         self._light = self._current_light()
         self._renderer = load_renderer(around, self._light, self._model, plain=plain, camera=self._mounted.at(),
@@ -140,6 +146,16 @@ class SimulatedCamera:
         images = [self._lens.distort(view.colour) for view in views]
         image = self._lens.rectify(self._sensor.expose(images, self._renderer.level))
         return View(image, views[-1].depth)
+
+
+def displaced(camera: CameraConfig, error: Sequence[float]) -> CameraConfig:
+    """Return a camera moved by x, y, z [m] and turned by roll, pitch, yaw [rad] in its own optical frame."""
+    if not any(error):
+        return camera
+    dx, dy, dz, roll, pitch, yaw = error
+    T: Array = camera_in_mount(camera) @ transform(rpy_to_matrix(roll, pitch, yaw), (dx, dy, dz))
+    x, y, z = T[:3, 3].tolist()
+    return camera.model_copy(update={"position": (x, y, z), "rpy": matrix_to_rpy(T[:3, :3])})
 
 
 class Lens:

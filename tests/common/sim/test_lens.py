@@ -109,3 +109,18 @@ def test_changed_light_affects_the_next_image():
     bright = one.capture(WorldObjects(), None, 0).colour
     config.ambient = 20.0
     assert one.capture(WorldObjects(), None, 0).colour.mean() == pytest.approx(bright.mean() * 370 / 500, rel=0.02)
+
+
+def test_pose_error_moves_the_image_but_not_the_configured_pose():
+    """The camera looks down from 0.8 m: 10 mm along its x axis and 20 mrad about it each move the picture."""
+    def middle(*error: float) -> np.ndarray:
+        """Of the picture of a sphere [px]."""
+        one = camera(CameraParameters(pose_error=error))
+        table = one.capture(WorldObjects(), None, 0).colour.astype(int)
+        picture = one.capture(sphere(0.40, 0), None, 0).colour.astype(int)
+        return np.argwhere(np.abs(picture - table).max(axis=2) > 8).mean(axis=0)[::-1]
+
+    exact = middle(0, 0, 0, 0, 0, 0)
+    assert middle(0.01, 0, 0, 0, 0, 0) - exact == pytest.approx((-520 * 0.01 / 0.77, 0), abs=0.7)
+    assert middle(0, 0, 0, 0.02, 0, 0) - exact == pytest.approx((0, 520 * 0.02), abs=0.7)
+    assert CELL.world.camera.position == (0.40, 0.0, 0.80)
