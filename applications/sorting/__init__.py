@@ -7,4 +7,5 @@ APPLICATION = Application(
     task="sorter",
     grasps=True,
     fills_containers=True,
+    page="applications.sorting.page:PAGE",
 )
