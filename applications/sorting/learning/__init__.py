@@ -1,0 +1,1 @@
+"""Grasps tried in physics without an arm, and a scorer learned from them."""
