@@ -17,6 +17,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from common.cache import cache_folder
 from common.errors import ConfigError
 from common.robot.collision_shapes import distinct, solid
 from common.robot.description_values import numbers
@@ -30,17 +31,9 @@ from drivers.mujoco.scene import COLLIDES, ROBOT, SOLIMP, SOLREF, set_contact, s
 if TYPE_CHECKING:
     from common.robot.visual_meshes import Piece
 
-CACHE_VARIABLE = "ZENCELL_CACHE"  # cache folder; default: zencell in the user's cache
 _FORMAT = b"2"  # version of the cached format
 
 Arrays = dict[str, NDArray[Any]]
-
-
-def cache_folder() -> Path:
-    """Return the cache folder, which need not exist."""
-    if named := os.environ.get(CACHE_VARIABLE):
-        return Path(named)
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "zencell"
 
 
 def hull_points(path: Path, scale: tuple[float, ...]) -> NDArray[np.float64]:
