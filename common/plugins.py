@@ -28,6 +28,7 @@ PACKAGES = {
     "zencell.grippers": ("common.hardware", "drivers"),
     "zencell.cameras": ("drivers",),
     "zencell.worlds": ("common.sim", "drivers"),
+    "zencell.generators": (),
     "zencell.page": ("page.layers",),
     "zencell.verbs": (),
 }

@@ -31,4 +31,14 @@ from common.config.robot import (
     SuctionCup,
     TcpConfig,
 )
-from common.config.world import CameraConfig, Container, Fixture, Light, ObjectConfig, Scenery, Surroundings, World
+from common.config.world import (
+    CameraConfig,
+    Container,
+    Fixture,
+    Generator,
+    Light,
+    ObjectConfig,
+    Scenery,
+    Surroundings,
+    World,
+)

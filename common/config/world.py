@@ -10,7 +10,7 @@ import math
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import ConfigDict, Field, model_validator
 
 from common.config.basics import Coordinate, Length, Number, Point, Rgb, Section
 from common.errors import UnknownName
@@ -117,6 +117,10 @@ class ObjectConfig(Section):
     scale: Length = Field(1.0, description="of the mesh: 0.001 for a file in millimetres")
     color: Rgb = (1.0, 1.0, 0.0)
     mass: float = Field(0.1, gt=0, le=100, description="[kg]")
+    friction: float | None = Field(
+        None, gt=0, le=5, description="with physics: coefficient of sliding friction against everything, also against "
+                                      "the pads of fingers; default: of the other surface"
+    )
 
     @model_validator(mode="after")
     def _require_fields_of_shape(self) -> ObjectConfig:
@@ -159,6 +163,14 @@ class ObjectConfig(Section):
         return self.position is not None or self.x is not None
 
 
+class Generator(Section):
+    """A module that adds objects to the world; its options are the other fields here."""
+
+    model_config = ConfigDict(extra="allow")
+
+    module: str = Field(min_length=1, max_length=200, description="dotted, or an entry point zencell.generators")
+
+
 class Light(Section):
     """A lamp, or parallel light like that of the sun. Its illuminance is that of a light meter at `aim`."""
 
@@ -173,8 +185,8 @@ class Light(Section):
 
 
 __all__ = [
-    "CAMERA", "TCP", "CameraConfig", "Container", "Fixture", "Light", "ObjectConfig", "Scenery", "Surroundings",
-    "World",
+    "CAMERA", "TCP", "CameraConfig", "Container", "Fixture", "Generator", "Light", "ObjectConfig", "Scenery",
+    "Surroundings", "World",
 ]
 
 MAX_BALLS = 8  # of a layout
@@ -276,6 +288,7 @@ class ObjectFields(SurroundingsFields):
     spots: list[tuple[Coordinate, Coordinate]] = Field([], description="of the fixed layout: uses the first `count`")
     balls: list[tuple[Coordinate, Coordinate]] = Field([], description="centres [m]; replaces layout and count")
     objects: list[ObjectConfig] = Field([], description="movable objects; the balls are added")
+    generator: Generator | None = Field(None, description="module that adds objects, drawn by the seed")
 
     @model_validator(mode="after")
     def _add_balls_to_objects(self) -> Self:

@@ -38,6 +38,7 @@ from common.messages import Header, SceneUpdate, WorldEdit, WorldEditReply, Worl
 from common.perception.pinhole import cameras_at_home
 from common.robot.model import RobotModel
 from common.scene.workspace import WorkspaceBounds, unreachable_reason
+from common.sim.generators import with_generated
 from common.sim.interface import (
     KINEMATIC,
     GraspTolerances,
@@ -77,8 +78,9 @@ def create_world(
     """Create the world with all its objects laid out; random positions are within reach of the robot.
 
     Raises:
-        ConfigError: no layout was found, or the simulator cannot be used.
+        ConfigError: no layout was found, or the simulator or the generator of objects cannot be used.
     """
+    world = with_generated(world, seed)
     seen = cameras_at_home(world, robot)
     objects = layout(seen, seed, lambda x, y, z: _within_reach(robot, (x, y, z), grasp, bounds))
     return load_world(world, objects, tolerances, gripper)

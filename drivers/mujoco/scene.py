@@ -28,12 +28,13 @@ DEFAULT_MASS = 0.1  # [kg]
 
 @dataclass(frozen=True, eq=False)
 class SceneObject:
-    """An object: shape in its own frame, color and mass [kg]."""
+    """An object: shape in its own frame, color, mass [kg], and friction, by default that of the other surface."""
 
     id: str
     solid: Solid
     color: tuple[float, float, float]
     mass: float = DEFAULT_MASS
+    friction: float | None = None
 
 
 def add_object(spec: mujoco.MjSpec, obj: SceneObject) -> None:
@@ -46,6 +47,8 @@ def add_object(spec: mujoco.MjSpec, obj: SceneObject) -> None:
         geom.mass = obj.mass * part / volume
         geom.rgba = [*obj.color, 1.0]
         set_contact(geom, OBJECT)
+        if obj.friction is not None:  # a rubber pad on a polished object slips like the object
+            geom.friction, geom.priority = (obj.friction, obj.friction * TORSION, ROLLING), OBJECT_PRIORITY
 
 
 def _geoms(spec: mujoco.MjSpec, body: Any, obj: SceneObject) -> list[tuple[Any, float]]:
@@ -117,6 +120,7 @@ SOLIMP = (0.95, 0.99, 0.001, 0.5, 2.0)
 SLIDING, TORSION = 1.0, 0.01  # coefficient, [m]
 FINGER_SLIDING = 1.5  # rubber pads
 CONDIM = 6  # sliding, torsion and rolling
+FINGER_PRIORITY, OBJECT_PRIORITY = 1, 2  # the friction of the geom of higher priority applies; else the larger one
 
 ROBOT, FIXED, OBJECT, HIDDEN = 1, 2, 4, 0  # collision categories; only the planner checks self-collision
 _COLLIDES_WITH = {ROBOT: 0, FIXED: ROBOT, OBJECT: ROBOT | FIXED | OBJECT, HIDDEN: 0}
@@ -142,7 +146,7 @@ def set_contact(geom: Any, kind: int, *, group: int = 0) -> Any:
 def set_finger_contact(geom: Any) -> Any:
     """Set the contact parameters of a finger pad, which override those of the object; return the geom."""
     geom.friction = (FINGER_SLIDING, TORSION, ROLLING)
-    geom.condim, geom.priority = CONDIM, 1
+    geom.condim, geom.priority = CONDIM, FINGER_PRIORITY
     return geom
 
 

@@ -56,6 +56,8 @@ class PhysicsWorld(WorldEvents):
         self._kinematic = KinematicWorld(world, objects, tolerances, gripper)
         self._first_masses = {obj.id: obj.mass for obj in objects}
         self._masses = dict(self._first_masses)
+        self._first_frictions = {obj.id: obj.friction for obj in objects}
+        self._frictions = dict(self._first_frictions)
         self._states = ObjectStates(world)
         self._removed: set[str] = set()  # objects reported as removed
         self._slippery: dict[str, float] = {}  # end of the slip time [s]
@@ -94,8 +96,8 @@ class PhysicsWorld(WorldEvents):
         """Build the model; joints and objects of the previous model keep position and velocity."""
         before = None if self._cell is None else (self._cell, self._data)
         bodies = self._kinematic.bodies
-        objects = [SceneObject(name, body.solid, body.color, self._masses.get(name, DEFAULT_MASS))
-                  for name, body in bodies.items()]
+        objects = [SceneObject(name, body.solid, body.color, self._masses.get(name, DEFAULT_MASS),
+                               self._frictions.get(name)) for name, body in bodies.items()]
         cell = build_model(self._robot, self._config, objects)
         tune(cell, self._robot)
         data = mujoco.MjData(cell.model)
@@ -203,6 +205,7 @@ class PhysicsWorld(WorldEvents):
             snapshot, at = body.snapshot(), cell.objects[name]
             speeds = data.qvel[at.dof: at.dof + 6]
             details = {**snapshot.details, "mass": self._masses.get(name, DEFAULT_MASS),
+                       "friction": self._frictions.get(name),
                        "slippery": name in self._slippery,
                        "qpos": data.qpos[at.qpos: at.qpos + 7].tolist(),
                        "qvel": speeds.tolist() if np.abs(speeds).max() > ASLEEP else [0.0] * 6}
@@ -213,6 +216,7 @@ class PhysicsWorld(WorldEvents):
         """Restore a state with velocities; a held object is at rest, like the restarted arm."""
         self._kinematic.restore(objects)
         self._masses = {name: float(snapshot.details.get("mass", DEFAULT_MASS)) for name, snapshot in objects.items()}
+        self._frictions = {name: snapshot.details.get("friction") for name, snapshot in objects.items()}
         self._removed = {name for name, body in self._kinematic.bodies.items() if body.state in ("held", "falling")}
         self._slippery = {name: -math.inf for name, snapshot in objects.items() if snapshot.details.get("slippery")}
         self._build()
@@ -239,10 +243,11 @@ class PhysicsWorld(WorldEvents):
         updates = self._kinematic.take_events()
         changed = self._kinematic.ids if request.op == "reset" else [name] if name in self._kinematic.bodies else []
         if request.op == "reset":
-            self._masses = dict(self._first_masses)
+            self._masses, self._frictions = dict(self._first_masses), dict(self._first_frictions)
         elif request.op == "add":
             template = request.like or self._default_template
             self._masses[name] = request.mass or self._first_masses.get(template, DEFAULT_MASS)
+            self._frictions[name] = self._first_frictions.get(template)
         if request.op == "reset" or before != set(self._kinematic.ids):
             try:
                 self._build()

@@ -22,6 +22,7 @@ from common.hardware.interface import has_simulated_world
 from common.messages import TaskStatus
 from common.robot.finger_joints import driven_position
 from common.robot.urdf import merged_urdf
+from common.sim.generators import require_generator
 from common.sim.interface import require_simulator
 from common.supervision.launch import module_command
 from common.supervision.wiring import WiringFailed, load_service, wire_service
@@ -56,6 +57,7 @@ def require_safe(cell: Cell) -> None:
     """
     if has_simulated_world(cell.robot):
         require_simulator(cell.world.simulator)
+        require_generator(cell.world)
     for found in blocking_errors(cell):
         field, _, rest = found.line.partition(": ")
         raise ConfigError(field, ..., rest)
