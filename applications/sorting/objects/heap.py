@@ -1,0 +1,171 @@
+"""Generates the objects of a world: a heap that falls into the tray, drawn by the seed.
+
+    generator: {module: applications.sorting.objects.heap, count: 10, kinds: test}
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import os
+import struct
+import tempfile
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import Field, field_validator
+
+from applications.sorting.objects.kinds import (
+    FRICTIONS,
+    KINDS,
+    MASSES,
+    TEST_KINDS,
+    TRAIN_KINDS,
+    DrawnObject,
+    draw,
+)
+from common.cache import cache_folder
+from common.config import Container, ObjectConfig, Parameters, World
+from common.errors import ConfigError
+from common.robot.transforms import quaternion_to_matrix
+
+Array = npt.NDArray[np.float64]
+Mass = Annotated[float, Field(gt=0, le=20)]
+Friction = Annotated[float, Field(gt=0, le=2)]
+
+MARGIN = 0.02  # [m] from the walls
+GAP = 0.005  # [m] between objects, and above the floor of the tray
+SPREAD = 0.045  # [m] standard deviation of positions about the middle of the tray
+TRIES = 4  # random positions of an object that is not heaped, of which the lowest is taken
+
+
+class Options(Parameters):
+    """Which objects, how many, and how they are placed."""
+
+    count: int = Field(10, ge=1, le=30, description="number of objects")
+    kinds: Literal["train", "test", "all"] | list[str] = Field(
+        "test", description="train, test, all, or a list of names of kinds"
+    )
+    container: str = Field("tray", description="id of the container that they fall into")
+    placement: Literal["heap", "spread"] = Field("heap", description="about the middle, or all over the container")
+    masses: tuple[Mass, Mass] = Field(MASSES, description="smallest and largest [kg]")
+    frictions: tuple[Friction, Friction] = Field(FRICTIONS, description="smallest and largest coefficient")
+
+    @field_validator("kinds")
+    @classmethod
+    def _require_known_kinds(cls, kinds: str | list[str]) -> str | list[str]:
+        if isinstance(kinds, list) and (unknown := [kind for kind in kinds if kind not in KINDS] or kinds == []):
+            names = ", ".join(KINDS)
+            raise ValueError(f"{unknown[0]!r} is no kind; choices: {names}" if unknown is not True
+                             else f"must name at least one kind; choices: {names}")
+        return kinds
+
+    @field_validator("masses", "frictions")
+    @classmethod
+    def _require_order(cls, values: tuple[float, float]) -> tuple[float, float]:
+        if values[0] > values[1]:
+            raise ValueError(f"{values[0]:g} is larger than {values[1]:g}: give the smallest first")
+        return values
+
+
+def generate(world: World, options: Options, seed: int) -> list[ObjectConfig]:
+    """Return objects in the air above the container, which fall into it.
+
+    Raises:
+        ConfigError: there is no such container.
+    """
+    container = world.containers.get(options.container)
+    if container is None:
+        raise ConfigError("world.generator.container", options.container,
+                          f"is no container; choices: {', '.join(world.containers)}")
+    rng = np.random.default_rng(seed)
+    names = {"train": list(TRAIN_KINDS), "test": list(TEST_KINDS), "all": list(KINDS)}
+    kinds = options.kinds if isinstance(options.kinds, list) else names[options.kinds]
+    order = [kinds[k] for _ in range(math.ceil(options.count / len(kinds))) for k in rng.permutation(len(kinds))]
+    drawn = [draw(kind, rng, options.masses, options.frictions) for kind in order[: options.count]]
+    rotations = [_random_rotation(rng) for _ in drawn]
+    boxes = [_bounds(each, rotation) for each, rotation in zip(drawn, rotations, strict=True)]
+    positions = stacked(boxes, container, world.table_height, options.placement == "heap", rng)
+    return [_config(number, each, rotation, position) for number, (each, rotation, position) in enumerate(
+        zip(drawn, rotations, positions, strict=True), 1)]
+
+
+def stacked(
+    boxes: list[Array], container: Container, table: float, heap: bool, rng: np.random.Generator
+) -> list[Array]:
+    """Positions (3,) [m] in world at which bounding boxes (2, 3) about them are apart, above a container.
+
+    Args:
+        boxes: lowest and highest corner of each, relative to its position [m].
+        container: the boxes are within its walls.
+        table: height of the table [m].
+        heap: about the middle; else anywhere.
+        rng: source of the positions.
+    """
+    room = container.half_side - container.wall_thickness - MARGIN
+    placed: list[Array] = []
+    found = []
+    for low, high in boxes:
+        options = []
+        for _ in range(1 if heap else TRIES):
+            xy = rng.normal(0.0, SPREAD, 2) if heap else rng.uniform(-room, room, 2)
+            least, most = -room - low[:2], room - high[:2]
+            xy = np.clip(xy, np.minimum(least, most), np.maximum(least, most))
+            below = [other[1, 2] for other in placed
+                     if (xy + low[:2] < other[1, :2]).all() and (xy + high[:2] > other[0, :2]).all()]
+            options.append((max(below, default=container.floor_thickness) + GAP, xy))
+        bottom, xy = min(options, key=lambda option: option[0])
+        at = np.array([*xy, bottom - low[2]])
+        placed.append(np.stack([low, high]) + at)
+        found.append(at + np.array([container.x, container.y, table]))
+    return found
+
+
+def _random_rotation(rng: np.random.Generator) -> Array:
+    """Uniform rotation (3, 3)."""
+    x, y, z, w = rng.normal(size=4)
+    return quaternion_to_matrix(*(np.array([x, y, z, w]) / np.linalg.norm([x, y, z, w])))
+
+
+def _bounds(drawn: DrawnObject, rotation: Array) -> Array:
+    """Lowest and highest corner (2, 3) [m] relative to its origin."""
+    points = drawn.triangles.reshape(-1, 3) @ rotation.T
+    return np.stack([points.min(axis=0), points.max(axis=0)])
+
+
+def _config(number: int, drawn: DrawnObject, rotation: Array, position: Array) -> ObjectConfig:
+    x, y, z = position.tolist()
+    roll, pitch, yaw = _rpy(rotation)
+    return ObjectConfig(
+        id=f"{drawn.kind}_{number}", shape="mesh", mesh=str(mesh_file(drawn.triangles)), position=(x, y, z),
+        rpy=(roll, pitch, yaw), color=drawn.color, mass=drawn.mass, friction=drawn.friction)
+
+
+def _rpy(rotation: Array) -> tuple[float, float, float]:
+    """Roll, pitch, yaw [rad] with R = Rz Ry Rx."""
+    return (math.atan2(rotation[2, 1], rotation[2, 2]), math.asin(float(np.clip(-rotation[2, 0], -1.0, 1.0))),
+            math.atan2(rotation[1, 0], rotation[0, 0]))
+
+
+def mesh_file(triangles: Array) -> Path:
+    """Return an STL file of triangles (n, 3, 3) [m] in the cache; it is written unless it exists.
+
+    Raises:
+        ConfigError: it cannot be written.
+    """
+    record = np.zeros(len(triangles), np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("used", "<u2")]))
+    record["corners"] = triangles
+    data = bytes(80) + struct.pack("<I", len(triangles)) + record.tobytes()
+    path = cache_folder() / "objects" / f"{hashlib.sha256(data).hexdigest()[:32]}.stl"
+    if not path.exists():
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            descriptor, name = tempfile.mkstemp(dir=path.parent, suffix=".new")
+            with os.fdopen(descriptor, "wb") as file:
+                file.write(data)
+            os.replace(name, path)
+        except OSError as error:
+            raise ConfigError("ZENCELL_CACHE", str(path.parent), f"cannot be written: {error.strerror}") from None
+    return path
