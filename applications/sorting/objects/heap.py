@@ -26,19 +26,15 @@ from applications.sorting.objects.kinds import (
     DrawnObject,
     draw,
 )
+from applications.sorting.objects.stacking import silhouette, stacked
 from common.cache import cache_folder
-from common.config import Container, ObjectConfig, Parameters, World
+from common.config import ObjectConfig, Parameters, World
 from common.errors import ConfigError
 from common.robot.transforms import quaternion_to_matrix
 
 Array = npt.NDArray[np.float64]
 Mass = Annotated[float, Field(gt=0, le=20)]
 Friction = Annotated[float, Field(gt=0, le=2)]
-
-MARGIN = 0.02  # [m] from the walls
-GAP = 0.005  # [m] between objects, and above the floor of the tray
-SPREAD = 0.045  # [m] standard deviation of positions about the middle of the tray
-TRIES = 4  # random positions of an object that is not heaped, of which the lowest is taken
 
 
 class Options(Parameters):
@@ -86,53 +82,16 @@ def generate(world: World, options: Options, seed: int) -> list[ObjectConfig]:
     order = [kinds[k] for _ in range(math.ceil(options.count / len(kinds))) for k in rng.permutation(len(kinds))]
     drawn = [draw(kind, rng, options.masses, options.frictions) for kind in order[: options.count]]
     rotations = [_random_rotation(rng) for _ in drawn]
-    boxes = [_bounds(each, rotation) for each, rotation in zip(drawn, rotations, strict=True)]
-    positions = stacked(boxes, container, world.table_height, options.placement == "heap", rng)
+    outlines = [silhouette(each.triangles @ rotation.T) for each, rotation in zip(drawn, rotations, strict=True)]
+    positions = stacked(outlines, container, world.table_height, options.placement == "heap", rng)
     return [_config(number, each, rotation, position) for number, (each, rotation, position) in enumerate(
         zip(drawn, rotations, positions, strict=True), 1)]
-
-
-def stacked(
-    boxes: list[Array], container: Container, table: float, heap: bool, rng: np.random.Generator
-) -> list[Array]:
-    """Positions (3,) [m] in world at which bounding boxes (2, 3) about them are apart, above a container.
-
-    Args:
-        boxes: lowest and highest corner of each, relative to its position [m].
-        container: the boxes are within its walls.
-        table: height of the table [m].
-        heap: about the middle; else anywhere.
-        rng: source of the positions.
-    """
-    room = container.half_side - container.wall_thickness - MARGIN
-    placed: list[Array] = []
-    found = []
-    for low, high in boxes:
-        options = []
-        for _ in range(1 if heap else TRIES):
-            xy = rng.normal(0.0, SPREAD, 2) if heap else rng.uniform(-room, room, 2)
-            least, most = -room - low[:2], room - high[:2]
-            xy = np.clip(xy, np.minimum(least, most), np.maximum(least, most))
-            below = [other[1, 2] for other in placed
-                     if (xy + low[:2] < other[1, :2]).all() and (xy + high[:2] > other[0, :2]).all()]
-            options.append((max(below, default=container.floor_thickness) + GAP, xy))
-        bottom, xy = min(options, key=lambda option: option[0])
-        at = np.array([*xy, bottom - low[2]])
-        placed.append(np.stack([low, high]) + at)
-        found.append(at + np.array([container.x, container.y, table]))
-    return found
 
 
 def _random_rotation(rng: np.random.Generator) -> Array:
     """Uniform rotation (3, 3)."""
     x, y, z, w = rng.normal(size=4)
     return quaternion_to_matrix(*(np.array([x, y, z, w]) / np.linalg.norm([x, y, z, w])))
-
-
-def _bounds(drawn: DrawnObject, rotation: Array) -> Array:
-    """Lowest and highest corner (2, 3) [m] relative to its origin."""
-    points = drawn.triangles.reshape(-1, 3) @ rotation.T
-    return np.stack([points.min(axis=0), points.max(axis=0)])
 
 
 def _config(number: int, drawn: DrawnObject, rotation: Array, position: Array) -> ObjectConfig:
