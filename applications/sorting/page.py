@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from applications.sorting.fingers import finger_lines
 from applications.sorting.topics import HEAP, Grasp, Heap, SeenObject, SortingStatus
 from common import topics
 from common.messages import TaskStatus
-from common.robot.transforms import pose_to_matrix
 from common.topics import Topic
 from page.application import ApplicationPage
 from page.layers import Layer
@@ -26,7 +26,6 @@ Array = NDArray[np.float64]
 TRAY = "tray"
 MAX_POINTS = 15_000  # of the heap: a browser without a GPU draws them several times a second
 ABOVE, BEYOND = 0.25, 0.02  # [m] over and next to the tray, within which points belong to the heap
-FINGER = 0.045  # [m] length of a drawn finger
 MOST = 24  # grasps that are drawn, the best first
 GOOD, POOR = np.array([70.0, 220.0, 110.0]), np.array([230.0, 150.0, 40.0])  # color of the scores 1 and 0
 FAINT = 0.4  # brightness of a grasp that is not proved
@@ -171,21 +170,6 @@ class ForeignBodies(Layer):
             f"{self.root}/{number}", FOREIGN, (each.size.x, each.size.y, each.size.z), opacity=0.45,
             flat_shading=False, position=(each.center.x, each.center.y, each.center.z), **FLAT)
             for number, each in enumerate(message.foreign)]
-
-
-def finger_lines(grasp: Grasp, axis: int) -> Array:
-    """Return two fingers and the bar that joins them as segments (3, 2, 3) [m] in world.
-
-    Args:
-        grasp: pose of the tool center point between the finger tips, and its opening.
-        axis: of the tool along which the fingers close, 0 or 1.
-    """
-    T, aside = pose_to_matrix(grasp.pose), np.zeros(3)
-    aside[axis] = grasp.opening / 2
-    back = np.array([0.0, 0.0, -FINGER])
-    left, right = -aside, aside
-    local = np.array([[left, left + back], [right, right + back], [left + back, right + back]])
-    return np.asarray(local @ T[:3, :3].T + T[:3, 3])
 
 
 def score_color(grasp: Grasp) -> NDArray[np.uint8]:
