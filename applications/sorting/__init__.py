@@ -7,6 +7,7 @@ APPLICATION = Application(
     task="sorter",
     grasps=True,
     fills_containers=True,
+    figures="applications.sorting.figures:SortingFigures",
     page="applications.sorting.page:PAGE",
     double=SimulationDouble(
         module="applications.sorting.double",

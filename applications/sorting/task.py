@@ -351,6 +351,7 @@ class Sorting(Task[SortingView]):
         if cycle.chosen is None:
             return
         chosen = cycle.chosen
+        self.status.grasp = chosen.grasp.id
         remark = width_remark(view.gripper.width, chosen.grasp.width, self.p.width_tolerance)
         self.status.held, self.status.last = "", f"{cycle.subject}: {remark or 'gripped'}"
         self._remember(thing=chosen.thing, container=chosen.container, back=False)
@@ -375,6 +376,7 @@ class Sorting(Task[SortingView]):
         self._remember(attempts=self._memory.attempts + 1)
         found = by_width(view.gripper.width, view.holding)
         if isinstance(cycle, Pick) and cycle.chosen is not None:
+            self.status.grasp = cycle.chosen.grasp.id
             self._choice.penalize(cycle.chosen.grasp, view.now, found.why or stage.problem)
             self._note(found.held or "empty", f"{cycle.subject}: {found.why or stage.problem}")
         self.clear()
