@@ -32,7 +32,7 @@ class Surface:
         """World (..., 2) [m] of cell centers."""
         x = self.origin[0] + self.step * (np.asarray(column, float) + 0.5)
         y = self.origin[1] + self.step * (np.asarray(row, float) + 0.5)
-        return np.stack([x, y], axis=-1)
+        return np.stack(np.broadcast_arrays(x, y), axis=-1)
 
     def cells(self, xy: npt.ArrayLike) -> npt.NDArray[np.int64]:
         """(..., 2) row and column of the cells that contain world positions (..., 2) [m]; may be outside the grid."""

@@ -1,0 +1,149 @@
+"""Find the objects on a surface: in the tray, in the other containers and on the table; with ids that are stable."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from applications.sorting.describing import Segment, described
+from applications.sorting.places import TABLE, Place, containers_of, in_container, lab, on_table
+from applications.sorting.seeing import crop
+from applications.sorting.segments import segments
+from applications.sorting.surface import Surface
+from applications.sorting.topics import MAX_OBJECTS, SeenObject
+from common.config import Surroundings
+
+Labels = npt.NDArray[np.int32]
+Bools = npt.NDArray[np.bool_]
+Values = npt.NDArray[np.float32]
+
+PAD = 4  # [cells] around a segment that its description uses
+MARGIN = 0.01  # [m] around a container
+SAME_PLACE = 0.02  # [m] an object whose center moved less did not move
+SAME_SIZE = 0.03  # [m] largest difference of length, width or top of one object in two images
+FADES = 5  # images after which an object that is not seen is forgotten
+
+
+def find_objects(surface: Surface, world: Surroundings) -> tuple[Labels, list[SeenObject]]:
+    """Return all objects of a surface of containers and the table around them.
+
+    Args:
+        surface: at most a part of the world.
+        world: its containers and fixtures, which are no objects.
+
+    Returns:
+        labels (rows, columns): k + 1 at the cells of object k, 0 elsewhere; and the objects, with ids 1, 2, ...
+    """
+    labels = np.zeros(surface.top.shape, np.int32)
+    found: list[SeenObject] = []
+    containers = containers_of(world)
+    gain = np.ones(3, np.float32)
+    for place in containers:
+        area = place.area(MARGIN)
+        piece, part = crop(surface, area)
+        if piece.top.size == 0:
+            continue
+        colors = lab(piece.color)
+        inside = in_container(piece, colors, place)
+        gain = inside.gain
+        _add(found, labels[part], piece, inside.mask, inside.near_wall, inside.gain, place.id, place.floor)
+    mask = on_table(surface, containers, world)
+    for part in _islands(mask):
+        piece = _piece(surface, part)
+        nowhere = np.zeros(piece.top.shape, bool)
+        _add(found, labels[part], piece, mask[part], nowhere, gain, TABLE, world.table_height)
+    return labels, found
+
+
+def _add(
+    found: list[SeenObject], labels: Labels, piece: Surface, mask: Bools, near_wall: Bools, gain: Values, place: str,
+    floor: float,
+) -> None:
+    """Append the objects of a mask to those found, and write their labels."""
+    if not mask.any():
+        return
+    parts = segments(mask, piece.top, lab(piece.color))
+    boxes = _boxes(parts.labels, parts.count)
+    for number, box in enumerate(boxes, 1):
+        if len(found) >= MAX_OBJECTS:
+            return
+        cells = parts.labels[box] == number
+        segment = Segment(cells, _piece(piece, box), (parts.labels[box] > 0) & ~cells, near_wall[box], gain,
+                          number in parts.patched)
+        found.append(described(segment, str(len(found) + 1), place, floor))
+        labels[box][cells] = len(found)
+
+
+def _boxes(labels: Labels, count: int) -> list[tuple[slice, slice]]:
+    """Rows and columns of each label with a margin of `PAD`."""
+    rows, columns = np.nonzero(labels)
+    number = labels[rows, columns]
+    low, high = np.full((count + 1, 2), 2**30), np.full((count + 1, 2), -1)
+    for axis, at in ((0, rows), (1, columns)):
+        np.minimum.at(low[:, axis], number, at)
+        np.maximum.at(high[:, axis], number, at)
+    low = np.maximum(low - PAD, 0)
+    return [(slice(int(low[k, 0]), int(high[k, 0]) + PAD + 1), slice(int(low[k, 1]), int(high[k, 1]) + PAD + 1))
+            for k in range(1, count + 1)]
+
+
+def _islands(mask: Bools) -> list[tuple[slice, slice]]:
+    """Rows and columns of regions around the connected parts of a mask; parts that are near are in one region."""
+    if not mask.any():
+        return []
+    near = cv2.dilate(mask.astype(np.uint8), np.ones((2 * PAD + 1, 2 * PAD + 1), np.uint8))
+    count, labels, _, _ = cv2.connectedComponentsWithStats(near)
+    return _boxes(np.asarray(labels * mask, np.int32), count - 1)
+
+
+def _piece(surface: Surface, part: tuple[slice, slice]) -> Surface:
+    rows, columns = part
+    origin = (surface.origin[0] + surface.step * columns.start, surface.origin[1] + surface.step * rows.start)
+    return Surface(origin, surface.step, surface.top[part], surface.color[part], surface.floor)
+
+
+class Identities:
+    """Gives objects the ids of those that were at the same places in earlier images, and others new ones."""
+
+    def __init__(self) -> None:
+        """Start without objects."""
+        self._known: dict[str, tuple[SeenObject, int]] = {}
+        self._next, self._image = 1, 0
+
+    def named(self, found: Sequence[SeenObject]) -> list[SeenObject]:
+        """Return the objects of the newest image with their ids, in the same order."""
+        self._image += 1
+        pairs = sorted(
+            (distance, index, name)
+            for index, seen in enumerate(found) for name, (known, _) in self._known.items()
+            if (distance := _difference(seen, known)) < 1)
+        names: dict[int, str] = {}
+        for _, index, name in pairs:
+            if index not in names and name not in names.values():
+                names[index] = name
+        result = []
+        for index, seen in enumerate(found):
+            if index not in names:
+                names[index] = f"o{self._next}"
+                self._next += 1
+            named = seen.model_copy(update={"id": names[index]})
+            self._known[names[index]] = named, self._image
+            result.append(named)
+        self._known = {name: item for name, item in self._known.items() if self._image - item[1] < FADES}
+        return result
+
+
+def _difference(a: SeenObject, b: SeenObject) -> float:
+    """Return how different two objects are; from 1 on they are not the same one at the same place."""
+    away = math.hypot(a.center.x - b.center.x, a.center.y - b.center.y) / SAME_PLACE
+    size = max(abs(a.size.x - b.size.x), abs(a.size.y - b.size.y), abs(a.top - b.top)) / SAME_SIZE
+    return max(away, size) if a.place == b.place else 1.0
+
+
+def tray_index(found: Sequence[SeenObject], tray: Place) -> list[int]:
+    """Return the indices of the objects that lie in the tray."""
+    return [index for index, seen in enumerate(found) if seen.place == tray.id]
