@@ -77,7 +77,7 @@ def ring(x: float, y: float, outer: float, inner: float, height: float, color: R
 def angle_piece(x: float, y: float, side: float, color: Rgb) -> Mesh:
     """Return an L-shaped prism with its corner at a position [m]."""
     third = side / 2.5
-    corners = np.array([(0, 0), (side, 0), (side, third), (third, third), (third, side), (0, side)]) + [x, y]
+    corners = np.array([(0, 0), (side, 0), (side, third), (third, third), (third, side), (0, side)]) + np.array([x, y])
     return Mesh(extrude(corners, NO_HOLE, FLOOR, FLOOR + 0.03), color)
 
 
