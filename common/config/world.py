@@ -55,6 +55,7 @@ class Container(Section):
     slot_offset: Length = Field(0.033, description="slots are at plus and minus this from the centre [m]")
     layers: int = Field(2, ge=1, le=5, description="of four slots each")
     color: Rgb = (1.0, 0.6, 0.0)
+    source: bool = Field(False, description="objects are taken out of it: those in it do not count as put away")
 
 
 class CameraConfig(Section):
@@ -265,6 +266,11 @@ class SurroundingsFields(Section):
         if name is not None and name not in self.cameras:
             raise UnknownName("camera", name, self.cameras)
         return self.cameras[name] if name is not None else next(iter(self.cameras.values()))
+
+    @property
+    def destinations(self) -> list[str]:
+        """Ids of the containers that objects are put into."""
+        return [name for name, container in self.containers.items() if not container.source]
 
     @property
     def on_hand(self) -> bool:

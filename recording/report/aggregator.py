@@ -45,7 +45,7 @@ class RunAggregator:
             robot: of the cell; None if unknown.
             seed: of the run.
             speed: cell seconds per wall second.
-            containers: ids of the cell's containers.
+            containers: ids of those that objects are put into; empty: unknown, all.
             history: to be filled as well, for a report.
             listeners: further listeners by topic, as for a verification.
         """

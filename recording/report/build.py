@@ -91,7 +91,7 @@ def build_report(recording: Recording, cell: str | None = None) -> str:
     aggregator = RunAggregator(
         recording.cell, _application_of(recording, resolved), robot=resolved.robot if resolved and robot else None,
         seed=run.seed or 0, speed=run.speed, history=history,
-        containers=list(resolved.world.containers) if resolved else (),
+        containers=resolved.world.destinations if resolved else (),
     )
     skipped = _aggregate(recording, run, aggregator)
     if not (aggregator.status or history.joint_states or history.services):

@@ -43,7 +43,7 @@ class TrueObject:
 class Truth:
     """Newest ground truth of the objects."""
 
-    containers: tuple[str, ...] = ()  # ids of the cell's containers, if known
+    containers: tuple[str, ...] = ()  # ids of those that objects are put into, if known
     _objects: list[TrueObject] | None = None
     _labelled: list[TrueObject] | None = None
 
@@ -73,24 +73,31 @@ class Truth:
         return not any(each.state in ("falling", "held") for each in self.objects or ())
 
     def left(self, explained: Sequence[Sequence[float]]) -> list[TrueObject]:
-        """Return the objects outside of containers that are at none of the explained positions (x, y, ...) [m]."""
-        return [each for each in self.objects or () if each.state != "contained" and all(
+        """Return the objects that are not put away and at none of the explained positions (x, y, ...) [m]."""
+        return [each for each in self.objects or () if not self._is_put_away(each) and all(
             math.dist(each.position[:2], place[:2]) > SAME_OBJECT for place in explained)]
 
+    def _is_put_away(self, each: TrueObject) -> bool:
+        return each.state == "contained" and (not self.containers or each.container in self.containers)
+
     def is_left_at(self, place: Sequence[float]) -> bool:
-        """Return whether an object outside of containers is at a position (x, y, ...) [m]."""
+        """Return whether an object that is not put away is at a position (x, y, ...) [m]."""
         return len(self.left([place])) < len(self.left([]))
 
     def counted(self) -> dict[str, Any] | None:
-        """Return the number of objects in containers, on the table and elsewhere; None without ground truth."""
+        """Return the number of objects in containers, on the table and elsewhere; None without ground truth.
+
+        Objects in a container that objects are taken out of are only in the count of that container.
+        """
         if self.objects is None:
             return None
         contained = dict.fromkeys(self.containers, 0)
         for each in self.objects:
             if each.state == "contained":
                 contained[each.container] = contained.get(each.container, 0) + 1
-        in_box, on_table = sum(contained.values()), sum(each.state == "table" for each in self.objects)
-        elsewhere = len(self.objects) - in_box - on_table
+        in_box = sum(self._is_put_away(each) for each in self.objects)
+        on_table = sum(each.state == "table" for each in self.objects)
+        elsewhere = len(self.objects) - sum(contained.values()) - on_table
         return {"in_box": in_box, "on_table": on_table, "elsewhere": elsewhere, "containers": contained}
 
 

@@ -101,7 +101,7 @@ class Summary:
             seed: of the run.
             speed: cell seconds per wall second.
             figures: of the application.
-            containers: ids of the cell's containers.
+            containers: ids of those that objects are put into; empty: unknown, all.
             fills: whether the task moves all objects into containers.
         """
         self.figures = figures or Figures()

@@ -128,6 +128,15 @@ def test_truth_counts_objects_by_location():
     assert truth.settled
 
 
+def test_truth_does_not_count_objects_in_a_container_that_they_are_taken_from_as_put_away():
+    truth = Truth(("left",))
+    truth.on_objects(WorldObjects(objects=[
+        WorldObject(id=f"object_{n}", shape="sphere", pose=Pose(position=Vector3(x=0.2 * n)), state="contained",
+                    container=name) for n, name in enumerate(("left", "tray", "tray"))]))
+    assert truth.counted() == {"in_box": 1, "on_table": 0, "elsewhere": 0, "containers": {"left": 1, "tray": 2}}
+    assert [each.container for each in truth.left([])] == ["tray", "tray"]
+
+
 @given(st.lists(st.floats(0, 1e6), min_size=1), st.floats(0.01, 1))
 def test_percentile_is_a_value_with_that_share_below_it(values, fraction):
     found = percentile(values, fraction)
