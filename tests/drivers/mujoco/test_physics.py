@@ -304,6 +304,25 @@ def test_object_dropped_on_the_table_is_not_flung_away_by_closing_fingers(restar
     assert rig.fingers.read(rig.now).holding, "graspable again"
 
 
+@pytest.mark.parametrize(("friction", "holds"), [(0.2, False), (0.6, True), (None, True)])
+def test_friction_of_an_object_wins_over_that_of_the_pads_also_after_a_restart(friction: float, holds: bool) -> None:
+    for restarted in (False, True):
+        rig = Rig({**CUBE, "mass": 0.4, "friction": friction})
+        if restarted:
+            rig.wait(0.1)
+            rig.restart()
+        rig.grasp(effort=5.0)  # by two pads: carries 10 N times the coefficient; the cube weighs 3.9 N
+        assert (rig.position()[2] > 0.15) == holds
+
+
+def test_added_object_has_the_friction_of_the_one_that_it_is_like() -> None:
+    rig = Rig({**CUBE, "friction": 0.3})
+    rig.world.edit(WorldEdit(op="add", id="another", like="object_1", position=Vector3(x=0.5, y=-0.2)), rig.now)
+    cell, _ = rig.world.simulation
+    geoms = np.isin(cell.model.geom_bodyid, [each.body for each in cell.objects.values()])
+    assert cell.model.geom_friction[geoms][:, 0] == pytest.approx([0.3, 0.3])
+
+
 def test_suction_cup_and_missing_mujoco_are_rejected_with_the_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
     config = Rig().config
     with pytest.raises(ConfigError, match="kinematic"):
