@@ -36,14 +36,14 @@ Array = npt.NDArray[np.float64]
 Mass = Annotated[float, Field(gt=0, le=20)]
 Friction = Annotated[float, Field(gt=0, le=2)]
 
+SETS = {"train": list(TRAIN_KINDS), "test": list(TEST_KINDS), "all": list(KINDS)}
+
 
 class Options(Parameters):
     """Which objects, how many, and how they are placed."""
 
     count: int = Field(10, ge=1, le=30, description="number of objects")
-    kinds: Literal["train", "test", "all"] | list[str] = Field(
-        "test", description="train, test, all, or a list of names of kinds"
-    )
+    kinds: str | list[str] = Field("test", description="train, test, all, the name of a kind, or a list of names")
     container: str = Field("tray", description="id of the container that they fall into")
     placement: Literal["heap", "spread"] = Field("heap", description="about the middle, or all over the container")
     masses: tuple[Mass, Mass] = Field(MASSES, description="smallest and largest [kg]")
@@ -52,11 +52,19 @@ class Options(Parameters):
     @field_validator("kinds")
     @classmethod
     def _require_known_kinds(cls, kinds: str | list[str]) -> str | list[str]:
-        if isinstance(kinds, list) and (unknown := [kind for kind in kinds if kind not in KINDS] or kinds == []):
-            names = ", ".join(KINDS)
-            raise ValueError(f"{unknown[0]!r} is no kind; choices: {names}" if unknown is not True
-                             else f"must name at least one kind; choices: {names}")
+        names = [kinds] if isinstance(kinds, str) else kinds
+        choices = [*SETS, *KINDS]
+        unknown = [name for name in names if name not in choices]
+        if unknown or not names:
+            wrong = f"{unknown[0]!r} is no kind" if unknown else "must name at least one kind"
+            raise ValueError(f"{wrong}; choices: {', '.join(choices)}")
         return kinds
+
+    @property
+    def kind_names(self) -> list[str]:
+        """Names of the kinds that objects are drawn from."""
+        names = [self.kinds] if isinstance(self.kinds, str) else self.kinds
+        return list(dict.fromkeys(kind for name in names for kind in SETS.get(name, [name])))
 
     @field_validator("masses", "frictions")
     @classmethod
@@ -77,8 +85,7 @@ def generate(world: World, options: Options, seed: int) -> list[ObjectConfig]:
         raise ConfigError("world.generator.container", options.container,
                           f"is no container; choices: {', '.join(world.containers)}")
     rng = np.random.default_rng(seed)
-    names = {"train": list(TRAIN_KINDS), "test": list(TEST_KINDS), "all": list(KINDS)}
-    kinds = options.kinds if isinstance(options.kinds, list) else names[options.kinds]
+    kinds = options.kind_names
     order = [kinds[k] for _ in range(math.ceil(options.count / len(kinds))) for k in rng.permutation(len(kinds))]
     drawn = [draw(kind, rng, options.masses, options.frictions) for kind in order[: options.count]]
     rotations = [_random_rotation(rng) for _ in drawn]
