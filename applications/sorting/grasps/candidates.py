@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,6 +60,7 @@ class Candidates:
         features: (n, k) in the order of `names`.
         score: (n,) 0 to 1, parts: of the score.
         contacts: (n, 2, 3) where the fingers meet the object [m], world.
+        heights: the map on which they were found.
         reasons: why an object (index) has no candidates.
         names: of the features.
     """
@@ -72,6 +73,7 @@ class Candidates:
     score: Array
     parts: dict[str, Array]
     contacts: Array
+    heights: HeightMap
     reasons: dict[int, str] = field(default_factory=dict)
     names: tuple[str, ...] = FEATURES
 
@@ -83,7 +85,8 @@ class Candidates:
         """Return some candidates, in a given order."""
         parts = {name: values[chosen] for name, values in self.parts.items()}
         return Candidates(self.T[chosen], self.width[chosen], self.opening[chosen], self.object[chosen],
-                          self.features[chosen], self.score[chosen], parts, self.contacts[chosen], self.reasons)
+                          self.features[chosen], self.score[chosen], parts, self.contacts[chosen], self.heights,
+                          self.reasons)
 
     def axis(self, gripper: GripperShape) -> Array:
         """Return (n, 3) unit vectors along which the fingers close, world."""
@@ -126,7 +129,7 @@ def candidates(
     result = found.select(kept)
     for index in np.unique(result.object).tolist():
         reasons.pop(index, None)
-    return Candidates(**{**vars(result), "reasons": reasons})
+    return replace(result, reasons=reasons)
 
 
 def _mark(reasons: dict[int, str], labels: Indices, reason: str) -> None:
@@ -235,7 +238,7 @@ def _assembled(
     sides = middle[:, None] + axis[:, None] * (contacts.width[:, None] / 2 * [-1, 1])[:, :, None]
     score = scorer.score(features)
     found = Candidates(
-        T, contacts.width, placed.opening, placed.label - 1, features, score, scorer.parts(features), sides)
+        T, contacts.width, placed.opening, placed.label - 1, features, score, scorer.parts(features), sides, heights)
     return found.select(np.argsort(-score, kind="stable"))
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import cv2
@@ -49,6 +50,7 @@ class HeightMap:
         origin, step, floor: as of the surface, with the margin.
         height: (rows, columns) z of what stands in each cell [m]; unknown cells are as high as their neighbors.
         labels: (rows, columns) number of the object in each cell, 0 for none.
+        measured: (rows, columns) cells of the surface, without margin and walls.
     """
 
     def __init__(self, surface: Surface, labels: Labels, walls: Sequence[Walls] = ()) -> None:
@@ -59,6 +61,7 @@ class HeightMap:
         known = _without_noise(surface, labels)
         self.height: Heights = np.pad(known, pad, constant_values=np.float32(surface.floor))
         self.labels: Labels = np.pad(labels.astype(np.int32), pad)
+        self.measured: NDArray[np.bool_] = np.pad(np.ones(known.shape, bool), pad)
         for wall in walls:
             self._raise(wall)
         self._dilated: dict[int, Heights] = {0: self.height}
@@ -71,6 +74,12 @@ class HeightMap:
         inside = (away > wall.inner) & (away < wall.outer)
         self.height[inside] = np.maximum(self.height[inside], np.float32(wall.top))
         self.labels[away > wall.inner] = 0
+        self.measured &= away <= wall.inner
+
+    @cached_property
+    def lowest(self) -> Heights:
+        """(rows, columns) the lowest point of each cell and those next to it [m]."""
+        return np.asarray(cv2.erode(self.height, _SQUARE), np.float32)
 
     def dilated(self, cells: int) -> Heights:
         """Return (rows, columns) the highest point within a number of cells [m]."""
