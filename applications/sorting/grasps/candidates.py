@@ -26,7 +26,8 @@ Indices = NDArray[np.int64]
 _BELOW_EDGE = 0.012  # [m] that tips reach below the visible edge of an object, if they can,
 _ROUND_SHARE = 0.5  # and more by this share of the height from edge to top: a ball is widest below the edge
 _PALM_GAP = 0.003  # [m] between the palm and the top of the object
-_BLOCKED = 0.003  # [m] too high: a tilted gripper may reach deeper
+_BLOCKED, _DEEP = 0.003, 0.015  # [m] too high and less deep: a tilted gripper may reach deeper
+_ENOUGH = 4  # upright grasps of an object that are so deep: no tilted ones are looked for
 _FLAT = 0.012  # [m] height of an object that needs the tips nearer to the floor
 
 
@@ -213,13 +214,20 @@ def _placed(
     upright = lowered(heights, strips, tip, contacts, gripper, options.spares, slack)
     high = contacts.height.min(axis=1) - heights.floor
     least = np.minimum(options.engagement, 0.4 * high)
-    blocked = _first(np.flatnonzero(upright.rise > _BLOCKED), strips.label, options.tilted_for_each)
-    tilts = [tilted(heights, upright, blocked, angle, axis, gripper, slack)
+    blocked = _blocked(upright, least, options)
+    tilts = [tilted(heights, upright, blocked, angle, axis, gripper, slack, least)
              for size in options.tilts for angle in (size, -size) for axis in (0, 1)] if len(blocked) else []
     every = Placed.joined([upright, *tilts])
     kept = every.select(np.flatnonzero(every.free & (every.engagement >= least[every.seed])))
     return kept.select(np.flatnonzero(
         ~strips.select(kept.seed).obstructed(kept.contacts, kept.opening, kept.tip)))
+
+
+def _blocked(upright: Placed, least: Array, options: Options) -> Indices:
+    """Return indices of grippers to tilt: of objects with few free upright grasps, those that something holds up."""
+    deep = np.bincount(upright.label, upright.engagement >= np.maximum(least, _DEEP))
+    held_up = (upright.rise > _BLOCKED) & (upright.engagement < _DEEP) & (deep[upright.label] < _ENOUGH)
+    return _first(np.flatnonzero(held_up), upright.label, options.tilted_for_each)
 
 
 def _assembled(

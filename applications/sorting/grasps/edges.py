@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 DROP = 0.0035  # [m] beside a cell that makes it an edge: a finger can stand there
 REACH = 2  # cells within which the drop must be
 CONE = 0.6  # coefficient of friction for which a pair of edges must hold
-_EDGES = 110  # of an object that are paired
+_EDGES = 90  # of an object that are paired
 _PAIRS = 60  # of an object that are used
 _YAWS = 12  # of lines across an object's middle
 _ASIDE = (0.0, -0.014, 0.014)  # [m] of these lines from the middle
@@ -121,9 +121,9 @@ def _pairs(
     aside = np.abs(away[:, 0] * along[:, 1] - away[:, 1] * along[:, 0])
     best = np.argsort(aside / 0.03 - one[held] - other[held])
     middle, width, yaw = middle[best], width[best], np.arctan2(along[best, 1], along[best, 0])
-    keys = np.column_stack([
-        np.floor(middle / _SAME_PLACE), np.floor((yaw % math.pi) / _SAME_ANGLE), np.floor(width / 0.012)])
-    _, kept = np.unique(keys, axis=0, return_index=True)
+    cell = np.floor((middle - center) / _SAME_PLACE).astype(np.int64) + 500
+    turn, size = np.floor((yaw % math.pi) / _SAME_ANGLE), np.floor(width / (2 * _SAME_PLACE))
+    _, kept = np.unique(cell[:, 0] * 10**8 + cell[:, 1] * 10**4 + turn * 100 + size, return_index=True)
     kept = np.sort(kept)[:_PAIRS]
     return middle[kept], yaw[kept], width[kept]
 

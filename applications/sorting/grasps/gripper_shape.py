@@ -25,7 +25,8 @@ Coordinates = NDArray[np.float32]
 WIDTHS = 9  # at which the boxes are measured; between them they are interpolated
 HEIGHT = 0.10  # [m] parts that start farther behind the tips are left to the planning kernel
 UNDERSIDES = 0.005, 0.012  # [m] between sample points of fingers and of the palm, on faces towards the tips
-SURFACES = 0.008, 0.020  # [m] the same where sides count, too
+SURFACES = 0.009, 0.020  # [m] the same where sides count, too
+_ROUNDING = 1e-6  # [m]
 TIP_BAND = 0.012  # [m] of the length of the fingers that counts as their tips
 
 
@@ -159,6 +160,7 @@ class GripperShape:
                 low, high, strict=True))
             grid = np.stack(np.meshgrid(x, y, z if sides else z[-1:], indexing="ij"), axis=-1).reshape(-1, 3)
             outer = (grid[:, 2] == 1) | ((grid[:, :2] == 0) | (grid[:, :2] == 1)).any(axis=1)
+            outer &= ~self._covered(low + grid * (high - low), number, sides)
             fractions.append(grid[outer])
             index += [number] * int(outer.sum())
         if not index:
@@ -166,6 +168,19 @@ class GripperShape:
         low, high = self.table[:, index, 0], self.table[:, index, 1]
         points = low + np.concatenate(fractions) * (high - low)  # (k, m, 3)
         return Samples(self.max_width, np.ascontiguousarray(points.transpose(2, 0, 1), dtype=np.float32))
+
+    def _covered(self, points: Array, number: int, sides: bool) -> NDArray[np.bool_]:
+        """Return (m,) which points (m, 3) of a box are inside another one, or above one if sides do not count."""
+        covered = np.zeros(len(points), bool)
+        for other in np.flatnonzero(self.finger == self.finger[number]).tolist():
+            low, high = self.table[-1, other]
+            if other == number or high[2] < self.table[-1, number, 1, 2]:
+                continue
+            low = low.copy()
+            low[2] = low[2] if sides else -np.inf
+            strictly = (points > low + _ROUNDING) & (points < high - _ROUNDING)
+            covered |= strictly.all(axis=1)
+        return covered
 
 
 def _between(width: ArrayLike, max_width: float, count: int) -> tuple[NDArray[np.int64], Array]:

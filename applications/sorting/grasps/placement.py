@@ -114,9 +114,10 @@ def lowered(
 
 
 def tilted(
-    heights: HeightMap, upright: Placed, chosen: Indices, angle: float, axis: int, gripper: GripperShape, slack: Array
+    heights: HeightMap, upright: Placed, chosen: Indices, angle: float, axis: int, gripper: GripperShape, slack: Array,
+    least: Array,
 ) -> Placed:
-    """Return some grippers tilted about a point between their tips, as deep as they can be.
+    """Return some grippers tilted about a point between their tips, as deep as they can be, if that is deep enough.
 
     Args:
         heights: what stands around.
@@ -124,24 +125,26 @@ def tilted(
         angle: [rad]; axis: of the closing frame, 0: across, one finger becomes the lower one; 1: the closing axis.
         gripper: its shape.
         slack: (n,) required distance of each upright one from everything below [m].
+        least: (n,) engagement of each upright one that is enough [m].
     """
     base = upright.select(chosen)
     T = base.T_world_closing.copy()
-    tip = base.tip - base.rise
     R = T[:, :3, :3] @ _turn(axis, angle)
-    pivot = np.column_stack([base.middle, tip])
+    pivot = np.column_stack([base.middle, base.tip - base.rise])
     T[:, :3, :3], T[:, :3, 3] = R, pivot - R[:, :, 2] * base.reach[:, None]
-    needed, rise = slack[chosen], np.zeros(len(chosen))
+    rise, needed = np.zeros(len(chosen)), slack[chosen]
     for _ in range(_CORRECTIONS):  # along the tool, which moves it sideways, too
         deep = heights.penetration(gripper.surfaces.placed(T, base.opening), WIDER)[0]
         more = np.maximum(deep + needed, 0.0) / math.cos(angle)
         T[:, :3, 3] -= R[:, :, 2] * more[:, None]
         rise += more
+        enough = np.flatnonzero(_engagement(T, base) >= least[base.seed])
+        base, T, R, rise, needed = base.select(enough), T[enough], R[enough], rise[enough], needed[enough]
     left = heights.penetration(gripper.surfaces.placed(T, base.opening), WIDER)[0] + needed
     raised = rise * math.cos(angle)
     return replace(
-        base, T_world_closing=T, tip=tip + raised, engagement=_engagement(T, base), rise=rise,
-        tilt=np.full(len(chosen), abs(angle)), free=left <= _TOLERANCE)
+        base, T_world_closing=T, tip=base.tip - base.rise + raised, engagement=_engagement(T, base), rise=rise,
+        tilt=np.full(len(rise), abs(angle)), free=left <= _TOLERANCE)
 
 
 def _engagement(T: Array, base: Placed) -> Array:
