@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from applications.sorting.describing import Segment, described
-from applications.sorting.places import TABLE, Place, containers_of, in_container, lab, on_table
+from applications.sorting.places import TABLE, Place, containers_of, features, in_container, on_table
 from applications.sorting.seeing import crop
 from applications.sorting.segments import segments
 from applications.sorting.surface import Surface
@@ -47,7 +47,7 @@ def find_objects(surface: Surface, world: Surroundings) -> tuple[Labels, list[Se
         piece, part = crop(surface, area)
         if piece.top.size == 0:
             continue
-        colors = lab(piece.color)
+        colors = features(piece.color)
         inside = in_container(piece, colors, place)
         gain = inside.gain
         _add(found, labels[part], piece, inside.mask, inside.near_wall, inside.gain, place.id, place.floor)
@@ -66,7 +66,7 @@ def _add(
     """Append the objects of a mask to those found, and write their labels."""
     if not mask.any():
         return
-    parts = segments(mask, piece.top, lab(piece.color))
+    parts = segments(mask, piece.top, features(piece.color))
     boxes = _boxes(parts.labels, parts.count)
     for number, box in enumerate(boxes, 1):
         if len(found) >= MAX_OBJECTS:

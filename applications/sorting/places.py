@@ -23,8 +23,9 @@ THIN = 0.003  # [m] what is higher and has another color than the floor is one t
 NEAR_WALL = 0.007  # [m] from a wall, points may belong to it
 OVER_RIM = 0.008  # [m] what is higher above a rim lies on it
 AROUND = 0.012  # [m] around containers, points on the table may belong to their walls
-COLOR_STEP = 14.0  # of `color_distance`: different colors
-LIGHTNESS = 0.35  # weight of lightness in colors, which changes with the light
+SHARE_STEP = 0.07  # difference of the share of red or blue that makes another color
+SHADE_STEP = 1.2  # difference of the logarithm of brightness that makes another color
+DARK = 12.0  # [0..255] added to each channel: the noise of dark pixels is no color
 FEWEST = 200  # [cells] of a floor from which its color is measured
 
 
@@ -84,15 +85,25 @@ def tray_of(world: Surroundings, tray: str, field: str) -> Place:
     return found
 
 
-def lab(color: npt.NDArray[np.uint8]) -> Colors:
-    """Colors (..., 3) in which the Euclidean distance tells surfaces apart, of bgr8; lightness counts less."""
-    shape = color.shape
-    values = cv2.cvtColor(np.ascontiguousarray(color).reshape(-1, 1, 3), cv2.COLOR_BGR2LAB).astype(np.float32)
-    return np.asarray((values * np.array([LIGHTNESS, 1, 1], np.float32)).reshape(shape), np.float32)
+def features(color: npt.NDArray[np.uint8]) -> Colors:
+    """Colors (..., 3) in which the Euclidean distance tells surfaces apart, of bgr8.
+
+    Two are the shares of red and blue, which shading does not change; the third is the logarithm of the brightness, of
+    which shading changes a part only. A distance of 1 is a different color.
+    """
+    values = color.astype(np.float32) + np.float32(DARK)
+    total = values.sum(axis=-1)
+    result = np.empty(values.shape, np.float32)
+    np.divide(values[..., 2], total, out=result[..., 0])
+    np.divide(values[..., 0], total, out=result[..., 1])
+    result[..., :2] /= np.float32(SHARE_STEP)
+    np.log(total, out=result[..., 2])
+    result[..., 2] /= np.float32(SHADE_STEP)
+    return result
 
 
 def color_distance(a: Colors, b: Colors) -> Values:
-    """Distance (...) of colors (..., 3) of `lab`."""
+    """Distance (...) of colors (..., 3) of `features`."""
     return np.asarray(np.sqrt(((a - b) ** 2).sum(axis=-1)), np.float32)
 
 
@@ -112,7 +123,7 @@ class Foreground:
 
 
 def in_container(surface: Surface, colors: Colors, place: Place) -> Foreground:
-    """Return the objects in a container, of a surface around it with its colors (rows, columns, 3) of `lab`."""
+    """Return the objects in a container, of a surface around it with its colors (rows, columns, 3) of `features`."""
     rows, columns = surface.top.shape
     dx = np.abs(surface.xy(0, np.arange(columns))[:, 0] - place.x)[None, :]
     dy = np.abs(surface.xy(np.arange(rows), 0)[:, 1] - place.y)[:, None]
@@ -125,11 +136,12 @@ def in_container(surface: Surface, colors: Colors, place: Place) -> Foreground:
     if np.count_nonzero(floor) >= FEWEST:
         blue, green, red = np.median(surface.color[floor], axis=0)
         reference = (float(blue), float(green), float(red))
-    plain = lab(np.array(reference, np.uint8))
-    colored = color_distance(colors, plain) > COLOR_STEP
+    plain = features(np.array(reference, np.uint8))
+    colored = color_distance(colors, plain) > 1
+    tinted = color_distance(colors[..., :2], plain[:2]) > 1  # walls may be in shadow
     mask = (height > LOWEST) | ((height > THIN) & colored)
     over = height > place.rim - place.floor + OVER_RIM
-    mask &= np.where(wall, over | (colored & inside), inside)
+    mask &= np.where(wall, over | (tinted & inside), inside)
     gain = np.clip(np.array(place.color) / np.maximum(reference, 1.0), 0.4, 2.5).astype(np.float32)
     return Foreground(mask & known, wall, gain)
 

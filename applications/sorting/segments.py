@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from applications.sorting.places import COLOR_STEP, Colors, color_distance
+from applications.sorting.places import Colors, color_distance
 
 Bools = npt.NDArray[np.bool_]
 Values = npt.NDArray[np.float32]
@@ -22,6 +22,9 @@ Labels = npt.NDArray[np.int32]
 STEP = 0.008  # [m] difference of height within 3 x 3 cells that separates surfaces
 GROOVE = 0.004  # [m] a cell this far below the mean of those on both sides is in a groove
 GROOVE_REACH = 4  # [cells] to those
+SAME_COLOR = 0.35  # distance of colors below which surfaces are probably of one object
+STEP_OF_ONE = 0.016  # [m] step within an object of one color
+GROOVE_OF_ONE = 0.8  # fraction of its border that is a groove between two objects of one color
 CORE = 12  # [cells] smallest core of a segment
 SMALLEST = 15  # [cells] smaller segments join a neighbor, or are noise
 MAJORITY = 4.5 / 9  # of a cell and its neighbors must be cells of objects
@@ -47,7 +50,7 @@ class Segments:
 
 
 def segments(mask: Bools, top: Values, colors: Colors) -> Segments:
-    """Divide a mask (rows, columns) by heights (rows, columns) [m] and colors (rows, columns, 3) of `lab`."""
+    """Divide a mask (rows, columns) by heights (rows, columns) [m] and colors (rows, columns, 3) of `features`."""
     height = np.where(np.isfinite(top), top, np.float32(-1.0)).astype(np.float32)
     mask = _without_specks(mask)
     edges = _color_edges(colors)
@@ -79,7 +82,7 @@ def _color_edges(colors: Colors) -> Bools:
     smooth = cv2.medianBlur(colors, 3)
     cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
     change = cv2.morphologyEx(smooth, cv2.MORPH_GRADIENT, cross)
-    return np.asarray(np.sqrt((change**2).sum(axis=-1)) > COLOR_STEP)
+    return np.asarray(np.sqrt((change**2).sum(axis=-1)) > 1)
 
 
 def _grooves(height: Values, mask: Bools) -> Bools:
@@ -134,7 +137,7 @@ def _grown(labels: Labels, mask: Bools, height: Values, colors: Colors) -> Label
         for i, k in _AROUND:
             other = grown[rows + 1 + i, columns + 1 + k]
             step = np.abs(level[rows + 1 + i, columns + 1 + k] - height[rows, columns])
-            cost = step / STEP + color_distance(means[other], colors[rows, columns]) / COLOR_STEP
+            cost = step / STEP + color_distance(means[other], colors[rows, columns])
             better = (other > 0) & (cost < best)
             best, chosen = np.where(better, cost, best), np.where(better, other, chosen)
         inner[rows, columns] = chosen
@@ -205,14 +208,16 @@ def _joined(labels: Labels, height: Values, colors: Colors, groove: Bools) -> Se
         for (a, b), border in _borders(labels, height, groove).items():
             small, large = (a, b) if sizes[a] <= sizes[b] else (b, a)
             color = float(np.linalg.norm(means[a] - means[b]))
-            apart = border.step > STEP or (border.groove > 0.5 and border.length > 4)
+            alike = color < SAME_COLOR
+            apart = border.step > (STEP_OF_ONE if alike else STEP) or (
+                border.groove > (GROOVE_OF_ONE if alike else 0.5) and border.length > 4)
             enclosed = border.length >= ENCLOSED * perimeters[small] and sizes[small] <= PATCH * sizes[large]
             tiny = sizes[small] < SMALLEST
-            if not (tiny and border.step <= 2 * STEP) and (apart or (color > COLOR_STEP and not enclosed)):
+            if not (tiny and border.step <= 2 * STEP) and (apart or (color > 1 and not enclosed)):
                 continue
-            order = color / COLOR_STEP + border.step / STEP
+            order = color + border.step / STEP
             if best is None or order < best[0]:
-                best = order, small, large, color > COLOR_STEP and not tiny
+                best = order, small, large, color > 1 and not tiny
         if best is None:
             break
         _, small, large, other_color = best
