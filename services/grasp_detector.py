@@ -15,8 +15,11 @@ from pydantic import Field
 from applications.sorting.detector import HeapDetector, Seen
 from applications.sorting.drawing import annotate_heap
 from applications.sorting.foreign import ForeignOptions
+from applications.sorting.grasp_finder import GraspFinder
+from applications.sorting.grasps.candidates import Options
+from applications.sorting.grasps.proof import ProofOptions
 from applications.sorting.seeing import View
-from applications.sorting.topics import HEAP, HEAP_IMAGE
+from applications.sorting.topics import HEAP, HEAP_IMAGE, Heap
 from common import topics
 from common.config import Parameters, RobotConfig, Surroundings, Tunable
 from common.messages import Image
@@ -43,10 +46,13 @@ class Config(Parameters):
     tray: str = Field("tray", description="id of the container with the objects; all others are destinations")
     views: list[ViewName] = Field([], max_length=4, description="names of several cameras, the main one first, as "
                                                                 "left: left/depth_camera/image_raw")
+    grasps: Options | None = Field(None, description="limits of grasps: depth, slack, spares, tilts, ...")
+    proof: ProofOptions | None = Field(None, description="how many grasps are proved and for how long: wanted, "
+                                                         "for_each, seconds, approach, ...")
     rises: Tunable[float] = Field(0.04, gt=0, le=0.5, description="a foreign body is this much higher than all that is "
                                                                   "known there [m]")
-    ceiling: Tunable[float] = Field(0.20, gt=0, le=2, description="height in world above which everything but the "
-                                                                  "robot is foreign [m]")
+    ceiling: Tunable[float] = Field(0.20, gt=0, le=2, description="height above the table from which on everything "
+                                                                  "but the robot is foreign [m]")
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,6 +122,9 @@ async def run(bus: Bus, config: Config) -> None:
     home = HomeMonitor(config.robot.named_poses["home"])
     detector = await asyncio.to_thread(
         HeapDetector, config.world, config.robot, tray=config.tray, field_name=f"services.{bus.service}.tray")
+    finder = await asyncio.to_thread(
+        GraspFinder, config.world, config.robot, config.tray, options=config.grasps,
+        proof=config.proof)
     await bus.ready()
 
     async def watch_arm() -> None:
@@ -154,14 +163,20 @@ async def run(bus: Bus, config: Config) -> None:
             if seen is None:
                 skipped.note(FrameError("no_state", "no joint state at the time of the image"))
                 continue
-            await publish(first, seen)
+            await publish(first, await asyncio.to_thread(with_grasps, seen))
 
-    async def publish(shot: Shot, seen: Seen) -> None:
-        heap = seen.heap.model_copy(update={"seconds": time.perf_counter() - shot.received})
+    def with_grasps(seen: Seen) -> Heap:
+        if seen.surface is None:
+            return seen.heap
+        found = finder.find(seen.surface, seen.labels, seen.heap.objects)
+        return seen.heap.model_copy(update={"grasps": found.grasps, "left": found.left, "scorer": found.scorer})
+
+    async def publish(shot: Shot, found: Heap) -> None:
+        heap = found.model_copy(update={"seconds": time.perf_counter() - shot.received})
         heaps.put(heap)
         if shown.matched:
             _, pixels, camera = shot.view
-            picture = await asyncio.to_thread(annotate_heap, pixels, camera, heap)
+            picture = await asyncio.to_thread(annotate_heap, pixels, camera, heap, finder.closing)
             shown.put(array_to_image(picture, "bgr8", shot.image.header))
 
     async with asyncio.TaskGroup() as group:

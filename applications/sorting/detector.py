@@ -96,7 +96,7 @@ class HeapDetector:
         surface = self._surface(smooth, robot)
         labels, objects = find_objects(surface, self.world)
         labels, objects, large = without_bodies(labels, objects)
-        self._known.update(without(surface, labels == -1), self.options.ceiling)
+        self._known.update(without(surface, labels == -1), self.world.table_height + self.options.ceiling)
         foreign = [*self._foreign(smooth, robot), *large][:MAX_OBJECTS]
         heap = Heap(header=header, at_home=True, objects=self._identities.named(objects), foreign=foreign,
                     hidden=hidden_fraction(surface, self.tray))
@@ -113,7 +113,7 @@ class HeapDetector:
         for depth, image, camera in views:
             x, y, z = world_points(depth, camera)
             with np.errstate(invalid="ignore"):
-                drop = z > self.options.ceiling
+                drop = z > self.world.table_height + self.options.ceiling
                 high = np.flatnonzero((z > self.world.table_height + LOW) & ~drop)
             if len(high):
                 points = np.column_stack([x[high], y[high], z[high]]).astype(float)

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import cv2
 import numpy as np
 import numpy.typing as npt
 
 from applications.sorting.topics import Foreign, Grasp, Heap, SeenObject
-from common.perception.labels import draw_labels
+from common.perception.labels import WIDTH, draw_labels
 from common.perception.pinhole import Pinhole
 from common.robot.transforms import pose_to_matrix
 
@@ -23,6 +21,8 @@ PROVED: Bgr = (60, 170, 60)
 UNPROVED: Bgr = (60, 140, 255)
 FOREIGN: Bgr = (200, 40, 255)
 MOST_GRASPS = 12  # drawn
+MOST_LINES = 6  # of reasons
+TEXT = 0.38  # scale of their font
 FINGER = 0.011  # [m] half width of a finger bar
 _SHIFT = 4  # fractional bits of pixels
 
@@ -37,20 +37,22 @@ def annotate_heap(image: Pixels, camera: Pinhole, heap: Heap, closing: Array | N
         closing: (3,) axis along which fingers close, in the frame of the tool; default: y.
     """
     shown = image.copy()
-    left = {each.object: each.reason for each in heap.left}
     labels: list[tuple[str, float, float, float]] = []
+    best = {grasp.object: grasp.score for grasp in reversed(heap.grasps) if grasp.proved}
     for seen in heap.objects:
         pixels = _draw_outline(shown, camera, seen)
         if pixels is not None:
-            text = seen.id if seen.id not in left else f"{seen.id}: {left[seen.id]}"
+            text = f"{seen.id} {best[seen.id]:.2f}" if seen.id in best else seen.id
             labels.append((text, *pixels.mean(axis=0).tolist(), float(np.ptp(pixels[:, 1])) / 2))
     axis = np.array([0.0, 1.0, 0.0]) if closing is None else np.asarray(closing, float)
-    labels += _draw_grasps(shown, camera, heap.grasps[:MOST_GRASPS], axis)
+    for index in range(min(len(heap.grasps), MOST_GRASPS) - 1, -1, -1):  # the best is drawn last
+        _draw_fingers(shown, camera, heap.grasps[index], axis, first=index == 0)
     for body in heap.foreign:
         pixels = _draw_box(shown, camera, body)
         if pixels is not None:
             labels.append(("foreign", *pixels.mean(axis=0).tolist(), float(np.ptp(pixels[:, 1])) / 2))
     draw_labels(shown, labels)
+    _list_reasons(shown, heap)
     return shown
 
 
@@ -66,28 +68,22 @@ def _draw_outline(image: Pixels, camera: Pinhole, seen: SeenObject) -> Array | N
     return pixels
 
 
-def _draw_grasps(
-    image: Pixels, camera: Pinhole, grasps: Sequence[Grasp], axis: Array
-) -> list[tuple[str, float, float, float]]:
-    """Draw the worst first; return the label of the best of each object."""
-    labels: list[tuple[str, float, float, float]] = []
-    named: set[str] = set()
-    for index in range(len(grasps) - 1, -1, -1):
-        grasp = grasps[index]
-        color = (BEST if index == 0 else PROVED) if grasp.proved else UNPROVED
-        _draw_fingers(image, camera, grasp, axis, color, 2 if index == 0 else 1)
-    for grasp in grasps:
-        if grasp.object in named:
-            continue
-        named.add(grasp.object)
-        pixels = camera.project(pose_to_matrix(grasp.pose)[:3, 3][None])[0]
-        if np.isfinite(pixels).all():
-            labels.append((f"{grasp.score:.2f}", float(pixels[0]), float(pixels[1]), 12.0))
-    return labels
+def _list_reasons(image: Pixels, heap: Heap) -> None:
+    """Write at the top left why objects have no grasp; objects with the same reason share a line."""
+    by_reason: dict[str, list[str]] = {}
+    for each in heap.left:
+        by_reason.setdefault(each.reason, []).append(each.object)
+    lines = [f"{', '.join(names)}: {reason}" for reason, names in by_reason.items()][:MOST_LINES]
+    factor = max(1.0, image.shape[1] / WIDTH)
+    for number, line in enumerate(lines, 1):
+        at = round(6 * factor), round(14 * factor * number)
+        for color, weight in (((0, 0, 0), 3), ((255, 255, 255), 1)):
+            cv2.putText(image, line, at, cv2.FONT_HERSHEY_SIMPLEX, TEXT * factor, color, weight, cv2.LINE_AA)
 
 
-def _draw_fingers(image: Pixels, camera: Pinhole, grasp: Grasp, axis: Array, color: Bgr, weight: int) -> None:
+def _draw_fingers(image: Pixels, camera: Pinhole, grasp: Grasp, axis: Array, *, first: bool) -> None:
     """Draw a grasp as two bars, at the opening, and a line between the contacts."""
+    color = (BEST if first else PROVED) if grasp.proved else UNPROVED
     T = pose_to_matrix(grasp.pose)
     along, across = T[:3, :3] @ axis, T[:3, :3] @ np.cross(axis, (0.0, 0.0, 1.0))
     center = T[:3, 3]
@@ -97,7 +93,7 @@ def _draw_fingers(image: Pixels, camera: Pinhole, grasp: Grasp, axis: Array, col
     if not all(np.isfinite(each).all() for each in (contacts, *bars)):
         return
     cv2.polylines(image, [_fixed(contacts)], False, color, 1, cv2.LINE_AA, _SHIFT)
-    cv2.polylines(image, [_fixed(bar) for bar in bars], False, color, weight + 1, cv2.LINE_AA, _SHIFT)
+    cv2.polylines(image, [_fixed(bar) for bar in bars], False, color, 3 if first else 2, cv2.LINE_AA, _SHIFT)
 
 
 def _draw_box(image: Pixels, camera: Pinhole, body: Foreign) -> Array | None:

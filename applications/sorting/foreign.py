@@ -41,10 +41,10 @@ class ForeignOptions:
 
     Attributes:
         rises: height above the known world [m].
-        ceiling: height z up to which unknown objects at home are objects and no bodies [m].
+        ceiling: height above the table up to which unknown objects at home are objects and no bodies [m].
         area: least area of a body seen from above [m^2].
         near_tool: points this close to the tool center point of a robot that holds or grips belong to the object [m].
-        top: z above which nothing is looked for [m].
+        top: height above the table from which on nothing is looked for [m].
     """
 
     rises: float = 0.04
@@ -69,7 +69,7 @@ class KnownWorld:
 
     def __init__(self, world: Surroundings, containers: Sequence[Place], area: Area) -> None:
         """Start with table, containers and fixtures; objects are added by `update`."""
-        self.area = area
+        self.area, self.table = area, world.table_height
         self._shape = (max(1, round((area[3] - area[1]) / CELL)), max(1, round((area[2] - area[0]) / CELL)))
         self._fixed = np.full(self._shape, world.table_height, np.float32)
         for place in containers:
@@ -114,7 +114,7 @@ def strange_points(
     coarse = _coarse(camera)
     x, y, z = world_points(np.ascontiguousarray(sampled), coarse)
     with np.errstate(invalid="ignore"):
-        candidate = (z > known.top.min() + options.rises) & (z < options.top)
+        candidate = (z > known.top.min() + options.rises) & (z < known.table + options.top)
     points = np.column_stack([x[candidate], y[candidate], z[candidate]]).astype(float)
     points = points[known.above(points) > options.rises]
     if not len(points):
