@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.up-to-date
 
-.PHONY: setup franka-sim run up test test-all campaign containers check audit bench bench-check chaos fuzz soak docs docs-site deploy clean
+.PHONY: setup franka-sim run up test test-all campaign grasping containers check audit bench bench-check chaos fuzz soak docs docs-site deploy clean
 
 setup: $(STAMP)
 
@@ -49,6 +49,14 @@ test-all: setup  ## `make test`, and what takes long
 campaign: setup  ## tests that repeat over hundreds of seeds, or for minutes
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder -m "campaign and not alone"
 	$(BIN)/python -m pytest -q -m "campaign and alone"
+
+# Resumable: seeds that are in build/grasping.jsonl are not run again. Needs the extra: make setup EXTRAS=physics.
+grasping: setup  ## grasps of unseen objects by the complete sorting cell, hours; seeds as published in docs/grasping.md
+	@mkdir -p build
+	$(BIN)/python -m benchmarks.grasping --singles 300 --force 20 --jobs 2 --json build/grasping.jsonl
+	$(BIN)/python -m benchmarks.grasping --singles 300 --force 40 --jobs 2 --json build/grasping.jsonl
+	$(BIN)/python -m benchmarks.grasping --heaps 30 --force 40 --jobs 2 --json build/grasping.jsonl
+	$(BIN)/python -m benchmarks.grasping --latency 10 --force 40 --json build/grasping.jsonl
 
 containers: setup  ## build the image and run a cell in containers; needs a container engine
 	$(BIN)/python -m pytest -q -m container tests/deploy
