@@ -155,6 +155,8 @@ class Truth:
         if not attempt.lifted:
             return "empty"
         places = {self.objects[name].container or self.objects[name].state for name in attempt.lifted}
+        if places & {"held", "falling"}:
+            return "unfinished"
         if places == {TRAY}:
             return "put back" if attempt.noticed == "two" else "slipped"
         return "fell in transit"
