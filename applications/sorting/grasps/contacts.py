@@ -129,12 +129,13 @@ class Strips:
     def _side(
         self, index: NDArray[np.int64], used: Mask, outwards: Array, outlines: Outlines
     ) -> Array:
-        """Return (n,) the cosine between the closing axis and the mean direction of the edge; 0 without an edge."""
+        """Return (n,) the mean cosine between closing axis and edge direction on the lines; 0 without an edge."""
         cells = np.take_along_axis(self.cells, index[:, :, None], 2)[:, :, 0]
-        is_open = (outlines.edge.ravel()[cells] & used).sum(axis=1) >= OPEN * np.maximum(used.sum(axis=1), 1)
-        normal = (outlines.normal.reshape(-1, 2)[cells] * used[:, :, None]).sum(axis=1)
-        length = np.maximum(np.linalg.norm(normal, axis=1), 1e-9)
-        return np.asarray(np.where(is_open, np.clip((normal * outwards).sum(axis=1) / length, 0.0, 1.0), 0.0))
+        count = np.maximum(used.sum(axis=1), 1)
+        is_open = (outlines.edge.ravel()[cells] & used).sum(axis=1) >= OPEN * count
+        cosine = (outlines.normal.reshape(-1, 2)[cells] * outwards[:, None]).sum(axis=2)
+        mean = np.where(used, np.clip(cosine, 0.0, 1.0), 0.0).sum(axis=1) / count
+        return np.asarray(np.where(is_open, mean, 0.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,7 +146,7 @@ class Contacts:
         found: (n,) whether there are any.
         shift: (n,) of their middle from the seed's, along the closing axis; width: (n,) between them [m].
         height: (n, 2) z of the object just inside each edge [m].
-        alignment: (n, 2) cosine between closing axis and direction of each edge.
+        alignment: (n, 2) mean cosine between closing axis and direction of each edge.
         extent: (n,) fraction of the finger tips' width that meets the object.
         roughness: (n,) how unevenly the edges meet the finger tips [m].
         purity: (n,) fraction of what is between the fingers that is the object.

@@ -71,7 +71,7 @@ def test_a_ring_is_gripped_at_its_rim_with_a_finger_inside(robot: str) -> None:
     found = grasps(robot, cylinder(0.55, 0.0, 0.05, 0.03, hole=0.04))
     assert len(found) > 8
     assert np.hypot(*(found.T[:, :2, 3] - (0.55, 0.0)).T) == pytest.approx(0.045, abs=0.003)
-    assert found.width.max() < 0.022
+    assert found.width.max() < 0.026
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
@@ -106,7 +106,7 @@ def test_an_object_at_a_wall_is_gripped_along_the_wall(robot: str, solid: Solid,
 @pytest.mark.parametrize("robot", ROBOTS)
 @pytest.mark.parametrize(("solids", "reason"), [
     ([box(0.55, 0.0, 0.12, 0.12, 0.04)], "wider than the"),
-    ([box(0.55 + 0.192 - 0.02, 0.192 - 0.02, 0.04, 0.04, 0.04)], "free space"),  # in the corner, lower than the walls
+    ([box(0.55 + 0.192 - 0.02, 0.192 - 0.02, 0.04, 0.04, 0.04)], "opposite edges"),  # in the corner, lower than the walls
     ([box(0.55, 0.0, 0.04, 0.04, 0.03), *(box(0.55 + dx, dy, 0.06, 0.06, 0.06) for dx in (-0.06, 0, 0.06)
       for dy in (-0.06, 0, 0.06) if dx or dy)], ""),  # in a pit
 ])
