@@ -16,8 +16,6 @@ from common.errors import ConfigError
 from common.terminal import echo
 
 if TYPE_CHECKING:
-    from common.config import Cell
-    from common.supervision.wiring import ServiceWiring
     from tools.graph import Graph
 
 app = CommandGroup("List services, and describe what each reads, writes, serves and calls.")
@@ -89,6 +87,7 @@ def graph(
 ) -> None:
     """Draw the services and topics of a cell; if the cell is running, services that are not alive are dashed."""
     from common.config import load_cell
+    from common.supervision.wiring import wire_services
     from security.page_tokens import VIEWER
     from tools.graph import graph_of, names
 
@@ -96,7 +95,8 @@ def graph(
     write = _writer_of(path)
     loaded = load_cell(cell, overrides or ())
     presence = CellTarget(domain=domain, connect=connect).running_cells().get(loaded.name)
-    services = [each for each in _wired_services(loaded) if not (no_viewer and each.name == VIEWER)]
+    wired = wire_services(loaded, _warn)
+    services = [each for each in wired if not (no_viewer and each.name == VIEWER)]
     made = graph_of(loaded.name, services, presence.ready if presence else None)
     text = write(made)
     if path is None:
@@ -118,18 +118,28 @@ def _writer_of(path: Path | None) -> Callable[[Graph], str]:
     return writers[path.suffix]
 
 
-def _wired_services(cell: Cell) -> list[ServiceWiring]:
-    """Return the services in start order; a service whose wiring fails is drawn without its keys."""
-    from common.supervision.wiring import ServiceWiring, WiringFailed, wire_service
+def _warn(error: Exception) -> None:
+    echo(f"zencell: {error}", err=True)
 
-    found = []
-    for entry in cell.services.values():
-        try:
-            found.append(wire_service(cell, entry))
-        except WiringFailed as error:
-            echo(f"zencell: {error}", err=True)
-            found.append(ServiceWiring(entry.name, ""))
-    return found
+
+def schema(
+    cell: options.CellArgument,
+    out: Annotated[
+        str, typer.Option("--out", metavar="FOLDER", help="write asyncapi.json, messages/*.json [AsyncAPI on stdout]")
+    ] = "",
+    overrides: options.Overrides = None,
+    domain: options.Domain = None,
+    connect: options.Connect = None,
+) -> None:
+    """Describe a cell for other languages: JSON Schema of its messages, AsyncAPI of its keys."""
+    from common.config import load_cell
+    from common.supervision.wiring import wire_services
+    from common.transport.endpoint import endpoint_of
+    from tools.wire import asyncapi, files
+
+    loaded = load_cell(cell, overrides or ())
+    made = loaded.name, wire_services(loaded, _warn), endpoint_of(domain, connect)
+    echo(files.write(*made, Path(out).expanduser()) if out else files.to_text(asyncapi.document(*made)))
 
 
 param = CommandGroup("List, read, change and save parameters of running services.")

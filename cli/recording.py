@@ -17,7 +17,7 @@ from cli import choices, options
 from cli.options import RUNNING, CellTarget
 from common.errors import ConfigError
 from common.terminal import Progress, echo, printable, rewrite
-from recording.formatting import format_bytes, format_contents, require_new
+from recording.formatting import cell_to_play, format_bytes, format_contents, format_recovery, require_new
 
 if TYPE_CHECKING:
     from recording.player import Player
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from recording.selection import Selection
 
 
-MOST_HOLES = 3  # that a line lists
 MIN_FILE_SIZE = 1.0  # [MB] of a recording that is split
 
 File = Annotated[str, typer.Argument(metavar="FILE.mcap", help="a recording")]
@@ -117,14 +116,7 @@ def recover(
     require_new(target)
     with Progress(f"reading {file}") as read:
         saved = recover_file(source, target, read)
-    lost = [f"{format_bytes(size)} in a hole" for size in saved.holes[:MOST_HOLES]]
-    if more := saved.holes[MOST_HOLES:]:
-        lost.append(f"{format_bytes(sum(more))} in {len(more)} more holes")
-    lost += [f"{format_bytes(saved.lost_bytes)} after the last record"] if saved.lost_bytes else []
-    lost += [f"{saved.damaged_chunks} damaged chunks"] if saved.damaged_chunks else []
-    lost += [f"{saved.unknown:,} messages whose topic is unknown"] if saved.unknown else []
-    echo(f"saved {saved.messages:,} messages, {saved.seconds:.1f} s: {target}; "
-         f"lost {' and '.join(lost) or 'nothing'}")
+    echo(format_recovery(saved, target))
 
 
 MAX_RATE = 1000.0
@@ -190,7 +182,7 @@ def play_(
             return Player(recording, selection.wants, renamed, rate=speed, offset=offset, loop=loop,
                           paused=start_paused, stamp_now=stamp_now, into_live=into_live or ())
 
-        name, show = _cell_of(recording, file, cell), rewrite if on_terminal else None
+        name, show = cell_to_play(recording.cell, file, cell), rewrite if on_terminal else None
         messages = {renamed(topic): message for topic, (message, _) in played.items()}
         _confirm_commands(into_live or [], messages, name, on_terminal)
         code = asyncio.run(play(create, recording, played, name, wait or [], domain, connect, echo, show))
@@ -213,22 +205,6 @@ def _confirm_commands(into_live: list[str], played: Mapping[str, str], cell: str
             raise ConfigError("--into-live", key, "needs a terminal, to confirm that the cell may move")
         if typer.prompt(f"{key} moves the robot of {cell} as recorded. To confirm, type {cell}") != cell:
             raise ConfigError("--into-live", key, "was not confirmed")
-
-
-def _cell_of(recording: Recording, file: str, named: str | None) -> str:
-    """Return the cell as which a recording is played: the named one, else that of the recording.
-
-    Raises:
-        ConfigError: there is none, or its name is not valid.
-    """
-    from common.remapping import is_cell
-
-    name = named or recording.cell
-    if not name:
-        raise ConfigError("--cell", ..., f"{file} does not name its cell: name one")
-    if not is_cell(name):
-        raise ConfigError("--cell", name, "is not a valid name of a cell")
-    return name
 
 
 PLOT_ERRORS = (ArithmeticError, ValueError, LookupError, TypeError)  # errors from values that no real run contains

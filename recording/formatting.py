@@ -12,8 +12,10 @@ from common.terminal import printable
 
 if TYPE_CHECKING:
     from recording.capture import RecordingStats
+    from recording.reader import Recovered
     from recording.summary import Summary
 
+MOST_HOLES = 3  # that a line lists
 MOST_SHOWN = 200  # [characters] of each value that describes the run
 
 
@@ -34,6 +36,34 @@ def format_result(files: list[str], stats: RecordingStats, missed: dict[str, int
     lost = [f"  {key}: {count} dropped, {why}" for key, count in sorted(stats.dropped.items())]
     lost += [f"  {key}: {count} lost on the network" for key, count in sorted(missed.items())]
     return [line, *(lost or ["no message was lost"])]
+
+
+def format_recovery(saved: Recovered, target: Path) -> str:
+    """Return what was saved to a file, and what was lost, in one line."""
+    lost = [f"{format_bytes(size)} in a hole" for size in saved.holes[:MOST_HOLES]]
+    if more := saved.holes[MOST_HOLES:]:
+        lost.append(f"{format_bytes(sum(more))} in {len(more)} more holes")
+    lost += [f"{format_bytes(saved.lost_bytes)} after the last record"] if saved.lost_bytes else []
+    lost += [f"{saved.damaged_chunks} damaged chunks"] if saved.damaged_chunks else []
+    lost += [f"{saved.unknown:,} messages whose topic is unknown"] if saved.unknown else []
+    return (f"saved {saved.messages:,} messages, {saved.seconds:.1f} s: {target}; "
+            f"lost {' and '.join(lost) or 'nothing'}")
+
+
+def cell_to_play(recorded: str, file: str, named: str | None) -> str:
+    """Return the cell as which a recording is played: the named one, else that of the recording.
+
+    Raises:
+        ConfigError: there is none, or its name is not valid.
+    """
+    from common.remapping import is_cell
+
+    name = named or recorded
+    if not name:
+        raise ConfigError("--cell", ..., f"{file} does not name its cell: name one")
+    if not is_cell(name):
+        raise ConfigError("--cell", name, "is not a valid name of a cell")
+    return name
 
 
 def format_bytes(size: float) -> str:

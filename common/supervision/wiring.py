@@ -217,6 +217,22 @@ def wire_service(cell: Cell, entry: ServiceEntry) -> ServiceWiring:
     return ServiceWiring(entry.name, doc, config, reads, writes, serves, calls, {topic.key: topic for topic in every})
 
 
+def wire_services(cell: Cell, on_failure: Callable[[WiringFailed], None]) -> list[ServiceWiring]:
+    """Return the services of a cell in start order; one that fails has no keys, and is reported.
+
+    Raises:
+        ConfigError: the parameters of a service or its module are not valid.
+    """
+    found = []
+    for entry in cell.services.values():
+        try:
+            found.append(wire_service(cell, entry))
+        except WiringFailed as error:
+            on_failure(error)
+            found.append(ServiceWiring(entry.name, ""))
+    return found
+
+
 def _in_order(side: list[Any]) -> list[str]:
     """Return keys in the order of common/topics.py, then the others sorted."""
     known = list(all_topics())
