@@ -28,12 +28,15 @@ SAME_SIZE = 0.03  # [m] largest difference of length, width or top of one object
 FADES = 5  # images after which an object that is not seen is forgotten
 
 
-def find_objects(surface: Surface, world: Surroundings) -> tuple[Labels, list[SeenObject]]:
+def find_objects(
+    surface: Surface, world: Surroundings, before: Labels | None = None
+) -> tuple[Labels, list[SeenObject]]:
     """Return all objects of a surface of containers and the table around them.
 
     Args:
         surface: at most a part of the world.
         world: its containers and fixtures, which are no objects.
+        before: labels of the image before, if it was of the same grid.
 
     Returns:
         labels (rows, columns): k + 1 at the cells of object k, 0 elsewhere; and the objects, with ids 1, 2, ...
@@ -50,23 +53,25 @@ def find_objects(surface: Surface, world: Surroundings) -> tuple[Labels, list[Se
         colors = features(piece.color)
         inside = in_container(piece, colors, place)
         gain = inside.gain
-        _add(found, labels[part], piece, inside.mask, inside.near_wall, inside.gain, place.id, place.floor)
+        _add(found, labels[part], piece, inside.mask, inside.near_wall, inside.gain, place.id, place.floor,
+             None if before is None else before[part])
     mask = on_table(surface, containers, world)
     for part in _islands(mask):
         piece = _piece(surface, part)
         nowhere = np.zeros(piece.top.shape, bool)
-        _add(found, labels[part], piece, mask[part], nowhere, gain, TABLE, world.table_height)
+        _add(found, labels[part], piece, mask[part], nowhere, gain, TABLE, world.table_height,
+             None if before is None else before[part])
     return labels, found
 
 
 def _add(
     found: list[SeenObject], labels: Labels, piece: Surface, mask: Bools, near_wall: Bools, gain: Values, place: str,
-    floor: float,
+    floor: float, before: Labels | None,
 ) -> None:
     """Append the objects of a mask to those found, and write their labels."""
     if not mask.any():
         return
-    parts = segments(mask, piece.top, features(piece.color))
+    parts = segments(mask, piece.top, features(piece.color), before)
     boxes = _boxes(parts.labels, parts.count)
     for number, box in enumerate(boxes, 1):
         if len(found) >= MAX_OBJECTS:

@@ -75,6 +75,7 @@ class HeapDetector:
         self._shapes = KnownShapeFilter(self.geometry)
         self._known = KnownWorld(world, containers, self.area)
         self._identities, self._debounce = Identities(), Debounce()
+        self._before: Labels | None = None  # labels of the newest image from home
 
     def look(self, views: Sequence[View], stamp: int, *, at_home: bool, gripping: bool) -> Seen | None:
         """Return what images of one instant show; None while the position of the arm at that time is unknown.
@@ -94,13 +95,14 @@ class HeapDetector:
         if not at_home:
             return Seen(Heap(header=header, foreign=self._foreign(smooth, robot)))
         surface = self._surface(smooth, robot)
-        labels, objects = find_objects(surface, self.world)
+        labels, objects = find_objects(surface, self.world, self._before)
         labels, objects, large = without_bodies(labels, objects)
         self._known.update(without(surface, labels == -1), self.world.table_height + self.options.ceiling)
         foreign = [*self._foreign(smooth, robot), *large][:MAX_OBJECTS]
+        self._before = np.maximum(labels, 0)
         heap = Heap(header=header, at_home=True, objects=self._identities.named(objects), foreign=foreign,
                     hidden=hidden_fraction(surface, self.tray))
-        return Seen(heap, surface, np.maximum(labels, 0))
+        return Seen(heap, surface, self._before)
 
     def _foreign(self, views: Sequence[View], robot: RobotAt) -> list[Foreign]:
         points = [strange_points(depth, camera, self._known, robot, self._shapes, self.options)

@@ -88,12 +88,14 @@ class KnownWorld:
 
     def update(self, surface: Surface, ceiling: float) -> None:
         """Take the objects of a surface seen with the arm at home, up to a height z [m]."""
-        rows, columns = np.nonzero(np.isfinite(surface.top) & (surface.top < ceiling))
-        xy = surface.xy(rows, columns)
+        top = np.where(surface.top < ceiling, surface.top, np.float32(-np.inf))  # NaN is not
+        highest = cv2.dilate(top, np.ones((3, 3), np.uint8))[1::3, 1::3]  # of 3 x 3 cells
+        rows, columns = np.nonzero(np.isfinite(highest))
+        xy = surface.xy(3 * rows + 1, 3 * columns + 1)
         x, y = ((xy[:, k] - self.area[k]) / CELL for k in (0, 1))
         inside = (x >= 0) & (x < self._shape[1]) & (y >= 0) & (y < self._shape[0])
         seen = self._fixed.copy()
-        np.maximum.at(seen, (y[inside].astype(int), x[inside].astype(int)), surface.top[rows, columns][inside])
+        np.maximum.at(seen, (y[inside].astype(int), x[inside].astype(int)), highest[rows, columns][inside])
         size = 2 * math.ceil(SHIFT / CELL) + 1
         self.top = np.asarray(cv2.dilate(seen, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))), np.float32)
 

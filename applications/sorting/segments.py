@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from applications.sorting.places import Colors, color_distance
 
+Array = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]
 Values = npt.NDArray[np.float32]
 Labels = npt.NDArray[np.int32]
@@ -24,10 +25,12 @@ GROOVE = 0.004  # [m] a cell this far below the mean of those on both sides is i
 GROOVE_REACH = 4  # [cells] to those
 SAME_COLOR = 0.35  # distance of colors below which surfaces are probably of one object
 STEP_OF_ONE = 0.016  # [m] step within an object of one color
+GROOVE_OF_TWO = 0.5  # fraction of their border that is a groove between objects
 GROOVE_OF_ONE = 0.8  # fraction of its border that is a groove between two objects of one color
 CORE = 12  # [cells] smallest core of a segment
 SMALLEST = 15  # [cells] smaller segments join a neighbor, or are noise
 MAJORITY = 4.5 / 9  # of a cell and its neighbors must be cells of objects
+HYSTERESIS = 1.4  # by which limits favor the segments of the image before
 ROUNDS = 8  # in which cut cells join the cores
 ENCLOSED = 0.6  # fraction of the border of a patch that touches the segment it belongs to
 PATCH = 0.35  # largest area of a patch, as a fraction of that of its segment
@@ -49,8 +52,12 @@ class Segments:
     patched: frozenset[int]
 
 
-def segments(mask: Bools, top: Values, colors: Colors) -> Segments:
-    """Divide a mask (rows, columns) by heights (rows, columns) [m] and colors (rows, columns, 3) of `features`."""
+def segments(mask: Bools, top: Values, colors: Colors, before: Labels | None = None) -> Segments:
+    """Divide a mask (rows, columns) by heights (rows, columns) [m] and colors (rows, columns, 3) of `features`.
+
+    Cells that were one segment `before` (rows, columns), in the image before, are divided only by clearer steps, edges
+    and grooves, and others are joined only across smaller ones: noise does not change what is seen of a still heap.
+    """
     height = np.where(np.isfinite(top), top, np.float32(-1.0)).astype(np.float32)
     mask = _without_specks(mask)
     edges = _color_edges(colors)
@@ -59,7 +66,7 @@ def segments(mask: Bools, top: Values, colors: Colors) -> Segments:
     count, labels = cv2.connectedComponents((mask & ~cut).astype(np.uint8), connectivity=4)
     cores = _large_enough(np.asarray(labels, np.int32), count, CORE)
     grown = _grown(cores, mask, height, colors)
-    return _joined(_with_leftovers(grown, mask), height, colors, groove)
+    return _joined(_with_leftovers(grown, mask), height, colors, groove, before)
 
 
 def _without_specks(mask: Bools) -> Bools:
@@ -111,14 +118,12 @@ def _large_enough(labels: Labels, count: int, least: int) -> Labels:
     return np.asarray(numbers[labels], np.int32)
 
 
-def mean_by_label(labels: Labels, values: Values | Colors, count: int) -> npt.NDArray[np.float64]:
-    """Mean (count + 1, ...) of the values of each label; that of unused labels is 0."""
-    flat = labels.ravel()
+def mean_by_label(labels: Labels, values: Colors, count: int) -> Array:
+    """Mean (count + 1, k) of the values (rows, columns, k) of each label; that of unused labels is 0."""
+    used = labels > 0
+    flat, chosen = labels[used], values[used]
     sizes = np.maximum(np.bincount(flat, minlength=count + 1), 1)
-    if values.ndim == labels.ndim:
-        return np.asarray(np.bincount(flat, values.ravel(), count + 1) / sizes)
-    parts = [np.bincount(flat, values[..., k].ravel(), count + 1) / sizes for k in range(values.shape[-1])]
-    return np.stack(parts, axis=-1)
+    return np.stack([np.bincount(flat, chosen[:, k], count + 1) / sizes for k in range(values.shape[-1])], axis=-1)
 
 
 def _grown(labels: Labels, mask: Bools, height: Values, colors: Colors) -> Labels:
@@ -157,74 +162,98 @@ def _with_leftovers(labels: Labels, mask: Bools) -> Labels:
     return result
 
 
-@dataclass(eq=False)
-class _Border:
-    """The common border of two segments: its length [cells], median step [m] and fraction in grooves."""
+@dataclass(frozen=True, eq=False)
+class _Sides:
+    """Sides of cells between two segments: their labels (n, 2), the smaller first, and step [m] and groove (n,)."""
 
-    length: int
-    step: float
-    groove: float
+    labels: npt.NDArray[np.int64]
+    step: Values
+    groove: Bools
 
 
-def _borders(labels: Labels, height: Values, groove: Bools) -> dict[tuple[int, int], _Border]:
-    """Return the borders of all pairs of segments; steps are measured between cells two apart from the border."""
-    pairs, steps, grooves = [], [], []
-    for axis in (0, 1):
-        a, b = (labels[:-1], labels[1:]) if axis == 0 else (labels[:, :-1], labels[:, 1:])
+def _sides(labels: Labels, height: Values, groove: Bools) -> _Sides:
+    """Return all sides between segments; steps are measured between cells two apart from the border."""
+    pairs, steps, grooves = [np.empty((0, 2), np.int64)], [np.empty(0, np.float32)], [np.empty(0, bool)]
+    limit = np.array(labels.shape) - 1
+    for down, right in ((1, 0), (0, 1)):
+        a, b = labels[: limit[0] + 1 - down, : limit[1] + 1 - right], labels[down:, right:]
         rows, columns = np.nonzero((a != b) & (a > 0) & (b > 0))
-        if not len(rows):
-            continue
         first, second = a[rows, columns], b[rows, columns]
-        down, right = (1, 0) if axis == 0 else (0, 1)
-        limit = np.array(labels.shape) - 1
-        before = np.clip(rows - down, 0, limit[0]), np.clip(columns - right, 0, limit[1])
-        after = np.clip(rows + 2 * down, 0, limit[0]), np.clip(columns + 2 * right, 0, limit[1])
-        pairs.append(np.sort(np.column_stack([first, second]), axis=1))
+        before = np.maximum(rows - down, 0), np.maximum(columns - right, 0)
+        after = np.minimum(rows + 2 * down, limit[0]), np.minimum(columns + 2 * right, limit[1])
         low = np.where(labels[before] == first, height[before], height[rows, columns])
         high = np.where(labels[after] == second, height[after], height[rows + down, columns + right])
+        pairs.append(np.sort(np.column_stack([first, second]), axis=1).astype(np.int64))
         steps.append(np.abs(high - low))
         grooves.append(groove[rows, columns] | groove[rows + down, columns + right])
-    if not pairs:
-        return {}
-    found, owner = np.unique(np.concatenate(pairs), axis=0, return_inverse=True)
-    owner, step, in_groove = owner.ravel(), np.concatenate(steps), np.concatenate(grooves)
-    return {
-        (int(pair[0]), int(pair[1])): _Border(
-            int((owner == k).sum()), float(np.median(step[owner == k])), float(in_groove[owner == k].mean()))
-        for k, pair in enumerate(found)}
+    return _Sides(np.concatenate(pairs), np.concatenate(steps), np.concatenate(grooves))
 
 
-def _joined(labels: Labels, height: Values, colors: Colors, groove: Bools) -> Segments:
+def _joined(labels: Labels, height: Values, colors: Colors, groove: Bools, before: Labels | None) -> Segments:
     """Join segments between which nothing separates objects, the most similar first."""
+    count = int(labels.max())
+    if count == 0:
+        return Segments(labels, 0, frozenset())
+    sizes = np.bincount(labels.ravel(), minlength=count + 1).astype(float)
+    means = mean_by_label(labels, colors, count)
+    perimeters = _perimeters(labels, count).astype(float)
+    sides = _sides(labels, height, groove)
+    earlier = _majority(labels, before, count)
+    now = np.arange(count + 1)  # label that each one has become
     patched: set[int] = set()
-    while True:
-        count = int(labels.max())
-        if count == 0:
-            return Segments(labels, 0, frozenset())
-        sizes = np.bincount(labels.ravel(), minlength=count + 1)
-        means = mean_by_label(labels, colors, count)
-        perimeters = _perimeters(labels, count)
-        best: tuple[float, int, int, bool] | None = None
-        for (a, b), border in _borders(labels, height, groove).items():
-            small, large = (a, b) if sizes[a] <= sizes[b] else (b, a)
-            color = float(np.linalg.norm(means[a] - means[b]))
-            alike = color < SAME_COLOR
-            apart = border.step > (STEP_OF_ONE if alike else STEP) or (
-                border.groove > (GROOVE_OF_ONE if alike else 0.5) and border.length > 4)
-            enclosed = border.length >= ENCLOSED * perimeters[small] and sizes[small] <= PATCH * sizes[large]
-            tiny = sizes[small] < SMALLEST
-            if not (tiny and border.step <= 2 * STEP) and (apart or (color > 1 and not enclosed)):
-                continue
-            order = color + border.step / STEP
-            if best is None or order < best[0]:
-                best = order, small, large, color > 1 and not tiny
+    while len(sides.labels):
+        best = _most_similar(sides, sizes, means, perimeters, earlier)
         if best is None:
             break
-        _, small, large, other_color = best
-        labels[labels == small] = large
+        small, large, length, other_color = best
+        now[now == small] = large
+        total = sizes[small] + sizes[large]
+        means[large] = (sizes[small] * means[small] + sizes[large] * means[large]) / total
+        sizes[large], sizes[small] = total, 0
+        perimeters[large] += perimeters[small] - 2 * length
         if other_color or small in patched:
             patched.add(large)
-    return _numbered(labels, patched)
+        renamed = np.sort(now[sides.labels], axis=1)
+        left = renamed[:, 0] != renamed[:, 1]
+        sides = _Sides(renamed[left], sides.step[left], sides.groove[left])
+    return _numbered(np.asarray(now[labels], np.int32), patched)
+
+
+def _most_similar(
+    sides: _Sides, sizes: Array, means: Array, perimeters: Array, earlier: npt.NDArray[np.int64]
+) -> tuple[int, int, int, bool] | None:
+    """Return the two segments to join next, the smaller first, their common sides, and whether colors differ."""
+    keys = sides.labels[:, 0] * len(sizes) + sides.labels[:, 1]
+    order = np.argsort(keys, kind="stable")
+    starts = np.flatnonzero(np.diff(keys[order], prepend=-1))
+    best: tuple[float, tuple[int, int, int, bool]] | None = None
+    for own in np.split(order, starts[1:]):
+        a, b = (int(each) for each in sides.labels[own[0]])
+        small, large = (a, b) if sizes[a] <= sizes[b] else (b, a)
+        step, grooved, length = float(np.median(sides.step[own])), float(sides.groove[own].mean()), len(own)
+        color = float(np.linalg.norm(means[a] - means[b]))
+        factor = 1.0 if not earlier[a] or not earlier[b] else HYSTERESIS if earlier[a] == earlier[b] else 1 / HYSTERESIS
+        alike, tiny = color < SAME_COLOR * factor, sizes[small] < SMALLEST
+        apart = step > (STEP_OF_ONE if alike else STEP) * factor or (
+            grooved > (GROOVE_OF_ONE if alike else GROOVE_OF_TWO) * factor and length > 4)
+        enclosed = length >= ENCLOSED * perimeters[small] and sizes[small] <= PATCH * sizes[large]
+        if (tiny and step <= 2 * STEP) or (not apart and (color <= factor or enclosed)):
+            order_of = color + step / STEP
+            if best is None or order_of < best[0]:
+                best = order_of, (small, large, length, color > 1 and not tiny)
+    return None if best is None else best[1]
+
+
+def _majority(labels: Labels, before: Labels | None, count: int) -> npt.NDArray[np.int64]:
+    """Return (count + 1,) the segment of the image before that covers most of each label; 0 for none."""
+    if before is None:
+        return np.zeros(count + 1, np.int64)
+    both = (labels > 0) & (before > 0)
+    width = int(before.max(initial=0)) + 1
+    votes = np.bincount(labels[both].astype(np.int64) * width + before[both], minlength=(count + 1) * width)
+    table = votes.reshape(count + 1, width)
+    sizes = np.bincount(labels.ravel(), minlength=count + 1)
+    return np.asarray(np.where(table.max(axis=1) > 0.5 * sizes, table.argmax(axis=1), 0))
 
 
 def _perimeters(labels: Labels, count: int) -> npt.NDArray[np.int64]:
