@@ -43,7 +43,8 @@ def move(to: HeapDetector, q, stamp: int, width: float = 0.08) -> None:
 def arm_at(to: HeapDetector, q) -> list[Mesh]:
     """Return the arm as solids."""
     poses = to.robot.link_poses(np.asarray(q, float), dict.fromkeys(robot().gripper.joints, 0.04))
-    return [Mesh(transformed(corners, poses[link]), (0.5, 0.5, 0.5)) for link, corners in robot_shapes(to.robot).items()]
+    shapes = robot_shapes(to.robot)
+    return [Mesh(transformed(corners, poses[link]), (0.5, 0.5, 0.5)) for link, corners in shapes.items()]
 
 
 def images(to: HeapDetector, meshes, q, *, at_home: bool, count: int = 1, gripping: bool = False, start: int = 1):
