@@ -89,6 +89,10 @@ class Candidates:
                           self.features[chosen], self.score[chosen], parts, self.contacts[chosen], self.heights,
                           self.reasons)
 
+    def ranked(self, score: Array) -> Candidates:
+        """Return the candidates with other scores (n,), the best first."""
+        return replace(self, score=score).select(np.argsort(-score, kind="stable"))
+
     def axis(self, gripper: GripperShape) -> Array:
         """Return (n, 3) unit vectors along which the fingers close, world."""
         return np.asarray(self.T[:, :3, :3] @ gripper.T_tcp_closing[:3, 1])
@@ -247,7 +251,7 @@ def _assembled(
     score = scorer.score(features)
     found = Candidates(
         T, contacts.width, placed.opening, placed.label - 1, features, score, scorer.parts(features), sides, heights)
-    return found.select(np.argsort(-score, kind="stable"))
+    return found.ranked(score)
 
 
 def _diverse(found: Candidates, gripper: GripperShape, options: Options) -> Indices:

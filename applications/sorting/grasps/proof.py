@@ -32,6 +32,8 @@ Array = NDArray[np.float64]
 POINTS = "points"  # name of what the camera saw, in reasons
 _HALF_TURN = transform(rpy_to_matrix(0.0, 0.0, math.pi), (0.0, 0.0, 0.0))  # fingers close along the same line
 _LOW = 0.006  # [m] above the floor: lower points are the floor itself, which is a solid
+_LIKE, _LIKE_TURN = 0.02, math.radians(30.0)  # [m], [rad] within which a grasp is like another one
+_SHORT = 1e-9  # [m]
 _PATIENCE = 3  # times the time limit while nothing is proved
 _SAME = 0.01  # [rad] between joint positions that are one solution
 _SAME_BRANCH = 1.5  # [rad] between approach and grasp in any joint
@@ -108,7 +110,7 @@ class Prover:
         start = self._home if home is None else np.asarray(home, dtype=float)
         points = PointObstacle(POINTS, measured_spheres(found.heights, self.options.side, self.options.radius))
         grasps: list[Grasp] = []
-        proved: dict[int, int] = {}
+        proved: dict[int, list[int]] = {}
         reasons = dict(found.reasons)
         failed: list[Grasp] = []
         tried = 0
@@ -126,18 +128,31 @@ class Prover:
                 continue
             self._last = result.q
             grasps.append(message)
-            proved[index] = proved.get(index, 0) + 1
+            proved.setdefault(index, []).append(i)
         for index in proved:
             reasons.pop(index, None)
         for index in set(found.object.tolist()) - set(proved):
             reasons.setdefault(index, "not examined: better grasps of other objects came first")
         return Proof((grasps + failed)[:MAX_GRASPS], reasons, tried, monotonic() - began)
 
-    def _order(self, found: Candidates, proved: dict[int, int]) -> Iterator[int]:
-        """Yield candidates, the best first, without further ones of objects that have enough proved ones."""
+    def _order(self, found: Candidates, proved: dict[int, list[int]]) -> Iterator[int]:
+        """Yield candidates, the best first, but those like a proved one of the same object after all others.
+
+        An object whose grasp fails then has others that differ from it.
+        """
+        position, axis = found.T[:, :3, 3], found.contacts[:, 1] - found.contacts[:, 0]
+        axis = axis / np.maximum(np.linalg.norm(axis, axis=1, keepdims=True), _SHORT)
+        later = []
         for i in range(len(found)):
-            if proved.get(int(found.object[i]), 0) < self.options.for_each:
+            others = proved.get(int(found.object[i]), [])
+            if len(others) >= self.options.for_each:
+                continue
+            near = np.linalg.norm(position[others] - position[i], axis=1) < _LIKE
+            if (near & (np.abs(axis[others] @ axis[i]) > math.cos(_LIKE_TURN))).any():
+                later.append(i)
+            else:
                 yield i
+        yield from (i for i in later if len(proved.get(int(found.object[i]), [])) < self.options.for_each)
 
     def _prove(self, T: Array, opening: float, start: Array, points: PointObstacle) -> _Found:
         """Return joint positions for a grasp (4, 4), in either direction of the gripper, or why there are none."""
