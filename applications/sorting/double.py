@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import math
+from itertools import product
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 from pydantic import Field
@@ -17,17 +19,18 @@ from common.errors import ConfigError
 from common.planning.ik import solve_ik
 from common.process.service import main
 from common.process.timing import LoopRate
-from common.robot.home import HomeMonitor
+from common.robot.home import HOME_TOLERANCE
 from common.robot.model import RobotModel
-from common.robot.transforms import matrix_to_pose, tool_down
+from common.robot.transforms import matrix_to_pose, pose_to_matrix, tool_down
 from common.transport.bus import Bus
 
 Array = npt.NDArray[np.float64]
 
 APPROACH = 0.10  # [m]
 DEPTH = 0.03  # [m] of the finger tips below the top
-LOWEST = 0.008  # [m] of the finger tips above the support
+LOWEST = 0.014  # [m] of the finger tips above the support
 SLACK = 0.02  # [m] by which the fingers open wider than an object
+BESIDE = 0.08  # [m] from the tool to the tray: the arm does not hide it then
 YAWS = (0.0, math.pi / 2, math.pi, -math.pi / 2)
 NAMES = {"red": (1, 0, 0), "orange": (1, 0.5, 0), "yellow": (1, 1, 0), "green": (0, 0.8, 0), "blue": (0, 0, 1),
          "purple": (0.6, 0, 0.6), "white": (1, 1, 1), "grey": (0.5, 0.5, 0.5), "black": (0, 0, 0)}
@@ -43,20 +46,35 @@ class Config(Parameters):
 
 
 def seen(thing: m.WorldObject) -> SeenObject:
-    """Return an upright object as it would be seen."""
-    at, size = thing.pose.position, thing.size
-    corners = np.array(thing.outline, float).reshape(-1, 2)
-    half = math.hypot(size.x, size.y) / 2
-    outline = [(float(x), float(y)) for x, y in corners] or [(at.x + half * dx, at.y + half * dy) for dx, dy in (
-        (1, 1), (-1, 1), (-1, -1), (1, -1))]
-    yaw = 2 * math.atan2(thing.pose.orientation.z, thing.pose.orientation.w)
+    """Return an object as it would be seen from above."""
+    corners, low, high = _extent(thing)
+    (x, y), (length, width), angle = cv2.minAreaRect(corners.astype(np.float32))
+    yaw = math.radians(angle)
+    if length < width:
+        length, width, yaw = width, length, yaw + math.pi / 2
     c = thing.color
     name = min(NAMES, key=lambda each: math.dist(NAMES[each], (c.r, c.g, c.b)))
     shape = {"sphere": "round", "cylinder": "round", "ring": "ring", "box": "box"}.get(thing.shape, "other")
     return SeenObject(
-        id=thing.id, place=thing.container or "table", center=m.Vector3(x=at.x, y=at.y, z=at.z + size.z / 2),
-        size=size, yaw=yaw, outline=outline[:64], top=at.z + size.z / 2, bottom=at.z - size.z / 2,
-        volume=size.x * size.y * size.z, color=thing.color, color_name=name, shape=shape)
+        id=thing.id, place=thing.container or "table", center=m.Vector3(x=x, y=y, z=high),
+        size=m.Vector3(x=length, y=width, z=high - low), yaw=math.remainder(yaw, math.pi),
+        outline=[(float(u), float(v)) for u, v in corners[:64]], top=high, bottom=low,
+        volume=length * width * (high - low) / 2, color=thing.color, color_name=name, shape=shape)
+
+
+def _extent(thing: m.WorldObject) -> tuple[Array, float, float]:
+    """Return the convex outline (n, 2) from above, z of the lowest and of the highest point [m], in world."""
+    T = pose_to_matrix(thing.pose)
+    if thing.vertices:
+        points = np.array(thing.vertices) @ T[:3, :3].T + T[:3, 3]
+    elif thing.outline:
+        flat = np.array(thing.outline, float)
+        points = np.concatenate([np.c_[flat, np.full(len(flat), z)] for z in (thing.base, thing.base + thing.height)])
+    else:
+        half = np.array([thing.size.x, thing.size.y, thing.size.z]) / 2
+        points = np.array(list(product((-1.0, 1.0), repeat=3))) * half @ T[:3, :3].T + T[:3, 3]
+    hull = cv2.convexHull(points[:, :2].astype(np.float32))[:, 0].astype(float)
+    return hull, float(points[:, 2].min()), float(points[:, 2].max())
 
 
 class TopDown:
@@ -119,31 +137,30 @@ def heap(objects: m.WorldObjects, finder: TopDown, stamp: int) -> Heap:
 
 
 async def run(bus: Bus, config: Config) -> None:
-    """Publish the heap at the rate; objects only while the arm is at home, as a camera above would see them."""
+    """Publish the heap at the rate; objects only while the arm hides nothing of the tray from above."""
     truth, joints = bus.reader(topics.SCENE_OBJECTS), bus.reader(topics.JOINT_STATES)
     out, finder = bus.writer(HEAP), TopDown(config.robot)
-    home = HomeMonitor(config.robot.named_poses["home"])
+    home = np.array(config.robot.named_poses["home"])
+    robot, box = RobotModel.load(config.robot), config.world.containers[config.tray]
     await bus.ready()
     pace = LoopRate(bus, lambda: bus.clock.wall_rate(config.rate, 50.0))
 
-    async def watch_arm() -> None:
-        async for state in joints:
-            at = dict(zip(state.name, state.position, strict=True))
-            if all(name in at for name in config.robot.joints):
-                home.add([at[name] for name in config.robot.joints], state.header.stamp)
+    def is_clear() -> bool:
+        """Return whether the tool is beside the tray, or above all that the arm could hide."""
+        state = joints.latest
+        q = robot.order(state.name, state.position) if state is not None else None
+        if q is None:
+            return False
+        y = float(robot.fk(q)[1, 3])
+        return bool(np.abs(q - home).max() < HOME_TOLERANCE) or abs(y - box.y) > box.half_side + BESIDE
 
-    async def look() -> None:
-        while True:
-            objects, stamp = truth.latest, bus.header().stamp
-            if objects is not None and home.was_home(stamp):
-                out.put(await asyncio.to_thread(heap, objects, finder, stamp))
-            elif objects is not None:
-                out.put(Heap(header=m.Header(stamp=stamp, frame_id="world"), at_home=False))
-            await pace.wait()
-
-    async with asyncio.TaskGroup() as group:
-        group.create_task(watch_arm())
-        group.create_task(look())
+    while True:
+        objects, stamp = truth.latest, bus.header().stamp
+        if objects is not None and is_clear():
+            out.put(await asyncio.to_thread(heap, objects, finder, stamp))
+        elif objects is not None:
+            out.put(Heap(header=m.Header(stamp=stamp, frame_id="world"), at_home=False))
+        await pace.wait()
 
 
 if __name__ == "__main__":

@@ -17,6 +17,7 @@ from common.robot.transforms import invert, matrix_to_pose, pose_to_matrix, tool
 from common.tasks.stages import AwaitImage, Cycle, Grip, Move, Stage, View, place_of
 
 NEAR = 0.15  # [m] from the grasp: the fingers may touch objects there, and the held object may leave them
+SUPPORTED = 0.012  # [m] between an object and what it lies on, as seen
 CONTACT = 0.10  # [m] of the lift in which the held object may touch what it touched before
 LIFT = 0.12  # [m]
 BLEND = 0.04  # [m]
@@ -40,8 +41,8 @@ class Pick(Cycle):
         chosen: the one that it reaches first; None before.
         spot: (x, y) of the release [m], and z of the tool there.
         before: objects in the tray when the grasp was chosen.
+        gripped: whether the fingers closed on it.
         checked: whether what is held is known.
-        skipped: number of spots of the container that were tried without success.
         back: whether the held object goes back to the tray.
     """
 
@@ -49,8 +50,8 @@ class Pick(Cycle):
     chosen: Option | None = None
     spot: tuple[float, float, float] = (0.0, 0.0, 0.0)
     before: list[SeenObject] = field(default_factory=list)
+    gripped: bool = False
     checked: bool = False
-    skipped: int = 0
     back: bool = False
 
 
@@ -72,10 +73,11 @@ def take(cycle: Pick, gripper: GripperConfig, view: View) -> list[Stage]:
     grasp, thing = cycle.chosen.grasp, cycle.chosen.thing
     near = neighbors(view, place_of(grasp.pose)[:2])
     fingers = [(link, name) for link in gripper.links for name in near]
-    descend = Move("descend", "GRASPING", cycle, goal=m.PoseGoal(pose=grasp.pose), straight=True, touches=fingers)
+    descend = Move("descend", "GRASPING", cycle, goal=m.PoseGoal(pose=grasp.pose), straight=True, touches=fingers,
+                   needs_full_plan=True)
     close = Grip("close", "GRASPING", cycle, width=0.0, holds=True, early=True,
                  effort=grip_force(thing.volume, gripper.max_effort))
-    touches = [*fingers, *((thing.id, name) for name in near if name != thing.id)]
+    touches = [*fingers, *((thing.id, name) for name in [*near, *supports(thing, view)] if name != thing.id)]
     return [descend, close, *carry(cycle, grasp.pose, touches)]
 
 
@@ -127,6 +129,13 @@ def neighbors(view: View, place: tuple[float, float], within: float = NEAR) -> l
         if math.dist(place_of(thing.pose)[:2], place) - radius < within:
             found.append(thing.id)
     return found
+
+
+def supports(thing: SeenObject, view: View) -> list[str]:
+    """Return ids of known solids on which an object lies: it leaves them upwards."""
+    solids = [*view.objects("container"), *view.objects("fixture")]
+    return [each.id for each in solids if each.shape == "box"
+            and abs(each.pose.position.z + each.dimensions[2] / 2 - thing.bottom) < SUPPORTED]
 
 
 def attach_pose(option: Option, view: View, name: str) -> m.Pose | None:

@@ -120,6 +120,7 @@ class Sorting(Task[SortingView]):
         self._dropped: list[Dropped] = []
         self._carried_since = math.inf
         self._skipped = 0  # spots tried for the held object
+        self._descending: Pick | None = None
 
     # --- what to do next -------------------------------------------------------------------------------------
 
@@ -130,6 +131,8 @@ class Sorting(Task[SortingView]):
         if view.holding:
             if view.attached:  # else the planning scene is not up to date yet
                 self._place_held(view)
+        elif self._memory.thing is not None:
+            self._lost()
         elif not self._refresh(view):
             self._look(view)
         elif not self._queue_pick(view):
@@ -270,14 +273,15 @@ class Sorting(Task[SortingView]):
         if self._memory.back:
             self._put_back(view)
             return
-        cycle = Pick(thing.id, spot=spot, checked=True)
+        cycle = Pick(thing.id, spot=spot, gripped=True, checked=True)
         if view.tool[2] - below > self._rim(self.p.tray) + RISEN:
             across = Move("across", "PLACING", cycle, goal=motions.over_spot(spot), carries=True)
             self.queue += [across, motions.release(cycle)]
             return
         near = motions.neighbors(view, view.tool[:2])
         touches = [(link, name) for link in self.gripper.links for name in near]
-        self.queue += motions.carry(cycle, view.tcp, [*touches, *((held.id, name) for name in near)])
+        touches += [(held.id, name) for name in [*near, *motions.supports(thing, view)]]
+        self.queue += motions.carry(cycle, view.tcp, touches)
 
     def _put_back(self, view: SortingView) -> None:
         """Queue the way of the held object to the freest spot of the tray."""
@@ -292,7 +296,7 @@ class Sorting(Task[SortingView]):
             self.end("ERROR", f"what is held cannot be put down: {full}")
             return
         above = release_height(box, spot, floor, below)
-        cycle = Pick(self._memory.thing.id if self._memory.thing else "held", back=True, checked=True)
+        cycle = Pick(self._memory.thing.id if self._memory.thing else "held", back=True, gripped=True, checked=True)
         self.queue += motions.put_back(cycle, (spot.x, spot.y, above + ABOVE), spot.top + below + LOWERED)
 
     # --- checks ----------------------------------------------------------------------------------------------
@@ -305,7 +309,7 @@ class Sorting(Task[SortingView]):
         if isinstance(cycle, Pick) and stage.name == "release" and not cycle.checked:
             return self._check(cycle, view)
         if isinstance(cycle, Pick) and stage.name == "descend":
-            self.images_after, self._heap = view.now, None
+            self.images_after, self._heap, self._descending = view.now, None, cycle
         return True
 
     def _check(self, cycle: Pick, view: SortingView) -> bool:
@@ -350,7 +354,8 @@ class Sorting(Task[SortingView]):
         self._carried_since, self._skipped = view.now, 0
         if cycle.chosen is None:
             return
-        chosen = cycle.chosen
+        chosen, cycle.gripped = cycle.chosen, True
+        self.status.message = ""
         self.status.grasp = chosen.grasp.id
         remark = width_remark(view.gripper.width, chosen.grasp.width, self.p.width_tolerance)
         self.status.held, self.status.last = "", f"{cycle.subject}: {remark or 'gripped'}"
@@ -386,14 +391,21 @@ class Sorting(Task[SortingView]):
         self.queue += [Grip("open", "GRASPING", width=opening), *self.back_off(view.released())]
 
     def fail(self, message: str, view: SortingView, *, go_home: bool = True) -> None:
-        """Record an object that fell, then count the failure."""
-        if "fell" in message:
-            running = self._memory.thing
-            self._note("slipped", f"{running.id if running else 'the object'}: {message}")
-            self.status.held = "slipped"
-            self._remember(thing=None, container="", back=False)
-            self._heap = None
-        super().fail(message, view, go_home=go_home)
+        """Count a failure; back off from what the arm ran into on its way down."""
+        stopped = self._descending if message.startswith("descend ") else None
+        super().fail(message, view, go_home=go_home and stopped is None)
+        if stopped is not None and stopped.chosen is not None:
+            self._choice.penalize(stopped.chosen.grasp, view.now, message)
+            self._note("empty", f"{stopped.subject}: {message}")
+            if self.status.state != "ERROR":
+                self.queue += self.back_off(view)
+
+    def _lost(self) -> None:
+        """Note that the object fell: nothing is held, and it was not released."""
+        thing = self._memory.thing
+        assert thing is not None
+        self._note("slipped", f"{thing.id} fell")
+        self._remember(thing=None, container="", back=False)
 
     def _note(self, outcome: str, last: str) -> None:
         counts = Counter(self._memory.outcomes) + Counter({outcome: 1})
@@ -405,19 +417,17 @@ class Sorting(Task[SortingView]):
     def plan_failed(self, move: Move, response: m.PlanResponse, view: SortingView) -> None:
         """Avoid grasps without a plan for a while; look for another spot for what is held."""
         cycle = move.cycle
-        if isinstance(cycle, Pick) and not cycle.started and not self.starts_in_contact(move, response):
-            tried = [cycle.chosen] if cycle.chosen is not None else cycle.options
-            if not response.error.startswith("start_"):
-                for one in tried:
-                    self._choice.penalize(one.grasp, view.now, response.message)
-            self._drop_cycle(cycle)
-            self.status.message = response.message
-            if response.error.startswith("start_") and self.running is None:
-                super().plan_failed(move, response, view)
+        if not isinstance(cycle, Pick) or cycle.gripped:
+            self._skipped += move.carries
+            super().plan_failed(move, response, view)
             return
-        if move.carries:
-            self._skipped += 1
-        super().plan_failed(move, response, view)
+        if response.error.startswith("start_"):
+            super().plan_failed(move, response, view)
+            return
+        for one in [cycle.chosen] if cycle.chosen is not None else cycle.options:
+            self._choice.penalize(one.grasp, view.now, f"no motion: {response.message}")
+        self._drop_cycle(cycle)  # the other grasps of the same image are as good as before
+        self.status.message = response.message
 
     def _drop_cycle(self, cycle: Pick) -> None:
         self._planning = None
@@ -493,7 +503,8 @@ class Sorting(Task[SortingView]):
     def request(self, move: Move, start: list[float], view: SortingView) -> m.PlanRequest:
         """Add the carried object, by its id in the planning scene, and the contact that it may have at first."""
         cycle = move.cycle
-        if move.carries and not view.attached and isinstance(cycle, Pick) and cycle.chosen is not None:
+        gripped = isinstance(cycle, Pick) and cycle.gripped and view.attached
+        if move.carries and not gripped and isinstance(cycle, Pick) and cycle.chosen is not None:
             move.attach = self._scene_id(cycle.chosen.thing, view)
             move.attach_pose = motions.attach_pose(cycle.chosen, view, move.attach)
         elif move.carries:
