@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -28,6 +29,7 @@ AROUND = 0.08  # [m] of the table around the containers in which objects are loo
 LOW = 0.10  # [m] above the table: lower points are compared with the robot only where they may be foreign
 LARGEST = 0.20  # [m] what is longer is no object of a tray but a foreign body
 ROBOT = 0.03  # [m] from the robot, points belong to it
+FEWEST = 30  # [px] of the arm in front of the tray
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +77,8 @@ class HeapDetector:
         self._shapes = KnownShapeFilter(self.geometry)
         self._known = KnownWorld(world, containers, self.area)
         self._identities, self._debounce = Identities(), Debounce()
-        self._before: Labels | None = None  # labels of the newest image from home
+        self._before: Labels | None = None  # labels of the newest image of the tray
+        self._at_home: Surface | None = None  # of the newest image from home
 
     def look(self, views: Sequence[View], stamp: int, *, at_home: bool, gripping: bool) -> Seen | None:
         """Return what images of one instant show; None while the position of the arm at that time is unknown.
@@ -83,7 +86,7 @@ class HeapDetector:
         Args:
             views: of the cameras, the main one first.
             stamp: of the images [ns].
-            at_home: whether the arm was at home.
+            at_home: whether the arm was at home; elsewhere the tray counts as seen if no view of it is obstructed.
             gripping: whether the gripper holds an object, or moves.
         """
         q = self.joints.at(stamp)
@@ -92,9 +95,13 @@ class HeapDetector:
         robot = RobotAt(q, self.joints.width(stamp), self.robot.fk(q), gripping)
         smooth: list[View] = [(denoised(depth), image, camera) for depth, image, camera in views]
         header = Header(stamp=stamp, frame_id=WORLD)
-        if not at_home:
+        if not at_home and (self._at_home is None or not self._tray_is_clear(smooth[0])):
             return Seen(Heap(header=header, foreign=self._foreign(smooth, robot)))
         surface = self._surface(smooth, robot)
+        if at_home or self._at_home is None:
+            self._at_home = surface
+        else:
+            surface = self._with_tray_of(surface, self._at_home)
         labels, objects = find_objects(surface, self.world, self._before)
         labels, objects, large = without_bodies(labels, objects)
         self._known.update(without(surface, labels == -1), self.world.table_height + self.options.ceiling)
@@ -103,6 +110,29 @@ class HeapDetector:
         heap = Heap(header=header, at_home=True, objects=self._identities.named(objects), foreign=foreign,
                     hidden=hidden_fraction(surface, self.tray))
         return Seen(heap, surface, self._before)
+
+    def _tray_is_clear(self, view: View) -> bool:
+        """Return whether nothing is between the camera and the tray, such as the arm."""
+        depth, _, camera = view
+        x0, y0, x1, y1 = self.tray.area()
+        corners = np.array([(x, y, z) for x in (x0, x1) for y in (y0, y1) for z in (self.tray.floor, self.tray.rim)])
+        pixels = camera.project(corners)
+        if not np.isfinite(pixels).all():
+            return False
+        inside = np.zeros(depth.shape, np.uint8)
+        cv2.fillConvexPoly(inside, cv2.convexHull(np.round(pixels).astype(np.int32)), 1)
+        z = world_points(depth, camera)[2].reshape(depth.shape)[inside > 0]
+        with np.errstate(invalid="ignore"):
+            return int((z > self.world.table_height + self.options.ceiling).sum()) < FEWEST
+
+    def _with_tray_of(self, now: Surface, before: Surface) -> Surface:
+        """Return a surface seen from home, with the tray as it is seen now: the arm hides the rest."""
+        x0, y0, x1, y1 = self.tray.area()
+        first, last = before.cells([(x0, y0), (x1, y1)])
+        rows, columns = slice(max(first[0], 0), last[0] + 1), slice(max(first[1], 0), last[1] + 1)
+        top, color = before.top.copy(), before.color.copy()
+        top[rows, columns], color[rows, columns] = now.top[rows, columns], now.color[rows, columns]
+        return Surface(before.origin, before.step, top, color, before.floor)
 
     def _foreign(self, views: Sequence[View], robot: RobotAt) -> list[Foreign]:
         points = [strange_points(depth, camera, self._known, robot, self._shapes, self.options)

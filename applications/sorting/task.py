@@ -7,7 +7,8 @@ chosen while the arm is above a container, where it hides nothing of the tray.
 from __future__ import annotations
 
 import math
-from collections import Counter
+from collections import Counter, deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from pydantic import BaseModel, Field, model_validator
@@ -34,6 +35,8 @@ BELOW = 0.06  # [m] of an unseen object below the tool
 RADIUS = 0.05  # [m] of an unseen object from above
 LOWERED = 0.015  # [m] above its support at which an object is put back
 MOST_FAILURES = 25  # in a row; each pick that has no plan is one
+STEADY = 0.6  # share of images that show an object at the same place
+SAME = 0.025  # [m]
 OLD = 20.0  # [s] an older image decides nothing, also while the arm only was on its way
 
 
@@ -117,6 +120,7 @@ class Sorting(Task[SortingView]):
         self._choice = Choice(self._rule, config.tray, self.gripper.closing_axis)
         self._memory = Memory()
         self._heap: Heap | None = None  # the newest that shows the whole tray and is not outdated
+        self._recent: deque[Heap] = deque()  # of the last seconds
         self._dropped: list[Dropped] = []
         self._carried_since = math.inf
         self._skipped = 0  # spots tried for the held object
@@ -151,8 +155,12 @@ class Sorting(Task[SortingView]):
         heap = view.heap
         if heap is not None and heap.at_home and self.has_fresh_image(view):
             stamp = heap.header.stamp
-            if stamp * 1e-9 > self.images_after and view.scene is not None and view.scene.settled == stamp:
+            shown = view.scene is not None and view.scene.settled == stamp
+            if shown and stamp * 1e-9 > self.images_after and heap is not self._heap:
                 self._heap = heap
+                self._recent.append(heap)
+                while self._recent[0].header.stamp * 1e-9 < max(self.images_after, stamp * 1e-9 - self.p.give_up - 1.0):
+                    self._recent.popleft()
         if self._heap is not None and not self.images_after < self._heap.header.stamp * 1e-9 >= view.now - OLD:
             self._heap = None
         return self._heap is not None
@@ -443,13 +451,14 @@ class Sorting(Task[SortingView]):
     def _nothing_to_take(self, view: SortingView) -> None:
         """Stir if objects are left, else end; both only once that was seen for a while."""
         assert self._heap is not None and view.q is not None
-        heap, left = self._heap, self._choice.left(self._heap)
-        home = is_home(view.q, self.p.robot.named_poses["home"])
-        if not home:  # the picture from home decides
+        heap = self._heap
+        if not is_home(view.q, self.p.robot.named_poses["home"]):  # the pictures from there decide
+            self.images_after, self._heap = view.now, None
             self.queue += [self.home(view), AwaitImage()]
             return
+        left = steady([self._choice.left(each) for each in self._recent])
         foreign = [thing for thing in view.objects("target") if thing.kind == FOREIGN]
-        waited = self.wait_timer.elapsed(f"left {bool(left)}", heap.header.stamp * 1e-9)
+        waited = 1e-9 * (heap.header.stamp - self._recent[0].header.stamp)
         if not left:
             self.status.state = "IDLE"
             if waited >= self.p.empty:
@@ -457,7 +466,8 @@ class Sorting(Task[SortingView]):
             return
         if foreign:
             x, y, _ = place_of(foreign[0].pose)
-            self.wait_timer.reset()
+            self._recent.clear()
+            self._recent.append(heap)
             self.status.message = f"waiting: a foreign body is in the cell at ({x:.2f}, {y:.2f})"
             return
         self.status.message = f"{len(left)} objects left, none can be grasped now"
@@ -486,7 +496,6 @@ class Sorting(Task[SortingView]):
         self.status.message = f"pushing {thing.id}: nothing can be grasped"
         self.queue += motions.stir(view, self.gripper, start, end, self.p.world.table_height + box.floor_thickness)
         self.images_after, self._heap = view.now, None
-        self.wait_timer.reset()
 
     def _finish(self, left: list[SeenObject], heap: Heap) -> None:
         reasons = [(thing, self._choice.reason(thing, heap)) for thing in left]
@@ -578,6 +587,21 @@ class Sorting(Task[SortingView]):
         self._choice.forget()
         self._remember(stirs=0)
         self.images_after, self._heap = 0.0, None
+
+
+def steady(images: Sequence[Sequence[SeenObject]]) -> list[SeenObject]:
+    """Return the objects that most images show at the same place: the others are noise."""
+    found: list[SeenObject] = []
+    for things in reversed(images):
+        for thing in things:
+            if not any(_near(thing, known) for known in found):
+                found.append(thing)
+    return [thing for thing in found
+            if sum(any(_near(thing, other) for other in things) for things in images) > STEADY * len(images)]
+
+
+def _near(one: SeenObject, other: SeenObject) -> bool:
+    return math.dist((one.center.x, one.center.y), (other.center.x, other.center.y)) < SAME
 
 
 def seen_as(held: m.CollisionObject) -> SeenObject:

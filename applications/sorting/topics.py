@@ -85,7 +85,8 @@ class Heap(Message):
     max_parts: ClassVar[int] = 64 * 1024
 
     header: Header
-    at_home: bool = Field(False, description="the arm hid nothing; only then objects and grasps are given")
+    at_home: bool = Field(False, description="nothing of the tray was hidden; only then objects and grasps are given. "
+                                           "Elsewhere they are those of the newest image from home")
     objects: list[SeenObject] = Field([], max_length=MAX_OBJECTS)
     grasps: list[Grasp] = Field([], max_length=MAX_GRASPS, description="the best first; proved ones before others")
     left: list[Left] = Field([], max_length=MAX_OBJECTS)
