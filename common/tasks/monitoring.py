@@ -133,7 +133,8 @@ class ExecutionMonitor(TaskDecisions[V]):
             self.obstructed(stage, view, f"{stage.name}: {blocked}")
             return stop
         elif stage.carries and view.gripper.outcome == "slipping":  # the object may still arrive
-            self.status.message = f"{stage.name}: {view.gripper.message}"
+            if not self.status.message.startswith(f"{stage.name}: "):  # once: the width changes with every reading
+                self.status.message = f"{stage.name}: {view.gripper.message}"
         return self._watch_opening(view)
 
     def _watch_early(self, view: V) -> None:
