@@ -2,14 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
-import hashlib
-import os
-import tempfile
 import xml.etree.ElementTree as ET
-import zipfile
 from collections import defaultdict
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +11,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from common.cache import cache_folder
+from common.cache import Arrays, cached_arrays
 from common.errors import ConfigError
 from common.robot.collision_shapes import distinct, solid
 from common.robot.description_values import numbers
@@ -30,10 +24,6 @@ from drivers.mujoco.scene import COLLIDES, ROBOT, SOLIMP, SOLREF, set_contact, s
 
 if TYPE_CHECKING:
     from common.robot.visual_meshes import Piece
-
-_FORMAT = b"2"  # version of the cached format
-
-Arrays = dict[str, NDArray[Any]]
 
 
 def hull_points(path: Path, scale: tuple[float, ...]) -> NDArray[np.float64]:
@@ -71,24 +61,6 @@ def cached_visual_meshes(robot: RobotModel, triangles: int) -> list[Piece]:
             faces = found[name.removesuffix(what) + "faces"]
             pieces[int(number)] = Piece(link, (int(red), int(green), int(blue)), vertices, faces)
     return [pieces[number] for number in sorted(pieces)]
-
-
-def cached_arrays(kind: str, content: list[bytes], make: Callable[[], Arrays]) -> Arrays:
-    """Return the cached arrays for the content, or compute them and cache them if possible."""
-    digest = hashlib.sha256(_FORMAT)
-    for part in content:
-        digest.update(len(part).to_bytes(8, "little") + part)
-    path = cache_folder() / "meshes" / f"{kind}-{digest.hexdigest()[:32]}.npz"
-    with contextlib.suppress(OSError, ValueError, EOFError, zipfile.BadZipFile), path.open("rb") as file:
-        return dict(np.load(file, allow_pickle=False))
-    arrays = make()
-    with contextlib.suppress(OSError):  # read-only folder: computed again next time
-        path.parent.mkdir(parents=True, exist_ok=True)
-        descriptor, name = tempfile.mkstemp(dir=path.parent, suffix=".npz")
-        with os.fdopen(descriptor, "wb") as file:
-            np.savez(file, **arrays)  # type: ignore[arg-type]
-        os.replace(name, path)
-    return arrays
 
 
 Array = NDArray[np.float64]

@@ -19,6 +19,7 @@ from common.sim.footprints import convex_parts
 from common.sim.objects import Solid
 from common.sim.resting import FLOOR_BELOW_TABLE
 from drivers.mujoco import ROLLING
+from drivers.mujoco.decomposition import mesh_pieces, points_and_volume
 
 Array = NDArray[np.float64]
 
@@ -62,21 +63,21 @@ def _geoms(spec: mujoco.MjSpec, body: Any, obj: SceneObject) -> list[tuple[Any, 
             return [(body.add_geom(type=kinds.mjGEOM_BOX, size=size, pos=center), 1.0)]
         return [(body.add_geom(type=kinds.mjGEOM_CYLINDER, size=[size[0], size[2], 0.0], pos=center), 1.0)]
     pieces = []
-    for number, points in enumerate(convex_pieces(solid)):
+    for number, (points, volume) in enumerate(convex_pieces(solid, obj.id)):
         mesh = spec.add_mesh(name=f"object:{obj.id}.{number}")
         mesh.uservert = points.ravel()
         mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
-        pieces.append((body.add_geom(type=kinds.mjGEOM_MESH, meshname=mesh.name), _volume(points)))
+        pieces.append((body.add_geom(type=kinds.mjGEOM_MESH, meshname=mesh.name), volume))
     return pieces
 
 
-def convex_pieces(solid: Solid) -> list[Array]:
-    """Points (n, 3) [m] of convex pieces of a solid.
+def convex_pieces(solid: Solid, name: str = "") -> list[tuple[Array, float]]:
+    """Points (n, 3) [m] and volume [m^3] of convex pieces of a solid; `name` is for warnings.
 
-    Concave prisms are split into triangles, rings into wedges; each connected part of a mesh becomes its convex hull.
+    Concave prisms are split into triangles, rings into wedges, meshes as in `decomposition`.
     """
     if solid.shape == "mesh":
-        return _connected_parts(solid.mesh)
+        return [points_and_volume(piece) for piece in mesh_pieces(solid.mesh, name)]
     heights = np.array([solid.low[2], solid.high[2]])
     if solid.shape == "ring":
         outer, inner = float(solid.high[0]), solid.inner_radius
@@ -87,23 +88,9 @@ def convex_pieces(solid: Solid) -> list[Array]:
             sections.append(np.concatenate([outer * directions, inner * directions[::-2]]))
     else:
         sections = [np.asarray(part) for part in convex_parts(solid.section)]
-    return [np.concatenate([np.column_stack([section, np.full(len(section), z)]) for z in heights])
-            for section in sections]
-
-
-def _connected_parts(triangles: Array) -> list[Array]:
-    """Split triangles (n, 3, 3) into connected parts; return the distinct points (m, 3) of each."""
-    points, corners = np.unique(triangles.reshape(-1, 3), axis=0, return_inverse=True)
-    corners = corners.reshape(-1, 3)
-    lowest = np.arange(len(points))
-    while True:
-        least = lowest[corners].min(axis=1)
-        before = lowest.copy()
-        for column in range(3):
-            np.minimum.at(lowest, corners[:, column], least)
-        if (lowest == before).all():
-            break
-    return [part for label in np.unique(lowest) if len(part := points[lowest == label]) >= 4]
+    pieces = [np.concatenate([np.column_stack([section, np.full(len(section), z)]) for z in heights])
+              for section in sections]
+    return [(points, _volume(points)) for points in pieces]
 
 
 def _volume(points: Array) -> float:
