@@ -6,10 +6,13 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 import math
 import os
 import struct
 import tempfile
+from collections.abc import Iterator
+from itertools import islice
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -26,11 +29,14 @@ from applications.sorting.objects.kinds import (
     DrawnObject,
     draw,
 )
+from applications.sorting.objects.others import from_file, mesh_files
 from applications.sorting.objects.stacking import silhouette, stacked
 from common.cache import cache_folder
 from common.config import ObjectConfig, Parameters, World
 from common.errors import ConfigError
 from common.robot.transforms import quaternion_to_matrix
+
+log = logging.getLogger(__name__)
 
 Array = npt.NDArray[np.float64]
 Mass = Annotated[float, Field(gt=0, le=20)]
@@ -44,6 +50,7 @@ class Options(Parameters):
 
     count: int = Field(10, ge=1, le=30, description="number of objects")
     kinds: str | list[str] = Field("test", description="train, test, all, the name of a kind, or a list of names")
+    meshes: str = Field("", description="folder of .obj, .stl, .ply or .urdf files, instead of kinds")
     container: str = Field("tray", description="id of the container that they fall into")
     placement: Literal["heap", "spread"] = Field("heap", description="about the middle, or all over the container")
     masses: tuple[Mass, Mass] = Field(MASSES, description="smallest and largest [kg]")
@@ -85,14 +92,36 @@ def generate(world: World, options: Options, seed: int) -> list[ObjectConfig]:
         raise ConfigError("world.generator.container", options.container,
                           f"is no container; choices: {', '.join(world.containers)}")
     rng = np.random.default_rng(seed)
-    kinds = options.kind_names
-    order = [kinds[k] for _ in range(math.ceil(options.count / len(kinds))) for k in rng.permutation(len(kinds))]
-    drawn = [draw(kind, rng, options.masses, options.frictions) for kind in order[: options.count]]
+    drawn = list(islice(_drawn(options, rng), options.count))
     rotations = [_random_rotation(rng) for _ in drawn]
     outlines = [silhouette(each.triangles @ rotation.T) for each, rotation in zip(drawn, rotations, strict=True)]
     positions = stacked(outlines, container, world.table_height, options.placement == "heap", rng)
     return [_config(number, each, rotation, position) for number, (each, rotation, position) in enumerate(
         zip(drawn, rotations, positions, strict=True), 1)]
+
+
+def _drawn(options: Options, rng: np.random.Generator) -> Iterator[DrawnObject]:
+    """Objects without end: each kind or mesh once in random order, then again.
+
+    Raises:
+        ConfigError: there are no meshes, or none can be used.
+    """
+    choices: list[str] | list[Path] = (
+        mesh_files(Path(options.meshes).expanduser()) if options.meshes else options.kind_names)
+    while True:
+        unusable = 0
+        for number in rng.permutation(len(choices)):
+            choice = choices[number]
+            if isinstance(choice, str):
+                yield draw(choice, rng, options.masses, options.frictions)
+                continue
+            try:
+                yield from_file(choice, rng, options.masses, options.frictions)
+            except ConfigError as error:
+                log.warning("left out: %s", error)
+                unusable += 1
+        if unusable == len(choices):
+            raise ConfigError("world.generator.meshes", options.meshes, "has no mesh that can be used")
 
 
 def _random_rotation(rng: np.random.Generator) -> Array:

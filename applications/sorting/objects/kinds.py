@@ -49,6 +49,7 @@ class DrawnObject:
 
     Attributes:
         parts: surface (n, 3, 3) [m] of each convex piece; pieces share no corner.
+        surface: (n, 3, 3) [m] that cameras see, of a mesh whose pieces only approximate it; else None.
         color: red, green, blue from 0 to 1.
         mass: [kg].
         friction: coefficient of sliding friction.
@@ -62,11 +63,12 @@ class DrawnObject:
     friction: float
     kind: str
     color_name: str
+    surface: Array | None = None
 
     @property
     def triangles(self) -> Array:
-        """Surface of all pieces (n, 3, 3) [m]."""
-        return np.concatenate(self.parts)
+        """Surface (n, 3, 3) [m] that cameras see."""
+        return np.concatenate(self.parts) if self.surface is None else self.surface
 
     @property
     def size(self) -> Array:
@@ -100,15 +102,18 @@ def sized(pieces: list[Piece], rng: np.random.Generator) -> list[Piece]:
 
 
 def finished(
-    parts: list[Array], kind: str, rng: np.random.Generator, masses: Range, frictions: Range
+    parts: list[Array], kind: str, rng: np.random.Generator, masses: Range, frictions: Range,
+    surface: Array | None = None,
 ) -> DrawnObject:
     """Return an object of these surfaces (n, 3, 3) [m], about its center of mass, with a random mass and color."""
     measured = [volume_and_center(part) for part in parts]
-    volumes = np.array([abs(volume) for volume, _ in measured])
+    volumes = np.array([volume for volume, _ in measured])
     center = volumes @ np.array([at for _, at in measured]) / volumes.sum()
     low, high = np.clip(volumes.sum() * np.array(DENSITIES), *masses)
     mass = float(np.exp(rng.uniform(np.log(low), np.log(high))))
     name = str(rng.choice(list(PALETTE)))
     red, green, blue = np.clip(np.array(PALETTE[name]) + rng.uniform(-SHADE, SHADE), 0.0, 1.0).tolist()
     placed = [part - center + APART * number for number, part in enumerate(parts)]
-    return DrawnObject(placed, (red, green, blue), mass, float(rng.uniform(*frictions)), kind, name)
+    friction = float(rng.uniform(*frictions))
+    return DrawnObject(placed, (red, green, blue), mass, friction, kind, name,
+                       None if surface is None else surface - center)

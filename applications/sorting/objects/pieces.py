@@ -123,7 +123,9 @@ def triangles_of(piece: Piece) -> Array:
 
 
 def volume_and_center(triangles: Array) -> tuple[float, Array]:
-    """Volume and center of mass (3,) of a closed surface (n, 3, 3) [unit of the triangles, cubed]."""
-    volumes = np.einsum("ni,ni->n", triangles[:, 0], np.cross(triangles[:, 1], triangles[:, 2])) / 6
-    total = float(volumes.sum())
-    return total, np.asarray((volumes[:, None] * triangles.sum(axis=1) / 4).sum(axis=0) / total)
+    """Volume and center of mass (3,) of a closed convex surface (n, 3, 3) [unit of the triangles, cubed]."""
+    inside = triangles.mean(axis=(0, 1))
+    a, b, c = np.moveaxis(triangles - inside, 1, 0)
+    volumes = np.abs(np.einsum("ni,ni->n", a, np.cross(b, c))) / 6
+    total = max(float(volumes.sum()), 1e-15)
+    return total, np.asarray(inside + (volumes[:, None] * (a + b + c) / 4).sum(axis=0) / total)

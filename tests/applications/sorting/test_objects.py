@@ -107,6 +107,41 @@ def test_wrong_option_is_rejected_in_one_line(options: dict[str, Any], text: str
     assert text in str(refused.value) and "\n" not in str(refused.value)
 
 
+OBJ = "o it\n" + "".join(f"v {x} {y} {z}\n" for x in (0, 2) for y in (0, 1) for z in (0, 1)) + "".join(
+    f"f {a} {b} {c}\n" for a, b, c in ((1, 2, 4), (1, 4, 3), (5, 8, 6), (5, 7, 8), (1, 6, 2), (1, 5, 6), (3, 4, 8),
+                                       (3, 8, 7), (1, 3, 7), (1, 7, 5), (2, 6, 8), (2, 8, 4)))
+URDF = """<robot name="r"><link name="l"><collision><origin xyz="1 0 0" rpy="0 0 1.5707963"/>
+<geometry><mesh filename="it.obj" scale="0.05 0.05 0.05"/></geometry></collision></link></robot>"""
+
+
+def test_meshes_of_a_folder_are_scaled_to_a_graspable_size(tmp_path: Path) -> None:
+    (tmp_path / "plain").mkdir()
+    (tmp_path / "plain" / "it.obj").write_text(OBJ)
+    (tmp_path / "plain" / "broken.stl").write_text("solid")
+    (tmp_path / "described").mkdir()
+    (tmp_path / "described" / "it.obj").write_text(OBJ)
+    (tmp_path / "described" / "it.urdf").write_text(URDF)
+    objects = heap.generate(tray(), heap.Options(meshes=str(tmp_path), count=4), 0)
+    sizes = [tuple(np.round(solid_of(each).size, 3).tolist()) for each in objects]
+    assert sorted(set(sizes)) == [(0.05, 0.1, 0.05), (0.124, 0.062, 0.062)]  # of the URDF; limited by its shortest side
+    assert sizes.count((0.05, 0.1, 0.05)) == 2 and {each.id for each in objects} == {f"it_{n}" for n in (1, 2, 3, 4)}
+
+
+@pytest.mark.parametrize(("files", "text"), [
+    ({}, "has no meshes; choices: .obj, .stl, .ply, .urdf"), (None, "is not a folder"),
+    ({"a.obj": "v 0 0 0\n"}, "has no mesh that can be used"),
+])
+def test_folder_without_usable_meshes_is_rejected(files: dict[str, str] | None, text: str, tmp_path: Path) -> None:
+    folder = tmp_path / "meshes"
+    if files is not None:
+        folder.mkdir()
+    for name, content in (files or {}).items():
+        (folder / name).write_text(content)
+    with pytest.raises(ConfigError, match=r"world\.generator\.meshes: ") as refused:
+        heap.generate(tray(), heap.Options(meshes=str(folder)), 0)
+    assert text in str(refused.value)
+
+
 class Cell:
     """The tray with a heap of objects, an arm at home, and a clock that tests drive by hand."""
 
