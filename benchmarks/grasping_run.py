@@ -20,13 +20,13 @@ import numpy as np
 
 from applications.sorting.objects.kinds import PALETTE
 from applications.sorting.rules import Rule
-from applications.sorting.topics import HEAP, SORTING_STATUS, Heap, SeenObject, SortingStatus
+from applications.sorting.topics import HEAP, SORTING_STATUS, Grasp, Heap, SeenObject, SortingStatus
 from common import messages as m
 from common import topics
 from common.config import Cell, load_cell
 from common.errors import RequestFailed
 from common.perception.pinhole import camera_in_mount
-from common.robot.transforms import invert, matrix_to_rpy, transform
+from common.robot.transforms import invert, matrix_to_rpy, pose_to_matrix, transform
 from common.transport.bus import Bus
 from lab.simulation import Outcome, Simulation
 
@@ -34,7 +34,7 @@ TRAY, CELL = "tray", "sorting"
 GENERATOR = "applications.sorting.objects.heap"
 MASSES, FRICTIONS = (0.05, 0.5), (0.2, 0.6)  # [kg]; of all contacts of an object
 SHIFT, TURN = 0.003, math.radians(3.0)  # [m], [rad] of the calibration's error at the tray
-LIFTED = 0.05  # [m] by which the fingers must have lifted an object
+LIFTED = 0.02  # [m] by which the fingers must have lifted an object
 SETTLED = 1.5  # [s] after which an object in a container stays there
 SINGLE_LIMIT, HEAP_LIMIT = 90.0, 900.0  # [s] of cell time
 IMAGES, CANDIDATES = 5, 10  # of a measurement of latency
@@ -65,6 +65,7 @@ class Attempt:
     lifted: set[str] = field(default_factory=set)
     landed: dict[str, str] = field(default_factory=dict)  # container by object
     heights: dict[str, float] = field(default_factory=dict)  # of all objects before [m]
+    grasp: dict[str, float] = field(default_factory=dict)  # of the grasp as it was seen
 
 
 class Finished(Exception):  # noqa: N818 - not an error
@@ -123,7 +124,9 @@ class Truth:
         """Start an attempt when the task counts one."""
         if status.attempts > len(self.attempts):
             heights = {name: each.pose.position.z for name, each in self.objects.items()}
-            self.attempts.append(Attempt(now, status.subject or self.status.subject, heights=heights))
+            grasp = next((each for each in self.heap.grasps if each.id == status.grasp), None)
+            self.attempts.append(Attempt(now, status.subject or self.status.subject, heights=heights,
+                                         grasp={} if grasp is None else seen(grasp)))
         elif self.attempts and status.held:
             self.attempts[-1].noticed = status.held
         self.status = status
@@ -166,6 +169,14 @@ class Truth:
         if self.proved:
             return "plan failed"
         return "no grasp proved" if self.heap.objects else "not seen"
+
+
+def seen(grasp: Grasp) -> dict[str, float]:
+    """Return figures of a grasp."""
+    T = pose_to_matrix(grasp.pose)
+    return {"x": round(T[0, 3], 3), "y": round(T[1, 3], 3), "z": round(T[2, 3], 4), "score": round(grasp.score, 3),
+            "width": round(grasp.width, 4), "opening": round(grasp.opening, 4),
+            "tilt": round(math.degrees(math.acos(np.clip(-T[2, 2], -1, 1))), 1)}
 
 
 async def watch(bus: Bus, truth: Truth, case: Case) -> None:
@@ -260,7 +271,7 @@ def judged(truth: Truth, outcome: Outcome, cell: Cell) -> dict[str, Any]:
     """Return the result of a run by ground truth."""
     attempts = [
         {"subject": each.subject, "noticed": each.noticed, "lifted": sorted(each.lifted), "landed": each.landed,
-         "failure": truth.failure(each)} for each in truth.attempts]
+         "grasp": each.grasp, "failure": truth.failure(each)} for each in truth.attempts]
     rule = rule_of(cell)
     wanted = {name: rule.destination(true_object(each)) for name, each in truth.objects.items()}
     containers: dict[str, str] = {name: each.container or each.state for name, each in truth.objects.items()}
