@@ -284,7 +284,8 @@ def judged(truth: Truth, outcome: Outcome, cell: Cell) -> dict[str, Any]:
         "first": first, "attempts": attempts, "ended_in": containers, "wanted": wanted,
         "state": truth.status.state, "message": truth.status.message, "seconds": truth.status.task_seconds,
         "left": [f"{each.object}: {each.reason}" for each in truth.heap.left],
-        "latencies": [round(each, 4) for each in truth.latencies[-IMAGES:]], "planned": truth.planned, "scorer": truth.heap.scorer,
+        "latencies": [round(each, 4) for each in truth.latencies[-IMAGES:]], "planned": truth.planned,
+        "scorer": truth.heap.scorer,
         "crashes": outcome.crashes, "broken": outcome.broken,
         "outcome": f"{outcome.state} {outcome.message}".strip(), "cpu": round(outcome.cpu_seconds, 1),
     }

@@ -18,8 +18,10 @@ HERE = Path(__file__).resolve().parent
 ARGUMENTS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 TIMEOUT = 240_000  # [ms]
 SPEED = "0.3"  # of the cell: a browser without a GPU draws slowly
-STATES = {"panda": "Placing", "ur5": "Tracing"}  # state of the task in which the screenshot of each cell is taken
-PLACED = 3  # balls in the box of the Panda cell
+# State of the task in which the screenshot of each cell is taken.
+STATES = {"panda": "Placing", "ur5": "Tracing", "sorting": "Grasping"}
+ZOOM = 6  # turns of the wheel towards the tray
+DONE = {"panda": 3, "sorting": 2}  # objects in containers
 
 
 def take(cell: str, page: Page) -> None:
@@ -27,8 +29,13 @@ def take(cell: str, page: Page) -> None:
     page.locator("canvas").first.wait_for()
     page.get_by_text("STOP", exact=True).wait_for()
     page.get_by_role("button", name="Start", exact=True).click()
-    if cell == "panda":
-        page.wait_for_function(f"[...document.querySelectorAll('*')].some(e => e.textContent.startsWith('{PLACED} of'))")
+    if cell in DONE:
+        page.wait_for_function(
+            f"[...document.querySelectorAll('*')].some(e => e.textContent.startsWith('{DONE[cell]} of'))")
+    if cell == "sorting":  # the tray is a small part of the scene
+        page.mouse.move(620, 560)
+        for _ in range(ZOOM):
+            page.mouse.wheel(0, -240)
     page.get_by_text(STATES[cell]).first.wait_for()
     page.wait_for_timeout(4000)
     page.screenshot(path=HERE / f"page_{cell}.jpg", type="jpeg", quality=80)

@@ -31,6 +31,7 @@ GOOD, POOR = np.array([70.0, 220.0, 110.0]), np.array([230.0, 150.0, 40.0])  # c
 FAINT = 0.4  # brightness of a grasp that is not proved
 FOREIGN = (235, 50, 50)
 LEFT = (255, 90, 200)
+WAITS = "not examined"  # begin of the reason of an object that may have grasps
 _LIFTED = 0.002  # [m] height of lines above surfaces, to stay visible
 _POINT_SIZE = 0.003  # [m]
 
@@ -80,17 +81,17 @@ class Points(Layer):
 
 
 class Objects(Layer):
-    """The outline of each object that was recognized, its name, and the reason why it is left."""
+    """The outline of each object that was recognized, and its name."""
 
-    LABEL = "Objects, and why one is left"
-    LEGEND = (("object that is left", LEFT),)
+    LABEL = "Objects"
+    LEGEND = (("object without a grasp", LEFT),)
     TOPICS = (HEAP,)
     PERIOD = 0.2
 
     def build(self) -> None:
         """Start without objects."""
         self.nodes: list[viser.LineSegmentsHandle] = []
-        self.labels = Labels(self.scene, self.root, scale=0.7)
+        self.labels = Labels(self.scene, self.root, scale=0.5)
         self._shown: object = None
 
     def show(self, topic: Topic[Any], message: Heap) -> None:
@@ -100,16 +101,36 @@ class Objects(Layer):
         self._shown = message.objects, message.left
         for node in self.nodes:
             node.remove()
-        reasons = {each.object: each.reason for each in message.left}
-        self.nodes = [self._add(each, LEFT if each.id in reasons else rgb_of(each.color))
+        left = reasons(message)
+        self.nodes = [self._add(each, LEFT if each.id in left else rgb_of(each.color))
                       for each in message.objects if len(each.outline) > 2]
-        self.labels.show({each.id: (_label(each, reasons.get(each.id, "")), np.array(
-            [each.center.x, each.center.y, each.top + _LIFTED])) for each in message.objects}, self.stage.projection())
+        self.labels.show({each.id: (each.id, above(each)) for each in message.objects}, self.stage.projection())
 
     def _add(self, thing: SeenObject, color: Rgb) -> viser.LineSegmentsHandle:
         outline = np.array(thing.outline)
         points = np.column_stack([outline, np.full(len(outline), thing.top + _LIFTED)])
         return add_line(self.scene, f"{self.root}/{thing.id}", points, color, 3.0, closed=True)
+
+
+class Left(Layer):
+    """Why an object cannot be grasped now."""
+
+    NAME = "left_objects"
+    LABEL = "Why objects are left"
+    TOPICS = (HEAP,)
+    PERIOD = 0.5
+
+    def build(self) -> None:
+        """Start without reasons."""
+        self.labels = Labels(self.scene, self.root, scale=0.6)
+
+    def show(self, topic: Topic[Any], message: Heap) -> None:
+        """Show the reasons of the newest image from home."""
+        if not message.at_home:
+            return
+        left = reasons(message)
+        self.labels.show({each.id: (f"{each.id}: {left[each.id]}", above(each))
+                          for each in message.objects if each.id in left}, self.stage.projection())
 
 
 class Grasps(Layer):
@@ -179,12 +200,18 @@ def score_color(grasp: Grasp) -> NDArray[np.uint8]:
     return np.asarray(color if grasp.proved else FAINT * color).round().astype(np.uint8)
 
 
-def _label(thing: SeenObject, reason: str) -> str:
-    return f"{thing.id.replace('_', ' ')}: {reason}" if reason else thing.id.replace("_", " ")
+def reasons(heap: Heap) -> dict[str, str]:
+    """Return why objects have no grasp, by id; without those that only wait for better grasps of others."""
+    return {each.object: each.reason for each in heap.left if not each.reason.startswith(WAITS)}
+
+
+def above(thing: SeenObject) -> Array:
+    """Return the position (3,) [m] of the label of an object."""
+    return np.array([thing.center.x, thing.center.y, thing.top + _LIFTED])
 
 
 PAGE = ApplicationPage(
-    layers=(Points, Objects, Grasps, ForeignBodies),
+    layers=(Points, Objects, Left, Grasps, ForeignBodies),
     states={"GRASPING": "Grasping", "CHECKING": "Checking", "PLACING": "Placing", "STIRRING": "Stirring"},
     latency="Image to grasps", counters=counters,
 )

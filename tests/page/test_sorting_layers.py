@@ -36,11 +36,10 @@ def heap(**fields: object) -> Heap:
     return Heap.model_validate({"header": m.Header(stamp=1, frame_id="world"), "at_home": True, **fields})
 
 
-def test_outline_is_drawn_on_top_of_each_object_with_the_reason_why_it_is_left(stage: Stage) -> None:
+def test_outline_and_name_are_drawn_on_top_of_each_object(stage: Stage) -> None:
     layer = stage.layer("objects")
     stage.say(HEAP, heap(objects=[CUP, BAR], left=[Left(object="object_2", reason="too wide")]))
-    assert sorted(text for label in layer.labels.texts for text in label.split("\n")) == ["object 1",
-                                                                                        "object 2: too wide"]
+    assert sorted(text for label in layer.labels.texts for text in label.split("\n")) == ["object_1", "object_2"]
     assert len(layer.nodes) == 2
     np.testing.assert_allclose(layer.nodes[0].points[:, 0, :2], SQUARE, atol=1e-6)
     np.testing.assert_allclose(layer.nodes[0].points[:, :, 2], 0.052, atol=1e-6)
@@ -48,6 +47,16 @@ def test_outline_is_drawn_on_top_of_each_object_with_the_reason_why_it_is_left(s
     assert len(layer.nodes) == 2, "away from home the arm may hide objects"
     stage.say(HEAP, heap(objects=[]))
     assert layer.nodes == [] and layer.labels.texts == []
+
+
+def test_reason_is_shown_at_an_object_that_no_grasp_fits_but_not_while_it_waits_for_others(stage: Stage) -> None:
+    layer = stage.layer("left_objects")
+    waits = "not examined: better grasps of other objects came first"
+    stage.say(HEAP, heap(objects=[CUP, BAR], left=[Left(object="object_2", reason="too wide"),
+                                                   Left(object="object_1", reason=waits)]))
+    assert layer.labels.texts == ["object_2: too wide"]
+    stage.say(HEAP, heap(objects=[CUP, BAR]))
+    assert layer.labels.texts == []
 
 
 def test_proved_grasps_are_bright_and_thick_and_green_by_their_score(stage: Stage) -> None:
