@@ -30,11 +30,12 @@ from applications.sorting.objects.kinds import (
     draw,
 )
 from applications.sorting.objects.others import from_file, mesh_files
-from applications.sorting.objects.stacking import silhouette, stacked
+from applications.sorting.objects.stacking import GAP, silhouette, stacked
 from common.cache import cache_folder
 from common.config import ObjectConfig, Parameters, World
 from common.errors import ConfigError
-from common.robot.transforms import quaternion_to_matrix
+from common.robot.transforms import quaternion_to_matrix, rpy_to_matrix
+from common.sim.interface import KINEMATIC
 
 log = logging.getLogger(__name__)
 
@@ -84,6 +85,8 @@ class Options(Parameters):
 def generate(world: World, options: Options, seed: int) -> list[ObjectConfig]:
     """Return objects in the air above the container, which fall into it.
 
+    The kinematic world moves nothing that is not touched: there they lie side by side, as far as there is room.
+
     Raises:
         ConfigError: there is no such container.
     """
@@ -93,9 +96,11 @@ def generate(world: World, options: Options, seed: int) -> list[ObjectConfig]:
                           f"is no container; choices: {', '.join(world.containers)}")
     rng = np.random.default_rng(seed)
     drawn = list(islice(_drawn(options, rng), options.count))
-    rotations = [_random_rotation(rng) for _ in drawn]
+    falls = world.simulator != KINEMATIC
+    rotations = [_random_rotation(rng) if falls else _lying(each, rng) for each in drawn]
     outlines = [silhouette(each.triangles @ rotation.T) for each, rotation in zip(drawn, rotations, strict=True)]
-    positions = stacked(outlines, container, world.table_height, options.placement == "heap", rng)
+    heap = falls and options.placement == "heap"
+    positions = stacked(outlines, container, world.table_height, rng, heap=heap, gap=GAP if falls else 0.0)
     return [_config(number, each, rotation, position) for number, (each, rotation, position) in enumerate(
         zip(drawn, rotations, positions, strict=True), 1)]
 
@@ -128,6 +133,12 @@ def _random_rotation(rng: np.random.Generator) -> Array:
     """Uniform rotation (3, 3)."""
     x, y, z, w = rng.normal(size=4)
     return quaternion_to_matrix(*(np.array([x, y, z, w]) / np.linalg.norm([x, y, z, w])))
+
+
+def _lying(drawn: DrawnObject, rng: np.random.Generator) -> Array:
+    """Rotation (3, 3) that turns the shortest side upright, with a random yaw."""
+    axes = np.roll(np.eye(3), 2 - int(np.argmin(drawn.size)), axis=0)
+    return np.asarray(rpy_to_matrix(0.0, 0.0, float(rng.uniform(-math.pi, math.pi))) @ axes)
 
 
 def _config(number: int, drawn: DrawnObject, rotation: Array, position: Array) -> ObjectConfig:

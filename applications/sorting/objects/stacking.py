@@ -16,7 +16,7 @@ STEP = 0.005  # [m] side of a grid cell
 MARGIN = 0.02  # [m] from the walls
 GAP = 0.004  # [m] between objects, and above the floor of the container
 SPREAD = 0.035  # [m] standard deviation of positions about the middle of a container
-TRIES = 6  # random positions of an object that is not heaped, of which the lowest is taken
+TRIES = 60  # random positions of an object that is not heaped, of which the lowest is taken
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +57,8 @@ def _dense_points(triangles: Array) -> Array:
 
 
 def stacked(
-    objects: Sequence[Silhouette], container: Container, table: float, heap: bool, rng: np.random.Generator
+    objects: Sequence[Silhouette], container: Container, table: float, rng: np.random.Generator, *, heap: bool,
+    gap: float = GAP,
 ) -> list[Array]:
     """Positions (3,) [m] in world of the origins of objects above a container.
 
@@ -65,8 +66,9 @@ def stacked(
         objects: all within the walls of the container.
         container: a square box.
         table: height of the table [m].
-        heap: about the middle; else anywhere.
         rng: source of the positions.
+        heap: about the middle; else anywhere, as low as possible.
+        gap: between objects, and above the floor of the container [m].
     """
     room = container.half_side - container.wall_thickness - MARGIN
     count = int(2 * room / STEP)
@@ -75,6 +77,7 @@ def stacked(
     for each in objects:
         options = [_lowest(each, top, heap, rng) for _ in range(1 if heap else TRIES)]
         z, row, column = min(options)
+        z += gap
         rows, columns = each.low.shape
         area = top[row: row + rows, column: column + columns]
         covered = (slice(0, area.shape[0]), slice(0, area.shape[1]))
@@ -95,4 +98,4 @@ def _lowest(each: Silhouette, top: Array, heap: bool, rng: np.random.Generator) 
         corner = rng.integers(0, most + 1)
     row, column = np.clip(corner, 0, most).tolist()
     area = top[row: row + size[0], column: column + size[1]]
-    return float((area - each.low[: area.shape[0], : area.shape[1]]).max()) + GAP, row, column
+    return float((area - each.low[: area.shape[0], : area.shape[1]]).max()), row, column

@@ -92,6 +92,19 @@ def test_heap_lies_in_the_air_within_the_walls_of_the_tray(options: dict[str, An
         assert low <= each.mass <= high and Path(each.mesh).is_file()
 
 
+def test_objects_lie_on_the_floor_of_the_tray_where_nothing_falls() -> None:
+    world = tray().model_copy(update={"simulator": "kinematic"})
+    objects = heap.generate(world, heap.Options(count=6), 2)
+    floor = world.containers["tray"].floor_thickness
+    for each in objects:
+        solid = solid_of(each)
+        rotation = initial_pose(each, solid)[:3, :3]
+        assert each.position is not None and each.position[2] + solid.lowest(rotation) == pytest.approx(floor, abs=1e-6)
+        assert solid.highest(rotation) - solid.lowest(rotation) == pytest.approx(solid.size.min(), abs=1e-6)
+    states = load_world(world, objects).objects(Header()).objects
+    assert {each.container for each in states} == {"tray"}
+
+
 @pytest.mark.parametrize(("options", "text"), [
     ({"count": 31}, "world.generator.count: 31 must be less than or equal to 30"),
     ({"kinds": ["mug", "cup"]}, "'cup' is no kind; choices: train, test, all, block, can,"),
