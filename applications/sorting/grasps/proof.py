@@ -42,9 +42,9 @@ _SAME_BRANCH = 1.5  # [rad] between approach and grasp in any joint
 class ProofOptions(Section):
     """How many grasps are proved, how long that may take, and how measured points count."""
 
-    wanted: int = Field(10, ge=1, le=MAX_GRASPS, description="proved grasps")
+    wanted: int = Field(20, ge=1, le=MAX_GRASPS, description="proved grasps")
     for_each: int = Field(3, ge=1, le=MAX_GRASPS, description="of these, of one object")
-    seconds: float = Field(0.06, gt=0, le=10, description="time limit [s]")
+    seconds: float = Field(0.1, gt=0, le=10, description="time limit [s]")
     approach: tuple[float, ...] = Field((0.10, 0.07), min_length=1, description="way back from the grasp along the "
                                                                                 "tool, the first that is free [m]")
     side: float = Field(0.004, gt=0, le=0.05, description="of cubes that measured points are merged in [m]")
@@ -96,7 +96,7 @@ class Prover:
         self._home = _home(self.robot)
         self._rng = np.random.default_rng(0)
         self._last: Array | None = None  # positions at the newest proved grasp: the next may be near
-        self._world(self._home, None, PointObstacle(POINTS, np.array([[0.0, 0.0, -1.0, 0.001]])))  # builds shapes once
+        self._world(self._home, PointObstacle(POINTS, np.array([[0.0, 0.0, -1.0, 0.001]])))  # builds shapes once
 
     def prove(self, found: Candidates, objects: Sequence[str], home: ArrayLike | None = None) -> Proof:
         """Return grasps as messages, until enough are proved or the time is over.
@@ -109,6 +109,7 @@ class Prover:
         began = monotonic()
         start = self._home if home is None else np.asarray(home, dtype=float)
         points = PointObstacle(POINTS, measured_spheres(found.heights, self.options.side, self.options.radius))
+        world = self._world(start, points)
         grasps: list[Grasp] = []
         proved: dict[int, list[int]] = {}
         reasons = dict(found.reasons)
@@ -119,7 +120,7 @@ class Prover:
             if monotonic() - began > limit or len(grasps) >= self.options.wanted:
                 break
             tried += 1
-            result = self._prove(found.T[i], float(found.opening[i]), start, points)
+            result = self._prove(found.T[i], float(found.opening[i]), start, world)
             index = int(found.object[i])
             message = self._message(found, i, objects[index], result)
             if result.q is None:
@@ -154,22 +155,23 @@ class Prover:
                 yield i
         yield from (i for i in later if len(proved.get(int(found.object[i]), [])) < self.options.for_each)
 
-    def _prove(self, T: Array, opening: float, start: Array, points: PointObstacle) -> _Found:
+    def _prove(self, T: Array, opening: float, start: Array, world: CollisionWorld) -> _Found:
         """Return joint positions for a grasp (4, 4), in either direction of the gripper, or why there are none."""
-        world: CollisionWorld | None = None
         why = ""
         for restarts in dict.fromkeys((0, self.options.restarts)):
             ways = self._ways(T, start, restarts)
             for pose, q in ways:
-                world = world or self._world(start, opening, points)
+                world.bank.open_fingers(opening)
+                world.bank.kernel()  # takes the fingers' poses
                 found = self._free(world, pose, q)
                 if found.q is not None:
                     return found
                 why = why or found.why
         return _Found(why=why or self._unreachable(T))
 
-    def _world(self, start: Array, opening: float | None, points: PointObstacle) -> CollisionWorld:
-        return CollisionWorld(self.robot, self._scene, start=start, cache=self._cache, points=[points], width=opening)
+    def _world(self, start: Array, points: PointObstacle) -> CollisionWorld:
+        """Return the arm among fixtures, containers and points, with fingers that are moved later."""
+        return CollisionWorld(self.robot, self._scene, start=start, cache=self._cache, points=[points])
 
     def _ways(self, T: Array, start: Array, restarts: int) -> list[tuple[Array, Array]]:
         """Return poses of the TCP for a grasp, with joint positions (dof,) [rad], the nearest to the start first.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 
 from applications.sorting.grasps.candidates import Candidates, Options, candidates
 from applications.sorting.grasps.gripper_shape import GripperShape
+from applications.sorting.grasps.height_map import HeightMap
 from common.config import load_cell
 from common.planning.robot_geometry import RobotGeometry
 from common.robot.model import RobotModel
@@ -106,7 +108,7 @@ def test_an_object_at_a_wall_is_gripped_along_the_wall(robot: str, solid: Solid,
 @pytest.mark.parametrize("robot", ROBOTS)
 @pytest.mark.parametrize(("solids", "reason"), [
     ([box(0.55, 0.0, 0.12, 0.12, 0.04)], "wider than the"),
-    ([box(0.55 + 0.192 - 0.02, 0.192 - 0.02, 0.04, 0.04, 0.04)], "opposite edges"),  # in the corner, lower than the walls
+    ([box(0.722, 0.172, 0.04, 0.04, 0.04)], "opposite edges"),  # in the corner, lower than the walls
     ([box(0.55, 0.0, 0.04, 0.04, 0.03), *(box(0.55 + dx, dy, 0.06, 0.06, 0.06) for dx in (-0.06, 0, 0.06)
       for dy in (-0.06, 0, 0.06) if dx or dy)], ""),  # in a pit
 ])
@@ -140,3 +142,45 @@ def test_unknown_cells_are_as_high_as_their_neighbors() -> None:
     across = [np.abs(each.axis(gripper("panda"))[each.object == 0, 0]) > 0.9 for each in (clear, hidden)]
     assert across[0].any()
     assert not across[1].any()
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_tilting_frees_the_palm_from_a_high_wall(robot: str) -> None:
+    high = replace(WALLS, top=0.15)
+    surface, labels = seen([box(0.55 + 0.192 - 0.018, 0.0, 0.03, 0.04, 0.04)])
+
+    def found(tilts: tuple[float, ...]) -> Candidates:
+        options = Options(tilts=tilts)
+        return candidates(surface, labels, gripper(robot), options, np.random.default_rng(0), [high])
+
+    upright, tilted = found(()), found((0.26, 0.52))
+    assert len(upright) == 0
+    assert "palm" in upright.reasons[0]
+    assert tilted.reasons == {}
+    assert tilted.T[0, 0, 2] > 0.2  # the tool points towards the wall: the palm is away from it
+    points = gripper(robot).surfaces.placed(tilted.T @ gripper(robot).T_tcp_closing, tilted.opening)
+    above = HeightMap(surface, labels, [high]).penetration(points, 0)[0]
+    assert (above < 0).all()
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_candidates_of_a_heap_are_many_and_differ(robot: str) -> None:
+    solids = [box(0.45 + 0.1 * i, 0.1 * j, 0.06, 0.03, 0.04, i + 2.0 * j) for i in range(3) for j in (-1, 0, 1)]
+    found = grasps(robot, *solids, noise=0.001)
+    counts = np.bincount(found.object, minlength=9)
+    assert (counts >= 3).all()
+    assert (np.diff(found.score) <= 0).all()
+    for index in range(9):
+        own = np.flatnonzero(found.object == index)
+        at = found.T[own][:, :3, 3]
+        away = np.linalg.norm(at[:, None] - at, axis=2)
+        turned = np.abs(found.axis(gripper(robot))[own] @ found.axis(gripper(robot))[own].T)
+        assert not ((away < 0.0099) & (turned > math.cos(0.25)) & ~np.eye(len(own), dtype=bool)).any()
+
+
+def test_other_scores_change_the_order() -> None:
+    found = grasps("panda", box(0.55, 0.0, 0.09, 0.03, 0.04))
+    order = np.random.default_rng(1).permutation(len(found))
+    ranked = found.ranked(-order.astype(float))
+    np.testing.assert_array_equal(ranked.T, found.T[np.argsort(order)])
+    assert (np.diff(ranked.score) < 0).all()
