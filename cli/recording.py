@@ -16,14 +16,12 @@ import typer
 from cli import choices, options
 from cli.options import RUNNING, CellTarget
 from common.errors import ConfigError
-from common.terminal import Progress, echo, printable, rewrite
-from recording.formatting import cell_to_play, format_bytes, format_contents, format_recovery, require_new
+from common.terminal import Progress, echo, rewrite
+from recording.formatting import cell_to_play, format_contents, format_recovery, require_new
 
 if TYPE_CHECKING:
     from recording.player import Player
     from recording.reader import Recording
-    from recording.sample import Decoder
-    from recording.selection import Selection
 
 
 MIN_FILE_SIZE = 1.0  # [MB] of a recording that is split
@@ -211,7 +209,7 @@ PLOT_ERRORS = (ArithmeticError, ValueError, LookupError, TypeError)  # errors fr
 
 
 def export(
-    file: File,
+    files: Annotated[list[str], typer.Argument(metavar="FILE.mcap", help="recordings")],
     foxglove: Annotated[
         str | None, typer.Option("--foxglove", metavar="OUT.mcap", help="for Foxglove: JSON with its own schemas")
     ] = None,
@@ -220,73 +218,41 @@ def export(
     video: Annotated[
         str | None, typer.Option("--video", metavar="OUT.mp4", help="video of one topic, named with --topics")
     ] = None,
+    lerobot: Annotated[
+        str | None, typer.Option("--lerobot", metavar="DIR", help="LeRobotDataset v3.0, an episode for each recording")
+    ] = None,
+    hdf5: Annotated[
+        str | None, typer.Option("--hdf5", metavar="OUT.hdf5", help="robomimic's layout, a demo for each recording")
+    ] = None,
+    parquet: Annotated[str | None, typer.Option("--parquet", metavar="DIR", help="typed tables of topics")] = None,
+    numpy: Annotated[str | None, typer.Option("--numpy", metavar="DIR", help="arrays for each topic")] = None,
     topics: Annotated[list[str] | None, typer.Option("--topics", metavar="KEY", help="only these; repeatable")] = None,
     exclude: Exclude = None,
+    fps: Annotated[str | None, typer.Option("--fps", metavar="N", help="frames per second of --lerobot and --hdf5 "
+                                                                       "[rate of the camera]")] = None,
+    task: Annotated[
+        list[str] | None, typer.Option("--task", metavar="TEXT", help="of all episodes, or one for each recording")
+    ] = None,
+    robot_type: Annotated[
+        str | None, typer.Option("--robot-type", metavar="NAME", help="of --lerobot [name of the cell]")
+    ] = None,
+    max_gap: Annotated[
+        str | None, typer.Option("--max-gap", metavar="S", help="longest gap that frames are filled over [0.5]")
+    ] = None,
+    embed_images: Annotated[
+        bool, typer.Option("--embed-images", help="PNG in the files of --lerobot instead of video")
+    ] = False,
 ) -> None:
-    """Export a recording for other programs: Foxglove, tables, images, a video."""
-    from recording.reader import Recording
-    from recording.sample import Decoder
+    """Export recordings for other programs: Foxglove, tables, images, a video, data sets for robot learning."""
+    from recording import exporting
+    from recording.datasets.command import DatasetOptions
     from recording.selection import Selection
 
-    if not (foxglove or csv or images or video):
-        raise ConfigError("export", ..., "needs one or more of --foxglove OUT.mcap, --csv DIR, --images DIR, "
-                                         "--video OUT.mp4")
-    selection = Selection.of(topics or (), None, exclude)
-    if foxglove:
-        require_new(Path(foxglove), "--foxglove")
-    for option, folder in (("--csv", csv), ("--images", images)):
-        if folder and Path(folder).exists() and not Path(folder).is_dir():
-            raise ConfigError(option, folder, "must be a folder")
-    if video:
-        require_new(Path(video), "--video", ".mp4")
-    with Progress(f"reading {file}") as read, Recording(Path(file), read) as recording:
-        selection.require_in(recording.topics(), recording.path, "--topics")
-        for option, target, write in (("--foxglove", foxglove, _foxglove), ("--csv", csv, _tables),
-                                      ("--images", images, _images), ("--video", video, _video)):
-            if target:
-                decoder = Decoder()
-                write(recording, Path(target), selection, decoder)
-                for counts, why in ((decoder.skipped, "this version does not know their type"),
-                                    (decoder.unfit, f"{option} cannot hold them")):
-                    for topic, count in sorted(counts.items()):
-                        echo(f"{printable(topic)}: {count:,} messages left out: {why}", err=True)
-        if recording.flaw:
-            echo(f"the recording is {recording.flaw}; to repair it: zencell recover {file}", err=True)
-
-
-def _foxglove(recording: Recording, target: Path, selection: Selection, decoder: Decoder) -> None:
-    from recording.foxglove import export_foxglove
-
-    count = export_foxglove(recording, target, selection.wants, decoder)
-    echo(f"{target}: {count:,} messages, {format_bytes(target.stat().st_size)}, for Foxglove")
-
-
-def _tables(recording: Recording, folder: Path, selection: Selection, decoder: Decoder) -> None:
-    from recording.export import export_tables
-
-    for name, count in export_tables(recording, folder, selection.wants, decoder).items():
-        echo(f"{folder / name}: {count:,} rows")
-
-
-def _images(recording: Recording, folder: Path, selection: Selection, decoder: Decoder) -> None:
-    from recording.export import export_images, file_names, image_topics
-
-    if not image_topics(recording, selection.wants):
-        raise ConfigError("--images", str(recording.path), "has no images among the selected topics")
-    names = file_names(image_topics(recording, selection.wants))
-    for topic, count in export_images(recording, folder, selection.wants, decoder).items():
-        echo(f"{folder / names[topic]}: {count:,} images")
-
-
-def _video(recording: Recording, target: Path, selection: Selection, decoder: Decoder) -> None:
-    from recording.export import export_video, image_topics
-
-    choices = image_topics(recording, selection.wants)
-    if len(choices) != 1:
-        named = ", ".join(choices) or "none"
-        raise ConfigError("--video", str(target), f"needs one topic with images, by --topics KEY; choices: {named}")
-    count, rate = export_video(recording, target, choices[0], decoder)
-    echo(f"{target}: {count:,} images of {choices[0]} at {rate:g} Hz")
+    targets = {"--foxglove": foxglove, "--csv": csv, "--images": images, "--video": video, "--lerobot": lerobot,
+               "--hdf5": hdf5, "--parquet": parquet, "--numpy": numpy}
+    exporting.export(exporting.ExportRequest(
+        files, {option: target for option, target in targets.items() if target},
+        Selection.of(topics or (), None, exclude), DatasetOptions(fps, task or (), robot_type, embed_images, max_gap)))
 
 
 def report(

@@ -35,6 +35,9 @@ if TYPE_CHECKING:
         ZencellError,
     )
     from common.messages import Pose
+    from recording.access import OpenRecording, open_recording
+    from recording.sample import RecordingError
+    from recording.tables import Table
 
 _FROM = {  # imported at first use: the command line starts without them
     "common.client.cell": ("Cell",),
@@ -45,6 +48,9 @@ _FROM = {  # imported at first use: the command line starts without them
                       "UnknownName", "ZencellError"),
     "common.messages": ("Pose",),
     "common.client.operator_motion": ("JogFailed", "MotionFailed"),
+    "recording.access": ("OpenRecording", "open_recording"),
+    "recording.sample": ("RecordingError",),
+    "recording.tables": ("Table",),
 }
 _MODULE = {name: module for module, names in _FROM.items() for name in names}
 # Names of earlier releases, for scripts that use them.
@@ -59,15 +65,19 @@ __all__ = [
     "NoResponder",
     "NotStarted",
     "NothingReceived",
+    "OpenRecording",
     "Plan",
     "Pose",
+    "RecordingError",
     "RemoteError",
     "RequestFailed",
     "RequestLost",
     "RequestTimeout",
+    "Table",
     "UnknownName",
     "ZencellError",
     "any_of",
+    "open_recording",
     "pose",
     "region",
     "through",
