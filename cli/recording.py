@@ -21,7 +21,6 @@ from recording.formatting import cell_to_play, format_contents, format_recovery,
 
 if TYPE_CHECKING:
     from recording.player import Player
-    from recording.reader import Recording
 
 
 MIN_FILE_SIZE = 1.0  # [MB] of a recording that is split

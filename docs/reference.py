@@ -30,7 +30,7 @@ WIDTH = 90  # characters of a code line that needs no scrolling
 PARTS = {  # of the client, by the expression that gives each
     "Cell": Cell, "cell.arm": Arm, "cell.gripper": Gripper, "cell.camera()": Camera, "cell.task": TaskControl,
     "cell.param": Parameters, "cell.scene": Scene, "cell.world": World,
-    "open_recording()": OpenRecording, "table()": Table,  # both below the function `open_recording`
+    "recording": OpenRecording, "table": Table,  # of `open_recording`
 }
 
 
