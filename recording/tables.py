@@ -33,7 +33,7 @@ class Row:
 
 
 class Table:
-    """Messages of one topic as arrays: `table["header.frame_id"]`, `table["panda_joint1.position"]`.
+    """Messages of one topic as arrays: `table["header.frame_id"]`, `table["joint1.position"]`.
 
     Numbers are float64, int64 or bool; a number that some messages lack is NaN. Lists of n numbers make an array
     (messages, n); other lists, and texts, make arrays of objects.
@@ -125,7 +125,7 @@ def _objects(values: Sequence[Any]) -> Array:
 def values_of(message: Message, *, images: bool = False) -> dict[str, Any]:
     """Return the values of a message by column.
 
-    Joint states have a column for each joint and quantity, such as `panda_joint1.position`. Pixels are a column
+    Joint states have a column for each joint and quantity, such as `joint1.position`. Pixels are a column
     `image` if wanted: (height, width, 3) in the order of their encoding, or (height, width). Bytes are left out.
 
     Raises:
