@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -15,7 +16,8 @@ Array = npt.NDArray[np.float64]
 STEP = 0.005  # [m] side of a grid cell
 MARGIN = 0.02  # [m] from the walls
 GAP = 0.004  # [m] between objects, and above the floor of the container
-SPREAD = 0.035  # [m] standard deviation of positions about the middle of a container
+SPREAD = 0.035  # [m] standard deviation of positions about the middle of a container, for a heap of FEW objects
+FEW = 10  # objects; a heap of more of them is wider and flatter, else some fall over the walls
 TRIES = 60  # random positions of an object that is not heaped, of which the lowest is taken
 
 
@@ -73,9 +75,11 @@ def stacked(
     room = container.half_side - container.wall_thickness - MARGIN
     count = int(2 * room / STEP)
     top = np.full((count, count), container.floor_thickness)
+    spread = SPREAD * math.sqrt(max(1.0, len(objects) / FEW)) if heap else None
+    tries = 1 + 2 * ((len(objects) - 1) // FEW) if heap else TRIES
     found = []
     for each in objects:
-        options = [_lowest(each, top, heap, rng) for _ in range(1 if heap else TRIES)]
+        options = [_lowest(each, top, spread, rng) for _ in range(tries)]
         z, row, column = min(options)
         z += gap
         rows, columns = each.low.shape
@@ -88,12 +92,17 @@ def stacked(
     return found
 
 
-def _lowest(each: Silhouette, top: Array, heap: bool, rng: np.random.Generator) -> tuple[float, int, int]:
-    """Height of an object's origin above the table at a random cell (row, column) of its first corner."""
+def _lowest(
+    each: Silhouette, top: Array, spread: float | None, rng: np.random.Generator
+) -> tuple[float, int, int]:
+    """Height of an object's origin above the table at a random cell (row, column) of its first corner.
+
+    `spread` is the standard deviation about the middle [m]; None: anywhere.
+    """
     count, size = len(top), np.array(each.low.shape)
     most = np.maximum(count - size, 0)
-    if heap:
-        corner = np.round(rng.normal(count / 2, SPREAD / STEP, 2) - each.origin).astype(int)
+    if spread is not None:
+        corner = np.round(rng.normal(count / 2, spread / STEP, 2) - each.origin).astype(int)
     else:
         corner = rng.integers(0, most + 1)
     row, column = np.clip(corner, 0, most).tolist()
