@@ -29,6 +29,9 @@ SLACK = 1e-6  # [m] tolerance of the bounding box test
 _OFF = np.array([1.234e-7, 2.345e-7])  # [m] shifts lines off edges at round coordinates
 _NONE = np.empty((0, 2))
 
+Indexed = tuple[list[tuple[float, float, float]], list[tuple[int, int, int]]]
+_NO_MESH: Indexed = ([], [])
+
 
 @dataclass(frozen=True, eq=False)
 class Solid:
@@ -66,6 +69,12 @@ class Solid:
             return np.unique(self.triangles.reshape(-1, 3), axis=0)
         return np.concatenate([np.column_stack([self.section, np.full(len(self.section), z)])
                                for z in (self.low[2], self.high[2])])
+
+    @cached_property
+    def indexed(self) -> Indexed:
+        """Distinct corners [m] of a mesh, and the indices of those of each triangle, as in messages."""
+        points, index = np.unique(self.mesh.reshape(-1, 3), axis=0, return_inverse=True)
+        return [(x, y, z) for x, y, z in points.tolist()], [(a, b, c) for a, b, c in index.reshape(-1, 3).tolist()]
 
     @cached_property
     def reach(self) -> float:
@@ -234,12 +243,9 @@ def object_message(
     name: str, solid: Solid, T: Array, color: Sequence[float], *, state: str = "table", container: str = ""
 ) -> WorldObject:
     """Return the message of a solid at a (4, 4) pose."""
-    vertices: list[tuple[float, float, float]] = []
-    triangles: list[tuple[int, int, int]] = []
+    vertices, triangles = _NO_MESH
     if solid.shape == "mesh":
-        points, index = np.unique(solid.mesh.reshape(-1, 3), axis=0, return_inverse=True)
-        vertices = [(x, y, z) for x, y, z in points.tolist()]
-        triangles = [(a, b, c) for a, b, c in index.reshape(-1, 3).tolist()]
+        vertices, triangles = solid.indexed
     is_upright = len(solid.section) > 0 and T[2, 2] > UPRIGHT and state not in ("held", "falling")
     at, turn = T[:2, 3], T[:2, :2].T
     size = solid.size
