@@ -99,6 +99,7 @@ class MotionInvariants:
         self._while_held = 0  # consecutive set-points that moved a held arm
         self._unrequested = 0  # consecutive set-points that moved after a stop
         self._held_since: float | None = None  # cell time [s]
+        self._braking_until = 0.0  # cell time until which an arm that left its path may come to rest [s]
         self._stopped = False  # whether the newest command of an operator was a stop or hold
         self._stopped_at: float | None = None  # cell time of the first set-point since [s]
         self._stopped_by: Incarnation | None = None  # process that served the stop, which brakes first
@@ -114,6 +115,7 @@ class MotionInvariants:
         """Shift all cell times: the cell was started again and its clock is ahead by `step` [s]."""
         if self._held_since is not None:
             self._held_since += step
+        self._braking_until += step
         if self._stopped_at is not None:
             self._stopped_at += step
         if self._cap_at is not None:
@@ -126,6 +128,8 @@ class MotionInvariants:
         self._on_goal(self._motion, instance, status.id, status.state)
         held = status.held and status.state == "active"
         self._held_since = None if not held else self._held_since or status.header.stamp * 1e-9
+        if status.state == "aborted":
+            self._braking_until = status.header.stamp * 1e-9 + AT_REST
 
     def on_gripper(self, instance: str, state: GripperState) -> None:
         """Check a gripper state."""
@@ -204,7 +208,8 @@ class MotionInvariants:
         """Check that the arm may move, and as fast as it does."""
         checks, goals = self._checks, self._goals.get(self._motion)
         active = goals.active if goals is not None else ""
-        self._without_goal = 0 if self.jogging or active else self._without_goal + 1
+        free = self.jogging or active or now < self._braking_until
+        self._without_goal = 0 if free else self._without_goal + 1
         if checks.fails(self._without_goal <= UNREPORTED, GOAL):
             checks.add_violation(GOAL, f"{step:.4f} rad without one")
         resting = self._held_since is not None and now - self._held_since >= AT_REST
