@@ -52,6 +52,8 @@ async def run(bus: Bus, config: Config) -> None:
     async def watch_heap() -> None:
         async for heap in heaps:
             scene.update_heap(heap)
+            if gripper.latest is not None:  # the tool may have been unknown before
+                scene.update_gripper(gripper.latest, tool())
             out.put(scene.scene())
 
     async with asyncio.TaskGroup() as group:

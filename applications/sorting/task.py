@@ -37,6 +37,7 @@ LOWERED = 0.015  # [m] above its support at which an object is put back
 MOST_FAILURES = 25  # in a row; each pick that has no plan is one
 STEADY = 0.6  # share of images that show an object at the same place
 SAME = 0.025  # [m]
+NO_MOTION = ("no_ik", "collision")  # errors of a goal itself; a planner without an answer says nothing about it
 OLD = 20.0  # [s] an older image decides nothing, also while the arm only was on its way
 
 
@@ -429,7 +430,7 @@ class Sorting(Task[SortingView]):
             self._skipped += move.carries
             super().plan_failed(move, response, view)
             return
-        if response.error.startswith("start_"):
+        if response.error.startswith("start_") or not (response.attempts or response.error in NO_MOTION):
             super().plan_failed(move, response, view)
             return
         for one in [cycle.chosen] if cycle.chosen is not None else cycle.options:
