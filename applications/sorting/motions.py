@@ -40,6 +40,7 @@ class Pick(Cycle):
         options: grasps among which the planner chooses.
         chosen: the one that it reaches first; None before.
         spot: (x, y) of the release [m], and z of the tool there.
+        inside: number of objects that were seen in its container.
         before: objects in the tray when the grasp was chosen.
         gripped: whether the fingers closed on it.
         checked: whether what is held is known.
@@ -50,6 +51,7 @@ class Pick(Cycle):
     chosen: Option | None = None
     spot: tuple[float, float, float] = (0.0, 0.0, 0.0)
     before: list[SeenObject] = field(default_factory=list)
+    inside: int = 0
     gripped: bool = False
     checked: bool = False
     back: bool = False

@@ -105,6 +105,7 @@ class Memory(BaseModel):
     thing: SeenObject | None = None
     container: str = ""
     back: bool = False
+    inside: int = 0  # objects seen in that container before
     stirs: int = 0
 
 
@@ -137,7 +138,7 @@ class Sorting(Task[SortingView]):
             if view.attached:  # else the planning scene is not up to date yet
                 self._place_held(view)
         elif self._memory.thing is not None:
-            self._lost()
+            self._find_lost(view)
         elif not self._refresh(view):
             self._look(view)
         elif not self._queue_pick(view):
@@ -218,6 +219,7 @@ class Sorting(Task[SortingView]):
             assert isinstance(stage, Move)
             if stage.trajectory is None or any(each.name == "descend" and each.cycle is cycle for each in self.queue):
                 return
+            cycle.inside = self._inside(cycle.chosen.container)
             try:
                 cycle.spot = self._spot(cycle.chosen.thing, cycle.chosen.container, self._below(cycle))
             except Full as full:
@@ -368,20 +370,22 @@ class Sorting(Task[SortingView]):
         self.status.grasp = chosen.grasp.id
         remark = width_remark(view.gripper.width, chosen.grasp.width, self.p.width_tolerance)
         self.status.held, self.status.last = "", f"{cycle.subject}: {remark or 'gripped'}"
-        self._remember(thing=chosen.thing, container=chosen.container, back=False)
+        self._remember(thing=chosen.thing, container=chosen.container, back=False, inside=cycle.inside)
 
     def _released(self, cycle: Pick, view: SortingView) -> None:
         thing, container = self._memory.thing, self._memory.container
         if not container:
             container = next((name for name, box in self.p.world.containers.items()
                               if math.dist(cycle.spot[:2], (box.x, box.y)) < box.half_side), "")
-        done = self._memory.done + 1
-        counts = Counter(self._memory.sorted) + Counter({container: 1})
-        self._remember(done=done, sorted=dict(counts), thing=None, container="", back=False, stirs=0)
+        self._count_sorted(cycle.subject, container)
         size = max(thing.size.x, thing.size.y) / 2 if thing else RADIUS
         height = thing.size.z if thing else RADIUS
         self._dropped = [*self._dropped[-50:], Dropped(container, cycle.spot[:2], size, height)]
-        self._note("one", f"{cycle.subject} to {container}")
+
+    def _count_sorted(self, name: str, container: str) -> None:
+        counts = Counter(self._memory.sorted) + Counter({container: 1})
+        self._remember(done=self._memory.done + 1, sorted=dict(counts), thing=None, container="", back=False, stirs=0)
+        self._note("one", f"{name} to {container}")
 
     def missed(self, stage: Grip, view: SortingView) -> None:
         """Penalize an empty grasp, open, back off and look again."""
@@ -409,12 +413,25 @@ class Sorting(Task[SortingView]):
             if self.status.state != "ERROR":
                 self.queue += self.back_off(view)
 
-    def _lost(self) -> None:
-        """Note that the object fell: nothing is held, and it was not released."""
-        thing = self._memory.thing
-        assert thing is not None
+    def _find_lost(self, view: SortingView) -> None:
+        """Find out by a picture from home whether an object fell, or was released before the task could note it."""
+        assert view.q is not None and self._memory.thing is not None
+        if not is_home(view.q, self.p.robot.named_poses["home"]):
+            self.queue += self.back_off(view)
+            return
+        if not self._refresh(view) or self._heap is None:
+            self._look(view)
+            return
+        thing, container = self._memory.thing, self._memory.container
+        if self._inside(container) > self._memory.inside and not self._memory.back:
+            self._count_sorted(thing.id, container)
+            return
         self._note("slipped", f"{thing.id} fell")
         self._remember(thing=None, container="", back=False)
+
+    def _inside(self, container: str) -> int:
+        """Return how many objects are seen in a container."""
+        return sum(thing.place == container for thing in self._heap.objects) if self._heap is not None else 0
 
     def _note(self, outcome: str, last: str) -> None:
         counts = Counter(self._memory.outcomes) + Counter({outcome: 1})
