@@ -44,6 +44,8 @@ def assert_all_done(line: str, ran: subprocess.CompletedProcess[str]) -> None:
     count = "8" if "count=8" in line else "7"
     wanted = "outlined: 100.0%" if " ur5 " in line else (
         f"DONE, {count} of {count} placed (truth: {count} in the box, 0 on the table)")
+    if " sorting" in line:  # how many of a heap are sorted is measured by benchmarks.grasping
+        wanted = "sorting: DONE, "
     assert ran.returncode == 0, ran.stdout + ran.stderr
     assert wanted in ran.stdout
 
@@ -61,6 +63,8 @@ def test_run_of_the_readme_ends_done(line: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("line", [line for line in RUNS if line not in AS_PROCESSES])
 def test_simulated_run_of_the_readme_ends_done(line: str, tmp_path: Path) -> None:
+    if " sorting" in line:
+        pytest.importorskip("mujoco")
     with no_processes():
         assert_all_done(line, ask(tmp_path, *command(line)[1:], "--domain", str(free_domain())))
 
