@@ -175,7 +175,7 @@ async def run(bus: Bus, config: Config) -> None:
         heap = found.model_copy(update={"seconds": time.perf_counter() - shot.received})
         heaps.put(heap)
         if shown.matched:
-            _, pixels, camera = shot.view
+            _, pixels, camera = detector.registration.apply([shot.view])[0]
             picture = await asyncio.to_thread(annotate_heap, pixels, camera, heap, finder.closing)
             shown.put(array_to_image(picture, "bgr8", shot.image.header))
 

@@ -12,6 +12,7 @@ import numpy.typing as npt
 from applications.sorting.clusters import Identities, Labels, find_objects
 from applications.sorting.foreign import NOTHING, Debounce, ForeignOptions, KnownWorld, RobotAt, bodies, strange_points
 from applications.sorting.places import containers_of, hidden_fraction, tray_of
+from applications.sorting.registration import Registration
 from applications.sorting.seeing import Area, View, denoised, surface_of, world_points
 from applications.sorting.surface import Surface
 from applications.sorting.topics import MAX_OBJECTS, Foreign, Heap, SeenObject
@@ -76,6 +77,7 @@ class HeapDetector:
         self.area = area or area_around([place.area(AROUND) for place in containers])
         self._shapes = KnownShapeFilter(self.geometry)
         self._known = KnownWorld(world, containers, self.area)
+        self.registration = Registration(self.tray)
         self._identities, self._debounce = Identities(), Debounce()
         self._before: Labels | None = None  # labels of the newest image of the tray
         self._at_home: Surface | None = None  # of the newest image from home
@@ -94,6 +96,9 @@ class HeapDetector:
             return None
         robot = RobotAt(q, self.joints.width(stamp), self.robot.fk(q), gripping)
         smooth: list[View] = [(denoised(depth), image, camera) for depth, image, camera in views]
+        if at_home:
+            self.registration.update(smooth)
+        smooth = self.registration.apply(smooth)
         header = Header(stamp=stamp, frame_id=WORLD)
         if not at_home and (self._at_home is None or not self._tray_is_clear(smooth[0])):
             return Seen(Heap(header=header, foreign=self._foreign(smooth, robot)))
