@@ -110,6 +110,10 @@ class ApplicationVerbs:
         verbs: Verbs | None = application.verbs
         if verbs is None:
             return
+        for name, text in verbs.groups.items():
+            if name not in self._groups:
+                self._groups[name] = options.CommandGroup(text)
+                self._app.add_typer(self._groups[name], name=name)
         for name, verb in verbs.commands.items():
             group, _, last = name.rpartition(" ")
             (self._groups[group] if group else self._app).command(last)(with_shared_options(verb))

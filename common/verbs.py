@@ -26,6 +26,8 @@ class Verbs:
 
     commands: Mapping[str, Callable[..., None]] = field(default_factory=dict)
     """By name; "task select" is a command of the group `task`."""
+    groups: Mapping[str, str] = field(default_factory=dict)
+    """Further groups of commands by name, with their help."""
     before_run: Callable[..., BeforeRun] | None = None
     """`before_run(cell, overrides, world, *, ...)`, called before `run` starts a cell; its keyword-only parameters
     become options of `run`."""

@@ -32,7 +32,8 @@ def before_run(
 
 APPLICATION = Application(
     topics=ApplicationTopics(status=Topic("thing_status", TaskStatus, "state", "state")), task="thing",
-    verbs=Verbs(commands={"greet": greet, "task greet": greet}, before_run=before_run),
+    verbs=Verbs(commands={"greet": greet, "task greet": greet, "things greet": greet},
+                groups={"things": "All about things."}, before_run=before_run),
 )
 '''
 
@@ -71,7 +72,9 @@ def output(tmp_path, monkeypatch, capsys):
 
 def test_commands_of_a_custom_application_are_added(output):
     assert output("greet", "cell.yaml", "--set", "a=1", "--loud") == "hello cell.yaml ['a=1'] True CommandShell"
-    assert output("task", "greet", "cell.yaml") == "hello cell.yaml None False CommandShell"
+    for group in ("task", "things"):
+        assert output(group, "greet", "cell.yaml") == "hello cell.yaml None False CommandShell"
+    assert "All about things." in output("things", "--help")
 
 
 def test_options_of_applications_reach_the_run_as_overrides(output):
