@@ -9,6 +9,7 @@ APPLICATION = Application(
     fills_containers=True,
     figures="applications.sorting.figures:SortingFigures",
     page="applications.sorting.page:PAGE",
+    verbs="applications.sorting.verbs:VERBS",
     double=SimulationDouble(
         module="applications.sorting.double",
         replaces=("depth_camera", "grasp_detector"),

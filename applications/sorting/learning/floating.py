@@ -43,6 +43,9 @@ APPROACH = 0.08  # [m] straight line before the grasp
 DESCENT = 0.30  # [m/s]
 CLOSING = 0.10  # [m/s] of the width
 SQUEEZE = 0.10  # [s] at full force before the lift
+CLOSE_TIMEOUT = 0.8  # [s] after the fingers could have closed
+PRESSING, STILL = 0.98, 0.003  # fraction of the force, and speed [m/s], of fingers that press on something
+FULL_FORCE = -0.02  # [m] target of a finger that presses with its full force at any width
 LIFT, LIFT_TIME = 0.25, 0.8  # [m], [s]
 SHAKE, SHAKE_TIME, SHAKE_RATE, SHAKE_TILT = 0.015, 0.7, 3.0, 0.15  # [m], [s], [Hz], [rad]
 LIFTED = 0.12  # [m] an object that rose this far was lifted
@@ -147,6 +150,7 @@ class Bench:
         self._dofs = [int(model.joint(name).dofadr[0]) for name in joints]
         self._hand = int(model.joint(HAND).qposadr[0])
         self._fingers = [int(model.joint(name).qposadr[0]) for name in FINGERS]
+        self._finger_dofs = [int(model.joint(name).dofadr[0]) for name in FINGERS]
         self._finger_bodies = [int(model.body(name).id) for name in FINGERS]
         self._pads = np.flatnonzero(np.isin(model.geom_bodyid, self._finger_bodies))
         self._mocap = int(model.body_mocapid[model.body("target").id])
@@ -248,9 +252,9 @@ class Bench:
         self._place(_retreated(goal, APPROACH), opening)
         mujoco.mj_forward(model, self.data)
         self._descend(goal, watch)
-        self._close(opening, watch)
+        width = self._close(opening, watch)
         self._lift_and_shake(goal, watch)
-        return self._judge(before)
+        return self._judge(before, width)
 
     def _step(self, watch: Callable[[mujoco.MjData], None] | None) -> None:
         mujoco.mj_step(self.model, self.data, STEPS)
@@ -264,18 +268,21 @@ class Bench:
             self._aim(_retreated(goal, APPROACH * (1 - step / steps)))
             self._step(watch)
 
-    def _close(self, opening: float, watch: Any) -> None:
-        """Close by a ramp until the fingers press on something, or each other, for `SQUEEZE`."""
+    def _close(self, opening: float, watch: Any) -> float:
+        """Close by a ramp until the fingers press on something, or each other, for `SQUEEZE`; return the width."""
         tick = STEPS * self.model.opt.timestep
         target, pressed = opening / 2, 0.0
-        while pressed < SQUEEZE:
-            target -= CLOSING / 2 * tick
-            self.data.ctrl[:] = max(target, -0.02)
+        enough = PRESSING * self.model.actuator_forcerange[0, 1]
+        for _ in range(round((opening / CLOSING + CLOSE_TIMEOUT) / tick)):
+            target = max(target - CLOSING / 2 * tick, FULL_FORCE)
+            self.data.ctrl[:] = target
             self._step(watch)
-            force = np.abs(self.data.actuator_force).max()
-            pressed = pressed + tick if force >= 0.98 * self.model.actuator_forcerange[0, 1] else pressed
-            if target < -0.04:  # so deep that the force is at its limit: a finger cannot move
+            still = np.abs(self.data.qvel[self._finger_dofs]).max() < STILL
+            pressed = pressed + tick if still and np.abs(self.data.actuator_force).max() >= enough else 0.0
+            if pressed >= SQUEEZE:
                 break
+        self.data.ctrl[:] = FULL_FORCE
+        return self._width()
 
     def _lift_and_shake(self, goal: Array, watch: Any) -> None:
         tick = STEPS * self.model.opt.timestep
@@ -288,18 +295,21 @@ class Bench:
             self._aim(T)
             self._step(watch)
 
-    def _judge(self, before: Array) -> Outcome:
+    def _width(self) -> float:
+        return 2 * float(self.data.qpos[self._fingers].mean())
+
+    def _judge(self, before: Array, closed: float) -> Outcome:
+        """Return the outcome by the heights (n,) before [m] and the width of the closed fingers [m]."""
         at = self.positions()
         rose = at[:, 2] - before > LIFTED
-        width = 2 * float(self.data.qpos[self._fingers].mean())
         lifted = tuple(np.flatnonzero(rose).tolist())
         lost = int((~rose & ~self._inside(at)).sum())
         result: Result = "held" if len(lifted) == 1 else "two"
         if lost:
             result = "knocked out"
         elif not lifted:
-            result = "empty" if width < CLOSED else "slipped"
-        return Outcome(result, lifted, width, lost)
+            result = "empty" if closed < CLOSED else "slipped"
+        return Outcome(result, lifted, self._width(), lost)
 
 
 def _retreated(T: Array, distance: float) -> Array:

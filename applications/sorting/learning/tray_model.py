@@ -16,6 +16,7 @@ Array = npt.NDArray[np.float64]
 
 TIMESTEP = 0.002  # [s]
 IMPRATIO = 10.0  # friction stiffer than contact: held objects do not creep
+SLEEP = 1e-3  # [m/s] below which objects are at rest
 SOLREF = (0.005, 1.0)  # time constant [s], damping: at 40 N pads sink in by less than 1 mm
 CONDIM = 4  # sliding and torsion
 TORSION, ROLLING = 0.005, 0.0001  # [m]
@@ -55,6 +56,8 @@ def new_spec() -> mujoco.MjSpec:
     option = spec.option
     option.timestep, option.impratio = TIMESTEP, IMPRATIO
     option.integrator, option.cone = mujoco.mjtIntegrator.mjINT_IMPLICITFAST, mujoco.mjtCone.mjCONE_ELLIPTIC
+    option.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP  # of objects at rest: a heap costs a third
+    option.sleep_tolerance = SLEEP
     spec.compiler.boundmass, spec.compiler.boundinertia, spec.compiler.balanceinertia = 1e-4, 1e-7, True
     spec.compiler.degree = False
     return spec
