@@ -115,7 +115,7 @@ def fallen(rig: Rig, objects: Sequence[PhysicalObject], rng: np.random.Generator
         rotations = [_random_rotation(rng) for _ in objects]
         outlines = [silhouette(np.concatenate(list(thing.parts)) @ R.T)
                     for thing, R in zip(objects, rotations, strict=True)]
-        places = stacked(outlines, rig.tray, rig.around.table_height, len(objects) > 1, rng)
+        places = stacked(outlines, rig.tray, rig.around.table_height, rng, heap=len(objects) > 1)
         poses = [transform(R, place) for R, place in zip(rotations, places, strict=True)]
         bench = Bench(objects, poses, rig.tray, rig.shape, rig.around.table_height)
         if bench.settle(2.0 + 0.2 * len(objects)):
