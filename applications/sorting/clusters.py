@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from applications.sorting.describing import Segment, described
-from applications.sorting.places import TABLE, Place, containers_of, features, in_container, on_table
+from applications.sorting.places import TABLE, containers_of, features, in_container, on_table
 from applications.sorting.seeing import crop
 from applications.sorting.segments import segments
 from applications.sorting.surface import Surface
@@ -25,6 +25,9 @@ PAD = 4  # [cells] around a segment that its description uses
 MARGIN = 0.01  # [m] around a container
 SAME_PLACE = 0.02  # [m] an object whose center moved less did not move
 SAME_SIZE = 0.03  # [m] largest difference of length, width or top of one object in two images
+SAME_TOP = 0.02  # [m] difference of heights
+SAME_COLOR = 0.3  # difference of red, green or blue, each 0 to 1
+COVERED = 0.5  # fraction of the smaller one that both cover
 FADES = 5  # images after which an object that is not seen is forgotten
 
 
@@ -117,15 +120,23 @@ class Identities:
     def __init__(self) -> None:
         """Start without objects."""
         self._known: dict[str, tuple[SeenObject, int]] = {}
+        self._before: tuple[Labels, list[SeenObject]] | None = None
         self._next, self._image = 1, 0
 
-    def named(self, found: Sequence[SeenObject]) -> list[SeenObject]:
-        """Return the objects of the newest image with their ids, in the same order."""
+    def named(self, found: Sequence[SeenObject], labels: Labels | None = None) -> list[SeenObject]:
+        """Return the objects of the newest image with their ids, in the same order.
+
+        Args:
+            found: in the newest image.
+            labels: (rows, columns) k + 1 at the cells of found[k]; objects that cover the same cells in two images are
+                the same ones even if their visible size differs.
+        """
         self._image += 1
-        pairs = sorted(
+        pairs = [
             (distance, index, name)
             for index, seen in enumerate(found) for name, (known, _) in self._known.items()
-            if (distance := _difference(seen, known)) < 1)
+            if (distance := _difference(seen, known)) < 1]
+        pairs = sorted([*self._covering(found, labels), *pairs])
         names: dict[int, str] = {}
         for _, index, name in pairs:
             if index not in names and name not in names.values():
@@ -139,7 +150,34 @@ class Identities:
             self._known[names[index]] = named, self._image
             result.append(named)
         self._known = {name: item for name, item in self._known.items() if self._image - item[1] < FADES}
+        self._before = None if labels is None else (labels, result)
         return result
+
+    def _covering(self, found: Sequence[SeenObject], labels: Labels | None) -> list[tuple[float, int, str]]:
+        """Return pairs of objects of this image and the one before that cover the same cells; negative sorts first."""
+        if labels is None or self._before is None or self._before[0].shape != labels.shape:
+            return []
+        earlier, objects = self._before
+        width = len(objects) + 1
+        both = (labels > 0) & (earlier > 0)
+        common = np.bincount(
+            labels[both].astype(np.int64) * width + earlier[both], minlength=(len(found) + 1) * width
+        ).reshape(-1, width)
+        sizes = np.bincount(labels[labels > 0], minlength=len(found) + 1)
+        sizes_before = np.bincount(earlier[earlier > 0], minlength=width)
+        pairs = []
+        for a, b in np.argwhere(common > 0).tolist():
+            share = common[a, b] / max(1, min(sizes[a], sizes_before[b]))
+            if share > COVERED and _alike(found[a - 1], objects[b - 1]):
+                union = sizes[a] + sizes_before[b] - common[a, b]
+                pairs.append((-float(common[a, b] / union), a - 1, objects[b - 1].id))
+        return pairs
+
+
+def _alike(a: SeenObject, b: SeenObject) -> bool:
+    """Return whether two objects have about the same height and color."""
+    color = max(abs(a.color.r - b.color.r), abs(a.color.g - b.color.g), abs(a.color.b - b.color.b))
+    return a.place == b.place and abs(a.top - b.top) < SAME_TOP and color < SAME_COLOR
 
 
 def _difference(a: SeenObject, b: SeenObject) -> float:
@@ -148,7 +186,3 @@ def _difference(a: SeenObject, b: SeenObject) -> float:
     size = max(abs(a.size.x - b.size.x), abs(a.size.y - b.size.y), abs(a.top - b.top)) / SAME_SIZE
     return max(away, size) if a.place == b.place else 1.0
 
-
-def tray_index(found: Sequence[SeenObject], tray: Place) -> list[int]:
-    """Return the indices of the objects that lie in the tray."""
-    return [index for index, seen in enumerate(found) if seen.place == tray.id]

@@ -29,6 +29,7 @@ FLAT_HEIGHT = 0.02  # [m] largest height of a flat one
 ROUND = 0.875  # fraction of its rectangle that a round object covers at most; a circle covers 0.785
 BOX = 0.88  # fraction that a box covers at least
 CONVEX = 0.90  # fraction of its hull that a round object and a box cover at least
+TOP = 0.98  # quantile of the heights that is the top
 STRAY = 0.015  # fraction of cells that may stick out on each side
 GREY = 55  # [0..255] saturation below which an object has no hue
 HUES = ((9, "red"), (20, "orange"), (34, "yellow"), (85, "green"), (130, "blue"), (165, "purple"), (181, "red"))
@@ -61,7 +62,7 @@ def described(segment: Segment, name: str, place: str, floor: float) -> SeenObje
     rows, columns = np.nonzero(mask)
     xy = surface.xy(rows, columns)
     z = surface.top[rows, columns].astype(float)
-    center, top = xy.mean(axis=0), float(np.percentile(z, 98))
+    center, top = xy.mean(axis=0), float(np.sort(z)[int(TOP * (len(z) - 1))])
     bottom = min(_support(segment, floor), top - DROP / 2)
     hull = cv2.convexHull((xy - center).astype(np.float32)).reshape(-1, 2).astype(float)
     length, width, yaw = _principal(xy - center, surface.step)
@@ -87,7 +88,7 @@ def _support(segment: Segment, floor: float) -> float:
     high = lower[lower > floor + 2 * DROP]
     if len(high) < ON_OTHERS * count:
         return floor
-    return float(np.percentile(high, 50))
+    return float(np.median(high))
 
 
 def _principal(offsets: Array, step: float) -> tuple[float, float, float]:
@@ -106,8 +107,8 @@ def _principal(offsets: Array, step: float) -> tuple[float, float, float]:
 
 def _extent(values: Array) -> float:
     """Return the extent of evenly spread values (n,) without a few that stick out."""
-    low, high = np.percentile(values, (100 * STRAY, 100 - 100 * STRAY))
-    return float(high - low) / (1 - 2 * STRAY)
+    ordered, out = np.sort(values), int(STRAY * len(values))
+    return float(ordered[-1 - out] - ordered[out]) / (1 - 2 * out / len(values))
 
 
 def _outline(hull: Array, center: Array, step: float) -> list[tuple[float, float]]:

@@ -112,7 +112,7 @@ class HeapDetector:
         self._known.update(without(surface, labels == -1), self.world.table_height + self.options.ceiling)
         foreign = [*self._foreign(smooth, robot), *large][:MAX_OBJECTS]
         self._before = np.maximum(labels, 0)
-        heap = Heap(header=header, at_home=True, objects=self._identities.named(objects), foreign=foreign,
+        heap = Heap(header=header, at_home=True, objects=self._identities.named(objects, self._before), foreign=foreign,
                     hidden=hidden_fraction(surface, self.tray))
         return Seen(heap, surface, self._before)
 
