@@ -56,25 +56,25 @@ def find_objects(
         colors = features(piece.color)
         inside = in_container(piece, colors, place)
         gain = inside.gain
-        _add(found, labels[part], piece, inside.mask, inside.near_wall, inside.gain, place.id, place.floor,
+        _add(found, labels[part], piece, colors, inside.mask, inside.near_wall, inside.gain, place.id, place.floor,
              None if before is None else before[part])
     mask = on_table(surface, containers, world)
     for part in _islands(mask):
         piece = _piece(surface, part)
         nowhere = np.zeros(piece.top.shape, bool)
-        _add(found, labels[part], piece, mask[part], nowhere, gain, TABLE, world.table_height,
+        _add(found, labels[part], piece, features(piece.color), mask[part], nowhere, gain, TABLE, world.table_height,
              None if before is None else before[part])
     return labels, found
 
 
 def _add(
-    found: list[SeenObject], labels: Labels, piece: Surface, mask: Bools, near_wall: Bools, gain: Values, place: str,
-    floor: float, before: Labels | None,
+    found: list[SeenObject], labels: Labels, piece: Surface, colors: Values, mask: Bools, near_wall: Bools,
+    gain: Values, place: str, floor: float, before: Labels | None,
 ) -> None:
     """Append the objects of a mask to those found, and write their labels."""
     if not mask.any():
         return
-    parts = segments(mask, piece.top, features(piece.color), before)
+    parts = segments(mask, piece.top, colors, before)
     boxes = _boxes(parts.labels, parts.count)
     for number, box in enumerate(boxes, 1):
         if len(found) >= MAX_OBJECTS:

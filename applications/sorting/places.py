@@ -91,7 +91,7 @@ def features(color: npt.NDArray[np.uint8]) -> Colors:
     which shading changes a part only. A distance of 1 is a different color.
     """
     values = color.astype(np.float32) + np.float32(DARK)
-    total = values.sum(axis=-1)
+    total = values[..., 0] + values[..., 1] + values[..., 2]
     result = np.empty(values.shape, np.float32)
     np.divide(values[..., 2], total, out=result[..., 0])
     np.divide(values[..., 0], total, out=result[..., 1])
@@ -103,7 +103,8 @@ def features(color: npt.NDArray[np.uint8]) -> Colors:
 
 def color_distance(a: Colors, b: Colors) -> Values:
     """Distance (...) of colors (..., 3) of `features`."""
-    return np.asarray(np.sqrt(((a - b) ** 2).sum(axis=-1)), np.float32)
+    apart = a - b
+    return np.asarray(np.sqrt(np.einsum("...k,...k->...", apart, apart)), np.float32)
 
 
 @dataclass(frozen=True, eq=False)

@@ -91,7 +91,7 @@ def _color_edges(colors: Colors) -> Bools:
     smooth = cv2.medianBlur(colors, 3)
     cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
     change = cv2.morphologyEx(smooth, cv2.MORPH_GRADIENT, cross)
-    return np.asarray(np.sqrt((change**2).sum(axis=-1)) > 1)
+    return np.asarray(np.einsum("...k,...k->...", change, change) > 1)
 
 
 def _grooves(height: Values, mask: Bools) -> Bools:
