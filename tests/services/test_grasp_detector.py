@@ -16,7 +16,7 @@ from common.messages import GripperState, Header
 from common.perception.image import image_to_array
 from services import grasp_detector
 from tests.applications.sorting.scenes import BLUE, GREEN, RED, box, tray_world, view_of
-from tests.services.fake_cell import FakeCell, until
+from tests.services.fake_cell import FakeCell, settle, until
 
 FRAME = "depth_camera_optical_frame"
 ROBOT = load_robot("panda")
@@ -35,11 +35,12 @@ class SortingCell(FakeCell):
         self.calibrate(view_of([])[2], FRAME, topics.DEPTH_CAMERA_INFO)
         self.put(topics.GRIPPER_STATE, GripperState(header=Header(), width=0.08))
 
-    def arm(self, stamp: int, *, away: float = 0.0) -> None:
-        """Publish joint positions about the time of an image."""
+    async def arm(self, stamp: int, *, away: float = 0.0) -> None:
+        """Publish joint positions before and after an image, and let the service read each."""
         q = [value + away for value in ROBOT.named_poses["home"]]
         for at in (stamp - SECOND // 50, stamp + SECOND // 50):
             self.put_joints([*ROBOT.joints, *ROBOT.gripper.joints], [*q, 0.04, 0.04], at)
+            await settle()
 
     def image(self, meshes, stamp: int, *, depth_first: bool = True, encoding: str = "32FC1") -> None:
         depth, color, _ = view_of(meshes, stamp % 97)
@@ -57,22 +58,9 @@ async def cell() -> AsyncIterator[SortingCell]:
         yield fake
 
 
-async def settled(cell: SortingCell, stamp: int, away: float = 0.0) -> None:
-    """Publish the arm's position and let the service read it."""
-    cell.arm(stamp, away=away)
-    for _ in range(50):
-        await until_idle()
-
-
-async def until_idle() -> None:
-    import asyncio
-
-    await asyncio.sleep(0)
-
-
 @pytest.mark.parametrize(("depth_first", "encoding"), [(True, "32FC1"), (False, "32FC1"), (True, "16UC1")])
 async def test_objects_have_proved_grasps_at_their_own_places(cell, depth_first, encoding) -> None:
-    await settled(cell, SECOND)
+    await cell.arm(SECOND)
     cell.image(MESHES, SECOND, depth_first=depth_first, encoding=encoding)
     heap = await until(cell.heaps)
     assert (heap.header.stamp, heap.at_home, heap.foreign) == (SECOND, True, [])
@@ -91,7 +79,7 @@ async def test_objects_have_proved_grasps_at_their_own_places(cell, depth_first,
 
 async def test_image_shows_outlines_where_the_objects_are(cell) -> None:
     shown = cell.reader(HEAP_IMAGE)
-    await settled(cell, SECOND)
+    await cell.arm(SECOND)
     cell.image([box(0.62, 0.12, (0.05, 0.05, 0.05), GREEN)], SECOND)
     picture = image_to_array(await until(shown)).astype(int)
     before = view_of([box(0.62, 0.12, (0.05, 0.05, 0.05), GREEN)], SECOND % 97)[1].astype(int)
@@ -103,11 +91,11 @@ async def test_image_shows_outlines_where_the_objects_are(cell) -> None:
 
 
 async def test_away_from_home_only_foreign_bodies_are_published(cell) -> None:
-    await settled(cell, SECOND)
+    await cell.arm(SECOND)
     cell.image(MESHES, SECOND)
     assert (await until(cell.heaps)).at_home
     for number in (2, 3):
-        await settled(cell, number * SECOND, away=0.2)
+        await cell.arm(number * SECOND, away=0.2)
         cell.image([*MESHES, HAND], number * SECOND)
         heap = await until(cell.heaps)
         assert not heap.at_home and heap.objects == [] and heap.grasps == []
@@ -115,14 +103,14 @@ async def test_away_from_home_only_foreign_bodies_are_published(cell) -> None:
 
 
 async def test_unusable_images_do_not_end_the_service(cell) -> None:
-    await settled(cell, SECOND)
+    await cell.arm(SECOND)
     depth, color, _ = view_of(MESHES)
     cell.put_image(topics.DEPTH_CAMERA_DEPTH, depth[:100], "32FC1", SECOND, FRAME)  # wrong size
     cell.put_image(topics.DEPTH_CAMERA_IMAGE, color, "bgr8", SECOND, FRAME)
     cell.put_image(topics.DEPTH_CAMERA_IMAGE, color, "bgr8", SECOND + 1, FRAME)  # without depth
     cell.put_image(topics.DEPTH_CAMERA_DEPTH, np.full_like(depth, np.nan), "32FC1", SECOND + 2, FRAME)
     cell.put_image(topics.DEPTH_CAMERA_IMAGE, color, "bgr8", SECOND + 2, FRAME)  # without any measurement
-    await settled(cell, 2 * SECOND)
+    await cell.arm(2 * SECOND)
     cell.image(MESHES, 2 * SECOND)
     assert len((await until(cell.heaps, lambda heap: heap.header.stamp == 2 * SECOND)).objects) == 2
 
@@ -131,4 +119,4 @@ async def test_unknown_tray_is_refused_with_the_choices() -> None:
     fake = SortingCell()
     with pytest.raises(ConfigError, match=r"services.grasp_detector.tray.*tray, left, right"):
         async with fake.running(grasp_detector, grasp_detector.Config(robot=ROBOT, world=WORLD, tray="bin")):
-            await until_idle()
+            await settle()
