@@ -51,7 +51,7 @@ async def run(bus: Bus, config: Config) -> None:
 
     async def watch_heap() -> None:
         async for heap in heaps:
-            scene.update_heap(heap)
+            scene.update_heap(heap, tool())
             if gripper.latest is not None:  # the tool may have been unknown before
                 scene.update_gripper(gripper.latest, tool())
             out.put(scene.scene())

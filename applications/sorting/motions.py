@@ -73,14 +73,23 @@ def take(cycle: Pick, gripper: GripperConfig, view: View) -> list[Stage]:
     """Return descend, close, and the way across to the release, for the chosen grasp."""
     assert cycle.chosen is not None
     grasp, thing = cycle.chosen.grasp, cycle.chosen.thing
-    near = neighbors(view, place_of(grasp.pose)[:2])
-    fingers = [(link, name) for link in gripper.links for name in near]
-    descend = Move("descend", "GRASPING", cycle, goal=m.PoseGoal(pose=grasp.pose), straight=True, touches=fingers,
+    down, up = contacts(cycle, gripper, view)
+    descend = Move("descend", "GRASPING", cycle, goal=m.PoseGoal(pose=grasp.pose), straight=True, touches=down,
                    needs_full_plan=True)
     close = Grip("close", "GRASPING", cycle, width=0.0, holds=True, early=True,
                  effort=grip_force(thing.volume, gripper.max_effort))
-    touches = [*fingers, *((thing.id, name) for name in [*near, *supports(thing, view)] if name != thing.id)]
-    return [descend, close, *carry(cycle, grasp.pose, touches)]
+    return [descend, close, *carry(cycle, grasp.pose, up)]
+
+
+def contacts(
+    cycle: Pick, gripper: GripperConfig, view: View,
+) -> tuple[list[tuple[str, str]], list[tuple[str, str]]]:
+    """Return the pairs that may touch on the way down to the chosen grasp, and on the way up."""
+    assert cycle.chosen is not None
+    grasp, thing = cycle.chosen.grasp, cycle.chosen.thing
+    near = neighbors(view, place_of(grasp.pose)[:2])
+    fingers = [(link, name) for link in gripper.links for name in near]
+    return fingers, [*fingers, *((thing.id, name) for name in [*near, *supports(thing, view)] if name != thing.id)]
 
 
 def carry(cycle: Pick, start: m.Pose, touches: list[tuple[str, str]]) -> list[Stage]:

@@ -10,6 +10,7 @@ import numpy.typing as npt
 from applications.sorting.topics import Foreign, Heap, SeenObject
 from common import messages as m
 from common.config import Surroundings
+from common.errors import ConfigError
 from common.robot.transforms import invert, matrix_to_pose, pose_to_matrix
 from common.scene.fixtures import fixed_objects
 
@@ -21,6 +22,7 @@ LEAST_SIDE = 0.004  # [m]
 GROWN = 0.004  # [m] by which a held object is larger than it was seen: its hidden sides, and its motion in the grasp
 REACH = 0.06  # [m] from the tool to the outline of an object that is held
 UNKNOWN = 0.08  # [m] height of a held object that was not seen before
+IN_TRAY = 0.25  # [m] height of a tool above the table from which on it is not in the tray
 MOST_SEEN = 300  # objects of a planning scene
 
 
@@ -85,20 +87,36 @@ class SortingScene:
     """
 
     def __init__(self, around: Surroundings, tcp_link: str, tray: str = "tray") -> None:
-        """Start with fixtures and containers only."""
-        self._fixed, self._tcp_link, self._tray = fixed_objects(around), tcp_link, tray
+        """Start with fixtures and containers only.
+
+        Raises:
+            ConfigError: the world has no such tray.
+        """
+        if tray not in around.containers:
+            raise ConfigError("services.sorting_scene.tray", tray,
+                              f"is no container; choices: {', '.join(around.containers) or 'none'}")
+        self._fixed, self._tcp_link = fixed_objects(around), tcp_link
         self._containers = set(around.containers) - {tray}
+        box = around.containers[tray]
+        self._above_tray, self._half = np.array([box.x, box.y, around.table_height]), box.half_side
         self._objects: list[SeenObject] = []
         self._foreign: list[Foreign] = []
         self._stamp = self._settled = 0
         self._holding = False
         self.held: m.CollisionObject | None = None
 
-    def update_heap(self, heap: Heap) -> None:
-        """Take what an image shows; away from home only its foreign bodies."""
+    def update_heap(self, heap: Heap, T_world_tcp: Array | None = None) -> None:
+        """Take what an image shows; while the tool is in the tray only its foreign bodies: the image is older.
+
+        Motions into the tray are planned by the objects that it showed before.
+        """
         self._stamp, self._foreign = heap.header.stamp, heap.foreign
-        if heap.at_home:
+        if heap.at_home and not (T_world_tcp is not None and self._is_in_tray(T_world_tcp)):
             self._objects, self._settled = heap.objects[:MOST_SEEN], heap.header.stamp
+
+    def _is_in_tray(self, T_world_tcp: Array) -> bool:
+        x, y, z = T_world_tcp[:3, 3] - self._above_tray
+        return bool(max(abs(x), abs(y)) < self._half and z < IN_TRAY)
 
     def update_gripper(self, state: m.GripperState, T_world_tcp: Array | None) -> bool:
         """Attach the object under the tool once the gripper holds something; return whether that changed.

@@ -320,7 +320,24 @@ class Sorting(Task[SortingView]):
         if isinstance(cycle, Pick) and stage.name == "release" and not cycle.checked:
             return self._check(cycle, view)
         if isinstance(cycle, Pick) and stage.name == "descend":
+            if self._replans(cycle, view):
+                return False
             self.images_after, self._heap, self._descending = view.now, None, cycle
+        return True
+
+    def _replans(self, cycle: Pick, view: SortingView) -> bool:
+        """Return whether the scene has other objects near the grasp than when it was planned: it is planned again."""
+        down, up = motions.contacts(cycle, self.gripper, view)
+        moves = [stage for stage in self.queue if isinstance(stage, Move) and stage.cycle is cycle]
+        known = {pair for stage in moves if stage.name == "descend" for pair in stage.touches}
+        if known.issuperset(down):
+            return False
+        for stage in moves:
+            stage.touches, stage.trajectory = (down if stage.name == "descend" else up), None
+            for other in stage.fallback:
+                if isinstance(other, Move) and other.name == "lift":
+                    other.touches = up
+        self._planning = None
         return True
 
     def _check(self, cycle: Pick, view: SortingView) -> bool:

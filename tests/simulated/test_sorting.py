@@ -66,7 +66,8 @@ def test_rule_decides_the_container(setting, places):
 
 
 def test_function_of_the_user_decides_the_container(tmp_path, monkeypatch):
-    (tmp_path / "own_rule.py").write_text("def choose(thing):\n    return 'left' if thing.id == 'blue_can' else 'right'\n")
+    rule = "def choose(thing):\n    return 'left' if thing.id == 'blue_can' else 'right'\n"
+    (tmp_path / "own_rule.py").write_text(rule)
     monkeypatch.chdir(tmp_path)
     outcome, observer = run("services.sorter={by: 'own_rule:choose'}")
     assert outcome.state == "DONE", outcome
