@@ -7,7 +7,8 @@ import time
 from collections import deque
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Annotated
+from pathlib import Path
+from typing import Annotated, Literal
 
 import cv2
 from pydantic import Field
@@ -15,9 +16,10 @@ from pydantic import Field
 from applications.sorting.detector import HeapDetector, Seen
 from applications.sorting.drawing import annotate_heap
 from applications.sorting.foreign import ForeignOptions
-from applications.sorting.grasp_finder import GraspFinder
+from applications.sorting.grasp_finder import NUMBERS, GraspFinder
 from applications.sorting.grasps.candidates import Options
 from applications.sorting.grasps.proof import ProofOptions
+from applications.sorting.learning.network import SHIPPED, Network
 from applications.sorting.seeing import View
 from applications.sorting.topics import HEAP, HEAP_IMAGE, Heap
 from common import topics
@@ -46,6 +48,10 @@ class Config(Parameters):
     tray: str = Field("tray", description="id of the container with the objects; all others are destinations")
     views: list[ViewName] = Field([], max_length=4, description="names of several cameras, the main one first, as "
                                                                 "left: left/depth_camera/image_raw")
+    scorer: Literal["geometric", "learned"] = Field("geometric", description="what ranks grasps: weighted features, or "
+                                                                             "a network that learned from tries")
+    network: str = Field("", max_length=1000, description="with learned: .onnx file of `zencell grasp train`; empty: "
+                                                          "the included one")
     grasps: Options | None = Field(None, description="limits of grasps: depth, slack, spares, tilts, ...")
     proof: ProofOptions | None = Field(None, description="how many grasps are proved and for how long: wanted, "
                                                          "for_each, seconds, approach, ...")
@@ -122,9 +128,11 @@ async def run(bus: Bus, config: Config) -> None:
     home = HomeMonitor(config.robot.named_poses["home"])
     detector = await asyncio.to_thread(
         HeapDetector, config.world, config.robot, tray=config.tray, field_name=f"services.{bus.service}.tray")
+    network = Network.load(Path(config.network) if config.network else SHIPPED, NUMBERS) \
+        if config.scorer == "learned" else None
     finder = await asyncio.to_thread(
-        GraspFinder, config.world, config.robot, config.tray, options=config.grasps,
-        proof=config.proof)
+        GraspFinder, config.world, config.robot, config.tray, options=config.grasps, proof=config.proof,
+        network=network)
     await bus.ready()
 
     async def watch_arm() -> None:

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from applications.sorting.clusters import Labels
-from applications.sorting.grasps.candidates import Options, candidates
+from applications.sorting.grasps.candidates import Candidates, Options, candidates
 from applications.sorting.grasps.gripper_shape import GripperShape
 from applications.sorting.grasps.height_map import Walls
 from applications.sorting.grasps.proof import ProofOptions, Prover
-from applications.sorting.grasps.scoring import GeometricScorer, Scorer
+from applications.sorting.grasps.scoring import FEATURES
+from applications.sorting.learning.network import Network
+from applications.sorting.learning.patches import patches_of
 from applications.sorting.seeing import crop
 from applications.sorting.surface import Surface
 from applications.sorting.topics import MAX_OBJECTS, Grasp, Left, SeenObject
@@ -21,6 +23,8 @@ from common.config import RobotConfig, Surroundings
 
 MARGIN = 0.04  # [m] of the surface around the tray
 REASON = 200  # longest reason
+GEOMETRIC, LEARNED = "geometric", "learned"  # scorers
+NUMBERS = (*FEATURES, "opening", "height")  # what a network gets besides the patch: width and height of the tool [m]
 
 
 @dataclass(frozen=True)
@@ -37,14 +41,14 @@ class GraspFinder:
 
     def __init__(
         self, world: Surroundings, robot: RobotConfig, tray: str, *, options: Options | None = None,
-        proof: ProofOptions | None = None, scorer: Scorer | None = None,
+        proof: ProofOptions | None = None, network: Network | None = None,
     ) -> None:
-        """Load the robot.
+        """Load the robot; with a network, candidates are ranked by it.
 
         Raises:
             ConfigError: the robot has no gripper with fingers, or a file of it is missing.
         """
-        self.options, self.scorer = options or Options(), scorer or GeometricScorer()
+        self.options, self._network = options or Options(), network
         self._tray, self._place = tray, world.containers[tray]
         self._walls = [Walls.of(self._place, world.table_height)]
         self._prover = Prover(robot, world, proof)
@@ -60,19 +64,35 @@ class GraspFinder:
         """
         inside = [index for index, seen in enumerate(objects) if seen.place == self._tray]
         if not inside:
-            return Found([], [], self.scorer.name)
+            return Found([], [], self.scorer)
         r, box = self._place.half_side + MARGIN, self._place
         piece, part = crop(surface, (box.x - r, box.y - r, box.x + r, box.y + r))
         in_tray = np.zeros(len(objects) + 1, np.int32)
         in_tray[np.array(inside) + 1] = np.array(inside) + 1
         found = candidates(piece, in_tray[labels[part]], self.gripper, self.options, np.random.default_rng(0),
-                           self._walls, self.scorer)
+                           self._walls)
+        if self._network is not None:
+            found = self._ranked(found, piece, self._network)
         names = [seen.id for seen in objects]
         proof = self._prover.prove(found, names)
         proved = {grasp.object for grasp in proof.grasps if grasp.proved}
         left = [Left(object=names[index], reason=proof.reasons.get(index, "no free edge")[:REASON])
                 for index in inside if names[index] not in proved]
-        return Found(proof.grasps, left[:MAX_OBJECTS], self.scorer.name)
+        return Found(proof.grasps, left[:MAX_OBJECTS], self.scorer)
+
+    @property
+    def scorer(self) -> str:
+        """Name of what ranks the grasps."""
+        return GEOMETRIC if self._network is None else LEARNED
+
+    def _ranked(self, found: Candidates, surface: Surface, network: Network) -> Candidates:
+        """Return candidates in the order of the network, whose estimate becomes their score."""
+        if not len(found):
+            return found
+        numbers = np.column_stack([found.features, found.opening, found.T[:, 2, 3] - surface.floor])
+        score = network.score(patches_of(surface, found.T @ self.gripper.T_tcp_closing), numbers.astype(np.float32))
+        scored = replace(found, score=score, parts={**found.parts, LEARNED: score})
+        return scored.select(np.argsort(-score, kind="stable"))
 
     @property
     def closing(self) -> npt.NDArray[np.float64]:
