@@ -13,7 +13,7 @@ from applications.sorting.clusters import Identities, Labels, find_objects
 from applications.sorting.foreign import NOTHING, Debounce, ForeignOptions, KnownWorld, RobotAt, bodies, strange_points
 from applications.sorting.places import containers_of, hidden_fraction, tray_of
 from applications.sorting.registration import Registration
-from applications.sorting.seeing import Area, View, denoised, surface_of, world_points
+from applications.sorting.seeing import Area, View, denoised, heights_of, points_at, surface_of
 from applications.sorting.surface import Surface
 from applications.sorting.topics import MAX_OBJECTS, Foreign, Heap, SeenObject
 from common.config import RobotConfig, Surroundings
@@ -126,7 +126,7 @@ class HeapDetector:
             return False
         inside = np.zeros(depth.shape, np.uint8)
         cv2.fillConvexPoly(inside, cv2.convexHull(np.round(pixels).astype(np.int32)), 1)
-        z = world_points(depth, camera)[2].reshape(depth.shape)[inside > 0]
+        z = heights_of(depth, camera).reshape(depth.shape)[inside > 0]
         with np.errstate(invalid="ignore"):
             return int((z > self.world.table_height + self.options.ceiling).sum()) < FEWEST
 
@@ -148,12 +148,12 @@ class HeapDetector:
         """Return the surface without the robot and without what is above the ceiling."""
         cleared: list[View] = []
         for depth, image, camera in views:
-            x, y, z = world_points(depth, camera)
+            z = heights_of(depth, camera)
             with np.errstate(invalid="ignore"):
                 drop = z > self.world.table_height + self.options.ceiling
                 high = np.flatnonzero((z > self.world.table_height + LOW) & ~drop)
             if len(high):
-                points = np.column_stack([x[high], y[high], z[high]]).astype(float)
+                points = points_at(high, depth, camera)
                 own = self._shapes.mask(NOTHING, robot.q, points, margin=ROBOT, object_margin=0.0,
                                         width=robot.width)
                 drop[high[own]] = True

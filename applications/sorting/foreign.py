@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from applications.sorting.places import AROUND, Place, reach_of
-from applications.sorting.seeing import Area, world_points
+from applications.sorting.seeing import Area, heights_of, points_at
 from applications.sorting.surface import Surface
 from applications.sorting.topics import MAX_OBJECTS, Foreign
 from common.config import Surroundings
@@ -112,12 +112,12 @@ def strange_points(
     depth: Depth, camera: Pinhole, known: KnownWorld, robot: RobotAt, shapes: KnownShapeFilter, options: ForeignOptions
 ) -> Array:
     """Return points (n, 3) [m] in world of a depth image that may be foreign bodies."""
-    sampled = depth[::STRIDE, ::STRIDE]
+    sampled = np.ascontiguousarray(depth[::STRIDE, ::STRIDE])
     coarse = _coarse(camera)
-    x, y, z = world_points(np.ascontiguousarray(sampled), coarse)
+    z = heights_of(sampled, coarse)
     with np.errstate(invalid="ignore"):
         candidate = (z > known.top.min() + options.rises) & (z < known.table + options.top)
-    points = np.column_stack([x[candidate], y[candidate], z[candidate]]).astype(float)
+    points = points_at(np.flatnonzero(candidate), sampled, coarse)
     points = points[known.above(points) > options.rises]
     if not len(points):
         return points

@@ -103,6 +103,17 @@ def _directions(camera: Pinhole) -> tuple[Values, Values, Values]:
     return x, y, z
 
 
+def heights_of(depth: Depth, camera: Pinhole) -> Values:
+    """z (height * width,) [m] in world of all pixels; NaN where nothing is measured."""
+    return np.asarray(np.float32(camera.position[2]) + depth.ravel() * _directions(camera)[2], np.float32)
+
+
+def points_at(pixels: npt.NDArray[np.int64], depth: Depth, camera: Pinhole) -> Array:
+    """Points (n, 3) [m] in world of some pixels (n,), given by their flat indices."""
+    along = np.column_stack([axis[pixels] for axis in _directions(camera)])
+    return np.asarray(camera.position + depth.ravel()[pixels, None].astype(float) * along)
+
+
 def world_points(depth: Depth, camera: Pinhole) -> tuple[Values, Values, Values]:
     """x, y and z (height * width,) [m] in world of all pixels; NaN where nothing is measured."""
     x, y, z = _directions(camera)
