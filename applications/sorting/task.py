@@ -37,6 +37,7 @@ LOWERED = 0.015  # [m] above its support at which an object is put back
 MOST_FAILURES = 25  # in a row; each pick that has no plan is one
 STEADY = 0.6  # share of images that show an object at the same place
 SAME = 0.025  # [m]
+STILL = 0.01  # [m] that an object at rest may seem to move between two images
 NO_MOTION = ("no_ik", "collision")  # errors of a goal itself; a planner without an answer says nothing about it
 OLD = 20.0  # [s] an older image decides nothing, also while the arm only was on its way
 
@@ -141,7 +142,7 @@ class Sorting(Task[SortingView]):
             self._find_lost(view)
         elif not self._refresh(view):
             self._look(view)
-        elif not self._queue_pick(view):
+        elif not self._queue_pick(view) and len(self._recent) > 1:  # one image does not show what is at rest
             self._nothing_to_take(view)
 
     def decide_ahead(self, running: Stage, view: SortingView) -> None:
@@ -188,12 +189,19 @@ class Sorting(Task[SortingView]):
         return any(max(abs(x - box.x), abs(y - box.y)) < box.half_side
                    for name, box in self.p.world.containers.items() if name != self.p.tray)
 
+    def _is_at_rest(self, thing: SeenObject, heap: Heap) -> bool:
+        """Return whether an earlier image shows the object, too: what still falls or rolls is not gripped."""
+        here = (thing.center.x, thing.center.y, thing.top)
+        return any(math.dist((other.center.x, other.center.y, other.top), here) < STILL
+                   for each in self._recent if each is not heap for other in each.objects)
+
     def _queue_pick(self, view: SortingView) -> bool:
         """Queue the approach of the best grasps; return whether there is one."""
         if not self._refresh(view) or self._heap is None:
             return False
         heap = self._heap
         options = self._choice.options(heap, view.now, self.p.penalty, self.p.most_tries)
+        options = [option for option in options if self._is_at_rest(option.thing, heap)]
         if not options:
             return False
         cycle = Pick(options[0].thing.id, options=options, before=self._choice.left(heap))
