@@ -44,8 +44,11 @@ def export(request: ExportRequest) -> None:
     """
     if not request.targets:
         raise ConfigError("export", ..., f"needs one or more of {FORMATS}")
+    stems = [Path(file).stem for file in request.files]
     for option, target in request.targets.items():
         _require_target(option, Path(target), len(request.files))
+        if option in FOLDERS and len(set(stems)) < len(stems):
+            raise ConfigError(option, target, "has a folder for each recording: two recordings have the same name")
     for option, write in WHOLE.items():
         if option in request.targets:
             paths = [Path(file) for file in request.files]

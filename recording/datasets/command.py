@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 
 from common.errors import ConfigError
-from common.terminal import printable
+from common.terminal import Progress, printable
 from recording.datasets.alignment import Choice
 from recording.datasets.episode import (
     GRIPPER,
@@ -29,6 +28,7 @@ from recording.datasets.robomimic import RobomimicWriter
 from recording.reader import Recording
 from recording.sample import Decoder
 from recording.selection import Selection
+from recording.writer import FULL, ExportFailed
 
 RULES = {
     "times": "frame k is at start_ns + k / fps; header stamps, of images that of the exposure",
@@ -36,6 +36,7 @@ RULES = {
     "state": "positions of joint_states; gripper.width of gripper/state is the newest at or before the frame",
     "action": "state of the next frame; of the last frame its own",
 }
+NO_DEPTH = "  {}: depth left out, LeRobot v3.0 has no feature for it; --hdf5 has"
 
 
 @dataclass(frozen=True)
@@ -58,6 +59,9 @@ class Writer(Protocol):
     def close(self, provenance: dict[str, Any]) -> None:
         """Finish the files."""
 
+    def abandon(self) -> None:
+        """Release files that were not finished."""
+
 
 def write_lerobot(
     paths: Sequence[Path], folder: Path, selection: Selection, options: DatasetOptions, say: Callable[[str], None],
@@ -69,8 +73,8 @@ def write_lerobot(
         RecordingError: a recording is damaged, or differs from the first.
     """
     _require_new_folder("--lerobot", folder)
-    _write("--lerobot", paths, folder, selection, options, say,
-           lambda part, fps, robot: LeRobotWriter(part, fps, robot, embed=options.embed_images))
+    _write(paths, folder, selection, options, say,
+           lambda part, fps, robot: LeRobotWriter(part, fps, robot, embed=options.embed_images), depth=False)
 
 
 def write_robomimic(
@@ -82,12 +86,12 @@ def write_robomimic(
         ConfigError: an option or a recording lacks something.
         RecordingError: a recording is damaged, or differs from the first.
     """
-    _write("--hdf5", paths, file, selection, options, say, lambda part, fps, robot: RobomimicWriter(part, fps))
+    _write(paths, file, selection, options, say, lambda part, fps, robot: RobomimicWriter(part, fps), depth=True)
 
 
 def _write(
-    option: str, paths: Sequence[Path], target: Path, selection: Selection, options: DatasetOptions,
-    say: Callable[[str], None], create: Callable[[Path, int, str], Writer],
+    paths: Sequence[Path], target: Path, selection: Selection, options: DatasetOptions,
+    say: Callable[[str], None], create: Callable[[Path, int, str], Writer], *, depth: bool,
 ) -> None:
     """Write all episodes to a hidden neighbor of the target, which gets its name once it is complete."""
     max_gap = _number("--max-gap", options.max_gap, MAX_GAP)
@@ -96,19 +100,23 @@ def _write(
         raise ConfigError("--task", tasks, f"must be one for all, or one for each of the {len(paths)} recordings")
     part = target.with_name(f".{target.name}.part")
     fps, writer, episodes = _fps(options.fps), None, list[dict[str, Any]]()
+    without_depth = list[str]()
     try:
         for number, path in enumerate(paths):
-            with ExitStack() as stack:
-                recording, decoder = stack.enter_context(Recording(path)), Decoder()
+            decoder = Decoder()
+            with Progress(f"reading {path}") as read, Recording(path, read) as recording:
                 selection.require_in(recording.topics(), path, "--topics")
                 streams = read_streams(recording, camera_topics(recording, selection), decoder)
+                if not depth:
+                    without_depth = [camera.topic for camera in streams.cameras if camera.depth]
+                    streams = replace(streams, cameras=tuple(each for each in streams.cameras if not each.depth))
                 fps = fps or _camera_rate(streams.cameras, path)
                 episode = align(recording, streams, fps, max_gap)
                 robot = options.robot_type or episode.cell or "unknown"
                 writer = writer or create(part, fps, robot)
                 task = tasks[min(number, len(tasks) - 1)] if tasks else f"run the cell {episode.cell}"
                 writer.add(recording, episode, task)
-            for line in report(number, episode, task, depth=option != "--lerobot"):
+            for line in [*report(number, episode, task), *map(NO_DEPTH.format, without_depth)]:
                 say(line)
             for topic, count in sorted((decoder.skipped + decoder.unfit).items()):
                 say(f"  {printable(topic)}: {count:,} messages cannot be read, or have no stamp or pixels: left out")
@@ -116,12 +124,20 @@ def _write(
         assert writer is not None  # the command requires a recording
         writer.close({"rules": RULES, "episodes": episodes})
         part.replace(target)
+    except OSError as error:
+        raise ExportFailed(target, "the disk is full" if _is_full(error) else str(error)) from None
     finally:
+        if writer is not None:
+            writer.abandon()
         if part.is_dir():
             shutil.rmtree(part)
         part.unlink(missing_ok=True)
     frames = sum(each["frames"] for each in episodes)
     say(f"{target}: {len(episodes)} episodes, {frames:,} frames at {fps} Hz")
+
+
+def _is_full(error: OSError) -> bool:
+    return error.errno in FULL or "No space left" in str(error)  # HDF5 gives no number
 
 
 def _require_new_folder(option: str, folder: Path) -> None:
@@ -157,16 +173,13 @@ def _camera_rate(cameras: Sequence[Any], path: Path) -> int:
     return min(found, MAX_FPS)
 
 
-def report(number: int, episode: Episode, task: str, *, depth: bool) -> list[str]:
+def report(number: int, episode: Episode, task: str) -> list[str]:
     """Return what an episode has, with the time error of each column, as lines."""
     seconds = (int(episode.times[-1]) - int(episode.times[0])) * 1e-9
     lines = [f"episode {number}: {episode.path}: {len(episode):,} frames, {seconds:.1f} s, task: {printable(task)}"]
     for topic, choice in episode.choices.items():
         lines.append(f"  {topic}: {_error(choice, len(episode))}" if topic != GRIPPER
                      else f"  {topic}: newest value at or before each frame")
-    if not depth:
-        lines += [f"  {camera.topic}: depth left out, LeRobot has no feature for it; --hdf5 has"
-                  for camera in episode.cameras if camera.depth]
     return lines
 
 

@@ -71,7 +71,7 @@ class LeRobotWriter:
             ConfigError: it differs from the first in joints or cameras, or an image cannot be a video.
             RecordingError: the recording is damaged.
         """
-        cameras = [camera for camera in episode.cameras if not camera.depth]
+        cameras = episode.cameras  # without depth
         self._require_video(cameras)
         features = {STATE: _vector(episode.names), ACTION: _vector(episode.names)} | {
             f"{IMAGES}{camera.name}": feature_of_camera(camera, self._fps, embed=self._embed) for camera in cameras}
@@ -100,7 +100,11 @@ class LeRobotWriter:
             self._data.close()
         self._meta.write(provenance)
 
-    def _require_video(self, cameras: list[Camera]) -> None:
+    def abandon(self) -> None:
+        """Release files that were not finished; their destructors do."""
+        self._data, self._videos = None, {}
+
+    def _require_video(self, cameras: tuple[Camera, ...]) -> None:
         for camera in cameras:
             if not self._embed and (camera.width % 2 or camera.height % 2):
                 raise ConfigError("--topics", camera.topic, f"has images of {camera.width}x{camera.height}, but video "

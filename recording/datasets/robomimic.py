@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from recording.datasets import optional
+from recording.datasets.deferring_file import DeferringFile
 from recording.datasets.episode import WIDTH, Camera, Episode
 from recording.reader import Recording
 from recording.sample import RecordingError
@@ -32,7 +33,8 @@ class RobomimicWriter:
             ConfigError: h5py is not installed.
         """
         self._h5py = optional("h5py", OPTION)
-        self._file: Any = self._h5py.File(path, "w")
+        self._sink = DeferringFile(path)
+        self._file: Any = self._h5py.File(self._sink, "w")
         self._data: Any = self._file.create_group("data")
         self._fps, self._frames, self._demos = fps, 0, list[str]()
         self._layout: dict[str, Any] = {}
@@ -67,6 +69,7 @@ class RobomimicWriter:
                                         chunks=(1, *shape), compression="gzip", compression_opts=1)
             for i, pixels in enumerate(episode.pixels(recording, camera)):
                 images[i] = pixels.reshape(shape)
+                self._sink.check()
         demo.attrs.update(num_samples=count, task=task, recording=episode.path.name, start_ns=int(episode.times[0]))
         self._demos.append(name)
         self._frames += count
@@ -82,6 +85,14 @@ class RobomimicWriter:
         mask.create_dataset("train", data=np.array([demo for demo in self._demos if demo not in valid], dtype="S"))
         mask.create_dataset("valid", data=np.array(valid, dtype="S8"))
         self._file.close()
+        self._sink.check()
+        self._sink.close()
+
+    def abandon(self) -> None:
+        """Close a file that was not finished."""
+        if self._file:
+            self._file.close()
+        self._sink.close()
 
 
 def _key(camera: Camera) -> str:

@@ -146,14 +146,16 @@ def _write_pixels(recording: Recording, topic: str, path: Path, decoder: Decoder
             kept.add(number)
     if first is None:
         return []
-    stored = np.lib.format.open_memmap(path, "w+", first.dtype, (len(kept), *first.shape))
+    header = {"descr": np.lib.format.dtype_to_descr(first.dtype), "fortran_order": False,
+              "shape": (len(kept), *first.shape)}
     rows: list[Row] = []
-    for number, row in enumerate(rows_of(recording, topic, decoder, images=True)):
-        if number in kept:
-            stored[len(rows)] = row.values[IMAGE]
-            values = {name: value for name, value in row.values.items() if name != IMAGE}
-            rows.append(Row(row.log_time_ns, row.stamp_ns, values))
-        else:
-            decoder.unfit[topic] += 1
-    stored.flush()
+    with path.open("wb") as file:  # a memory map would end the process when the disk is full
+        np.lib.format.write_array_header_2_0(file, header)
+        for number, row in enumerate(rows_of(recording, topic, decoder, images=True)):
+            if number in kept:
+                file.write(np.ascontiguousarray(row.values[IMAGE]).data)
+                values = {name: value for name, value in row.values.items() if name != IMAGE}
+                rows.append(Row(row.log_time_ns, row.stamp_ns, values))
+            else:
+                decoder.unfit[topic] += 1
     return rows

@@ -2,6 +2,10 @@
 
 import io
 import json
+import os
+import resource
+import subprocess
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +14,9 @@ from PIL import Image as Picture
 from cli.main import app
 from recording.access import open_recording
 from tests.recording.datasets.episodes import HEIGHT, WIDTH, exposure, picture, recording
+
+ROBOMIMIC = os.environ.get("ZENCELL_ROBOMIMIC_PYTHON", "")
+READER = Path(__file__).with_name("robomimic_reader.py")
 
 
 def test_robomimic_file_has_demos_observations_and_filter_keys(tmp_path):
@@ -32,6 +39,24 @@ def test_robomimic_file_has_demos_observations_and_filter_keys(tmp_path):
         assert all(np.array_equal(demo["obs/camera_image"][k], picture(k)) for k in range(7))
         depth = demo["obs/depth_camera_depth"][3, ..., 0]
         assert np.isnan(depth[0, 0]) and depth[5, 5] == np.float32(1.3)
+
+
+@pytest.mark.skipif(not ROBOMIMIC, reason="ZENCELL_ROBOMIMIC_PYTHON does not name a Python that has robomimic 0.3")
+def test_loader_of_robomimic_returns_the_recorded_values(tmp_path):
+    h5py = pytest.importorskip("h5py", reason="needs the extra datasets")
+    paths = [recording(tmp_path / f"{n}.mcap", images=6 + n) for n in range(3)]
+    assert app.execute(["export", *map(str, paths), "--hdf5", str(tmp_path / "set.hdf5")]) == 0
+    done = subprocess.run([ROBOMIMIC, str(READER), str(tmp_path / "set.hdf5"), str(tmp_path / "read.npz")], text=True,
+                          check=False, capture_output=True)
+    assert done.returncode == 0, done.stderr
+    read = np.load(tmp_path / "read.npz")
+    with h5py.File(tmp_path / "set.hdf5") as found:
+        for part, names in (("train", ["demo_0", "demo_1"]), ("valid", ["demo_2"])):
+            demos = [found["data"][name] for name in names]
+            for key in ("joint_pos", "gripper_width", "camera_image"):
+                expected = np.concatenate([demo["obs"][key] for demo in demos])
+                assert np.array_equal(read[f"{part}_{key}"], expected), key
+            assert np.allclose(read[f"{part}_actions"], np.concatenate([demo["actions"] for demo in demos]), atol=1e-6)
 
 
 def test_parquet_and_numpy_files_have_every_message_of_a_topic(tmp_path):
@@ -61,6 +86,26 @@ def test_several_recordings_have_a_folder_each(tmp_path):
     assert app.execute(["export", *map(str, paths), "--numpy", str(tmp_path / "np"), "--topics", "joint_states"]) == 0
     found = sorted(path.relative_to(tmp_path / "np").as_posix() for path in (tmp_path / "np").rglob("*.npz"))
     assert found == ["a/joint_states.npz", "b/joint_states.npz"]
+
+
+@pytest.mark.parametrize("option", [["--lerobot", "set"], ["--lerobot", "set", "--embed-images"], ["--hdf5", "set.hdf5"]])
+def test_data_set_that_does_not_fit_on_the_disk_leaves_nothing(tmp_path, capsys, option):
+    pytest.importorskip("h5py", reason="needs the extra datasets")
+    path, before = recording(tmp_path / "a.mcap"), resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))  # [bytes] of each file
+    try:
+        code = app.execute(["export", str(path), option[0], str(tmp_path / option[1]), *option[2:]])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert code == 1 and "cannot be written, the disk is full" in capsys.readouterr().err
+    assert [each.name for each in tmp_path.iterdir()] == ["a.mcap"]
+
+
+def test_recordings_of_the_same_name_do_not_overwrite_each_other(tmp_path, capsys):
+    (tmp_path / "other").mkdir()
+    paths = [recording(folder / "a.mcap", images=3) for folder in (tmp_path, tmp_path / "other")]
+    assert app.execute(["export", *map(str, paths), "--numpy", str(tmp_path / "np")]) == 2
+    assert "two recordings have the same name" in capsys.readouterr().err
 
 
 def test_format_of_one_file_rejects_several_recordings(tmp_path, capsys):

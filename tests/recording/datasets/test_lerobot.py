@@ -6,10 +6,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 from cli.main import app
+from recording.datasets import lerobot
+from tests.recording.datasets import episodes
 from tests.recording.datasets.episodes import HEIGHT, WIDTH, picture, position, recording
 from tests.recording.samples import START
 
@@ -79,9 +82,9 @@ def test_episodes_follow_each_other_and_tasks_are_their_own(written):
     tasks = pq.read_table(folder / "meta/tasks.parquet")
     assert tasks.to_pydict() == {"task_index": [0, 1], "__index_level_0__": ["pick", "place"]}
     assert json.loads(tasks.schema.metadata[b"pandas"])["index_columns"] == ["__index_level_0__"]
-    episodes = pq.read_table(folder / "meta/episodes/chunk-000/file-000.parquet").to_pydict()
-    assert (episodes["dataset_from_index"], episodes["dataset_to_index"]) == ([0, 12], [12, 20])
-    assert (episodes["length"], episodes["tasks"]) == ([12, 8], [["pick"], ["place"]])
+    found = pq.read_table(folder / "meta/episodes/chunk-000/file-000.parquet").to_pydict()
+    assert (found["dataset_from_index"], found["dataset_to_index"]) == ([0, 12], [12, 20])
+    assert (found["length"], found["tasks"]) == ([12, 8], [["pick"], ["place"]])
 
 
 def test_state_is_recorded_within_the_printed_error_and_action_is_the_next_state(written):
@@ -102,8 +105,6 @@ def test_state_is_recorded_within_the_printed_error_and_action_is_the_next_state
 def shown(folder: Path, embedded: bool) -> list[np.ndarray]:
     """Return the images of a data set as RGB."""
     if embedded:
-        from common.perception.image import cv2
-
         data = [each["bytes"] for each in rows(folder)[CAMERA]]
         return [cv2.imdecode(np.frombuffer(each, np.uint8), cv2.IMREAD_COLOR)[..., ::-1] for each in data]
     with av.open(str(folder / f"videos/{CAMERA}/chunk-000/file-000.mp4")) as video:
@@ -197,6 +198,38 @@ def test_recording_with_another_camera_is_rejected(tmp_path, capsys):
     second = recording(tmp_path / "b.mcap")
     assert app.execute(["export", str(first), str(second), "--lerobot", str(tmp_path / "set")]) == 2
     assert "b.mcap: observation.images.wrist is missing, but 24x16 in the first" in capsys.readouterr().err
+
+
+def test_depth_is_left_out_with_a_line(tmp_path, capsys):
+    path = recording(tmp_path / "a.mcap", images=4, with_depth=True)
+    assert app.execute(["export", str(path), "--lerobot", str(tmp_path / "set")]) == 0
+    assert "depth_camera/depth/image_raw: depth left out" in capsys.readouterr().out
+    assert [each.name for each in (tmp_path / "set" / "videos").iterdir()] == [CAMERA]
+
+
+def test_odd_sizes_are_rejected_for_video(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(episodes, "WIDTH", 25)
+    path = recording(tmp_path / "a.mcap", images=4)
+    assert app.execute(["export", str(path), "--lerobot", str(tmp_path / "set")]) == 2
+    assert "25x16, but video needs even sizes: use --embed-images" in capsys.readouterr().err
+    assert app.execute(["export", str(path), "--lerobot", str(tmp_path / "set"), "--embed-images"]) == 0
+
+
+def test_large_files_are_followed_by_the_next_at_the_next_episode(recordings, tmp_path, monkeypatch):
+    monkeypatch.setattr(lerobot, "DATA_BYTES", 1)
+    monkeypatch.setattr(lerobot, "VIDEO_BYTES", 1)
+    monkeypatch.setattr(lerobot, "FILES_PER_CHUNK", 1)
+    folder = tmp_path / "set"
+    assert app.execute(["export", *map(str, recordings), "--lerobot", str(folder)]) == 0
+    episode = pq.read_table(folder / "meta/episodes/chunk-000/file-000.parquet").to_pydict()
+    for kind in ("data", f"videos/{CAMERA}"):
+        assert (episode[f"{kind}/chunk_index"], episode[f"{kind}/file_index"]) == ([0, 1], [0, 0])
+    assert episode[f"videos/{CAMERA}/from_timestamp"] == [0, 0]
+    assert episode[f"videos/{CAMERA}/to_timestamp"] == [1.2, 0.8]
+    second = pq.read_table(folder / "data/chunk-001/file-000.parquet").to_pydict()
+    assert second["index"] == list(range(12, 20))
+    with av.open(str(folder / f"videos/{CAMERA}/chunk-001/file-000.mp4")) as video:
+        assert sum(1 for _ in video.decode(video=0)) == 8
 
 
 def test_missing_package_names_the_extra(tmp_path, capsys, monkeypatch):
