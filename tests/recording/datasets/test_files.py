@@ -88,7 +88,8 @@ def test_several_recordings_have_a_folder_each(tmp_path):
     assert found == ["a/joint_states.npz", "b/joint_states.npz"]
 
 
-@pytest.mark.parametrize("option", [["--lerobot", "set"], ["--lerobot", "set", "--embed-images"], ["--hdf5", "set.hdf5"]])
+@pytest.mark.parametrize("option", [
+    ["--lerobot", "set"], ["--lerobot", "set", "--embed-images"], ["--hdf5", "set.hdf5"]])
 def test_data_set_that_does_not_fit_on_the_disk_leaves_nothing(tmp_path, capsys, option):
     pytest.importorskip("h5py", reason="needs the extra datasets")
     path, before = recording(tmp_path / "a.mcap"), resource.getrlimit(resource.RLIMIT_FSIZE)
