@@ -36,7 +36,7 @@ MASSES, FRICTIONS = (0.05, 0.5), (0.2, 0.6)  # [kg]; of all contacts of an objec
 SHIFT, TURN = 0.003, math.radians(3.0)  # [m], [rad] of the calibration's error at the tray
 LIFTED = 0.02  # [m] by which the fingers must have lifted an object
 SETTLED = 1.5  # [s] after which an object in a container stays there
-SINGLE_LIMIT, HEAP_LIMIT = 90.0, 900.0  # [s] of cell time
+SINGLE_LIMIT, HEAP_LIMIT = 60.0, 600.0  # [s] of cell time
 IMAGES, CANDIDATES = 5, 10  # of a measurement of latency
 
 Mode = Literal["single", "heap", "latency"]
@@ -117,6 +117,7 @@ class Truth:
         self.objects: dict[str, m.WorldObject] = {}
         self.status, self.heap = SortingStatus(), Heap(header=m.Header())
         self.latencies: list[float] = []  # [s] wall time
+        self._grasps: dict[str, Grasp] = {}
         self.proved = False  # whether any grasp was ever proved
         self.planned: list[str] = []  # errors of motions to the best candidates, empty for a success
 
@@ -124,7 +125,7 @@ class Truth:
         """Start an attempt when the task counts one."""
         if status.attempts > len(self.attempts):
             heights = {name: each.pose.position.z for name, each in self.objects.items()}
-            grasp = next((each for each in self.heap.grasps if each.id == status.grasp), None)
+            grasp = self._grasps.get(status.grasp)
             self.attempts.append(Attempt(now, status.subject or self.status.subject, heights=heights,
                                          grasp={} if grasp is None else seen(grasp)))
         elif self.attempts and status.held:
@@ -148,6 +149,7 @@ class Truth:
         """Note how long images took."""
         if heap.at_home and heap.objects:
             self.heap = heap
+            self._grasps |= {grasp.id: grasp for grasp in heap.grasps}
             self.latencies.append(heap.seconds)
             self.proved = self.proved or any(grasp.proved for grasp in heap.grasps)
 
