@@ -22,6 +22,7 @@ CONTACT = 0.10  # [m] of the lift in which the held object may touch what it tou
 LIFT = 0.12  # [m]
 BLEND = 0.04  # [m]
 TILTED = math.radians(25)  # [rad] tool at the release
+OPEN_SHARE = 0.75  # of the largest width that fingers open at least to release an object
 WIDTH_OFF = 0.003  # [m] between widths that need no motion of the fingers
 STRONG, WEAK = 40.0, 25.0  # [N] grip force for objects of this volume and more, and for the smallest
 STRONG_FROM = 6e-5  # [m^3]
@@ -78,7 +79,7 @@ def take(cycle: Pick, gripper: GripperConfig, view: View) -> list[Stage]:
                    needs_full_plan=True)
     close = Grip("close", "GRASPING", cycle, width=0.0, holds=True, early=True,
                  effort=grip_force(thing.volume, gripper.max_effort))
-    return [descend, close, *carry(cycle, grasp.pose, up)]
+    return [descend, close, *carry(cycle, gripper, grasp.pose, up)]
 
 
 def contacts(
@@ -92,11 +93,12 @@ def contacts(
     return fingers, [*fingers, *((thing.id, name) for name in [*near, *supports(thing, view)] if name != thing.id)]
 
 
-def carry(cycle: Pick, start: m.Pose, touches: list[tuple[str, str]]) -> list[Stage]:
+def carry(cycle: Pick, gripper: GripperConfig, start: m.Pose, touches: list[tuple[str, str]]) -> list[Stage]:
     """Return one motion from the grasp, up and across to above the spot, and the release there.
 
     Args:
         cycle: with the spot.
+        gripper: of the robot.
         start: pose of the tool.
         touches: pairs that may touch on the way.
     """
@@ -109,7 +111,8 @@ def carry(cycle: Pick, start: m.Pose, touches: list[tuple[str, str]]) -> list[St
     ]
     joined = m.SequenceGoal(items=[
         m.SequenceItem(goal=lifted, straight=True, blend_radius=BLEND), m.SequenceItem(goal=over)])
-    return [Move("carry", state, cycle, goal=joined, carries=True, touches=touches, fallback=apart), release(cycle)]
+    return [Move("carry", state, cycle, goal=joined, carries=True, touches=touches, fallback=apart),
+            release(cycle, gripper)]
 
 
 def over_spot(spot: tuple[float, float, float]) -> m.PoseGoal:
@@ -119,15 +122,11 @@ def over_spot(spot: tuple[float, float, float]) -> m.PoseGoal:
         tilt_tolerance=TILTED, yaw_tolerance=math.pi)
 
 
-def release(cycle: Pick) -> Grip:
-    """Return the stage that opens the fingers."""
-    return Grip("release", "PLACING", cycle, width=cycle_opening(cycle), carries=True, holds=False, early=True)
-
-
-def cycle_opening(cycle: Pick) -> float:
-    """Return the width of fingers that let an object fall [m]."""
-    width = cycle.chosen.grasp.opening if cycle.chosen is not None else 0.0
-    return max(width, 0.06)
+def release(cycle: Pick, gripper: GripperConfig) -> Grip:
+    """Return the stage that opens the fingers so far that an object falls."""
+    opening = cycle.chosen.grasp.opening if cycle.chosen is not None else gripper.max_width
+    width = min(max(opening, OPEN_SHARE * gripper.max_width), gripper.max_width)
+    return Grip("release", "PLACING", cycle, width=width, carries=True, holds=False, early=True)
 
 
 def neighbors(view: View, place: tuple[float, float], within: float = NEAR) -> list[str]:
@@ -163,7 +162,9 @@ def raised(pose: m.Pose, height: float) -> m.Pose:
     return pose.model_copy(update={"position": m.Vector3(x=at.x, y=at.y, z=at.z + height)})
 
 
-def put_back(cycle: Pick, spot: tuple[float, float, float], lowered: float) -> list[Stage]:
+def put_back(
+    cycle: Pick, gripper: GripperConfig, spot: tuple[float, float, float], lowered: float,
+) -> list[Stage]:
     """Return the way to a spot of the tray, down to it, and home; the picture shows what lies there then."""
     x, y, _ = spot
     down = m.PoseGoal(pose=matrix_to_pose(tool_down(x, y, lowered)))
@@ -171,7 +172,7 @@ def put_back(cycle: Pick, spot: tuple[float, float, float], lowered: float) -> l
     return [
         Move("back", "PLACING", cycle, goal=above, carries=True),
         Move("lower", "PLACING", cycle, goal=down, straight=True, carries=True),
-        Grip("release", "PLACING", cycle, width=0.08, carries=True, holds=False),
+        Grip("release", "PLACING", cycle, width=gripper.max_width, carries=True, holds=False),
         Move("up", "HOMING", cycle, goal=above, straight=True),
         Move("home", "HOMING", cycle, goal=m.JointGoal(named="home")),
         AwaitImage(),

@@ -20,7 +20,7 @@ from applications.sorting.motions import Pick
 from applications.sorting.placing import ABOVE, Dropped, Full, free_spot, release_height
 from applications.sorting.rules import NoDestination, Rule
 from applications.sorting.scene import FOREIGN
-from applications.sorting.topics import Heap, SeenObject, SortingStatus
+from applications.sorting.topics import Grasp, Heap, SeenObject, SortingStatus
 from common import messages as m
 from common.config import Container, Surroundings, Tunable
 from common.errors import ConfigError
@@ -104,6 +104,7 @@ class Memory(BaseModel):
     outcomes: dict[str, int] = {}
     failures: list[Failure] = []
     thing: SeenObject | None = None
+    grasp: Grasp | None = None
     container: str = ""
     back: bool = False
     inside: int = 0  # objects seen in that container before
@@ -295,12 +296,12 @@ class Sorting(Task[SortingView]):
         cycle = Pick(thing.id, spot=spot, gripped=True, checked=True)
         if view.tool[2] - below > self._rim(self.p.tray) + RISEN:
             across = Move("across", "PLACING", cycle, goal=motions.over_spot(spot), carries=True)
-            self.queue += [across, motions.release(cycle)]
+            self.queue += [across, motions.release(cycle, self.gripper)]
             return
         near = motions.neighbors(view, view.tool[:2])
         touches = [(link, name) for link in self.gripper.links for name in near]
         touches += [(held.id, name) for name in [*near, *motions.supports(thing, view)]]
-        self.queue += motions.carry(cycle, view.tcp, touches)
+        self.queue += motions.carry(cycle, self.gripper, view.tcp, touches)
 
     def _put_back(self, view: SortingView) -> None:
         """Queue the way of the held object to the freest spot of the tray."""
@@ -316,7 +317,7 @@ class Sorting(Task[SortingView]):
             return
         above = release_height(box, spot, floor, below)
         cycle = Pick(self._memory.thing.id if self._memory.thing else "held", back=True, gripped=True, checked=True)
-        self.queue += motions.put_back(cycle, (spot.x, spot.y, above + ABOVE), spot.top + below + LOWERED)
+        self.queue += motions.put_back(cycle, self.gripper, (spot.x, spot.y, above + ABOVE), spot.top + below + LOWERED)
 
     # --- checks ----------------------------------------------------------------------------------------------
 
@@ -395,7 +396,8 @@ class Sorting(Task[SortingView]):
         self.status.grasp = chosen.grasp.id
         remark = width_remark(view.gripper.width, chosen.grasp.width, self.p.width_tolerance)
         self.status.held, self.status.last = "", f"{cycle.subject}: {remark or 'gripped'}"
-        self._remember(thing=chosen.thing, container=chosen.container, back=False, inside=cycle.inside)
+        self._remember(thing=chosen.thing, grasp=chosen.grasp, container=chosen.container, back=False,
+                       inside=cycle.inside)
 
     def _released(self, cycle: Pick, view: SortingView) -> None:
         thing, container = self._memory.thing, self._memory.container
@@ -451,6 +453,8 @@ class Sorting(Task[SortingView]):
         if self._inside(container) > self._memory.inside and not self._memory.back:
             self._count_sorted(thing.id, container)
             return
+        if self._memory.grasp is not None:
+            self._choice.penalize(self._memory.grasp, view.now, "it fell out of the fingers")
         self._note("slipped", f"{thing.id} fell")
         self._remember(thing=None, container="", back=False)
 

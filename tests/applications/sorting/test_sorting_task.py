@@ -65,7 +65,7 @@ def task():
 
 def test_two_objects_at_once_are_noticed_before_the_release_and_put_back_to_the_tray(task):
     cycle = carrying(task)
-    stage = release(cycle)
+    stage = release(cycle, task.gripper)
     task.queue.append(stage)
     seen = view([C], holding=True)
     assert not task.may_start(stage, seen)
@@ -81,7 +81,7 @@ def test_two_objects_at_once_are_noticed_before_the_release_and_put_back_to_the_
 
 def test_one_object_is_released_and_counted(task):
     cycle = carrying(task)
-    stage = release(cycle)
+    stage = release(cycle, task.gripper)
     assert task.may_start(stage, view([B, C], holding=True)) and task.status.held == "one"
     task.succeeded(stage, view([B, C]))
     assert (task.memory.done, task.memory.sorted) == (1, {"left": 1})
@@ -89,7 +89,7 @@ def test_one_object_is_released_and_counted(task):
 
 def test_release_waits_for_a_picture_of_the_tray(task):
     cycle = carrying(task)
-    assert not task.may_start(release(cycle), view([A, B, C], holding=True, stamp=NOW - 2.0))
+    assert not task.may_start(release(cycle, task.gripper), view([A, B, C], holding=True, stamp=NOW - 2.0))
     assert not cycle.checked
 
 
@@ -141,9 +141,10 @@ def test_object_held_after_a_restart_goes_where_the_memory_says(task):
 
 @pytest.mark.parametrize(("inside", "done", "outcome"), [(0, 1, "one"), (1, 0, "slipped")])
 def test_object_that_is_gone_after_a_restart_was_released_if_its_container_has_one_more(task, inside, done, outcome):
-    task.remember(Memory(attempts=1, thing=A, container="left", inside=inside))
+    task.remember(Memory(attempts=1, thing=A, grasp=grasp(), container="left", inside=inside))
     task.decide(view([B, A.model_copy(update={"place": "left"})]))
     assert (task.memory.done, task.status.held, task.memory.thing) == (done, outcome, None)
+    assert bool(task._choice.failures) is (outcome == "slipped")
 
 
 def test_noise_that_few_images_show_is_no_object():
