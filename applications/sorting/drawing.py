@@ -20,6 +20,7 @@ BEST: Bgr = (80, 220, 80)
 PROVED: Bgr = (60, 170, 60)
 UNPROVED: Bgr = (60, 140, 255)
 FOREIGN: Bgr = (200, 40, 255)
+BEHIND: Bgr = (32, 32, 32)  # text
 MOST_GRASPS = 12  # drawn
 MOST_LINES = 6  # of reasons
 TEXT = 0.38  # scale of their font
@@ -76,9 +77,10 @@ def _list_reasons(image: Pixels, heap: Heap) -> None:
     lines = [f"{', '.join(names)}: {reason}" for reason, names in by_reason.items()][:MOST_LINES]
     factor = max(1.0, image.shape[1] / WIDTH)
     for number, line in enumerate(lines, 1):
-        at = round(6 * factor), round(14 * factor * number)
-        for color, weight in (((0, 0, 0), 3), ((255, 255, 255), 1)):
-            cv2.putText(image, line, at, cv2.FONT_HERSHEY_SIMPLEX, TEXT * factor, color, weight, cv2.LINE_AA)
+        left, bottom = round(6 * factor), round(15 * factor * number)
+        (width, height), base = cv2.getTextSize(line, cv2.FONT_HERSHEY_SIMPLEX, TEXT * factor, 1)
+        cv2.rectangle(image, (left - 2, bottom - height - 2), (left + width + 2, bottom + base), BEHIND, cv2.FILLED)
+        cv2.putText(image, line, (left, bottom), cv2.FONT_HERSHEY_SIMPLEX, TEXT * factor, OUTLINE, 1, cv2.LINE_AA)
 
 
 def _draw_fingers(image: Pixels, camera: Pinhole, grasp: Grasp, axis: Array, *, first: bool) -> None:
