@@ -44,13 +44,14 @@ def data(
 def train(
     file: Annotated[str, typer.Argument(metavar="FILE.npz", help="tries of `zencell grasp data`")],
     out: Annotated[str, typer.Option("--out", metavar="FILE.onnx", help="network; its card is written next to it")],
+    note: Annotated[str, typer.Option("--note", metavar="TEXT", help="about the data, for the card")] = "",
     seed: str | None = None,
 ) -> None:
     """Train the learned scorer; write it as ONNX with a card that says how well it ranks grasps."""
-    options: TrainOptions = _options("TrainOptions", file=file, out=out, seed=seed or 0)
+    options: TrainOptions = _options("TrainOptions", file=file, out=out, note=note, seed=seed or 0)
     from applications.sorting.learning.train import train as train_network
 
-    card = train_network(options.file, options.out, options.seed, echo)
+    card = train_network(options.file, options.out, options.seed, options.note, echo)
     areas = ", ".join(f"{name} {groups['all']:.3f}" for name, groups in card.auc.items())
     echo(f"{options.out}: {card.parameters} weights; area under the curve on {card.tries['test']} tries: {areas}")
 

@@ -32,6 +32,7 @@ class Card:
         auc: of the network and the geometric score on the test scenes; of all, single objects and heaps.
         calibration: rows of mean predicted probability, fraction held and number of tries of the test scenes.
         seed: of training.
+        note: about the data.
     """
 
     numbers: list[str]
@@ -43,10 +44,12 @@ class Card:
     auc: dict[str, dict[str, float]]
     calibration: list[list[float]]
     seed: int
+    note: str = ""
 
     @classmethod
     def of(
-        cls, tries: Tries, train: Bools, check: Bools, test: Bools, logits: Array, seed: int, parameters: int
+        cls, tries: Tries, train: Bools, check: Bools, test: Bools, logits: Array, seed: int, parameters: int,
+        note: str = "",
     ) -> Card:
         """Measure logits (n,) of tries on those of a mask `test`."""
         masks = {"train": train, "check": check, "test": test}
@@ -59,7 +62,7 @@ class Card:
             held=round(float(tries.held.mean()), 4),
             auc={name: {group: round(auc(score[mask], tries.held[mask]), 4) for group, mask in groups.items()}
                  for name, score in scores.items()},
-            calibration=calibration(logits[test], tries.held[test]), seed=seed)
+            calibration=calibration(logits[test], tries.held[test]), seed=seed, note=note)
 
 
 def auc(score: Array, held: Bools) -> float:
@@ -99,7 +102,7 @@ def as_text(card: dict[str, Any]) -> str:
         "the pads, mass, and the error of the tool's pose were random. Scenes are not divided between the parts:", "",
         "| part | scenes | tries |", "|---|---|---|",
         *(f"| {name} | {scenes[name]} | {tries[name]} |" for name in ("train", "check", "test")), "",
-        f"{100 * card['held']:.0f} % of all tries held.", "",
+        " ".join([f"{100 * card['held']:.0f} % of all tries held.", *([card["note"]] if card["note"] else [])]), "",
         "## Ranking on the test part (area under the ROC curve)", "",
         "| score | all | single objects | heaps |", "|---|---|---|---|",
         *(f"| {name} | " + " | ".join(f"{value:.3f}" for value in groups.values()) + " |"

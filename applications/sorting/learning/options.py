@@ -43,6 +43,7 @@ class TrainOptions(Section):
 
     file: Path = Field(description="file of tries")
     out: Path = Field(description="network to write")
+    note: str = Field("", max_length=500, description="about the data")
     seed: Whole = Field(0, ge=0, description="of split, weights and order")
 
 

@@ -29,9 +29,9 @@ Bools = npt.NDArray[np.bool_]
 log = logging.getLogger(__name__)
 
 TRAINED = 0.8  # fraction of the scenes
-EPOCHS, PATIENCE = 60, 12  # at most, and without an improvement
+EPOCHS, PATIENCE = 40, 8  # at most, and without an improvement
 BATCH = 128
-RATE, DECAY = 2e-3, 1e-3
+RATE, DECAY = 1e-3, 1e-2
 NOISE = 0.03  # of the patch, in its units; augments the data
 LEAST = 100  # tries
 OPSET = 17
@@ -55,13 +55,16 @@ class Split:
         return cls(*(np.isin(scene, part) for part in np.split(scenes, [first, second])))
 
 
-def train(data: Path, out: Path, seed: int = 0, progress: Callable[[str], None] = log.info) -> Card:
+def train(
+    data: Path, out: Path, seed: int = 0, note: str = "", progress: Callable[[str], None] = log.info
+) -> Card:
     """Train on a file of tries; write the network and its card.
 
     Args:
         data: file of `zencell grasp data`.
         out: .onnx file; the card is written next to it as .json and .md.
         seed: of the split, the weights and the order.
+        note: about the data, for the card.
         progress: called with a line now and then.
 
     Raises:
@@ -79,7 +82,7 @@ def train(data: Path, out: Path, seed: int = 0, progress: Callable[[str], None] 
     _rescale(model, scale, shift)
     _export(model, out, tries.numbers.shape[1])
     logits = scale * logits + shift
-    card = Card.of(tries, split.train, split.check, split.test, logits, seed, parameters=_size(model))
+    card = Card.of(tries, split.train, split.check, split.test, logits, seed, parameters=_size(model), note=note)
     write_card(card, out)
     return card
 
@@ -102,10 +105,10 @@ def _network(columns: int) -> Any:
         def __init__(self) -> None:
             super().__init__()
             self.scaling = nn.Linear(columns, columns)  # to mean 0 and deviation 1
-            self.patch = nn.Sequential(*block(1, 8), *block(8, 16), *block(16, 24), nn.Flatten(), nn.Dropout(0.2),
+            self.patch = nn.Sequential(*block(1, 8), *block(8, 16), *block(16, 24), nn.Flatten(), nn.Dropout(0.3),
                                        nn.Linear(384, 32), nn.ReLU())
             self.numbers = nn.Sequential(nn.Linear(columns, 32), nn.ReLU())
-            self.both = nn.Sequential(nn.Linear(64, 32), nn.ReLU(), nn.Dropout(0.1), nn.Linear(32, 1))
+            self.both = nn.Sequential(nn.Linear(64, 32), nn.ReLU(), nn.Dropout(0.2), nn.Linear(32, 1))
 
         def forward(self, patch: Any, numbers: Any) -> Any:
             import torch
