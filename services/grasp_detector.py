@@ -16,9 +16,10 @@ from pydantic import Field
 from applications.sorting.detector import HeapDetector, Seen
 from applications.sorting.drawing import annotate_heap
 from applications.sorting.foreign import ForeignOptions
-from applications.sorting.grasp_finder import NUMBERS, GraspFinder
+from applications.sorting.grasp_finder import GraspFinder
 from applications.sorting.grasps.candidates import Options
 from applications.sorting.grasps.proof import ProofOptions
+from applications.sorting.learning.learned import NUMBERS
 from applications.sorting.learning.network import SHIPPED, Network
 from applications.sorting.seeing import View
 from applications.sorting.topics import HEAP, HEAP_IMAGE, Heap

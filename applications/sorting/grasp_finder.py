@@ -13,9 +13,8 @@ from applications.sorting.grasps.candidates import Candidates, Options, candidat
 from applications.sorting.grasps.gripper_shape import GripperShape
 from applications.sorting.grasps.height_map import Walls
 from applications.sorting.grasps.proof import ProofOptions, Prover
-from applications.sorting.grasps.scoring import FEATURES
+from applications.sorting.learning.learned import learned_score
 from applications.sorting.learning.network import Network
-from applications.sorting.learning.patches import patches_of
 from applications.sorting.seeing import crop
 from applications.sorting.surface import Surface
 from applications.sorting.topics import MAX_OBJECTS, Grasp, Left, SeenObject
@@ -24,7 +23,6 @@ from common.config import RobotConfig, Surroundings
 MARGIN = 0.04  # [m] of the surface around the tray
 REASON = 200  # longest reason
 GEOMETRIC, LEARNED = "geometric", "learned"  # scorers
-NUMBERS = (*FEATURES, "opening", "height")  # what a network gets besides the patch: width and height of the tool [m]
 
 
 @dataclass(frozen=True)
@@ -89,8 +87,7 @@ class GraspFinder:
         """Return candidates in the order of the network, whose estimate becomes their score."""
         if not len(found):
             return found
-        numbers = np.column_stack([found.features, found.opening, found.T[:, 2, 3] - surface.floor])
-        score = network.score(patches_of(surface, found.T @ self.gripper.T_tcp_closing), numbers.astype(np.float32))
+        score = learned_score(network, found, surface, self.gripper.T_tcp_closing)
         scored = replace(found, score=score, parts={**found.parts, LEARNED: score})
         return scored.select(np.argsort(-score, kind="stable"))
 

@@ -62,6 +62,8 @@ def evaluate(
     force: Force = "20",
     error: Annotated[
         str, typer.Option("--error", metavar="X", help="of the tool's pose, in multiples of 3 mm and 3 degrees")] = "1",
+    meshes: Annotated[
+        str | None, typer.Option("--meshes", metavar="DIR", help="folder of meshes instead of the test kinds")] = None,
     scorer: Annotated[
         str | None, typer.Option("--scorer", metavar="FILE.onnx", help="another network than the included one")] = None,
     cell: CellOption = CELL, processes: Processes = "2", overrides: list[str] | None = None, seed: str | None = None,
@@ -69,7 +71,7 @@ def evaluate(
     """Let the scorers choose grasps in the same scenes, try them in physics, and compare how many hold."""
     _require_physics("grasp evaluate")
     options: EvaluateOptions = _options(
-        "EvaluateOptions", scenes=scenes, objects=objects, force=force, error=error, scorer=scorer,
+        "EvaluateOptions", scenes=scenes, objects=objects, force=force, error=error, meshes=meshes, scorer=scorer,
         processes=processes, seed=seed or 0)
     from applications.sorting.learning.evaluate import Job, evaluate, table
 

@@ -15,13 +15,11 @@ import numpy.typing as npt
 
 from applications.sorting.grasps.candidates import Candidates, Options, candidates
 from applications.sorting.grasps.height_map import Walls
-from applications.sorting.grasps.scoring import FEATURES
+from applications.sorting.learning.learned import NUMBERS, numbers_of
 from applications.sorting.learning.patches import patches_of
 from applications.sorting.learning.scenes import Rig, Seen, draw_conditions, fallen, perceive, rig_of
 from applications.sorting.learning.tries import Tries
 from applications.sorting.objects.kinds import TRAIN_KINDS, draw
-
-Array = npt.NDArray[np.float64]
 
 HEAPS = (1, 1, 1, 5, 10)  # numbers of objects, drawn with equal probability
 TRIES = {1: 10, 5: 12, 10: 12}  # of a scene
@@ -33,24 +31,12 @@ FRICTIONS = (0.08, 0.6)
 MASSES = (0.1, 0.8)  # [kg]
 ERRORS = (0.0, 3.0)  # of the pose, in multiples of the cell's
 LOOSE = Options(alignment=0.6, purity=0.75, engagement=0.004)  # of candidates in every other scene
-NUMBERS = (*FEATURES, "opening", "height")  # features of a candidate, width of the fingers and height of the tool [m]
 
 
 def grasps_of(rig: Rig, seen: Seen, rng: np.random.Generator, options: Options | None = None) -> Candidates:
     """Return the candidates for the objects in the tray, the best first; by default those of the cell."""
     walls = Walls.of(rig.tray, rig.around.table_height)
     return candidates(seen.surface, seen.labels, rig.shape, options or Options(), rng, [walls])
-
-
-def numbers_of(found: Candidates, floor: float) -> npt.NDArray[np.float32]:
-    """Return (n, k) what `NUMBERS` names of candidates; `floor` is its z [m]."""
-    height = found.T[:, 2, 3] - floor
-    return np.column_stack([found.features, found.opening, height]).astype(np.float32)
-
-
-def closing_frames(rig: Rig, found: Candidates) -> Array:
-    """Return (n, 4, 4) poses of the closing frame in world."""
-    return np.asarray(found.T @ rig.shape.T_tcp_closing)
 
 
 def tries_of_scene(rig: Rig, seed: int, number: int) -> Tries | None:
@@ -73,7 +59,7 @@ def tries_of_scene(rig: Rig, seed: int, number: int) -> Tries | None:
         frictions.append(conditions.friction)
     n = len(found)
     return Tries(
-        patches=patches_of(seen.surface, closing_frames(rig, found)).astype(np.float16),
+        patches=patches_of(seen.surface, np.asarray(found.T @ rig.shape.T_tcp_closing)).astype(np.float16),
         numbers=numbers_of(found, seen.surface.floor),
         parts=np.column_stack(list(found.parts.values())).astype(np.float32), score=found.score.astype(np.float32),
         held=np.array([each.held for each in results]), result=np.array([each.result for each in results]),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import multiprocessing
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,12 +13,14 @@ import numpy as np
 import numpy.typing as npt
 
 from applications.sorting.grasps.candidates import Candidates
-from applications.sorting.learning.data import NUMBERS, closing_frames, grasps_of, numbers_of
+from applications.sorting.learning.data import grasps_of
 from applications.sorting.learning.floating import Outcome, PhysicalObject
+from applications.sorting.learning.learned import NUMBERS, learned_score
 from applications.sorting.learning.network import SHIPPED, Network
-from applications.sorting.learning.patches import patches_of
 from applications.sorting.learning.scenes import Rig, Seen, draw_conditions, fallen, perceive, rig_of
 from applications.sorting.objects.kinds import TEST_KINDS, draw
+from applications.sorting.objects.others import from_file, mesh_files
+from common.errors import ConfigError
 
 Array = npt.NDArray[np.float64]
 Choice = Callable[[Rig, Seen, Candidates, np.random.Generator], Array]
@@ -68,8 +71,8 @@ def scorers(network: Network | None) -> dict[str, Choice]:
         "geometric": lambda rig, seen, grasps, rng: grasps.score,
     }
     if network is not None:
-        found["learned"] = lambda rig, seen, grasps, rng: network.score(
-            patches_of(seen.surface, closing_frames(rig, grasps)), numbers_of(grasps, seen.surface.floor))
+        found["learned"] = lambda rig, seen, grasps, rng: learned_score(
+            network, grasps, seen.surface, rig.shape.T_tcp_closing)
     return found
 
 
@@ -77,7 +80,7 @@ def trial(rig: Rig, choices: Mapping[str, Choice], job: Job, number: int, source
     """Let each scorer choose a grasp in a scene and try it; None if the objects do not come to rest in the tray."""
     rng = np.random.default_rng((job.seed, FIRST_SCENE + number))
     objects = source(rng, number, job.count)
-    bench = fallen(rig, objects, rng)
+    bench = fallen(rig, objects, rng) if objects else None
     if bench is None:
         return None
     seen = perceive(rig, bench, rng)
@@ -104,8 +107,24 @@ def source_of(meshes: str | None) -> ObjectSource:
     Raises:
         ConfigError: the folder has no usable mesh.
     """
+    if meshes is not None:
+        return _of_meshes(Path(meshes))
     names = list(TEST_KINDS)
     return lambda rng, number, count: [draw(names[(number + k) % len(names)], rng) for k in range(count)]
+
+
+def _of_meshes(folder: Path) -> ObjectSource:
+    """Return what reads the meshes of a folder in turn; those that cannot be simulated are left out."""
+    files = mesh_files(folder)
+
+    def read(rng: np.random.Generator, number: int, count: int) -> Sequence[PhysicalObject]:
+        found: list[PhysicalObject] = []
+        for path in (files[(number * count + k) % len(files)] for k in range(count)):
+            with suppress(ConfigError):
+                found.append(from_file(path, rng))
+        return found
+
+    return read
 
 
 def evaluate(job: Job, scenes: int, processes: int = PROCESSES) -> Iterator[Trial]:
@@ -115,8 +134,8 @@ def evaluate(job: Job, scenes: int, processes: int = PROCESSES) -> Iterator[Tria
         ConfigError: the cell, the network or the meshes cannot be used.
     """
     rig_of(job.cell, job.overrides)
-    source_of(job.meshes)
     _network_of(job)
+    source_of(job.meshes)
     with multiprocessing.get_context("spawn").Pool(processes, _start, (job,)) as pool:
         for found in pool.imap(_trial, range(scenes), chunksize=4):
             if found is not None:

@@ -24,6 +24,7 @@ import numpy.typing as npt
 from applications.sorting.learning.tray_model import (
     FINGERS,
     HAND,
+    HIDDEN_GROUP,
     TOOL_GROUP,
     HandShape,
     add_gripper,
@@ -130,7 +131,7 @@ class Bench:
         spec = new_spec()
         add_tray(spec, tray, table)
         for number, thing in enumerate(objects):
-            add_object(spec, number, thing.parts, thing.color, thing.friction)
+            add_object(spec, number, thing.parts, thing.color, thing.friction, getattr(thing, "surface", None))
         add_gripper(spec, shape)
         self.model = spec.compile()
         self.data = mujoco.MjData(self.model)
@@ -220,7 +221,7 @@ class Bench:
         count = len(directions)
         geoms, distances = np.full(count, -1, np.int32), np.empty(count)
         groups = np.ones(6, np.uint8)
-        groups[TOOL_GROUP] = 0
+        groups[[TOOL_GROUP, HIDDEN_GROUP]] = 0
         mujoco.mj_multiRay(self.model, self.data, origin, np.ascontiguousarray(directions, np.float64).ravel(), groups,
                            True, -1, geoms, distances, None, count, 1e3)
         return np.where(geoms >= 0, distances, np.inf), geoms

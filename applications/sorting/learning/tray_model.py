@@ -22,7 +22,7 @@ CONDIM = 4  # sliding and torsion
 TORSION, ROLLING = 0.005, 0.0001  # [m]
 SURFACE_FRICTION = 0.6  # of tray and hand
 OBJECT, FIXED, TOOL = 1, 2, 4  # collision categories
-TOOL_GROUP = 5  # of geoms that the camera does not see
+TOOL_GROUP, HIDDEN_GROUP = 5, 4  # of geoms that the camera does not see
 HAND = "hand"
 FINGERS = ("finger:0", "finger:1")
 HAND_MASS, FINGER_MASS = 0.6, 0.06  # [kg]
@@ -80,9 +80,19 @@ def add_tray(spec: mujoco.MjSpec, tray: Container, table: float) -> None:
 
 
 def add_object(
-    spec: mujoco.MjSpec, number: int, parts: Sequence[Array], color: tuple[float, float, float], friction: float
+    spec: mujoco.MjSpec, number: int, parts: Sequence[Array], color: tuple[float, float, float], friction: float,
+    surface: Array | None = None,
 ) -> None:
-    """Add a free body `object:N` of the convex hulls of triangles (n, 3, 3) [m]."""
+    """Add a free body `object:N`.
+
+    Args:
+        spec: model.
+        number: of the object.
+        parts: triangles (n, 3, 3) [m] of pieces, whose convex hulls collide.
+        color: red, green, blue.
+        friction: against all but the pads.
+        surface: triangles (n, 3, 3) [m] that the camera sees; None: those of the parts.
+    """
     name = f"object:{number}"
     body = spec.worldbody.add_body(name=name)
     body.add_freejoint(name=name)
@@ -92,6 +102,15 @@ def add_object(
         mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
         geom = body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name, rgba=[*color, 1.0])
         _set_contact(geom, OBJECT, friction)
+        if surface is not None:
+            geom.group = HIDDEN_GROUP
+    if surface is not None:
+        mesh = spec.add_mesh(name=f"{name}.surface")
+        points, faces = np.unique(surface.reshape(-1, 3), axis=0, return_inverse=True)
+        mesh.uservert, mesh.userface = points.ravel(), faces.ravel()
+        mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+        body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name, rgba=[*color, 1.0], contype=0, conaffinity=0,
+                      mass=0.0)
 
 
 def add_gripper(spec: mujoco.MjSpec, shape: HandShape) -> None:

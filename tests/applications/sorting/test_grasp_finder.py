@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from applications.sorting.grasp_finder import NUMBERS, GraspFinder
+from applications.sorting.grasp_finder import GraspFinder
+from applications.sorting.learning.learned import NUMBERS
 from applications.sorting.learning.network import Network
 from common.config import Surroundings
 from common.config.loading import load_robot
