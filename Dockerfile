@@ -37,6 +37,7 @@ COPY applications applications
 COPY page page
 COPY drivers drivers
 COPY recording recording
+COPY bridges bridges
 COPY tools tools
 COPY lab lab
 COPY security security

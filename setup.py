@@ -14,7 +14,7 @@ from setuptools.command.bdist_wheel import bdist_wheel
 from setuptools.command.build_py import build_py
 
 FOLDERS = ("common", "services", "cli", "config", "applications", "page", "drivers", "recording", "tools", "lab",
-           "security")
+           "security", "bridges")
 KERNEL = Path("common", "planning", "kernel")
 
 

@@ -26,6 +26,9 @@ Record = Annotated[
     str | None, typer.Option("--record", metavar="FILE.mcap", help="record all published messages; requests are not "
                                                                    "recorded")
 ]
+Foxglove = Annotated[
+    str | None, typer.Option("--foxglove", metavar="[PORT]", help="serve Foxglove at this port [8765]; needs the extra")
+]
 ChaosSeed = Annotated[
     str | None, typer.Option("--chaos", metavar="SEED", help="inject faults; the same seed plans the same faults")
 ]
@@ -57,6 +60,7 @@ def _session(
     summary: SummaryFile = None,
     log_json: LogJson = False,
     record: Record = None,
+    foxglove: Foxglove = None,
     chaos: ChaosSeed = None,
     chaos_rate: ChaosRate = None,
     until_stdin_ends: UntilStdinEnds = False,
@@ -64,10 +68,12 @@ def _session(
     until_ended: bool,
 ) -> CellSession:
     """Return the session that the options of `run` and `up` describe; these are its parameters."""
+    from bridges.foxglove.option import overrides_for
     from common.supervision.lifecycle import interrupt_at_stdin_end
     from security.preflight import choose
 
     choose(secure)
+    overrides = [*overrides_for(cell, foxglove), *(overrides or ())]
     session = CellSession(
         cell, overrides, world=world, seed=options.whole("--seed", seed, 0), speed=options.number("--speed", speed),
         domain=domain, connect=connect, no_viewer=no_viewer, summary=summary, log_json=log_json,

@@ -22,6 +22,7 @@ from cli import (
     choices,
     commands,
     node,
+    options,
     recording,
     robot,
     secure,
@@ -50,8 +51,8 @@ class CommandLine(CommandGroup):
         choices.prepare()
         try:
             of_applications.take_own(arguments)
-            command = typer.main.get_command(self)
-            code = command(list(arguments), standalone_mode=False, prog_name="zencell", obj=verbs.CommandShell())
+            command, given = typer.main.get_command(self), options.with_optional_port(arguments)
+            code = command(given, standalone_mode=False, prog_name="zencell", obj=verbs.CommandShell())
         except typer.TyperException as error:
             code = _fail(_with_choices(error), error.exit_code)
         except RequestFailed as error:

@@ -6,7 +6,7 @@ import asyncio
 import functools
 import inspect
 import math
-from collections.abc import AsyncGenerator, Awaitable, Callable
+from collections.abc import AsyncGenerator, Awaitable, Callable, Sequence
 from contextlib import aclosing
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from common.transport.bus import Bus
 
 MOST_PER_SECOND = 1000.0  # messages or lines
+FOXGLOVE_PORT = "8765"  # to which Foxglove connects by default
 
 CellArgument = Annotated[
     str, typer.Argument(metavar="CELL", help="a name of `zencell cells`, or the path of a YAML file",
@@ -84,6 +85,16 @@ WorldName = Annotated[
                              autocompletion=choices.worlds)
 ]
 Seed = Annotated[str | None, typer.Option("--seed", metavar="N", help="seed of all random numbers")]
+
+
+def with_optional_port(arguments: Sequence[str]) -> list[str]:
+    """Return the arguments of `run` and `up` with the port of a --foxglove that has none."""
+    found = list(arguments)
+    if found[:1] in (["run"], ["up"]) and "--foxglove" in found:
+        at = found.index("--foxglove") + 1
+        if at == len(found) or found[at].startswith("-"):
+            found.insert(at, FOXGLOVE_PORT)
+    return found
 
 
 def write_text(output: str, text: str) -> None:

@@ -275,8 +275,7 @@ def _write(recording: Recording, file: AppendedFile, wants: Wanted, decoder: Dec
             decoder.unfit[sample.topic] += 1
             continue
         if name not in schemas:
-            text = json.dumps(SCHEMAS[name]).encode() if name in SCHEMAS else sample.schema or schema_of(name)
-            schemas[name] = writer.register_schema(name, "jsonschema", text)
+            schemas[name] = writer.register_schema(name, "jsonschema", schema_text(name, sample.schema))
         if sample.key not in channels:
             channels[sample.key] = writer.register_channel(sample.key, "json", schemas[name])
         data = json.dumps(value, separators=(",", ":")).encode()
@@ -294,6 +293,16 @@ def convert(message: Message) -> tuple[str, dict[str, Any]]:
         if isinstance(message, kind):
             return name, to_json(message)
     return type(message).__name__, message.model_dump(mode="json")
+
+
+def schema_name(model: type[Message]) -> str:
+    """Return the name of the schema to which `convert` converts messages of a class, except images."""
+    return next((name for kind, name, _ in _kinds() if issubclass(model, kind)), model.__name__)
+
+
+def schema_text(name: str, recorded: bytes = b"") -> bytes:
+    """Return a JSON schema as UTF-8: that of Foxglove, else the recorded one, else that of the message class."""
+    return json.dumps(SCHEMAS[name]).encode() if name in SCHEMAS else recorded or schema_of(name)
 
 
 @cache

@@ -14,10 +14,10 @@ ROOT = Path(__file__).resolve().parent.parent
 PURE = ("robot", "scene", "planning", "perception", "tasks", "hardware", "sim")
 CONTAINER_FILES = ("Dockerfile", "compose.yaml", ".dockerignore")  # with paths of the image
 MACHINE_PATH = re.compile(rb"(?<![\w.])/(?:home|root|work|Users|farm)/\w")
-PLATFORM = ("page", "drivers", "recording", "tools", "lab", "security", "cli")
+PLATFORM = ("page", "drivers", "recording", "tools", "lab", "security", "bridges", "cli")
 PLATFORM_SERVICES = (
     "motion_planner", "robot_state_publisher", "trajectory_executor", "viewer", "camera_simulator", "depth_camera",
-    "camera_opencv", "real_depth_camera", "router",
+    "camera_opencv", "real_depth_camera", "router", "foxglove_bridge",
 )
 APPLICATIONS = [path.parent.name for path in sorted((ROOT / "applications").glob("*/__init__.py"))]
 SHORT_FORMS = ("common/config/world.py",)  # of world files

@@ -13,7 +13,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 FOLDERS = ("common", "services", "cli", "zencell", "applications", "page", "drivers", "recording", "tools", "lab",
-           "security")
+           "security", "bridges")
 KERNEL = Path("common", "planning", "kernel")
 DOMAIN = 110
 

@@ -178,9 +178,10 @@ def _apply_overrides(tree: dict[str, Any], overrides: Iterable[tuple[list[str], 
     by_name = {_name_of(str(key)): key for key in services}
     for parts, value in overrides:
         if parts[0] == "services" and len(parts) > 1 and parts[1] not in services:
-            if parts[1] not in by_name:
+            adds = len(parts) == 2 and isinstance(value, dict)  # a complete entry is a further service, started last
+            if parts[1] not in by_name and not adds:
                 raise UnknownName("service", parts[1], by_name)
-            parts[1] = by_name[parts[1]]
+            parts[1] = by_name.get(parts[1], parts[1])
         if parts[0] == "world":
             _unify_names(tree["world"], parts)
         is_camera = parts == ["world", "camera"] or (len(parts) == 3 and parts[:2] == ["world", "cameras"])

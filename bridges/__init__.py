@@ -1,0 +1,1 @@
+"""Servers that show a cell to programs of other makers."""
