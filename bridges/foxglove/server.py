@@ -7,10 +7,10 @@ import ipaddress
 import os
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from typing import Protocol
+from typing import Any, Protocol, cast
 
 from foxglove import Parameter, StatusLevel, start_server
-from foxglove.websocket import Capability, ChannelView, Client, ServerListener, WebSocketServer
+from foxglove.websocket import Capability, ChannelView, Client, WebSocketServer
 
 from bridges.foxglove.channels import Channels, topics_of
 from bridges.foxglove.controls import CallFailed, Controls
@@ -35,8 +35,8 @@ class Options(Protocol):
 BACKLOG = 256  # messages that wait for a slow client; then the oldest is dropped
 
 
-class Listener(ServerListener):
-    """Passes what clients ask for, on threads of the server, to the event loop."""
+class Listener:
+    """A `ServerListener`: passes what clients ask for, on threads of the server, to the event loop."""
 
     def __init__(self, channels: Channels, controls: Controls | None) -> None:
         """Listen for a cell; without `controls` it is read only."""
@@ -68,6 +68,12 @@ class Listener(ServerListener):
         """Change parameters; after a refusal return the values that they still have."""
         changed = self._answer(lambda controls: controls.set(parameters))
         return changed or self._answer(lambda controls: controls.get([each.name for each in parameters]))
+
+    def on_parameters_subscribe(self, param_names: list[str]) -> None:
+        """Do nothing: the server publishes the parameters that a client sets."""
+
+    def on_parameters_unsubscribe(self, param_names: list[str]) -> None:
+        """Do nothing."""
 
     def _answer(self, ask: Callable[[Controls], Sequence[Parameter]]) -> list[Parameter]:
         if self._controls is None:
@@ -104,7 +110,8 @@ async def serve(bus: Bus, config: Options, application: Application) -> None:
     listener = Listener(channels, controls)
     server = listener.server = start_server(
         name=f"zencell {bus.cell}", host=config.host, port=config.port,
-        capabilities=[Capability.Parameters, Capability.Services] if controls else [], server_listener=listener,
+        capabilities=[Capability.Parameters, Capability.Services] if controls else [],
+        server_listener=cast(Any, listener),  # it has the methods that these capabilities need
         supported_encodings=["json"], services=controls.services() if controls else [], context=channels.context,
         message_backlog_size=BACKLOG)
     try:
