@@ -12,8 +12,8 @@ from applications.sorting.learning.patches import SIZE, patches_of
 from applications.sorting.surface import Surface
 
 FLOOR = 0.005
-GOOD = {"engagement": 0.02, "off_center": 0.001, "alignment": 0.98, "other_alignment": 0.99, "slack": 0.006, "tilt": 0.0,
-        "spare": 0.02, "width": 0.03, "tip_height": 0.01, "extent": 1.0, "roughness": 0.001, "purity": 1.0,
+GOOD = {"engagement": 0.02, "off_center": 0.001, "alignment": 0.98, "other_alignment": 0.99, "slack": 0.006,
+        "tilt": 0.0, "spare": 0.02, "width": 0.03, "tip_height": 0.01, "extent": 1.0, "roughness": 0.001, "purity": 1.0,
         "opening": 0.05, "height": 0.019}
 BAD = GOOD | {"engagement": 0.003, "off_center": 0.03, "alignment": 0.75, "other_alignment": 0.8, "slack": 0.002,
               "width": 0.06, "opening": 0.068, "tip_height": 0.027, "roughness": 0.006, "purity": 0.9, "height": 0.036}
@@ -21,7 +21,8 @@ BAD = GOOD | {"engagement": 0.003, "off_center": 0.03, "alignment": 0.75, "other
 
 def block(height: float, half: tuple[float, float]) -> Surface:
     """A block in the middle of a floor, with half sides along x and y [m]."""
-    made = Surface((0.40, -0.15), 0.002, np.full((150, 150), FLOOR, np.float32), np.zeros((150, 150, 3), np.uint8), FLOOR)
+    top, color = np.full((150, 150), FLOOR, np.float32), np.zeros((150, 150, 3), np.uint8)
+    made = Surface((0.40, -0.15), 0.002, top, color, FLOOR)
     x, y = made.xy(*np.indices((150, 150))).transpose(2, 0, 1)
     made.top[(np.abs(x - 0.55) < half[0]) & (np.abs(y) < half[1])] = FLOOR + height
     return made

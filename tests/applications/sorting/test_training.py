@@ -23,7 +23,8 @@ def test_opencv_computes_what_pytorch_does(tmp_path: Path) -> None:
     model = train._network(3).eval()
     path = tmp_path / "scorer.onnx"
     train._export(model, path, 3)
-    path.with_suffix(".json").write_text(json.dumps({"numbers": ["a", "b", "c"], "patch": {"size": SIZE, "step": STEP}}))
+    card = {"numbers": ["a", "b", "c"], "patch": {"size": SIZE, "step": STEP}}
+    path.with_suffix(".json").write_text(json.dumps(card), encoding="utf-8")
     rng = np.random.default_rng(0)
     network = Network.load(path, ["a", "b", "c"])
     for count in (1, 7, 100):
