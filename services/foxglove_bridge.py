@@ -6,7 +6,7 @@ from pydantic import Field
 
 from bridges.foxglove.option import require_package
 from common.application import find_application
-from common.config import Members, Parameters, Run, Tunable
+from common.config import Members, Parameters, RobotConfig, Run, Tunable
 from common.process.service import main
 from common.transport.bus import Bus
 
@@ -14,6 +14,7 @@ from common.transport.bus import Bus
 class Config(Parameters):
     """Address, rights of clients, and rates."""
 
+    robot: RobotConfig
     run: Run
     members: Members
     host: str = Field(

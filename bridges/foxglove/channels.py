@@ -12,6 +12,7 @@ from typing import Any
 from foxglove import Channel, Context, Schema
 
 from common.application import Application
+from common.errors import ZencellError
 from common.messages import Image, Message, PointCloud2
 from common.remapping import Remapping
 from common.topics import SUPERVISOR_STATUS, Topic, general_key, platform_topics
@@ -60,6 +61,7 @@ class Channels:
         self._clients: dict[str, int] = {}  # subscribed, by key
         self._tasks: dict[str, asyncio.Task[None]] = {}
         self._unfit: set[str] = set()
+        self._made: dict[str, Callable[[], bytes]] = {}  # messages of channels without a topic, by key
 
     def watch(self) -> None:
         """Open a channel for each topic that has a writer, now and later."""
@@ -71,9 +73,17 @@ class Channels:
         self._bus.raw_watch_tokens(owns_key(self._bus.cell), on_owner)
         self._found(SUPERVISOR_STATUS.key)  # each host's supervisor writes it, so no process owns it
 
+    def add(self, key: str, schema: str, make: Callable[[], bytes]) -> None:
+        """Open a channel without a topic: `make` returns its only message, on a thread, for each subscription."""
+        self._made[key] = make
+        self._open(key, schema)
+
     def subscribe(self, channel: int) -> None:
         """Read a topic for one more client."""
         if (key := self._keys.get(channel)) is None:
+            return
+        if key in self._made:
+            self._start(key, self._make(key))
             return
         self._clients[key] = self._clients.get(key, 0) + 1
         reader = self._readers[key]
@@ -85,7 +95,7 @@ class Channels:
 
     def unsubscribe(self, channel: int) -> None:
         """Read a topic for one client less; without one it is not read any more."""
-        if (key := self._keys.get(channel)) is None:
+        if (key := self._keys.get(channel)) is None or key in self._made:
             return
         self._clients[key] = max(0, self._clients.get(key, 0) - 1)
         if not self._clients[key] and (task := self._tasks.pop(key, None)) is not None:
@@ -131,6 +141,14 @@ class Channels:
                           context=self.context)
         self._channels[key] = channel
         self._keys[channel.id()] = key
+
+    async def _make(self, key: str) -> None:
+        try:
+            data = await asyncio.to_thread(self._made[key])
+        except ZencellError as error:
+            self._report(key, str(error))
+            return
+        self._channels[key].log(data, log_time=self._bus.clock.now_ns())
 
     async def _pump(self, reader: Reader[Any]) -> None:
         await _drain(reader)

@@ -7,16 +7,18 @@ import ipaddress
 import os
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from functools import cache
 from typing import Any, Protocol, cast
 
 from foxglove import Parameter, StatusLevel, start_server
 from foxglove.websocket import Capability, ChannelView, Client, WebSocketServer
 
+from bridges.foxglove import arm
 from bridges.foxglove.channels import Channels, topics_of
 from bridges.foxglove.controls import CallFailed, Controls
 from bridges.foxglove.option import require_free
 from common.application import Application
-from common.config import Members
+from common.config import Members, RobotConfig
 from common.transport.bus import Bus
 from common.transport.credentials import secure_folder
 
@@ -24,6 +26,7 @@ from common.transport.credentials import secure_folder
 class Options(Protocol):
     """Parameters of the bridge."""
 
+    robot: RobotConfig
     members: Members
     host: str
     port: int
@@ -116,6 +119,7 @@ async def serve(bus: Bus, config: Options, application: Application) -> None:
         message_backlog_size=BACKLOG)
     try:
         channels.watch()
+        channels.add(arm.KEY, arm.SCHEMA, cache(lambda: arm.arm_scene(config.robot, bus.clock.now_ns())))
         await bus.ready()
         bus.log.info("Foxglove connects to ws://%s:%d%s", config.host, server.port,
                      "" if controls else "; topics only, no commands and parameters")

@@ -13,7 +13,7 @@ from websockets.asyncio.client import ClientConnection, connect
 
 SUBPROTOCOL = "foxglove.sdk.v1"
 MESSAGE_DATA, SERVICE_CALL_RESPONSE, SERVICE_CALL = 1, 3, 2
-PATIENCE = 20.0  # [s]
+PATIENCE = 60.0  # [s]
 
 
 class FoxgloveClient:

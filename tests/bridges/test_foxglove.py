@@ -18,7 +18,7 @@ from pydantic import Field
 from cli.main import app
 from common import messages as m
 from common import topics
-from common.config import Members, Parameters, Run, Tunable, load_cell
+from common.config import Members, Parameters, Run, Tunable, load_cell, load_robot
 from common.errors import Refused
 from common.perception.image import array_to_image
 from common.process.in_process import running_service
@@ -94,7 +94,8 @@ class Rig:
         self.net, self.arm, self.port = LocalNetwork(), Arm(), free_port()
         members = Members(services=["arm", "foxglove_bridge"])
         self.config = foxglove_bridge.Config(
-            run=Run(cell="cell"), members=members, port=self.port, niceness=0, rate=1000.0, **options)
+            robot=load_robot("panda"), run=Run(cell="cell"), members=members, port=self.port, niceness=0, rate=1000.0,
+            **options)
         self.probe = self.net.bus("probe")
         self.joints_read = self.probe.raw_publisher(f"{self.probe.cell}/joint_states", "", reliable=False)
 
@@ -163,6 +164,20 @@ async def test_each_client_gets_the_current_value_of_a_state(rig: Rig, client: F
     async with connected(rig.port) as later:
         await later.subscribe("test/planning_scene")
         assert (await later.data("test/planning_scene"))["data"]["entities"][0]["id"] == "box"
+
+
+async def test_arm_is_drawn_in_the_frames_of_its_links(client: FoxgloveClient) -> None:
+    await client.subscribe("test/robot/meshes")
+    scene = (await client.data("test/robot/meshes"))["data"]
+    Draft202012Validator(json.loads(client.channels["test/robot/meshes"]["schema"])).validate(scene)
+    entities = scene["entities"]
+    frames = {each["frame_id"] for each in entities}
+    assert {f"panda_link{number}" for number in range(8)} | {"panda_hand", "panda_leftfinger"} <= frames
+    for (mesh,) in (each["triangles"] for each in entities):
+        assert len(mesh["indices"]) % 3 == 0 and max(mesh["indices"]) < len(mesh["points"])
+    highest = max(point["z"] for each in entities if each["frame_id"] == "panda_link0"
+                  for point in each["triangles"][0]["points"])
+    assert highest == pytest.approx(0.14, abs=0.02), "the base of a Panda [m]"
 
 
 async def test_every_event_arrives_in_order(rig: Rig, client: FoxgloveClient) -> None:

@@ -22,7 +22,8 @@ from common import messages as m
 from common.messages import Header, Image, Message, Pose, Quaternion, Vector3
 from common.perception.image import array_to_image
 from recording import export, foxglove
-from recording.foxglove import SCHEMAS, convert
+from recording.foxglove import convert
+from recording.foxglove_schemas import SCHEMAS
 from recording.reader import Recording, recover
 from recording.sample import Decoder, RecordingError, Sample
 from tests.recording.samples import START, STEP, fill_disk, joints, packed, status, write
