@@ -151,7 +151,7 @@ def test_noise_that_few_images_show_is_no_object():
     assert [each.id for each in steady([[A], [A, B], [A], [A, C]])] == ["a"]
 
 
-@pytest.mark.parametrize(("volume", "force"), [(0.0, 25.0), (3e-5, 32.5), (6e-5, 40.0), (1.0, 40.0)])
+@pytest.mark.parametrize(("volume", "force"), [(0.0, 30.0), (3e-5, 35.0), (6e-5, 40.0), (1.0, 40.0)])
 def test_grip_force_grows_with_the_volume(volume, force):
     assert grip_force(volume, 70.0) == pytest.approx(force) and grip_force(volume, 30.0) <= 30.0
 
