@@ -22,7 +22,6 @@ CONTACT = 0.10  # [m] of the lift in which the held object may touch what it tou
 LIFT = 0.12  # [m]
 BLEND = 0.04  # [m]
 TILTED = math.radians(25)  # [rad] tool at the release
-OPEN_SHARE = 0.75  # of the largest width that fingers open at least to release an object
 WIDTH_OFF = 0.003  # [m] between widths that need no motion of the fingers
 STRONG, WEAK = 40.0, 30.0  # [N] grip force for objects of this volume and more, and for the smallest
 STRONG_FROM = 6e-5  # [m^3]
@@ -30,7 +29,8 @@ STIR_LENGTH = 0.10  # [m]
 STIR_DEPTH = 0.02  # [m] of closed finger tips above the floor of the tray
 STIR_ABOVE = 0.15  # [m]
 FREE_OF = 0.03  # [m] between finger tips and an object before they push it
-OFF_WALL = 0.045  # [m] between the tool and walls of the tray
+TURNED = 0.6  # cosine between directions of pushes that differ
+OFF_WALL = 0.028  # [m] between the tool and walls of the tray
 
 
 @dataclass(eq=False)
@@ -123,10 +123,8 @@ def over_spot(spot: tuple[float, float, float]) -> m.PoseGoal:
 
 
 def release(cycle: Pick, gripper: GripperConfig) -> Grip:
-    """Return the stage that opens the fingers so far that an object falls."""
-    opening = cycle.chosen.grasp.opening if cycle.chosen is not None else gripper.max_width
-    width = min(max(opening, OPEN_SHARE * gripper.max_width), gripper.max_width)
-    return Grip("release", "PLACING", cycle, width=width, carries=True, holds=False, early=True)
+    """Return the stage that opens the fingers; fully: an object may be wider than it was seen, or turned."""
+    return Grip("release", "PLACING", cycle, width=gripper.max_width, carries=True, holds=False, early=True)
 
 
 def neighbors(view: View, place: tuple[float, float], within: float = NEAR) -> list[str]:
@@ -216,21 +214,30 @@ def stir(
 def push_line(
     thing: SeenObject, center: tuple[float, float], inner: float, attempt: int,
 ) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return start and end (x, y) [m] of a push through an object, towards the middle of the tray.
+    """Return start and end (x, y) [m] of a push through an object, as far towards the middle of the tray as possible.
+
+    An object at a wall, behind which there is no room for the tool, is pushed along the wall.
 
     Args:
         thing: the object to push.
         center: of the tray.
         inner: half side of the area in which the tool may be [m].
-        attempt: number of pushes before, each turned by 60 degrees.
+        attempt: number of pushes before: each takes the next best direction.
     """
-    at = np.array([thing.center.x, thing.center.y])
-    to = np.array(center) - at
-    angle = math.atan2(to[1], to[0]) if np.linalg.norm(to) > 0.02 else thing.yaw + math.pi / 2
-    angle += attempt * math.radians(60)
-    direction = np.array([math.cos(angle), math.sin(angle)])
-    behind = at - direction * (max(thing.size.x, thing.size.y) / 2 + FREE_OF)
-    low, high = np.array(center) - inner, np.array(center) + inner
-    start = np.clip(behind, low, high)
-    end = np.clip(at + direction * STIR_LENGTH, low, high)
+    middle = np.array(center)
+    at = np.clip([thing.center.x, thing.center.y], middle - inner, middle + inner)
+    inward = middle - at
+    angles = np.radians(np.arange(0, 360, 15)) + (math.atan2(inward[1], inward[0]) if inward.any() else thing.yaw)
+    ways = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    behind = at - ways * (max(thing.size.x, thing.size.y) / 2 + FREE_OF)
+    missing = np.linalg.norm(behind - np.clip(behind, middle - inner, middle + inner), axis=1)
+    turned = np.abs(np.remainder(angles - angles[0] + math.pi, 2 * math.pi) - math.pi)
+    order = np.lexsort((turned, np.round(missing, 2)))
+    chosen: list[int] = []
+    for index in order.tolist():  # directions that differ
+        if all(float(ways[index] @ ways[other]) < TURNED for other in chosen):
+            chosen.append(index)
+    best = chosen[attempt % len(chosen)]
+    start = np.clip(behind[best], middle - inner, middle + inner)
+    end = np.clip(at + ways[best] * STIR_LENGTH, middle - inner, middle + inner)
     return (float(start[0]), float(start[1])), (float(end[0]), float(end[1]))

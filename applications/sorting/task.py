@@ -61,8 +61,8 @@ class Config(TaskConfig):
                                                                  "grasped")
     width_tolerance: Tunable[float] = Field(
         0.015, gt=0, le=0.1, description="what is held may be so much wider or narrower than it was seen [m]")
-    carrying: Tunable[float] = Field(0.25, gt=0, le=1, description="fraction of the joints' acceleration limits while an "
-                                                                   "object is held")
+    carrying: Tunable[float] = Field(
+        0.25, gt=0, le=1, description="fraction of the joints' acceleration limits while an object is held")
     check_patience: Tunable[float] = Field(
         1.0, ge=0, le=60, description="wait for a picture of the tray before an object is released [s]")
     empty: Tunable[float] = Field(1.0, ge=0, le=600, description="the tray must look empty for so long [s]")

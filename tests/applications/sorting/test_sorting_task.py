@@ -103,7 +103,8 @@ def test_empty_grasp_is_penalized_and_the_arm_looks_again(task):
 
 
 def test_all_best_grasps_are_planned_at_once_and_the_reached_one_is_followed_up(task):
-    task.decide(view([A, B], grasps=[grasp(), grasp("b", 0.55)]))
+    for stamp in (NOW - 0.2, NOW):  # at rest: two images show the same
+        task.decide(view([A, B], grasps=[grasp(), grasp("b", 0.55)], stamp=stamp))
     move = task.queue[0]
     assert isinstance(move, Move) and [len(goal.positions) for goal in move.goal.goals] == [7, 7]
     task.planned(move, m.PlanResponse(id="1", ok=True, goal_index=1))
@@ -157,8 +158,16 @@ def test_grip_force_grows_with_the_volume(volume, force):
 
 
 def test_push_starts_behind_the_object_and_ends_towards_the_middle_within_the_tray():
-    start, end = push_line(thing("a", 0.68, 0.0), (0.55, 0.0), 0.15, 0)
-    assert start == pytest.approx((0.70, 0.0)) and end == pytest.approx((0.58, 0.0))
+    start, end = push_line(thing("a", 0.64, 0.0), (0.55, 0.0), 0.16, 0)
+    assert start == pytest.approx((0.69, 0.0)) and end == pytest.approx((0.54, 0.0))
+
+
+def test_object_at_a_wall_is_pushed_along_it_from_where_the_tool_has_room():
+    for attempt in range(2):
+        start, end = push_line(thing("a", 0.55, 0.178), (0.55, 0.0), 0.165, attempt)
+        assert max(abs(start[0] - 0.55), abs(start[1]), abs(end[0] - 0.55), abs(end[1])) <= 0.165 + 1e-9
+        assert abs(end[0] - start[0]) > 0.08, "along the wall"
+        assert min(start[1], end[1]) > 0.12, "through the object"
 
 
 @pytest.mark.parametrize(("parameters", "text"), [
