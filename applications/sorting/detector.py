@@ -30,6 +30,7 @@ AROUND = 0.08  # [m] of the table around the containers in which objects are loo
 LOW = 0.10  # [m] above the table: lower points are compared with the robot only where they may be foreign
 LARGEST = 0.20  # [m] what is longer is no object of a tray but a foreign body
 ROBOT = 0.03  # [m] from the robot, points belong to it
+BESIDE = 0.08  # [m] from the tray to the tool: what that holds hides nothing of the tray either
 FEWEST = 30  # [px] of the arm in front of the tray
 
 
@@ -100,7 +101,7 @@ class HeapDetector:
             self.registration.update(smooth)
         smooth = self.registration.apply(smooth)
         header = Header(stamp=stamp, frame_id=WORLD)
-        if not at_home and (self._at_home is None or not self._tray_is_clear(smooth[0])):
+        if not at_home and (self._at_home is None or not self._tray_is_clear(smooth[0], robot)):
             return Seen(Heap(header=header, foreign=self._foreign(smooth, robot)))
         surface = self._surface(smooth, robot)
         if at_home or self._at_home is None:
@@ -116,9 +117,12 @@ class HeapDetector:
                     hidden=hidden_fraction(surface, self.tray))
         return Seen(heap, surface, self._before)
 
-    def _tray_is_clear(self, view: View) -> bool:
-        """Return whether nothing is between the camera and the tray, such as the arm."""
+    def _tray_is_clear(self, view: View, robot: RobotAt) -> bool:
+        """Return whether nothing is between the camera and the tray, such as the arm or the object that it holds."""
         depth, _, camera = view
+        x, y, _ = robot.T_world_tcp[:3, 3]
+        if max(abs(x - self.tray.x), abs(y - self.tray.y)) < self.tray.outer + BESIDE:
+            return False
         x0, y0, x1, y1 = self.tray.area()
         corners = np.array([(x, y, z) for x in (x0, x1) for y in (y0, y1) for z in (self.tray.floor, self.tray.rim)])
         pixels = camera.project(corners)

@@ -438,6 +438,7 @@ class Sorting(Task[SortingView]):
         super().fail(message, view, go_home=go_home and stopped is None)
         if stopped is not None and stopped.chosen is not None:
             self._choice.penalize(stopped.chosen.grasp, view.now, message)
+            self._remember(attempts=self._memory.attempts + 1)
             self._note("empty", f"{stopped.subject}: {message}")
             if self.status.state != "ERROR":
                 self.queue += self.back_off(view)

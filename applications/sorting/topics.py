@@ -100,7 +100,7 @@ class SortingStatus(TaskStatus):
     """State and counters of the sorting task. `subject` is the id of the current object."""
 
     state: Literal["IDLE", "GRASPING", "CHECKING", "PLACING", "STIRRING", "HOMING", "DONE", "ERROR"] = "IDLE"
-    attempts: Count = Field(0, description="times that the fingers closed")
+    attempts: Count = Field(0, description="times that the fingers closed, or hit something on the way down")
     held: Label = Field("", description="what the check after the lift found: one, empty, two, slipped")
     grasp: Label = Field("", description="id of the grasp of the last attempt")
     last: Text = Field("", description="result of the last attempt")
