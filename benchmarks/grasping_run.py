@@ -66,6 +66,7 @@ class Attempt:
     landed: dict[str, str] = field(default_factory=dict)  # container by object
     heights: dict[str, float] = field(default_factory=dict)  # of all objects before [m]
     grasp: dict[str, float] = field(default_factory=dict)  # of the grasp as it was seen
+    places: dict[str, str] = field(default_factory=dict)  # of all objects when the next one began
 
 
 class Finished(Exception):  # noqa: N818 - not an error
@@ -125,6 +126,8 @@ class Truth:
         """Start an attempt when the task counts one."""
         if status.attempts > len(self.attempts):
             heights = {name: each.pose.position.z for name, each in self.objects.items()}
+            if self.attempts:
+                self.attempts[-1].places = self._places()
             grasp = self._grasps.get(status.grasp)
             self.attempts.append(Attempt(now, status.subject or self.status.subject, heights=heights,
                                          grasp={} if grasp is None else seen(grasp)))
@@ -159,12 +162,17 @@ class Truth:
             return ""
         if not attempt.lifted:
             return "empty"
-        places = {self.objects[name].container or self.objects[name].state for name in attempt.lifted}
+        now = attempt.places or self._places()
+        places = {now[name] for name in attempt.lifted}
         if places & {"held", "falling"}:
             return "unfinished"
         if places == {TRAY}:
             return "put back" if attempt.noticed == "two" else "slipped"
         return "fell in transit"
+
+    def _places(self) -> dict[str, str]:
+        """Return the container of each object, or its state outside of all."""
+        return {name: each.container or each.state for name, each in self.objects.items()}
 
     def nothing_tried(self) -> str:
         """Return why the fingers never closed."""
