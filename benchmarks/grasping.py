@@ -2,8 +2,9 @@
 
 `python -m benchmarks.grasping --singles 300 --force 20` puts one object of a kind that training never saw into the tray
 for each seed; only the first try counts, and it counts if the object came to rest in a container. `--heaps 30` clears
-heaps of 10. `--latency 10` measures the time from an image to proved grasps, and plans motions to the first ten. Every
-seed draws objects, mass (50 to 500 g), friction (0.2 to 0.6) and an error of the camera's pose of 3 mm and 3 degrees.
+heaps of 10. `--latency 10` measures the processor time from an image to proved grasps, and plans motions to the first
+ten. Every seed draws objects, mass (50 to 500 g), friction (0.2 to 0.6) and an error of the camera's pose of 3 mm and
+3 degrees.
 
 Results are appended to a file, one line a run; seeds that are in it are not run again. A run that crashes or does not
 end is a failure with its reason. Needs the extra `physics`.
@@ -168,7 +169,7 @@ def latency_table(rows: list[Row]) -> list[str]:
     lines = ["from the image to proved grasps: no image"]
     if len(times):
         lines = [f"from the image to proved grasps: {np.median(times):.0f} ms in the median, "
-                 f"{np.percentile(times, 95):.0f} ms at 95 % ({len(times)} images of {len(rows)} heaps)"]
+                 f"{np.percentile(times, 95):.0f} ms at 95 %, processor time ({len(times)} images, {len(rows)} heaps)"]
     return [*lines, f"motions to the first candidates: {share(sum(not e for e in plans), len(plans))}; errors: "
                     f"{failures(plans)}"]
 
