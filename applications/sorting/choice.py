@@ -130,7 +130,8 @@ class Choice:
             return f"{len(failed)} attempts failed, the last one: {failed[-1].reason}"
         found = next((left.reason for left in heap.left if left.object == thing.id), "")
         why = next((grasp.why for grasp in heap.grasps if grasp.object == thing.id and not grasp.proved), "")
-        return found or why or "no grasp was found"
+        where = "" if thing.place == self._tray else f"it lies on the {thing.place}, outside of the tray: "
+        return f"{where}{found or why or 'no grasp was found'}"
 
 
 def _between(a: tuple[float, float, float], b: tuple[float, float, float]) -> float:

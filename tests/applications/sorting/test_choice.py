@@ -76,6 +76,7 @@ def test_object_is_given_up_after_its_tries_and_allowed_again_once_the_heap_was_
 @pytest.mark.parametrize(("seen", "reason"), [
     (heap([thing("a", 0.5)], [], [Left(object="a", reason="no free edge")]), "no free edge"),
     (heap([thing("a", 0.5)], []), "no grasp was found"),
+    (heap([thing("a", 0.5, "table")], []), "it lies on the table, outside of the tray: no grasp was found"),
 ])
 def test_reason_of_an_object_without_attempts_is_that_of_the_detector(choice, seen, reason):
     assert choice.reason(seen.objects[0], seen) == reason
