@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from applications.sorting.task import Config, Sorting, SortingView
+from applications.sorting.settings import Config, SortingView
+from applications.sorting.task import Sorting
 from applications.sorting.topics import HEAP, SORTING_STATUS
 from common.process.service import main
 from common.process.task_runner import run_task

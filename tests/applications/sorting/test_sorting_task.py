@@ -4,7 +4,9 @@ import pytest
 
 from applications.sorting.choice import Option
 from applications.sorting.motions import Pick, grip_force, push_line, release
-from applications.sorting.task import Config, Memory, Sorting, SortingView, steady
+from applications.sorting.settings import Config, Memory, SortingView
+from applications.sorting.steady import steady
+from applications.sorting.task import Sorting
 from applications.sorting.topics import Grasp, Heap, SeenObject, SortingStatus
 from common import messages as m
 from common.config import load_cell, service_config
@@ -142,7 +144,7 @@ def test_object_held_after_a_restart_goes_where_the_memory_says(task):
 
 @pytest.mark.parametrize(("inside", "done", "outcome"), [(0, 1, "one"), (1, 0, "slipped")])
 def test_object_that_is_gone_after_a_restart_was_released_if_its_container_has_one_more(task, inside, done, outcome):
-    task.remember(Memory(attempts=1, thing=A, grasp=grasp(), container="left", inside=inside))
+    task.remember(Memory(attempts=1, thing=A, grasp=grasp(), container="left", inside=inside, left=2))
     task.decide(view([B, A.model_copy(update={"place": "left"})]))
     assert (task.memory.done, task.status.held, task.memory.thing) == (done, outcome, None)
     assert bool(task._choice.failures) is (outcome == "slipped")
