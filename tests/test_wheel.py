@@ -193,9 +193,10 @@ def test_new_project_and_user_scripts_run_from_a_wheel(wheel: Installation, tmp_
 
 
 @pytest.mark.slow
-def test_wheel_contains_the_kernel_and_the_codec_of_zenoh_cli(wheel: Installation, tmp_path: Path) -> None:
+def test_wheel_contains_the_kernel_the_scorer_and_the_codec_of_zenoh_cli(wheel: Installation, tmp_path: Path) -> None:
     assert wheel.file.endswith(f"-py3-none-{sysconfig.get_platform().replace('-', '_')}.whl")
     assert list((wheel.modules / KERNEL).glob("*.so"))
+    assert (wheel.modules / "applications" / "sorting" / "data" / "scorer.onnx").is_file()
     output = wheel.python(tmp_path, "-c", PLAN)
     assert output.startswith("ok planning kernel: planning_kernel") and output.endswith(" rrt_connect\n")
     assert wheel.python(tmp_path, "-c", CODECS).split() == ["decode", "encode"]
