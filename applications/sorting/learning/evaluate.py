@@ -115,7 +115,10 @@ def source_of(meshes: str | None) -> ObjectSource:
 
 def _of_meshes(folder: Path) -> ObjectSource:
     """Return what reads the meshes of a folder in turn; those that cannot be simulated are left out."""
-    files = mesh_files(folder)
+    try:
+        files = mesh_files(folder)
+    except ConfigError as error:
+        raise ConfigError("--meshes", error.value, error.expected) from None
 
     def read(rng: np.random.Generator, number: int, count: int) -> Sequence[PhysicalObject]:
         found: list[PhysicalObject] = []

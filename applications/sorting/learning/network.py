@@ -48,13 +48,13 @@ class Network:
         Raises:
             ConfigError: the file or its card is missing, too large, unreadable, or for other values.
         """
+        data = _read(path)
         card = _read_card(path)
         numbers = tuple(card["numbers"])
         if expected is not None and numbers != tuple(expected):
             differ = sorted(set(numbers) ^ set(expected)) or ["their order"]
             raise ConfigError(FIELD, str(path), f"was trained on other values ({', '.join(differ)}): train it again, "
                                                 "or use scorer: geometric")
-        data = _read(path)
         try:
             net = cv2.dnn.readNetFromONNX(np.frombuffer(data, np.uint8))
             made = cls(numbers, net)
