@@ -26,7 +26,6 @@ class Config(Parameters):
         True, description="offer task commands and parameters; never in a secured cell, since the protocol has no "
                           "passwords"
     )
-    niceness: int = Field(10, ge=0, le=19, description="niceness of the process: the other services come first")
     rate: Tunable[float] = Field(30.0, gt=0, le=1000, description="maximum rate of each stream, wall time [Hz]")
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import ipaddress
-import os
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import cache
@@ -31,7 +30,6 @@ class Options(Protocol):
     host: str
     port: int
     commands: bool
-    niceness: int
     rate: float
 
 
@@ -107,7 +105,6 @@ async def serve(bus: Bus, config: Options, application: Application) -> None:
     channels = Channels(bus, topics_of(application, config.members.keys), lambda: config.rate)
     controls = Controls(bus) if may_command(config.host, config.commands) else None
     await bus.acquire_keys()
-    os.nice(config.niceness)
     if config.port:
         require_free(f"services.{bus.service}.port", config.host, config.port)
     listener = Listener(channels, controls)

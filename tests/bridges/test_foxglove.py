@@ -94,8 +94,7 @@ class Rig:
         self.net, self.arm, self.port = LocalNetwork(), Arm(), free_port()
         members = Members(services=["arm", "foxglove_bridge"])
         self.config = foxglove_bridge.Config(
-            robot=load_robot("panda"), run=Run(cell="cell"), members=members, port=self.port, niceness=0, rate=1000.0,
-            **options)
+            robot=load_robot("panda"), run=Run(cell="cell"), members=members, port=self.port, rate=1000.0, **options)
         self.probe = self.net.bus("probe")
         self.joints_read = self.probe.raw_publisher(f"{self.probe.cell}/joint_states", "", reliable=False)
 
