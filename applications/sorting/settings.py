@@ -14,8 +14,6 @@ from common.errors import ConfigError
 from common.tasks.decisions import TaskConfig
 from common.tasks.stages import View
 
-SERVICE = "services.sorter."
-
 
 class Config(TaskConfig):
     """The rule, and when an object is given up; times are cell time unless they say wall."""
@@ -59,10 +57,10 @@ class Config(TaskConfig):
             ConfigError: the tray, a value or a container is unknown.
         """
         if self.tray not in self.world.containers:
-            raise ConfigError(f"{SERVICE}tray", self.tray,
+            raise ConfigError("tray", self.tray,
                               f"is no container; choices: {', '.join(self.world.containers) or 'none'}")
         others = [name for name in self.world.containers if name != self.tray]
-        return Rule(self.by, self.where, others, self.large, SERVICE)
+        return Rule(self.by, self.where, others, self.large)
 
 
 @dataclass

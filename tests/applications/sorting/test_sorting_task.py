@@ -173,8 +173,8 @@ def test_object_at_a_wall_is_pushed_along_it_from_where_the_tool_has_room():
 
 
 @pytest.mark.parametrize(("parameters", "text"), [
-    ({"by": "weight"}, "services.sorter.by: 'weight' is no rule; choices: color, size, shape, or module:function"),
-    ({"tray": "bin"}, "services.sorter.tray: 'bin' is no container; choices: tray, left, right"),
+    ({"by": "weight"}, "services.sorter: by: 'weight' is no rule; choices: color, size, shape, or module:function"),
+    ({"tray": "bin"}, "services.sorter: tray: 'bin' is no container; choices: tray, left, right"),
     ({"where": "{red: bin}"}, "where.red: 'bin' is no destination; choices: left, right"),
 ])
 def test_bad_parameters_are_one_line(parameters, text):
