@@ -167,7 +167,7 @@ class Truth:
         now = attempt.places or self._places()
         places = {now[name] for name in attempt.lifted}
         if places & {"held", "falling"}:
-            return "unfinished"
+            return "not released" if self.status.state in ("DONE", "ERROR") else "unfinished"
         if places == {TRAY}:
             return "put back" if attempt.noticed == "two" else "slipped"
         return "fell in transit"
