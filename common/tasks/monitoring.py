@@ -132,9 +132,11 @@ class ExecutionMonitor(TaskDecisions[V]):
             stop = self.stop(view, blocked)
             self.obstructed(stage, view, f"{stage.name}: {blocked}")
             return stop
-        elif stage.carries and view.gripper.outcome == "slipping":  # the object may still arrive
-            if not self.status.message.startswith(f"{stage.name}: "):  # once: the width changes with every reading
-                self.status.message = f"{stage.name}: {view.gripper.message}"
+        elif (
+            stage.carries and view.gripper.outcome == "slipping"  # the object may still arrive
+            and not self.status.message.startswith(f"{stage.name}: ")  # once: the width changes with every reading
+        ):
+            self.status.message = f"{stage.name}: {view.gripper.message}"
         return self._watch_opening(view)
 
     def _watch_early(self, view: V) -> None:
