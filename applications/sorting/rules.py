@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib
+import inspect
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,6 +20,7 @@ SHAPES = ("round", "long", "flat", "ring", "box", "other")
 VALUES = {"color": COLORS, "size": SIZES, "shape": SHAPES}
 FIRST = {"color": ("red", "orange", "yellow", "white"), "size": ("small",), "shape": ("round", "ring", "box")}
 MOST_SHOWN = 120  # characters of an error of the user's function
+LONGEST_CALL = 0.5  # [s] wall time of the user's function: the task cannot react meanwhile
 
 Property = Callable[[SeenObject], str]
 
@@ -52,6 +55,7 @@ class Rule:
             raise ConfigError("world.containers", ..., "has no container besides the tray: nowhere to put objects")
         self._containers, self._large, self._by = tuple(containers), large, by
         self._function: Callable[[SeenObject], Any] | None = None
+        self._call: threading.Thread | None = None  # of the user's function that did not return in time
         if ":" in by:
             self._function = _imported(by, f"{field}by")
             if where:
@@ -86,15 +90,38 @@ class Rule:
         """
         if self._function is None:
             return self.where.get(self.value(thing), self.where[OTHERS])
-        try:
-            found = self._function(thing.model_copy(deep=True))
-        except Exception as error:  # code of the user
-            message = " ".join(f"{type(error).__name__}: {error}".split())[:MOST_SHOWN]
-            raise NoDestination(f"{self._by} fails: {message}") from None
+        found = self._called(self._function, thing)
         if not isinstance(found, str) or found not in self._containers:
-            raise NoDestination(f"{self._by} returns {found!r:.60}, which is no destination; choices: "
+            shown = " ".join(repr(found).split())[:60]
+            raise NoDestination(f"{self._by} returns {shown}, which is no destination; choices: "
                                 f"{', '.join(self._containers)}")
         return found
+
+    def _called(self, function: Callable[[SeenObject], Any], thing: SeenObject) -> Any:
+        """Return what the user's function returns.
+
+        Raises:
+            NoDestination: it fails, or takes too long; until a late call ends, there is no other one.
+        """
+        results: list[Any] = []
+        errors: list[BaseException] = []
+
+        def call() -> None:
+            try:
+                results.append(function(thing.model_copy(deep=True)))
+            except BaseException as error:  # code of the user, which may also call sys.exit
+                errors.append(error)
+
+        if self._call is None or not self._call.is_alive():
+            self._call = threading.Thread(target=call, name="rule", daemon=True)
+            self._call.start()
+            self._call.join(LONGEST_CALL)
+        if errors:
+            message = " ".join(f"{type(errors[0]).__name__}: {errors[0]}".split())[:MOST_SHOWN]
+            raise NoDestination(f"{self._by} fails: {message}")
+        if not results:
+            raise NoDestination(f"{self._by} takes longer than {LONGEST_CALL:g} s")
+        return results[0]
 
 
 def _imported(reference: str, field: str) -> Callable[[SeenObject], Any]:
@@ -109,9 +136,17 @@ def _imported(reference: str, field: str) -> Callable[[SeenObject], Any]:
     extend_path(str(Path.cwd()))
     try:
         found = getattr(importlib.import_module(module), name, None)
-    except Exception as error:  # code of the user
+    except (Exception, SystemExit) as error:  # code of the user
         text = " ".join(f"{type(error).__name__}: {error}".split())[:MOST_SHOWN]
         raise ConfigError(field, reference, f"cannot be imported: {text}") from None
     if not callable(found):
         raise ConfigError(field, reference, f"is no function: {module} has no function {name}")
+    if inspect.iscoroutinefunction(found):
+        raise ConfigError(field, reference, "is a coroutine function; needs a plain function")
+    try:
+        inspect.signature(found).bind(None)
+    except TypeError:
+        raise ConfigError(field, reference, "must take one argument, the SeenObject") from None
+    except ValueError:  # a function without a known signature
+        pass
     return found  # type: ignore[no-any-return]

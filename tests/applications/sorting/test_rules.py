@@ -1,7 +1,11 @@
 """The rule names a container by color, size, shape or a function of the user; bad values are one line."""
 
+import threading
+import zlib
+
 import pytest
 
+from applications.sorting import rules
 from applications.sorting.rules import NoDestination, Rule
 from applications.sorting.topics import SeenObject
 from common.errors import ConfigError
@@ -62,6 +66,8 @@ def functions(tmp_path, monkeypatch):
         "def fails(thing):\n    raise ValueError('two\\nlines')\n"
         "def wrong(thing):\n    return 'floor'\n"
         "def number(thing):\n    return 3\n"
+        "def exits(thing):\n    raise SystemExit(3)\n"
+        "def shows_lines(thing):\n    return type('T', (), {'__repr__': lambda self: 'two\\nlines'})()\n"
         "def changes(thing):\n    thing.id = 'changed'\n    return 'left'\n")
     monkeypatch.chdir(tmp_path)
     return lambda name: Rule(f"rules_of_a_user:{name}", {}, CONTAINERS)
@@ -75,6 +81,8 @@ def test_function_of_the_user_names_the_container(functions):
     ("fails", "fails: ValueError: two lines"),
     ("wrong", "returns 'floor', which is no destination; choices: left, right"),
     ("number", "returns 3, which is no destination"),
+    ("exits", "fails: SystemExit: 3"),
+    ("shows_lines", "returns two lines, which is no destination"),
 ])
 def test_failing_function_of_the_user_gives_a_reason_in_one_line(functions, name, text):
     with pytest.raises(NoDestination) as error:
@@ -86,3 +94,38 @@ def test_function_of_the_user_cannot_change_what_was_seen(functions):
     seen = thing()
     assert functions("changes").destination(seen) == "left"
     assert seen.id == "o1"
+
+
+@pytest.mark.parametrize(("source", "text"), [
+    ("async def rule(thing):\n    return 'left'\n", "is a coroutine function; needs a plain function"),
+    ("def rule():\n    return 'left'\n", "must take one argument, the SeenObject"),
+    ("def rule(thing, other):\n    return 'left'\n", "must take one argument, the SeenObject"),
+    ("raise SystemExit(4)\n", "cannot be imported: SystemExit: 4"),
+])
+def test_unusable_function_is_reported_before_the_cell_starts(tmp_path, monkeypatch, source, text):
+    module = f"unusable_{zlib.crc32(source.encode())}"
+    (tmp_path / f"{module}.py").write_text(source)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigError, match=text):
+        Rule(f"{module}:rule", {}, CONTAINERS)
+
+
+def test_function_that_does_not_return_blocks_the_task_only_once(monkeypatch):
+    monkeypatch.setattr(rules, "LONGEST_CALL", 0.01)
+    calls, release = [], threading.Event()
+
+    def waits(thing):
+        calls.append(thing.id)
+        release.wait(10)
+        return "left"
+
+    monkeypatch.setattr(rules, "_imported", lambda *_: waits)
+    rule = Rule("mine:waits", {}, CONTAINERS)
+    for _ in range(3):
+        with pytest.raises(NoDestination, match=r"mine:waits takes longer than 0\.01 s"):
+            rule.destination(thing())
+    assert calls == ["o1"], "one call waits, no other one starts"
+    release.set()
+    rule._call.join(10)
+    monkeypatch.setattr(rules, "LONGEST_CALL", 10)
+    assert rule.destination(thing()) == "left"
