@@ -71,17 +71,27 @@ def containers_of(world: Surroundings) -> list[Place]:
     return found
 
 
+def require_tray(world: Surroundings, tray: str, field: str) -> None:
+    """Check the container with the objects; `field` is the parameter that names it.
+
+    Raises:
+        ConfigError: the world has no such container, or says that objects are taken from others.
+    """
+    if tray not in world.containers:
+        raise ConfigError(field, tray, f"is no container; choices: {', '.join(world.containers) or 'none'}")
+    sources = [name for name, box in world.containers.items() if box.source]
+    if sources and tray not in sources:
+        raise ConfigError(field, tray, f"is a destination; choices (source: true): {', '.join(sources)}")
+
+
 def tray_of(world: Surroundings, tray: str, field: str) -> Place:
     """Return the container with the objects.
 
     Raises:
-        ConfigError: the world has no such container; `field` is the parameter that names it.
+        ConfigError: see `require_tray`.
     """
-    found = next((place for place in containers_of(world) if place.id == tray), None)
-    if found is None:
-        choices = ", ".join(world.containers) or "none, so the world needs one"
-        raise ConfigError(field, tray, f"is no container of the world; choices: {choices}")
-    return found
+    require_tray(world, tray, field)
+    return next(place for place in containers_of(world) if place.id == tray)
 
 
 def features(color: npt.NDArray[np.uint8]) -> Colors:

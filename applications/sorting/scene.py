@@ -92,9 +92,7 @@ class SortingScene:
         Raises:
             ConfigError: the world has no such tray.
         """
-        if tray not in around.containers:
-            raise ConfigError("services.sorting_scene.tray", tray,
-                              f"is no container; choices: {', '.join(around.containers) or 'none'}")
+        require_tray(around, tray, "services.sorting_scene.tray")
         self._fixed, self._tcp_link = fixed_objects(around), tcp_link
         self._containers = set(around.containers) - {tray}
         box = around.containers[tray]

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pydantic import BaseModel, Field, model_validator
 
 from applications.sorting.choice import Failure
+from applications.sorting.places import require_tray
 from applications.sorting.rules import Rule
 from applications.sorting.topics import Grasp, Heap, SeenObject
 from common.config import Surroundings, Tunable
@@ -56,9 +57,7 @@ class Config(TaskConfig):
         Raises:
             ConfigError: the tray, a value or a container is unknown.
         """
-        if self.tray not in self.world.containers:
-            raise ConfigError("tray", self.tray,
-                              f"is no container; choices: {', '.join(self.world.containers) or 'none'}")
+        require_tray(self.world, self.tray, "tray")
         others = [name for name in self.world.containers if name != self.tray]
         return Rule(self.by, self.where, others, self.large)
 
