@@ -67,6 +67,8 @@ class WorldInvariants:
         self._open_edits = 0  # requested and not answered
         self._edited = False  # since the newest ground truth
         self._objects: dict[str, tuple[str, Position]] = {}  # state and position by id
+        self._containers: dict[str, str] = {}  # container by id of the objects in one
+        self._destinations = frozenset(cell.world.destinations)
 
     def on_edit_requested(self) -> None:
         """Allow any change until the edit is answered and published."""
@@ -93,6 +95,7 @@ class WorldInvariants:
         held = [name for name, (state, _) in found.items() if state == "held"]
         if checks.fails(len(held) <= 1 or self._physics, OBJECTS):  # fingers may close on two of a heap
             checks.add_violation(OBJECTS, f"{held} are held at once")
+        self._containers = {each["id"]: each["container"] for each in objects if each["state"] == CONTAINED}
         for name, (state, position) in found.items():
             before, old_position = self._objects.get(name, (state, position))
             self._objects[name] = state, position
@@ -106,7 +109,7 @@ class WorldInvariants:
         """Compare the final ground truth with what the task reports."""
         checks = self._checks
         if state == "DONE" and self._fills and not self._physics:  # with physics one camera cannot count a pile
-            contained = sum(label == CONTAINED for label, _ in self._objects.values())
+            contained = sum(container in self._destinations for container in self._containers.values())
             if checks.fails(done == contained, COUNTED):
                 checks.add_violation(COUNTED, f"the task reports {done}, the ground truth has {contained}")
         if state == "DONE" and self._truth_check is not None and self._newest:

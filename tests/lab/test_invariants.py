@@ -137,3 +137,14 @@ def test_application_checks_the_ground_truth_once_its_task_is_done(tmp_path, mon
         invariants.on_end(0, state)
         assert [line.endswith(f"{ACCEPTED}: cube") for line in invariants.broken] == [True] * broken
     assert ACCEPTED not in Invariants(PANDA, RequestLog(), lambda: 1.0).checked
+
+
+@pytest.mark.parametrize(("counted", "holds"), [(1, True), (3, False)])
+def test_objects_in_a_container_that_they_are_taken_from_are_not_placed(counted, holds):
+    cell = load_cell("sorting", ["world.simulator=kinematic"])
+    invariants = Invariants(cell, RequestLog(), lambda: 1.0)
+    objects = [m.WorldObject(id=f"o{k}", shape="box", pose=m.Pose(), state="contained", container=container)
+               for k, container in enumerate(("tray", "tray", "left"))]
+    invariants._world.on_truth(encode(m.WorldObjects(objects=objects)))
+    invariants._world.on_end(counted, "DONE")
+    assert (invariants.broken == []) == holds
