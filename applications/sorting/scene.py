@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
+from itertools import count
 
 import numpy as np
 import numpy.typing as npt
 
+from applications.sorting.places import require_tray
 from applications.sorting.topics import Foreign, Heap, SeenObject
 from common import messages as m
 from common.config import Surroundings
-from common.errors import ConfigError
 from common.robot.transforms import invert, matrix_to_pose, pose_to_matrix
 from common.scene.fixtures import fixed_objects
 
@@ -110,7 +111,20 @@ class SortingScene:
         """
         self._stamp, self._foreign = heap.header.stamp, heap.foreign
         if heap.at_home and not (T_world_tcp is not None and self._is_in_tray(T_world_tcp)):
-            self._objects, self._settled = heap.objects[:MOST_SEEN], heap.header.stamp
+            self._objects, self._settled = self._distinct(heap.objects[:MOST_SEEN]), heap.header.stamp
+
+    def _distinct(self, things: list[SeenObject]) -> list[SeenObject]:
+        """Rename objects whose ids are those of others or of fixed solids: pairs that may touch are named by ids."""
+        used = {solid.id for solid in self._fixed}
+        result = []
+        numbers = count(1)
+        for thing in things:
+            name = thing.id
+            while name in used or name.startswith(f"{FOREIGN}_"):
+                name = f"object_{next(numbers)}"
+            used.add(name)
+            result.append(thing if name == thing.id else thing.model_copy(update={"id": name}))
+        return result
 
     def _is_in_tray(self, T_world_tcp: Array) -> bool:
         x, y, z = T_world_tcp[:3, 3] - self._above_tray

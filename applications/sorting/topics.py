@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar, Literal
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from common import messages as m
 from common.application import ApplicationTopics
@@ -15,6 +15,19 @@ from common.topics import Topic
 
 MAX_OBJECTS = 100  # in a tray
 MAX_GRASPS = 60  # of one image
+LARGEST = 10.0  # [m]
+
+
+def _require_size(size: Vector3) -> Vector3:
+    for axis, side in (("x", size.x), ("y", size.y), ("z", size.z)):
+        if not 0 <= side <= LARGEST:
+            raise ValueError(f"size.{axis} {side:g} is not from 0 to {LARGEST:g} m")
+    return size
+
+
+Size = Annotated[Vector3, AfterValidator(_require_size)]
+Height = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
+Volume = Annotated[float, Field(ge=0, le=LARGEST**3)]
 Width = Annotated[float, Field(ge=0, le=0.2)]
 
 
@@ -28,12 +41,12 @@ class SeenObject(Message):
     id: Name
     place: Name = Field("tray", description="id of the container that it lies in; 'table' or 'floor' outside of all")
     center: Vector3 = Field(description="center of its surface seen from above")
-    size: Vector3
+    size: Size
     yaw: Finite = 0.0
     outline: list[tuple[Finite, Finite]] = Field([], max_length=64)
-    top: Finite = Field(0.0, description="z of its highest point")
-    bottom: Finite = Field(0.0, description="z of its support")
-    volume: Finite = Field(0.0, description="below its surface, down to its support [m^3]")
+    top: Height = Field(0.0, description="z of its highest point")
+    bottom: Height = Field(0.0, description="z of its support")
+    volume: Volume = Field(0.0, description="below its surface, down to its support [m^3]")
     color: Color = Color()
     color_name: Label = Field("", description="red, orange, yellow, green, blue, purple, white, grey, black")
     shape: Label = Field("", description="round, long, flat, ring, box, other")
@@ -75,7 +88,7 @@ class Foreign(Message):
     """A box around points that belong to no known object, such as a hand: nothing may move into it."""
 
     center: Vector3
-    size: Vector3
+    size: Size
 
 
 class Heap(Message):

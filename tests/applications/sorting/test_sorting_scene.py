@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from applications.sorting.scene import GROWN, SortingScene, distance_to, prism
 from applications.sorting.topics import Foreign, Heap, SeenObject
@@ -93,3 +94,21 @@ def test_distance_to_an_outline_is_negative_inside(place, distance):
 def test_object_without_an_outline_is_a_rectangle_along_its_yaw():
     seen = thing().model_copy(update={"outline": [], "yaw": np.pi / 2})
     assert np.ptp(prism(seen).outline, axis=0) == pytest.approx([0.04, 0.06])
+
+
+def test_objects_cannot_take_the_id_of_a_fixture_a_foreign_body_or_another_object(world):
+    scene = SortingScene(world, "tool")
+    body = Foreign(center=Vector3(x=0.4, z=0.3), size=Vector3(x=0.1, y=0.1, z=0.2))
+    scene.update_heap(heap(thing("table"), thing("foreign_1", 0.4), thing("a", 0.6), thing("a", 0.7), foreign=[body]))
+    solids = scene.scene().objects
+    assert len({each.id for each in solids}) == len(solids), "else fingers that may touch a target may touch the table"
+    assert [each.id for each in solids if each.kind == "foreign"] == ["foreign_1"]
+    assert sum(each.role == "target" and not each.kind for each in solids) == 4
+
+
+@pytest.mark.parametrize(("field", "value"), [
+    ("size", {"x": -1e9, "y": 0.0, "z": 0.0}), ("size", {"x": 1e9, "y": 0.0, "z": 0.0}), ("top", 1e9),
+    ("bottom", -1e9), ("volume", -1.0)])
+def test_messages_have_no_objects_of_impossible_size(field, value):
+    with pytest.raises(ValidationError):
+        SeenObject.model_validate({**thing().model_dump(), field: value})
