@@ -13,12 +13,14 @@ from applications.sorting.rules import NoDestination
 from applications.sorting.settings import SortingView
 from applications.sorting.steady import depth_below, seen_as
 from applications.sorting.topics import SeenObject
+from common import messages as m
 from common.robot.home import is_home
 from common.tasks.stages import AwaitImage, Grip, Move, Stage, place_of
 
 RISEN = 0.03  # [m] of the lowest held point above the walls: high enough to move across
 BELOW = 0.06  # [m] of an unseen object below the tool
 RADIUS = 0.05  # [m] of an unseen object from above
+CHECKS = "waiting for an image of the tray: is one object held, or two?"
 LOWERED = 0.015  # [m] above its support at which an object is put back
 
 
@@ -54,26 +56,35 @@ class Holding(SortingProgress):
         return True
 
     def _check(self, cycle: Pick, view: SortingView) -> bool:
-        """Compare the tray with the picture before the grasp; return whether the object may be released."""
-        assert cycle.chosen is not None
+        """Compare the tray with the picture before the grasp; return whether the object may be released.
+
+        If the tray cannot be seen from here, it is looked at from home, with the object.
+        """
         self.images_after = max(self.images_after, min(self._carried_since, view.now))
-        if not self._refresh(view) or self._heap is None:
-            waited = self.wait_timer.elapsed("check", view.now)
-            arrived = self.running is None
-            if not arrived or waited < self.p.check_patience:
-                return False
-            cycle.checked = True
-            self.status.held = "one"
-            return True
-        found = by_picture(cycle.chosen.thing, place_of(cycle.chosen.grasp.pose)[:2], cycle.before,
-                           self._choice.left(self._heap))
-        cycle.checked, self.status.held = True, found.held
+        if not self._refresh(view):
+            if self.running is None and self.wait_timer.elapsed("check", view.now) >= self.p.check_patience:
+                self.clear()
+                self.queue += [self.home(view), AwaitImage()]
+            return False
+        cycle.checked = self._compare(view)
+        if not cycle.checked:
+            self.clear()
+        return cycle.checked
+
+    def _compare(self, view: SortingView) -> bool:
+        """Find out by the newest image what is held; return whether it is one object."""
+        memory = self._memory
+        assert memory.thing is not None and memory.grasp is not None and self._heap is not None
+        found = by_picture(memory.thing, place_of(memory.grasp.pose)[:2], memory.before, self._choice.left(self._heap))
+        self.status.held = found.held
+        if self.status.message == CHECKS:
+            self.status.message = ""
+        self._remember(checked=True)
         if found.held != "two":
             return True
-        self._choice.penalize(cycle.chosen.grasp, view.now, found.why)
-        self._note("two", f"{cycle.subject}: {found.why}")
+        self._choice.penalize(memory.grasp, view.now, found.why)
+        self._note("two", f"{memory.thing.id}: {found.why}")
         self._remember(back=True)
-        self.clear()
         return False
 
     def succeeded(self, stage: Stage, view: SortingView) -> None:
@@ -101,7 +112,7 @@ class Holding(SortingProgress):
         remark = width_remark(view.gripper.width, chosen.grasp.width, self.p.width_tolerance)
         self.status.held, self.status.last = "", f"{cycle.subject}: {remark or 'gripped'}"
         self._remember(thing=chosen.thing, grasp=chosen.grasp, container=chosen.container, back=False,
-                       inside=cycle.inside, left=len(cycle.before))
+                       inside=cycle.inside, left=len(cycle.before), before=cycle.before, checked=False)
 
     def _released(self, cycle: Pick, view: SortingView) -> None:
         thing, container = self._memory.thing, self._memory.container
@@ -188,6 +199,17 @@ class Holding(SortingProgress):
         held = view.scene.attached[0].object
         thing = self._memory.thing or seen_as(held)
         below = depth_below(held)
+        if not home and view.tool[2] - below <= self._rim(self.p.tray) + RISEN:
+            self._lift_held(thing, held, view)
+            return
+        if self._memory.thing is None:  # it was never compared with an image
+            self.status.message = "what is held is unknown: it goes back to the tray"
+            self._remember(back=True)
+        if not (self._memory.checked or self._memory.back or self._look_at_tray(view)):
+            return
+        if self._memory.back:
+            self._put_back(view)
+            return
         try:
             container = self._memory.container or self._rule.destination(thing)
             spot = self._spot(thing, container, below)
@@ -195,18 +217,29 @@ class Holding(SortingProgress):
             self.status.message = str(error)
             self._put_back(view)
             return
-        if self._memory.back:
-            self._put_back(view)
-            return
         cycle = Pick(thing.id, spot=spot, gripped=True, checked=True)
-        if view.tool[2] - below > self._rim(self.p.tray) + RISEN:
-            across = Move("across", "PLACING", cycle, goal=motions.over_spot(spot), carries=True)
-            self.queue += [across, motions.release(cycle, self.gripper)]
-            return
+        across = Move("across", "PLACING", cycle, goal=motions.over_spot(spot), carries=True)
+        self.queue += [across, motions.release(cycle, self.gripper)]
+
+    def _lift_held(self, thing: SeenObject, held: m.CollisionObject, view: SortingView) -> None:
+        """Lift what is held out of the heap."""
+        assert view.tcp is not None
         near = motions.neighbors(view, view.tool[:2])
         touches = [(link, name) for link in self.gripper.links for name in near]
         touches += [(held.id, name) for name in [*near, *motions.supports(thing, view)]]
-        self.queue += motions.carry(cycle, self.gripper, view.tcp, touches)
+        self.queue.append(motions.lift(Pick(thing.id, gripped=True), view.tcp, touches))
+
+    def _look_at_tray(self, view: SortingView) -> bool:
+        """Compare the tray with the picture before the grasp, from home if need be; return whether that was done."""
+        if math.isinf(self._carried_since):  # another process of this task took it
+            self._carried_since = view.now
+        self.images_after = max(self.images_after, self._carried_since)
+        if self._refresh(view):
+            self._compare(view)
+            return True
+        self._look(view)
+        self.status.message = self.status.message or CHECKS
+        return False
 
     def _put_back(self, view: SortingView) -> None:
         """Queue the way of the held object to the freest spot of the tray."""

@@ -102,17 +102,18 @@ def carry(cycle: Pick, gripper: GripperConfig, start: m.Pose, touches: list[tupl
         start: pose of the tool.
         touches: pairs that may touch on the way.
     """
-    over = over_spot(cycle.spot)
-    state = "CHECKING"
-    lifted = m.PoseGoal(pose=raised(start, LIFT))
-    apart: list[Stage] = [
-        Move("lift", state, cycle, goal=lifted, straight=True, carries=True, touches=touches),
-        Move("across", "PLACING", cycle, goal=over, carries=True),
-    ]
+    over, lifted = over_spot(cycle.spot), m.PoseGoal(pose=raised(start, LIFT))
+    apart: list[Stage] = [lift(cycle, start, touches), Move("across", "PLACING", cycle, goal=over, carries=True)]
     joined = m.SequenceGoal(items=[
         m.SequenceItem(goal=lifted, straight=True, blend_radius=BLEND), m.SequenceItem(goal=over)])
-    return [Move("carry", state, cycle, goal=joined, carries=True, touches=touches, fallback=apart),
+    return [Move("carry", "CHECKING", cycle, goal=joined, carries=True, touches=touches, fallback=apart),
             release(cycle, gripper)]
+
+
+def lift(cycle: Pick, start: m.Pose, touches: list[tuple[str, str]]) -> Move:
+    """Return the motion straight up from the pose of the tool, touching the pairs."""
+    return Move("lift", "CHECKING", cycle, goal=m.PoseGoal(pose=raised(start, LIFT)), straight=True, carries=True,
+                touches=touches)
 
 
 def over_spot(spot: tuple[float, float, float]) -> m.PoseGoal:

@@ -79,6 +79,8 @@ class Memory(BaseModel):
     failures: list[Failure] = []
     thing: SeenObject | None = None
     grasp: Grasp | None = None
+    before: list[SeenObject] = []  # objects in the tray when the grasp was chosen
+    checked: bool = False  # whether what is held is known
     container: str = ""
     back: bool = False
     inside: int = 0  # objects seen in that container before

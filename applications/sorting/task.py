@@ -21,6 +21,7 @@ from common import messages as m
 from common.robot.home import is_home
 from common.tasks.stages import AwaitImage, Grip, Move, Stage, place_of
 
+MOST_HIDDEN = 0.4  # fraction of the tray without depth from which on it cannot be called empty
 STILL = 0.01  # [m] that an object at rest may seem to move between two images
 NO_MOTION = ("no_ik", "collision")  # errors of a goal itself; a planner without an answer says nothing about it
 
@@ -143,6 +144,11 @@ class Sorting(Holding):
         left = steady([self._choice.left(each) for each in self._recent])
         foreign = [thing for thing in view.objects("target") if thing.kind == FOREIGN]
         waited = 1e-9 * (heap.header.stamp - self._recent[0].header.stamp)
+        if heap.hidden > MOST_HIDDEN:
+            self.status.message = f"no depth of {100 * heap.hidden:.0f} % of the tray"
+            if waited >= self.p.give_up:
+                self._finish(left, heap, self.status.message)
+            return
         if not left:
             self.status.state = "IDLE"
             if waited >= self.p.empty:
@@ -181,14 +187,14 @@ class Sorting(Holding):
         self.queue += motions.stir(view, self.gripper, start, end, self.p.world.table_height + box.floor_thickness)
         self.images_after, self._heap = view.now, None
 
-    def _finish(self, left: list[SeenObject], heap: Heap) -> None:
+    def _finish(self, left: list[SeenObject], heap: Heap, error: str = "") -> None:
         reasons = [(thing, self._choice.reason(thing, heap)) for thing in left]
         self.status.skipped = [
             m.Rejection(position=thing.center, reason=f"{thing.id}: {reason}") for thing, reason in reasons]
         overlooked = "; ".join(
             f"{thing.id} at ({thing.center.x:.3f}, {thing.center.y:.3f}): {reason}" for thing, reason in reasons)
         message = f"{len(left)} objects are left" if left else "the tray is empty"
-        self.end("DONE", message)
+        self.end("ERROR" if error else "DONE", error or message)
         self.status.overlooked = overlooked[:400]
 
     def note(self, view: SortingView) -> None:

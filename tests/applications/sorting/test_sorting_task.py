@@ -55,7 +55,7 @@ def carrying(task):
     """Let a task carry the object a above its container, and return its pick."""
     cycle = Pick("a", options=[Option(grasp(), A, "left")], chosen=Option(grasp(), A, "left"), before=[A, B, C],
                  gripped=True)
-    task._memory = Memory(attempts=1, thing=A, container="left")
+    task._memory = Memory(attempts=1, thing=A, grasp=grasp(), container="left", before=[A, B, C])
     task._carried_since = NOW - 1.0
     return cycle
 
@@ -134,12 +134,55 @@ def test_heap_without_grasps_is_stirred_after_a_while(task):
     assert [stage.name for stage in task.queue] == ["shut", "above", "down", "push", "up", "home", "open", "look"]
 
 
-def test_object_held_after_a_restart_goes_where_the_memory_says(task):
-    task.remember(Memory(attempts=3, done=2, thing=A, container="right"))
+@pytest.mark.parametrize(("after", "held", "stages"), [
+    ([B, C], "one", ["across", "release"]),
+    ([C], "two", ["back", "lower", "release", "up", "home", "look"]),
+])
+def test_object_held_after_a_restart_is_compared_with_the_picture_before_its_grasp(task, after, held, stages):
+    task.remember(Memory(attempts=3, done=2, thing=A, grasp=grasp(), container="right", before=[A, B, C]))
     task.decide(view([B, C], holding=True))
-    goal = task.queue[0].goal
-    goal = goal.items[-1].goal if isinstance(goal, m.SequenceGoal) else goal
-    assert goal.pose.position.y < -0.2 and task.queue[-1].name == "release"
+    assert not task.queue and "is one object held, or two?" in task.status.message, "that picture may be older"
+    task.decide(view(after, holding=True, stamp=NOW + 1.0))
+    assert task.status.held == held and [stage.name for stage in task.queue] == stages
+    assert (task.queue[0].goal.pose.position.y < -0.2) == (held == "one"), "in the container of the memory"
+
+
+def test_object_that_was_compared_before_a_restart_goes_where_the_memory_says(task):
+    task.remember(Memory(thing=A, grasp=grasp(), container="right", before=[A, B, C], checked=True))
+    task.decide(view([B, C], holding=True))
+    assert task.queue[0].goal.pose.position.y < -0.2 and task.queue[-1].name == "release"
+
+
+def test_held_object_that_no_memory_knows_goes_back_to_the_tray(task):
+    task.decide(view([B, C], holding=True))
+    assert [stage.name for stage in task.queue] == ["back", "lower", "release", "up", "home", "look"]
+    assert "goes back to the tray" in task.status.message
+
+
+def test_object_held_low_in_the_tray_after_a_restart_is_lifted_first(task):
+    seen = view([A, B], holding=True, q=[0.3, *HOME[1:]])
+    seen.tcp = matrix_to_pose(tool_down(0.55, 0.0, 0.03))
+    task.decide(seen)
+    assert [stage.name for stage in task.queue] == ["lift"]
+
+
+def test_tray_that_cannot_be_seen_above_the_container_is_seen_from_home_before_the_release(task):
+    cycle = carrying(task)
+    stage = release(cycle, task.gripper)
+    task.queue.append(stage)
+    for k in range(30):
+        hidden = view([], holding=True, stamp=NOW + 0.1 * k, at_home=False)
+        if list(task.queue) == [stage]:
+            assert not task.may_start(stage, hidden)
+    assert [each.name for each in task.queue] == ["home", "look"] and not task.memory.checked
+
+
+def test_tray_without_depth_is_not_called_empty(task):
+    for k in range(40):
+        seen = view([], stamp=NOW + 0.2 * k)
+        seen.heap.hidden = 0.9
+        task.decide(seen)
+    assert (task.status.state, task.status.message) == ("ERROR", "no depth of 90 % of the tray")
 
 
 @pytest.mark.parametrize(("inside", "done", "outcome"), [(0, 1, "one"), (1, 0, "slipped")])
