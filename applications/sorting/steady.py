@@ -5,8 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+import numpy as np
+
 from applications.sorting.topics import SeenObject
 from common import messages as m
+from common.robot.transforms import pose_to_matrix
 
 STEADY = 0.6  # share of images that show an object at the same place
 SAME = 0.025  # [m]
@@ -36,5 +39,12 @@ def seen_as(held: m.CollisionObject) -> SeenObject:
 
 
 def depth_below(held: m.CollisionObject) -> float:
-    """Return how far a held object reaches below a tool that points down [m]."""
-    return max(0.01, held.pose.position.z + held.dimensions[-1 if held.shape == "box" else 0] / 2)
+    """Return how far a held object reaches below a tool that points down [m]; tilted grasps hold it tilted."""
+    if held.shape == "prism":
+        flat, height = np.array(held.outline, float), held.dimensions[0]
+    else:
+        x, y, height = (list(held.dimensions) * 3)[:3] if held.shape == "box" else [2 * max(held.dimensions)] * 3
+        flat = np.array([(a * x / 2, b * y / 2) for a in (-1, 1) for b in (-1, 1)])
+    corners = np.concatenate([np.c_[flat, np.full(len(flat), z)] for z in (-height / 2, height / 2)])
+    T = pose_to_matrix(held.pose)
+    return max(0.01, float((corners @ T[2, :3] + T[2, 3]).max()))

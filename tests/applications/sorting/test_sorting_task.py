@@ -1,17 +1,20 @@
 """Decisions of the sorting task: two objects at once, a foreign body, and what is held after a restart."""
 
+import math
+
+import numpy as np
 import pytest
 
 from applications.sorting.choice import Option
 from applications.sorting.motions import Pick, grip_force, push_line, release
 from applications.sorting.settings import Config, Memory, SortingView
-from applications.sorting.steady import steady
+from applications.sorting.steady import depth_below, steady
 from applications.sorting.task import Sorting
 from applications.sorting.topics import Grasp, Heap, SeenObject, SortingStatus
 from common import messages as m
 from common.config import load_cell, service_config
 from common.errors import ConfigError
-from common.robot.transforms import matrix_to_pose, tool_down
+from common.robot.transforms import matrix_to_pose, rpy_to_matrix, tool_down
 from common.tasks.stages import Grip, Move
 
 HOME = [0.0, -0.785398, 0.0, -2.356194, 0.0, 1.570796, 0.785398]
@@ -224,3 +227,13 @@ def test_bad_parameters_are_one_line(parameters, text):
     with pytest.raises(ConfigError) as error:
         config(**parameters)
     assert text in str(error.value) and "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(("tilt", "below"), [(0.0, 0.015), (30.0, 0.02 * 0.5 + 0.015 * 3**0.5 / 2)])
+def test_object_held_tilted_reaches_farther_below_the_tool(tilt, below):
+    T = np.eye(4)
+    T[:3, :3] = rpy_to_matrix(0.0, math.radians(tilt), 0.0)
+    held = m.CollisionObject(
+        id="a", role="attached", shape="prism", dimensions=[0.03], pose=matrix_to_pose(T),
+        outline=[(x, y) for x in (-0.02, 0.02) for y in (-0.01, 0.01)])
+    assert depth_below(held) == pytest.approx(below)
