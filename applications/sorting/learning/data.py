@@ -20,6 +20,7 @@ from applications.sorting.learning.patches import patches_of
 from applications.sorting.learning.scenes import Rig, Seen, draw_conditions, fallen, perceive, rig_of
 from applications.sorting.learning.tries import Tries
 from applications.sorting.objects.kinds import TRAIN_KINDS, draw
+from common.errors import ConfigError
 
 HEAPS = (1, 1, 1, 5, 10)  # numbers of objects, drawn with equal probability
 TRIES = {1: 10, 5: 12, 10: 12}  # of a scene
@@ -86,9 +87,16 @@ def collect(
         tries: number of tries, at least; whole groups are stored.
         seed: of the scenes.
         processes: number of processes.
+
+    Raises:
+        ConfigError: the file cannot be written, or the cell cannot be used.
     """
     folder = path.with_name(path.name + ".parts")
-    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError("--out", str(path), f"cannot be written: {error.strerror}") from None
+    rig_of(cell, overrides)
     done, group = 0, 0
     context = multiprocessing.get_context("spawn")
     with context.Pool(processes, _start, (cell, tuple(overrides))) as pool:
