@@ -166,10 +166,12 @@ class Truth:
             return "empty"
         now = attempt.places or self._places()
         places = {now[name] for name in attempt.lifted}
+        if attempt.noticed == "two" and places <= {TRAY, "held"}:  # the next one may have begun
+            return "put back"
+        if places == {TRAY}:
+            return "slipped"
         if places & {"held", "falling"}:
             return "not released" if self.status.state in ("DONE", "ERROR") else "unfinished"
-        if places == {TRAY}:
-            return "put back" if attempt.noticed == "two" else "slipped"
         return "fell in transit"
 
     def _places(self) -> dict[str, str]:
