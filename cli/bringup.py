@@ -29,6 +29,10 @@ Record = Annotated[
 Foxglove = Annotated[
     str | None, typer.Option("--foxglove", metavar="[PORT]", help="serve Foxglove at this port [8765]; needs the extra")
 ]
+Ros2 = Annotated[
+    str | None, typer.Option("--ros2", metavar="[DOMAIN_ID]", help="publish to this domain of ROS 2 [0] with "
+                                                                   "rmw_zenoh; needs the extra")
+]
 ChaosSeed = Annotated[
     str | None, typer.Option("--chaos", metavar="SEED", help="inject faults; the same seed plans the same faults")
 ]
@@ -61,6 +65,7 @@ def _session(
     log_json: LogJson = False,
     record: Record = None,
     foxglove: Foxglove = None,
+    ros2: Ros2 = None,
     chaos: ChaosSeed = None,
     chaos_rate: ChaosRate = None,
     until_stdin_ends: UntilStdinEnds = False,
@@ -69,11 +74,12 @@ def _session(
 ) -> CellSession:
     """Return the session that the options of `run` and `up` describe; these are its parameters."""
     from bridges.foxglove.option import overrides_for
+    from bridges.ros2.option import overrides_for as overrides_for_ros2
     from common.supervision.lifecycle import interrupt_at_stdin_end
     from security.preflight import choose
 
     choose(secure)
-    overrides = [*overrides_for(cell, foxglove), *(overrides or ())]
+    overrides = [*overrides_for(cell, foxglove), *overrides_for_ros2(cell, ros2), *(overrides or ())]
     session = CellSession(
         cell, overrides, world=world, seed=options.whole("--seed", seed, 0), speed=options.number("--speed", speed),
         domain=domain, connect=connect, no_viewer=no_viewer, summary=summary, log_json=log_json,

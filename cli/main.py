@@ -51,7 +51,7 @@ class CommandLine(CommandGroup):
         choices.prepare()
         try:
             of_applications.take_own(arguments)
-            command, given = typer.main.get_command(self), options.with_optional_port(arguments)
+            command, given = typer.main.get_command(self), options.with_optional_values(arguments)
             code = command(given, standalone_mode=False, prog_name="zencell", obj=verbs.CommandShell())
         except typer.TyperException as error:
             code = _fail(_with_choices(error), error.exit_code)

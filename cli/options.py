@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from common.transport.bus import Bus
 
 MOST_PER_SECOND = 1000.0  # messages or lines
-FOXGLOVE_PORT = "8765"  # to which Foxglove connects by default
+OPTIONAL_VALUES = {"--foxglove": "8765", "--ros2": "0"}  # port to which Foxglove connects by default; domain of ROS 2
 
 CellArgument = Annotated[
     str, typer.Argument(metavar="CELL", help="a name of `zencell cells`, or the path of a YAML file",
@@ -87,13 +87,14 @@ WorldName = Annotated[
 Seed = Annotated[str | None, typer.Option("--seed", metavar="N", help="seed of all random numbers")]
 
 
-def with_optional_port(arguments: Sequence[str]) -> list[str]:
-    """Return the arguments of `run` and `up` with the port of a --foxglove that has none."""
+def with_optional_values(arguments: Sequence[str]) -> list[str]:
+    """Return the arguments of `run` and `up` with the values of a --foxglove and a --ros2 that have none."""
     found = list(arguments)
-    if found[:1] in (["run"], ["up"]) and "--foxglove" in found:
-        at = found.index("--foxglove") + 1
-        if at == len(found) or found[at].startswith("-"):
-            found.insert(at, FOXGLOVE_PORT)
+    for option, value in OPTIONAL_VALUES.items() if found[:1] in (["run"], ["up"]) else ():
+        if option in found:
+            at = found.index(option) + 1
+            if at == len(found) or found[at].startswith("-"):
+                found.insert(at, value)
     return found
 
 

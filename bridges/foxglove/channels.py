@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import json
 from collections.abc import Callable, Coroutine, Iterable
-from dataclasses import replace
 from typing import Any
 
 from foxglove import Channel, Context, Schema
 
-from common.application import Application
+from bridges.cell_topics import drain
 from common.errors import ZencellError
 from common.messages import Image, Message, PointCloud2
-from common.remapping import Remapping
-from common.topics import SUPERVISOR_STATUS, Topic, general_key, platform_topics
+from common.topics import SUPERVISOR_STATUS, Topic, general_key
 from common.transport.bus import Bus
 from common.transport.ownership import Owner
 from common.transport.reader import Reader
@@ -23,22 +20,6 @@ from common.transport.session import owns_key
 from recording.foxglove import CONVERSION_ERRORS, convert, schema_name, schema_text
 
 LARGE = (Image, PointCloud2)  # converted in a thread
-
-
-def topics_of(application: Application, keys: Iterable[dict[str, str]]) -> list[Topic[Any]]:
-    """Return all topics that a cell may have, under the keys that they have there.
-
-    Args:
-        application: of the cell.
-        keys: remapping tables of its services.
-    """
-    found: dict[str, Topic[Any]] = {}
-    tables = [Remapping(table) for table in keys]
-    for topic in [*platform_topics().values(), *application.topics_by_key.values()]:
-        if isinstance(topic, Topic):
-            for key in (topic.key, *(table.key(topic.key) for table in tables)):
-                found.setdefault(key, replace(topic, key=key))
-    return list(found.values())
 
 
 class Channels:
@@ -151,7 +132,7 @@ class Channels:
         self._channels[key].log(data, log_time=self._bus.clock.now_ns())
 
     async def _pump(self, reader: Reader[Any]) -> None:
-        await _drain(reader)
+        await drain(reader)
         while True:
             await self._send(reader, await reader.next())
             if reader.topic.kind == "stream":
@@ -175,16 +156,6 @@ class Channels:
         if key not in self._unfit:
             self._unfit.add(key)
             self._bus.log.warning("%s: messages are left out: %s", key, why)
-
-
-async def _drain(reader: Reader[Any]) -> None:
-    """Discard what a stream received before it was last unsubscribed."""
-    if reader.topic.kind == "state":
-        return
-    with contextlib.suppress(TimeoutError):
-        async with asyncio.timeout(0):
-            while True:
-                await reader.next()
 
 
 def _encoded(message: Message) -> tuple[str, bytes]:

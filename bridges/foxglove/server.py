@@ -12,8 +12,9 @@ from typing import Any, Protocol, cast
 from foxglove import Parameter, StatusLevel, start_server
 from foxglove.websocket import Capability, ChannelView, Client, WebSocketServer
 
+from bridges.cell_topics import topics_of
 from bridges.foxglove import arm
-from bridges.foxglove.channels import Channels, topics_of
+from bridges.foxglove.channels import Channels
 from bridges.foxglove.controls import CallFailed, Controls
 from bridges.foxglove.option import require_free
 from common.application import Application

@@ -1,0 +1,77 @@
+"""Publishes a cell in a domain of ROS 2 until cancelled."""
+
+from __future__ import annotations
+
+import asyncio
+import xml.etree.ElementTree as ET
+from typing import Protocol
+
+from bridges.cell_topics import topics_of
+from bridges.ros2 import convert, keys
+from bridges.ros2.controls import serve_commands
+from bridges.ros2.graph import Graph, Publisher
+from bridges.ros2.topics import Topics
+from bridges.ros2.types import make
+from common.application import Application
+from common.config import Members, RobotConfig
+from common.transport.bus import Bus
+from common.transport.endpoint import endpoint_of
+
+CLOCK_PERIOD = 0.02  # [s] wall
+
+
+class Options(Protocol):
+    """Parameters of the bridge."""
+
+    robot: RobotConfig
+    members: Members
+    domain: int
+    namespace: str
+    commands: bool
+    rate: float
+
+
+async def serve(bus: Bus, config: Options, application: Application, endpoint: str | None = None) -> None:
+    """Serve the cell until cancelled; `endpoint` is that of a router, by default the cell's."""
+    await bus.acquire_keys()
+    namespace = "/" + keys.ros_name(config.namespace or bus.cell)
+    graph = await asyncio.to_thread(
+        Graph, endpoint or endpoint_of(), config.domain, namespace, "zencell", bus.log)
+    topics = Topics(bus, graph, topics_of(application, config.members.keys), lambda: config.rate)
+    try:
+        description = await asyncio.to_thread(description_of, config.robot)
+        graph.publisher(f"{namespace}/robot_description", "std_msgs/msg/String", keys.LATCHED).put(
+            convert.text(description))
+        if config.commands:
+            serve_commands(bus, graph)
+        topics.watch()
+        await bus.ready()
+        bus.log.info("ROS 2 domain %d, namespace %s, with rmw_zenoh at %s", config.domain, namespace,
+                     endpoint or endpoint_of())
+        await _publish_clock(bus, graph.publisher("/clock", "rosgraph_msgs/msg/Clock", keys.LATEST))
+    finally:
+        topics.close()
+        await asyncio.to_thread(graph.close)
+
+
+def description_of(robot: RobotConfig) -> str:
+    """Return the robot as one URDF, whose meshes are URLs of files of this host.
+
+    Raises:
+        ConfigError: a description is missing or does not parse.
+    """
+    from common.robot.urdf import merged_urdf  # slow to import
+
+    root = ET.fromstring(merged_urdf(robot))
+    for mesh in root.iter("mesh"):
+        if (path := mesh.get("filename", "")).startswith("/"):
+            mesh.set("filename", f"file://{path}")
+    return ET.tostring(root, encoding="unicode")
+
+
+async def _publish_clock(bus: Bus, publisher: Publisher) -> None:
+    """Publish cell time while there is a subscription, for nodes with use_sim_time."""
+    while True:
+        if publisher.matched:
+            publisher.put(make("rosgraph_msgs/msg/Clock", clock=convert.time_of(bus.clock.now_ns())))
+        await asyncio.sleep(CLOCK_PERIOD)
