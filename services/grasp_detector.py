@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import cv2
-from pydantic import Field
+from pydantic import Field, field_validator, model_validator
 
 from applications.sorting.detector import HeapDetector, Seen
 from applications.sorting.drawing import annotate_heap
@@ -60,6 +60,19 @@ class Config(Parameters):
                                                                   "known there [m]")
     ceiling: Tunable[float] = Field(0.20, gt=0, le=2, description="height above the table from which on everything "
                                                                   "but the robot is foreign [m]")
+
+    @field_validator("views")
+    @classmethod
+    def _require_distinct_views(cls, views: list[str]) -> list[str]:
+        if len(set(views)) < len(views):
+            raise ValueError(f"{next(name for name in views if views.count(name) > 1)!r} is listed twice")
+        return views
+
+    @model_validator(mode="after")
+    def _require_scorer_of_network(self) -> Config:
+        if self.network and self.scorer != "learned":
+            raise ValueError(f"network {self.network!r} has no effect with scorer {self.scorer!r}; choose learned")
+        return self
 
 
 @dataclass(frozen=True, eq=False)

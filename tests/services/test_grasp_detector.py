@@ -6,6 +6,7 @@ from collections.abc import AsyncIterator
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from applications.sorting.topics import HEAP, HEAP_IMAGE
 from common import topics
@@ -120,3 +121,12 @@ async def test_unknown_tray_is_refused_with_the_choices() -> None:
     with pytest.raises(ConfigError, match=r"services.grasp_detector.tray.*tray, left, right"):
         async with fake.running(grasp_detector, grasp_detector.Config(robot=ROBOT, world=WORLD, tray="bin")):
             await settle()
+
+
+@pytest.mark.parametrize(("parameters", "text"), [
+    ({"views": ["left", "left"]}, "'left' is listed twice"),
+    ({"network": "mine.onnx"}, "network 'mine.onnx' has no effect with scorer 'geometric'; choose learned"),
+])
+def test_parameters_without_an_effect_are_refused(parameters, text) -> None:
+    with pytest.raises(ValidationError, match=text):
+        grasp_detector.Config(robot=ROBOT, world=WORLD, **parameters)
