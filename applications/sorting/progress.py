@@ -42,6 +42,7 @@ class SortingProgress(Task[SortingView]):
         self._carried_since = math.inf
         self._skipped = 0  # spots tried for the held object
         self._descending: Pick | None = None
+        self._earlier = 0.0  # [s] that earlier processes of this task worked
 
     def _refresh(self, view: SortingView) -> bool:
         """Take the newest heap if it shows the whole tray after what was done; return whether one is there."""
@@ -91,7 +92,8 @@ class SortingProgress(Task[SortingView]):
 
     def _count_sorted(self, name: str, container: str) -> None:
         counts = Counter(self._memory.sorted) + Counter({container: 1})
-        self._remember(done=self._memory.done + 1, sorted=dict(counts), thing=None, container="", back=False, stirs=0)
+        self._remember(done=self._memory.done + 1, sorted=dict(counts), thing=None, container="", back=False, stirs=0,
+                       seconds=self._earlier + self.status.task_seconds)
         self._note("one", f"{name} to {container}")
 
     def _note(self, outcome: str, last: str) -> None:
@@ -145,7 +147,7 @@ class SortingProgress(Task[SortingView]):
         if self._heap is not None and not view.holding:
             status.total = memory.done + len(self._choice.left(self._heap))
         status.total = max(status.total, memory.done)
-        seconds = status.task_seconds
+        seconds = self._earlier + status.task_seconds
         status.figures = {
             "attempts": memory.attempts,
             "success_rate": round(memory.done / memory.attempts, 3) if memory.attempts else None,
@@ -165,7 +167,7 @@ class SortingProgress(Task[SortingView]):
     def remember(self, memory: BaseModel) -> None:
         """Continue from the memory of the task before its restart."""
         assert isinstance(memory, Memory)
-        self._memory, self._choice.failures = memory, memory.failures
+        self._memory, self._choice.failures, self._earlier = memory, memory.failures, memory.seconds
 
     def _remember(self, **changes: object) -> None:
         self._memory = self._memory.model_copy(update=changes)

@@ -74,6 +74,7 @@ class Memory(BaseModel):
 
     attempts: int = 0
     done: int = 0
+    seconds: float = 0.0  # [s] of work until the last one was done
     sorted: dict[str, int] = {}
     outcomes: dict[str, int] = {}
     failures: list[Failure] = []

@@ -237,3 +237,10 @@ def test_object_held_tilted_reaches_farther_below_the_tool(tilt, below):
         id="a", role="attached", shape="prism", dimensions=[0.03], pose=matrix_to_pose(T),
         outline=[(x, y) for x in (-0.02, 0.02) for y in (-0.01, 0.01)])
     assert depth_below(held) == pytest.approx(below)
+
+
+def test_rate_after_a_restart_includes_the_time_before_it(task):
+    task.remember(Memory(attempts=9, done=9, seconds=170.0))
+    task.status.task_seconds = 10.0
+    task.note(view([A]))
+    assert task.status.figures["picks_per_hour"] == 180.0
