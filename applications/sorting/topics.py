@@ -26,7 +26,7 @@ def _require_size(size: Vector3) -> Vector3:
 
 
 Size = Annotated[Vector3, AfterValidator(_require_size)]
-Height = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
+Position = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
 Volume = Annotated[float, Field(ge=0, le=LARGEST**3)]
 Width = Annotated[float, Field(ge=0, le=0.2)]
 
@@ -43,9 +43,9 @@ class SeenObject(Message):
     center: Vector3 = Field(description="center of its surface seen from above")
     size: Size
     yaw: Finite = 0.0
-    outline: list[tuple[Finite, Finite]] = Field([], max_length=64)
-    top: Height = Field(0.0, description="z of its highest point")
-    bottom: Height = Field(0.0, description="z of its support")
+    outline: list[tuple[Position, Position]] = Field([], max_length=64)
+    top: Position = Field(0.0, description="z of its highest point")
+    bottom: Position = Field(0.0, description="z of its support")
     volume: Volume = Field(0.0, description="below its surface, down to its support [m^3]")
     color: Color = Color()
     color_name: Label = Field("", description="red, orange, yellow, green, blue, purple, white, grey, black")

@@ -108,7 +108,7 @@ def test_objects_cannot_take_the_id_of_a_fixture_a_foreign_body_or_another_objec
 
 @pytest.mark.parametrize(("field", "value"), [
     ("size", {"x": -1e9, "y": 0.0, "z": 0.0}), ("size", {"x": 1e9, "y": 0.0, "z": 0.0}), ("top", 1e9),
-    ("bottom", -1e9), ("volume", -1.0)])
+    ("bottom", -1e9), ("volume", -1.0), ("outline", [(1e12, 0.0), (0.0, 1e12), (-1e12, 0.0)])])
 def test_messages_have_no_objects_of_impossible_size(field, value):
     with pytest.raises(ValidationError):
         SeenObject.model_validate({**thing().model_dump(), field: value})
