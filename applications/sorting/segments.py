@@ -271,7 +271,7 @@ def _perimeters(labels: Labels, count: int) -> npt.NDArray[np.int64]:
 
 def _numbered(labels: Labels, patched: set[int]) -> Segments:
     """Drop segments of fewer than `SMALLEST` cells and number the others from 1."""
-    sizes = np.bincount(labels.ravel())
+    sizes = np.bincount(labels.ravel(), minlength=max(patched, default=0) + 1)  # patched ones may have been joined
     keep = np.flatnonzero(sizes >= SMALLEST)
     keep = keep[keep > 0]
     numbers = np.zeros(len(sizes), np.int32)
