@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+from applications.sorting.contents import gap
 from applications.sorting.topics import SeenObject
 
 Held = Literal["", "one", "empty", "two", "slipped"]
@@ -17,6 +18,8 @@ GONE = 0.6  # share of its volume that an object has lost if it was taken
 MORE = 1.6  # times the expected volume: that is two objects
 LEAST_VOLUME = 5e-6  # [m^3] less is noise
 BESIDE = 0.12  # [m] from the grasp: what disappears farther away was not taken by it
+TOUCHING = 0.006  # [m] between outlines; of one color, they may be one object that was seen as two
+TWO_COLORS = "two colors"  # in `SeenObject.why`
 
 
 @dataclass(frozen=True)
@@ -25,6 +28,7 @@ class Check:
 
     held: Held
     why: str = ""
+    doubt: str = ""  # why "one" may be two: the container is looked at after the release
 
 
 def by_width(width: float, holding: bool) -> Check:
@@ -46,30 +50,42 @@ def width_remark(width: float, expected: float, tolerance: float) -> str:
 
 def by_picture(
     taken: SeenObject, place: tuple[float, float], before: Sequence[SeenObject], after: Sequence[SeenObject],
+    remark: str = "",
 ) -> Check:
     """Return what is held by comparing the tray before and after the lift.
 
-    Objects that touch may be seen as one before and as several afterwards, so volumes count, not numbers.
+    Objects that touch may be seen as one before and as several afterwards, so volumes count, not numbers. "two" needs
+    evidence: another object is missing, or two colors and a measurement. Anything less is a doubt.
 
     Args:
         taken: the object that the grasp was for.
         place: (x, y) of the grasp in world [m].
-        before: objects in the tray before the grasp.
+        before: objects in the tray before the grasp, those that two images show.
         after: objects in the tray, seen while the arm hides nothing of it.
+        remark: how the fingers are wider apart than expected; empty if they are not.
     """
     lost = {thing.id: _lost(thing, after) for thing in before}
     near = [thing for thing in before if thing.id != taken.id and _distance(thing, place) < BESIDE]
-    others = [thing for thing in near if lost[thing.id] >= max(GONE * thing.volume, LEAST_VOLUME)
-              and not _moved(thing, before, after)]
+    missing = [thing for thing in near if lost[thing.id] >= max(GONE * thing.volume, LEAST_VOLUME)
+               and not _moved(thing, before, after)]
+    parts = [thing for thing in missing if thing.color_name == taken.color_name and gap(thing, taken) < TOUCHING]
+    others = [thing for thing in missing if thing not in parts]
     own = lost.get(taken.id, 0.0)
     if others and own >= GONE * taken.volume:
         return Check("two", f"{taken.id} and {', '.join(thing.id for thing in others)} are missing in the tray")
+    expected = max(taken.volume + sum(thing.volume for thing in parts), LEAST_VOLUME)
     total = sum(thing.volume for thing in before) - sum(thing.volume for thing in after)
-    if others and total > MORE * max(taken.volume, LEAST_VOLUME):
-        return Check("two", f"{1e6 * total:.0f} cm^3 are missing in the tray, not {1e6 * taken.volume:.0f}")
+    amount = f"{1e6 * total:.0f} cm^3 are missing in the tray, not {1e6 * expected:.0f}"
+    if others and total > MORE * expected:
+        return Check("two", amount)
     if own < (1 - GONE) * taken.volume and total < (1 - GONE) * taken.volume:
         return Check("one", "nothing is missing in the tray")
-    return Check("one")
+    measured = [*([remark] if remark else []), *([amount] if total > MORE * expected else [])]
+    seen = [TWO_COLORS] if TWO_COLORS in taken.why else []
+    if seen and measured:
+        return Check("two", f"{taken.id}: {', '.join(seen + measured)}")
+    touching = [f"{thing.id} of the same color touched it and is missing" for thing in parts]
+    return Check("one", doubt=", ".join([*seen, *measured, *touching]))
 
 
 def _distance(thing: SeenObject, place: tuple[float, float]) -> float:

@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 
 from applications.sorting import motions
-from applications.sorting.checking import by_picture, by_width, width_remark
+from applications.sorting.checking import Check, by_picture, by_width, width_remark
 from applications.sorting.motions import Pick
 from applications.sorting.placing import ABOVE, Dropped, Full, free_spot, release_height
 from applications.sorting.progress import SortingProgress
 from applications.sorting.rules import NoDestination
 from applications.sorting.settings import SortingView
 from applications.sorting.steady import depth_below, seen_as
-from applications.sorting.topics import SeenObject
+from applications.sorting.topics import Heap, SeenObject
 from common import messages as m
 from common.robot.home import is_home
 from common.tasks.stages import AwaitImage, Grip, Move, Stage, place_of
@@ -61,7 +61,7 @@ class Holding(SortingProgress):
         If the tray cannot be seen from here, it is looked at from home, with the object.
         """
         self.images_after = max(self.images_after, min(self._carried_since, view.now))
-        if not self._refresh(view):
+        if not self._refresh(view) or self._needs_another():
             if self.running is None and self.wait_timer.elapsed("check", view.now) >= self.p.check_patience:
                 self.clear()
                 self.queue += [self.home(view), AwaitImage()]
@@ -71,15 +71,27 @@ class Holding(SortingProgress):
             self.clear()
         return cycle.checked
 
+    def _held_by(self, heap: Heap) -> Check:
+        """Return what is held by one image."""
+        memory = self._memory
+        assert memory.thing is not None and memory.grasp is not None
+        return by_picture(memory.thing, place_of(memory.grasp.pose)[:2], memory.before, self._choice.left(heap),
+                          memory.wider)
+
+    def _needs_another(self) -> bool:
+        """Return whether the only image after the lift shows that two objects are held: a second one confirms that."""
+        after = [heap for heap in self._recent if heap.header.stamp * 1e-9 > self.images_after]
+        return self._memory.thing is not None and len(after) == 1 and self._held_by(after[0]).held == "two"
+
     def _compare(self, view: SortingView) -> bool:
         """Find out by the newest image what is held; return whether it is one object."""
         memory = self._memory
         assert memory.thing is not None and memory.grasp is not None and self._heap is not None
-        found = by_picture(memory.thing, place_of(memory.grasp.pose)[:2], memory.before, self._choice.left(self._heap))
+        found = self._held_by(self._heap)
         self.status.held = found.held
         if self.status.message == CHECKS:
             self.status.message = ""
-        self._remember(checked=True)
+        self._remember(checked=True, doubt=found.doubt)
         if found.held != "two":
             return True
         self._choice.penalize(memory.grasp, view.now, found.why)
@@ -112,7 +124,8 @@ class Holding(SortingProgress):
         remark = width_remark(view.gripper.width, chosen.grasp.width, self.p.width_tolerance)
         self.status.held, self.status.last = "", f"{cycle.subject}: {remark or 'gripped'}"
         self._remember(thing=chosen.thing, grasp=chosen.grasp, container=chosen.container, back=False,
-                       inside=cycle.inside, left=len(cycle.before), before=cycle.before, checked=False)
+                       inside=cycle.inside, left=len(cycle.before), before=cycle.before, checked=False, doubt="",
+                       wider=remark if view.gripper.width > chosen.grasp.width else "")
 
     def _released(self, cycle: Pick, view: SortingView) -> None:
         thing, container = self._memory.thing, self._memory.container
@@ -234,7 +247,7 @@ class Holding(SortingProgress):
         if math.isinf(self._carried_since):  # another process of this task took it
             self._carried_since = view.now
         self.images_after = max(self.images_after, self._carried_since)
-        if self._refresh(view):
+        if self._refresh(view) and not self._needs_another():
             self._compare(view)
             return True
         self._look(view)

@@ -9,8 +9,10 @@ from pydantic import BaseModel
 
 from applications.sorting import motions
 from applications.sorting.choice import Choice
+from applications.sorting.contents import Contents
 from applications.sorting.motions import Pick
 from applications.sorting.placing import Dropped
+from applications.sorting.rules import NoDestination
 from applications.sorting.scene import FOREIGN
 from applications.sorting.settings import Config, Memory, SortingView
 from applications.sorting.topics import Heap, SeenObject, SortingStatus
@@ -43,6 +45,8 @@ class SortingProgress(Task[SortingView]):
         self._skipped = 0  # spots tried for the held object
         self._descending: Pick | None = None
         self._earlier = 0.0  # [s] that earlier processes of this task worked
+        self._home_since: float | None = 0.0  # [s]; no earlier motion is known
+        self._from_home: deque[Heap] = deque(maxlen=2)  # the newest images that show all containers
 
     def _refresh(self, view: SortingView) -> bool:
         """Take the newest heap if it shows the whole tray after what was done; return whether one is there."""
@@ -90,11 +94,61 @@ class SortingProgress(Task[SortingView]):
         """Return how many objects are seen in a container."""
         return sum(thing.place == container for thing in self._heap.objects) if self._heap is not None else 0
 
+    def _watch_containers(self, view: SortingView) -> None:
+        """Count objects that arrived in containers unnoticed, by two images from home: others may be older there."""
+        if view.q is None or not is_home(view.q, self.p.robot.named_poses["home"]):
+            self._home_since = None
+            self._from_home.clear()
+            return
+        if self._home_since is None:
+            self._home_since = view.now
+        heap = view.heap
+        if heap is None or not heap.at_home or heap.header.stamp * 1e-9 <= self._home_since or (
+                self._from_home and heap.header.stamp <= self._from_home[-1].header.stamp):
+            return
+        self._from_home.append(heap)
+        if len(self._from_home) < 2 or self._memory.thing is not None or view.holding:
+            return
+        for container in self.p.world.containers:
+            if container != self.p.tray:
+                self._compare_contents(container)
+        self._remember(doubt="")
+
+    def _compare_contents(self, container: str) -> None:
+        images = [[thing for thing in heap.objects if thing.place == container] for heap in self._from_home]
+        memory = self._memory
+        known = memory.contents.get(container)
+        extra, new = known.more(images) if known is not None else (0, [])
+        self._remember(contents={**memory.contents, container: (known or Contents()).updated(images)})
+        if not extra or known is None:
+            return
+        names = ", ".join(f"{thing.id} ({thing.color_name})" for thing in new)
+        wrong = [f"{thing.id} belongs in {place}" for thing in new
+                 if (place := self._belongs(thing)) and place != container]
+        text = "; ".join([f"two at once: {names} arrived in {container} after {len(known.pending)} releases", *wrong])
+        counts = Counter(memory.sorted) + Counter({container: extra})
+        self._remember(done=memory.done + extra, sorted=dict(counts), two_at_once=memory.two_at_once + extra,
+                       arrivals=[*memory.arrivals[-9:], text])
+        self._note("two", text)
+        self.status.message = text
+
+    def _belongs(self, thing: SeenObject) -> str:
+        """Return the container that the rule names; empty if none."""
+        try:
+            return self._rule.destination(thing)
+        except NoDestination:
+            return ""
+
     def _count_sorted(self, name: str, container: str) -> None:
         counts = Counter(self._memory.sorted) + Counter({container: 1})
+        if container in self._memory.contents and self._memory.thing is not None:
+            known = self._memory.contents[container]
+            known = known.model_copy(update={"pending": [*known.pending, self._memory.thing.color_name]})
+            self._remember(contents={**self._memory.contents, container: known})
         self._remember(done=self._memory.done + 1, sorted=dict(counts), thing=None, container="", back=False, stirs=0,
                        seconds=self._earlier + self.status.task_seconds)
-        self._note("one", f"{name} to {container}")
+        doubt = self._memory.doubt
+        self._note("one", f"{name} to {container}{f'; may be two: {doubt}' if doubt else ''}")
 
     def _note(self, outcome: str, last: str) -> None:
         counts = Counter(self._memory.outcomes) + Counter({outcome: 1})
@@ -142,6 +196,7 @@ class SortingProgress(Task[SortingView]):
 
     def note(self, view: SortingView) -> None:
         """Update the counters of the status."""
+        self._watch_containers(view)
         memory, status = self._memory, self.status
         status.done, status.attempts = memory.done, memory.attempts
         if self._heap is not None and not view.holding:
@@ -154,6 +209,7 @@ class SortingProgress(Task[SortingView]):
             "picks_per_hour": round(3600 * memory.done / seconds, 1) if seconds > 0 and memory.done else None,
             **{f"sorted_{name}": count for name, count in sorted(memory.sorted.items())},
             **{f"check_{name}": count for name, count in sorted(memory.outcomes.items())},
+            "two_at_once": memory.two_at_once,
             "stirs": memory.stirs,
         }
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pydantic import BaseModel, Field, model_validator
 
 from applications.sorting.choice import Failure
+from applications.sorting.contents import Contents
 from applications.sorting.places import require_tray
 from applications.sorting.rules import Rule
 from applications.sorting.topics import Grasp, Heap, SeenObject
@@ -87,3 +88,8 @@ class Memory(BaseModel):
     inside: int = 0  # objects seen in that container before
     left: int = 0  # objects seen outside of the containers before
     stirs: int = 0
+    wider: str = ""  # by how much the fingers are wider apart than expected
+    doubt: str = ""  # why two objects may be in the container, until an image shows it
+    contents: dict[str, Contents] = {}
+    two_at_once: int = 0  # objects that arrived in a container in addition to those that were released
+    arrivals: list[str] = []  # what images showed of them

@@ -15,7 +15,7 @@ from applications.sorting.placing import Full
 from applications.sorting.rules import NoDestination
 from applications.sorting.scene import FOREIGN
 from applications.sorting.settings import SortingView
-from applications.sorting.steady import steady
+from applications.sorting.steady import SAME, steady
 from applications.sorting.topics import Heap, SeenObject
 from common import messages as m
 from common.robot.home import is_home
@@ -38,7 +38,7 @@ class Sorting(Holding):
                 self._place_held(view)
         elif self._memory.thing is not None:
             self._find_lost(view)
-        elif not self._refresh(view):
+        elif not self._refresh(view) or self._memory.doubt:  # an image from home shows what is in the container
             self._look(view)
         elif not self._queue_pick(view) and len(self._recent) > 1:  # one image does not show what is at rest
             self._nothing_to_take(view)
@@ -48,13 +48,13 @@ class Sorting(Holding):
         cycle = running.cycle
         if running.name not in ("carry", "across", "release") or not isinstance(cycle, Pick) or not cycle.checked:
             return
-        if not any(isinstance(stage, Move | AwaitImage) for stage in self.queue) and not cycle.back:
+        if not (any(isinstance(stage, Move | AwaitImage) for stage in self.queue) or cycle.back or self._memory.doubt):
             self._queue_pick(view)
 
-    def _is_at_rest(self, thing: SeenObject, heap: Heap) -> bool:
+    def _is_at_rest(self, thing: SeenObject, heap: Heap, within: float = STILL) -> bool:
         """Return whether an earlier image shows the object, too: what still falls or rolls is not gripped."""
         here = (thing.center.x, thing.center.y, thing.top)
-        return any(math.dist((other.center.x, other.center.y, other.top), here) < STILL
+        return any(math.dist((other.center.x, other.center.y, other.top), here) < within
                    for each in self._recent if each is not heap for other in each.objects)
 
     def _queue_pick(self, view: SortingView) -> bool:
@@ -66,7 +66,8 @@ class Sorting(Holding):
         options = [option for option in options if self._is_at_rest(option.thing, heap)]
         if not options:
             return False
-        cycle = Pick(options[0].thing.id, options=options, before=self._choice.left(heap))
+        before = [thing for thing in self._choice.left(heap) if self._is_at_rest(thing, heap, SAME)]
+        cycle = Pick(options[0].thing.id, options=options, before=before)
         self.queue.append(motions.approach(cycle))
         self.wait_timer.reset()
         self.status.message = self.status.overlooked = ""
@@ -141,6 +142,8 @@ class Sorting(Holding):
             self.images_after, self._heap = view.now, None
             self.queue += [self.home(view), AwaitImage()]
             return
+        if any(contents.pending for contents in self._memory.contents.values()):
+            return  # two images from home show first what arrived in the containers
         left = steady([self._choice.left(each) for each in self._recent])
         foreign = [thing for thing in view.objects("target") if thing.kind == FOREIGN]
         waited = 1e-9 * (heap.header.stamp - self._recent[0].header.stamp)
@@ -194,8 +197,10 @@ class Sorting(Holding):
         overlooked = "; ".join(
             f"{thing.id} at ({thing.center.x:.3f}, {thing.center.y:.3f}): {reason}" for thing, reason in reasons)
         message = f"{len(left)} objects are left" if left else "the tray is empty"
+        if two := self._memory.two_at_once:
+            message = f"{message}; {two} more objects arrived in containers than were released"
         self.end("ERROR" if error else "DONE", error or message)
-        self.status.overlooked = overlooked[:400]
+        self.status.overlooked = "; ".join([*self._memory.arrivals, *filter(None, [overlooked])])[:400]
 
     def note(self, view: SortingView) -> None:
         """Queue what follows a planned approach, and update the counters of the status."""

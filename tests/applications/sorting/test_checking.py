@@ -39,3 +39,21 @@ A, B, C = at("a", 0.50), at("b", 0.56), at("c", 0.70)
 def test_what_is_missing_in_the_tray_tells_what_is_held(before, after, held, why):
     found = by_picture(before[0], (0.50, 0.0), before, after)
     assert (found.held, why in found.why) == (held, True), found
+
+
+TWO_COLORED = A.model_copy(update={"why": "two colors, touches others"})
+TOUCHING = at("t", 0.542)
+WIDER = "55 mm wide, not 30 mm"
+
+
+@pytest.mark.parametrize(("before", "remark", "held", "text"), [
+    ([TWO_COLORED, C], "", "one", "two colors"),
+    ([A, C], WIDER, "one", WIDER),
+    ([TWO_COLORED, C], WIDER, "two", f"a: two colors, {WIDER}"),
+    ([A, TOUCHING, C], "", "one", "t of the same color touched it and is missing"),  # a gear that was seen as two
+    ([A, TOUCHING.model_copy(update={"color_name": "red"}), C], "", "two", "a and t are missing in the tray"),
+    ([A, C], "", "one", ""),
+])
+def test_two_objects_need_evidence_and_less_is_a_doubt(before, remark, held, text):
+    found = by_picture(before[0], (0.50, 0.0), before, [C], remark)
+    assert (found.held, found.why or found.doubt) == (held, text)

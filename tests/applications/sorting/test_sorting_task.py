@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from applications.sorting.choice import Option
+from applications.sorting.contents import Contents
 from applications.sorting.motions import Pick, grip_force, push_line, release
 from applications.sorting.settings import Config, Memory, SortingView
 from applications.sorting.steady import depth_below, steady
@@ -72,6 +73,8 @@ def test_two_objects_at_once_are_noticed_before_the_release_and_put_back_to_the_
     cycle = carrying(task)
     stage = release(cycle, task.gripper)
     task.queue.append(stage)
+    assert not task.may_start(stage, view([C], holding=True, stamp=NOW - 0.2))
+    assert not cycle.checked and task.queue and task.status.held == "", "one image is no evidence"
     seen = view([C], holding=True)
     assert not task.may_start(stage, seen)
     assert (task.status.held, list(task.queue)) == ("two", []) and "a and b are missing" in task.status.last
@@ -82,6 +85,72 @@ def test_two_objects_at_once_are_noticed_before_the_release_and_put_back_to_the_
     task.succeeded(task.queue[2], view([C]))
     assert task.memory.done == 0 and task.memory.thing is None
     assert not task._choice.options(view([A], grasps=[grasp()]).heap, NOW, 60.0, 4), "the grasp is avoided"
+
+
+def test_missing_object_that_one_image_does_not_confirm_is_no_second_one(task):
+    cycle = carrying(task)
+    stage = release(cycle, task.gripper)
+    assert not task.may_start(stage, view([C], holding=True, stamp=NOW - 0.2))
+    assert task.may_start(stage, view([B, C], holding=True)) and task.status.held == "one"
+
+
+def arrived(name, x, color="red", tint=(1.0, 0.0, 0.0)):
+    r, g, b = tint
+    return thing(name, x, 0.45, color).model_copy(update={"place": "left", "color": m.Color(r=r, g=g, b=b)})
+
+
+RED, BLUE = arrived("o7", 0.50), arrived("o8", 0.55, "blue", (0.0, 0.0, 1.0))
+
+
+@pytest.mark.parametrize(("shown", "done", "two", "overlooked"), [
+    ([RED], 1, 0, ""),
+    ([RED, BLUE], 2, 1, "two at once: o7 (red), o8 (blue) arrived in left after 1 releases; o8 belongs in right"),
+    ([RED, arrived("o9", 0.58)], 2, 1, "two at once: o7 (red), o9 (red) arrived in left after 1 releases"),
+    ([RED, arrived("o9", 0.55)], 1, 0, ""),  # so near: may be one
+])
+def test_second_object_that_arrived_in_a_container_is_counted_and_reported(task, shown, done, two, overlooked):
+    for stamp in (NOW - 4.0, NOW - 3.8):
+        task.note(view([A, C], stamp=stamp))
+    cycle = carrying(task)
+    task._memory = task._memory.model_copy(update={"contents": {"left": Contents(), "right": Contents()}})
+    stage = release(cycle, task.gripper)
+    away = [0.5, *HOME[1:]]
+    assert task.may_start(stage, view([B, C], holding=True, q=away))
+    task.note(view([B, C, *shown], holding=True, q=away))
+    task.succeeded(stage, view([B, C], q=away))
+    for k in range(60):
+        seen = view(shown, stamp=NOW + 1.0 + 0.2 * k)
+        if not task.queue:
+            task.decide(seen)
+        task.note(seen)
+    status = task.status
+    assert (status.state, status.done, status.figures["two_at_once"]) == ("DONE", done, two)
+    assert (task.memory.sorted, status.overlooked) == ({"left": done}, overlooked)
+    assert ("1 more objects arrived" in status.message) is bool(two)
+    assert status.held == ("two" if two else "one") and (overlooked or "a to left") == status.last
+
+
+def test_container_is_looked_at_from_home_after_a_doubtful_release_before_the_next_pick(task):
+    cycle = carrying(task)
+    task._memory = task._memory.model_copy(update={"wider": "55 mm wide, not 30 mm"})
+    stage = release(cycle, task.gripper)
+    away = [0.5, *HOME[1:]]
+    cell = [B, C, A.model_copy(update={"place": "left"})]
+    grasps = [grasp("b", 0.55)]
+    assert task.may_start(stage, view([B, C], holding=True, q=away))
+    task.succeeded(stage, view([B, C], q=away))
+    assert task.status.last == "a to left; may be two: 55 mm wide, not 30 mm"
+    for k in range(30):
+        if not task.queue:
+            task.decide(view(cell, grasps=grasps, stamp=NOW + 0.2 * k, q=away))
+    assert [each.name for each in task.queue] == ["home", "look"]
+    task.queue.clear()
+    for k in range(30, 40):
+        seen = view(cell, grasps=grasps, stamp=NOW + 0.2 * k)
+        if not task.queue:
+            task.decide(seen)
+        task.note(seen)
+    assert task.queue[0].name == "approach" and not task.memory.doubt
 
 
 def test_one_object_is_released_and_counted(task):
@@ -146,6 +215,9 @@ def test_object_held_after_a_restart_is_compared_with_the_picture_before_its_gra
     task.decide(view([B, C], holding=True))
     assert not task.queue and "is one object held, or two?" in task.status.message, "that picture may be older"
     task.decide(view(after, holding=True, stamp=NOW + 1.0))
+    if held == "two":
+        assert not task.queue, "one image is no evidence"
+        task.decide(view(after, holding=True, stamp=NOW + 1.2))
     assert task.status.held == held and [stage.name for stage in task.queue] == stages
     assert (task.queue[0].goal.pose.position.y < -0.2) == (held == "one"), "in the container of the memory"
 
