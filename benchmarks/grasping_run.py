@@ -22,7 +22,7 @@ import numpy as np
 
 from applications.sorting.objects.kinds import PALETTE
 from applications.sorting.rules import Rule
-from applications.sorting.topics import HEAP, SORTING_STATUS, Grasp, Heap, SeenObject, SortingStatus
+from applications.sorting.topics import HEAP, SORTING_STATUS, GraspCandidate, Heap, SeenObject, SortingStatus
 from common import messages as m
 from common import topics
 from common.config import Cell, load_cell
@@ -120,7 +120,7 @@ class Truth:
         self.objects: dict[str, m.WorldObject] = {}
         self.status, self.heap = SortingStatus(), Heap(header=m.Header())
         self.latencies: list[float] = []  # [s] processor time
-        self._grasps: dict[str, Grasp] = {}
+        self._grasps: dict[str, GraspCandidate] = {}
         self.proved = False  # whether any grasp was ever proved
         self.planned: list[str] = []  # errors of motions to the best candidates, empty for a success
 
@@ -185,7 +185,7 @@ class Truth:
         return "no grasp proved" if self.heap.objects else "not seen"
 
 
-def seen(grasp: Grasp) -> dict[str, float]:
+def seen(grasp: GraspCandidate) -> dict[str, float]:
     """Return figures of a grasp."""
     T = pose_to_matrix(grasp.pose)
     return {"x": round(T[0, 3], 3), "y": round(T[1, 3], 3), "z": round(T[2, 3], 4), "score": round(grasp.score, 3),

@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import BaseModel
 
 from applications.sorting.rules import NoDestination, Rule
-from applications.sorting.topics import Grasp, Heap, SeenObject
+from applications.sorting.topics import GraspCandidate, Heap, SeenObject
 from common.robot.transforms import pose_to_matrix
 
 SAME_PLACE = 0.02  # [m]
@@ -24,7 +24,7 @@ WITHIN = 0.1  # of the best score
 class Option:
     """A grasp that may be next, its object and where that goes."""
 
-    grasp: Grasp
+    grasp: GraspCandidate
     thing: SeenObject
     container: str
 
@@ -91,19 +91,19 @@ class Choice:
             if grasp.proved and grasp.object in destinations and not self._penalized(grasp, now, penalty):
                 yield Option(grasp, things[grasp.object], destinations[grasp.object])
 
-    def _penalized(self, grasp: Grasp, now: float, penalty: float) -> bool:
+    def _penalized(self, grasp: GraspCandidate, now: float, penalty: float) -> bool:
         place, closing = self._place_of(grasp)
         return any(
             now - failure.at < penalty and math.dist(place, failure.place) < SAME_PLACE
             and _between(closing, failure.closing) < SAME_DIRECTION for failure in self.failures)
 
-    def _place_of(self, grasp: Grasp) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    def _place_of(self, grasp: GraspCandidate) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
         T = pose_to_matrix(grasp.pose)
         x, y, z = T[:3, 3].tolist()
         a, b, c = T[:3, self._axis].tolist()
         return (x, y, z), (a, b, c)
 
-    def penalize(self, grasp: Grasp, now: float, reason: str) -> None:
+    def penalize(self, grasp: GraspCandidate, now: float, reason: str) -> None:
         """Remember that an attempt failed."""
         place, closing = self._place_of(grasp)
         self.failures = [*self.failures[-199:], Failure(place=place, closing=closing, at=now, reason=reason)]

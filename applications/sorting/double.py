@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
-from applications.sorting.topics import HEAP, Grasp, Heap, Left, SeenObject
+from applications.sorting.topics import HEAP, GraspCandidate, Heap, Left, SeenObject
 from common import messages as m
 from common import topics
 from common.config import Parameters, RobotConfig, Surroundings, Tunable
@@ -92,7 +92,7 @@ class TopDown:
         self._home = np.array(config.named_poses["home"])
         self._known: dict[tuple[float, ...], tuple[list[float], list[float]]] = {}
 
-    def grasp(self, thing: SeenObject) -> Grasp | Left:
+    def grasp(self, thing: SeenObject) -> GraspCandidate | Left:
         """Return a proved grasp, or why there is none."""
         width = min(thing.size.x, thing.size.y)
         if width + SLACK > self._gripper.max_width:
@@ -107,7 +107,7 @@ class TopDown:
             if found:
                 above = T.copy()
                 above[2, 3] += APPROACH
-                return Grasp(
+                return GraspCandidate(
                     id=f"g_{thing.id}", object=thing.id, pose=matrix_to_pose(T), approach=matrix_to_pose(above),
                     width=width, opening=width + SLACK, score=round(1.0 - 0.02 * len(thing.id), 3), proved=True,
                     q_approach=found[0], q=found[1])
@@ -132,7 +132,7 @@ def heap(objects: m.WorldObjects, finder: TopDown, stamp: int) -> Heap:
     found = [finder.grasp(each) for each in things if each.place in ("tray", "table")]
     return Heap(
         header=m.Header(stamp=stamp, frame_id="world"), at_home=True, objects=things, scorer="geometric",
-        grasps=[each for each in found if isinstance(each, Grasp)],
+        grasps=[each for each in found if isinstance(each, GraspCandidate)],
         left=[each for each in found if isinstance(each, Left)])
 
 

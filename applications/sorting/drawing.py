@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from applications.sorting.topics import Foreign, Grasp, Heap, SeenObject
+from applications.sorting.topics import Foreign, GraspCandidate, Heap, SeenObject
 from common.perception.labels import WIDTH, draw_labels
 from common.perception.pinhole import Pinhole
 from common.robot.transforms import pose_to_matrix
@@ -83,7 +83,7 @@ def _list_reasons(image: Pixels, heap: Heap) -> None:
         cv2.putText(image, line, (left, bottom), cv2.FONT_HERSHEY_SIMPLEX, TEXT * factor, OUTLINE, 1, cv2.LINE_AA)
 
 
-def _draw_fingers(image: Pixels, camera: Pinhole, grasp: Grasp, axis: Array, *, first: bool) -> None:
+def _draw_fingers(image: Pixels, camera: Pinhole, grasp: GraspCandidate, axis: Array, *, first: bool) -> None:
     """Draw a grasp as two bars, at the opening, and a line between the contacts."""
     color = (BEST if first else PROVED) if grasp.proved else UNPROVED
     T = pose_to_matrix(grasp.pose)

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from applications.sorting.topics import Grasp
+from applications.sorting.topics import GraspCandidate
 from common.robot.transforms import pose_to_matrix
 
 LENGTH = 0.045  # [m] of a drawn finger
 
 
-def finger_lines(grasp: Grasp, axis: int) -> npt.NDArray[np.float64]:
+def finger_lines(grasp: GraspCandidate, axis: int) -> npt.NDArray[np.float64]:
     """Return two fingers and the bar that joins them as segments (3, 2, 3) [m] in world.
 
     Args:

@@ -17,7 +17,7 @@ from applications.sorting.learning.learned import learned_score
 from applications.sorting.learning.network import Network
 from applications.sorting.seeing import crop
 from applications.sorting.surface import Surface
-from applications.sorting.topics import MAX_OBJECTS, Grasp, Left, SeenObject
+from applications.sorting.topics import MAX_OBJECTS, GraspCandidate, Left, SeenObject
 from common.config import RobotConfig, Surroundings
 
 MARGIN = 0.04  # [m] of the surface around the tray
@@ -29,7 +29,7 @@ GEOMETRIC, LEARNED = "geometric", "learned"  # scorers
 class Found:
     """Grasps, proved ones first, and objects in the tray without a proved one."""
 
-    grasps: list[Grasp]
+    grasps: list[GraspCandidate]
     left: list[Left]
     scorer: str
 

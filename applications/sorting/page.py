@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from applications.sorting.fingers import finger_lines
-from applications.sorting.topics import HEAP, Grasp, Heap, SeenObject, SortingStatus
+from applications.sorting.topics import HEAP, GraspCandidate, Heap, SeenObject, SortingStatus
 from common import topics
 from common.messages import TaskStatus
 from common.topics import Topic
@@ -193,7 +193,7 @@ class ForeignBodies(Layer):
             for number, each in enumerate(message.foreign)]
 
 
-def score_color(grasp: Grasp) -> NDArray[np.uint8]:
+def score_color(grasp: GraspCandidate) -> NDArray[np.uint8]:
     """Return red, green and blue (3,) of a grasp."""
     share = min(max(grasp.score, 0.0), 1.0)
     color = share * GOOD + (1 - share) * POOR

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from applications.sorting.fingers import finger_lines
-from applications.sorting.topics import HEAP, SORTING_STATUS, Grasp, Heap, SortingStatus
+from applications.sorting.topics import HEAP, SORTING_STATUS, GraspCandidate, Heap, SortingStatus
 from common import messages as m
 from common import topics
 from common.perception.camera_input import FrameError, decode_color_image
@@ -43,7 +43,7 @@ class Try:
     at: float  # [s] since the start of the recording
     number: int
     subject: str
-    grasp: Grasp | None
+    grasp: GraspCandidate | None
     before: str  # data URL, empty without a picture
     after: str = ""
     width: float | None = None  # between the fingers when they had closed [m]
@@ -122,13 +122,13 @@ class Tries:
             if last.width is None and last.result:
                 last.width = self._width
 
-    def _grasp_of(self, status: SortingStatus) -> Grasp | None:
+    def _grasp_of(self, status: SortingStatus) -> GraspCandidate | None:
         """Return the grasp that is tried: by its id, else the best one of the object."""
         grasps = self._heap.grasps if self._heap is not None else []
         return next((each for each in grasps if each.id == status.grasp), None) or next(
             (each for each in grasps if each.object == status.subject), None)
 
-    def _picture(self, image: m.Image | None, grasp: Grasp | None, *, drawn: bool) -> str:
+    def _picture(self, image: m.Image | None, grasp: GraspCandidate | None, *, drawn: bool) -> str:
         """Return the surroundings of a grasp in an image as a data URL; empty without image or camera."""
         if image is None or grasp is None or self._info is None:
             return ""

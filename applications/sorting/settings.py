@@ -10,7 +10,7 @@ from applications.sorting.choice import Failure
 from applications.sorting.contents import Contents
 from applications.sorting.places import require_tray
 from applications.sorting.rules import Rule
-from applications.sorting.topics import Grasp, Heap, SeenObject
+from applications.sorting.topics import GraspCandidate, Heap, SeenObject
 from common.config import Surroundings, Tunable
 from common.errors import ConfigError
 from common.tasks.decisions import TaskConfig
@@ -80,7 +80,7 @@ class Memory(BaseModel):
     outcomes: dict[str, int] = {}
     failures: list[Failure] = []
     thing: SeenObject | None = None
-    grasp: Grasp | None = None
+    grasp: GraspCandidate | None = None
     before: list[SeenObject] = []  # objects in the tray when the grasp was chosen
     checked: bool = False  # whether what is held is known
     container: str = ""

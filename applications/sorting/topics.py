@@ -54,7 +54,7 @@ class SeenObject(Message):
     why: Text = Field("", description="what is uncertain, for operators")
 
 
-class Grasp(Message):
+class GraspCandidate(Message):
     """A grasp by two parallel fingers.
 
     `pose` is the tool center point while gripping, in world; `approach` the pose from which the tool reaches it on a
@@ -101,7 +101,8 @@ class Heap(Message):
     at_home: bool = Field(False, description="nothing of the tray was hidden; only then objects and grasps are given. "
                                            "Elsewhere they are those of the newest image from home")
     objects: list[SeenObject] = Field([], max_length=MAX_OBJECTS)
-    grasps: list[Grasp] = Field([], max_length=MAX_GRASPS, description="the best first; proved ones before others")
+    grasps: list[GraspCandidate] = Field(
+        [], max_length=MAX_GRASPS, description="the best first; proved ones before others")
     left: list[Left] = Field([], max_length=MAX_OBJECTS)
     foreign: list[Foreign] = Field([], max_length=MAX_OBJECTS)
     scorer: Label = Field("", description="geometric or learned")

@@ -6,7 +6,7 @@ import viser
 
 from applications.sorting.fingers import finger_lines
 from applications.sorting.page import counters
-from applications.sorting.topics import HEAP, Foreign, Grasp, Heap, Left, SeenObject, SortingStatus
+from applications.sorting.topics import HEAP, Foreign, GraspCandidate, Heap, Left, SeenObject, SortingStatus
 from common import messages as m
 from common import topics
 from common.messages import Vector3
@@ -26,9 +26,9 @@ def stage(server: viser.ViserServer) -> Stage:
     return Stage(server, "sorting")
 
 
-def grasp(name: str = "g", *, proved: bool = True, score: float = 1.0) -> Grasp:
+def grasp(name: str = "g", *, proved: bool = True, score: float = 1.0) -> GraspCandidate:
     pose = matrix_to_pose(tool_down(0.5, 0.1, 0.03))
-    return Grasp(id=name, object="object_1", pose=pose, approach=pose, width=0.04, opening=0.06, score=score,
+    return GraspCandidate(id=name, object="object_1", pose=pose, approach=pose, width=0.04, opening=0.06, score=score,
                  proved=proved)
 
 

@@ -12,7 +12,7 @@ from pydantic import Field
 
 from applications.sorting.grasps.candidates import Candidates
 from applications.sorting.grasps.height_map import HeightMap
-from applications.sorting.topics import MAX_GRASPS, Grasp
+from applications.sorting.topics import MAX_GRASPS, GraspCandidate
 from common.config import RobotConfig, Surroundings
 from common.config.basics import Section
 from common.errors import UnknownName
@@ -62,7 +62,7 @@ class Proof:
         tried: number of candidates that were examined; seconds: that it took.
     """
 
-    grasps: list[Grasp]
+    grasps: list[GraspCandidate]
     reasons: dict[int, str]
     tried: int
     seconds: float
@@ -110,10 +110,10 @@ class Prover:
         start = self._home if home is None else np.asarray(home, dtype=float)
         points = PointObstacle(POINTS, measured_spheres(found.heights, self.options.side, self.options.radius))
         world = self._world(start, points)
-        grasps: list[Grasp] = []
+        grasps: list[GraspCandidate] = []
         proved: dict[int, list[int]] = {}
         reasons = dict(found.reasons)
-        failed: list[Grasp] = []
+        failed: list[GraspCandidate] = []
         tried = 0
         for i in self._order(found, proved):
             limit = self.options.seconds * (1 if grasps else _PATIENCE)
@@ -215,11 +215,11 @@ class Prover:
             return f"it is {away:.2f} m from the first joint; the arm reaches {self.robot.reach:.2f} m"
         return "no joint positions within the limits put the gripper there"
 
-    def _message(self, found: Candidates, i: int, name: str, result: _Found) -> Grasp:
+    def _message(self, found: Candidates, i: int, name: str, result: _Found) -> GraspCandidate:
         T = found.T[i] if result.T is None else result.T
         approach = T.copy()
         approach[:3, 3] -= (result.back or self.options.approach[0]) * T[:3, 2]
-        return Grasp(
+        return GraspCandidate(
             id=f"{name}/{i}", object=name, pose=matrix_to_pose(T), approach=matrix_to_pose(approach),
             width=float(found.width[i]), opening=float(found.opening[i]), score=float(found.score[i]),
             parts={label: float(values[i]) for label, values in found.parts.items()}, proved=result.q is not None,

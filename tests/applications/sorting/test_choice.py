@@ -6,7 +6,7 @@ import pytest
 
 from applications.sorting.choice import Choice
 from applications.sorting.rules import Rule
-from applications.sorting.topics import Grasp, Heap, Left, SeenObject
+from applications.sorting.topics import GraspCandidate, Heap, Left, SeenObject
 from common.messages import Header, Vector3
 from common.robot.transforms import matrix_to_pose, tool_down
 
@@ -18,8 +18,8 @@ def thing(name, x, place="tray", color="red"):
 
 def grasp(name, x=0.5, y=0.0, yaw=0.0, score=0.8, proved=True, number=0):
     pose = matrix_to_pose(tool_down(x, y, 0.03, yaw))
-    return Grasp(id=f"{name}/{number}", object=name, pose=pose, approach=pose, width=0.03, opening=0.05, score=score,
-                 proved=proved)
+    return GraspCandidate(id=f"{name}/{number}", object=name, pose=pose, approach=pose, width=0.03, opening=0.05,
+                          score=score, proved=proved)
 
 
 def heap(objects, grasps, left=()):

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from applications.sorting.report import MOST, SIDE, Tries
-from applications.sorting.topics import Grasp, Heap, SortingStatus
+from applications.sorting.topics import GraspCandidate, Heap, SortingStatus
 from common import messages as m
 from common.config import CameraConfig
 from common.perception.image import array_to_image
@@ -18,16 +18,16 @@ CAMERA = CameraConfig(frame="eye", position=(0.53, 0.0, 0.95))
 SCORE = 0.83
 
 
-def grasp(name: str, x: float = 0.5) -> Grasp:
+def grasp(name: str, x: float = 0.5) -> GraspCandidate:
     pose = matrix_to_pose(tool_down(x, 0.1, 0.03))
-    return Grasp(id=name, object="object_1", pose=pose, approach=pose, width=0.04, opening=0.06, score=SCORE)
+    return GraspCandidate(id=name, object="object_1", pose=pose, approach=pose, width=0.04, opening=0.06, score=SCORE)
 
 
 def header(stamp: int) -> m.Header:
     return m.Header(stamp=stamp, frame_id="world")
 
 
-def look(tries: Tries, stamp: int, grey: int, *grasps: Grasp) -> None:
+def look(tries: Tries, stamp: int, grey: int, *grasps: GraspCandidate) -> None:
     pixels = np.full((CAMERA.height, CAMERA.width, 3), grey, np.uint8)
     tries.listeners()[m_topic("depth_camera/image_raw")](0.0, array_to_image(pixels, "bgr8", header(stamp)))
     tries.on_heap(Heap(header=header(stamp), at_home=True, grasps=list(grasps)))

@@ -11,7 +11,7 @@ from applications.sorting.motions import Pick, grip_force, push_line, release
 from applications.sorting.settings import Config, Memory, SortingView
 from applications.sorting.steady import depth_below, steady
 from applications.sorting.task import Sorting
-from applications.sorting.topics import Grasp, Heap, SeenObject, SortingStatus
+from applications.sorting.topics import GraspCandidate, Heap, SeenObject, SortingStatus
 from common import messages as m
 from common.config import load_cell, service_config
 from common.errors import ConfigError
@@ -37,7 +37,7 @@ A, B, C = thing("a", 0.50), thing("b", 0.55), thing("c", 0.65)
 
 def grasp(name="a", x=0.5):
     pose = matrix_to_pose(tool_down(x, 0.0, 0.03))
-    return Grasp(id=f"{name}/0", object=name, pose=pose, approach=pose, width=0.03, opening=0.05, score=0.8,
+    return GraspCandidate(id=f"{name}/0", object=name, pose=pose, approach=pose, width=0.03, opening=0.05, score=0.8,
                  proved=True, q_approach=HOME, q=HOME)
 
 
