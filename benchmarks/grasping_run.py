@@ -138,7 +138,7 @@ class Truth:
         self.status = status
 
     def on_objects(self, world: m.WorldObjects) -> None:
-        """Note what the fingers lift and what rests in a container."""
+        """Note what the fingers lift and what lies in a container."""
         self.objects = {each.id: each for each in world.objects}
         last = self.attempts[-1] if self.attempts else None
         for name, each in self.objects.items():
@@ -166,7 +166,7 @@ class Truth:
             return "empty"
         now = attempt.places or self._places()
         places = {now[name] for name in attempt.lifted}
-        if attempt.noticed == "two" and places <= {TRAY, "held"}:  # the next one may have begun
+        if attempt.noticed == "two" and places <= {TRAY, "held"}:  # the next one may have started
             return "put back"
         if places == {TRAY}:
             return "slipped"

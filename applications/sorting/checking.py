@@ -17,7 +17,7 @@ SAME = 0.025  # [m] an object that moved farther is another one
 GONE = 0.6  # share of its volume that an object has lost if it was taken
 MORE = 1.6  # times the expected volume: that is two objects
 LEAST_VOLUME = 5e-6  # [m^3] less is noise
-BESIDE = 0.12  # [m] from the grasp: what disappears farther away was not taken by it
+NEARBY = 0.12  # [m] from the grasp: what disappears farther away was not taken by it
 TOUCHING = 0.006  # [m] between outlines; of one color, they may be one object that was seen as two
 TWO_COLORS = "two colors"  # in `SeenObject.why`
 
@@ -32,7 +32,7 @@ class Check:
 
 
 def by_width(width: float, holding: bool) -> Check:
-    """Return what is held by the width between closed fingers [m]; "" if only a picture can tell."""
+    """Return what is held by the width between closed fingers [m]; "" if only a picture shows it."""
     if not holding:
         return Check("empty", "the fingers closed on nothing")
     if width < CLOSED:
@@ -65,7 +65,7 @@ def by_picture(
         remark: how the fingers are wider apart than expected; empty if they are not.
     """
     lost = {thing.id: _lost(thing, after) for thing in before}
-    near = [thing for thing in before if thing.id != taken.id and _distance(thing, place) < BESIDE]
+    near = [thing for thing in before if thing.id != taken.id and _distance(thing, place) < NEARBY]
     missing = [thing for thing in near if lost[thing.id] >= max(GONE * thing.volume, LEAST_VOLUME)
                and not _moved(thing, before, after)]
     parts = [thing for thing in missing if thing.color_name == taken.color_name and gap(thing, taken) < TOUCHING]

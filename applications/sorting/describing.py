@@ -21,7 +21,7 @@ Labels = npt.NDArray[np.int32]
 MOST_CORNERS = 32  # of an outline
 RIM = 3  # [cells] around an object in which its support is visible
 DROP = 0.005  # [m] an object is at least this much higher than what it may rest on
-ON_OTHERS = 0.7  # fraction of its surroundings that is higher than the floor when an object rests on others
+ON_OTHERS = 0.7  # fraction of its surroundings that is higher than the floor when an object lies on others
 HOLE = 20  # [cells] smallest hole of a ring
 LONG = 2.5  # length by width of a long object
 FLAT = 0.35  # height by width of a flat one
@@ -78,7 +78,7 @@ def described(segment: Segment, name: str, place: str, floor: float) -> SeenObje
 
 
 def _support(segment: Segment, floor: float) -> float:
-    """Return the height z [m] of what the object rests on: the floor, or lower objects that surround it."""
+    """Return the height z [m] of what supports the object: the floor, or lower objects that surround it."""
     mask = segment.mask.astype(np.uint8)
     around = cv2.dilate(mask, np.ones((2 * RIM + 1, 2 * RIM + 1), np.uint8)).astype(bool) & ~segment.mask
     edge = segment.surface.top[segment.mask].min()

@@ -30,7 +30,7 @@ AROUND = 0.08  # [m] of the table around the containers in which objects are loo
 LOW = 0.10  # [m] above the table: lower points are compared with the robot only where they may be foreign
 LARGEST = 0.20  # [m] what is longer is no object of a tray but a foreign body
 ROBOT = 0.03  # [m] from the robot, points belong to it
-BESIDE = 0.08  # [m] from the tray to the tool: what that holds hides nothing of the tray either
+NEAR_TRAY = 0.08  # [m] from the tray to the tool: what that holds hides nothing of the tray either
 FEWEST = 30  # [px] of the arm in front of the tray
 
 
@@ -121,7 +121,7 @@ class HeapDetector:
         """Return whether nothing is between the camera and the tray, such as the arm or the object that it holds."""
         depth, _, camera = view
         x, y, _ = robot.T_world_tcp[:3, 3]
-        if max(abs(x - self.tray.x), abs(y - self.tray.y)) < self.tray.outer + BESIDE:
+        if max(abs(x - self.tray.x), abs(y - self.tray.y)) < self.tray.outer + NEAR_TRAY:
             return False
         x0, y0, x1, y1 = self.tray.area()
         corners = np.array([(x, y, z) for x in (x0, x1) for y in (y0, y1) for z in (self.tray.floor, self.tray.rim)])

@@ -30,7 +30,7 @@ APPROACH = 0.10  # [m]
 DEPTH = 0.03  # [m] of the finger tips below the top
 LOWEST = 0.014  # [m] of the finger tips above the support
 SLACK = 0.02  # [m] by which the fingers open wider than an object
-BESIDE = 0.08  # [m] from the tool to the tray: the arm does not hide it then
+CLEAR = 0.08  # [m] from the tool to the tray: the arm does not hide it then
 YAWS = (0.0, math.pi / 2, math.pi, -math.pi / 2)
 NAMES = {"red": (1, 0, 0), "orange": (1, 0.5, 0), "yellow": (1, 1, 0), "green": (0, 0.8, 0), "blue": (0, 0, 1),
          "purple": (0.6, 0, 0.6), "white": (1, 1, 1), "grey": (0.5, 0.5, 0.5), "black": (0, 0, 0)}
@@ -146,13 +146,13 @@ async def run(bus: Bus, config: Config) -> None:
     pace = LoopRate(bus, lambda: bus.clock.wall_rate(config.rate, 50.0))
 
     def is_clear() -> bool:
-        """Return whether the tool is beside the tray, or above all that the arm could hide."""
+        """Return whether the tool is next to the tray, or above all that the arm could hide."""
         state = joints.latest
         q = robot.order(state.name, state.position) if state is not None else None
         if q is None:
             return False
         y = float(robot.fk(q)[1, 3])
-        return bool(np.abs(q - home).max() < HOME_TOLERANCE) or abs(y - box.y) > box.half_side + BESIDE
+        return bool(np.abs(q - home).max() < HOME_TOLERANCE) or abs(y - box.y) > box.half_side + CLEAR
 
     while True:
         objects, stamp = truth.latest, bus.header().stamp

@@ -76,8 +76,8 @@ class Points(Layer):
         tray = around.containers.get(TRAY)
         if tray is None:
             return np.full(len(points), True)
-        beside = np.abs(points[:, :2] - (tray.x, tray.y)).max(axis=1)
-        return np.asarray((beside < tray.half_side + BEYOND) & (points[:, 2] < around.table_height + ABOVE))
+        outside = np.abs(points[:, :2] - (tray.x, tray.y)).max(axis=1)
+        return np.asarray((outside < tray.half_side + BEYOND) & (points[:, 2] < around.table_height + ABOVE))
 
 
 class Objects(Layer):

@@ -95,7 +95,7 @@ def tray_of(world: Surroundings, tray: str, field: str) -> Place:
 
 
 def features(color: npt.NDArray[np.uint8]) -> Colors:
-    """Colors (..., 3) in which the Euclidean distance tells surfaces apart, of bgr8.
+    """Colors (..., 3) in which the Euclidean distance separates surfaces, of bgr8.
 
     Two are the shares of red and blue, which shading does not change; the third is the logarithm of the brightness, of
     which shading changes a part only. A distance of 1 is a different color.

@@ -2,7 +2,7 @@
 
 A calibration that is wrong by 3 degrees raises the floor at one side of the tray by a centimeter, and shifts what is
 seen there. The floor determines height, roll and pitch, the tops of the walls x, y and yaw. What lies in the tray is
-higher than the floor and beside the walls, and counts as outliers.
+higher than the floor and next to the walls, and counts as outliers.
 """
 
 from __future__ import annotations

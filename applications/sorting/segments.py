@@ -31,8 +31,8 @@ CORE = 12  # [cells] smallest core of a segment
 SMALLEST = 15  # [cells] smaller segments join a neighbor, or are noise
 MAJORITY = 4.5 / 9  # of a cell and its neighbors must be cells of objects
 HYSTERESIS = 1.8  # by which limits favor the segments of the image before
-SLIVER = 45  # [cells] smaller segments beside one of their color are its steep side
-BESIDE = 0.15  # fraction of their border there
+SLIVER = 45  # [cells] smaller segments next to one of their color are its steep side
+ALONG = 0.15  # fraction of their border there
 ROUNDS = 8  # in which cut cells join the cores
 ENCLOSED = 0.6  # fraction of the border of a patch that touches the segment it belongs to
 PATCH = 0.35  # largest area of a patch, as a fraction of that of its segment
@@ -239,7 +239,7 @@ def _most_similar(
         apart = step > (STEP_OF_ONE if alike else STEP) * factor or (
             grooved > (GROOVE_OF_ONE if alike else GROOVE_OF_TWO) * factor and length > 4)
         enclosed = length >= ENCLOSED * perimeters[small] and sizes[small] <= PATCH * sizes[large]
-        sliver = alike and sizes[small] < SLIVER and length >= BESIDE * perimeters[small]
+        sliver = alike and sizes[small] < SLIVER and length >= ALONG * perimeters[small]
         if (tiny and step <= 2 * STEP) or sliver or (not apart and (color <= factor or enclosed)):
             order_of = color + step / STEP
             if best is None or order_of < best[0]:

@@ -139,10 +139,10 @@ def _scene(path: Path, data: bytes) -> list[trimesh.Trimesh]:
         """Reads what a file refers to, up to the size of a mesh."""
 
         def get(self, name: str) -> bytes:
-            beside = path.parent / name
-            if not beside.is_file() or beside.stat().st_size > _MAX_BYTES:
+            neighbor = path.parent / name
+            if not neighbor.is_file() or beside.stat().st_size > _MAX_BYTES:
                 raise UnusableMesh(f"it refers to {name}, which is missing or too large")
-            return beside.read_bytes()
+            return neighbor.read_bytes()
 
     loaded = trimesh.load_scene(io.BytesIO(data), file_type=suffix, process=False, resolver=Resolver(str(path)))
     parts = [part for part in loaded.dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)]

@@ -138,21 +138,21 @@ def _without_objects(values: Array) -> Array:
 def _write_pixels(recording: Recording, topic: str, path: Path, decoder: Decoder) -> list[Row]:
     """Write the pixels of a topic to a file; return the rows of its images without them."""
     first: Array | None = None
-    kept = set[int]()  # positions of the images of the first one's size
+    used = set[int]()  # positions of the images of the first one's size
     for number, row in enumerate(rows_of(recording, topic, Decoder(), images=True)):
         pixels = row.values[IMAGE]
         first = pixels if first is None else first
         if (pixels.shape, pixels.dtype) == (first.shape, first.dtype):
-            kept.add(number)
+            used.add(number)
     if first is None:
         return []
     header = {"descr": np.lib.format.dtype_to_descr(first.dtype), "fortran_order": False,
-              "shape": (len(kept), *first.shape)}
+              "shape": (len(used), *first.shape)}
     rows: list[Row] = []
     with path.open("wb") as file:  # a memory map would end the process when the disk is full
         np.lib.format.write_array_header_2_0(file, header)
         for number, row in enumerate(rows_of(recording, topic, decoder, images=True)):
-            if number in kept:
+            if number in used:
                 file.write(np.ascontiguousarray(row.values[IMAGE]).data)
                 values = {name: value for name, value in row.values.items() if name != IMAGE}
                 rows.append(Row(row.log_time_ns, row.stamp_ns, values))

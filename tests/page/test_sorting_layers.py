@@ -98,8 +98,8 @@ def test_heap_shows_the_points_over_the_tray_only(stage: Stage) -> None:
     node = stage.layer("points").nodes[topics.DEPTH_CAMERA_POINTS.key]
     world = node.points @ camera.T_world_optical[:3, :3].T + camera.position
     tray = around.containers["tray"]
-    beside = np.abs(world[:, :2] - (tray.x, tray.y)).max(axis=1)
-    assert 5_000 < len(world) <= 15_000 and beside.max() < tray.half_side + 0.02 + 1e-3
+    outside = np.abs(world[:, :2] - (tray.x, tray.y)).max(axis=1)
+    assert 5_000 < len(world) <= 15_000 and outside.max() < tray.half_side + 0.02 + 1e-3
 
 
 @pytest.mark.parametrize(("done", "attempts", "success"), [(0, 0, "–"), (3, 4, "75 %"), (5, 4, "100 %")])

@@ -130,8 +130,8 @@ def candidates(
     chosen = _promising(usable, contacts, tip, strips, centers, options)
     placed = _placed(heights, strips.select(chosen), tip[chosen], contacts.select(chosen), gripper, options)
     found = _assembled(heights, placed, centers, gripper, scorer)
-    kept = _diverse(found, gripper, options)
-    result = found.select(kept)
+    selected = _diverse(found, gripper, options)
+    result = found.select(selected)
     for index in np.unique(result.object).tolist():
         reasons.pop(index, None)
     return replace(result, reasons=reasons)
@@ -155,7 +155,7 @@ def _explain(
 def _depths(
     strips: Strips, outlines: Outlines, gripper: GripperShape, options: Options
 ) -> tuple[Array, Contacts]:
-    """Return (n,) z of the tips [m] if nothing is in the way, and the contacts there."""
+    """Return (n,) z of the tips [m] where nothing obstructs, and the contacts there."""
     top = np.where(np.isfinite(strips.top), strips.top, strips.floor)
     flat = top - strips.floor < _FLAT
     lowest = strips.floor + np.where(flat, options.flat_slack, options.slack)
@@ -222,9 +222,9 @@ def _placed(
     tilts = [tilted(heights, upright, blocked, angle, axis, gripper, slack, least)
              for size in options.tilts for angle in (size, -size) for axis in (0, 1)] if len(blocked) else []
     every = Placed.joined([upright, *tilts])
-    kept = every.select(np.flatnonzero(every.free & (every.engagement >= least[every.seed])))
-    return kept.select(np.flatnonzero(
-        ~strips.select(kept.seed).obstructed(kept.contacts, kept.opening, kept.tip)))
+    selected = every.select(np.flatnonzero(every.free & (every.engagement >= least[every.seed])))
+    return selected.select(np.flatnonzero(
+        ~strips.select(selected.seed).obstructed(selected.contacts, selected.opening, selected.tip)))
 
 
 def _blocked(upright: Placed, least: Array, options: Options) -> Indices:
@@ -258,17 +258,17 @@ def _diverse(found: Candidates, gripper: GripperShape, options: Options) -> Indi
     """Return indices of candidates that differ from better ones of the same object, at most `limit`."""
     position, axis = found.T[:, :3, 3], found.axis(gripper)
     down = found.T[:, :3, 2]
-    kept: list[int] = []
+    selected: list[int] = []
     for label in np.unique(found.object).tolist():
         left = np.flatnonzero(found.object == label)
         while len(left):
             best, left = left[0], left[1:]
-            kept.append(int(best))
+            selected.append(int(best))
             near = np.linalg.norm(position[left] - position[best], axis=1) < options.apart
             near &= np.abs(axis[left] @ axis[best]) > math.cos(options.turned)
             near &= down[left] @ down[best] > math.cos(options.turned)
             left = left[~near]
-    order = np.sort(np.array(kept, int))
+    order = np.sort(np.array(selected, int))
     if len(order) <= options.limit:
         return order
     first = np.argsort(_rank(found.object[order]), kind="stable")  # none is left without any

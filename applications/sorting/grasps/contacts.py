@@ -17,7 +17,7 @@ Mask = NDArray[np.bool_]
 LINES = np.array([-0.8, -0.4, 0.0, 0.4, 0.8])  # of the strip, in half widths of a finger tip
 ABOVE_TIPS = 0.003  # [m] what is lower cannot be between the fingers; a third of their depth for flat objects
 OPEN = 0.4  # least fraction of the lines on which a side must be an edge: else something else touches it
-BLUR = 1.5  # cells beside a contact that may still show the object
+BLUR = 1.5  # cells next to a contact that may still show the object
 _RIM = 3  # cells inside an edge in which the height of the contact is measured
 
 
@@ -109,7 +109,7 @@ class Strips:
         )
 
     def obstructed(self, contacts: Contacts, opening: Array, tip: Array) -> Mask:
-        """Return (n,) whether anything stands between open fingers with tips at z (n,) [m] and their contacts."""
+        """Return (n,) whether anything is between open fingers with tips at z (n,) [m] and their contacts."""
         step = self.along[1] - self.along[0]
         away = np.abs(self.along - contacts.shift[:, None])
         closing = (away > contacts.width[:, None] / 2 + BLUR * step) & (away < opening[:, None] / 2)

@@ -13,7 +13,7 @@ from applications.sorting.grasps.height_map import HeightMap, Labels
 
 Array = NDArray[np.float64]
 
-DROP = 0.0035  # [m] beside a cell that makes it an edge: a finger can stand there
+DROP = 0.0035  # [m] next to a cell that makes it an edge: a finger can stand there
 REACH = 2  # cells within which the drop must be
 CONE = 0.6  # coefficient of friction for which a pair of edges must hold
 _EDGES = 90  # of an object that are paired
@@ -46,7 +46,7 @@ class Outlines:
     """Edges of a height map.
 
     Attributes:
-        edge: (rows, columns) cells of objects beside which it is lower.
+        edge: (rows, columns) cells of objects next to which it is lower.
         normal: (rows, columns, 2) horizontal unit vectors downhill, world x and y.
     """
 
@@ -123,9 +123,9 @@ def _pairs(
     middle, width, yaw = middle[best], width[best], np.arctan2(along[best, 1], along[best, 0])
     cell = np.floor((middle - center) / _SAME_PLACE).astype(np.int64) + 500
     turn, size = np.floor((yaw % math.pi) / _SAME_ANGLE), np.floor(width / (2 * _SAME_PLACE))
-    _, kept = np.unique(cell[:, 0] * 10**8 + cell[:, 1] * 10**4 + turn * 100 + size, return_index=True)
-    kept = np.sort(kept)[:_PAIRS]
-    return middle[kept], yaw[kept], width[kept]
+    _, unique = np.unique(cell[:, 0] * 10**8 + cell[:, 1] * 10**4 + turn * 100 + size, return_index=True)
+    unique = np.sort(unique)[:_PAIRS]
+    return middle[unique], yaw[unique], width[unique]
 
 
 def _lines(at: Array, center: Array, step: float, widest: float) -> tuple[Array, Array, Array]:

@@ -1,4 +1,4 @@
-"""What stands above each cell of a surface, with unknown cells and walls filled in, for checks of clearance."""
+"""Heights of the cells of a surface, with unknown cells and walls filled in, for checks of clearance."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Labels = NDArray[np.int32]
 MARGIN = 0.12  # [m] around the surface, so that the palm stays on the map
 FLOOR_NOISE = 0.006  # [m] above the floor that an unlabeled cell may be measured and still counts as floor
 _GAP = 3  # cells: narrower gaps between measured cells are no hiding places
-_DEEP = np.float32(-10.0)  # [m] stands for unknown
+_DEEP = np.float32(-10.0)  # [m] means unknown
 _SQUARE = np.ones((3, 3), np.uint8)
 
 
@@ -48,7 +48,7 @@ class HeightMap:
 
     Attributes:
         origin, step, floor: as of the surface, with the margin.
-        height: (rows, columns) z of what stands in each cell [m]; unknown cells are as high as their neighbors.
+        height: (rows, columns) z of the top of each cell [m]; unknown cells are as high as their neighbors.
         labels: (rows, columns) number of the object in each cell, 0 for none.
         measured: (rows, columns) cells of the surface, without margin and walls.
     """
@@ -100,7 +100,7 @@ class HeightMap:
         return np.asarray(row)
 
     def penetration(self, points: Coordinates, *cells: int) -> list[Array]:
-        """Return (n,) how far the deepest of points (3, n, m) [m] is below what stands there; negative: above.
+        """Return (n,) how far the deepest of points (3, n, m) [m] is below the surface there; negative: above.
 
         Args:
             points: x, y, z in world.

@@ -85,7 +85,7 @@ def lowered(
     """Return upright grippers as deep as wanted, or as deep as they can be.
 
     Args:
-        heights: what stands around.
+        heights: of the surroundings.
         strips, contacts: of the seeds; tip: (n,) wanted z of the tips [m].
         gripper: its shape.
         spares: opening beyond the width [m], to choose from by free space.
@@ -120,8 +120,8 @@ def tilted(
     """Return some grippers tilted about a point between their tips, as deep as they can be, if that is deep enough.
 
     Args:
-        heights: what stands around.
-        upright: grippers that were raised because something is in the way; chosen: indices of those to tilt.
+        heights: of the surroundings.
+        upright: grippers that were raised because something obstructs it; chosen: indices of those to tilt.
         angle: [rad]; axis: of the closing frame, 0: across, one finger becomes the lower one; 1: the closing axis.
         gripper: its shape.
         slack: (n,) required distance of each upright one from everything below [m].

@@ -234,7 +234,7 @@ def measured_spheres(heights: HeightMap, side: float, radius: float) -> Array:
     Args:
         heights: the map. The floor and what is outside its labels and as low is left out.
         side: of cubes in each of which one sphere is left [m].
-        radius: of the spheres [m]: larger ones would reach out of the surface and into the fingers beside it.
+        radius: of the spheres [m]: larger ones would reach out of the surface and into the fingers next to it.
     """
     top, step = heights.height, heights.step
     lowest = np.float32(heights.floor + _LOW)

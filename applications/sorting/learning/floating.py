@@ -120,7 +120,7 @@ class Bench:
         Args:
             objects: in the tray.
             poses: (4, 4) of each in world.
-            tray: stands on the table.
+            tray: on the table.
             shape: of the gripper.
             table: z of the table [m].
 

@@ -64,7 +64,7 @@ def new_spec() -> mujoco.MjSpec:
 
 
 def add_tray(spec: mujoco.MjSpec, tray: Container, table: float) -> None:
-    """Add a table and the five panels of a tray that stands on it."""
+    """Add a table and the five panels of a tray on it."""
     plane = spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[2.0, 2.0, 0.1], pos=[0.0, 0.0, table],
                                     rgba=[0.42, 0.42, 0.44, 1.0])
     _set_contact(plane, FIXED, SURFACE_FRICTION)

@@ -38,7 +38,7 @@ PATIENT = 300.0  # [s] for each mesh ahead of time
 
 
 def mesh_files(folder: Path) -> list[Path]:
-    """Return the files of objects in a folder and those below it, sorted; beside a URDF no meshes.
+    """Return the files of objects in a folder and those below it, sorted; no meshes next to a URDF.
 
     Raises:
         ConfigError: it is no folder, or has no such files.

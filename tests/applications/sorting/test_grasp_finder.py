@@ -52,5 +52,5 @@ def test_network_ranks_the_candidates():
 
 
 def test_missing_network_is_named(tmp_path):
-    with pytest.raises(ConfigError, match=r"none\.json"):
+    with pytest.raises(ConfigError, match=r"none\.onnx"):
         Network.load(tmp_path / "none.onnx", NUMBERS)
