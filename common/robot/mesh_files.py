@@ -140,7 +140,7 @@ def _scene(path: Path, data: bytes) -> list[trimesh.Trimesh]:
 
         def get(self, name: str) -> bytes:
             neighbor = path.parent / name
-            if not neighbor.is_file() or beside.stat().st_size > _MAX_BYTES:
+            if not neighbor.is_file() or neighbor.stat().st_size > _MAX_BYTES:
                 raise UnusableMesh(f"it refers to {name}, which is missing or too large")
             return neighbor.read_bytes()
 
