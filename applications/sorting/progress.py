@@ -125,7 +125,8 @@ class SortingProgress(Task[SortingView]):
         names = ", ".join(f"{thing.id} ({thing.color_name})" for thing in new)
         wrong = [f"{thing.id} belongs in {place}" for thing in new
                  if (place := self._belongs(thing)) and place != container]
-        text = "; ".join([f"two at once: {names} arrived in {container} after {len(known.pending)} releases", *wrong])
+        releases = "1 release" if len(known.pending) == 1 else f"{len(known.pending)} releases"
+        text = "; ".join([f"two at once: {names} arrived in {container} after {releases}", *wrong])
         counts = Counter(memory.sorted) + Counter({container: extra})
         self._remember(done=memory.done + extra, sorted=dict(counts), two_at_once=memory.two_at_once + extra,
                        arrivals=[*memory.arrivals[-9:], text])

@@ -104,8 +104,8 @@ RED, BLUE = arrived("o7", 0.50), arrived("o8", 0.55, "blue", (0.0, 0.0, 1.0))
 
 @pytest.mark.parametrize(("shown", "done", "two", "overlooked"), [
     ([RED], 1, 0, ""),
-    ([RED, BLUE], 2, 1, "two at once: o7 (red), o8 (blue) arrived in left after 1 releases; o8 belongs in right"),
-    ([RED, arrived("o9", 0.58)], 2, 1, "two at once: o7 (red), o9 (red) arrived in left after 1 releases"),
+    ([RED, BLUE], 2, 1, "two at once: o7 (red), o8 (blue) arrived in left after 1 release; o8 belongs in right"),
+    ([RED, arrived("o9", 0.58)], 2, 1, "two at once: o7 (red), o9 (red) arrived in left after 1 release"),
     ([RED, arrived("o9", 0.55)], 1, 0, ""),  # so near: may be one
 ])
 def test_second_object_that_arrived_in_a_container_is_counted_and_reported(task, shown, done, two, overlooked):
