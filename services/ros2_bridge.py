@@ -1,4 +1,4 @@
-"""Publishes the cell to ROS 2 with rmw_zenoh, and takes its task commands and trajectories (extra `ros2`)."""
+"""Publishes the cell to ROS 2 with rmw_zenoh, and takes its task commands (extra `ros2`)."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ class Config(Parameters):
     members: Members
     domain: int = Field(0, ge=0, le=232, description="ROS_DOMAIN_ID")
     namespace: str = Field("", max_length=100, description="namespace of names in ROS; empty: the name of the cell")
-    commands: bool = Field(True, description="offer task commands and the trajectory action")
-    rate: Tunable[float] = Field(100.0, gt=0, le=1000, description="maximum rate of each stream, wall time [Hz]")
+    commands: bool = Field(True, description="offer task commands")
+    rate: Tunable[float] = Field(200.0, gt=0, le=1000, description="maximum rate of each stream, wall time [Hz]")
 
 
 async def run(bus: Bus, config: Config) -> None:

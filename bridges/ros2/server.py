@@ -33,10 +33,11 @@ class Options(Protocol):
 
 async def serve(bus: Bus, config: Options, application: Application, endpoint: str | None = None) -> None:
     """Serve the cell until cancelled; `endpoint` is that of a router, by default the cell's."""
+    endpoint = endpoint or bus.endpoint or endpoint_of()
     await bus.acquire_keys()
     namespace = "/" + keys.ros_name(config.namespace or bus.cell)
     graph = await asyncio.to_thread(
-        Graph, endpoint or endpoint_of(), config.domain, namespace, "zencell", bus.log)
+        Graph, endpoint, config.domain, namespace, "zencell", bus.log)
     topics = Topics(bus, graph, topics_of(application, config.members.keys), lambda: config.rate)
     try:
         description = await asyncio.to_thread(description_of, config.robot)
@@ -46,8 +47,7 @@ async def serve(bus: Bus, config: Options, application: Application, endpoint: s
             serve_commands(bus, graph)
         topics.watch()
         await bus.ready()
-        bus.log.info("ROS 2 domain %d, namespace %s, with rmw_zenoh at %s", config.domain, namespace,
-                     endpoint or endpoint_of())
+        bus.log.info("ROS 2 domain %d, namespace %s, with rmw_zenoh at %s", config.domain, namespace, endpoint)
         await _publish_clock(bus, graph.publisher("/clock", "rosgraph_msgs/msg/Clock", keys.LATEST))
     finally:
         topics.close()

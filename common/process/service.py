@@ -205,6 +205,7 @@ async def _live(run: Run[P], start: Start[P], lifeline: Lifeline) -> int:
     try:
         await _pass_gate(lifeline)
         bus = Bus(session, service=start.name, cell=start.cell, clock=start.clock, topics=start.topics)
+        bus.endpoint = start.endpoint
         root = logging.getLogger()
         to_topic = BusLog(bus)
         root.addHandler(to_topic)

@@ -117,6 +117,7 @@ class Bus(RawAccess):
         super().__init__(session, service)
         self.cell = cell
         self.clock = clock
+        self.endpoint = ""  # of the router, in a process of its own; for a further session
         self.log = logging.getLogger(service)
         self.ready_event = asyncio.Event()
         self._limit = limit
