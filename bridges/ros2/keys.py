@@ -87,7 +87,7 @@ def data_key(domain: int, name: str, dds_type: str, type_hash: str) -> str:
 
 def gid_of(token: str) -> bytes:
     """Return the id of an entity: the XXH3 hash of its token, low half first, both little-endian."""
-    return xxhash.xxh3_128_digest(token.encode())[::-1]
+    return bytes(xxhash.xxh3_128_digest(token.encode())[::-1])
 
 
 @dataclass(frozen=True)

@@ -39,7 +39,7 @@ def store() -> Typestore:
 @cache
 def type_hash(name: str) -> str:
     """Return the hash of a type, such as RIHS01_a13e... of sensor_msgs/msg/JointState."""
-    return store().hash_rihs01(name)
+    return str(store().hash_rihs01(name))
 
 
 def dds_name(name: str) -> str:
