@@ -32,7 +32,7 @@ def offered(line: str, folder: Path, shell: str = "bash", **variables: str) -> l
     ("zencell node info vision", ["vision_detector"]),
     ("zencell up panda --set motion.vel", ["motion.velocity_scaling="]),
     ("zencell task home --planner lin", ["lin"]),
-    ("zencell gra", ["graph"]),
+    ("zencell gra", ["graph", "grasp"]),
     ("zencell --install-completion z", ["zsh"]),
 ])
 def test_word_is_completed(line, wanted, tmp_path):
@@ -87,8 +87,9 @@ def test_completed_names_are_those_of_the_code():
         assert len(about) <= choices.LONGEST_DOC and "[" not in about
     assert words(choices.services("")) == set(service_names()) - {"router"}
     assert words(choices.planners("")) == set(planner_names())
-    cell, wanted = load_cell("panda"), set[str]()
+    panda, sorting, wanted = load_cell("panda"), load_cell("sorting"), set[str]()
     for name in set(service_names()) - {"router"}:
+        cell = sorting if name in sorting.services else panda
         config = service_config(cell, name, importlib.import_module(f"services.{name}").Config)
         wanted |= {path for path in leaves(config, name) if path.startswith("services.")}
     assert words(choices.parameters("services.")) == wanted
