@@ -114,8 +114,8 @@ def test_extras_are_named(monkeypatch):
 
 def test_robots_and_cells_of_the_project_are_well():
     found = [(finding.level, finding.what.split(":")[0]) for finding in (*examination.robots(), *examination.cells())]
-    assert found == [("ok", f"{kind} {name}") for kind, name in (
-        ("robot", "fr3"), ("robot", "panda"), ("robot", "ur5"), ("cell", "panda"), ("cell", "ur5"))]
+    names = {"robot": ("fr3", "panda", "ur5"), "cell": ("panda", "sorting", "sorting_ur5", "ur5")}
+    assert found == [("ok", f"{kind} {name}") for kind in names for name in names[kind]]
 
 
 def test_incomplete_robot_and_missing_description_fail(tmp_path, monkeypatch):

@@ -24,7 +24,7 @@ from tests.recording.samples import joints, packed, status
 
 STEERING = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202e]")
 EVIL = "\x1b]0;owned\x07\x9b2J[/x]<script>alert(1)</script>\u202e"
-WITHIN = 1.0  # [s of processor time]
+WITHIN = 5.0  # [s of processor time]: reading all messages takes minutes
 MEMORY = 300_000  # [kB] more than before
 TOPICS = ["..", "../../up", "/etc/passwd", ".hidden", "a/b", "a_b", "nul\0", "x" * 300, EVIL, "", "con/../../x"]
 
