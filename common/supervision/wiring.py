@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 from common.application import all_topics
 from common.clock import Clock
-from common.config import Cell, Parameters, ServiceEntry, service_config
+from common.config import Cell, Parameters, Scenery, ServiceEntry, World, service_config
 from common.errors import ConfigError, ZencellError
 from common.messages import Message
 from common.supervision.launch import require_module
@@ -23,6 +23,8 @@ from common.transport.ownership import SHARED, Owner, refusal
 from common.transport.reader import Reader
 from common.transport.requests import Client
 from common.transport.writer import Writer
+
+KINEMATIC = "kinematic"  # needs no extra
 
 M = TypeVar("M", bound=Message)
 Q = TypeVar("Q", bound=Message)
@@ -123,7 +125,7 @@ async def wiring(
         RuntimeError: it ended, or `timeout` passed, before it was ready. Its own exceptions are passed on.
     """
     recorder = Recorder(service, topics)
-    task = asyncio.create_task(recorder.run(run(recorder, config)))
+    task = asyncio.create_task(recorder.run(run(recorder, _without_simulator(config))))
     is_ready = asyncio.create_task(recorder.ready_event.wait())
     try:
         await asyncio.wait({task, is_ready}, timeout=timeout, return_when=asyncio.FIRST_COMPLETED)
@@ -137,6 +139,16 @@ async def wiring(
         await asyncio.wait({task})
         await recorder.close()
     return recorder.wiring
+
+
+def _without_simulator(config: C) -> C:
+    """Return the configuration with the built-in simulator and no generator: topics depend on neither."""
+    if not isinstance(config, Parameters):
+        return config
+    plain: dict[str, object] = {"simulator": KINEMATIC}
+    return config.model_copy(update={
+        name: section.model_copy(update=plain | ({"generator": None} if isinstance(section, World) else {}))
+        for name, section in config if isinstance(section, Scenery)})
 
 
 async def wiring_of(cell: Cell, entry: ServiceEntry) -> Wiring:

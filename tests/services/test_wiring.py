@@ -103,3 +103,10 @@ def test_only_cells_with_a_camera_on_the_robot_read_tf() -> None:
     mounted = load_cell(str(Path(__file__).parents[1] / "data" / "hand_camera.yaml"))
     found = wiring_of(vision_detector, service_config(mounted, "vision_detector", vision_detector.Config))
     assert topics.TF in found.reads and topics.TF not in wired("panda")["vision_detector"].reads
+
+
+def test_topics_of_a_cell_with_physics_are_known_without_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("drivers.mujoco.find_spec", lambda _: None)
+    for name in ("trajectory_executor", "depth_camera"):
+        config = service_config(CELLS["sorting"], name, config_class("sorting", name))
+        assert wiring_of(importlib.import_module(f"services.{name}"), config) == wired("sorting")[name]
