@@ -47,10 +47,11 @@ async def run(bus: Bus, config: Config) -> None:
     lens = Lens(config.world.camera, distorted=config.distorted, rectify=config.rectify)
     camera = SimulatedCamera(config.world, config.scenery, config.robot, config, rng, plain=True, lens=lens,
                              arm=config.draw_robot)
-    joints = bus.reader(topics.JOINT_STATES) if camera.needs_joints else None
+    # Declared in every case: access rules come from the declarations, with whatever simulator they are made.
+    joints = bus.reader(topics.JOINT_STATES, listening=camera.needs_joints)
     await bus.ready()
     await truth.next()
-    if joints is not None:
+    if camera.needs_joints:
         await joints.next()
     infos.put(camera.info(bus.header(frame)))
     pace = LoopRate(bus, lambda: bus.clock.wall_rate(config.rate, config.max_rate))
@@ -59,7 +60,7 @@ async def run(bus: Bus, config: Config) -> None:
     while True:
         header = bus.header(frame)  # the instant of exposure: the latest state is rendered
         world = truth.latest or WorldObjects()
-        state = joints.latest if joints is not None else None
+        state = joints.latest
         if state is not None and camera.is_at(state):
             header = header.model_copy(update={"stamp": state.header.stamp})
         view = (await asyncio.to_thread(camera.capture, world, state, header.stamp) if camera.takes_long(world)
