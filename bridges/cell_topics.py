@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import Iterable
+from collections.abc import Coroutine, Iterable
 from dataclasses import replace
 from typing import Any
 
 from common.application import Application
 from common.remapping import Remapping
 from common.topics import Topic, platform_topics
+from common.transport.bus import Bus
 from common.transport.reader import Reader
 
 
@@ -38,3 +39,44 @@ async def drain(reader: Reader[Any]) -> None:
         async with asyncio.timeout(0):
             while True:
                 await reader.next()
+
+
+class Pumps:
+    """The running work of a bridge, one task for each name; what fails or is left out is logged."""
+
+    def __init__(self, bus: Bus, bridge: str) -> None:
+        self._bus, self._bridge = bus, bridge
+        self._tasks: dict[str, asyncio.Task[None]] = {}
+        self._unfit: set[str] = set()
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._tasks
+
+    def start(self, name: str, work: Coroutine[Any, Any, None]) -> None:
+        """Run `work` under a name."""
+        task = self._tasks[name] = asyncio.create_task(work, name=f"{self._bridge} {name}")
+        task.add_done_callback(lambda ended: self._ended(name, ended))
+
+    def stop(self, name: str) -> bool:
+        """Cancel what runs under a name; return whether something did."""
+        if (task := self._tasks.pop(name, None)) is None:
+            return False
+        task.cancel()
+        return True
+
+    def close(self) -> None:
+        """Cancel everything."""
+        for name in list(self._tasks):
+            self.stop(name)
+
+    def report(self, key: str, why: str) -> None:
+        """Log once for each topic why messages are left out."""
+        if key not in self._unfit:
+            self._unfit.add(key)
+            self._bus.log.warning("%s: messages are left out: %s", key, why)
+
+    def _ended(self, name: str, task: asyncio.Task[None]) -> None:
+        if self._tasks.get(name) is task:
+            del self._tasks[name]
+        if not task.cancelled() and (error := task.exception()) is not None:
+            self._bus.log.error("%s: %r", name, error)

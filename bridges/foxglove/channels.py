@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import Callable, Coroutine, Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 from foxglove import Channel, Context, Schema
 
-from bridges.cell_topics import drain
+from bridges.cell_topics import Pumps, drain
 from common.errors import ZencellError
 from common.messages import Image, Message, PointCloud2
 from common.topics import SUPERVISOR_STATUS, Topic, general_key
@@ -40,8 +40,7 @@ class Channels:
         self._channels: dict[str, Channel] = {}
         self._keys: dict[int, str] = {}  # by channel id
         self._clients: dict[str, int] = {}  # subscribed, by key
-        self._tasks: dict[str, asyncio.Task[None]] = {}
-        self._unfit: set[str] = set()
+        self._pumps = Pumps(bus, "foxglove")
         self._made: dict[str, Callable[[], bytes]] = {}  # messages of channels without a topic, by key
 
     def watch(self) -> None:
@@ -64,50 +63,37 @@ class Channels:
         if (key := self._keys.get(channel)) is None:
             return
         if key in self._made:
-            self._start(key, self._make(key))
+            self._pumps.start(key, self._make(key))
             return
         self._clients[key] = self._clients.get(key, 0) + 1
         reader = self._readers[key]
         if self._clients[key] == 1:
             self._bus.listen(reader, True)
-            self._start(key, self._pump(reader))
+            self._pumps.start(key, self._pump(reader))
         if reader.topic.kind == "state" and (current := reader.latest) is not None:
-            self._start(f"{key} {self._clients[key]}", self._send(reader, current))
+            self._pumps.start(f"{key} {self._clients[key]}", self._send(reader, current))
 
     def unsubscribe(self, channel: int) -> None:
         """Read a topic for one client less; without one it is not read any more."""
         if (key := self._keys.get(channel)) is None or key in self._made:
             return
         self._clients[key] = max(0, self._clients.get(key, 0) - 1)
-        if not self._clients[key] and (task := self._tasks.pop(key, None)) is not None:
-            task.cancel()
+        if not self._clients[key] and self._pumps.stop(key):
             self._bus.listen(self._readers[key], False)
 
     def close(self) -> None:
         """Stop reading."""
-        for task in self._tasks.values():
-            task.cancel()
-        self._tasks.clear()
+        self._pumps.close()
 
     def _found(self, key: str) -> None:
         reader = self._readers.get(key)
-        if reader is None or key in self._channels or key in self._tasks:
+        if reader is None or key in self._channels or key in self._pumps:
             return
         if issubclass(reader.topic.message, Image):  # its schema depends on the encoding of the pixels
             self._bus.listen(reader, True)
-            self._start(key, self._probe(reader))
+            self._pumps.start(key, self._probe(reader))
         else:
             self._open(key, schema_name(reader.topic.message))
-
-    def _start(self, name: str, work: Coroutine[Any, Any, None]) -> None:
-        task = self._tasks[name] = asyncio.create_task(work, name=f"foxglove {name}")
-        task.add_done_callback(lambda ended: self._ended(name, ended))
-
-    def _ended(self, name: str, task: asyncio.Task[None]) -> None:
-        if self._tasks.get(name) is task:
-            del self._tasks[name]
-        if not task.cancelled() and (error := task.exception()) is not None:
-            self._bus.log.error("%s: %r", name, error)
 
     async def _probe(self, reader: Reader[Any]) -> None:
         """Open the channel of images once the first one is there."""
@@ -127,7 +113,7 @@ class Channels:
         try:
             data = await asyncio.to_thread(self._made[key])
         except ZencellError as error:
-            self._report(key, str(error))
+            self._pumps.report(key, str(error))
             return
         self._channels[key].log(data, log_time=self._bus.clock.now_ns())
 
@@ -144,18 +130,12 @@ class Channels:
         try:
             name, data = await asyncio.to_thread(_encoded, message) if isinstance(message, LARGE) else _encoded(message)
         except CONVERSION_ERRORS as error:
-            self._report(key, str(error))
+            self._pumps.report(key, str(error))
             return
         if name != channel.schema_name():
-            self._report(key, f"now has the schema {name}, not {channel.schema_name()}; restart the bridge")
+            self._pumps.report(key, f"now has the schema {name}, not {channel.schema_name()}; restart the bridge")
             return
         channel.log(data, log_time=stamp_of(message) or self._bus.clock.now_ns())
-
-    def _report(self, key: str, why: str) -> None:
-        """Log once for each topic why messages are left out."""
-        if key not in self._unfit:
-            self._unfit.add(key)
-            self._bus.log.warning("%s: messages are left out: %s", key, why)
 
 
 def _encoded(message: Message) -> tuple[str, bytes]:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Coroutine, Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
-from bridges.cell_topics import drain
+from bridges.cell_topics import Pumps, drain
 from bridges.ros2 import keys
 from bridges.ros2.convert import calibration, conversion_of
 from bridges.ros2.graph import Graph, Publisher
@@ -47,8 +47,7 @@ class Topics:
             topic.key: bus.reader(topic, listening=False) for topic in topics
             if not topic.signed and conversion_of(topic.message) is not None}
         self._publishers: dict[str, Publisher] = {}
-        self._tasks: dict[str, asyncio.Task[None]] = {}
-        self._unfit: set[str] = set()
+        self._pumps = Pumps(bus, "ros2")
 
     def watch(self) -> None:
         """Publish each topic that has a writer, now and later."""
@@ -61,9 +60,7 @@ class Topics:
 
     def close(self) -> None:
         """Stop reading."""
-        for task in self._tasks.values():
-            task.cancel()
-        self._tasks.clear()
+        self._pumps.close()
 
     def _found(self, key: str) -> None:
         reader = self._readers.get(key)
@@ -78,7 +75,7 @@ class Topics:
         if reader.topic.kind == "state":
             self._bus.listen(reader, True)
             if is_state:
-                self._start(key, self._pump(reader, publisher, conversion[1]))
+                self._pumps.start(key, self._pump(reader, publisher, conversion[1]))
             return
 
         def on_change(matched: bool) -> None:  # on a network thread
@@ -96,27 +93,16 @@ class Topics:
         reader, publisher = self._readers[key], self._publishers[key]
         info = self._publishers.get(f"{key.partition('/')[0]}/{INFO}") if self._is_image(key) else None
         wanted = publisher.matched or (info is not None and info.matched)
-        if wanted and key not in self._tasks:
+        if wanted and key not in self._pumps:
             conversion = conversion_of(reader.topic.message)
             assert conversion is not None
             self._bus.listen(reader, True)
-            self._start(key, self._pump(reader, publisher, conversion[1]))
-        elif not wanted and (task := self._tasks.pop(key, None)) is not None:
-            task.cancel()
+            self._pumps.start(key, self._pump(reader, publisher, conversion[1]))
+        elif not wanted and self._pumps.stop(key):
             self._bus.listen(reader, False)
 
     def _is_image(self, key: str) -> bool:
         return issubclass(self._readers[key].topic.message, Image)
-
-    def _start(self, key: str, work: Coroutine[Any, Any, None]) -> None:
-        task = self._tasks[key] = asyncio.create_task(work, name=f"ros2 {key}")
-        task.add_done_callback(lambda ended: self._ended(key, ended))
-
-    def _ended(self, key: str, task: asyncio.Task[None]) -> None:
-        if self._tasks.get(key) is task:
-            del self._tasks[key]
-        if not task.cancelled() and (error := task.exception()) is not None:
-            self._bus.log.error("%s: %r", key, error)
 
     async def _pump(self, reader: Reader[Any], publisher: Publisher, convert: Callable[[Any], Any]) -> None:
         await drain(reader)
@@ -129,7 +115,7 @@ class Topics:
                 else:
                     publisher.put(convert(message))
             except (ValueError, ArithmeticError, LookupError, TypeError) as error:
-                self._report(reader.topic.key, str(error))
+                self._pumps.report(reader.topic.key, str(error))
             if reader.topic.kind == "stream":
                 await asyncio.sleep(1 / self._rate())
 
@@ -139,9 +125,3 @@ class Topics:
         publisher, reader = self._publishers.get(info), self._readers.get(info)
         if self._is_image(key) and publisher is not None and reader is not None and reader.latest is not None:
             publisher.put(calibration(reader.latest.model_copy(update={"header": header})))
-
-    def _report(self, key: str, why: str) -> None:
-        """Log once for each topic why messages are left out."""
-        if key not in self._unfit:
-            self._unfit.add(key)
-            self._bus.log.warning("%s: messages are left out: %s", key, why)
