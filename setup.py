@@ -40,6 +40,8 @@ class BuildWithFolders(build_py):
             shutil.copytree(folder, inside / folder, ignore=shutil.ignore_patterns("__pycache__", "*.so"))
         for example in Path("examples").glob("*/cell.yaml"):  # templates of `zencell new`
             shutil.copytree(example.parent, inside / example.parent, ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copytree("examples/policy", inside / "examples" / "policy",  # config/cells/policy_panda.yaml names it
+                        ignore=shutil.ignore_patterns("__pycache__", "test_*"))
         shutil.copy("constraints.txt", inside)  # for `zencell doctor`
         compile_kernel(inside / KERNEL, cache)
         shutil.rmtree(cache, ignore_errors=True)
