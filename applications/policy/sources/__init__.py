@@ -1,0 +1,20 @@
+"""Sources of a policy's actions: a Python function, an ONNX file, a server of openpi."""
+
+from __future__ import annotations
+
+from applications.policy.interface import PolicySource
+from applications.policy.sources.settings import PolicyCell, SourceConfig
+from common.errors import ConfigError
+
+
+def source(config: SourceConfig, cell: PolicyCell) -> PolicySource:
+    """Return the source that a configuration names. Imports and loads what it needs, which may take seconds.
+
+    Raises:
+        ConfigError: it does not exist or does not fit the cell; names the field, the value and what is expected.
+    """
+    if config.callable:
+        from applications.policy.sources.function import FunctionPolicy
+
+        return FunctionPolicy(config, cell)
+    raise ConfigError(f"source.{config.named[0]}", getattr(config, config.named[0]), "is no source yet")
