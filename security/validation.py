@@ -92,9 +92,9 @@ def allowances(rules: Mapping[str, Any]) -> dict[str, dict[str, set[str]]]:
     """Return what each common name may do: key expressions by the kind of rule, such as `reads`."""
     by_id = {rule["id"]: rule for rule in rules["rules"]}
     found: dict[str, dict[str, set[str]]] = {}
-    for policy in rules["policies"]:
-        for name in policy["subjects"]:
-            for identity in policy["rules"]:
+    for granted in rules["policies"]:
+        for name in granted["subjects"]:
+            for identity in granted["rules"]:
                 kind = identity.removeprefix(f"{name} ")
                 found.setdefault(name, {}).setdefault(kind, set()).update(by_id[identity]["key_exprs"])
     return found

@@ -14,6 +14,7 @@ from common.control.goals import Assessment
 from common.control.gripper_controller import DeferredCommand, GripperController
 from common.control.interlocks import Interlocks
 from common.control.jogging import Jogging, ToolKinematics
+from common.control.joining import Join
 from common.control.motion_authority import MotionAuthority
 from common.control.status import ChangeDetector, Report, joint_state, robot_fields
 from common.control.trajectory import Tolerances
@@ -236,12 +237,14 @@ class Executor:
         refusal = (authority.check_interlocks(request, request.id) or refusal or authority.check_owner(request.owner)
                    or self._check_devices())
         status = self.arm.accept(request.id, request.trajectory, now, self._q, refusal, assessment, request.plan,
-                                 request.scene_stamp)
+                                 request.scene_stamp, Join(request.joins, request.join_time) if request.joins else None)
         if not known:
             authority.note_refusal(request, status)
         if request.id == self.arm.goal and (self._followed is None or self._followed.id != request.id):
             self._followed = request
             authority.use(request.owner)
+            if request.joins:
+                authority.continue_hold(request.joins, request.id)
         return status
 
     def _check_devices(self) -> Refused | None:
@@ -258,13 +261,15 @@ class Executor:
         self.authority.jog(request, refusal or self._check_devices())
 
     def followed(self, goal: str) -> ExecuteRequest:
-        """Return the request of the goal that is followed.
+        """Return the request of the goal that is followed; after a join, with the complete path.
 
         Raises:
             Refused: another goal, or none, is followed.
         """
         if self._followed is None or not goal == self._followed.id == self.arm.goal:
             raise Refused("unknown_goal", f"goal {goal!r} is not followed now")
+        if self._followed.joins:
+            return self._followed.model_copy(update={"trajectory": self.arm.path})
         return self._followed
 
     def command_gripper(self, request: GripperCommand, now: float, refusal: Refused | None = None) -> GripperState:

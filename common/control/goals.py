@@ -44,6 +44,7 @@ class Goal:
     pace: Pace
     share: float = 1.0
     time: float = 0.0
+    begin: float = 0.0  # time at which the trajectory of the request starts: later than 0 if it joined another goal
     behind: float = 0.0  # distance of the newest set-point from the path [rad]
     stopping: bool = False
     reason: str = ""
@@ -104,7 +105,7 @@ def blend_time(offset: Vector, duration: float, limits: Limits) -> float:
 
 
 def possible_share(goal: Goal, limits: Limits, period: float) -> float:
-    """Return the share of its speed, at most 1, at which set-points of a goal every `period` [s] keep the limits.
+    """Return the share of its speed, at most 1, at which the rest of a goal keeps the limits, every `period` [s].
 
     Raises:
         Refused: it is below SLOWEST.
@@ -112,8 +113,8 @@ def possible_share(goal: Goal, limits: Limits, period: float) -> float:
     share, most = 1.0, 1 + SLACK
     while share >= SLOWEST:
         step = share * period / 2  # of the trajectory's time: differences over two, starting at every second one
-        count = min(int(goal.duration / step) + 1, MAX_SAMPLES)
-        q = goal.positions_at(np.arange(-6.0, count + 6) * step)
+        count = min(int((goal.duration - goal.time) / step) + 1, MAX_SAMPLES)
+        q = goal.positions_at(goal.time + np.arange(-6.0, count + 6) * step)
         v = (q[2:] - q[:-2]) / period
         a = (v[2:] - v[:-2]) / period
         j = (a[2:] - a[:-2]) / period
@@ -258,6 +259,7 @@ class GoalReports:
         self.newest = MotionStatus(
             id=goal.id, state=outcome.state, progress=progress, error=outcome.error, message=outcome.message,
             source=outcome.source or self._source, plan=goal.plan, scene_stamp=goal.scene_stamp,
+            path_time=goal.time - goal.begin,
         )
         return self._with_holds(self.memory.put(goal.id, self.newest))
 
@@ -266,6 +268,7 @@ class GoalReports:
         message = self.hold_message(goal)
         if message == self.newest.message:
             self.newest.progress = goal.progress(delay)  # the rest of it has not changed
+            self.newest.path_time = goal.time - goal.begin
             self.memory.put(goal.id, self.newest)
         else:
             self.report(goal, delay, Outcome("active", message=message))

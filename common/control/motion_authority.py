@@ -73,7 +73,7 @@ class OrphanPolicy:
         Args:
             present: whether the task is ready, by its liveliness token.
             goal: id of the goal that is followed; empty without one.
-            when_alone: the configured policy.
+            when_alone: what is configured.
         """
         if present:
             self._orphan = ""
@@ -342,6 +342,11 @@ class MotionAuthority:
         if not request.stops or self.interlocks.stops:
             return False
         return own or (now.asked and now.owner == UNKNOWN_OPERATOR) or request.override
+
+    def continue_hold(self, goal: str, joined: str) -> None:
+        """Keep a hold of the scene monitor when a goal is joined, until the monitor has checked the new path."""
+        if goal == self._monitored_goal:
+            self._monitored_goal = joined
 
     def hold_by_controller(self, hold: bool, reason: str = "") -> None:
         """Bring the arm to rest on its path for a reason of the executor itself, or release that hold."""

@@ -57,7 +57,7 @@ class ChangeDetector:
         last, key, now = self._motion, self._arm.reports.key, header.stamp * 1e-9
         if last is not None and (
             last.progress == self._arm.reports.newest.progress or now - self._motion_at < PROGRESS_PERIOD
-        ) and (key == self._motion_key or last.equals_except(self._arm.status, "progress")):
+        ) and (key == self._motion_key or last.equals_except(self._arm.status, "progress", "path_time")):
             self._motion_key = key
             return None
         self._motion, self._motion_at, self._motion_key = self._arm.status, now, key

@@ -25,6 +25,7 @@ _BEZIER = np.array([[math.comb(i, k) / math.comb(5, k) for k in range(6)] for i 
 ACCELERATION_MISMATCH = 0.3  # share of the velocity changes that the accelerations may leave unexplained
 _SAMPLES = 256  # positions of a segment that are checked if it may leave a limit
 _ROUNDING = 1e-9  # [rad]
+JOIN_POSITION, JOIN_VELOCITY = 1e-5, 1e-3  # [rad], [rad/s] between a motion and what joins it: one cycle evens it out
 
 
 class Tolerances(Parameters):
@@ -56,6 +57,7 @@ class Trajectory:
     velocities: Vector
     accelerations: Vector
     quintic: bool = False
+    given: Vector | None = None  # coefficients of its segments, if it was joined from other trajectories
 
     @cached_property
     def duration(self) -> float:
@@ -69,34 +71,36 @@ class Trajectory:
             return self.positions[end], 0.0 * self.positions[end]
         index = int(np.searchsorted(self.times, time, side="right")) - 1
         begin, end = self.times[index], self.times[index + 1]
-        return _interpolated((time - begin) / (end - begin), end - begin, self._segments[:, index])
+        return _interpolated((time - begin) / (end - begin), end - begin, self.segments[:, index])
 
     def positions_at(self, times: Vector) -> Vector:
         """Return positions (N, dof) at times (N,) [s]; those of the ends outside the trajectory."""
         index = np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, len(self.times) - 2)
         begin, end = self.times[index], self.times[index + 1]
         u = np.clip((times - begin) / (end - begin), 0.0, 1.0)[:, None]
-        return _interpolated(u, (end - begin)[:, None], self._segments[:, index])[0]
+        return _interpolated(u, (end - begin)[:, None], self.segments[:, index])[0]
 
     def between(self, fraction: float) -> tuple[Vector, Vector, Vector]:
         """Return positions, velocities and accelerations (N - 1, dof) at a fraction, 0 to 1, of every segment."""
-        h, (_, _, a0, c3, c4, c5) = np.diff(self.times)[:, None], self._segments
+        h, (_, _, a0, c3, c4, c5) = np.diff(self.times)[:, None], self.segments
         u = fraction
         ddq = (2 * a0 + u * (6 * c3 + u * (12 * c4 + u * 20 * c5))) / h**2
-        return *_interpolated(u, h, self._segments), ddq
+        return *_interpolated(u, h, self.segments), ddq
 
     def hull(self) -> tuple[Vector, Vector]:
         """Return bounds (N - 1, dof) of each segment's positions: those of its Bezier points."""
-        points = np.tensordot(_BEZIER, self._segments, axes=1)
+        points = np.tensordot(_BEZIER, self.segments, axes=1)
         return points.min(axis=0), points.max(axis=0)
 
     def at_share(self, u: float, chosen: NDArray[np.bool_]) -> Vector:
         """Return positions (M,) at a share u, 0 to 1, of the M chosen among segments and joints (N - 1, dof)."""
-        return _interpolated(u, 1.0, self._segments[:, chosen])[0]
+        return _interpolated(u, 1.0, self.segments[:, chosen])[0]
 
     @cached_property
-    def _segments(self) -> Vector:
+    def segments(self) -> Vector:
         """Coefficients (6, N - 1, dof) [rad] of the segments' polynomials, lowest first."""
+        if self.given is not None:
+            return self.given
         h = (self.times[1:] - self.times[:-1])[:, None]
         q0, move = self.positions[:-1], self.positions[1:] - self.positions[:-1]
         v0, v1 = self.velocities[:-1] * h, self.velocities[1:] * h
@@ -136,6 +140,14 @@ def from_message(message: JointTrajectory, names: tuple[str, ...]) -> Trajectory
     )
 
 
+def to_message(trajectory: Trajectory, names: tuple[str, ...]) -> JointTrajectory:
+    """Return the points of a trajectory, whose joints have these names."""
+    columns = (trajectory.times, trajectory.positions, trajectory.velocities, trajectory.accelerations)
+    return JointTrajectory.model_construct(joint_names=list(names), points=[
+        JointTrajectoryPoint.model_construct(time_from_start=t, positions=q, velocities=dq, accelerations=ddq)
+        for t, q, dq, ddq in zip(*(column.tolist() for column in columns), strict=True)])
+
+
 def with_best_interpolation(trajectory: Trajectory, limits: Limits, slack: float) -> Trajectory:
     """Return the trajectory with quintic segments if its accelerations explain its velocities, else with cubic ones.
 
@@ -160,15 +172,16 @@ def with_best_interpolation(trajectory: Trajectory, limits: Limits, slack: float
 
 
 def checked_trajectory(
-    message: JointTrajectory, limits: Limits, measured: Vector, tolerances: Tolerances
+    message: JointTrajectory, limits: Limits, measured: Vector, tolerances: Tolerances, velocity: Vector | None = None
 ) -> Trajectory:
     """Return the trajectory, ready to be sampled.
 
     Args:
         message: joints in any order, but exactly those of the robot.
         limits: of the robot.
-        measured: where the robot is, (dof,) [rad].
+        measured: where the robot is, or will be when it joins a motion, (dof,) [rad].
         tolerances: start, rest and slack.
+        velocity: of the motion that it joins, (dof,) [rad/s]; None: it starts at rest.
 
     Raises:
         Refused: with a code and one line that names joint, point, value and limit.
@@ -179,7 +192,11 @@ def checked_trajectory(
     _check_points(message)
     trajectory = from_message(message, limits.names)
     _check_numbers(trajectory, limits, tolerances)
-    _check_start(trajectory, limits, measured, tolerances)
+    if velocity is None:
+        _check_start(trajectory, limits, measured, tolerances)
+    else:
+        _check_join(trajectory, limits, measured, velocity)
+    _check_end(trajectory, limits, tolerances)
     _check_limits(trajectory, limits, measured, tolerances)
     _check_consistency(trajectory, limits, tolerances)
     best = with_best_interpolation(trajectory, limits, 1 + tolerances.slack)
@@ -239,12 +256,30 @@ def _check_start(trajectory: Trajectory, limits: Limits, measured: Vector, toler
         j = int(np.argmax(off))
         raise Refused("start_mismatch", f"trajectory starts with {limits.names[j]} at {trajectory.positions[0, j]:.4f} "
                                         f"rad, but it is at {measured[j]:.4f} rad (tolerance {tolerances.start:g})")
-    for name, end in (("first", 0), ("last", -1)):
-        speed = np.abs(trajectory.velocities[end])
-        if np.any(speed > tolerances.stopped_velocity):
-            j = int(np.argmax(speed))
-            raise Refused("not_at_rest", f"{name} point is not at rest: {limits.names[j]} moves at "
-                                         f"{trajectory.velocities[end, j]:.4f} rad/s")
+    _check_end(trajectory, limits, tolerances, "first", 0)
+
+
+def _check_end(
+    trajectory: Trajectory, limits: Limits, tolerances: Tolerances, name: str = "last", index: int = -1
+) -> None:
+    speed = np.abs(trajectory.velocities[index])
+    if np.any(speed > tolerances.stopped_velocity):
+        j = int(np.argmax(speed))
+        raise Refused("not_at_rest", f"{name} point is not at rest: {limits.names[j]} moves at "
+                                     f"{trajectory.velocities[index, j]:.4f} rad/s")
+
+
+def _check_join(trajectory: Trajectory, limits: Limits, position: Vector, velocity: Vector) -> None:
+    for what, first, there, unit, tolerance in (
+        ("", trajectory.positions[0], position, "rad", JOIN_POSITION),
+        ("the speed of ", trajectory.velocities[0], velocity, "rad/s", JOIN_VELOCITY),
+    ):
+        off = np.abs(first - there)
+        if np.any(off > tolerance):
+            j = int(np.argmax(off))
+            raise Refused("discontinuous", f"trajectory starts with {what}{limits.names[j]} at {first[j]:.6f} {unit}, "
+                                           f"but the motion that it joins is at {there[j]:.6f} {unit} there "
+                                           f"(tolerance {tolerance:g})")
 
 
 def _within(what: str, values: Vector, lower: Vector, upper: Vector, names: tuple[str, ...]) -> None:

@@ -11,9 +11,10 @@ import math
 import numpy as np
 
 from common.control.goals import MAX_SAMPLES, REMEMBERED, Assessment, Goal, GoalReports, Outcome
+from common.control.joining import Join, join_goal
 from common.control.limiter import Limiter
 from common.control.set_points import GoalFollower, SetPointHistory, Standstill
-from common.control.trajectory import Tolerances, checked_trajectory
+from common.control.trajectory import Tolerances, checked_trajectory, to_message
 from common.errors import Refused
 from common.hardware.interface import HardwareFault, Limits, Vector
 from common.messages import Holder, JointTrajectory, MotionStatus
@@ -104,7 +105,7 @@ class TrajectoryController:
 
     def accept(
         self, goal: str, trajectory: JointTrajectory, now: float, measured: Vector, refusal: Refused | None = None,
-        assessment: Assessment | None = None, plan: str = "", scene_stamp: int = 0,
+        assessment: Assessment | None = None, plan: str = "", scene_stamp: int = 0, join: Join | None = None,
     ) -> MotionStatus:
         """Return the state of the goal: active, or rejected with code and message; of a known id its present state.
 
@@ -117,6 +118,7 @@ class TrajectoryController:
             assessment: of the trajectory, if `assess` was called before.
             plan: id of the plan request behind the goal, reported with it.
             scene_stamp: stamp of the planning scene of that plan [ns], reported with it.
+            join: where the trajectory continues the goal that is followed, and replaces the rest of it.
         """
         known = self.reports.get(goal)
         if known is not None:
@@ -124,6 +126,8 @@ class TrajectoryController:
         try:
             if refusal is not None:
                 raise refusal
+            if join is not None:
+                return self._join(goal, trajectory, join, plan, scene_stamp)
             start = self._require_ready(measured)
             if assessment is None:
                 assessment = self.assess(trajectory, measured, start)
@@ -142,6 +146,21 @@ class TrajectoryController:
         self._goal = accepted
         self._standstill.goal_accepted()
         return self._report_active(accepted, self.reports.hold_message(accepted))
+
+    def _join(self, goal: str, trajectory: JointTrajectory, join: Join, plan: str, scene_stamp: int) -> MotionStatus:
+        """Replace the rest of the goal that is followed; return the state of the new one.
+
+        Raises:
+            Refused: that goal is not followed, or cannot be continued so.
+        """
+        running = self._goal
+        if running is None or running.id != join.goal:
+            raise Refused("unknown_goal", f"goal {join.goal!r} is not followed now")
+        joined = join_goal(running, goal, trajectory, join.time, self._limits, self._tolerances, self._period)
+        joined.plan, joined.scene_stamp = plan, scene_stamp
+        self.reports.report(running, self.history.delay, Outcome("cancelled", "replaced", f"replaced by {goal!r}"))
+        self._goal = joined
+        return self._report_active(joined, self.reports.hold_message(joined))
 
     def _require_ready(self, measured: Vector) -> Vector:
         """Return where a new motion starts (dof,) [rad].
@@ -243,6 +262,12 @@ class TrajectoryController:
     def knows(self, goal: str) -> bool:
         """Return whether a goal is known."""
         return self.reports.get(goal) is not None
+
+    @property
+    def path(self) -> JointTrajectory:
+        """What is followed, with the part of it from before the newest join; its duration is that of the progress."""
+        assert self._goal is not None
+        return to_message(self._goal.trajectory, self._limits.names)
 
     @property
     def end(self) -> Vector | None:

@@ -50,7 +50,7 @@ class ExecuteRequest(Message):
 
     max_bytes: ClassVar[int] = TRAJECTORY_BYTES + SMALL_BYTES
     max_parts: ClassVar[int] = 128 * 1024
-    omitted_defaults: ClassVar[tuple[str, ...]] = ("plan", "scene_stamp")
+    omitted_defaults: ClassVar[tuple[str, ...]] = ("plan", "scene_stamp", "joins", "join_time")
 
     header: Header = Header()
     id: Name
@@ -61,6 +61,10 @@ class ExecuteRequest(Message):
         None, description="`since` of the newest interlock that the operator has seen: later ones block the motion")
     plan: Label = Field("", description="id of the plan request that returned the trajectory")
     scene_stamp: Since = Field(0, description="stamp of the planning scene it was planned on; 0: unknown")
+    joins: Label = Field("", description="id of the goal that is followed and that this one continues; it ends as "
+                                         "cancelled with error replaced. Empty: start from rest")
+    join_time: Finite = Field(0.0, description="time on the trajectory of that goal at which this one starts, at its "
+                                               "position and velocity [s]")
 
 
 class FollowedRequest(Message):
@@ -136,7 +140,7 @@ class MotionStatus(Message):
 
     max_bytes: ClassVar[int] = 4 * SMALL_BYTES  # with all interlocks
     max_parts: ClassVar[int] = 256
-    omitted_defaults: ClassVar[tuple[str, ...]] = ("fault", "plan", "scene_stamp")
+    omitted_defaults: ClassVar[tuple[str, ...]] = ("fault", "plan", "scene_stamp", "path_time")
 
     header: Header = Header()
     id: Label = ""
@@ -153,6 +157,8 @@ class MotionStatus(Message):
     fault: Text = Field("", description="why the hardware does not move the robot; empty while it does")
     plan: Label = Field("", description="id of the plan request behind the goal, if the requester named it")
     scene_stamp: Since = Field(0, description="stamp of the planning scene it was planned on; 0: unknown")
+    path_time: Finite = Field(0.0, description="time of the newest set-point on the trajectory of the goal [s]; "
+                                               "negative until it joins the one before")
 
     @property
     def stopped(self) -> str:
