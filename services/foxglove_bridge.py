@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from bridges.foxglove.option import require_package
+from bridges.foxglove.option import require_usable
 from common.application import find_application
 from common.config import Members, Parameters, RobotConfig, Run, Tunable
 from common.process.service import main
@@ -23,8 +23,7 @@ class Config(Parameters):
     )
     port: int = Field(8765, ge=0, le=65535, description="TCP port; 0: any free port")
     commands: bool = Field(
-        True, description="offer task commands and parameters; never in a secured cell, since the protocol has no "
-                          "passwords"
+        True, description="offer task commands and parameters to clients of this host"
     )
     rate: Tunable[float] = Field(30.0, gt=0, le=1000, description="maximum rate of each stream, wall time [Hz]")
 
@@ -33,9 +32,9 @@ async def run(bus: Bus, config: Config) -> None:
     """Serve Foxglove until cancelled.
 
     Raises:
-        ConfigError: the package is missing, or the port is in use.
+        ConfigError: the package is missing, the port is in use, or the cell is secured.
     """
-    require_package(f"services.{bus.service}", ...)
+    require_usable(f"services.{bus.service}", ...)
     from bridges.foxglove.server import serve
 
     await serve(bus, config, find_application(config.members.application))

@@ -9,10 +9,12 @@ from collections.abc import Sequence
 
 from common.config import find_file, read_yaml
 from common.errors import ConfigError
+from common.transport.credentials import secure_folder
 
 SERVICE = "foxglove_bridge"
 HIGHEST_PORT = 65535
 EXTRA = "needs the extra `foxglove`: pip install 'zencell[foxglove]'"
+OPEN_ONLY = "needs an open cell: Foxglove's protocol has no passwords, so every user of this host could read it"
 
 
 def overrides_for(cell: str, port: str | None) -> Sequence[str]:
@@ -23,14 +25,14 @@ def overrides_for(cell: str, port: str | None) -> Sequence[str]:
         port: of the option; None without it.
 
     Raises:
-        ConfigError: the package is missing, or the port is invalid or in use.
+        ConfigError: the package is missing, the port is invalid or in use, or the cell is secured.
         UnknownName: there is no such cell.
     """
     if port is None:
         return ()
     if not (port.isascii() and port.isdigit() and 1 <= int(port) <= HIGHEST_PORT):
         raise ConfigError("--foxglove", port, f"must be a whole number from 1 to {HIGHEST_PORT}")
-    require_package("--foxglove", port)
+    require_usable("--foxglove", port)
     services = read_yaml(find_file("cells", cell)).get("services")
     if isinstance(services, dict) and SERVICE in services:
         return (f"services.{SERVICE}.port={port}",)
@@ -38,14 +40,16 @@ def overrides_for(cell: str, port: str | None) -> Sequence[str]:
     return (f"services.{SERVICE}={{port: {port}}}",)
 
 
-def require_package(field: str, value: object) -> None:
-    """Return if the package of the extra is installed.
+def require_usable(field: str, value: object) -> None:
+    """Return if the package of the extra is installed and the cell is open.
 
     Raises:
-        ConfigError: it is missing; names the extra.
+        ConfigError: the package is missing, with the extra; or the cell is secured.
     """
     if importlib.util.find_spec("foxglove") is None:
         raise ConfigError(field, value, EXTRA)
+    if secure_folder() is not None:
+        raise ConfigError(field, value, OPEN_ONLY)
 
 
 def require_free(field: str, host: str, port: int) -> None:

@@ -20,7 +20,6 @@ from bridges.foxglove.option import require_free
 from common.application import Application
 from common.config import Members, RobotConfig
 from common.transport.bus import Bus
-from common.transport.credentials import secure_folder
 
 
 class Options(Protocol):
@@ -94,7 +93,7 @@ def may_command(host: str, offered: bool) -> bool:
         local = ipaddress.ip_address(host.strip("[]")).is_loopback
     except ValueError:
         local = host.lower() == "localhost"
-    return offered and local and secure_folder() is None
+    return offered and local
 
 
 async def serve(bus: Bus, config: Options, application: Application) -> None:

@@ -19,7 +19,7 @@ from cli.main import app
 from common import messages as m
 from common import topics
 from common.config import Members, Parameters, Run, Tunable, load_cell, load_robot
-from common.errors import Refused
+from common.errors import ConfigError, Refused
 from common.perception.image import array_to_image
 from common.process.in_process import running_service
 from common.supervision.wiring import wire_service
@@ -260,16 +260,11 @@ async def test_without_commands_there_are_topics_only(stack: AsyncExitStack) -> 
     assert client.info["capabilities"] == [] and client.services == {}
 
 
-@pytest.mark.parametrize(("host", "offered", "secured", "expected"), [
-    ("127.0.0.1", True, False, True), ("::1", True, False, True), ("localhost", True, False, True),
-    ("127.0.0.1", False, False, False), ("0.0.0.0", True, False, False), ("robot.lan", True, False, False),
-    ("127.0.0.1", True, True, False),
+@pytest.mark.parametrize(("host", "offered", "expected"), [
+    ("127.0.0.1", True, True), ("::1", True, True), ("localhost", True, True),
+    ("127.0.0.1", False, False), ("0.0.0.0", True, False), ("robot.lan", True, False),
 ])
-def test_only_clients_of_this_host_command_an_open_cell(
-    host: str, offered: bool, secured: bool, expected: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    if secured:
-        monkeypatch.setenv("ZENCELL_SECURE", str(tmp_path))
+def test_only_clients_of_this_host_command_the_cell(host: str, offered: bool, expected: bool) -> None:
     assert may_command(host, offered) is expected
 
 
@@ -318,6 +313,17 @@ def test_bad_port_is_one_line(
 ) -> None:
     assert app.execute(["up", "panda", "--no-viewer", *arguments]) == 2
     assert capsys.readouterr().err.strip() == f"zencell: {expected}"
+
+
+def test_secured_cell_is_refused(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr("bridges.foxglove.option.secure_folder", lambda: tmp_path)
+    assert app.execute(["up", "panda", "--no-viewer", "--foxglove"]) == 2
+    assert "--foxglove: '8765' needs an open cell" in capsys.readouterr().err
+    cell = load_cell("panda", ["services.foxglove_bridge={port: 8799}"])
+    with pytest.raises(ConfigError, match="foxglove_bridge: needs an open cell"):
+        wire_service(cell, cell.services["foxglove_bridge"])
 
 
 def test_port_in_use_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
