@@ -47,6 +47,7 @@ class ContactRules:
         *,
         start: ArrayLike,
         padding: float = 0.0,
+        clearance: float = 0.0,
         allowed: Iterable[Pair] = (),
         attach: str = "",
         attach_pose: Pose | None = None,
@@ -63,7 +64,7 @@ class ContactRules:
             robot: the model.
             scene: obstacles and attached objects; its poses are in the base frame.
             start: joint positions at which contact and the pose of the attached object are taken.
-            padding: additional distance from perceived objects [m].
+            padding: additional distance from perceived objects [m]; clearance: from everything around the robot [m].
             allowed: pairs of link or object names that may touch, besides the scene's.
             attach: the only object that moves with the TCP: an attached one, or one of the scene from its present pose.
             attach_pose: of that object in the TCP frame, if not attached yet; default: its pose relative to the start.
@@ -87,7 +88,7 @@ class ContactRules:
         self._origin = T_world_tcp_start[:3, 3].copy()
         self.contact_distance = contact_distance
         environment, held = _split_scene(robot, scene, T_world_tcp_start, attach, attach_pose, release)
-        margins = self._load(environment, held, points, width, padding)
+        margins = self._load(environment, held, points, width, padding, clearance)
         self._set_rules(margins, _pairs_named(self._bank, self._names, (*scene.allowed_collisions, *allowed)))
         self._lever = self._bank.lever
         if held and not self._lever.max() <= _FARTHEST_HELD:  # pieces of 1 mm of its path would be too many
@@ -109,7 +110,7 @@ class ContactRules:
 
     def _load(
         self, environment: list[CollisionObject], held: list[tuple[CollisionObject, int, Array]],
-        points: Sequence[PointObstacle], width: float | None, padding: float,
+        points: Sequence[PointObstacle], width: float | None, padding: float, clearance: float,
     ) -> Array:
         """Place all geometry; return (pairs,) the required distances [m]."""
         objects = [*environment, *(item for item, _, _ in held)]
@@ -125,8 +126,9 @@ class ContactRules:
         self.attached: list[str] = [o.id for o, _, _ in held]
         padded = np.array(
             [0.0] * self._bank.robot_count
-            + [padding if o.role in PERCEIVED else 0.0 for o in objects]
-            + [padding] * len(points)
+            + [clearance + (padding if o.role in PERCEIVED else 0.0) for o in environment]
+            + [padding if o.role in PERCEIVED else 0.0 for o, _, _ in held]
+            + [clearance + padding] * len(points)
         )
         return np.asarray(padded[self._bank.first] + padded[self._bank.second])
 
