@@ -71,8 +71,11 @@ def decode(chunk: Chunk, observation: Observation, robot: RobotModel) -> tuple[A
 def _values(given: object, shape: tuple[int | None, ...], what: str) -> Array:
     """Return a copy as floats of an array of this shape; None: 1 to `MAX_ROWS`."""
     expected = f"({', '.join('n' if size is None else str(size) for size in shape)}{',' if len(shape) == 1 else ''})"
-    array = np.asarray(given) if isinstance(given, np.ndarray | list | tuple) else None
-    if array is None or array.dtype.kind not in "fiu":
+    try:
+        array = np.asarray(given) if isinstance(given, np.ndarray | list | tuple) else None
+    except ValueError:
+        raise PolicyFailed(f"{what}: must be an array {expected}; its rows differ in length") from None
+    if array is None or array.dtype.kind not in "fiu" or array.dtype.itemsize > 8:
         found = type(given).__name__ if array is None else f"an array of {array.dtype}"
         raise PolicyFailed(f"{what}: must be an array {expected} of numbers, not {found}")
     if array.ndim != len(shape) or any(size not in (None, have) for size, have in zip(shape, array.shape, strict=True)):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from applications.policy.interface import PolicySource
 from applications.policy.sources.settings import PolicyCell, SourceConfig
-from common.errors import ConfigError
 
 
 def source(config: SourceConfig, cell: PolicyCell) -> PolicySource:
@@ -17,4 +16,10 @@ def source(config: SourceConfig, cell: PolicyCell) -> PolicySource:
         from applications.policy.sources.function import FunctionPolicy
 
         return FunctionPolicy(config, cell)
-    raise ConfigError(f"source.{config.named[0]}", getattr(config, config.named[0]), "is no source yet")
+    if config.onnx:
+        from applications.policy.sources.onnx_file import OnnxPolicy
+
+        return OnnxPolicy(config, cell)
+    from applications.policy.sources.openpi import OpenpiPolicy
+
+    return OpenpiPolicy(config, cell)

@@ -69,7 +69,8 @@ def widths_of(column: Array, form: ActionFormat, cell: PolicyCell) -> Array:
     """Return widths (n,) [m] of the gripper's column, within 0 and the open width where it is no width itself."""
     if form.gripper_open is None:
         return column
-    share = (column - form.gripper_closed) / (form.gripper_open - form.gripper_closed)
+    with np.errstate(all="ignore"):
+        share = (column - form.gripper_closed) / (form.gripper_open - form.gripper_closed)
     return np.clip(share, 0.0, 1.0) * cell.gripper_width
 
 

@@ -12,6 +12,9 @@ from applications.policy.interface import ChunkKind
 from common.config import Parameters
 from common.config.basics import Number
 
+StatePart = Literal["positions", "velocities", "gripper", "tcp", "tcp_vector"]
+PARTS = ("positions and velocities (dof,), gripper (1,), tcp (7,) x, y, z and quaternion x, y, z, w in world, "
+         "tcp_vector (6,) x, y, z and rotation vector in world")
 SOURCES = ("callable", "onnx", "openpi")
 
 
@@ -60,18 +63,17 @@ class ActionFormat(Parameters):
 
 
 class OpenpiKeys(Parameters):
-    """Names of the fields of an observation for a server of openpi; an empty name leaves the field out."""
+    """Keys of an observation for a server of openpi; an empty key leaves the field out."""
 
     images: dict[str, str] = Field(
         {}, max_length=16, description="key by the name of the camera; by default one camera is observation/image, of "
                                        "several each is observation/NAME")
-    state: str = Field(
-        "observation/state", max_length=200, description="joint positions [rad], then the gripper, as in the column of "
-                                                         "the actions")
+    state: str = Field("observation/state", max_length=200, description="vector of state_parts")
+    state_parts: list[StatePart] = Field(["positions", "gripper"], min_length=1, max_length=8, description=PARTS)
     joints: str = Field("", max_length=200, description="joint positions [rad]")
     gripper: str = Field("", max_length=200, description="(1,) gripper, as in the column of the actions")
-    tcp: str = Field("", max_length=200, description="x, y, z [m] and quaternion x, y, z, w of the tool in world")
     prompt: str = Field("prompt", max_length=200, description="instruction")
+    api_key: str = Field("", max_length=1000, repr=False, description="that the server requires")
 
 
 class SourceConfig(Parameters):

@@ -78,6 +78,8 @@ WRONG = [
     ("objects", chunk("joints", np.array([[None] * 7])), "of numbers, not an array of object"),
     ("text", chunk("joints", np.array([["1"] * 7])), "not an array of <U1"),
     ("complex", chunk("joints", np.zeros((1, 7), complex)), "not an array of complex128"),
+    ("ragged", chunk("joints", [[0.0] * 7, [0.0]]), "its rows differ in length"),
+    ("long double", chunk("joints", np.zeros((1, 7), np.longdouble)), "of numbers, not an array of"),
     ("no array", chunk("joints", None), "not NoneType"),
     ("kind", chunk("velocities", ROW), "kind 'velocities'; choices: joints, joint_steps, tcp, tcp_steps"),
     ("no rate", chunk("joints", ROW, rate=0.0), "rate of a chunk: 0.0"),
