@@ -20,7 +20,8 @@ CELL = "panda"  # its robot and its camera are those of policy_panda
 RATE, ROWS = 20.0, 20  # [Hz], one second
 SPEED, ACCELERATION = 0.20, 0.40  # [m/s], [m/s^2] of the tool center point
 DESCENT = 0.12  # [m/s] next to the ball
-TURN, TURNED = 1.2, 0.1  # [rad/s] of the tool, [rad] missing rotation that allows the descent
+TURN, TURN_ACCELERATION = 1.2, 3.0  # [rad/s], [rad/s^2] of the tool
+TURNED = 0.1  # [rad] missing rotation that allows the descent
 BALL = 0.03  # [m] height of its center: the height of the grasp
 ABOVE, LIFTED = 0.15, 0.20  # [m] height before the descent, and with the ball
 NEAREST = 0.29  # [m] from the base axis: nearer, the elbow meets its limit
@@ -37,10 +38,11 @@ def policy(observation: Observation) -> Chunk:
     committed = [robot.fk(q) for q in observation.committed[:ROWS]]
     T = committed[-1] if committed else observation.tcp
     if len(committed) > 1:
-        speed = float(np.linalg.norm(T[:3, 3] - committed[-2][:3, 3])) * RATE
+        turned = cv2.Rodrigues(T[:3, :3] @ committed[-2][:3, :3].T)[0].ravel()
+        twist = RATE * np.array([*(T[:3, 3] - committed[-2][:3, 3]), *turned])
     else:
-        speed = robot.tool_speed(observation.positions, observation.velocities)
-    rows = [*committed, *_ahead(T, speed, ball, observation.gripper, ROWS - len(committed))]
+        twist = robot.jacobian(observation.positions) @ observation.velocities
+    rows = [*committed, *_ahead(T, twist, ball, observation.gripper, ROWS - len(committed))]
     width = _width(T[:3, 3], ball, observation.gripper)
     poses = [(*T[:3, 3], *matrix_to_quaternion(T[:3, :3])) for T in rows]
     return Chunk(observation.stamp, RATE, "tcp", np.array(poses), np.full(len(poses), width))
@@ -59,19 +61,22 @@ def find_ball(image: np.ndarray) -> np.ndarray | None:
     return np.array([*camera.on_plane((u, v), BALL), BALL])
 
 
-def _ahead(T: np.ndarray, speed: float, ball: np.ndarray | None, gripper: float, rows: int) -> list[np.ndarray]:
-    """Return poses (4, 4) of the next rows, from T_world_tcp with a speed [m/s]."""
+def _ahead(T: np.ndarray, twist: np.ndarray, ball: np.ndarray | None, gripper: float, rows: int) -> list[np.ndarray]:
+    """Return poses (4, 4) of the next rows, from T_world_tcp with a twist (6,) [m/s], [rad/s], along axes of world."""
     T, dt, found = T.copy(), 1 / (RATE * TICKS), []
+    speed, rate = float(np.linalg.norm(twist[:3])), float(np.linalg.norm(twist[3:]))
     for _ in range(rows):
         for _ in range(TICKS):
             turn = _missing_turn(T, ball)
-            goal, fastest = _goal(T[:3, 3], ball, gripper, float(np.linalg.norm(turn)))
+            angle = float(np.linalg.norm(turn))
+            goal, fastest = _goal(T[:3, 3], ball, gripper, angle)
             away = goal - T[:3, 3]
             distance = float(np.linalg.norm(away))
             speed = min(speed + ACCELERATION * dt, fastest, float(np.sqrt(2 * ACCELERATION * distance)))
             T[:3, 3] += away * min(speed * dt / max(distance, 1e-9), 1.0)
             T[:2, 3] *= max(NEAREST / max(np.linalg.norm(T[:2, 3]), 1e-9), 1.0)
-            T[:3, :3] = cv2.Rodrigues(turn * min(TURN * dt / max(np.linalg.norm(turn), 1e-9), 1.0))[0] @ T[:3, :3]
+            rate = min(rate + TURN_ACCELERATION * dt, TURN, float(np.sqrt(2 * TURN_ACCELERATION * angle)))
+            T[:3, :3] = cv2.Rodrigues(turn * min(rate * dt / max(angle, 1e-9), 1.0))[0] @ T[:3, :3]
         found.append(T.copy())
     return found
 
