@@ -17,11 +17,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from applications.policy.sources.onnx_file import OnnxPolicy
 
 from applications.policy.decoding import decode
 from applications.policy.interface import Chunk, MotionState, Observation, PolicyFailed
 from applications.policy.proof import ChunkProver, ProofOptions
+from applications.policy.sources.onnx_file import OnnxPolicy
 from applications.policy.sources.settings import SourceConfig
 from common.hardware.interface import Limits
 from common.planning.trajectory import TimedPath, sample
