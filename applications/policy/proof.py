@@ -10,18 +10,22 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from applications.policy.interface import MotionState, ProvedMotion, Violation
-from applications.policy.proof_motion import Excess, Stops, excess_of, first_excess, fitted, slowed_times, stops_from
+from applications.policy.proof_motion import (
+    Excess,
+    Stops,
+    braked,
+    excess_of,
+    first_excess,
+    fitted,
+    slowed_times,
+    stops_from,
+)
+from applications.policy.proof_space import Found, Space
 from common.control.goals import blend_time
-from common.errors import ZencellError
 from common.hardware.interface import Limits
-from common.messages import Box, PathConstraints, PlanningScene
-from common.planning.collision import CollisionWorld
-from common.planning.constraints import ToolConstraints
-from common.planning.contact_rules import PERCEIVED, Pair
-from common.planning.obstacles import ObstacleCache
+from common.messages import Box, PlanningScene
 from common.planning.point_obstacles import PointObstacle
-from common.planning.robot_geometry import RobotGeometry
-from common.planning.trajectory import TimedPath, cubics, sample
+from common.planning.trajectory import TimedPath, cubics
 from common.robot.model import RobotModel
 
 Array = NDArray[np.float64]
@@ -32,10 +36,9 @@ MAX_SECONDS = 60.0  # that a chunk may take
 _FADES = (0.0, 0.15, 0.3)  # [s] in which a difference between the state and the rows fades; the shortest that works
 _INSET = 2e-3  # [rad] rows nearer to a position limit, or this much beyond it, are moved to this distance
 _SLOWEST = 10.0  # factor by which a chunk is slowed down at most
-_SLOW_RAMP = 0.15  # [s] in which the motion slows down
+_SLOW_RAMP = 0.3  # [s] in which the motion slows down
 _SLOW_TRIES, _SLOW_REFINED = 8, 3
-_REGION_SHARES = (0.0, 0.5)  # of the tolerance of a region that states may use, and that is proved between them
-_STEP = 0.005  # [rad] between states where the kernel cannot check what an attached object touches
+_BRAKED_STEP = 0.01  # [rad] between positions of a stop in which each joint brakes on its own
 
 
 @dataclass(frozen=True)
@@ -56,10 +59,6 @@ class ProofOptions:
     acceleration: float = 0.95
 
 
-class ProverUnavailable(ZencellError):
-    """The compiled kernel, which proves that motions are free, is missing or does not support the robot or a shape."""
-
-
 class ChunkProver:
     """Proves motions for chunks of joint positions. Not thread-safe; the robot model belongs to it.
 
@@ -69,25 +68,22 @@ class ChunkProver:
     attached object may touch what it touches when it is attached, until the TCP is 20 mm away from there.
 
     A stop stays possible everywhere. Braking along the path is proved by construction: the path to its end at rest is
-    free, and a slower motion along it visits the same positions. Stops of the arm that leave the path, with all joints
-    at rest at the same time, are checked from each knot of the spline, which are at most as far apart as the rows.
+    free, and a slower motion along it visits the same positions. Stops that leave the path are checked from each knot
+    of the spline, which are at most as far apart as the rows: with all joints at rest at the same time (proved as the
+    motion is), and with each joint braking on its own at its deceleration limit (collision only, in small steps).
     """
 
     def __init__(self, robot: RobotModel, limits: Limits, options: ProofOptions | None = None) -> None:
         """Prove motions of a robot within limits, after `set_scene`."""
         self._robot, self._limits = robot, limits
-        self._cache = ObstacleCache(RobotGeometry(robot))
-        self._world: CollisionWorld | None = None
-        self._region = ToolConstraints.none(robot)
-        self._attached: tuple[tuple[str, ...], Array] | None = None
-        self.set_options(options or ProofOptions())
+        self.options = options or ProofOptions()
+        self._space = Space(robot, self.options.region, self.options.clearance)
 
     def set_options(self, options: ProofOptions) -> None:
         """Apply other options from the next chunk on; another clearance from the next scene on."""
         self.options = options
-        requested = PathConstraints(region=options.region)
-        self._region = ToolConstraints(self._robot, requested, np.zeros(self._robot.dof))
-        self._attach_region()
+        self._space.clearance = options.clearance
+        self._space.set_region(options.region)
 
     def set_scene(
         self, scene: PlanningScene, positions: ArrayLike, points: Sequence[PointObstacle] = (),
@@ -105,23 +101,7 @@ class ChunkProver:
             ProverUnavailable: the kernel is missing or does not support a shape.
             InvalidShape: a solid has no volume.
         """
-        names = tuple(item.object.id for item in scene.attached)
-        if self._attached is None or self._attached[0] != names:
-            self._attached = names, np.array(positions, dtype=float)
-        gripper = self._robot.config.gripper
-        touchable = [item.id for item in scene.objects if item.role in PERCEIVED]
-        allowed = [(link, name) for link in (gripper.links if gripper else []) for name in touchable]
-        self._world = CollisionWorld(
-            self._robot, scene, start=self._attached[1], clearance=self.options.clearance, allowed=allowed,
-            cache=self._cache, points=points, width=width)
-        if self._world.kernel is None:
-            self._world = None
-            raise ProverUnavailable("the planning kernel is not built, or does not support a shape of this cell")
-        self._attach_region()
-
-    def _attach_region(self) -> None:
-        if self._world is not None and self._world.kernel is not None:
-            self._region.attach_to_kernel(self._world.kernel)
+        self._space.set_scene(scene, positions, points, width)
 
     def prove(self, state: MotionState, rows: object, times: object) -> ProvedMotion:
         """Return what of a chunk is executed: always a motion that is proved as a whole.
@@ -137,8 +117,7 @@ class ChunkProver:
         Raises:
             RuntimeError: no scene was set.
         """
-        if self._world is None:
-            raise RuntimeError("set_scene() must be called before prove()")
+        _ = self._space.world
         checked = self._checked(rows, times)
         if isinstance(checked, Violation):
             return self._stopped(state, checked)
@@ -254,24 +233,29 @@ class ChunkProver:
         self, state: MotionState, q: Array, t: Array, fade: float, excess: Excess
     ) -> tuple[TimedPath, float, Array] | None:
         """Return a spline that keeps the limits along the same rows, how much slower it is, and the rows' times."""
+        slope = (q[0] - state.positions) / t[0] if len(q) == 1 else (q[1] - q[0]) / (t[1] - t[0])
+        weight = slope / self._limits.velocity**2
+        first = float(np.clip(state.velocities @ weight / max(float(slope @ weight), 1e-9), 0.0, 1.0))
+
+        def slower(factor: float) -> tuple[TimedPath, Array, Excess | None]:
+            later = slowed_times(t, factor, _SLOW_RAMP, first)
+            path = fitted(state, q, later, fade)
+            return path, later, self._excess(state, path)
+
         low, factor = 1.0, min(max(excess.slowing, 1.02), _SLOWEST)
-        found: tuple[TimedPath, float, Array] | None = None
+        path, later, over = slower(factor)
         for _ in range(_SLOW_TRIES):
-            later = slowed_times(t, factor, _SLOW_RAMP)
-            path = fitted(state, q, later, fade)
-            over = self._excess(state, path)
-            if over is None:
-                found = path, factor, later
+            if over is None or over.cause == "position" or factor >= _SLOWEST:
                 break
-            if factor >= _SLOWEST or over.cause == "position":
-                return None
             low, factor = factor, min(factor * min(max(over.slowing, 1.05), 2.0), _SLOWEST)
-        for _ in range(_SLOW_REFINED if found is not None else 0):
-            assert found is not None
+            path, later, over = slower(factor)
+        if over is not None:
+            return None
+        found = path, factor, later
+        for _ in range(_SLOW_REFINED):
             factor = float(np.sqrt(low * found[1]))
-            later = slowed_times(t, factor, _SLOW_RAMP)
-            path = fitted(state, q, later, fade)
-            if self._excess(state, path) is None:
+            path, later, over = slower(factor)
+            if over is None:
                 found = path, factor, later
             else:
                 low = factor
@@ -289,67 +273,41 @@ class ChunkProver:
     ) -> tuple[int, Violation | None]:
         """Return the last knot from which the stop ends a proved motion, -1 for none, and why no later one does."""
         pieces = cubics(path)[:last] if last else np.zeros((0, 4, self._robot.dof))
-        outside = self._region.first_violation(pieces, _REGION_SHARES) if last else None
-        if outside is not None:
-            last, violation = outside[0], self._left_region(path, *outside)
-        hit = self._hit(pieces[:last]) if last else None
-        if hit is not None:
-            last, (where, pair) = int(hit[0]), hit
-            at = float(np.interp(where, np.arange(len(path.times)), path.times))
-            message = f"{pair[0]} would touch {pair[1]} after {at:.2f} s"
-            violation = Violation("collision", " - ".join(pair), at, message)
-        stopping = stops.cubics()[: 3 * (last + 1)]
-        found = self._stop_violation(state, stops, stopping)
+        found = self._space.leaves_region(pieces)
         if found is not None:
-            knot, what, why = found
+            last, violation = int(found.where), _violation("region", path, found)
+        found = self._space.hit(pieces[:last])
+        if found is not None:
+            last, violation = int(found.where), _violation("collision", path, found)
+        stop = self._no_stop(state, stops, last + 1)
+        if stop is not None:
+            knot, what, why = stop
             at, last = float(path.times[knot]), knot - 1
-            violation = violation or Violation(
-                "stop", what, at, f"a stop after {at:.2f} s would not be possible: {why}")
+            message = f"the arm could not stop any more after {at:.2f} s: {why}"
+            violation = violation or Violation("stop", what, at, message)
         return last, violation
 
-    def _stop_violation(self, state: MotionState, stops: Stops, pieces: Array) -> tuple[int, str, str] | None:
-        """Return the first stop that is not proved, the joint, side or pair, and a reason."""
-        found: tuple[int, str, str] | None = None
-        spans = np.diff(stops.times, axis=1).reshape(-1)[: len(pieces)]
-        excess = first_excess(spans, pieces, self._limits, self._limits.acceleration, *self._bounds(state))
+    def _no_stop(self, state: MotionState, stops: Stops, count: int) -> tuple[int, str, str] | None:
+        """Return the first of `count` states whose stops are not proved, the joint, side or pair, and a reason."""
+        answer: tuple[int, str, str] | None = None
+        excess = first_excess(
+            stops.spans[: 3 * count], stops.cubics()[: 3 * count], self._limits, self._limits.acceleration,
+            *self._bounds(state))
         if excess is not None:
-            name = self._robot.joint_names[excess.joint]
-            found = excess.piece // 3, name, f"{name} would exceed its {excess.cause} limit"
-            pieces = pieces[: 3 * found[0]]
-        outside = self._region.first_violation(pieces, _REGION_SHARES) if len(pieces) else None
-        if outside is not None:
-            side = self._side(_at(pieces, outside[0] + outside[1]))
-            found = outside[0] // 3, side, f"the TCP would leave the region at {side}"
-            pieces = pieces[: 3 * found[0]]
-        hit = self._hit(pieces) if len(pieces) else None
-        if hit is not None:
-            found = int(hit[0]) // 3, " - ".join(hit[1]), f"{hit[1][0]} would touch {hit[1][1]}"
-        return found
-
-    def _hit(self, pieces: Array) -> tuple[float, Pair] | None:
-        """Return the first collision of cubics (N, 4, dof): index and share of the cubic, and the pair."""
-        world = self._world
-        assert world is not None and world.kernel is not None
-        proved, hit = world.check_cubics(pieces)
-        if proved:
-            return None
-        index, where = world.kernel.cubics_collision(pieces)
-        if index >= 0:
-            return min(where, len(pieces) - 1e-9), hit.pair if hit is not None else world.pair(index)
-        for number, piece in enumerate(pieces):  # something held touches what only coal can check
-            count = max(1, int(np.ceil(np.abs(piece[1:]).sum(axis=0).max() / _STEP)))
-            r = np.linspace(0.0, 1.0, count + 1)[:, None]
-            states = piece[0] + r * (piece[1] + r * (piece[2] + r * piece[3]))
-            touched = world.first_collision(states)
-            if touched is not None:
-                return number + touched.index / (count + 1), touched.pair
-        return None
-
-    def _side(self, q: Array) -> str:
-        """Return the side of the region that the TCP is outside of at q."""
-        values = self._region.bounds.n @ self._robot.fk(q)[:3, 3] - self._region.bounds.least
-        axis, inwards = divmod(int(np.argmin(values)), 2)
-        return f"{'+' if inwards else '-'}{'xyz'[axis]}"
+            name, count = self._robot.joint_names[excess.joint], excess.piece // 3
+            answer = count, name, f"{name} would exceed its {excess.cause} limit"
+        curves = stops.curves()
+        for check in (self._space.leaves_region, self._space.hit):
+            found = check(curves[: 2 * count])
+            if found is not None:
+                count = int(found.where) // 2
+                answer = count, found.what, found.message
+        positions, velocities = stops.positions[:count, 0], stops.velocities[:count, 0]
+        states, owners = braked(positions, velocities, self._limits.braking, _BRAKED_STEP)
+        found = self._space.hit_at(states)
+        if found is not None:
+            answer = int(owners[int(found.where)]), found.what, found.message
+        return answer
 
     # --- answers ---
 
@@ -357,16 +315,11 @@ class ChunkProver:
         name, at = self._robot.joint_names[excess.joint], float(path.times[excess.piece])
         return Violation(excess.cause, name, at, f"{name} would exceed its {excess.cause} limit after {at:.2f} s")
 
-    def _left_region(self, path: TimedPath, piece: int, where: float) -> Violation:
-        at = float(np.interp(piece + where, np.arange(len(path.times)), path.times))
-        side = self._side(sample(path, [at])[0])
-        return Violation("region", side, at, f"the TCP would leave its region at {side} after {at:.2f} s")
-
     def _stopped(self, state: MotionState, violation: Violation | None) -> ProvedMotion:
         """Return the stop from the state, if it is proved."""
         path = TimedPath(np.zeros(1), state.positions[None], state.velocities[None], state.accelerations[None])
         stops = self._stops(path, 0)
-        if self._stop_violation(state, stops, stops.cubics()) is not None:
+        if self._no_stop(state, stops, 1) is not None:
             return self._empty(violation)
         stop = stops.one(0)
         return ProvedMotion(
@@ -377,9 +330,10 @@ class ChunkProver:
         return ProvedMotion(np.zeros(0), none, none, none, 0.0, 0, violation=violation)
 
 
-def _at(pieces: Array, where: float) -> Array:
-    piece = min(int(where), len(pieces) - 1)
-    return np.asarray((where - piece) ** np.arange(4) @ pieces[piece])
+def _violation(cause: Literal["region", "collision"], path: TimedPath, found: Found) -> Violation:
+    """Return what was found on the cubics of a path."""
+    at = float(np.interp(found.where, np.arange(len(path.times)), path.times))
+    return Violation(cause, found.what, at, f"{found.message} after {at:.2f} s")
 
 
 def _joined(path: TimedPath, last: int, stop: TimedPath) -> tuple[Array, Array, Array, Array]:

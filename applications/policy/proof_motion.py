@@ -20,6 +20,7 @@ from common.planning.trajectory import TimedPath, cubics
 Array = NDArray[np.float64]
 
 SHORTEST_STEP, LONGEST_STEP = 0.02, 0.1  # [s] between knots
+MOST_KNOTS = 100  # unless there are more rows
 CUTOFF = 30.0  # [rad/s] faster parts of the rows are smoothed away
 ROUNDING = 1e-6  # share by which a limit may be exceeded, and [rad]
 _RAMP = 0.2  # share of a stop's duration in which the deceleration is reached, and the same at the end
@@ -38,7 +39,7 @@ def fitted(state: MotionState, rows: Array, times: Array, fade: float = 0.0) -> 
     """
     end = float(times[-1])
     step = float(np.clip(end / len(times), SHORTEST_STEP, LONGEST_STEP))
-    count = max(1, int(np.ceil(end / step - 1e-6)))
+    count = min(max(1, int(np.ceil(end / step - 1e-6))), max(MOST_KNOTS, len(times)))
     h = end / count
     place = np.minimum((times / h).astype(int), count - 1)
     basis = np.zeros((len(times), count + 3))
@@ -86,6 +87,11 @@ class Stops:
         return TimedPath(
             self.times[index], self.positions[index], self.velocities[index], self.accelerations[index])
 
+    @property
+    def spans(self) -> Array:
+        """Durations (3 N,) of the cubics [s]."""
+        return np.diff(self.times, axis=1).reshape(-1)
+
     def cubics(self) -> Array:
         """Return (3 N, 4, dof) all of them, one after the other, as `common.planning.trajectory.cubics`."""
         count, _, dof = self.positions.shape
@@ -94,6 +100,32 @@ class Stops:
         c3 = np.diff(self.accelerations, axis=1) * h**2 / 6
         pieces = np.stack([self.positions[:, :-1], self.velocities[:, :-1] * h, c2, c3], axis=2)
         return pieces.reshape(3 * count, 4, dof)
+
+    def curves(self) -> Array:
+        """Return (2 N, 4, dof) the same positions as two curves each: the last two cubics are one straight line.
+
+        From the end of the first, the joints lose their velocities in the same proportion.
+        """
+        curves = self.cubics().reshape(len(self.times), 3, 4, -1)[:, :2].copy()
+        curves[:, 1, 1] = self.positions[:, 3] - self.positions[:, 1]
+        curves[:, 1, 2:] = 0.0
+        return curves.reshape(-1, *curves.shape[2:])
+
+
+def braked(q: Array, dq: Array, braking: Array, step: float) -> tuple[Array, NDArray[np.int64]]:
+    """Return positions (M, dof) along stops from states (N, dof), and the state of each.
+
+    Each joint brakes on its own with its deceleration limit (dof,) [rad/s^2], and they stop at different times.
+    Positions of a stop are about `step` [rad] apart.
+    """
+    durations = np.abs(dq) / braking
+    last = durations.max(axis=1)
+    counts = np.maximum(1, np.ceil((np.abs(dq) * durations).max(axis=1) / (2 * step)).astype(int))
+    owners = np.repeat(np.arange(len(q)), counts)
+    number = np.arange(len(owners)) - np.repeat(np.cumsum(counts) - counts, counts) + 1
+    share = 1 - np.sqrt(1 - number / counts[owners])  # of the time at which the slowest has covered an equal part
+    t = np.minimum((share * last[owners])[:, None], durations[owners])
+    return q[owners] + dq[owners] * t - np.sign(dq[owners]) * braking * t**2 / 2, owners
 
 
 def stops_from(q: Array, dq: Array, ddq: Array, acceleration: Array, jerk: Array) -> Stops:
@@ -198,7 +230,14 @@ def excess_of(
     return first_excess(np.diff(path.times), cubics(path), limits, acceleration, lower, upper)
 
 
-def slowed_times(times: Array, factor: float, ramp: float) -> Array:
-    """Return times (n,) [s] of rows on a motion that slows down by a factor within a time `ramp` [s] from its start."""
-    begun = np.minimum(times, ramp)
-    return np.asarray(times + (factor - 1) * (begun**2 / (2 * ramp) + (times - begun)))
+def slowed_times(times: Array, factor: float, ramp: float, first: float) -> Array:
+    """Return times (n,) [s] at which a motion that becomes slower by a factor is at rows of these times.
+
+    Args:
+        times: (n,) [s] of the rows; factor: how much slower the motion is after a time `ramp` [s].
+        first: share of its speed that it has at time 0, from where it changes linearly.
+    """
+    gain = (1 / factor - first) / ramp
+    within = 2 * times / (first + np.sqrt(np.maximum(first**2 + 2 * gain * times, 1e-12)))
+    covered = ramp * (first + 1 / factor) / 2
+    return np.asarray(np.where(times < covered, within, ramp + (times - covered) * factor))
