@@ -42,7 +42,7 @@ async def drain(reader: Reader[Any]) -> None:
 
 
 class Pumps:
-    """The running work of a bridge, one task for each name; what fails or is left out is logged."""
+    """The running work of a bridge, one task for each name. An error is logged with its traceback."""
 
     def __init__(self, bus: Bus, bridge: str) -> None:
         self._bus, self._bridge = bus, bridge
@@ -79,4 +79,4 @@ class Pumps:
         if self._tasks.get(name) is task:
             del self._tasks[name]
         if not task.cancelled() and (error := task.exception()) is not None:
-            self._bus.log.error("%s: %r", name, error)
+            self._bus.log.error("%s has ended by an error", name, exc_info=error)

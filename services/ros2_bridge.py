@@ -20,6 +20,7 @@ class Config(Parameters):
     domain: int = Field(0, ge=0, le=232, description="ROS_DOMAIN_ID")
     namespace: str = Field("", max_length=100, description="namespace of names in ROS; empty: the name of the cell")
     commands: bool = Field(True, description="offer task commands")
+    trajectories: bool = Field(True, description="offer the action FollowJointTrajectory, which moves the arm")
     rate: Tunable[float] = Field(200.0, gt=0, le=1000, description="maximum rate of each stream, wall time [Hz]")
 
 

@@ -20,13 +20,20 @@ CALLED: Sequence[topics.Request[Any, Any]] = (topics.TASK_COMMAND, topics.MOTION
 COMMANDS = ("start", "pause", "resume", "stop")
 
 
-def serve_commands(bus: Bus, graph: Graph) -> None:
-    """Serve task/start, task/pause, task/resume and task/stop; they never override other operators."""
-    for request in CALLED:
-        bus.client(request)  # so that `zencell graph` and access rules know them
-    task = TaskControl(Subscriptions(bus), OWNER)
-    for command in COMMANDS:
-        graph.service(f"{graph.node.namespace}/task/{command}", TRIGGER, partial(_obey, bus, task, command))
+class Commands:
+    """Serves task/start, task/pause, task/resume and task/stop; they never override other operators."""
+
+    def __init__(self, bus: Bus) -> None:
+        """Declare the requests."""
+        for request in CALLED:
+            bus.client(request)  # so that `zencell graph` and access rules know them
+        self._bus, self._task = bus, TaskControl(Subscriptions(bus), OWNER)
+
+    def serve(self, graph: Graph) -> None:
+        """Offer the services."""
+        for command in COMMANDS:
+            graph.service(
+                f"{graph.node.namespace}/task/{command}", TRIGGER, partial(_obey, self._bus, self._task, command))
 
 
 async def _obey(bus: Bus, task: TaskControl, command: str, _request: Any) -> Any:

@@ -35,6 +35,11 @@ def header_of(header: m.Header) -> Any:
     return make("std_msgs/msg/Header", stamp=time_of(header.stamp), frame_id=header.frame_id)
 
 
+def uuid_of(data: bytes) -> Any:
+    """Return an id of 16 bytes."""
+    return make("unique_identifier_msgs/msg/UUID", uuid=np.frombuffer(data, np.uint8))
+
+
 def text(data: str) -> Any:
     """Return a std_msgs/String."""
     return make("std_msgs/msg/String", data=data)

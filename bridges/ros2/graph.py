@@ -1,21 +1,20 @@
-"""A node of ROS 2 on a Zenoh session of its own: its publishers and services, as rmw_zenoh declares them."""
+"""A node of ROS 2: its publishers, subscriptions and services, as rmw_zenoh declares them."""
 
 from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Coroutine
+from functools import partial
 from typing import Any
-
-import zenoh
-from zenoh import ext
 
 from bridges.ros2 import keys, types
 from bridges.ros2.keys import TRANSIENT_LOCAL, Attachment, Node, Qos
+from common.errors import ZencellError
 from common.time_source import wall_ns
-from common.transport.endpoint import client_config
+from common.transport.foreign import RAW, ForeignSession
+from common.transport.session import Query, RawSample, call_on_loop
 
-CONNECT_MS = 5000
 HEARTBEAT = 0.5  # [s] SAMPLE_MISS_DETECTION_HEARTBEAT_PERIOD of rmw_zenoh
 SERVICE_QOS = Qos(depth=10)
 
@@ -25,114 +24,107 @@ Handler = Callable[[Any], Awaitable[Any]]  # from the message of a request to th
 class Publisher:
     """Publishes messages of one type under one name; from one thread at a time."""
 
-    def __init__(self, graph: Graph, name: str, type_name: str, qos: Qos) -> None:
+    def __init__(self, graph: Graph, name: str, type_name: str, qos: Qos, variant: types.Variant) -> None:
         """Declare the publisher and its token; with TRANSIENT_LOCAL it has a cache for late subscriptions."""
         self.name, self.type_name, self.qos = name, type_name, qos
-        key, token = graph.entity("MP", name, type_name, qos)
-        self._gid, self._sequence = keys.gid_of(token), 0
-        reliability = (zenoh.Reliability.RELIABLE if qos.reliability == keys.RELIABLE
-                       else zenoh.Reliability.BEST_EFFORT)
-        self._publisher: Any
-        if qos.durability == TRANSIENT_LOCAL:
-            self._publisher = ext.declare_advanced_publisher(
-                graph.session, key, congestion_control=zenoh.CongestionControl.DROP, reliability=reliability,
-                cache=ext.CacheConfig(max_samples=qos.depth), publisher_detection=True,
-                sample_miss_detection=ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=HEARTBEAT))
-        else:
-            self._publisher = graph.session.declare_publisher(
-                key, congestion_control=zenoh.CongestionControl.DROP, reliability=reliability)
-        graph.announce(token)
+        key, token = graph.entity("MP", name, type_name, qos, variant)
+        self._gid, self._sequence, self._variant = keys.gid_of(token), 0, variant
+        self._publisher = graph.session.foreign_publisher(
+            key, reliable=qos.reliability == keys.RELIABLE, heartbeat=HEARTBEAT,
+            cached=qos.depth if qos.durability == TRANSIENT_LOCAL else 0)
+        self.watch = self._publisher.watch
+        graph.session.token(token)
 
     def put(self, message: Any) -> None:
         """Publish a message; a congested network drops it."""
         self._sequence += 1
         attachment = Attachment(self._sequence, wall_ns(), self._gid)
-        self._publisher.put(types.encode(message), attachment=attachment.encoded())
-
-    def watch(self, on_change: Callable[[bool], None]) -> None:
-        """Call back, on the network's thread, when the first subscription appears and when the last one is gone."""
-        self._publisher.declare_matching_listener(
-            zenoh.handlers.Callback(lambda status: on_change(status.matching), None, indirect=False))
+        self._publisher.put(types.encode(message, self._variant), attachment.encoded())
 
     @property
     def matched(self) -> bool:
         """Whether there is a subscription."""
-        return bool(self._publisher.matching_status.matching)
+        return self._publisher.matched
 
 
 class Graph:
-    """One node on one session. Services are answered on the event loop that was running when it was made."""
+    """One node on one session. Services are answered on the running loop, while `run` runs."""
 
-    def __init__(self, endpoint: str, domain: int, namespace: str, name: str, log: logging.Logger) -> None:
-        """Connect to a router and announce the node; may block for seconds.
+    def __init__(self, session: ForeignSession, domain: int, namespace: str, name: str, log: logging.Logger) -> None:
+        """Announce the node; closing the session withdraws it."""
+        self.session, self._log = session, log
+        self.node = Node(domain, session.id, namespace, name)
+        self._entities = 0
+        self._loop = asyncio.get_running_loop()
+        self._requests: asyncio.Queue[Callable[[], Coroutine[Any, Any, None]]] = asyncio.Queue()
+        session.token(self.node.token())
+
+    async def run(self) -> None:
+        """Answer requests concurrently until cancelled.
 
         Raises:
-            zenoh.ZError: there is no router.
+            ExceptionGroup: of any error that a handler raises and that is no `ZencellError`: it is a bug.
         """
-        self.session = zenoh.open(client_config(endpoint, connect_ms=CONNECT_MS))
-        self.node = Node(domain, str(self.session.info.zid()), namespace, name)
-        self._log, self._tokens, self._queryables = log, list[Any](), list[Any]()
-        self._publishers: list[Publisher] = []
-        self._entities = 0
-        self._tasks: set[asyncio.Task[None]] = set()
-        self.announce(self.node.token())
+        async with asyncio.TaskGroup() as group:
+            while True:
+                answer = await self._requests.get()
+                group.create_task(answer())
 
-    def entity(self, kind: keys.Kind, name: str, type_name: str, qos: Qos) -> tuple[str, str]:
+    def entity(
+        self, kind: keys.Kind, name: str, type_name: str, qos: Qos, variant: types.Variant = types.JAZZY
+    ) -> tuple[str, str]:
         """Return the key and the token of a new entity."""
         self._entities += 1
-        dds, type_hash = types.dds_name(type_name), types.type_hash(type_name)
+        dds, type_hash = types.dds_name(type_name), types.type_hash(type_name, variant)
         token = self.node.entity_token(self._entities, kind, name, dds, type_hash, qos)
         return keys.data_key(self.node.domain, name, dds, type_hash), token
 
-    def announce(self, token: str) -> None:
-        """Declare a token until `close`."""
-        self._tokens.append(self.session.liveliness().declare_token(token))
+    def publisher(
+        self, name: str, type_name: str, qos: Qos, variant: types.Variant = types.JAZZY
+    ) -> Publisher:
+        """Return a new publisher."""
+        return Publisher(self, name, type_name, qos, variant)
 
-    def publisher(self, name: str, type_name: str, qos: Qos) -> Publisher:
-        """Return a new publisher; it stays until `close`."""
-        made = Publisher(self, name, type_name, qos)
-        self._publishers.append(made)  # Zenoh undeclares one that is garbage
-        return made
+    def subscribe(self, name: str, type_name: str, qos: Qos, on_sample: Callable[[RawSample], None]) -> None:
+        """Call back on the network's thread for each message of a topic, still encoded."""
+        key, token = self.entity("MS", name, type_name, qos)
+        self.session.subscriber(key, on_sample)
+        self.session.token(token)
 
     def service(self, name: str, type_name: str, handler: Handler) -> None:
-        """Answer requests with `await handler(request)`, concurrently, on the running loop.
+        """Answer requests with `await handler(request)`, concurrently.
 
-        A malformed request, and one whose handler raises, gets an error reply and is logged.
+        A malformed request, and one whose handler raises a `ZencellError`, gets an error reply and is logged in a line.
+        Any other error also ends `run`.
         """
-        loop = asyncio.get_running_loop()
         key, token = self.entity("SS", name, type_name, SERVICE_QOS)
 
-        def on_query(query: zenoh.Query) -> None:  # on the network's thread
-            loop.call_soon_threadsafe(start, query)
+        def on_query(query: Query) -> None:  # on the network's thread
+            answer = partial(self._answer, query, key, name, type_name, handler)
+            call_on_loop(self._loop, lambda: self._requests.put_nowait(answer))
 
-        def start(query: zenoh.Query) -> None:
-            task = loop.create_task(self._answer(query, key, name, type_name, handler))
-            self._tasks.add(task)
-            task.add_done_callback(self._tasks.discard)
+        self.session.queryable(key, on_query, complete=True)
+        self.session.token(token)
 
-        self._queryables.append(self.session.declare_queryable(
-            key, zenoh.handlers.Callback(on_query, None, indirect=False), complete=True))
-        self.announce(token)
-
-    async def _answer(self, query: zenoh.Query, key: str, name: str, type_name: str, handler: Handler) -> None:
+    async def _answer(self, query: Query, key: str, name: str, type_name: str, handler: Handler) -> None:
         try:
-            attachment = Attachment.decoded(query.attachment.to_bytes() if query.attachment is not None else b"")
-            data = query.payload.to_bytes() if query.payload is not None else b""
-            response = types.encode(await handler(types.decode(data, f"{type_name}_Request")))
+            try:
+                attachment = Attachment.decoded(query.attachment or b"")
+                request = types.decode(query.payload or b"", f"{type_name}_Request")
+            except ValueError as error:
+                self._refuse(query, name, error)
+                return
+            response = types.encode(await handler(request))
             reply = Attachment(attachment.sequence, wall_ns(), attachment.gid)
-            query.reply(key, response, attachment=reply.encoded())
-        except asyncio.CancelledError:
+            query.reply(key, response, RAW, reply.encoded())
+        except ZencellError as error:
+            self._refuse(query, name, error)
+        except Exception as error:
+            query.refuse(f"{type(error).__name__}: {error}".encode())
             raise
-        except Exception as error:  # of one request: the others continue
-            self._log.warning("%s: %s", name, error)
-            query.reply_err(str(error).encode())
         finally:
-            query.drop()  # type: ignore[no-untyped-call]
+            query.finish()
 
-    def close(self) -> None:
-        """Withdraw everything; may block for a moment."""
-        for task in self._tasks:
-            task.cancel()
-        for declared in (*self._queryables, *reversed(self._tokens)):
-            declared.undeclare()
-        self.session.close()  # type: ignore[no-untyped-call]
+    def _refuse(self, query: Query, name: str, error: Exception) -> None:
+        self._log.warning("%s: %s", name, error)
+        query.refuse(str(error).encode())

@@ -8,14 +8,17 @@ from typing import Protocol
 
 from bridges.cell_topics import topics_of
 from bridges.ros2 import convert, keys
-from bridges.ros2.controls import serve_commands
+from bridges.ros2.action import TrajectoryAction
+from bridges.ros2.controls import Commands
 from bridges.ros2.graph import Graph, Publisher
+from bridges.ros2.scene_check import SceneCheck
 from bridges.ros2.topics import Topics
 from bridges.ros2.types import make
 from common.application import Application
 from common.config import Members, RobotConfig
 from common.transport.bus import Bus
 from common.transport.endpoint import endpoint_of
+from common.transport.foreign import open_foreign
 
 CLOCK_PERIOD = 0.02  # [s] wall
 
@@ -28,30 +31,41 @@ class Options(Protocol):
     domain: int
     namespace: str
     commands: bool
+    trajectories: bool
     rate: float
 
 
 async def serve(bus: Bus, config: Options, application: Application, endpoint: str | None = None) -> None:
     """Serve the cell until cancelled; `endpoint` is that of a router, by default the cell's."""
     endpoint = endpoint or bus.endpoint or endpoint_of()
+    topics = Topics(bus, topics_of(application, config.members.keys), lambda: config.rate)
+    commands = Commands(bus) if config.commands else None
+    action = TrajectoryAction(bus) if config.trajectories else None
     await bus.acquire_keys()
     namespace = "/" + keys.ros_name(config.namespace or bus.cell)
-    graph = await asyncio.to_thread(
-        Graph, endpoint, config.domain, namespace, "zencell", bus.log)
-    topics = Topics(bus, graph, topics_of(application, config.members.keys), lambda: config.rate)
+    description = await asyncio.to_thread(description_of, config.robot)
+    check = await asyncio.to_thread(SceneCheck, config.robot) if action else None
+    session = await open_foreign(endpoint)
     try:
-        description = await asyncio.to_thread(description_of, config.robot)
+        graph = Graph(session, config.domain, namespace, "zencell", bus.log)
         graph.publisher(f"{namespace}/robot_description", "std_msgs/msg/String", keys.LATCHED).put(
             convert.text(description))
-        if config.commands:
-            serve_commands(bus, graph)
-        topics.watch()
-        await bus.ready()
-        bus.log.info("ROS 2 domain %d, namespace %s, with rmw_zenoh at %s", config.domain, namespace, endpoint)
-        await _publish_clock(bus, graph.publisher("/clock", "rosgraph_msgs/msg/Clock", keys.LATEST))
+        if commands is not None:
+            commands.serve(graph)
+        async with asyncio.TaskGroup() as group:
+            group.create_task(graph.run())
+            if action is not None and check is not None:
+                action.serve(graph, check)
+                group.create_task(action.run())
+            topics.watch(graph)
+            try:
+                await bus.ready()
+                bus.log.info("ROS 2 domain %d, namespace %s, with rmw_zenoh at %s", config.domain, namespace, endpoint)
+                await _publish_clock(bus, graph.publisher("/clock", "rosgraph_msgs/msg/Clock", keys.LATEST))
+            finally:
+                topics.close()
     finally:
-        topics.close()
-        await asyncio.to_thread(graph.close)
+        await asyncio.to_thread(session.close)
 
 
 def description_of(robot: RobotConfig) -> str:

@@ -32,16 +32,15 @@ def name_of(namespace: str, key: str) -> str:
 class Topics:
     """Publishers of the topics that a service of the cell writes; they appear with their writers and stay."""
 
-    def __init__(self, bus: Bus, graph: Graph, topics: Iterable[Topic[Any]], rate: Callable[[], float]) -> None:
+    def __init__(self, bus: Bus, topics: Iterable[Topic[Any]], rate: Callable[[], float]) -> None:
         """Declare a reader for each topic that has a type in ROS, without reading anything.
 
         Args:
             bus: of the bridge, on the running loop.
-            graph: the node that publishes.
             topics: that may be published.
             rate: returns the maximum rate of a stream, wall time [Hz].
         """
-        self._bus, self._graph, self._rate = bus, graph, rate
+        self._bus, self._rate = bus, rate
         self._loop = asyncio.get_running_loop()
         self._readers: dict[str, Reader[Any]] = {
             topic.key: bus.reader(topic, listening=False) for topic in topics
@@ -49,8 +48,9 @@ class Topics:
         self._publishers: dict[str, Publisher] = {}
         self._pumps = Pumps(bus, "ros2")
 
-    def watch(self) -> None:
-        """Publish each topic that has a writer, now and later."""
+    def watch(self, graph: Graph) -> None:
+        """Publish each topic that has a writer, now and later, by a node."""
+        self._graph = graph
 
         def on_owner(token: str) -> None:  # on a network thread
             self._loop.call_soon_threadsafe(self._found, general_key(Owner.of(token).key))
@@ -114,7 +114,7 @@ class Topics:
                     self._publish_calibration(reader.topic.key, message.header)
                 else:
                     publisher.put(convert(message))
-            except (ValueError, ArithmeticError, LookupError, TypeError) as error:
+            except (ValueError, ArithmeticError) as error:  # a message that ROS cannot represent
                 self._pumps.report(reader.topic.key, str(error))
             if reader.topic.kind == "stream":
                 await asyncio.sleep(1 / self._rate())

@@ -1,13 +1,13 @@
 """Message types of ROS 2 with their hashes, and their encoding in CDR, by `rosbags`.
 
-The types are those of ROS 2 Jazzy; all that are used here have the same hashes in Kilted, except the action, whose
-feedback grew: see `FEEDBACK_INDEX`.
+The types are those of ROS 2 Jazzy; all that are used here have the same hashes in Kilted, except the feedback of
+FollowJointTrajectory: since version 6.3 of control_msgs it has the indices of its points (`INDEXED`).
 """
 
 from __future__ import annotations
 
 from functools import cache
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from rosbags.interfaces import Nodetype
@@ -19,27 +19,30 @@ CANCEL = "action_msgs/srv/CancelGoal"
 FOLLOW = "control_msgs/action/FollowJointTrajectory"
 EVENT_INFO = "service_msgs/msg/ServiceEventInfo"
 
+Variant = Literal["jazzy", "indexed"]  # of the definitions
+JAZZY: Variant = "jazzy"
+INDEXED: Variant = "indexed"
 FieldDesc = Any  # of rosbags: a pair of kind and element
 Fields = list[tuple[str, FieldDesc]]
 
 
 @cache
-def store() -> Typestore:
+def store(variant: Variant = JAZZY) -> Typestore:
     """Return all types by name, with services and the action as structures of their own."""
     types = get_typestore(Stores.ROS2_JAZZY)
     # A `char` of a .msg file is a uint8 in ROS 2 (rosidl_adapter), also in the hash; rosbags hashes it as a char.
     constants, fields = types.fielddefs[EVENT_INFO]
     types.fielddefs[EVENT_INFO] = (
         constants, [(name, _array("uint8", 16) if name == "client_gid" else field) for name, field in fields])
-    for name, defined in {**_control_types(), **_service_types(), **_action_types()}.items():
+    for name, defined in {**_control_types(), **_service_types(), **_action_types(variant)}.items():
         types.register({name: ([], defined)})
     return types
 
 
 @cache
-def type_hash(name: str) -> str:
+def type_hash(name: str, variant: Variant = JAZZY) -> str:
     """Return the hash of a type, such as RIHS01_a13e... of sensor_msgs/msg/JointState."""
-    return str(store().hash_rihs01(name))
+    return str(store(variant).hash_rihs01(name))
 
 
 def dds_name(name: str) -> str:
@@ -48,19 +51,19 @@ def dds_name(name: str) -> str:
     return f"{package}::{kind}::dds_::{last}_"
 
 
-def make(name: str, /, **fields: Any) -> Any:
+def make(name: str, variant: Variant = JAZZY, /, **fields: Any) -> Any:
     """Return a message of a type; fields that are not given have their default: zero or empty."""
-    defined = store().fielddefs[name][1]
+    defined = store(variant).fielddefs[name][1]
     unknown = fields.keys() - {field for field, _ in defined}
     if unknown:
         raise TypeError(f"{name} has no field {', '.join(sorted(unknown))}")
     values = {field: fields[field] if field in fields else _default(desc) for field, desc in defined}
-    return store().types[name](**values)
+    return store(variant).types[name](**values)
 
 
-def encode(message: Any) -> bytes:
+def encode(message: Any, variant: Variant = JAZZY) -> bytes:
     """Return a message as little-endian CDR (XCDR1) with its header of four bytes."""
-    return bytes(store().serialize_cdr(message, message.__msgtype__))
+    return bytes(store(variant).serialize_cdr(message, message.__msgtype__))
 
 
 def decode(data: bytes, name: str) -> Any:
@@ -134,7 +137,8 @@ def _service_types() -> dict[str, Fields]:
     }
 
 
-def _action_types() -> dict[str, Fields]:
+def _action_types(variant: Variant) -> dict[str, Fields]:
+    indexed = variant == INDEXED
     tolerances = _sequence(_name("control_msgs/msg/JointTolerance"))
     components = _sequence(_name("control_msgs/msg/JointComponentTolerance"))
     point = _name("trajectory_msgs/msg/JointTrajectoryPoint")
@@ -150,9 +154,9 @@ def _action_types() -> dict[str, Fields]:
     feedback: Fields = [
         ("header", _name("std_msgs/msg/Header")), ("joint_names", names),
         ("desired", point), ("actual", point), ("error", point),
-        *([("index", _base("int32"))] if FEEDBACK_INDEX else []), ("multi_dof_joint_names", names),
+        *([("index", _base("int32"))] if indexed else []), ("multi_dof_joint_names", names),
         ("multi_dof_desired", multi_point), ("multi_dof_actual", multi_point), ("multi_dof_error", multi_point),
-        *([("multi_dof_index", _base("int32"))] if FEEDBACK_INDEX else []),
+        *([("multi_dof_index", _base("int32"))] if indexed else []),
     ]
     return {
         f"{FOLLOW}_Goal": goal,
@@ -164,6 +168,3 @@ def _action_types() -> dict[str, Fields]:
         **_service(f"{FOLLOW}_GetResult", [("goal_id", goal_id)],
                    [("status", _base("int8")), ("result", _name(f"{FOLLOW}_Result"))]),
     }
-
-
-FEEDBACK_INDEX = False

@@ -20,7 +20,7 @@ from common.errors import Refused
 from common.perception.image import array_to_image
 from common.process.in_process import running_service
 from common.transport.bus import Bus
-from common.transport.endpoint import client_config, endpoint_of, router_config
+from common.transport.endpoint import endpoint_of, router_config
 from common.transport.local import LocalNetwork
 from tests.harness import free_domain
 
@@ -33,6 +33,7 @@ from zenoh import ext  # noqa: E402
 from bridges.ros2 import convert, keys, types  # noqa: E402
 from bridges.ros2.server import description_of, serve  # noqa: E402
 from services import ros2_bridge  # noqa: E402
+from tests.bridges.ros_client import Ros  # noqa: E402
 
 STAMP = 1_700_000_000_123_456_789
 HEADER = m.Header(stamp=STAMP, frame_id="world")
@@ -40,7 +41,6 @@ SOLID = m.CollisionObject(id="box", role="fixture", shape="box", dimensions=[1, 
 PIXELS = np.full((6, 8, 3), (255, 0, 0), np.uint8)
 CALIBRATION = m.CameraInfo(header=HEADER, height=6, width=8, k=[5, 0, 4, 0, 5, 3, 0, 0, 1])
 DOMAIN = 7
-TIMEOUT = 10.0  # [s]
 
 
 # --- formats ----------------------------------------------------------------------------------------------------------
@@ -146,52 +146,6 @@ class Arm:
         return m.MotionStatus()
 
 
-class Ros:
-    """A session on the side of ROS."""
-
-    def __init__(self, endpoint: str) -> None:
-        self.session = zenoh.open(client_config(endpoint, connect_ms=5000))
-
-    def _tokens(self) -> list[zenoh.Reply]:
-        return list(self.session.liveliness().get(f"@ros2_lv/{DOMAIN}/**"))
-
-    async def tokens(self, part: str) -> str:
-        """Return the token of the entity with this part, once it is there."""
-        async with asyncio.timeout(TIMEOUT):
-            while True:
-                for reply in await asyncio.to_thread(self._tokens):
-                    if reply.ok is not None and part in str(reply.ok.key_expr):
-                        return str(reply.ok.key_expr)
-
-    async def next(self, name: str, type_name: str) -> tuple[Any, keys.Attachment]:
-        """Return the next message of a topic, as a subscription of rmw_zenoh receives it, also a late one."""
-        loop, found = asyncio.get_running_loop(), asyncio.Queue[zenoh.Sample]()
-        key = keys.data_key(DOMAIN, name, types.dds_name(type_name), types.type_hash(type_name))
-        subscriber = ext.declare_advanced_subscriber(
-            self.session, key,
-            zenoh.handlers.Callback(lambda s: loop.call_soon_threadsafe(found.put_nowait, s), None, indirect=False),
-            history=ext.HistoryConfig(detect_late_publishers=True, max_samples=1))
-        async with asyncio.timeout(TIMEOUT):
-            sample = await found.get()
-        subscriber.undeclare()
-        assert sample.attachment is not None
-        message = types.decode(sample.payload.to_bytes(), type_name)
-        return message, keys.Attachment.decoded(sample.attachment.to_bytes())
-
-    async def call(self, name: str, type_name: str, request: Any) -> Any:
-        """Return the response of a service."""
-        key = keys.data_key(DOMAIN, name, types.dds_name(type_name), types.type_hash(type_name))
-        sent = keys.Attachment(17, STAMP, bytes(range(16)))
-        replies = await asyncio.to_thread(lambda: list(self.session.get(
-            key, payload=types.encode(request), attachment=sent.encoded(), timeout=TIMEOUT,
-            target=zenoh.QueryTarget.ALL_COMPLETE, consolidation=zenoh.ConsolidationMode.NONE)))
-        (reply,) = replies
-        assert reply.ok is not None, reply.err
-        received = keys.Attachment.decoded(reply.ok.attachment.to_bytes())
-        assert (received.sequence, received.gid) == (sent.sequence, sent.gid)
-        return types.decode(reply.ok.payload.to_bytes(), f"{type_name}_Response")
-
-
 @pytest.fixture(scope="module")
 def endpoint() -> Iterator[str]:
     found = endpoint_of(free_domain())
@@ -225,7 +179,7 @@ async def arm(stack: AsyncExitStack, endpoint: str) -> Arm:
 
 @pytest.fixture
 def ros(stack: AsyncExitStack, arm: Arm, endpoint: str) -> Ros:
-    ros = Ros(endpoint)
+    ros = Ros(endpoint, DOMAIN)
     stack.callback(ros.session.close)
     return ros
 
