@@ -1,4 +1,4 @@
-"""The card of an ONNX file: what its network sees and returns, in FILE.json beside FILE.onnx."""
+"""The card of an ONNX file: what its network sees and returns, in FILE.json next to FILE.onnx."""
 
 from __future__ import annotations
 

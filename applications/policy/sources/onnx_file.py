@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib.util
+import subprocess
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Protocol
@@ -19,6 +22,8 @@ from common.errors import ConfigError
 
 EXTRA = "needs the extra `policy`: pip install 'zencell[policy]'"
 MAX_BYTES = 1_000_000_000  # of a file
+_TRIAL = "import cv2, sys, numpy; cv2.dnn.readNetFromONNX(numpy.frombuffer(sys.stdin.buffer.read(), numpy.uint8))"
+_TRIED: set[bytes] = set()  # digests of files that OpenCV reads without a crash
 
 
 class _Network(Protocol):
@@ -28,7 +33,11 @@ class _Network(Protocol):
 
 class _OpenCV:
     def __init__(self, data: bytes, output: str) -> None:
-        self._net = cv2.dnn.readNetFromONNX(np.frombuffer(data, np.uint8))
+        before = cv2.utils.logging.setLogLevel(0)  # errors are raised
+        try:
+            self._net = cv2.dnn.readNetFromONNX(np.frombuffer(data, np.uint8))
+        finally:
+            cv2.utils.logging.setLogLevel(before)
         self._output = output
 
     def run(self, inputs: Mapping[str, Values]) -> Any:
@@ -123,6 +132,22 @@ def _read(path: Path) -> bytes:
         raise ConfigError(FIELD, str(path), f"cannot be read: {error.strerror}") from None
 
 
+def _require_no_crash(data: bytes) -> None:
+    """Return if OpenCV can read a file, or raises an error, in another process; once for each file.
+
+    OpenCV 5.0 crashes while it reports an error in a file with texts that are not UTF-8.
+
+    Raises:
+        ValueError: it crashes.
+    """
+    digest = hashlib.sha256(data).digest()
+    if digest not in _TRIED:
+        trial = subprocess.run([sys.executable, "-c", _TRIAL], input=data, capture_output=True, check=False)
+        if trial.returncode < 0:
+            raise ValueError("OpenCV crashes while it reads the file")
+        _TRIED.add(digest)
+
+
 def _load(data: bytes, runtime: str, output: str, path: Path) -> _Network:
     installed = importlib.util.find_spec("onnxruntime") is not None
     if runtime == "onnxruntime" and not installed:
@@ -130,6 +155,7 @@ def _load(data: bytes, runtime: str, output: str, path: Path) -> _Network:
     try:
         if runtime == "onnxruntime" or (runtime == "auto" and installed):
             return _OnnxRuntime(data, output)
+        _require_no_crash(data)
         return _OpenCV(data, output)
     except Exception as error:  # each runtime has its own
         raise ConfigError(FIELD, str(path), f"is no usable ONNX file: {one_line(error)}") from None

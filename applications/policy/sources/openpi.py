@@ -29,7 +29,7 @@ _CLOSING = 0.5  # [s] for a server to confirm the end
 
 
 class OpenpiPolicy:
-    """Client of a server of openpi; connects when it is needed, and anew after each failure."""
+    """Client of a server of openpi; connects when needed, and reconnects after each failure."""
 
     def __init__(self, config: SourceConfig, cell: PolicyCell) -> None:
         """Prepare; the server need not run yet.

@@ -80,7 +80,7 @@ class SourceConfig(Parameters):
     """Where the actions of a policy come from: exactly one of callable, onnx and openpi."""
 
     callable: str = Field("", max_length=1000, description="function of yours, dotted.module:name")
-    onnx: str = Field("", max_length=1000, description="file of a network, with its card FILE.json beside FILE.onnx")
+    onnx: str = Field("", max_length=1000, description="file of a network, with its card FILE.json next to it")
     openpi: str = Field("", max_length=1000, description="server of openpi, ws://host:port")
     timeout: float = Field(2.0, gt=0, le=600, description="longest wait for actions [s, wall time]")
     runtime: Literal["auto", "opencv", "onnxruntime"] = Field(

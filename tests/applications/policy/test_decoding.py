@@ -1,5 +1,6 @@
 """Chunks of every kind become joint targets; what has a wrong shape or cannot be reached is named."""
 
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -108,3 +109,20 @@ def test_what_cannot_be_decoded_is_named(given, text):
 def test_integers_and_lists_of_numbers_are_rows():
     decoded, _ = decode(chunk("joint_steps", [[0] * 7]), SEEN, panda())
     np.testing.assert_array_equal(decoded, [READY])
+
+
+def test_hostile_chunks_raise_nothing_else():
+    rng = np.random.default_rng(0)
+    specials = np.array([np.nan, np.inf, -np.inf, 1e308, -1e308, 1e-320, 0.0, 2**53, 99.9])
+    for _ in range(400):
+        kind = rng.choice(["joints", "joint_steps", "tcp", "tcp_steps"])
+        shape = (rng.integers(0, 4), {"tcp_steps": 6}.get(kind, 7)) if rng.random() < 0.8 else rng.integers(0, 4, 3)
+        values = rng.normal(scale=rng.choice([1e-3, 1.0, 1e3]), size=shape)
+        values[rng.random(values.shape) < 0.1] = rng.choice(specials)
+        if kind == "tcp" and rng.random() < 0.7 and values.ndim == 2 and len(values):
+            with np.errstate(all="ignore"):
+                values[:, 3:] /= np.linalg.norm(values[:, 3:], axis=1, keepdims=True)
+        with suppress(PolicyFailed):
+            rows, _ = decode(chunk(kind, values, np.full(len(values), 0.04)), SEEN, panda())
+            assert rows.shape == (len(values), 7)
+            assert kind.startswith("joint") or np.isfinite(rows).all()

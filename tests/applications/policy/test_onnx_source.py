@@ -124,7 +124,8 @@ def test_missing_files_are_named(tmp_path):
 @pytest.mark.parametrize("runtime", RUNTIMES)
 def test_damaged_file_is_one_line(tmp_path, runtime):
     random.seed(3)
-    damaged = [b"", b"no network", NETWORK[:100], NETWORK[:-40], *(random.randbytes(300) for _ in range(5))]
+    damaged = [b"no network", NETWORK[:100], NETWORK[:-40], random.randbytes(300),
+               NETWORK.replace(b"GlobalAverage", b"Glo\xffalAverage")]  # which crashes OpenCV 5.0
     for data in damaged:
         with pytest.raises(ConfigError, match=r"policy.onnx' (is|does)") as raised:
             made(written(tmp_path, data), runtime=runtime)
