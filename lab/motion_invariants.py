@@ -91,6 +91,7 @@ class MotionInvariants:
         self._ended: dict[tuple[str, str], str] = {}  # end state by key and goal
         self._requested_at: dict[str, float] = {}  # virtual time of the first request by goal [s]
         self._accepted: dict[tuple[str, str], bool] = {}  # by controller's process and goal
+        self._replaces: dict[str, str] = {}  # goal that joined another one while that was followed
         self._never: set[str] = set()  # goals stopped before any report that they move
         self._of_operators: set[str] = set()  # goals
         self._last: tuple[Vector, Vector, float] | None = None  # newest set-points and their cell time
@@ -147,8 +148,9 @@ class MotionInvariants:
             if goal == known.active:
                 known.active = ""
         elif state == "active":
-            # A newer gripper goal ends the older one.
-            if checks.fails(not known.active or goal == known.active or key == self._gripper, TWO):
+            # A newer gripper goal ends the older one, and a goal that joins another one replaces it.
+            replaced = key == self._gripper or self._joined(goal, known.active)
+            if checks.fails(not known.active or goal == known.active or replaced, TWO):
                 checks.add_violation(TWO, f"{key}: {goal} is active while {known.active} is")
             if goal != known.active and checks.fails(goal not in self._never, NEVER):
                 checks.add_violation(NEVER, goal)
@@ -157,6 +159,13 @@ class MotionInvariants:
                 if checks.fails(age <= OLDEST, FRESH):
                     checks.add_violation(FRESH, f"{goal} starts {age:.2f} s after its first request")
             known.active = goal
+
+    def _joined(self, goal: str, before: str) -> bool:
+        """Return whether a goal joined another one, or one that joined that one."""
+        while goal := self._replaces.get(goal, ""):
+            if goal == before:
+                return True
+        return False
 
     # --- set-points ---------------------------------------------------------------------------------------------------
 
@@ -247,6 +256,8 @@ class MotionInvariants:
         if isinstance(request, ExecuteRequest):
             if request.owner:
                 self._of_operators.add(request.id)
+            if request.joins:
+                self._replaces[request.id] = request.joins
             self._requested_at.setdefault(request.id, self._checks.now())
 
     def on_serve(self, instance: str, request: Message, answer: Message) -> None:

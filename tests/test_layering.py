@@ -17,7 +17,7 @@ MACHINE_PATH = re.compile(rb"(?<![\w.])/(?:home|root|work|Users|farm)/\w")
 PLATFORM = ("page", "drivers", "recording", "tools", "lab", "security", "bridges", "cli")
 PLATFORM_SERVICES = (
     "motion_planner", "robot_state_publisher", "trajectory_executor", "viewer", "camera_simulator", "depth_camera",
-    "camera_opencv", "real_depth_camera", "router", "foxglove_bridge", "ros2_bridge",
+    "camera_opencv", "real_depth_camera", "fixture_scene", "router", "foxglove_bridge", "ros2_bridge",
 )
 APPLICATIONS = [path.parent.name for path in sorted((ROOT / "applications").glob("*/__init__.py"))]
 SHORT_FORMS = ("common/config/world.py",)  # of world files

@@ -66,14 +66,14 @@ def splice(lead: Trajectory, at: float, rest: Trajectory, keep_from: float = 0.0
     """
     first = max(int(np.searchsorted(lead.times, keep_from, side="right")) - 1, 0)
     last = max(int(np.searchsorted(lead.times, at - 1e-9)), first + 1)
-    kept, begin = slice(first, last), float(lead.times[first])
-    segments = lead.segments[:, kept].copy()
+    part, begin = slice(first, last), float(lead.times[first])
+    segments = lead.segments[:, part].copy()
     share = (at - lead.times[last - 1]) / (lead.times[last] - lead.times[last - 1])
     segments[:, -1] *= share ** np.arange(6)[:, None]
     return Trajectory(
-        np.concatenate([lead.times[kept], at + rest.times]) - begin,
-        np.concatenate([lead.positions[kept], rest.positions]),
-        np.concatenate([lead.velocities[kept], rest.velocities]),
-        np.concatenate([lead.accelerations[kept], rest.accelerations]),
+        np.concatenate([lead.times[part], at + rest.times]) - begin,
+        np.concatenate([lead.positions[part], rest.positions]),
+        np.concatenate([lead.velocities[part], rest.velocities]),
+        np.concatenate([lead.accelerations[part], rest.accelerations]),
         given=np.concatenate([segments, rest.segments], axis=1),
     ), begin

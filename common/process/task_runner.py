@@ -154,15 +154,19 @@ class TaskRunner(Generic[V]):
 
     def _claim_motion(self, group: asyncio.TaskGroup, motion: m.MotionStatus | None) -> None:
         """Take motion authority from a start until the end or a stop, unless another client has it."""
-        now, status = self._owner.latest, self._task.status
+        now = self._owner.latest
         if now is None or (self._owning is not None and not self._owning.done()):
             return
-        needed = status.started and status.state not in ENDED and not (motion and motion.stopped)
+        needed = self._needs_motion(motion)
         ours = now.kind == "task" and now.owner in ("", self._bus.service)
         if needed == (ours and now.asked) or not (ours or now.kind == "none"):
             return
         request = m.OwnRequest(act="take" if needed else "give", owner=self._bus.service, kind="task")
         self._owning = group.create_task(self._request_authority(request), name="own")
+
+    def _needs_motion(self, motion: m.MotionStatus | None) -> bool:
+        status = self._task.status
+        return status.started and status.state not in ENDED and not (motion and motion.stopped)
 
     async def _request_authority(self, request: m.OwnRequest) -> None:
         with contextlib.suppress(RequestFailed):  # the refusals of motions name the owner

@@ -25,7 +25,7 @@ def offered(line: str, folder: Path, shell: str = "bash", **variables: str) -> l
 
 
 @pytest.mark.parametrize(("line", "wanted"), [
-    ("zencell run p", ["panda"]),
+    ("zencell run p", ["panda", "policy_panda"]),
     ("zencell run panda --world w", ["w1", "w2", "w3", "w4", "w5", "w6"]),
     ("zencell topic echo camera/", ["camera/camera_info", "camera/image_raw"]),
     ("zencell call gripper", ["gripper/command"]),
@@ -66,7 +66,7 @@ def test_bash_completes_after_installing(tmp_path):
     program.write_text('#!/bin/sh\nexec ' + " ".join(command_line()) + ' "$@"\n')
     program.chmod(0o755)
     script = (
-        f'source "{tmp_path}/.bash_completions/zencell.sh"; COMP_WORDS=(zencell run p); COMP_CWORD=2; '
+        f'source "{tmp_path}/.bash_completions/zencell.sh"; COMP_WORDS=(zencell run pa); COMP_CWORD=2; '
         f'_zencell_completion "{program}"; echo "${{COMPREPLY[@]}}"'
     )
     bash = subprocess.run(["bash", "--norc", "-c", script], env=environment() | home, capture_output=True, text=True,

@@ -19,9 +19,10 @@ from common.planning.camera_obstacles import PointsOptions
 from common.supervision.wiring import Wiring, owned_in, require_one_owner, wiring
 from services import camera_opencv, motion_planner, real_depth_camera, vision_detector
 
-CELLS = {name: load_cell(name, ["services.viewer.port=0"]) for name in ("panda", "ur5", "sorting")}
+CELLS = {name: load_cell(name, ["services.viewer.port=0"]) for name in ("panda", "ur5", "sorting", "policy_panda")}
 SERVICES = [(cell, name) for cell, loaded in CELLS.items() for name in loaded.services]
-CAMERAS = {"panda": "camera_simulator", "ur5": "depth_camera", "sorting": "depth_camera"}
+CAMERAS = {"panda": "camera_simulator", "ur5": "depth_camera", "sorting": "depth_camera",
+           "policy_panda": "camera_simulator"}
 VIEWER = "viewer"  # shows the truth on demand, and decides nothing
 DECIDING = [(cell, name) for cell, name in SERVICES if name not in (*CAMERAS.values(), VIEWER, "trajectory_executor")]
 TRUTH = {SCENE_BALLS, topics.SCENE_OBJECTS}
