@@ -136,7 +136,8 @@ def read_card(network: Path) -> Card:
         with path.open(encoding="utf-8") as file:
             values = json.loads(file.read(MAX_BYTES))
     except OSError as error:
-        raise ConfigError(FIELD, str(path), f"cannot be read: {error.strerror}") from None
+        raise ConfigError(FIELD, str(path), f"cannot be read: {error.strerror}; an ONNX file needs this card: "
+                                            "docs/policies.md") from None
     except (ValueError, RecursionError):
         raise ConfigError(FIELD, str(path), "is no JSON of a card: docs/policies.md") from None
     if not isinstance(values, dict):

@@ -79,7 +79,8 @@ def load_function(name: str) -> Callable[..., Any]:
         raise ConfigError(FIELD, name, where_searched(module) if missing else f"cannot be imported: {error}") from None
     function = getattr(found, attribute, None)
     if not callable(function):
-        names = [each for each, value in vars(found).items() if inspect.isfunction(value) and not each.startswith("_")]
+        names = [each for each, value in vars(found).items() if not each.startswith("_") and inspect.isfunction(value)
+                 and value.__module__ == module]
         raise ConfigError(FIELD, name, f"{module} has no function {attribute}; choices: {', '.join(names) or 'none'}")
     return function  # type: ignore[no-any-return]
 

@@ -92,7 +92,7 @@ class SourceConfig(Parameters):
     def _require_one(self) -> SourceConfig:
         if len(self.named) != 1:
             found = " and ".join(self.named) or "none"
-            raise ValueError(f"source must have exactly one of {', '.join(SOURCES)}, not {found}")
+            raise ValueError(f"exactly one of {', '.join(SOURCES)} is required, not {found}")
         return self
 
     @property

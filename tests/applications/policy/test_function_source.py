@@ -1,6 +1,8 @@
 """A function of the user's is a policy; what it does wrong is one line and never blocks."""
 
 import asyncio
+import subprocess
+import sys
 import threading
 from contextlib import suppress
 
@@ -146,6 +148,15 @@ async def test_function_that_does_not_return_fails_in_time_and_is_not_called_twi
     await policy.close()
 
 
+def test_process_ends_although_a_function_does_not():
+    code = ("import asyncio, time\n"
+            "from applications.policy.sources.computing import Computation\n"
+            "try:\n    asyncio.run(Computation('it', 0.05).call(time.sleep, 1000))\n"
+            "except Exception as error:\n    print(error)\n")
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=30, check=True)
+    assert ended.stdout == "it returned nothing within 0.05 s\n"
+
+
 @pytest.mark.parametrize("name,text", [
     ("rows", "must be dotted.module:name"), (f"{HERE}:none", "has no function none; choices: .*rows_async"),
     ("no.such.module:policy", "is not a module"), (f"{HERE}:READY", "has no function READY")])
@@ -155,7 +166,8 @@ def test_unknown_function_is_named(name, text):
 
 
 @pytest.mark.parametrize("values,text", [
-    ({}, "exactly one of callable, onnx, openpi, not none"), ({"onnx": "a", "openpi": "b"}, "not onnx and openpi"),
+    ({}, "exactly one of callable, onnx, openpi is required, not none"),
+    ({"onnx": "a", "openpi": "b"}, "not onnx and openpi"),
     ({"callable": "a.b:c", "actions": {"kind": "tcp", "cumulative": True}}, "cumulative has no meaning for kind tcp"),
     ({"callable": "a.b:c", "actions": {"gripper_open": 0.0}}, "must differ"),
     ({"callable": "a.b:c", "actions": {"rate": 0}}, "actions.rate: 0 must be greater than 0"),
