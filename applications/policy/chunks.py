@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from applications.policy.decoding import decode
 from applications.policy.interface import MotionState, Observation, PolicyFailed, PolicySource, ProvedMotion
 from applications.policy.observation import Missing, ObservationBuffer
-from applications.policy.proof import ChunkProver, ProverUnavailable
+from applications.policy.proof import ChunkProver
+from applications.policy.proof_space import ProverUnavailable
 from applications.policy.runner import PolicyTask
 from applications.policy.settings import Config
 from common.clock import Clock
