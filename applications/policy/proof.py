@@ -33,7 +33,8 @@ OnViolation = Literal["shorten", "slow", "refuse"]
 
 MAX_ROWS = 300  # of a chunk
 MAX_SECONDS = 60.0  # that a chunk may take
-_FADES = (0.0, 0.15, 0.3)  # [s] in which a difference between the state and the rows fades; the shortest that works
+_FADES = (0.0, 0.15, 0.3, 0.5)  # [s] in which the state's difference from the rows fades; the shortest that works
+_JUMP_FADE = 0.3  # [s] in which it must be able to fade at half of the limits
 _INSET = 2e-3  # [rad] rows nearer to a position limit, or this much beyond it, are moved to this distance
 _SLOWEST = 10.0  # factor by which a chunk is slowed down at most
 _SLOW_RAMP = 0.3  # [s] in which the motion slows down
@@ -176,7 +177,7 @@ class ChunkProver:
         slope = (q[1] - q[0]) / (t[1] - t[0]) if len(q) > 1 else state.velocities
         off = np.minimum(np.abs(q[0] - slope * t[0] - state.positions),
                          np.abs(q[0] - state.velocities * t[0] - state.positions))
-        if blend_time(off, 0.0, self._limits) <= _FADES[-1]:
+        if blend_time(off, 0.0, self._limits) <= _JUMP_FADE:
             return None
         joint = int(np.argmax(off))
         name = self._robot.joint_names[joint]
