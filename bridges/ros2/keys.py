@@ -40,6 +40,7 @@ class Qos:
 
 
 STREAM = Qos()
+SENSOR = Qos(depth=5, reliability=BEST_EFFORT)  # as rmw_qos_profile_sensor_data
 LATCHED = Qos(depth=1, durability=TRANSIENT_LOCAL)
 LATEST = Qos(depth=1)
 
