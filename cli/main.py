@@ -33,6 +33,7 @@ from cli import (
 from cli.options import CommandGroup
 from common.errors import RequestFailed, ZencellError
 from common.terminal import echo, printable
+from tools import io_verbs
 
 NO_HOME = "Could not determine home directory."  # pathlib's error for ~NAME/...
 EXIT_FAILED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 1, 2, 130
@@ -119,6 +120,7 @@ app.command()(node.schema)
 app.add_typer(commands.task, name="task")
 app.add_typer(commands.world, name="world")
 app.add_typer(commands.scene, name="scene")
+of_applications.take_verbs(io_verbs.VERBS)
 of_applications.take_all()
 app.add_typer(robot.app, name="robot")
 app.add_typer(calibrate.app, name="calibrate")

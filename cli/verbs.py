@@ -107,9 +107,11 @@ class ApplicationVerbs:
         if application.name in self._known:
             return
         self._known.add(application.name)
-        verbs: Verbs | None = application.verbs
-        if verbs is None:
-            return
+        if application.verbs is not None:
+            self.take_verbs(application.verbs)
+
+    def take_verbs(self, verbs: Verbs) -> None:
+        """Add commands and options."""
         for name, text in verbs.groups.items():
             if name not in self._groups:
                 self._groups[name] = options.CommandGroup(text)

@@ -27,6 +27,7 @@ PACKAGES = {
     "zencell.hardware": ("common.hardware", "drivers"),
     "zencell.grippers": ("common.hardware", "drivers"),
     "zencell.cameras": ("drivers",),
+    "zencell.io": ("drivers.io",),
     "zencell.worlds": ("common.sim", "drivers"),
     "zencell.generators": (),
     "zencell.page": ("page.layers",),

@@ -98,6 +98,7 @@ ROBOT_STATUS = Topic("robot/status", m.RobotStatus, "state",
                      "state of the arm's own controller: mode, why it cannot move, speed slider")
 ROBOT_DESCRIPTION = Topic("robot/description", m.RobotDescription, "state",
                           "the arm: joints, limits, named poses, tool frame")
+IO_STATE = Topic("io/state", m.IoState, "state", "inputs and outputs: value, time of its change, quality")
 DISPLAY_TRAJECTORY = Topic("display_trajectory", m.JointTrajectory, "state", "newest plan")
 SCENE_OBJECTS = Topic("scene_objects", m.WorldObjects, "state",
                       "ground truth: poses of all objects; simulated hardware only")
@@ -125,6 +126,7 @@ GRIPPER_COMMAND = Request("gripper/command", m.GripperCommand, m.GripperState,
                           "move the fingers; the result appears on gripper/state")
 ROBOT_COMMAND = Request("robot/command", m.RobotCommand, m.RobotStatus,
                         "enable, recover, freedrive, payload, output: commands to the arm's own controller")
+IO_SET = Request("io/set", m.IoSet, m.IoReply, "set a digital or analog output")
 SCENE_EDIT = Request("scene/edit", m.SceneEdit, m.SceneEditReply,
                      "add a solid that no camera perceives to the planning scene, or remove it")
 WORLD_EDIT = Request("world/edit", m.WorldEdit, m.WorldEditReply, "add, move, remove, reset; simulated hardware only")

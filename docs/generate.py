@@ -124,6 +124,7 @@ def writers() -> dict[str, str]:
         for key, (_, services) in owned_in(wirings).items():
             found.setdefault(key, {}).update(dict.fromkeys(services))
     return {**{key: ", ".join(services) for key, services in found.items()}, **shared,
+            topics.IO_STATE.key: "io", topics.IO_SET.key: "io",  # of no included cell
             topics.SUPERVISOR_STATUS.key: "supervisor", topics.MOTION_JOG.key: "clients that jog"}
 
 

@@ -21,7 +21,8 @@ from applications.policy.topics import PolicyStatus
 from common import messages as m
 from common.control.trajectory import to_message
 from common.hardware.interface import Limits
-from common.tasks.engine import FOUND_HELD, MISSING, NO_ARM, NOT_ITS_FAULT, START
+from common.tasks.decisions import NOT_ITS_FAULT
+from common.tasks.engine import FOUND_HELD, MISSING, NO_ARM, START
 from common.tasks.stages import OVER, Command, View
 
 Array = NDArray[np.float64]

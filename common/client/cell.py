@@ -16,6 +16,7 @@ from common import topics
 from common.application import all_topics, find_topic
 from common.client.arm import Arm, Gripper
 from common.client.frames import Frames
+from common.client.io import Signals
 from common.client.joining import StartedCell, cell_clock, domain_of_only, joined, operator_name, supervisor_status
 from common.client.keys import published_keys, require_key
 from common.client.parameters import Parameters
@@ -54,6 +55,7 @@ class Cell(Part):
         owner: name of this client in its requests.
         arm: state, plans, motions, jogging.
         gripper: fingers or suction cup.
+        io: digital and analog inputs and outputs.
         task: start, pause, resume, stop, status.
         param: parameters of the services by path.
         scene: solids in the planning scene that no camera sees.
@@ -64,6 +66,7 @@ class Cell(Part):
     owner: str
     arm: Arm
     gripper: Gripper
+    io: Signals
     task: TaskControl
     param: Parameters
     scene: Scene
@@ -137,6 +140,7 @@ class Cell(Part):
         arm = Arm(self._subscriptions, self.owner, self.tf)
         self._set(
             arm=arm, gripper=Gripper(self._subscriptions, self.owner, arm),
+            io=Signals(self._subscriptions, self.owner),
             task=TaskControl(self._subscriptions, self.owner, self._application), param=Parameters(bus),
             scene=Scene(self._subscriptions, self.owner), world=World(bus, self._subscriptions))
 

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, Field
 
 from common.config.basics import Section, Tunable
+from common.config.io import Io
 from common.config.robot import RobotConfig
 from common.config.world import Scenery, Surroundings, World
 from common.remapping import is_cell
@@ -142,6 +143,7 @@ class Cell(Section):
     world: World
     motion: Motion = Motion()
     grasp: Grasp = Grasp()
+    io: Io = Io()
     pipeline: Pipeline
     watchdogs: Watchdogs = Watchdogs()
     services: dict[str, ServiceEntry]
@@ -174,7 +176,8 @@ class Cell(Section):
             return Members(services=names, task=self.task, application=self.application, keys=keys)
         if kind is Reach:
             return Reach(parameters={name: entry.parameters for name, entry in self.services.items()})
-        for value in (self.run, self.robot, self.world, self.motion, self.grasp, self.pipeline, self.watchdogs):
+        for value in (self.run, self.robot, self.world, self.motion, self.grasp, self.io, self.pipeline,
+                      self.watchdogs):
             if type(value) is kind:
                 return value
         raise TypeError(f"{kind.__name__} is not a section of a cell")

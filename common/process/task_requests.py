@@ -38,13 +38,16 @@ class AnswerHandler(Protocol[V_contra]):
     def on_goal(self, answer: m.MotionStatus | m.GripperState, view: V_contra) -> None:
         """Handle whether a goal was accepted."""
 
+    def on_output(self, reply: m.IoReply, view: V_contra) -> None:
+        """Handle whether an output was set."""
+
 
 class TaskRequests(Generic[V]):
     """Sends the commands of a task and returns the answers to it."""
 
     def __init__(
         self, bus: Bus, task: AnswerHandler[V], observe: Callable[[], V], planning_time: Callable[[], float],
-        report: Callable[[str], None], wake: Callable[[], None],
+        report: Callable[[str], None], wake: Callable[[], None], *, io: bool = False,
     ) -> None:
         """Declare the requests of a task.
 
@@ -55,12 +58,14 @@ class TaskRequests(Generic[V]):
             planning_time: returns the planning time that the task requests [s, wall].
             report: receives why a request is sent again.
             wake: called after each answer.
+            io: whether the cell has outputs to set.
         """
         self._task, self._observe, self._bus = task, observe, bus
         self._planning_time, self._report, self._wake = planning_time, report, wake
         self._plan, self._execute = bus.client(topics.MOTION_PLAN), bus.client(topics.MOTION_EXECUTE)
         self._stop, self._grip = bus.client(topics.MOTION_STOP), bus.client(topics.GRIPPER_COMMAND)
         self._hold = bus.client(topics.MOTION_HOLD)
+        self._output = bus.client(topics.IO_SET) if io else None
         self._sending: dict[str, asyncio.Task[m.MotionStatus | None]] = {}  # the newest of each kind
         self._pending: Pending = {}
         self._finished: dict[int, asyncio.Event] = {}  # by id() of a command: set when it is answered or cancelled
@@ -74,7 +79,7 @@ class TaskRequests(Generic[V]):
 
     def begin(self, group: asyncio.TaskGroup, command: Command) -> None:
         """Send a command, and stop sending unanswered ones that it makes void."""
-        if isinstance(command, m.ExecuteRequest | m.GripperCommand):
+        if isinstance(command, m.ExecuteRequest | m.GripperCommand | m.IoSet):
             command.header = self._bus.header()  # time of the decision, also when it is sent again
         pending = {sending: owner for sending, owner in self._pending.items() if not sending.done()}
         self._sending = {kind: sending for kind, sending in self._sending.items() if not sending.done()}
@@ -141,11 +146,22 @@ class TaskRequests(Generic[V]):
             moved = await call_until_answered(self._execute, command, GOAL_TIMEOUT, lambda error: m.MotionStatus(
                 id=command.id, state="rejected", error=error.code, message=error.message), self._report)
             await self._deliver(moved)
+        elif isinstance(command, m.IoSet):
+            await self._set_output(command)
         elif isinstance(command, m.HoldRequest):
             return await self._set_interlock(self._hold, command)
         else:
             return await self._set_interlock(self._stop, command)
         return None
+
+    async def _set_output(self, command: m.IoSet) -> None:
+        assert self._output is not None, "a task sets outputs only in a cell that has some"
+        reply = await call_until_answered(self._output, command, GOAL_TIMEOUT, lambda error: m.IoReply(
+            id=command.id, signal=command.signal, error=error.code, message=error.message), self._report)
+        if reply.error:  # the reason is published, too: do not request again before it is received
+            await asyncio.sleep(REFUSAL_DELAY)
+        self._task.on_output(reply, self._observe())
+        self._wake()
 
     async def _deliver(self, answer: m.MotionStatus | m.GripperState) -> None:
         """Pass the reply to a goal to the task; delay it more and more after repeated rejections."""
@@ -199,10 +215,12 @@ def _release_until(seen: int, before: Pending) -> int:
 def _voided(command: Command) -> tuple[str, ...]:
     """Return the kinds of unanswered commands that a command makes void.
 
-    A stop voids the motion before it, an operator's stop also a release; a hold voids the same owner's earlier one.
+    A stop voids the motion and the output before it, an operator's stop also a release; a hold voids the earlier one
+    of the same owner.
     """
     if isinstance(command, m.StopRequest):
-        return f"{m.ExecuteRequest.__name__} ", *((RELEASE,) if command.by == "operator" else ())
+        release = (RELEASE,) if command.by == "operator" else ()
+        return f"{m.ExecuteRequest.__name__} ", f"{m.IoSet.__name__} ", *release
     if not isinstance(command, m.HoldRequest):
         return ()
     return _kind(command), *((RELEASE,) if command.by == "operator" else ())

@@ -56,6 +56,8 @@ async def run_task(
     scene, gripper = bus.reader(topics.PLANNING_SCENE), bus.reader(topics.GRIPPER_STATE)
     motion, joints = bus.reader(topics.MOTION_STATUS), bus.reader(topics.JOINT_STATES)
     own = {name: bus.reader(topic) for name, topic in reads.items()}
+    signals = [bus.reader(topics.IO_STATE)] if config.io.signals else []
+    outputs = bus.client(topics.IO_SET) if signals else None
     out = bus.writer(status)
     robot = RobotModel.load(config.robot)
     task = make(config, status.message(), new_id(), bus.clock.speed)
@@ -73,6 +75,8 @@ async def run_task(
         known.gripper = gripper.latest if config.robot.gripper is not None else m.GripperState()
         for name, reader in own.items():
             setattr(known, name, reader.latest)
+        known.io = signals[0].latest if outputs is not None and outputs.available else None
+        known.blocked = task.blocked(known)
         newest = joints.latest
         if newest is not None and newest is not measured:
             measured = newest
@@ -83,10 +87,11 @@ async def run_task(
 
     watchdog = LivenessWatchdog(lambda: joints.received, lambda: config.joint_states_timeout)
     memory = TaskMemory(bus, task)
-    runner = TaskRunner(bus, task, observe, out, lambda: config.planning_time, watchdog, memory)
+    runner = TaskRunner(bus, task, observe, out, lambda: config.planning_time, watchdog, memory,
+                        io=bool(signals))
     await memory.load()
     await bus.ready()
-    await runner.run((*own.values(), scene, gripper, motion))
+    await runner.run((*own.values(), *signals, scene, gripper, motion))
 
 
 class Steppable(AnswerHandler[V_contra], Protocol[V_contra]):
@@ -109,7 +114,7 @@ class TaskRunner(Generic[V]):
     def __init__(
         self, bus: Bus, task: Steppable[V], observe: Callable[[], V], status: Writer[Any],
         planning_time: Callable[[], float], watchdog: LivenessWatchdog | None = None,
-        memory: TaskMemory | None = None,
+        memory: TaskMemory | None = None, *, io: bool = False,
     ) -> None:
         """Declare the requests of a task and the command that it serves.
 
@@ -121,10 +126,11 @@ class TaskRunner(Generic[V]):
             planning_time: returns the planning time that the task requests [s, wall].
             watchdog: holds the arm while services or messages that the task depends on are missing.
             memory: persists what the task has to know after a restart.
+            io: whether the cell has inputs and outputs.
         """
         self._task, self._observe, self._status, self._bus = task, observe, status, bus
         self._woken = asyncio.Event()
-        self._requests = TaskRequests(bus, task, observe, planning_time, self._report, self._woken.set)
+        self._requests = TaskRequests(bus, task, observe, planning_time, self._report, self._woken.set, io=io)
         self._own, self._owner = bus.client(topics.MOTION_OWN), bus.reader(topics.MOTION_OWNER)
         self._owning: asyncio.Task[None] | None = None
         self._watchdog, self._memory = watchdog, memory
@@ -177,7 +183,7 @@ class TaskRunner(Generic[V]):
         """Return holds to request or release because of missing messages or services; the view gets the reason."""
         if self._watchdog is None:
             return []
-        holds = self._watchdog.update(monotonic(), self._requests.serving, view.motion)
+        holds = self._watchdog.update(monotonic(), self._requests.serving, view.motion, view.blocked)
         view.trouble = self._watchdog.trouble
         return holds
 

@@ -12,12 +12,14 @@ from typing import Generic, Literal, TypeVar
 from pydantic import BaseModel, Field
 
 from common import messages as m
-from common.config import GripperConfig, Parameters, RobotConfig, Run, Tunable
+from common.config import GripperConfig, Io, Parameters, RobotConfig, Run, Tunable
 from common.errors import ConfigError
 from common.tasks.stages import AwaitImage, Command, DwellTimer, Execution, Grip, ImageAge, Move, Stage, View
 
 V = TypeVar("V", bound=View)
 
+# Rejections that say nothing about the motion itself: the task decides again.
+NOT_ITS_FAULT = ("busy", "stale_request", "clock_ahead", "stopped", "not_owner")
 MOST_FAILURES = 10
 PAUSE, LONGEST_PAUSE = 0.25, 2.0  # [s] after the second failure in a row; doubled with each further one
 OVERTIME = 30.0  # [s] a motion that takes this much longer than planned is stopped
@@ -30,6 +32,7 @@ class TaskConfig(Parameters):
 
     robot: RobotConfig
     run: Run
+    io: Io = Io()
     planning_time: Tunable[float] = Field(2.0, gt=0, le=600, description="wall time for one plan [s]")
     frame_timeout: Tunable[float] = Field(
         1.0, ge=0.1, le=60, description="an older picture starts no motion [s, wall time]"

@@ -13,12 +13,11 @@ import math
 from collections.abc import Iterator
 
 from common import messages as m
-from common.tasks.decisions import V
+from common.tasks.decisions import NOT_ITS_FAULT, V
 from common.tasks.monitoring import ExecutionMonitor
+from common.tasks.signals import Output, WaitFor
 from common.tasks.stages import AwaitImage, Command, Execution, Grip, Move, Report, Stage
 
-# Rejections that say nothing about the motion itself: the task decides again.
-NOT_ITS_FAULT = ("busy", "stale_request", "clock_ahead", "stopped", "not_owner")
 START = ": start to go on"
 MISSING = "waiting for "
 NO_ARM = "the arm cannot be moved: "
@@ -206,10 +205,15 @@ class Task(ExecutionMonitor[V]):
         if self.running is not None or self._early is not None or not self.queue:
             return
         stage = self.queue[0]
+        if isinstance(stage, Output | WaitFor):
+            yield from self._run_signal(stage, view)
+            return
         if stage.carries and not view.holding:
             self.fail(f"what the hand held fell before {stage.name}", view, go_home=False)
             return
         if (isinstance(stage, Move) and not self._is_planned(stage)) or not self.may_start(stage, view):
+            return
+        if isinstance(stage, Move) and not self._may_use(stage, view):
             return
         if isinstance(stage, Move) and (
             appeared(self.obstacles(stage, view), stage.planned_around, self.moved) or self._fingers_differ(stage, view)

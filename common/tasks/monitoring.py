@@ -11,7 +11,8 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from common import messages as m
-from common.tasks.decisions import TaskDecisions, V
+from common.tasks.decisions import V
+from common.tasks.signals import SignalStages
 from common.tasks.stages import MISSES, Command, Grip, Move, Report, Stage
 from common.time_source import WatchdogClock
 
@@ -44,18 +45,21 @@ class LivenessWatchdog:
         self._seen: set[str] = set()
         self._holding: bool | None = None  # unknown until the first motion status
 
-    def update(self, now: float, serving: dict[str, bool], motion: m.MotionStatus | None) -> list[m.HoldRequest]:
+    def update(
+        self, now: float, serving: dict[str, bool], motion: m.MotionStatus | None, blocked: str = ""
+    ) -> list[m.HoldRequest]:
         """Return the hold requests to send; `trouble` names what is missing.
 
         Args:
             now: monotonic clock [s].
             serving: by service name, whether it answers requests.
             motion: newest motion status.
+            blocked: why the running motion must not continue, from its task; empty if it may.
         """
         self._seen |= {name for name, there in serving.items() if there}
         gone = [name for name, there in serving.items() if not there and name in self._seen]
         silent = self._joints_are_missing(self._awake.advance(now))
-        self.trouble = f"{' and '.join(gone)} {'is' if len(gone) == 1 else 'are'} gone" if gone else silent
+        self.trouble = f"{' and '.join(gone)} {'is' if len(gone) == 1 else 'are'} gone" if gone else silent or blocked
         if motion is None:
             return []
         if self._holding is None:  # set by the task process before this one
@@ -87,7 +91,7 @@ def _hold(hold: bool, reason: str) -> m.HoldRequest:
     return m.HoldRequest(hold=hold, reason=reason, by="watchdog")
 
 
-class ExecutionMonitor(TaskDecisions[V]):
+class ExecutionMonitor(SignalStages[V]):
     """Follows the started stages by the reports of the controllers, and calls the hooks of the task."""
 
     def _watch(self, view: V) -> list[Command]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Literal, Self
 
@@ -10,7 +11,7 @@ from common.robot.transforms import matrix_to_pose, pose_to_matrix
 
 Place = tuple[float, float, float]
 Goal = m.AnyGoal
-Command = m.PlanRequest | m.ExecuteRequest | m.GripperCommand | m.StopRequest | m.HoldRequest
+Command = m.PlanRequest | m.ExecuteRequest | m.GripperCommand | m.StopRequest | m.HoldRequest | m.IoSet
 Report = m.MotionStatus | m.GripperState
 
 OVER = ("succeeded", "aborted", "cancelled")
@@ -53,6 +54,8 @@ class Move(Stage):
     needs_fresh_image: bool = field(default=False, kw_only=True)  # starts only while images arrive
     needs_full_plan: bool = field(default=False, kw_only=True)  # starts only once all motions of its cycle are planned
     fallback: list[Stage] = field(default_factory=list, kw_only=True)
+    # Digital signals that must have these values from start to end: the arm does not start, or is held on its path.
+    requires: Mapping[str, bool] = field(default_factory=dict, kw_only=True)
     trajectory: m.JointTrajectory | None = field(default=None, init=False)
     planned_around: list[tuple[float, float]] = field(default_factory=list, init=False)  # (x, y) of objects [m]
     planned_width: float | None = field(default=None, init=False)  # finger width during the motion [m]
@@ -195,11 +198,18 @@ class View:
     q: list[float] | None = None
     tcp: m.Pose | None = None
     trouble: str = ""  # why no motion may start
+    io: m.IoState | None = None  # None also while its service is gone
+    blocked: str = ""  # why the running motion must not continue: a signal that it requires
 
     def __post_init__(self) -> None:
         """Drop objects that are out of range."""
         if self.scene is not None:
             self.scene = within_range(self.scene)
+
+    def signal(self, name: str) -> bool | float | None:
+        """Return the value of an input or output; None while it is unknown or its backend is lost."""
+        found = self.io.find(name) if self.io is not None and not self.io.problem(name) else None
+        return found.value if found is not None else None
 
     @property
     def missing(self) -> list[str]:

@@ -29,6 +29,7 @@ from common.supervision.wiring import WiringFailed, load_service, wire_service
 from common.transport import ownership
 from common.transport.ownership import SHARED, Owner
 from tools.check import Finding, error, refusal, warning
+from tools.check.signals import check_signals, require_valid_io
 
 if TYPE_CHECKING:
     from common.robot.model import RobotModel
@@ -71,6 +72,7 @@ def require_valid_services(cell: Cell) -> None:
     Raises:
         ConfigError: names the field, the value and the choices.
     """
+    require_valid_io(cell)
     given = [entry for entry in cell.services.values()
              if entry.parameters or entry.topics or not entry.module.startswith("services.")]
     if not given:
@@ -281,7 +283,7 @@ VIEWER = "viewer"  # shows any topics, so none is missing
 def examine(cell: Cell) -> Iterator[Finding]:
     """Yield all findings of a cell, each once; the quick ones first."""
     known: set[str] = set()
-    for found in (*check_files(cell), *check_model(cell), *wiring(cell)):
+    for found in (*check_files(cell), *check_signals(cell), *check_model(cell), *wiring(cell)):
         if not any(found.what.startswith(what) for what in known):  # a service may find the same
             known.add(found.what)
             yield found

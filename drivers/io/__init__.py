@@ -1,0 +1,1 @@
+"""Digital and analog inputs and outputs: docs/io.md."""
