@@ -44,7 +44,13 @@ class _Camera:
     recent: deque[Image] = field(default_factory=lambda: deque(maxlen=_IMAGES))  # by arrival: bad stamps age out
     converted: tuple[int, Pixels] | None = None  # stamp and pixels of the newest image that was used
 
+    def drop_before(self, stamp: int) -> None:
+        """Forget images that are too old, but the newest one."""
+        stamp = min(stamp, max((each.header.stamp for each in self.recent), default=stamp))
+        self.recent = deque((each for each in self.recent if each.header.stamp >= stamp), maxlen=_IMAGES)
+
     def until(self, stamp: int) -> list[Image]:
+        """Return the images that are not newer than a stamp, by their stamps."""
         return sorted((each for each in self.recent if each.header.stamp <= stamp), key=lambda each: each.header.stamp)
 
 
@@ -143,6 +149,7 @@ class ObservationBuffer:
         """Return the newest image of each camera such that their stamps agree; not newer than the joint states."""
         history = {}
         for name, camera in self._cameras.items():
+            camera.drop_before(now - int(self._max_age * 1e9) - self._tolerance_ns)
             if not camera.recent:
                 return Missing(name, f"no image of camera {name} received yet")
             history[name] = camera.until(newest_joints)

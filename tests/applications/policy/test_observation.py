@@ -1,6 +1,7 @@
 """An observation has images and joint positions of one time, or there is none and the reason is stated."""
 
 import random
+import weakref
 
 import numpy as np
 import pytest
@@ -119,6 +120,18 @@ def test_image_with_a_stamp_in_the_future_does_not_block_later_ones():
     made.add_image("top", image(3_600_000))
     made.add_image("top", image(150))
     assert observe(made).stamp == START + 150 * MS
+
+
+def test_old_images_are_not_held():
+    made = filled("top", until=900)
+    images = [image(ms) for ms in range(0, 900, 100)]
+    for each in images:
+        made.add_image("top", each)
+    references = [weakref.ref(each) for each in images]
+    assert observe(made, 900).stamp == START + 800 * MS
+    del images, each
+    assert [number for number, reference in enumerate(references) if reference()] == [4, 5, 6, 7, 8]
+    assert observe(made, 5000).age == pytest.approx(4.1)
 
 
 def test_gripper_is_the_newest_not_later_than_the_image():
