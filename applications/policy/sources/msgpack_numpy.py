@@ -61,7 +61,8 @@ def unpack(data: bytes) -> Any:
     except WrongMessage:
         raise
     except (ValueError, TypeError, OverflowError, RecursionError, MemoryError, msgpack.UnpackException) as error:
-        raise WrongMessage(" ".join(f"no msgpack of openpi: {error or type(error).__name__}".split())[:200]) from None
+        reason = " ".join((str(error) or type(error).__name__).split())
+        raise WrongMessage(f"no msgpack of openpi: {reason[:200]}") from None
 
 
 def _packed(value: Any) -> Any:

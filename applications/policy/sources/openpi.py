@@ -55,18 +55,18 @@ class OpenpiPolicy:
         """Return the next actions; see `PolicySource`."""
         message = pack(self._message(observation))
         async with self._lock:
-            doing, complete = "connects", False
+            awaited, complete = "connection", False
             try:
                 async with asyncio.timeout(self._timeout):
                     if self._connection is None:
                         self._connection = await self._connect()
                     await self._require_silence(self._connection)
-                    doing = "answers"
+                    awaited = "answer"
                     await self._connection.send(message)
                     answer = self._decoded(await self._connection.recv())
                 complete = True
             except TimeoutError:
-                raise self._failure(f"{doing} not within {self._timeout:g} s") from None
+                raise self._failure(f"no {awaited} within {self._timeout:g} s") from None
             except (OSError, WebSocketException) as error:
                 raise self._failure(f"the connection ended: {one_line(error)}") from None
             finally:
