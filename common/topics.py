@@ -86,6 +86,8 @@ CAMERA_INFO = Topic("camera/camera_info", m.CameraInfo, "state", "intrinsics of 
 PLANNING_SCENE = Topic("planning_scene", m.PlanningScene, "state",
                        "fixtures and perceived objects with ids, attached object, allowed collisions")
 JOINT_STATES = Topic("joint_states", m.JointState, "stream", "joint positions, 100 Hz")
+SET_POINTS = Topic("motion/set_points", m.SetPoints, "stream",
+                   "commanded positions and gripper width, 100 Hz; only while there is a subscriber, as a recorder")
 TF = Topic("tf", m.TFMessage, "stream", "poses of the robot's links")
 TF_STATIC = Topic("tf_static", m.TFMessage, "state", "constant poses: base, camera")
 GRIPPER_STATE = Topic("gripper/state", m.GripperState, "state", "width, whether it holds an object, newest command")

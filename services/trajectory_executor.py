@@ -84,6 +84,7 @@ class Publishers:
         }
         if config.robot.gripper:
             self._writers["gripper"] = bus.writer(topics.GRIPPER_STATE)
+        self._set_points = bus.writer(topics.SET_POINTS)
         self._updates = bus.writer(topics.SCENE_OBJECT_UPDATES) if simulated else None
         if simulated:
             self._writers["objects"] = bus.writer(topics.SCENE_OBJECTS)
@@ -95,8 +96,10 @@ class Publishers:
         """Publish a status at once."""
         self._writers["owner" if isinstance(status, MotionOwner) else "motion"].put(status)
 
-    def put_report(self, report: Report) -> None:
-        """Publish what has changed in a cycle."""
+    def put_report(self, report: Report, executor: Executor) -> None:
+        """Publish what has changed in a cycle, and its set-points if there is a subscriber."""
+        if report.joints is not None and self._set_points.matched:
+            self._set_points.put(executor.set_points(report.joints.header))
         for field, writer in self._writers.items():
             if (message := getattr(report, field)) is not None:
                 writer.put(message)
@@ -227,7 +230,7 @@ async def control(
         executor.speed_scaling = config.speed_scaling
         report = executor.cycle(bus.header("world"))
         handlers.after_cycle(report)
-        publishers.put_report(report)
+        publishers.put_report(report, executor)
         due = max(due + period, loop.time())  # no burst after an overrun
 
     try:

@@ -43,6 +43,7 @@ from common.messages import (
     MotionStatus,
     RobotCommand,
     RobotStatus,
+    SetPoints,
 )
 
 
@@ -351,6 +352,11 @@ class Executor:
         self._speed_scaling = share
         slider = self._controlled.state.speed if self._controlled is not None else 1.0
         self.arm.reports.speed_scaling = share * slider
+
+    def set_points(self, header: Header) -> SetPoints:
+        """Return what was commanded last."""
+        return SetPoints(header=header, name=list(self._limits.names), position=self.arm.set_point.tolist(),
+                         width=self.gripper.commanded_width if self.gripper is not None else None)
 
     def restore(self, now: float) -> None:
         """Continue what simulated hardware did before a restart, at a time [s]."""

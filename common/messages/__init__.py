@@ -80,6 +80,7 @@ from common.messages.robot import (
     RobotDescription,
     RobotMode,
     RobotStatus,
+    SetPoints,
 )
 from common.messages.scene import (
     AttachedObject,

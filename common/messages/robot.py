@@ -49,6 +49,26 @@ class JointState(Message):
         return self
 
 
+class SetPoints(Message):
+    """What was commanded in one control cycle: positions of the arm's joints [rad or m], width of the gripper [m].
+
+    The stamp is that of the joint states of the cycle. The width is that of the newest command; None before the first.
+    """
+
+    max_bytes: ClassVar[int] = SMALL_BYTES
+
+    header: Header
+    name: list[Name] = Field(max_length=MAX_JOINTS)
+    position: Joints
+    width: Finite | None = None
+
+    @model_validator(mode="after")
+    def _require_same_length(self) -> SetPoints:
+        if len(self.position) != len(self.name):
+            raise ValueError(f"position has {len(self.position)} entries for {len(self.name)} joints")
+        return self
+
+
 class RobotDescription(Message):
     """Description of an arm for its clients: `joints` are those of goals and plans, in their order."""
 
