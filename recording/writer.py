@@ -15,6 +15,7 @@ from mcap.writer import CompressionType, Writer
 
 from common.messages import SupervisorStatus
 from common.messages.basics import MAX_NAME
+from recording.chunk_indexes import ChunkIndexes
 from recording.sample import RecordingError, Sample, schema_of, stamp_of
 
 # Limits of a file: any client of the network can invent keys and writers, and readers refuse files with many more.
@@ -74,7 +75,7 @@ class AppendedFile:
         self.path = path
         self._closed = False
         try:
-            self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
+            self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
         except FileExistsError:
             raise RecordingError(f"{path}: exists already; choose another name") from None
         except OSError as error:
@@ -102,6 +103,10 @@ class AppendedFile:
         """Return the number of bytes written."""
         return self._size
 
+    def indexes(self) -> ChunkIndexes:
+        """Return the index of the chunks that were written."""
+        return ChunkIndexes(self._file, self.tell)
+
     def flush(self) -> None:
         """Do nothing: nothing is buffered."""
 
@@ -128,6 +133,7 @@ class RecordingWriter:
         self.messages = 0
         self._file = AppendedFile(path)
         self._writer = Writer(self._file, chunk_size=_NEVER, compression=CompressionType.ZSTD)  # type: ignore[arg-type]
+        self._file.indexes().install(self._writer)
         self._channels: dict[tuple[tuple[str, str, str], str], int] = {}  # by (key, message, kind) and writer
         self._known: set[tuple[str, str, str]] = set()
         self._schemas: dict[str, int] = {"": 0}
