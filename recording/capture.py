@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from recording.selection import Selection
 
 QUERY_TIMEOUT = 1.0  # [s] for the values of states
+SILENCE, MANY = 5.0, 10  # [s] without a message after which a stream of so many messages has ceased
 
 
 @dataclass(frozen=True)
@@ -89,6 +90,7 @@ class Capture:
         self._known = custom.topics()
         self._kinds = custom.kinds(self._known)
         self._run_known = False
+        self._streams: dict[str, tuple[int, int]] = {}  # count of messages, and log time of the newest one, by key
         self._declared: list[Declaration] = []
 
     async def start(self) -> None:
@@ -132,11 +134,23 @@ class Capture:
         with self._lock:  # so that times increase in the file
             if writer and not self.sequences.is_new(raw.key, writer, sequence):
                 return
+            now, kind = self._now_ns(), self._kinds.get(topics.general_key(topic)) or kind or "stream"
+            if kind == "stream" and (topic in self._streams or len(self._streams) < MAX_KEYS):
+                self._streams[topic] = self._streams.get(topic, (0, 0))[0] + 1, now
             self._sink.offer(Sample(
-                raw.key, raw.payload, time.monotonic_ns() + self._wall_offset, message=message_of(raw.encoding),
-                kind=self._kinds.get(topics.general_key(topic)) or kind or "stream", writer=writer, sequence=sequence,
-                trace=trace,
+                raw.key, raw.payload, now, message=message_of(raw.encoding), kind=kind, writer=writer,
+                sequence=sequence, trace=trace,
             ))
+
+    def _now_ns(self) -> int:
+        return time.monotonic_ns() + self._wall_offset
+
+    def silent(self) -> dict[str, float]:
+        """Return the streams that have ceased, such as that of a camera, and since when [s]."""
+        with self._lock:
+            streams = dict(self._streams)
+        since = {topic: (self._now_ns() - at) * 1e-9 for topic, (count, at) in streams.items() if count >= MANY}
+        return {topic: seconds for topic, seconds in since.items() if seconds > SILENCE}
 
     def _on_owner(self, token: str) -> None:
         owner = Owner.of(token)

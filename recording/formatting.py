@@ -28,6 +28,11 @@ def format_progress(now: RecordingStats, before: RecordingStats, missed: int) ->
             f"{lost or 'none'} lost")
 
 
+def format_silent(silent: dict[str, float]) -> list[str]:
+    """Return a line for each stream that has ceased, with the time since its last message [s]."""
+    return [f"  {topic}: no message in the last {seconds:.0f} s" for topic, seconds in sorted(silent.items())]
+
+
 def format_result(files: list[str], stats: RecordingStats, missed: dict[str, int]) -> list[str]:
     """Return the result of a recording as lines."""
     names = files[0] if len(files) == 1 else f"{files[0]} to {files[-1]}"

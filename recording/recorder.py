@@ -19,7 +19,7 @@ from common.transport.endpoint import endpoint_of
 from common.transport.session import call_on_loop
 from common.transport.zenoh_session import connect as connect_to
 from recording.capture import Capture, CustomTopics, Sink
-from recording.formatting import about, format_progress, format_result
+from recording.formatting import about, format_progress, format_result, format_silent
 from recording.selection import Selection
 from recording.writer import SplitWriter
 
@@ -103,9 +103,12 @@ async def record(bus: Bus, request: RecordRequest, echo: Echo, show: Echo | None
         if await _wait_for_end(interrupts, request.seconds, sink, capture, show):
             reason = "duration"
     finally:
+        silent = capture.silent()
         capture.stop()
         stats = await asyncio.to_thread(sink.close, {"reason": reason, "missed": dict(capture.sequences.missed)})
     for line in format_result([str(file) for file in writer.files], stats, dict(capture.sequences.missed)):
+        echo(line)
+    for line in format_silent(silent):
         echo(line)
 
 

@@ -77,3 +77,24 @@ async def test_run_is_described_by_the_first_valid_status_of_a_supervisor(invali
     sink.close({"reason": "test"})
     with Recording(tmp_path / "a.mcap") as recording:
         assert recording.run.speed == 2.0
+
+
+async def test_stream_that_has_ceased_is_named(tmp_path, monkeypatch):
+    network = LocalNetwork()
+    recorder, camera = bus_of(network, "recorder"), bus_of(network, "camera")
+    sink = Sink(SplitWriter(tmp_path / "a.mcap", {"cell": "cell"}))
+    capture = Capture(recorder, Selection.of(), sink)
+    await capture.start()
+    now = [0]
+    monkeypatch.setattr(capture, "_now_ns", lambda: now[0])
+    joints = camera.writer(topics.JOINT_STATES)
+    for _ in range(12):
+        joints.put(m.JointState(header=m.Header(), name=[], position=[]))
+    await asyncio.sleep(0)
+    assert capture.silent() == {}
+    now[0] = 7_000_000_000
+    assert capture.silent() == {"joint_states": 7.0}
+    capture.stop()
+    sink.close({"reason": "test"})
+    for bus in (camera, recorder):
+        await bus.close()
