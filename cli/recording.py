@@ -208,7 +208,8 @@ PLOT_ERRORS = (ArithmeticError, ValueError, LookupError, TypeError)  # errors fr
 
 
 def export(
-    files: Annotated[list[str], typer.Argument(metavar="FILE.mcap", help="recordings")],
+    files: Annotated[list[str], typer.Argument(
+        metavar="FILE.mcap", help="recordings, or a folder of `zencell demo record`")],
     foxglove: Annotated[
         str | None, typer.Option("--foxglove", metavar="OUT.mcap", help="for Foxglove: JSON with its own schemas")
     ] = None,
@@ -238,6 +239,9 @@ def export(
     max_gap: Annotated[
         str | None, typer.Option("--max-gap", metavar="S", help="longest gap that frames are filled over [0.5]")
     ] = None,
+    actions: Annotated[str | None, typer.Option("--actions", metavar="WHAT", help="set-points or next-state "
+                                                "[set-points if they are recorded]")] = None,
+    failures: Annotated[bool, typer.Option("--failures", help="also failed episodes of a folder")] = False,
     embed_images: Annotated[
         bool, typer.Option("--embed-images", help="PNG in the files of --lerobot instead of video")
     ] = False,
@@ -251,7 +255,8 @@ def export(
                "--hdf5": hdf5, "--parquet": parquet, "--numpy": numpy}
     exporting.export(exporting.ExportRequest(
         files, {option: target for option, target in targets.items() if target},
-        Selection.of(topics or (), None, exclude), DatasetOptions(fps, task or (), robot_type, embed_images, max_gap)))
+        Selection.of(topics or (), None, exclude),
+        DatasetOptions(fps, task or (), robot_type, embed_images, max_gap, actions), failures))
 
 
 def report(

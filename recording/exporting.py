@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from common.errors import ConfigError
 from common.terminal import Progress, echo, printable
 from recording.datasets.command import DatasetOptions, write_lerobot, write_robomimic
+from recording.datasets.manifest import read_manifest
 from recording.datasets.topic_files import write_numpy, write_parquet
 from recording.export import export_images, export_tables, export_video, file_names, image_topics
 from recording.formatting import format_bytes, require_new
@@ -27,12 +28,16 @@ WHOLE = {"--lerobot": write_lerobot, "--hdf5": write_robomimic}  # formats of al
 
 @dataclass(frozen=True)
 class ExportRequest:
-    """Recordings, and the target of each wanted format by its option."""
+    """Recordings, and the target of each wanted format by its option.
+
+    A folder of demonstrations means the recordings of its manifest that succeeded, or all with `failures`.
+    """
 
     files: list[str]
     targets: dict[str, str]
     selection: Selection
     dataset: DatasetOptions = field(default_factory=DatasetOptions)
+    failures: bool = False
 
 
 def export(request: ExportRequest) -> None:
@@ -44,6 +49,7 @@ def export(request: ExportRequest) -> None:
     """
     if not request.targets:
         raise ConfigError("export", ..., f"needs one or more of {FORMATS}")
+    request = _with_episodes(request)
     stems = [Path(file).stem for file in request.files]
     for option, target in request.targets.items():
         _require_target(option, Path(target), len(request.files))
@@ -55,6 +61,30 @@ def export(request: ExportRequest) -> None:
             write(paths, Path(request.targets[option]), request.selection, request.dataset, echo)
     for file in request.files:
         _export_one(request, file)
+
+
+def _with_episodes(request: ExportRequest) -> ExportRequest:
+    """Return the request with the episodes and tasks of folders of demonstrations.
+
+    Raises:
+        ConfigError: a folder has no valid manifest, or no episode to export.
+    """
+    files, tasks = list[str](), list[str]()
+    for given in request.files:
+        if not Path(given).is_dir():
+            files.append(given)
+            tasks.append("")
+            continue
+        episodes = read_manifest(Path(given)).episodes
+        chosen = [each for each in episodes if each.success or request.failures]
+        if not chosen:
+            raise ConfigError("FILE", given, "has no episode that succeeded; --failures exports the others")
+        if len(chosen) < len(episodes):
+            echo(f"{given}: {len(episodes) - len(chosen)} failed episodes left out; --failures exports them")
+        files += [str(Path(given) / each.file) for each in chosen]
+        tasks += [each.task for each in chosen]
+    given_tasks = request.dataset.tasks or (tasks if any(tasks) else ())
+    return replace(request, files=files, dataset=replace(request.dataset, tasks=given_tasks))
 
 
 def _require_target(option: str, target: Path, recordings: int) -> None:

@@ -14,9 +14,12 @@ from common.errors import ConfigError
 from common.terminal import Progress, printable
 from recording.datasets.alignment import Choice
 from recording.datasets.episode import (
+    ACTIONS,
     GRIPPER,
     MAX_FPS,
     MAX_GAP,
+    NEXT_STATE,
+    SET_POINTS,
     Episode,
     align,
     camera_topics,
@@ -34,7 +37,10 @@ RULES = {
     "times": "frame k is at start_ns + k / fps; header stamps, of images that of the exposure",
     "sample": "nearest stamp within half a period; otherwise the newest sample before the frame, counted as filled",
     "state": "positions of joint_states; gripper.width of gripper/state is the newest at or before the frame",
-    "action": "state of the next frame; of the last frame its own",
+}
+ACTION_RULES = {
+    SET_POINTS: "newest of motion/set_points at or before the time of the next frame, fingers: the commanded width",
+    NEXT_STATE: "state of the next frame; of the last frame its own",
 }
 NO_DEPTH = "  {}: depth left out, LeRobot v3.0 has no feature for it; --hdf5 has"
 
@@ -48,6 +54,7 @@ class DatasetOptions:
     robot_type: str | None = None
     embed_images: bool = False
     max_gap: str | None = None
+    actions: str | None = None
 
 
 class Writer(Protocol):
@@ -94,7 +101,9 @@ def _write(
     say: Callable[[str], None], create: Callable[[Path, int, str], Writer], *, depth: bool,
 ) -> None:
     """Write all episodes to a hidden neighbor of the target, which gets its name once it is complete."""
-    max_gap = _number("--max-gap", options.max_gap, MAX_GAP)
+    max_gap, actions = _number("--max-gap", options.max_gap, MAX_GAP), options.actions
+    if actions not in (None, *ACTIONS):
+        raise ConfigError("--actions", actions, f"choices: {', '.join(ACTIONS)}")
     tasks = list(options.tasks)
     if len(tasks) not in (0, 1, len(paths)):
         raise ConfigError("--task", tasks, f"must be one for all, or one for each of the {len(paths)} recordings")
@@ -111,10 +120,11 @@ def _write(
                     without_depth = [camera.topic for camera in streams.cameras if camera.depth]
                     streams = replace(streams, cameras=tuple(each for each in streams.cameras if not each.depth))
                 fps = fps or _camera_rate(streams.cameras, path)
-                episode = align(recording, streams, fps, max_gap)
+                episode = align(recording, streams, fps, max_gap, actions)
+                actions = episode.actions  # of the first recording for all
                 robot = options.robot_type or episode.cell or "unknown"
                 writer = writer or create(part, fps, robot)
-                task = tasks[min(number, len(tasks) - 1)] if tasks else f"run the cell {episode.cell}"
+                task = (tasks[min(number, len(tasks) - 1)] if tasks else "") or f"run the cell {episode.cell}"
                 writer.add(recording, episode, task)
             for line in [*report(number, episode, task), *map(NO_DEPTH.format, without_depth)]:
                 say(line)
@@ -122,7 +132,8 @@ def _write(
                 say(f"  {printable(topic)}: {count:,} messages cannot be read, or have no stamp or pixels: left out")
             episodes.append(_provenance(episode, task))
         assert writer is not None  # the command requires a recording
-        writer.close({"rules": RULES, "episodes": episodes})
+        assert actions is not None
+        writer.close({"rules": {**RULES, "action": ACTION_RULES[actions]}, "actions": actions, "episodes": episodes})
         part.replace(target)
     except OSError as error:
         raise ExportFailed(target, "the disk is full" if _is_full(error) else str(error)) from None
@@ -180,6 +191,11 @@ def report(number: int, episode: Episode, task: str) -> list[str]:
     for topic, choice in episode.choices.items():
         lines.append(f"  {topic}: {_error(choice, len(episode))}" if topic != GRIPPER
                      else f"  {topic}: newest value at or before each frame")
+    for topic, seconds in episode.ended_early.items():
+        lines.append(f"  {topic}: ended {seconds:.1f} s before the recording; there are no frames after it")
+    lines.append(f"  action: {ACTION_RULES[episode.actions]}")
+    if episode.intervention is not None:
+        lines.append(f"  intervention: an operator had control in {int(episode.intervention.sum())} frames")
     return lines
 
 

@@ -2,8 +2,10 @@
 
 - State: positions of the arm's joints, by joint_states, and the width of the gripper in force, by gripper/state. The
   joints are those of robot/description; without it, all of joint_states.
-- Action of a frame: the state of the next frame. Set-points are not recorded; the arm reached this position one period
-  later. The action of the last frame is its own state.
+- Action of a frame, from set-points: what was commanded last at the time of the next frame, by motion/set_points.
+  Before the first command of the gripper its width is that of the state.
+- Action of a frame, from states: the state of the next frame; of the last its own.
+- Intervention: whether an operator had taken over, by `control` of the status of a task that lets an operator do so.
 - Times are header stamps: of images the exposure. See `alignment` for the choice of samples.
 """
 
@@ -13,12 +15,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from common.errors import ConfigError
-from common.messages import GripperState, Image, JointState, RobotDescription
+from common.messages import GripperState, Image, JointState, RobotDescription, SetPoints
 from common.perception.image import ImageError
 from recording.access import pixels_of
 from recording.datasets.alignment import SECOND, Choice, Stamps, grid, in_force, nearest, phase
@@ -27,7 +30,10 @@ from recording.sample import Decoder, RecordingError
 from recording.selection import Selection
 from recording.tables import Array
 
-JOINTS, GRIPPER, ROBOT = "joint_states", "gripper/state", "robot/description"
+JOINTS, GRIPPER, ROBOT, COMMANDS = "joint_states", "gripper/state", "robot/description", "motion/set_points"
+STATUS = "_status"  # end of the topics of tasks
+CONTROL, OPERATOR = "control", "operator"  # field of the status of a task that an operator can take over, and its value
+SET_POINTS, NEXT_STATE = ACTIONS = ("set-points", "next-state")
 WIDTH = "gripper.width"
 CAMERA_IMAGE = "image_raw"  # last part of the topics of cameras
 DEPTHS = ("16UC1", "32FC1")  # encodings
@@ -58,6 +64,10 @@ class Streams:
     gripper_stamps: Stamps  # empty without gripper/state
     widths: npt.NDArray[np.float64]  # [m]
     cameras: tuple[Camera, ...]
+    command_stamps: Stamps  # of the set-points; empty without them
+    commands: npt.NDArray[np.float64]  # (messages, joints + 1) [rad or m], then the width [m]; NaN: not commanded
+    control_stamps: Stamps  # of the status of a task with `control`; empty without one
+    taken_over: npt.NDArray[np.bool_]  # by an operator
 
 
 @dataclass(frozen=True)
@@ -72,12 +82,10 @@ class Episode:
     state: npt.NDArray[np.float64]  # (frames, names) [rad or m]
     choices: dict[str, Choice]  # by topic
     cameras: tuple[Camera, ...]
-    left_out: dict[str, str] = field(default_factory=dict)  # topics with the reason
-
-    @property
-    def action(self) -> npt.NDArray[np.float64]:
-        """State of the next frame; of the last its own (frames, names)."""
-        return np.concatenate([self.state[1:], self.state[-1:]])
+    action: npt.NDArray[np.float64]  # (frames, names) [rad or m]
+    actions: str  # one of ACTIONS
+    intervention: npt.NDArray[np.bool_] | None  # (frames,) whether an operator had control; None: unknown
+    ended_early: dict[str, float] = field(default_factory=dict)  # topics, and how long before the last one [s]
 
     def __len__(self) -> int:
         """Return the number of frames."""
@@ -125,13 +133,20 @@ def read_streams(recording: Recording, topics: Sequence[str], decoder: Decoder) 
     """
     stamps, joints, rows = list[int](), tuple[str, ...](), list[list[float]]()
     gripper_stamps, widths, arm = list[int](), list[float](), tuple[str, ...]()
-    for sample in recording.samples(lambda topic: topic in (JOINTS, GRIPPER, ROBOT)):
+    commands, control = list[SetPoints](), dict[int, bool]()
+    for sample in recording.samples(
+        lambda topic: topic in (JOINTS, GRIPPER, ROBOT, COMMANDS) or topic.endswith(STATUS)
+    ):
         message = decoder.message(sample)
         if isinstance(message, RobotDescription):
             arm = tuple(message.joints)
         elif isinstance(message, GripperState):
             gripper_stamps.append(message.header.stamp)
             widths.append(message.width)
+        elif isinstance(message, SetPoints):
+            commands.append(message)
+        elif isinstance(taken := getattr(message, CONTROL, None), str) and message is not None:
+            control[_stamp(message)] = taken == OPERATOR
         elif isinstance(message, JointState) and message.header.stamp:
             if rows and tuple(message.name) != joints:
                 raise RecordingError(f"{recording.path}: the joints of {JOINTS} change")
@@ -143,10 +158,22 @@ def read_streams(recording: Recording, topics: Sequence[str], decoder: Decoder) 
     order, gripper_order = _ascending(stamps), _ascending(gripper_stamps)
     positions = np.array(rows, np.float64)[order]
     chosen = [i for i, name in enumerate(joints) if name in arm] or list(range(len(joints)))
+    names = tuple(joints[i] for i in chosen)
+    command_order = _ascending([each.header.stamp for each in commands])
+    commanded = [[*map(dict(zip(each.name, each.position, strict=True)).get, names), each.width] for each in commands]
     return Streams(
-        tuple(joints[i] for i in chosen), np.array(stamps, np.int64)[order], positions[:, chosen],
+        names, np.array(stamps, np.int64)[order], positions[:, chosen],
         np.array(gripper_stamps, np.int64)[gripper_order], np.array(widths, np.float64)[gripper_order],
-        tuple(_camera(recording, topic, decoder) for topic in topics))
+        tuple(_camera(recording, topic, decoder) for topic in topics),
+        np.array([each.header.stamp for each in commands], np.int64)[command_order],
+        np.array(commanded, np.float64).reshape(-1, len(names) + 1)[command_order],
+        np.array(sorted(control), np.int64), np.array([control[stamp] for stamp in sorted(control)], np.bool_))
+
+
+def _stamp(message: Any) -> int:
+    """Return the stamp of a status, whose class need not be installed."""
+    header = message.header
+    return int(header["stamp"] if isinstance(header, dict) else header.stamp)
 
 
 def _ascending(stamps: list[int]) -> npt.NDArray[np.intp]:
@@ -198,10 +225,15 @@ def rate_of(cameras: Sequence[Camera]) -> int | None:
     return round(1e9 / float(np.median(gaps))) or None if len(gaps) else None
 
 
-def align(recording: Recording, streams: Streams, fps: int, max_gap: float) -> Episode:
+def align(
+    recording: Recording, streams: Streams, fps: int, max_gap: float, actions: str | None = None
+) -> Episode:
     """Return the frames of a recording: from the first exposure with all streams to the end of the first that ends.
 
+    Actions are set-points if the recording has any, unless `actions` is one of ACTIONS.
+
     Raises:
+        ConfigError: the recording has no set-points, but `actions` requires them.
         RecordingError: there are too few frames, or a stream lacks samples for longer than `max_gap` [s].
     """
     timed = {JOINTS: streams.stamps, **{camera.topic: camera.stamps for camera in streams.cameras}}
@@ -228,4 +260,31 @@ def align(recording: Recording, streams: Streams, fps: int, max_gap: float) -> E
         choices[GRIPPER] = in_force(streams.gripper_stamps, times)
         state = np.column_stack([state, streams.widths[choices[GRIPPER].index]])
         names = (*names, WIDTH)
-    return Episode(recording.path, recording.cell, fps, times, names, state, choices, streams.cameras)
+    if actions == SET_POINTS and not len(streams.command_stamps):
+        raise ConfigError("--actions", actions, f"needs {COMMANDS}, which {recording.path} lacks: use {NEXT_STATE}")
+    actions = actions or (SET_POINTS if len(streams.command_stamps) else NEXT_STATE)
+    intervention = None
+    if len(streams.control_stamps):
+        intervention = streams.taken_over[in_force(streams.control_stamps, times).index]
+    return Episode(
+        recording.path, recording.cell, fps, times, names, state, choices, streams.cameras,
+        _actions(streams, times, state, fps, actions), actions, intervention, _ended_early(timed, max_gap))
+
+
+def _ended_early(timed: dict[str, Stamps], max_gap: float) -> dict[str, float]:
+    """Return the streams that ended more than `max_gap` [s] before the last one, and how long before [s]."""
+    end = max(int(stamps[-1]) for stamps in timed.values())
+    before = {topic: (end - int(stamps[-1])) * 1e-9 for topic, stamps in timed.items()}
+    return {topic: seconds for topic, seconds in before.items() if seconds > max_gap}
+
+
+def _actions(
+    streams: Streams, times: Stamps, state: npt.NDArray[np.float64], fps: int, actions: str
+) -> npt.NDArray[np.float64]:
+    """Return the action of each frame (frames, names); what was not commanded is the next state."""
+    found = np.concatenate([state[1:], state[-1:]])
+    if actions == SET_POINTS:
+        following = np.append(times[1:], times[-1] + SECOND // fps)
+        commanded = streams.commands[in_force(streams.command_stamps, following).index, : state.shape[1]]
+        found = np.where(np.isnan(commanded), found, commanded)
+    return found

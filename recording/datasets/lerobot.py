@@ -29,6 +29,7 @@ DATA_BYTES, VIDEO_BYTES = 100 * 1024**2, 200 * 1024**2  # of a file, after which
 ROWS = 1000  # of a row group; with embedded images fewer
 ROWS_WITH_IMAGES = 50
 STATE, ACTION, IMAGES = "observation.state", "action", "observation.images."
+INTERVENTION = "intervention"  # whether an operator had control
 
 
 @dataclass
@@ -75,6 +76,8 @@ class LeRobotWriter:
         self._require_video(cameras)
         features = {STATE: _vector(episode.names), ACTION: _vector(episode.names)} | {
             f"{IMAGES}{camera.name}": feature_of_camera(camera, self._fps, embed=self._embed) for camera in cameras}
+        if episode.intervention is not None:
+            features[INTERVENTION] = {"dtype": "bool", "shape": [1], "names": None}
         self._meta.require_same(features, episode.path)
         first = self._meta.frames
         columns = _columns(episode, len(self._meta.episodes), first, self._meta.task_index(task))
@@ -175,8 +178,9 @@ def _columns(episode: Episode, number: int, first: int, task: int) -> dict[str, 
     """Return the columns of an episode without images, in the order of the file."""
     count = len(episode)
     frames = np.arange(count, dtype=np.int64)
+    taken_over = {} if episode.intervention is None else {INTERVENTION: episode.intervention}
     return {
-        ACTION: episode.action.astype(np.float32), STATE: episode.state.astype(np.float32),
+        ACTION: episode.action.astype(np.float32), STATE: episode.state.astype(np.float32), **taken_over,
         "timestamp": (frames / episode.fps).astype(np.float32), "frame_index": frames,
         "episode_index": np.full(count, number, np.int64), "index": frames + first,
         "task_index": np.full(count, task, np.int64),

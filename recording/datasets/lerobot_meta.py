@@ -129,4 +129,6 @@ class Meta:
 def _shown(feature: dict[str, Any] | None) -> str:
     if feature is None:
         return "missing"
-    return f"{feature['shape'][1]}x{feature['shape'][0]}" if len(feature["shape"]) == 3 else ", ".join(feature["names"])
+    if len(feature["shape"]) == 3:
+        return f"{feature['shape'][1]}x{feature['shape'][0]}"
+    return ", ".join(feature["names"] or ["there"])

@@ -58,6 +58,8 @@ class RobomimicWriter:
         dones[-1] = 1
         for key, values in (("actions", episode.action), ("rewards", np.zeros(count)), ("dones", dones)):
             demo.create_dataset(key, data=values)
+        if episode.intervention is not None:
+            demo.create_dataset("interventions", data=episode.intervention.astype(np.int64))
         obs = demo.create_group("obs")
         arm = [i for i, joint in enumerate(episode.names) if joint != WIDTH]
         obs.create_dataset("joint_pos", data=episode.state[:, arm])
