@@ -34,6 +34,7 @@ from cli.options import CommandGroup
 from common.errors import RequestFailed, ZencellError
 from common.terminal import echo, printable
 from tools import io_verbs
+from tools.teleoperation.verbs import VERBS as TELEOPERATION
 
 NO_HOME = "Could not determine home directory."  # pathlib's error for ~NAME/...
 EXIT_FAILED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 1, 2, 130
@@ -124,6 +125,7 @@ of_applications.take_verbs(io_verbs.VERBS)
 of_applications.take_all()
 app.add_typer(robot.app, name="robot")
 app.add_typer(calibrate.app, name="calibrate")
+of_applications.take_verbs(TELEOPERATION)
 app.command("record")(recording.record_)
 app.command()(recording.info)
 app.command("play")(recording.play_)

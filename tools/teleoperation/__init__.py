@@ -1,0 +1,1 @@
+"""Teleoperation with a keyboard, gamepad or 3D mouse, and recording of demonstrations."""
