@@ -92,6 +92,7 @@ class Executor:
         self._speed_scaling = 1.0  # as operators and programs set it
         self._followed: ExecuteRequest | None = None  # newest accepted goal
         self._controlled = hardware if isinstance(hardware, ControlledArm) else None
+        self._slowed = hardware if isinstance(hardware, SlowedArm) else None  # isinstance takes long for a protocol
         self._payload = PayloadReporter(self._controlled, gripper)
         self._arm_fault, self._gripper_fault = DeviceFault("the arm"), DeviceFault("the gripper")
         self._changes = ChangeDetector(self.arm)
@@ -147,8 +148,8 @@ class Executor:
         return joint_state(header, self._limits.names, self._q, dq, self._gripper_config, width, self._width_rate)
 
     def _send(self, positions: Vector, velocities: Vector, now: float) -> None:
-        if isinstance(self._controlled, SlowedArm):
-            self._controlled.share = self.arm.share_of_speed(velocities, self._speed_scaling)
+        if self._slowed is not None:
+            self._slowed.share = self.arm.share_of_speed(velocities, self._speed_scaling)
         try:
             call_device("sending set-points", self._hardware.write, positions, velocities, now)
             self._arm_fault.clear(now)

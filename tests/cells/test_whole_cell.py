@@ -48,10 +48,12 @@ def up(tmp_path_factory: pytest.TempPathFactory):
         yield cell
 
 
+@pytest.mark.slow
 def test_every_process_runs_once(up: RunningCell) -> None:
     assert sorted(up.processes()) == sorted(["router", *SERVICES])
 
 
+@pytest.mark.slow
 def test_printed_zenoh_cli_command_decodes_the_topics(up: RunningCell) -> None:
     program, *arguments = shlex.split(next(line for line in up.text.splitlines() if line.startswith("zenoh --mode")))
     assert arguments == ["--mode", "client", "--connect", up.endpoint, "subscribe", "-k", "panda/**", "--decoder",
@@ -77,6 +79,7 @@ def test_printed_zenoh_cli_command_decodes_the_topics(up: RunningCell) -> None:
         assert isinstance(json.loads(seen[key]), dict), seen[key]
 
 
+@pytest.mark.slow
 async def test_terminal_jogs_the_arm_and_releases_it_when_killed(up: RunningCell) -> None:
     command = command_line("robot", "jog", "--linear", "0,0,0.05", "--seconds", "60", "--domain", str(up.domain))
     jogging = await asyncio.to_thread(
@@ -99,6 +102,7 @@ async def test_terminal_jogs_the_arm_and_releases_it_when_killed(up: RunningCell
         jogging.wait()
 
 
+@pytest.mark.slow
 def test_taking_releasing_and_jogging_print_one_line(up: RunningCell) -> None:
     place = Place(up.folder, up.domain)
     for arguments, wanted in (
@@ -118,6 +122,7 @@ def test_taking_releasing_and_jogging_print_one_line(up: RunningCell) -> None:
         assert re.fullmatch(wanted, answer.stdout + answer.stderr), arguments
 
 
+@pytest.mark.slow
 def test_interrupted_cell_ends_with_a_summary_and_no_process(up: RunningCell) -> None:
     up.interrupt()
     assert asyncio.run(up.ended(END)) == 0

@@ -315,7 +315,8 @@ def test_new_arm_clears_its_table(folder):
     clear_table(folder / "side_cell.yaml")
 
 
-@pytest.mark.parametrize(("size", "below", "camera"), [(0.08, 0.0, 0.4), (0.25, 0.0, 0.8), (1.0, 0.7, 0.8)])
+@pytest.mark.parametrize(("size", "below", "camera"), [
+    (0.08, 0.0, 0.4), pytest.param(0.25, 0.0, 0.8, marks=pytest.mark.slow), (1.0, 0.7, 0.8)])
 def test_table_container_and_camera_suit_the_size_of_the_arm(size, below, camera, tmp_path):
     (tmp_path / "arm.urdf").write_text(six(size))
     done = ask(tmp_path, "robot", "new", "arm.urdf", "--yes", "--name", "six", "--cell", "six_cell.yaml")

@@ -215,6 +215,7 @@ def test_jogging_moves_for_the_requested_time() -> None:
     run(program)
 
 
+@pytest.mark.slow
 def test_jog_in_a_direction_that_the_arm_cannot_keep_fails_with_the_reason() -> None:
     async def program(cell: Cell) -> None:
         for seconds in (20.0, 0.5):  # until the end of reach, and from there

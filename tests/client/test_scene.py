@@ -23,6 +23,7 @@ LEFT, RIGHT = pose(0.45, 0.25, 0.35), pose(0.45, -0.25, 0.35)
 WALL = ("box", (0.3, 0.02, 0.7))  # between them
 
 
+@pytest.mark.slow
 def test_added_solid_is_avoided_also_after_a_restart_until_it_is_removed() -> None:
     async def program(simulated: Simulation, cell: Cell) -> None:
         await cell.arm.move(LEFT)

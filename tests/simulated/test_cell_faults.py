@@ -20,6 +20,7 @@ def halfway(status: MotionStatus) -> bool:
     return status.state == "active" and status.progress > 0.3
 
 
+@pytest.mark.slow
 def test_arm_is_held_while_the_planner_is_down_and_then_resumes() -> None:
     async def visit(cell: SimulatedCell, bus: Bus) -> None:
         motion, status = bus.reader(topics.MOTION_STATUS), bus.reader(PICK_PLACE_STATUS)

@@ -28,13 +28,17 @@ def outcome_of(name: str, seed: int) -> Outcome:
     return Simulation(cell_of(name), seed, faults=True, digest=True).run()
 
 
+def slow(*row):
+    return pytest.param(*row, marks=pytest.mark.slow)
+
+
 @pytest.mark.parametrize(("name", "seed"), [
     ("panda", 1),
     ("ur5", 1),
-    ("panda", 21),  # a start is on its way when the robot is held
-    ("panda", 5848),  # the released object is detected before the task receives the release
-    ("ur5", 31),  # the robot is held for good while the next executor waits for the end of another
-    ("ur5", 39),  # the arm moves meanwhile
+    slow("panda", 21),  # a start is on its way when the robot is held
+    slow("panda", 5848),  # the released object is detected before the task receives the release
+    slow("ur5", 31),  # the robot is held for good while the next executor waits for the end of another
+    slow("ur5", 39),  # the arm moves meanwhile
 ])
 def test_cell_with_doubles_succeeds_under_all_faults(name, seed):
     outcome = outcome_of(name, seed)

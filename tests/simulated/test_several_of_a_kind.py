@@ -28,6 +28,7 @@ def test_two_cameras_clear_a_table_that_neither_sees_completely(tmp_path: Path) 
     assert outcome.crashes == [] and outcome.restarts == {}
 
 
+@pytest.mark.slow
 def test_single_camera_leaves_objects_out_of_its_view() -> None:
     blind = [f"services.{name}.views=[left]" for name in ("scene_manager", "workspace_validator")]
     outcome = Simulation(load_cell(CELL, blind), 1).run()

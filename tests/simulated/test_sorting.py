@@ -55,9 +55,10 @@ def test_tray_is_cleared_by_color_without_returning_home_between_objects():
 @pytest.mark.parametrize(("setting", "places"), [
     ("services.sorter={by: color, where: {green: left, red: right}}",
      {"red_box": "right", "blue_can": "right", "green_bar": "left"}),
-    ("services.sorter={by: size}", {"red_box": "left", "blue_can": "left", "green_bar": "right"}),
-    ("services.sorter={by: shape, where: {box: right}}",
-     {"red_box": "right", "blue_can": "left", "green_bar": "right"}),
+    pytest.param("services.sorter={by: size}", {"red_box": "left", "blue_can": "left", "green_bar": "right"},
+                 marks=pytest.mark.slow),
+    pytest.param("services.sorter={by: shape, where: {box: right}}",
+                 {"red_box": "right", "blue_can": "left", "green_bar": "right"}, marks=pytest.mark.slow),
 ])
 def test_rule_decides_the_container(setting, places):
     outcome, observer = run(setting)
@@ -85,7 +86,7 @@ def test_object_without_a_grasp_is_left_with_its_reason_after_stirring():
     assert [each.reason for each in status.skipped] == ["plate: it is 100 mm wide, too wide for the fingers"]
 
 
-@pytest.mark.parametrize("seed", [3, 7])
+@pytest.mark.parametrize("seed", [3, pytest.param(7, marks=pytest.mark.slow)])
 def test_task_continues_after_crashes_of_its_services(seed):
     outcome, _ = run(faults=True, seed=seed)
     assert outcome.ok and not outcome.broken and not outcome.crashes, outcome

@@ -80,6 +80,7 @@ def test_jaw_that_turns_towards_a_fixed_finger_is_measured(urdf, opens, closed):
         assert in_tool(width)[tip, 1] - shut[tip, 1] == pytest.approx(width, abs=5e-4)
 
 
+@pytest.mark.slow
 def test_wrong_values_of_a_gripper_are_reported_with_the_measured_ones():
     config = check(RobotConfig, draft(f"{ROBOTS}/z1_description/urdf/z1.urdf", "arm").values, "robot")
     jaw = config.gripper.jaw
