@@ -43,11 +43,11 @@ def decode(chunk: Chunk, observation: Observation, robot: RobotModel) -> tuple[A
     Raises:
         PolicyFailed: the shape, the rate or a width is wrong, or a TCP pose is not finite or out of reach.
     """
-    if chunk.kind not in KINDS:
+    if not isinstance(chunk.kind, str) or chunk.kind not in KINDS:
         raise PolicyFailed(f"chunk of kind {str(chunk.kind)[:40]!r}; choices: {', '.join(KINDS)}")
     if not (isinstance(chunk.rate, int | float | np.number) and 0 < chunk.rate <= MAX_RATE):
         raise PolicyFailed(f"rate of a chunk: {str(chunk.rate)[:40]} is not within 0 to {MAX_RATE:g} Hz")
-    if chunk.stamp != observation.stamp:
+    if not isinstance(chunk.stamp, int | np.integer) or chunk.stamp != observation.stamp:
         raise PolicyFailed(f"a chunk has the stamp {str(chunk.stamp)[:40]}; that of its observation is "
                            f"{observation.stamp}")
     values = _values(chunk.values, (None, columns(chunk.kind, robot.dof)), chunk.kind)

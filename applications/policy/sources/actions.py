@@ -83,7 +83,10 @@ def gripper_value(width: float, form: ActionFormat, cell: PolicyCell) -> float:
 
 def one_line(error: BaseException) -> str:
     """Return an error and its type in one line of at most 200 characters."""
-    text = " ".join(f"{type(error).__name__}: {error}".split())
+    try:
+        text = " ".join(f"{type(error).__name__}: {error}".split())
+    except Exception:  # of the error's own __str__
+        text = type(error).__name__
     return text if len(text) <= 200 else text[:197] + "..."
 
 

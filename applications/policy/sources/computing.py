@@ -47,7 +47,8 @@ class Computation:
             raise PolicyFailed(f"{self._name} still computes since {time_source.monotonic() - self._busy_since:.1f} s")
         self._busy_since = time_source.monotonic()
         loop = asyncio.get_running_loop()
-        asynchronous = inspect.iscoroutinefunction(function)
+        asynchronous = inspect.iscoroutinefunction(function) or inspect.iscoroutinefunction(
+            getattr(function, "__call__", None))  # noqa: B004 - of an object
         future: asyncio.Future[tuple[Any, Exception | None]] = (
             loop.create_task(_awaited(function, *args)) if asynchronous else
             loop.run_in_executor(self._executor, partial(_outcome, function, *args)))

@@ -103,13 +103,30 @@ def lies(seen):
     return Lies()
 
 
+class Unprintable(Exception):
+    def __str__(self):
+        raise ValueError("no text")
+
+
+def fails_without_text(seen):
+    raise Unprintable
+
+
+class Policy:
+    async def __call__(self, seen):
+        return np.tile(seen.positions, (4, 1))
+
+
+an_object = Policy()
+
+
 def made(name, timeout=5.0, **actions):
     return source(SourceConfig(callable=f"{HERE}:{name}", timeout=timeout, actions=actions), panda_cell("top"))
 
 
 @pytest.mark.parametrize("name,actions,widths", [
-    ("rows", {}, None), ("rows_async", {}, None), ("chunk", {}, 0.08), ("with_widths", {}, 0.02),
-    ("with_gripper", {}, 1.0), ("with_gripper", {"gripper_open": -1.0, "gripper_closed": 1.0}, 0.0),
+    ("rows", {}, None), ("rows_async", {}, None), ("an_object", {}, None), ("chunk", {}, 0.08),
+    ("with_widths", {}, 0.02), ("with_gripper", {}, 1.0), ("with_gripper", {"gripper_open": -1.0, "gripper_closed": 1.0}, 0.0),
     ("with_gripper", {"gripper_open": 1.0, "gripper_closed": -1.0}, 0.08)])
 async def test_function_returns_actions(name, actions, widths):
     decoded, found = decode(await made(name, **actions).infer(SEEN), SEEN, panda())
@@ -128,7 +145,7 @@ async def test_function_gets_a_copy():
     ("exits", "RuntimeError: SystemExit: 3"), ("returns_none", "not NoneType"),
     ("returns_wrong_shape", r"shape \(n, 7\) or, with the gripper, \(n, 8\), n at most 1000; they are 3x5"),
     ("returns_objects", "of numbers, not ndarray"), ("returns_ragged", "actions must be an array"),
-    ("lies", "RuntimeError: no array")])
+    ("lies", "RuntimeError: no array"), ("fails_without_text", ": Unprintable$")])
 async def test_wrong_result_is_one_line(name, text):
     with pytest.raises(PolicyFailed, match=text) as raised:
         await made(name).infer(SEEN)
