@@ -126,7 +126,8 @@ def made(name, timeout=5.0, **actions):
 
 @pytest.mark.parametrize("name,actions,widths", [
     ("rows", {}, None), ("rows_async", {}, None), ("an_object", {}, None), ("chunk", {}, 0.08),
-    ("with_widths", {}, 0.02), ("with_gripper", {}, 1.0), ("with_gripper", {"gripper_open": -1.0, "gripper_closed": 1.0}, 0.0),
+    ("with_widths", {}, 0.02), ("with_gripper", {}, 1.0),
+    ("with_gripper", {"gripper_open": -1.0, "gripper_closed": 1.0}, 0.0),
     ("with_gripper", {"gripper_open": 1.0, "gripper_closed": -1.0}, 0.08)])
 async def test_function_returns_actions(name, actions, widths):
     decoded, found = decode(await made(name, **actions).infer(SEEN), SEEN, panda())
