@@ -7,7 +7,7 @@ interlocks, motion authority, limits and the running check against the scene are
 from __future__ import annotations
 
 import asyncio
-from collections import OrderedDict
+from collections import OrderedDict, deque
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -27,8 +27,9 @@ from common.errors import Refused, RequestFailed, ZencellError
 from common.transport.bus import Bus
 
 NAME = "follow_joint_trajectory"
-FEEDBACK_PERIOD = 0.05  # [s] wall; as joint_trajectory_controller by default
+WATCH_PERIOD = 0.05  # [s] wall; feedback follows the reports of the executor, every 0.1 s of cell time
 REQUEST_TIMEOUT = 2.0  # [s] wall
+REMEMBERED_STATES = 50  # half a second of them
 REMEMBERED = 100  # goals that are over and whose result can be read
 LOST_AFTER = 3.0  # [s] wall without the executor, which survives a restart of the router
 GONE = "trajectory_executor does not answer any more"
@@ -82,6 +83,8 @@ class TrajectoryAction:
         self._execute, self._stop = bus.client(topics.MOTION_EXECUTE), bus.client(topics.MOTION_STOP)
         self._status, self._joints = bus.reader(topics.MOTION_STATUS), bus.reader(topics.JOINT_STATES)
         self._scene = bus.reader(topics.PLANNING_SCENE)
+        self._states: deque[m.JointState] = deque(maxlen=REMEMBERED_STATES)
+        self._watched: m.MotionStatus | None = None  # newest status with feedback
         self._answered = asyncio.get_running_loop().time()  # when the executor was last there
         self._goals: OrderedDict[bytes, Goal] = OrderedDict()
         self._requests = asyncio.Lock()  # goals are accepted one after the other, and not during the scene check
@@ -103,8 +106,9 @@ class TrajectoryAction:
         try:
             async with asyncio.TaskGroup() as group:
                 group.create_task(self._follow_status())
+                group.create_task(self._remember_joints())
                 while True:
-                    await asyncio.sleep(FEEDBACK_PERIOD)
+                    await asyncio.sleep(WATCH_PERIOD)
                     await self._watch()
         finally:
             for goal in self._running():
@@ -153,7 +157,7 @@ class TrajectoryAction:
         if answer.state == "rejected":
             raise Refused(answer.error, answer.message)
         goal.stamp, goal.status = answer.header.stamp or goal.stamp, EXECUTING
-        self._feedback.start(goal.uuid, trajectory)
+        self._feedback.start(goal.uuid, self._check.robot.joint_names, self._check.as_followed(trajectory))
         self._bus.log.info("%s by %s", goal.id, OWNER)
         self._publish_statuses()
         self._update(goal, answer)
@@ -229,6 +233,10 @@ class TrajectoryAction:
                     self._end(goal, ABORTED, "lost", "the end of this motion was not reported: another one is newer, "
                                                      "or trajectory_executor was restarted")
 
+    async def _remember_joints(self) -> None:
+        async for state in self._joints:
+            self._states.append(state)
+
     async def _watch(self) -> None:
         """Publish the feedback of the running goal; stop it outside its own tolerance."""
         clock = asyncio.get_running_loop().time
@@ -238,9 +246,12 @@ class TrajectoryAction:
             if clock() - self._answered > LOST_AFTER:
                 self._end(goal, ABORTED, "lost", GONE)
                 continue
-            status, state = self._status.latest, self._joints.latest
-            if status is None or state is None or status.id != goal.id:
+            status = self._status.latest
+            if status is None or status.id != goal.id or status is self._watched or not self._states:
                 continue
+            self._watched, stamp = status, status.header.stamp
+            # Where the arm was when the executor measured its progress: 10 ms later it is somewhere else.
+            state = min(self._states, key=lambda each: abs(each.header.stamp - stamp))
             off = self._feedback.publish(convert.header_of(state.header), state, status.progress, goal.tolerances.path)
             if off and not goal.error:
                 goal.error, goal.message = "path_tolerance", off

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,9 +12,9 @@ from bridges.ros2.graph import Graph
 from bridges.ros2.keys import Qos
 from bridges.ros2.trajectories import violation
 from bridges.ros2.types import FOLLOW, INDEXED, JAZZY, make
-from common.control.trajectory import Trajectory, from_message
+from common.control.trajectory import Trajectory
 from common.hardware.interface import Vector
-from common.messages import JointState, JointTrajectory
+from common.messages import JointState
 
 POINT = "trajectory_msgs/msg/JointTrajectoryPoint"
 QOS = Qos(depth=10)
@@ -29,10 +30,9 @@ class Feedback:
         self._uuid, self._names = b"", list[str]()
         self._trajectory: Trajectory | None = None
 
-    def start(self, uuid: bytes, trajectory: JointTrajectory) -> None:
-        """Give feedback of this goal from now on."""
-        self._uuid, self._names = uuid, trajectory.joint_names
-        self._trajectory = from_message(trajectory, tuple(self._names))
+    def start(self, uuid: bytes, names: Sequence[str], trajectory: Trajectory) -> None:
+        """Give feedback of this goal from now on, for joints in the order of the trajectory."""
+        self._uuid, self._names, self._trajectory = uuid, list(names), trajectory
 
     def publish(self, header: Any, state: JointState, progress: float, tolerances: dict[str, float]) -> str:
         """Publish the feedback at a share of the trajectory; return which joint is beyond its tolerance, or nothing."""
@@ -58,7 +58,7 @@ class Feedback:
         return violation(self._names, self._trajectory.positions[-1], self._ordered(state)[0], tolerances)
 
     def _ordered(self, state: JointState) -> tuple[Vector, Vector]:
-        """Return positions and velocities (dof,) in the order of the goal."""
+        """Return positions and velocities (dof,) in the order of the trajectory."""
         order = [state.name.index(name) for name in self._names]
         velocities = state.velocity or [0.0] * len(state.name)
         return np.array([state.position[i] for i in order]), np.array([velocities[i] for i in order])

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from common.config import RobotConfig
-from common.control.trajectory import Trajectory, from_message
+from common.control.trajectory import Tolerances, Trajectory, from_message, with_best_interpolation
 from common.errors import Refused
-from common.hardware.interface import Vector
+from common.hardware.interface import Limits, Vector
 from common.messages import JointTrajectory, PlanningScene
 from common.planning.collision import CollisionWorld
 from common.planning.contact_rules import PERCEIVED
@@ -33,7 +33,15 @@ class SceneCheck:
         """Load the robot, which takes a second."""
         self.robot = RobotModel.load(config)
         self._cache = ObstacleCache(RobotGeometry(self.robot))
+        robot = self.robot
+        self._limits = Limits(
+            tuple(robot.joint_names), robot.lower, robot.upper, robot.velocity, robot.acceleration)
         self._fingers = config.gripper.links if config.gripper else []
+
+    def as_followed(self, trajectory: JointTrajectory) -> Trajectory:
+        """Return a trajectory as the executor follows it, with the joints in the order of the robot."""
+        points = from_message(trajectory, self._limits.names)
+        return with_best_interpolation(points, self._limits, 1 + Tolerances().slack)
 
     def require_free(self, trajectory: JointTrajectory, scene: PlanningScene, measured: ArrayLike) -> None:
         """Return if nothing collides along the trajectory.
@@ -49,8 +57,8 @@ class SceneCheck:
         Raises:
             Refused: a collision, with the pair and the time; or the check is impossible.
         """
-        points = from_message(trajectory, tuple(self.robot.joint_names))
-        # The executor joins the points by cubics, or by quintics where the accelerations fit.
+        points = from_message(trajectory, self._limits.names)
+        # The executor joins the points by cubics, or by quintics if the accelerations fit: check both.
         times, states = zip(*(_samples(replace(points, quintic=quintic)) for quintic in (False, True)), strict=True)
         touchable = [item.id for item in scene.objects if item.role in PERCEIVED]
         try:

@@ -5,6 +5,7 @@ import logging
 from collections.abc import AsyncIterator, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AsyncExitStack
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -26,7 +27,7 @@ from tests.services.fake_cell import FakeCell
 pytest.importorskip("rosbags", reason="the extra `ros2` is not installed")
 pytest.importorskip("xxhash", reason="the extra `ros2` is not installed")
 
-from bridges.ros2 import convert, types  # noqa: E402
+from bridges.ros2 import convert, inputs, types  # noqa: E402
 from bridges.ros2.camera import Camera, Unusable  # noqa: E402
 from tests.bridges.ros_client import Ros  # noqa: E402
 
@@ -209,6 +210,14 @@ async def test_bad_configuration_is_one_line(module: ModuleType, fields: dict[st
     base = {"world": Surroundings()} if module is ros2_camera else {"robot": PANDA}
     with pytest.raises(ConfigError, match=text):
         await wiring(module.run, module.Config(**base, **fields))
+
+
+async def test_secured_cell_needs_a_router_of_the_nodes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(inputs, "secure_folder", lambda: tmp_path)
+    bus, endpoint = FakeCell().bus, "tcp/192.168.1.5:7447"
+    assert inputs.usable_endpoint(bus, ros2_joints.Config(robot=PANDA, endpoint=endpoint), "/joint_states") == endpoint
+    with pytest.raises(ConfigError, match=r"services\.tester\.endpoint: '' needs an open cell"):
+        inputs.usable_endpoint(bus, ros2_joints.Config(robot=PANDA), "/joint_states")
 
 
 async def test_missing_package_is_one_line_with_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
