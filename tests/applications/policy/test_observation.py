@@ -1,5 +1,6 @@
 """An observation has images and joint positions of one time, or there is none and the reason is stated."""
 
+import itertools
 import random
 import weakref
 
@@ -104,6 +105,22 @@ def test_the_newest_set_within_the_tolerance_is_used_although_one_camera_dropped
     seen = observe(made)
     assert seen.stamp == START + 150 * MS
     assert seen.images["top"][0, 0, 0] == 140 and seen.images["wrist"][0, 0, 0] == 150
+
+
+def test_the_set_is_the_newest_of_all_sets_within_the_tolerance():
+    rng = random.Random(2)
+    for _ in range(60):
+        stamps = {name: rng.sample(range(600, 1000), rng.randint(1, 5)) for name in ("a", "b", "c")}
+        made = filled(*stamps, until=1000, tolerance=0.04)
+        for name, all_of_one in stamps.items():
+            for ms in all_of_one:
+                made.add_image(name, image(ms, shape=(2, 2, 3)))
+        agreeing = [each for each in itertools.product(*stamps.values()) if max(each) - min(each) <= 40]
+        seen = observe(made, 1000)
+        if agreeing:
+            assert seen.stamp == START + max(map(max, agreeing)) * MS
+        else:
+            assert isinstance(seen, Missing) and "no images of all cameras within 0.04 s" in seen.message
 
 
 def test_image_ahead_of_the_joint_states_waits_for_them():
