@@ -34,6 +34,10 @@ class Arm:
     payload: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
     registers: dict[str, list[float]] = field(default_factory=lambda: {
         f"{way}_{kind}_register": [0] * 48 for way in ("input", "output") for kind in ("int", "double")})
+    inputs: int = 0  # digital, one bit each
+    digital_outputs: int = 0
+    analog_inputs: list[float] = field(default_factory=lambda: [0.0, 0.0])  # [V]
+    analog_outputs: list[float] = field(default_factory=lambda: [0.0, 0.0])
     stops: int = 0  # protective ones
     commands: int = 0  # steps with a servoj command
     packets: int = 0  # from the client that sends commands
@@ -121,6 +125,16 @@ class Arm:
         self.end_program()
         sys.stderr.write(f"protective stop: {reason}\n")
 
+    def set_outputs(self, values: dict[str, float]) -> None:
+        """Set the digital and analog outputs that the masks of a packet select."""
+        for bank, first in (("standard", 0), ("configurable", 8), ("tool", 16)):
+            mask = int(values.get(f"{bank}_digital_output_mask", 0)) << first
+            bits = int(values.get(f"{bank}_digital_output", 0)) << first
+            self.digital_outputs = self.digital_outputs & ~mask | bits & mask
+        for number in (0, 1):
+            if int(values.get("standard_analog_output_mask", 0)) >> number & 1:
+                self.analog_outputs[number] = 10.0 * values[f"standard_analog_output_{number}"]  # [V]
+
     def outputs(self) -> dict[str, object]:
         """Return the outputs that are not 0, except registers."""
         powered = self.mode in (IDLE, RUNNING)
@@ -132,6 +146,9 @@ class Arm:
             "safety_status_bits": {PROTECTIVE_STOP: 4, EMERGENCY_STOP: 0xC0}.get(self.safety, 1),
             "speed_scaling": self.slider, "target_speed_fraction": self.slider, "payload": self.payload[0],
             "payload_cog": self.payload[1:], "joint_mode": (253 if self.mode == RUNNING else 239,) * 6,
+            "actual_digital_input_bits": self.inputs, "actual_digital_output_bits": self.digital_outputs,
+            "standard_analog_input0": self.analog_inputs[0], "standard_analog_input1": self.analog_inputs[1],
+            "standard_analog_output0": self.analog_outputs[0], "standard_analog_output1": self.analog_outputs[1],
             "actual_main_voltage": 48.0, "actual_robot_voltage": 48.0,
         }
 

@@ -213,6 +213,7 @@ class Controller:
                 self.arm.registers[head][int(number)] = value
             elif name == "speed_slider_fraction":
                 self.arm.slider = value
+        self.arm.set_outputs(dict(zip(names, values, strict=True)))
 
     async def _dashboard(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         writer.write(b"Connected: Universal Robots Dashboard Server\n")
@@ -248,6 +249,10 @@ class Controller:
                 case ["forget"]:
                     arm.targets.clear()
                     arm.arrivals.clear()
+                case ["input", bit, level]:
+                    self.arm.inputs = self.arm.inputs & ~(1 << int(bit)) | int(level) << int(bit)
+                case ["analog", number, volts]:
+                    self.arm.analog_inputs[int(number)] = float(volts)
                 case ["slider", share]:
                     arm.slider = float(share)
                 case ["pull", seconds]:

@@ -101,7 +101,7 @@ async def test_refused_output_is_no_loss() -> None:
     ({"input": "a"}, {"host": "h"}, "io.signals.s.input: 'a' must be an address from 0 to 65535"),
     ({"input": 1}, {}, "io.options.host: is missing"),
     ({"input": 1}, {"host": "h", "raw": [5, 5]}, "io.options.raw: [5, 5] must be two different numbers"),
-    ({"input": 1}, {"host": "h", "hots": "h"}, "io.options.hots: 'h' is not a parameter; choices: device, host, port, raw"),
+    ({"input": 1}, {"host": "h", "hots": "h"}, "io.options.hots: 'h' is not a parameter; choices: device, host"),
 ])
 def test_bad_channels_and_options(signal: dict[str, Any], options: dict[str, Any], words: str) -> None:
     section = check(Io, {"backend": "modbus", "signals": {"s": signal}, "options": options}, "io")
