@@ -89,7 +89,7 @@ class UrIo:
             return bool(bits >> (BANKS[bank][0] + number) & 1)
         read = getattr(receive, f"getStandardAnalog{'Output' if out else 'Input'}{signal.channel}")
         low, high = SPANS[self._options.outputs if out else self._options.inputs]
-        share = min(max((read() - low) / (high - low), 0.0), 1.0)
+        share = min(max((float(read()) - low) / (high - low), 0.0), 1.0)
         return signal.range[0] + share * (signal.range[1] - signal.range[0])
 
     async def write(self, name: str, value: Value) -> None:
