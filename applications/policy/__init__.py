@@ -2,4 +2,6 @@
 
 from common.application import Application
 
-APPLICATION = Application(topics="applications.policy.topics:TOPICS", task="policy_runner", grasps=True)
+APPLICATION = Application(
+    topics="applications.policy.topics:TOPICS", task="policy_runner", grasps=True,
+    figures="applications.policy.figures:PolicyFigures", page="applications.policy.page:PAGE")

@@ -124,7 +124,8 @@ class ChunkLoop:
             await self._clock.sleep(POLL)
             return
         times = join.rows[join.ahead]
-        motion = await asyncio.to_thread(self._prove, join.state, ahead, times, view.scene, view.gripper)
+        width = self._width(view.gripper, widths)
+        motion = await asyncio.to_thread(self._prove, join.state, ahead, times, view.scene, width)
         proving = monotonic() - began
         status.proof_ms = 1e3 * proving
         self._proving += USUAL_SHARE * (proving - self._proving)
@@ -147,10 +148,17 @@ class ChunkLoop:
         self._newest = found.stamp
         return found
 
+    def _width(self, gripper: GripperState | None, widths: Array | None) -> float:
+        """Return the largest width that the fingers may have during the motion [m]."""
+        if gripper is None or gripper.moving:
+            return self._widest
+        wider = widths is not None and bool((widths > gripper.width + FINGERS).any())
+        opens = wider or self._task.grip.opens(gripper.width + FINGERS)
+        return self._widest if opens else min(gripper.width + FINGERS, self._widest)
+
     def _prove(
-        self, state: MotionState, rows: Array, times: Array, scene: PlanningScene, gripper: GripperState | None
+        self, state: MotionState, rows: Array, times: Array, scene: PlanningScene, width: float
     ) -> ProvedMotion:
-        width = self._widest if gripper is None or gripper.moving else min(gripper.width + FINGERS, self._widest)
         known = self._proved_in
         if known is None or known[0] is not scene or abs(known[1] - width) > FINGERS:
             self._prover.set_scene(scene, state.positions, width=width or None)
