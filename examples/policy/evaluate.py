@@ -133,6 +133,14 @@ def summary(results: list[dict]) -> dict:
             "layouts_with_broken_limits": sum(each["limits_broken"] > 0 for each in results), "causes": dict(causes)}
 
 
+def write_figures(network: str, what: str, figures: dict) -> None:
+    """Write figures to the card of a network."""
+    path = Path(network).with_suffix(".json")
+    card = json.loads(path.read_text(encoding="utf-8"))
+    card["training"].setdefault("evaluation", {})[what] = figures
+    path.write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
+
+
 def main() -> None:
     """Evaluate, and print the failures and the figures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -150,11 +158,8 @@ def main() -> None:
     figures = summary(results)
     print(json.dumps(figures))
     if given.card:
-        path = Path(given.policy).with_suffix(".json")
-        card = json.loads(path.read_text(encoding="utf-8"))
-        what = f"layouts {given.first} to {given.first + given.layouts - 1}, proof {given.proof}"
-        card["training"].setdefault("evaluation", {})[what] = figures
-        path.write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
+        last = given.first + given.layouts - 1
+        write_figures(given.policy, f"layouts {given.first} to {last}, proof {given.proof}", figures)
 
 
 if __name__ == "__main__":

@@ -63,11 +63,11 @@ class SimulatedPick:
         contacts: number of cycles in which the arm touches itself or a fixture.
     """
 
-    def __init__(self, seed: int, q: np.ndarray | None = None) -> None:
-        """Lay out the ball by a seed, with the arm at rest at q (dof,) [rad], by default at home."""
+    def __init__(self, seed: int, *, size: tuple[int, int] = (SIZE, SIZE)) -> None:
+        """Lay out the ball by a seed, with the arm at rest at home; images have a `size` (width, height) [px]."""
         config, self.robot = cell(), pipeline().robot
-        robot = self.robot
-        start = robot.named("home") if q is None else np.asarray(q, float)
+        robot, self._size = self.robot, size
+        start = robot.named("home")
         limits = Limits(tuple(robot.joint_names), robot.lower, robot.upper, robot.velocity, robot.acceleration, None,
                         robot.jerk)
         bounds = configured_bounds({})
@@ -85,7 +85,7 @@ class SimulatedPick:
         self._check = pipeline().world(
             PlanRequest.model_validate({"id": "check", "goal": {"kind": "joints", "named": "home"}}), scene(), start)
         self._next_image, self._view = 0.0, None
-        self._image = np.zeros((SIZE, SIZE, 3), np.uint8)
+        self._image = np.zeros((*size[::-1], 3), np.uint8)
         self.step(start)
 
     @property
@@ -162,9 +162,5 @@ class SimulatedPick:
             self._next_image = self.now + CAMERA_PERIOD
             view = self._renderer.render(self._world.objects(Header()).objects)
             if view is not self._view:  # an unchanged scene has the same view
-                self._view, self._image = view, picture(view.colour)
-
-
-def picture(image: np.ndarray) -> np.ndarray:
-    """Return a BGR image as RGB of `SIZE` x `SIZE`, the complete view."""
-    return cv2.resize(image, (SIZE, SIZE), interpolation=cv2.INTER_AREA)[..., ::-1].copy()
+                self._view = view
+                self._image = cv2.resize(view.colour, self._size, interpolation=cv2.INTER_AREA)[..., ::-1].copy()
