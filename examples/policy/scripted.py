@@ -16,7 +16,7 @@ from common.perception.pinhole import Pinhole
 from common.robot.model import RobotModel
 from common.robot.transforms import matrix_to_quaternion, tool_down
 
-CELL = "panda"  # its robot and its camera are those of policy_panda
+CELL = "policy_panda"
 RATE, ROWS = 20.0, 20  # [Hz], one second
 SPEED, ACCELERATION = 0.20, 0.40  # [m/s], [m/s^2] of the tool center point
 DESCENT = 0.12  # [m/s] next to the ball

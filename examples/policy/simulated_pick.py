@@ -25,14 +25,13 @@ CYCLE = 0.01  # [s] between set-points, as of the executor
 CAMERA_PERIOD = 0.1  # [s]
 SIZE = 96  # [px] of the images
 LIFTED = 0.10  # [m] that count as a success
-CELL = ("panda", ["world.layout=random", "world.count=1"])
+CELL = "policy_panda"
 
 
 @cache
 def cell() -> Cell:
     """Return the resolved cell."""
-    name, overrides = CELL
-    return load_cell(name, overrides)
+    return load_cell(CELL)
 
 
 @cache
