@@ -158,7 +158,8 @@ class TrajectoryAction:
             raise Refused(answer.error, answer.message)
         goal.stamp, goal.status = answer.header.stamp or goal.stamp, EXECUTING
         self._feedback.start(goal.uuid, self._check.robot.joint_names, self._check.as_followed(trajectory))
-        self._bus.log.info("%s by %s", goal.id, OWNER)
+        self._bus.log.info("goal %s of a client of ROS 2 is followed, for %.1f s", goal.id,
+                           trajectory.points[-1].time_from_start)
         self._publish_statuses()
         self._update(goal, answer)
 

@@ -66,9 +66,16 @@ class Ros:
     async def call(self, name: str, type_name: str, request: Any) -> Any:
         """Return the response of a service."""
         sent = keys.Attachment(17, STAMP, bytes(range(16)))
-        replies = await asyncio.to_thread(lambda: list(self.session.get(
-            self.key(name, type_name), payload=types.encode(request), attachment=sent.encoded(), timeout=TIMEOUT,
-            target=zenoh.QueryTarget.ALL_COMPLETE, consolidation=zenoh.ConsolidationMode.NONE)))
+
+        def query() -> list[zenoh.Reply]:
+            return list(self.session.get(
+                self.key(name, type_name), payload=types.encode(request), attachment=sent.encoded(), timeout=TIMEOUT,
+                target=zenoh.QueryTarget.ALL_COMPLETE, consolidation=zenoh.ConsolidationMode.NONE))
+
+        replies = list[zenoh.Reply]()
+        async with asyncio.timeout(TIMEOUT):
+            while not replies:  # the service is not known to this session yet
+                replies = await asyncio.to_thread(query)
         (reply,) = replies
         assert reply.ok is not None, reply.err
         received = keys.Attachment.decoded(reply.ok.attachment.to_bytes())
