@@ -2,7 +2,7 @@
 
     python -m benchmarks.policy_physics [--sequences N] [--first N] [--seconds S] [--solids N]
 
-Each sequence is the cell `policy_panda` on the virtual clock, `world.simulator: mujoco`, with solids around the arm, and
+Each sequence is the cell `policy_panda` on the virtual clock, `world.simulator: mujoco`, with solids around the arm and
 a policy whose chunks are hostile in all ways of tests/applications/policy/hostile.py. After each step of 2 ms MuJoCo's
 contacts between a link and anything else are counted; MuJoCo finds no contact of links with each other. Invariants of
 the simulated cell, such as limits of set-points, hold too. Ends with 1 if anything touched or broke.
