@@ -117,8 +117,12 @@ class ChunkProver:
 
         Raises:
             RuntimeError: no scene was set.
+            ValueError: the state is not one of this arm.
         """
         _ = self._space.world
+        for values in (state.positions, state.velocities, state.accelerations):
+            if values.shape != (self._robot.dof,) or not np.isfinite(values).all():
+                raise ValueError(f"the state of the set-points has {values} for {self._robot.dof} joints")
         checked = self._checked(rows, times)
         if isinstance(checked, Violation):
             return self._stopped(state, checked)
@@ -136,10 +140,13 @@ class ChunkProver:
         """Return rows and times as arrays, or what is wrong with them."""
         dof = self._robot.dof
         try:
-            with np.errstate(all="ignore"):
-                q, t = np.array(rows, dtype=float), np.array(times, dtype=float)
-        except (TypeError, ValueError, OverflowError):
-            return Violation("shape", "rows", 0.0, "the chunk is no array of numbers")
+            given = np.asarray(rows), np.asarray(times)
+        except ValueError:  # rows of different lengths
+            given = (np.empty(0, dtype=object),) * 2
+        if any(values.dtype.kind not in "fiu" for values in given):
+            return Violation("shape", "rows", 0.0, "the chunk is no array of real numbers")
+        with np.errstate(all="ignore"):
+            q, t = (values.astype(float) for values in given)
         if q.ndim != 2 or q.shape[1] != dof or not 1 <= len(q) <= MAX_ROWS or t.shape != (len(q),):
             message = f"the chunk has shape {q.shape} with {t.shape} times, not (1 to {MAX_ROWS}, {dof})"
             return Violation("shape", "rows", 0.0, message)

@@ -193,7 +193,7 @@ def first_excess(
     jerk = 6 * np.abs(c3) / h**3 / limits.jerks
     outside = _outside(pieces, lower, upper)
     most = 1 + ROUNDING
-    bad = outside | (speed > most) | (strength > most) | (jerk > most)
+    bad = outside | ~((speed <= most) & (strength <= most) & (jerk <= most))  # also where one is NaN
     if not bad.any():
         return None
     piece, joint = (int(i) for i in np.argwhere(bad)[0])

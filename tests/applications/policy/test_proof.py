@@ -93,9 +93,10 @@ def test_executor_follows_a_proved_motion_at_its_full_speed() -> None:
 
 
 @pytest.mark.parametrize(("rows", "times", "cause", "message"), [
-    (None, TIMES, "shape", r"has shape \(\)"),
-    ("left", TIMES, "shape", "no array of numbers"),
-    ([[1.0], [1.0, 2.0]], TIMES, "shape", "no array of numbers"),
+    (None, TIMES, "shape", "no array of real numbers"),
+    (np.zeros((30, 7), dtype=complex), TIMES, "shape", "no array of real numbers"),
+    ("left", TIMES, "shape", "no array of real numbers"),
+    ([[1.0], [1.0, 2.0]], TIMES, "shape", "no array of real numbers"),
     (np.zeros((30, 6)), TIMES, "shape", r"has shape \(30, 6\)"),
     (np.zeros((30, 7)), TIMES[:29], "shape", r"\(29,\) times"),
     (np.zeros((0, 7)), np.zeros(0), "shape", r"has shape \(0, 7\)"),
@@ -107,7 +108,7 @@ def test_executor_follows_a_proved_motion_at_its_full_speed() -> None:
     (np.full((30, 7), np.nan), TIMES, "not_finite", "row 0: panda_joint1 is nan"),
     (np.full((30, 7), -np.inf), TIMES, "not_finite", "row 0: panda_joint1 is -inf"),
     (np.full((30, 7), 1e300), TIMES, "position", "panda_joint1 at 1e\\+300 rad"),
-    (np.full((30, 7), 10**400), TIMES, "shape", "no array of numbers"),
+    (np.full((30, 7), 10**400), TIMES, "shape", "no array of real numbers"),
     (READY + 0.5 * np.ones((30, 7)), TIMES, "jump", "0.500 rad away from panda_joint"),
 ])
 def test_chunk_of_which_nothing_is_executed_is_answered_with_a_stop(rows, times, cause, message) -> None:
