@@ -15,7 +15,7 @@ import viser
 
 from common import topics
 from common.application import Application
-from common.config import Members, RobotConfig
+from common.config import Io, Members, RobotConfig
 from common.messages import TaskStatus
 from common.topics import Topic
 from page.access import CURRENT_SESSION
@@ -27,6 +27,7 @@ from page.diagnostics import SECONDS, Limits, PlotPanel
 from page.feeds import ANNOTATED, DEPTH, LIVE, MASK, Feeds, Schedule, Topics, Updater
 from page.hand_eye import HandEyePanel
 from page.history import Timeline
+from page.io_panel import IoPanel
 from page.layers import Layers, shown_layers
 from page.layout import Layout, LayoutSaver, ViewPanel
 from page.markup import BAD
@@ -34,7 +35,7 @@ from page.move_panel import Motions, MovePanel
 from page.panels import Panels
 from page.recorded_history import HistoryRecorder, RecordedHistory, recordings_in
 from page.situation import situation, summarize
-from page.status_text import TaskText, gripper_text
+from page.status_text import TaskText, arm_blocked, gripper_text
 from page.subscriptions import Subscriptions
 from page.time_panel import TimePanel
 from page.viewpoint import keep_framed, prepare_scene
@@ -61,7 +62,7 @@ class Page:
     def __init__(
         self, server: viser.ViserServer, feeds: Feeds, console: Console, motions: Motions, members: Members,
         application: Application | None, layers: Layers, control: ControlSocket, *, cell: str, layout: Layout,
-        layout_file: str, robot: RobotConfig, recordings: Path, schedule: Schedule,
+        layout_file: str, robot: RobotConfig, recordings: Path, schedule: Schedule, io: Io,
     ) -> None:
         """Build the page; on the running loop.
 
@@ -80,6 +81,7 @@ class Page:
             robot: of the cell.
             recordings: folder of recordings that can be opened.
             schedule: update periods.
+            io: inputs and outputs of the cell.
 
         Raises:
             UnknownName: the layout names a layer that does not exist.
@@ -95,6 +97,8 @@ class Page:
         self._scene: Scene | None = None
         self._plots: PlotPanel | None = None
         self._move: MovePanel | None = None
+        self._signals = io
+        self._io: IoPanel | None = None
         self.pages = 0
         self.visited = asyncio.Event()
         prepare_scene(server, layout, cell)
@@ -170,6 +174,9 @@ class Page:
                 gui, self.console, self._motions, scene, robot, planners, cell=self._cell,
                 planner=self._layout.planner, marker=self._layout.goal_marker, notify=self._panels.task.notify)
             self._control.hold_handler = self._move.jogger
+            if self._signals.signals:
+                with gui.add_folder("Inputs and outputs"):
+                    self._io = IoPanel(gui, self.console, self._signals)
         for name, on in self._shown.items():
             scene.set_shown(name, on)
         if self._editing:
@@ -235,6 +242,8 @@ class Page:
                                len(self._subscriptions.rejected.positions))
         if self._move is not None:
             self._move.show(self._status, now)
+        if self._io is not None:
+            self._io.show(arm_blocked(self._status, latest(topics.MOTION_STATUS)))
         self._panels.controller.show(latest(topics.ROBOT_STATUS))
         self._panels.alarm_panel.show()
         self._panels.log.show()

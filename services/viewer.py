@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING
 import viser
 from pydantic import Field
 
+from common import topics
 from common.application import find_application
 from common.client.operator_motion import OperatorMotion
-from common.config import Members, Parameters, RobotConfig, Run, Surroundings
+from common.config import Io, Members, Parameters, RobotConfig, Run, Surroundings
 from common.process.service import main
 from common.transport.bus import Bus
 from common.transport.credentials import secure_folder
@@ -41,6 +42,7 @@ class Config(Parameters):
     world: Surroundings
     run: Run
     members: Members
+    io: Io = Io()
     host: str = Field(
         "127.0.0.1", min_length=1, description="listening address; any other than this, and secured cells, need a token"
     )
@@ -98,9 +100,10 @@ async def run(bus: Bus, config: Config) -> None:
     application = find_application(config.members.application) if config.members.application else None
     layers = find_layers(application, config.layers, config.members.keys)
     read = Topics(application, layers.values(), config.members.keys)
-    feeds = Feeds(bus, read.always, read.on_demand)
+    has_io = bool(config.io.signals)
+    feeds = Feeds(bus, [*read.always, *([topics.IO_STATE] if has_io else [])], read.on_demand)
     permissions = Permissions(lambda line: bus.log.info("%s", line))
-    console = Console(bus, config.members, feeds, read.requests, permissions)
+    console = Console(bus, config.members, feeds, [*read.requests, *([topics.IO_SET] if has_io else [])], permissions)
     control = ControlSocket(console)
     status = feeds.reader(read.status) if read.status is not None else None
     motions = OperatorMotion(bus, [status] if status is not None else [], owner=lambda: permissions.client_name)
@@ -116,6 +119,7 @@ async def run(bus: Bus, config: Config) -> None:
             server, feeds, console, motions, config.members, application, layers, control, cell=config.run.cell,
             layout=layout, layout_file=config.layout, robot=config.robot,
             recordings=recordings_folder(config.recordings), schedule=Schedule(images=1 / config.picture_rate),
+            io=config.io,
         )
         await bus.ready()
         host = "127.0.0.1" if config.published else config.host

@@ -21,7 +21,7 @@ from common import messages as m
 from common import topics
 from common.application import find_application
 from common.client.operator_motion import OperatorMotion
-from common.config import Members
+from common.config import Io, Members
 from common.topics import Topic
 from common.transport.codec import decode, encode
 from common.transport.local import LocalNetwork
@@ -180,7 +180,7 @@ async def test_no_message_closes_pages(
     serve(tester)
     page = Page(server, feeds, console, OperatorMotion(bus, []), members, application, kinds, control, cell=cell,
                 layout=Layout(edit_world=True, layers=dict.fromkeys(kinds, True)), layout_file="",
-                robot=cell_of(cell).robot, recordings=tmp_path, schedule=Schedule())
+                robot=cell_of(cell).robot, recordings=tmp_path, schedule=Schedule(), io=Io())
     rough = {"visual_pieces": lambda _robot: rough_of(cell), "coarse": lambda pieces, _share: pieces}
     with patch.multiple("page.scene", **rough):
         scene = Scene(server, robot, around_of(cell), kinds, console, page.timeline.latest, shown=page.shown)
