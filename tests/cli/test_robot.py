@@ -304,15 +304,15 @@ def test_collision_pairs_are_written_or_shown_and_depend_on_the_seed(tmp_path):
     assert (tmp_path / "mine.srdf").is_file()
 
 
-def clear_table(cell: Path, seed: int | None = None) -> None:
-    outcome = Simulation(load_cell(str(cell), seed=seed), 1).run()
-    assert (outcome.state, outcome.done, outcome.total) == ("DONE", 7, 7), outcome.message
+def clear_table(cell: Path, count: int, seed: int | None = None) -> None:
+    outcome = Simulation(load_cell(str(cell), [f"world.count={count}"], seed=seed), 1).run()
+    assert (outcome.state, outcome.done, outcome.total) == ("DONE", count, count), outcome.message
     assert (outcome.broken, outcome.crashes) == ([], [])
 
 
 @pytest.mark.campaign  # that of the docs does it among the slow tests
 def test_new_arm_clears_its_table(folder):
-    clear_table(folder / "side_cell.yaml")
+    clear_table(folder / "side_cell.yaml", 7)
 
 
 @pytest.mark.parametrize(("size", "below", "camera"), [
@@ -334,16 +334,17 @@ def test_table_container_and_camera_suit_the_size_of_the_arm(size, below, camera
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("count", [2, pytest.param(7, marks=pytest.mark.campaign)])
 @pytest.mark.parametrize("arm", [
     scara, lambda: six(0.08), lambda: six(1.0), pytest.param(nodding, marks=pytest.mark.campaign),
     "package://example-robot-data/robots/z1_description/urdf/z1.urdf"])
-def test_arm_of_any_size_of_four_joints_or_with_one_jaw_clears_its_table(arm, tmp_path):
+def test_arm_of_any_size_of_four_joints_or_with_one_jaw_clears_its_table(arm, count, tmp_path):
     if not isinstance(arm, str):
         (tmp_path / "arm.urdf").write_text(arm())
     done = ask(tmp_path, "robot", "new", arm if isinstance(arm, str) else "arm.urdf", "--yes", "--name", "few",
                "--cell", "few_cell.yaml")
     assert done.returncode == 0, done.stderr
-    clear_table(tmp_path / "few_cell.yaml", seed=1)
+    clear_table(tmp_path / "few_cell.yaml", count, seed=1)
 
 
 @pytest.mark.slow
