@@ -132,7 +132,7 @@ class RunningCell:
         Args:
             folder: existing folder for the files.
             verb: run or up.
-            cell: name of the cell.
+            cell: name of the cell, or of its file in the folder.
             arguments: further options except domain and summary; no page without `--viewer-port`.
             secrets: environment variables that must not appear on a command line.
             output: file descriptor for stdout and stderr instead of the log; a terminal becomes the controlling one.
@@ -140,7 +140,7 @@ class RunningCell:
         end_in_order()
         if "--viewer-port" not in arguments:
             arguments = (*arguments, "--no-viewer")
-        self.folder, self.name = folder, cell
+        self.folder, self.name = folder, Path(cell).stem
         self.domain = free_domain()
         self.endpoint = endpoint_of(self.domain)
         command = command_line(verb, cell, *arguments, "--domain", str(self.domain), "--summary", str(folder / SUMMARY))

@@ -7,7 +7,7 @@ import pytest
 
 from common import topics
 from common.messages import Image, JointState, MotionStatus
-from tests.cells.test_watchdogs import halfway, restarted
+from tests.cells.test_watchdogs import restarted
 from tests.harness import ROOT, RunningCell, until
 
 pytestmark = [pytest.mark.cell, pytest.mark.slow]
@@ -20,6 +20,10 @@ _time, _time_ns, _step = time.time, time.time_ns, Path({file!r})
 time.time = lambda: _time() + float(_step.read_text())
 time.time_ns = lambda: _time_ns() + int(1e9 * float(_step.read_text()))
 """
+
+
+def halfway(status: MotionStatus) -> bool:
+    return status.state == "active" and status.progress > 0.2
 
 
 @pytest.mark.parametrize("step", [pytest.param(3600.0, marks=pytest.mark.campaign), -600.0])

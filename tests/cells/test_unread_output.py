@@ -7,8 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from applications.pick_place.topics import PICK_PLACE_STATUS
 from common import topics
-from tests.cells.test_watchdogs import halfway, restarted
+from tests.cells.test_watchdogs import restarted
+from tests.cli.conftest import make_folder
 from tests.harness import RunningCell, until
 
 pytestmark = [pytest.mark.cell, pytest.mark.slow]
@@ -37,15 +39,16 @@ async def test_cell_with_unread_output_works_and_can_be_stopped(
     read, write = full_pipe()
     if kind == "dead":
         os.close(read)
-    with RunningCell(tmp_path, "up", "panda", "--set", "world.count=2", *options, output=write) as cell:
+    with RunningCell(make_folder(tmp_path), "up", "tiny.yaml", *options, output=write) as cell:
         os.close(write)
         async with cell.listen() as bus:
-            supervisor, motion = bus.reader(topics.SUPERVISOR_STATUS), bus.reader(topics.MOTION_STATUS)
-            await until(motion, halfway, 120)
-            # The supervisor logs the end of the service and restarts it.
-            cell.processes()["vision_detector"].send_signal(signal.SIGKILL)
-            await until(supervisor, lambda status: restarted("vision_detector", status), 60)
-            await until(motion, halfway, 60)
+            supervisor, status = bus.reader(topics.SUPERVISOR_STATUS), bus.reader(PICK_PLACE_STATUS)
+            await until(supervisor, lambda status: all(one.state == "ready" for one in status.services))
+            # The supervisor logs the end of the service, which is the task, and restarts it.
+            first = await until(status, lambda one: one.started)
+            cell.processes()["last"].send_signal(signal.SIGKILL)
+            await until(supervisor, lambda status: restarted("last", status), 60)
+            await until(status, lambda one: one.header.stamp > first.header.stamp)
         cell.process.send_signal(signal.SIGINT)
         assert await cell.ended(20) == 0
         assert not cell.processes()
