@@ -95,7 +95,7 @@ async def run(bus: Bus, config: Config, helpers: Sequence[PlanningWorker] = ()) 
     _add_workers(pool, helpers, config)
     pool.add(partial(plan_in_thread, pipeline))
     if cameras is not None:
-        await asyncio.to_thread(cameras.load, pipeline)
+        await asyncio.to_thread(cameras.load, pipeline.robot, pipeline.geometry)
     if watchdog is not None:
         await watchdog.load(config.robot, config.motion.object_padding)
     await bus.ready()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -16,6 +17,8 @@ from common import messages as m
 from common import topics
 from common.errors import Refused
 from common.hardware.interface import Limits
+from common.planning.robot_geometry import RobotGeometry
+from common.process.obstacles import ObstacleReader
 from common.process.service import main
 from common.process.task_runner import TaskRunner
 from common.robot.model import RobotModel
@@ -84,8 +87,14 @@ async def run(bus: Bus, config: Config) -> None:
 
     watchdog = LivenessWatchdog(lambda: joints.received, lambda: config.joint_states_timeout)
     runner = PolicyRunner(bus, task, observe, out, lambda: config.planning_time, watchdog)
-    chunks = ChunkLoop(config, limits, task, await asyncio.to_thread(source, config.source, config.cell()), bus.clock,
-                       observe, runner.wake)
+    cameras = None if config.points is None else ObstacleReader(bus, config.points)
+    actions = await asyncio.to_thread(source, config.source, config.cell())
+    points = None
+    if cameras is not None:
+        seen_by = RobotModel.load(config.robot)
+        cameras.load(seen_by, RobotGeometry(seen_by))
+        points = partial(cameras.snapshot, stage="chunk")
+    chunks = ChunkLoop(config, limits, task, actions, bus.clock, observe, runner.wake, points)
     await bus.ready()
 
     async def watch(camera: str, reader: Reader[m.Image]) -> None:
@@ -107,6 +116,8 @@ async def run(bus: Bus, config: Config) -> None:
         group.create_task(watch_joints())
         group.create_task(watch_gripper())
         group.create_task(chunks.run())
+        if cameras is not None:
+            group.create_task(cameras.follow())
         group.create_task(runner.run((scenes, motion)))
 
 

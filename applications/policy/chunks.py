@@ -17,6 +17,7 @@ from applications.policy.proof_space import ProverUnavailable
 from applications.policy.runner import PolicyTask
 from applications.policy.settings import Config
 from common.clock import Clock
+from common.errors import Refused
 from common.hardware.interface import Limits
 from common.messages import GripperState, PlanningScene
 from common.planning.obstacles import InvalidShape
@@ -26,7 +27,7 @@ from common.tasks.stages import View
 from common.time_source import monotonic
 
 Array = NDArray[np.float64]
-Points = Callable[[PlanningScene, str], Callable[[], list[PointObstacle]]]
+Points = Callable[[], list[PointObstacle]]
 
 POLL = 0.01  # [s, cell time] between looks at what is known
 BACKOFF, LONGEST_BACKOFF = 0.1, 1.0  # [s, wall time] after a failure; doubled with each further one
@@ -41,7 +42,7 @@ class ChunkLoop:
 
     def __init__(
         self, config: Config, limits: Limits, task: PolicyTask, source: PolicySource, clock: Clock,
-        observe: Callable[[], View], wake: Callable[[], None], points: Points | None = None,
+        observe: Callable[[], View], wake: Callable[[], None], points: Callable[[PlanningScene], Points] | None = None,
     ) -> None:
         """Load the models of the robot: for decoding and for the proof, each for one thread at a time.
 
@@ -53,7 +54,7 @@ class ChunkLoop:
             clock: of the cell.
             observe: returns what is known now.
             wake: called after each motion.
-            points: returns a function for a thread that computes point obstacles; None: there are none.
+            points: returns a function for a thread that computes what cameras see beyond the scene; None: nothing.
         """
         self._p, self._task, self._source, self._clock = config, task, source, clock
         self._observe, self._wake, self._points = observe, wake, points
@@ -76,7 +77,7 @@ class ChunkLoop:
             while True:
                 try:
                     await self._next()
-                except (PolicyFailed, ProverUnavailable, InvalidShape) as error:
+                except (PolicyFailed, ProverUnavailable, InvalidShape, Refused) as error:
                     await self._fail(str(error))
         finally:
             await self._source.close()
@@ -125,7 +126,8 @@ class ChunkLoop:
             return
         times = join.rows[join.ahead]
         width = self._width(view.gripper, widths)
-        motion = await asyncio.to_thread(self._prove, join.state, ahead, times, view.scene, width)
+        points = None if self._points is None else self._points(view.scene)
+        motion = await asyncio.to_thread(self._prove, join.state, ahead, times, view.scene, width, points)
         proving = monotonic() - began
         status.proof_ms = 1e3 * proving
         self._proving += USUAL_SHARE * (proving - self._proving)
@@ -157,10 +159,10 @@ class ChunkLoop:
         return self._widest if opens else min(gripper.width + FINGERS, self._widest)
 
     def _prove(
-        self, state: MotionState, rows: Array, times: Array, scene: PlanningScene, width: float
+        self, state: MotionState, rows: Array, times: Array, scene: PlanningScene, width: float, points: Points | None
     ) -> ProvedMotion:
         known = self._proved_in
-        if known is None or known[0] is not scene or abs(known[1] - width) > FINGERS:
-            self._prover.set_scene(scene, state.positions, width=width or None)
+        if known is None or known[0] is not scene or abs(known[1] - width) > FINGERS or points is not None:
+            self._prover.set_scene(scene, state.positions, () if points is None else points(), width or None)
             self._proved_in = scene, width
         return self._prover.prove(state, rows, times)

@@ -11,6 +11,7 @@ from applications.policy.sources.settings import PolicyCell, SourceConfig
 from common.config import Parameters, Tunable
 from common.config.basics import Number
 from common.messages import Box, Pose, Vector3
+from common.planning.camera_obstacles import PointsOptions
 from common.tasks.decisions import TaskConfig
 
 Corner = tuple[Number, Number, Number]
@@ -69,6 +70,7 @@ class Config(TaskConfig):
                                "refuse: nothing, and the operator gets control")
     region: Region | None = Field(None, description="box that the tool center point stays in; by default none")
     clearance: float = Field(0.005, ge=0, le=0.2, description="distance of the arm from everything else [m]")
+    points: PointsOptions | None = Field(None, description="cameras whose points are obstacles, as of motion_planner")
     acceleration: float = Field(
         0.95, gt=0, le=0.95, description="share of the acceleration limits for following a chunk; stops may use all")
     until: Until = Field(Until(), description="when the episode is done")

@@ -12,9 +12,10 @@ from common.config import RobotConfig
 from common.errors import Refused, RemoteError, RequestFailed
 from common.messages import CameraInfo, FollowedRequest, HoldRequest, Image, MotionStatus, PlanningScene, PointCloud2
 from common.planning.camera_obstacles import Camera, CameraMessages, CameraObstacles, JointHistory, PointsOptions
-from common.planning.pipeline import PlanningPipeline
 from common.planning.point_obstacles import PointObstacle
+from common.planning.robot_geometry import RobotGeometry
 from common.planning.scene_monitor import NotMonitored, SceneMonitor
+from common.robot.model import RobotModel
 from common.transport.bus import Bus
 from common.transport.reader import Reader
 
@@ -30,10 +31,10 @@ class ObstacleReader:
         self._readers = [_readers(bus, camera) for camera in options.cameras]
         self._poses, self._states = bus.reader(topics.TF_STATIC), bus.reader(topics.JOINT_STATES)
 
-    def load(self, pipeline: PlanningPipeline) -> None:
-        """Load the robot's geometry."""
-        self._obstacles = CameraObstacles(pipeline.robot, pipeline.geometry, self._options)
-        self._joints = JointHistory(pipeline.robot)
+    def load(self, robot: RobotModel, geometry: RobotGeometry) -> None:
+        """Set the robot, whose model the functions of `snapshot` use."""
+        self._obstacles = CameraObstacles(robot, geometry, self._options)
+        self._joints = JointHistory(robot)
 
     async def follow(self) -> None:
         """Record joint states until cancelled."""
