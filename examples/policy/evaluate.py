@@ -5,7 +5,7 @@
 
 A success is a ball that is held and 0.1 m higher within 20 s of cell time, by the ground truth of the simulated world.
 `--proof none` executes rows as they are, with straight interpolation. Else each chunk is proved before the arm
-moves, in the way of the task `policy_runner`, but without its latency.
+moves, as the task `policy_runner` does, but without its latency.
 """
 
 import argparse
