@@ -135,7 +135,8 @@ class Capture:
             if writer and not self.sequences.is_new(raw.key, writer, sequence):
                 return
             now, kind = self._now_ns(), self._kinds.get(topics.general_key(topic)) or kind or "stream"
-            if kind == "stream" and (topic in self._streams or len(self._streams) < MAX_KEYS):
+            commands = getattr(self._known.get(topics.general_key(topic)), "commands", False)
+            if kind == "stream" and not commands and (topic in self._streams or len(self._streams) < MAX_KEYS):
                 self._streams[topic] = self._streams.get(topic, (0, 0))[0] + 1, now
             self._sink.offer(Sample(
                 raw.key, raw.payload, now, message=message_of(raw.encoding), kind=kind, writer=writer,

@@ -7,8 +7,8 @@ from typing import Literal, Protocol
 
 from common.errors import ZencellError
 
-Action = Literal["gripper", "stop", "home", "faster", "slower", "frame", "quit", "start", "success", "failure",
-                 "discard"]
+Action = Literal["gripper", "stop", "home", "control", "faster", "slower", "frame", "quit", "start", "success",
+                 "failure", "discard"]
 Axes = tuple[float, float, float, float, float, float]
 """Shares -1 to 1 of the full speed: along x, y, z of the frame, then about them. x is forward, y left, z up."""
 REST: Axes = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)

@@ -46,7 +46,7 @@ class EpisodeFolder:
     def interrupted(self) -> list[str]:
         """Return the names of recordings without an entry: their program was killed."""
         known = {each.file for each in self.manifest.episodes}
-        return sorted(file.name for file in self.path.glob("episode_*.mcap") if file.name not in known)
+        return sorted(file.name for file in self.path.glob(f"episode_{4 * '[0-9]'}.mcap") if file.name not in known)
 
     def next_file(self) -> Path:
         """Return the file of the next episode; a file that a killed program left is not used again."""

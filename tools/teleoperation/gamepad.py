@@ -7,13 +7,13 @@ from typing import Any
 from tools.teleoperation.devices import REST, Action, Axes, Reading
 from tools.teleoperation.input_events import EV_ABS, EV_KEY, EV_SYN, SYN_DROPPED, EventSource, open_input
 
-BTN_SOUTH, BTN_EAST, BTN_NORTH, BTN_WEST, BTN_TL, BTN_TR, BTN_SELECT, BTN_START = (
-    304, 305, 307, 308, 310, 311, 314, 315)
+BTN_SOUTH, BTN_EAST, BTN_NORTH, BTN_WEST, BTN_TL, BTN_TR, BTN_SELECT, BTN_START, BTN_MODE = (
+    304, 305, 307, 308, 310, 311, 314, 315, 316)
 ABS_X, ABS_Y, ABS_RX, ABS_RY, ABS_HAT0X, ABS_HAT0Y = 0, 1, 3, 4, 16, 17
 DEAD_MAN = BTN_TL
 ACTIONS: dict[int, Action] = {
     BTN_SOUTH: "gripper", BTN_EAST: "stop", BTN_NORTH: "success", BTN_WEST: "failure", BTN_TR: "frame",
-    BTN_SELECT: "discard", BTN_START: "start",
+    BTN_SELECT: "discard", BTN_START: "start", BTN_MODE: "control",
 }
 DEAD_ZONE = 0.15  # share of a stick's range about its middle that requests rest
 SILENCE = 3.0  # [s] without an event, after which it requests no motion: its radio link may be lost
@@ -23,7 +23,7 @@ class Gamepad:
     """Sticks and buttons as velocities and actions."""
 
     help = ("hold LB (left bumper) to move; left stick: x y, right stick: z and yaw, hat: roll and pitch, A: gripper, "
-            "B: STOP, RB: frame")
+            "B: STOP, RB: frame, logo: take over")
 
     def __init__(self, source: EventSource) -> None:
         """Read a device; nothing counts as held that was held before."""

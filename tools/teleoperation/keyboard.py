@@ -18,16 +18,17 @@ MOTIONS: dict[str, Axes] = {
     "k": (0, 0, 0, 0, 1, 0), "i": (0, 0, 0, 0, -1, 0), "j": (0, 0, 0, 0, 0, 1), "l": (0, 0, 0, 0, 0, -1),
 }
 ACTIONS: dict[str, Action] = {
-    "g": "gripper", "space": "stop", "h": "home", "+": "faster", "=": "faster", "-": "slower", "t": "frame",
-    "q": "quit", "n": "start", "\n": "start", "\r": "start", "y": "success", "x": "failure", "z": "discard",
-    "\x7f": "discard",
+    "g": "gripper", "space": "stop", "h": "home", "p": "control", "+": "faster", "=": "faster", "-": "slower",
+    "t": "frame", "q": "quit", "n": "start", "\n": "start", "\r": "start", "y": "success", "x": "failure",
+    "z": "discard", "\x7f": "discard",
 }
 
 
 class Keyboard:
     """Keys of the terminal as velocities, if `moves`, and as actions."""
 
-    help = "w s a d r f: move, u o i k j l: rotate, g: gripper, space: STOP, h: home, + -: speed, t: frame, q: quit"
+    help = ("w s a d r f: move, u o i k j l: rotate, g: gripper, space: STOP, h: home, + -: speed, t: frame, "
+            "p: take over, q: quit")
 
     def __init__(self, *, moves: bool = True) -> None:
         """Start with no key pressed; without `moves` another device moves the arm."""

@@ -7,11 +7,14 @@ import contextlib
 from collections.abc import Callable, Coroutine, Sequence
 from typing import Any, get_args
 
+from common import topics
 from common.client.cell import Cell
+from common.client.operator_motion import MotionFailed
 from common.errors import RequestFailed, ZencellError
+from common.messages import GripperCommand
 from common.messages.execution import JogFrame
 from common.supervision.lifecycle import run_with_background
-from common.time_source import monotonic
+from common.time_source import monotonic, new_id
 from tools.teleoperation.devices import REST, Action, Device
 from tools.teleoperation.jogging import JogSender
 
@@ -19,6 +22,7 @@ PERIOD = 0.02  # [s] between two readings of the devices
 SHOW_PERIOD = 0.2  # [s]
 FASTER, SLOWEST = 1.25, 0.02  # factor, and least share, of the speed
 FRAMES: tuple[JogFrame, ...] = get_args(JogFrame)
+CONTROL = "/control"  # end of the key by which an operator takes over from a task
 OPEN = 0.5  # share of the largest width, above which the gripper counts as open
 
 Show = Callable[[str], None]
@@ -42,6 +46,7 @@ class Operation:
         self._jog = JogSender(cell, frame, speed)
         self._requests, self._motions = set[asyncio.Task[None]](), set[asyncio.Task[None]]()
         self._quit = asyncio.Event()
+        self.in_control = False  # instead of the task
         self._must_release = False  # until then the devices do not move the arm
 
     def act(self, action: Action) -> None:
@@ -58,7 +63,9 @@ class Operation:
             case "frame":
                 self._jog.frame = FRAMES[(FRAMES.index(self._jog.frame) + 1) % len(FRAMES)]
             case "gripper":
-                self.start("gripper", self._toggle_gripper())
+                self.start("gripper", self._toggle_gripper(), moves=False)
+            case "control":
+                self.start("control", self._toggle_control(), moves=False)
             case "home":
                 self.start("home", self.go_home())
 
@@ -105,15 +112,15 @@ class Operation:
             self._motions.discard(task)
             if not task.cancelled():
                 task.result()
-        self._must_release = axes != REST and (self._must_release or bool(self._requests))
+        self._must_release = axes != REST and (self._must_release or bool(self._motions))
         self._jog.update(REST if self._must_release else axes, now)
         if self._jog.following:
             self.message = ""
 
     def start(self, name: str, request: Coroutine[Any, Any, None], *, moves: bool = True) -> None:
-        """Send a request in the background unless another one is under way; the device moves nothing meanwhile.
+        """Send a request in the background unless another one is under way.
 
-        A STOP, and the end of the operation, cancel one that `moves`.
+        While one that `moves` is under way, the device moves nothing. A STOP, and the end of the operation, cancel it.
         """
         if self._requests:
             request.close()
@@ -141,6 +148,7 @@ class Operation:
             self.message = str(error)
 
     def _stop_all(self) -> None:
+        self._must_release = True
         self._cancel_motions()
         self._spawn(self._stop(), moves=False)
 
@@ -152,11 +160,25 @@ class Operation:
             self.message = f"NOT STOPPED: {error}"
 
     async def _toggle_gripper(self) -> None:
+        """Close the fingers, or open them; return when the executor has accepted that, so that jogging goes on.
+
+        The executor checks the owner of motion: the arm of a task that gave control to an operator has none.
+        """
         state, description = await self.cell.gripper.state(), await self.cell.arm.description()
-        if state.width > OPEN * description.gripper_width:
-            await self.cell.gripper.close()
-        else:
-            await self.cell.gripper.open()
+        width = 0.0 if state.width > OPEN * description.gripper_width else description.gripper_width
+        reply = await self.cell.call(topics.GRIPPER_COMMAND, GripperCommand(
+            header=self.cell.bus.header(), id=f"gripper-{new_id()}", owner=self.cell.owner, width=width,
+            acknowledged=(await self.cell.arm.status()).newest))
+        if reply.state == "rejected":
+            raise MotionFailed(reply.error, f"the gripper rejected the command: {reply.message}")
+
+    async def _toggle_control(self) -> None:
+        """Take the arm from the task of the cell, or give it back; the application serves a request for that."""
+        keys = [owner.key for owner in await self.cell.bus.owners() if owner.key.endswith(CONTROL)]
+        if not keys:
+            raise MotionFailed("no_control", "no task of this cell hands its control over: stop the task instead")
+        reply = await self.cell.call(keys[0], take=not self.in_control, owner=self.cell.owner)
+        self.in_control = reply.control == "operator" and reply.operator == self.cell.owner
 
     async def go_home(self) -> None:
         """Move the arm to its home pose by a planned motion."""
@@ -172,6 +194,7 @@ class Operation:
     async def _show_state(self) -> None:
         while True:
             problem = self._jog.problem or self.message
-            self._show(f"{self._where}speed {100 * self._jog.speed:.0f} % in {self._jog.frame}  "
+            control = "IN CONTROL, p: give back  " if self.in_control else ""
+            self._show(f"{self._where}{control}speed {100 * self._jog.speed:.0f} % in {self._jog.frame}  "
                        f"{self.describe()}{problem and f'| {problem}'}")
             await asyncio.sleep(SHOW_PERIOD)

@@ -46,7 +46,10 @@ def teleop(
 
     async def visit(client: Cell, _: CellConfig) -> None:
         with operation.keys:
-            await Operation(client, **operation.arguments).run()
+            session = Operation(client, **operation.arguments)
+            await session.run()
+        if session.in_control:
+            echo("the task still waits: `zencell teleop` and p twice give control back to it")
 
     _visit(visit, cell, overrides, world, _whole("--seed", seed, 0), domain, connect, operation.help)
 
@@ -86,7 +89,7 @@ def record(
         operation = _operation(device, path, speed, frame)
     folder = EpisodeFolder(absolute(output, loaded.name), loaded.name)
     for name in folder.interrupted():
-        echo(f"{folder.path / name}: was interrupted and is no episode; to use it alone: zencell recover", err=True)
+        echo(f"{name} was interrupted and is no episode; to use it: zencell recover {folder.path / name}", err=True)
     if by == "task":
         options = [part for value in overrides or () for part in ("--set", value)]
         for option, value in (("--world", world), ("--domain", domain), ("--connect", connect)):
