@@ -141,7 +141,7 @@ class TrajectoryAction:
             ZencellError: why not.
         """
         goal.tolerances = Tolerances.of(given)
-        await self._motion.require_free()
+        await self._motion.release_holds(goal.acknowledged)
         measured = await self._measured()
         trajectory = await asyncio.to_thread(trajectory_of, given, measured, self._bus.clock.now_ns())
         scene = await self._subscriptions.latest(topics.PLANNING_SCENE)

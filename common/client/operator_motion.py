@@ -130,9 +130,7 @@ class OperatorMotion:
         """Follow a trajectory; interlocks newer than `acknowledged` block it."""
         if not isinstance(timeout, int | float) or not timeout > 0:
             raise ConfigError("timeout", timeout, "must be more than 0 [s]")
-        if (await self.require_free()).held:  # nothing is active: this release moves nothing, now or later
-            await self._hold.call(m.HoldRequest(hold=False, reason="an operator moves the robot", owner=self._owner(),
-                                                into_stop=True, acknowledged=acknowledged), REQUEST_TIMEOUT)
+        await self.release_holds(acknowledged)
         request = m.ExecuteRequest(
             header=self._bus.header(), id=_new_goal_id(), trajectory=trajectory, owner=self._owner(),
             acknowledged=acknowledged, plan=plan.id if plan else "", scene_stamp=plan.scene_stamp if plan else 0)
@@ -146,6 +144,17 @@ class OperatorMotion:
             if not isinstance(error, MotionFailed) or isinstance(error, _Stalled):  # the goal may still be active
                 await self._stop_goal(request.id)
             raise
+
+    async def release_holds(self, acknowledged: int) -> None:
+        """Turn the operator's own holds, up to `acknowledged`, into stops, so that their next motion is not held.
+
+        Raises:
+            MotionFailed: as `require_free`.
+            RequestFailed: the executor does not answer.
+        """
+        if (await self.require_free()).held:  # nothing is active: this release moves nothing, now or later
+            await self._hold.call(m.HoldRequest(hold=False, reason="an operator moves the robot", owner=self._owner(),
+                                                into_stop=True, acknowledged=acknowledged), REQUEST_TIMEOUT)
 
     async def require_free(self) -> m.MotionStatus:
         """Return the motion status if the robot is at standstill and no other operator blocks it.

@@ -266,7 +266,14 @@ async def test_stop_by_ros_voids_the_goals_before_it(cell: Cell) -> None:
     await cell.stop.call(m.StopRequest(owner="ros2", reason="too close"))
     goal, accepted = await pending
     assert not accepted and "too close" in (await cell.result(goal))[2]
-    assert (await cell.send(SLOW))[1]  # a later one of the same operator
+    await cell.hold.call(m.HoldRequest(hold=True, owner="ros2", reason="paused"))
+    await cell.scene()  # the bridge knows the hold by now
+    later, accepted = await cell.send(GOAL(NAMES, (8.0, HOME)))
+    assert accepted and (await cell.result(later))[0] == SUCCEEDED  # of the same operator
+    await cell.hold.call(m.HoldRequest(hold=True, owner="anna", reason="look"))
+    await cell.scene()
+    held, accepted = await cell.send(GOAL(NAMES, (8.0, HOME)))
+    assert not accepted and "by anna (look)" in (await cell.result(held))[2]
 
 
 async def test_tolerance_of_the_goal_aborts_it(cell: Cell) -> None:
