@@ -19,7 +19,7 @@ from applications.policy.settings import Config
 from common.clock import Clock
 from common.errors import Refused
 from common.hardware.interface import Limits
-from common.messages import GripperState, PlanningScene
+from common.messages import PlanningScene
 from common.planning.obstacles import InvalidShape
 from common.planning.point_obstacles import PointObstacle
 from common.robot.model import RobotModel
@@ -33,7 +33,6 @@ POLL = 0.01  # [s, cell time] between looks at what is known
 BACKOFF, LONGEST_BACKOFF = 0.1, 1.0  # [s, wall time] after a failure; doubled with each further one
 USUAL_SHARE = 0.2  # weight of the newest delay in the mean
 STILL = 0.01  # [rad/s] an arm that is slower was observed at rest
-FINGERS = 1e-3  # [m] change of their width that is proved again
 NO_IMAGE = "no observation: "
 
 
@@ -61,11 +60,11 @@ class ChunkLoop:
         self._robot = RobotModel.load(config.robot)
         self._prover = ChunkProver(RobotModel.load(config.robot), limits, config.proof_options())
         gripper = config.robot.gripper
-        self._widest = gripper.max_width if gripper is not None else 0.0
+        self._widest = gripper.max_width if gripper is not None else None
         self.buffer = ObservationBuffer(
             self._robot, list(config.cameras), image_size=config.image_size, tolerance=config.image_tolerance,
             max_age=config.observation_age, gripper=gripper is not None)
-        self._proved_in: tuple[PlanningScene, float] | None = None
+        self._proved_in: PlanningScene | None = None
         self._rate = config.source.actions.rate
         self._inferring = self._proving = 0.0  # mean delays [s, wall time]
         self._newest = 0  # stamp of the observation that was used last
@@ -125,9 +124,8 @@ class ChunkLoop:
             await self._clock.sleep(POLL)
             return
         times = join.rows[join.ahead]
-        width = self._width(view.gripper, widths)
         points = None if self._points is None else self._points(view.scene)
-        motion = await asyncio.to_thread(self._prove, join.state, ahead, times, view.scene, width, points)
+        motion = await asyncio.to_thread(self._prove, join.state, ahead, times, view.scene, points)
         proving = monotonic() - began
         status.proof_ms = 1e3 * proving
         self._proving += USUAL_SHARE * (proving - self._proving)
@@ -150,19 +148,11 @@ class ChunkLoop:
         self._newest = found.stamp
         return found
 
-    def _width(self, gripper: GripperState | None, widths: Array | None) -> float:
-        """Return the largest width that the fingers may have during the motion [m]."""
-        if gripper is None or gripper.moving:
-            return self._widest
-        wider = widths is not None and bool((widths > gripper.width + FINGERS).any())
-        opens = wider or self._task.grip.opens(gripper.width + FINGERS)
-        return self._widest if opens else min(gripper.width + FINGERS, self._widest)
-
     def _prove(
-        self, state: MotionState, rows: Array, times: Array, scene: PlanningScene, width: float, points: Points | None
+        self, state: MotionState, rows: Array, times: Array, scene: PlanningScene, points: Points | None
     ) -> ProvedMotion:
-        known = self._proved_in
-        if known is None or known[0] is not scene or abs(known[1] - width) > FINGERS or points is not None:
-            self._prover.set_scene(scene, state.positions, () if points is None else points(), width or None)
-            self._proved_in = scene, width
+        if self._proved_in is not scene or points is not None:
+            # With open fingers, which the planner assumes when it checks the motion again: they may open anywhere.
+            self._prover.set_scene(scene, state.positions, () if points is None else points(), self._widest)
+            self._proved_in = scene
         return self._prover.prove(state, rows, times)

@@ -30,10 +30,6 @@ class GripperSchedule:
         self._times = np.concatenate([self._times[before], times])
         self._widths = np.concatenate([self._widths[before], np.clip(widths, 0.0, self._widest)])
 
-    def opens(self, width: float) -> bool:
-        """Return whether the fingers may open wider than a width [m]: were commanded to, or will be."""
-        return self._widest > width and (self.open is True or bool((self._widths > width).any()))
-
     def due(self, now: float) -> float | None:
         """Return the width [m] to command at a cell time [s], or None."""
         index = int(np.searchsorted(self._times, now, side="right")) - 1

@@ -207,7 +207,7 @@ def test_motion_joins_at_speed_without_a_jump() -> None:
     require_executable(second, state)
 
 
-def test_clearance_is_kept_and_held_objects_may_leave_what_they_touch() -> None:
+def test_clearance_holds_and_attached_objects_may_leave_what_they_touch() -> None:
     low = panda().fk(READY)[2, 3]
     box = solid("box", "box", [0.04, 0.04, 0.1], np.array([0, 0, 0.04]))
     held = [AttachedObject(object=box, link="panda_hand_tcp")]

@@ -287,12 +287,3 @@ def test_bad_settings_are_named(settings: list[str], words: str) -> None:
 def test_region_is_a_box_in_world() -> None:
     box = Region(lower=(0.2, -0.4, 0.0), upper=(0.6, 0.4, 0.5)).box
     assert (box.pose.position.x, box.pose.position.z, box.size.y) == pytest.approx((0.4, 0.25, 0.8))
-
-
-def test_fingers_that_may_open_are_known() -> None:
-    schedule = GripperSchedule(0.08)
-    assert not schedule.opens(0.03)
-    schedule.set(np.arange(3.0), np.array([0.0, 0.06, 0.0]))
-    assert schedule.opens(0.03) and not schedule.opens(0.07)
-    schedule.reset(0.08)
-    assert schedule.opens(0.07) and not schedule.opens(0.08)
