@@ -45,8 +45,8 @@ class OpcUaIo:
 
     async def connect(self) -> None:
         """Open a session, and read the types of outputs."""
-        ua = _library()
-        self._client = importlib.import_module("asyncua").Client(self._options.url, timeout=TIMEOUT, auto_reconnect=False)
+        ua, client = _library(), importlib.import_module("asyncua").Client
+        self._client = client(self._options.url, timeout=TIMEOUT, auto_reconnect=False)
         if self._options.user:
             self._client.set_user(self._options.user)
             self._client.set_password(self._options.password)
