@@ -30,6 +30,7 @@ from examples.policy.simulated_pick import CYCLE, SimulatedPick, policy_cell, sc
 
 LIMIT = 20.0  # [s]
 PERIOD = 0.4  # [s] between chunks
+MOVED, MOVED_SEED = 2.0, 500  # [s] at which the ball is moved, and where: the layout of this seed and more
 Policy = Callable[[Observation], Chunk]
 
 
@@ -94,12 +95,16 @@ def prover_of(pick: SimulatedPick, on_violation: str) -> ChunkProver:
     return prover
 
 
-def attempt(policy: Policy, seed: int, proof: str) -> dict:
-    """Return the result of one layout."""
+def attempt(policy: Policy, seed: int, proof: str, moved: bool = False) -> dict:
+    """Return the result of one layout; `moved`: the ball is put where another layout has it after `MOVED` seconds."""
     pick = SimulatedPick(seed)
+    there = SimulatedPick(MOVED_SEED + seed).ball if moved else None
     arm = Direct(pick) if proof == "none" else Proved(pick, prover_of(pick, proof))
     ball, failed = pick.ball.round(3).tolist(), ""
     while pick.now < LIMIT and not pick.lifted:
+        if there is not None and pick.now > MOVED:
+            pick.move_ball(*there[:2])
+            there = None
         observation = pick.observe()
         try:
             chunk = policy(observation)
@@ -148,18 +153,20 @@ def main() -> None:
     parser.add_argument("--layouts", type=int, default=100)
     parser.add_argument("--first", type=int, default=0, help="seed of the first layout; demonstrations begin at 100000")
     parser.add_argument("--proof", choices=("none", "shorten", "slow", "refuse"), default="slow")
+    parser.add_argument("--moved", action="store_true", help="move the ball while the arm is on its way to it")
     parser.add_argument("--card", action="store_true", help="write the figures to the card of the network")
     given = parser.parse_args()
     policy, results = load_policy(given.policy), []
     for seed in range(given.first, given.first + given.layouts):
-        results.append(attempt(policy, seed, given.proof))
+        results.append(attempt(policy, seed, given.proof, given.moved))
         if not results[-1]["success"] or results[-1]["contacts"] or results[-1]["limits_broken"]:
             print(json.dumps(results[-1]), flush=True)
     figures = summary(results)
     print(json.dumps(figures))
     if given.card:
         last = given.first + given.layouts - 1
-        write_figures(given.policy, f"layouts {given.first} to {last}, proof {given.proof}", figures)
+        write_figures(given.policy, f"layouts {given.first} to {last}, proof {given.proof}"
+                      f"{', moved ball' if given.moved else ''}", figures)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ from applications.policy.interface import Observation
 from applications.policy.sources.settings import PolicyCell
 from common.config import Cell, load_cell
 from common.hardware.interface import Limits, load_hardware
-from common.messages import Header, PlanningScene, PlanRequest, Vector3
+from common.messages import Header, PlanningScene, PlanRequest, Vector3, WorldEdit
 from common.perception.pinhole import Pinhole
 from common.planning.pipeline import PlanningPipeline
 from common.robot.model import RobotModel
@@ -116,6 +116,11 @@ class SimulatedPick:
     def lifted(self) -> bool:
         """Whether the ball is held, and higher by `LIFTED` than at the start."""
         return self.held and self._ball.z - self._start_height >= LIFTED
+
+    def move_ball(self, x: float, y: float) -> None:
+        """Put the ball somewhere else on the table [m]."""
+        self._cell.edit(WorldEdit(op="move", id=self._object.id, position=Vector3(x=x, y=y, z=0.0)), self.now)
+        self._start_height = self._ball.z
 
     # --- what a policy sees ---
 
