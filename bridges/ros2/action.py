@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 from collections import OrderedDict, deque
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -24,6 +25,7 @@ from common import topics
 from common.client.operator_motion import OperatorMotion
 from common.client.subscriptions import Subscriptions
 from common.errors import Refused, RequestFailed, ZencellError
+from common.topics import Topic
 from common.transport.bus import Bus
 
 NAME = "follow_joint_trajectory"
@@ -75,14 +77,14 @@ class TrajectoryAction:
     _check: SceneCheck  # set by `serve`, as the publishers
     _feedback: Feedback
 
-    def __init__(self, bus: Bus) -> None:
-        """Declare the readers and requests."""
+    def __init__(self, bus: Bus, tasks: Sequence[Topic[Any]]) -> None:
+        """Declare the readers and requests; `tasks` are statuses of the cell's task, which may have the arm."""
         self._bus = bus
         self._subscriptions = Subscriptions(bus)
-        self._motion = OperatorMotion(bus, owner=OWNER)
+        self._motion = OperatorMotion(bus, [bus.reader(task) for task in tasks], owner=OWNER)
         self._execute, self._stop = bus.client(topics.MOTION_EXECUTE), bus.client(topics.MOTION_STOP)
         self._status, self._joints = bus.reader(topics.MOTION_STATUS), bus.reader(topics.JOINT_STATES)
-        self._scene = bus.reader(topics.PLANNING_SCENE)
+        self._subscriptions.reader(topics.PLANNING_SCENE)
         self._states: deque[m.JointState] = deque(maxlen=REMEMBERED_STATES)
         self._watched: m.MotionStatus | None = None  # newest status with feedback
         self._answered = asyncio.get_running_loop().time()  # when the executor was last there
@@ -209,7 +211,7 @@ class TrajectoryAction:
         if goal.status == EXECUTING:
             goal.status = CANCELING
             self._publish_statuses()
-        return True
+        return goal.status != SUCCEEDED
 
     async def _stop_goal(self, goal: Goal, reason: str) -> bool:
         try:
@@ -249,6 +251,9 @@ class TrajectoryAction:
                 continue
             status = self._status.latest
             if status is None or status.id != goal.id or status is self._watched or not self._states:
+                continue
+            self._update(goal, status)  # it may have ended before the answer to its request was read
+            if goal.ended.is_set():
                 continue
             self._watched, stamp = status, status.header.stamp
             # Where the arm was when the executor measured its progress: 10 ms later it is somewhere else.

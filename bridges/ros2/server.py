@@ -16,6 +16,7 @@ from bridges.ros2.topics import Topics
 from bridges.ros2.types import make
 from common.application import Application
 from common.config import Members, RobotConfig
+from common.messages import TaskStatus
 from common.transport.bus import Bus
 from common.transport.endpoint import endpoint_of
 from common.transport.foreign import open_foreign
@@ -38,9 +39,11 @@ class Options(Protocol):
 async def serve(bus: Bus, config: Options, application: Application, endpoint: str | None = None) -> None:
     """Serve the cell until cancelled; `endpoint` is that of a router, by default the cell's."""
     endpoint = endpoint or bus.endpoint or endpoint_of()
-    topics = Topics(bus, topics_of(application, config.members.keys), lambda: config.rate)
+    found = topics_of(application, config.members.keys)
+    topics = Topics(bus, found, lambda: config.rate)
     commands = Commands(bus) if config.commands else None
-    action = TrajectoryAction(bus) if config.trajectories else None
+    tasks = [topic for topic in found if issubclass(topic.message, TaskStatus)]
+    action = TrajectoryAction(bus, tasks) if config.trajectories else None
     await bus.acquire_keys()
     namespace = "/" + keys.ros_name(config.namespace or bus.cell)
     description = await asyncio.to_thread(description_of, config.robot)

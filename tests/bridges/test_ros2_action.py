@@ -2,6 +2,7 @@
 
 import asyncio
 import logging
+import threading
 from collections.abc import AsyncIterator, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AsyncExitStack
@@ -29,6 +30,7 @@ pytest.importorskip("xxhash", reason="the extra `ros2` is not installed")
 from bridges.ros2 import trajectories, types  # noqa: E402
 from bridges.ros2.action import ABORTED, CANCELED, SUCCEEDED, UNKNOWN  # noqa: E402
 from bridges.ros2.graph import Graph  # noqa: E402
+from bridges.ros2.scene_check import SceneCheck  # noqa: E402
 from bridges.ros2.server import serve  # noqa: E402
 from services import ros2_bridge  # noqa: E402
 from tests.bridges.ros_client import TIMEOUT, FollowClient, Ros  # noqa: E402
@@ -256,15 +258,31 @@ async def test_nothing_moves_after_a_stop_of_an_operator(cell: Cell) -> None:
     assert (await cell.send(GOAL(NAMES, (20.0, HOME))))[1]
 
 
-async def test_stop_by_ros_voids_the_goals_before_it(cell: Cell) -> None:
+async def test_stop_by_ros_voids_the_goals_before_it(cell: Cell, monkeypatch: pytest.MonkeyPatch) -> None:
     running, _ = await cell.send(SLOW)
     await cell.moving()
     await cell.stop.call(m.StopRequest(owner="ros2"))
     assert (await cell.result(running))[0] == ABORTED
-    pending = asyncio.create_task(cell.send(SLOW))  # it takes a moment until it is checked
-    await asyncio.sleep(0.1)
-    await cell.stop.call(m.StopRequest(owner="ros2", reason="too close"))
-    goal, accepted = await pending
+    arrived, stopped = threading.Event(), threading.Event()
+
+    def slow_check(*_: object) -> None:
+        arrived.set()
+        stopped.wait(TIMEOUT)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(SceneCheck, "require_free", slow_check)
+        pending = asyncio.create_task(cell.send(SLOW))
+        await asyncio.to_thread(arrived.wait, TIMEOUT)
+        await cell.stop.call(m.StopRequest(owner="ros2", reason="too close"))
+        stopped.set()
+        goal, accepted = await pending
+        arrived.clear()
+        stopped.clear()
+        pending = asyncio.create_task(cell.send(SLOW))
+        await asyncio.to_thread(arrived.wait, TIMEOUT)
+        assert (await cell.cancel())[0] == 0
+        stopped.set()
+        assert not (await pending)[1]  # cancelled before it started
     assert not accepted and "too close" in (await cell.result(goal))[2]
     await cell.hold.call(m.HoldRequest(hold=True, owner="ros2", reason="paused"))
     await cell.scene()  # the bridge knows the hold by now
