@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from applications.pick_place.detections import CameraDetections, DetectionViews, ViewsParameters
-from applications.pick_place.perceived_scene import PerceivedScene, SceneParameters
+from applications.pick_place.perceived_scene import PerceivedScene
+from applications.pick_place.tracks import SceneParameters
 from common import topics
 from common.config import RobotConfig, Surroundings
 from common.errors import ConfigError

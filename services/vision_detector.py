@@ -13,8 +13,8 @@ from pydantic import Field
 
 from applications.pick_place.detector import Detection, Detector, DetectorOptions, annotate, warm_up
 from applications.pick_place.outliers import Outlier
-from applications.pick_place.perceived_scene import Place
 from applications.pick_place.topics import DETECTED_OBJECTS, DETECTION_IMAGE, DETECTION_MASK
+from applications.pick_place.tracks import Place
 from common import topics
 from common.config import Surroundings
 from common.config.basics import Rgb

@@ -18,12 +18,12 @@ from applications.pick_place.detections import (
     Validation,
     ViewsParameters,
 )
-from applications.pick_place.perceived_scene import Place
 from applications.pick_place.topics import (
     REJECTED_TARGETS,
     VALIDATED_TARGETS,
     WORKSPACE_MARKERS,
 )
+from applications.pick_place.tracks import Place
 from common.config import Grasp, RobotConfig, Surroundings, Tunable
 from common.messages import Color, Header, Marker, MarkerArray, Pose, PoseArray, Rejections, Vector3
 from common.messages.basics import MAX_POSES

@@ -10,16 +10,12 @@ import json
 import logging
 import os
 import queue
-import random
 import signal
-import socket
 import subprocess
 import sys
-import tempfile
 import termios
 import threading
 import time
-from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from contextlib import (
     AbstractAsyncContextManager,
@@ -39,56 +35,16 @@ import psutil
 from cli.main import app
 from common.messages import Message
 from common.transport.bus import Bus, Reader
-from common.transport.endpoint import BASE_PORT, endpoint_of
+from common.transport.endpoint import endpoint_of
 from common.transport.zenoh_session import connect
+from tests.domains import free_domain
 
 M = TypeVar("M", bound=Message)
 
 ROOT = Path(__file__).resolve().parent.parent
-DOMAINS = range(60, 233)
 PATIENCE = 60.0  # [s] timeout of a test that waits for an event
 logging.getLogger("watcher").addHandler(logging.NullHandler())  # the end of the router needs no message
-_given: deque[int] = deque(maxlen=len(DOMAINS) // 4)  # recently returned, perhaps without a listener yet
-_locks: dict[int, int] = {}  # lock descriptors by domain
 SUMMARY, LOG = "summary.json", "cell.log"
-
-
-def free_domain() -> int:
-    """Return a domain with a free port, locked against other test processes until this one ends.
-
-    Workers of one test run use disjoint ranges; a suite and a benchmark, or two suites, share all.
-
-    Raises:
-        RuntimeError: no domain is free.
-    """
-    share = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
-    domains = DOMAINS[share :: int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))]
-    choices = [number for number in domains if number not in _given]
-    random.shuffle(choices)
-    for number in choices:
-        with socket.socket() as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            with suppress(OSError):
-                probe.bind(("127.0.0.1", BASE_PORT + number))
-                _take(number)
-                _given.append(number)
-                return number
-    raise RuntimeError(f"no domain from {domains[0]} to {domains[-1]} is free")
-
-
-def _take(domain: int) -> None:
-    """Lock a domain until this process ends; raise OSError if another process holds it."""
-    if domain in _locks:
-        return
-    folder = Path(tempfile.gettempdir(), f"zencell-test-domains-{os.getuid()}")
-    folder.mkdir(exist_ok=True)
-    lock = os.open(folder / str(domain), os.O_RDWR | os.O_CREAT, 0o600)
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        os.close(lock)
-        raise
-    _locks[domain] = lock
 
 
 def folder_for(parent: Path, label: str) -> Path:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from applications.pick_place.perceived_scene import PerceivedScene, SceneParameters
+from applications.pick_place.perceived_scene import PerceivedScene
 from applications.pick_place.topics import VALIDATED_TARGETS
+from applications.pick_place.tracks import SceneParameters
 from common import topics
 from common.config import RobotConfig, Surroundings, Tunable
 from common.errors import ConfigError

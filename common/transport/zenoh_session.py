@@ -8,7 +8,6 @@ import os
 import threading
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ from common.clock import Clock
 from common.errors import NoRouter, ZencellError
 from common.transport.bus import Bus
 from common.transport.credentials import OPERATOR, Credentials, common_name, credentials_of, secure_folder
-from common.transport.endpoint import LARGE_BYTES, client_config, nearby_endpoints
+from common.transport.endpoint import client_config, nearby_endpoints
 from common.transport.session import (
     Declaration,
     OnQuery,
@@ -26,10 +25,17 @@ from common.transport.session import (
     OnSample,
     OnToken,
     RawReply,
-    RawSample,
     SendQueue,
 )
 from common.transport.tokens import MAX_NAMES
+from common.transport.zenoh_declarations import (
+    TokenWatcher,
+    Undeclare,
+    ZenohPublisher,
+    ZenohQuery,
+    direct,
+    raw_sample,
+)
 
 log = logging.getLogger(__name__)
 
@@ -38,93 +44,6 @@ _MAX_PAUSE_SECONDS = 0.2  # between two attempts: each takes 7 ms of a processor
 _FLUSH_SECONDS = 0.2
 _LIVELINESS_SECONDS = 2.0
 _CLOSE_SECONDS = 0.5
-
-
-def _direct(on_item: Callable[[Any], None], on_drop: Callable[[], None] | None = None) -> Any:
-    # The default, an indirect callback, starts a thread that keeps the interpreter from exiting.
-    return zenoh.handlers.Callback(on_item, on_drop, indirect=False)
-
-
-def _sample(sample: zenoh.Sample) -> RawSample:
-    attachment = sample.attachment
-    return RawSample(
-        str(sample.key_expr),
-        sample.payload.to_bytes(),
-        str(sample.encoding),
-        attachment.to_bytes() if attachment is not None else None,
-    )
-
-
-class _Publisher:
-    def __init__(self, declare: Callable[[zenoh.Priority], zenoh.Publisher], queue: SendQueue | None) -> None:
-        """Declare a reliable publisher with a send queue, or a stream without one."""
-        # Each on its own priority: small messages do not queue behind images, reliable ones not behind a stream.
-        self._publisher = declare(zenoh.Priority.DATA if queue is None else zenoh.Priority.DATA_HIGH)
-        self._declare = declare
-        self._large: zenoh.Publisher | None = None  # of a stream, from its first large message on
-        self._queue = queue
-        self._undeclared = False
-
-    @property
-    def matched(self) -> bool:
-        return not self._undeclared and self._publisher.matching_status.matching  # type: ignore[attr-defined]
-
-    def put(self, payload: bytes, attachment: bytes) -> None:
-        if self._undeclared:
-            return
-        if self._queue is None:
-            if self._large is None and len(payload) > LARGE_BYTES:
-                self._large = self._declare(zenoh.Priority.DATA_LOW)
-            (self._large or self._publisher).put(payload, attachment=attachment or None)
-        else:
-            self._queue.post(lambda: self._publisher.put(payload, attachment=attachment or None))
-
-    def undeclare(self) -> None:
-        if self._undeclared:
-            return
-        self._undeclared = True
-        if self._queue is None:
-            for publisher in filter(None, (self._large, self._publisher)):
-                publisher.undeclare()  # type: ignore[no-untyped-call]
-        else:  # a put may be running in the queue's thread; Zenoh refuses both at once
-            self._queue.post(self._publisher.undeclare)
-
-
-class _Query:
-    def __init__(self, query: zenoh.Query, queue: SendQueue) -> None:
-        self._query = query
-        self._queue = queue
-        self.key = str(query.key_expr)
-        self.payload = query.payload.to_bytes() if query.payload is not None else None
-        self.attachment = query.attachment.to_bytes() if query.attachment is not None else None
-
-    def reply(self, key: str, payload: bytes, encoding: str, attachment: bytes) -> None:
-        self._queue.post(lambda: self._query.reply(key, payload, encoding=encoding, attachment=attachment))
-
-    def refuse(self, payload: bytes) -> None:
-        self._queue.post(lambda: self._query.reply_err(payload, encoding="application/msgpack"))
-
-    def finish(self) -> None:
-        self._queue.post(self._query.drop)
-
-
-class _Undeclare:
-    """Runs a Zenoh undeclaration once."""
-
-    def __init__(self, undeclare: Callable[[], Any]) -> None:
-        self._undeclare: Callable[[], Any] | None = undeclare
-
-    def undeclare(self) -> None:
-        undeclare, self._undeclare = self._undeclare, None
-        if undeclare is not None:
-            undeclare()
-
-
-@dataclass(eq=False)
-class _TokenWatcher:
-    pattern: zenoh.KeyExpr
-    on_token: OnToken
-    reported: set[str] = field(default_factory=set)  # existing tokens, as Zenoh reported them
 
 
 class ZenohSession:
@@ -137,7 +56,7 @@ class ZenohSession:
         self._declared: list[Declaration] = []
         self._lock = threading.Lock()
         self._own_tokens: set[str] = set()
-        self._token_watchers: list[_TokenWatcher] = []
+        self._token_watchers: list[TokenWatcher] = []
 
     @property
     def connected(self) -> bool:
@@ -148,14 +67,14 @@ class ZenohSession:
     def watch_connection(self, on_change: Callable[[], None]) -> None:
         """Call back when the router may have been lost or reached."""
         # The events are not a reliable count: after a frozen router some come twice and some out of order.
-        listener = self._session.info.declare_transport_events_listener(_direct(lambda _event: on_change()))
-        self._keep(_Undeclare(listener.undeclare))  # else it calls into an interpreter that is exiting
+        listener = self._session.info.declare_transport_events_listener(direct(lambda _event: on_change()))
+        self._keep(Undeclare(listener.undeclare))  # else it calls into an interpreter that is exiting
 
     def _keep(self, declared: Declaration) -> Declaration:
         self._declared.append(declared)
         return declared
 
-    def publisher(self, key: str, encoding: str, *, reliable: bool) -> _Publisher:
+    def publisher(self, key: str, encoding: str, *, reliable: bool) -> ZenohPublisher:
         """Declare a publisher; a congested network drops a stream's values, reliable ones wait in the send queue."""
         control = zenoh.CongestionControl.BLOCK if reliable else zenoh.CongestionControl.DROP
 
@@ -165,7 +84,7 @@ class ZenohSession:
                 reliability=zenoh.Reliability.RELIABLE,
             )
 
-        publisher = _Publisher(declare, self._queue if reliable else None)
+        publisher = ZenohPublisher(declare, self._queue if reliable else None)
         self._keep(publisher)
         return publisher
 
@@ -174,16 +93,16 @@ class ZenohSession:
 
         def on_zenoh(sample: zenoh.Sample) -> None:
             if sample.kind == zenoh.SampleKind.PUT:
-                on_sample(_sample(sample))
+                on_sample(raw_sample(sample))
 
-        return self._keep(_Undeclare(self._session.declare_subscriber(key, _direct(on_zenoh)).undeclare))
+        return self._keep(Undeclare(self._session.declare_subscriber(key, direct(on_zenoh)).undeclare))
 
     def queryable(self, key: str, on_query: OnQuery, *, complete: bool) -> Declaration:
         """Call back for each `get` that covers the key."""
         declared = self._session.declare_queryable(
-            key, _direct(lambda query: on_query(_Query(query, self._queue))), complete=complete
+            key, direct(lambda query: on_query(ZenohQuery(query, self._queue))), complete=complete
         )
-        return self._keep(_Undeclare(declared.undeclare))
+        return self._keep(Undeclare(declared.undeclare))
 
     def get(
         self,
@@ -201,14 +120,14 @@ class ZenohSession:
 
         def on_zenoh(reply: zenoh.Reply) -> None:
             if reply.ok is not None:
-                on_reply(RawReply(_sample(reply.ok)))
+                on_reply(RawReply(raw_sample(reply.ok)))
             elif reply.err is not None:
                 on_reply(RawReply(None, reply.err.payload.to_bytes()))
 
         def send() -> None:
             try:
                 self._session.get(
-                    key, _direct(on_zenoh, on_done), payload=payload, encoding=encoding or None,
+                    key, direct(on_zenoh, on_done), payload=payload, encoding=encoding or None,
                     attachment=attachment, timeout=timeout, consolidation=zenoh.ConsolidationMode.NONE,
                     priority=zenoh.Priority.DATA_HIGH, express=True, cancellation_token=token,
                 )
@@ -228,7 +147,7 @@ class ZenohSession:
             declared.undeclare()  # type: ignore[no-untyped-call]
             self._report_own_token(key, there=False)
 
-        return self._keep(_Undeclare(undeclare))
+        return self._keep(Undeclare(undeclare))
 
     def _report_own_token(self, key: str, *, there: bool) -> None:
         # Zenoh does not report a session's own tokens to it.
@@ -242,7 +161,7 @@ class ZenohSession:
         self, key: str, on_token: OnToken, on_first: Callable[[str], None], on_known: Callable[[], None]
     ) -> Declaration:
         """Call back for each matching token that exists, appears or vanishes, after a first query for them."""
-        watcher = _TokenWatcher(zenoh.KeyExpr(key), on_token)
+        watcher = TokenWatcher(zenoh.KeyExpr(key), on_token)
 
         def report(sample: zenoh.Sample) -> None:
             token, there = str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT
@@ -260,14 +179,14 @@ class ZenohSession:
             on_token(token, True)
         # Before the watch: afterwards Zenoh would answer from what the watch has seen so far, which may be nothing.
         self.get_tokens(key, on_first, on_known, timeout=_LIVELINESS_SECONDS)
-        declared = self._session.liveliness().declare_subscriber(key, _direct(report), history=True)
+        declared = self._session.liveliness().declare_subscriber(key, direct(report), history=True)
 
         def undeclare() -> None:
             with self._lock:
                 self._token_watchers.remove(watcher)
             declared.undeclare()  # type: ignore[no-untyped-call]
 
-        return self._keep(_Undeclare(undeclare))
+        return self._keep(Undeclare(undeclare))
 
     def get_tokens(
         self, key: str, on_token: Callable[[str], None], on_done: Callable[[], None], *, timeout: float
@@ -290,7 +209,7 @@ class ZenohSession:
                     on_token(token)
             on_done()
 
-        self._session.liveliness().get(key, _direct(on_found, done), timeout=timeout)
+        self._session.liveliness().get(key, direct(on_found, done), timeout=timeout)
 
     def close(self) -> None:
         """Undeclare all in reverse order and close; may block."""

@@ -7,7 +7,8 @@ import pytest
 
 from applications.pick_place.ball_places import MOST_HIDDEN, VisibleTable, find_viewing_poses
 from applications.pick_place.detections import HIDDEN, OccludedTargets
-from applications.pick_place.perceived_scene import PerceivedScene, SceneParameters, Sighting, Tracks
+from applications.pick_place.perceived_scene import PerceivedScene
+from applications.pick_place.tracks import SceneParameters, Sighting, Tracks
 from common import messages as m
 from common.perception.occlusion import Occlusion, RobotSilhouettes
 from common.robot.model import RobotModel

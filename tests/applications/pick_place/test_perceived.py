@@ -4,7 +4,8 @@ import math
 
 import pytest
 
-from applications.pick_place.perceived_scene import PerceivedScene, SceneParameters
+from applications.pick_place.perceived_scene import PerceivedScene
+from applications.pick_place.tracks import SceneParameters
 from common import messages as m
 from common.config import Surroundings
 from common.robot.transforms import matrix_to_rpy, pose_to_matrix, tool_down

@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from applications.pick_place.perceived_scene import SceneParameters, Sighting, Tracks
+from applications.pick_place.tracks import SceneParameters, Sighting, Tracks
 
 
 def at(x, y, z=0.03, **fields):
