@@ -65,6 +65,8 @@ def main() -> None:
         results.append(attempt(given.policy, seed))
         if not results[-1]["success"] or results[-1]["broken"] or results[-1]["crashes"]:
             print(json.dumps(results[-1]), flush=True)
+        if len(results) % 10 == 0:
+            print(f"{sum(each['success'] for each in results)} of {len(results)}", flush=True)
     done = [each for each in results if each["success"]]
     low, high = interval(len(done), len(results))
     figures = {"layouts": len(results), "successes": len(done), "interval": [round(low, 3), round(high, 3)],
