@@ -157,7 +157,7 @@ class ChunkProver:
             name = self._robot.joint_names[joint]
             return Violation("not_finite", name, float(max(t[row], 0.0)), f"row {row}: {name} is {q[row, joint]}")
         if not (t[0] > 1e-6 and t[-1] <= MAX_SECONDS and (np.diff(t) > 5e-4).all()):
-            message = f"the times of the chunk do not increase by 0.5 ms or more from above 0 to {MAX_SECONDS:g} s at most"
+            message = f"the times of the chunk do not increase by 0.5 ms or more from above 0 to {MAX_SECONDS:g} s"
             return Violation("shape", "times", 0.0, message)
         return q, t
 
