@@ -6,6 +6,7 @@ registers. A register from `raw[0]` to `raw[1]` is the range of its signal.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
@@ -41,6 +42,7 @@ class ModbusIo:
         self._signals, self._options, self._create = signals, options, client
         self._client: Any = None
         self._blocks = list(_blocks(signals))
+        logging.getLogger("pymodbus").setLevel(logging.CRITICAL)  # the service logs a loss, once
 
     async def connect(self) -> None:
         """Connect to the server."""
