@@ -261,6 +261,7 @@ def render(report: Report) -> str:
         joints=_joint_rows(report, positions, velocities),
         joints_figure=lambda: charts.joints(times, positions, velocities, report.names, report.limits),
         problems=_problem_rows(run), services=_service_rows(run), lost={k: n for k, n in report.lost.items() if n},
+        signals=[(event.time, event.what, event.note) for event in run.signals[:MOST_LINES]],
         log=[(event.time, event.level, event.what, event.note) for event in run.log],
     )
     return printable(text, keep="\n\t")

@@ -182,6 +182,7 @@ class RunHistory:
     restarts: list[Event] = field(default_factory=list)
     failures: list[Event] = field(default_factory=list)  # failures and retries of the task
     losses: list[Event] = field(default_factory=list)  # by ground truth: objects out of reach
+    signals: list[Event] = field(default_factory=list)  # changes of inputs and outputs, and losses of their backend
     log: list[Event] = field(default_factory=list)
     lines_left_out: int = 0
     counters: dict[str, m.ServiceCounters] = field(default_factory=dict)
@@ -193,6 +194,7 @@ class RunHistory:
     _failed: int | None = None  # failures so far; those before the recording are no events
     _ended_before: str | None = None  # goal that had ended before the recording
     _scene: dict[str, Position] = field(default_factory=dict)
+    _signals: dict[str, str] = field(default_factory=dict)  # newest values as text
     _in_place: set[str] = field(default_factory=set)  # ids of objects that were not lost
 
     def listeners(self) -> dict[Topic[Any], Callable[[float, Any], None]]:
@@ -200,7 +202,7 @@ class RunHistory:
         return {
             t.MOTION_STATUS: self.on_motion, t.GRIPPER_STATE: self.on_gripper, t.DISPLAY_TRAJECTORY: self.on_trajectory,
             t.JOINT_STATES: self.on_joints, t.PLANNING_SCENE: self.on_scene, t.SUPERVISOR_STATUS: self.on_services,
-            t.LOG: self.on_log, t.COUNTERS: self.on_counters, t.SCENE_OBJECTS: self.on_objects,
+            t.IO_STATE: self.on_signals, t.LOG: self.on_log, t.COUNTERS: self.on_counters, t.SCENE_OBJECTS: self.on_objects,
         }
 
     def on_task(self, time: float, status: m.TaskStatus) -> None:
@@ -240,6 +242,18 @@ class RunHistory:
     def on_trajectory(self, time: float, trajectory: m.JointTrajectory) -> None:
         """Add a plan."""
         _append(self.trajectories, (time, trajectory.points[-1].time_from_start if trajectory.points else 0.0))
+
+    def on_signals(self, time: float, state: m.IoState) -> None:
+        """Add changes of inputs and outputs; the first values are no changes."""
+        shown = {"backend": state.reason or "connected"}
+        for signal in state.signals:
+            value = ("on" if signal.value else "off") if isinstance(signal.value, bool) else signal.value
+            if signal.value is not None:
+                shown[signal.name] = signal.reason or f"{value} {signal.unit}".rstrip()
+        for name, value in shown.items():
+            if self._signals.setdefault(name, value) != value:
+                _append(self.signals, Event(time, name, value))
+                self._signals[name] = value
 
     def on_joints(self, time: float, state: m.JointState) -> None:
         """Add joint states."""

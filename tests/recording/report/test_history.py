@@ -116,3 +116,17 @@ def test_history_of_any_length_has_a_bounded_number_of_entries(run, monkeypatch)
     assert 50 <= len(run.joint_states) <= 100 and len(run.trajectories) == 50
     steps = np.diff(run.joint_times)
     assert run.joint_times[0] < 32 and run.joint_times[-1] > 980 and max(steps) <= 2 * min(steps), "the whole run"
+
+
+def test_changes_of_signals_and_losses_of_their_backend_are_events(run):
+    def state(clamp, pressure=1.5, reason="", unplugged=""):
+        return m.IoState(reason=reason, signals=[
+            m.IoSignal(name="clamp", direction="output", value=clamp),
+            m.IoSignal(name="pressure", direction="input", value=pressure, unit="bar", reason=unplugged)])
+
+    for time, message in enumerate((state(None), state(False), state(True), state(True, 2.0), state(True, 2.0, "gone"),
+                                    state(True, 2.0), state(True, 2.0, "", "unplugged"))):
+        run.on_signals(time, message)
+    assert [(each.time, each.what, each.note) for each in run.signals] == [
+        (2, "clamp", "on"), (3, "pressure", "2.0 bar"), (4, "backend", "gone"), (5, "backend", "connected"),
+        (6, "pressure", "unplugged")]
