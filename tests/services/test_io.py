@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import asyncio
 import math
+import sys
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from typing import Any
@@ -207,6 +208,18 @@ def test_bad_section_is_one_line_that_names_field_and_choices(section: dict[str,
     with pytest.raises(ZencellError) as error:
         load_io(check(Only, {"io": section}).io, lambda: 0.0)
     assert words in str(error.value) and "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(("backend", "module", "options"), [
+    ("modbus", "pymodbus.client", {"host": "h"}), ("opcua", "asyncua.ua", {"url": "opc.tcp://h"}),
+    ("ur", "rtde_io", {"host": "h"}),
+])
+def test_missing_package_is_named_with_its_extra(
+    monkeypatch: pytest.MonkeyPatch, backend: str, module: str, options: dict[str, Any]
+) -> None:
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(ConfigError, match=rf"io.backend: '{backend}' needs the extra `{backend}`: pip install"):
+        load_io(check(Io, {"backend": backend, "options": options}, "io"), lambda: 0.0)
 
 
 def test_values_are_parsed() -> None:
