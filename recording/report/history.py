@@ -202,7 +202,8 @@ class RunHistory:
         return {
             t.MOTION_STATUS: self.on_motion, t.GRIPPER_STATE: self.on_gripper, t.DISPLAY_TRAJECTORY: self.on_trajectory,
             t.JOINT_STATES: self.on_joints, t.PLANNING_SCENE: self.on_scene, t.SUPERVISOR_STATUS: self.on_services,
-            t.IO_STATE: self.on_signals, t.LOG: self.on_log, t.COUNTERS: self.on_counters, t.SCENE_OBJECTS: self.on_objects,
+            t.IO_STATE: self.on_signals, t.LOG: self.on_log, t.COUNTERS: self.on_counters,
+            t.SCENE_OBJECTS: self.on_objects,
         }
 
     def on_task(self, time: float, status: m.TaskStatus) -> None:
