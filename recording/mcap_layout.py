@@ -55,7 +55,7 @@ LEAST_MESSAGE, MESSAGES_FREE = 8, 50_000  # [bytes] of the file for each message
 MOST_GROWTH, GROWTH_FREE = 5000, 2**30  # decompressed size over file size, above a decompressed size [bytes]
 
 
-@dataclass
+@dataclass(slots=True)
 class ChunkPosition:
     """Where a chunk is, which log times it covers, and which channels have messages in it if the file is indexed.
 

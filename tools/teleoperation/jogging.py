@@ -40,6 +40,7 @@ class JogSender:
         self._motion, self._owners = cell.bus.reader(topics.MOTION_STATUS), cell.bus.reader(topics.MOTION_OWNER)
         self._pressed = self._refused = self.following = False
         self._acknowledged, self._since = 0, 0.0
+        self._known = 0  # stamp of the motion status when the operator began
 
     def update(self, axes: Axes, now: float) -> None:
         """Send a command for what is requested at a monotonic time [s], or end the motion."""
@@ -68,7 +69,7 @@ class JogSender:
             self._pressed = self._refused = self.following = False
 
     def _press(self, motion: MotionStatus, now: float) -> None:
-        self._pressed, self._since = True, now
+        self._pressed, self._since, self._known = True, now, motion.header.stamp
         ended = motion.message.startswith(ENDED)
         if motion.newest != self._acknowledged or ended or self.problem:
             self._acknowledged, self._since = motion.newest, now + PAUSE + MARGIN
@@ -84,6 +85,8 @@ class JogSender:
         if self.following and not jogging:
             return motion.message or "jogging was interrupted: release and press again"
         self.following = jogging
+        if not jogging and motion.header.stamp > self._known and motion.message.startswith(ENDED):
+            return motion.message
         if jogging or now - self._since < NO_EFFECT_TIME:
             return ""
         controlled = f"the motion is {owner.description}" if owner.kind != "none" else ""

@@ -113,9 +113,12 @@ class Operation:
             if not task.cancelled():
                 task.result()
         self._must_release = axes != REST and (self._must_release or bool(self._motions))
+        before = self._jog.problem
         self._jog.update(REST if self._must_release else axes, now)
         if self._jog.following:
             self.message = ""
+        elif self._jog.problem not in ("", before):
+            self.message = self._jog.problem
 
     def start(self, name: str, request: Coroutine[Any, Any, None], *, moves: bool = True) -> None:
         """Send a request in the background unless another one is under way.
@@ -160,11 +163,14 @@ class Operation:
             self.message = f"NOT STOPPED: {error}"
 
     async def _toggle_gripper(self) -> None:
-        """Close the fingers, or open them; return when the executor has accepted that, so that jogging goes on.
+        """Close the fingers, or open them; return when the executor has accepted that, so that jogging continues.
 
         The executor checks the owner of motion: the arm of a task that gave control to an operator has none.
         """
-        state, description = await self.cell.gripper.state(), await self.cell.arm.description()
+        description = await self.cell.arm.description()
+        if not description.gripper:
+            raise MotionFailed("no_gripper", "the robot of this cell has no gripper")
+        state = await self.cell.gripper.state()
         width = 0.0 if state.width > OPEN * description.gripper_width else description.gripper_width
         reply = await self.cell.call(topics.GRIPPER_COMMAND, GripperCommand(
             header=self.cell.bus.header(), id=f"gripper-{new_id()}", owner=self.cell.owner, width=width,
@@ -193,8 +199,7 @@ class Operation:
 
     async def _show_state(self) -> None:
         while True:
-            problem = self._jog.problem or self.message
             control = "IN CONTROL, p: give back  " if self.in_control else ""
             self._show(f"{self._where}{control}speed {100 * self._jog.speed:.0f} % in {self._jog.frame}  "
-                       f"{self.describe()}{problem and f'| {problem}'}")
+                       f"{self.describe()}{self.message and f'| {self.message}'}")
             await asyncio.sleep(SHOW_PERIOD)

@@ -5,8 +5,13 @@ import asyncio
 import numpy as np
 import pytest
 
+from applications.policy.topics import POLICY_CONTROL, ControlReply
 from common import topics
+from common.client.cell import Cell
+from common.clock import Clock
 from common.messages import StopRequest
+from common.transport.bus import Bus
+from common.transport.local import LocalNetwork
 from tests.client.simulated_cell import run, standstill
 from tools.teleoperation.devices import REST, DeviceLost, Reading
 from tools.teleoperation.operation import Operation
@@ -123,3 +128,29 @@ def test_unplugged_device_stops_the_arm_and_ends_the_operation():
                 await operated.running
 
     run(program)
+
+
+async def test_operator_takes_over_from_a_task_and_gives_back():
+    network = LocalNetwork()
+    runner, operator = (Bus(network.session(), service=name, cell="cell", clock=Clock()) for name in ("task", "teleop"))
+    asked = []
+
+    async def control(request):
+        asked.append(request.take)
+        return ControlReply(control="operator" if request.take else "policy", operator=request.owner)
+
+    async with Cell.on(operator, owner="anna") as cell:
+        operation = Operation(cell, [], frame="base", speed=0.2, show=lambda _: None)
+
+        async def press():
+            operation.act("control")
+            await asyncio.gather(*operation._requests)
+            operation.step(0.0)
+            return operation.in_control
+
+        assert not await press() and "hands its control over" in operation.message
+        runner.serve(POLICY_CONTROL, control)
+        await runner.ready()
+        assert [await press(), await press()] == [True, False] and asked == [True, False]
+    for bus in (operator, runner):
+        await bus.close()
