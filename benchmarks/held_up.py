@@ -105,7 +105,7 @@ class Rig:
 
 
 def outcome(rig: Rig, good: bool, why: Counter[str]) -> int:
-    """Return 1 for a motion that went on; else note why it did not."""
+    """Return 1 for a motion that continued; else note why it did not."""
     status = rig.executor.arm.status
     if good:
         return 1

@@ -29,7 +29,7 @@ from lab.processes import SimulatedBus, SimulatedHost
 
 POLL = 0.1  # [s] between checks of a condition
 OPERATOR, PAGE = "operator", "page"  # sessions
-NAME = "anna"  # of the operator, who has motions without the page
+NAME = "anna"  # of the operator, who moves the arm without the page
 EXECUTOR = "trajectory_executor"
 SPEED = f"services.{EXECUTOR}.speed_scaling"
 SLOWEST, SLOW = 0.1, 0.4  # speed that an operator sets, share of the full speed

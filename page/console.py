@@ -242,7 +242,7 @@ class Console(ActionQueue):
         return await client.call(message, timeout)
 
     def _require(self, role: str) -> None:
-        """Check the role of the page that causes a request once more where the request leaves this process.
+        """Check the role of the page that causes a request again where the request leaves this process.
 
         Raises:
             RemoteError: its token has not that role.

@@ -26,7 +26,7 @@ _HEAD = struct.Struct("<BQ")  # opcode, length of the record's content
 _CHUNK_HEAD = struct.Struct("<QQQ")  # first and last log time [ns], size before compression
 _MESSAGE = struct.Struct("<HIQQ")  # the same, and publish time [ns]
 _MESSAGE_HEAD = struct.Struct("<HIQ")  # channel, sequence number, log time [ns]
-_PEEK = 64  # [bytes] of a record's content that tell whether it is one
+_PEEK = 64  # [bytes] of a record's content that show whether it is one
 _DESCRIPTIONS = (Opcode.METADATA, Opcode.SCHEMA, Opcode.CHANNEL)
 _HIGHEST, _PRIVATE = 0x0F, 0x80  # opcodes between these are undefined
 _SHORTEST = {Opcode.MESSAGE: 22, Opcode.FOOTER: 20, Opcode.DATA_END: 4, Opcode.STATISTICS: 46}  # [bytes] of content
@@ -229,7 +229,7 @@ class _Search:
     def record_after(self, offset: int) -> int | None:
         """Return the offset of the next chunk with the right checksum, or of the next series of other records.
 
-        Messages of a destroyed chunk do not count: no checksum tells whether they are complete.
+        Messages of a destroyed chunk do not count: no checksum shows whether they are complete.
         """
         if self._loose is None:
             has_chunk = any(not chunk.loose for chunk in self._found.chunks)

@@ -143,7 +143,7 @@ def _arrays(points: Sequence[Any], dof: int) -> tuple[Vector, Rows]:
 
 
 def spline(times: Vector, q: Vector) -> tuple[Vector, Vector]:
-    """Return velocities and accelerations (N, dof) of the cubic spline through q (N, dof) that rests at its ends.
+    """Return velocities and accelerations (N, dof) of the cubic spline through q (N, dof) that is at rest at its ends.
 
     The accelerations at the ends are 0, so that the first and last segments, as quintics, begin and end smoothly.
     """

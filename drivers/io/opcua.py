@@ -28,7 +28,7 @@ class IoOptions(Parameters):
     url: str = Field(pattern="^opc.tcp://.+", description="such as opc.tcp://192.168.1.20:4840")
     user: str = Field("", description="user name; empty: anonymous")
     password: str = Field("", repr=False, description="of the user")
-    security: str = Field("", description="policy, mode, certificate and key, such as "
+    security: str = Field("", description="suite, mode, certificate and key, such as "
                                           "Basic256Sha256,SignAndEncrypt,cert.der,key.pem; empty: none")
 
 

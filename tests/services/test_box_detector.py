@@ -49,7 +49,7 @@ async def camera() -> AsyncIterator[DepthCamera]:
         yield cell
 
 
-async def test_cube_is_detected_whichever_image_arrives_first(camera: DepthCamera) -> None:
+async def test_cube_is_detected_in_any_order_of_its_images(camera: DepthCamera) -> None:
     images, masks = camera.reader(DETECTION_IMAGE), camera.reader(DETECTION_MASK)
     for stamp, order in ((5, (camera.depth, camera.color)), (6, (camera.color, camera.depth))):
         for publish in order:

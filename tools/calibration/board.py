@@ -247,7 +247,7 @@ def _charuco(o: BoardOptions) -> cv2.aruco.CharucoBoard:
 
 
 def _share(markers: dict[int, Array], expected: dict[int, Array]) -> float:
-    """Share of the known markers that are arranged as expected; 1 if they are too few to tell."""
+    """Share of the known markers that are arranged as expected; 1 if they are too few."""
     known = [number for number in markers if number in expected]
     if len(known) < MIN_MARKERS:
         return 1.0

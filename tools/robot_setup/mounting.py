@@ -1,4 +1,4 @@
-"""Guesses how an arm stands at a table: how far its base is below the top, and which way it faces."""
+"""Guesses how an arm is mounted at a table: how far its base is below the top, and which way it faces."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The task of a policy: which requests chunks lead to, how an episode ends, and who has control."""
+"""The task of a policy: the requests that chunks lead to, the end of an episode, and its control."""
 
 from __future__ import annotations
 
@@ -208,7 +208,7 @@ def test_episode_is_done_at_rest_once_an_object_is_held_at_the_height() -> None:
 
 
 @pytest.mark.parametrize(("holding", "height"), [(False, 0.3), (True, 1.5)])
-def test_episode_goes_on_until_all_conditions_hold_and_is_an_error_when_its_time_is_over(
+def test_episode_continues_until_all_conditions_hold_and_is_an_error_when_its_time_is_over(
     holding: bool, height: float
 ) -> None:
     rig = Rig(f"until={{holding: true, height: {height}}}", "seconds=2")

@@ -64,7 +64,7 @@ def box(x: float, y: float, size: tuple[float, float, float], color: Rgb, yaw: f
 
 
 def sphere(x: float, y: float, radius: float, color: Rgb, z: float = FLOOR) -> Mesh:
-    """Return a sphere that rests at a height z [m]."""
+    """Return a sphere that lies at a height z [m]."""
     return Mesh(primitive("sphere", [radius]) + np.array([x, y, z + radius]), color)
 
 

@@ -13,7 +13,7 @@ def at(name, x, y=0.0, volume=4e-5, size=0.04):
 
 @pytest.mark.parametrize(("width", "holding", "held"), [
     (0.0, False, "empty"), (0.03, False, "empty"), (0.001, True, "empty"), (0.03, True, "")])
-def test_width_tells_an_empty_grasp(width, holding, held):
+def test_width_shows_an_empty_grasp(width, holding, held):
     assert by_width(width, holding).held == held
 
 
@@ -36,7 +36,7 @@ A, B, C = at("a", 0.50), at("b", 0.56), at("c", 0.70)
     ([A, B], [at("m", 0.56, volume=5e-5)], "one", ""),
     ([at("m", 0.53, volume=8e-5, size=0.1), C], [B, C], "one", ""),  # two that touched, seen as one, and one was taken
 ])
-def test_what_is_missing_in_the_tray_tells_what_is_held(before, after, held, why):
+def test_what_is_missing_in_the_tray_shows_what_is_held(before, after, held, why):
     found = by_picture(before[0], (0.50, 0.0), before, after)
     assert (found.held, why in found.why) == (held, True), found
 

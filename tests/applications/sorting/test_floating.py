@@ -43,7 +43,7 @@ def test_null_friction_holds_almost_nothing() -> None:
     assert held <= 1
 
 
-def test_fingers_beside_the_object_close_empty() -> None:
+def test_fingers_next_to_the_object_close_empty() -> None:
     outcome = gripped(Block((0.03, 0.03, 0.03)), Conditions(), x=0.62)
     assert (outcome.result, outcome.lifted) == ("empty", ())
 

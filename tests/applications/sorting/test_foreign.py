@@ -33,7 +33,7 @@ def detector() -> HeapDetector:
 
 
 def move(to: HeapDetector, q, stamp: int, width: float = 0.08) -> None:
-    """Tell the detector that the arm is at q (dof,) [rad] from a time on [ns]."""
+    """Report to the detector that the arm is at q (dof,) [rad] from a time on [ns]."""
     for at in (stamp - SECOND // 100, stamp + SECOND // 100):
         to.joints.add(JointState(
             header=Header(stamp=at), name=[*robot().joints, *robot().gripper.joints],
@@ -78,7 +78,7 @@ def test_hand_is_found_in_the_second_image(at_home, x, y, z):
     assert second[0].size.x == pytest.approx(HAND[0], abs=0.02)
 
 
-def test_hand_beside_the_arm_over_the_tray_is_found():
+def test_hand_next_to_the_arm_over_the_tray_is_found():
     to = detector()
     images(to, HEAP, home(), at_home=True)
     found = images(to, [*HEAP, box(0.66, -0.13, HAND, SKIN, z=0.10)], OVER_TRAY, at_home=False, count=2, start=2)

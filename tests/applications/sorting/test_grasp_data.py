@@ -40,7 +40,7 @@ def test_camera_sees_the_object_where_it_lies(rig: Rig) -> None:
     assert labeled == pytest.approx(at[:2], abs=0.01)
 
 
-def test_heap_falls_into_the_tray_and_rests(rig: Rig) -> None:
+def test_heap_falls_into_the_tray_and_comes_to_rest(rig: Rig) -> None:
     rng = np.random.default_rng(4)
     bench = scenes.fallen(rig, [draw(kind, rng) for kind in ("block", "can", "bar", "washer")], rng)
     assert bench is not None and len(bench.positions()) == 4

@@ -1,4 +1,4 @@
-"""The kernel's proof of grasps: positions that reach them, and reasons where something is in the way."""
+"""The kernel's proof of grasps: positions that reach them, and reasons where something obstructs them."""
 
 from __future__ import annotations
 
@@ -72,9 +72,9 @@ def test_proved_positions_reach_approach_and_grasp(name: str, solid: Solid) -> N
 @pytest.mark.parametrize("name", ROBOTS)
 def test_a_finger_that_would_meet_a_measured_point_is_rejected(name: str) -> None:
     cube = box(0.55, 0.0, 0.04, 0.04, 0.04)
-    beside = tuple(box(0.55 + dx, dy, 0.02 if dx else 0.11, 0.11 if dx else 0.02, 0.06)
+    around = tuple(box(0.55 + dx, dy, 0.02 if dx else 0.11, 0.11 if dx else 0.02, 0.06)
                    for dx, dy in ((0.045, 0), (-0.045, 0), (0, 0.045), (0, -0.045)))
-    found, proof = examined(name, cube, behind=beside)
+    found, proof = examined(name, cube, behind=around)
     assert len(found) > 0
     assert not any(grasp.proved for grasp in proof.grasps)
     assert all(POINTS in grasp.why for grasp in proof.grasps)

@@ -35,7 +35,7 @@ def test_stop_is_passed_only_by_its_operator_who_acknowledges_what_was_published
     assert np.array_equal(arm.q, before) is blocked
 
 
-def test_hold_without_a_name_is_turned_into_a_stop_of_the_operator_who_moves_the_arm(arm):
+def test_hold_without_a_name_is_turned_into_a_stop_of_the_moving_operator(arm):
     arm.hold("")
     arm.run(0.1)
     arm.hold("ann", hold=False, into_stop=True, acknowledged=arm.executor.arm.status.newest)
