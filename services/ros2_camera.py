@@ -21,7 +21,7 @@ class Config(InputConfig):
 
     world: Surroundings
     topic: str = Field("", max_length=200, description="of sensor_msgs/Image, such as /camera/image_raw")
-    info: str = Field("", max_length=200, description="of sensor_msgs/CameraInfo; empty: camera_info next to the images")
+    info: str = Field("", max_length=200, description="of sensor_msgs/CameraInfo; empty: the camera_info next to it")
     rectified: bool = Field(False, description="the images are rectified (image_rect): intrinsics are those of P; "
                                                "false: distortion of camera_info is removed here")
 

@@ -245,7 +245,7 @@ async def test_parameters_are_read_and_set(rig: Rig, client: FoxgloveClient) -> 
     assert await client.parameters(services__arm__weights=[3, 4.5]) == {"services.arm.weights": [3.0, 4.5]}
 
 
-async def test_refused_parameter_keeps_its_value_and_the_client_gets_the_reason(rig: Rig, client: FoxgloveClient) -> None:
+async def test_refused_parameter_keeps_its_value_and_the_client_gets_why(rig: Rig, client: FoxgloveClient) -> None:
     assert await client.parameters(services__arm__speed=7.0) == {"services.arm.speed": 0.5}
     assert rig.arm.config.speed == 0.5
     assert any("services.arm.speed" in status and "7" in status for status in client.statuses)
