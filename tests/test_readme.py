@@ -34,9 +34,9 @@ def command(line: str, *more: str) -> list[str]:
 
 @pytest.fixture(scope="module")
 def cell(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Place]:
-    """Start the README's `up` cell."""
+    """Start the README's `up` cell, without its page."""
     line = next(line for line in LINES if " up " in line)
-    with place_of(tmp_path_factory.mktemp("up"), *shlex.split(line)[2:]) as place:
+    with place_of(tmp_path_factory.mktemp("up"), *shlex.split(line)[2:], "--no-viewer") as place:
         yield place
 
 

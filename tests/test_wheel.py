@@ -161,7 +161,7 @@ def test_processes_of_the_clone_load_no_module_twice(tmp_path: Path, arguments: 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["clone", "wheel"])
+@pytest.mark.parametrize("kind", [pytest.param("clone", marks=pytest.mark.campaign), "wheel"])
 def test_cell_runs_from_an_empty_folder_without_loading_a_module_twice(
     kind: str, tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:

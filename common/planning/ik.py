@@ -268,14 +268,14 @@ def _unmet_bounds(region: Region, R: Array, p: Array) -> Iterator[tuple[Array, f
     target = region.T_world_tcp
     away = target[:3, 3] - p
     beyond = np.sign(away) * np.maximum(np.abs(away) - region.half_sides, 0.0)
-    place = [(np.eye(6)[axis], float(beyond[axis])) for axis in range(3)]
+    place = [(_EYE[axis], float(beyond[axis])) for axis in range(3)]
     point = [row for axis, row in enumerate(place) if region.half_sides[axis] == 0.0 or row[1] != 0.0]
     in_place = float(np.abs(beyond).max()) < POSITION_TOLERANCE
 
     turned = target[:3, :3].T @ R
-    tilt = math.acos(float(np.clip(turned[2, 2], -1, 1)))
-    axis = np.cross(R[:, 2], target[:3, 2])
-    length = float(np.linalg.norm(axis))
+    tilt = math.acos(min(max(float(turned[2, 2]), -1.0), 1.0))
+    axis = _cross(R[:, 2], target[:3, 2])
+    length = math.sqrt(axis @ axis)
     axis = axis / length if length > _NO_AXIS else np.asarray(R[:, 0])
     # The yaw is the turn that remains after the shortest rotation has aligned the tool axes.
     yaw = math.atan2(turned[1, 0] - turned[0, 1], turned[0, 0] + turned[1, 1])
@@ -292,6 +292,12 @@ def _unmet_bounds(region: Region, R: Array, p: Array) -> Iterator[tuple[Array, f
     if not facing or region.yaw == 0.0:
         missing = -math.copysign(max(abs(yaw) - region.yaw * (1 - _INNER_SHARE), 0.0), yaw)
         yield _rotation_about(target[:3, 2]), missing
+
+
+def _cross(a: Array, b: Array) -> Array:
+    """Return the product of two vectors (3,), as `np.cross` does, which is slow for one pair."""
+    (a0, a1, a2), (b0, b1, b2) = a.tolist(), b.tolist()
+    return np.array([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0])
 
 
 def _rotation_about(axis: Array) -> Array:
