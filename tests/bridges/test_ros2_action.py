@@ -199,7 +199,7 @@ async def test_goal_moves_the_arm_with_status_feedback_and_result(cell: Cell) ->
         assert reached == sorted(reached) and len(reached) > 2 and reached[-1] > reached[0]
         last = messages[-1].feedback
         assert last.joint_names == NAMES
-        # Of most: on a busy machine a reading of the joints may be missing. Cubics instead of quintics are 0.015 off.
+        # Of most: on a busy machine a reading of the joints may be missing. Cubics instead of quintics are 0.014 off.
         assert np.median([abs(each.feedback.error.positions).max() for each in messages]) < 0.008
         assert hasattr(last, "index") is (variant == types.INDEXED)
     seen = [[(bytes(each.goal_info.goal_id.uuid), each.status) for each in statuses.get_nowait()[0].status_list]
