@@ -1,4 +1,4 @@
-"""Domains for the cells of tests, which no other test process uses."""
+"""Domains and ports for the cells of tests, which no other test process uses."""
 
 from __future__ import annotations
 
@@ -39,6 +39,12 @@ def free_domain() -> int:
                 _given.append(number)
                 return number
     raise RuntimeError(f"no domain from {domains[0]} to {domains[-1]} is free")
+
+
+def free_port() -> int:
+    """Return a port of 127.0.0.1 that is free now."""
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        return int(probe.getsockname()[1])
 
 
 def _take(domain: int) -> None:

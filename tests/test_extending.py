@@ -197,7 +197,7 @@ def start(line: str, folder: Path, env: dict[str, str]) -> subprocess.Popen[str]
 def test_custom_service_joins_a_cell(folder: Path) -> None:
     up, join, echo = COMMANDS[COMMANDS.index("zencell up panda"):][:3]
     env = environment()
-    with start(up, folder, env) as cell:
+    with start(f"{up} --no-viewer", folder, env) as cell:
         while "is up at" not in (output := cell.stdout.readline()):
             assert output, "the cell did not come up"
         with start(join, folder, env) as service:

@@ -28,6 +28,7 @@ from common.transport.local import LocalNetwork
 from services import foxglove_bridge
 from tests.bridges.client import FoxgloveClient, connected
 from tests.cli.conftest import make_folder
+from tests.domains import free_port
 from tests.harness import Zencell, free_domain
 
 pytest.importorskip("foxglove", reason="the extra `foxglove` is not installed")
@@ -81,12 +82,6 @@ class Arm:
             self.joints.put(m.JointState(header=HEADER, name=["a"], position=[float(number)]))
             self.picture.put(array_to_image(PIXELS, "bgr8", HEADER))
             await asyncio.sleep(0.01)
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 class Rig:

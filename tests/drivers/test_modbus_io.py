@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import socket
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from typing import Any
@@ -12,6 +11,7 @@ import pytest
 from common.config import Io, check
 from common.errors import ConfigError, Refused
 from common.hardware.signals import IoLost, Unreadable, load_io
+from tests.domains import free_port
 
 pytest.importorskip("pymodbus")
 from pymodbus.server import ModbusTcpServer
@@ -22,13 +22,6 @@ SIGNALS = {
     "clamp": {"output": 0}, "start": {"output": 1}, "other": {"output": 9},
     "pressure": {"input": 2, "range": [0, 10], "unit": "bar"}, "valve": {"output": 7, "range": [-1, 1]},
 }
-
-
-def free_port() -> int:
-    with socket.socket() as found:
-        found.bind(("127.0.0.1", 0))
-        port: int = found.getsockname()[1]
-        return port
 
 
 @asynccontextmanager

@@ -10,7 +10,7 @@ import pytest
 from common.config import Io, check
 from common.errors import ConfigError, Refused
 from common.hardware.signals import IoLost, Unreadable, load_io
-from tests.drivers.test_modbus_io import free_port
+from tests.domains import free_port
 
 pytest.importorskip("asyncua")
 from asyncua import Server, ua

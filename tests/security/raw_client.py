@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import socket
 import threading
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -18,11 +17,6 @@ TIMEOUT = 30.0  # [s] only a failing test waits that long
 TIMEOUT_REPLY = b"Timeout"  # of Zenoh itself, when no queryable has replied
 REFUSAL_MS = 1500  # [ms] for which a connection is tried that must be refused
 Samples = list[tuple[str, bytes]]
-
-
-def free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as probe:
-        return int(probe.getsockname()[1])
 
 
 def issue(

@@ -14,8 +14,9 @@ import pytest
 from common import messages as m
 from common import topics
 from common.transport.credentials import credentials_of
+from tests.domains import free_port
 from tests.harness import RunningCell, ask, command_line, environment, until
-from tests.security.raw_client import RawClient, free_port
+from tests.security.raw_client import RawClient
 
 TOKEN = "the-token-of-this-page-0123456789"
 SERVICES = 9

@@ -26,8 +26,9 @@ from common.transport.zenoh_session import connect
 from recording.reader import Recording
 from security.certificates import Authority
 from security.page_tokens import ROLES, read_tokens
+from tests.domains import free_port
 from tests.harness import until
-from tests.security.raw_client import REFUSAL_MS, RawClient, Received, free_port, issue
+from tests.security.raw_client import REFUSAL_MS, RawClient, Received, issue
 from tests.security.secured_cell import SERVICES, TOKEN, Secured, running_secured, sockets_of
 from zencell.blocking import Cell
 

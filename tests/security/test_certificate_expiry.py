@@ -17,7 +17,8 @@ from common.transport.router import Router, maintain
 from security.access import Rights, access_control
 from security.certificates import Authority
 from security.validation import certificate_in, require_valid
-from tests.security.raw_client import REFUSAL_MS, RawClient, free_port, issue
+from tests.domains import free_port
+from tests.security.raw_client import REFUSAL_MS, RawClient, issue
 from tools.doctor.network import certificates as findings
 
 NAMES = ("router", "operator", "panda.camera")

@@ -18,7 +18,8 @@ from common.transport.router import Router
 from common.transport.zenoh_session import ZenohSession, open_zenoh
 from security.certificates import Authority
 from tests.common.transport.conftest import until
-from tests.security.raw_client import REFUSAL_MS, RawClient, free_port, issue
+from tests.domains import free_port
+from tests.security.raw_client import REFUSAL_MS, RawClient, issue
 
 SILENT = 150  # Zenoh without the gate accepts no client for 100 ms after each
 WITHIN = 3.0  # [s]

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from common.transport.endpoint import port_of
+from tests.domains import free_port
 from tests.harness import RunningCell
-from tests.security.raw_client import free_port
 from tests.security.secured_cell import all_processes, ready, sockets_of
 
 pytestmark = [pytest.mark.cell, pytest.mark.timeout(300)]

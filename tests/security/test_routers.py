@@ -16,8 +16,9 @@ from common.transport.endpoint import MAX_OTHER_BYTES, router_config
 from common.transport.router import open_router
 from security.access import Rights, access_control
 from security.certificates import Authority
+from tests.domains import free_port
 from tests.harness import ROOT, environment
-from tests.security.raw_client import RawClient, free_port, issue
+from tests.security.raw_client import RawClient, issue
 
 
 @pytest.fixture

@@ -8,8 +8,8 @@ import pytest
 
 from common.transport.credentials import credentials_of
 from common.transport.router import PER_CERTIFICATE, Router, maintain
+from tests.domains import free_port
 from tests.security.raw_client import RawClient
-from tests.security.test_routers import free_port
 
 MORE = PER_CERTIFICATE + 8
 

@@ -15,7 +15,8 @@ from common.transport.endpoint import peer_group
 from common.transport.inner_certificates import InnerAuthority, name_of
 from common.transport.tls_gate import TlsGate
 from security.certificates import Authority
-from tests.security.raw_client import free_port, issue
+from tests.domains import free_port
+from tests.security.raw_client import issue
 
 TIMEOUT = 20.0  # [s] only a failing test waits that long
 Open = Callable[[], socket.socket]
