@@ -159,7 +159,9 @@ class PolicyTask:
             self.fail(f"a motion was rejected: {answer.message}")
 
     def fail(self, problem: str) -> None:
-        """Count a failure; too many in a row end the episode."""
+        """Count a failure; too many in a row end the episode, unless it is over already."""
+        if self._ending is not None or self.status.state in ("DONE", "ERROR"):
+            return
         self.status.failures += 1
         self._failures += 1
         self.status.message = problem

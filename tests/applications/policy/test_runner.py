@@ -204,6 +204,10 @@ def test_episode_is_done_at_rest_once_an_object_is_held_at_the_height() -> None:
     assert isinstance(stop, StopRequest) and rig.status.state == "ENDING"
     rig.step(0.1, id="p-1", state="cancelled")
     assert (rig.status.state, rig.status.done, rig.status.message) == ("DONE", 1, "")
+    for _ in range(20):  # answers to requests that were under way
+        rig.task.fail("too late")
+    rig.step()
+    assert (rig.status.state, rig.status.message) == ("DONE", "")
     assert isinstance(rig.task.command("start", rig.view)[0], HoldRequest) and rig.status.state == "IDLE"
 
 
