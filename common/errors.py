@@ -27,6 +27,10 @@ class ConfigError(ZencellError):
         self.value = value
         self.expected = expected
 
+    def within(self, section: str) -> ConfigError:
+        """Return the same error with the section of the cell that its field is in."""
+        return ConfigError(f"{section}.{self.field}", self.value, self.expected)
+
 
 class UnknownName(ZencellError):
     """A name that is not among the choices."""

@@ -7,9 +7,10 @@ from typing import Annotated
 from pydantic import Field, model_validator
 
 from applications.policy.proof import OnViolation, ProofOptions
+from applications.policy.sources import require_source
 from applications.policy.sources.settings import PolicyCell, SourceConfig
 from common.config import Parameters, Tunable
-from common.config.basics import Number
+from common.config.basics import Key, Number
 from common.messages import Box, Pose, Vector3
 from common.planning.camera_obstacles import PointsOptions
 from common.tasks.decisions import TaskConfig
@@ -50,7 +51,7 @@ class Config(TaskConfig):
     """Where actions come from, what is required of them, and when an episode ends. Times are cell time unless said."""
 
     source: SourceConfig = SourceConfig(callable="examples.policy.scripted:policy")
-    cameras: dict[str, str] = Field(
+    cameras: dict[Annotated[str, Field(min_length=1, max_length=100)], Key] = Field(
         {"camera": "camera/image_raw"}, max_length=8, description="key of the images by the name that the policy knows")
     image_size: tuple[Annotated[int, Field(ge=8, le=4096)], Annotated[int, Field(ge=8, le=4096)]] | None = Field(
         None, description="width and height that images are resized to [px]; by default they are not")
@@ -77,6 +78,10 @@ class Config(TaskConfig):
     seconds: Tunable[float] = Field(60.0, gt=0, le=36_000, description="longest episode, without an operator [s]")
     most_failures: Tunable[int] = Field(
         10, ge=1, le=1000, description="requests for actions that may fail in a row before the episode ends")
+
+    def require_usable(self) -> None:
+        """Check module, file or address of the source."""
+        require_source(self.source, self.cell())
 
     def proof_options(self) -> ProofOptions:
         """Return what is required of a motion."""

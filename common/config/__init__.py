@@ -17,6 +17,7 @@ from common.config.loading import (
     expanded,
     load_cell,
     load_robot,
+    located,
     parse_override,
     service_config,
     service_names,

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 from types import NoneType, UnionType
 from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from common.errors import ConfigError
+from common.remapping import is_key
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Length = Annotated[float, Field(gt=0, le=10, allow_inf_nan=False)]
@@ -18,6 +19,15 @@ Point = tuple[Coordinate, Coordinate, Coordinate]
 Rgb = tuple[
     Annotated[float, Field(ge=0, le=1)], Annotated[float, Field(ge=0, le=1)], Annotated[float, Field(ge=0, le=1)]
 ]
+
+
+def _key(text: str) -> str:
+    if not is_key(text):
+        raise ValueError(f"{text!r} is no key, such as camera/image_raw")
+    return text
+
+
+Key = Annotated[str, AfterValidator(_key)]  # of a topic, without the cell and without wildcards
 
 
 @dataclass(frozen=True)
@@ -44,6 +54,13 @@ class Parameters(BaseModel):
     """
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False, defer_build=True)
+
+    def require_usable(self) -> None:
+        """Check what the values name on this host, such as files; called before any process starts, so it is quick.
+
+        Raises:
+            ConfigError: names the field without the service, the value and what is expected.
+        """
 
 
 C = TypeVar("C", bound=BaseModel)

@@ -27,7 +27,7 @@ from common.config.files import (
 )
 from common.config.robot import RobotConfig
 from common.config.world import CAMERA, Surroundings
-from common.errors import ConfigError, UnknownName
+from common.errors import ConfigError, UnknownName, ZencellError
 from common.remapping import SERVICE_NAME, validate_table
 
 NOT_A_SERVICE = ("router", "supervisor", "recorder")  # names of other processes
@@ -297,3 +297,10 @@ def service_config(cell: Cell, name: str, config: type[P]) -> P:
             # A copy, because each service changes its parameters at run time.
             values[field] = cell.section(info.annotation, camera).model_copy()  # type: ignore[arg-type]
     return check(config, values, f"services.{name}")
+
+
+def located(error: ZencellError, config: Parameters, service: str) -> ZencellError:
+    """Return an error that a service raised in use, with the complete path if it names a parameter of the service."""
+    if isinstance(error, ConfigError) and error.field.partition(".")[0] in own_fields(type(config)):
+        return error.within(f"services.{service}")
+    return error

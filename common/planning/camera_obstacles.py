@@ -11,6 +11,7 @@ import numpy.typing as npt
 from pydantic import Field, model_validator
 
 from common.config import Section
+from common.config.basics import Key
 from common.errors import Refused, ZencellError
 from common.messages import CameraInfo, Image, JointState, PlanningScene, PointCloud2, TFMessage
 from common.perception.camera_input import FrameError
@@ -34,9 +35,9 @@ _MAX_GAP = 0.1  # [s] between an image and the joint states before and after it
 class Camera(Section):
     """A camera: the key of its point clouds, or of its depth images and their intrinsics."""
 
-    points: str = Field("", description="key of a PointCloud2, such as depth_camera/points")
-    depth: str = Field("", description="key of a depth Image, such as depth_camera/depth/image_raw")
-    info: str = Field("", description="key of its CameraInfo, such as depth_camera/camera_info")
+    points: Key | Literal[""] = Field("", description="key of a PointCloud2, such as depth_camera/points")
+    depth: Key | Literal[""] = Field("", description="key of a depth Image, such as depth_camera/depth/image_raw")
+    info: Key | Literal[""] = Field("", description="key of its CameraInfo, such as depth_camera/camera_info")
 
     @property
     def key(self) -> str:

@@ -16,7 +16,7 @@ from typing import Any, Generic, NoReturn, Protocol, TypeVar
 
 from common import topics
 from common.clock import BOOTED_VARIABLE, CLOCK_FOLDER_VARIABLE, EPOCH_VARIABLE, SPEED_VARIABLE, Clock
-from common.config import OVERRIDES_VARIABLE, Cell, Parameters, Watchdogs, load_cell, service_config
+from common.config import OVERRIDES_VARIABLE, Cell, Parameters, Watchdogs, load_cell, located, service_config
 from common.config.tunables import apply, checked, describe, values_of
 from common.errors import ConfigError, UnknownName, ZencellError
 from common.messages import ParameterReply, ParameterRequest
@@ -292,7 +292,7 @@ async def serve(run: Run[P], bus: Bus, config: P, lifeline: StopState) -> int:
         serve_parameters(bus, config)
         await bus.run(run(bus, config))
     except (ConfigError, UnknownName) as error:  # bad input that shows only in use, such as a missing URDF
-        bus.log.error("%s", error)
+        bus.log.error("%s", located(error, config, bus.service))
         return 2
     except asyncio.CancelledError:
         if not lifeline.stopping:

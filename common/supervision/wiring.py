@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 from common.application import all_topics
 from common.clock import Clock
-from common.config import Cell, Parameters, Scenery, ServiceEntry, World, service_config
+from common.config import Cell, Parameters, Scenery, ServiceEntry, World, located, service_config
 from common.errors import ConfigError, ZencellError
 from common.messages import Message
 from common.supervision.launch import require_module
@@ -217,8 +217,8 @@ def wire_service(cell: Cell, entry: ServiceEntry) -> ServiceWiring:
     try:
         with redirect_stdout(sys.stderr):  # stdout carries the output of the command
             found = asyncio.run(wiring(module.run, unbound, service=entry.name, topics=entry.topics))
-    except ZencellError:
-        raise
+    except ZencellError as error:
+        raise located(error, config, entry.name) from None
     except Exception as error:
         raise WiringFailed(entry.name, error) from error
     doc = (module.__doc__ or "").strip().partition("\n")[0]

@@ -33,6 +33,8 @@ TICKS = 10  # of the integration in a row
 
 def policy(observation: Observation) -> Chunk:
     """Return tool poses for the next second. Uses the first image, which shows the complete view of the camera."""
+    if not observation.images:
+        raise ValueError("no camera in the observation")
     robot, _ = _cell()
     ball = find_ball(next(iter(observation.images.values())))
     committed = [robot.fk(q) for q in observation.committed[:ROWS]]

@@ -16,7 +16,7 @@ from difflib import get_close_matches
 from typing import TYPE_CHECKING, NamedTuple
 
 from common.application import find_application
-from common.config import Cell, GripperConfig, RobotConfig, Surroundings
+from common.config import Cell, GripperConfig, RobotConfig, Surroundings, located
 from common.errors import ConfigError, ZencellError
 from common.hardware.interface import has_simulated_world
 from common.messages import TaskStatus
@@ -70,7 +70,7 @@ def require_valid_services(cell: Cell) -> None:
     A service of the project without either has its defaults, and its imports would delay the start.
 
     Raises:
-        ConfigError: names the field, the value and the choices.
+        ConfigError: names the field, the value and the choices, or a file that is missing on this host.
     """
     require_valid_io(cell)
     given = [entry for entry in cell.services.values()
@@ -79,7 +79,11 @@ def require_valid_services(cell: Cell) -> None:
         return
     for entry in given:
         with contextlib.suppress(WiringFailed):  # its process reports the error
-            load_service(cell, entry)
+            _, config = load_service(cell, entry)
+            try:
+                config.require_usable()
+            except ConfigError as problem:
+                raise located(problem, config, entry.name) from None
             if entry.topics:
                 wire_service(cell, entry)
 

@@ -23,3 +23,21 @@ def source(config: SourceConfig, cell: PolicyCell) -> PolicySource:
     from applications.policy.sources.openpi import OpenpiPolicy
 
     return OpenpiPolicy(config, cell)
+
+
+def require_source(config: SourceConfig, cell: PolicyCell) -> None:
+    """Check as much of a source as can be checked without running what it names.
+
+    Raises:
+        ConfigError: a module, file or card is missing or does not fit the cell, or an address is none.
+    """
+    if config.callable:
+        from applications.policy.sources.function import require_module
+
+        require_module(config.callable)
+    elif config.onnx:
+        from applications.policy.sources.onnx_file import require_file
+
+        require_file(config.onnx, cell)
+    else:
+        source(config, cell)

@@ -72,15 +72,19 @@ class Computation:
 async def _awaited(function: Callable[..., Any], *args: Any) -> tuple[Any, Exception | None]:
     try:
         return await function(*args), None
-    except Exception as error:
-        return None, error
+    except BaseException as error:
+        return None, _ordinary(error)
 
 
 def _outcome(function: Callable[..., Any], *args: Any) -> tuple[Any, Exception | None]:
-    """Return the result or the error; one that ends a process becomes an ordinary error."""
     try:
         return function(*args), None
-    except Exception as error:
-        return None, error
     except BaseException as error:
-        return None, RuntimeError(f"{type(error).__name__}: {error}")
+        return None, _ordinary(error)
+
+
+def _ordinary(error: BaseException) -> Exception:
+    """Return an error that can be raised in a coroutine; one that ends a process, task or iterator becomes another."""
+    if isinstance(error, Exception) and not isinstance(error, StopIteration):
+        return error
+    return RuntimeError(f"{type(error).__name__}: {error}".removesuffix(": ")).with_traceback(error.__traceback__)

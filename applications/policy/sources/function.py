@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-import importlib
+import importlib.util
 import inspect
 import traceback
 from collections.abc import Callable
@@ -68,11 +68,8 @@ def load_function(name: str) -> Callable[..., Any]:
     Raises:
         ConfigError: the module or the name does not exist, or it is no function.
     """
-    module, _, attribute = name.partition(":")
-    if not module or not attribute:
-        raise ConfigError(FIELD, name, "must be dotted.module:name")
+    module, attribute = _parts(name)
     try:
-        import_from_working_directory(module)
         found = importlib.import_module(module)
     except ImportError as error:
         missing = isinstance(error, ModuleNotFoundError) and f"{module}.".startswith(f"{error.name}.")
@@ -83,6 +80,32 @@ def load_function(name: str) -> Callable[..., Any]:
                  and value.__module__ == module]
         raise ConfigError(FIELD, name, f"{module} has no function {attribute}; choices: {', '.join(names) or 'none'}")
     return function  # type: ignore[no-any-return]
+
+
+def require_module(name: str) -> None:
+    """Return if the module of `dotted.module:name` can be found; packages around it are imported.
+
+    Raises:
+        ConfigError: it cannot, or the name is none.
+    """
+    module, _ = _parts(name)
+    try:
+        found = importlib.util.find_spec(module) is not None
+    except ImportError:
+        found = False
+    except Exception:  # a package of the user; the service reports it, with file and line
+        return
+    if not found:
+        raise ConfigError(FIELD, name, where_searched(module))
+
+
+def _parts(name: str) -> tuple[str, str]:
+    """Return module and name of a function; the module is searched in the working directory, too."""
+    module, _, attribute = name.partition(":")
+    if not all(part.isidentifier() for part in [*module.split("."), attribute]):
+        raise ConfigError(FIELD, name, "must be dotted.module:name")
+    import_from_working_directory(module)
+    return module, attribute
 
 
 def _place(error: BaseException) -> str:

@@ -123,6 +123,18 @@ def _find(name: str) -> Path:
     return included if not path.exists() and included.exists() else path
 
 
+def require_file(name: str, cell: PolicyCell) -> None:
+    """Return if a file is there and its card fits the cell.
+
+    Raises:
+        ConfigError: says why it is or does not.
+    """
+    path = _find(name)
+    if not path.is_file():
+        raise ConfigError(FIELD, str(path), "is not a file")
+    read_card(path).require(cell, path)
+
+
 def _read(path: Path) -> bytes:
     try:
         if path.stat().st_size > MAX_BYTES:

@@ -78,6 +78,18 @@ def exits(seen):
     raise SystemExit(3)
 
 
+async def exits_async(seen):
+    raise SystemExit(3)
+
+
+async def cancels_itself(seen):
+    raise asyncio.CancelledError
+
+
+def ends_an_iterator(seen):
+    return next(iter(()))
+
+
 def returns_none(seen):
     return None
 
@@ -143,8 +155,10 @@ async def test_function_gets_a_copy():
 
 @pytest.mark.parametrize("name,text", [
     ("crashes", r"failed at test_function_source.py:\d+: ValueError: two lines"), ("crashes_async", "KeyError: 'x'"),
-    ("exits", "RuntimeError: SystemExit: 3"), ("returns_none", "not NoneType"),
+    ("exits", r"test_function_source.py:\d+: RuntimeError: SystemExit: 3"), ("returns_none", "not NoneType"),
     ("returns_wrong_shape", r"shape \(n, 7\) or, with the gripper, \(n, 8\), n at most 1000; they are 3x5"),
+    ("exits_async", "RuntimeError: SystemExit: 3"), ("cancels_itself", "RuntimeError: CancelledError$"),
+    ("ends_an_iterator", r"test_function_source.py:\d+: RuntimeError: StopIteration$"),
     ("returns_objects", "of numbers, not ndarray"), ("returns_ragged", "actions must be an array"),
     ("lies", "RuntimeError: no array"), ("fails_without_text", ": Unprintable$")])
 async def test_wrong_result_is_one_line(name, text):
