@@ -20,7 +20,7 @@ from common.hardware.interface import Limits
 from common.planning.robot_geometry import RobotGeometry
 from common.process.obstacles import ObstacleReader
 from common.process.service import main
-from common.process.task_runner import TaskRunner
+from common.process.task_runner import TaskMemory, TaskRunner
 from common.robot.model import RobotModel
 from common.robot.transforms import matrix_to_pose
 from common.tasks.monitoring import LivenessWatchdog
@@ -86,7 +86,8 @@ async def run(bus: Bus, config: Config) -> None:
         return known
 
     watchdog = LivenessWatchdog(lambda: joints.received, lambda: config.joint_states_timeout)
-    runner = PolicyRunner(bus, task, observe, out, lambda: config.planning_time, watchdog)
+    memory = TaskMemory(bus, task)
+    runner = PolicyRunner(bus, task, observe, out, lambda: config.planning_time, watchdog, memory)
     cameras = None if config.points is None else ObstacleReader(bus, config.points)
     actions = await asyncio.to_thread(source, config.source, config.cell())
     points = None
@@ -95,6 +96,7 @@ async def run(bus: Bus, config: Config) -> None:
         cameras.load(seen_by, RobotGeometry(seen_by))
         points = partial(cameras.snapshot, stage="chunk")
     chunks = ChunkLoop(config, limits, task, actions, bus.clock, observe, runner.wake, points)
+    await memory.load()
     await bus.ready()
 
     async def watch(camera: str, reader: Reader[m.Image]) -> None:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from applications.policy.blending import AT_REST, FollowedPath, blended, trajectory_of
 from applications.policy.gripping import GripperSchedule
 from applications.policy.interface import Chunk, MotionState, ProvedMotion, Violation
-from applications.policy.settings import Config
+from applications.policy.settings import Config, Memory
 from applications.policy.topics import PolicyStatus
 from common import messages as m
 from common.control.trajectory import to_message
@@ -85,11 +85,35 @@ class PolicyTask:
         self.causes: Counter[str] = Counter()
         self._commands: list[Command] = []
         self._ending: tuple[Literal["DONE", "ERROR"], str] | None = None
+        self._memory = Memory()
         self._minted = 0
         self._failures = 0  # in a row
         self._found = False  # whether the state of the robot was read, or an operator sent a command
         self._counted = -math.inf  # cell time until which times are counted
         self._accepted_at = -math.inf
+
+    # --- restarts ---------------------------------------------------------------------------------------------------
+
+    @property
+    def memory(self) -> Memory:
+        """What the task continues with after a restart of its process; another object once that changes."""
+        status = self.status
+        ended: Literal["", "DONE", "ERROR"] = status.state if status.state in ("DONE", "ERROR") else ""
+        now = Memory(control=status.control, operator=status.operator, ended=ended,
+                     message=status.message if ended else "", seconds=int(status.task_seconds))
+        if now != self._memory:
+            self._memory = now
+        return self._memory
+
+    def remember(self, memory: Memory) -> None:
+        """Continue from the memory of the process before."""
+        self._memory, status = memory, self.status
+        status.task_seconds = float(memory.seconds)
+        if memory.control == "operator":
+            self.take(memory.operator)
+        if memory.ended:
+            status.state, status.message = memory.ended, memory.message
+            status.done = status.total = int(memory.ended == "DONE")
 
     # --- operators ------------------------------------------------------------------------------------------------
 

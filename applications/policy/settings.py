@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import BaseModel, Field, model_validator
 
 from applications.policy.proof import OnViolation, ProofOptions
 from applications.policy.sources import require_source
 from applications.policy.sources.settings import PolicyCell, SourceConfig
+from applications.policy.topics import Control
 from common.config import Parameters, Tunable
 from common.config.basics import Key, Number
 from common.messages import Box, Pose, Vector3
@@ -45,6 +46,16 @@ class Until(Parameters):
     holding: bool = Field(True, description="the gripper holds an object")
     height: Annotated[float, Field(ge=-10, le=10)] | None = Field(
         None, description="the tool center point is at least this high in world [m]")
+
+
+class Memory(BaseModel):
+    """What a restarted task continues with: an operator in control, and an episode that is over, stay as they are."""
+
+    control: Control = "policy"
+    operator: str = ""
+    ended: Literal["", "DONE", "ERROR"] = ""
+    message: str = ""  # of the end
+    seconds: int = 0  # of the episode
 
 
 class Config(TaskConfig):

@@ -255,10 +255,21 @@ def _require_allowed(command: m.TaskCommand, motion: m.MotionStatus | None, owne
         raise Refused("held", f"the robot is {'; '.join(others)}: only they can release it, unless you override")
 
 
+class Remembering(Protocol):
+    """A task that continues from its memory after a restart."""
+
+    @property
+    def memory(self) -> Any:
+        """What it continues with, another object after each change; None: nothing."""
+
+    def remember(self, memory: Any) -> None:
+        """Continue from the memory of the task before its restart."""
+
+
 class TaskMemory:
     """State that a restarted task restores, in a file that is deleted when the cell ends; nothing without a folder."""
 
-    def __init__(self, bus: Bus, task: Task[Any]) -> None:
+    def __init__(self, bus: Bus, task: Remembering) -> None:
         """Start with the memory of a new task; nothing is written yet."""
         self._bus, self._task = bus, task
         self._saved = task.memory

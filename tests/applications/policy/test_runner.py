@@ -291,3 +291,46 @@ def test_bad_settings_are_named(settings: list[str], words: str) -> None:
 def test_region_is_a_box_in_world() -> None:
     box = Region(lower=(0.2, -0.4, 0.0), upper=(0.6, 0.4, 0.5)).box
     assert (box.pose.position.x, box.pose.position.z, box.size.y) == pytest.approx((0.4, 0.25, 0.8))
+
+
+def restarted(rig: Rig) -> Rig:
+    """A task of a new process that continues from the memory of another one."""
+    after = Rig()
+    after.task.remember(rig.task.memory)
+    return after
+
+
+def test_restart_leaves_an_operator_in_control():
+    rig = Rig()
+    rig.step()
+    before = rig.task.memory
+    rig.task.take("ann")
+    assert rig.task.memory is not before and rig.task.memory is rig.task.memory
+    rig = restarted(rig)
+    rig.step()
+    assert (rig.status.control, rig.status.operator, rig.task.wants_chunk(rig.view)) == ("operator", "ann", False)
+    rig.task.give()
+    rig = restarted(rig)
+    rig.step()
+    assert rig.status.control == "policy" and rig.task.wants_chunk(rig.view)
+
+
+def test_restart_does_not_begin_an_episode_again():
+    rig = Rig("seconds=2.0")
+    for _ in range(30):
+        rig.step()
+    assert rig.status.state == "ERROR"
+    rig = restarted(rig)
+    rig.step()
+    assert (rig.status.state, rig.status.message) == ("ERROR", "not done within 2 s")
+    assert not rig.task.wants_chunk(rig.view)
+    assert rig.task.command("start", rig.view)
+    rig.step()
+    assert rig.status.state == "ACTING" and rig.status.task_seconds < 0.2
+
+
+def test_restart_does_not_prolong_an_episode():
+    rig = Rig()
+    for _ in range(15):
+        rig.step()
+    assert restarted(rig).status.task_seconds == pytest.approx(1.0)
