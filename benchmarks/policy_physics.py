@@ -1,6 +1,7 @@
 """A hostile policy in a complete cell with physics: contacts of the arm, counted by MuJoCo itself.
 
     python -m benchmarks.policy_physics [--sequences N] [--first N] [--seconds S] [--solids N]
+                                        [--clearance M]
 
 Each sequence is the cell `policy_panda` on the virtual clock, `world.simulator: mujoco`, with solids around the arm and
 a policy whose chunks are hostile in all ways of tests/applications/policy/hostile.py. After each step of 2 ms MuJoCo's
@@ -103,7 +104,7 @@ class ContactCounter:
         self.objects += OBJECT in found
 
 
-def cell_of(seed: int, solids: int, seconds: float) -> tuple[Cell, np.ndarray]:
+def cell_of(seed: int, solids: int, seconds: float, clearance: float) -> tuple[Cell, np.ndarray]:
     """Return the cell of a sequence, and the places (N, 3) [m] of its solids."""
     rng = np.random.default_rng((seed, 8))
     choice = str(rng.choice(["slow", "shorten"]))
@@ -111,7 +112,7 @@ def cell_of(seed: int, solids: int, seconds: float) -> tuple[Cell, np.ndarray]:
         "world.simulator=mujoco", f"seed={seed}", "services.policy_runner.cameras={}",
         "services.policy_runner.source.callable=benchmarks.policy_physics:policy",
         f"services.policy_runner.on_violation={choice}", f"services.policy_runner.seconds={seconds}",
-        "services.policy_runner.until.height=9.0"])
+        "services.policy_runner.until.height=9.0", f"services.policy_runner.clearance={clearance}"])
     found, home = list(cell.world.fixtures), panda().link_poses(panda().named("home"))
     for item in crowded(rng, 3 * solids).objects[1:]:
         at = np.array([item.pose.position.x, item.pose.position.y, item.pose.position.z])
@@ -132,10 +133,11 @@ def main() -> int:
     parser.add_argument("--first", type=int, default=0, help="number of the first sequence")
     parser.add_argument("--seconds", type=float, default=5.0, help="virtual time of each")
     parser.add_argument("--solids", type=int, default=12)
+    parser.add_argument("--clearance", type=float, default=0.015, help="[m] more than servos leave their set-points")
     options = parser.parse_args()
     total, kinds, began, broken, ran = Counter[str](), Counter[str](), time.perf_counter(), [], 0
     for seed in range(options.first, options.first + options.sequences):
-        cell, places = cell_of(seed, options.solids, options.seconds)
+        cell, places = cell_of(seed, options.solids, options.seconds, options.clearance)
         hostile.restart(seed, places)
         counter = ContactCounter()
         with patch.object(mujoco, "mj_step", counter):
