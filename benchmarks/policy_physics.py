@@ -119,9 +119,10 @@ def cell_of(seed: int, solids: int, seconds: float, clearance: float) -> tuple[C
         away = min(float(np.linalg.norm(T[:3, 3] - at)) for T in home.values())
         if away > CLOSEST and np.linalg.norm(at[:2]) > CLOSEST and len(found) <= solids:
             found.append(Fixture(id=item.id, shape=item.shape, dimensions=list(item.dimensions), position=at.tolist()))
+    places = np.array([item.position for item in found[1:]])
+    found.append(Fixture(id="ground", shape="box", dimensions=[3.0, 3.0, 0.02], position=[0.0, 0.0, -0.08]))
     world = cell.world.model_copy(update={"fixtures": found, "objects": []})
     services = {key: entry for key, entry in cell.services.items() if entry.name != "camera_simulator"}
-    places = np.array([item.position for item in found[1:]])
     return cell.model_copy(update={"world": world, "services": services}), places
 
 
