@@ -65,7 +65,7 @@ class Controls:
         command = request.service_name.rpartition("/")[2]
         try:
             fields = json.loads(request.payload or b"{}")
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             raise CallFailed(f"{request.service_name}: is not JSON: {error}") from None
         allowed = {"override"} if COMMANDS[command] else set()
         if not isinstance(fields, dict) or fields.keys() - allowed or not all(
@@ -131,7 +131,7 @@ def to_parameter(name: str, value: Any) -> Parameter:
 def _from_text(text: str) -> Any:
     try:
         return json.loads(text)
-    except ValueError:
+    except (ValueError, RecursionError):
         return text  # the service refuses it, with the reason
 
 

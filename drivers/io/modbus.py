@@ -65,13 +65,17 @@ class ModbusIo:
 
     def _values(self, names: list[str], answer: Any) -> dict[str, Value]:
         limits = self._signals[names[0]].range
+        given, most = (answer.bits, len(names) + 7) if limits is None else (answer.registers, len(names))
+        if not len(names) <= len(given) <= most:
+            raise IoLost(f"{self._options.host}:{self._options.port}: an answer has {len(given)} values instead of "
+                         f"{len(names)}")
         if limits is None:
             return dict(zip(names, map(bool, answer.bits), strict=False))  # bits are padded to bytes
         (low, high) = self._options.raw
         found: dict[str, Value] = {}
         for name, number in zip(names, answer.registers, strict=True):
-            least, most = self._signals[name].range or limits
-            found[name] = least + (number - low) / (high - low) * (most - least)
+            least, greatest = self._signals[name].range or limits
+            found[name] = least + (number - low) / (high - low) * (greatest - least)
         return found
 
     async def write(self, name: str, value: Value) -> None:

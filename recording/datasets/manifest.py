@@ -19,7 +19,7 @@ class Demonstration(BaseModel):
 
     model_config = ConfigDict(extra="forbid")
 
-    file: Annotated[str, Field(pattern=r"^[^/\\]+\.mcap$", description="in the folder of the manifest")]
+    file: Annotated[str, Field(pattern=r"^[^/\\\x00-\x1f]+\.mcap$", description="in the folder of the manifest")]
     success: bool
     task: Annotated[str, Field(max_length=1000)]
     seed: int | None = Field(None, ge=0, description="of the cell; null: that of its file")
@@ -45,7 +45,7 @@ def read_manifest(folder: Path) -> Manifest:
         values = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise ConfigError(str(folder), ..., f"is a folder without {NAME}, which `zencell demo record` writes") from None
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise ConfigError(str(path), ..., f"cannot be read: {error}") from None
     return check(Manifest, values, str(path))
 

@@ -150,7 +150,7 @@ def _is_task_status(sample: Sample | None) -> bool:
     """Return whether the recorded schema of a message has the fields of a task's status."""
     try:
         return sample is not None and set(json.loads(sample.schema)["properties"]) >= STATUS_FIELDS
-    except (ValueError, TypeError, KeyError):
+    except (ValueError, TypeError, KeyError, RecursionError):
         return False
 
 

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-from common.config import Io, check
+from common.config import Io, Signal, check
 from common.errors import ConfigError, Refused
 from common.hardware.signals import IoLost, Unreadable, load_io
+from drivers.io.modbus import IoOptions, ModbusIo
 from tests.domains import free_port
 
 pytest.importorskip("pymodbus")
@@ -101,3 +103,18 @@ def test_bad_channels_and_options(signal: dict[str, Any], options: dict[str, Any
     with pytest.raises(ConfigError) as error:
         load_io(section, lambda: 0.0)
     assert words in str(error.value)
+
+
+@pytest.mark.parametrize("numbers", [[], [1, 2]])
+async def test_answer_of_another_length_is_a_lost_server(numbers: list[int]) -> None:
+    class Client:
+        async def connect(self) -> bool:
+            return True
+
+        async def read_input_registers(self, *address: int, **more: int) -> Any:
+            return SimpleNamespace(isError=lambda: False, registers=numbers, bits=[])
+
+    io = ModbusIo({"pressure": Signal(input=2, range=(0, 10))}, IoOptions(host="plc"), Client)
+    await io.connect()
+    with pytest.raises(IoLost, match=f"plc:502: an answer has {len(numbers)} values instead of 1"):
+        await io.read()

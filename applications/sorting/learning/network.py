@@ -103,7 +103,7 @@ def _read_card(path: Path) -> dict[str, Any]:
         size, step, numbers = found["patch"]["size"], found["patch"]["step"], found["numbers"]
     except OSError as error:
         raise ConfigError(FIELD, str(card), f"cannot be read: {error.strerror}") from None
-    except (ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError, RecursionError):
         raise ConfigError(FIELD, str(card), "is no card of a scorer: `zencell grasp train` writes it") from None
     if (size, step) != (SIZE, STEP) or not all(isinstance(name, str) for name in numbers):
         raise ConfigError(FIELD, str(card), f"is for patches of {size} cells of {step} m, not {SIZE} of {STEP} m")

@@ -130,6 +130,8 @@ def test_folder_of_demonstrations_is_exported_as_a_whole(demonstrations, tmp_pat
 
 @pytest.mark.parametrize("manifest, error", [
     (None, "is a folder without episodes.json"), ("{", "cannot be read"),
+    (100_000 * "[", "cannot be read: maximum recursion"),
+    ('{"cell": "a", "episodes": [{"file": "\\u0000.mcap", "success": true, "task": ""}]}', "episodes.0.file"),
     ('{"cell": "panda", "episodes": []}', "has no episode that succeeded"),
     ('{"cell": "panda", "episodes": [{"file": "../a.mcap", "success": true, "task": ""}]}', "episodes.0.file"),
     ('{"cell": "panda", "episodes": [{"file": "a.mcap", "task": ""}]}', "episodes.0.success: is missing"),
