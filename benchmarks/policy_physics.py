@@ -110,7 +110,7 @@ def cell_of(seed: int, solids: int, seconds: float, clearance: float) -> tuple[C
     choice = str(rng.choice(["slow", "shorten"]))
     cell = load_cell(CELL, [
         "world.simulator=mujoco", f"seed={seed}", "services.policy_runner.cameras={}",
-        "services.policy_runner.source.callable=benchmarks.policy_physics:policy",
+        "services.policy_runner.source={callable: \"benchmarks.policy_physics:policy\"}",
         f"services.policy_runner.on_violation={choice}", f"services.policy_runner.seconds={seconds}",
         "services.policy_runner.until.height=9.0", f"services.policy_runner.clearance={clearance}"])
     found, home = list(cell.world.fixtures), panda().link_poses(panda().named("home"))

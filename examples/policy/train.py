@@ -58,7 +58,7 @@ class Policy(nn.Module):
         """Return (n, 3 MAPS): center of mass and mean of each map."""
         maps = self.see(image - 0.5).flatten(2)
         centers = torch.softmax(maps, 2) @ self.grid
-        means = torch.tanh(torch.relu(maps).mean(2))
+        means = torch.tanh(torch.relu(maps).mean(2).clamp(0.0, 20.0))  # OpenCV's Tanh returns NaN for large values
         return torch.cat([centers.flatten(1), means], 1)
 
     def act(self, features: torch.Tensor, state: torch.Tensor) -> torch.Tensor:

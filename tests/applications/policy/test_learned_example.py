@@ -1,5 +1,7 @@
 """The learned and the scripted policy of examples/policy pick a ball in layouts that no demonstration has."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -23,6 +25,14 @@ def test_learned_policy_picks_ball_of_unseen_layout_under_proof(learned, seed: i
     result = attempt(learned, seed, "slow")
     assert result["success"], result
     assert result["contacts"] == result["limits_broken"] == 0
+
+
+@pytest.mark.parametrize("color", [(0, 0, 0), (255, 255, 255), (140, 90, 30), (255, 0, 0)])
+def test_learned_policy_returns_numbers_for_images_unlike_those_of_the_training(learned, color) -> None:
+    image = np.full((96, 96, 3), color, np.uint8)
+    chunk = learned(replace(SimulatedPick(0).observe(), images={"camera": image}))
+    assert np.isfinite(chunk.values).all()
+    assert np.isfinite(chunk.gripper).all()
 
 
 def test_scripted_policy_picks_ball_under_proof() -> None:
