@@ -11,6 +11,7 @@ from pathlib import Path
 from common.errors import ZencellError
 from common.supervision.launch import module_command, pythonpath
 from recording.formatting import format_bytes
+from recording.reader import Recording
 from tools.teleoperation.episodes import EpisodeFolder
 
 BAD_INPUT, INTERRUPTED = 2, (130, -2)  # exit codes of `zencell run`
@@ -40,7 +41,8 @@ def record_runs(
         show: called with a line that replaces the one before.
 
     Raises:
-        RunFailed: a run wrote no recording.
+        RunFailed: a run wrote no recording, or not all of it.
+        RecordingError: it is damaged.
         KeyboardInterrupt: a signal ended a run; its episode is discarded.
     """
     succeeded = 0
@@ -55,6 +57,9 @@ def record_runs(
         if code == BAD_INPUT or not file.exists():
             file.unlink(missing_ok=True)
             raise RunFailed(f"seed {seed}: {output}")
+        with Recording(file) as recording:
+            if recording.flaw:  # as on a full disk, with which the run itself ends well
+                raise RunFailed(f"seed {seed}: {file}: {recording.flaw}")
         success = code == 0
         succeeded += success
         folder.add(file, success=success, task=task, seed=seed)

@@ -17,7 +17,7 @@ from common.transport.local import LocalNetwork
 from recording.datasets.manifest import read_manifest
 from recording.reader import Recording
 from recording.sample import RecordingError
-from tests.recording.samples import fill_disk
+from tests.recording.samples import fill_disk, write
 from tools.teleoperation import planner_made
 from tools.teleoperation.demonstrating import Demonstrating
 from tools.teleoperation.devices import Reading
@@ -133,25 +133,31 @@ def test_folder_is_continued_and_a_file_of_a_killed_program_is_not_used_again(tm
         EpisodeFolder(tmp_path, "panda")
 
 
-def fake_run(code, output="", records=True):
-    """Return a command that acts as `zencell run` with an exit code."""
+def fake_run(code, recorded, output=""):
+    """Return a command that acts as `zencell run` with an exit code and the bytes of its recording."""
     script = ("import sys, pathlib; file = sys.argv[sys.argv.index('--record') + 1]\n"
-              f"{records} and pathlib.Path(file).write_bytes(b'x'); print({output!r}); sys.exit({code})")
+              f"data = {recorded!r}; data and pathlib.Path(file).write_bytes(data)\n"
+              f"print({output!r}); sys.exit({code})")
     return [sys.executable, "-c", script]
 
 
 def test_runs_of_the_task_have_seeds_of_their_own_and_failures_are_marked(tmp_path, monkeypatch):
     folder, lines = EpisodeFolder(tmp_path / "demos", "panda"), []
+    complete = write(tmp_path / "run.mcap", []).read_bytes()
     for code in (0, 1):
-        monkeypatch.setattr(planner_made, "module_command", lambda _, code=code: fake_run(code, "ended"))
+        monkeypatch.setattr(planner_made, "module_command", lambda _, code=code: fake_run(code, complete, "ended"))
         record_runs("panda", [], folder, episodes=2, task="pick", first_seed=10 * code, say=lines.append,
                     show=lambda _: None)
     assert [(each.success, each.seed) for each in folder.manifest.episodes] == [
         (True, 0), (True, 1), (False, 10), (False, 11)]
     assert lines[3].startswith("episode 2 of 2: seed 11, failure (ended)")
-    monkeypatch.setattr(planner_made, "module_command", lambda _: fake_run(2, "zencell: bad", records=False))
+    monkeypatch.setattr(planner_made, "module_command", lambda _: fake_run(2, b"", "zencell: bad"))
     with pytest.raises(RunFailed, match=r"^seed 3: bad$"):
         record_runs("panda", [], folder, episodes=1, task="", first_seed=3, say=lines.append, show=lines.append)
+    monkeypatch.setattr(planner_made, "module_command", lambda _: fake_run(0, complete[:-30]))  # the disk is full
+    with pytest.raises(RunFailed, match=r"^seed 3: .*episode_0004\.mcap: not finished"):
+        record_runs("panda", [], folder, episodes=1, task="", first_seed=3, say=lines.append, show=lines.append)
+    assert len(folder.manifest.episodes) == 4 and folder.interrupted() == ["episode_0004.mcap"]
 
 
 @pytest.mark.parametrize("arguments, error", [
