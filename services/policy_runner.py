@@ -48,9 +48,12 @@ class PolicyRunner(TaskRunner[View]):
 
     async def _control(self, request: ControlRequest) -> ControlReply:
         task, owner = self._policy, self._owner.latest
-        if request.take and task.status.control == "policy":
+        holder = task.status.operator
+        if request.take and (task.status.control == "policy" or request.owner != holder):
             task.take(request.owner)
         elif not request.take and task.status.control == "operator":
+            if holder and request.owner != holder:  # who may be next to the arm
+                raise Refused("not_owner", f"{holder} has control: only {holder} gives it back; take it over first")
             if owner is not None and owner.asked and owner.kind != "task" and owner.owner != request.owner:
                 raise Refused("not_owner", f"the motion is {owner.description}: only its owner gives it back")
             task.give()

@@ -43,7 +43,8 @@ class Controls:
 
     def show(self, topic: Topic[Any], message: Any) -> None:
         """Offer what is possible now."""
-        options = (GIVE,) if message.control == "operator" else (TAKE,)
+        ours = message.operator in ("", self._console.permissions.client_name)  # from another operator it is taken
+        options = (GIVE,) if message.control == "operator" and ours else (TAKE,)
         if options != self._buttons.options:
             self._buttons.options = options
 

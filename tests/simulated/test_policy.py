@@ -10,6 +10,7 @@ from applications.policy.interface import Observation, PolicyFailed
 from applications.policy.topics import POLICY_CONTROL, POLICY_STATUS, ControlRequest
 from common import topics
 from common.config import load_cell
+from common.errors import RemoteError
 from common.messages import JogCommand, TaskCommand
 from common.transport.bus import Bus
 from lab.simulation import Outcome, Simulation
@@ -50,6 +51,8 @@ def test_operator_takes_over_jogs_and_gives_back() -> None:
         seen["status"], seen["chunks"] = status.latest.model_copy(), status.latest.chunks
         await bus.clock.sleep(0.5)
         seen["later"] = status.latest.chunks
+        with pytest.raises(RemoteError, match="anna has control: only anna gives it back"):
+            await control.call(ControlRequest(take=False, owner="bob"), 1.0)
         seen["given"] = await control.call(ControlRequest(take=False, owner="anna"), 1.0)
 
     outcome = run(visit=visit)

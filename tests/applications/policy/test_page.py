@@ -43,8 +43,9 @@ async def test_buttons_take_over_and_give_back() -> None:
     assert page.options == (GIVE,)
     await page.chosen(GIVE)
     assert page.sent == [(POLICY_CONTROL, True, "anna"), (POLICY_CONTROL, False, "anna")]
-    controls.show(POLICY_STATUS, STATUS)
-    assert page.options == (TAKE,)
+    for status in (STATUS, STATUS.model_copy(update={"control": "operator", "operator": "bob"})):
+        controls.show(POLICY_STATUS, status)
+        assert page.options == (TAKE,)
 
 
 @pytest.mark.parametrize(("update", "control"), [
