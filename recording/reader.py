@@ -63,6 +63,8 @@ class Recording:
             RecordingError: the file does not exist, cannot be read, or is no recording of zencell.
         """
         self.path = path
+        if path.exists() and not path.is_file():
+            raise RecordingError(f"{path}: is not a regular file")  # opening a pipe would wait for its writer
         try:
             self.file: BinaryIO = path.open("rb")
         except FileNotFoundError:

@@ -21,6 +21,7 @@ T = TypeVar("T")
 
 LOST = "io_lost"  # code of a refusal: the backend does not answer
 NOT_CONNECTED = "not connected yet"
+NOISE_SHARE = 0.02  # of the range of an analog signal, by which good values may leave it
 
 
 class Waits(Protocol):
@@ -151,6 +152,7 @@ class SignalServer:
         now, signals = self._clock.now_ns(), []
         for signal in self.state.signals:
             value = values.get(signal.name, Unreadable("not read"))
+            value = _out_of_range(signal, value) or value
             if isinstance(value, Unreadable):
                 update: dict[str, object] = {"reason": value.reason}
             else:
@@ -209,3 +211,13 @@ class SignalServer:
         stale = check_age(age, self._waits.request_timeout, self._waits.clock_tolerance)
         return (interlocks.check("", request.owner, request.acknowledged)
                 or (stale if request.header.stamp else None) or ownership.check(request.owner))
+
+
+def _out_of_range(signal: IoSignal, value: Value | Unreadable) -> Unreadable | None:
+    """Return the reason why an analog value is not good: a broken wire or a wrong scale, beyond noise."""
+    if signal.low is None or signal.high is None or not isinstance(value, int | float):
+        return None
+    noise = NOISE_SHARE * (signal.high - signal.low)
+    if signal.low - noise <= value <= signal.high + noise:
+        return None
+    return Unreadable(f"{value:g} is not within {signal.low:g} to {signal.high:g} {signal.unit}".rstrip())

@@ -1,6 +1,7 @@
 """Recordings are read as they were written, by zencell and by the reader of the mcap library."""
 
 import json
+import os
 
 import pytest
 from hypothesis import given
@@ -113,6 +114,10 @@ def test_each_file_of_a_split_recording_is_usable_alone(path):
 def test_existing_file_is_not_overwritten_and_other_files_are_rejected(path):
     with pytest.raises(RecordingError, match="no such file"):
         Recording(path)
+    os.mkfifo(path.with_suffix(".pipe"))
+    for other in (path.with_suffix(".pipe"), path.parent):
+        with pytest.raises(RecordingError, match="is not a regular file"):
+            Recording(other)
     with pytest.raises(RecordingError, match="exists already"):
         RecordingWriter(write(path, [joints(0)]), {})
     path.write_bytes(b"hello world")

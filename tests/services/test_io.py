@@ -156,6 +156,20 @@ async def test_lost_server_is_a_state_with_a_reason_and_nothing_is_written_when_
         assert (await fake.until(clamp=False)).reason == ""
 
 
+@pytest.mark.parametrize(("reading", "reason"), [
+    (10.1, ""), (-0.1, ""), (164.0, "164 is not within 0 to 10 bar"), (math.nan, "nan is not within 0 to 10 bar"),
+])
+async def test_analog_value_far_out_of_its_range_is_not_good(reading: float, reason: str) -> None:
+    Server.restart(clamp=True, start=True, closed=True, busy=False, pressure=1.0, valve=1.0)
+    async with cell("tests.doubles.lossy_io") as fake:
+        await fake.until(pressure=1.0)
+        Server.values["pressure"] = reading
+        def read(state: m.IoState) -> bool:
+            return state.find("pressure").value == reading or bool(state.problem("pressure"))
+        state = await until(fake.states, read)
+        assert state.problem("pressure") == reason
+
+
 async def test_stop_while_the_server_is_lost_switches_outputs_once_it_is_back() -> None:
     Server.restart(clamp=True, start=True, closed=True, busy=False, pressure=1.0, valve=1.0)
     async with cell("tests.doubles.lossy_io") as fake:
