@@ -49,7 +49,7 @@ def test_crashed_and_killed_services_are_restarted(zencell):
 @pytest.mark.slow
 @pytest.mark.parametrize(("options", "wanted"), [
     (["--set", "services.middle.plcaed=3"], "services.middle.plcaed: 3 is not a parameter; choices: behave, placed"),
-    (["--set", "services.last.behave=wrong", "--log-json"], "behave: 'wrong' cannot be done"),
+    (["--set", "services.last.behave=wrong", "--log-json"], "services.last.behave: 'wrong' cannot be done"),
 ])
 def test_rejected_configuration_of_one_service_ends_the_cell_with_one_line(zencell, options, wanted):
     command = zencell("up", "tiny.yaml", *options)
