@@ -24,7 +24,7 @@ def counters(status: TaskStatus, rejected: int) -> dict[str, object]:
     owner = status.operator or "operator" if status.control == "operator" else "policy"
     return {
         "control": owner, "chunks": status.chunks, "proved": status.proved, "slowed": status.slowed,
-        "shortened": status.shortened, "refused": status.refused, "late": status.late, "failed": status.failed,
+        "cut short": status.shortened, "refused": status.refused, "late": status.late, "failed": status.failed,
         "inference": f"{status.inference_ms:.0f} ms", "proof": f"{status.proof_ms:.1f} ms",
         "last violation": status.violation or "–"}
 

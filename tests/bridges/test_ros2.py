@@ -2,15 +2,12 @@
 
 import asyncio
 import struct
-from collections.abc import AsyncIterator, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import AsyncExitStack
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import zenoh
 
 from cli.main import app
 from common import messages as m
@@ -20,9 +17,7 @@ from common.errors import Refused
 from common.perception.image import array_to_image
 from common.process.in_process import running_service
 from common.transport.bus import Bus
-from common.transport.endpoint import endpoint_of, router_config
 from common.transport.local import LocalNetwork
-from tests.harness import free_domain
 
 pytest.importorskip("rosbags", reason="the extra `ros2` is not installed")
 pytest.importorskip("xxhash", reason="the extra `ros2` is not installed")
@@ -144,21 +139,6 @@ class Arm:
 
     async def _stop(self, request: m.StopRequest) -> m.MotionStatus:
         return m.MotionStatus()
-
-
-@pytest.fixture(scope="module")
-def endpoint() -> Iterator[str]:
-    found = endpoint_of(free_domain())
-    with ThreadPoolExecutor(1) as thread:  # this thread may already run a loop
-        router = thread.submit(lambda: zenoh.open(router_config([found]))).result()
-        yield found
-        router.close()
-
-
-@pytest.fixture
-async def stack() -> AsyncIterator[AsyncExitStack]:
-    async with AsyncExitStack() as stack:
-        yield stack
 
 
 @pytest.fixture

@@ -3,25 +3,21 @@
 import asyncio
 import logging
 import threading
-from collections.abc import AsyncIterator, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import AsyncExitStack
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import zenoh
 
 from common import messages as m
 from common import topics
 from common.clock import Clock
 from common.config import Members, Run
 from common.transport.bus import Bus
-from common.transport.endpoint import endpoint_of, router_config
 from common.transport.foreign import open_foreign
 from services import trajectory_executor
-from tests.harness import RunningCell, free_domain
+from tests.harness import RunningCell
 from tests.services.executor_rig import HOME, PANDA, SPEED, ExecutorClient, config
 
 pytest.importorskip("rosbags", reason="the extra `ros2` is not installed")
@@ -154,21 +150,6 @@ class Cell(ExecutorClient):
         async with asyncio.timeout(TIMEOUT):
             while await self.turned() < 0.02:
                 pass
-
-
-@pytest.fixture(scope="module")
-def endpoint() -> Iterator[str]:
-    found = endpoint_of(free_domain())
-    with ThreadPoolExecutor(1) as thread:  # this thread may already run a loop
-        router = thread.submit(lambda: zenoh.open(router_config([found]))).result()
-        yield found
-        router.close()
-
-
-@pytest.fixture
-async def stack() -> AsyncIterator[AsyncExitStack]:
-    async with AsyncExitStack() as stack:
-        yield stack
 
 
 @pytest.fixture

@@ -2,8 +2,6 @@
 
 import asyncio
 import logging
-from collections.abc import AsyncIterator, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import AsyncExitStack
 from pathlib import Path
 from types import ModuleType
@@ -11,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import zenoh
 
 from common import topics
 from common.config import Surroundings, load_robot
@@ -19,9 +16,8 @@ from common.errors import ConfigError
 from common.perception.image import image_to_array
 from common.supervision.wiring import wiring
 from common.time_source import wall_ns
-from common.transport.endpoint import endpoint_of, router_config
 from services import ros2_camera, ros2_joints
-from tests.harness import PATIENCE, free_domain
+from tests.harness import PATIENCE
 from tests.services.fake_cell import FakeCell
 
 pytest.importorskip("rosbags", reason="the extra `ros2` is not installed")
@@ -130,21 +126,6 @@ def test_joint_states_that_cannot_be_used_are_left_out_with_a_line(fields: Any, 
 
 
 # --- services ---------------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def endpoint() -> Iterator[str]:
-    found = endpoint_of(free_domain())
-    with ThreadPoolExecutor(1) as thread:  # this thread may already run a loop
-        router = thread.submit(lambda: zenoh.open(router_config([found]))).result()
-        yield found
-        router.close()
-
-
-@pytest.fixture
-async def stack() -> AsyncIterator[AsyncExitStack]:
-    async with AsyncExitStack() as stack:
-        yield stack
 
 
 async def next_of(reader: Any, publish: Any) -> Any:
