@@ -1,6 +1,8 @@
 """A certificate has a limited number of sessions, so that its holder cannot keep the others out."""
 
 import threading
+import time
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -9,7 +11,7 @@ import pytest
 from common.transport.credentials import credentials_of
 from common.transport.router import PER_CERTIFICATE, Router, maintain
 from tests.domains import free_port
-from tests.security.raw_client import RawClient
+from tests.security.raw_client import TIMEOUT, RawClient
 
 MORE = PER_CERTIFICATE + 8
 
@@ -21,22 +23,32 @@ def test_newest_sessions_beyond_the_limit_are_ended_for_a_service_only(certifica
         stop = threading.Event()
         stack.callback(stop.set)
 
-        def sessions(name: str) -> int:
-            return sum(link.auth_identifier == name for link in router.session.info.links())
+        def sessions(name: str) -> set[str]:
+            return {link.dst for link in router.session.info.links() if link.auth_identifier == name}
 
         def connect(name: str) -> None:
             endpoint = near if at == "near" else gated
             stack.enter_context(RawClient(endpoint, credentials_of(name, certificates)))
 
-        for _ in range(MORE):
+        def until(holds: Callable[[], bool]) -> None:
+            deadline = time.monotonic() + TIMEOUT
+            while not holds() and time.monotonic() < deadline:
+                stop.wait(0.02)
+            assert holds()
+
+        for _ in range(PER_CERTIFICATE):
             connect("panda.camera_simulator")
+        oldest = sessions("panda.camera_simulator")
+        checked = threading.Semaphore(0)
+        threading.Thread(target=maintain, args=(router, stop, checked.release), daemon=True).start()
+        assert checked.acquire(timeout=TIMEOUT) and checked.acquire(timeout=TIMEOUT)  # it knows them now
+        for _ in range(MORE - PER_CERTIFICATE):
+            connect("panda.camera_simulator")
+        for _ in range(MORE):
             connect("operator")
-        assert sessions("panda.camera_simulator") == MORE
-        threading.Thread(target=maintain, args=(router, stop), daemon=True).start()
-        fewest = MORE
-        for _ in range(300):
-            fewest = min(fewest, sessions("panda.camera_simulator"))
-            if fewest <= PER_CERTIFICATE:
-                break
-            stop.wait(0.05)
-        assert fewest == PER_CERTIFICATE and sessions("operator") == MORE
+        operators = sessions("operator")
+        newest: set[str] = set()  # these clients connect again, each time with another address
+        until(lambda: bool(newest.update(sessions("panda.camera_simulator") - oldest) or newest))
+        until(lambda: not newest & sessions("panda.camera_simulator"))
+        assert oldest <= sessions("panda.camera_simulator") and sessions("operator") == operators
+        assert len(oldest) == PER_CERTIFICATE and len(operators) == MORE
