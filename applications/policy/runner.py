@@ -21,6 +21,7 @@ from applications.policy.topics import PolicyStatus
 from common import messages as m
 from common.control.trajectory import to_message
 from common.hardware.interface import Limits
+from common.tasks.commands import obey
 from common.tasks.decisions import NOT_ITS_FAULT
 from common.tasks.engine import FOUND_HELD, MISSING, NO_ARM, START
 from common.tasks.stages import OVER, Command, View
@@ -119,19 +120,14 @@ class PolicyTask:
 
     def command(self, command: str, view: View) -> list[Command]:
         """Start, pause, resume or stop. A pause holds the arm on its path; a stop ends the motion."""
-        status, self._found = self.status, True
-        if command == "pause":
-            status.paused = True
-            return [m.HoldRequest(hold=True, reason="the task is paused")]
-        reason = f"the operator sent {command} to the task"
-        if command in ("start", "resume"):
-            status.started, status.paused = status.started or command == "start", False
-            if command == "start" and status.state in ("DONE", "ERROR"):
-                status.state, status.message, status.done, status.task_seconds = "IDLE", "", 0, 0.0
-                self._ending, self._failures = None, 0
-            return [m.HoldRequest(hold=False, reason=reason, stops=command == "start")]
-        status.paused = status.started = False
-        return [m.StopRequest(id=self._leave(), reason=reason, by="operator")]
+        self._found = True
+
+        def restart() -> None:
+            self.status.done, self.status.task_seconds = 0, 0.0
+            self._ending, self._failures = None, 0
+
+        return obey(command, self.status, restart, lambda reason: [
+            m.StopRequest(id=self._leave(), reason=reason, by="operator")])
 
     def take(self, operator: str) -> None:
         """Give control to an operator: the arm comes to rest on its proved path and waits."""

@@ -26,6 +26,25 @@ def names_of(kind: str) -> list[str]:
     return sorted(path.stem for path in (config_root() / kind).glob("*.yaml"))
 
 
+def read_file(path: Path, field: str, most: int) -> bytes:
+    """Return the content of a file that a configuration names.
+
+    Args:
+        path: of the file.
+        field: of the configuration that names it.
+        most: limit of its size [bytes].
+
+    Raises:
+        ConfigError: it cannot be read, or is larger.
+    """
+    try:
+        if (size := path.stat().st_size) > most:
+            raise ConfigError(field, str(path), f"has {size} bytes; the limit is {most}")
+        return path.read_bytes()
+    except OSError as error:
+        raise ConfigError(field, str(path), f"cannot be read: {error.strerror}") from None
+
+
 def parse_yaml(text: str, loader: type = yaml.SafeLoader) -> Any:
     """Return the value of a YAML text.
 

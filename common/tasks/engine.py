@@ -13,6 +13,7 @@ import math
 from collections.abc import Iterator
 
 from common import messages as m
+from common.tasks.commands import obey
 from common.tasks.decisions import NOT_ITS_FAULT, V
 from common.tasks.monitoring import ExecutionMonitor
 from common.tasks.signals import Output, WaitFor
@@ -40,23 +41,16 @@ class Task(ExecutionMonitor[V]):
 
     def command(self, command: str, view: V) -> list[Command]:
         """Start, pause, resume or stop. A pause holds the arm on its path; a stop ends the motion."""
-        status = self.status
         self.wait_timer.reset()
         self._found = True
-        if command == "pause":
-            status.paused = True
-            return [m.HoldRequest(hold=True, reason="the task is paused")]
-        reason = f"the operator sent {command} to the task"
-        if command in ("start", "resume"):
-            status.started, status.paused = status.started or command == "start", False
-            if command == "start" and status.state in ("DONE", "ERROR"):
-                status.state, status.message = "IDLE", ""
-                self._began, self._failures_in_a_row = None, 0
-                self._again_at = -math.inf
-                self.on_restart()
-            return [m.HoldRequest(hold=False, reason=reason, stops=command == "start")]
-        status.paused = status.started = False
-        return self.stop(view, reason, "operator") or [m.StopRequest(reason=reason)]
+
+        def restart() -> None:
+            self._began, self._failures_in_a_row = None, 0
+            self._again_at = -math.inf
+            self.on_restart()
+
+        return obey(command, self.status, restart, lambda reason: (
+            self.stop(view, reason, "operator") or [m.StopRequest(reason=reason)]))
 
     # --- answers ---------------------------------------------------------------------------------------------
 

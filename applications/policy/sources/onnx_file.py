@@ -18,6 +18,7 @@ from applications.policy.sources.actions import one_line
 from applications.policy.sources.card import FIELD, Values, read_card
 from applications.policy.sources.computing import Computation
 from applications.policy.sources.settings import PolicyCell, SourceConfig
+from common.config.files import read_file
 from common.errors import ConfigError
 
 EXTRA = "needs the extra `policy`: pip install 'zencell[policy]'"
@@ -76,7 +77,7 @@ class OnnxPolicy:
                 cell; says why.
         """
         path = _find(config.onnx)
-        data = _read(path)
+        data = read_file(path, FIELD, MAX_BYTES)
         self._card = read_card(path)
         self._card.require(cell, path)
         self._name = f"network {path.name}"
@@ -133,15 +134,6 @@ def require_file(name: str, cell: PolicyCell) -> None:
     if not path.is_file():
         raise ConfigError(FIELD, str(path), "is not a file")
     read_card(path).require(cell, path)
-
-
-def _read(path: Path) -> bytes:
-    try:
-        if path.stat().st_size > MAX_BYTES:
-            raise ConfigError(FIELD, str(path), f"has {path.stat().st_size} bytes; the limit is {MAX_BYTES}")
-        return path.read_bytes()
-    except OSError as error:
-        raise ConfigError(FIELD, str(path), f"cannot be read: {error.strerror}") from None
 
 
 def _require_no_crash(data: bytes) -> None:

@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from applications.sorting.learning.patches import SIZE, STEP
+from common.config.files import read_file
 from common.errors import ConfigError
 
 Array = npt.NDArray[np.float64]
@@ -48,7 +49,7 @@ class Network:
         Raises:
             ConfigError: the file or its card is missing, too large, unreadable, or for other values.
         """
-        data = _read(path)
+        data = read_file(path, FIELD, MAX_BYTES)
         card = _read_card(path)
         numbers = tuple(card["numbers"])
         if expected is not None and numbers != tuple(expected):
@@ -85,15 +86,6 @@ class Network:
     def score(self, patches: Values, numbers: Values) -> Array:
         """Return (n,) probabilities that grasps hold."""
         return np.asarray(1 / (1 + np.exp(-self.logits(patches, numbers))))
-
-
-def _read(path: Path) -> bytes:
-    try:
-        if path.stat().st_size > MAX_BYTES:
-            raise ConfigError(FIELD, str(path), f"has {path.stat().st_size} bytes; the limit is {MAX_BYTES}")
-        return path.read_bytes()
-    except OSError as error:
-        raise ConfigError(FIELD, str(path), f"cannot be read: {error.strerror}") from None
 
 
 def _read_card(path: Path) -> dict[str, Any]:
