@@ -47,6 +47,12 @@ class SuctionCup(Section):
 
     lip_radius: Length = Field(0.01, description="of the ring that must be on the object [m]")
     give: Length = Field(0.005, description="compliance of the lip [m]")
+    vacuum: float = Field(60_000, gt=0, le=101_325, description="pressure under it, below that of the air [Pa]")
+
+    @property
+    def force(self) -> float:
+        """Largest force that pulls an object off [N]: vacuum times the area of the lip."""
+        return self.vacuum * math.pi * self.lip_radius**2
 
 
 class PayloadConfig(Section):

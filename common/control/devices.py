@@ -76,7 +76,8 @@ def _joints(hardware: Hardware, count: int, now: float) -> tuple[Vector, Vector]
 def _fingers(gripper: Gripper, now: float) -> GripperReading:
     raw = gripper.read(now)
     reading = GripperReading(
-        float(raw.width), float(raw.velocity), bool(raw.moving), bool(raw.holding), float(raw.effort))
+        float(raw.width), float(raw.velocity), bool(raw.moving), bool(raw.holding), float(raw.effort),
+        str(getattr(raw, "message", "")))
     for what in ("width", "velocity", "effort"):
         if not abs(value := getattr(reading, what)) < MOST:
             raise HardwareFault(f"reading the gripper: {what} is no finite number: {value}")

@@ -206,14 +206,17 @@ class GripperController:
             message = f"fingers stopped at {width:.4f} m, not at {self._target:.4f} m"
             return {"state": "aborted", "message": message}
         if expected is not None:
-            return {"state": "aborted", "outcome": "empty", "message": "the fingers closed on nothing"}
-        return {"state": "succeeded"}
+            message = reading.message or "the fingers closed on nothing"
+            return {"state": "aborted", "outcome": "empty", "message": message}
+        return {"state": "succeeded", "message": reading.message if self._target < self._start_width else ""}
 
     def _watch_held(self, reading: GripperReading, held: float) -> dict[str, object]:
         """Return whether an object, `held` [m] wide, is still grasped."""
         if reading.holding and reading.width >= held - SLIPPED:
             return {"outcome": "grasped", "message": ""}
-        if reading.holding:
+        if self._config.cup is not None:
+            message = "the held object came off the cup"
+        elif reading.holding:
             message = f"the held object slips: it was {held:.4f} m wide, the fingers are {reading.width:.4f} m apart"
         else:
             message = f"the held object slipped out: it was {held:.4f} m wide, nothing is between the fingers now"

@@ -94,6 +94,7 @@ class GripperReading(NamedTuple):
     """State of the fingers: `width` between their inner faces [m], its rate [m/s], `effort` they press with [N].
 
     A cup reads `max_width` without suction, `held_width` with `holding` while it holds an object, 0 with nothing.
+    `message` may say why nothing is held.
     """
 
     width: float
@@ -101,6 +102,7 @@ class GripperReading(NamedTuple):
     moving: bool
     holding: bool
     effort: float = 0.0
+    message: str = ""
 
 
 class Gripper(Protocol):

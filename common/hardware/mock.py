@@ -44,6 +44,9 @@ class SimulatedFingers:
     """A gripper whose width follows a jerk-limited motion and stops at an obstruction; also the valve of a suction cup.
 
     While an object blocks the fingers they press; without it they close to the commanded width.
+
+    Attributes:
+        no_seal: why a cup holds nothing, reported by its readings.
     """
 
     def __init__(self, config: GripperConfig, width: float | None = None) -> None:
@@ -52,7 +55,7 @@ class SimulatedFingers:
         self._width, self._velocity, self._acceleration = config.max_width if width is None else width, 0.0, 0.0
         self._target = self._width
         self._effort = config.max_effort
-        self._obstruction = 0.0
+        self._obstruction, self.no_seal = 0.0, ""
         self._blocked = False
         self._start_time = 0.0
         self._motion: ruckig.Trajectory | None = None
@@ -88,7 +91,8 @@ class SimulatedFingers:
         """Return width [m], its rate [m/s], whether the fingers move, whether they press, and with what effort [N]."""
         self._advance(now)
         effort = self._effort if self._blocked else 0.0
-        return GripperReading(self._width, self._velocity, self._motion is not None, self._blocked, effort)
+        return GripperReading(self._width, self._velocity, self._motion is not None, self._blocked, effort,
+                              "" if self._blocked else self.no_seal)
 
     def _start(self, now: float) -> None:
         self._blocked = False

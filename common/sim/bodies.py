@@ -11,7 +11,6 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from common.config import GripperConfig, SuctionCup
 from common.messages import Pose, SceneUpdate, Vector3, WorldObject
 from common.robot.transforms import invert, matrix_to_pose, matrix_to_quaternion, quaternion_to_matrix, transform
 from common.sim.footprints import boxes_disjoint, convex_parts, parts_meet
@@ -51,6 +50,7 @@ class Body:
     rest: Rest | None = None
     added: bool = False  # by an operator
     like: str = ""  # id of the object of the initial layout whose shape it shares
+    mass: float = 0.0  # [kg]; 0: unknown
     _message: WorldObject | None = None  # cached until the body changes
     _snapshot: ObjectSnapshot | None = None  # cached until the body changes
 
@@ -112,7 +112,7 @@ class Body:
                 definition=self.message() if self.added and not self.like else None,
                 details={
                     "state": self.state, "container": self.container, "slot": self.slot, "dropped": self.drop_height,
-                    "since": self.drop_time, "width": self.width, "added": self.added,
+                    "since": self.drop_time, "width": self.width, "added": self.added, "mass": self.mass,
                     "grip": None if self.grip is None else _numbers(self.grip),
                     "rest": None if rest is None else [_numbers(rest.T), rest.state, rest.container, rest.slot],
                 },
@@ -173,7 +173,7 @@ def restored(name: str, snapshot: ObjectSnapshot, solid: Solid, color: tuple[flo
     body = Body(
         name, solid, color, _matrix(snapshot.pose), d["state"], d["container"], _slot(d["slot"]),
         None if d["grip"] is None else _matrix(d["grip"]), d["width"], d["dropped"], d["since"],
-        added=d["added"], like=snapshot.like,
+        added=d["added"], like=snapshot.like, mass=d.get("mass", 0.0),
     )
     if d["rest"] is not None:
         T, state, container, slot = d["rest"]
@@ -195,29 +195,23 @@ def _slot(value: Any) -> Slot | None:
 
 
 TOUCH = 1e-6  # [m]
-LIP_POINTS = 8  # on the ring of a suction cup
 LINES = 5  # sampled across a finger pad to find the object between the fingers
 
 
 def pressed_ends(
-    gripper: GripperConfig | None, allowed: GraspTolerances, body: Body, T_world_tcp: Array, width: float,
-    before: tuple[float, float] | None,
+    allowed: GraspTolerances, body: Body, T_world_tcp: Array, width: float, before: tuple[float, float] | None,
 ) -> tuple[float, float] | None:
     """Ends along tool y [m] of the part of a body between the pads; None if it is not between them.
 
     A body that was clear of both fingers stays between them: the closing finger pushes it to the center.
 
     Args:
-        gripper: fingers or cup; None: unknown fingers.
         allowed: grasp tolerances.
         body: the candidate.
         T_world_tcp: (4, 4) of a tool whose fingers close along its y axis.
         width: between the fingers [m].
         before: ends in the previous cycle; None if it was not between them.
     """
-    if gripper is not None and gripper.cup is not None:
-        half = gripper.held_width / 2
-        return (-half, half) if lies_on(gripper.cup, body.solid, invert(T_world_tcp) @ body.T) else None
     solid = body.solid
     reach = allowed.across + allowed.along + max(width / 2, solid.reach) + solid.reach
     if abs(body.T[2, 3] - T_world_tcp[2, 3]) > reach:
@@ -242,27 +236,6 @@ def pressed_ends(
         near = abs(low + high) / 2 < max(width / 2, half)
     enters = width / 2 >= half and fits
     return (low, high) if enters or (before is not None and near) else None
-
-
-def lies_on(cup: SuctionCup, solid: Solid, T_tcp_object: Array) -> bool:
-    """Whether the complete lip of a cup lies on a solid: center and ring meet it within the give of the lip."""
-    around = np.linspace(0.0, 2 * math.pi, LIP_POINTS, endpoint=False)
-    lip = np.vstack([(0.0, 0.0), cup.lip_radius * np.column_stack([np.cos(around), np.sin(around)])])
-    if solid.shape == "sphere":
-        x, y, z = T_tcp_object[:3, 3]
-        inside = solid.radius**2 - ((lip - (x, y)) ** 2).sum(axis=1)
-        if (inside <= 0).any():
-            return False
-        near = z - np.sqrt(inside)
-    else:
-        # Along the tool's z axis, which is the y axis of lines through (x, -y).
-        T_along_tcp = np.eye(4)
-        T_along_tcp[:3, :3] = [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]
-        spans = solid.spans(T_along_tcp @ T_tcp_object, lip * (1.0, -1.0))[: len(lip)]
-        if any(not len(span) for span in spans):
-            return False
-        near = np.array([span[:, 0].min() for span in spans])
-    return bool((np.abs(near) <= cup.give).all())
 
 
 def _pressed(

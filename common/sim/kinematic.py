@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from common.config import GripperConfig, ObjectConfig, Scenery, Surroundings, World
+from common.config import GripperConfig, ObjectConfig, Scenery, SuctionCup, Surroundings, World
 from common.errors import ConfigError, Refused, UnknownName
 from common.messages import Header, WorldEdit, WorldObject, WorldObjects
 from common.robot.finger_joints import closing_frame
@@ -23,6 +23,7 @@ from common.sim.interface import GraspTolerances, ObjectSnapshot
 from common.sim.layout import new_body, requested_position, require_room
 from common.sim.objects import initial_pose, solid_of, solid_of_message
 from common.sim.resting import Ground
+from common.sim.suction import GRAVITY, NOTHING, seal_problem, weight_problem
 
 if TYPE_CHECKING:
     from common.perception.pinhole import Pinhole
@@ -31,7 +32,6 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-GRAVITY = 9.81  # [m/s^2]
 FEW = 32  # spheres for which a search is fast
 
 
@@ -58,6 +58,7 @@ class KinematicWorld(WorldEvents):
 
     Attributes:
         version: increases with every change.
+        no_seal: why a suction cup does not seal on anything, by the newest `obstruction`; empty if it does.
     """
 
     def __init__(
@@ -70,7 +71,7 @@ class KinematicWorld(WorldEvents):
             ConfigError: an object cannot lie there.
         """
         super().__init__()
-        self._config = world
+        self._config, self.no_seal = world, ""
         self._tolerances = tolerances or GraspTolerances()
         self._gripper = gripper
         self._T_tcp_closing = closing_frame(gripper) if gripper else np.eye(4)
@@ -120,16 +121,30 @@ class KinematicWorld(WorldEvents):
         """Width [m] below which the fingers cannot close: see `common.sim.interface`."""
         if held := self.held:
             return self._bodies[held].width
+        if self._gripper is not None and self._gripper.cup is not None:
+            return self._seal(T_world_tcp, self._gripper.cup, self._gripper.held_width)
         found: dict[str, tuple[float, float]] = {}
         T_world_hand = T_world_tcp @ self._T_tcp_closing
         for name, body in self._bodies.items():
             if body.state in ("table", "contained") and (
-                ends := pressed_ends(
-                    self._gripper, self._tolerances, body, T_world_hand, width, self._between.get(name))
+                ends := pressed_ends(self._tolerances, body, T_world_hand, width, self._between.get(name))
             ):
                 found[name] = ends
         self._between = found
         return max((high - low for low, high in found.values()), default=0.0)
+
+    def _seal(self, T_world_tcp: Array, cup: SuctionCup, width: float) -> float:
+        """Return the width [m] of a cup that seals on an object, else 0; note why it does not seal."""
+        self._between, self.no_seal = {}, NOTHING
+        for name, body in self._bodies.items():
+            if body.state in ("table", "contained"):
+                problem = seal_problem(cup, body.solid, invert(T_world_tcp) @ body.T)
+                if not (problem := problem or weight_problem(cup, body.mass)):
+                    self._between, self.no_seal = {name: (-width / 2, width / 2)}, ""
+                    return width
+                if problem != NOTHING:
+                    self.no_seal = f"{name}: {problem}"
+        return 0.0
 
     def takes_long(self, width: float, gripping: bool) -> bool:
         """Whether the next `tick` may take longer than a control cycle, since it searches for a rest position."""
@@ -294,7 +309,7 @@ class KinematicWorld(WorldEvents):
     def _lay_out(self) -> None:
         for name, obj in self._first.items():
             solid = self._solids[name]
-            body = Body(name, solid, obj.color, initial_pose(obj, solid))
+            body = Body(name, solid, obj.color, initial_pose(obj, solid), mass=obj.mass)
             if solid.shape == "sphere" and obj.x is not None and obj.y is not None and (
                 obj.z == self._config.table_height
             ):

@@ -173,7 +173,8 @@ def new_body(
         like = model.id if model.id in first and c is None else ""
     else:
         solid, like = requested_solid(request), ""
-    return Body(name, solid, color, np.eye(4), "elsewhere", added=True, like=like)
+    mass = request.mass or (model.mass if request.shape is None else 0.0)
+    return Body(name, solid, color, np.eye(4), "elsewhere", added=True, like=like, mass=mass)
 
 
 def _free_name(kind: str, taken: Collection[str]) -> str:

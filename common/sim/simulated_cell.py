@@ -34,6 +34,7 @@ from common.hardware.interface import (
     SimulatedGripper,
     Vector,
 )
+from common.hardware.mock import SimulatedFingers
 from common.messages import Header, SceneUpdate, WorldEdit, WorldEditReply, WorldObjects
 from common.perception.pinhole import cameras_at_home
 from common.robot.model import RobotModel
@@ -144,6 +145,8 @@ class SimulatedCell:
             not self.suspended
         ):
             self._blockable.obstruct(self._felt.obstruction(self._kinematics.fk(q), self._width))
+            if isinstance(self._blockable, SimulatedFingers):
+                self._blockable.no_seal = getattr(self._felt, "no_seal", "")
 
     def step(self, now: float, q: Vector, gripper: GripperReading) -> None:
         """Advance to a cell time [s] with the arm at q (dof,) [rad]; defer a step that takes long."""

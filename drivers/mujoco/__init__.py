@@ -28,7 +28,7 @@ def create(
     """Create the world with objects that all have a position; `hardware` adds the arm.
 
     Raises:
-        ConfigError: MuJoCo is not installed, an object cannot lie at its position, or the gripper is a suction cup.
+        ConfigError: MuJoCo is not installed, or an object cannot lie at its position.
     """
     require()
     from drivers.mujoco.world import PhysicsWorld

@@ -13,6 +13,7 @@ from common.hardware.interface import Gripper, GripperReading, Vector
 from common.hardware.mock import SimulatedFingers
 from common.robot.finger_joints import driven_position, finger_positions, width_at
 from common.robot.model import RobotModel
+from drivers.mujoco.cup import PhysicsCup, Seal
 from drivers.mujoco.model import CellModel
 from drivers.mujoco.robot import FINGER_ARMATURE
 
@@ -23,11 +24,13 @@ MAX_AGE = 0.1  # [s] to which a set-point is extrapolated
 class PhysicsArm:
     """An arm moved by servos: reading it advances the world."""
 
-    def __init__(self, robot: RobotModel, start: Vector, advance: Callable[[float], None]) -> None:
-        """Start at rest at `start` (dof,) [rad]; `advance` advances the world to a time [s]."""
+    def __init__(self, robot: RobotModel, start: Vector, advance: Callable[[float], None], seal: Seal) -> None:
+        """Start at rest at `start` (dof,) [rad]; `advance` advances the world to a time [s]; `seal` is of a cup."""
         config = robot.config.gripper
         self.fingers = PhysicsFingers(config) if config is not None and config.joints else None
-        self.gripper: Gripper | None = self.fingers
+        self.cup = PhysicsCup(config, seal) if config is not None and config.cup is not None else None
+        self._tool = self.fingers or self.cup
+        self.gripper: Gripper | None = self._tool
         self._names = robot.joint_names
         self._advance = advance
         self._q, self._dq, self._written = start.copy(), np.zeros(len(start)), -np.inf
@@ -38,8 +41,8 @@ class PhysicsArm:
         self._qpos = [cell.joints[name] for name in self._names]
         self._dofs = [cell.dofs[name] for name in self._names]
         self._actuators = [cell.actuators[name] for name in self._names]
-        if self.fingers is not None:
-            self.fingers.attach(cell, data)
+        if self._tool is not None:
+            self._tool.attach(cell, data)
 
     def read(self, now: float) -> tuple[Vector, Vector]:
         """Return measured positions (dof,) [rad] and velocities (dof,) [rad/s]; time must not decrease."""
@@ -59,13 +62,13 @@ class PhysicsArm:
         else:
             extrapolated = MAX_AGE if np.isfinite(self._written) else 0.0
             self._data.ctrl[self._actuators] = self._q + extrapolated * self._dq
-        if self.fingers is not None:
-            self.fingers.drive(now)
+        if self._tool is not None:
+            self._tool.drive(now)
 
     def sense(self, now: float) -> None:
-        """Update the fingers' state after steps."""
-        if self.fingers is not None:
-            self.fingers.sense(now)
+        """Update the state of fingers or cup after steps."""
+        if self._tool is not None:
+            self._tool.sense(now)
 
     def close(self) -> None:
         """Do nothing: there is no resource to release."""

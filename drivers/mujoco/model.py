@@ -36,6 +36,7 @@ from drivers.mujoco.scene import (
     TIMESTEP,
     SceneObject,
     add_cameras,
+    add_lip,
     add_object,
     add_surroundings,
 )
@@ -118,6 +119,8 @@ def build_model(
     for obj in objects:
         add_object(spec, obj)
     gripper = robot.config.gripper
+    if gripper is not None and gripper.cup is not None:
+        add_lip(spec, robot.config.tcp_link, gripper.cup)
     for name in [*robot.joint_names, *(gripper.joints[:1] if gripper else [])]:
         actuator = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
         actuator.set_to_position(kp=1.0, kv=1.0)  # gains: `arm.tune`

@@ -11,13 +11,14 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from common.config import CameraConfig, Container, Fixture, Surroundings
+from common.config import CameraConfig, Container, Fixture, SuctionCup, Surroundings
 from common.config.world import TCP
 from common.robot.model import RobotModel
 from common.robot.transforms import matrix_to_quaternion, rpy_to_matrix
 from common.sim.footprints import convex_parts
 from common.sim.objects import Solid
 from common.sim.resting import FLOOR_BELOW_TABLE
+from common.sim.suction import lip
 from drivers.mujoco import ROLLING
 from drivers.mujoco.decomposition import mesh_pieces, points_and_volume
 
@@ -142,6 +143,23 @@ def visual_only(geom: Any) -> Any:
     geom.contype = geom.conaffinity = HIDDEN
     geom.group, geom.mass, geom.density = SEEN, 0.0, 0.0
     return geom
+
+
+LIP, LIP_RADIUS = "lip", 0.002  # name of the body and actuator of a suction cup; radius of its spheres [m]
+SOFT = (0.01, 1.0)  # time constant [s] and damping of a rubber lip
+
+
+def add_lip(spec: mujoco.MjSpec, tcp_link: str, cup: SuctionCup) -> None:
+    """Add the lip of a suction cup, a ring of small spheres that protrude from the tool, and its adhesion actuator."""
+    body = spec.body(tcp_link).add_body(name=LIP, gravcomp=1.0)
+    for x, y in lip(cup)[1:]:
+        geom = body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[LIP_RADIUS, 0.0, 0.0], pos=[x, y, 0.0])
+        set_finger_contact(set_contact(geom, ROBOT, group=COLLIDES))
+        geom.mass, geom.solref = 1e-4, SOFT
+        geom.gap = cup.give  # within it the cup pulls, without touching yet
+    actuator = spec.add_actuator(name=LIP, target=LIP, trntype=mujoco.mjtTrn.mjTRN_BODY)
+    actuator.set_to_adhesion(gain=cup.force)
+    actuator.ctrlrange = [0.0, 1.0]
 
 
 # Surroundings and cameras

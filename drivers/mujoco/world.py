@@ -17,9 +17,11 @@ from common.errors import ConfigError, Refused
 from common.hardware.interface import Hardware, Limits, Vector
 from common.messages import Header, WorldEdit, WorldObjects
 from common.robot.model import RobotModel
+from common.robot.transforms import invert, transform
 from common.sim.bodies import Body, WorldEvents
 from common.sim.interface import GraspTolerances, Numbers, ObjectSnapshot
 from common.sim.kinematic import KinematicWorld
+from common.sim.suction import NOTHING, seal_problem
 from drivers.mujoco.arm import PhysicsArm, tune
 from drivers.mujoco.model import REST_SPEED, CellModel, Contacts, ObjectStates, build_model, pose_changed, snap_upright
 from drivers.mujoco.scene import DEFAULT_MASS, ROBOT, TIMESTEP, SceneObject
@@ -47,10 +49,8 @@ class PhysicsWorld(WorldEvents):
         """Place all objects; motion starts with `hardware`.
 
         Raises:
-            ConfigError: an object cannot lie at its position, or the gripper is a suction cup.
+            ConfigError: an object cannot lie at its position.
         """
-        if gripper is not None and gripper.cup is not None:
-            raise ConfigError("world.simulator", "mujoco", "supports fingers only; use kinematic with a suction cup")
         super().__init__()
         self._config = world
         self._kinematic = KinematicWorld(world, objects, tolerances, gripper)
@@ -76,7 +76,7 @@ class PhysicsWorld(WorldEvents):
             ConfigError: the robot cannot be simulated.
         """
         self._robot = robot
-        self._arm = PhysicsArm(robot, start, self.advance)
+        self._arm = PhysicsArm(robot, start, self.advance, self._seal)
         self._build()
         cell, data = self.simulation
         cell.set_joints(data, robot.joint_names, start)
@@ -137,6 +137,8 @@ class PhysicsWorld(WorldEvents):
             del self._slippery[name]
             self._set_robot_contact(name, True)
         contacts = self._contacts.update(data)
+        if (cup := self._arm.cup) is not None:
+            contacts = {cup.held} - {""}, *contacts[1:]
         bodies = self._kinematic.bodies
         self._states.update(now, contacts, bodies)
         qpos = data.qpos[self._qpos]
@@ -159,6 +161,19 @@ class PhysicsWorld(WorldEvents):
             self.version += 1
             self._published_at = now
             self._publish_events(body)
+
+    def _seal(self) -> tuple[str, str]:
+        """Return the object that the suction cup seals on, else why it seals on none."""
+        cell, data = self.simulation
+        gripper, link = self._robot.config.gripper, data.body(self._robot.config.tcp_link)
+        assert gripper is not None and gripper.cup is not None
+        T_tcp_world, reason = invert(transform(link.xmat.reshape(3, 3), link.xpos)), NOTHING
+        for name, body in self._kinematic.bodies.items():
+            problem = seal_problem(gripper.cup, body.solid, T_tcp_world @ cell.pose_of(data, name))
+            if not problem and name not in self._slippery:
+                return name, ""
+            reason = f"{name}: {problem}" if problem and problem != NOTHING else reason
+        return "", reason
 
     def _publish_events(self, body: Body) -> None:
         if body.state == "held" and body.name not in self._removed:

@@ -8,7 +8,7 @@ import msgpack
 import pytest
 from pydantic import ValidationError
 
-from common.config import GripperConfig, load_cell
+from common.config import GripperConfig, SuctionCup, load_cell
 from common.control.gripper_controller import GripperController
 from common.hardware.interface import GripperReading
 from common.hardware.mock import SimulatedFingers
@@ -187,3 +187,32 @@ def test_only_fingers_that_press_without_having_moved_are_given_their_latency(wi
     began = rig.now
     assert rig.grip(expected_width=0.06).outcome == "grasped" and not rig.hand.read(rig.now).moving
     assert (rig.now - began < CONFIG.latency - 1e-6) == at_once, "readings may be older than the command"
+
+
+def test_cup_reports_why_it_holds_nothing_and_that_an_object_came_off() -> None:
+    config = GripperConfig(cup=SuctionCup(), links=["cup"])
+    cup, now = SimulatedFingers(config), 10.0
+    controller = GripperController(cup, config)
+
+    def run(between: float, command: GripperCommand | None = None) -> GripperState:
+        nonlocal now
+        if command is not None:
+            controller.command(command, now)
+        cup.obstruct(between)
+        for _ in range(150):
+            now += 0.01
+            state = controller.update(cup.read(now), now)
+        return state
+
+    cup.no_seal = "box: the surface is not flat"
+    missed = run(0.0, GripperCommand(id="a", width=0.0, expected_width=config.held_width))
+    assert (missed.state, missed.outcome, missed.message) == ("aborted", "empty", "box: the surface is not flat")
+    assert run(0.0, GripperCommand(id="b", width=0.0)).message == "", "it draws already"
+    assert run(0.0, GripperCommand(id="c", width=config.max_width)).message == ""
+    assert run(0.0, GripperCommand(id="d", width=0.0)).message == "box: the surface is not flat"
+    assert run(config.held_width).holding
+    run(0.0, GripperCommand(id="e", width=config.max_width))
+    held = run(config.held_width, GripperCommand(id="f", width=0.0, expected_width=config.held_width))
+    assert (held.outcome, held.message) == ("grasped", "")
+    lost = run(0.0)
+    assert (lost.outcome, lost.message) == ("slipping", "the held object came off the cup")

@@ -11,7 +11,7 @@ from common.hardware.mock import SimulatedFingers
 from common.messages import Header
 from common.robot.finger_joints import finger_positions
 from common.robot.transforms import rpy_to_matrix, tool_down, transform
-from common.sim.bodies import lies_on
+from common.sim.suction import seal_problem
 from common.sim.kinematic import KinematicWorld
 from common.sim.objects import centre_of, solid_of
 
@@ -78,7 +78,25 @@ def test_complete_lip_must_touch_the_object(x: float, tilt: float, held: bool) -
     solid = solid_of(BAR)
     R = rpy_to_matrix(0.0, tilt, 0.0) @ np.diag([1.0, -1.0, -1.0])  # the tool looks down, its tip on top of the bar
     T = transform(R, R @ [-x, 0.0, -solid.triangles[..., 2].max()])
-    assert lies_on(SuctionCup(lip_radius=0.012, give=0.002), solid, T) is held
+    assert (seal_problem(SuctionCup(lip_radius=0.012, give=0.002), solid, T) == "") is held
+
+
+@pytest.mark.parametrize(("thing", "x", "z", "reason"), [
+    (BALL, 0.5, 0.075, "ball: the lip is up to 16.7 mm above the surface, and gives 5 mm"),
+    (BALL, 0.5, 0.2, "nothing is at the cup"),
+    (BAR.model_copy(update={"size": (0.015, 0.2)}), 0.5, 0.04,
+     "bar: the surface is smaller than the lip, 20 mm, or the cup is at its edge"),
+    (BAR, 0.52, 0.04, "bar: the surface is smaller than the lip, 20 mm, or the cup is at its edge"),
+    (BALL.model_copy(update={"radius": 0.0101}), 0.5, 0.0202,
+     "ball: the surface is not flat: 8.7 mm under the lip, which gives 8 mm"),
+    (BAR.model_copy(update={"mass": 2.0}), 0.5, 0.04, "bar: it weighs 19.6 N, and the cup holds 18.8 N"),
+    (BAR.model_copy(update={"mass": 1.9}), 0.5, 0.04, ""),
+])
+def test_cup_that_takes_nothing_says_why(thing: ObjectConfig, x: float, z: float, reason: str) -> None:
+    gripper = CUP if "flat" not in reason else CUP.model_copy(update={"cup": SuctionCup(give=0.004)})
+    rig = GripperRig(gripper, thing)
+    rig.move(x, 0.0, z, width=0.0)
+    assert rig.holding is not bool(reason) and rig.world.no_seal == reason
 
 
 @pytest.mark.parametrize(("axis", "yaw", "takes"), [

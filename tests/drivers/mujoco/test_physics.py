@@ -323,10 +323,8 @@ def test_added_object_has_the_friction_of_the_one_that_it_is_like() -> None:
     assert cell.model.geom_friction[geoms][:, 0] == pytest.approx([0.3, 0.3])
 
 
-def test_suction_cup_and_missing_mujoco_are_rejected_with_the_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_mujoco_is_rejected_with_the_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
     config = Rig().config
-    with pytest.raises(ConfigError, match="kinematic"):
-        load_world(config, [], None, GRIPPER.model_copy(update={"cup": object()}))
     monkeypatch.setattr("drivers.mujoco.find_spec", lambda name: None)
     with pytest.raises(ConfigError, match="zencell\\[physics\\]"):
         load_world(config, [])
