@@ -11,9 +11,9 @@ from common.hardware.mock import SimulatedFingers
 from common.messages import Header
 from common.robot.finger_joints import finger_positions
 from common.robot.transforms import rpy_to_matrix, tool_down, transform
-from common.sim.suction import seal_problem
 from common.sim.kinematic import KinematicWorld
 from common.sim.objects import centre_of, solid_of
+from common.sim.suction import seal_problem
 
 CUP = GripperConfig(cup=SuctionCup(), links=["cup"])
 BALL = ObjectConfig(id="ball", shape="sphere", radius=0.03, x=0.5, y=0.0)
