@@ -6,8 +6,8 @@ import math
 
 from common.config import World
 from common.messages import WorldObject, WorldObjects
-from common.sim.kinematic import GRAVITY
 from common.sim.layout import sphere_in_image
+from common.sim.suction import GRAVITY
 from drivers.mujoco import ROLLING
 
 CLEARANCE = 0.12  # [m] from a container's edge: an object between its wall and this may be occluded by the wall
