@@ -90,6 +90,8 @@ SET_POINTS = Topic("motion/set_points", m.SetPoints, "stream",
                    "commanded positions and gripper width, 100 Hz; only while there is a subscriber, as a recorder")
 TF = Topic("tf", m.TFMessage, "stream", "poses of the robot's links")
 TF_STATIC = Topic("tf_static", m.TFMessage, "state", "constant poses: base, camera")
+WRENCH = Topic("robot/wrench", m.Wrench, "stream",
+               "force and torque that the environment exerts on the tool, 100 Hz; why there is none, 1 Hz")
 GRIPPER_STATE = Topic("gripper/state", m.GripperState, "state", "width, whether it holds an object, newest command")
 MOTION_STATUS = Topic("motion/status", m.MotionStatus, "state", "newest goal: state, progress, error, source")
 MOTION_OWNER = Topic("motion/owner", m.MotionOwner, "state", "current owner of motion: motions of others are refused")
@@ -128,6 +130,8 @@ GRIPPER_COMMAND = Request("gripper/command", m.GripperCommand, m.GripperState,
                           "move the fingers; the result appears on gripper/state")
 ROBOT_COMMAND = Request("robot/command", m.RobotCommand, m.RobotStatus,
                         "enable, recover, freedrive, payload, output: commands to the arm's own controller")
+WRENCH_ZERO = Request("robot/zero_wrench", m.ZeroWrench, m.Wrench,
+                      "take the present wrench as zero; only while the arm is at rest")
 IO_SET = Request("io/set", m.IoSet, m.IoReply, "set a digital or analog output")
 SCENE_EDIT = Request("scene/edit", m.SceneEdit, m.SceneEditReply,
                      "add a solid that no camera perceives to the planning scene, or remove it")

@@ -19,16 +19,19 @@ from common import topics
 from common.application import find_application
 from common.config import Grasp, Members, Parameters, Reach, RobotConfig, Run, Tunable, World
 from common.control.executor import Executor
+from common.control.force_sensing import ForceSensing
 from common.control.interlocks import InterlockStore, effective_speed, exclusive_lock, interlock_file
 from common.control.motion_authority import OrphanPolicy, WhenAlone
 from common.control.request_handlers import MAX_STOPS, RequestHandlers
 from common.control.status import Report
 from common.control.trajectory import Tolerances
+from common.control.wrench import Payload
 from common.errors import ConfigError
 from common.hardware.interface import ControlledArm, Limits, has_simulated_world, load_hardware, real_arm
 from common.messages import MotionOwner, MotionStatus
 from common.process.service import main
 from common.robot.model import RobotModel
+from common.robot.tool_mass import described_tool
 from common.scene.workspace import configured_bounds
 from common.sim.interface import GraspTolerances, PhysicalWorld
 from common.sim.simulated_cell import (
@@ -81,6 +84,7 @@ class Publishers:
         self._writers: dict[str, Writer[Any]] = {  # by field of a report
             "joints": bus.writer(topics.JOINT_STATES), "motion": bus.writer(topics.MOTION_STATUS),
             "robot": bus.writer(topics.ROBOT_STATUS), "owner": bus.writer(topics.MOTION_OWNER),
+            "wrench": bus.writer(topics.WRENCH),
         }
         if config.robot.gripper:
             self._writers["gripper"] = bus.writer(topics.GRIPPER_STATE)
@@ -142,10 +146,13 @@ def create_executor(
         raise ConfigError("speed", clock.speed, "must be 1: the arm has a controller with a clock of its own")
     backend = None if world is None else SimulatedCell(
         world, hardware, robot, simulator=config.world.simulator, persisted=persisted, saver=saver)
+    tool = described_tool(robot)
+    force = ForceSensing(hardware, robot, config.robot.tcp_link, config.robot.gripper, config.robot.wrench,
+                         Payload(tool[0], *tool[1].tolist()) if tool is not None else None)
     executor = Executor(
         hardware, limits, start, tolerances=config.tolerances, gripper=config.robot.gripper,
         controller=config.robot.controller, kinematics=robot, world=backend, interlocks=store.interlocks,
-        period=period * clock.speed,
+        force=force, period=period * clock.speed,
     )
     executor.restore(clock.now())
     return executor
@@ -160,6 +167,7 @@ def serve(bus: Bus, config: Config, handlers: RequestHandlers, simulated: bool) 
     bus.serve(topics.MOTION_HOLD, handlers.hold)
     bus.serve(topics.MOTION_OWN, handlers.own)
     bus.serve(topics.ROBOT_COMMAND, handlers.order)
+    bus.serve(topics.WRENCH_ZERO, handlers.zero_wrench)
     if config.robot.gripper:
         bus.serve(topics.GRIPPER_COMMAND, handlers.command_gripper)
     if simulated:

@@ -29,9 +29,11 @@ from common.config.robot import (
     GripperConfig,
     HardwareConfig,
     ParallelLinkage,
+    PayloadConfig,
     RobotConfig,
     SuctionCup,
     TcpConfig,
+    WrenchConfig,
 )
 from common.config.world import (
     CameraConfig,

@@ -190,6 +190,13 @@ class TcpConfig(Section):
     rpy: tuple[Number, Number, Number] = Field((0.0, 0.0, 0.0), description="roll, pitch, yaw [rad], R = Rz Ry Rx")
 
 
+class WrenchConfig(Section):
+    """How the measured wrench at the tool is processed."""
+
+    bandwidth: float = Field(20.0, ge=0.5, le=500, description="of the first-order low-pass, at -3 dB [Hz]")
+    inertia: bool = Field(True, description="subtract the force that accelerates the payload")
+
+
 class RobotConfig(Section):
     """A robot: its descriptions, its planning group, and limits that are not in the URDF."""
 
@@ -214,6 +221,10 @@ class RobotConfig(Section):
     )
     tcp_link: str = Field("", description="link of the tool centre point; not needed if `tcp` defines it")
     tcp: TcpConfig | None = Field(None, description="tool centre point, if the URDF has no link for it")
+    flange_link: str = Field(
+        "", description="link of the flange, from which payloads are given and at which a wrench is measured; default: "
+                        "parent of the first attachment, else the link that the last joint moves"
+    )
     locked_joints: dict[str, Number] = Field(
         {}, description="positions of joints outside the group in planning; fingers while their width is unknown"
     )
@@ -229,6 +240,7 @@ class RobotConfig(Section):
     jerk_limits: list[Annotated[float, Field(gt=0, le=1e6)]] = Field(description="[rad/s^3]")
     controller: str = Field("controller", description="name of the arm's controller, the source of its status")
     gripper: GripperConfig | None = None
+    wrench: WrenchConfig = WrenchConfig()
     hardware: HardwareConfig = HardwareConfig()
 
     @model_validator(mode="before")

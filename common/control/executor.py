@@ -10,6 +10,7 @@ from typing import Any
 
 from common.config import GripperConfig
 from common.control.devices import DeviceFault, PayloadReporter, call_device, read_gripper, read_joints
+from common.control.force_sensing import ForceSensing
 from common.control.goals import Assessment
 from common.control.gripper_controller import DeferredCommand, GripperController
 from common.control.interlocks import Interlocks
@@ -54,6 +55,7 @@ class Executor:
         arm: follows trajectories.
         gripper: commands the fingers; None without a gripper.
         authority: decides which motions may start.
+        force: the wrench at the tool in this cycle.
         world: the simulated world; None with real hardware.
     """
 
@@ -69,6 +71,7 @@ class Executor:
         kinematics: ToolKinematics | None = None,
         world: WorldBackend | None = None,
         interlocks: Interlocks | None = None,
+        force: ForceSensing | None = None,
         period: float = PERIOD,
     ) -> None:
         """Control this hardware every `period` [s], subject to `interlocks`; jog the tool if there are kinematics.
@@ -80,7 +83,7 @@ class Executor:
             raise ConfigError("robot.hardware.backend", type(hardware).__name__,
                               "has no gripper, but the robot has one: name its backend in robot.gripper.hardware")
         self._hardware, self._limits, self._gripper_config = hardware, limits, gripper
-        self.world = world
+        self.world, self.force = world, force or ForceSensing(hardware)
         self.arm = TrajectoryController(limits, start, tolerances, name=controller, period=period)
         self.gripper = None
         if gripper is not None and hardware.gripper is not None:
@@ -114,6 +117,7 @@ class Executor:
             except HardwareFault as fault:
                 self._arm_fault.set(str(fault), now)
                 self.arm.fault(str(fault))
+                self.force.lose(str(fault))
                 self.authority.interrupt_jogging()
         if self.gripper is not None:
             self._update_deferred(self.gripper, now)
@@ -138,6 +142,8 @@ class Executor:
             self._fail_gripper(fault, now)
             if self.gripper is not None:
                 self.gripper.fault(str(fault))
+        held = self.gripper.held_mass if self.gripper is not None else 0.0
+        self.force.update(now, self._q, dq, held, self.arm.at_rest)
         if self._controlled is None or self._update_controlled_arm(self._controlled):
             slider = self._controlled.state.speed if self._controlled is not None else 1.0
             self.arm.jog(self.authority.jog_velocity(self._speed_scaling), slider)
@@ -205,6 +211,7 @@ class Executor:
             gripper.cancel_deferred(*failed)
 
     def _report_changes(self, report: Report, header: Header) -> None:
+        report.wrench = self.force.due(header)
         report.robot = self._changes.robot(header, self._robot_fields, self._late)
         report.notes = [*filter(None, (self._arm_fault.pop_log_line(), self._gripper_fault.pop_log_line(),
                                        self.arm.pop_log_line(), self._payload.pop_log_line()))]

@@ -32,6 +32,8 @@ from common.messages import (
     StopRequest,
     WorldEdit,
     WorldEditReply,
+    Wrench,
+    ZeroWrench,
 )
 
 T = TypeVar("T")
@@ -240,6 +242,15 @@ class RequestHandlers:
         if outcome := await self._orders[number]:
             raise Refused("robot", f"{request.act}: {outcome}")
         return self._executor.robot.model_copy(update={"header": self._header()})
+
+    async def zero_wrench(self, request: ZeroWrench) -> Wrench:
+        """Take the present wrench as zero."""
+        refusal = self._check_age(request.header) if request.header.stamp else None
+        if refusal := refusal or self._executor.authority.check_owner(request.owner):
+            raise refusal
+        self._executor.force.zero()
+        self._log.info("%s zeroed the wrench", request.owner or "the task")
+        return self._executor.force.message(self._header())
 
     async def edit(self, request: WorldEdit) -> WorldEditReply:
         """Change the simulated world."""

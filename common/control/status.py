@@ -19,6 +19,7 @@ from common.messages import (
     RobotStatus,
     SceneUpdate,
     WorldObjects,
+    Wrench,
 )
 from common.robot.finger_joints import finger_positions, finger_velocities
 
@@ -37,6 +38,7 @@ class Report:
     updates: list[SceneUpdate] = field(default_factory=list)
     robot: RobotStatus | None = None
     owner: MotionOwner | None = None
+    wrench: Wrench | None = None
     notes: list[str] = field(default_factory=list)
 
 

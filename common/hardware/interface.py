@@ -197,6 +197,25 @@ class SlowedArm(ControlledArm, Protocol):
     share: float
 
 
+@runtime_checkable
+class SensingArm(Hardware, Protocol):
+    """An arm with a force sensor at its flange, or with an estimate of the force there.
+
+    `known_payload` is what the arm's controller subtracts by itself: mass [kg] and centre of mass from the flange x, y,
+    z [m]; None: nothing, the sensor also measures the weight of the gripper.
+    """
+
+    @property
+    def known_payload(self) -> tuple[float, float, float, float] | None:
+        """Return the payload that `wrench` does not contain."""
+
+    def wrench(self) -> Vector | None:
+        """Return force [N] and torque [N m] (6,) that act on the flange from beyond it, along the axes of the flange.
+
+        The torque is about the origin of the flange. None: the newest reading of the arm has none.
+        """
+
+
 class PersistedState(NamedTuple):
     """Arm and gripper as they persist over a restart of simulated hardware.
 

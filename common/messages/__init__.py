@@ -46,6 +46,7 @@ from common.messages.execution import (
     TaskCommand,
     TaskStatus,
 )
+from common.messages.force import Wrench, ZeroWrench
 from common.messages.io import IoReply, IoSet, IoSignal, IoState
 from common.messages.planning import (
     AnyGoal,

@@ -81,6 +81,7 @@ class RobotModel:
                 raise ConfigError(f"robot.{field}", link, f"is not a link; choices: {', '.join(self._links)}")
         self.tcp_frame: int = self._links[config.tcp_link]
         self.link_parents = _link_parents(full_model)
+        self.flange_link = self._find_flange()
         for one, other in config.allowed_pairs:
             for each in (one, other):
                 if each not in self._links:
@@ -205,6 +206,28 @@ class RobotModel:
         axes = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
         found = pin.computeFrameJacobian(self.model, self.data, self._checked(q), self.tcp_frame, axes)
         return np.array(found).reshape(6, self.dof)  # pinocchio returns (6,) for one joint
+
+    def _find_flange(self) -> str:
+        """Return the link of the flange.
+
+        Raises:
+            ConfigError: it is no link, or does not move with the tool centre point.
+        """
+        config, last = self.config, self.model.frames[self.tcp_frame].parentJoint
+        link = config.flange_link or (config.attachments[0].parent_link if config.attachments else "")
+        on_last = [name for name, index in self._links.items() if self.model.frames[index].parentJoint == last]
+        if not link:
+            return on_last[0]
+        if link not in on_last:
+            raise ConfigError("robot.flange_link", link, "is no link that moves with the tool centre point; choices: "
+                              f"{', '.join(on_last)}")
+        return link
+
+    @property
+    def T_flange_tcp(self) -> Array:  # noqa: N802
+        """Pose (4, 4) of the TCP in the flange: the axes of the flange are those of payloads and force sensors."""
+        flange, tcp = (self.model.frames[index].placement for index in (self._links[self.flange_link], self.tcp_frame))
+        return np.array(flange.actInv(tcp).homogeneous)
 
     @property
     def base_axes(self) -> Array:

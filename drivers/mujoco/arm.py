@@ -9,12 +9,12 @@ import mujoco
 import numpy as np
 
 from common.config import GripperConfig
-from common.hardware.interface import Gripper, GripperReading, Vector
+from common.hardware.interface import Gripper, GripperReading, HardwareFault, Vector
 from common.hardware.mock import SimulatedFingers
 from common.robot.finger_joints import driven_position, finger_positions, width_at
 from common.robot.model import RobotModel
 from drivers.mujoco.cup import PhysicsCup, Seal
-from drivers.mujoco.model import CellModel
+from drivers.mujoco.model import FORCE_SENSOR, CellModel
 from drivers.mujoco.robot import FINGER_ARMATURE
 
 ENCODER = 6  # decimals of measured [rad], [rad/s]
@@ -31,6 +31,9 @@ class PhysicsArm:
         self.cup = PhysicsCup(config, seal) if config is not None and config.cup is not None else None
         self._tool = self.fingers or self.cup
         self.gripper: Gripper | None = self._tool
+        self.known_payload = None  # the sensor measures all that is beyond the flange
+        self._wrench: Vector | None = None
+        self._wrenches: list[Vector] = []  # of the steps since the last reading of the joints
         self._names = robot.joint_names
         self._advance = advance
         self._q, self._dq, self._written = start.copy(), np.zeros(len(start)), -np.inf
@@ -41,11 +44,14 @@ class PhysicsArm:
         self._qpos = [cell.joints[name] for name in self._names]
         self._dofs = [cell.dofs[name] for name in self._names]
         self._actuators = [cell.actuators[name] for name in self._names]
+        self._sensor = np.concatenate([range(at := int(cell.model.sensor(name).adr[0]), at + 3)
+                                       for name in FORCE_SENSOR])
         if self._tool is not None:
             self._tool.attach(cell, data)
 
     def read(self, now: float) -> tuple[Vector, Vector]:
         """Return measured positions (dof,) [rad] and velocities (dof,) [rad/s]; time must not decrease."""
+        self._wrenches.clear()
         self._advance(now)
         q, dq = self._data.qpos[self._qpos], self._data.qvel[self._dofs]
         return np.round(q, ENCODER) + 0.0, np.round(dq, ENCODER) + 0.0  # no negative zeros: readings at rest are equal
@@ -64,6 +70,22 @@ class PhysicsArm:
             self._data.ctrl[self._actuators] = self._q + extrapolated * self._dq
         if self._tool is not None:
             self._tool.drive(now)
+
+    def measure(self) -> None:
+        """Read the force sensor after a step. MuJoCo's is what the arm exerts on the flange: of the other sign."""
+        self._wrenches.append(-self._data.sensordata[self._sensor])
+
+    def wrench(self) -> Vector | None:
+        """Return the mean (6,) over the steps of the last reading; before the first step None.
+
+        Raises:
+            HardwareFault: a cup pulls: the sensor contains what presses on its lip, but not what it pulls with.
+        """
+        if self.cup is not None and self.cup.pulls:
+            raise HardwareFault("MuJoCo measures no force at a cup that pulls")
+        if self._wrenches:
+            self._wrench = np.mean(self._wrenches, axis=0)
+        return self._wrench
 
     def sense(self, now: float) -> None:
         """Update the state of fingers or cup after steps."""

@@ -52,6 +52,11 @@ class PhysicsCup:
         draws = self._valve.read(now).width <= self._config.held_width + SAME_WIDTH
         self._data.ctrl[self._actuator] = 1.0 if draws and self._sealed else 0.0
 
+    @property
+    def pulls(self) -> bool:
+        """Whether the actuator pulls."""
+        return bool(self._data.ctrl[self._actuator])
+
     def sense(self, now: float) -> None:
         """Find out after steps what the lip seals on."""
         self._sealed, self._valve.no_seal = self._seal()

@@ -124,12 +124,23 @@ def build_model(
     for name in [*robot.joint_names, *(gripper.joints[:1] if gripper else [])]:
         actuator = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
         actuator.set_to_position(kp=1.0, kv=1.0)  # gains: `arm.tune`
+    _add_force_sensor(spec, robot)
     cell = compiled(spec, robot, [obj.id for obj in objects])
     if excluded := _contacts_at_home(cell):
         for pair in excluded:
             spec.add_exclude(bodyname1=pair[0], bodyname2=pair[1])
         cell = compiled(spec, robot, [obj.id for obj in objects])
     return cell
+
+
+FORCE_SENSOR = "flange force", "flange torque"
+
+
+def _add_force_sensor(spec: mujoco.MjSpec, robot: RobotModel) -> None:
+    """Measure what acts on the flange from beyond it: force [N] and torque [N m] along the axes of its link."""
+    site = spec.body(robot.flange_link).add_site(name="flange")
+    for name, kind in zip(FORCE_SENSOR, (mujoco.mjtSensor.mjSENS_FORCE, mujoco.mjtSensor.mjSENS_TORQUE), strict=True):
+        spec.add_sensor(name=name, type=kind, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=site.name)
 
 
 def compiled(spec: mujoco.MjSpec, robot: RobotModel, objects: Iterable[str]) -> CellModel:

@@ -125,6 +125,7 @@ class PhysicsWorld(WorldEvents):
         for _ in range(steps):
             self._arm.drive(self._time)
             mujoco.mj_step(cell.model, data)
+            self._arm.measure()
             self._time += TIMESTEP
         if steps > 0:
             self._arm.sense(self._time)
