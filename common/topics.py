@@ -103,6 +103,7 @@ ROBOT_STATUS = Topic("robot/status", m.RobotStatus, "state",
 ROBOT_DESCRIPTION = Topic("robot/description", m.RobotDescription, "state",
                           "the arm: joints, limits, named poses, tool frame")
 IO_STATE = Topic("io/state", m.IoState, "state", "inputs and outputs: value, time of its change, quality")
+ARMS_STATUS = Topic("arms/status", m.ArmsStatus, "state", "motions of several arms: queue, holds")
 DISPLAY_TRAJECTORY = Topic("display_trajectory", m.JointTrajectory, "state", "newest plan")
 SCENE_OBJECTS = Topic("scene_objects", m.WorldObjects, "state",
                       "ground truth: poses of all objects; simulated hardware only")
@@ -132,6 +133,8 @@ ROBOT_COMMAND = Request("robot/command", m.RobotCommand, m.RobotStatus,
                         "enable, recover, freedrive, payload, output: commands to the arm's own controller")
 WRENCH_ZERO = Request("robot/zero_wrench", m.ZeroWrench, m.Wrench,
                       "take the present wrench as zero; only while the arm is at rest")
+RESERVE = Request("arms/reserve", m.ReserveRequest, m.ReserveReply,
+                  "permission to move next to the other arms of the cell")
 IO_SET = Request("io/set", m.IoSet, m.IoReply, "set a digital or analog output")
 SCENE_EDIT = Request("scene/edit", m.SceneEdit, m.SceneEditReply,
                      "add a solid that no camera perceives to the planning scene, or remove it")

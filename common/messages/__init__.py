@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from common.messages.arms import ArmsStatus, ReserveReply, ReserveRequest
 from common.messages.basics import (
     SCHEMA_VERSION,
     SELF_RELEASING,

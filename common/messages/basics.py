@@ -111,7 +111,8 @@ Plain = Annotated[JsonValue, PlainValidator(_plain)]  # any JSON value
 
 # Former names, which older programs, recordings and record files still contain: read, never written.
 UNKNOWN_OPERATOR = "operator"  # name of an operator who gives none, and `by` of an operator's requests
-SELF_RELEASING = ("watchdog", "controller", "scene_monitor")  # values of `by` whose holds end without an operator
+SELF_RELEASING = (  # values of `by` whose holds end without an operator
+    "watchdog", "controller", "scene_monitor", "coordinator")
 FORMER_FIELDS: Mapping[str, str] = {"acknowledged": "heard", "interlocks": "inhibits"}
 _FORMER_OPERATOR = "person"
 

@@ -32,7 +32,8 @@ from common.messages.robot import TRAJECTORY_BYTES, JointTrajectory
 
 GoalState = Literal["none", "rejected", "active", "succeeded", "aborted", "cancelled"]
 GripOutcome = Literal["", "grasped", "too_wide", "too_narrow", "empty", "slipping"]
-Holder = Annotated[Literal["operator", "watchdog", "controller", "scene_monitor"], FormerOperator]
+Holder = Annotated[Literal["operator", "watchdog", "controller", "scene_monitor", "coordinator"],
+                   FormerOperator]
 OwnerKind = Literal["none", "task", "operator", "script"]
 JogFrame = Literal["base", "tool", "world"]
 Since = Annotated[int, Field(ge=0, le=MAX_STAMP)]  # [ns since the Unix epoch]
@@ -101,7 +102,7 @@ class HoldRequest(Message):
 
     hold: bool
     reason: Text = ""
-    by: Annotated[Literal["operator", "watchdog", "scene_monitor"], FormerOperator] = Field(
+    by: Annotated[Literal["operator", "watchdog", "scene_monitor", "coordinator"], FormerOperator] = Field(
         "operator", description="each releases only its own hold; the robot moves when no hold is left")
     goal: Label = Field(
         "", description="hold only while this goal is followed; empty: until released. Not for operators")
@@ -119,7 +120,8 @@ class Interlock(Message):
     """A reason why the robot does not move: a stop, which blocks new motions, or a hold on its path."""
 
     kind: Literal["stopped", "held"]
-    by: OperatorName = Field(description="name of an operator; watchdog; controller; scene_monitor")
+    by: OperatorName = Field(description="name of an operator; watchdog; controller; scene_monitor; "
+                                      "coordinator")
     reason: Remark = ""
     since: Since = Field(description="last time it was requested [ns since the Unix epoch], later than all before it")
 

@@ -19,7 +19,7 @@ PLAN_OVERTIME = 5.0  # [s] wall: that a plan may take beyond its planning time
 REFUSAL_DELAY = 0.1  # [s] wall: after the second refused motion in a row; doubles with each further one
 LONGEST_REFUSAL_DELAY = 2.0  # [s] wall
 RELEASE = "release"  # kind of a command that ends an operator's hold
-SELF_RELEASING = ("watchdog", "controller", "scene_monitor")  # owners of holds that they release themselves
+SELF_RELEASING = m.SELF_RELEASING  # owners of holds that they release themselves
 
 # Unanswered stops and holds of an operator, each with its interlock's kind and owner.
 Pending = dict[asyncio.Task[m.MotionStatus | None], tuple[str, str]]
