@@ -25,7 +25,7 @@ def both_to_the_middle() -> TwoArms:
     return sim
 
 
-def test_an_arm_at_rest_in_the_way_of_an_older_request_moves_back_and_lets_it_pass() -> None:
+def test_an_arm_at_rest_that_obstructs_an_older_request_moves_back() -> None:
     sim = both_to_the_middle()
     sim.run(10.0)
     assert sim.results["in"].state == sim.results["other"].state == "succeeded"
