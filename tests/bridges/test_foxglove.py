@@ -160,6 +160,7 @@ async def test_each_client_gets_the_current_value_of_a_state(rig: Rig, client: F
         assert (await later.data("test/planning_scene"))["data"]["entities"][0]["id"] == "box"
 
 
+@pytest.mark.slow
 async def test_arm_is_drawn_in_the_frames_of_its_links(client: FoxgloveClient) -> None:
     await client.subscribe("test/robot/meshes")
     scene = (await client.data("test/robot/meshes"))["data"]
@@ -276,6 +277,7 @@ def test_bridge_declares_its_topics_and_requests() -> None:
     assert wired.writes == []
 
 
+@pytest.mark.slow
 async def test_killed_bridge_returns_and_no_other_service_notices(tmp_path: Path) -> None:
     port, folder = free_port(), make_folder(tmp_path)
     command = Zencell(folder, free_domain(), "up", "tiny.yaml", "--foxglove", str(port))

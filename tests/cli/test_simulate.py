@@ -21,6 +21,7 @@ pytestmark = pytest.mark.timeout(600)  # some seconds of work, on a machine that
 SMALL = ["panda", "--set", "world.count=1"]
 
 
+@pytest.mark.slow
 def test_campaign_counts_faults_and_checked_invariants(capfd):
     code = app.execute(["simulate", *SMALL, "--seeds", "1-2", "--faults", "--doubles", "--jobs", "2"])
     table = capfd.readouterr().out
@@ -31,6 +32,7 @@ def test_campaign_counts_faults_and_checked_invariants(capfd):
         assert row in table
 
 
+@pytest.mark.slow
 def test_no_module_but_drivers_needs_an_extra():
     imports = """
 import importlib, pathlib, sys

@@ -119,6 +119,7 @@ def test_renewal_includes_an_authority_that_would_expire_earlier(folder: Path) -
     certificate_in(folder / "camera.pem").verify_directly_issued_by(certificate_in(folder / "ca.pem"))
 
 
+@pytest.mark.slow
 def test_authority_is_replaced_with_overlap_while_clients_are_connected(folder, endpoint, tmp_path_factory) -> None:
     elsewhere = tmp_path_factory.mktemp("another_host")  # gets its new files later
     for name in ("ca.pem", "operator.pem", "operator.key"):

@@ -16,6 +16,7 @@ def test_balls_below_the_minimum_area_are_reported_as_left() -> None:
     assert summary["unexplained"] == [[0.4, -0.3, 0.03], [0.52, -0.3, 0.03]]
 
 
+@pytest.mark.slow
 def test_rejected_balls_are_explained() -> None:
     summary = SimulatedCell("panda", ["world.balls=[[0.4,-0.3]]", "services.workspace_validator.max_radius=0.4",
                                       "services.smart_pick_place.grace=1.0"]).summary

@@ -62,6 +62,7 @@ def test_operator_takes_over_jogs_and_gives_back() -> None:
     assert seen["moved"] == pytest.approx(0.3, abs=0.1)
 
 
+@pytest.mark.slow
 def test_stop_ends_the_motion_and_start_continues() -> None:
     async def visit(bus: Bus) -> None:
         status, command = bus.reader(POLICY_STATUS), bus.client(topics.TASK_COMMAND)
@@ -85,6 +86,7 @@ async def failing(observation: Observation) -> None:
     raise PolicyFailed("out of memory")
 
 
+@pytest.mark.slow
 def test_policy_that_always_fails_ends_the_episode_with_its_reason() -> None:
     outcome = run(f"services.policy_runner.source={{callable: '{__name__}:failing'}}")
     assert outcome.state == "ERROR" and "out of memory (10 failures in a row)" in outcome.message, outcome

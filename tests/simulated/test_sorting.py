@@ -75,6 +75,7 @@ def test_function_of_the_user_decides_the_container(tmp_path, monkeypatch):
     assert observer.places == {"red_box": "right", "blue_can": "left", "green_bar": "right"}
 
 
+@pytest.mark.slow
 def test_object_without_a_grasp_is_left_with_its_reason_after_stirring():
     wide = ("world.objects=[{id: plate, shape: box, x: 0.55, y: 0.0, z: 0.005, size: [0.12, 0.10], height: 0.03, "
             "color: [0.9, 0.1, 0.1]}]")
@@ -87,6 +88,7 @@ def test_object_without_a_grasp_is_left_with_its_reason_after_stirring():
 
 
 @pytest.mark.parametrize("seed", [3, pytest.param(7, marks=pytest.mark.slow)])
+@pytest.mark.slow
 def test_task_continues_after_crashes_of_its_services(seed):
     outcome, _ = run(faults=True, seed=seed)
     assert outcome.ok and not outcome.broken and not outcome.crashes, outcome
