@@ -104,6 +104,7 @@ ROBOT_DESCRIPTION = Topic("robot/description", m.RobotDescription, "state",
                           "the arm: joints, limits, named poses, tool frame")
 IO_STATE = Topic("io/state", m.IoState, "state", "inputs and outputs: value, time of its change, quality")
 ARMS_STATUS = Topic("arms/status", m.ArmsStatus, "state", "motions of several arms: queue, holds")
+CONVEYOR_STATE = Topic("conveyor/state", m.ConveyorState, "state", "belts: encoder, speed, light barrier, 50 Hz")
 DISPLAY_TRAJECTORY = Topic("display_trajectory", m.JointTrajectory, "state", "newest plan")
 SCENE_OBJECTS = Topic("scene_objects", m.WorldObjects, "state",
                       "ground truth: poses of all objects; simulated hardware only")
@@ -136,6 +137,7 @@ WRENCH_ZERO = Request("robot/zero_wrench", m.ZeroWrench, m.Wrench,
 RESERVE = Request("arms/reserve", m.ReserveRequest, m.ReserveReply,
                   "permission to move next to the other arms of the cell")
 IO_SET = Request("io/set", m.IoSet, m.IoReply, "set a digital or analog output")
+CONVEYOR_SET = Request("conveyor/set", m.ConveyorSet, m.ConveyorState, "start or stop a belt, or change its speed")
 SCENE_EDIT = Request("scene/edit", m.SceneEdit, m.SceneEditReply,
                      "add a solid that no camera perceives to the planning scene, or remove it")
 WORLD_EDIT = Request("world/edit", m.WorldEdit, m.WorldEditReply, "add, move, remove, reset; simulated hardware only")

@@ -126,6 +126,7 @@ def writers() -> dict[str, str]:
     return {**{key: ", ".join(services) for key, services in found.items()}, **shared,
             topics.IO_STATE.key: "io", topics.IO_SET.key: "io",  # of no included cell
             topics.RESERVE.key: "arm_coordinator", topics.ARMS_STATUS.key: "arm_coordinator",
+            topics.CONVEYOR_STATE.key: "trajectory_executor", topics.CONVEYOR_SET.key: "trajectory_executor",
             topics.SUPERVISOR_STATUS.key: "supervisor", topics.MOTION_JOG.key: "clients that jog"}
 
 

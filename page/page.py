@@ -6,7 +6,7 @@ An application extends it by an `ApplicationPage` (application.py).
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Coroutine, Mapping
+from collections.abc import Callable, Collection, Coroutine, Mapping
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,6 +20,7 @@ from common.messages import TaskStatus
 from common.topics import Topic
 from page.access import CURRENT_SESSION
 from page.application import page_of
+from page.belt_panel import BeltPanel
 from page.camera_panel import CameraPanel
 from page.console import EXECUTOR, Console
 from page.control_socket import ARM_LOST, HOLD, STOP, TASK_LOST, ControlSocket, LossDetector, PageStatus
@@ -63,6 +64,7 @@ class Page:
         self, server: viser.ViserServer, feeds: Feeds, console: Console, motions: Motions, members: Members,
         application: Application | None, layers: Layers, control: ControlSocket, *, cell: str, layout: Layout,
         layout_file: str, robot: RobotConfig, recordings: Path, schedule: Schedule, io: Io,
+        belts: Collection[str] = (),
     ) -> None:
         """Build the page; on the running loop.
 
@@ -82,6 +84,7 @@ class Page:
             recordings: folder of recordings that can be opened.
             schedule: update periods.
             io: inputs and outputs of the cell.
+            belts: names of its conveyors.
 
         Raises:
             UnknownName: the layout names a layer that does not exist.
@@ -97,8 +100,9 @@ class Page:
         self._scene: Scene | None = None
         self._plots: PlotPanel | None = None
         self._move: MovePanel | None = None
-        self._signals = io
+        self._signals, self._belt_names = io, belts
         self._io: IoPanel | None = None
+        self._belts: BeltPanel | None = None
         self.pages = 0
         self.visited = asyncio.Event()
         prepare_scene(server, layout, cell)
@@ -177,6 +181,9 @@ class Page:
             if self._signals.signals:
                 with gui.add_folder("Inputs and outputs"):
                     self._io = IoPanel(gui, self.console, self._signals)
+            if self._belt_names:
+                with gui.add_folder("Conveyors"):
+                    self._belts = BeltPanel(gui, self.console, self._belt_names)
         for name, on in self._shown.items():
             scene.set_shown(name, on)
         if self._editing:
@@ -242,8 +249,9 @@ class Page:
                                len(self._subscriptions.rejected.positions))
         if self._move is not None:
             self._move.show(self._status, now)
-        if self._io is not None:
-            self._io.show(arm_blocked(self._status, latest(topics.MOTION_STATUS)))
+        for panel in (self._io, self._belts):
+            if panel is not None:
+                panel.show(arm_blocked(self._status, latest(topics.MOTION_STATUS)))
         self._panels.controller.show(latest(topics.ROBOT_STATUS))
         self._panels.alarm_panel.show()
         self._panels.log.show()

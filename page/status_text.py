@@ -62,7 +62,7 @@ KEY_NAMES = {
     "gripper/command": "the gripper", "motion/plan": "the motion planner", "motion/execute": "the arm's controller",
     "motion/stop": "the arm's controller", "motion/hold": "the arm's controller", "motion/own": "the arm's controller",
     "planning_scene": "the planning scene", "task/command": "the task", "robot/command": "the robot controller",
-    "io/set": "the I/O service",
+    "io/set": "the I/O service", "conveyor/set": "the drive of the belts",
     "world/edit": "the simulated world", "camera/image_raw": "the camera", "camera/camera_info": "the camera",
     "depth_camera/image_raw": "the depth camera", "depth_camera/camera_info": "the depth camera",
 }

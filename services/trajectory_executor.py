@@ -92,6 +92,8 @@ class Publishers:
         self._updates = bus.writer(topics.SCENE_OBJECT_UPDATES) if simulated else None
         if simulated:
             self._writers["objects"] = bus.writer(topics.SCENE_OBJECTS)
+        if simulated and config.world.conveyors:
+            self._writers["conveyors"] = bus.writer(topics.CONVEYOR_STATE)
         application = config.members.application
         views = find_application(application).truth_views if simulated and application else {}
         self._views = [(bus.writer(topic), view) for topic, view in views.items()]  # the truth in application messages
@@ -172,6 +174,8 @@ def serve(bus: Bus, config: Config, handlers: RequestHandlers, simulated: bool) 
         bus.serve(topics.GRIPPER_COMMAND, handlers.command_gripper)
     if simulated:
         bus.serve(topics.WORLD_EDIT, handlers.edit)
+    if simulated and config.world.conveyors:
+        bus.serve(topics.CONVEYOR_SET, handlers.set_conveyor)
 
 
 async def run(

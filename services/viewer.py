@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import viser
 from pydantic import Field
@@ -100,10 +100,14 @@ async def run(bus: Bus, config: Config) -> None:
     application = find_application(config.members.application) if config.members.application else None
     layers = find_layers(application, config.layers, config.members.keys)
     read = Topics(application, layers.values(), config.members.keys)
-    has_io = bool(config.io.signals)
-    feeds = Feeds(bus, [*read.always, *([topics.IO_STATE] if has_io else [])], read.on_demand)
+    has_io, belts = bool(config.io.signals), config.world.conveyors
+    more: list[topics.Topic[Any]] = [topics.IO_STATE] if has_io else []
+    more += [topics.CONVEYOR_STATE] if belts else []
+    feeds = Feeds(bus, [*read.always, *more], read.on_demand)
     permissions = Permissions(lambda line: bus.log.info("%s", line))
-    console = Console(bus, config.members, feeds, [*read.requests, *([topics.IO_SET] if has_io else [])], permissions)
+    requests: list[topics.Request[Any, Any]] = [topics.IO_SET] if has_io else []
+    requests += [topics.CONVEYOR_SET] if belts else []
+    console = Console(bus, config.members, feeds, [*read.requests, *requests], permissions)
     control = ControlSocket(console)
     status = feeds.reader(read.status) if read.status is not None else None
     motions = OperatorMotion(bus, [status] if status is not None else [], owner=lambda: permissions.client_name)
@@ -119,7 +123,7 @@ async def run(bus: Bus, config: Config) -> None:
             server, feeds, console, motions, config.members, application, layers, control, cell=config.run.cell,
             layout=layout, layout_file=config.layout, robot=config.robot,
             recordings=recordings_folder(config.recordings), schedule=Schedule(images=1 / config.picture_rate),
-            io=config.io,
+            io=config.io, belts=[*belts],
         )
         await bus.ready()
         host = "127.0.0.1" if config.published else config.host

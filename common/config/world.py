@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import ConfigDict, Field, model_validator
 
 from common.config.basics import Coordinate, Length, Number, Point, Rgb, Section
+from common.config.conveyors import Conveyor
 from common.errors import UnknownName
 
 CAMERA = "camera"  # name of a single camera
@@ -355,7 +356,19 @@ class Surroundings(SurroundingsFields):
     """Known to all services: fixtures, containers and cameras."""
 
     fixtures: list[Fixture] = []
+    conveyors: dict[str, Conveyor] = Field({}, max_length=8, description="belts by name; each is a fixture, too")
     table_height: Coordinate = Field(0.0, description="z of the surface that carries objects [m]")
+
+    @model_validator(mode="after")
+    def _add_conveyors_to_fixtures(self) -> Self:
+        fixtures = {fixture.id: fixture for fixture in self.fixtures}
+        for name, belt in self.conveyors.items():
+            solid = Fixture(id=name, dimensions=[*belt.dimensions], position=belt.position, rpy=(0.0, 0.0, belt.yaw),
+                            color=belt.color)
+            if fixtures.setdefault(name, solid) != solid:
+                raise ValueError(f"fixtures and conveyors both have {name!r}: a conveyor is a fixture, too")
+        object.__setattr__(self, "fixtures", [*fixtures.values()])
+        return self
 
 
 class Scenery(Section):

@@ -35,6 +35,8 @@ from common.hardware.interface import (
 )
 from common.messages import (
     CLOSED_BEFORE,
+    ConveyorSet,
+    ConveyorState,
     ExecuteRequest,
     GripperCommand,
     GripperState,
@@ -221,6 +223,7 @@ class Executor:
             report.gripper = self._changes.gripper(header, self.gripper.state)
         if self.world is not None:
             report.updates, report.objects = self.world.updates(header)
+            report.conveyors = self.world.conveyors(header, max((s.since for s in self._interlocks.stops), default=0))
             self.world.save(PersistedState(self._q, *(
                 (self.gripper.state.width, self.gripper.commanded_width, self.gripper.commanded_effort)
                 if self.gripper is not None else ())))
@@ -315,6 +318,21 @@ class Executor:
     def _replace_deferred(self, gripper: GripperController, request: GripperCommand) -> None:
         if (replaced := self._deferred.take()) is not None:
             gripper.cancel_deferred(replaced, f"replaced by {request.id!r}")
+
+    def set_conveyor(self, request: ConveyorSet, header: Header, refusal: Refused | None = None) -> ConveyorState:
+        """Start or stop a belt, by the rules of motion; stopping is open to everyone.
+
+        Raises:
+            Refused: a `refusal` already, an interlock, another owner, or the belt cannot do that.
+        """
+        if self.world is None:
+            raise Refused("not_simulated", "the belts of this cell are not simulated: ask the service that drives them")
+        if request.running is not False or request.speed is not None:
+            refusal = (self.authority.interlocks.check("", request.owner, request.acknowledged) or refusal
+                       or self.authority.check_owner(request.owner))
+            if refusal is not None:
+                raise refusal
+        return self.world.set_conveyor(request, header)
 
     def order(self, request: RobotCommand) -> int:
         """Start a function of the arm's own controller; return a number for `outcome`.

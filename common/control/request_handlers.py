@@ -17,6 +17,8 @@ from common.errors import Refused
 from common.hardware.interface import WorldBackend
 from common.messages import (
     UNKNOWN_OPERATOR,
+    ConveyorSet,
+    ConveyorState,
     ExecuteRequest,
     FollowedRequest,
     GripperCommand,
@@ -251,6 +253,16 @@ class RequestHandlers:
         self._executor.force.zero()
         self._log.info("%s zeroed the wrench", request.owner or "the task")
         return self._executor.force.message(self._header())
+
+    async def set_conveyor(self, request: ConveyorSet) -> ConveyorState:
+        """Start or stop a belt, or change its speed."""
+        refusal = self._check_age(request.header) if request.header.stamp else None
+        state = self._executor.set_conveyor(request, self._header("world"), refusal)
+        wanted = [] if request.running is None else ["on" if request.running else "off"]
+        wanted += [] if request.speed is None else [f"{request.speed:g} m/s"]
+        self._log.info("conveyor %s: %s by %s", request.name or state.belts[0].name, ", ".join(wanted),
+                       request.owner or "the task")
+        return state
 
     async def edit(self, request: WorldEdit) -> WorldEditReply:
         """Change the simulated world."""

@@ -11,6 +11,7 @@ from common.config import GripperConfig
 from common.control.trajectory_controller import TrajectoryController
 from common.hardware.interface import ControlledArm, Vector
 from common.messages import (
+    ConveyorState,
     GripperState,
     Header,
     JointState,
@@ -35,6 +36,7 @@ class Report:
     motion: MotionStatus | None = None
     gripper: GripperState | None = None
     objects: WorldObjects | None = None
+    conveyors: ConveyorState | None = None
     updates: list[SceneUpdate] = field(default_factory=list)
     robot: RobotStatus | None = None
     owner: MotionOwner | None = None

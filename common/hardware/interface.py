@@ -28,7 +28,16 @@ from numpy.typing import NDArray
 
 from common.config import GripperConfig, HardwareConfig, Parameters, RobotConfig, check
 from common.errors import ConfigError, UnknownName, ZencellError
-from common.messages import Header, RobotMode, SceneUpdate, WorldEdit, WorldEditReply, WorldObjects
+from common.messages import (
+    ConveyorSet,
+    ConveyorState,
+    Header,
+    RobotMode,
+    SceneUpdate,
+    WorldEdit,
+    WorldEditReply,
+    WorldObjects,
+)
 from common.plugins import find_plugin, plugin_names
 
 Vector = NDArray[np.float64]
@@ -259,6 +268,16 @@ class WorldBackend(Protocol):
 
     def updates(self, header: Header) -> tuple[list[SceneUpdate], WorldObjects | None]:
         """Return the events since the last call, and all objects if it is time to publish a change."""
+
+    def set_conveyor(self, request: ConveyorSet, header: Header) -> ConveyorState:
+        """Start or stop a belt, or change its speed; return the state of all belts.
+
+        Raises:
+            Refused: no such belt, or it is not that fast.
+        """
+
+    def conveyors(self, header: Header, stopped: int) -> ConveyorState | None:
+        """Return the state of all belts if it is to be published; `stopped` is the time of a STOP, or 0 [ns]."""
 
     def save(self, state: PersistedState) -> None:
         """Persist the world with arm and gripper, if something has changed."""

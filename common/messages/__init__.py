@@ -28,6 +28,7 @@ from common.messages.basics import (
     Vector3,
 )
 from common.messages.camera import CameraInfo, Image, Marker, MarkerArray, PointCloud2, Rejection, Rejections
+from common.messages.conveyor import BeltState, ConveyorSet, ConveyorState
 from common.messages.execution import (
     CLOSED_BEFORE,
     ExecuteRequest,

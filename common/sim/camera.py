@@ -84,7 +84,7 @@ class SimulatedCamera:
         self._light = self._current_light()
         self._renderer = load_renderer(around, self._light, self._model, plain=plain, camera=self._mounted.at(),
                                        arm=arm)
-        self._sensor, self._motion = Sensor(config, rng), ObjectMotion()
+        self._sensor, self._motion = Sensor(config, rng), ObjectMotion(current=bool(around.conveyors))
         self.moves = self._mounted.moves
         self.needs_joints = self.moves or self._renderer.needs_arm
 
@@ -227,10 +227,15 @@ def _is_inverse(camera: CameraFile, ideal: Array) -> bool:
 
 
 class ObjectMotion:
-    """Velocities of objects from the last two world states, for motion blur."""
+    """Velocities of objects from the last two world states, for motion blur.
 
-    def __init__(self) -> None:
+    World states are published less often than images are taken. `current` extrapolates to the time of the image: on
+    a belt an object is up to 10 mm ahead of its last published position.
+    """
+
+    def __init__(self, *, current: bool = False) -> None:
         """Start without a world state."""
+        self._current = current
         self._last: WorldObjects | None = None
         self._velocities: dict[str, Array] = {}
 
@@ -254,7 +259,9 @@ class ObjectMotion:
         """Return the objects some time [s] before the last world state; `now` is a stamp [ns]."""
         if self._last is None:
             return []
-        if ago == 0 or not self._velocities or (now - self._last.header.stamp) * 1e-9 > MAX_AGE:
+        age = (now - self._last.header.stamp) * 1e-9
+        ago -= max(age, 0.0) if self._current else 0.0
+        if ago == 0 or not self._velocities or age > MAX_AGE:
             return self._last.objects
         return [self._moved(obj, ago) for obj in self._last.objects]
 

@@ -60,7 +60,10 @@ class ObjectSnapshot(BaseModel):
 
 
 class SimulatedWorld(Protocol):
-    """Ground truth of a simulated world. `version` increases with every change."""
+    """Ground truth of a simulated world. `version` increases with every change.
+
+    A world that supports conveyors has an attribute `belts` of the class `common.sim.conveyors.Belts`.
+    """
 
     version: int
 

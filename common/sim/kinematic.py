@@ -19,6 +19,7 @@ from common.messages import Header, WorldEdit, WorldObject, WorldObjects
 from common.robot.finger_joints import closing_frame
 from common.robot.transforms import invert, transform
 from common.sim.bodies import Body, Rest, WorldEvents, pressed_ends, restored
+from common.sim.conveyors import Belts, carried
 from common.sim.interface import GraspTolerances, ObjectSnapshot
 from common.sim.layout import new_body, requested_position, require_room
 from common.sim.objects import initial_pose, solid_of, solid_of_message
@@ -59,6 +60,7 @@ class KinematicWorld(WorldEvents):
     Attributes:
         version: increases with every change.
         no_seal: why a suction cup does not seal on anything, by the newest `obstruction`; empty if it does.
+        belts: carry what lies on them.
     """
 
     def __init__(
@@ -75,7 +77,7 @@ class KinematicWorld(WorldEvents):
         self._tolerances = tolerances or GraspTolerances()
         self._gripper = gripper
         self._T_tcp_closing = closing_frame(gripper) if gripper else np.eye(4)
-        self._ground = Ground(world)
+        self._ground, self.belts = Ground(world), Belts(world.conveyors)
         self._first = {obj.id: obj for obj in (world.objects if objects is None else objects)}
         self._solids = {name: solid_of(obj) for name, obj in self._first.items()}
         self._bodies: dict[str, Body] = {}
@@ -161,6 +163,7 @@ class KinematicWorld(WorldEvents):
 
     def tick(self, now: float, T_world_tcp: Array, width: float, gripping: bool) -> None:
         """Advance to a time: see `common.sim.interface`."""
+        self._convey(now)
         held = self.held
         if not held and gripping and self._between:
             held = min(self._between,
@@ -174,6 +177,25 @@ class KinematicWorld(WorldEvents):
         for body in self._bodies.values():
             if body.state == "falling":
                 self._fall(body, now)
+
+    def _convey(self, now: float) -> None:
+        """Move what lies on belts; at their end it falls off, or comes again at their start."""
+        moves = self.belts.advance(now)
+        if not any(moves.values()):
+            return
+        for name, (belt, move) in carried(self.belts, moves, self._bodies.values()).items():
+            body = self._bodies[name]
+            body.T = body.T.copy()
+            body.T[:3, 3] += move
+            body.changed()
+            self.version += 1
+            way, length = belt.config.along(float(body.T[0, 3]), float(body.T[1, 3]))[0], belt.config.dimensions[0]
+            if not 0 <= way <= length and belt.config.end == "wrap":
+                body.T[:2, 3] -= np.array(belt.config.direction) * (length if way > length else -length)
+            elif not 0 <= way <= length:
+                self._add_event("remove", body)
+                self._release(body, now)
+        self.belts.update_barriers(self._bodies.values())
 
     def _grasp(self, body: Body, T_world_tcp: Array, now: float) -> None:
         low, high = self._between[body.name]

@@ -35,10 +35,11 @@ from common.hardware.interface import (
     Vector,
 )
 from common.hardware.mock import SimulatedFingers
-from common.messages import Header, SceneUpdate, WorldEdit, WorldEditReply, WorldObjects
+from common.messages import ConveyorSet, ConveyorState, Header, SceneUpdate, WorldEdit, WorldEditReply, WorldObjects
 from common.perception.pinhole import cameras_at_home
 from common.robot.model import RobotModel
 from common.scene.workspace import WorkspaceBounds, unreachable_reason
+from common.sim.conveyors import Belts
 from common.sim.generators import with_generated
 from common.sim.interface import (
     KINEMATIC,
@@ -184,6 +185,25 @@ class SimulatedCell:
             return events, None
         self._published_version, self._published_at = self._world.version, now
         return events, self._world.objects(header)
+
+    @property
+    def _belts(self) -> Belts:
+        belts = getattr(self._world, "belts", None)
+        return belts if isinstance(belts, Belts) else Belts({})
+
+    def set_conveyor(self, request: ConveyorSet, header: Header) -> ConveyorState:
+        """Start or stop a belt, or change its speed; return the state of all belts.
+
+        Raises:
+            Refused: no such belt, or it is not that fast.
+        """
+        self._belts.set(request)
+        return self._belts.state(header)
+
+    def conveyors(self, header: Header, stopped: int) -> ConveyorState | None:
+        """Return the state of all belts if it is to be published; `stopped` is the time of a STOP, or 0 [ns]."""
+        self._belts.apply_stop(stopped)
+        return self._belts.changed(header)
 
     def save(self, state: PersistedState) -> None:
         """Persist the world with arm and gripper, if something has changed."""

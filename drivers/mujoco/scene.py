@@ -165,6 +165,7 @@ def add_lip(spec: mujoco.MjSpec, tcp_link: str, cup: SuctionCup) -> None:
 # Surroundings and cameras
 
 MIN_HEIGHT = 0.3  # [m] smallest height of fixtures that reach the floor
+BELT_INERTIA = 1e5  # [kg] of the drive: what lies on a belt does not slow it
 FLOOR_COLOR = (0.62, 0.62, 0.60, 1.0)
 _OPTICAL_TO_GL = np.diag([1.0, -1.0, -1.0])  # optical frame: z forward, y down; MuJoCo camera: -z forward, y up
 
@@ -179,6 +180,8 @@ def add_surroundings(spec: mujoco.MjSpec, world: Surroundings) -> None:
         d = fixture.dimensions
         size = {"box": [side / 2 for side in d], "sphere": [d[0], 0.0, 0.0],
                 "cylinder": [d[0], d[-1] / 2, 0.0]}[fixture.shape]
+        if fixture.id in world.conveyors:
+            _add_slide(body, f"belt:{fixture.id}")
         geom = body.add_geom(name=f"fixture:{fixture.id}", type=kinds[fixture.shape], size=size,
                              rgba=[*fixture.color, 1.0])
         set_contact(geom, FIXED)
@@ -187,6 +190,12 @@ def add_surroundings(spec: mujoco.MjSpec, world: Surroundings) -> None:
     floor = spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[5.0, 5.0, 0.1],
                                     pos=[0.0, 0.0, floor_height(world)], rgba=FLOOR_COLOR)
     set_contact(floor, FIXED)
+
+
+def _add_slide(body: Any, name: str) -> None:
+    """Let a body slide along its own x axis, as the surface of a belt: see `drivers.mujoco.belts`."""
+    slide = body.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[1.0, 0.0, 0.0])
+    slide.armature = BELT_INERTIA
 
 
 def floor_height(world: Surroundings) -> float:

@@ -19,10 +19,12 @@ from common.messages import Header, WorldEdit, WorldObjects
 from common.robot.model import RobotModel
 from common.robot.transforms import invert, transform
 from common.sim.bodies import Body, WorldEvents
+from common.sim.conveyors import Belts
 from common.sim.interface import GraspTolerances, Numbers, ObjectSnapshot
 from common.sim.kinematic import KinematicWorld
 from common.sim.suction import NOTHING, seal_problem
 from drivers.mujoco.arm import PhysicsArm, tune
+from drivers.mujoco.belts import PhysicsBelts
 from drivers.mujoco.model import REST_SPEED, CellModel, Contacts, ObjectStates, build_model, pose_changed, snap_upright
 from drivers.mujoco.scene import DEFAULT_MASS, ROBOT, TIMESTEP, SceneObject
 
@@ -40,6 +42,7 @@ class PhysicsWorld(WorldEvents):
 
     Attributes:
         version: increases with every published change.
+        belts: carry what lies on them.
     """
 
     def __init__(
@@ -52,7 +55,7 @@ class PhysicsWorld(WorldEvents):
             ConfigError: an object cannot lie at its position.
         """
         super().__init__()
-        self._config = world
+        self._config, self.belts = world, Belts(world.conveyors)
         self._kinematic = KinematicWorld(world, objects, tolerances, gripper)
         self._first_masses = {obj.id: obj.mass for obj in objects}
         self._masses = dict(self._first_masses)
@@ -108,6 +111,7 @@ class PhysicsWorld(WorldEvents):
             _copy(*before, cell, data)
         mujoco.mj_forward(cell.model, data)
         self._cell, self._data, self._contacts = cell, data, Contacts(cell, self._robot)
+        self._drives = PhysicsBelts(self._config, cell, self.belts)
         for name in self._slippery:
             self._set_robot_contact(name, False)
         self._qpos = np.array([i for at in cell.objects.values() for i in range(at.qpos, at.qpos + 7)], int)
@@ -124,12 +128,14 @@ class PhysicsWorld(WorldEvents):
         steps = math.floor((now - self._time) / TIMESTEP + 1e-6)
         for _ in range(steps):
             self._arm.drive(self._time)
+            self._drives.drive(data, self._time + TIMESTEP)
             mujoco.mj_step(cell.model, data)
             self._arm.measure()
             self._time += TIMESTEP
         if steps > 0:
             self._arm.sense(self._time)
             self._update(self._time)
+            self._drives.update(data, self._kinematic.bodies)
 
     def _update(self, now: float) -> None:
         """Update bodies and events from physics."""
@@ -146,7 +152,8 @@ class PhysicsWorld(WorldEvents):
         is_quiet = np.abs(qpos - self._last_qpos).max(initial=0.0) < QUIET
         if contacts == self._touching and not self._removed and is_quiet:
             return
-        self._touching, publish = contacts, now - self._published_at >= PUBLISH_INTERVAL
+        # Objects on belts move all the time: an older position would be published with the time of a newer one.
+        self._touching, publish = contacts, bool(self.belts) or now - self._published_at >= PUBLISH_INTERVAL
         if publish:  # else the next update publishes it
             self._last_qpos = qpos
         for name, body in bodies.items():
