@@ -326,11 +326,10 @@ class Executor:
             Refused: a `refusal` already, an interlock, another owner, or the belt cannot do that.
         """
         if self.world is None:
-            raise Refused("not_simulated", "the belts of this cell are not simulated: ask the service that drives them")
+            raise Refused("not_simulated", "the belts of this cell are not simulated")
         if request.running is not False or request.speed is not None:
-            refusal = (self.authority.interlocks.check("", request.owner, request.acknowledged) or refusal
-                       or self.authority.check_owner(request.owner))
-            if refusal is not None:
+            interlock = self.authority.interlocks.check("", request.owner, request.acknowledged)
+            if refusal := interlock or refusal or self.authority.check_owner(request.owner):
                 raise refusal
         return self.world.set_conveyor(request, header)
 
