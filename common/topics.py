@@ -125,6 +125,9 @@ MOTION_PLAN = Request("motion/plan", m.PlanRequest, m.PlanResponse, "plan a traj
 MOTION_EXECUTE = Request("motion/execute", m.ExecuteRequest, m.MotionStatus,
                          "follow a trajectory; the result appears on motion/status")
 MOTION_FOLLOWED = Request("motion/followed", m.FollowedRequest, m.ExecuteRequest, "the goal that is being followed")
+MOTION_FORCE = Request("motion/force", m.ForceMotion, m.MotionStatus,
+                       "move by the wrench at the tool: until contact, compliant, insert; the result appears on "
+                       "motion/status")
 MOTION_STOP = Request("motion/stop", m.StopRequest, m.MotionStatus, "bring the robot to rest")
 MOTION_HOLD = Request("motion/hold", m.HoldRequest, m.MotionStatus, "hold the robot on its path, or release it")
 MOTION_OWN = Request("motion/own", m.OwnRequest, m.MotionOwner, "take the ownership of motion, or give it back")

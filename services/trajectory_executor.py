@@ -19,6 +19,7 @@ from common import topics
 from common.application import find_application
 from common.config import Grasp, Members, Parameters, Reach, RobotConfig, Run, Tunable, World
 from common.control.executor import Executor
+from common.control.force_requests import ForceLimits
 from common.control.force_sensing import ForceSensing
 from common.control.interlocks import InterlockStore, effective_speed, exclusive_lock, interlock_file
 from common.control.motion_authority import OrphanPolicy, WhenAlone
@@ -155,6 +156,7 @@ def create_executor(
         hardware, limits, start, tolerances=config.tolerances, gripper=config.robot.gripper,
         controller=config.robot.controller, kinematics=robot, world=backend, interlocks=store.interlocks,
         force=force, period=period * clock.speed,
+        force_limits=ForceLimits(config.robot.force_limit, config.robot.torque_limit),
     )
     executor.restore(clock.now())
     return executor
@@ -164,6 +166,7 @@ def serve(bus: Bus, config: Config, handlers: RequestHandlers, simulated: bool) 
     """Declare all requests."""
     bus.save_parameters = handlers.save_speed
     bus.serve(topics.MOTION_EXECUTE, handlers.execute)
+    bus.serve(topics.MOTION_FORCE, handlers.move_by_force)
     bus.serve(topics.MOTION_FOLLOWED, handlers.followed)
     bus.serve(topics.MOTION_STOP, handlers.stop, max_pending=MAX_STOPS, on_overload=handlers.stop_for_unread)
     bus.serve(topics.MOTION_HOLD, handlers.hold)
@@ -252,6 +255,7 @@ async def control(
             if was_present and not present:
                 executor.authority.disown_task()
             orphaned = orphan_policy.update(present, executor.arm.goal, config.when_alone)
+            executor.force_motions.task_present = present
             executor.authority.hold_by_controller(orphaned, f"{task} is gone")
             cycle()
             if jogging.done():

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from common import topics
+from common.client.force import ForceArm
 from common.client.goals import GoalLike, Plan, Point, WaypointPath, goal_of, numbers
 from common.client.operator_motion import PROGRESS_TIMEOUT, Jogging, MotionFailed, OperatorMotion, check_seconds
 from common.client.subscriptions import NothingReceived, Part, Subscriptions
@@ -42,7 +43,7 @@ STANDSTILL_TIMEOUT, STANDSTILL = 1.0, 1e-3  # [s] wall until a jogged arm is at 
 ARC_PLANNER = "circ"  # plans arcs; it need not be in the pipeline of a cell
 
 
-class Arm(Part):
+class Arm(ForceArm, Part):
     """The arm. Lengths in metres, angles in radians; poses are (4, 4), of the tool centre point in world.
 
     Nothing moves while a task or another client has the robot; the operator can always move what they stopped or hold

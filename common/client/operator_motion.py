@@ -8,8 +8,9 @@ the same moment, the executor accepts one of the two, and the task waits for the
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
 from common import messages as m
@@ -21,6 +22,7 @@ from common.errors import ConfigError, RequestFailed, RequestLost, ZencellError
 from common.time_source import new_id, wall_ns
 from common.transport.bus import Bus
 from common.transport.reader import Reader
+from common.transport.requests import Client
 
 log = logging.getLogger(__name__)
 
@@ -29,6 +31,7 @@ PLAN_OVERTIME = 15.0  # [s] wall for the answer beyond the planning time: reques
 REQUEST_TIMEOUT = 2.0  # [s] wall
 PROGRESS_TIMEOUT = 10.0  # [s] wall without progress, holds not counted
 STATUS_TIMEOUT = 0.5  # [s] wall in which an existing task status has arrived
+REPEAT_PERIOD = 0.2  # [s] wall between requests of a force motion
 BRAKING_TIMEOUT = 1.0  # [s] wall for a motion that is being stopped
 AT_REST = ("IDLE", "DONE", "ERROR")  # states in which a task does not move the robot
 
@@ -118,14 +121,15 @@ class OperatorMotion:
 
     async def follow(
         self, trajectory: m.JointTrajectory, *, timeout: float = PROGRESS_TIMEOUT, plan: m.PlanResponse | None = None,
-        acknowledged: int | None = None,
+        acknowledged: int | None = None, force: Mapping[str, Any] | None = None,
     ) -> m.MotionStatus:
-        """Follow a trajectory of an earlier plan; otherwise like `move`."""
+        """Follow a trajectory of an earlier plan; otherwise like `move`. With the fields of a force motion, do that."""
         known = (await self.require_free()).newest if acknowledged is None else acknowledged
-        return await self._follow(trajectory, timeout, known, plan)
+        return await self._follow(trajectory, timeout, known, plan, force)
 
     async def _follow(
-        self, trajectory: m.JointTrajectory, timeout: float, acknowledged: int, plan: m.PlanResponse | None = None
+        self, trajectory: m.JointTrajectory, timeout: float, acknowledged: int, plan: m.PlanResponse | None = None,
+        force: Mapping[str, Any] | None = None,
     ) -> m.MotionStatus:
         """Follow a trajectory; interlocks newer than `acknowledged` block it."""
         if not isinstance(timeout, int | float) or not timeout > 0:
@@ -134,8 +138,16 @@ class OperatorMotion:
         request = m.ExecuteRequest(
             header=self._bus.header(), id=_new_goal_id(), trajectory=trajectory, owner=self._owner(),
             acknowledged=acknowledged, plan=plan.id if plan else "", scene_stamp=plan.scene_stamp if plan else 0)
+        repeating = None
         try:
-            answer = await self._execute.call(request, REQUEST_TIMEOUT)
+            if force is None:
+                answer = await self._execute.call(request, REQUEST_TIMEOUT)
+            else:
+                given = {name: getattr(request, name) for name in type(request).model_fields}
+                request = check(m.ForceMotion, {**given, **force}, "force motion")
+                client = self._bus.client(topics.MOTION_FORCE)
+                answer = await client.call(request, REQUEST_TIMEOUT)
+                repeating = asyncio.create_task(self._repeat(client, request), name="repeat force motion")
             if answer.state == "rejected":
                 self._require_no_task()
                 raise MotionFailed(answer.error, f"the motion was rejected: {answer.message}")
@@ -144,6 +156,17 @@ class OperatorMotion:
             if not isinstance(error, MotionFailed) or isinstance(error, _Stalled):  # the goal may still be active
                 await self._stop_goal(request.id)
             raise
+        finally:
+            if repeating is not None:
+                repeating.cancel()
+
+    async def _repeat(self, client: Client[m.ForceMotion, m.MotionStatus], request: m.ForceMotion) -> None:
+        """Repeat a force motion until cancelled: without that the executor ends it."""
+        nothing = request.trajectory.model_copy(update={"points": []})
+        while True:
+            await asyncio.sleep(REPEAT_PERIOD)
+            with contextlib.suppress(RequestFailed):
+                await client.call(request.model_copy(update={"trajectory": nothing}), REPEAT_PERIOD)
 
     async def release_holds(self, acknowledged: int) -> None:
         """Turn the operator's own holds, up to `acknowledged`, into stops, so that their next motion is not held.

@@ -241,6 +241,10 @@ class RobotConfig(Section):
     controller: str = Field("controller", description="name of the arm's controller, the source of its status")
     gripper: GripperConfig | None = None
     wrench: WrenchConfig = WrenchConfig()
+    force_limit: float = Field(
+        60.0, gt=0, le=1000, description="hard limit of force motions: a larger force at the tool ends them [N]")
+    torque_limit: float = Field(
+        10.0, gt=0, le=1000, description="the same of the torque at the tool centre point [N m]")
     hardware: HardwareConfig = HardwareConfig()
 
     @model_validator(mode="before")

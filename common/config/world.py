@@ -34,6 +34,10 @@ class Fixture(Section):
     position: Point
     rpy: tuple[Number, Number, Number] = Field((0.0, 0.0, 0.0), description="roll, pitch, yaw [rad], R = Rz Ry Rx")
     color: Rgb = (0.5, 0.5, 0.5)
+    friction: float | None = Field(
+        None, gt=0, le=5, description="with physics: coefficient of sliding friction against everything; default: the "
+                                      "larger one of 1 and that of the other surface"
+    )
 
     @model_validator(mode="after")
     def _require_dimensions(self) -> Fixture:
@@ -388,3 +392,6 @@ class World(Surroundings, Scenery, ObjectFields):
 
     min_separation: Length = Field(0.07, description="random positions: least distance of centres [m]")
     container_clearance: Length = Field(0.04, description="random positions: least distance from a container [m]")
+    slip_iterations: int = Field(
+        0, ge=0, le=50, description="with physics: solver iterations that keep held objects from creeping under a force"
+    )

@@ -6,20 +6,23 @@ changed. Requests are checked by the motion authority, which knows interlocks an
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from common.config import GripperConfig
 from common.control.devices import DeviceFault, PayloadReporter, call_device, read_gripper, read_joints
+from common.control.force_requests import FORCE_LIMITS, ForceLimits, ForceRequests
 from common.control.force_sensing import ForceSensing
-from common.control.goals import Assessment
+from common.control.goals import Assessment, ForceControl
 from common.control.gripper_controller import DeferredCommand, GripperController
 from common.control.interlocks import Interlocks
 from common.control.jogging import Jogging, ToolKinematics
 from common.control.joining import Join
 from common.control.motion_authority import MotionAuthority
 from common.control.status import ChangeDetector, Report, joint_state, robot_fields
-from common.control.trajectory import Tolerances
+from common.control.trajectory import Tolerances, Trajectory
 from common.control.trajectory_controller import PERIOD, TrajectoryController
+from common.control.wrench import Wrenches
 from common.errors import ConfigError, Refused
 from common.hardware.interface import (
     SAFETY_STOPS,
@@ -38,6 +41,7 @@ from common.messages import (
     ConveyorSet,
     ConveyorState,
     ExecuteRequest,
+    ForceMotion,
     GripperCommand,
     GripperState,
     Header,
@@ -59,6 +63,7 @@ class Executor:
         authority: decides which motions may start.
         force: the wrench at the tool in this cycle.
         world: the simulated world; None with real hardware.
+        force_motions: checks force motions and watches their requester.
     """
 
     def __init__(
@@ -75,6 +80,7 @@ class Executor:
         interlocks: Interlocks | None = None,
         force: ForceSensing | None = None,
         period: float = PERIOD,
+        force_limits: ForceLimits = FORCE_LIMITS,
     ) -> None:
         """Control this hardware every `period` [s], subject to `interlocks`; jog the tool if there are kinematics.
 
@@ -102,6 +108,7 @@ class Executor:
         self._arm_fault, self._gripper_fault = DeviceFault("the arm"), DeviceFault("the gripper")
         self._changes = ChangeDetector(self.arm)
         self._interlocks = interlocks or Interlocks()
+        self.force_motions = ForceRequests(limits, kinematics, force_limits, period)
         if self._controlled is not None:
             self.arm.history.delay, self.arm.bridges = self._controlled.delay, self._controlled.ahead
             self._controlled.stopped = self._controlled.stopped or self._interlocks.arm_stopped
@@ -149,6 +156,8 @@ class Executor:
         if self._controlled is None or self._update_controlled_arm(self._controlled):
             slider = self._controlled.state.speed if self._controlled is not None else 1.0
             self.arm.jog(self.authority.jog_velocity(self._speed_scaling), slider)
+            if gone := self.force_motions.sense(self.arm, self._q, Wrenches.of(self.force.estimator)):
+                self.arm.abort("requester_gone", gone)
             set_points = self.arm.update(now, self._q, dq)
             if set_points is not None:
                 self._send(*set_points, now)
@@ -242,14 +251,27 @@ class Executor:
         """Return whether and how the arm can follow the trajectory; any thread may call it."""
         return self.arm.assess(request.trajectory, self._q)
 
+    def move_by_force(self, request: ForceMotion, now: float, refusal: Refused | None = None) -> MotionStatus:
+        """Return the state of a force motion, as `execute` does. A request without points repeats a known one."""
+        if not request.trajectory.points:
+            self.force_motions.seen(request, self.arm.goal)
+            return self.arm.reports.get(request.id) or self.arm.reports.unknown(request.id)
+        followed = ExecuteRequest(**{name: getattr(request, name) for name in ExecuteRequest.model_fields})
+        refusal = refusal or self.force_motions.check(request, self.force.reason)
+        status = self.execute(followed, now, refusal, force=self.force_motions.follower(request))
+        self.force_motions.seen(request, self.arm.goal)
+        return status
+
     def execute(self, request: ExecuteRequest, now: float, refusal: Refused | None = None,
-                assessment: Assessment | None = None) -> MotionStatus:
+                assessment: Assessment | None = None,
+                force: Callable[[Trajectory, Vector], ForceControl] | None = None) -> MotionStatus:
         """Return the state of the goal: active, or rejected with the reason; of a known id its present state."""
         authority, known = self.authority, self.arm.knows(request.id)
         refusal = (authority.check_interlocks(request, request.id) or refusal or authority.check_owner(request.owner)
                    or self._check_devices())
+        join = Join(request.joins, request.join_time) if request.joins else None
         status = self.arm.accept(request.id, request.trajectory, now, self._q, refusal, assessment, request.plan,
-                                 request.scene_stamp, Join(request.joins, request.join_time) if request.joins else None)
+                                 request.scene_stamp, join, force)
         if not known:
             authority.note_refusal(request, status)
         if request.id == self.arm.goal and (self._followed is None or self._followed.id != request.id):

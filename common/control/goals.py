@@ -6,13 +6,14 @@ import math
 from collections import OrderedDict
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Generic, NamedTuple, TypeVar
+from typing import Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from pydantic import BaseModel
 
-from common.control.limiter import SLACK
+from common.control.limiter import SLACK, Limiter
 from common.control.trajectory import Trajectory
+from common.control.wrench import Wrenches
 from common.errors import Refused
 from common.hardware.interface import Limits, Vector
 from common.hardware.pace import Pace
@@ -26,6 +27,28 @@ BLEND_TIME = 0.3  # [s] in which the difference between the robot's and the traj
 BLEND_SHARE = 0.5  # of the limits is for that difference at most; else it takes longer
 SLOWEST = 0.01  # share of its speed below which a trajectory is refused
 MAX_SAMPLES = 20_000  # of a trajectory, to find how fast it can be followed
+
+
+class ForceControl(Protocol):
+    """What moves the arm in a force motion: `common.control.force_follower`.
+
+    Attributes:
+        end: how the motion ends, from when it is known; the arm comes to rest first.
+    """
+
+    end: Outcome | None
+
+    @property
+    def result(self) -> tuple[float, float]:
+        """Force of the tool along the direction [N], and distance in it [m]."""
+
+    def sense(self, measured: Vector, wrench: Wrenches | None) -> None:
+        """Take the reading of a cycle: joint positions (dof,) [rad], and the wrench, None while it is unknown."""
+
+    def set_points(
+        self, goal: Goal, now: float, elapsed: float, limiter: Limiter, share: float, held: bool
+    ) -> tuple[Vector, Vector]:
+        """Return set-points (dof,) [rad], [rad/s] after a cycle."""
 
 
 @dataclass
@@ -52,6 +75,7 @@ class Goal:
     source: str = ""
     plan: str = ""  # id of the plan request behind it
     scene_stamp: int = 0  # of the planning scene that it was planned on
+    force: ForceControl | None = None  # follows a force motion; None: the trajectory is followed
     ended: float | None = None  # cell time at which the set-points came to rest
     _reported: float = 0.0  # progress so far
     _newest: tuple[float, tuple[Vector, Vector]] | None = None  # cached time and result: most are read three times
@@ -256,10 +280,11 @@ class GoalReports:
     def report(self, goal: Goal, delay: float, outcome: Outcome) -> MotionStatus:
         """Set, remember and return the status of the goal, whose arm has a delay [s]."""
         progress = 1.0 if outcome.state == "succeeded" else goal.progress(delay)
+        force, distance = (0.0, 0.0) if goal.force is None else goal.force.result
         self.newest = MotionStatus(
             id=goal.id, state=outcome.state, progress=progress, error=outcome.error, message=outcome.message,
             source=outcome.source or self._source, plan=goal.plan, scene_stamp=goal.scene_stamp,
-            path_time=goal.time - goal.begin,
+            path_time=goal.time - goal.begin, force=force, distance=distance,
         )
         return self._with_holds(self.memory.put(goal.id, self.newest))
 

@@ -21,6 +21,7 @@ from common.messages import (
     ConveyorState,
     ExecuteRequest,
     FollowedRequest,
+    ForceMotion,
     GripperCommand,
     GripperState,
     Header,
@@ -141,6 +142,15 @@ class RequestHandlers:
         status = self._executor.execute(request, self._clock.now(), refusal, assessment)
         if status.state == "rejected":
             self._log.warning("goal %s rejected: %s [%s]", request.id, status.message, status.error)
+        return await self._persisted(status)
+
+    async def move_by_force(self, request: ForceMotion) -> MotionStatus:
+        """Move by the wrench at the tool."""
+        if not request.trajectory.points:
+            return self._executor.move_by_force(request, self._clock.now())
+        status = self._executor.move_by_force(request, self._clock.now(), self._check_age(request.header))
+        if status.state == "rejected":
+            self._log.warning("force motion %s rejected: %s [%s]", request.id, status.message, status.error)
         return await self._persisted(status)
 
     async def followed(self, request: FollowedRequest) -> ExecuteRequest:

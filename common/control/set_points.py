@@ -216,6 +216,10 @@ class GoalFollower:
             speed_scaling: share of its speed at which it is followed.
             held: whether the arm is to come to rest on its path.
         """
+        if goal.force is not None:
+            found = goal.force.set_points(goal, now, elapsed, self._limiter, speed_scaling, held)
+            self._standstill.position = found[0]
+            return found
         braking = goal.stopping or held
         share = max(speed_scaling, goal.pace.rate)
         goal.pace.ramp_up = SHORTEST_STOP if speed_scaling * goal.share < goal.pace.rate else RAMP_UP
@@ -242,8 +246,10 @@ class GoalFollower:
     def rewind(self, goal: Goal, now: float, measured: Vector) -> Outcome | None:
         """Continue from rest at the place of the path where the arm is at rest; end a goal whose arm is not on it.
 
-        Where the path passes there more than once, the first time counts.
+        Where the path passes there more than once, the first time counts. A force motion ends.
         """
+        if goal.force is not None:
+            return self._lost_force(measured)
         times = np.linspace(max(goal.time - REWOUND, 0.0), goal.time, SAMPLES)
         off = np.abs(goal.positions_at(times) - measured).max(axis=1)
         nearest = int(np.argmax(off <= off.min() + ARRIVED))
@@ -257,6 +263,8 @@ class GoalFollower:
 
     def resume_from_rest(self, goal: Goal, now: float, measured: Vector, velocity: Vector) -> Outcome | None:
         """Continue from rest at the newest set-point, or where the arm is; end a goal whose arm was moved too far."""
+        if goal.force is not None:
+            return self._lost_force(measured)
         off = float(np.abs(measured - self._limiter.position).max())
         if off > self._tolerances.start and not self._standstill.is_trailing(measured, velocity):
             self._limiter.rest(measured)
@@ -267,6 +275,12 @@ class GoalFollower:
         goal.last = now
         goal.pace.rest()
         return self._check_place(measured, off)
+
+    def _lost_force(self, measured: Vector) -> Outcome:
+        self._standstill.position = measured.copy()
+        self._limiter.rest(measured)
+        self._history.clear()
+        return Outcome("aborted", "interrupted", "there were no set-points for a while, and so no reaction to forces")
 
     def _check_place(self, measured: Vector, off: float) -> Outcome | None:
         if off <= self._tolerances.path:
@@ -302,6 +316,8 @@ class GoalFollower:
         allowed = self._tolerances
         at_rest = bool(np.all(np.abs(velocity) <= allowed.stopped_velocity))
         timed_out = now - goal.ended > allowed.goal_time
+        if goal.force is not None and not goal.stopping and goal.force.end is not None:
+            return goal.force.end if at_rest or timed_out else None
         j = int(np.argmax(off))
         if goal.stopping:
             if not at_rest and not timed_out:

@@ -7,14 +7,15 @@ robot is held its goal stays active, at rest on its path; a goal accepted meanwh
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 
-from common.control.goals import MAX_SAMPLES, REMEMBERED, Assessment, Goal, GoalReports, Outcome
+from common.control.goals import MAX_SAMPLES, REMEMBERED, Assessment, ForceControl, Goal, GoalReports, Outcome
 from common.control.joining import Join, join_goal
 from common.control.limiter import Limiter
 from common.control.set_points import GoalFollower, SetPointHistory, Standstill
-from common.control.trajectory import Tolerances, checked_trajectory, to_message
+from common.control.trajectory import Tolerances, Trajectory, checked_trajectory, to_message
 from common.errors import Refused
 from common.hardware.interface import HardwareFault, Limits, Vector
 from common.messages import Holder, JointTrajectory, MotionStatus
@@ -76,6 +77,11 @@ class TrajectoryController:
         return self._goal.id if self._goal else ""
 
     @property
+    def force(self) -> ForceControl | None:
+        """What follows the force motion in progress; None without one."""
+        return self._goal.force if self._goal else None
+
+    @property
     def set_point(self) -> Vector:
         """The newest set-point (dof,) [rad]."""
         return self._limiter.position
@@ -106,6 +112,7 @@ class TrajectoryController:
     def accept(
         self, goal: str, trajectory: JointTrajectory, now: float, measured: Vector, refusal: Refused | None = None,
         assessment: Assessment | None = None, plan: str = "", scene_stamp: int = 0, join: Join | None = None,
+        force: Callable[[Trajectory, Vector], ForceControl] | None = None,
     ) -> MotionStatus:
         """Return the state of the goal: active, or rejected with code and message; of a known id its present state.
 
@@ -119,6 +126,7 @@ class TrajectoryController:
             plan: id of the plan request behind the goal, reported with it.
             scene_stamp: stamp of the planning scene of that plan [ns], reported with it.
             join: where the trajectory continues the goal that is followed, and replaces the rest of it.
+            force: prepares a force motion along the trajectory from a position (dof,) [rad]; it may raise Refused.
         """
         known = self.reports.get(goal)
         if known is not None:
@@ -139,6 +147,7 @@ class TrajectoryController:
             rate = 0.0 if self.reports.holds else self.reports.speed_scaling * assessment.share
             accepted = assessment.goal(goal, start, now, rate, self._limits)
             accepted.plan, accepted.scene_stamp = plan, scene_stamp
+            accepted.force = None if force is None else force(assessment.trajectory, start)
         except Refused as error:
             return self.reports.reject(goal, error)
         if start is not self._standstill.position:
@@ -154,7 +163,7 @@ class TrajectoryController:
             Refused: that goal is not followed, or cannot be continued so.
         """
         running = self._goal
-        if running is None or running.id != join.goal:
+        if running is None or running.id != join.goal or running.force is not None:
             raise Refused("unknown_goal", f"goal {join.goal!r} is not followed now")
         joined = join_goal(running, goal, trajectory, join.time, self._limits, self._tolerances, self._period)
         joined.plan, joined.scene_stamp = plan, scene_stamp

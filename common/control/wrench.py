@@ -170,3 +170,17 @@ class WrenchEstimator:
         self._bias = np.mean([reading for _, reading in self._at_rest], axis=0)
         self.wrench = self.unfiltered = np.zeros(6)
         self.zeroed = True
+
+
+class Wrenches(NamedTuple):
+    """What the environment exerts on the tool (6,) [N, N m], at the TCP along its axes: low-passed, and newest."""
+
+    smooth: Vector
+    newest: Vector
+
+    @classmethod
+    def of(cls, estimator: WrenchEstimator | None) -> Wrenches | None:
+        """Return the estimate of this cycle; None while there is none."""
+        if estimator is None or estimator.wrench is None or estimator.unfiltered is None:
+            return None
+        return cls(estimator.wrench, estimator.unfiltered)

@@ -49,6 +49,7 @@ from common.messages.execution import (
     TaskStatus,
 )
 from common.messages.force import Wrench, ZeroWrench
+from common.messages.force_motion import ForceMotion
 from common.messages.io import IoReply, IoSet, IoSignal, IoState
 from common.messages.planning import (
     AnyGoal,

@@ -142,7 +142,7 @@ class MotionStatus(Message):
 
     max_bytes: ClassVar[int] = 4 * SMALL_BYTES  # with all interlocks
     max_parts: ClassVar[int] = 256
-    omitted_defaults: ClassVar[tuple[str, ...]] = ("fault", "plan", "scene_stamp", "path_time")
+    omitted_defaults: ClassVar[tuple[str, ...]] = ("fault", "plan", "scene_stamp", "path_time", "force", "distance")
 
     header: Header = Header()
     id: Label = ""
@@ -161,6 +161,8 @@ class MotionStatus(Message):
     scene_stamp: Since = Field(0, description="stamp of the planning scene it was planned on; 0: unknown")
     path_time: Finite = Field(0.0, description="time of the newest set-point on the trajectory of the goal [s]; "
                                                "negative until it joins the one before")
+    force: Finite = Field(0.0, description="of the tool along its direction at the end of a force motion [N]")
+    distance: Finite = Field(0.0, description="that the tool went in that direction [m]")
 
     @property
     def stopped(self) -> str:

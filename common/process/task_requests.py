@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
-from typing import Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 from common import messages as m
 from common import topics
@@ -63,6 +63,7 @@ class TaskRequests(Generic[V]):
         self._task, self._observe, self._bus = task, observe, bus
         self._planning_time, self._report, self._wake = planning_time, report, wake
         self._plan, self._execute = bus.client(topics.MOTION_PLAN), bus.client(topics.MOTION_EXECUTE)
+        self._force = bus.client(topics.MOTION_FORCE)
         self._stop, self._grip = bus.client(topics.MOTION_STOP), bus.client(topics.GRIPPER_COMMAND)
         self._hold = bus.client(topics.MOTION_HOLD)
         self._output = bus.client(topics.IO_SET) if io else None
@@ -143,7 +144,9 @@ class TaskRequests(Generic[V]):
                 id=command.id, state="rejected", error=error.code, message=error.message), self._report)
             await self._deliver(gripped)
         elif isinstance(command, m.ExecuteRequest):
-            moved = await call_until_answered(self._execute, command, GOAL_TIMEOUT, lambda error: m.MotionStatus(
+            client: Client[Any, m.MotionStatus] = (
+                self._force if isinstance(command, m.ForceMotion) else self._execute)
+            moved = await call_until_answered(client, command, GOAL_TIMEOUT, lambda error: m.MotionStatus(
                 id=command.id, state="rejected", error=error.code, message=error.message), self._report)
             await self._deliver(moved)
         elif isinstance(command, m.IoSet):
@@ -189,6 +192,8 @@ class TaskRequests(Generic[V]):
 
 def _kind(command: Command) -> str:
     """Return the kind of a command, of which only the newest counts; each owner's holds are a kind of their own."""
+    if isinstance(command, m.ExecuteRequest):  # force motions, too
+        return f"{m.ExecuteRequest.__name__} "
     if not isinstance(command, m.HoldRequest):
         return f"{type(command).__name__} "
     if command.by == "operator":

@@ -13,8 +13,10 @@ import math
 from collections.abc import Iterator
 
 from common import messages as m
+from common.robot.transforms import rpy_to_matrix
 from common.tasks.commands import obey
 from common.tasks.decisions import NOT_ITS_FAULT, V
+from common.tasks.force import ForceMove
 from common.tasks.monitoring import ExecutionMonitor
 from common.tasks.signals import Output, WaitFor
 from common.tasks.stages import AwaitImage, Command, Execution, Grip, Move, Report, Stage
@@ -169,9 +171,9 @@ class Task(ExecutionMonitor[V]):
 
     def _plan_ahead(self, view: V) -> Iterator[Command]:
         """Request a plan for the first motion without a trajectory, from the end of the motion before it."""
-        if self._planning is not None:
-            return
         running = self.running.stage if self.running else None
+        if self._planning is not None or isinstance(running, ForceMove):  # only the force decides where it ends
+            return
         end = running.end() if isinstance(running, Move) else []
         width = self._width(view)
         for grip in (running, self._early.stage if self._early else None):
@@ -182,6 +184,10 @@ class Task(ExecutionMonitor[V]):
                 width = move.width_after(width)
             if not isinstance(move, Move):
                 continue
+            if isinstance(move, ForceMove):
+                if move is not self.queue[0] or running is not None or self._early is not None or view.tcp is None:
+                    return  # its line begins where the tool is then
+                move.aim(view, rpy_to_matrix(*self.p.robot.base_rpy))
             if move.trajectory is None:
                 move.planned_around, move.planned_width = self.obstacles(move, view), width
                 request = self.request(move, end, view)
@@ -191,6 +197,8 @@ class Task(ExecutionMonitor[V]):
                 yield request
                 return
             end = move.end()
+            if isinstance(move, ForceMove):
+                return
 
     def _advance(self, view: V) -> Iterator[Command]:
         """Start the next stage once the one before has ended and its plan is still valid."""
@@ -272,9 +280,7 @@ class Task(ExecutionMonitor[V]):
     def _execution(self, stage: Stage, view: V) -> Execution:
         command: m.ExecuteRequest | m.GripperCommand
         if isinstance(stage, Move):
-            assert stage.trajectory is not None
-            command = m.ExecuteRequest(
-                id=self.new_id(), trajectory=stage.trajectory, plan=stage.plan, scene_stamp=stage.scene_stamp)
+            command = stage.execution(self.new_id())
         else:
             assert isinstance(stage, Grip)
             command = m.GripperCommand(id=self.new_id(), width=stage.width, effort=stage.effort, mass=stage.mass)

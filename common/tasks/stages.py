@@ -62,6 +62,12 @@ class Move(Stage):
     plan: str = field(default="", init=False)  # id of the request that the trajectory answers
     scene_stamp: int = field(default=0, init=False)  # of the planning scene used [ns]
 
+    def execution(self, name: str) -> m.ExecuteRequest:
+        """Return the request with an id that executes it once it is planned."""
+        assert self.trajectory is not None
+        return m.ExecuteRequest(
+            id=name, trajectory=self.trajectory, plan=self.plan, scene_stamp=self.scene_stamp)
+
     def end(self) -> list[float]:
         """Joint positions at its end [rad]; empty without a plan."""
         return self.trajectory.points[-1].positions if self.trajectory else []

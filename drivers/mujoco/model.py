@@ -110,6 +110,7 @@ def build_model(
     spec.modelname = robot.config.name
     option = spec.option
     option.timestep, option.impratio = TIMESTEP, IMPRATIO
+    option.noslip_iterations = world.slip_iterations if isinstance(world, World) else 0
     option.integrator, option.cone = mujoco.mjtIntegrator.mjINT_IMPLICITFAST, mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.compiler.boundmass, spec.compiler.boundinertia, spec.compiler.balanceinertia = 1e-4, 1e-7, True
     spec.compiler.degree = False

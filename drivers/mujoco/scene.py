@@ -50,7 +50,7 @@ def add_object(spec: mujoco.MjSpec, obj: SceneObject) -> None:
         geom.rgba = [*obj.color, 1.0]
         set_contact(geom, OBJECT)
         if obj.friction is not None:  # a rubber pad on a polished object slips like the object
-            geom.friction, geom.priority = (obj.friction, obj.friction * TORSION, ROLLING), OBJECT_PRIORITY
+            set_friction(geom, obj.friction)
 
 
 def _geoms(spec: mujoco.MjSpec, body: Any, obj: SceneObject) -> list[tuple[Any, float]]:
@@ -131,6 +131,11 @@ def set_contact(geom: Any, kind: int, *, group: int = 0) -> Any:
     return geom
 
 
+def set_friction(geom: Any, sliding: float) -> None:
+    """Set the coefficient of sliding friction of a geom against everything, also the pads of fingers."""
+    geom.friction, geom.priority = (sliding, sliding * TORSION, ROLLING), OBJECT_PRIORITY
+
+
 def set_finger_contact(geom: Any) -> Any:
     """Set the contact parameters of a finger pad, which override those of the object; return the geom."""
     geom.friction = (FINGER_SLIDING, TORSION, ROLLING)
@@ -185,6 +190,8 @@ def add_surroundings(spec: mujoco.MjSpec, world: Surroundings) -> None:
         geom = body.add_geom(name=f"fixture:{fixture.id}", type=kinds[fixture.shape], size=size,
                              rgba=[*fixture.color, 1.0])
         set_contact(geom, FIXED)
+        if fixture.friction is not None:
+            set_friction(geom, fixture.friction)
     for container in world.containers.values():
         _add_container(spec, container, world.table_height)
     floor = spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[5.0, 5.0, 0.1],
