@@ -12,13 +12,12 @@ import viser
 import yaml
 from pydantic import Field
 
-from common.atomic_file import state_folder
+from common.atomic_file import state_folder, write_atomically
 from common.config import Section, check, config_root, read_yaml
 from common.errors import ConfigError, ZencellError
 from page.diagnostics import LogLevel
 from page.layers import Layers, has_data, shown_layers
 from page.markup import Html, block, span, swatch, text
-from page.saved_poses import write_atomically
 from page.viser_inside import element_id
 
 if TYPE_CHECKING:

@@ -10,9 +10,9 @@ import viser
 
 from common.client.operator_motion import MotionFailed
 from common.messages import Interlock, JointTrajectory, JointTrajectoryPoint, MotionStatus, PlanResponse
+from common.saved_poses import SavedPoses, poses_file, save_poses
 from page.console import ActionQueue
 from page.move_panel import MovePanel
-from page.saved_poses import SavedPoses, poses_file, save_poses
 from tests.page.scene_cell import robot_of
 
 STOP = MotionStatus(interlocks=[Interlock(kind="stopped", by="anna", since=8)])

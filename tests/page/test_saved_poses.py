@@ -8,8 +8,9 @@ import viser
 
 from common.config import check
 from common.errors import ConfigError
+from common.saved_poses import HEADER, SavedPoses, load_poses, poses_file, save_poses
 from page.console import ActionQueue
-from page.saved_poses import HEADER, SavedPoses, SavedPosesPanel, load_poses, poses_file, save_poses
+from page.saved_poses import SavedPosesPanel
 
 POSES = {"bin": {"a": 0.25, "b": -1.0}, "über der Kiste": {"b": 0.5, "a": 0.0}}
 JOINTS = ["a", "b"]

@@ -1,0 +1,243 @@
+"""Program files: reading with errors that name file, line, step and field; writing; ids of steps."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, cast
+
+import yaml
+from pydantic import BaseModel, ValidationError
+
+from applications.programming.model import STEPS, BaseStep, Call, Program, as_data, walk
+from common.atomic_file import write_atomically
+from common.config import parse_yaml
+from common.errors import ConfigError, UnknownName, ZencellError
+
+SUFFIX = ".yaml"
+MAX_BYTES = 1_000_000
+
+
+class BadProgram(ZencellError):
+    """Everything that is wrong with a program, one line for each problem."""
+
+    def __init__(self, problems: list[str]) -> None:
+        super().__init__("\n".join(problems))
+        self.problems = problems
+
+
+@dataclass(frozen=True)
+class ProgramFile:
+    """A program, the file that it is from, and the lines of its steps there by their id."""
+
+    name: str
+    path: Path
+    program: Program
+    lines: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def steps(self) -> dict[str, BaseStep]:
+        """All steps by their id, in the order of the file."""
+        return {step.id: step for _, step in walk(self.program.steps)}
+
+    def where(self, step: BaseStep) -> str:
+        """Return file, line and step in words, for messages."""
+        line = self.lines.get(step.id)
+        return f"{self.path.name}{f':{line}' if line else ''}: {step.id}"
+
+    def at(self, id_: str) -> BaseStep:
+        """Return the step of an id.
+
+        Raises:
+            UnknownName: lists the choices.
+        """
+        steps = self.steps
+        if id_ not in steps:
+            raise UnknownName("step", id_, steps)
+        return steps[id_]
+
+
+def names_in(folder: Path) -> list[str]:
+    """Return the names of the programs of a folder."""
+    return sorted(path.stem for path in folder.glob(f"*{SUFFIX}")) if folder.is_dir() else []
+
+
+def load_program(path: Path) -> ProgramFile:
+    """Return the program of a file.
+
+    Raises:
+        BadProgram: names file, line, step, field, value and choices.
+        ConfigError: the file cannot be read.
+    """
+    try:
+        text = path.read_bytes()[:MAX_BYTES].decode()
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError("program", str(path), f"cannot be read: {getattr(error, 'strerror', '') or error}") from None
+    return parse_program(text, path)
+
+
+def parse_program(text: str, path: Path) -> ProgramFile:
+    """Return the program of a text that is, or will be, in a file; the errors are those of `load_program`."""
+    try:
+        tree = parse_yaml(text)
+    except (yaml.YAMLError, ValueError) as error:
+        mark = getattr(error, "problem_mark", None)
+        problem = getattr(error, "problem", None) or str(error)
+        raise BadProgram([f"{path}{f':{mark.line + 1}' if mark else ''}: does not parse: {problem}"]) from None
+    lines = dict(_lines(yaml.compose(text)))
+    if not isinstance(tree, dict):
+        raise BadProgram([f"{path}: must hold a mapping with steps"])
+    try:
+        program = Program.model_validate(tree)
+    except ValidationError as error:
+        raise BadProgram([_problem(path, lines, each) for each in error.errors(include_url=False)]) from None
+    twice = [id_ for id_, count in Counter(step.id for _, step in walk(program.steps) if step.id).items() if count > 1]
+    if twice:
+        raise BadProgram([f"{path}: id: {twice[0]!r} is given to several steps; each needs its own"])
+    program = with_ids(program)
+    found = {step.id: lines[place] for place, step in walk(program.steps) if place in lines}
+    return ProgramFile(path.stem, path, program, found)
+
+
+def save_program(file: ProgramFile) -> None:
+    """Write a program to its file, completely or not at all.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    write_atomically(file.path, text_of(file.program))
+
+
+def text_of(program: Program) -> str:
+    """Return a program as YAML, with one line for each simple step."""
+    return "\n".join(_yaml(as_data(program), "")) + "\n"
+
+
+def with_ids(program: Program) -> Program:
+    """Return the program with an id for each step that has none: its kind and a number."""
+    used = {step.id for _, step in walk(program.steps)}
+    numbers: Counter[str] = Counter()
+
+    def named(step: Any) -> Any:
+        changed: dict[str, Any] = {name: [named(each) for each in getattr(step, name)] for name in step.BODIES}
+        if not step.id:
+            changed["id"] = new_id(step.step, numbers, used)
+        return step.model_copy(update=changed) if changed else step
+
+    return program.model_copy(update={"steps": [named(step) for step in program.steps]})
+
+
+def new_id(kind: str, numbers: Counter[str], used: set[str]) -> str:
+    """Return the next free id for a step of a kind, and mark it as used."""
+    while True:
+        numbers[kind] += 1
+        found = f"{kind}{numbers[kind]}"
+        if found not in used:
+            used.add(found)
+            return found
+
+
+def load_all(file: ProgramFile) -> dict[str, ProgramFile]:
+    """Return a program and all programs that it calls, by name.
+
+    Raises:
+        BadProgram, ConfigError: one cannot be read, or is missing, or programs call each other in a circle.
+    """
+    found: dict[str, ProgramFile] = {}
+
+    def visit(one: ProgramFile, above: tuple[str, ...]) -> None:
+        found[one.name] = one
+        for place, step in walk(one.program.steps):
+            if not isinstance(step, Call):
+                continue
+            where = f"{one.path}:{one.lines.get(step.id, 0)}: {place}.program ({step.id})"
+            if step.program in (*above, one.name):
+                raise BadProgram([f"{where}: {step.program!r} calls itself: {' > '.join((*above, one.name))} > "
+                                  f"{step.program}"])
+            path = one.path.with_name(f"{step.program}{SUFFIX}")
+            if not path.is_file():
+                raise BadProgram([f"{where}: {UnknownName('program', step.program, names_in(one.path.parent))}"])
+            visit(found.get(step.program) or load_program(path), (*above, one.name))
+
+    visit(file, ())
+    return found
+
+
+def _lines(node: yaml.Node | None, place: str = "") -> Iterator[tuple[str, int]]:
+    """Yield the line of each value of a document by its path, such as `steps[0].to`."""
+    if node is None:
+        return
+    if place:
+        yield place, node.start_mark.line + 1
+    if isinstance(node, yaml.MappingNode):
+        for key, value in node.value:
+            yield from _lines(value, f"{place}.{key.value}".lstrip("."))
+    elif isinstance(node, yaml.SequenceNode):
+        for number, value in enumerate(node.value):
+            yield from _lines(value, f"{place}[{number}]")
+
+
+def _problem(path: Path, lines: Mapping[str, int], error: Mapping[str, Any]) -> str:
+    """Return one validation error as a line with file, line, path of the field, value and choices."""
+    place, model = "", cast("type[BaseModel]", Program)
+    for part in error["loc"]:
+        if isinstance(part, int):
+            place += f"[{part}]"
+        elif place.endswith("]") and part in STEPS and place.rpartition("[")[0].rpartition(".")[2] in _BODIES:
+            model = STEPS[part]  # the discriminator, which is no field
+        elif "-" not in part and not part.endswith("]"):  # not a branch of a union, such as constrained-float
+            place = f"{place}.{part}".lstrip(".")
+    known = place
+    while known and known not in lines:
+        known = known[: max(known.rfind("."), known.rfind("["), 0)]
+    line = f":{lines[known]}" if known else ""
+    text = error["msg"].removeprefix("Value error, ").replace("Input should be", "must be").replace("Input ", "")
+    if error["type"] == "extra_forbidden":
+        text = f"is not a field; choices: {', '.join(_fields_at(model, place))}"
+    elif error["type"] == "missing":
+        return f"{path}{line}: {place}: is missing"
+    elif error["type"] in ("union_tag_invalid", "union_tag_not_found"):
+        given = error["input"].get("step") if isinstance(error["input"], dict) else error["input"]
+        return f"{path}{line}: {place}.step: {given!r} is not a step; choices: {', '.join(STEPS)}"
+    elif error["type"] == "value_error":
+        return f"{path}{line}: {place or 'program'}: {text}"
+    return f"{path}{line}: {ConfigError(place, error['input'], text)}"
+
+
+_BODIES = ("steps", "then", "else")
+
+
+def _fields_at(model: type[BaseModel], place: str) -> list[str]:
+    """Return the fields of the model that a path leads to, below a step or the program."""
+    from applications.programming.model import Condition, Target
+
+    parts = place.rpartition("]")[2].strip(".").split(".")
+    if len(parts) > 1 or place.rpartition(".")[0].rpartition(".")[2].startswith("points["):
+        model = Condition if parts[0] in ("for", "while", "when") else Target
+    return sorted(info.alias or name for name, info in model.model_fields.items())
+
+
+def _yaml(value: Any, indent: str) -> Iterator[str]:
+    """Yield the lines of a mapping: nested steps are lists, all else is in flow style."""
+    for name, each in value.items():
+        if name in _BODIES or name == "poses":
+            yield f"{indent}{name}:"
+            items = each.items() if isinstance(each, dict) else enumerate(each)
+            for key, item in items:
+                if isinstance(each, dict):
+                    yield f"{indent}  {_flow(key)}: {_flow(item)}"
+                elif any(body in item for body in _BODIES):
+                    first, *rest = _yaml(item, f"{indent}    ")
+                    yield f"{indent}  - {first.strip()}"
+                    yield from rest
+                else:
+                    yield f"{indent}  - {_flow(item)}"
+        else:
+            yield f"{indent}{name}: {_flow(each)}"
+
+
+def _flow(value: Any) -> str:
+    text: str = yaml.safe_dump(value, default_flow_style=True, allow_unicode=True, width=10**9, sort_keys=False)
+    return text.removesuffix("\n").removesuffix("\n...")
