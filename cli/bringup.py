@@ -122,15 +122,16 @@ def run(**given: Any) -> None:
     from tools.check.cell import require_task  # slow to import
 
     before = verbs.before_run(given["cell"], given["overrides"], given["world"], of_applications)
-    session = _session(**{**given, "overrides": before.overrides}, until_ended=True)
+    session = _session(**before.changed(given), until_ended=True)
     require_task(session.on_all_hosts)
     session.first = before.first
-    raise typer.Exit(session.run_to_end())
+    raise typer.Exit(before.ending(session.run_to_end))
 
 
 def up(**given: Any) -> None:
     """Bring a cell up and stay until Ctrl-C. Its task starts unless the cell file says `autostart: false`."""
-    raise typer.Exit(_session(**given, until_ended=False).stay())
+    before = verbs.before_run(given["cell"], given["overrides"], given["world"], {})
+    raise typer.Exit(before.ending(_session(**before.changed(given), until_ended=False).stay))
 
 
 _SIGNATURE = inspect.signature(_session, eval_str=True)

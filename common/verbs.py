@@ -29,8 +29,8 @@ class Verbs:
     groups: Mapping[str, str] = field(default_factory=dict)
     """Further groups of commands by name, with their help."""
     before_run: Callable[..., BeforeRun] | None = None
-    """`before_run(cell, overrides, world, *, ...)`, called before `run` starts a cell; its keyword-only parameters
-    become options of `run`."""
+    """`before_run(cell, overrides, world, *, ...)`, called before `run` or `up` starts a cell; its keyword-only
+    parameters become options of `run`."""
 
 
 class Shell(Protocol):
@@ -59,3 +59,19 @@ class BeforeRun:
     """Overrides of the cell, including those of the command line."""
     first: Callable[[Bus], Awaitable[None]] | None = None
     """Runs in the cell as soon as it is up, with the terminal reserved for a question."""
+    cell: str = ""
+    """Name or path of the cell to run instead of the given file; empty: that is the cell."""
+    after: Callable[[], None] | None = None
+    """Called after the end of the run, also after Ctrl-C."""
+
+    def changed(self, given: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the options of the run with its cell and overrides."""
+        return {**given, "cell": self.cell or given["cell"], "overrides": self.overrides}
+
+    def ending(self, work: Callable[[], T]) -> T:
+        """Return the result of the run, and call `after` at its end."""
+        try:
+            return work()
+        finally:
+            if self.after is not None:
+                self.after()

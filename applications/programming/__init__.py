@@ -2,4 +2,6 @@
 
 from common.application import Application
 
-APPLICATION = Application(topics="applications.programming.topics:TOPICS", task="program_runner", grasps=True)
+APPLICATION = Application(
+    topics="applications.programming.topics:TOPICS", task="program_runner", grasps=True,
+    verbs="applications.programming.verbs:VERBS")

@@ -64,6 +64,12 @@ def names_in(folder: Path) -> list[str]:
     return sorted(path.stem for path in folder.glob(f"*{SUFFIX}")) if folder.is_dir() else []
 
 
+def path_of(folder: str | Path, program: str) -> Path:
+    """Return the absolute path of a program: of a name in the folder, or of a path that ends in .yaml."""
+    path = Path(program) if program.endswith(SUFFIX) else Path(folder) / f"{program}{SUFFIX}"
+    return path.expanduser().resolve()
+
+
 def load_program(path: Path) -> ProgramFile:
     """Return the program of a file.
 

@@ -18,6 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, JsonValue, SerializerFunction
 from pydantic import model_validator as after
 
 from common.config import Number
+from common.tasks.palletizing import Pattern
 
 Distance = Annotated[float, Field(gt=0, le=2, allow_inf_nan=False)]  # [m]
 Metres3 = tuple[Number, Number, Number]
@@ -236,20 +237,14 @@ class Place(BaseStep):
 
 
 class Palletize(BaseStep):
-    """For each position of a grid: do `steps`, which bring an object into the gripper, and place it there.
-
-    `at` is the target of the first position. The others follow along the axes of world: first columns along x, then
-    rows along y, then layers upwards, `pitch` apart.
-    """
+    """For each place of a pattern on a pallet: do `steps`, which bring an item into the gripper, and place it there."""
 
     BODIES: ClassVar[tuple[str, ...]] = ("steps",)
 
     step: Literal["palletize"] = "palletize"
-    at: Target
-    columns: Annotated[int, Field(ge=1, le=1000)] = 1
-    rows: Annotated[int, Field(ge=1, le=1000)] = 1
-    layers: Annotated[int, Field(ge=1, le=1000)] = 1
-    pitch: Metres3 = Field(description="between columns, rows and layers [m]")
+    pattern: Pattern
+    height: Number = Field(0.0, description="of the tool centre point above the centre of an item at the release; not "
+                                            "for an item that was picked by sight [m]")
     distance: Distance = 0.1
     speed: Share | None = None
     steps: list[Step] = Field(min_length=1, max_length=MOST_STEPS)

@@ -40,7 +40,8 @@ V_contra = TypeVar("V_contra", bound=View, contravariant=True)
 
 
 async def run_task(
-    bus: Bus, config: C, make: Callable[[C, S, str, float], Task[V]], status: Topic[S], view: Callable[..., V],
+    bus: Bus, config: C, make: Callable[[C, S, str, float], Task[V]], status: Topic[S], view: Callable[..., V], *,
+    runner: Callable[..., TaskRunner[V]] | None = None, memory: Callable[[Bus, Any], TaskMemory] | None = None,
     **reads: Topic[Any],
 ) -> None:
     """Run the service of a task: step it after each received message, and at least 20 times a second.
@@ -51,6 +52,8 @@ async def run_task(
         make: class of the task.
         status: topic of its status.
         view: class of its input: `View`, or a subclass of the application.
+        runner: class derived from `TaskRunner` that serves further requests.
+        memory: class derived from `TaskMemory`.
         reads: topics whose newest messages the view holds, by the name of its field.
     """
     scene, gripper = bus.reader(topics.PLANNING_SCENE), bus.reader(topics.GRIPPER_STATE)
@@ -86,12 +89,12 @@ async def run_task(
         return known
 
     watchdog = LivenessWatchdog(lambda: joints.received, lambda: config.joint_states_timeout)
-    memory = TaskMemory(bus, task)
-    runner = TaskRunner(bus, task, observe, out, lambda: config.planning_time, watchdog, memory,
-                        io=bool(signals))
-    await memory.load()
+    remembers = (memory or TaskMemory)(bus, task)
+    steps = (runner or TaskRunner)(bus, task, observe, out, lambda: config.planning_time, watchdog, remembers,
+                                   io=bool(signals))
+    await remembers.load()
     await bus.ready()
-    await runner.run((*own.values(), *signals, scene, gripper, motion))
+    await steps.run((*own.values(), *signals, scene, gripper, motion))
 
 
 class Steppable(AnswerHandler[V_contra], Protocol[V_contra]):
@@ -192,7 +195,7 @@ class TaskRunner(Generic[V]):
             logging.DEBUG if command.command == "stop" else logging.INFO, "command %s%s", command.command,
             f" by {command.by}" if command.by else "")
         view = self._observe()
-        _require_allowed(command, view.motion if view else None, self._owner.latest)
+        require_allowed(command, view.motion if view else None, self._owner.latest)
         requests = self._task.command(command.command, view)
         for request in requests:
             if isinstance(request, m.HoldRequest | m.StopRequest) and request.by == "operator":
@@ -234,7 +237,7 @@ class TaskRunner(Generic[V]):
             self._woken.set()
 
 
-def _require_allowed(command: m.TaskCommand, motion: m.MotionStatus | None, owner: m.MotionOwner | None) -> None:
+def require_allowed(command: m.TaskCommand, motion: m.MotionStatus | None, owner: m.MotionOwner | None) -> None:
     """Check that the operator may give the command.
 
     Raises:

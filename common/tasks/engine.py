@@ -208,7 +208,8 @@ class Task(ExecutionMonitor[V]):
             return
         stage = self.queue[0]
         if isinstance(stage, Output | WaitFor):
-            yield from self._run_signal(stage, view)
+            if self.may_start(stage, view):
+                yield from self._run_signal(stage, view)
             return
         if stage.carries and not view.holding:
             self.fail(f"what the hand held fell before {stage.name}", view, go_home=False)

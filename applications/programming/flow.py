@@ -1,0 +1,186 @@
+"""Control flow of a program: positions in it, and which step follows. Pure, and without side effects.
+
+A position is a stack of frames, one for each list of steps that is entered, the last one at the current step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict
+
+from applications.programming.files import ProgramFile
+from applications.programming.model import BaseStep, Call, Condition, If, Loop, Palletize
+from common.errors import UnknownName
+from common.messages import Pose
+from common.tasks.palletizing import slots
+
+TOP = ""  # owner of the frame of a program itself
+TRANSITIONS = 50  # of control flow at once: a loop may have nothing to do
+
+
+class Undecided(Exception):
+    """A condition that is not known yet."""
+
+
+class Frame(BaseModel):
+    """One list of steps that is entered: `owner` is the id of its loop, if or palletize, `turn` counts from 0."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    program: str
+    owner: str = TOP
+    body: Literal["steps", "then", "otherwise"] = "steps"
+    index: int = 0
+    turn: int = 0
+
+
+Position = tuple[Frame, ...]  # empty: the end
+Decide = Callable[[Condition], bool]
+
+
+class Flow:
+    """Steps of a program and of those that it calls, by position."""
+
+    def __init__(self, files: Mapping[str, ProgramFile], main: str) -> None:
+        """Follow the program `main` of the files, by name."""
+        self.files, self.main = files, main
+        self._steps = {name: file.steps for name, file in files.items()}
+
+    @property
+    def start(self) -> Position:
+        """The first step."""
+        return (Frame(program=self.main),)
+
+    def contains(self, position: Position) -> bool:
+        """Return whether the position exists: the program may have changed since."""
+        try:
+            return all(frame.index < len(self._body(frame)) for frame in position[:-1]) and bool(
+                not position or self.step(position))
+        except (KeyError, AttributeError, IndexError):
+            return False
+
+    def file(self, position: Position) -> ProgramFile:
+        """Return the file that the step of a position is in."""
+        return self.files[position[-1].program]
+
+    def step(self, position: Position) -> BaseStep:
+        """Return the step of a position; where a pallet is filled, the placing with the id of its step."""
+        frame = position[-1]
+        body = self._body(frame)
+        owner = self._steps[frame.program].get(frame.owner)
+        if isinstance(owner, Palletize) and frame.index == len(body):
+            return placing(owner, frame.turn)
+        return body[frame.index]
+
+    def find(self, id_: str) -> Position:
+        """Return the position of a step of the main program, in the first turn of the loops around it.
+
+        Raises:
+            UnknownName: lists the choices.
+        """
+        def search(body: Sequence[BaseStep], above: Position, frame: Frame) -> Position | None:
+            for index, step in enumerate(body):
+                here = (*above, frame.model_copy(update={"index": index}))
+                if step.id == id_:
+                    return here
+                for name, (_, inner) in zip(type(step).BODIES, step.bodies(), strict=True):
+                    found = search(inner, here, Frame(program=self.main, owner=step.id, body=name))
+                    if found is not None:
+                        return found
+            return None
+
+        file = self.files[self.main]
+        found = search(file.program.steps, (), Frame(program=self.main))
+        if found is None:
+            raise UnknownName("step", id_, file.steps)
+        return found
+
+    def is_leaf(self, position: Position) -> bool:
+        """Return whether the step of a position does something, instead of leading to other steps."""
+        return not isinstance(self.step(position), Loop | If | Call | Palletize)
+
+    def enter(self, position: Position, decide: Decide) -> Position:
+        """Return the first position inside a step that leads to others, or what follows it.
+
+        Raises:
+            Undecided: its condition is not known.
+        """
+        step, program = self.step(position), position[-1].program
+        if isinstance(step, Call):
+            return (*position, Frame(program=step.program))
+        if isinstance(step, If):
+            body: Literal["steps", "then", "otherwise"] = "then" if decide(step.condition) else "otherwise"
+            enters = bool(getattr(step, body))
+        else:
+            body, enters = "steps", not isinstance(step, Loop) or step.count != 0
+            if isinstance(step, Loop) and step.condition is not None:
+                enters = decide(step.condition)
+        return (*position, Frame(program=program, owner=step.id, body=body)) if enters else self.after(position)
+
+    def after(self, position: Position) -> Position:
+        """Return the position after a step, which may be at a step that leads to others."""
+        *above, frame = position
+        frame = frame.model_copy(update={"index": frame.index + 1})
+        owner = self._steps[frame.program].get(frame.owner) if frame.owner else None
+        if frame.index < len(self._body(frame)) + isinstance(owner, Palletize):
+            return (*above, frame)
+        again = frame.model_copy(update={"index": 0, "turn": frame.turn + 1})
+        if isinstance(owner, Palletize) and again.turn < places_of(owner):
+            return (*above, again)
+        if isinstance(owner, Loop):
+            if owner.condition is not None:
+                return tuple(above)  # is decided again
+            if owner.count is None or again.turn < owner.count:
+                return (*above, again)
+        return self.after(tuple(above)) if above else ()
+
+    def leaf(self, position: Position, decide: Decide) -> Position:
+        """Return the next position whose step does something, from a position on; empty: the end.
+
+        Raises:
+            Undecided: a condition on the way is not known, or there is nothing to do for many turns.
+        """
+        for _ in range(TRANSITIONS):
+            if not position or self.is_leaf(position):
+                return position
+            position = self.enter(position, decide)
+        raise Undecided("nothing to do")
+
+    def repetitions(self, position: Position) -> list[str]:
+        """Return the turns of the loops around a position, in words."""
+        found = []
+        for frame in position:
+            owner = self._steps[frame.program].get(frame.owner) if frame.owner else None
+            if isinstance(owner, Loop | Palletize):
+                total = places_of(owner) if isinstance(owner, Palletize) else owner.count
+                found.append(f"{owner.id}: {frame.turn + 1}{f' of {total}' if total is not None else ''}")
+        return found
+
+    def _body(self, frame: Frame) -> Sequence[BaseStep]:
+        if not frame.owner:
+            return self.files[frame.program].program.steps
+        body: Sequence[BaseStep] = getattr(self._steps[frame.program][frame.owner], frame.body)
+        return body
+
+
+def places_of(step: Palletize) -> int:
+    """Return the number of places on a pallet."""
+    return len(slots(step.pattern))
+
+
+def placing(step: Palletize, number: int) -> PlaceOnPallet:
+    """Return the step that places an item at a place of a pallet, counted from 0."""
+    return PlaceOnPallet(id=step.id, on_failure=step.on_failure, distance=step.distance, speed=step.speed,
+                         slot=slots(step.pattern)[number].pose, height=step.height)
+
+
+class PlaceOnPallet(BaseStep):
+    """Place the held item with its centre at a pose in world."""
+
+    step: Literal["place"] = "place"
+    slot: Pose
+    height: float  # as of Palletize
+    distance: float
+    speed: float | None

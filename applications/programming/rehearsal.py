@@ -1,0 +1,241 @@
+"""Plan a program without motion: what cannot run, and how long it takes. Requests and answers pass through a generator.
+
+Unknown conditions are assumed: an `if` by a signal does `then`, a loop while a signal has a value turns once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Iterator, Mapping
+from dataclasses import replace
+
+from applications.programming.files import ProgramFile
+from applications.programming.flow import TRANSITIONS, Flow, Position
+from applications.programming.functions import find_function
+from applications.programming.model import BaseStep, Condition, Grip, If, Loop, Motion, Output, Pick, Python, Wait, walk
+from applications.programming.stages import Builder, Cell, NotSeen, Outlook, ProgramMove, StepCycle
+from applications.programming.topics import Rehearsal, RehearsedStep
+from common import messages as m
+from common.config import Io
+from common.errors import ConfigError, UnknownName, ZencellError
+from common.robot.transforms import matrix_to_pose, pose_to_matrix
+from common.tasks import stages as engine
+from common.tasks.signals import Output as OutputStage
+from common.tasks.signals import WaitFor, check_condition
+from common.tasks.stages import View
+
+MOST = 1000  # executed steps
+Planning = Generator[m.PlanRequest, m.PlanResponse, None]
+
+
+def static_problems(file: ProgramFile, cell: Cell, io: Io) -> Iterator[tuple[BaseStep, str]]:
+    """Yield the steps of a file that cannot run in a cell, whatever happens before: poses, signals, functions."""
+    for place, step in walk(file.program.steps):
+        for field, problem in _wrong(step, file, cell, io):
+            yield step, f"{place}.{field}: {problem}"
+
+
+def _wrong(step: BaseStep, file: ProgramFile, cell: Cell, io: Io) -> Iterator[tuple[str, str]]:
+    for field in ("to", "at", "points"):
+        found = getattr(step, field, None)
+        for number, target in enumerate(found if isinstance(found, list) else [found] if found is not None else []):
+            if target.by is None:
+                try:
+                    cell.resolve(target, file.program.poses, None)
+                except ZencellError as error:
+                    yield field + (f"[{number}]" if field == "points" else ""), str(error)
+    for field, condition in (("for", getattr(step, "until", None)), ("when", getattr(step, "condition", None))):
+        if isinstance(condition, Condition) and condition.signal:
+            yield from _wrong_signal("while" if isinstance(step, Loop) else field, condition.signal, io,
+                                     condition=condition)
+    if isinstance(step, Output):
+        yield from _wrong_signal("signal", step.signal, io, value=step.value)
+    if isinstance(step, Motion):
+        for name in step.requires:
+            yield from _wrong_signal("requires", name, io)
+    if isinstance(step, Grip):
+        try:
+            Builder(cell, {}, None, Outlook(None, holding=False), View(0.0), StepCycle()).build(step)
+        except ZencellError as error:
+            yield "width", str(error)
+    if isinstance(step, Python):
+        try:
+            find_function(step.function, file.path.parent)
+        except ConfigError as error:
+            yield "function", f"{error.value!r} {error.expected}"
+
+
+def _wrong_signal(
+    field: str, name: str, io: Io, *, condition: Condition | None = None, value: bool | float | None = None
+) -> Iterator[tuple[str, str]]:
+    try:
+        signal = io.find(name, output=value is not None)
+        if value is not None:
+            signal.checked(name, value)
+        if condition is not None:
+            check_condition(name, signal.range is not None, condition.above, condition.below)
+    except (UnknownName, ConfigError) as error:
+        yield field, str(error)
+
+
+class Rehearser:
+    """Goes through a program as the task does, with planned motions only."""
+
+    def __init__(self, flow: Flow, cell: Cell, io: Io, view: View, planning_time: float) -> None:
+        """Begin at the state of a view, which has a planning scene, joint positions and the pose of the tool."""
+        assert view.q is not None and view.scene is not None
+        self.flow, self.cell, self.io, self._planning_time = flow, cell, io, planning_time
+        self.result = Rehearsal(program=flow.main, state="running")
+        self.trajectories: list[m.JointTrajectory] = []  # of the newest step
+        self._q, self.scene, self._view = list(view.q), view.scene, view
+        self._now = Outlook.of(view)
+        self._outcome = "succeeded"
+        self.planned = 0
+        self._turned: dict[Position, bool] = {}  # loops by condition that have turned once
+        self._visited: set[str] = set()
+        self._lost = ""  # step after which the state of the robot is not known
+        self._wrong: Mapping[str, str] = {
+            step.id: problem for file in flow.files.values() for step, problem in static_problems(file, cell, io)}
+
+    def run(self, start: Position, *, everything: bool = False) -> Planning:
+        """Yield plan requests, and be sent the responses; `result` grows with each step.
+
+        Args:
+            start: first step.
+            everything: also plan steps that are not reached, such as those of `else`, each from the state at the start.
+        """
+        begin = self._q, self.scene, self._now
+        position = start
+        while position and len(self.result.steps) < MOST:
+            position = self._leaf(position)
+            if not position:
+                break
+            step = self.flow.step(position)
+            yield from self._rehearse(step, self.flow.file(position), assumed="")
+            position = self.flow.after(position)
+            if endless := self._endless(position):
+                self.result.message = f"{endless} repeats without end: one turn is planned"
+                break
+        if len(self.result.steps) >= MOST:
+            self.result.message = f"only the first {MOST} steps are planned"
+        if everything:
+            for file in self.flow.files.values():
+                for step in file.steps.values():
+                    if step.id not in self._visited and not type(step).BODIES:
+                        self._q, self.scene, self._now = begin
+                        self._lost = ""
+                        yield from self._rehearse(step, file, assumed="is not reached in the dry run: planned from the "
+                                                                       "state at the start")
+        failed = any(each.problem for each in self.result.steps)
+        self.result.state, self.result.step = "failed" if failed else "done", ""
+
+    def _rehearse(self, step: BaseStep, file: ProgramFile, assumed: str) -> Planning:
+        """Plan one step and add it to the result."""
+        self._visited.add(step.id)
+        self.result.step = step.id
+        self.trajectories = []
+        item = RehearsedStep(program=file.name, step=step.id, kind=getattr(step, "step", ""))
+        if problem := self._wrong.get(step.id, ""):
+            item.problem = problem
+            self._lost = self._lost or step.id
+        elif isinstance(step, Python):
+            item.unknown = "the time that the function takes"
+        elif isinstance(step, Wait) and step.seconds is not None:
+            item.seconds = step.seconds
+        else:
+            yield from self._plan(step, file, item)
+        after = f"begins after {self._lost}, whose end is not known" if self._lost not in ("", step.id) else ""
+        notes = [assumed, after]
+        item.unknown = "; ".join(each for each in [item.unknown, *notes] if each)
+        self.result.seconds += item.seconds or 0.0
+        self.result.steps.append(item)
+
+    def _plan(self, step: BaseStep, file: ProgramFile, item: RehearsedStep) -> Planning:
+        main = self.flow.files[self.flow.main].program
+        view = replace(self._view, scene=self.scene)
+        try:
+            built = Builder(self.cell, file.program.poses, file.program.speed or main.speed, self._now, view,
+                            StepCycle()).build(step)
+        except NotSeen as error:
+            item.unknown, self._lost = str(error), self._lost or step.id
+            self._now = replace(self._now, holding=isinstance(step, Pick))
+            return
+        except ZencellError as error:
+            item.problem, self._lost = str(error)[:500], self._lost or step.id
+            return
+        seconds, unknown = 0.0, ""
+        for stage in built.stages:
+            if isinstance(stage, ProgramMove):
+                response = yield self._request(stage)
+                if response.trajectory is None or not response.ok:
+                    item.problem, self._lost = response.message[:500], self._lost or step.id
+                    if isinstance(stage.goal, m.JointGoal):
+                        self._q = self._positions(stage.goal)
+                    break
+                self.trajectories.append(response.trajectory)
+                seconds += response.trajectory.points[-1].time_from_start
+                self._q = list(response.trajectory.points[-1].positions)
+            elif isinstance(stage, engine.Grip):
+                assert self.cell.gripper is not None
+                before = self._now.width if self._now.width is not None else 0.0
+                seconds += self.cell.gripper.least_time(abs(before - stage.width_after(before)))
+                self._now = replace(self._now, width=stage.width_after(before))
+                if stage.name == "release":
+                    self._release()
+            elif isinstance(stage, WaitFor):
+                unknown = f"the wait for {stage.condition}"
+            elif isinstance(stage, OutputStage):
+                unknown = ""
+        item.seconds, item.unknown = (None if unknown else seconds), unknown
+        self._now = replace(built.after, T_world_tcp=self.cell.robot.fk(self._q))
+
+    def _request(self, move: ProgramMove) -> m.PlanRequest:
+        self.planned += 1
+        return m.PlanRequest(
+            id=f"dry-run-{id(self)}-{self.planned}", stage=move.name, start=self._q, goal=move.goal,
+            straight=move.straight, allowed_collisions=move.touches, attach=move.attach if move.carries else "",
+            attach_pose=move.attach_pose, release=not move.carries, planning_time=self._planning_time,
+            velocity_scaling=move.speed, planner=move.planner, gripper_width=self._width())
+
+    def _width(self) -> float | None:
+        gripper = self.cell.gripper
+        if gripper is None or not gripper.joints or self._now.width is None:
+            return None
+        return min(max(self._now.width, 0.0), gripper.max_width)
+
+    def _positions(self, goal: m.JointGoal) -> list[float]:
+        return list(goal.positions or self.cell.robot.config.named_poses[goal.named])
+
+    def _release(self) -> None:
+        """Leave the held object in the scene where it is released; it is not picked again."""
+        if not self._now.object or self._now.pose is None:
+            return
+        T = self.cell.robot.fk(self._q) @ pose_to_matrix(self._now.pose)
+        objects = [each.model_copy(update={"pose": matrix_to_pose(T), "role": "contained"})
+                   if each.id == self._now.object else each for each in self.scene.objects]
+        self.scene = self.scene.model_copy(update={"objects": objects})
+
+    def _leaf(self, position: Position) -> Position:
+        for _ in range(TRANSITIONS):
+            if not position or self.flow.is_leaf(position):
+                return position
+            here = position
+            position = self.flow.enter(here, lambda condition, here=here: self._assume(condition, here))  # type: ignore[misc]
+        return ()
+
+    def _assume(self, condition: Condition, position: Position) -> bool:
+        step = self.flow.step(position)
+        if condition.holding is not None and isinstance(step, If):
+            return self._now.holding is condition.holding
+        if condition.outcome and isinstance(step, If):
+            return condition.outcome == self._outcome
+        first = not self._turned.get(position, False)
+        self._turned[position] = first
+        return first or isinstance(step, If)
+
+    def _endless(self, position: Position) -> str:
+        """Return the id of a loop without end that has turned once."""
+        for frame in position:
+            owner = self.flow.files[frame.program].steps.get(frame.owner) if frame.owner else None
+            if isinstance(owner, Loop) and owner.count is None and owner.condition is None and frame.turn:
+                return owner.id
+        return ""
