@@ -5,9 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from applications.programming.export import Exporter
 from applications.programming.files import BadProgram, ProgramFile, load_all, load_program
 from applications.programming.flow import Flow
-from applications.programming.rehearsal import Rehearser
+from applications.programming.rehearsal import Rehearser, static_problems
 from applications.programming.stages import Cell
 from common import messages as m
 from common.atomic_file import state_folder
@@ -142,3 +143,20 @@ def require_no_problems(rehearser: Rehearser) -> None:
     """
     if found := problems(rehearser):
         raise BadProgram(found)
+
+
+def exported(path: Path, cell: str | None) -> str:
+    """Return a program as a Python script over the client; arguments and errors as of `rehearse`.
+
+    Raises:
+        BadProgram: a pose of the program is unknown.
+    """
+    file = load_program(path)
+    files, name = load_all(file), cell_of(file, cell)
+    loaded = load_cell(name)
+    stages = cell_with(loaded, RobotModel.load(loaded.robot))
+    found = [f"{each.path}:{each.lines.get(step.id, 0)}: {step.id}: {problem}" for each in files.values()
+             for step, problem in static_problems(each, stages, loaded.io)]
+    if found:
+        raise BadProgram(found)
+    return Exporter(stages, files, file.name).script(name)

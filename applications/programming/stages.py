@@ -267,7 +267,7 @@ class Builder:
         if self.before.holding:
             return self._after_grasp(step)
         thing = self._choose(step)
-        yaw, width = grasp_directions(thing, gripper)[0]
+        yaw, width = grasp_directions(thing, gripper.closing_axis, gripper.max_width)[0]
         x, y, z = place_of(thing.pose)
         T = tool_down(x, y, self.cell.grasp.height(z), yaw)
         above = backed(T, self.cell.grasp.approach_clearance, "world")

@@ -15,7 +15,9 @@ if TYPE_CHECKING:
     from applications.programming.topics import ProgramStatus
 
 File = Annotated[Path, typer.Argument(metavar="FILE", help="a program")]
-InCell = Annotated[str | None, typer.Option("--cell", metavar="CELL", help="name or file; default: `cell` of the program")]
+InCell = Annotated[
+    str | None, typer.Option("--cell", metavar="CELL", help="name or file; default: that of the program")
+]
 Name = Annotated[str | None, typer.Argument(metavar="[PROGRAM]", help="name of its file; default: the loaded one")]
 At = Annotated[str | None, typer.Option("--from", metavar="STEP", help="id of a step; default: the first")]
 Step = Annotated[str, typer.Argument(metavar="STEP", help="id of a step")]
@@ -24,7 +26,7 @@ RunIn = Annotated[str | None, typer.Option("--cell", metavar="CELL", help="for a
 
 
 def check(file: File, on: InCell = None, overrides: list[str] | None = None) -> None:
-    """Check a program before it runs: poses, signals, functions, and a plan of each motion; exit 2 with all problems."""
+    """Check poses, signals and functions of a program, and plan each motion; exit 2 with all problems."""
     from applications.programming import offline
 
     found = offline.rehearse(file, on, tuple(overrides or ()), everything=True)
@@ -53,12 +55,9 @@ def dry_run(file: File, on: InCell = None, overrides: list[str] | None = None) -
 
 def export(file: File, on: InCell = None) -> None:
     """Print a Python script over `zencell.blocking` that does the same as a program."""
-    from applications.programming.export import script
-    from applications.programming.files import load_all, load_program
-    from applications.programming.offline import cell_of
+    from applications.programming.offline import exported
 
-    loaded = load_program(file)
-    echo(script(loaded, load_all(loaded), cell_of(loaded, on)), end="")
+    echo(exported(file, on), nl=False)
 
 
 def _command(cell: str | None, domain: str | None, connect: str | None, **fields: Any) -> None:
@@ -74,7 +73,8 @@ def _command(cell: str | None, domain: str | None, connect: str | None, **fields
 
     status = asyncio.run(send())
     where = f"step {status.step} (line {status.line})" if status.step else status.state
-    echo(f"{status.program}: {where}" + (f"; breakpoints: {', '.join(status.breakpoints)}" if status.breakpoints else ""))
+    halts = f"; breakpoints: {', '.join(status.breakpoints)}" if status.breakpoints else ""
+    echo(f"{status.program}: {where}{halts}")
 
 
 def run(

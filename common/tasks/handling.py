@@ -17,7 +17,7 @@ import numpy.typing as npt
 from pydantic import Field
 
 from common import messages as m
-from common.config import Grasp, GripperConfig, Surroundings, Tunable
+from common.config import Grasp, Surroundings, Tunable
 from common.robot.home import HOME_TOLERANCE
 from common.robot.transforms import invert, matrix_to_pose, matrix_to_rpy, pose_to_matrix, rpy_to_matrix, tool_down
 from common.tasks.decisions import TaskConfig
@@ -195,7 +195,7 @@ class Handling(Task[View]):
     def _take(self, thing: m.CollisionObject, view: View) -> list[Stage]:
         """Open, move above the object, descend, close, lift; then the stages of `_put`."""
         x, y, z = place_of(thing.pose)
-        yaw, width = grasp_directions(thing, self.gripper)[self._tries[thing.id] % 2]
+        yaw, width = grasp_directions(thing, self.gripper.closing_axis, self.gripper.max_width)[self._tries[thing.id] % 2]
         low, cycle = self.p.grasp.height(z), Cycle(thing.id)
         T_world_tcp = tool_down(x, y, low, yaw)
         held = matrix_to_pose(invert(T_world_tcp) @ pose_to_matrix(thing.pose))
@@ -267,9 +267,17 @@ class Handling(Task[View]):
         return [(link, thing.id) for link in self.gripper.links]
 
 
-def grasp_directions(thing: m.CollisionObject, gripper: GripperConfig) -> list[tuple[float, float | None]]:
-    """Return tool yaws [rad] and finger widths [m] for two opposite faces of a box, and for the other two."""
-    turn = math.pi / 2 if gripper.closing_axis == "x" else 0.0
+def grasp_directions(
+    thing: m.CollisionObject, closing_axis: str, max_width: float
+) -> list[tuple[float, float | None]]:
+    """Return tool yaws [rad] and finger widths [m] for two opposite faces of a box, and for the other two.
+
+    Args:
+        thing: upright, to be gripped from above.
+        closing_axis: of the tool centre point, along which the fingers close.
+        max_width: of the open gripper [m]: ways that do not fit are left out.
+    """
+    turn = math.pi / 2 if closing_axis == "x" else 0.0
     if thing.shape != "box":
         width = 2 * thing.dimensions[0]
         return [(turn, width), (turn + math.pi / 2, width)]
@@ -277,7 +285,7 @@ def grasp_directions(thing: m.CollisionObject, gripper: GripperConfig) -> list[t
     ways = [(math.remainder(yaw + turn + quarter, math.pi), width)
             for quarter, width in ((0.0, thing.dimensions[1]), (math.pi / 2, thing.dimensions[0]))]
     ways.sort(key=lambda way: abs(way[0] - turn))
-    fitting = [way for way in ways if way[1] < gripper.max_width] or ways
+    fitting = [way for way in ways if way[1] < max_width] or ways
     return [fitting[0], fitting[-1]]
 
 

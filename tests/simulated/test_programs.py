@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from common import topics
-from lab.simulation import Simulation
 from tests.simulated.program_cell import Operator, simulate
 
 TEND = """\
@@ -21,7 +19,10 @@ steps:
   - step: if
     when: {signal: busy}
     then: [{step: wait, seconds: 60}]
-    else: [{step: output, signal: start}, {step: wait, for: {signal: busy}}, {step: output, signal: start, value: false}]
+    else:
+      - {step: output, signal: start}
+      - {step: wait, for: {signal: busy}}
+      - {step: output, signal: start, value: false}
   - {step: call, program: finish}
 """
 FINISH = """\
