@@ -17,7 +17,7 @@ from pydantic import BaseModel
 
 from common import config as c
 from common import topics
-from common.application import all_topics
+from common.application import all_topics, find_application
 from common.config.tunables import bounds_of, is_tunable
 from common.planning.planners import load_planner
 from common.supervision.wiring import owned_in, wiring, wiring_of
@@ -116,6 +116,7 @@ def parameters() -> str:
 
 def writers() -> dict[str, str]:
     """Return by key which services write or serve it in the included cells."""
+    programs = find_application("programming").topics_by_key  # which run in any cell
     shared = {topic.key: "every service" for topic in (topics.LOG, topics.COUNTERS, topics.PARAMETERS)}
     found: dict[str, dict[str, None]] = {}
     for name in c.names_of("cells"):
@@ -127,6 +128,7 @@ def writers() -> dict[str, str]:
             topics.IO_STATE.key: "io", topics.IO_SET.key: "io",  # of no included cell
             topics.RESERVE.key: "arm_coordinator", topics.ARMS_STATUS.key: "arm_coordinator",
             topics.CONVEYOR_STATE.key: "trajectory_executor", topics.CONVEYOR_SET.key: "trajectory_executor",
+            **dict.fromkeys(programs, "program_runner"),
             topics.SUPERVISOR_STATUS.key: "supervisor", topics.MOTION_JOG.key: "clients that jog"}
 
 

@@ -195,7 +195,8 @@ class Handling(Task[View]):
     def _take(self, thing: m.CollisionObject, view: View) -> list[Stage]:
         """Open, move above the object, descend, close, lift; then the stages of `_put`."""
         x, y, z = place_of(thing.pose)
-        yaw, width = grasp_directions(thing, self.gripper.closing_axis, self.gripper.max_width)[self._tries[thing.id] % 2]
+        ways = grasp_directions(thing, self.gripper.closing_axis, self.gripper.max_width)
+        yaw, width = ways[self._tries[thing.id] % 2]
         low, cycle = self.p.grasp.height(z), Cycle(thing.id)
         T_world_tcp = tool_down(x, y, low, yaw)
         held = matrix_to_pose(invert(T_world_tcp) @ pose_to_matrix(thing.pose))

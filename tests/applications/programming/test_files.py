@@ -21,7 +21,7 @@ steps:
       - {step: move, to: {by: [0, 0, 0.1], frame: tool}, straight: true}
       - {step: wait, for: {signal: door}, timeout: 3}
   - {step: if, when: {holding: true}, then: [{step: grip, width: open}], else: [{step: grip, width: 0.01}]}
-  - {step: palletize, at: bin, columns: 2, pitch: [0.1, 0.1, 0.1], steps: [{step: pick, kind: part}]}
+  - {step: palletize, pattern: {item: [0.1, 0.1, 0.1], columns: 2}, steps: [{step: pick, kind: part}]}
 """
 
 
