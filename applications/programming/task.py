@@ -10,41 +10,26 @@ from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
 
-from pydantic import BaseModel, Field
+from pydantic import BaseModel
 
 from applications.programming.cursor import FAILED, SUCCEEDED, Cursor, Progress
 from applications.programming.files import BadProgram, load_program, path_of
 from applications.programming.flow import Position, Undecided
 from applications.programming.model import BaseStep, Condition, Pick, Python, Target, Wait
+from applications.programming.settings import Config
 from applications.programming.stages import Builder, Built, Cell, NotSeen, Outlook, ProgramMove, Repeated, StepCycle
 from applications.programming.topics import ProgramStatus
 from common import messages as m
-from common.config import Grasp, Surroundings, Tunable
 from common.errors import ConfigError, ZencellError
 from common.robot.model import RobotModel
 from common.robot.transforms import pose_to_matrix
 from common.saved_poses import load_poses, poses_file
-from common.tasks.decisions import TaskConfig
 from common.tasks.engine import Task
 from common.tasks.signals import LONGEST_COUNTED, condition_met
 from common.tasks.stages import Command, Grip, Move, Stage, View
 
 AHEAD = 3  # steps whose motions are planned before they begin
 ENDED = ("DONE", "ERROR")
-
-
-class ProgramConfig(TaskConfig):
-    """Parameters of the program runner; times are cell time unless they say wall."""
-
-    world: Surroundings
-    grasp: Grasp = Grasp()
-    folder: str = Field("programs", description="folder of the programs, relative to the working directory")
-    program: str = Field("", description="program to load at the start: a name in the folder, or a path")
-    progress: str = Field("", description="file in which the progress also outlives the cell; default: none")
-    attempts: Tunable[int] = Field(5, ge=1, le=100, description="of a step whose motion fails, before the program "
-                                                                "stops with an error")
-    frame_timeout: Tunable[float] = Field(
-        3.0, ge=0.1, le=60, description="an older picture shows no object to pick [s, wall time]")
 
 
 @dataclass(frozen=True)
@@ -59,10 +44,10 @@ class PythonCall:
 class ProgramTask(Task[View]):
     """Executes the steps of the loaded program."""
 
-    p: ProgramConfig
+    p: Config
     status: ProgramStatus
 
-    def __init__(self, config: ProgramConfig, status: ProgramStatus, prefix: str, speed: float = 1.0) -> None:
+    def __init__(self, config: Config, status: ProgramStatus, prefix: str, speed: float = 1.0) -> None:
         """Start without a program; the arguments are those of `Task`."""
         super().__init__(config, status, prefix, speed)
         self.at = Cursor(status)

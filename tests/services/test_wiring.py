@@ -12,17 +12,18 @@ import pytest
 
 from applications.pick_place.topics import SCENE_BALLS
 from common import topics
-from common.application import all_topics
+from common.application import all_topics, find_application
 from common.config import Surroundings, World, load_cell, service_config
 from common.errors import ConfigError
 from common.planning.camera_obstacles import PointsOptions
 from common.supervision.wiring import Wiring, owned_in, require_one_owner, wiring
-from services import camera_opencv, motion_planner, real_depth_camera, vision_detector
+from services import camera_opencv, motion_planner, program_runner, real_depth_camera, vision_detector
 
 CELLS = {name: load_cell(name, ["services.viewer.port=0"]) for name in ("panda", "ur5", "sorting", "policy_panda")}
 SERVICES = [(cell, name) for cell, loaded in CELLS.items() for name in loaded.services]
 CAMERAS = {"panda": "camera_simulator", "ur5": "depth_camera", "sorting": "depth_camera",
            "policy_panda": "camera_simulator"}
+PROGRAMS = load_cell(str(Path(__file__).parents[1] / "data" / "programs.yaml"))
 VIEWER = "viewer"  # shows the truth on demand, and decides nothing
 DECIDING = [(cell, name) for cell, name in SERVICES if name not in (*CAMERAS.values(), VIEWER, "trajectory_executor")]
 TRUTH = {SCENE_BALLS, topics.SCENE_OBJECTS}
@@ -50,6 +51,12 @@ def test_no_deciding_service_reads_the_ground_truth(cell: str, name: str) -> Non
     assert not [f for f, info in config_class(cell, name).model_fields.items() if info.annotation is World]
 
 
+def test_program_runner_owns_its_keys_and_reads_no_ground_truth() -> None:
+    found = wiring_of(program_runner, service_config(PROGRAMS, "program_runner", program_runner.Config))
+    assert set(find_application("programming").topics_by_key.values()) < found.owns
+    assert not found.reads & TRUTH
+
+
 @pytest.mark.parametrize("cell", CELLS)
 def test_only_camera_and_viewer_read_the_ground_truth_and_only_from_topics(cell: str) -> None:
     assert {name for name, found in wired(cell).items() if found.reads & TRUTH} == {CAMERAS[cell], VIEWER}
@@ -61,6 +68,7 @@ def test_every_known_topic_has_an_owner() -> None:
     of_no_service = {topics.SUPERVISOR_STATUS, topics.LOG, topics.COUNTERS, topics.PARAMETERS, topics.MOTION_JOG,
                      topics.IO_STATE, topics.IO_SET,  # no included cell has I/O
                      topics.RESERVE, topics.ARMS_STATUS}  # or several arms
+    of_no_service |= set(find_application("programming").topics_by_key.values())  # they run in any cell
     assert owned == set(all_topics().values()) - of_no_service
 
 
