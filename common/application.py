@@ -84,6 +84,8 @@ class ApplicationTopics:
     """`Image`: white where a pixel has a color that the detector looks for."""
     truth_views: Mapping[Topic[Any], Callable[[WorldObjects], Message]] = field(default_factory=dict)
     """Simulated ground truth in the messages of the application; the simulator publishes each under its topic."""
+    of_arm: Sequence[Topic[Any] | Request[Any, Any]] = ()
+    """Besides `status`: topics that each arm has for itself in a cell with several arms; all arms share the others."""
     declared: Sequence[Topic[Any] | Request[Any, Any]] = ()
     """All topics and requests of the application, in the order of the documentation."""
 
@@ -93,7 +95,8 @@ class ApplicationTopics:
         from common.topics import Topic, platform_topics
 
         roles = (getattr(self, each.name) for each in fields(self))
-        found = [*self.declared, *(topic for topic in roles if isinstance(topic, Topic)), *self.truth_views]
+        roles_given = (topic for topic in roles if isinstance(topic, Topic))
+        found = [*self.declared, *self.of_arm, *roles_given, *self.truth_views]
         shared = platform_topics()
         return {topic.key: topic for topic in found if topic.key not in shared}
 
@@ -170,6 +173,11 @@ class Application:
     def truth_views(self) -> Mapping[Topic[Any], Callable[[WorldObjects], Message]]:
         """Simulated ground truth in its own messages, by topic."""
         return self.topics.truth_views if self.topics is not None else {}
+
+    @property
+    def arm_keys(self) -> list[str]:
+        """Keys of its topics that each arm has for itself in a cell with several arms."""
+        return [topic.key for topic in (self.topics.status, *self.topics.of_arm)] if self.topics is not None else []
 
     @property
     def topics_by_key(self) -> dict[str, AnyTopic]:

@@ -14,6 +14,10 @@ from typing import Any
 from common.errors import ConfigError
 
 PER_SERVICE_KEYS = ("log", "counters", "param")  # first parts of keys that each service has for itself
+# Keys that each arm of a cell with several has for itself, below its name; an application adds some: common/arms.py.
+ARM_KEYS = ("joint_states", "tf", "tf_static", "motion/*", "gripper/*", "robot/*", "display_trajectory",
+            "planning_scene", "scene/*", "task/*")
+POSE_KEYS = ("tf", "tf_static")
 MAX_CELL_NAME = 100  # characters
 SERVICE_NAME = re.compile(r"[A-Za-z_]\w*")
 _KEY = re.compile(r"[^\s/*$?#|]+(/[^\s/*$?#|]+)*")
@@ -39,6 +43,11 @@ class Remapping:
         self._used: set[str] = set()
         self._asked: set[str] = set()
 
+    @property
+    def table(self) -> dict[str, str]:
+        """Keys in the cell by keys in the code."""
+        return dict(self._table)
+
     def key(self, own: str) -> str:
         """Return the key in the cell of a key in the service's code."""
         if own.partition("/")[0] in PER_SERVICE_KEYS:
@@ -52,13 +61,14 @@ class Remapping:
         return self._table[found].replace("*", own[len(found) - 1:]) if found.endswith("*") else self._table[found]
 
     def require_used(self, service: str) -> None:
-        """Return if every entry of the table matches a key of the service.
+        """Return if every entry of the table matches a key of the service, or only puts it below the name of an arm.
 
         Raises:
             ConfigError: an entry matches none, most likely a typing error; lists the keys.
         """
+        of_arm = all(key in self._table for key in POSE_KEYS)
         for pattern in self._table:
-            if pattern not in self._used:
+            if pattern not in self._used and not (of_arm and self._table[pattern].endswith(f"/{pattern}")):
                 raise ConfigError(f"services.{service}.topics", pattern, "is no key that it reads, writes, serves or "
                                   f"calls; choices: {', '.join(sorted(self._asked))}")
 

@@ -60,6 +60,7 @@ class WorldInvariants:
     def __init__(self, checks: Checks, cell: Cell) -> None:
         self._checks = checks
         application = find_application(cell.application)
+        self._hands = max(len(cell.robots), 1)
         self._fills, self._truth_check = application.fills_containers, application.truth_check
         self._physics = cell.world.simulator != "kinematic"  # objects are pushed, and roll
         self._newest = b""  # encoded ground truth
@@ -93,7 +94,7 @@ class WorldInvariants:
             position = each["pose"]["position"]
             found[each["id"]] = each["state"], (position["x"], position["y"], position["z"])
         held = [name for name, (state, _) in found.items() if state == "held"]
-        if checks.fails(len(held) <= 1 or self._physics, OBJECTS):  # fingers may close on two of a heap
+        if checks.fails(len(held) <= self._hands or self._physics, OBJECTS):  # fingers may close on two of a heap
             checks.add_violation(OBJECTS, f"{held} are held at once")
         self._containers = {each["id"]: each["container"] for each in objects if each["state"] == CONTAINED}
         for name, (state, position) in found.items():
@@ -130,6 +131,7 @@ class Invariants:
         self.finished = False  # ignore set-points from now on
         self.truth_readers: set[str] = set()  # processes that subscribe to what only cameras may read
         self.motion = MotionInvariants(checks, cell)
+        self._several = bool(cell.robots)  # set-points do not say of which arm they are
         self._world = WorldInvariants(checks, cell)
         self._requests = requests
         requests.on_request, requests.on_answer = self._on_request, self._on_answer
@@ -200,7 +202,7 @@ class Invariants:
 
     def on_set_point(self, limits: Limits, measured: Vector, q: Vector, dq: Vector, now: float) -> None:
         """Check a set-point; see `MotionInvariants.on_set_point`."""
-        if not self.finished:
+        if not self.finished and not self._several:
             self.motion.on_set_point(limits, measured, q, dq, now)
 
     # --- requests -----------------------------------------------------------------------------------------------------

@@ -81,11 +81,16 @@ def with_observed_arm(cell: Cell) -> Cell:
     Raises:
         ConfigError: its arm is real, so it cannot run on virtual time.
     """
-    hardware = cell.robot.hardware
-    if not find_backend(cell.robot).simulated:  # a backend that talks to an arm has a clock of its own
+    robots = {arm: _observed(robot) for arm, robot in cell.robots.items()}
+    return cell.model_copy(update={"robot": _observed(cell.robot), "robots": robots})
+
+
+def _observed(robot: RobotConfig) -> RobotConfig:
+    hardware = robot.hardware
+    if not find_backend(robot).simulated:  # a backend that talks to an arm has a clock of its own
         raise ConfigError("robot.hardware.backend", hardware.backend, "is a real arm: simulate needs a simulated one")
     observed = HardwareConfig(backend=__name__, options={"backend": hardware.backend, "options": hardware.options})
-    return cell.model_copy(update={"robot": cell.robot.model_copy(update={"hardware": observed})})
+    return robot.model_copy(update={"hardware": observed})
 
 
 @contextmanager

@@ -47,7 +47,7 @@ class CustomTopics:
         services = cell.services.values()
         modules = dict.fromkeys([cell.application, *(entry.module for entry in services)])
         custom = (name for name in modules if "." in name and not name.startswith("services."))
-        return cls(tuple(custom), tuple(entry.topics for entry in services if entry.topics))
+        return cls(tuple(custom), tuple(cell.tables))
 
     @classmethod
     def read(cls, text: str) -> CustomTopics:

@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import Field
 
 from common import topics
-from common.config import RobotConfig, Run, Scenery, Surroundings, Tunable
+from common.config import Arms, RobotConfig, Run, Scenery, Surroundings, Tunable
 from common.messages import Image, WorldObjects
 from common.perception.image import array_to_image
 from common.process.service import main
@@ -24,6 +24,7 @@ class Config(CameraParameters):
     world: Surroundings
     scenery: Scenery = Scenery()
     robot: RobotConfig
+    arms: Arms = Arms()
     run: Run
     rate: Tunable[float] = Field(10.0, gt=0, le=250, description="frames per second of cell time [Hz]")
     max_rate: Tunable[float] = Field(50.0, gt=0, le=250, description="frames per second of wall time at most [Hz]")

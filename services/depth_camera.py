@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import Field
 
 from common import topics
-from common.config import RobotConfig, Run, Scenery, Surroundings, Tunable
+from common.config import Arms, RobotConfig, Run, Scenery, Surroundings, Tunable
 from common.messages import JointState, WorldObjects
 from common.perception.depth import point_cloud
 from common.perception.image import array_to_image
@@ -27,6 +27,7 @@ class Config(CameraParameters, DepthSensorParameters):
     world: Surroundings
     scenery: Scenery = Scenery()
     robot: RobotConfig
+    arms: Arms = Arms()
     run: Run
     rate: Tunable[float] = Field(1.0, gt=0, le=30, description="frames per second of cell time [Hz]")
     max_rate: Tunable[float] = Field(5.0, gt=0, le=30, description="frames per second of wall time at most [Hz]")

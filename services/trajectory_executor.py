@@ -7,43 +7,27 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import Callable
-from functools import partial
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from pydantic import Field
 
 from common import topics
 from common.application import find_application
-from common.config import Grasp, Members, Parameters, Reach, RobotConfig, Run, Tunable, World
+from common.config import Arms, Grasp, Members, Parameters, Reach, RobotConfig, Run, Tunable, World
 from common.control.executor import Executor
-from common.control.force_requests import ForceLimits
-from common.control.force_sensing import ForceSensing
-from common.control.interlocks import InterlockStore, effective_speed, exclusive_lock, interlock_file
+from common.control.interlocks import InterlockFile, InterlockStore, effective_speed, exclusive_lock, interlock_file
 from common.control.motion_authority import OrphanPolicy, WhenAlone
 from common.control.request_handlers import MAX_STOPS, RequestHandlers
 from common.control.status import Report
 from common.control.trajectory import Tolerances
-from common.control.wrench import Payload
-from common.errors import ConfigError
-from common.hardware.interface import ControlledArm, Limits, has_simulated_world, load_hardware, real_arm
+from common.hardware.interface import has_simulated_world, real_arm
 from common.messages import MotionOwner, MotionStatus
+from common.process.hosted_arms import create_executors, hosted_arms
 from common.process.service import main
-from common.robot.model import RobotModel
-from common.robot.tool_mass import described_tool
-from common.scene.workspace import configured_bounds
-from common.sim.interface import GraspTolerances, PhysicalWorld
-from common.sim.simulated_cell import (
-    BackgroundSaver,
-    Saver,
-    SimulatedCell,
-    StateFile,
-    create_world,
-    matching_state,
-    state_file,
-)
+from common.sim.interface import GraspTolerances
+from common.sim.state_file import BackgroundSaver, Saver, StateFile
 from common.transport.bus import Bus
 from common.transport.writer import Writer
 
@@ -55,6 +39,7 @@ class Config(Parameters):
     """Rates and tolerances of the controller."""
 
     robot: RobotConfig
+    arms: Arms = Arms()
     world: World
     run: Run
     grasp: Grasp
@@ -80,14 +65,14 @@ class Config(Parameters):
 class Publishers:
     """Writers of all topics of the executor."""
 
-    def __init__(self, bus: Bus, config: Config, simulated: bool) -> None:
-        """Declare them."""
+    def __init__(self, bus: Bus, config: Config, robot: RobotConfig, simulated: bool) -> None:
+        """Declare those of a robot and, if `simulated`, of the world."""
         self._writers: dict[str, Writer[Any]] = {  # by field of a report
             "joints": bus.writer(topics.JOINT_STATES), "motion": bus.writer(topics.MOTION_STATUS),
             "robot": bus.writer(topics.ROBOT_STATUS), "owner": bus.writer(topics.MOTION_OWNER),
             "wrench": bus.writer(topics.WRENCH),
         }
-        if config.robot.gripper:
+        if robot.gripper:
             self._writers["gripper"] = bus.writer(topics.GRIPPER_STATE)
         self._set_points = bus.writer(topics.SET_POINTS)
         self._updates = bus.writer(topics.SCENE_OBJECT_UPDATES) if simulated else None
@@ -118,74 +103,88 @@ class Publishers:
                 self._updates.put(update)
 
 
-def create_executor(
-    bus: Bus, config: Config, store: InterlockStore, simulated: bool, period: float,
-    saver_for: Callable[[StateFile], Saver] = BackgroundSaver,
-) -> Executor:
-    """Create the executor with its hardware at the home pose and, when simulated, all objects laid out.
+class HostedArm:
+    """One arm of this process on the bus: its topics, requests, interlocks and, once created, its executor.
 
-    Its cycles are `period` of wall time [s] apart. Simulated hardware starts where it was before a restart, if that was
-    in the same world.
+    Attributes:
+        name: of the arm; empty in a cell with one robot.
     """
-    clock, robot = bus.clock, RobotModel.load(config.robot)
-    deceleration = np.array(config.robot.deceleration_limits) if config.robot.deceleration_limits else None
-    limits = Limits(
-        tuple(robot.joint_names), robot.lower, robot.upper, robot.velocity, robot.acceleration, deceleration, robot.jerk
-    )
-    start, world, persisted, saver = robot.named("home"), None, None, None
-    if simulated:
-        bounds = configured_bounds(config.reach.parameters)
-        world = create_world(config.world, config.run.seed, robot, config.grasp, bounds, config.grasp_tolerances,
-                             config.robot.gripper)
-        if file := state_file(bus.cell):
-            persisted = matching_state(file.load(), config.world.simulator, world, robot.dof)
-            saver = saver_for(file)
-        if persisted is not None:
-            start = np.array(persisted.q)
-    world_arm = partial(world.hardware, robot, limits, start) if isinstance(world, PhysicalWorld) else None
-    hardware = load_hardware(config.robot, limits, start, world_arm)
-    if isinstance(hardware, ControlledArm) and clock.speed != 1.0:
-        hardware.close()
-        raise ConfigError("speed", clock.speed, "must be 1: the arm has a controller with a clock of its own")
-    backend = None if world is None else SimulatedCell(
-        world, hardware, robot, simulator=config.world.simulator, persisted=persisted, saver=saver)
-    tool = described_tool(robot)
-    force = ForceSensing(hardware, robot, config.robot.tcp_link, config.robot.gripper, config.robot.wrench,
-                         Payload(tool[0], *tool[1].tolist()) if tool is not None else None)
-    executor = Executor(
-        hardware, limits, start, tolerances=config.tolerances, gripper=config.robot.gripper,
-        controller=config.robot.controller, kinematics=robot, world=backend, interlocks=store.interlocks,
-        force=force, period=period * clock.speed,
-        force_limits=ForceLimits(config.robot.force_limit, config.robot.torque_limit),
-    )
-    executor.restore(clock.now())
-    return executor
 
+    def __init__(self, name: str, bus: Bus, config: Config, robot: RobotConfig, *, reports_world: bool) -> None:
+        """Declare topics and requests; one simulated arm of a cell also reports and edits the world."""
+        self.name, self.robot, self._bus, self._config = name, robot, bus.of_arm(name), config
+        self._publishers = Publishers(self._bus, config, robot, reports_world)
+        self._jog_commands = self._bus.reader(topics.MOTION_JOG)
+        self.handlers = RequestHandlers(bus.service, config, bus.clock, bus.log, self._publishers.put)
+        self._serve(reports_world)
+        self._orphan_policy, self._present = OrphanPolicy(), False
+        self._task = config.arms.tasks.get(name, "") if name else config.members.task
+        self._working: list[asyncio.Task[None]] = []
 
-def serve(bus: Bus, config: Config, handlers: RequestHandlers, simulated: bool) -> None:
-    """Declare all requests."""
-    bus.save_parameters = handlers.save_speed
-    bus.serve(topics.MOTION_EXECUTE, handlers.execute)
-    bus.serve(topics.MOTION_FORCE, handlers.move_by_force)
-    bus.serve(topics.MOTION_FOLLOWED, handlers.followed)
-    bus.serve(topics.MOTION_STOP, handlers.stop, max_pending=MAX_STOPS, on_overload=handlers.stop_for_unread)
-    bus.serve(topics.MOTION_HOLD, handlers.hold)
-    bus.serve(topics.MOTION_OWN, handlers.own)
-    bus.serve(topics.ROBOT_COMMAND, handlers.order)
-    bus.serve(topics.WRENCH_ZERO, handlers.zero_wrench)
-    if config.robot.gripper:
-        bus.serve(topics.GRIPPER_COMMAND, handlers.command_gripper)
-    if simulated:
-        bus.serve(topics.WORLD_EDIT, handlers.edit)
-    if simulated and config.world.conveyors:
-        bus.serve(topics.CONVEYOR_SET, handlers.set_conveyor)
+    def _serve(self, edits: bool) -> None:
+        bus, handlers = self._bus, self.handlers
+        bus.serve(topics.MOTION_EXECUTE, handlers.execute)
+        bus.serve(topics.MOTION_FOLLOWED, handlers.followed)
+        bus.serve(topics.MOTION_STOP, handlers.stop, max_pending=MAX_STOPS, on_overload=handlers.stop_for_unread)
+        bus.serve(topics.MOTION_HOLD, handlers.hold)
+        bus.serve(topics.MOTION_OWN, handlers.own)
+        bus.serve(topics.ROBOT_COMMAND, handlers.order)
+        bus.serve(topics.WRENCH_ZERO, handlers.zero_wrench)
+        bus.serve(topics.MOTION_FORCE, handlers.move_by_force)
+        if self.robot.gripper:
+            bus.serve(topics.GRIPPER_COMMAND, handlers.command_gripper)
+        if edits:
+            bus.serve(topics.WORLD_EDIT, handlers.edit)
+        if edits and self._config.world.conveyors:
+            bus.serve(topics.CONVEYOR_SET, handlers.set_conveyor)
+
+    def open_store(self) -> InterlockFile:
+        """Return the file of its interlocks; that of a simulated arm is named after cell and arm."""
+        return interlock_file(".".join(filter(None, (self._bus.cell, self.name))), real_arm(self.robot))
+
+    def start(self, executor: Executor, store: InterlockStore, began: int, configured: float) -> None:
+        """Work with this executor from now on."""
+        self.executor = executor
+        self.handlers.start(executor, store, began, configured)
+        self._working = [asyncio.create_task(self._jog(), name="jog"),
+                         asyncio.create_task(store.restore_file(), name="restore interlock file")]
+
+    async def _jog(self) -> None:
+        async for command in self._jog_commands:
+            self.handlers.jog(command)
+
+    def cycle(self) -> None:
+        """Do one control cycle and publish what has changed."""
+        self.executor.speed_scaling = self._config.speed_scaling
+        report = self.executor.cycle(self._bus.header("world"))
+        self.handlers.after_cycle(report)
+        self._publishers.put_report(report, self.executor)
+        for task in self._working[:1]:
+            if task.done():
+                task.result()
+
+    def watch_task(self) -> None:
+        """Hold, or finish, the motion of a task that has vanished."""
+        was_present, self._present = self._present, self._task in self._bus.alive
+        if was_present and not self._present:
+            self.executor.authority.disown_task()
+        self.executor.force_motions.task_present = self._present
+        orphaned = self._orphan_policy.update(self._present, self.executor.arm.goal, self._config.when_alone)
+        self.executor.authority.hold_by_controller(orphaned, f"{self._task} is gone")
+
+    async def close(self) -> None:
+        """End what runs beside the cycle."""
+        for task in self._working:
+            task.cancel()
+        await self.handlers.close()
+        self.executor.close()
 
 
 async def run(
     bus: Bus, config: Config, *, file_lock: FileLock = exclusive_lock,
     saver_for: Callable[[StateFile], Saver] = BackgroundSaver,
 ) -> None:
-    """Control the arm until cancelled.
+    """Control the arm, or all simulated arms of the cell, until cancelled.
 
     Args:
         bus: in the cell.
@@ -193,77 +192,67 @@ async def run(
         file_lock: keeps other executors, also of another cell of that name, from the interlock store.
         saver_for: creates what saves the state of simulated hardware without blocking the loop.
     """
-    simulated = has_simulated_world(config.robot)
-    publishers = Publishers(bus, config, simulated)
-    jog_commands = bus.reader(topics.MOTION_JOG)
-    handlers = RequestHandlers(bus.service, config, bus.clock, bus.log, publishers.put)
-    serve(bus, config, handlers, simulated)
+    robots = hosted_arms(config, bus.service)
+    simulated = has_simulated_world(next(iter(robots.values())))
+    arms = [HostedArm(name, bus, config, robot, reports_world=simulated and not at)
+            for at, (name, robot) in enumerate(robots.items())]
+
+    async def save_speed() -> None:
+        for arm in arms:
+            await arm.handlers.save_speed()
+
+    bus.save_parameters = save_speed
     await bus.acquire_keys()  # before, another executor may still change the file
     async with contextlib.AsyncExitStack() as stack:
-        file = interlock_file(bus.cell, real_arm(config.robot))
-        await stack.enter_async_context(file_lock(file.path, f"{bus.service} of {bus.cell}"))
-        file.require_writable()
+        stores = {}
+        for name, arm in zip(robots, arms, strict=True):
+            file = arm.open_store()
+            await stack.enter_async_context(file_lock(file.path, f"{bus.service} of {bus.cell}"))
+            file.require_writable()
+            stores[name] = InterlockStore(file, bus.log)
         began = bus.clock.now_ns()  # an executor before this one may have executed what was decided until now
-        store = InterlockStore(file, bus.log)
         configured = config.speed_scaling
-        config.speed_scaling = effective_speed(store.interlocks.speed, configured)
+        config.speed_scaling = min(effective_speed(store.interlocks.speed, configured) for store in stores.values())
         if config.speed_scaling != configured:
             bus.log.warning("speed is at %.0f %%, as it was set while the cell ran: `zencell param set "
                             "services.trajectory_executor.speed_scaling=1` ends that", 100 * config.speed_scaling)
         period = 1 / bus.clock.wall_rate(config.joint_state_rate, MAX_CYCLES)
-        executor = await asyncio.to_thread(create_executor, bus, config, store, simulated, period, saver_for)
-        handlers.start(executor, store, began, configured)
-        if executor.world is not None and executor.world.restored:
+        executors = await asyncio.to_thread(
+            create_executors, bus, config, robots, stores, simulated, period, saver_for)
+        for name, arm in zip(robots, arms, strict=True):
+            arm.start(executors[name], stores[name], began, configured)
+        world = next(iter(executors.values())).world
+        if world is not None and world.restored:
             bus.log.info("the arm and its surroundings are as they were before the restart")
-
-        async def jog() -> None:
-            async for command in jog_commands:
-                handlers.jog(command)
-
-        jogging = asyncio.create_task(jog(), name="jog")
-        restoring = asyncio.create_task(store.restore_file(), name="restore interlock file")
         try:
-            await control(bus, config, executor, handlers, publishers, jogging, period)
+            await control(bus, arms, period)
         finally:
-            jogging.cancel()
-            restoring.cancel()
-            await handlers.close()
-            executor.close()
+            for arm in arms:
+                await arm.close()
 
 
-async def control(
-    bus: Bus, config: Config, executor: Executor, handlers: RequestHandlers, publishers: Publishers,
-    jogging: asyncio.Task[None], period: float,
-) -> None:
-    """Run a control cycle every `period` of wall time [s] until cancelled; then bring the arm to rest first."""
+async def control(bus: Bus, arms: Sequence[HostedArm], period: float) -> None:
+    """Run a control cycle of every arm each `period` of wall time [s] until cancelled; then bring them to rest."""
     loop = asyncio.get_running_loop()
-    orphan_policy, task, present = OrphanPolicy(), config.members.task, False
     due = loop.time()
 
     def cycle() -> None:
         nonlocal due
-        executor.speed_scaling = config.speed_scaling
-        report = executor.cycle(bus.header("world"))
-        handlers.after_cycle(report)
-        publishers.put_report(report, executor)
+        for arm in arms:
+            arm.cycle()
         due = max(due + period, loop.time())  # no burst after an overrun
 
     try:
         await bus.ready()
         while True:
-            was_present, present = present, task in bus.alive
-            if was_present and not present:
-                executor.authority.disown_task()
-            orphaned = orphan_policy.update(present, executor.arm.goal, config.when_alone)
-            executor.force_motions.task_present = present
-            executor.authority.hold_by_controller(orphaned, f"{task} is gone")
+            for arm in arms:
+                arm.watch_task()
             cycle()
-            if jogging.done():
-                jogging.result()
             await asyncio.sleep(due - loop.time())
     except asyncio.CancelledError:
-        executor.authority.hold_by_controller(True, f"{bus.service} ends")
-        while not executor.arm.at_rest:
+        for arm in arms:
+            arm.executor.authority.hold_by_controller(True, f"{bus.service} ends")
+        while not all(arm.executor.arm.at_rest for arm in arms):
             await asyncio.sleep(due - loop.time())
             cycle()
         raise

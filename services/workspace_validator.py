@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Any
 
@@ -53,9 +53,9 @@ class Config(ViewsParameters, WorkspaceBounds):
 class OcclusionReport:
     """Reports which part of the table the newest images do not show."""
 
-    def __init__(self, around: Surroundings, bounds: WorkspaceBounds) -> None:
-        """Start; the grid of the table is created on the first occlusion."""
-        self._around, self._bounds = around, bounds
+    def __init__(self, around: Surroundings, bounds: WorkspaceBounds, base: Sequence[float]) -> None:
+        """Start; the grid of the table about a base [m] is created on the first occlusion."""
+        self._around, self._bounds, self._base = around, bounds, base
         self._region: VisibleTable | None = None
 
     def unseen(self, seen: list[CameraDetections], views: DetectionViews, most: float) -> tuple[str, bool]:
@@ -70,7 +70,7 @@ class OcclusionReport:
             return "", False
         if len(hiding) == len(seen) and all(hidden.covers_image for hidden in hiding):
             return hiding[0].by, True
-        self._region = self._region or VisibleTable(self._around, self._bounds)
+        self._region = self._region or VisibleTable(self._around, self._bounds, self._base)
         robot, silhouettes = views.robot
         share = self._region.hidden((self._region.within(one.camera, silhouettes, robot), one.hidden) for one in seen)
         by = " and ".join(dict.fromkeys(hidden.by for hidden in hiding))
@@ -90,7 +90,8 @@ def shells(config: Config, header: Header) -> MarkerArray:
     height = config.max_height - config.min_height
     inner = max(config.min_radius, config.singularity_radius)
     cylinders = (("reachable shell", config.max_radius, (0.2, 0.8, 0.3)), ("excluded column", inner, (0.9, 0.2, 0.2)))
-    pose = Pose(position=Vector3(z=(config.max_height + config.min_height) / 2))
+    x, y, _ = config.robot.base_position
+    pose = Pose(position=Vector3(x=x, y=y, z=(config.max_height + config.min_height) / 2))
     return MarkerArray(
         header=header,
         markers=[
@@ -123,7 +124,8 @@ async def run(bus: Bus, config: Config) -> None:
     reach = ReachCache(RobotModel.load(config.robot), config.grasp, config)
     validation = Validation(config.world, reach, forget_after=config.forget_after)
 
-    watched, remembered, radius = OcclusionReport(config.world, config), OccludedTargets(), config.world.ball_radius
+    watched = OcclusionReport(config.world, config, config.robot.base_position)
+    remembered, radius = OccludedTargets(), config.world.ball_radius
 
     def publish_shells() -> None:
         markers.put(shells(config, bus.header(WORLD)))

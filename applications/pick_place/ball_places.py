@@ -123,8 +123,10 @@ STEP = 0.02  # [m] grid of positions that represent the table
 class VisibleTable:
     """Positions (n, 3) [m] in world where a ball may lie within reach, and which of them each camera can see."""
 
-    def __init__(self, around: Surroundings, bounds: WorkspaceBounds) -> None:
-        """Spread positions over the tables, within the bounds and outside of the containers."""
+    def __init__(
+        self, around: Surroundings, bounds: WorkspaceBounds, base: Sequence[float] = (0.0, 0.0, 0.0)
+    ) -> None:
+        """Spread positions over the tables, outside of the containers and within the bounds about a base [m]."""
         self.radius = around.ball_radius
         self._resting = [BallGeometry(around.ball_radius, around.table_height, box)
                          for box in around.containers.values()]
@@ -138,7 +140,7 @@ class VisibleTable:
         ]
         self.places = np.array([
             place for place in dict.fromkeys(found)
-            if not out_of_bounds_reason(bounds, place)
+            if not out_of_bounds_reason(bounds, place, base)
             and not any(max(abs(place[0] - box.x), abs(place[1] - box.y)) < box.half_side + self.radius
                         for box in around.containers.values())
         ]).reshape(-1, 3)

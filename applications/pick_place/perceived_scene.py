@@ -103,7 +103,8 @@ class PerceivedScene:
             if shown and thing.shape == "sphere" and shown[0].container is self._with_slots:
                 in_container.append((pixel[0], pixel[1]))
             elif shown:
-                unsorted.append(thing)
+                if shown[0].container.id not in self.around.filled_by_others:
+                    unsorted.append(thing)
             elif hand is None or math.dist(hand, thing.position) > max(thing.size) / 2:
                 on_table.append(thing)
         radius = self.around.ball_radius

@@ -9,7 +9,19 @@ the true poses of objects; all other services declare `Surroundings`.
 from __future__ import annotations
 
 from common.config.basics import Coordinate, Length, Number, Parameters, Point, Rgb, Section, Tunable, check
-from common.config.cell import Cell, Grasp, Members, Motion, Pipeline, PlannerEntry, Reach, Run, ServiceEntry, Watchdogs
+from common.config.cell import (
+    Arms,
+    Cell,
+    Grasp,
+    Members,
+    Motion,
+    Pipeline,
+    PlannerEntry,
+    Reach,
+    Run,
+    ServiceEntry,
+    Watchdogs,
+)
 from common.config.conveyors import Conveyor
 from common.config.files import config_root, find_file, names_of, parse_yaml, read_robot, read_yaml
 from common.config.io import Io, Signal

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, Field, model_validator
 
+from common.application import find_application
+from common.arms import arm_table
+from common.config.arms import require_distinct
 from common.config.basics import Section, Tunable
 from common.config.io import Io
 from common.config.robot import RobotConfig
-from common.config.world import Scenery, Surroundings, World
+from common.config.world import Container, Scenery, Surroundings, World
 from common.remapping import is_cell
 
 
@@ -106,6 +110,7 @@ class ServiceEntry(Section):
 
     name: str = Field(description="unique in the cell: one module may run several times")
     module: str
+    arm: str = Field("", description="arm that it serves, in a cell with several robots; empty: all of them")
     topics: dict[str, str] = Field({}, description="keys of the cell by the keys in its code")
     parameters: dict[str, Any] = {}
 
@@ -129,10 +134,23 @@ class Members(Section):
     keys: list[dict[str, str]] = Field([], description="remapping tables: keys of the cell by the keys in the code")
 
 
+class Arms(Section):
+    """The arms of a cell with several robots, for services that serve or read all of them."""
+
+    robots: dict[str, RobotConfig] = Field({}, description="by name, in the order of the cell file; empty: one robot")
+    tasks: dict[str, str] = Field({}, description="name of the service that runs the task of each arm")
+    own: str = Field("", description="arm of the service; empty: it serves all of them")
+
+
 class Reach(Section):
     """Parameters of all services: some of them define the reachable workspace."""
 
     parameters: dict[str, dict[str, Any]] = Field({}, description="parameters by service")
+    arms: dict[str, str] = Field({}, description="arm of each service that serves one of several")
+
+    def of(self, arm: str) -> dict[str, dict[str, Any]]:
+        """Return the parameters of the services of one arm and of those that serve all, by service."""
+        return {name: values for name, values in self.parameters.items() if self.arms.get(name, arm) == arm}
 
 
 class Cell(Section):
@@ -140,6 +158,7 @@ class Cell(Section):
 
     run: Run
     robot: RobotConfig
+    robots: dict[str, RobotConfig] = Field({}, description="by the name of the arm; `robot` is the first of them")
     world: World
     motion: Motion = Motion()
     grasp: Grasp = Grasp()
@@ -150,32 +169,75 @@ class Cell(Section):
     task: str = Field("", description="the service that runs the task and ends in DONE; default: no task")
     application: str = Field("", description="application: a name, or a dotted module")
 
+    @model_validator(mode="after")
+    def _distinct_arms(self) -> Cell:
+        require_distinct(self.robots)
+        return self
+
     @property
     def name(self) -> str:
         """The first part of every key."""
         return self.run.cell
 
-    def section(self, kind: type[Section], camera: str | None = None) -> Section:
+    def _by_distance(self, arm: str) -> dict[str, Container]:
+        """Return the containers of the world, the one nearest to the base of an arm first."""
+        base = self.robots[arm].base_position[:2]
+        return dict(sorted(self.world.containers.items(), key=lambda item: math.dist((item[1].x, item[1].y), base)))
+
+    def _nearest_arm(self, box: Container) -> str:
+        return min(self.robots, key=lambda arm: math.dist((box.x, box.y), self.robots[arm].base_position[:2]))
+
+    def of_arm(self, arm: str) -> Cell:
+        """Return the cell as one arm has it: its robot, its services and those that serve all."""
+        services = {name: entry for name, entry in self.services.items() if entry.arm in ("", arm)}
+        return self.model_copy(update={"robot": self.robots[arm], "robots": {}, "services": services})
+
+    @property
+    def tables(self) -> list[dict[str, str]]:
+        """Remapping tables of all arms and services: keys of the cell by the keys in the code."""
+        more = find_application(self.application).arm_keys if self.robots else []
+        found = [arm_table(arm, more) for arm in self.robots]
+        return [*found, *(each.topics for each in self.services.values() if each.topics and each.topics not in found)]
+
+    @property
+    def arms(self) -> Arms:
+        """All arms of a cell with several robots, with the services that run their tasks."""
+        kind = find_application(self.application).task if self.robots else ""
+        tasks = {entry.arm: entry.name for entry in self.services.values() if entry.arm and entry.kind == kind}
+        return Arms(robots=self.robots, tasks=tasks)
+
+    def section(self, kind: type[Section], camera: str | None = None, arm: str = "") -> Section:
         """Return the section of a type; surroundings are the world without its objects.
 
         Args:
             kind: the type.
             camera: name of the camera that becomes `camera` of the surroundings; by default the first.
+            arm: whose robot and task it is, in a cell with several.
 
         Raises:
             UnknownName: the world has no such camera.
         """
         if kind is Surroundings:
             around = {f: getattr(self.world, f) for f in Surroundings.model_fields}
+            if arm and self.world.containers:
+                around["containers"] = nearest = self._by_distance(arm)
+                around["container"] = next(iter(nearest.values()))
+                around["filled_by_others"] = [name for name, box in nearest.items() if self._nearest_arm(box) != arm]
             return Surroundings.model_validate(around | {"camera": self.world.camera_of(camera)})
         if kind is Scenery:
             return Scenery.model_validate({f: getattr(self.world, f) for f in Scenery.model_fields})
         if kind is Members:
             names = [entry.name for entry in self.services.values()]
-            keys = [entry.topics for entry in self.services.values() if entry.topics]
-            return Members(services=names, task=self.task, application=self.application, keys=keys)
+            task = self.arms.tasks.get(arm, self.task) if arm else self.task
+            return Members(services=names, task=task, application=self.application, keys=self.tables)
+        if kind is Arms:
+            return self.arms.model_copy(update={"own": arm})
+        if kind is RobotConfig and arm:
+            return self.robots[arm]
         if kind is Reach:
-            return Reach(parameters={name: entry.parameters for name, entry in self.services.items()})
+            entries = [entry for entry in self.services.values() if not arm or entry.arm in ("", arm)]
+            return Reach(parameters={entry.name: entry.parameters for entry in entries},
+                         arms={entry.name: entry.arm for entry in entries if entry.arm})
         for value in (self.run, self.robot, self.world, self.motion, self.grasp, self.io, self.pipeline,
                       self.watchdogs):
             if type(value) is kind:

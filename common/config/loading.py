@@ -12,8 +12,10 @@ import yaml
 from pydantic_core import to_jsonable_python
 
 from common.application import application_of_task, find_application, import_from_folder_of
+from common.arms import arm_table
+from common.config.arms import read_robots, require_arm, services_of_arms
 from common.config.basics import Parameters, check, is_section, own_fields
-from common.config.cell import Cell
+from common.config.cell import Arms, Cell
 from common.config.files import (
     find_file,
     names_of,
@@ -28,10 +30,12 @@ from common.config.files import (
 from common.config.robot import RobotConfig
 from common.config.world import CAMERA, Surroundings
 from common.errors import ConfigError, UnknownName, ZencellError
-from common.remapping import SERVICE_NAME, validate_table
+from common.remapping import POSE_KEYS, SERVICE_NAME, validate_table
 
 NOT_A_SERVICE = ("router", "supervisor", "recorder")  # names of other processes
-SECTIONS = ("robot", "world", "pipeline", "services")  # an override of a complete one precedes those of its fields
+# An override of a complete section precedes those of its fields.
+SECTIONS = ("robot", "robots", "world", "pipeline", "services")
+ARM_TASKS = "arm_tasks"  # the service that combines the tasks of several arms
 P = TypeVar("P", bound=Parameters)
 OVERRIDES_VARIABLE = "ZENCELL_SET"  # JSON list of overrides that a supervisor gives to its services
 
@@ -131,15 +135,21 @@ def load_cell(
     services = tree.get("services")
     if not isinstance(services, dict):
         raise ConfigError("services", services, "must be a mapping of services in start order")
+    arms = list(tree.get("robots", ()))
+    services = tree["services"] = services_of_arms(services, arms)
     _apply_overrides(tree, parsed)
+    if arms:
+        tree["robot"] = tree["robots"][arms[0]]
     if "run" in tree:
         raise ConfigError("run", tree["run"], "is no section of a cell: autostart and seed are top-level fields")
     run = {"cell": tree.pop("cell", path.stem), "autostart": tree.pop("autostart", True), "seed": tree.pop("seed", 0)}
     if seed is not None:
         run["seed"] = seed
     tree["run"] = run
-    tree["services"] = _service_entries(services)
+    tree["services"] = _service_entries(services, arms)
     _name_application(tree)
+    if arms:
+        _remap_arms(tree["services"], arms[0], tree.get("application", ""))
     return check(Cell, tree)
 
 
@@ -152,8 +162,9 @@ def _read_sections(
     """
     overridden = {parts[0]: value for parts, value in overrides if len(parts) == 1}
     overridden |= {"world": world} if world is not None else {}
-    tree |= {section: overridden[section] for section in SECTIONS if section in overridden}
-    for section in ("robot", "world", "pipeline"):
+    read_robots(tree, overridden, folder)
+    tree |= {section: overridden[section] for section in SECTIONS if section in overridden and section != "robots"}
+    for section in ("world", "pipeline") if "robots" in tree else ("robot", "world", "pipeline"):
         value = tree.get(section)
         if isinstance(value, str):
             in_cwd = section in overridden and Path(value).expanduser().is_file()
@@ -217,7 +228,8 @@ def _name_application(tree: dict[str, Any]) -> None:
         tree["application"] = application_of_task(kinds.get(task, task))
     elif isinstance(application, str):
         kind = find_application(application).task or application.rpartition(".")[2]
-        tree.setdefault("task", next((name for name in kinds if kinds[name] == kind), kind))
+        several = next((name for name in kinds if kinds[name] == ARM_TASKS), None) if "robots" in tree else None
+        tree.setdefault("task", several or next((name for name in kinds if kinds[name] == kind), kind))
 
 
 def _unify_names(world: dict[str, Any], path: list[str]) -> None:
@@ -237,11 +249,11 @@ def _name_of(key: str) -> str:
     return key.rpartition(".")[2]
 
 
-def _service_entries(services: dict[str, Any]) -> dict[str, dict[str, Any]]:
+def _service_entries(services: dict[str, Any], arms: Sequence[str]) -> dict[str, dict[str, Any]]:
     """Return the services by name, in start order."""
     entries: dict[str, dict[str, Any]] = {}
     for key, parameters in services.items():
-        entry = _service_entry(str(key), parameters)
+        entry = _service_entry(str(key), parameters, arms)
         name = entry["name"]
         if name in entries:
             before = entries[name]["module"]
@@ -251,7 +263,7 @@ def _service_entries(services: dict[str, Any]) -> dict[str, dict[str, Any]]:
     return entries
 
 
-def _service_entry(key: str, values: Any) -> dict[str, Any]:
+def _service_entry(key: str, values: Any, arms: Sequence[str]) -> dict[str, Any]:
     if values is not None and not isinstance(values, dict):
         raise ConfigError(f"services.{key}", values, "must be a mapping of parameters")
     parameters = dict(values or {})
@@ -266,7 +278,19 @@ def _service_entry(key: str, values: Any) -> dict[str, Any]:
     if "." not in kind and importlib.util.find_spec(module) is None:
         raise UnknownName("service", kind, service_names())
     topics = validate_table(f"services.{name}.topics", parameters.pop("topics", None) or {})
-    return {"name": name, "module": module, "topics": topics, "parameters": parameters}
+    arm = parameters.pop("arm", "") if arms else ""
+    return {"name": name, "module": module, "arm": arm, "topics": topics, "parameters": parameters}
+
+
+def _remap_arms(services: Mapping[str, dict[str, Any]], first: str, application: str) -> None:
+    """Put the keys of an arm below its name for its services; the tables of the cell file go first.
+
+    Services of all arms read the poses of cameras, and of one on a hand, from the first arm.
+    """
+    more = find_application(application).arm_keys
+    for entry in services.values():
+        own = arm_table(entry["arm"], more) if entry["arm"] else {key: f"{first}/{key}" for key in POSE_KEYS}
+        entry["topics"] = own | entry["topics"]
 
 
 def service_names() -> list[str]:
@@ -282,9 +306,11 @@ def service_config(cell: Cell, name: str, config: type[P]) -> P:
         ConfigError: names `services.<name>.<parameter>`, the value and the bounds or choices.
     """
     entry = cell.services.get(name)
-    values = dict(entry.parameters) if entry else {}
+    values, arm = (dict(entry.parameters), entry.arm) if entry else ({}, "")
     # `camera` selects the camera of the surroundings, unless the service declares a parameter of that name.
     sections = [info.annotation for info in config.model_fields.values() if is_section(info.annotation)]
+    if entry and cell.robots and not arm and RobotConfig in sections and Arms not in sections:
+        require_arm(name, entry.kind, list(cell.robots))
     selects_camera = Surroundings in sections and "camera" not in config.model_fields
     camera = values.pop("camera", None) if selects_camera else None
     if camera is not None and camera not in cell.world.cameras:
@@ -295,7 +321,7 @@ def service_config(cell: Cell, name: str, config: type[P]) -> P:
                 raise ConfigError(f"services.{name}.{field}", values[field], "is a section of the cell, no parameter "
                                   f"of a service; choices: {', '.join(own_fields(config))}")
             # A copy, because each service changes its parameters at run time.
-            values[field] = cell.section(info.annotation, camera).model_copy()  # type: ignore[arg-type]
+            values[field] = cell.section(info.annotation, camera, arm).model_copy()  # type: ignore[arg-type]
     return check(config, values, f"services.{name}")
 
 

@@ -362,6 +362,8 @@ class Surroundings(SurroundingsFields):
     fixtures: list[Fixture] = []
     conveyors: dict[str, Conveyor] = Field({}, max_length=8, description="belts by name; each is a fixture, too")
     table_height: Coordinate = Field(0.0, description="z of the surface that carries objects [m]")
+    filled_by_others: list[str] = Field([], description="containers of other arms, in a cell with several robots: set "
+                                                        "by the cell, each container is of the arm nearest to it")
 
     @model_validator(mode="after")
     def _add_conveyors_to_fixtures(self) -> Self:

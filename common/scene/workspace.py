@@ -65,13 +65,15 @@ def configured_bounds(services: Mapping[str, Mapping[str, Any]]) -> WorkspaceBou
     return WorkspaceBounds()
 
 
-def out_of_bounds_reason(bounds: WorkspaceBounds, position: Sequence[float]) -> str:
+def out_of_bounds_reason(
+    bounds: WorkspaceBounds, position: Sequence[float], base: Sequence[float] = (0.0, 0.0)
+) -> str:
     """Return why a position (x, y, z) [m], world, is out of bounds, with value and bound; empty if it is within.
 
-    The singularity column comes first: the least radius would hide it.
+    The singularity column comes first: the least radius would hide it. The axis of the base is at x, y of `base`.
     """
     x, y, z = position
-    radius = math.hypot(x, y)
+    radius = math.hypot(x - base[0], y - base[1])
     if radius < bounds.singularity_radius:
         return f"singularity column: {radius:.3f} m from the base axis, less than {bounds.singularity_radius:.3f} m"
     if z < bounds.min_height:
@@ -119,7 +121,7 @@ def unreachable_reason(
 ) -> str:
     """Return why the arm cannot grasp an object centred at (x, y, z) [m], world; empty if it can."""
     limits = bounds or WorkspaceBounds()
-    outside = out_of_bounds_reason(limits, position)
+    outside = out_of_bounds_reason(limits, position, robot.config.base_position)
     return outside or grasp_chain_failure(robot, position, grasp or Grasp(), limits, explained=explained)
 
 
@@ -158,7 +160,7 @@ class ReachCache:
 
     def known(self, position: Sequence[float]) -> str | None:
         """Return the reason at a position if no inverse kinematics is needed, else None."""
-        reason = out_of_bounds_reason(self._bounds, position)
+        reason = out_of_bounds_reason(self._bounds, position, self._robot.config.base_position)
         if reason:
             return reason
         key = self._key(position)

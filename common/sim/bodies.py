@@ -51,18 +51,32 @@ class Body:
     added: bool = False  # by an operator
     like: str = ""  # id of the object of the initial layout whose shape it shares
     mass: float = 0.0  # [kg]; 0: unknown
+    holder: str = ""  # arm that holds it, in a world with several
+    second: str = ""  # arm whose gripper presses on it too, and takes it over when the holder lets go
     _message: WorldObject | None = None  # cached until the body changes
     _snapshot: ObjectSnapshot | None = None  # cached until the body changes
 
     def rest_at(self, rest: Rest) -> None:
         """Put the body at rest."""
         self.T, self.state, self.container, self.slot = rest.T, rest.state, rest.container, rest.slot
-        self.rest, self.grip = None, None
+        self.rest, self.grip, self.holder, self.second = None, None, "", ""
         self.changed()
 
     def changed(self) -> None:
         """Invalidate the cached message and snapshot."""
         self._message = self._snapshot = None
+
+    def carry(self, T_world_hand: Array) -> bool:
+        """Move a held body with the frame (4, 4) of its grip; return whether it has moved."""
+        assert self.grip is not None
+        T = T_world_hand @ self.grip
+        if self.solid.shape == "sphere":
+            T[:3, :3] = self.T[:3, :3]
+        moved = not np.array_equal(T, self.T)
+        if moved:
+            self.T = T
+            self.changed()
+        return moved
 
     @property
     def rest_pose(self) -> Array:
@@ -115,6 +129,7 @@ class Body:
                     "since": self.drop_time, "width": self.width, "added": self.added, "mass": self.mass,
                     "grip": None if self.grip is None else _numbers(self.grip),
                     "rest": None if rest is None else [_numbers(rest.T), rest.state, rest.container, rest.slot],
+                    **({"holder": self.holder, "second": self.second} if self.holder or self.second else {}),
                 },
             )
         return self._snapshot
@@ -174,6 +189,7 @@ def restored(name: str, snapshot: ObjectSnapshot, solid: Solid, color: tuple[flo
         name, solid, color, _matrix(snapshot.pose), d["state"], d["container"], _slot(d["slot"]),
         None if d["grip"] is None else _matrix(d["grip"]), d["width"], d["dropped"], d["since"],
         added=d["added"], like=snapshot.like, mass=d.get("mass", 0.0),
+        holder=d.get("holder", ""), second=d.get("second", ""),
     )
     if d["rest"] is not None:
         T, state, container, slot = d["rest"]

@@ -130,6 +130,25 @@ class PhysicalWorld(SimulatedWorld, Protocol):
         """
 
 
+@runtime_checkable
+class PhysicalWorldOfArms(PhysicalWorld, Protocol):
+    """A world with forces and several arms, which are all in its model before the first one is read."""
+
+    def arm(self, name: str, robot: RobotModel, limits: Limits, start: Array) -> Hardware:
+        """Return one more arm in this world, at rest at `start` (dof,) [rad]; called once for each name.
+
+        Raises:
+            ConfigError: the robot cannot be simulated.
+        """
+
+
+class WorldOfGrippers(SimulatedWorld, Protocol):
+    """A world without forces for several grippers."""
+
+    def hand(self, arm: str, gripper: GripperConfig | None) -> GripperDrivenWorld:
+        """Return the world as the gripper of an arm meets it; called once for each arm."""
+
+
 class GraspTolerances(Parameters):
     """Where an object must be for the fingers to grasp it, in the frame of the tool center point."""
 

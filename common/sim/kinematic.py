@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from common.config import GripperConfig, ObjectConfig, Scenery, SuctionCup, Surroundings, World
 from common.errors import ConfigError, Refused, UnknownName
 from common.messages import Header, WorldEdit, WorldObject, WorldObjects
-from common.robot.finger_joints import closing_frame
 from common.robot.transforms import invert, transform
 from common.sim.bodies import Body, Rest, WorldEvents, pressed_ends, restored
 from common.sim.conveyors import Belts, carried
+from common.sim.hands import Hand, HandInWorld
 from common.sim.interface import GraspTolerances, ObjectSnapshot
 from common.sim.layout import new_body, requested_position, require_room
 from common.sim.objects import initial_pose, solid_of, solid_of_message
@@ -75,13 +75,12 @@ class KinematicWorld(WorldEvents):
         super().__init__()
         self._config, self.no_seal = world, ""
         self._tolerances = tolerances or GraspTolerances()
-        self._gripper = gripper
-        self._T_tcp_closing = closing_frame(gripper) if gripper else np.eye(4)
+        self._hand = Hand("", gripper)
+        self._hands = {"": self._hand}
         self._ground, self.belts = Ground(world), Belts(world.conveyors)
         self._first = {obj.id: obj for obj in (world.objects if objects is None else objects)}
         self._solids = {name: solid_of(obj) for name, obj in self._first.items()}
         self._bodies: dict[str, Body] = {}
-        self._between: dict[str, tuple[float, float]] = {}  # bodies between the fingers: ends along tool y [m]
         try:
             self._lay_out()
         except Refused as refusal:
@@ -103,8 +102,12 @@ class KinematicWorld(WorldEvents):
     def restore(self, objects: Mapping[str, ObjectSnapshot]) -> None:
         """Restore a state; objects of unknown shape are skipped."""
         self._bodies = {name: body for name, snapshot in objects.items() if (body := self._restored(name, snapshot))}
-        self._between = {}
+        self._forget_between()
         self.version += 1
+
+    def _forget_between(self) -> None:
+        for hand in self._hands.values():
+            hand.between = {}
 
     def _restored(self, name: str, snapshot: ObjectSnapshot) -> Body | None:
         first = self._first.get(snapshot.like or name)
@@ -119,30 +122,40 @@ class KinematicWorld(WorldEvents):
 
     # --- gripper ---
 
+    def hand(self, arm: str, gripper: GripperConfig | None) -> HandInWorld:
+        """Return this world as the gripper of an arm meets it, in a cell with several."""
+        self._hands[arm] = Hand(arm, gripper)
+        return HandInWorld(self, self._hands[arm])
+
     def obstruction(self, T_world_tcp: Array, width: float) -> float:
         """Width [m] below which the fingers cannot close: see `common.sim.interface`."""
-        if held := self.held:
-            return self._bodies[held].width
-        if self._gripper is not None and self._gripper.cup is not None:
-            return self._seal(T_world_tcp, self._gripper.cup, self._gripper.held_width)
+        return self.obstruction_of(self._hand, T_world_tcp, width)
+
+    def obstruction_of(self, hand: Hand, T_world_tcp: Array, width: float) -> float:
+        """Width [m] below which the fingers of one gripper cannot close; remembers what is between them."""
+        if held := self.held_by(hand.arm):
+            return held.width
+        if hand.gripper is not None and hand.gripper.cup is not None:
+            return self._seal(hand, T_world_tcp, hand.gripper.cup, hand.gripper.held_width)
         found: dict[str, tuple[float, float]] = {}
-        T_world_hand = T_world_tcp @ self._T_tcp_closing
+        T_world_hand = hand.T = T_world_tcp @ hand.T_tcp_closing
         for name, body in self._bodies.items():
-            if body.state in ("table", "contained") and (
-                ends := pressed_ends(self._tolerances, body, T_world_hand, width, self._between.get(name))
+            if body.state in ("table", "contained", "held") and (
+                ends := pressed_ends(self._tolerances, body, T_world_hand, width, hand.between.get(name))
             ):
                 found[name] = ends
-        self._between = found
+        hand.between = found
         return max((high - low for low, high in found.values()), default=0.0)
 
-    def _seal(self, T_world_tcp: Array, cup: SuctionCup, width: float) -> float:
+    def _seal(self, hand: Hand, T_world_tcp: Array, cup: SuctionCup, width: float) -> float:
         """Return the width [m] of a cup that seals on an object, else 0; note why it does not seal."""
-        self._between, self.no_seal = {}, NOTHING
+        hand.between, self.no_seal = {}, NOTHING
+        hand.T = T_world_tcp @ hand.T_tcp_closing
         for name, body in self._bodies.items():
-            if body.state in ("table", "contained"):
+            if body.state in ("table", "contained", "held"):
                 problem = seal_problem(cup, body.solid, invert(T_world_tcp) @ body.T)
                 if not (problem := problem or weight_problem(cup, body.mass)):
-                    self._between, self.no_seal = {name: (-width / 2, width / 2)}, ""
+                    hand.between, self.no_seal = {name: (-width / 2, width / 2)}, ""
                     return width
                 if problem != NOTHING:
                     self.no_seal = f"{name}: {problem}"
@@ -150,11 +163,15 @@ class KinematicWorld(WorldEvents):
 
     def takes_long(self, width: float, gripping: bool) -> bool:
         """Whether the next `tick` may take longer than a control cycle, since it searches for a rest position."""
+        return self.takes_long_for(self._hand, width, gripping)
+
+    def takes_long_for(self, hand: Hand, width: float, gripping: bool) -> bool:
+        """Whether the next tick of one gripper may take longer than a control cycle."""
         if self.is_simple:
             return False
-        if held := self.held:
-            return width > self._bodies[held].width + self._tolerances.release
-        return gripping and bool(self._between)
+        if held := self.held_by(hand.arm):
+            return width > held.width + self._tolerances.release
+        return gripping and bool(hand.between)
 
     @property
     def is_simple(self) -> bool:
@@ -163,20 +180,31 @@ class KinematicWorld(WorldEvents):
 
     def tick(self, now: float, T_world_tcp: Array, width: float, gripping: bool) -> None:
         """Advance to a time: see `common.sim.interface`."""
+        self.tick_of(self._hand, now, T_world_tcp, width, gripping)
+
+    def tick_of(self, hand: Hand, now: float, T_world_tcp: Array, width: float, gripping: bool) -> None:
+        """Advance to a time with one of the grippers."""
         self._convey(now)
-        held = self.held
-        if not held and gripping and self._between:
-            held = min(self._between,
-                       key=lambda n: float(np.linalg.norm(self._bodies[n].T[:3, 3] - T_world_tcp[:3, 3])))
-            self._grasp(self._bodies[held], T_world_tcp @ self._T_tcp_closing, now)
-        if held:
-            body = self._bodies[held]
-            self._carry(body, T_world_tcp @ self._T_tcp_closing)
+        body = self.held_by(hand.arm)
+        T_world_hand = hand.T = T_world_tcp @ hand.T_tcp_closing
+        pressed = set(hand.between) if gripping else set()
+        for other in self._bodies.values():  # it let go of what another one holds
+            if other.second == hand.arm and other.holder != hand.arm and other.name not in pressed:
+                other.second = ""
+        if body is None and pressed:
+            near = min(pressed, key=lambda n: float(np.linalg.norm(self._bodies[n].T[:3, 3] - T_world_tcp[:3, 3])))
+            body = self._bodies[near]
+            if body.state == "held":
+                body.second, body = hand.arm, None
+            else:
+                self._grasp(body, hand, now)
+        if body is not None:
+            self.version += body.carry(T_world_hand)
             if width > body.width + self._tolerances.release:
-                self._release(body, now)
-        for body in self._bodies.values():
-            if body.state == "falling":
-                self._fall(body, now)
+                self._let_go(body, now)
+        for each in self._bodies.values():
+            if each.state == "falling":
+                self._fall(each, now)
 
     def _convey(self, now: float) -> None:
         """Move what lies on belts; at their end it falls off, or comes again at their start."""
@@ -197,29 +225,29 @@ class KinematicWorld(WorldEvents):
                 self._release(body, now)
         self.belts.update_barriers(self._bodies.values())
 
-    def _grasp(self, body: Body, T_world_tcp: Array, now: float) -> None:
-        low, high = self._between[body.name]
-        body.grip = invert(T_world_tcp) @ body.T
+    def _let_go(self, body: Body, now: float) -> None:
+        """Hand a body over to the other gripper that presses on it; drop it if there is none."""
+        taker = self._hands.get(body.second) if body.second != body.holder else None
+        if taker is None or taker.T is None or body.name not in taker.between:
+            self._release(body, now)
+            return
+        taker.take(body)
+        self.version += 1
+
+    def _grasp(self, body: Body, hand: Hand, now: float) -> None:
+        assert hand.T is not None
+        low, high = hand.between[body.name]
+        body.grip = invert(hand.T) @ body.T
         body.grip[1, 3] -= (low + high) / 2  # the fingers center it
-        has_cup = self._gripper is not None and self._gripper.cup is not None
+        has_cup = hand.gripper is not None and hand.gripper.cup is not None
         body.width = 2 * body.solid.radius if body.solid.shape == "sphere" and not has_cup else high - low
         slot, block = body.slot_taken, body.block()
-        body.state, body.container, body.slot = "held", "", None
+        body.state, body.container, body.slot, body.holder = "held", "", None, hand.arm
         body.changed()
-        self._between = {}
+        hand.between = {}
         self._add_event("remove", body)
         self._lower_layers(slot, now)
         self._drop_bodies_above(block, now)
-
-    def _carry(self, body: Body, T_world_tcp: Array) -> None:
-        assert body.grip is not None
-        T = T_world_tcp @ body.grip
-        if body.solid.shape == "sphere":
-            T[:3, :3] = body.T[:3, :3]
-        if not np.array_equal(T, body.T):
-            body.T = T
-            body.changed()
-            self.version += 1
 
     def _release(self, body: Body, now: float) -> None:
         body.rest = self._ground.below(body, self._bodies)
@@ -227,7 +255,7 @@ class KinematicWorld(WorldEvents):
 
     def _drop(self, body: Body, now: float) -> None:
         body.state, body.grip, body.drop_height, body.drop_time = "falling", None, float(body.T[2, 3]), now
-        body.container, body.slot = "", None
+        body.container, body.slot, body.holder, body.second = "", None, "", ""
         body.changed()
         self.version += 1
 
@@ -304,7 +332,8 @@ class KinematicWorld(WorldEvents):
             self._add_event("add", body)
         else:
             del self._bodies[name]
-        self._between.pop(body.name, None)
+        for hand in self._hands.values():
+            hand.between.pop(body.name, None)
         if body.slot_taken != slot or rest is None:
             self._lower_layers(slot, now)
         if block is not None:
@@ -314,8 +343,8 @@ class KinematicWorld(WorldEvents):
 
     def _slip(self, name: str, now: float) -> str:
         """Let the held body slip out of the fingers, which close; return its id. Raises Refused if nothing is held."""
-        held = self.held
-        if not held or name not in ("", held):
+        held = name if name in self._bodies and self._bodies[name].state == "held" else "" if name else self.held
+        if not held:
             raise Refused("not_held", f"{name or 'nothing'} is {'not ' if name else ''}between the fingers")
         self._release(self._bodies[held], now)
         return held
@@ -324,7 +353,8 @@ class KinematicWorld(WorldEvents):
         for body in self._bodies.values():
             if body.state in ("table", "contained"):
                 self._add_event("remove", body)
-        self._bodies, self._between = {}, {}
+        self._bodies = {}
+        self._forget_between()
         self._lay_out()
         return ""
 
@@ -352,6 +382,10 @@ class KinematicWorld(WorldEvents):
     def bodies(self) -> dict[str, Body]:
         """All bodies by id, for a world with other dynamics."""
         return self._bodies
+
+    def held_by(self, arm: str) -> Body | None:
+        """Return the body that the gripper of an arm holds."""
+        return next((body for body in self._bodies.values() if body.state == "held" and body.holder == arm), None)
 
     @property
     def held(self) -> str:

@@ -6,24 +6,14 @@ file, which survives the process however it ends.
 
 from __future__ import annotations
 
-import contextlib
-import errno
 import math
-import os
-import struct
-import threading
-import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Sequence
 from functools import partial
-from pathlib import Path
 from typing import Protocol
 
-import msgpack
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AliasChoices, BaseModel, ConfigDict, Field
 
-from common.atomic_file import Unreadable, open_regular, world_file
 from common.config import Grasp, GripperConfig, World
 from common.errors import ConfigError
 from common.hardware.interface import (
@@ -42,7 +32,6 @@ from common.scene.workspace import WorkspaceBounds, unreachable_reason
 from common.sim.conveyors import Belts
 from common.sim.generators import with_generated
 from common.sim.interface import (
-    KINEMATIC,
     GraspTolerances,
     GripperDrivenWorld,
     ObjectSnapshot,
@@ -50,6 +39,7 @@ from common.sim.interface import (
     load_world,
 )
 from common.sim.layout import layout
+from common.sim.state_file import Saver, SimulationState
 
 CONTACT = 1e-3  # [m] by which fingers may be wider than the object that they press on
 WORLD_PERIOD = 0.05  # [s] cell time between reports of a moving object
@@ -63,28 +53,19 @@ class Kinematics(Protocol):
         """Return T_world_tcp (4, 4) at q (dof,) [rad]."""
 
 
-class Saver(Protocol):
-    """Where the state of the simulated hardware is written."""
-
-    def save(self, state: SimulationState) -> None:
-        """Write a state."""
-
-    def close(self) -> None:
-        """Write what is not written yet."""
-
-
 def create_world(
     world: World, seed: int, robot: RobotModel, grasp: Grasp, bounds: WorkspaceBounds, tolerances: GraspTolerances,
-    gripper: GripperConfig | None,
+    gripper: GripperConfig | None, others: Sequence[tuple[RobotModel, WorkspaceBounds]] = (),
 ) -> SimulatedWorld:
-    """Create the world with all its objects laid out; random positions are within reach of the robot.
+    """Create the world with all its objects laid out; random positions are within reach of the robot, or of `others`.
 
     Raises:
         ConfigError: no layout was found, or the simulator or the generator of objects cannot be used.
     """
     world = with_generated(world, seed)
     seen = cameras_at_home(world, robot)
-    objects = layout(seen, seed, lambda x, y, z: _within_reach(robot, (x, y, z), grasp, bounds))
+    objects = layout(seen, seed, lambda x, y, z: any(
+        _within_reach(each, (x, y, z), grasp, within) for each, within in ((robot, bounds), *others)))
     return load_world(world, objects, tolerances, gripper)
 
 
@@ -92,19 +73,11 @@ def _within_reach(
     robot: RobotModel, position: tuple[float, float, float], grasp: Grasp, bounds: WorkspaceBounds
 ) -> bool:
     """Return whether the arm can grasp at a position [m], and REACH_MARGIN nearer and farther."""
-    x, y, z = position
-    radius = max(math.hypot(x, y), REACH_MARGIN)
+    (x, y, z), (x0, y0, _) = position, robot.config.base_position
+    radius = max(math.hypot(x - x0, y - y0), REACH_MARGIN)
     scales = (1 + off / radius for off in (REACH_MARGIN, -REACH_MARGIN, 0.0))
-    return all(not unreachable_reason(robot, (s * x, s * y, z), grasp, bounds, explained=False) for s in scales)
-
-
-def matching_state(
-    state: SimulationState | None, simulator: str, world: SimulatedWorld, dof: int
-) -> SimulationState | None:
-    """Return a persisted state if it is of this simulator, layout and robot; else None."""
-    fits = state is not None and (
-        state.simulator == simulator and state.layout == world.layout and len(state.q) == dof)
-    return state if fits else None
+    return all(not unreachable_reason(robot, (x0 + s * (x - x0), y0 + s * (y - y0), z), grasp, bounds, explained=False)
+               for s in scales)
 
 
 class SimulatedCell:
@@ -117,8 +90,18 @@ class SimulatedCell:
     def __init__(
         self, world: SimulatedWorld, hardware: Hardware, kinematics: Kinematics | None, *,
         simulator: str = "kinematic", persisted: SimulationState | None = None, saver: Saver | None = None,
+        beside: SimulatedCell | None = None,
     ) -> None:
-        """Surround this hardware; `persisted` is the state before a restart, which `restore` applies.
+        """Surround this hardware.
+
+        Args:
+            world: the objects.
+            hardware: the arm with its gripper.
+            kinematics: of the arm.
+            simulator: name of the simulator.
+            persisted: the state before a restart, which `restore` applies.
+            saver: of the state.
+            beside: that of the first arm, if this is a further one in the same world: it reports the objects.
 
         Raises:
             ConfigError: the gripper cannot be blocked by objects.
@@ -135,10 +118,23 @@ class SimulatedCell:
         self._published_version, self._published_at = -1, -math.inf  # cell time [s]
         self._saved: tuple[object, ...] = ()
         self._saved_objects: tuple[int, dict[str, ObjectSnapshot]] | None = None  # with the version of the world
-        self.suspended = False
+        self._first = beside
+        self._suspended = False
         self.defers_steps = False
         self.deferred: Callable[[], None] | None = None
         self.restored = False
+
+    @property
+    def suspended(self) -> bool:
+        """Whether a long change of the world is in progress, which all arms wait for."""
+        return self._suspended if self._first is None else self._first.suspended
+
+    @suspended.setter
+    def suspended(self, value: bool) -> None:
+        if self._first is None:
+            self._suspended = value
+        else:
+            self._first.suspended = value
 
     def obstruct(self, q: Vector) -> None:
         """Block the fingers of the arm at q (dof,) [rad] at what is between them."""
@@ -176,7 +172,7 @@ class SimulatedCell:
 
     def updates(self, header: Header) -> tuple[list[SceneUpdate], WorldObjects | None]:
         """Return the events since the last call, and all objects if it is time to publish a change."""
-        if self.suspended:
+        if self.suspended or self._first is not None:
             return [], None
         events = [update.model_copy(update={"header": header}) for update in self._world.take_events()]
         now = header.stamp * 1e-9
@@ -202,6 +198,8 @@ class SimulatedCell:
 
     def conveyors(self, header: Header, stopped: int) -> ConveyorState | None:
         """Return the state of all belts if it is to be published; `stopped` is the time of a STOP, or 0 [ns]."""
+        if self._first is not None:
+            return None
         self._belts.apply_stop(stopped)
         return self._belts.changed(header)
 
@@ -250,138 +248,3 @@ class SimulatedCell:
         """Write what is not persisted yet."""
         if self._saver is not None:
             self._saver.close()
-
-
-SLOT = 4 * 1024 * 1024  # [bytes] for each of the two newest states
-CLOSE_SECONDS = 0.3
-_HEAD = struct.Struct("<QII")  # number of the state, its length and checksum
-
-
-class SimulationState(BaseModel):
-    """Joints (dof,) [rad], fingers [m] and objects at one moment; initial positions (x, y, z) [m].
-
-    Details of objects are specific to the `simulator`.
-    """
-
-    model_config = ConfigDict(extra="forbid", populate_by_name=True)
-
-    simulator: str = KINEMATIC
-    layout: dict[str, tuple[float, ...]]
-    q: list[float]
-    width: float | None = None
-    commanded_width: float | None = Field(None, validation_alias=AliasChoices("commanded_width", "told_width"))
-    commanded_effort: float = Field(0.0, validation_alias=AliasChoices("commanded_effort", "told_effort"))  # [N]
-    objects: dict[str, ObjectSnapshot] = {}
-
-
-class StateFile:
-    """Stores the newest state in a file with two alternating slots, of which one is always valid."""
-
-    def __init__(self, path: Path) -> None:
-        """Open the file, or create it.
-
-        Raises:
-            Unreadable: it cannot be opened, or is a symbolic link, which could point to a foreign file.
-        """
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            self._descriptor = open_regular(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW)
-        except OSError as error:
-            raise Unreadable(path, "it is a link" if error.errno == errno.ELOOP else error.strerror or str(error)
-                             ) from None
-        self._number = 0
-        self._packer = msgpack.Packer(default=vars)
-        self._packed: dict[str, tuple[object, bytes]] = {}  # packed maps of the newest state, most of which stay equal
-
-    def load(self) -> SimulationState | None:
-        """Return the newest valid state, or None."""
-        newest: SimulationState | None = None
-        for place in (0, SLOT):
-            head = os.pread(self._descriptor, _HEAD.size, place)
-            if len(head) < _HEAD.size:
-                continue
-            number, length, checksum = _HEAD.unpack(head)
-            body = os.pread(self._descriptor, min(length, SLOT), place + _HEAD.size)
-            if number <= self._number or _checksum(number, body) != checksum:
-                continue
-            try:
-                found = SimulationState.model_validate(msgpack.unpackb(body))
-                if _finite(found.model_dump()):  # else positions would be undefined
-                    newest, self._number = found, number
-            except (ValueError, RecursionError):  # another version, or foreign data
-                continue
-        return newest
-
-    def save(self, state: SimulationState) -> None:
-        """Write a state; it survives this process immediately, but not a crash of the machine."""
-        fields = vars(state)
-        packed = [self._packer.pack(name) + self._pack(name, value) for name, value in fields.items()]
-        body = self._packer.pack_map_header(len(fields)) + b"".join(packed)
-        if _HEAD.size + len(body) > SLOT:  # it would overwrite the previous state
-            return
-        self._number += 1
-        place = SLOT * (self._number % 2)
-        os.pwrite(self._descriptor, _HEAD.pack(self._number, len(body), _checksum(self._number, body)) + body, place)
-
-    def _pack(self, name: str, value: object) -> bytes:
-        before, packed = self._packed.get(name, (None, b""))
-        if value is not before or not isinstance(value, dict):
-            packed = self._packer.pack(value)
-            self._packed[name] = value, packed
-        return packed
-
-    def close(self) -> None:
-        """Close the file."""
-        os.close(self._descriptor)
-
-
-class BackgroundSaver:
-    """Saves the newest state on a thread: a slow disk blocks no caller."""
-
-    def __init__(self, file: StateFile) -> None:
-        """Save to this file."""
-        self._file = file
-        self._newest: SimulationState | None = None
-        self._ends = False
-        self._changed = threading.Condition()
-        self._thread = threading.Thread(target=self._work, name="state-file", daemon=True)
-        self._thread.start()
-
-    def save(self, state: SimulationState) -> None:
-        """Save a state next; replaces one that is not written yet."""
-        with self._changed:
-            self._newest = state
-            self._changed.notify()
-
-    def close(self, seconds: float = CLOSE_SECONDS) -> None:
-        """Close the file once everything is written; wait at most this long [s]."""
-        with self._changed:
-            self._ends = True
-            self._changed.notify()
-        self._thread.join(seconds)
-
-    def _work(self) -> None:
-        while True:
-            with self._changed:
-                self._changed.wait_for(lambda: self._newest is not None or self._ends)
-                state, self._newest = self._newest, None
-            if state is None:
-                return self._file.close()
-            with contextlib.suppress(OSError):  # a full disk must not stop the arm; the previous state stays
-                self._file.save(state)
-
-
-def _finite(value: object) -> bool:
-    parts = value.values() if isinstance(value, dict) else value if isinstance(value, list | tuple) else None
-    return all(map(_finite, parts)) if parts is not None else not isinstance(value, float) or math.isfinite(value)
-
-
-def _checksum(number: int, body: bytes) -> int:
-    """Checksum including the number: a state written over an older one must not become the newest by accident."""
-    return zlib.crc32(body, zlib.crc32(number.to_bytes(8, "little")))
-
-
-def state_file(cell: str, environ: Mapping[str, str] = os.environ) -> StateFile | None:
-    """Return the state file of a cell, or None if no folder is configured."""
-    path = world_file(cell, environ)
-    return StateFile(path) if path else None

@@ -130,7 +130,7 @@ class Supervisor:
         ]
         self._router = None
         if not launch.connect:
-            small = remapped_small_keys(entry.topics for entry in cell.services.values())
+            small = remapped_small_keys(cell.tables)
             self._router = SupervisedProcess(make_child(ROUTER, launch.router_command(small), environment, on_line))
         self._all = [self._router, *self._services] if self._router else list(self._services)
         self._by_name = {watched.child.name: watched for watched in self._all}

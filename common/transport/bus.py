@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import copy
 import logging
 from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from dataclasses import replace
-from typing import Any, TypeVar
+from typing import Any, Self, TypeVar
 
 from common import topics
+from common.arms import arm_table
 from common.clock import Clock
 from common.errors import ConfigError
 from common.messages import Header, Message, ServiceCounters
@@ -218,6 +220,14 @@ class Bus(RawAccess):
         return self.client_class(
             self._session, self.cell, self.service, called, servers, loop=self._loop, limit=self._limit
         )
+
+    def of_arm(self, arm: str) -> Self:
+        """Return this bus for declarations with the keys of an arm, which are below its name; itself for no name."""
+        if not arm:
+            return self
+        view = copy.copy(self)  # shares what is declared, so that its own bus counts, repeats and closes it
+        view._remapping = Remapping(self._remapping.table | arm_table(arm))
+        return view
 
     def full_key(self, topic: Topic[Any] | Request[Any, Any]) -> str:
         """Return the key of a topic or request on the wire."""

@@ -17,7 +17,7 @@ from common.robot.transforms import tool_down
 from common.scene.workspace import unreachable_reason
 from common.sim.interface import ObjectSnapshot
 from common.sim.kinematic import KinematicWorld
-from common.sim.simulated_cell import SimulationState, StateFile, state_file
+from common.sim.state_file import SimulationState, StateFile, state_file
 from common.transport.bus import Bus
 from common.transport.local import LocalNetwork
 from tests.services.executor_rig import (

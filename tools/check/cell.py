@@ -13,12 +13,13 @@ import sys
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from difflib import get_close_matches
+from itertools import chain
 from typing import TYPE_CHECKING, NamedTuple
 
 from common.application import find_application
 from common.config import Cell, GripperConfig, RobotConfig, Surroundings, located
 from common.errors import ConfigError, ZencellError
-from common.hardware.interface import has_simulated_world
+from common.hardware.interface import has_simulated_world, real_arm
 from common.messages import TaskStatus
 from common.robot.finger_joints import driven_position
 from common.robot.urdf import merged_urdf
@@ -44,9 +45,14 @@ def blocking_errors(cell: Cell) -> list[Finding]:
     from tools.check.cell import check_robot_file
 
     try:
-        return [found for found in (*check_arms(cell), *check_robot_file(cell.robot)) if found.refused]
+        found = (*check_arms(cell), *chain(*map(check_robot_file, _robots(cell))))
+        return [each for each in found if each.refused]
     except ConfigError:  # a service reports it
         return []
+
+
+def _robots(cell: Cell) -> list[RobotConfig]:
+    return list(cell.robots.values()) or [cell.robot]
 
 
 def require_safe(cell: Cell) -> None:
@@ -56,7 +62,7 @@ def require_safe(cell: Cell) -> None:
         ConfigError: they would not, with the finding of `zencell check`; or the simulator is not usable.
         UnknownName: the simulator does not exist.
     """
-    if has_simulated_world(cell.robot):
+    if any(map(has_simulated_world, _robots(cell))):
         require_simulator(cell.world.simulator)
         require_generator(cell.world)
     for found in blocking_errors(cell):
@@ -120,7 +126,7 @@ def check_files(cell: Cell) -> list[Finding]:
     from tools.check.cell import check_robot_file
     from tools.check.world import check_world
 
-    of_robot = [*check_arms(cell), *_collect(lambda: check_robot_file(cell.robot))]
+    of_robot = [*check_arms(cell), *_collect(lambda: chain(*map(check_robot_file, _robots(cell))))]
     try:
         seen = seen_from_home(cell)
     except ConfigError as problem:
@@ -146,7 +152,21 @@ def seen_from_home(cell: Cell, robot: RobotModel | None = None) -> Cell:
 
 
 def check_model(cell: Cell) -> Iterator[Finding]:
-    """Yield findings that need the robot model."""
+    """Yield findings that need the robot model; with several arms what one of them reaches is within reach."""
+    each = [cell.of_arm(arm) for arm in cell.robots] or [cell]
+    found = [list(_check_model(one)) for one in each]
+    about = [{_subject(finding) for finding in findings} for findings in found]
+    for number, findings in enumerate(found):
+        for finding in findings:
+            if finding.refused or all(_subject(finding) in others for others in about[number + 1:] + about[:number]):
+                yield finding
+
+
+def _subject(finding: Finding) -> str:
+    return " ".join(finding.what.split()[:2])
+
+
+def _check_model(cell: Cell) -> Iterator[Finding]:
     from tools.check.arm import Arm
 
     try:
@@ -214,11 +234,28 @@ SLACK = 1e-3  # [m] or [rad] by which a finger position may exceed its limit: bo
 
 
 def check_arms(cell: Cell) -> Iterator[Finding]:
-    """Yield a second executor: the files describe one arm, and each executor would drive it."""
-    executors = [entry.name for entry in cell.services.values() if entry.kind == EXECUTOR]
-    if len(executors) > 1:
-        yield error(f"services.{executors[1]}: is a second {EXECUTOR} besides {executors[0]}, but a cell has one arm",
-                    "take a cell for each arm, in domains of their own", refused=True)
+    """Yield an arm with two executors, or with none, and two arms that are one device."""
+    executors = [entry for entry in cell.services.values() if entry.kind == EXECUTOR]
+    if not cell.robots and len(executors) > 1:
+        yield error(f"services.{executors[1].name}: is a second {EXECUTOR} besides {executors[0].name}, but a cell "
+                    "with `robot` has one arm", "name the arms below `robots`: docs/two_arms.md", refused=True)
+    driven: dict[str, str] = {}
+    for entry in executors if cell.robots else ():
+        for arm in [entry.arm] if entry.arm else [a for a, robot in cell.robots.items() if has_simulated_world(robot)]:
+            if arm in driven:
+                yield error(f"services.{entry.name}: drives {arm}, as {driven[arm]} does", "leave one of them out",
+                            refused=True)
+            driven[arm] = entry.name
+    devices: dict[str, str] = {}
+    for arm, robot in cell.robots.items():
+        if executors and arm not in driven:
+            yield error(f"robots.{arm}: no {EXECUTOR} drives it", f"add {arm}_executor: {{service: {EXECUTOR}, arm: "
+                        f"{arm}}}", refused=True)
+        if device := real_arm(robot):
+            if device in devices:
+                yield error(f"robots.{arm}.hardware: is {device}, which {devices[device]} is already",
+                            "give each arm the address of its own controller", refused=True)
+            devices[device] = arm
 
 
 def check_robot_file(config: RobotConfig) -> Iterator[Finding]:

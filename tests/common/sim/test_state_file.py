@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from common.atomic_file import STATE_VARIABLE, Unreadable
 from common.messages import Header
 from common.sim.interface import ObjectSnapshot
-from common.sim.simulated_cell import SLOT, SimulationState, StateFile, state_file
+from common.sim.state_file import SLOT, SimulationState, StateFile, state_file
 from tests.common.sim.rig import BOX, Rig
 
 

@@ -1,0 +1,50 @@
+"""A cell with two arms in one simulated world: both clear their side at the same time."""
+
+from pathlib import Path
+
+import pytest
+
+from common import messages as m
+from common import topics
+from common.arms import arms_topic
+from common.config import load_cell
+from lab.simulation import Simulation
+
+CELL = str(Path(__file__).parents[1] / "data" / "two_arms.yaml")
+
+
+@pytest.mark.slow
+def test_both_arms_clear_their_side_of_the_table_into_their_own_box() -> None:
+    contained: dict[str, str] = {}
+
+    async def visit(bus) -> None:
+        objects = bus.reader(topics.SCENE_OBJECTS)
+        while len(contained) < 2:
+            truth = await objects.next()
+            contained.update({each.id: each.container for each in truth.objects if each.state == "contained"})
+
+    outcome = Simulation(load_cell(CELL), 1, visit=visit, limit=60.0).run()
+    assert (outcome.state, outcome.done, outcome.total) == ("DONE", 2, 2), outcome
+    assert contained == {"ball_1": "box_left", "ball_2": "box_right"}
+    assert outcome.crashes == [] and outcome.restarts == {}
+
+
+@pytest.mark.slow
+def test_one_arm_is_held_alone_while_the_other_moves() -> None:
+    states: dict[str, m.MotionStatus] = {}
+
+    async def visit(bus) -> None:
+        readers = {arm: bus.reader(arms_topic(topics.MOTION_STATUS, arm)) for arm in ("left", "right")}
+        hold = bus.client(arms_topic(topics.MOTION_HOLD, "left"))
+        while not all(reader.latest and reader.latest.state == "active" for reader in readers.values()):
+            await readers["right"].next()
+        await hold.call(m.HoldRequest(hold=True, owner="ann"))
+        goal = readers["right"].latest.id
+        while readers["right"].latest.id == goal:
+            await readers["right"].next()
+        states.update({arm: reader.latest for arm, reader in readers.items()})
+        await hold.call(m.HoldRequest(hold=False, owner="ann"))
+
+    outcome = Simulation(load_cell(CELL), 1, visit=visit, limit=60.0).run()
+    assert states["left"].held and not states["right"].held
+    assert (outcome.state, outcome.done) == ("DONE", 2), outcome
