@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field, model_validator
 
-from common.config.basics import Coordinate, Length, Number, Point, Section
+from common.config.basics import Coordinate, Length, Number, Parameters, Point
 from common.messages import Pose
 from common.robot.transforms import matrix_to_pose, rpy_to_matrix, transform
 
@@ -28,7 +28,7 @@ MARGIN = 0.1  # share of an item's side beyond its center at which it must be su
 _AXES = "xy"
 
 
-class Pattern(Section):
+class Pattern(Parameters, frozen=True):
     """Equal items on a pallet. An item is `item` long (x), wide (y) and high [m]; sizes are before it is turned."""
 
     item: tuple[Length, Length, Length] = Field(description="length, width and height of an item [m]")
