@@ -14,7 +14,7 @@ from common import messages as m
 from common.config import Tunable
 from common.config.basics import Coordinate
 from common.tasks.handling import Handling, HandlingConfig
-from common.tasks.palletizing import Pattern, free_slots, slot_at
+from common.tasks.palletizing import Pattern, filled, free_slots, slot_at
 from common.tasks.signals import Output, WaitFor
 from common.tasks.stages import Cycle, Grip, Move, Stage, View, place_of
 
@@ -75,7 +75,7 @@ class Tending(Handling):
                 if isinstance(stage, Move):  # the arm stays out while the machine works or the clamp is closed
                     stage.requires = {"busy": False, "clamp_closed": False}
         elif stored:
-            self.finish(view, parts=len(stored))
+            self.finish(view)
         else:
             self.lack("no part is seen", view)
 
@@ -132,8 +132,8 @@ class Tending(Handling):
         return m.Pose(position=m.Vector3(x=x, y=y, z=self.p.world.table_height + thing.dimensions[2] / 2))
 
     def note(self, view: View) -> None:
-        """Count the parts on the pallet."""
+        """Count the parts on the pallet, also those below others."""
         if self.shown(view):
-            parts = view.objects("target")
-            self.status.total = len(parts)
-            self.status.done = sum(slot_at(self.p.pallet, place_of(part.pose)) is not None for part in parts)
+            places = [place_of(part.pose) for part in view.objects("target")]
+            self.status.done = len(filled(self.p.pallet, places))
+            self.status.total = self.status.done + sum(slot_at(self.p.pallet, place) is None for place in places)

@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import Literal
 
 from common.application import ApplicationTopics
-from common.tasks.handling import HandlingStatus
+from common.messages.execution import TaskStatus
 from common.topics import Topic
 
 
-class TendingStatus(HandlingStatus):
+class TendingStatus(TaskStatus):
     """State and counters; `done` counts the parts seen on the pallet, `subject` is the id of the current one."""
 
     state: Literal["IDLE", "GRASPING", "PLACING", "HOMING", "MACHINING", "DONE", "ERROR"] = "IDLE"

@@ -1,0 +1,99 @@
+"""Parts drawn by a seed, decisions about lost parts, and the check by ground truth."""
+
+from __future__ import annotations
+
+import math
+from itertools import combinations
+
+import pytest
+
+from applications.tending.parts import Options, find_misplaced, generate
+from applications.tending.task import PALLET, Config, Part, Tending
+from applications.tending.topics import TendingStatus
+from common import messages as m
+from common.config import Surroundings, World, load_cell
+from common.errors import ConfigError
+from common.tasks.palletizing import slots
+from common.tasks.stages import View
+
+CELL = load_cell("tending")
+HOME = list(CELL.robot.named_poses["home"])
+
+
+def test_parts_depend_on_the_seed_and_leave_room_for_fingers() -> None:
+    found = {seed: generate(World(count=0), Options(count=6), seed) for seed in (1, 2)}
+    assert found[1] == generate(World(count=0), Options(count=6), 1) != found[2]
+    for one, other in combinations(found[1], 2):
+        assert math.dist((one.x, one.y), (other.x, other.y)) >= 0.085  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match=r"world\.generator\.count: 8 parts do not fit 0\.2 m apart"):
+        generate(World(count=0), Options(count=8, separation=0.2), 1)
+
+
+def part(name: str, x: float, y: float, z: float = 0.015) -> m.CollisionObject:
+    pose = m.Pose(position=m.Vector3(x=x, y=y, z=z))
+    return m.CollisionObject(id=name, role="target", shape="box", dimensions=list(PALLET.item), pose=pose, kind="part")
+
+
+def decided(state: str, *parts: m.CollisionObject) -> Tending:
+    """Return the task after one decision at home with an empty gripper."""
+    sections = {"robot": CELL.robot, "run": CELL.run, "grasp": CELL.grasp, "world": CELL.section(Surroundings),
+                "io": CELL.io}
+    task = Tending(Config.model_validate(sections), TendingStatus(), "t")
+    task.remember(Part.model_validate({"state": state}))
+    scene = m.PlanningScene(header=m.Header(stamp=int(10e9)), objects=list(parts))
+    tcp = m.Pose(position=m.Vector3(x=0.3, z=0.5), orientation=m.Quaternion(x=1.0, w=0.0))
+    task.decide(View(10.0, scene, m.GripperState(width=0.08), m.MotionStatus(), HOME, tcp))
+    return task
+
+
+RAW, CLAMPED = part("raw", 0.45, -0.25), part("clamped", 0.6, 0.0)
+STORED = [part(f"stored_{n}", slot.pose.position.x, slot.pose.position.y, slot.pose.position.z)
+          for n, slot in enumerate(slots(PALLET))]
+
+
+@pytest.mark.parametrize(("state", "parts", "stages", "subject"), [
+    ("raw", [RAW, *STORED[:1]], ["open", "pre-grasp"], "raw"),
+    ("raw", [RAW, CLAMPED], ["set clamp", "clamp"], "clamped"),
+    ("machining", [RAW, CLAMPED], ["set start", "machine works"], "clamped"),
+    ("machined", [RAW, CLAMPED], ["open", "pre-grasp"], "clamped"),
+])
+def test_next_stages_follow_from_what_is_seen_and_how_far_the_part_is(
+    state: str, parts: list[m.CollisionObject], stages: list[str], subject: str
+) -> None:
+    task = decided(state, *parts)
+    assert [stage.name for stage in task.queue][:2] == stages
+    cycle = task.queue[0].cycle
+    assert cycle is not None and cycle.subject == subject
+
+
+def test_motions_into_and_out_of_the_fixture_require_an_idle_machine_and_an_open_clamp() -> None:
+    for state, parts in (("raw", [RAW]), ("machined", [CLAMPED])):
+        moves = [stage for stage in decided(state, *parts).queue if hasattr(stage, "requires")]
+        assert moves and all(move.requires == {"busy": False, "clamp_closed": False} for move in moves)
+
+
+@pytest.mark.parametrize("state", ["machining", "machined"])
+def test_part_that_left_the_fixture_is_asked_for_instead_of_taking_a_raw_one_for_it(state: str) -> None:
+    task = decided(state, RAW, *STORED[:1])
+    assert task.status.state == "ERROR" and task.status.message == (
+        f"the part that was {state} is not in the fixture any more: put it onto the pallet or away, then start "
+        "the task")
+    task.on_restart()
+    assert task.memory.state == "raw"
+
+
+def test_full_pallet_is_reported() -> None:
+    task = decided("raw", RAW, *STORED)
+    assert not task.queue and task.status.message == "the pallet is full"
+
+
+@pytest.mark.parametrize(("places", "message"), [
+    ([slot.pose for slot in slots(PALLET)], ""),
+    ([slots(PALLET)[0].pose, slots(PALLET)[0].pose], "not in a slot of the pallet: p0, p1"),
+    ([slots(PALLET)[0].pose, RAW.pose], "not in a slot of the pallet: p1"),
+])
+def test_truth_check_names_what_is_not_in_a_slot_of_its_own(places: list[m.Pose], message: str) -> None:
+    size = m.Vector3(x=0.05, y=0.04, z=0.03)
+    truth = m.WorldObjects(objects=[
+        m.WorldObject(id=f"p{n}", shape="box", pose=pose, size=size) for n, pose in enumerate(places)])
+    assert find_misplaced(truth) == message
