@@ -237,6 +237,10 @@ class Permissions:
         """Set the permission that an element of the page requires; by default it is "operate"."""
         self._required[element] = (permission, label)
 
+    def forget(self, element: str) -> None:
+        """Forget an element that was removed from the page."""
+        self._required.pop(element, None)
+
     # --- sessions ---
 
     def issue_key(self, session: PageSession) -> str:

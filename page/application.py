@@ -11,6 +11,21 @@ from common.messages import MotionStatus, TaskStatus
 from common.topics import Request
 
 
+@dataclass(frozen=True)
+class ApplicationTab:
+    """A tab of an application, the first one of the page.
+
+    Attributes:
+        label: of the tab.
+        panel: class of its content, created with `(gui, console, readout)` once the robot is loaded; `readout` is a
+            `page.manual_control.ArmReadout`. Its method `show(arm_blocked, now)` updates it while a browser is
+            connected: why no operator can move the arm now, or an empty text; wall time [s], monotonic.
+    """
+
+    label: str
+    panel: Callable[..., Any]
+
+
 @dataclass(frozen=True, kw_only=True)
 class ApplicationPage:
     """Layers, controls and labels of an application; see `Application.page`."""
@@ -19,8 +34,10 @@ class ApplicationPage:
     """Layers of the 3D scene, classes derived from `page.layers.Layer`."""
     controls: Callable[..., Any] | None = None
     """Class of the controls below the task's buttons, created with `(gui, console)`; has TOPICS, PERIOD and `show`."""
+    tab: ApplicationTab | None = None
+    """A tab of its own."""
     requests: Sequence[Request[Any, Any]] = ()
-    """Requests that controls and layers send by `Console.call`."""
+    """Requests that controls, tab and layers send by `Console.call`."""
     states: Mapping[str, str] = field(default_factory=dict)
     """Labels of its task states, in addition to IDLE, HOMING, DONE and ERROR."""
     latency: str = "Image to decision"

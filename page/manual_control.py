@@ -65,11 +65,17 @@ class ArmReadout:
         state = self._latest(topics.JOINT_STATES)
         return self._robot.order(state.name, state.position) if state is not None else None
 
+    def tool(self, q: Array) -> tuple[list[float], list[float]]:
+        """Return position [m] and roll, pitch, yaw [rad] of the tool center point in world; q (dof,)."""
+        T_world_tcp = self._robot.fk(q)
+        position, rpy = T_world_tcp[:3, 3], matrix_to_rpy(T_world_tcp[:3, :3])
+        return [float(each) for each in position], [float(each) for each in rpy]
+
     def convert(self, q: Array) -> tuple[Numbers, Numbers, list[float]]:
         """Return tool position [mm] and roll, pitch, yaw [degrees] in world, and joint values, rounded; q (dof,)."""
-        T_world_tcp = self._robot.fk(q)
-        x, y, z = (round(1e3 * float(value), 1) for value in T_world_tcp[:3, 3])
-        roll, pitch, yaw = (round(math.degrees(value), 1) for value in matrix_to_rpy(T_world_tcp[:3, :3]))
+        position, rpy = self.tool(q)
+        x, y, z = (round(1e3 * value, 1) for value in position)
+        roll, pitch, yaw = (round(math.degrees(value), 1) for value in rpy)
         return (x, y, z), (roll, pitch, yaw), [round(float(value), 2) for value in q * self.scales]
 
     def live(self) -> dict[str, str]:

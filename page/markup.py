@@ -156,14 +156,18 @@ def row(*cells: str, **data: object) -> str:
 class Html:
     """An HTML element that is sent to browsers only when its content changes."""
 
-    def __init__(self, gui: viser.GuiApi, content: str = "") -> None:
-        """Add the element at the current position of the GUI."""
-        self._handle = gui.add_html(content)
+    def __init__(self, gui: viser.GuiApi, content: str = "", order: float | None = None) -> None:
+        """Add the element at the current position of the GUI, or where viser's `order` puts it."""
+        self._handle = gui.add_html(content, order=order)
 
     @property
     def content(self) -> str:
         """Current content."""
         return self._handle.content
+
+    def remove(self) -> None:
+        """Remove the element."""
+        self._handle.remove()
 
     def set(self, content: str) -> None:
         """Replace the content."""

@@ -110,7 +110,9 @@ class Page:
         create = page_of(application).controls
         self._controls = create(server.gui, console) if create is not None else None
         self._controls_updater = Updater(self._controls, feeds.latest) if self._controls is not None else None
-        self._panels.add_tabs()
+        self._tab = page_of(application).tab
+        self._own_tab = self._panels.add_tabs(self._tab.label if self._tab is not None else "")
+        self._own: Any = None  # content of that tab
         self._subscriptions = Subscriptions(feeds, self._topics, layers, self._panels, self._recorder)
         self._fill_tabs(members, robot, layout_file)
         self._connect()
@@ -184,6 +186,9 @@ class Page:
             if self._belt_names:
                 with gui.add_folder("Conveyors"):
                     self._belts = BeltPanel(gui, self.console, self._belt_names)
+        if self._tab is not None and self._own_tab is not None:
+            with self._own_tab:
+                self._own = self._tab.panel(gui, self.console, self._move.readout)
         for name, on in self._shown.items():
             scene.set_shown(name, on)
         if self._editing:
@@ -249,9 +254,12 @@ class Page:
                                len(self._subscriptions.rejected.positions))
         if self._move is not None:
             self._move.show(self._status, now)
+        blocked = arm_blocked(self._status, latest(topics.MOTION_STATUS))
         for panel in (self._io, self._belts):
             if panel is not None:
-                panel.show(arm_blocked(self._status, latest(topics.MOTION_STATUS)))
+                panel.show(blocked)
+        if self._own is not None:
+            self._own.show(blocked, now)
         self._panels.controller.show(latest(topics.ROBOT_STATUS))
         self._panels.alarm_panel.show()
         self._panels.log.show()

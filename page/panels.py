@@ -47,14 +47,16 @@ class Panels:
         self.alarms = Alarms()
         self.tabs: dict[Tab, viser.GuiTabHandle | viser.GuiFolderHandle] = {}
 
-    def add_tabs(self) -> None:
-        """Add the tabs below the main panel."""
+    def add_tabs(self, first: str = "") -> viser.GuiTabHandle | None:
+        """Add the tabs below the main panel; return the one that an application labels `first`, if it has one."""
         panel = self._gui.add_panel()
+        own = panel.add_tab(first) if first else None
         tabs = {name: panel.add_tab(name) for name in self._layout.tabs}
         panel.dock_below(self._gui.main_panel)
         panel.expand()  # also on a phone: jogging and gripper are below the buttons of the task
         hidden = self._gui.add_folder(None, visible=False)
         self.tabs = {tab: tabs.get(tab, hidden) for tab in TABS}
+        return own
 
     def add_diagnostics(self, services: Iterable[str]) -> None:
         """Fill the tabs Health, Log and Tuning."""

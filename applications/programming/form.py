@@ -1,0 +1,308 @@
+"""The fields of a step as an operator enters them: millimeters, degrees and percent, and a choice of alternatives."""
+
+from __future__ import annotations
+
+import copy
+import itertools
+import math
+import re
+import types
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
+
+import yaml
+from pydantic import BaseModel
+
+from applications.programming.editing import Data, EditRefused, bodies
+from applications.programming.model import STEPS, Condition, Target
+from common.config import parse_yaml
+from common.errors import ConfigError
+
+DEGREE = 180 / math.pi
+MM, DEGREES, PERCENT = (1e3, "mm"), (DEGREE, "°"), (100.0, "%")
+UNITS = {  # of fields: displayed per stored value, and the unit that is displayed
+    **dict.fromkeys(("distance", "width", "blend", "expected_width", "width_tolerance", "position", "by", "pitch"), MM),
+    **dict.fromkeys(("rpy", "turn"), DEGREES), "speed": PERCENT,
+    "seconds": (1.0, "s"), "timeout": (1.0, "s"), "force": (1.0, "N"), "mass": (1.0, "kg"),
+}
+LABELS = {"rpy": "Roll, pitch, yaw", "by": "Displacement", "name": "Pose"}
+COMMON = ("id", "note", "on_failure", "speed", "touch", "requires")  # rarely changed, listed last
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)e[+-]?\d{1,3}", re.IGNORECASE)  # which is a text in YAML
+ZERO = [0.0, 0.0, 0.0]
+Path = tuple[str | int, ...]
+
+
+@dataclass(frozen=True)
+class Known:
+    """What a form offers.
+
+    Attributes:
+        poses, signals, programs: names.
+        outputs: names of signals that can be set.
+        joints: present joint positions [rad, m]; None: unknown.
+        position, rpy: present pose of the tool center point in world [m], [rad].
+        scales: displayed values per joint position.
+    """
+
+    poses: Sequence[str] = ()
+    signals: Sequence[str] = ()
+    outputs: Sequence[str] = ()
+    programs: Sequence[str] = ()
+    joints: Sequence[float] | None = None
+    position: Sequence[float] = (0.0, 0.0, 0.0)
+    rpy: Sequence[float] = (math.pi, 0.0, 0.0)
+    scales: Sequence[float] = ()
+
+    def here(self, *, tool: bool = False) -> Data:
+        """Return the present pose as a target: joint positions, or the pose of the tool in world.
+
+        Raises:
+            EditRefused: it is unknown.
+        """
+        if self.joints is None:
+            raise EditRefused("the joint positions are unknown: no reading received yet")
+        given = {"position": self.position, "rpy": self.rpy} if tool else {"joints": self.joints}
+        return {name: [round(float(each), 5) for each in values] for name, values in given.items()}
+
+
+@dataclass(frozen=True)
+class FormField:
+    """A field of the form.
+
+    Attributes:
+        path: of the value in the data of the step; the complete step for ().
+        label: with the unit.
+        kind: of the element: check, choice, vector or text.
+        shown: displayed value.
+        hint: meaning.
+        options: of a choice.
+        parse: returns the stored value of a displayed one; None: the default. Raises ConfigError.
+    """
+
+    path: Path
+    label: str
+    kind: Literal["check", "choice", "vector", "text"]
+    shown: Any
+    hint: str
+    parse: Callable[[Any], Any]
+    options: list[str] = field(default_factory=list)
+
+    @property
+    def common(self) -> bool:
+        """Whether steps of every kind have it."""
+        return bool(self.path) and self.path[0] in COMMON
+
+    def values(self, step: Mapping[str, Any], shown: Any) -> Data:
+        """Return the fields of the step to set for a displayed value.
+
+        Raises:
+            ConfigError: the value cannot be read.
+        """
+        stored = self.parse(shown)
+        if not self.path:
+            return dict(stored)
+        first, *rest = self.path
+        if not rest:
+            return {str(first): stored}
+        top = [copy.deepcopy(step.get(str(first)))]  # in a list, so that it can be replaced as well
+        inner: Any = top
+        for part, following in itertools.pairwise((0, *rest)):
+            if isinstance(inner[part], str) and isinstance(following, str):  # a target that is given by its name
+                inner[part] = {"name": inner[part]}
+            inner = inner[part]
+        if stored is None and isinstance(inner, dict):
+            inner.pop(rest[-1], None)
+        else:
+            inner[rest[-1]] = stored
+        return {str(first): top[0]}
+
+
+def fields_of(step: Data, known: Known, point: int = 0) -> list[FormField]:
+    """Return the form of a step; of the points of a `through`, that with the number `point` is shown."""
+    kind = STEPS[step["step"]]
+    found = _alternatives(step, known, (), _STEP_ALTERNATIVES.get(step["step"], {}))
+    hidden = _hidden(step, _STEP_ALTERNATIVES.get(step["step"], {}))
+    for name, info in sorted(kind.model_fields.items(), key=lambda each: each[0] in COMMON):
+        alias = info.alias or name
+        if alias in ("step", *bodies(step), *hidden):
+            continue
+        inner = _part_in(info.annotation)
+        if inner is None:
+            found.append(_field(kind, name, (alias,), step.get(alias), known))
+        elif alias == "points":
+            number = min(point, len(step["points"]) - 1)
+            found += _part_fields(inner, (alias, number), step["points"][number], known)
+        elif step.get(alias) is not None:
+            found += _part_fields(inner, (alias,), step[alias], known)
+    return found
+
+
+def new_step(kind: str, known: Known) -> Data:
+    """Return the data of a new step.
+
+    Raises:
+        EditRefused: the cell has nothing that such a step needs.
+        UnknownName: there is no such kind.
+    """
+    here = known.here
+    made: dict[str, Callable[[], Data]] = {
+        "move": lambda: {"to": here()}, "through": lambda: {"points": [here()]}, "approach": lambda: {"to": here()},
+        "grip": lambda: {"width": "open"}, "wait": lambda: {"seconds": 1.0}, "loop": lambda: {"count": 2, "steps": []},
+        "output": lambda: {"signal": _first(known.outputs, "outputs")}, "place": lambda: {"at": here(tool=True)},
+        "if": lambda: {"when": {"signal": known.signals[0]} if known.signals else {"holding": True}, "then": []},
+        "call": lambda: {"program": _first(known.programs, "other programs")},
+        "palletize": lambda: {"at": here(tool=True), "columns": 2, "pitch": [0.05, 0.05, 0.05], "steps": []},
+        "python": lambda: {"function": "module:function"},
+    }
+    return {"step": kind, **made.get(kind, dict)()}
+
+
+def _first(names: Sequence[str], what: str) -> str:
+    if not names:
+        raise EditRefused(f"this cell has no {what}")
+    return names[0]
+
+
+# --- alternatives: of each exactly one is given ---
+
+# The fields of each alternative, and the values of the first ones when it is chosen.
+Alternatives = Mapping[str, tuple[tuple[str, ...], Callable[[Known], Data]]]
+_STEP_ALTERNATIVES: dict[str, Alternatives] = {
+    "wait": {"a time": (("seconds",), lambda _: {"seconds": 1.0}),
+             "a signal": (("for", "timeout"), lambda known: {"for": {"signal": _first(known.signals, "signals")}})},
+    "loop": {"a number of times": (("count",), lambda _: {"count": 2}),
+             "while a condition holds": (("while",), lambda _: {"while": {"holding": True}}),
+             "without end": ((), lambda _: {})},
+}
+_TARGET: Alternatives = {
+    "named pose": (("name",), lambda known: {"name": _first(known.poses, "named poses")}),
+    "joint positions": (("joints",), lambda known: known.here()),
+    "tool pose": (("position", "rpy"), lambda known: known.here(tool=True)),
+    "displacement": (("by", "turn", "frame"), lambda _: {"by": [0.0, 0.0, 0.05]}),
+}
+_CONDITION: Alternatives = {
+    "signal": (("signal", "value", "above", "below"), lambda known: {"signal": _first(known.signals, "signals")}),
+    "gripper holds": (("holding",), lambda _: {"holding": True}),
+    "outcome of the step before": (("outcome",), lambda _: {"outcome": "succeeded"}),
+}
+
+
+def _current(data: Mapping[str, Any], some: Alternatives) -> str:
+    return next((name for name, (fields, _) in some.items() if fields and fields[0] in data), list(some)[-1])
+
+
+def _hidden(data: Mapping[str, Any], some: Alternatives) -> list[str]:
+    if not some:
+        return []
+    shown = some[_current(data, some)][0]
+    return [name for fields, _ in some.values() for name in fields if name not in shown]
+
+
+def _alternatives(data: Mapping[str, Any], known: Known, path: Path, some: Alternatives) -> list[FormField]:
+    if not some:
+        return []
+
+    def parse(chosen: str) -> Data:
+        new = some[chosen][1](known) if chosen in some else {}
+        return {name: new.get(name) for fields, _ in some.values() for name in fields} if not path else new
+
+    name = "Repeat" if "steps" in data else "Wait for"
+    if path:
+        name = f"Point {int(path[1]) + 1}" if path[0] == "points" else str(path[0]).capitalize()
+    return [FormField(path, name, "choice", _current(data, some), "which of these is given", parse, list(some))]
+
+
+def _part_fields(kind: type[BaseModel], path: Path, data: Any, known: Known) -> list[FormField]:
+    """Return the fields of a target or a condition."""
+    data = {"name": data} if isinstance(data, str) else data
+    some = _TARGET if kind is Target else _CONDITION
+    found = _alternatives(data, known, path, some)
+    for name in some[_current(data, some)][0]:
+        found.append(_field(kind, name, (*path, name), data.get(name), known))
+    return found
+
+
+# --- single values ---
+
+
+def _field(kind: type[BaseModel], name: str, path: Path, value: Any, known: Known) -> FormField:
+    info = kind.model_fields[name]
+    default = None if info.is_required() else info.get_default(call_default_factory=True)
+    scale, unit = UNITS.get(name, (1.0, ""))
+    label = " ".join([LABELS.get(name, name.replace("_", " ").capitalize()), *([f"[{unit}]"] if unit else [])])
+    hint = re.sub(r" *\[[^]]*\]", "", info.description or "").lstrip("; ")  # the unit of the file
+    choices = {"name": known.poses, "signal": known.outputs if path == ("signal",) else known.signals,
+               "program": known.programs}.get(name)
+    literals = [each for each in get_args(info.annotation) if isinstance(each, str)] if (
+        get_origin(info.annotation) is Literal) else None
+    given = default if value is None else value
+    if literals or (choices and given in choices):
+        return FormField(path, label, "choice", given, hint, str, list(literals or choices or ()))
+    if info.annotation is bool:
+        return FormField(path, label, "check", bool(given), hint, bool)
+    if name in ("position", "rpy", "by", "turn", "pitch"):
+        vector = tuple(round(scale * each, 3) for each in (given or ZERO))
+        return FormField(path, label, "vector", vector, hint, lambda entered: [each / scale for each in entered])
+    if name == "joints":
+        values = list(given or ())
+        scales = list(known.scales) if len(known.scales) == len(values) else [DEGREE] * len(values)
+        shown = ", ".join(f"{round(scale * each, 3):g}" for scale, each in zip(scales, values, strict=True))
+        return FormField(path, "Joints [°, mm]", "text", shown, hint, partial(_joints, scales))
+    is_text = info.annotation is str or (name in ("signal", "program", "function"))
+    shown = "" if given in (None, [], {}) else _text(given, scale)
+    if not info.is_required() and default not in (None, "", [], {}):
+        hint += f"{'; ' if hint else ''}empty: {_text(default, scale)}"
+    return FormField(path, label, "text", shown, hint, partial(_words if is_text else _value, name, scale))
+
+
+def _text(value: Any, scale: float) -> str:
+    if isinstance(value, bool):
+        return "on" if value else "off"
+    if isinstance(value, float | int):
+        return f"{round(scale * value, 6):g}" if abs(scale * value) < 1e6 else str(value)
+    if isinstance(value, str):
+        return value
+    written: str = yaml.safe_dump(value, default_flow_style=True, allow_unicode=True, width=10**9, sort_keys=False)
+    written = written.removesuffix("\n").removesuffix("\n...")
+    return written[1:-1] if isinstance(value, dict | list) else written
+
+
+def _words(_name: str, _scale: float, entered: str) -> str | None:
+    return entered.strip() or None
+
+
+def _value(name: str, scale: float, entered: str) -> Any:
+    """Return the value of a text: a number, true, false, a word, or for a list or map its items."""
+    entered = entered.strip()
+    if not entered:
+        return None
+    if name in ("touch", "requires", "arguments"):
+        entered = f"[{entered}]" if name == "touch" else f"{{{entered}}}"
+    try:
+        value = float(entered) if _NUMBER.fullmatch(entered) else parse_yaml(entered)
+    except (yaml.YAMLError, ValueError):
+        raise ConfigError(name, entered[:40], "cannot be read") from None
+    if isinstance(value, float | int) and not isinstance(value, bool) and scale != 1.0:
+        return value / scale
+    return value
+
+
+def _joints(scales: Sequence[float], entered: str) -> list[float]:
+    try:
+        values = [float(each) for each in entered.replace(";", ",").split(",")]
+    except ValueError:
+        raise ConfigError("joints", entered[:40], "must be numbers, separated by commas") from None
+    if len(values) != len(scales):
+        raise ConfigError("joints", entered[:40], f"must be {len(scales)} numbers, not {len(values)}")
+    return [value / scale for value, scale in zip(values, scales, strict=True)]
+
+
+def _part_in(annotation: Any) -> type[BaseModel] | None:
+    """Return Target or Condition where a field, or the items of a list, are one."""
+    if annotation in (Target, Condition):
+        return annotation  # type: ignore[no-any-return]
+    if get_origin(annotation) in (list, Union, types.UnionType, Annotated):
+        return next((found for each in get_args(annotation) if (found := _part_in(each))), None)
+    return None
