@@ -31,6 +31,9 @@ STYLE = """<style>
 .zc .small { font-size: 0.875em; }
 .zc .small td, .zc .small th { padding: 0.2em 0.3em; }
 .zc .tight { white-space: nowrap; }
+.zc .steps td { padding: 0 0.2em; } .zc .steps td:has(button) { width: auto; white-space: normal; }
+.zc .steps button { width: 100%; min-height: 1.9em; padding: 0.1em 0.4em; text-align: left; border-color: transparent; }
+.zc .steps td:first-child, .zc .steps td:nth-child(2), .zc .steps td:last-child { width: 1%; white-space: nowrap; }
 .zc .log td { border: none; padding-top: 0; padding-bottom: 0; }
 .zc .log td:first-child, .zc .log td:nth-child(2) { white-space: nowrap; opacity: 0.6; }
 .zc .fields { display: grid; grid-template-columns: repeat(auto-fit, minmax(4.6em, 1fr)); gap: 0.2em 0.6em; }

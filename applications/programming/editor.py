@@ -22,6 +22,7 @@ from applications.programming.topics import (
 )
 from common.config import check
 from common.errors import ConfigError, RemoteError
+from page.status_text import error_text
 
 if TYPE_CHECKING:
     from page.console import Console
@@ -275,7 +276,7 @@ class ProgramEditor:
         except RemoteError as error:
             if error.code in ("held", "not_owner") and command in MOVES:
                 self._rejected = request
-                console.notify(f"{error}: press again to override")
+                console.notify(f"{error_text(error)}: press again to override")
                 return
             raise
 

@@ -23,8 +23,10 @@ from common.errors import ConfigError
 DEGREE = 180 / math.pi
 MM, DEGREES, PERCENT = (1e3, "mm"), (DEGREE, "°"), (100.0, "%")
 UNITS = {  # of fields: displayed per stored value, and the unit that is displayed
-    **dict.fromkeys(("distance", "width", "blend", "expected_width", "width_tolerance", "position", "by", "pitch"), MM),
-    **dict.fromkeys(("rpy", "turn"), DEGREES), "speed": PERCENT,
+    **dict.fromkeys((
+        "distance", "width", "blend", "expected_width", "width_tolerance", "position", "by", "height", "item", "gap",
+        "pitch", "sheet", "pallet", "robot"), MM),
+    **dict.fromkeys(("rpy", "turn", "yaw"), DEGREES), "speed": PERCENT,
     "seconds": (1.0, "s"), "timeout": (1.0, "s"), "force": (1.0, "N"), "mass": (1.0, "kg"),
 }
 LABELS = {"rpy": "Roll, pitch, yaw", "by": "Displacement", "name": "Pose"}
@@ -134,8 +136,8 @@ def fields_of(step: Data, known: Known, point: int = 0) -> list[FormField]:
         elif alias == "points":
             number = min(point, len(step["points"]) - 1)
             found += _part_fields(inner, (alias, number), step["points"][number], known)
-        elif step.get(alias) is not None:
-            found += _part_fields(inner, (alias,), step[alias], known)
+        elif step.get(alias) is not None or inner not in (Target, Condition):
+            found += _part_fields(inner, (alias,), step.get(alias, {}), known)
     return found
 
 
@@ -153,7 +155,7 @@ def new_step(kind: str, known: Known) -> Data:
         "output": lambda: {"signal": _first(known.outputs, "outputs")}, "place": lambda: {"at": here(tool=True)},
         "if": lambda: {"when": {"signal": known.signals[0]} if known.signals else {"holding": True}, "then": []},
         "call": lambda: {"program": _first(known.programs, "other programs")},
-        "palletize": lambda: {"at": here(tool=True), "columns": 2, "pitch": [0.05, 0.05, 0.05], "steps": []},
+        "palletize": lambda: {"pattern": {"item": [0.05, 0.05, 0.05], "columns": 2}, "steps": []},
         "python": lambda: {"function": "module:function"},
     }
     return {"step": kind, **made.get(kind, dict)()}
@@ -215,13 +217,12 @@ def _alternatives(data: Mapping[str, Any], known: Known, path: Path, some: Alter
 
 
 def _part_fields(kind: type[BaseModel], path: Path, data: Any, known: Known) -> list[FormField]:
-    """Return the fields of a target or a condition."""
+    """Return the fields of a target, a condition or another part."""
     data = {"name": data} if isinstance(data, str) else data
-    some = _TARGET if kind is Target else _CONDITION
-    found = _alternatives(data, known, path, some)
-    for name in some[_current(data, some)][0]:
-        found.append(_field(kind, name, (*path, name), data.get(name), known))
-    return found
+    some = _TARGET if kind is Target else _CONDITION if kind is Condition else {}
+    names = some[_current(data, some)][0] if some else kind.model_fields
+    return [*_alternatives(data, known, path, some),
+            *(_field(kind, name, (*path, name), data.get(name), known) for name in names)]
 
 
 # --- single values ---
@@ -242,19 +243,24 @@ def _field(kind: type[BaseModel], name: str, path: Path, value: Any, known: Know
         return FormField(path, label, "choice", given, hint, str, list(literals or choices or ()))
     if info.annotation is bool:
         return FormField(path, label, "check", bool(given), hint, bool)
-    if name in ("position", "rpy", "by", "turn", "pitch"):
+    size = _tuple_size(info.annotation)
+    if size == 3:
         vector = tuple(round(scale * each, 3) for each in (given or ZERO))
         return FormField(path, label, "vector", vector, hint, lambda entered: [each / scale for each in entered])
-    if name == "joints":
-        values = list(given or ())
-        scales = list(known.scales) if len(known.scales) == len(values) else [DEGREE] * len(values)
-        shown = ", ".join(f"{round(scale * each, 3):g}" for scale, each in zip(scales, values, strict=True))
-        return FormField(path, "Joints [°, mm]", "text", shown, hint, partial(_joints, scales))
-    is_text = info.annotation is str or (name in ("signal", "program", "function"))
+    if size or name == "joints":
+        values, scales = list(given or ()), [scale] * size
+        if name == "joints":
+            label = "Joints [°, mm]"
+            scales = list(known.scales) if len(known.scales) == len(values) else [DEGREE] * len(values)
+        shown = ", ".join(f"{round(scale * each, 3):g}" for scale, each in zip(scales, values, strict=bool(values)))
+        return FormField(path, label, "text", shown, hint, partial(_numbers, name, scales))
+    is_text = info.annotation is str or name in ("signal", "program", "function")
+    brackets = {list: "[]", dict: "{}"}.get(get_origin(info.annotation) or str, "")
     shown = "" if given in (None, [], {}) else _text(given, scale)
     if not info.is_required() and default not in (None, "", [], {}):
         hint += f"{'; ' if hint else ''}empty: {_text(default, scale)}"
-    return FormField(path, label, "text", shown, hint, partial(_words if is_text else _value, name, scale))
+    return FormField(path, label, "text", shown, hint, partial(_words, brackets) if is_text else partial(
+        _value, name, scale, brackets))
 
 
 def _text(value: Any, scale: float) -> str:
@@ -269,17 +275,17 @@ def _text(value: Any, scale: float) -> str:
     return written[1:-1] if isinstance(value, dict | list) else written
 
 
-def _words(_name: str, _scale: float, entered: str) -> str | None:
+def _words(_brackets: str, entered: str) -> str | None:
     return entered.strip() or None
 
 
-def _value(name: str, scale: float, entered: str) -> Any:
+def _value(name: str, scale: float, brackets: str, entered: str) -> Any:
     """Return the value of a text: a number, true, false, a word, or for a list or map its items."""
     entered = entered.strip()
     if not entered:
         return None
-    if name in ("touch", "requires", "arguments"):
-        entered = f"[{entered}]" if name == "touch" else f"{{{entered}}}"
+    if brackets:
+        entered = f"{brackets[0]}{entered}{brackets[1]}"
     try:
         value = float(entered) if _NUMBER.fullmatch(entered) else parse_yaml(entered)
     except (yaml.YAMLError, ValueError):
@@ -289,20 +295,32 @@ def _value(name: str, scale: float, entered: str) -> Any:
     return value
 
 
-def _joints(scales: Sequence[float], entered: str) -> list[float]:
+def _numbers(name: str, scales: Sequence[float], entered: str) -> list[float] | None:
+    if not entered.strip():
+        return None
     try:
         values = [float(each) for each in entered.replace(";", ",").split(",")]
     except ValueError:
-        raise ConfigError("joints", entered[:40], "must be numbers, separated by commas") from None
+        raise ConfigError(name, entered[:40], "must be numbers, separated by commas") from None
     if len(values) != len(scales):
-        raise ConfigError("joints", entered[:40], f"must be {len(scales)} numbers, not {len(values)}")
-    return [value / scale for value, scale in zip(values, scales, strict=True)]
+        raise ConfigError(name, entered[:40], f"must be {len(scales)} numbers, not {len(values)}")
+    return [int(value) if scale == 1.0 and value.is_integer() else value / scale
+            for value, scale in zip(values, scales, strict=True)]
+
+
+def _tuple_size(annotation: Any) -> int:
+    """Return the number of values of a tuple; 0 for another type."""
+    if get_origin(annotation) is tuple:
+        return len(get_args(annotation))
+    if get_origin(annotation) in (Union, types.UnionType, Annotated):
+        return max((_tuple_size(each) for each in get_args(annotation)), default=0)
+    return 0
 
 
 def _part_in(annotation: Any) -> type[BaseModel] | None:
-    """Return Target or Condition where a field, or the items of a list, are one."""
-    if annotation in (Target, Condition):
-        return annotation  # type: ignore[no-any-return]
+    """Return the model of a field, or of the items of a list."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
     if get_origin(annotation) in (list, Union, types.UnionType, Annotated):
         return next((found for each in get_args(annotation) if (found := _part_in(each))), None)
     return None

@@ -90,23 +90,23 @@ class ProgramPanel:
         if self._open.value != name:
             assign(self._open, name)
         closed = "" if draft is not None else "open a program first"
-        unsaved, undo = draft is not None and draft.unsaved, draft.undoes if draft is not None else ""
+        unsaved, undo = draft is not None and (draft.unsaved or self._form.pending), draft.undoes if draft else ""
         rows = buttons(
             self._button("New", "new", lambda: editor.new(self._name), lost or (
                 "" if self._name else "enter a new name first")),
             self._button("Save", "save", editor.save, lost or editor.incomplete or (
                 "" if unsaved else "nothing has changed"), main=unsaved),
-            self._button("Undo", "undo", editor.undo, "" if undo else "there is no edit to undo"),
-            self._button("Reload", "reload", editor.reload, lost or closed or (
-                "" if draft is not None and draft.revision else "it has no file yet")),
-            self._button("Delete again" if editor.confirms_deletion else "Delete program", "delete", editor.delete,
+            self._button("Confirm deletion" if editor.confirms_deletion else "Delete program", "delete", editor.delete,
                          lost or closed))
+        rows += buttons(
+            self._button(f"Undo: {undo}" if undo else "Undo", "undo", editor.undo, "" if undo else "there is no edit"),
+            self._button("Reload file", "reload", editor.reload, lost or closed or (
+                "" if draft is not None and draft.revision else "it has no file yet")))
         if editor.changed_elsewhere:
             rows += line(f"{name} is not saved, as its file was changed elsewhere. Reload shows the new content; Undo "
                          "then returns to the steps of this page.", "bad")
         elif draft is not None:
-            rows += line(f"{'Not saved' if unsaved else 'Saved'}" + (f". Undo: {undo}" if undo else ""),
-                         "busy" if unsaved else "dim")
+            rows += line("Not saved" if unsaved else "Saved", "busy" if unsaved else "dim")
         self._file.set(block(rows, "program", open=name, unsaved=unsaved))
 
     def _show_run(self, status: ProgramStatus | None) -> None:
@@ -147,10 +147,11 @@ class ProgramPanel:
                 button("↑ Up", f"up:{id_}", partial(editor.move, id_, -1)),
                 button("↓ Down", f"down:{id_}", partial(editor.move, id_, 1)),
                 button("Duplicate", f"duplicate:{id_}", partial(editor.duplicate, id_)),
-                button("Delete", f"remove:{id_}", partial(editor.remove, id_)),
+                button("Delete step", f"remove:{id_}", partial(editor.remove, id_)))
+            rows += buttons(
                 button("Use present pose", f"present:{id_}", partial(editor.use_present_pose, id_)),
                 button("Remove breakpoint" if stops else "Breakpoint", f"breakpoint:{id_}:{not stops}",
-                       partial(editor.command, "breakpoint", id_, enabled=not stops), editor.incomplete), label=id_)
+                       partial(editor.command, "breakpoint", id_, enabled=not stops), editor.incomplete))
             if points := step.get("points"):
                 at = min(editor.point, len(points) - 1)
                 rows += buttons(

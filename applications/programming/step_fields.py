@@ -51,6 +51,11 @@ class StepFields:
             if each.path not in self._pending and each.path not in self._reasons and element.value != each.shown:
                 assign(element, each.shown)
 
+    @property
+    def pending(self) -> bool:
+        """Whether a value was entered that is not applied yet."""
+        return bool(self._pending)
+
     def flush(self) -> None:
         """Apply what was entered so far without waiting for the end of typing.
 

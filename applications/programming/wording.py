@@ -37,8 +37,8 @@ def summary(step: Mapping[str, Any]) -> str:
         case "place":
             return f"place at {target_text(step['at'])}"
         case "palletize":
-            size = " x ".join(str(get(name, 1)) for name in ("columns", "rows", "layers"))
-            return f"palletize {size} from {target_text(step['at'])}"
+            counts = [str(step["pattern"].get(name, 1)) for name in ("columns", "rows", "layers")]
+            return f"palletize {' x '.join(counts)}"
         case "python":
             return f"python {step['function']}"
     return str(step["step"])
