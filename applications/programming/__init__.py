@@ -4,4 +4,4 @@ from common.application import Application
 
 APPLICATION = Application(
     topics="applications.programming.topics:TOPICS", task="program_runner", grasps=True,
-    verbs="applications.programming.verbs:VERBS")
+    page="applications.programming.page:PAGE", verbs="applications.programming.verbs:VERBS")

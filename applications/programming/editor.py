@@ -87,7 +87,7 @@ class ProgramEditor:
         draft = self._drafts.get(name)
         if draft is None:
             content = await self._request("load", name)
-            draft = Draft.of(name, _program(name, content.text), content.revision)
+            draft = Draft.of(name, _program(name, content), content.revision)
         self._show(draft)
 
     def new(self, name: str) -> None:
@@ -118,9 +118,9 @@ class ProgramEditor:
             self.changed_elsewhere = self.changed_elsewhere or error.code == "changed"
             raise
         self._note_problems(draft, content)
-        if content.problems:
+        if not content.revision:
             raise BadProgram([f"{draft.name} is not saved: {content.problems[0]}"])
-        draft.saved(_program(draft.name, content.text), content.revision, sent)
+        draft.saved(_program(draft.name, content), content.revision, sent)
         self.changed_elsewhere = False
         self._console.notify(f"{draft.name} is saved", "good")
 
@@ -128,7 +128,7 @@ class ProgramEditor:
         """Take the content of the file; `undo` then returns to the steps of this page."""
         draft = self._required()
         content = await self._request("load", draft.name)
-        draft.reloaded(_program(draft.name, content.text), content.revision)
+        draft.reloaded(_program(draft.name, content), content.revision)
         self._show(draft)
 
     async def delete(self) -> None:
@@ -281,8 +281,10 @@ class ProgramEditor:
             raise
 
 
-def _program(name: str, text: str) -> Program:
-    return parse_program(text, Path(f"{name}.yaml")).program
+def _program(name: str, content: ProgramContent) -> Program:
+    if not content.text:  # the file is invalid
+        raise BadProgram(content.problems[:1])
+    return parse_program(content.text, Path(f"{name}.yaml")).program
 
 
 _PATH = re.compile(r"steps\[\d+\](?:\.(?:steps|then|else)\[\d+\])*")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -68,6 +69,18 @@ def path_of(folder: str | Path, program: str) -> Path:
     """Return the absolute path of a program: of a name in the folder, or of a path that ends in .yaml."""
     path = Path(program) if program.endswith(SUFFIX) else Path(folder) / f"{program}{SUFFIX}"
     return path.expanduser().resolve()
+
+
+def revision_of(path: Path) -> str:
+    """Return what changes with each change of a file; empty without a file.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()[:12]
+    except FileNotFoundError:
+        return ""
 
 
 def load_program(path: Path) -> ProgramFile:

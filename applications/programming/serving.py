@@ -16,6 +16,7 @@ from applications.programming.files import (
     names_in,
     parse_program,
     path_of,
+    revision_of,
     save_program,
     text_of,
 )
@@ -87,6 +88,7 @@ class ProgramRunner(TaskRunner[View]):
         self._program, self._look = task, observe
         self._planner = bus.client(topics.MOTION_PLAN)
         self._called = asyncio.Event()
+        self._editing = asyncio.Lock()  # between the check of a revision and the write
         self._wanted: tuple[ProgramCommand, Flow] | None = None
         self._rehearse = asyncio.Event()
         bus.serve(PROGRAM_COMMAND, self._command)
@@ -263,7 +265,8 @@ class ProgramRunner(TaskRunner[View]):
         try:
             if request.act != "list":
                 _require_name(request.program)
-                await asyncio.to_thread(self._apply, request, reply)
+                async with self._editing:
+                    await asyncio.to_thread(self._apply, request, reply)
         except BadProgram as error:
             reply.problems = error.problems[:200]
         except OSError as error:
@@ -277,7 +280,11 @@ class ProgramRunner(TaskRunner[View]):
         path = path_of(self.folder, request.program)
         if request.act == "load":
             reply.text = text_of(load_program(path).program)
+            reply.revision = revision_of(path)
             return
+        if request.act in ("save", "delete") and request.revision != (found := revision_of(path)):
+            raise Refused("changed", f"{request.program} was changed elsewhere: its file is of revision "
+                          f"{found or 'none'}, the request is for {request.revision or 'none'}; load it again")
         if request.act == "delete":
             if self._program.is_active and request.program == self._program.status.program:
                 raise Refused("busy", f"{request.program} runs: stop it first")
@@ -287,6 +294,7 @@ class ProgramRunner(TaskRunner[View]):
         reply.text = text_of(file.program)
         if request.act == "save":
             save_program(file)
+            reply.revision = revision_of(path)
             self._bus.log.info("program %s saved%s", file.name, f" by {request.by}" if request.by else "")
         load_all(file)
         task = self._program

@@ -81,6 +81,7 @@ class ProgramEdit(Message):
     program: Label = Field("", description="name, which is that of its file without .yaml")
     text: ProgramText = Field("", description="of check and save: YAML")
     by: OperatorName = Field("", description="name of the operator")
+    revision: Label = Field("", description="of save and delete: of the file when it was read; empty: no file yet")
 
 
 class ProgramContent(Message):
@@ -92,6 +93,7 @@ class ProgramContent(Message):
     programs: list[Name] = Field([], max_length=1000, description="names of all programs of the folder")
     program: Label = ""
     text: ProgramText = Field("", description="YAML, with an id for each step")
+    revision: Label = Field("", description="of the file after the edit; empty: there is no file, or it was not saved")
     problems: list[Text] = Field([], max_length=200, description="file, line, step, field, value and choices")
     poses: list[Label] = Field([], max_length=500, description="names that a target may have")
     signals: list[Label] = Field([], max_length=500, description="signals of the cell")
