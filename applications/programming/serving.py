@@ -282,9 +282,9 @@ class ProgramRunner(TaskRunner[View]):
             reply.text = text_of(load_program(path).program)
             reply.revision = revision_of(path)
             return
-        if request.act in ("save", "delete") and request.revision != (found := revision_of(path)):
+        if request.act in ("save", "delete") and request.revision != (revision := revision_of(path)):
             raise Refused("changed", f"{request.program} was changed elsewhere: its file is of revision "
-                          f"{found or 'none'}, the request is for {request.revision or 'none'}; load it again")
+                          f"{revision or 'none'}, the request is for {request.revision or 'none'}; load it again")
         if request.act == "delete":
             if self._program.is_active and request.program == self._program.status.program:
                 raise Refused("busy", f"{request.program} runs: stop it first")
