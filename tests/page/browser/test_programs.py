@@ -31,6 +31,7 @@ async def cell(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[Viewed
     nothing_to_draw = Path(__file__).with_name("nothing_to_draw.yaml")
     with Viewed(folder, "up", "first.yaml", "--set", "autostart=false",
                 "--set", f"services.viewer.layout={nothing_to_draw}") as cell:
+        cell.name = "panda"  # the cell of the program
         yield await cell.served()
 
 
