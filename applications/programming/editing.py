@@ -194,7 +194,7 @@ def set_fields(data: Data, id_: str, values: Mapping[str, Any]) -> None:
 
 
 def set_target(data: Data, id_: str, target: Mapping[str, Any]) -> None:
-    """Set the target of a step, whichever field has it, or add it to the points of a `through`.
+    """Set the target of a step, in the field of its kind, or add it to the points of a `through`.
 
     Raises:
         EditRefused: the step has no target.
