@@ -18,11 +18,13 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from common.config import Parameters, RobotConfig
+from common.control.wrench import shifted
 from common.errors import ConfigError
 from common.hardware.driven_arm import DrivenArm
 from common.hardware.interface import ArmState, Gripper, Limits, Vector
 from common.hardware.mock import simulated_fingers
 from common.messages import RobotMode
+from common.robot.transforms import invert
 from drivers import franka_hand
 
 Array = NDArray[np.float64]
@@ -151,7 +153,8 @@ class FrankaArm:
         self._state = state
         mode, message = self._mode(state)
         self._check_clock(time.monotonic(), state.time.to_sec())
-        return ArmState(list(state.q), list(state.dq), mode, message, self._speed)
+        return ArmState(list(state.q), list(state.dq), mode, message, self._speed, wrench=_wrench_at_flange(state),
+                        payload=(state.m_load, state.F_x_Cload[0], state.F_x_Cload[1], state.F_x_Cload[2]))
 
     def _check_clock(self, now: float, arms: float) -> None:
         """Measure the speed of the arm's clock: a slow one, as of a simulated arm, slows motions down."""
@@ -282,6 +285,25 @@ def _faded(deviation: Array, since: float) -> Vector:
     parts = (1 - u**3 * (10 - 15 * u + 6 * u * u), u - u**3 * (6 - 8 * u + 3 * u * u),
              u * u * (1 - u * (3 - 3 * u + u * u)) / 2)
     return np.asarray(sum(part * BLEND**n * each for n, (part, each) in enumerate(zip(parts, deviation, strict=True))))
+
+
+def _wrench_at_flange(state: Any) -> list[float] | None:
+    """Return what acts on the flange (6,) [N], [N m], along its axes; None near a singularity, where it is unknown.
+
+    The estimate is what the arm exerts on its surroundings, in the stiffness frame K; it is exactly 0 near a
+    singularity (libfranka, RobotState). The other form of it, O_F_ext_hat_K, would need the pose of the base.
+    Subtracted are the hand as configured in Desk and the load.
+    """
+    exerted = np.array(state.K_F_ext_hat_K)
+    if not exerted.any():
+        return None
+    T_flange_K = _pose(state.F_T_EE) @ _pose(state.EE_T_K)
+    return shifted(-exerted, invert(T_flange_K)).tolist()  # type: ignore[no-any-return]
+
+
+def _pose(columns: Any) -> Array:
+    """Return a pose (4, 4) from its 16 numbers, columns first."""
+    return np.reshape(columns, (4, 4)).T
 
 
 def _active_errors(errors: Any) -> str:

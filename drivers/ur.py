@@ -23,6 +23,7 @@ from common.hardware.interface import ArmState, Gripper, Limits, Vector
 from common.hardware.mock import simulated_fingers
 from common.messages import RobotMode
 from drivers import robotiq
+from drivers.ur_wrench import at_flange
 
 # Rated payload [kg] by model, from the maker's data sheets; the UR30 carries its 35 kg with the tool pointing down.
 PAYLOADS = {"3": 3.0, "5": 5.0, "10": 10.0, "3e": 3.0, "5e": 5.0, "7e": 7.5, "10e": 12.5, "12e": 12.5, "16e": 16.0,
@@ -45,6 +46,7 @@ RUNNING, PROTECTIVE_STOP = 7, 3  # robot mode, safety mode
 VARIABLES = ["timestamp", "actual_q", "actual_qd", "robot_mode", "safety_mode", "safety_status_bits", "runtime_state",
              "target_speed_fraction", "speed_scaling", "robot_status_bits", "actual_digital_input_bits",
              "actual_digital_output_bits"]
+SENSOR = ["actual_TCP_force", "payload", "payload_cog"]  # of arms with a force sensor
 SAFETY: dict[int, tuple[RobotMode, str]] = {
     3: ("protective_stop", "protective stop: find the cause, then `zencell robot recover`"),
     4: ("protective_stop", "in recovery mode: move the joints back within their limits at the pendant"),
@@ -170,7 +172,9 @@ class UrArm:
         self._smoothing = Smoothing(self.rate)
         self._dashboard = DashboardClient(options.host)
         self._dashboard.connect()
-        self._receive = rtde_receive.RTDEReceiveInterface(options.host, self.rate, VARIABLES)
+        self._senses = CB3.match(options.model) is None
+        self._receive = rtde_receive.RTDEReceiveInterface(
+            options.host, self.rate, VARIABLES + SENSOR if self._senses else VARIABLES)
         self._control: Any = None
         self._control_lock = threading.Lock()  # the control interface is not thread-safe
         self._stamp, self._since = -1.0, time.monotonic()
@@ -211,11 +215,16 @@ class UrArm:
                 self._upload()
             elif mode not in ("running", "freedrive") and self._control is not None:
                 self._drop()
-        speed = self._receive.getTargetSpeedFraction()
-        return ArmState(
-            self._receive.getActualQ(), self._receive.getActualQd(), mode, message, min(max(speed, 0.0), 1.0),
+        speed, q = self._receive.getTargetSpeedFraction(), self._receive.getActualQ()
+        state = ArmState(
+            q, self._receive.getActualQd(), mode, message, min(max(speed, 0.0), 1.0),
             self._receive.getActualDigitalInputBits(), self._receive.getActualDigitalOutputBits(), now - self._since,
         )
+        if self._senses and mode == "running":
+            x, y, z = self._receive.getPayloadCog()
+            state = state._replace(wrench=at_flange(q, self._receive.getActualTCPForce()),
+                                   payload=(self._receive.getPayload(), x, y, z))
+        return state
 
     def _mode(self) -> tuple[RobotMode, str]:
         safety, robot = self._receive.getSafetyMode(), self._receive.getRobotMode()

@@ -60,7 +60,7 @@ class ForceSensing:
             self.lose(str(fault))
             return
         if raw is None:
-            self.lose("the force sensor does not report")
+            self.lose("the arm reports no force")
             return
         self.reason = ""
         still = at_rest and float(np.abs(dq).max()) < STILL

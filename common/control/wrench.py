@@ -61,10 +61,16 @@ class FlangeKinematics(Protocol):
         """Pose (4, 4) of the TCP in the flange."""
 
 
+def cross(a: Vector, b: Vector) -> Vector:
+    """Return the vector product of (3,) and (3,): much faster than numpy's in a control cycle."""
+    (ax, ay, az), (bx, by, bz) = a.tolist(), b.tolist()
+    return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
+
+
 def shifted(wrench: Vector, T: NDArray[np.float64]) -> Vector:
     """Return a wrench (6,) at the origin and along the axes of a frame with the pose T (4, 4) in the wrench's frame."""
     force, torque = wrench[:3], wrench[3:]
-    return np.concatenate([T[:3, :3].T @ force, T[:3, :3].T @ (torque - np.cross(T[:3, 3], force))])
+    return np.concatenate([force @ T[:3, :3], (torque - cross(T[:3, 3], force)) @ T[:3, :3]])
 
 
 def weight(payload: Payload, acceleration: Vector) -> Vector:
@@ -75,7 +81,7 @@ def weight(payload: Payload, acceleration: Vector) -> Vector:
         acceleration: gravity minus the acceleration of the centre of mass (3,) [m/s^2], along the axes of the flange.
     """
     force = payload.mass * acceleration
-    return np.concatenate([force, np.cross(payload.com, force)])
+    return np.concatenate([force, cross(payload.com, force)])
 
 
 class WrenchEstimator:
@@ -150,7 +156,7 @@ class WrenchEstimator:
         """Return the acceleration (3,) [m/s^2] of the payload's centre of mass in world since the last reading."""
         twist = self._kinematics.jacobian(q) @ dq
         arm = T_world_flange[:3, :3] @ (payload.com - self._T_flange_tcp[:3, 3])  # from the TCP
-        velocity = twist[:3] + np.cross(twist[3:], arm)
+        velocity = twist[:3] + cross(twist[3:], arm)
         last, self._last = self._last, (now, payload, velocity)
         if last is None or last[1] != payload or now <= last[0]:
             return np.zeros(3)
@@ -163,7 +169,7 @@ class WrenchEstimator:
             Refused: the arm moves, was not at rest for that long, or the sensor does not report.
         """
         if self.wrench is None:
-            raise Refused("no_wrench", "the force sensor does not report")
+            raise Refused("no_wrench", "the arm reports no force")
         rest = self._at_rest[-1][0] - self._at_rest[0][0] if self._at_rest else 0.0
         if rest < REST - 0.02:
             raise Refused("moving", f"the arm must be at rest for {REST:g} s, and is for {rest:.2f} s")

@@ -154,6 +154,16 @@ class DrivenArm:
         self._extra_delay = age + newest.behind
         return np.array(newest.state.q), np.array(newest.state.dq)
 
+    @property
+    def known_payload(self) -> tuple[float, float, float, float] | None:
+        """Payload that the arm's controller subtracts: mass [kg], centre of mass from the flange x, y, z [m]."""
+        return self._newest.state.payload if self._newest is not None else None
+
+    def wrench(self) -> Vector | None:
+        """Return what acts on the flange (6,) [N], [N m], along its axes, as last reported; None: nothing is."""
+        newest = self._newest
+        return None if newest is None or newest.state.wrench is None else np.array(newest.state.wrench)
+
     @staticmethod
     def _is_stale(newest: Reading) -> bool:
         """Return whether the process reports no more, or for too long nothing new of the arm, as if it were held up."""

@@ -86,7 +86,7 @@ class ArmState(NamedTuple):
     """State reported by the arm's controller: positions [rad], velocities [rad/s], mode.
 
     `speed` is the share set by the speed slider of its pendant; `message` says why it cannot be moved; the state is
-    `age` [s] old.
+    `age` [s] old. `wrench` and `payload` are those of `SensingArm`; None without a force sensor.
     """
 
     q: list[float]
@@ -97,6 +97,8 @@ class ArmState(NamedTuple):
     inputs: int = 0
     outputs: int = 0
     age: float = 0.0
+    wrench: list[float] | None = None
+    payload: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
 
 
 class GripperReading(NamedTuple):

@@ -32,6 +32,7 @@ class Arm:
     program: bool = False
     freedrive: bool = False
     payload: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
+    push: tuple[float, ...] = (0.0,) * 6  # wrench of the force sensor, in base axes
     registers: dict[str, list[float]] = field(default_factory=lambda: {
         f"{way}_{kind}_register": [0] * 48 for way in ("input", "output") for kind in ("int", "double")})
     inputs: int = 0  # digital, one bit each
@@ -145,7 +146,8 @@ class Arm:
             "runtime_state": 2 if self.program else 1, "robot_status_bits": powered | (self.program << 1),
             "safety_status_bits": {PROTECTIVE_STOP: 4, EMERGENCY_STOP: 0xC0}.get(self.safety, 1),
             "speed_scaling": self.slider, "target_speed_fraction": self.slider, "payload": self.payload[0],
-            "payload_cog": self.payload[1:], "joint_mode": (253 if self.mode == RUNNING else 239,) * 6,
+            "payload_cog": self.payload[1:], "actual_TCP_force": self.push,
+            "joint_mode": (253 if self.mode == RUNNING else 239,) * 6,
             "actual_digital_input_bits": self.inputs, "actual_digital_output_bits": self.digital_outputs,
             "standard_analog_input0": self.analog_inputs[0], "standard_analog_input1": self.analog_inputs[1],
             "standard_analog_output0": self.analog_outputs[0], "standard_analog_output1": self.analog_outputs[1],

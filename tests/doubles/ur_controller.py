@@ -253,6 +253,8 @@ class Controller:
                     self.arm.inputs = self.arm.inputs & ~(1 << int(bit)) | int(level) << int(bit)
                 case ["analog", number, volts]:
                     self.arm.analog_inputs[int(number)] = float(volts)
+                case ["push", *values]:
+                    arm.push = tuple(map(float, values))
                 case ["slider", share]:
                     arm.slider = float(share)
                 case ["pull", seconds]:

@@ -1,5 +1,6 @@
 """The drivers of Franka's arm and hand with a fake library: the arm's clock, and reports of grasps."""
 
+import math
 import sys
 from types import ModuleType, SimpleNamespace
 
@@ -15,11 +16,18 @@ MILLISECOND = 1e-3
 GRIPPER = load_cell("panda").robot.gripper
 
 
+def columns(z: float, yaw: float) -> list[float]:
+    """Return a pose turned about z and moved along it as the arm reports it: columns first."""
+    c, s = math.cos(yaw), math.sin(yaw)
+    return [c, s, 0, 0, -s, c, 0, 0, 0, 0, 1, 0, 0, 0, z, 1]
+
+
 class Clocks:
     """The clock of the host, and that of an arm at a share of its speed."""
 
     def __init__(self, driver: franka.FrankaArm) -> None:
         self.driver, self.host, self.arms, self.share = driver, 100.0, 7.0, 1.0
+        self.exerted = [0.0] * 6
 
     def monotonic(self) -> float:
         return self.host
@@ -27,7 +35,9 @@ class Clocks:
     def state(self) -> SimpleNamespace:
         rest = np.zeros(7)
         return SimpleNamespace(q=rest, dq=rest, q_d=rest, dq_d=rest, ddq_d=rest,
-                               robot_mode=SimpleNamespace(name="Move"), time=SimpleNamespace(to_sec=lambda: self.arms))
+                               robot_mode=SimpleNamespace(name="Move"), m_load=0.3, F_x_Cload=[0.0, 0.0, 0.1],
+                               K_F_ext_hat_K=self.exerted, F_T_EE=columns(0.1034, math.pi / 4),
+                               EE_T_K=columns(0.05, 0.2), time=SimpleNamespace(to_sec=lambda: self.arms))
 
     def run(self, seconds: float) -> tuple[np.ndarray, np.ndarray]:
         """Return the host's time and that of the due set-points, for each cycle of a period of the arm's time."""
@@ -120,3 +130,13 @@ def test_closed_fingers_hold_nothing(monkeypatch: pytest.MonkeyPatch, between: f
     assert hand.read() == FingerState(between, False, holds, 20.0 if holds else 0.0)
     hand.move(0.08, 20.0)
     assert not hand.read().holding
+
+
+def test_wrench_is_what_acts_on_the_flange_and_unknown_near_a_singularity(clocks: Clocks) -> None:
+    assert clocks.driver.read().wrench is None
+    clocks.exerted = [10.0, 0.0, 0.0, 0.0, 0.0, 1.0]  # the arm pushes along x of K, 0.1534 m beyond the flange
+    state = clocks.driver.read()
+    yaw = math.pi / 4 + 0.2
+    x, y = -10 * math.cos(yaw), -10 * math.sin(yaw)
+    assert state.wrench == pytest.approx([x, y, 0, -0.1534 * y, 0.1534 * x, -1.0])
+    assert state.payload == (0.3, 0.0, 0.0, 0.1)

@@ -14,6 +14,7 @@ from common.errors import ConfigError
 from common.hardware.driven_arm import DrivenArm, Reading
 from common.hardware.interface import Limits, has_simulated_world, is_simulated, real_arm
 from drivers.ur import Options, create
+from drivers.ur_wrench import at_flange
 from tests.common.hardware.test_backends import robot
 from tests.doubles.ur_host import UrHost
 from tests.drivers.driven_rig import FASTEST, SWING, TIMEOUT, Rig
@@ -205,6 +206,17 @@ def test_speed_slider_is_reported(host: UrHost, rig: Rig) -> None:
     host.command("slider 0.3")
     rig.wait_for(lambda: (rig.cycle(None, REST), rig.arm.state.speed == 0.3)[1])
     host.command("slider 1")
+
+
+def test_force_and_the_payload_that_the_controller_subtracts_arrive(host: UrHost, rig: Rig) -> None:
+    assert np.allclose(rig.arm.wrench(), 0)
+    host.command("push 0 0 12 0.5 0 0")  # in the axes of the base
+    rig.wait_for(lambda: np.linalg.norm(rig.arm.wrench()[:3]) > 11.9)
+    assert np.linalg.norm(rig.arm.wrench()[3:]) == pytest.approx(0.5)
+    assert np.allclose(rig.arm.wrench(), at_flange(rig.arm.read(0.0)[0].tolist(), [0, 0, 12, 0.5, 0, 0]), atol=0.01)
+    number = rig.arm.order("payload", 0.7, 0.0, 0.01, 0.05)
+    assert rig.done(number) == ""
+    rig.wait_for(lambda: np.allclose(rig.arm.known_payload, [0.7, 0.0, 0.01, 0.05]))
 
 
 def test_payload_is_set_only_between_motions(host: UrHost, rig: Rig) -> None:

@@ -6,10 +6,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from common.config import load_cell
 from common.hardware.interface import Limits
+from common.robot.model import RobotModel
 from drivers.ur import LONGEST_STEP, STATE_TIMEOUT, Options, SilenceTimer, UrArm
+from drivers.ur_wrench import at_flange
 
-SIX = np.ones(6)
+SIX, ROBOT = np.ones(6), RobotModel.load(load_cell("ur5").robot)
 LIMITS = Limits(tuple("abcdef"), -6 * SIX, 6 * SIX, 3 * SIX, 5 * SIX, 10 * SIX, 500 * SIX)
 OFF, IDLE, RUNNING, NORMAL, PROTECTIVE_STOP, EMERGENCY_STOP = 3, 5, 7, 1, 3, 7
 
@@ -22,6 +25,7 @@ class Controller:
     def __init__(self) -> None:
         self.mode, self.safety, self.stamp = RUNNING, NORMAL, 0.0
         self.by_hand, self.program = False, True
+        self.force = [0.0] * 6
 
     def getTimestamp(self) -> float:  # noqa: N802
         self.stamp += 0.002
@@ -49,7 +53,8 @@ class Controller:
 
     def __getattr__(self, name: str) -> object:
         answers = {"getRobotMode": self.mode, "getSafetyMode": self.safety, "getRobotStatus": 1 | self.program << 1,
-                   "getTargetSpeedFraction": 1.0, "getActualQ": [0.0] * 6, "getActualQd": [0.0] * 6}
+                   "getTargetSpeedFraction": 1.0, "getActualQ": [0.0] * 6, "getActualQd": [0.0] * 6,
+                   "getActualTCPForce": self.force, "getPayloadCog": [0.0, 0.0, 0.06], "getPayload": 0.9}
         return lambda *_: answers.get(name, 0)
 
 
@@ -131,6 +136,28 @@ def test_enable_ends_with_the_reason_when_a_stop_occurs_meanwhile(controller: Co
     with pytest.raises(ValueError, match="zencell robot recover"):
         arm.do("enable")
     assert controller.safety == PROTECTIVE_STOP
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_wrench_of_the_base_axes_is_given_in_those_of_the_flange(seed: int) -> None:
+    q = np.random.default_rng(seed).uniform(ROBOT.lower, ROBOT.upper)
+    poses = ROBOT.link_poses(q)
+    in_flange = poses["base"][:3, :3].T @ poses["tool0"][:3, :3]  # link `base` has the axes of the controller's base
+    force, torque = np.array([1.0, -2.0, 30.0]), np.array([0.1, 0.2, -0.3])
+    found = np.array(at_flange(q.tolist(), [*force, *torque]))
+    assert found[:3] == pytest.approx(in_flange.T @ force, abs=1e-4)
+    assert found[3:] == pytest.approx(in_flange.T @ torque, abs=1e-4)
+
+
+def test_arm_reports_force_and_payload_and_none_while_it_is_off(controller: Controller, arm: UrArm) -> None:
+    controller.force = [1.0, 2.0, 3.0, 0.0, 0.0, 0.0]
+    state = arm.read()
+    assert np.linalg.norm(state.wrench) == pytest.approx(14 ** 0.5) and state.payload == (0.9, 0.0, 0.0, 0.06)
+    controller.mode = OFF
+    assert arm.read().wrench is None
+    old = UrArm(Options(host="h", model="ur5"), LIMITS)
+    controller.mode = RUNNING
+    assert old.read().wrench is None, "a CB3 has no sensor"
 
 
 def test_silence_is_the_time_of_listening_since_the_last_message() -> None:

@@ -103,7 +103,7 @@ def test_low_pass_has_the_stated_bandwidth(bandwidth: float) -> None:
 
 def test_zero_needs_rest_and_a_reading() -> None:
     estimator, q = WrenchEstimator(ROBOT), random_q(3)
-    with pytest.raises(Refused, match="does not report"):
+    with pytest.raises(Refused, match="reports no force"):
         estimator.zero()
     for cycle in range(30):
         estimator.update(cycle * PERIOD, reading(q), q, 0 * q, LOAD, at_rest=cycle >= 20)
@@ -174,7 +174,7 @@ def test_payload_that_the_arm_does_not_subtract_is_subtracted(
 
 
 @pytest.mark.parametrize("reads, reason", [
-    (None, "does not report"), (HardwareFault("the cable is out"), "the cable is out"),
+    (None, "reports no force"), (HardwareFault("the cable is out"), "the cable is out"),
 ])
 def test_sensor_without_a_reading_gives_a_reason_and_no_zeros(reads: object, reason: str) -> None:
     arm = FakeSensor(HOME, None)
