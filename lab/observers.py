@@ -10,7 +10,7 @@ from typing import Any
 from common import topics
 from common.config import Cell, HardwareConfig, Parameters, RobotConfig
 from common.errors import ConfigError
-from common.hardware.interface import Gripper, Hardware, Limits, Vector, find_backend, load_hardware
+from common.hardware.interface import Gripper, Hardware, Limits, SensingArm, Vector, find_backend, load_hardware
 from common.messages import SupervisorStatus
 from common.transport.codec import decode, decode_attachment
 from common.transport.reader import SequenceFilter
@@ -61,10 +61,29 @@ class ObservedArm:
         self._below.close()
 
 
+class ObservedSensor(ObservedArm):
+    """An observed arm with a force sensor."""
+
+    _below: SensingArm
+
+    @property
+    def known_payload(self) -> tuple[float, float, float, float] | None:
+        """What the sensor of the arm below does not measure."""
+        return self._below.known_payload
+
+    def wrench(self) -> Vector | None:
+        """Return the wrench of the arm below."""
+        return self._below.wrench()
+
+
+def _observed(below: Hardware, limits: Limits) -> ObservedArm:
+    return (ObservedSensor if isinstance(below, SensingArm) else ObservedArm)(below, limits)
+
+
 def create(robot: RobotConfig, limits: Limits, start: Vector, options: Options) -> ObservedArm:
     """Return an observed arm around the configured backend."""
     below = robot.model_copy(update={"hardware": HardwareConfig(backend=options.backend, options=options.options)})
-    return ObservedArm(load_hardware(below, limits, start), limits)
+    return _observed(load_hardware(below, limits, start), limits)
 
 
 def around(
@@ -72,7 +91,7 @@ def around(
 ) -> ObservedArm:
     """Return an observed arm around the arm of a simulated world, which replaces the configured backend."""
     below = robot.model_copy(update={"hardware": HardwareConfig(backend=options.backend, options=options.options)})
-    return ObservedArm(load_hardware(below, limits, start, arm), limits)
+    return _observed(load_hardware(below, limits, start, arm), limits)
 
 
 def with_observed_arm(cell: Cell) -> Cell:

@@ -88,6 +88,7 @@ def description(robot: RobotModel, stamp: int) -> RobotDescription:
     return RobotDescription.model_validate({
         "header": {"stamp": stamp}, "joints": robot.joint_names, "lower": robot.lower.tolist(),
         "upper": robot.upper.tolist(), "velocity": robot.velocity.tolist(), "tcp": config.tcp_link,
+        "flange": robot.flange_link,
         "named_poses": {name: list(robot.named(name)) for name in config.named_poses},
         "gripper": gripper is not None, "fingers": gripper.links if gripper else [],
         "gripper_width": gripper.max_width if gripper else 0.0})

@@ -15,6 +15,7 @@ from common.client.force import ForceArm
 from common.client.goals import GoalLike, Plan, Point, WaypointPath, goal_of, numbers
 from common.client.operator_motion import PROGRESS_TIMEOUT, Jogging, MotionFailed, OperatorMotion, check_seconds
 from common.client.subscriptions import NothingReceived, Part, Subscriptions
+from common.client.wrench import WrenchArm
 from common.config import check
 from common.errors import ConfigError, RequestLost, RequestTimeout, UnknownName
 from common.messages import (
@@ -43,7 +44,7 @@ STANDSTILL_TIMEOUT, STANDSTILL = 1.0, 1e-3  # [s] wall until a jogged arm is at 
 ARC_PLANNER = "circ"  # plans arcs; it need not be in the pipeline of a cell
 
 
-class Arm(ForceArm, Part):
+class Arm(ForceArm, WrenchArm):
     """The arm. Lengths in metres, angles in radians; poses are (4, 4), of the tool centre point in world.
 
     Nothing moves while a task or another client has the robot; the operator can always move what they stopped or hold

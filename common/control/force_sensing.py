@@ -48,6 +48,7 @@ class ForceSensing:
             config = config or WrenchConfig()
             self.estimator = WrenchEstimator(kinematics, bandwidth=config.bandwidth, inertia=config.inertia)
             self._T_flange_tcp = kinematics.T_flange_tcp
+        self._subtracted = Payload()
         self._published_at = -float("inf")
 
     def update(self, now: float, q: Vector, dq: Vector, held: float, at_rest: bool) -> None:
@@ -63,8 +64,10 @@ class ForceSensing:
             self.lose("the arm reports no force")
             return
         self.reason = ""
+        known, measured = self._arm.known_payload, self._measured(self._arm, held)
+        self._subtracted = measured if known is None else measured.with_other(Payload(*known))
         still = at_rest and float(np.abs(dq).max()) < STILL
-        self.estimator.update(now, raw, q, dq, self._measured(self._arm, held), still)
+        self.estimator.update(now, raw, q, dq, measured, still)
 
     def lose(self, reason: str) -> None:
         """Forget the wrench, for a reason."""
@@ -98,9 +101,10 @@ class ForceSensing:
         header = header.model_copy(update={"frame_id": self._frame})
         if self.estimator is None or self.reason or self.estimator.wrench is None:
             return Wrench(header=header, reason=self.reason)
+        mass, x, y, z = self._subtracted
         fx, fy, fz, tx, ty, tz = self.estimator.wrench.tolist()
         return Wrench(header=header, force=Vector3(x=fx, y=fy, z=fz), torque=Vector3(x=tx, y=ty, z=tz),
-                      zeroed=self.estimator.zeroed)
+                      zeroed=self.estimator.zeroed, payload=mass, com=Vector3(x=x, y=y, z=z))
 
     def due(self, header: Header) -> Wrench | None:
         """Return the message of this cycle; without a wrench, one each second."""

@@ -43,6 +43,7 @@ T = TypeVar("T")
 
 MAX_STOPS = 50  # unread requests to stop: each takes about 1 ms
 ON_REQUEST = "on request"  # logged for a stop or a hold without a reason
+SETTLE_TIMEOUT = 1.0  # [s] cell time for an arm at rest to be so for long enough to zero its wrench
 MAX_JOG_NAMES = 16  # operators whose refused jogging was logged
 
 
@@ -256,11 +257,19 @@ class RequestHandlers:
         return self._executor.robot.model_copy(update={"header": self._header()})
 
     async def zero_wrench(self, request: ZeroWrench) -> Wrench:
-        """Take the present wrench as zero."""
+        """Take the present wrench as zero; wait for the end of a motion's swing, but for no motion."""
         refusal = self._check_age(request.header) if request.header.stamp else None
         if refusal := refusal or self._executor.authority.check_owner(request.owner):
             raise refusal
-        self._executor.force.zero()
+        end = self._clock.now() + SETTLE_TIMEOUT
+        while True:
+            try:
+                self._executor.force.zero()
+                break
+            except Refused as refused:
+                if refused.code != "settling" or self._clock.now() > end:
+                    raise
+            await self._clock.sleep(SETTLE_TIMEOUT / 20)
         self._log.info("%s zeroed the wrench", request.owner or "the task")
         return self._executor.force.message(self._header())
 

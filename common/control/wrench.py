@@ -166,13 +166,14 @@ class WrenchEstimator:
         """Take the mean of the last REST seconds as zero: of a bias of the sensor, for every orientation.
 
         Raises:
-            Refused: the arm moves, was not at rest for that long, or the sensor does not report.
+            Refused: the arm moves (`moving`), was not at rest for that long (`settling`), or reports no force.
         """
         if self.wrench is None:
             raise Refused("no_wrench", "the arm reports no force")
         rest = self._at_rest[-1][0] - self._at_rest[0][0] if self._at_rest else 0.0
         if rest < REST - 0.02:
-            raise Refused("moving", f"the arm must be at rest for {REST:g} s, and is for {rest:.2f} s")
+            raise Refused("settling" if self._at_rest else "moving",
+                          f"the arm must be at rest for {REST:g} s, and is for {rest:.2f} s")
         self._bias = np.mean([reading for _, reading in self._at_rest], axis=0)
         self.wrench = self.unfiltered = np.zeros(6)
         self.zeroed = True

@@ -6,7 +6,7 @@ from typing import ClassVar
 
 from pydantic import Field
 
-from common.messages.basics import SMALL_BYTES, Header, Message, OperatorName, Text, Vector3
+from common.messages.basics import SMALL_BYTES, Finite, Header, Message, OperatorName, Text, Vector3
 
 
 class Wrench(Message):
@@ -21,6 +21,8 @@ class Wrench(Message):
     force: Vector3 | None = Field(None, description="[N]; null: unknown, see reason")
     torque: Vector3 | None = Field(None, description="about the tool centre point [N m]; null: unknown, see reason")
     zeroed: bool = Field(False, description="whether the sensor was zeroed since the executor started")
+    payload: Finite = Field(0.0, description="mass whose weight is subtracted, by the arm's controller or here [kg]")
+    com: Vector3 = Field(Vector3(), description="centre of mass of that payload, from the flange [m]")
     reason: Text = Field("", description="why there is no wrench; empty while there is one")
 
 

@@ -12,6 +12,7 @@ from common.messages.basics import (
     Finite,
     Fraction,
     Header,
+    Label,
     Message,
     Name,
     OperatorName,
@@ -74,12 +75,15 @@ class RobotDescription(Message):
 
     max_bytes: ClassVar[int] = 4 * SMALL_BYTES
 
+    omitted_defaults: ClassVar[tuple[str, ...]] = ("flange",)
+
     header: Header = Header()
     joints: list[Name] = Field(max_length=MAX_JOINTS)
     lower: Joints = Field(description="lower position limits [rad or m]")
     upper: Joints = Field(description="upper position limits [rad or m]")
     velocity: Joints = Field(description="velocity limits [rad/s or m/s]")
     tcp: Name = Field(description="frame of the tool centre point, which pose goals are for")
+    flange: Label = Field("", description="frame of the flange, from which payloads are given")
     named_poses: dict[Name, Joints] = Field({}, max_length=200)
     gripper: bool = False
     fingers: list[Name] = Field([], max_length=100, description="links that touch a grasped object")
