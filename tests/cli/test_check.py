@@ -48,6 +48,7 @@ THOROUGH = [
      "would touch lid"),
     ("panda", "world.fixtures=[{id: post, dimensions: [0.1,0.1,1.0], position: [0.3,0,0.5]}]", "rejected",
      "named_poses.home"),
+    ("panda", "robot.flange_link=panda_link3", "rejected", "robot.flange_link: 'panda_link3' is no link that moves"),
     ("panda", "robot.tcp_link=nonsense", "rejected", "robot.tcp_link: 'nonsense' is not a link"),
     ("panda", "robot.srdf=/etc/passwd", "rejected", "robot.srdf: '/etc/passwd' does not parse"),
     ("panda", "robot.named_poses.home=[9,0,0,-2,0,1.5,0]", "rejected", "must be within"),
