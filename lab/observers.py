@@ -76,14 +76,14 @@ class ObservedSensor(ObservedArm):
         return self._below.wrench()
 
 
-def _observed(below: Hardware, limits: Limits) -> ObservedArm:
+def _around(below: Hardware, limits: Limits) -> ObservedArm:
     return (ObservedSensor if isinstance(below, SensingArm) else ObservedArm)(below, limits)
 
 
 def create(robot: RobotConfig, limits: Limits, start: Vector, options: Options) -> ObservedArm:
     """Return an observed arm around the configured backend."""
     below = robot.model_copy(update={"hardware": HardwareConfig(backend=options.backend, options=options.options)})
-    return _observed(load_hardware(below, limits, start), limits)
+    return _around(load_hardware(below, limits, start), limits)
 
 
 def around(
@@ -91,7 +91,7 @@ def around(
 ) -> ObservedArm:
     """Return an observed arm around the arm of a simulated world, which replaces the configured backend."""
     below = robot.model_copy(update={"hardware": HardwareConfig(backend=options.backend, options=options.options)})
-    return _observed(load_hardware(below, limits, start, arm), limits)
+    return _around(load_hardware(below, limits, start, arm), limits)
 
 
 def with_observed_arm(cell: Cell) -> Cell:

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from common import topics
 from common.client.cell import Cell
-from common.client.wrench import TIMEOUT, as_array
 from common.client.operator_motion import MotionFailed
+from common.client.wrench import TIMEOUT, as_array
 from common.control.wrench import Payload, shifted, weight
 from common.errors import ConfigError
 from common.messages import Wrench
