@@ -48,6 +48,7 @@ class Exporter:
     parts: set[str] = field(default_factory=set)  # names that are imported from PARTS
     imports: set[str] = field(default_factory=set)
     file: ProgramFile | None = None
+    patterns: list[str] = field(default_factory=list)  # variables of the pallets that are filled around a step
 
     def script(self, cell: str) -> str:
         """Return the script; `cell` is where it runs if it is given no name of a running cell."""
@@ -168,6 +169,7 @@ class Exporter:
         self.parts.add("pick")
         how = "".join(f", {name}={getattr(step, name)!r}" for name in ("kind", "role", "object", "force", "timeout")
                       if getattr(step, name) != type(step).model_fields[name].default)
+        how += f", outside=[{', '.join(self.patterns)}]" if self.patterns else ""
         yield (f"pick(cell, closing_axis={self.cell.require_gripper().closing_axis!r}, "
                f"approach={self.cell.grasp.approach_clearance:g}, lowest={self.cell.grasp.min_grasp_z:g}{how}"
                f"{self._speed(step)})")
@@ -179,8 +181,12 @@ class Exporter:
     def _palletize(self, step: Palletize) -> Iterator[str]:
         self.parts |= {"place", "over_slot"}
         self.imports.add("from common.tasks.palletizing import Pattern, slots")
-        yield f"for slot in slots(Pattern(**{step.pattern.model_dump(mode='json', exclude_defaults=True)!r})):"
+        pattern = f"pattern_{_name(step.id)}"
+        yield f"{pattern} = Pattern(**{step.pattern.model_dump(mode='json', exclude_defaults=True)!r})"
+        yield f"for slot in slots({pattern}):"
+        self.patterns.append(pattern)
         yield from self._body(step.steps, "    ")
+        self.patterns.pop()
         yield f"    place(cell, over_slot(cell, slot.pose, {step.height:g}), {step.distance:g}{self._speed(step)})"
 
     def _python(self, step: Python) -> Iterator[str]:

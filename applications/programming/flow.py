@@ -14,7 +14,7 @@ from applications.programming.files import ProgramFile
 from applications.programming.model import BaseStep, Call, Condition, If, Loop, Palletize
 from common.errors import UnknownName
 from common.messages import Pose
-from common.tasks.palletizing import slots
+from common.tasks.palletizing import Pattern, slots
 
 TOP = ""  # owner of the frame of a program itself
 TRANSITIONS = 50  # of control flow at once: a loop may have nothing to do
@@ -157,6 +157,11 @@ class Flow:
                 total = places_of(owner) if isinstance(owner, Palletize) else owner.count
                 found.append(f"{owner.id}: {frame.turn + 1}{f' of {total}' if total is not None else ''}")
         return found
+
+    def patterns(self, position: Position) -> list[Pattern]:
+        """Return the patterns that are filled around a position: what is placed there is not picked again."""
+        owners = [self._steps[frame.program].get(frame.owner) for frame in position]
+        return [owner.pattern for owner in owners if isinstance(owner, Palletize)]
 
     def _body(self, frame: Frame) -> Sequence[BaseStep]:
         if not frame.owner:

@@ -20,7 +20,8 @@ from common import messages as m
 from common.client.goals import goal_of
 from common.client.operator_motion import MotionFailed
 from common.robot.transforms import invert, matrix_to_pose, pose_to_matrix, rpy_to_matrix, tool_down, transform
-from common.tasks.handling import grasp_directions
+from common.tasks.handling import DROP, grasp_directions
+from common.tasks.palletizing import Pattern, slot_at
 from common.tasks.stages import place_of
 
 Array = NDArray[np.float64]
@@ -75,7 +76,7 @@ def require_holding(state: m.GripperState, *, holding: bool = True) -> None:
 
 def pick(
     cell: Any, *, closing_axis: str, approach: float, lowest: float, kind: str = "", role: str = "target",
-    object: str = "", force: float = 0.0, timeout: float = 5.0, **how: Any,
+    object: str = "", force: float = 0.0, timeout: float = 5.0, outside: Sequence[Pattern] = (), **how: Any,
 ) -> None:
     """Grasp the fitting object that is nearest to the tool from above, and lift it.
 
@@ -85,7 +86,8 @@ def pick(
     ends, found = time.monotonic() + timeout, list[m.CollisionObject]()
     while not found:
         found = [each for each in cell.objects() if each.role == role and kind in ("", each.kind)
-                 and object in ("", each.id)]
+                 and object in ("", each.id)
+                 and not any(slot_at(pattern, place_of(each.pose)) for pattern in outside)]
         if not found and time.monotonic() > ends:
             raise MotionFailed("not_seen", f"no {object or kind or 'object'} with role {role} is seen")
     at = cell.arm.pose()[:2, 3]
@@ -116,7 +118,7 @@ def place(cell: Any, T: Array, distance: float, **how: Any) -> None:
 
 def over_slot(cell: Any, slot: m.Pose, height: float) -> Array:
     """Return the pose that places the held item at a slot of a pallet; `height` [m] for one that no camera saw."""
-    T_slot = pose_to_matrix(slot)
+    T_slot = backed(pose_to_matrix(slot), DROP, "world")
     attached = cell.planning_scene().attached
     if attached:
         held = invert(pose_to_matrix(attached[0].object.pose))

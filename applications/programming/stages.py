@@ -34,7 +34,8 @@ from common.robot.model import RobotModel
 from common.robot.transforms import invert, matrix_to_pose, pose_to_matrix, rpy_to_matrix, tool_down, transform
 from common.saved_poses import SavedPoses
 from common.tasks import stages as engine
-from common.tasks.handling import grasp_directions, height_of
+from common.tasks.handling import DROP, grasp_directions, height_of
+from common.tasks.palletizing import Pattern, slot_at
 from common.tasks.signals import Output as OutputStage
 from common.tasks.signals import WaitFor
 from common.tasks.stages import Cycle, Stage, View, place_of
@@ -166,7 +167,7 @@ class Builder:
     """Builds the stages of one step."""
 
     def __init__(self, cell: Cell, poses: Mapping[str, Target], speed: float | None, before: Outlook, view: View,
-                 cycle: StepCycle, repeated: Repeated | None = None) -> None:
+                 cycle: StepCycle, repeated: Repeated | None = None, patterns: Sequence[Pattern] = ()) -> None:
         """Build for a program.
 
         Args:
@@ -177,9 +178,10 @@ class Builder:
             view: with the planning scene.
             cycle: of all stages.
             repeated: how far the step came before it was interrupted.
+            patterns: places of items that are not to be picked.
         """
         self.cell, self.poses, self.speed, self.before, self.view = cell, poses, speed, before, view
-        self.cycle, self.repeated = cycle, repeated
+        self.cycle, self.repeated, self.patterns = cycle, repeated, patterns
 
     def build(self, step: BaseStep) -> Built:
         """Return the stages of a step.
@@ -305,7 +307,7 @@ class Builder:
         else:
             yaw = math.remainder(math.atan2(T_slot[1, 0], T_slot[0, 0]), math.pi)
             T = transform(rpy_to_matrix(DOWN[0], DOWN[1], yaw), T_slot[:3, 3] + (0.0, 0.0, step.height))
-        return self._placed(step, step.distance, T)
+        return self._placed(step, step.distance, backed(T, DROP, "world"))
 
     def _placed(self, step: Place | PlaceOnPallet, distance: float, T: Array) -> Built:
         gripper, before = self.cell.require_gripper(), self.before
@@ -357,7 +359,8 @@ class Builder:
     def _choose(self, step: Pick) -> m.CollisionObject:
         """Return the fitting object nearest to the tool; of two that are equally near the higher one."""
         fitting = [each for each in self.view.objects(step.role)
-                   if step.kind in ("", each.kind) and step.object in ("", each.id)]
+                   if step.kind in ("", each.kind) and step.object in ("", each.id)
+                   and not any(slot_at(pattern, place_of(each.pose)) for pattern in self.patterns)]
         if not fitting:
             seen = sorted({each.kind or each.id for each in self.view.objects(step.role)})
             what = step.object or step.kind or "object"

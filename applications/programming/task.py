@@ -121,7 +121,7 @@ class ProgramTask(Task[View]):
 
     def command(self, command: str, view: View) -> list[Command]:
         """Handle a command; a resume also lets a halted program continue."""
-        if command == "resume":
+        if command == "resume" and self.status.halted:
             self.proceed()
         return super().command(command, view)
 
@@ -325,7 +325,8 @@ class ProgramTask(Task[View]):
                 if not view.holding and not self.has_fresh_image(view):
                     raise NotSeen(self.unseen(view) or "no picture since the last motion of the fingers")
             speed = file.program.speed or main.speed
-            built = Builder(self.cell, file.program.poses, speed, before, view, cycle, repeated).build(step)
+            built = Builder(self.cell, file.program.poses, speed, before, view, cycle, repeated,
+                            flow.patterns(position)).build(step)
         except NotSeen as error:
             if self._spent >= getattr(step, "timeout", 0.0):
                 self._fail_step(str(error))

@@ -8,6 +8,7 @@ from typing import Any
 
 from applications.programming.topics import PROGRAM_COMMAND, PROGRAM_STATUS, ProgramCommand, ProgramStatus
 from common.config import load_cell
+from common.messages import MotionStatus
 from common.transport.bus import Bus
 from common.transport.reader import Reader
 from lab.simulation import Outcome, Simulation
@@ -43,8 +44,18 @@ def simulate(
     async def visited(bus: Bus) -> None:
         await visit(Operator(bus))
 
-    loaded = load_cell(cell, (f"services.program_runner.folder={folder}", *overrides))
+    loaded = load_cell(cell, (*overrides, f"services.program_runner.folder={folder}"))
     simulation = Simulation(loaded, 1, visit=visited, limit=limit)
     if made is not None:
         made.append(simulation)
     return simulation.run()
+
+
+async def until(motion: Reader[MotionStatus], condition: Callable[[MotionStatus], bool]) -> MotionStatus:
+    """Wait for a status of the arm."""
+    if motion.latest is not None and condition(motion.latest):
+        return motion.latest
+    async for status in motion:
+        if condition(status):
+            return status
+    raise AssertionError
