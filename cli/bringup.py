@@ -40,8 +40,7 @@ ChaosRate = Annotated[
     str | None, typer.Option("--chaos-rate", metavar="N", help="average number of faults per minute of wall time [30]")
 ]
 UntilStdinEnds = Annotated[
-    bool, typer.Option("--until-stdin-ends", help="shut down at the end of standard input, with the program that "
-                                                  "started this")
+    bool, typer.Option("--until-stdin-ends", help="shut down at the end of standard input")
 ]
 
 

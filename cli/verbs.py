@@ -139,10 +139,8 @@ def before_run(cell: str, overrides: list[str] | None, world: str | None, given:
     so_far = BeforeRun(list(overrides or ()))
     for before in BEFORE_RUN:
         names = inspect.signature(before).parameters
-        found = before(so_far.cell or cell, so_far.overrides, world, **{
-            name: given[name] for name in given if name in names})
-        so_far = BeforeRun(found.overrides, found.first or so_far.first, found.cell or so_far.cell,
-                           found.after or so_far.after)
+        found = before(so_far.cell or cell, so_far.overrides, world, **{n: given[n] for n in given if n in names})
+        so_far = found.following(so_far)
     return so_far
 
 

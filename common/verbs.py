@@ -64,6 +64,11 @@ class BeforeRun:
     after: Callable[[], None] | None = None
     """Called after the end of the run, also after Ctrl-C."""
 
+    def following(self, before: BeforeRun) -> BeforeRun:
+        """Return this, with what an earlier hook has set and this one has not."""
+        return BeforeRun(self.overrides, self.first or before.first, self.cell or before.cell,
+                         self.after or before.after)
+
     def changed(self, given: Mapping[str, Any]) -> dict[str, Any]:
         """Return the options of the run with its cell and overrides."""
         return {**given, "cell": self.cell or given["cell"], "overrides": self.overrides}

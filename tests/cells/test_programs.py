@@ -1,4 +1,4 @@
-"""Programs in a cell of real processes: the exported script does the same, and a killed supervisor resumes on request."""
+"""Programs in a cell of real processes: exported as a script, and resumed after the supervisor was killed."""
 
 from __future__ import annotations
 
