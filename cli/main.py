@@ -34,6 +34,7 @@ from cli.options import CommandGroup
 from common.errors import RequestFailed, ZencellError
 from common.terminal import echo, printable
 from tools import io_verbs
+from tools.payload import verbs as payload
 from tools.teleoperation.verbs import VERBS as TELEOPERATION
 
 NO_HOME = "Could not determine home directory."  # pathlib's error for ~NAME/...
@@ -103,7 +104,7 @@ app = CommandLine(
     rich_markup_mode=None,
 )
 app.callback()(choices.root)
-of_applications = verbs.ApplicationVerbs(app, {"task": commands.task}, bringup.run, last="chaos")
+of_applications = verbs.ApplicationVerbs(app, {"task": commands.task, "robot": robot.app}, bringup.run, last="chaos")
 app.command()(bringup.run)
 app.command()(bringup.up)
 app.command()(catalogue.new)
@@ -122,6 +123,7 @@ app.add_typer(commands.task, name="task")
 app.add_typer(commands.world, name="world")
 app.add_typer(commands.scene, name="scene")
 of_applications.take_verbs(io_verbs.VERBS)
+of_applications.take_verbs(payload.VERBS)
 of_applications.take_all()
 app.add_typer(robot.app, name="robot")
 app.add_typer(calibrate.app, name="calibrate")

@@ -113,23 +113,6 @@ def payload(
     _order(at, "payload", options.number("KG", mass), com={"x": x, "y": y, "z": z})
 
 
-@app.command("identify-payload")
-def identify_payload(
-    poses: Annotated[str, typer.Option("--poses", metavar="N", help="orientations to measure in, 4 to 12")] = "6",
-    speed: Annotated[str, typer.Option("--speed", metavar="S", help="share of the speed limits")] = "0.2",
-    at: CellTarget = RUNNING,
-) -> None:
-    """Tilt the tool where it is, measure mass and centre of mass beyond the flange at rest, and return."""
-    from tools.payload import measurement
-
-    count, share = options.whole("--poses", poses, 0) or 0, options.number("--speed", speed)
-    measurement.check_request(count, share)
-    found, flange = at.join(lambda cell: measurement.identify_payload(
-        cell, poses=count, speed=share, report=lambda line: echo(line, err=True)))
-    for line in measurement.report_lines(found, flange):
-        echo(line)
-
-
 @app.command()
 def io(
     output: Annotated[str | None, typer.Argument(metavar="OUTPUT", help="number of a digital output")] = None,

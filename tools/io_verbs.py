@@ -2,32 +2,19 @@
 
 from __future__ import annotations
 
-import asyncio
-from collections.abc import Awaitable, Callable
 from contextlib import aclosing
-from typing import TYPE_CHECKING, Annotated, TypeVar
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from common.errors import ConfigError
 from common.terminal import echo
 from common.verbs import Verbs
+from tools.joining import join
 
 if TYPE_CHECKING:
     from common.client.cell import Cell
     from common.messages import IoSignal, IoState
-
-T = TypeVar("T")
-
-
-def _join(visit: Callable[[Cell], Awaitable[T]], cell: str | None, domain: str | None, connect: str | None) -> T:
-    from common.client.cell import Cell
-
-    async def visited() -> T:
-        async with Cell(cell, domain=domain, connect=connect) as joined:
-            return await visit(joined)
-
-    return asyncio.run(visited())
 
 
 def _line(state: IoState, signal: IoSignal, width: int) -> str:
@@ -40,7 +27,7 @@ def _line(state: IoState, signal: IoSignal, width: int) -> str:
 
 def list_(cell: str | None = None, domain: str | None = None, connect: str | None = None) -> None:
     """List all signals: direction, value, and why one cannot be read."""
-    state = _join(lambda joined: joined.io.state(), cell, domain, connect)
+    state = join(lambda joined: joined.io.state(), cell, domain, connect)
     width = max((len(signal.name) for signal in state.signals), default=0)
     for signal in state.signals:
         echo(_line(state, signal, width))
@@ -55,7 +42,7 @@ def set_(
     from common.client.io import format_value, parse_value
 
     wanted = parse_value(signal, value)
-    reply = _join(lambda joined: joined.io.set(signal, wanted), cell, domain, connect)
+    reply = join(lambda joined: joined.io.set(signal, wanted), cell, domain, connect)
     echo(f"{reply.signal} is {format_value(reply.value)}")
 
 
@@ -89,7 +76,7 @@ def watch(
                             return
                 state = await anext(states)
 
-    _join(visit, cell, domain, connect)
+    join(visit, cell, domain, connect)
 
 
 VERBS = Verbs(commands={"io list": list_, "io set": set_, "io watch": watch},
