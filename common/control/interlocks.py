@@ -1,7 +1,8 @@
 """Interlocks: stops, holds and blocked goals that keep the robot from moving, and the file in which they persist.
 
 Interlocks of operators, the speed set by an operator and an unrecovered safety stop persist over restarts of the
-executor and the machine. Holds of the watchdog, the scene monitor and the controller do not.
+executor and the machine. Holds of the watchdog, the scene monitor, the coordinator of several arms and the controller
+do not.
 """
 
 from __future__ import annotations

@@ -32,6 +32,7 @@ from common.messages import (
 from common.time_source import monotonic, wall_ns
 
 NOT_OWNER = "not_owner"
+BOUND: tuple[Literal["scene_monitor", "coordinator"], ...] = ("scene_monitor", "coordinator")  # holds of one goal
 STALE, AHEAD = "stale_request", "clock_ahead"
 WhenAlone = Literal["finish", "hold"]
 
@@ -168,7 +169,7 @@ class MotionAuthority:
         self._ownership = MotionOwnership()
         self._jogged = False  # until the arm is at rest
         self._published: tuple[MotionOwner, bool] | None = None
-        self._monitored_goal = ""  # that the scene monitor holds
+        self._held_goals: dict[str, str] = {}  # by holder: its hold ends with this goal
         self._holding = False  # the controller itself
         self.apply_interlocks()
 
@@ -271,8 +272,10 @@ class MotionAuthority:
 
     def update(self, moving: bool) -> None:
         """End what is over; once a cycle."""
-        if self._monitored_goal and self._monitored_goal != self._arm.goal:  # nothing obstructs a goal that is over
-            self.hold(HoldRequest(hold=False, by="scene_monitor"))
+        for holder in BOUND:  # nothing obstructs a goal that is over
+            if self._held_goals.get(holder, self._arm.goal) != self._arm.goal:
+                del self._held_goals[holder]
+                self._hold_internally(holder, False, "")
         self._ownership.update(moving, monotonic())
 
     def changed_owner(self, header: Header) -> MotionOwner | None:
@@ -314,6 +317,8 @@ class MotionAuthority:
         """
         if request.by != "operator" and request.hold and request.goal not in ("", self._arm.goal):
             return self._arm.status, []  # that goal is over
+        if request.by == "coordinator" and request.goal != self._arm.goal:
+            return self._arm.status, []  # it was proved for that goal only
         released = self.interlocks.hold(request)
         if request.hold:
             self.interrupt_jogging()
@@ -323,8 +328,10 @@ class MotionAuthority:
                 starter = request.owner or UNKNOWN_OPERATOR
                 self._end_motion(f"{starter} started the task; the motion was {owner.description}", now)
             self._ownership.end()  # the next to move it is this operator, or the task that is started
-        if request.by == "scene_monitor":
-            self._monitored_goal = request.goal if request.hold else ""
+        if request.by in BOUND and request.hold and request.goal:
+            self._held_goals[request.by] = request.goal
+        elif request.by in BOUND:
+            self._held_goals.pop(request.by, None)
         if request.by != "operator":
             self._arm.hold(request.hold, request.reason, request.by)
         self.apply_interlocks()
@@ -345,8 +352,19 @@ class MotionAuthority:
 
     def continue_hold(self, goal: str, joined: str) -> None:
         """Keep a hold of the scene monitor when a goal is joined, until the monitor has checked the new path."""
-        if goal == self._monitored_goal:
-            self._monitored_goal = joined
+        for holder, held in self._held_goals.items():
+            if held == goal:
+                self._held_goals[holder] = joined
+
+    def hold_at_start(self, goal: str, reason: str) -> None:
+        """Hold a goal that is about to be accepted at its start, until the coordinator of the arms releases it."""
+        self._held_goals["coordinator"] = goal
+        self._hold_internally("coordinator", True, reason)
+
+    def _hold_internally(self, holder: Literal["scene_monitor", "coordinator"], hold: bool, reason: str) -> None:
+        self.interlocks.set_internal_hold(holder, hold, reason)
+        self._arm.hold(hold, reason, holder)
+        self.apply_interlocks()
 
     def hold_by_controller(self, hold: bool, reason: str = "") -> None:
         """Bring the arm to rest on its path for a reason of the executor itself, or release that hold."""

@@ -26,12 +26,14 @@ class Options:
         patience: how long an arm rests in the way of an older request before it moves back [s].
         overtaken: how long younger requests may overtake an older one [s].
         longest_wait: after which a request is refused [s].
+        effort: cells that may be measured in a step, about 0.1 ms each; longer proofs take several steps.
     """
 
     clearance: float = 0.02
     patience: float = 1.0
     overtaken: float = 5.0
     longest_wait: float = 120.0
+    effort: int = 300
     delays: Delays = field(default_factory=Delays)
 
 
@@ -60,6 +62,7 @@ class Ticket:
     moving: Moving | None  # None: it asks to move alone
     first: float
     last: float
+    possible: bool = False  # it was proved against the home poses of all other arms
     reason: str = ""
     waits_for: set[str] = field(default_factory=set)
 

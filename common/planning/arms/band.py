@@ -3,9 +3,9 @@
     band = drift + report + 2 message + tick + cycle + braking
 
 An arm may be `drift` behind before anything is done. That it is later shows at the latest in its next report, each
-`report`, which takes `message` to the coordinator; that decides within a `tick`, and its hold takes another `message`
-and a control `cycle` to the other arm, which then brakes on its path. No arm is ever ahead of its schedule by more
-than its start ramp, which `drift` contains.
+`report`, which takes `message` to the coordinator; that decides within a `tick`, proofs included, and its hold takes
+another `message` and a control `cycle` to the other arm, which then brakes on its path. No arm is ever ahead of its
+schedule by more than its start ramp, which `drift` contains.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class Delays:
     drift: float = 0.05
     report: float = 0.1  # common.control.status.PROGRESS_PERIOD
     message: float = 0.03
-    tick: float = 0.02
+    tick: float = 0.06
     cycle: float = 0.01
 
     def band(self, *braking: float) -> float:

@@ -27,6 +27,7 @@ Line = Callable[[str, Array, Array], bool]  # arm, from, to (dof,) [rad]: whethe
 
 RETREAT = "retreat-"  # first part of the ids of motions that the coordinator requests
 REPEATED = 2.0  # [s] a request that was not repeated for longer is withdrawn
+UNFINISHED = "the proof is not finished"
 PAST = 0.02  # [s] of a path that are proved again behind an arm: reports are rounded
 
 
@@ -107,7 +108,7 @@ class Coordinator:
             offset = None if own.state is None or path is None else path.positions[0] - own.state.q
             moving = None if path is None else Moving(body or own.body, ArmMotion(path, offset), frozenset(may_touch))
             ticket = own.ticket = Ticket(number, goal, moving, now, now)
-            if moving is not None and (problem := self._impossible(own, moving)):
+            if problem := self._impossible(own, ticket):
                 return self.refuse(own, "blocked", problem)
         ticket.last = now
         return Decision("wait", message=ticket.reason or "its turn has not come",
@@ -122,12 +123,14 @@ class Coordinator:
             del self.outcomes[next(iter(self.outcomes))]
         return decision
 
-    def _impossible(self, own: Arm, moving: Moving) -> str:
-        """Return why a motion could not run even if all other arms were at home; empty if it could."""
+    def _impossible(self, own: Arm, ticket: Ticket) -> str:
+        """Return why a motion could not run even if all other arms were at home; empty if that is not known."""
         for other in self._others(own):
-            if clash := self.proofs.anywhere(moving, other.home):
-                return (f"it would come closer than {self.options.clearance:g} m to {other.name} at home: "
-                        + _named(clash))
+            if ticket.moving is not None and (clash := self.proofs.anywhere(ticket.moving, other.home)):
+                return "" if self.proofs.exhausted else (
+                    f"it would come closer than {self.options.clearance:g} m to {other.name} at home: "
+                    + _named(clash))
+        ticket.possible = True
         return ""
 
     def _others(self, own: Arm) -> list[Arm]:
@@ -167,8 +170,9 @@ class Coordinator:
 
     def _end(self, arm: Arm, run: Committed, state: Observed, now: float) -> None:
         """Record the way back of an arm whose motion is over, complete or not."""
+        arm.rest, arm.rest_since = arm.end, now  # whose proofs are known
         arm.committed, arm.hold = None, ""
-        arm.rest, arm.rest_since = Moving(arm.body, ArmMotion.resting(state.q)), now
+        arm.rests_at(state.q, now)
         if np.abs(state.q - run.motion.end).max() <= way_back.CLOSE:
             arm.back = run.back
         else:
@@ -195,6 +199,12 @@ class Coordinator:
         assert ticket is not None
         ticket.waits_for.clear()
         ticket.reason = ""
+        if not ticket.possible and (problem := self._impossible(arm, ticket)):
+            self.refuse(arm, "blocked", problem)
+            return
+        if not ticket.possible:
+            ticket.reason = UNFINISHED
+            return
         if now - ticket.first > self.options.longest_wait:
             self.refuse(arm, "blocked_too_long", f"it waited {self.options.longest_wait:g} s")
             return
@@ -247,6 +257,9 @@ class Coordinator:
         if ticket.waits_for:
             return
         back = self._way_back(arm, moving, end, before)
+        if back is None and self.proofs.exhausted:
+            ticket.reason = UNFINISHED
+            return
         if back is None:
             blockers = [other.name for other in self._others(arm) if not other.is_home]
             if not blockers:

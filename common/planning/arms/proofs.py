@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from common.planning.arms.pair_world import ArmBody, PairWorld
-from common.planning.arms.timed_pairs import ArmMotion, Clash, PairProof, Schedule
+from common.planning.arms.timed_pairs import ArmMotion, Clash, Effort, PairProof, Schedule
 
 Array = NDArray[np.float64]
 
@@ -38,8 +38,14 @@ class Proofs:
     def __init__(self, clearance: float) -> None:
         """Keep this clearance [m]."""
         self.clearance = clearance
+        self.effort = Effort()
         self._worlds: OrderedDict[tuple[int, int, frozenset[str]], PairWorld] = OrderedDict()
         self._proofs: OrderedDict[tuple[int, int], tuple[Moving, Moving, PairProof]] = OrderedDict()
+
+    @property
+    def exhausted(self) -> bool:
+        """Whether answers since the effort was set may lack a proof that is only not finished."""
+        return self.effort.left <= 0
 
     def in_time(self, one: Moving, at: Schedule, other: Moving, other_at: Schedule, band: float) -> Clash | None:
         """Return where two motions may come too close while their schedules differ by at most `band` [s], or None."""
@@ -57,7 +63,7 @@ class Proofs:
         key = id(one), id(other)
         found = self._proofs.get(key)
         if found is None:
-            proof = PairProof(self._world(one, other), one.motion, other.motion, self.clearance)
+            proof = PairProof(self._world(one, other), one.motion, other.motion, self.clearance, self.effort)
             found = self._proofs[key] = one, other, proof  # the motions are referenced: their ids stay unique
             if len(self._proofs) > _MOST_PROOFS:
                 self._proofs.popitem(last=False)

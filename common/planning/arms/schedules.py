@@ -40,6 +40,7 @@ class ScheduleKeeper:
 
     def step(self, now: float) -> list[Retreat | Cancel]:
         """Set which arms to hold; return what else must be requested; cell time [s]."""
+        self._all.proofs.effort.left = self._all.options.effort
         running = [arm for arm in self._all.arms.values() if arm.committed is not None]
         holds = self._pairs(running, now)
         drift = self._all.options.delays.drift
