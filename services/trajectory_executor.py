@@ -25,6 +25,7 @@ from common.control.trajectory import Tolerances
 from common.hardware.interface import has_simulated_world, real_arm
 from common.messages import MotionOwner, MotionStatus
 from common.process.hosted_arms import create_executors, hosted_arms
+from common.process.reservation import Reservation
 from common.process.service import main
 from common.sim.interface import GraspTolerances
 from common.sim.state_file import BackgroundSaver, Saver, StateFile
@@ -116,6 +117,8 @@ class HostedArm:
         self._publishers = Publishers(self._bus, config, robot, reports_world)
         self._jog_commands = self._bus.reader(topics.MOTION_JOG)
         self.handlers = RequestHandlers(bus.service, config, bus.clock, bus.log, self._publishers.put)
+        if len(config.arms.robots) > 1:
+            self.handlers.permission = Reservation(bus, name or config.arms.own)
         self._serve(reports_world)
         self._orphan_policy, self._present = OrphanPolicy(), False
         self._task = config.arms.tasks.get(name, "") if name else config.members.task

@@ -13,6 +13,7 @@ from common.control.interlocks import InterlockStore, Speed
 from common.control.jogging import DEADMAN
 from common.control.motion_authority import check_age
 from common.control.status import Report
+from common.control.trajectory_controller import TrajectoryController
 from common.errors import Refused
 from common.hardware.interface import WorldBackend
 from common.messages import (
@@ -93,8 +94,30 @@ class WorldThread:
             self._step.cancel()
 
 
+class Permission(Protocol):
+    """Asks for permission to move in a cell of several arms; see `common.process.reservation`."""
+
+    def check(self, request: ExecuteRequest) -> Refused | None:
+        """Return why a motion cannot be permitted, or None."""
+
+    def ask_for(self, request: ExecuteRequest, arm: TrajectoryController, held: Callable[[], bool]) -> None:
+        """Ask for a goal that is held at its start."""
+
+    def check_alone(self) -> Refused | None:
+        """Return why the arm may not move on an unknown path now, or None."""
+
+    def close(self) -> None:
+        """Stop asking."""
+
+
 class RequestHandlers:
-    """One method for each request of the executor's service; call `start` before the first request."""
+    """One method for each request of the executor's service; call `start` before the first request.
+
+    Attributes:
+        permission: to move, in a cell of several arms; None in a cell of one.
+    """
+
+    permission: Permission | None = None
 
     def __init__(
         self, name: str, settings: Settings, clock: Clock, log: logging.Logger,
@@ -140,7 +163,15 @@ class RequestHandlers:
         assessment = None
         if refusal is None and self._executor.takes_long(request):  # the control cycle continues meanwhile
             assessment = await asyncio.to_thread(self._executor.assess, request)
-        status = self._executor.execute(request, self._clock.now(), refusal, assessment)
+        permission, executor = self.permission, self._executor
+        new = permission is not None and not executor.arm.knows(request.id)
+        if permission is not None and new:
+            refusal = refusal or permission.check(request)
+            if not executor.arm.goal:
+                executor.authority.hold_at_start(request.id, "waits for the permission of the coordinator")
+        status = executor.execute(request, self._clock.now(), refusal, assessment)
+        if permission is not None and new and status.state == "active":
+            permission.ask_for(request, executor.arm, lambda: "coordinator" in executor.arm.reports.holds)
         if status.state == "rejected":
             self._log.warning("goal %s rejected: %s [%s]", request.id, status.message, status.error)
         return await self._persisted(status)
@@ -220,7 +251,10 @@ class RequestHandlers:
         logged = self._refused_jogging
         try:
             age, tolerance = self._clock.age_ms(request.header.stamp) * 1e-3, self._settings.clock_tolerance
-            self._executor.jog(request, check_age(age, DEADMAN + tolerance, tolerance))
+            refusal = check_age(age, DEADMAN + tolerance, tolerance)
+            if self.permission is not None:
+                refusal = refusal or self.permission.check_alone()
+            self._executor.jog(request, refusal)
             logged.pop(request.owner, None)
         except Refused as refusal:
             if refusal.code not in (logged.get(request.owner), "let_go"):
@@ -251,6 +285,8 @@ class RequestHandlers:
         self._log.info("%s orders the arm: %s", request.owner or UNKNOWN_OPERATOR, what)
         if request.header.stamp and (refusal := self._check_age(request.header)):
             raise refusal  # it does not recover from a stop after the request
+        if request.act == "freedrive" and request.value and self.permission is not None:
+            raise Refused("several_arms", "an arm next to others is not moved by hand: nothing proves where it goes")
         self._orders[number := self._executor.order(request)] = asyncio.get_running_loop().create_future()
         if outcome := await self._orders[number]:
             raise Refused("robot", f"{request.act}: {outcome}")
@@ -310,6 +346,8 @@ class RequestHandlers:
 
     async def close(self) -> None:
         """Finish writing a safety stop of the arm; do not wait for anything else."""
+        if self.permission is not None:
+            self.permission.close()
         if self._world is not None:
             self._world.close()
         if self._arm_stop_saving is not None:
