@@ -231,7 +231,7 @@ class TwoArms:
                 done = goal.time if goal is not None and goal.id == arm.committed.goal else arm.done
                 late = self.now - arm.committed.schedule.time(done)
                 ends = done >= arm.committed.motion.duration - 1e-3
-                lags.append(0.0 if ends else max(late, 0.0) if done <= 0 else late)
+                lags.append(0.0 if ends else max(late, 0.0) if arm.committed.schedule.is_starting(done) else late)
             self.largest_gap = max(self.largest_gap, abs(lags[0] - lags[1]))
 
     def _hold(self, name: str, goal: str, reason: str) -> None:

@@ -157,10 +157,11 @@ class Arm:
         assert run is not None
         if done >= run.motion.duration - 1e-3:
             return 0.0
-        if state is not None and done > 0.0 and not (state.held or state.held_by_others):
+        if run.schedule.is_starting(done):
+            return max(now - run.schedule.time(done), 0.0)
+        if state is not None and not (state.held or state.held_by_others):
             done += min(max(now - state.stamp, 0.0), report) * run.schedule.rate
-        late = now - run.schedule.time(done)
-        return max(late, 0.0) if done <= 0.0 else late
+        return now - run.schedule.time(done)
 
     @property
     def is_home(self) -> bool:

@@ -246,7 +246,7 @@ class Coordinator:
     def _commit(self, arm: Arm, ticket: Ticket, moving: Moving, now: float) -> None:
         delays, state = self.options.delays, arm.state
         rate = 1.0 if state is None else max(state.scaling, 0.05)
-        schedule = Schedule(now + delays.message + AFTER_RELEASE, rate)
+        schedule = Schedule(now + delays.message + AFTER_RELEASE * rate, rate)
         end = Moving(moving.body, ArmMotion.resting(moving.motion.end))
         before = arm.back.motion.path if arm.back is not None else None
         braking = braking_time(moving.motion.path, arm.limits)

@@ -14,7 +14,7 @@ from common.planning.arms.arm import Arm
 from common.planning.arms.band import AFTER_RELEASE
 from common.planning.arms.coordinator import PAST, Coordinator, Retreat
 from common.planning.arms.proofs import Moving
-from common.planning.arms.timed_pairs import ArmMotion, Schedule
+from common.planning.arms.timed_pairs import NOT_AT_REST, ArmMotion, Schedule
 
 RETRY = 0.1  # [s] between attempts to prove new schedules
 LEAST_RATE = 0.05
@@ -111,12 +111,12 @@ class ScheduleKeeper:
     def _from_here(self, arm: Arm, now: float) -> Schedule:
         assert arm.committed is not None
         rate = max(arm.state.scaling, LEAST_RATE) if arm.state is not None else 1.0
-        starts = arm.hold or arm.done <= 0.0
-        delay = AFTER_RELEASE + self._all.options.delays.message if starts else 0.0
+        starts = bool(arm.hold) or arm.done <= 0.0
+        delay = AFTER_RELEASE * rate + self._all.options.delays.message if starts else 0.0
         done = arm.done
         if not starts and arm.state is not None:
             done += min(max(now - arm.state.stamp, 0.0), self._all.options.delays.report) * rate
-        return Schedule(now + delay - done / rate, rate, arm.done - PAST)
+        return Schedule(now + delay - done / rate, rate, arm.done - PAST, done if starts else NOT_AT_REST)
 
     def _at_rest_in_the_way(
         self, running: list[Arm], holds: dict[str, str], now: float

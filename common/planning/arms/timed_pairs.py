@@ -26,6 +26,8 @@ Cell = tuple[float, float, float, float]  # from, to [s] on the first trajectory
 
 _PIECE = 0.025  # [s] longest piece of a cubic whose speed is bounded at once
 _FINEST = 0.002  # [m] cells in which no link moves farther are not divided
+SPEEDING_UP = 0.08  # [s] of a motion that an arm may be ahead, as it speeds up to the rate of its schedule
+NOT_AT_REST = -1e9
 MAX_CELLS = 20_000  # of one proof: then it fails
 
 
@@ -84,15 +86,25 @@ class ArmMotion:
 
 @dataclass(frozen=True)
 class Schedule:
-    """When a motion is followed: it starts at `start` [s], and its time passes at `rate`; it is `done` [s] so far."""
+    """When a motion is followed: its own time 0 is at `start` [s], and passes at `rate`.
+
+    Attributes:
+        done: own time [s] before which the arm will not be any more.
+        begin: own time [s] at which the arm rests until the schedule is there; NOT_AT_REST for an arm in motion.
+    """
 
     start: float
     rate: float = 1.0
     done: float = 0.0
+    begin: float = 0.0
 
     def time(self, own: float) -> float:
         """Return when the motion is at its own time [s]."""
         return self.start + own / self.rate
+
+    def is_starting(self, own: float) -> bool:
+        """Return whether the arm may be there at any earlier time, too: it rests there, or just speeds up."""
+        return own <= self.begin + SPEEDING_UP
 
 
 @dataclass(frozen=True)
@@ -148,10 +160,10 @@ class PairProof:
             a0, a1, b0, b1 = cell
             if a1 < one.done or b1 < other.done:
                 return False
-            first = -math.inf if a0 <= 0.0 else one.time(a0)
+            first = -math.inf if one.is_starting(a0) else one.time(a0)
             last = math.inf if a1 >= self.one.duration else one.time(a1)
             return first - band <= (math.inf if b1 >= self.other.duration else other.time(b1)) and (
-                -math.inf if b0 <= 0.0 else other.time(b0)) - band <= last
+                -math.inf if other.is_starting(b0) else other.time(b0)) - band <= last
 
         return self._clash(relevant)
 
