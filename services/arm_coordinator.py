@@ -31,8 +31,8 @@ class Config(Parameters):
     clearance: float = Field(0.02, ge=0.005, le=0.3, description="between two arms with what they carry [m]")
     carried: float = Field(0.06, ge=0, le=0.5, description="radius about the TCP while a gripper holds what no "
                                                            "planning scene knows [m]")
-    patience: float = Field(1.0, ge=0, le=60, description="an arm that rests in the way of an older request moves back "
-                                                          "after this time [s]")
+    patience: float = Field(1.0, ge=0, le=60, description="an arm at rest that obstructs an older request moves "
+                                                          "back after this time [s]")
     overtaken: float = Field(5.0, ge=0, le=60, description="a request that waited longer is not overtaken any more [s]")
     longest_wait: float = Field(120.0, ge=1, le=3600, description="a request that waited longer is refused [s]")
     message: float = Field(0.03, ge=0.001, le=0.5, description="longest time of a message to or from an executor [s]")

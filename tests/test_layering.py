@@ -18,7 +18,7 @@ PLATFORM = ("page", "drivers", "recording", "tools", "lab", "security", "bridges
 PLATFORM_SERVICES = (
     "motion_planner", "robot_state_publisher", "trajectory_executor", "viewer", "camera_simulator", "depth_camera",
     "camera_opencv", "real_depth_camera", "fixture_scene", "router", "foxglove_bridge", "ros2_bridge",
-    "ros2_camera", "ros2_joints", "io", "arm_tasks",
+    "ros2_camera", "ros2_joints", "io", "arm_coordinator", "arm_tasks",
 )
 APPLICATIONS = [path.parent.name for path in sorted((ROOT / "applications").glob("*/__init__.py"))]
 SHORT_FORMS = ("common/config/world.py",)  # of world files

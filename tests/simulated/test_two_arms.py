@@ -40,7 +40,7 @@ def test_one_arm_is_held_alone_while_the_other_moves() -> None:
             await readers["right"].next()
         await hold.call(m.HoldRequest(hold=True, owner="ann"))
         goal = readers["right"].latest.id
-        while readers["right"].latest.id == goal:
+        while readers["right"].latest.id == goal or readers["right"].latest.held:  # the next one has permission
             await readers["right"].next()
         states.update({arm: reader.latest for arm, reader in readers.items()})
         await hold.call(m.HoldRequest(hold=False, owner="ann"))
@@ -48,3 +48,22 @@ def test_one_arm_is_held_alone_while_the_other_moves() -> None:
     outcome = Simulation(load_cell(CELL), 1, visit=visit, limit=60.0).run()
     assert states["left"].held and not states["right"].held
     assert (outcome.state, outcome.done) == ("DONE", 2), outcome
+
+
+@pytest.mark.slow
+def test_nothing_moves_without_the_coordinator(tmp_path: Path) -> None:
+    cell = tmp_path / "two.yaml"
+    cell.write_text(Path(CELL).read_text(encoding="utf-8").replace("  arm_coordinator: {}\n", ""), encoding="utf-8")
+    positions, errors = set[tuple[float, ...]](), set[str]()
+
+    async def visit(bus) -> None:
+        states = bus.reader(arms_topic(topics.JOINT_STATES, "left"))
+        motion = bus.reader(arms_topic(topics.MOTION_STATUS, "left"))
+        while not errors:
+            positions.add(tuple((await states.next()).position[:7]))
+            if motion.latest is not None and motion.latest.error:
+                errors.add(motion.latest.error)
+
+    Simulation(load_cell(str(cell)), 1, visit=visit, limit=15.0).run()
+    assert errors == {"no_coordinator"}
+    assert len(positions) == 1

@@ -23,7 +23,7 @@ class Options:
 
     Attributes:
         clearance: between two arms [m], beyond their tracking errors.
-        patience: how long an arm rests in the way of an older request before it moves back [s].
+        patience: how long an arm at rest obstructs an older request before it moves back [s].
         overtaken: how long younger requests may overtake an older one [s].
         longest_wait: after which a request is refused [s].
         effort: cells that may be measured in a step, about 0.1 ms each; longer proofs take several steps.
@@ -115,7 +115,7 @@ class Arm:
 
     @property
     def end(self) -> Moving:
-        """Where it rests, or will rest after its committed motion."""
+        """Pose at rest, now or after its committed motion."""
         if self.committed is None:
             return self.rest
         if self._end is None or self._end[0] is not self.committed:
@@ -127,11 +127,11 @@ class Arm:
 
     @property
     def way_back(self) -> Moving | None:
-        """From where it rests, or will rest."""
+        """Way home from that pose."""
         return self.back if self.committed is None else self.committed.back
 
-    def rests_at(self, q: Array, now: float) -> None:
-        """Record where it rests (dof,) [rad]; a way back from elsewhere is forgotten."""
+    def set_rest(self, q: Array, now: float) -> None:
+        """Record its pose at rest (dof,) [rad]; a way back from elsewhere is forgotten."""
         if self.rest.body is self.body and np.abs(q - self.rest.motion.end).max() <= SAME_POSE:
             return
         moved = np.abs(q - self.rest.motion.end).max() > SAME_POSE
@@ -165,7 +165,7 @@ class Arm:
 
     @property
     def is_home(self) -> bool:
-        """Whether it rests at home."""
+        """Whether it is at rest at home."""
         return self.committed is None and bool(
             np.abs(self.rest.motion.end - self.geometry.home).max() <= way_back.CLOSE)
 

@@ -75,7 +75,7 @@ class Coordinator:
         for i, a in enumerate(names):
             for b in names[i + 1:]:
                 if clash := self.proofs.anywhere(self.arms[a].home, self.arms[b].home):
-                    raise ValueError(f"{a} and {b} are closer than {self.options.clearance:g} m at home: "
+                    raise ValueError(f"are closer than {self.options.clearance:g} m at home: "
                                      f"{clash.pair[0]} and {clash.pair[1]}")
 
     # --- what is observed and requested ---------------------------------------------------------------------------
@@ -151,7 +151,7 @@ class Coordinator:
         return self._retreats_for(waiting, now)
 
     def _follow_up(self, arm: Arm, now: float) -> None:
-        """Note the end of a committed motion, and where an arm rests."""
+        """Note the end of a committed motion, and the pose of an arm at rest."""
         state, run = arm.state, arm.committed
         if arm.ticket is not None and now - arm.ticket.last > REPEATED:
             arm.ticket = None
@@ -164,7 +164,7 @@ class Coordinator:
                 return
             self._end(arm, run, state, now)
         if state.at_rest:
-            arm.rests_at(state.q, now)
+            arm.set_rest(state.q, now)
             if arm.back is None:
                 arm.back = self._line_home(arm, arm.rest)
 
@@ -172,7 +172,7 @@ class Coordinator:
         """Record the way back of an arm whose motion is over, complete or not."""
         arm.rest, arm.rest_since = arm.end, now  # whose proofs are known
         arm.committed, arm.hold = None, ""
-        arm.rests_at(state.q, now)
+        arm.set_rest(state.q, now)
         if np.abs(state.q - run.motion.end).max() <= way_back.CLOSE:
             arm.back = run.back
         else:
@@ -282,10 +282,10 @@ class Coordinator:
         run, prove = other.committed, self.proofs
         if run is None:
             if clash := prove.anywhere(moving, other.rest):
-                return f"{other.name} rests in the way: " + _named(clash)
+                return f"{other.name} obstructs it at rest: " + _named(clash)
         elif other.is_frozen or other.hold:
             if self._passes(moving, (0.0, moving.motion.duration), end, other) is not None:
-                return f"{other.name} is held in the way"
+                return f"{other.name} is held on its path"
         else:
             if abs(other.lag(now, self.options.delays.report)) > self.options.delays.drift:
                 return f"{other.name} is not on its schedule"
@@ -316,10 +316,10 @@ class Coordinator:
                 return back
         return None
 
-    # --- arms in the way ------------------------------------------------------------------------------------------
+    # --- obstructing arms ------------------------------------------------------------------------------------------
 
     def _retreats_for(self, waiting: list[Arm], now: float) -> list[Retreat]:
-        """Return requests for arms that rest in the way of the oldest request."""
+        """Return requests for arms at rest that obstruct the oldest request."""
         oldest = next((arm for arm in waiting if arm.ticket is not None), None)
         if oldest is None or oldest.ticket is None:
             return []
@@ -329,7 +329,7 @@ class Coordinator:
             if other.committed is None and not (self.alone and self.alone[0] == name):
                 done = self.move_back(other, oldest, oldest.ticket.first, now)
                 if isinstance(done, str):
-                    self.refuse(oldest, "blocked", f"{name} rests in the way and {done}")
+                    self.refuse(oldest, "blocked", f"{name} obstructs it and {done}")
                     return []
                 found += done
         return found

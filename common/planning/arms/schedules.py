@@ -2,7 +2,7 @@
 
 The proof of a pair covers all states in which the schedules differ by at most the band. From each of them both motions
 can end: the arm ahead waits until the other one has caught up, then both go on. So a hold ends by itself. Where the
-rest of the motions is free with other schedules, too, nobody waits.
+rest of the motions is free with other schedules, too, no arm waits.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class ScheduleKeeper:
         for arm in running:
             if arm.committed is not None and arm.committed.parked_for:
                 holds.setdefault(arm.name, f"{' and '.join(sorted(arm.committed.parked_for))} passes first")
-        actions = self._at_rest_in_the_way(running, holds, now)
+        actions = self._obstructions(running, holds, now)
         for arm in self._all.arms.values():
             arm.hold = holds.get(arm.name, "")
         return actions
@@ -118,7 +118,7 @@ class ScheduleKeeper:
             done += min(max(now - arm.state.stamp, 0.0), self._all.options.delays.report) * rate
         return Schedule(now + delay - done / rate, rate, arm.done - PAST, done if starts else NOT_AT_REST)
 
-    def _at_rest_in_the_way(
+    def _obstructions(
         self, running: list[Arm], holds: dict[str, str], now: float
     ) -> list[Retreat | Cancel]:
         """Hold arms whose way an arm obstructs that came to rest elsewhere than committed; request that it moves."""
@@ -134,7 +134,7 @@ class ScheduleKeeper:
                 if self._all.proofs.anywhere(run.moving, other.rest, rest) is None:
                     continue
                 since = obstructed[run.goal] = self._obstructed.get(run.goal, now)
-                holds[arm.name] = f"{other.name} rests in its way"
+                holds[arm.name] = f"{other.name} obstructs it at rest"
                 if now - since > self._all.options.longest_wait:
                     actions.append(Cancel(arm.name, run.goal, holds[arm.name]))
                 elif not self._would_clash(other, arm):

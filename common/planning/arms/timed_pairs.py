@@ -32,7 +32,7 @@ MAX_CELLS = 20_000  # of one proof: then it fails
 
 
 class ArmMotion:
-    """A path of the joints over its own time, from rest to rest; before and after it the arm rests at its ends.
+    """A path of the joints over its own time, from rest to rest; before and after it the arm is at its ends.
 
     Attributes:
         duration: [s].
@@ -90,7 +90,7 @@ class Schedule:
 
     Attributes:
         done: own time [s] before which the arm will not be any more.
-        begin: own time [s] at which the arm rests until the schedule is there; NOT_AT_REST for an arm in motion.
+        begin: own time [s] at which the arm waits for its schedule; NOT_AT_REST for an arm in motion.
     """
 
     start: float
@@ -103,7 +103,7 @@ class Schedule:
         return self.start + own / self.rate
 
     def is_starting(self, own: float) -> bool:
-        """Return whether the arm may be there at any earlier time, too: it rests there, or just speeds up."""
+        """Return whether the arm may be there at any earlier time, too: it waits there, or just speeds up."""
         return own <= self.begin + SPEEDING_UP
 
 

@@ -1,4 +1,4 @@
-"""Ways back: how an arm that rests in the way of another one returns to its home pose."""
+"""Ways back: how an arm that obstructs another one returns to its home pose."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Array = NDArray[np.float64]
 SPEED = 0.5  # share of the limits of a way back that is not reversed
 CLOSE = 0.01  # [rad] an arm this close to a pose is at it
 _STEP = 0.05  # [s] between the states of a straight way back
-_MOST_SECONDS = 120.0  # of a reversed way back: a longer one is not kept
+_MOST_SECONDS = 120.0  # of a reversed way back: a longer one is not used
 
 
 def straight(start: Array, end: Array, limits: Limits, share: float = SPEED) -> TimedPath:
