@@ -15,8 +15,10 @@ from applications.programming.model import (
     BaseStep,
     Call,
     Condition,
+    Force,
     Grip,
     If,
+    Insert,
     Loop,
     Motion,
     Move,
@@ -28,10 +30,11 @@ from applications.programming.model import (
     Retreat,
     Target,
     Through,
+    Until,
     Wait,
     walk,
 )
-from applications.programming.stages import Cell
+from applications.programming.targets import Cell
 from common import messages as m
 from common.robot.transforms import matrix_to_rpy
 
@@ -189,6 +192,18 @@ class Exporter:
         self.patterns.pop()
         yield f"    place(cell, over_slot(cell, slot.pose, {step.height:g}), {step.distance:g}{self._speed(step)})"
 
+    def _until(self, step: Until) -> Iterator[str]:
+        yield (f"cell.arm.move_until({step.force:g}, direction={step.direction}, frame={step.frame!r}, "
+               f"max_distance={step.max_distance:g}, speed={step.tool_speed:g}{self._touching(step)})")
+
+    def _insert(self, step: Insert) -> Iterator[str]:
+        most = f", max_distance={step.max_distance:g}" if step.max_distance is not None else ""
+        yield (f"cell.arm.insert({step.depth:g}, force={step.force:g}, direction={step.direction}, "
+               f"frame={step.frame!r}{most}{self._touching(step)})")
+
+    def _touching(self, step: Force) -> str:
+        return f", touch={self._touch(step)}" if step.touch else ""
+
     def _python(self, step: Python) -> Iterator[str]:
         self.parts.add("call")
         module, _, name = step.function.partition(":")
@@ -210,7 +225,7 @@ class Exporter:
         how += f", planner={planner!r}" if planner else ""
         return f"cell.arm.move({target}{how}{self._speed(step)})"
 
-    def _touch(self, step: Motion) -> str:
+    def _touch(self, step: Motion | Force) -> str:
         self.parts.add("ids")
         return f"ids(cell, {step.touch!r})"
 
@@ -259,7 +274,7 @@ WRITERS: dict[type[BaseStep], Callable[[Exporter, Any], Iterator[str]]] = {
     Move: Exporter._move, Through: Exporter._through, Approach: Exporter._approach, Retreat: Exporter._retreat,
     Grip: Exporter._grip, Output: Exporter._output, Wait: Exporter._wait, Loop: Exporter._loop, If: Exporter._if,
     Call: Exporter._call, Pick: Exporter._pick, Place: Exporter._place, Palletize: Exporter._palletize,
-    Python: Exporter._python}
+    Until: Exporter._until, Insert: Exporter._insert, Python: Exporter._python}
 
 
 def _name(program: str) -> str:

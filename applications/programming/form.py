@@ -155,6 +155,7 @@ def new_step(kind: str, known: Known) -> Data:
         "output": lambda: {"signal": _first(known.outputs, "outputs")}, "place": lambda: {"at": here(tool=True)},
         "if": lambda: {"when": {"signal": known.signals[0]} if known.signals else {"holding": True}, "then": []},
         "call": lambda: {"program": _first(known.programs, "other programs")},
+        "until": lambda: {"force": 5.0}, "insert": lambda: {"depth": 0.02},
         "palletize": lambda: {"pattern": {"item": [0.05, 0.05, 0.05], "columns": 2}, "steps": []},
         "python": lambda: {"function": "module:function"},
     }

@@ -250,6 +250,33 @@ class Palletize(BaseStep):
     steps: list[Step] = Field(min_length=1, max_length=MOST_STEPS)
 
 
+class Force(BaseStep):
+    """What steps have whose end the force at the tool decides. They are not repeated after a failure."""
+
+    direction: Metres3 = (0.0, 0.0, -1.0)
+    frame: Literal["base", "tool", "world"] = Field("world", description="whose axes the direction follows")
+    touch: list[Word] = Field([], max_length=50, description="ids or classes of objects that may be touched, also by "
+                                                             "what is held")
+
+
+class Until(Force):
+    """Move the tool straight until it presses with a force."""
+
+    step: Literal["until"] = "until"
+    force: Annotated[float, Field(gt=0, le=1000)] = Field(description="[N]")
+    max_distance: Distance = Field(0.05, description="without contact until there it fails [m]")
+    tool_speed: Annotated[float, Field(gt=0, le=0.25)] = Field(0.01, description="[m/s]")
+
+
+class Insert(Force):
+    """Press the held part, search its hole on a spiral, and push it in."""
+
+    step: Literal["insert"] = "insert"
+    depth: Distance = Field(description="below the first contact [m]")
+    force: Annotated[float, Field(gt=0, le=1000)] = Field(12.0, description="[N]")
+    max_distance: Distance | None = Field(None, description="from the start [m]; default: the depth and 20 mm")
+
+
 class Python(BaseStep):
     """Call a function of the user, `module:function`; what it returns is the outcome."""
 
@@ -260,11 +287,13 @@ class Python(BaseStep):
 
 
 Step = Annotated[
-    Move | Through | Approach | Retreat | Grip | Output | Wait | Loop | If | Call | Pick | Place | Palletize | Python,
+    Move | Through | Approach | Retreat | Grip | Output | Wait | Loop | If | Call | Pick | Place | Palletize | Until
+    | Insert | Python,
     Field(discriminator="step")]
 STEPS: dict[str, type[BaseStep]] = {
     kind.model_fields["step"].default: kind
-    for kind in (Move, Through, Approach, Retreat, Grip, Output, Wait, Loop, If, Call, Pick, Place, Palletize, Python)}
+    for kind in (Move, Through, Approach, Retreat, Grip, Output, Wait, Loop, If, Call, Pick, Place, Palletize, Until,
+                 Insert, Python)}
 
 
 class Program(Part):

@@ -9,7 +9,7 @@ from applications.programming.export import Exporter
 from applications.programming.files import BadProgram, ProgramFile, load_all, load_program
 from applications.programming.flow import Flow
 from applications.programming.rehearsal import Rehearser, static_problems
-from applications.programming.stages import Cell
+from applications.programming.targets import Cell
 from common import messages as m
 from common.atomic_file import state_folder
 from common.config import Cell as CellConfig

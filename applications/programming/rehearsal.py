@@ -11,8 +11,22 @@ from dataclasses import replace
 from applications.programming.files import ProgramFile
 from applications.programming.flow import TRANSITIONS, Flow, Position
 from applications.programming.functions import find_function
-from applications.programming.model import BaseStep, Condition, Grip, If, Loop, Motion, Output, Pick, Python, Wait, walk
-from applications.programming.stages import Builder, Cell, NotSeen, Outlook, ProgramMove, StepCycle
+from applications.programming.model import (
+    BaseStep,
+    Condition,
+    Force,
+    Grip,
+    If,
+    Loop,
+    Motion,
+    Output,
+    Pick,
+    Python,
+    Wait,
+    walk,
+)
+from applications.programming.stages import Builder, Outlook, ProgramMove, StepCycle
+from applications.programming.targets import Cell, NotSeen
 from applications.programming.topics import Rehearsal, RehearsedStep
 from common import messages as m
 from common.config import Io
@@ -137,6 +151,8 @@ class Rehearser:
         if problem := self._wrong.get(step.id, ""):
             item.problem = problem
             self._lost = self._lost or step.id
+        elif isinstance(step, Force):
+            item.unknown, self._lost = "the force decides where it ends", self._lost or step.id
         elif isinstance(step, Python):
             item.unknown = "the time that the function takes"
         elif isinstance(step, Wait) and step.seconds is not None:

@@ -15,7 +15,9 @@ from applications.programming.model import (
     DOWN,
     Approach,
     BaseStep,
+    Force,
     Grip,
+    Insert,
     Motion,
     Move,
     Output,
@@ -25,15 +27,15 @@ from applications.programming.model import (
     Retreat,
     Target,
     Through,
+    Until,
     Wait,
 )
+from applications.programming.targets import Cell, NotSeen, StepProblem, backed, pose_goal
 from common import messages as m
-from common.config import Grasp, GripperConfig
-from common.errors import UnknownName, ZencellError
-from common.robot.model import RobotModel
 from common.robot.transforms import invert, matrix_to_pose, pose_to_matrix, rpy_to_matrix, tool_down, transform
-from common.saved_poses import SavedPoses
 from common.tasks import stages as engine
+from common.tasks.force import ForceMove, MoveUntil
+from common.tasks.force import Insert as InsertMove
 from common.tasks.handling import DROP, grasp_directions, height_of
 from common.tasks.palletizing import Pattern, slot_at
 from common.tasks.signals import Output as OutputStage
@@ -44,15 +46,8 @@ Array = NDArray[np.float64]
 RUNNING = "RUNNING"
 NEAR = 0.2  # [m] from the tool: objects that the gripper may touch when it moves straight back
 SEQUENCE = "sequence"  # planner of motions through several targets
+INSERT_ROOM = 0.02  # [m] above the hole, where an insertion starts at most
 ROOM = 0.02  # [m] by which the fingers open wider than the object
-
-
-class StepProblem(ZencellError):
-    """A step that cannot be turned into stages: an unknown pose, no such object."""
-
-
-class NotSeen(StepProblem):
-    """No fitting object is seen yet."""
 
 
 @dataclass(eq=False)
@@ -103,64 +98,6 @@ class Built:
     stages: list[Stage]
     after: Outlook
     known: bool = True
-
-
-@dataclass(frozen=True)
-class Cell:
-    """What the stages depend on besides the step."""
-
-    robot: RobotModel
-    gripper: GripperConfig | None
-    grasp: Grasp
-    saved: Callable[[], SavedPoses]
-    width_tolerance: float = 0.01  # of a grasped object [m]
-
-    def resolve(
-        self, target: Target, poses: Mapping[str, Target], start: Array | None
-    ) -> tuple[m.JointGoal | m.PoseGoal, Array]:
-        """Return the goal of a target and the pose (4, 4) of the tool there.
-
-        Raises:
-            StepProblem: the pose is unknown, or has another number of joints.
-        """
-        found = poses.get(target.name, target)
-        if found.name:
-            return self._named(found.name, poses)
-        if found.joints is not None:
-            if len(found.joints) != len(self.robot.joint_names):
-                raise StepProblem(f"joints: {len(found.joints)} values for {len(self.robot.joint_names)} joints: "
-                                  f"{', '.join(self.robot.joint_names)}")
-            return m.JointGoal(positions=found.joints), self.robot.fk(found.joints)
-        if found.position is not None:
-            T = transform(rpy_to_matrix(*found.rpy), found.position)
-        else:
-            assert found.by is not None
-            if start is None:
-                raise StepProblem("by: the pose of the tool is not known")
-            T = start.copy()
-            T[:3, 3] += found.by if found.frame == "world" else start[:3, :3] @ np.array(found.by)
-            T[:3, :3] = T[:3, :3] @ rpy_to_matrix(*found.turn)
-        return pose_goal(T), T
-
-    def _named(self, name: str, poses: Mapping[str, Target]) -> tuple[m.JointGoal, Array]:
-        config = self.robot.config
-        if name in config.named_poses:
-            return m.JointGoal(named=name), self.robot.fk(config.named_poses[name])
-        saved = self.saved()
-        if name not in saved.poses:
-            raise StepProblem(str(UnknownName("pose", name, {*poses, *config.named_poses, *saved.poses})))
-        q = saved.named(name, self.robot.joint_names)
-        return m.JointGoal(positions=q), self.robot.fk(q)
-
-    def require_gripper(self) -> GripperConfig:
-        """Return the gripper.
-
-        Raises:
-            StepProblem: the robot has none.
-        """
-        if self.gripper is None:
-            raise StepProblem("the robot of this cell has no gripper")
-        return self.gripper
 
 
 class Builder:
@@ -328,6 +265,22 @@ class Builder:
             self._motion(step, "across", pose_goal(above)), lower,
             engine.Grip("release", RUNNING, self.cycle, width=width, holds=False, carries=True), leave], after)
 
+    def _until(self, step: Until) -> Built:
+        return self._by_force(MoveUntil(
+            step.id, RUNNING, self.cycle, direction=step.direction, frame=step.frame, force=step.force,
+            max_distance=step.max_distance, fields={"speed": step.tool_speed}), step)
+
+    def _insert(self, step: Insert) -> Built:
+        return self._by_force(InsertMove(
+            step.id, RUNNING, self.cycle, direction=step.direction, frame=step.frame, force=step.force,
+            max_distance=step.max_distance or step.depth + INSERT_ROOM, fields={"depth": step.depth}), step)
+
+    def _by_force(self, move: ForceMove, step: Force) -> Built:
+        held, things = self.before.object, self._touched(step.touch)
+        move.carries, move.attach, move.attach_pose = self.before.holding, held, self.before.pose
+        move.touches = self._fingers_on(things) + [(held, thing.id) for thing in things if held]
+        return Built([move], replace(self.before, T_world_tcp=None), known=False)
+
     # --- parts of steps --------------------------------------------------------------------------------------------
 
     def _motion(self, step: BaseStep, name: str, goal: m.AnyGoal, *, straight: bool = False,
@@ -373,16 +326,5 @@ class Builder:
 BUILDERS: dict[type[BaseStep], Callable[[Builder, Any], Built]] = {
     Move: Builder._move, Through: Builder._through, Approach: Builder._approach, Retreat: Builder._retreat,
     Grip: Builder._grip, Output: Builder._output, Wait: Builder._wait, Pick: Builder._pick, Place: Builder._place,
-    PlaceOnPallet: Builder._place_on_pallet, Python: Builder._python}
-
-
-def backed(T: Array, distance: float, axis: str) -> Array:
-    """Return the pose (4, 4) of a tool that is moved back along its z axis, or up in world [m]."""
-    moved = T.copy()
-    moved[:3, 3] += (0.0, 0.0, distance) if axis == "world" else -distance * T[:3, 2]
-    return moved
-
-
-def pose_goal(T: Array) -> m.PoseGoal:
-    """Return the goal of a pose (4, 4) of the tool in world."""
-    return m.PoseGoal(pose=matrix_to_pose(T))
+    PlaceOnPallet: Builder._place_on_pallet, Python: Builder._python,
+    Until: Builder._until, Insert: Builder._insert}

@@ -15,9 +15,10 @@ from pydantic import BaseModel
 from applications.programming.cursor import FAILED, SUCCEEDED, Cursor, Progress
 from applications.programming.files import BadProgram, load_program, path_of
 from applications.programming.flow import Position, Undecided
-from applications.programming.model import BaseStep, Condition, Pick, Python, Target, Wait
+from applications.programming.model import BaseStep, Condition, Force, Pick, Python, Target, Wait
 from applications.programming.settings import Config
-from applications.programming.stages import Builder, Built, Cell, NotSeen, Outlook, ProgramMove, Repeated, StepCycle
+from applications.programming.stages import Builder, Built, Outlook, ProgramMove, Repeated, StepCycle
+from applications.programming.targets import Cell, NotSeen
 from applications.programming.topics import ProgramStatus
 from common import messages as m
 from common.errors import ConfigError, ZencellError
@@ -177,7 +178,8 @@ class ProgramTask(Task[View]):
     def fail(self, message: str, view: View, *, go_home: bool = True) -> None:
         """Repeat the step after a failure, or end it: a program never goes home by itself."""
         self._attempts += 1
-        if self._attempts < self.p.attempts or not self.at.position:
+        by_force = bool(self.at.position) and isinstance(self.at.step, Force)  # it began at another place
+        if (self._attempts < self.p.attempts and not by_force) or not self.at.position:
             super().fail(message, view, go_home=False)
         else:
             self.status.failures += 1
