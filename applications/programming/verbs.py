@@ -34,7 +34,7 @@ def check(file: File, on: InCell = None, overrides: list[str] | None = None) -> 
     items = found.result.steps
     steps = {(item.program, item.step) for item in items}
     echo(f"{file}: no problem found in {len(steps)} steps, {found.planned} motions planned from home")
-    for note in dict.fromkeys(f"  {item.step}: not checked: {item.unknown}" for item in items if item.unknown):
+    for note in dict.fromkeys(f"  {item.step}: {item.unknown}" for item in items if item.unknown):
         echo(note)
 
 
@@ -46,7 +46,7 @@ def dry_run(file: File, on: InCell = None, overrides: list[str] | None = None) -
     for line in offline.report(found):
         echo(line)
     unknown = sum(item.seconds is None for item in found.result.steps)
-    more = f", and {unknown} steps whose time is not known" if unknown else ""
+    more = f", and {unknown} steps of unknown time" if unknown else ""
     echo(f"{found.result.seconds:6.2f}s  cycle time{more}")
     if found.result.message:
         echo(found.result.message)
