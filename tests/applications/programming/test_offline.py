@@ -56,7 +56,7 @@ def test_check_reports_all_problems_at_once_each_with_line_and_step(tmp_path: Pa
         "8: python1: steps[6].function: 'json:load_it' does not exist; choices: ",
         "9: inside: "), strict=True):
         assert line.startswith(start), line
-    assert "reaches" in lines[3] and "collides with table" in lines[4], "reach, and the straight motion before contact"
+    assert "reach" in lines[3] and "collides with table" in lines[4], "reach, and the straight motion before contact"
 
 
 def test_dry_run_sums_the_durations_and_says_what_is_not_known(tmp_path: Path) -> None:
