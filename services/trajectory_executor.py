@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,7 @@ from common.messages import MotionOwner, MotionStatus
 from common.process.hosted_arms import create_executors, hosted_arms
 from common.process.reservation import Reservation
 from common.process.service import main
+from common.process.stop_of_all import StopOfAllArms
 from common.sim.interface import GraspTolerances
 from common.sim.state_file import BackgroundSaver, Saver, StateFile
 from common.transport.bus import Bus
@@ -111,7 +113,9 @@ class HostedArm:
         name: of the arm; empty in a cell with one robot.
     """
 
-    def __init__(self, name: str, bus: Bus, config: Config, robot: RobotConfig, *, reports_world: bool) -> None:
+    def __init__(
+        self, name: str, bus: Bus, config: Config, robot: RobotConfig, stops: StopOfAllArms, *, reports_world: bool
+    ) -> None:
         """Declare topics and requests; one simulated arm of a cell also reports and edits the world."""
         self.name, self.robot, self._bus, self._config = name, robot, bus.of_arm(name), config
         self._publishers = Publishers(self._bus, config, robot, reports_world)
@@ -119,6 +123,8 @@ class HostedArm:
         self.handlers = RequestHandlers(bus.service, config, bus.clock, bus.log, self._publishers.put)
         if len(config.arms.robots) > 1:
             self.handlers.permission = Reservation(bus, name or config.arms.own)
+        self._stops = stops
+        stops.hosted[name] = self.handlers
         self._serve(reports_world)
         self._orphan_policy, self._present = OrphanPolicy(), False
         self._task = config.arms.tasks.get(name, "") if name else config.members.task
@@ -128,7 +134,8 @@ class HostedArm:
         bus, handlers = self._bus, self.handlers
         bus.serve(topics.MOTION_EXECUTE, handlers.execute)
         bus.serve(topics.MOTION_FOLLOWED, handlers.followed)
-        bus.serve(topics.MOTION_STOP, handlers.stop, max_pending=MAX_STOPS, on_overload=handlers.stop_for_unread)
+        bus.serve(topics.MOTION_STOP, partial(self._stops.stop, self.name), max_pending=MAX_STOPS,
+                  on_overload=self._stops.stop_for_unread)
         bus.serve(topics.MOTION_HOLD, handlers.hold)
         bus.serve(topics.MOTION_OWN, handlers.own)
         bus.serve(topics.ROBOT_COMMAND, handlers.order)
@@ -197,7 +204,8 @@ async def run(
     """
     robots = hosted_arms(config, bus.service)
     simulated = has_simulated_world(next(iter(robots.values())))
-    arms = [HostedArm(name, bus, config, robot, reports_world=simulated and not at)
+    stops = StopOfAllArms(bus, [name for name in config.arms.robots if name not in robots])
+    arms = [HostedArm(name, bus, config, robot, stops, reports_world=simulated and not at)
             for at, (name, robot) in enumerate(robots.items())]
 
     async def save_speed() -> None:

@@ -67,3 +67,25 @@ def test_nothing_moves_without_the_coordinator(tmp_path: Path) -> None:
     Simulation(load_cell(str(cell)), 1, visit=visit, limit=15.0).run()
     assert errors == {"no_coordinator"}
     assert len(positions) == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pressed", ["left", "right"])
+def test_stop_of_an_operator_on_one_arm_stops_both_and_a_task_stops_only_its_own(pressed: str) -> None:
+    seen: dict[str, m.MotionStatus] = {}
+
+    async def visit(bus) -> None:
+        readers = {arm: bus.reader(arms_topic(topics.MOTION_STATUS, arm)) for arm in ("left", "right")}
+        while not all(reader.latest and reader.latest.state == "active" for reader in readers.values()):
+            await readers["right"].next()
+        stop = bus.client(arms_topic(topics.MOTION_STOP, pressed))
+        await stop.call(m.StopRequest(id="no goal of anyone", by="requester"))
+        assert not any(reader.latest.stopped for reader in readers.values())
+        await stop.call(m.StopRequest(owner="ann", reason="test"))
+        while not all(reader.latest.stopped for reader in readers.values()):
+            await readers["left" if pressed == "right" else "right"].next()
+        seen.update({arm: reader.latest for arm, reader in readers.items()})
+
+    Simulation(load_cell(CELL), 1, visit=visit, limit=8.0).run()
+    assert {arm: [each.by for each in status.interlocks] for arm, status in seen.items()} == {
+        "left": ["ann"], "right": ["ann"]}
