@@ -49,7 +49,7 @@ async def run(bus: Bus, config: Config) -> None:
     camera = SimulatedCamera(config.world, config.scenery, config.robot, config, rng, plain=True, lens=lens,
                              arm=config.draw_robot)
     # Declared in every case: access rules come from the declarations, with whatever simulator they are made.
-    joints = bus.reader(topics.JOINT_STATES, listening=camera.needs_joints)
+    joints = bus.of_arm(config.arms.first).reader(topics.JOINT_STATES, listening=camera.needs_joints)
     await bus.ready()
     await truth.next()
     if camera.needs_joints:

@@ -42,7 +42,7 @@ async def run(bus: Bus, config: Config) -> None:
 
     Images of a camera on the robot carry the stamp of the joint state from which its pose was computed.
     """
-    truth, joints = bus.reader(topics.SCENE_OBJECTS), bus.reader(topics.JOINT_STATES)
+    truth, joints = bus.reader(topics.SCENE_OBJECTS), bus.of_arm(config.arms.first).reader(topics.JOINT_STATES)
     images, depths = bus.writer(topics.DEPTH_CAMERA_IMAGE), bus.writer(topics.DEPTH_CAMERA_DEPTH)
     points, infos = bus.writer(topics.DEPTH_CAMERA_POINTS), bus.writer(topics.DEPTH_CAMERA_INFO)
     frame = config.world.camera.frame

@@ -12,13 +12,14 @@ from functools import partial
 from pydantic import Field
 
 from common import topics
-from common.config import Motion, Parameters, Pipeline, RobotConfig, Run, Surroundings
+from common.config import Arms, Motion, Parameters, Pipeline, RobotConfig, Run, Surroundings
 from common.errors import Refused
 from common.messages import PlanningScene, PlanRequest, PlanResponse
 from common.planning.camera_obstacles import PointsOptions
 from common.planning.pipeline import PlanningPipeline
 from common.process.environment import NICENESS
 from common.process.obstacles import ObstacleReader, ObstructionWatchdog
+from common.process.other_arms import OtherArms
 from common.process.planning_worker import (
     PlannerPool,
     PlanningWorker,
@@ -38,6 +39,7 @@ class Config(Parameters):
     """The sections `motion` and `pipeline` define how it plans."""
 
     robot: RobotConfig
+    arms: Arms = Arms()
     motion: Motion
     pipeline: Pipeline
     run: Run
@@ -56,6 +58,7 @@ async def run(bus: Bus, config: Config, helpers: Sequence[PlanningWorker] = ()) 
     states = bus.reader(topics.JOINT_STATES)
     display = bus.writer(topics.DISPLAY_TRAJECTORY)
     cameras = None if config.points is None else ObstacleReader(bus, config.points)
+    others = OtherArms(bus, config.arms)
     watchdog = ObstructionWatchdog(bus, scenes) if config.watch else None
     pool = PlannerPool()
     pipeline: PlanningPipeline
@@ -72,6 +75,12 @@ async def run(bus: Bus, config: Config, helpers: Sequence[PlanningWorker] = ()) 
             obstacles = None if cameras is None else cameras.snapshot(scene, stage)
             width = None if state is None else measured_width(config.robot.gripper, state.name, state.position)
             joints = None if current is None else current.tolist()
+            if standing := others.obstacles():
+                around = scene.model_copy(update={"objects": [*scene.objects, *standing]})
+                response = await planner(request, around, joints, width, obstacles)
+                if response.trajectory is not None:
+                    return response, scene, width
+                bus.log.info("%s: no way around the other arm where it is: %s", stage, response.message)
             return await planner(request, scene, joints, width, obstacles), scene, width
 
     async def handle(request: PlanRequest) -> PlanResponse:
@@ -96,6 +105,7 @@ async def run(bus: Bus, config: Config, helpers: Sequence[PlanningWorker] = ()) 
     pool.add(partial(plan_in_thread, pipeline))
     if cameras is not None:
         await asyncio.to_thread(cameras.load, pipeline.robot, pipeline.geometry)
+    await others.load()
     if watchdog is not None:
         await watchdog.load(config.robot, config.motion.object_padding)
     await bus.ready()

@@ -141,6 +141,11 @@ class Arms(Section):
     tasks: dict[str, str] = Field({}, description="name of the service that runs the task of each arm")
     own: str = Field("", description="arm of the service; empty: it serves all of them")
 
+    @property
+    def first(self) -> str:
+        """The service's own arm or the first one, which carries cameras that are not fixed; empty with one robot."""
+        return self.own or next(iter(self.robots), "")
+
 
 class Reach(Section):
     """Parameters of all services: some of them define the reachable workspace."""
