@@ -37,6 +37,7 @@ class Container:
     memory: int = USUAL_MEMORY  # [MB]
     is_task: bool = False  # starts after all others are ready
     page: bool = False  # publishes the operator's page
+    port: int = VIEWER_PORT  # of the page; another one is published as it is
     arguments: list[str] = field(default_factory=list)  # only where the engine publishes ports
 
 
@@ -60,6 +61,7 @@ def containers_of(file: str, cell: Cell) -> list[Container]:
             entry.name, ["python", "-m", entry.module, *entry.name_option], environment | state.get(entry.kind, {}),
             MEMORY.get(entry.kind, USUAL_MEMORY),
             is_task=entry.name == cell.task, page=entry.kind == VIEWER,
+            port=entry.parameters.get("port", VIEWER_PORT) if entry.kind == VIEWER else VIEWER_PORT,
             arguments=[part.format(name=entry.name) for part in PAGE] if entry.kind == VIEWER else [],
         )
         for entry in cell.services.values()
@@ -153,7 +155,8 @@ def _extras(container: Container, before: list[str]) -> dict[str, Any]:
     if container.memory != USUAL_MEMORY:
         extras["mem_limit"] = f"{container.memory}m"
     if container.page:
-        published = f"127.0.0.1:${{ZENCELL_PAGE:-{VIEWER_PORT}}}:{VIEWER_PORT}"
+        host = f"${{ZENCELL_PAGE:-{VIEWER_PORT}}}" if container.port == VIEWER_PORT else f"{container.port}"
+        published = f"127.0.0.1:{host}:{container.port}"
         token = {TOKEN_VARIABLE: f"${{{TOKEN_VARIABLE}:-}}"}
         extras |= {"networks": ["cell", "page"], "ports": [published], "environment": container.environment | token}
     if container.is_task:

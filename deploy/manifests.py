@@ -13,7 +13,6 @@ from deploy.compose import (
     ROUTER,
     ROUTER_PORT,
     USER,
-    VIEWER_PORT,
     Container,
     cells,
     containers_of,
@@ -34,7 +33,7 @@ def manifests() -> dict[str, str]:
     for file, cell in cells().items():
         made = [
             _deployment(f"{file}-{container.name}".replace("_", "-"), file, container,
-                        port=VIEWER_PORT if container.page else None)
+                        port=container.port if container.page else None)
             for container in containers_of(file, cell)
         ]
         made += _claims(file, containers_of(file, cell))

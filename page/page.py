@@ -64,7 +64,7 @@ class Page:
         self, server: viser.ViserServer, feeds: Feeds, console: Console, motions: Motions, members: Members,
         application: Application | None, layers: Layers, control: ControlSocket, *, cell: str, layout: Layout,
         layout_file: str, robot: RobotConfig, recordings: Path, schedule: Schedule, io: Io,
-        belts: Collection[str] = (),
+        belts: Collection[str] = (), title: str = "",
     ) -> None:
         """Build the page; on the running loop.
 
@@ -85,11 +85,13 @@ class Page:
             schedule: update periods.
             io: inputs and outputs of the cell.
             belts: names of its conveyors.
+            title: what the page is of: the cell, and its arm in a cell with several; default: the cell.
 
         Raises:
             UnknownName: the layout names a layer that does not exist.
         """
         self._server, self._feeds, self.console = server, feeds, console
+        self._title = title or cell
         self._motions, self._cell, self._kinds, self._control = motions, cell, layers, control
         self._layout, self._schedule, self._recordings = layout, schedule, recordings
         self._topics, self._text = Topics(application, layers.values(), members.keys), TaskText.of(application)
@@ -106,7 +108,7 @@ class Page:
         self.pages = 0
         self.visited = asyncio.Event()
         prepare_scene(server, layout, cell)
-        self._panels = Panels(server, console, layout, cell, self._text)
+        self._panels = Panels(server, console, layout, self._title, self._text)
         create = page_of(application).controls
         self._controls = create(server.gui, console) if create is not None else None
         self._controls_updater = Updater(self._controls, feeds.latest) if self._controls is not None else None
@@ -279,7 +281,7 @@ class Page:
         panels.alarms.update([*([first.text] if first.kind == BAD else []), *(loss.message for loss in lost)])
         self._control.publish(PageStatus(
             situation=first, summary=summarize(
-                self._cell, motion, gripper_text(latest(topics.GRIPPER_STATE)),
+                self._title, motion, gripper_text(latest(topics.GRIPPER_STATE)),
                 permissions.operating_page if permissions.enforced else None, panels.alarms.unacknowledged),
             lost=tuple(lost), note=task.note, note_time=task.note_time, owner=owner,
             live=self._move.readout.live() if self._move is not None else {}, past=self._time.position))

@@ -21,6 +21,8 @@ from common.transport.bus import Bus
 class Config(CameraParameters):
     """Rate and quality of the images."""
 
+    ALL_ARMS = True
+
     world: Surroundings
     scenery: Scenery = Scenery()
     robot: RobotConfig

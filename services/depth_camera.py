@@ -24,6 +24,8 @@ from common.transport.bus import Bus
 class Config(CameraParameters, DepthSensorParameters):
     """Rate, range and noise."""
 
+    ALL_ARMS = True
+
     world: Surroundings
     scenery: Scenery = Scenery()
     robot: RobotConfig

@@ -41,6 +41,8 @@ FileLock = Callable[[Path, str], contextlib.AbstractAsyncContextManager[None]]  
 class Config(Parameters):
     """Rates and tolerances of the controller."""
 
+    ALL_ARMS = True
+
     robot: RobotConfig
     arms: Arms = Arms()
     world: World

@@ -11,7 +11,7 @@ from pydantic import Field
 from common import topics
 from common.application import find_application
 from common.client.operator_motion import OperatorMotion
-from common.config import Io, Members, Parameters, RobotConfig, Run, Surroundings
+from common.config import Arms, Io, Members, Parameters, RobotConfig, Run, Surroundings
 from common.process.service import main
 from common.transport.bus import Bus
 from common.transport.credentials import secure_folder
@@ -21,6 +21,7 @@ from page.console import Console
 from page.control_socket import ControlSocket
 from page.feeds import Feeds, Schedule, Topics
 from page.layers import Layers, find_layers
+from page.layers.other_arms import other_arms
 from page.layout import load_layout
 from page.page import Page
 from page.recorded_history import recordings_folder
@@ -39,6 +40,7 @@ class Config(Parameters):
     """Address, access and update rates of the page."""
 
     robot: RobotConfig
+    arms: Arms = Arms()
     world: Surroundings
     run: Run
     members: Members
@@ -98,7 +100,7 @@ async def run(bus: Bus, config: Config) -> None:
     """Serve the page until cancelled."""
     layout = load_layout(config.layout, bus.log.warning)
     application = find_application(config.members.application) if config.members.application else None
-    layers = find_layers(application, config.layers, config.members.keys)
+    layers = {**find_layers(application, config.layers, config.members.keys), **other_arms(config.arms)}
     read = Topics(application, layers.values(), config.members.keys)
     has_io, belts = bool(config.io.signals), config.world.conveyors
     more: list[topics.Topic[Any]] = [topics.IO_STATE] if has_io else []
@@ -123,7 +125,7 @@ async def run(bus: Bus, config: Config) -> None:
             server, feeds, console, motions, config.members, application, layers, control, cell=config.run.cell,
             layout=layout, layout_file=config.layout, robot=config.robot,
             recordings=recordings_folder(config.recordings), schedule=Schedule(images=1 / config.picture_rate),
-            io=config.io, belts=[*belts],
+            io=config.io, belts=[*belts], title=" ".join(filter(None, (config.run.cell, config.arms.own))),
         )
         await bus.ready()
         host = "127.0.0.1" if config.published else config.host

@@ -14,7 +14,7 @@ from common.config.basics import Section, Tunable
 from common.config.io import Io
 from common.config.robot import RobotConfig
 from common.config.world import Container, Scenery, Surroundings, World
-from common.remapping import is_cell
+from common.remapping import POSE_KEYS, is_cell
 
 
 class Motion(Section):
@@ -234,7 +234,8 @@ class Cell(Section):
         if kind is Members:
             names = [entry.name for entry in self.services.values()]
             task = self.arms.tasks.get(arm, self.task) if arm else self.task
-            return Members(services=names, task=task, application=self.application, keys=self.tables)
+            keys = [each.topics for each in self.services.values() if not each.arm and each.topics.keys() - POSE_KEYS]
+            return Members(services=names, task=task, application=self.application, keys=keys if arm else self.tables)
         if kind is Arms:
             return self.arms.model_copy(update={"own": arm})
         if kind is RobotConfig and arm:

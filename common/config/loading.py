@@ -15,7 +15,7 @@ from common.application import application_of_task, find_application, import_fro
 from common.arms import arm_table
 from common.config.arms import read_robots, require_arm, services_of_arms
 from common.config.basics import Parameters, check, is_section, own_fields
-from common.config.cell import Arms, Cell
+from common.config.cell import Cell
 from common.config.files import (
     find_file,
     names_of,
@@ -187,7 +187,7 @@ def _apply_overrides(tree: dict[str, Any], overrides: Iterable[tuple[list[str], 
     """
     services: dict[str, Any] = tree["services"]
     by_name = {_name_of(str(key)): key for key in services}
-    for parts, value in overrides:
+    for parts, value in _for_each_arm(overrides, services, list(tree.get("robots", ()))):
         if parts[0] == "services" and len(parts) > 1 and parts[1] not in services:
             adds = len(parts) == 2 and isinstance(value, dict)  # a complete entry is a further service, started last
             if parts[1] not in by_name and not adds:
@@ -202,6 +202,18 @@ def _apply_overrides(tree: dict[str, Any], overrides: Iterable[tuple[list[str], 
             _override(tree, parts, camera)
         elif len(parts) > 1 or parts[0] not in SECTIONS:
             _override(tree, parts, value)
+
+
+def _for_each_arm(
+    overrides: Iterable[tuple[list[str], Any]], services: Mapping[str, Any], arms: Sequence[str]
+) -> Iterator[tuple[list[str], Any]]:
+    """Yield overrides; one of a service that is listed once for each arm is one for each of them."""
+    for parts, value in overrides:
+        each = [f"{arm}_{parts[1]}" for arm in arms] if parts[0] == "services" and len(parts) > 2 else []
+        if each and parts[1] not in services and all(name in services for name in each):
+            yield from (([parts[0], name, *parts[2:]], value) for name in each)
+        else:
+            yield parts, value
 
 
 def load_robot(robot: str | Path) -> RobotConfig:
@@ -309,7 +321,7 @@ def service_config(cell: Cell, name: str, config: type[P]) -> P:
     values, arm = (dict(entry.parameters), entry.arm) if entry else ({}, "")
     # `camera` selects the camera of the surroundings, unless the service declares a parameter of that name.
     sections = [info.annotation for info in config.model_fields.values() if is_section(info.annotation)]
-    if entry and cell.robots and not arm and RobotConfig in sections and Arms not in sections:
+    if entry and cell.robots and not arm and RobotConfig in sections and not config.ALL_ARMS:
         require_arm(name, entry.kind, list(cell.robots))
     selects_camera = Surroundings in sections and "camera" not in config.model_fields
     camera = values.pop("camera", None) if selects_camera else None

@@ -47,6 +47,14 @@ def test_parameters_below_the_name_of_an_arm_are_of_that_arm_alone(tmp_path: Pat
     assert [entry.parameters for entry in cell.services.values()] == [{"x": 1}, {"x": 1, "time": 3}]
 
 
+def test_override_of_a_service_that_each_arm_has_is_one_for_each() -> None:
+    cell = load_cell(CELL, ["services.workspace_validator.max_radius=0.5", "services.left_workspace_validator.x=1"])
+    assert cell.services["right_workspace_validator"].parameters == {"max_radius": 0.5}
+    assert cell.services["left_workspace_validator"].parameters == {"max_radius": 0.5, "x": 1}
+    with pytest.raises(UnknownName, match="left_workspace_validator"):
+        load_cell(CELL, ["services.validator.max_radius=0.5"])
+
+
 async def test_keys_of_arms_are_below_their_names_and_have_one_owner() -> None:
     cell = load_cell(CELL)
     wirings = {entry.name: await wiring_of(cell, entry) for entry in cell.services.values()}
