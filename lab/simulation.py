@@ -104,7 +104,7 @@ class Simulation:
         Raises:
             ConfigError: the cell has a real arm or cannot be simulated.
         """
-        services = {key: entry for key, entry in cell.services.items() if entry.name not in LEFT_OUT}
+        services = {key: entry for key, entry in cell.services.items() if not {entry.name, entry.kind} & {*LEFT_OUT}}
         self.cell = with_observed_arm(cell.model_copy(update={"services": services}))
         names = [entry.name for entry in services.values()]
         doubled = any(is_double(entry) for entry in services.values())

@@ -49,7 +49,8 @@ def test_containers_are_locked_down():
 
 def test_only_the_page_is_published_and_only_to_this_machine():
     published = {name: service["ports"] for name, service in COMPOSE["services"].items() if "ports" in service}
-    assert set(published) == {f"{cell}-viewer" for cell in CELLS}
+    assert set(published) == {f"{cell}-{name}" for cell in CELLS for name, each in load_cell(cell).services.items()
+                              if each.kind == "viewer"}
     assert all(port.startswith("127.0.0.1:") for ports in published.values() for port in ports)
     assert COMPOSE["networks"]["cell"]["internal"]
     for file in (ROOT / "deploy" / "kubernetes").rglob("*.yaml"):  # the page of a pod listens within it only
