@@ -63,6 +63,7 @@ class WorldInvariants:
         self._hands = max(len(cell.robots), 1)
         self._fills, self._truth_check = application.fills_containers, application.truth_check
         self._physics = cell.world.simulator != "kinematic"  # objects are pushed, and roll
+        self._belts = [*cell.world.conveyors.values()]  # carry objects, also off their end
         self._newest = b""  # encoded ground truth
         self._ids: list[str] = []
         self._open_edits = 0  # requested and not answered
@@ -101,9 +102,10 @@ class WorldInvariants:
             before, old_position = self._objects.get(name, (state, position))
             self._objects[name] = state, position
             distance = 0.0 if state in CARRIED else math.dist(position, old_position)
-            legal = (edited or self._physics or state in CARRIED or before in CARRIED
+            conveyed = any(0 <= belt.along(*old_position[:2])[0] <= belt.dimensions[0] for belt in self._belts)
+            legal = (edited or self._physics or state in CARRIED or before in CARRIED or conveyed
                      or (state == before and distance < MOVED))
-            if checks.fails(legal and (state != LOST or self._physics), OBJECTS):
+            if checks.fails(legal and (state != LOST or self._physics or bool(self._belts)), OBJECTS):
                 checks.add_violation(OBJECTS, f"{name} changed from {before} to {state} by itself, {distance:.3f} m")
 
     def on_end(self, done: int, state: str) -> None:

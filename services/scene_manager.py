@@ -15,6 +15,7 @@ from common import topics
 from common.config import RobotConfig, Surroundings
 from common.errors import ConfigError
 from common.perception.camera_input import FrameError, SkippedFrames
+from common.perception.moving import Encoders
 from common.process.planning_scene import SceneWriter
 from common.process.service import main
 from common.robot.model import RobotModel
@@ -39,7 +40,9 @@ async def run(bus: Bus, config: Config) -> None:
     robot = RobotModel.load(config.robot)
     if config.robot.gripper is None:
         raise ConfigError("robot.gripper", ..., "is missing: scene_manager needs a robot with one")
-    scene = PerceivedScene(config, config.world, config.robot.gripper, config.robot.tcp_link)
+    encoders = Encoders(config.world.conveyors) if config.world.conveyors else None
+    belts = bus.reader(topics.CONVEYOR_STATE) if encoders is not None else None
+    scene = PerceivedScene(config, config.world, config.robot.gripper, config.robot.tcp_link, encoders)
     skipped = SkippedFrames(bus.log, "planning scene")
     await out.begin(scene.scene())
     await bus.ready()
@@ -68,7 +71,13 @@ async def run(bus: Bus, config: Config) -> None:
         else:
             out.put(scene.scene())
 
+    async def watch_belts() -> None:
+        if encoders is not None and belts is not None:
+            async for state in belts:
+                encoders.add(state)
+
     async with asyncio.TaskGroup() as group:
+        group.create_task(watch_belts())
         group.create_task(watch_gripper())
         group.create_task(views.watch(update))
 

@@ -12,6 +12,7 @@ from applications.pick_place.ball_places import BallGeometry
 from applications.pick_place.tracks import WIDTH_SLACK, SceneParameters, Sighting, Track, Tracks
 from common import messages as m
 from common.config import GripperConfig, Surroundings
+from common.perception.moving import Encoders
 from common.perception.occlusion import Occlusion
 from common.perception.pinhole import Pinhole
 from common.robot.transforms import invert, matrix_to_pose, pose_to_matrix
@@ -40,7 +41,8 @@ class PerceivedScene:
     """Combines detections and gripper states into a planning scene."""
 
     def __init__(
-        self, parameters: SceneParameters, around: Surroundings, gripper: GripperConfig, tcp_link: str
+        self, parameters: SceneParameters, around: Surroundings, gripper: GripperConfig, tcp_link: str,
+        encoders: Encoders | None = None,
     ) -> None:
         """Start with the fixtures alone.
 
@@ -49,9 +51,10 @@ class PerceivedScene:
             around: fixtures, containers, and the radius of balls; the first container has slots for them.
             gripper: its links may touch the held object.
             tcp_link: link that the held object moves with.
+            encoders: of the belts of a cell with conveyors.
         """
         self.around, self.gripper, self.tcp_link = around, gripper, tcp_link
-        self.p, self._tracks = parameters, Tracks(parameters)
+        self.p, self._tracks = parameters, Tracks(parameters, encoders)
         self._fixed = fixed_objects(around)
         self._resting = [replace(BallGeometry.of(around), container=box) for box in around.containers.values()]
         self._with_slots = next((box.container for box in self._resting), None)
@@ -147,6 +150,7 @@ class PerceivedScene:
         # the container then, not two. Before the first image no slot is known to be free.
         self._free = set(range(len(self._slots))) - self._occupied_slots() if self._occupied else set()
         x, y, z = (float(v) for v in T_world_tcp[:3, 3])
+        self._tracks.move_to(gripper.header.stamp * 1e-9)
         track = self._tracks.take((x, y, z), self.p.match_radius, gripper.width if self.gripper.cup is None else 0.0)
         # The fingers centered it between them; along the fingers and along the tool it is where it was detected.
         offset = np.zeros(3)
@@ -188,7 +192,7 @@ class PerceivedScene:
 
     def scene(self) -> m.PlanningScene:
         """Return the planning scene; its stamp is that of its newest frame."""
-        table = [self._object(t.id, "target", t.sighting, _pose(t)) for t in self._tracks.confirmed()]
+        table = [self._object(t.id, "target", t.sighting, _pose(t), t.velocity) for t in self._tracks.confirmed()]
         seen = self._occupied_slots(beneath=False)
         contained = [self._in_slots[k] if k in seen else self._in_slots[k].model_copy(update={"unseen": True})
                      for k in sorted(self._occupied_slots())]
@@ -214,13 +218,17 @@ class PerceivedScene:
         columns = []
         for thing in table:
             gap = thing.pose.position.z - thing.dimensions[-1] / 2 - self.around.table_height
-            if thing.shape != "sphere" and gap > LEVEL:
+            if thing.shape != "sphere" and gap > LEVEL and not self._is_on_belt(thing):
                 at = m.Vector3(x=thing.pose.position.x, y=thing.pose.position.y, z=self.around.table_height + gap / 2)
                 pose = thing.pose.model_copy(update={"position": at})
                 columns.append(thing.model_copy(update={
                     "id": f"below_{thing.id}", "role": "fixture", "kind": "", "pose": pose, "mass": 0.0, "color": GREY,
                     "dimensions": [*thing.dimensions[:-1], gap]}))
         return columns
+
+    def _is_on_belt(self, thing: m.CollisionObject) -> bool:
+        p, half = thing.pose.position, thing.dimensions[-1] / 2
+        return any(belt.carries(p.x, p.y, p.z - half, 0.02) for belt in self.around.conveyors.values())
 
     def _occupied_slots(self, *, beneath: bool = True) -> set[int]:
         """Return the slots that any current view shows occupied, with or without the ones below that carry them."""
@@ -233,12 +241,15 @@ class PerceivedScene:
             "color": color_of(self.around.ball_color),
         })
 
-    def _object(self, name: str, role: str, thing: Sighting, pose: m.Pose) -> m.CollisionObject:
+    def _object(self, name: str, role: str, thing: Sighting, pose: m.Pose,
+                velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> m.CollisionObject:
         """Return an object of the planning scene with the detected shape, size and color."""
+        x, y, z = velocity
         return m.CollisionObject.model_validate({
             "id": name, "role": role, "shape": thing.shape, "dimensions": thing.dimensions, "pose": pose,
             "color": thing.color, "grip_effort": self.around.grip_efforts.get(thing.kind, 0.0),
             "mass": self.around.masses.get(thing.kind, 0.0), "kind": thing.kind,
+            "velocity": m.Vector3(x=x, y=y, z=z),
         })
 
 

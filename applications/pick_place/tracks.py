@@ -11,6 +11,7 @@ from pydantic import Field
 
 from common.config import Parameters, Tunable
 from common.messages import Color, Marker, Quaternion
+from common.perception.moving import Encoders, MovingEstimate
 
 Place = tuple[float, float, float]
 Shape = Literal["sphere", "box", "cylinder"]
@@ -83,14 +84,23 @@ class Track:
     sighting: Sighting = Sighting((0.0, 0.0, 0.0))
     view: int = 0
     before: float = 0.0  # time of the view's frame before the first detection [s]
+    velocity: Place = (0.0, 0.0, 0.0)  # [m/s]
+    motion: MovingEstimate | None = None  # in a cell with belts
+
+    def move_to(self, now: float) -> None:
+        """Update position and velocity of an object that moves to a time [s]."""
+        if self.motion is not None:
+            position, velocity = self.motion.at(now)
+            (x, y, z), (vx, vy, vz) = position.tolist(), velocity.tolist()
+            self.position, self.velocity = (x, y, z), (vx, vy, vz)
 
 
 class Tracks:
     """Matches detections to known objects of the same kind, one to one, nearest pairs first."""
 
-    def __init__(self, parameters: SceneParameters) -> None:
-        """Start without objects; the parameters may change between frames."""
-        self.p = parameters
+    def __init__(self, parameters: SceneParameters, encoders: Encoders | None = None) -> None:
+        """Start without objects; the parameters may change between frames. With belts, objects may move."""
+        self.p, self._encoders = parameters, encoders
         self._tracks: list[Track] = []
         self._count = 0
         self.crowded = False  # whether the last frame had more objects than fit
@@ -115,6 +125,7 @@ class Tracks:
             self._looked[view] = now
         else:
             self._hides[view] = now, hides
+        self.move_to(now)
         pairs = sorted(
             (math.dist(t.position, s.position), i, j)
             for i, t in enumerate(self._tracks)
@@ -133,6 +144,7 @@ class Tracks:
             x, y, z = (a + weight * (b - a) for a, b in zip(track.position, sightings[j].position, strict=True))
             track.position, track.seen, track.last_seen = (x, y, z), track.seen + 1, now
             track.sighting, track.view = sightings[j], view
+            self._estimate(track, now)
         for track in self._tracks:
             if track.last_seen < now and track.seen >= self.p.confirm_frames and self._is_hidden(track, now):
                 track.last_seen = now
@@ -144,6 +156,19 @@ class Tracks:
         for sighting in new[: max(room, 0)]:
             self._count += 1
             self._tracks.append(Track(f"track_{self._count}", sighting.position, 1, now, sighting, view, before))
+            self._estimate(self._tracks[-1], now)
+
+    def _estimate(self, track: Track, now: float) -> None:
+        """Update the motion of an object that was just detected."""
+        if self._encoders is not None:
+            track.motion = track.motion or MovingEstimate(self._encoders)
+            track.motion.add(now, track.sighting.position, track.sighting.size[2])
+            track.move_to(now)
+
+    def move_to(self, now: float) -> None:
+        """Update the positions of objects that move to a time [s]."""
+        for track in self._tracks:
+            track.move_to(now)
 
     def _is_hidden(self, track: Track, now: float) -> bool:
         """Return whether its position is occluded in all current views."""

@@ -271,7 +271,7 @@ class Executor:
                    or self._check_devices())
         join = Join(request.joins, request.join_time) if request.joins else None
         status = self.arm.accept(request.id, request.trajectory, now, self._q, refusal, assessment, request.plan,
-                                 request.scene_stamp, join, force)
+                                 request.scene_stamp, join, force, request.start_at * 1e-9)
         if not known:
             authority.note_refusal(request, status)
         if request.id == self.arm.goal and (self._followed is None or self._followed.id != request.id):

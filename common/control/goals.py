@@ -26,6 +26,7 @@ REMEMBERED = 1000  # goals that were followed, and as many that were refused; ol
 BLEND_TIME = 0.3  # [s] in which the difference between the robot's and the trajectory's start fades
 BLEND_SHARE = 0.5  # of the limits is for that difference at most; else it takes longer
 SLOWEST = 0.01  # share of its speed below which a trajectory is refused
+LATE_START, LONGEST_WAIT = 0.02, 30.0  # [s] for a goal with a time to start
 MAX_SAMPLES = 20_000  # of a trajectory, to find how fast it can be followed
 
 
@@ -66,7 +67,7 @@ class Goal:
     last: float  # cell time of the newest set-point
     pace: Pace
     share: float = 1.0
-    time: float = 0.0
+    time: float = 0.0  # negative: it waits for its start
     begin: float = 0.0  # time at which the trajectory of the request starts: later than 0 if it joined another goal
     behind: float = 0.0  # distance of the newest set-point from the path [rad]
     stopping: bool = False
@@ -87,6 +88,7 @@ class Goal:
 
     def at(self, time: float) -> tuple[Vector, Vector]:
         """Return positions [rad] and their derivative by the trajectory's time (dof,), with the blend."""
+        time = max(time, 0.0)  # it is negative before the start
         if self._newest is None or self._newest[0] != time:
             self._newest = time, self._blended(time)
         return self._newest[1]
@@ -150,6 +152,20 @@ def possible_share(goal: Goal, limits: Limits, period: float) -> float:
         share /= 1.01 * over
     raise Refused("contradiction", "its points are too far apart for their times: it could only be followed at less "
                                    f"than {SLOWEST:.0%} of its speed")
+
+
+def time_at(now: float, start_at: float) -> float:
+    """Return the time on a trajectory at a cell time, if it is to start at another one, both [s].
+
+    Raises:
+        Refused: that is over, or too far ahead.
+    """
+    wait = start_at - now
+    if wait < -LATE_START:
+        raise Refused("too_late", f"the trajectory was to start {-wait:.3f} s ago")
+    if wait > LONGEST_WAIT:
+        raise Refused("bad_times", f"the trajectory is to start in {wait:.3g} s; at most {LONGEST_WAIT:g} s ahead")
+    return min(-wait, 0.0)
 
 
 class Outcome(NamedTuple):

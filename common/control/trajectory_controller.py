@@ -11,7 +11,16 @@ from collections.abc import Callable
 
 import numpy as np
 
-from common.control.goals import MAX_SAMPLES, REMEMBERED, Assessment, ForceControl, Goal, GoalReports, Outcome
+from common.control.goals import (
+    MAX_SAMPLES,
+    REMEMBERED,
+    Assessment,
+    ForceControl,
+    Goal,
+    GoalReports,
+    Outcome,
+    time_at,
+)
 from common.control.joining import Join, join_goal
 from common.control.limiter import Limiter
 from common.control.set_points import GoalFollower, SetPointHistory, Standstill
@@ -112,7 +121,7 @@ class TrajectoryController:
     def accept(
         self, goal: str, trajectory: JointTrajectory, now: float, measured: Vector, refusal: Refused | None = None,
         assessment: Assessment | None = None, plan: str = "", scene_stamp: int = 0, join: Join | None = None,
-        force: Callable[[Trajectory, Vector], ForceControl] | None = None,
+        force: Callable[[Trajectory, Vector], ForceControl] | None = None, start_at: float = 0.0,
     ) -> MotionStatus:
         """Return the state of the goal: active, or rejected with code and message; of a known id its present state.
 
@@ -127,6 +136,7 @@ class TrajectoryController:
             scene_stamp: stamp of the planning scene of that plan [ns], reported with it.
             join: where the trajectory continues the goal that is followed, and replaces the rest of it.
             force: prepares a force motion along the trajectory from a position (dof,) [rad]; it may raise Refused.
+            start_at: cell time at which it starts [s]; 0: at once.
         """
         known = self.reports.get(goal)
         if known is not None:
@@ -148,6 +158,7 @@ class TrajectoryController:
             accepted = assessment.goal(goal, start, now, rate, self._limits)
             accepted.plan, accepted.scene_stamp = plan, scene_stamp
             accepted.force = None if force is None else force(assessment.trajectory, start)
+            accepted.time = time_at(now, start_at) if start_at else 0.0
         except Refused as error:
             return self.reports.reject(goal, error)
         if start is not self._standstill.position:

@@ -57,6 +57,7 @@ from common.messages.planning import (
     Box,
     GoalSet,
     JointGoal,
+    MovingGoal,
     PathConstraints,
     PathGoal,
     PlanAttempt,

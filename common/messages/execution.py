@@ -51,7 +51,7 @@ class ExecuteRequest(Message):
 
     max_bytes: ClassVar[int] = TRAJECTORY_BYTES + SMALL_BYTES
     max_parts: ClassVar[int] = 128 * 1024
-    omitted_defaults: ClassVar[tuple[str, ...]] = ("plan", "scene_stamp", "joins", "join_time")
+    omitted_defaults: ClassVar[tuple[str, ...]] = ("plan", "scene_stamp", "joins", "join_time", "start_at")
 
     header: Header = Header()
     id: Name
@@ -66,6 +66,7 @@ class ExecuteRequest(Message):
                                          "cancelled with error replaced. Empty: start from rest")
     join_time: Finite = Field(0.0, description="time on the trajectory of that goal at which this one starts, at its "
                                                "position and velocity [s]")
+    start_at: Since = Field(0, description="cell time at which the arm starts, at rest until then [ns]; 0: at once")
 
 
 class FollowedRequest(Message):

@@ -121,7 +121,26 @@ class SequenceGoal(Message):
         return self
 
 
-AnyGoal = JointGoal | PoseGoal | PathGoal | ArcGoal | SequenceGoal | GoalSet
+class MovingGoal(Message):
+    """A target that moves evenly, such as an object on a belt: meet it, stay with it for a while, and leave upwards.
+
+    `pose` is that of the tool centre point at the target at the time `stamp`. The arm starts at `begin`, meets a point
+    `approach` above the target as early as it can, descends, stays for `dwell`, rises and comes to rest, all while
+    it moves with the target. Objects of the scene with a velocity are avoided where they will be.
+    """
+
+    kind: Literal["moving"] = "moving"
+    pose: Pose
+    stamp: Annotated[int, Field(ge=0, le=MAX_STAMP)] = Field(description="cell time of the pose [ns]")
+    velocity: Vector3 = Field(description="of the target [m/s]")
+    begin: Annotated[int, Field(ge=0, le=MAX_STAMP)] = Field(description="cell time at which the arm starts [ns]")
+    approach: Annotated[float, Field(ge=0.01, le=0.5)] = Field(0.1, description="[m]")
+    dwell: Annotated[float, Field(ge=0, le=10)] = Field(0.5, description="[s]")
+    travel: Annotated[float, Field(ge=0, le=10)] = Field(
+        1.0, description="most way of the target from the pose until the arm leaves it [m]")
+
+
+AnyGoal = JointGoal | PoseGoal | PathGoal | ArcGoal | SequenceGoal | GoalSet | MovingGoal
 
 
 class Box(Message):
@@ -221,7 +240,7 @@ class PlanResponse(Message):
 
     max_bytes: ClassVar[int] = TRAJECTORY_BYTES + 64 * SMALL_BYTES  # with all attempts
     max_parts: ClassVar[int] = 128 * 1024
-    omitted_defaults: ClassVar[tuple[str, ...]] = ("scene_stamp",)
+    omitted_defaults: ClassVar[tuple[str, ...]] = ("scene_stamp", "meet_time")
 
     header: Header = Header()
     id: Name
@@ -232,6 +251,7 @@ class PlanResponse(Message):
     seconds: Finite = Field(0.0, description="wall time [s] of the complete request")
     scene_stamp: Annotated[int, Field(ge=0, le=MAX_STAMP)] = Field(
         0, description="stamp of the planning scene it was planned on; 0: unknown")
+    meet_time: Finite = Field(0.0, description="of a moving goal: time on the trajectory when the tool is there [s]")
     fraction: Finite = 0.0
     error: Label = Field("", description="code: start_in_collision, no_ik, collision, incomplete, timeout, ...")
     message: Text = Field("", description="one line naming stage, planner, waypoint and colliding pair")

@@ -43,7 +43,7 @@ class CollisionObject(Message):
     cross-section of a prism is the convex hull of `outline` [m]; its pose, like that of all shapes, is at its centre.
     """
 
-    omitted_defaults: ClassVar[tuple[str, ...]] = ("grip_effort", "mass", "kind", "unseen")
+    omitted_defaults: ClassVar[tuple[str, ...]] = ("grip_effort", "mass", "kind", "unseen", "velocity")
 
     id: Name
     role: Literal["fixture", "container", "target", "contained", "attached"]
@@ -58,6 +58,12 @@ class CollisionObject(Message):
     mass: Annotated[float, Field(ge=0, le=1000)] = Field(0.0, description="[kg]; 0: unknown")
     kind: Label = Field("", description="its class, as named by the detector; empty: unknown")
     unseen: bool = Field(False, description="inferred, not detected: a detected object must rest on it")
+    velocity: Vector3 = Field(Vector3(), description="by images and encoders, as of the stamp of the scene [m/s]")
+
+    @property
+    def moves(self) -> bool:
+        """Whether it has a velocity."""
+        return self.velocity != Vector3()
 
     @model_validator(mode="after")
     def _require_dimensions_of_shape(self) -> CollisionObject:

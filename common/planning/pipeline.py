@@ -11,10 +11,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from common.config import Motion, Parameters, Pipeline
 from common.errors import UnknownName
-from common.messages import PlanAttempt, PlanningScene, PlanRequest, PlanResponse
+from common.messages import MovingGoal, PlanAttempt, PlanningScene, PlanRequest, PlanResponse
 from common.planning.collision import CollisionWorld
 from common.planning.constraints import VALIDATION_SHARES, ToolConstraints
 from common.planning.goal_sampling import distance_outside
+from common.planning.moving_objects import scene_at, scene_for
 from common.planning.obstacles import InvalidShape, ObstacleCache
 from common.planning.planners import Plan, load_planner, planner_names
 from common.planning.planners.joint_move import straight_profile
@@ -24,6 +25,7 @@ from common.planning.problem import (
     NOT_APPLICABLE,
     Cancel,
     GoalChoice,
+    Moving,
     Problem,
     Region,
     Result,
@@ -50,6 +52,7 @@ Array = NDArray[np.float64]
 Planners = dict[str, tuple[Plan, Parameters]]
 
 CHECKS = "request_checks"
+TRACKING = "tracking"  # planner for moving goals, also of pipelines without it
 CYCLE = 0.01  # [s] between set-points: acceleration reaches its limit no faster, whatever jerk the arm allows
 FINISHING_SHARE = 0.1  # of the planning time, added to it for timing and checking a path that was found in time
 
@@ -113,19 +116,25 @@ class PlanningPipeline:
             state = None if current is None else np.asarray(current, dtype=float)
             checked = check_request(self.robot, request, scene, state, self._motion.start_tolerance)
             constraints = check_constraints(self.robot, request, checked)
-            world = self._checked_world(request, scene, checked, constraints, points, width)
+            still = scene_for(request, scene)
+            world = self._checked_world(request, still, checked, constraints, points, width)
             check_collisions(world, checked)
         except BadRequest as error:
             failure = Result(error=error.code, message=str(error), colliding=error.colliding)
             return _failure(request, began, CHECKS, failure, [])
-        return self._try_planners(request, scene, self._problem(request, checked, world, began), planners, flag, began)
+        problem = self._problem(request, checked, world, began)
+        if still is not scene:
+            problem = replace(problem, moving=lambda time: self._make_world(
+                request, scene_at(scene, time), checked.start, self._cache, width=width))
+        return self._try_planners(request, scene, problem, planners, flag, began)
 
     def world(
         self, request: PlanRequest, scene: PlanningScene, start: ArrayLike, width: float | None = None
     ) -> CollisionWorld:
         """Return a collision world of a request that shares nothing with `plan`, to check a trajectory again."""
         geometry = ObstacleCache(self._cache.robot)
-        return self._make_world(request, scene, np.asarray(start, dtype=float), geometry, width=width)
+        still = scene_for(request, scene)
+        return self._make_world(request, still, np.asarray(start, dtype=float), geometry, width=width)
 
     def _try_planners(
         self, request: PlanRequest, scene: PlanningScene, problem: Problem, planners: Planners, flag: Cancel,
@@ -150,6 +159,7 @@ class PlanningPipeline:
                     seconds=monotonic() - began,
                     scene_stamp=scene.header.stamp,
                     goal_index=_goal_index(problem, trajectory.positions[-1]),
+                    meet_time=result.meet,
                     fraction=result.fraction,
                     attempts=attempts,
                 )
@@ -185,7 +195,7 @@ class PlanningPipeline:
 
     def _requested_planners(self, request: PlanRequest) -> Planners:
         """Return the pipeline's planners, or the requested one, with default options if the pipeline lacks it."""
-        name = request.planner
+        name = request.planner or (TRACKING if isinstance(request.goal, MovingGoal) else "")
         if not name:
             return self._planners
         if name in self._planners:
@@ -286,6 +296,10 @@ class PlanningPipeline:
     def _timings(self, problem: Problem, result: Result) -> Iterator[TimedPath]:
         """Yield the planner's own trajectory, or its path timed with smaller and smaller blends."""
         robot, limit = problem.robot, problem.tool_speed
+        if isinstance(problem.goal, Moving):  # its times are fixed
+            assert result.trajectory is not None
+            yield result.trajectory
+            return
         if result.trajectory is not None:
             yield limit_tool_speed(robot, limited_jerk(result.trajectory, problem.jerk), limit)
             return

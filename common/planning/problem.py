@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -81,7 +82,38 @@ class GoalChoice:
     goals: tuple[Array | Region, ...]
 
 
-Goal = Array | Region | ToolPath | Arc | GoalSequence | GoalChoice
+@dataclass(frozen=True)
+class Moving:
+    """A target that moves evenly.
+
+    Attributes:
+        T_world_tcp: (4, 4) of the tool at the target at the start of the arm.
+        velocity: (3,) of the target [m/s].
+        begin: cell time at which the arm starts [s]; lead: since the target was observed [s].
+        approach: height above the target at which it is met [m].
+        dwell: for which the tool stays at the target [s].
+        travel: most way of the target since it was observed [m].
+    """
+
+    T_world_tcp: Array
+    velocity: Array
+    begin: float
+    lead: float
+    approach: float
+    dwell: float
+    travel: float
+
+    @property
+    def speed(self) -> float:
+        """Speed of the target [m/s]."""
+        return float(np.linalg.norm(self.velocity))
+
+    def at(self, time: float) -> Array:
+        """Return the position of the tool at the target (3,) a time [s] after the start."""
+        return np.asarray(self.T_world_tcp[:3, 3] + time * self.velocity)
+
+
+Goal = Array | Region | ToolPath | Arc | GoalSequence | GoalChoice | Moving
 
 
 @dataclass(frozen=True)
@@ -98,6 +130,7 @@ class Problem:
         deadline: of the search; latest: after which a path that was found in time is no longer timed and checked. Both
             are on the monotonic clock [s].
         outside_start: (dof,) [rad] where the robot is, outside a limit; it moves straight to the start first.
+        moving: returns the collision world with moving objects where they will be at a cell time [s]; or None.
         failed_goals: alternative goals, by their numbers from 1, whose lines were found but rejected later.
     """
 
@@ -114,6 +147,7 @@ class Problem:
     latest: float
     rng: np.random.Generator
     outside_start: Array | None = None
+    moving: Callable[[float], CollisionWorld] | None = None
     failed_goals: dict[int, Result] = field(default_factory=dict)
 
     @property
@@ -187,6 +221,7 @@ class Result:
         fraction: how much of the path is covered.
         waypoint, colliding: where and between what a failure was found.
         planner: which found the path, if it called others.
+        meet: time at which the tool is at a moving target [s].
         goal: number from 1 of the alternative goal that the line leads to; another may be tried instead.
     """
 
@@ -202,6 +237,7 @@ class Result:
     waypoint: int | None = None
     colliding: Pair | None = None
     goal: int | None = None
+    meet: float = 0.0
     planner: str = ""
     attempts: list[PlanAttempt] = field(default_factory=list)
 

@@ -15,6 +15,7 @@ from common.errors import ZencellError
 from common.messages import CollisionObject, JointTrajectory, PlanningScene, PlanRequest
 from common.planning.collision import CollisionWorld, Hit
 from common.planning.contact_rules import PERCEIVED
+from common.planning.moving_objects import scene_for
 from common.planning.obstacles import InvalidShape, ObstacleCache
 from common.planning.robot_geometry import RobotGeometry
 from common.planning.trajectory import cubics, timed_path
@@ -148,7 +149,7 @@ class SceneMonitor:
         if self._plan is None:
             return scene.objects
         attach = self._plan.request.attach
-        objects = [item for item in scene.objects if item.id != attach]
+        objects = [item for item in scene_for(self._plan.request, scene).objects if item.id != attach]
         if not objects:
             return []
         if not len(self._plan.reaches):

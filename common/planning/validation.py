@@ -15,6 +15,7 @@ from common.messages import (
     ArcGoal,
     GoalSet,
     JointGoal,
+    MovingGoal,
     PathGoal,
     PlanningScene,
     PlanRequest,
@@ -25,7 +26,7 @@ from common.messages import (
 from common.planning.collision import CollisionWorld, interpolate
 from common.planning.constraints import ToolConstraints
 from common.planning.contact_rules import Pair
-from common.planning.problem import Arc, Goal, GoalChoice, GoalSequence, Region, SequenceItem, ToolPath
+from common.planning.problem import Arc, Goal, GoalChoice, GoalSequence, Moving, Region, SequenceItem, ToolPath
 from common.planning.trajectory import TimedPath, cubics, end_accelerations, sample
 from common.robot.model import RobotModel
 from common.robot.transforms import invert, pose_to_matrix
@@ -147,6 +148,7 @@ def check_numbers(
 
 _MEASURED = 1e-4  # [rad] a measured state may be this far outside its limit
 _INWARDS = 2e-3  # [rad] steps in which the path back to a limit is checked
+_MAX_LEAD = 30.0  # [s]
 _FAR = 2.0  # times the reach; for nearer goals the planners report how far they get
 _AT_FIRST = (0.002, 0.02)  # [m], [rad] a path starts this close to where the robot is
 
@@ -203,10 +205,23 @@ def check_request(
 def _goal(robot: RobotModel, goal: AnyGoal, start: Array) -> Goal:
     if isinstance(goal, PathGoal):
         return _tool_path(robot, start, goal)
+    if isinstance(goal, MovingGoal):
+        return _moving(robot, goal)
     if isinstance(goal, SequenceGoal):
         items = [SequenceItem(_item_goal(robot, item.goal), item.straight, item.blend_radius) for item in goal.items]
         return GoalSequence(tuple(items))
     return _item_goal(robot, goal)
+
+
+def _moving(robot: RobotModel, goal: MovingGoal) -> Moving:
+    _require_near(robot, goal.pose, "moving goal")
+    v, lead = np.array([goal.velocity.x, goal.velocity.y, goal.velocity.z]), (goal.begin - goal.stamp) * 1e-9
+    if not 0 <= lead <= _MAX_LEAD:
+        message = f"the moving goal was observed {lead:.3g} s before the start, not 0 to {_MAX_LEAD:g} s"
+        raise BadRequest("bad_goal", message)
+    T = pose_to_matrix(goal.pose)
+    T[:3, 3] += lead * v
+    return Moving(T, v, goal.begin * 1e-9, lead, goal.approach, goal.dwell, goal.travel)
 
 
 def _item_goal(robot: RobotModel, goal: JointGoal | PoseGoal | ArcGoal | GoalSet) -> Array | Region | Arc | GoalChoice:

@@ -241,14 +241,17 @@ class Task(ExecutionMonitor[V]):
         if motion.id != running.command.id or motion.state != "active":
             return
         left = (1.0 - motion.progress) * arm.seconds
-        if left <= AHEAD * motion.speed_scaling and stage.carries == view.holding and self.may_start(stage, view):
+        due = left - stage.lead <= AHEAD * motion.speed_scaling
+        if due and stage.carries == view.holding and self.may_start(stage, view):
             self.queue.popleft()
             self._early = self._execution(stage, view)
             self._early.started = False
             command = self._early.command
             assert isinstance(command, m.GripperCommand)
             command.after = running.command.id
-            if stage.holds:
+            if stage.lead:
+                command.lead, command.within = stage.lead, 1.0
+            elif stage.holds:
                 way = 0.0 if stage.expected_width is None else view.gripper.width - stage.expected_width
                 command.lead, command.within = min(self.gripper.least_time(way), AHEAD), CLOSE_WITHIN
             else:

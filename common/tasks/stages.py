@@ -56,6 +56,7 @@ class Move(Stage):
     fallback: list[Stage] = field(default_factory=list, kw_only=True)
     # Digital signals that must have these values from start to end: the arm does not start, or is held on its path.
     requires: Mapping[str, bool] = field(default_factory=dict, kw_only=True)
+    start_at: int = field(default=0, kw_only=True)  # cell time at which the arm starts [ns]; 0: at once
     trajectory: m.JointTrajectory | None = field(default=None, init=False)
     planned_around: list[tuple[float, float]] = field(default_factory=list, init=False)  # (x, y) of objects [m]
     planned_width: float | None = field(default=None, init=False)  # finger width during the motion [m]
@@ -66,7 +67,8 @@ class Move(Stage):
         """Return the request with an id that executes it once it is planned."""
         assert self.trajectory is not None
         return m.ExecuteRequest(
-            id=name, trajectory=self.trajectory, plan=self.plan, scene_stamp=self.scene_stamp)
+            id=name, trajectory=self.trajectory, plan=self.plan, scene_stamp=self.scene_stamp,
+            start_at=self.start_at)
 
     def end(self) -> list[float]:
         """Joint positions at its end [rad]; empty without a plan."""
@@ -90,6 +92,7 @@ class Grip(Stage):
     expected_width: float | None = field(default=None, kw_only=True)  # [m]
     width_tolerance: float = field(default=0.01, kw_only=True)  # of expected_width [m]
     early: bool = field(default=False, kw_only=True)  # may start before the arm is at standstill
+    lead: float = field(default=0.0, kw_only=True)  # of an early one: before the end of the motion [s]; 0: late
     effort: float = field(default=0.0, kw_only=True)  # [N]; 0: the gripper's default
     mass: float = field(default=0.0, kw_only=True)  # of the object held then [kg]; 0: unknown
     problem: str = field(default="the fingers closed on nothing", init=False)
