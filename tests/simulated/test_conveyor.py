@@ -1,0 +1,63 @@
+"""A complete cell that picks from a running belt by images, on the virtual clock."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+
+from applications.belt_picking.topics import BELT_PICKING_STATUS
+from common import topics
+from common.config import Cell, load_cell
+from common.messages import ConveyorSet, GripperState, MotionStatus
+from common.transport.bus import Bus
+from lab.simulation import Simulation
+from tests.harness import until
+
+pytestmark = pytest.mark.slow
+
+
+def cell(y: float, speed: float) -> Cell:
+    """Return the cell with one cube on the belt, at this y [m] at the start."""
+    cube = {"id": "cube", "shape": "box", "size": [0.04, 0.04, 0.04], "x": 0.52, "y": y, "z": 0.06, "yaw": 0.4,
+            "color": [0.9, 0.1, 0.1]}
+    return load_cell("conveyor", [
+        f"world.objects={json.dumps([cube])}", f"world.conveyors.belt.speed={speed}", "services.depth_camera.rate=5",
+        "services.belt_picker.settle=1"])
+
+
+@pytest.mark.parametrize(("y", "speed"), [(-0.75, 0.2)])
+def test_cube_is_picked_from_the_moving_belt_and_put_into_the_box(y: float, speed: float) -> None:
+    held: list[float] = []
+
+    async def visit(bus: Bus) -> None:
+        states, gripper = bus.reader(topics.CONVEYOR_STATE), bus.reader(topics.GRIPPER_STATE)
+        grasped = await until(gripper, lambda state: state.outcome == "grasped")
+        assert states.latest is not None
+        held.extend((states.latest.belts[0].speed, grasped.width))
+
+    outcome = Simulation(cell(y, speed), 1, limit=60.0, visit=visit).run()
+    assert (outcome.state, outcome.done, outcome.crashes, outcome.broken) == ("DONE", 1, [], []), outcome
+    assert held == pytest.approx([speed, 0.04], abs=1e-3)
+
+
+def test_belt_that_stops_before_the_grasp_ends_the_motion_with_open_fingers_and_it_is_tried_again() -> None:
+    seen: dict[str, Any] = {}
+
+    async def visit(bus: Bus) -> None:
+        motion, gripper = bus.reader(topics.MOTION_STATUS), bus.reader(topics.GRIPPER_STATE)
+        status, set_ = bus.reader(BELT_PICKING_STATUS), bus.client(topics.CONVEYOR_SET)
+        await until(status, lambda one: one.stage == "track")
+        await until(motion, lambda one: one.state == "active" and one.progress > 0.3)
+        await set_.call(ConveyorSet(running=False))
+        ended: MotionStatus = await until(motion, lambda one: one.state != "active")
+        open_: GripperState = await until(gripper, lambda _: True)
+        seen.update(state=ended.state, progress=ended.progress, width=open_.width)
+        await set_.call(ConveyorSet(running=True))
+
+    outcome = Simulation(cell(-0.3, 0.08), 1, limit=90.0, visit=visit).run()
+    assert (outcome.state, outcome.done, outcome.crashes, outcome.broken) == ("DONE", 1, [], []), outcome
+    assert seen["state"] == "cancelled"
+    assert seen["progress"] < 0.7
+    assert seen["width"] > 0.06
