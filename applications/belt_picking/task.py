@@ -12,7 +12,7 @@ from common import messages as m
 from common.config import Tunable
 from common.errors import UnknownName
 from common.robot.transforms import tool_down
-from common.tasks.handling import Handling, HandlingConfig
+from common.tasks.handling import Handling, HandlingConfig, grasp_directions
 from common.tasks.stages import Cycle, Grip, Move, Stage, View, place_of
 from common.tasks.tracking import Expected, pick_stages, time_grip
 
@@ -120,7 +120,8 @@ class BeltPicking(Handling):
         belt = view.belts.find(self._name)
         assert belt is not None
         x, y, z = place_of(thing.pose)
-        yaw, width = min(self._grips(thing), key=self._sideways)
+        ways = grasp_directions(thing, self.gripper.closing_axis, self.gripper.max_width)
+        yaw, width = min(ways, key=self._sideways)
         stamp, begin = view.scene.header.stamp, round((view.now + self.p.lead_time) * 1e9)
         self._expected = Expected(self._name, view.belts.header.stamp * 1e-9, belt.position, belt.speed, math.inf)
         self.queue += pick_stages(
