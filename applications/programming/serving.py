@@ -39,11 +39,13 @@ from common.atomic_file import AtomicFile, Unreadable
 from common.errors import Refused, RequestFailed, ZencellError
 from common.process.task_runner import TaskMemory, TaskRunner, require_allowed
 from common.tasks.stages import View
+from common.time_source import monotonic
 from common.transport.bus import Bus
 from common.transport.reader import Reader
 
 NAME = re.compile(r"[\w-]{1,80}")
 PLAN_TIMEOUT = 30.0  # [s] wall
+FIRST_MESSAGES = 5.0  # [s] wall until a dry run knows the state of the robot
 
 
 class ProgramMemory(TaskMemory):
@@ -231,11 +233,13 @@ class ProgramRunner(TaskRunner[View]):
 
     async def _plan_all(self, request: ProgramCommand, flow: Flow) -> None:
         """Plan all motions by the planner of the cell, which shows each; a newer dry run ends this one."""
-        task, view = self._program, self._look()
-        if view.missing:
-            task.status.rehearsal = Rehearsal(program=flow.main, state="failed", message="waiting for "
-                                              + ", ".join(view.missing))
-            return
+        task, until = self._program, monotonic() + FIRST_MESSAGES
+        while (view := self._look()).missing:
+            if monotonic() > until:
+                missing = ", ".join(view.missing)
+                task.status.rehearsal = Rehearsal(program=flow.main, state="failed", message=f"no message on {missing}")
+                return
+            await asyncio.sleep(0.05)
         rehearser = Rehearser(flow, task.cell, task.p.io, view, task.p.planning_time)
         planning = rehearser.run(flow.find(request.step) if request.step else flow.start)
         response: m.PlanResponse | None = None

@@ -67,8 +67,10 @@ def test_every_known_topic_has_an_owner() -> None:
     owned = {topic for cell, name in SERVICES for topic in wired(cell)[name].owns}
     of_no_service = {topics.SUPERVISOR_STATUS, topics.LOG, topics.COUNTERS, topics.PARAMETERS, topics.MOTION_JOG,
                      topics.IO_STATE, topics.IO_SET,  # no included cell has I/O
-                     topics.RESERVE, topics.ARMS_STATUS}  # or several arms
-    of_no_service |= set(find_application("programming").topics_by_key.values())  # they run in any cell
+                     topics.RESERVE, topics.ARMS_STATUS, topics.CONVEYOR_STATE, topics.CONVEYOR_SET}  # arms, belts
+    of_others = [*find_application("programming").topics_by_key.values(),  # they run in any cell
+                 *find_application("tending").topics_by_key.values()]
+    of_no_service |= set(of_others)
     assert owned == set(all_topics().values()) - of_no_service
 
 
