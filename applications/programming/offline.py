@@ -52,6 +52,19 @@ def cell_of(file: ProgramFile, given: str | None) -> str:
     return file.program.cell
 
 
+def load_single(cell: str, overrides: tuple[str, ...] = ()) -> CellConfig:
+    """Return a cell with one robot.
+
+    Raises:
+        ConfigError, UnknownName: the cell is not valid, or has several robots.
+    """
+    loaded = load_cell(cell, overrides)
+    if loaded.robots:
+        raise ConfigError("cell", cell, f"has several robots ({', '.join(loaded.robots)}), and a program moves "
+                          "one: use a cell of one robot")
+    return loaded
+
+
 def overrides_for(file: ProgramFile, cell: str, others: tuple[str, ...] = ()) -> tuple[list[str], Path]:
     """Return the overrides that make a cell run a program instead of its task, and the file of the progress.
 
@@ -60,7 +73,7 @@ def overrides_for(file: ProgramFile, cell: str, others: tuple[str, ...] = ()) ->
         ConfigError, UnknownName: the cell is not valid.
     """
     load_all(file)
-    loaded = load_cell(cell, others)
+    loaded = load_single(cell, others)
     progress = state_folder() / "programs" / f"{loaded.name}.{file.name}.json"
     runner: dict[str, Any] = {"program": str(file.path.resolve()), "progress": str(progress)}
     services: dict[str, Any] = read_yaml(find_file("cells", cell))["services"]
@@ -88,7 +101,7 @@ def rehearse(path: Path, cell: str | None, overrides: tuple[str, ...] = (), *, e
     """
     file = load_program(path)
     flow = Flow(load_all(file), file.name)
-    loaded = load_cell(cell_of(file, cell), overrides)
+    loaded = load_single(cell_of(file, cell), overrides)
     robot = RobotModel.load(loaded.robot)
     around = loaded.section(Surroundings)
     assert isinstance(around, Surroundings)
@@ -153,7 +166,7 @@ def exported(path: Path, cell: str | None) -> str:
     """
     file = load_program(path)
     files, name = load_all(file), cell_of(file, cell)
-    loaded = load_cell(name)
+    loaded = load_single(name)
     stages = cell_with(loaded, RobotModel.load(loaded.robot))
     found = [f"{each.path}:{each.lines.get(step.id, 0)}: {step.id}: {problem}" for each in files.values()
              for step, problem in static_problems(each, stages, loaded.io)]

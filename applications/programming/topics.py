@@ -103,4 +103,5 @@ PROGRAM_STATUS = Topic(
     "program/status", ProgramStatus, "state", "state of the program: step, halts, breakpoints, dry run")
 PROGRAM_COMMAND = Request("program/command", ProgramCommand, ProgramStatus, "run, halt or rehearse the program")
 PROGRAM_EDIT = Request("program/edit", ProgramEdit, ProgramContent, "read, check and save programs")
-TOPICS = ApplicationTopics(status=PROGRAM_STATUS, declared=[PROGRAM_STATUS, PROGRAM_COMMAND, PROGRAM_EDIT])
+TOPICS = ApplicationTopics(status=PROGRAM_STATUS, declared=[PROGRAM_STATUS, PROGRAM_COMMAND, PROGRAM_EDIT],
+                           of_arm=[PROGRAM_COMMAND, PROGRAM_EDIT])

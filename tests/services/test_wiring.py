@@ -12,7 +12,7 @@ import pytest
 
 from applications.pick_place.topics import SCENE_BALLS
 from common import topics
-from common.application import all_topics, find_application
+from common.application import all_topics, applications, find_application
 from common.config import Surroundings, World, load_cell, service_config
 from common.errors import ConfigError
 from common.planning.camera_obstacles import PointsOptions
@@ -68,9 +68,9 @@ def test_every_known_topic_has_an_owner() -> None:
     of_no_service = {topics.SUPERVISOR_STATUS, topics.LOG, topics.COUNTERS, topics.PARAMETERS, topics.MOTION_JOG,
                      topics.IO_STATE, topics.IO_SET,  # no included cell has I/O
                      topics.RESERVE, topics.ARMS_STATUS, topics.CONVEYOR_STATE, topics.CONVEYOR_SET}  # arms, belts
-    of_others = [*find_application("programming").topics_by_key.values(),  # they run in any cell
-                 *find_application("tending").topics_by_key.values()]
-    of_no_service |= set(of_others)
+    for each in applications():  # of other cells
+        if all(each.name != cell.application for cell in CELLS.values()):
+            of_no_service |= set(each.topics_by_key.values())
     assert owned == set(all_topics().values()) - of_no_service
 
 

@@ -217,3 +217,31 @@ def test_objects_that_a_camera_sees_are_picked_and_placed_in_a_pattern(tmp_path:
     places = sorted((round(each.pose.position.x, 2), round(each.pose.position.y, 2)) for each in truth[0].objects
                     if each.shape == "box")
     assert places == [(0.40, -0.30), (0.50, -0.30)]
+
+
+TOUCH = """\
+steps:
+  - {step: move, to: {position: [0.5, 0.0, 0.10]}}
+  - {step: grip, width: close}
+  - {step: move, to: {position: [0.5, 0.0, 0.04]}, straight: true}
+  - {step: until, force: 5, max_distance: 0.06, touch: [table]}
+  - {step: retreat, distance: 0.05, axis: world, touch: [table]}
+  - {step: until, id: air, force: 5, max_distance: 0.01, on_failure: continue}
+"""
+
+
+def test_step_until_contact_ends_at_the_table_in_physics_and_fails_in_the_air(tmp_path: Path) -> None:
+    pytest.importorskip("mujoco")
+    (tmp_path / "touch.yaml").write_text(TOUCH)
+    heights: list[float] = []
+
+    async def visit(operator: Operator) -> None:
+        await operator.send("run", program="touch")
+        await operator.until(lambda status: status.step == "retreat1")
+        heights.append(await tool(operator.bus))
+        ended = await operator.until(lambda status: status.state in ("DONE", "ERROR"))
+        assert (ended.state, ended.outcome, ended.retries) == ("DONE", "failed", 0), ended.message
+
+    outcome = simulate(tmp_path, visit, "world.simulator=mujoco")
+    assert (outcome.state, outcome.crashes, outcome.broken) == ("DONE", [], []), outcome
+    assert abs(heights[0]) < 0.02, "the tips are at the height of the table"

@@ -79,6 +79,7 @@ def test_dry_run_sums_the_durations_and_says_what_is_not_known(tmp_path: Path) -
     (("check", "none.yaml"), "program: 'none.yaml' cannot be read: No such file or directory"),
     (("check", "program.yaml"), "cell: is missing in program.yaml: add `cell: NAME`, or use --cell NAME"),
     (("export", "program.yaml", "--cell", "pandda"), "unknown cell 'pandda' (did you mean 'panda'?)"),
+    (("check", "program.yaml", "--cell", "duo"), "cell: 'duo' has several robots (left, right), and a program"),
     (("dry-run", "bad.yaml"), "bad.yaml:1: steps[0].step: 'mov' is not a step; choices: move, "),
 ])
 def test_bad_input_is_one_line(tmp_path: Path, arguments: tuple[str, ...], problem: str) -> None:
