@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.up-to-date
 
-.PHONY: setup franka-sim run up test test-all campaign grasping containers check audit bench bench-check chaos fuzz soak docs docs-site deploy clean
+.PHONY: setup franka-sim run up test test-all campaign grasping conveyor containers check audit bench bench-check chaos fuzz soak docs docs-site deploy clean
 
 setup: $(STAMP)
 
@@ -57,6 +57,10 @@ grasping: setup  ## grasps of unseen objects by the complete sorting cell, hours
 	$(BIN)/python -m benchmarks.grasping --singles 300 --force 40 --jobs 2 --json build/grasping.jsonl
 	$(BIN)/python -m benchmarks.grasping --heaps 30 --force 40 --jobs 2 --json build/grasping.jsonl
 	$(BIN)/python -m benchmarks.grasping --latency 10 --force 40 --json build/grasping.jsonl
+
+conveyor: setup  ## picks from a moving belt by images, kinematic and with physics, half an hour; needs EXTRAS=physics
+	$(BIN)/python -m benchmarks.conveyor --picks 50 --jobs 2
+	$(BIN)/python -m benchmarks.conveyor --picks 50 --jobs 2 --simulator mujoco
 
 containers: setup  ## build the image and run a cell in containers; needs a container engine
 	$(BIN)/python -m pytest -q -m container tests/deploy
