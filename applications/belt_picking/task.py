@@ -10,7 +10,7 @@ from pydantic import Field
 
 from common import messages as m
 from common.config import Tunable
-from common.errors import UnknownName
+from common.errors import ConfigError
 from common.robot.transforms import tool_down
 from common.tasks.handling import Handling, HandlingConfig, grasp_directions
 from common.tasks.stages import Cycle, Grip, Move, Stage, View, place_of
@@ -34,6 +34,23 @@ class Config(HandlingConfig):
                                           "from where it was expected [m]")
     settle: Tunable[float] = Field(6.0, ge=0, le=600, description="so long nothing comes before it is DONE [s]")
 
+    def require_usable(self) -> None:
+        """Check belt, window and container.
+
+        Raises:
+            ConfigError: names the field, the value and what is expected.
+        """
+        super().require_usable()
+        belts, (begin, end) = self.world.conveyors, self.window
+        if self.belt not in belts and (self.belt or len(belts) != 1):
+            choices = ", ".join(belts) or "none"
+            raise ConfigError("belt", self.belt or ..., f"is no conveyor of the world; choices: {choices}")
+        length = belts[self.belt or next(iter(belts))].dimensions[0]
+        if not 0 <= begin < end <= length:
+            raise ConfigError("window", [begin, end], f"must increase within the belt, 0 to {length:g}")
+        if not self.world.destinations:
+            raise ConfigError("world.containers", ..., "is missing: the objects are put into the first container")
+
 
 @dataclass
 class BeltView(View):
@@ -50,11 +67,8 @@ class BeltPicking(Handling):
     def __init__(self, config: Config, status: m.TaskStatus, prefix: str, speed: float = 1.0) -> None:
         """Start without an object; the arguments are those of `Task`."""
         super().__init__(config, status, prefix, speed)
-        belts = config.world.conveyors
-        self._name = config.belt or next(iter(belts), "")
-        if self._name not in belts:
-            raise UnknownName("conveyor", self._name, belts)
-        self._belt = belts[self._name]
+        self._name = config.belt or next(iter(config.world.conveyors))
+        self._belt = config.world.conveyors[self._name]
         self._expected: Expected | None = None
         self._skipped: dict[str, float] = {}  # until when, by object [s]
         self._attempts = 0
