@@ -196,9 +196,18 @@ class ProgramRunner(TaskRunner[View]):
 
     def _set_breakpoint(self, request: ProgramCommand) -> None:
         at, status = self._program.at, self._program.status
-        if request.program and request.program != status.program:
-            self._load(request.program)
-        known = {step for each in at.program.files.values() for step in each.steps}
+
+        def find() -> set[str]:
+            return {step for each in at.program.files.values() for step in each.steps}
+
+        known = find() if at.flow is not None else set()
+        name = request.program or status.program
+        if name and (name != status.program or request.step not in known):  # the file may have steps since then
+            if self._program.is_active or status.halted:
+                raise Refused("busy", f"{status.program} is at step {status.step}, as it was loaded: stop it before "
+                              f"you set a breakpoint at {request.step}")
+            self._load(name)
+            known = find()
         if request.step not in known:
             raise Refused("bad_program", f"there is no step {request.step!r}; choices: {', '.join(sorted(known))}")
         others = [each for each in status.breakpoints if each != request.step]
@@ -244,6 +253,9 @@ class ProgramRunner(TaskRunner[View]):
         planning = rehearser.run(flow.find(request.step) if request.step else flow.start)
         response: m.PlanResponse | None = None
         while not self._rehearse.is_set():
+            if task.is_active:
+                rehearser.result.state, rehearser.result.message = "failed", "ended, as the program runs"
+                break
             try:
                 wanted = next(planning) if response is None else planning.send(response)
             except StopIteration:
@@ -273,6 +285,8 @@ class ProgramRunner(TaskRunner[View]):
                     await asyncio.to_thread(self._apply, request, reply)
         except BadProgram as error:
             reply.problems = error.problems[:200]
+        except Refused:
+            raise
         except OSError as error:
             raise Refused("not_saved", f"{error.filename}: {error.strerror}") from None
         except ZencellError as error:
