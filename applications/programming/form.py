@@ -25,7 +25,7 @@ MM, DEGREES, PERCENT = (1e3, "mm"), (DEGREE, "°"), (100.0, "%")
 UNITS = {  # of fields: displayed per stored value, and the unit that is displayed
     **dict.fromkeys((
         "distance", "width", "blend", "expected_width", "width_tolerance", "position", "by", "height", "item", "gap",
-        "pitch", "sheet", "pallet", "robot"), MM),
+        "pitch", "sheet", "pallet", "robot", "depth", "max_distance"), MM), "tool_speed": (1e3, "mm/s"),
     **dict.fromkeys(("rpy", "turn", "yaw"), DEGREES), "speed": PERCENT,
     "seconds": (1.0, "s"), "timeout": (1.0, "s"), "force": (1.0, "N"), "mass": (1.0, "kg"),
 }
