@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.up-to-date
 
-.PHONY: setup franka-sim run up test test-all campaign grasping conveyor containers check audit bench bench-check chaos fuzz soak docs docs-site deploy clean
+.PHONY: setup franka-sim run up test test-all campaign grasping conveyor force-motions containers check audit bench bench-check chaos fuzz soak docs docs-site deploy clean
 
 setup: $(STAMP)
 
@@ -61,6 +61,10 @@ grasping: setup  ## grasps of unseen objects by the complete sorting cell, hours
 conveyor: setup  ## picks from a moving belt by images, kinematic and with physics, half an hour; needs EXTRAS=physics
 	$(BIN)/python -m benchmarks.conveyor --picks 50 --jobs 2
 	$(BIN)/python -m benchmarks.conveyor --picks 50 --jobs 2 --simulator mujoco
+
+force-motions: setup  ## 100 contacts and 100 insertions in physics, half an hour; resumable. Needs the extra: make setup EXTRAS=physics
+	@mkdir -p build
+	$(BIN)/python -m benchmarks.force_motions --contacts 100 --insertions 100 --json build/force_motions.jsonl
 
 containers: setup  ## build the image and run a cell in containers; needs a container engine
 	$(BIN)/python -m pytest -q -m container tests/deploy

@@ -154,6 +154,10 @@ class ForceFollower:
                 into[:] = np.concatenate([R @ at_tcp[:3], R @ torque])
         self.sample = Sample(self._time, self._offset.copy(), self._offset_of(measured), *found)
 
+    def resume(self, position: Array) -> None:
+        """Continue from rest at a position (dof,) [rad]."""
+        self._offset = self._offset_of(position)
+
     @property
     def result(self) -> tuple[float, float]:
         """Force of the tool along the direction [N], and measured distance in it [m]: at the end, else now."""

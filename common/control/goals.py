@@ -46,6 +46,9 @@ class ForceControl(Protocol):
     def sense(self, measured: Vector, wrench: Wrenches | None) -> None:
         """Take the reading of a cycle: joint positions (dof,) [rad], and the wrench, None while it is unknown."""
 
+    def resume(self, position: Vector) -> None:
+        """Continue from rest at a position (dof,) [rad]."""
+
     def set_points(
         self, goal: Goal, now: float, elapsed: float, limiter: Limiter, share: float, held: bool
     ) -> tuple[Vector, Vector]:

@@ -21,6 +21,7 @@ BEHIND = 1e-3  # [rad] between path and set-point at which the goal's time stops
 ARRIVED = 1e-6  # [rad] closer, the set-point is on the path
 JITTER = 0.1  # [s] cell time by which the delay of an arm behind its set-points may grow: hosts and networks vary
 REWOUND, SAMPLES = 1.5, 1501  # [s] of a path, before the newest set-point, where an interrupted arm may have stopped
+LONGEST_BLIND = 0.5  # [s] cell time without a cycle, after which a force motion does not continue
 RELOCATION_PERIOD = 1.0  # [s] cell time: an arm moved from outside more often than this does not stay where it is held
 
 
@@ -217,6 +218,7 @@ class GoalFollower:
             held: whether the arm is to come to rest on its path.
         """
         if goal.force is not None:
+            goal.last = now
             found = goal.force.set_points(goal, now, elapsed, self._limiter, speed_scaling, held)
             self._standstill.position = found[0]
             return found
@@ -263,7 +265,7 @@ class GoalFollower:
 
     def resume_from_rest(self, goal: Goal, now: float, measured: Vector, velocity: Vector) -> Outcome | None:
         """Continue from rest at the newest set-point, or where the arm is; end a goal whose arm was moved too far."""
-        if goal.force is not None:
+        if goal.force is not None and now - goal.last > LONGEST_BLIND:
             return self._lost_force(measured)
         off = float(np.abs(measured - self._limiter.position).max())
         if off > self._tolerances.start and not self._standstill.is_trailing(measured, velocity):
@@ -274,6 +276,8 @@ class GoalFollower:
             self._limiter.rest()
         goal.last = now
         goal.pace.rest()
+        if goal.force is not None:
+            goal.force.resume(self._limiter.position)
         return self._check_place(measured, off)
 
     def _lost_force(self, measured: Vector) -> Outcome:

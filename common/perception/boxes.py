@@ -37,6 +37,12 @@ class BoxKind(Section):
 
     color: Rgb
     size: tuple[Length, Length, Length]
+    round: bool = Field(False, description="the top face is a disk: a cylinder, which is treated as the box around it")
+
+    @property
+    def fill(self) -> float:
+        """Fraction of its rectangle that the top face must cover."""
+        return MIN_FILL * (math.pi / 4 if self.round else 1.0)
 
 
 class BoxOptions(Parameters):
@@ -117,13 +123,13 @@ class BoxDetector:
         """Yield the boxes whose top face has these points (n, 3) [m]."""
         top = float(np.median(face[:, 2]))
         pixel = (float(camera.position[2]) - top) / camera.fx  # [m]
-        if len(face) * pixel**2 < MIN_FILL**2 * kind.size[0] * kind.size[1]:
+        if len(face) * pixel**2 < MIN_FILL * kind.fill * kind.size[0] * kind.size[1]:
             return
         origin = face[:, :2].mean(axis=0)  # float32 is precise enough near it
         corners = cv2.boxPoints(cv2.minAreaRect((face[:, :2] - origin).astype(np.float32))).astype(float)
         sides = corners[1] - corners[0], corners[3] - corners[0]
         lengths = [float(np.hypot(*side)) + pixel for side in sides]  # between outer edges, not between pixel centers
-        if len(face) * pixel**2 < MIN_FILL * lengths[0] * lengths[1]:
+        if len(face) * pixel**2 < kind.fill * lengths[0] * lengths[1]:
             return
         center = corners.mean(axis=0) + origin
         for first in (0, 1):

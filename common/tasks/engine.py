@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from itertools import takewhile
 
 from common import messages as m
 from common.robot.transforms import rpy_to_matrix
@@ -303,7 +304,8 @@ class Task(ExecutionMonitor[V]):
     def _is_planned(self, move: Move) -> bool:
         needed = [move]
         if move.needs_full_plan:
-            needed = [stage for stage in self.queue if isinstance(stage, Move) and stage.cycle is move.cycle]
+            known = takewhile(lambda stage: not isinstance(stage, ForceMove), self.queue)  # until a force decides
+            needed = [stage for stage in known if isinstance(stage, Move) and stage.cycle is move.cycle]
         return all(stage.trajectory is not None for stage in needed)
 
 

@@ -152,7 +152,7 @@ class Handling(Task[View]):
         elif view.holding:
             if view.scene.attached:  # else the planning scene is not up to date yet
                 held = view.scene.attached[0].object
-                self.queue += self._put(held, held.pose, Cycle(held.id), view, view.gripper.width)
+                self.queue += self.put(held, held.pose, Cycle(held.id), view, view.gripper.width)
         elif away:
             self.queue += self.back_off(view)
         elif self.has_fresh_image(view):
@@ -193,7 +193,7 @@ class Handling(Task[View]):
     # --- stages --------------------------------------------------------------------------------------------------
 
     def _take(self, thing: m.CollisionObject, view: View) -> list[Stage]:
-        """Open, move above the object, descend, close, lift; then the stages of `_put`."""
+        """Open, move above the object, descend, close, lift; then the stages of `put`."""
         x, y, z = place_of(thing.pose)
         ways = grasp_directions(thing, self.gripper.closing_axis, self.gripper.max_width)
         yaw, width = ways[self._tries[thing.id] % 2]
@@ -209,11 +209,11 @@ class Handling(Task[View]):
                  expected_width=width, width_tolerance=self.p.width_tolerance),
             Move("lift", "GRASPING", cycle, goal=_at(above), straight=True, carries=True, attach=thing.id,
                  attach_pose=held),
-            *self._put(thing, held, cycle, view, width),
+            *self.put(thing, held, cycle, view, width),
         ]
 
-    def _put(self, thing: m.CollisionObject, held: m.Pose, cycle: Cycle, view: View,
-             width: float | None) -> list[Stage]:
+    def put(self, thing: m.CollisionObject, held: m.Pose, cycle: Cycle, view: View,
+            width: float | None) -> list[Stage]:
         """Move above the destination, lower, release, move up, go home and look."""
         goal = self.destination(thing, view) if thing.kind else None
         goal = goal or self._aside(thing, view)

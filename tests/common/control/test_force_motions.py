@@ -151,6 +151,22 @@ def test_arm_without_a_sensor_is_refused_with_the_reason_and_a_lost_sensor_ends_
     assert rig.finish(0.5).error == "no_wrench" and rig.status.state == "aborted"
 
 
+def test_motion_continues_from_rest_after_late_cycles_and_ends_after_a_long_pause() -> None:
+    rig = WallRig(wall=0.03)
+    rig.send(force=5.0, max_distance=0.05)
+    rig.run(0.5)
+    before = rig.arm.q
+    rig.now += 0.2
+    rig.step()
+    assert np.abs(rig.arm.q - before).max() < 6e-4 and rig.status.state == "active"
+    rig.run(0.5)
+    rig.now += 0.6
+    rig.run(0.05)
+    assert (rig.status.state, rig.status.error) == ("aborted", "interrupted")
+    rig.send(force=5.0, max_distance=0.03)
+    assert rig.finish().state == "succeeded"
+
+
 @pytest.mark.parametrize(("fields", "code"), [
     ({"direction": (1.0, 0.0, 0.0), "trajectory": "down"}, "path_mismatch"),
     ({"max_distance": 0.08, "trajectory": "short"}, "path_mismatch"),

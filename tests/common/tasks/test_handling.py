@@ -112,7 +112,7 @@ def test_fingers_open_as_wide_as_the_task_says(clearance: float, width: float) -
 
 def test_only_the_support_may_be_touched() -> None:
     of = task()
-    of.queue.extend(of._put(box("a", 0.5, 0.0), m.Pose(), Cycle("a"), view(
+    of.queue.extend(of.put(box("a", 0.5, 0.0), m.Pose(), Cycle("a"), view(
         box("below", 0.4, 0.2, z=-0.02), box("near", 0.4, 0.23)), None))
     assert next(stage for stage in of.queue if stage.name == "lower").touches == [("a", "below")]
 
