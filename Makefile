@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.up-to-date
 
-.PHONY: setup franka-sim run up test test-all campaign grasping conveyor force-motions containers check audit bench bench-check chaos fuzz soak docs docs-site deploy clean
+.PHONY: setup franka-sim run up test test-all campaign grasping conveyor force-motions force-payload containers check audit bench bench-check chaos fuzz soak docs docs-site deploy clean
 
 setup: $(STAMP)
 
@@ -65,6 +65,9 @@ conveyor: setup  ## picks from a moving belt by images, kinematic and with physi
 force-motions: setup  ## 100 contacts and 100 insertions in physics, half an hour; resumable. Needs the extra: make setup EXTRAS=physics
 	@mkdir -p build
 	$(BIN)/python -m benchmarks.force_motions --contacts 100 --insertions 100 --json build/force_motions.jsonl
+
+force-payload: setup  ## identification of payloads in physics, minutes; needs the extra: make setup EXTRAS=physics
+	$(BIN)/python -m benchmarks.force_payload
 
 containers: setup  ## build the image and run a cell in containers; needs a container engine
 	$(BIN)/python -m pytest -q -m container tests/deploy

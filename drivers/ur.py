@@ -47,6 +47,7 @@ VARIABLES = ["timestamp", "actual_q", "actual_qd", "robot_mode", "safety_mode", 
              "target_speed_fraction", "speed_scaling", "robot_status_bits", "actual_digital_input_bits",
              "actual_digital_output_bits"]
 SENSOR = ["actual_TCP_force", "payload", "payload_cog"]  # of arms with a force sensor
+NOT_FOUND = "not found by the controller"  # in the library's message about an unknown variable
 SAFETY: dict[int, tuple[RobotMode, str]] = {
     3: ("protective_stop", "protective stop: find the cause, then `zencell robot recover`"),
     4: ("protective_stop", "in recovery mode: move the joints back within their limits at the pendant"),
@@ -173,8 +174,14 @@ class UrArm:
         self._dashboard = DashboardClient(options.host)
         self._dashboard.connect()
         self._senses = CB3.match(options.model) is None
-        self._receive = rtde_receive.RTDEReceiveInterface(
-            options.host, self.rate, VARIABLES + SENSOR if self._senses else VARIABLES)
+        try:
+            self._receive = rtde_receive.RTDEReceiveInterface(
+                options.host, self.rate, VARIABLES + SENSOR if self._senses else VARIABLES)
+        except RuntimeError as error:
+            if NOT_FOUND not in str(error) or not self._senses:
+                raise
+            self._senses = False  # an old PolyScope, which does not report the payload
+            self._receive = rtde_receive.RTDEReceiveInterface(options.host, self.rate, VARIABLES)
         self._control: Any = None
         self._control_lock = threading.Lock()  # the control interface is not thread-safe
         self._stamp, self._since = -1.0, time.monotonic()

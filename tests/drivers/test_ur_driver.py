@@ -160,6 +160,19 @@ def test_arm_reports_force_and_payload_and_none_while_it_is_off(controller: Cont
     assert old.read().wrench is None, "a CB3 has no sensor"
 
 
+def test_old_polyscope_without_the_payload_is_driven_without_force(
+    controller: Controller, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def connect(host: str, rate: float, variables: list[str]) -> Controller:
+        if "payload_cog" in variables:
+            raise RuntimeError("The following variables was not found by the controller: [payload_cog],\n see ...")
+        return controller
+
+    monkeypatch.setitem(sys.modules, "rtde_receive", SimpleNamespace(RTDEReceiveInterface=connect))
+    state = UrArm(Options(host="h", model="ur5e"), LIMITS).read()
+    assert state.mode == "running" and state.wrench is None
+
+
 def test_silence_is_the_time_of_listening_since_the_last_message() -> None:
     silence = SilenceTimer()
     assert silence.update(10.0, True) == 0.0
