@@ -2,8 +2,8 @@
 
     python -m benchmarks.force_payload [--poses N] [--sensors ideal,poor] [--seed N]
 
-The Panda cell on the virtual clock, `world.simulator: mujoco`, with weights at its hand that the cell is told nothing
-about (`robot.gripper.payload: {mass: 0}`): what `zencell robot identify-payload` does there, compared with the masses
+The Panda cell on the virtual clock, `world.simulator: mujoco`, with weights at its hand that are unknown to the cell
+(`robot.gripper.payload: {mass: 0}`): what `zencell robot identify-payload` does there, compared with the masses
 of the description. The poor sensor has a bias of 3 N and 0.3 N m (standard deviation, one draw per run), white noise of
 1 N and 0.05 N m in each reading of 10 ms, and an error of 0.1 N and 5 mN m that is new in each pose: every half second.
 """

@@ -78,7 +78,7 @@ def test_payload_of_the_simulated_gripper_is_found_and_the_arm_returns() -> None
         before, lines = await cell.arm.joints(), list[str]()
         found, flange = await identify_payload(cell, poses=4, speed=0.5, report=lines.append)
         assert np.allclose(await cell.arm.joints(), before, atol=2e-3) and len(lines) == 4
-        assert found.mass == pytest.approx(0.76, rel=0.01)  # hand and fingers in the URDF, which is not told here
+        assert found.mass == pytest.approx(0.76, rel=0.01)  # hand and fingers in the URDF
         assert found.com == pytest.approx([-0.0068, 0.0068, 0.0311], abs=5e-4)
         assert flange == "panda_link8"
         assert report_lines(found, flange)[-1] == "  payload: {mass: 0.760, com: [-0.0068, 0.0068, 0.0312]}"
