@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 import typer
 
 from cli import choices, options
-from cli.options import RUNNING, CellTarget, CommandGroup
+from cli.options import OF_ARM, RUNNING, CellTarget, CommandGroup
 from common.errors import ConfigError, UnknownName
 from common.terminal import echo
 
@@ -38,7 +38,7 @@ def call(
                             autocompletion=choices.requests)
     ],
     body: Annotated[str, typer.Argument(metavar="JSON", help="its fields; `zencell topic info KEY` shows an example")],
-    at: CellTarget = RUNNING,
+    at: CellTarget = OF_ARM,
     timeout: Annotated[str, typer.Option("--timeout", metavar="S", help="[s]")] = f"{TIMEOUT:g}",
 ) -> None:
     """Send a request and print the answer as JSON; exit 1 with one line without an answer."""
@@ -88,25 +88,25 @@ def _task(at: CellTarget, command: Callable[[TaskControl], Awaitable[Message]]) 
 
 
 @task.command()
-def start(override: options.Override = False, at: CellTarget = RUNNING) -> None:
+def start(override: options.Override = False, at: CellTarget = OF_ARM) -> None:
     """Start the task, or restart it after a stop or its end; releases your own holds of the robot."""
     _task(at, lambda task: task.start(override=override))
 
 
 @task.command()
-def pause(at: CellTarget = RUNNING) -> None:
+def pause(at: CellTarget = OF_ARM) -> None:
     """Stop the robot on its path at once and hold it there."""
     _task(at, lambda task: task.pause())
 
 
 @task.command()
-def resume(override: options.Override = False, at: CellTarget = RUNNING) -> None:
+def resume(override: options.Override = False, at: CellTarget = OF_ARM) -> None:
     """Let the robot continue along its path after your pause."""
     _task(at, lambda task: task.resume(override=override))
 
 
 @task.command()
-def stop(at: CellTarget = RUNNING) -> None:
+def stop(at: CellTarget = OF_ARM) -> None:
     """Stop the robot, abandon its motion, and wait for a start; works also if the task does not answer."""
     _task(at, lambda task: task.stop())
 
@@ -116,7 +116,7 @@ def home(
     planner: Annotated[
         str, typer.Option("--planner", metavar="NAME", help="use only this planner", autocompletion=choices.planners)
     ] = "",
-    at: CellTarget = RUNNING,
+    at: CellTarget = OF_ARM,
 ) -> None:
     """Move to the home pose while no task uses the robot; Ctrl-C stops the robot."""
     at.answer(lambda cell: cell.arm.move("home", planner=planner))
@@ -195,7 +195,7 @@ def reset(at: CellTarget = RUNNING) -> None:
 
 
 @scene.command("list")
-def list_solids(at: CellTarget = RUNNING, as_json: options.Json = False) -> None:
+def list_solids(at: CellTarget = OF_ARM, as_json: options.Json = False) -> None:
     """List the added solids; `zencell topic echo planning_scene` shows all obstacles."""
     from common.messages.schema import to_json
 
@@ -214,7 +214,7 @@ def add_solid(
     middle: Annotated[str, typer.Argument(metavar="X,Y,Z", help="its center in world [m]")],
     rpy: Annotated[str, typer.Option("--rpy", metavar="R,P,Y", help="roll, pitch, yaw [rad]")] = "0,0,0",
     color: Annotated[str, typer.Option("--color", metavar="R,G,B", help="0 to 1 each")] = "",
-    at: CellTarget = RUNNING,
+    at: CellTarget = OF_ARM,
 ) -> None:
     """Add a solid; it persists over restarts until it is removed. A motion that would hit it brakes."""
     from common.client.goals import pose
@@ -229,7 +229,7 @@ def add_solid(
 
 
 @scene.command("remove")
-def remove_solid(name: SolidName, at: CellTarget = RUNNING) -> None:
+def remove_solid(name: SolidName, at: CellTarget = OF_ARM) -> None:
     """Remove a solid by name, also one that another operator added."""
     left = at.join(lambda cell: cell.scene.remove(name))
     echo(f"still added: {', '.join(left) or 'nothing'}")

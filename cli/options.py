@@ -35,6 +35,7 @@ CellName = Annotated[
     str | None, typer.Option("--cell", metavar="NAME", help="name of the cell; not needed if only one is running",
                               autocompletion=choices.cells)
 ]
+ArmName = Annotated[str | None, typer.Option("--arm", metavar="NAME", help="arm of a cell with several robots")]
 Domain = Annotated[
     str | None,
     typer.Option("--domain", metavar="N", help="0 to 232; the router's port is 7447 + N [ZENCELL_DOMAIN, 42]"),
@@ -193,6 +194,7 @@ class CellTarget:
     cell: str | None = None
     domain: str | None = None
     connect: str | None = None
+    arm: str = ""
 
     def visit(
         self, visit: Callable[[Bus], Awaitable[T]], *, any_cell: bool = False, identity: str | None = None
@@ -219,10 +221,11 @@ class CellTarget:
         """Join the cell with the Python client and return the result of `visit`."""
         from common.client.cell import Cell
         from common.client.joining import cell_clock
+        from common.client.several_arms import chosen_arm
 
         async def visited(bus: Bus) -> T:
             bus.clock = await cell_clock(bus)
-            async with Cell.on(bus) as client:
+            async with chosen_arm(bus, self.arm) as own, Cell.on(own) as client:
                 return await visit(client)
 
         return self.visit(visited)
@@ -255,6 +258,7 @@ class CellTarget:
 
 
 RUNNING = CellTarget()  # the only running cell, at ZENCELL_DOMAIN or ZENCELL_CONNECT
+OF_ARM = CellTarget()  # the same, for commands to one arm
 _OPTIONS = {"cell": CellName, "domain": Domain, "connect": Connect}
 
 
@@ -279,15 +283,19 @@ class CommandGroup(typer.Typer):
 def _with_options(command: Callable[..., T]) -> Callable[..., T]:
     """Replace `at` by its options: --cell in its position, the others last, as in all commands."""
     signature = inspect.signature(command, eval_str=True)
-    if not isinstance(getattr(signature.parameters.get("at"), "default", None), CellTarget):
+    default = getattr(signature.parameters.get("at"), "default", None)
+    if not isinstance(default, CellTarget):
         return command
+    chosen = _OPTIONS | ({"arm": ArmName} if default is OF_ARM else {})
 
     @functools.wraps(command)
-    def targeted(cell: str | None, domain: str | None, connect: str | None, **given: Any) -> T:
-        return command(**given, at=CellTarget(cell, domain, connect))
+    def targeted(
+        cell: str | None, domain: str | None, connect: str | None, arm: str | None = None, **given: Any
+    ) -> T:
+        return command(**given, at=CellTarget(cell, domain, connect, arm or ""))
 
     added = {name: inspect.Parameter(name, inspect.Parameter.POSITIONAL_OR_KEYWORD, default=None, annotation=annotation)
-             for name, annotation in _OPTIONS.items()}
+             for name, annotation in chosen.items()}
     shown = [added.pop("cell") if name == "at" else each for name, each in signature.parameters.items()]
     targeted.__signature__ = signature.replace(parameters=[*shown, *added.values()])  # type: ignore[attr-defined]
     return targeted

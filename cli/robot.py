@@ -15,7 +15,7 @@ import typer
 from typer.core import TyperCommand
 
 from cli import choices, options
-from cli.options import RUNNING, CellTarget, CommandGroup
+from cli.options import OF_ARM, CellTarget, CommandGroup
 from common.errors import ConfigError
 from common.terminal import echo
 
@@ -65,7 +65,7 @@ def collisions(
 
 
 @app.command()
-def status(at: CellTarget = RUNNING) -> None:
+def status(at: CellTarget = OF_ARM) -> None:
     """Print the state of the arm's controller: mode, why it cannot move, speed slider."""
     state = at.join(lambda cell: cell.arm.robot())
     echo(f"{state.mode}{f': {state.message}' if state.message else ''}")
@@ -79,13 +79,13 @@ def _order(at: CellTarget, act: str, value: float = 0.0, **more: Any) -> None:
 
 
 @app.command()
-def enable(at: CellTarget = RUNNING) -> None:
+def enable(at: CellTarget = OF_ARM) -> None:
     """Power the joints and release the brakes; rejected in a protective or emergency stop."""
     _order(at, "enable")
 
 
 @app.command()
-def recover(at: CellTarget = RUNNING) -> None:
+def recover(at: CellTarget = OF_ARM) -> None:
     """Release the arm from a protective or emergency stop; rejected while its joints are without power."""
     _order(at, "recover")
 
@@ -93,7 +93,7 @@ def recover(at: CellTarget = RUNNING) -> None:
 @app.command()
 def freedrive(
     state: Annotated[str, typer.Argument(metavar="on|off", help="whether the arm can be guided by hand")],
-    at: CellTarget = RUNNING,
+    at: CellTarget = OF_ARM,
 ) -> None:
     """Switch hand guiding of the arm on or off."""
     if state not in ("on", "off"):
@@ -106,7 +106,7 @@ def payload(
     mass: Annotated[str, typer.Argument(metavar="KG", help="mass on the flange: gripper and object")],
     com: Annotated[
         str, typer.Option("--com", metavar="X,Y,Z", help="centre of mass in the flange frame [m]")] = "0,0,0",
-    at: CellTarget = RUNNING,
+    at: CellTarget = OF_ARM,
 ) -> None:
     """Set the payload of the arm's controller."""
     x, y, z = options.three("--com", com)
@@ -117,7 +117,7 @@ def payload(
 def io(
     output: Annotated[str | None, typer.Argument(metavar="OUTPUT", help="number of a digital output")] = None,
     state: Annotated[str | None, typer.Argument(metavar="on|off", help="new state of the output")] = None,
-    at: CellTarget = RUNNING,
+    at: CellTarget = OF_ARM,
 ) -> None:
     """Print the digital inputs and outputs of the arm's controller, or set an output."""
     if output is None:
@@ -138,7 +138,7 @@ def _numbers(bits: int) -> str:
 
 
 @app.command()
-def owner(at: CellTarget = RUNNING) -> None:
+def owner(at: CellTarget = OF_ARM) -> None:
     """Print which client has motion authority. Any client may stop or hold the robot."""
     current = at.join(lambda cell: cell.arm.owner_now())
     echo(f"the motion is {current.description}{', jogging the arm' if current.jogging else ''}")
@@ -153,14 +153,14 @@ def _own(at: CellTarget, act: Literal["take", "give"], *, over: bool = False) ->
 def take(
     over: Annotated[bool, typer.Option("--over", help="take it from its owner: their motion stops, and a task "
                                                       "waits for `zencell task start`")] = False,
-    at: CellTarget = RUNNING,
+    at: CellTarget = OF_ARM,
 ) -> None:
     """Take motion authority until you release it: no task and no other client can move the robot."""
     _own(at, "take", over=over)
 
 
 @app.command()
-def give(at: CellTarget = RUNNING) -> None:
+def give(at: CellTarget = OF_ARM) -> None:
     """Give motion authority back. This moves nothing."""
     _own(at, "give")
 
@@ -176,7 +176,7 @@ def jog(
     frame: Annotated[str, typer.Option("--frame", metavar="base|tool|world", help="frame of --linear and "
                                                                                   "--angular")] = "base",
     seconds: Annotated[str, typer.Option("--seconds", metavar="S", help="duration [s], at most 60")] = "1",
-    at: CellTarget = RUNNING,
+    at: CellTarget = OF_ARM,
 ) -> None:
     """Jog the arm for a while: at most 0.25 m/s; the arm is at standstill 0.2 s after Ctrl-C or the end."""
     from common.client.operator_motion import check_seconds

@@ -209,6 +209,9 @@ async def run(
     stops = StopOfAllArms(bus, [name for name in config.arms.robots if name not in robots])
     arms = [HostedArm(name, bus, config, robot, stops, reports_world=simulated and not at)
             for at, (name, robot) in enumerate(robots.items())]
+    if config.arms.robots and not config.arms.own:  # STOP of the cell, for clients that name no arm
+        bus.serve(topics.MOTION_STOP, partial(stops.stop, arms[0].name), max_pending=MAX_STOPS,
+                  on_overload=stops.stop_for_unread)
 
     async def save_speed() -> None:
         for arm in arms:

@@ -18,7 +18,7 @@ import weakref
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from typing import Any, TypeVar
 
-from common.client import arm, cell, io, parameters, scene, subscriptions, task
+from common.client import arm, cell, io, parameters, scene, several_arms, subscriptions, task
 from common.errors import ZencellError
 from common.transport.zenoh_session import Forked
 
@@ -26,7 +26,7 @@ T = TypeVar("T")
 
 END_TIMEOUT = 5.0  # [s] for pending calls to end
 WRAPPED = (arm.Arm, arm.Gripper, subscriptions.Camera, parameters.Parameters, task.TaskControl, scene.Scene,
-           scene.World, io.Signals)
+           scene.World, io.Signals, several_arms.Arms, cell.Cell)
 
 
 class LoopThread:

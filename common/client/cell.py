@@ -21,6 +21,7 @@ from common.client.joining import StartedCell, cell_clock, domain_of_only, joine
 from common.client.keys import published_keys, require_key
 from common.client.parameters import Parameters
 from common.client.scene import Scene, World
+from common.client.several_arms import Arms
 from common.client.subscriptions import (
     AnyTopic,
     Camera,
@@ -54,6 +55,7 @@ class Cell(Part):
     Attributes:
         owner: name of this client in its requests.
         arm: state, plans, motions, jogging.
+        arms: the arms of a cell with several, by name: `cell.arms["left"].move("home")`.
         gripper: fingers or suction cup.
         io: digital and analog inputs and outputs.
         task: start, pause, resume, stop, status.
@@ -65,6 +67,7 @@ class Cell(Part):
 
     owner: str
     arm: Arm
+    arms: Arms[Arm]
     gripper: Gripper
     io: Signals
     task: TaskControl
@@ -139,7 +142,8 @@ class Cell(Part):
         self._bus, self._subscriptions = bus, Subscriptions(bus)
         arm = Arm(self._subscriptions, self.owner, self.tf)
         self._set(
-            arm=arm, gripper=Gripper(self._subscriptions, self.owner, arm),
+            arm=arm, arms=Arms(bus, lambda name: self.of_arm(name).arm),
+            gripper=Gripper(self._subscriptions, self.owner, arm),
             io=Signals(self._subscriptions, self.owner),
             task=TaskControl(self._subscriptions, self.owner, self._application), param=Parameters(bus),
             scene=Scene(self._subscriptions, self.owner), world=World(bus, self._subscriptions))
@@ -190,6 +194,13 @@ class Cell(Part):
         if self._bus is None:
             raise ZencellError(f"the cell {NOT_JOINED}")
         return self._bus
+
+    def of_arm(self, name: str) -> Cell:
+        """Return the cell of one of its arms, joined as long as this one; its `task.stop` stops all arms.
+
+        Its `arm`, `gripper`, `task`, `scene` and `planning_scene` are those of the arm.
+        """
+        return Cell.on(self.bus.of_arm(name), owner=self.owner, application=self._application)
 
     @property
     def name(self) -> str:

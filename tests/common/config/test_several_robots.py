@@ -11,7 +11,7 @@ from common.errors import ConfigError, UnknownName
 from common.supervision.wiring import owned_in, require_one_owner, wiring_of
 from common.topics import CAMERA_IMAGE, MOTION_STATUS
 from services import motion_planner, trajectory_executor
-from tools.check.cell import check_arms
+from tools.check.cell import check_arms, examine
 
 CELL = str(Path(__file__).parents[2] / "data" / "two_arms.yaml")
 APART = "robots={left: panda, right: {robot: panda, base_position: [0, 1, 0]}}"
@@ -53,6 +53,10 @@ def test_override_of_a_service_that_each_arm_has_is_one_for_each() -> None:
     assert cell.services["left_workspace_validator"].parameters == {"max_radius": 0.5, "x": 1}
     with pytest.raises(UnknownName, match="left_workspace_validator"):
         load_cell(CELL, ["services.validator.max_radius=0.5"])
+
+
+def test_smallest_cell_of_two_arms_passes_every_check() -> None:
+    assert list(examine(load_cell(str(Path(__file__).parents[3] / "examples" / "two_arms.yaml")))) == []
 
 
 async def test_keys_of_arms_are_below_their_names_and_have_one_owner() -> None:
