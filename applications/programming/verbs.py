@@ -123,7 +123,8 @@ def before_run(cell: str, overrides: list[str], world: str | None, *, on: RunIn 
 
     def forget() -> None:
         """The operator has ended the run: the next one begins at the first step."""
-        progress.unlink(missing_ok=True)
+        for each in progress.parent.glob(f"{progress.name}*"):  # also the files that replace it
+            each.unlink(missing_ok=True)
 
     return BeforeRun([*own, *overrides], cell=name, after=forget)
 
