@@ -162,11 +162,10 @@ class OperatorMotion:
 
     async def _repeat(self, client: Client[m.ForceMotion, m.MotionStatus], request: m.ForceMotion) -> None:
         """Repeat a force motion until cancelled: without that the executor ends it."""
-        nothing = request.trajectory.model_copy(update={"points": []})
         while True:
             await asyncio.sleep(REPEAT_PERIOD)
             with contextlib.suppress(RequestFailed):
-                await client.call(request.model_copy(update={"trajectory": nothing}), REPEAT_PERIOD)
+                await client.call(request, REPEAT_PERIOD)
 
     async def release_holds(self, acknowledged: int) -> None:
         """Turn the operator's own holds, up to `acknowledged`, into stops, so that their next motion is not held.

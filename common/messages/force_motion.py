@@ -20,8 +20,8 @@ class ForceMotion(ExecuteRequest):
     `insert`: press with `force`, search a hole on a spiral, push to `depth`.
 
     The trajectory is the planned straight line to `max_distance`, checked against the planning scene; the tool leaves
-    it by `radius` and `angle` at most. An operator's request is repeated, with no points, at least every second: the
-    arm comes to rest when it is not. A task's motion ends with its process.
+    it by `radius` and `angle` at most. An operator's request is repeated, unchanged or without points, at least every
+    second: the arm comes to rest when it is not. A task's motion ends with its process.
     """
 
     kind: Literal["until", "comply", "insert"]
