@@ -90,7 +90,7 @@ def insertion(seed: int) -> dict[str, Any]:
 def report(rows: Sequence[dict[str, Any]]) -> None:
     """Print medians, largest values, and shares with their intervals."""
     for kind, good, values in (
-        ("contact", lambda row: row["state"] == "succeeded",
+        ("contact", lambda row: row["state"] == "succeeded" and row["over_n"] >= 0.0,  # else the hand met the peg
          ("set_points_ms", "standstill_ms", "over_n", "over_mm", "rest_n")),
         ("insertion", lambda row: row["inserted"],
          ("seconds", "depth_mm", "start_off_mm", "most_n", "penetration_mm", "usual_penetration_mm")),
