@@ -68,4 +68,4 @@ def test_client_without_zencell_reads_joints_and_commands_the_gripper() -> None:
 
 def test_two_arms_are_a_cell_without_errors(tmp_path: Path) -> None:
     done: Any = ask(tmp_path, "check", str(EXAMPLES / "two_arms.yaml"))
-    assert (done.returncode, done.stdout.strip().splitlines()[-1]) == (0, "duo: no errors, no warnings")
+    assert (done.returncode, done.stdout.strip().splitlines()[-1]) == (0, "two_arms: no errors, no warnings")
